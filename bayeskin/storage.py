@@ -1,0 +1,127 @@
+"""Any of the project's dataclasses to and from HDF5: arrays, numbers and text, nothing executed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import h5py
+import numpy as np
+
+from bayeskin import types
+from bayeskin.errors import InputError
+
+T = TypeVar("T")
+FORMAT = "bayeskin"
+FORMAT_VERSION = 1
+
+_STORED = {
+    cls.__name__: cls
+    for cls in vars(types).values()
+    if isinstance(cls, type) and dataclasses.is_dataclass(cls) and cls.__module__ == types.__name__
+}
+
+
+def save(path: Path | str, value: Any) -> None:
+    """Writes a dataclass of `bayeskin.types` to `path`, whole or not at all.
+
+    The file appears under its name only when it is complete and on disk, so that an
+    interruption leaves the earlier file as it was.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with h5py.File(partial, "w") as handle:
+            handle.attrs["format"] = FORMAT
+            handle.attrs["format_version"] = FORMAT_VERSION
+            write(handle, value)
+        with open(partial, "rb") as written:
+            os.fsync(written.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load(path: Path | str, cls: type[T]) -> T:
+    """Reads the dataclass `cls` that `save` wrote.
+
+    Raises InputError if the file is absent, is not HDF5, is not bayeskin's, or holds another type.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(path, "no such file", f"a bayeskin {cls.__name__} file")
+    try:
+        with h5py.File(path, "r") as handle:
+            if handle.attrs.get("format") != FORMAT:
+                raise InputError(path, "an HDF5 file of another origin", f"a bayeskin {cls.__name__} file")
+            return read(handle, cls, path)
+    except OSError as error:
+        raise InputError(path, f"not readable as HDF5 ({error})", f"a bayeskin {cls.__name__} file") from None
+
+
+def write(group: h5py.Group, value: Any) -> None:
+    """Writes the fields of a dataclass into an open HDF5 group."""
+    group.attrs["type"] = type(value).__name__
+    for field in dataclasses.fields(value):
+        _write_field(group, field.name, getattr(value, field.name))
+
+
+def read(group: h5py.Group, cls: type[T], where: object = "") -> T:
+    """Reads a dataclass from an open HDF5 group; raises InputError when it holds another type."""
+    found = group.attrs.get("type")
+    if found != cls.__name__:
+        raise InputError(where or group.name, f"type {found!r}", f"type {cls.__name__!r}")
+    values = {}
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        if field.name not in group and field.name not in group.attrs:
+            raise InputError(where or group.name, f"no field {field.name!r}", f"all fields of {cls.__name__}")
+        values[field.name] = _read_field(group, field.name)
+    return cls(**values)
+
+
+def _write_field(group: h5py.Group, name: str, value: Any) -> None:
+    if isinstance(value, np.ndarray):
+        compress = {"compression": "gzip", "shuffle": True} if value.size > 256 else {}
+        group.create_dataset(name, data=value, **compress)
+    elif dataclasses.is_dataclass(value):
+        write(group.create_group(name), value)
+    elif isinstance(value, tuple) and value and all(dataclasses.is_dataclass(v) for v in value):
+        items = group.create_group(name)
+        items.attrs["type"] = "tuple"
+        for index, item in enumerate(value):
+            write(items.create_group(f"{index:06d}"), item)
+    elif isinstance(value, str | bool | int | float):
+        group.attrs[name] = value
+    elif isinstance(value, tuple | list | Mapping):
+        plain = dict(value) if isinstance(value, Mapping) else list(value)
+        data = json.dumps({"json": plain}, allow_nan=True)
+        group.create_dataset(name, data=np.frombuffer(data.encode(), dtype=np.uint8)).attrs["json"] = True
+    else:
+        raise TypeError(f"{group.name}/{name}: cannot store a {type(value).__name__}")
+
+
+def _read_field(group: h5py.Group, name: str) -> Any:
+    if name in group.attrs:
+        value = group.attrs[name]
+        return value.item() if isinstance(value, np.generic) else value
+    node = group[name]
+    if isinstance(node, h5py.Dataset):
+        if node.attrs.get("json"):
+            plain = json.loads(node[()].tobytes().decode())["json"]
+            return tuple(plain) if isinstance(plain, list) else plain
+        return types.frozen_array(node[()], node.dtype)
+    if node.attrs.get("type") == "tuple":
+        return tuple(_read_dataclass(node[key], key) for key in sorted(node))
+    return _read_dataclass(node, name)
+
+
+def _read_dataclass(group: h5py.Group, name: str) -> Any:
+    found = group.attrs.get("type")
+    if found not in _STORED:
+        raise InputError(group.name, f"type {found!r}", "a type that bayeskin stores")
+    return read(group, _STORED[found], name)

@@ -1,0 +1,280 @@
+"""The values that flow through bayeskin: frozen, in SI units, with the unit in the name.
+
+Arrays in these types are read-only; a change makes a new object (`dataclasses.replace`).
+``n`` counts samples or parameter points, ``d`` parameters, ``m`` time bins, ``k`` corners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+PhaseKind = Literal["rest", "load", "hold", "unload"]
+Observation = Literal["reaction", "article"]
+
+
+def frozen_array(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
+    """A read-only copy of `values`."""
+    array = np.array(values, dtype=dtype)
+    array.setflags(write=False)
+    return array
+
+
+class _FreezesArrays:
+    """Makes every array field of a frozen dataclass read-only."""
+
+    def __post_init__(self) -> None:
+        for name, value in list(vars(self).items()):
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                object.__setattr__(self, name, frozen_array(value, value.dtype))
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One sampled parameter: its symbol, SI unit, prior and where the prior comes from."""
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    prior: Literal["uniform", "log-uniform"]
+    description: str = ""
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class ParameterSpace:
+    """An ordered box of independent priors; the only place where theta meets the unit cube.
+
+    `theta` is always in SI units, shape ``(..., d)``, columns in the order of `names`.
+    """
+
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(p.name for p in self.parameters)
+
+    @property
+    def dim(self) -> int:
+        return len(self.parameters)
+
+    @property
+    def lower(self) -> Array:
+        return np.array([p.lower for p in self.parameters])
+
+    @property
+    def upper(self) -> Array:
+        return np.array([p.upper for p in self.parameters])
+
+    @property
+    def is_log(self) -> NDArray[np.bool_]:
+        return np.array([p.prior == "log-uniform" for p in self.parameters])
+
+    def to_unit(self, theta: ArrayLike) -> Array:
+        """Prior cumulative probability of each coordinate, shape (..., d); outside [0, 1] beyond the box."""
+        theta = np.asarray(theta, dtype=float)
+        log = self.is_log
+        value = np.where(log, np.log(np.where(log, theta, 1.0)), theta)
+        low, high = self._transformed_bounds()
+        return (value - low) / (high - low)
+
+    def from_unit(self, unit: ArrayLike) -> Array:
+        """Inverse of `to_unit`, shape (..., d)."""
+        low, high = self._transformed_bounds()
+        value = low + np.asarray(unit, dtype=float) * (high - low)
+        log = self.is_log
+        return np.where(log, np.exp(np.where(log, value, 0.0)), value)
+
+    def contains(self, theta: ArrayLike) -> NDArray[np.bool_]:
+        """Whether each point lies in the closed box, shape (...,)."""
+        theta = np.asarray(theta, dtype=float)
+        return np.all((theta >= self.lower) & (theta <= self.upper), axis=-1)
+
+    def _transformed_bounds(self) -> tuple[Array, Array]:
+        log = self.is_log
+        low = np.where(log, np.log(np.where(log, self.lower, 1.0)), self.lower)
+        high = np.where(log, np.log(np.where(log, self.upper, 1.0)), self.upper)
+        return low, high
+
+
+@dataclass(frozen=True)
+class Phase(_FreezesArrays):
+    """A stretch of the protocol in which the pads rest, load, hold or unload."""
+
+    kind: PhaseKind
+    cycle: int  # 1 for the first loading; the rest before it belongs to cycle 0
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True)
+class PadMotion(_FreezesArrays):
+    """Protocol: the LVDT displacement over time as a piecewise-linear curve through its corners.
+
+    `displacement_m` is the *full* LVDT reading; each pad of the symmetric model moves half of it.
+    Both arrays have shape (k,); `time_s` increases strictly and starts at 0.
+    """
+
+    time_s: Array
+    displacement_m: Array
+
+    def at(self, time_s: ArrayLike) -> Array:
+        """LVDT displacement [m] at the times given, same shape."""
+        return np.interp(np.asarray(time_s, dtype=float), self.time_s, self.displacement_m)
+
+
+@dataclass(frozen=True)
+class Recording(_FreezesArrays):
+    """A recording as measured, in SI, nothing smoothed, nothing set to zero. Arrays (n,)."""
+
+    time_s: Array
+    displacement_m: Array
+    force_n: Array
+    name: str
+    sha256: str  # of the source file's bytes
+    notes: tuple[str, ...] = ()  # what the importer took for what
+
+
+@dataclass(frozen=True)
+class BinnedForce(_FreezesArrays):
+    """Robust bin means of a recording's force, with what each mean's noise is known to be.
+
+    edges_s (m+1,); force_n (m,) robust means; variance_n2 (m,) variance of each mean, the
+    correlation of samples within the bin included; correlation (m-1,) of neighbouring bins' noise;
+    phase (m,) index into `phases` of the phase that covers most of the bin.
+    """
+
+    edges_s: Array
+    force_n: Array
+    variance_n2: Array
+    correlation: Array
+    phase: NDArray[np.int64]
+    phases: tuple[Phase, ...]
+
+    @property
+    def time_s(self) -> Array:
+        """Bin centres, (m,)."""
+        return 0.5 * (self.edges_s[1:] + self.edges_s[:-1])
+
+
+@dataclass(frozen=True)
+class Simulation(_FreezesArrays):
+    """One full run. A failed run is a value too: `status` is not "ok" and `message` says what to do.
+
+    time_s, displacement_m, force_n (n,): accepted steps, corners of the protocol among them.
+    `displacement_m` is the LVDT displacement. `corner` (n,) is True at the protocol's corners,
+    where the slope of the force jumps. `stats` holds counts and seconds (floats).
+    """
+
+    theta: Mapping[str, float]
+    time_s: Array
+    displacement_m: Array
+    force_n: Array
+    corner: NDArray[np.bool_]
+    status: Literal["ok", "failed"]
+    message: str
+    stats: Mapping[str, float]
+    model_hash: str
+
+    def at(self, time_s: ArrayLike) -> Array:
+        """Force [N] between steps: monotone cubic (PCHIP) inside each phase, continuous at corners."""
+        from scipy.interpolate import PchipInterpolator
+
+        query = np.asarray(time_s, dtype=float)
+        out = np.interp(query, self.time_s, self.force_n)
+        breaks = np.unique(np.concatenate([[0], np.flatnonzero(self.corner), [len(self.time_s) - 1]]))
+        for a, b in zip(breaks[:-1], breaks[1:], strict=True):
+            inside = (query >= self.time_s[a]) & (query <= self.time_s[b])
+            if b - a >= 2 and inside.any():
+                out[inside] = PchipInterpolator(self.time_s[a : b + 1], self.force_n[a : b + 1])(query[inside])
+        return out
+
+    def bin_means(self, edges_s: ArrayLike) -> Array:
+        """Mean force [N] over each bin, (m,): composite trapezoid on eleven points a bin."""
+        edges = np.asarray(edges_s, dtype=float)
+        fine = edges[:-1, None] + np.linspace(0.0, 1.0, 11) * np.diff(edges)[:, None]
+        return np.trapezoid(self.at(fine), dx=0.1, axis=1)
+
+
+@dataclass(frozen=True)
+class Design(_FreezesArrays):
+    """Points, and the force that the full model gave at them (bin means; NaN row where it failed).
+
+    theta (n, d); force_n (n, m); edges_s (m+1,); wave (n,) 0, 1, ...; held_out (n,) bool;
+    ok (n,) bool; messages (n,) of failed runs; seconds (n,) of each run.
+    """
+
+    space: ParameterSpace
+    edges_s: Array
+    theta: Array
+    force_n: Array
+    wave: NDArray[np.int64]
+    held_out: NDArray[np.bool_]
+    ok: NDArray[np.bool_]
+    messages: tuple[str, ...]
+    seconds: Array
+    seed: int
+    model_hash: str
+
+    @property
+    def training(self) -> NDArray[np.bool_]:
+        """Rows that a surrogate may learn from, (n,)."""
+        return self.ok & ~self.held_out
+
+    @property
+    def testing(self) -> NDArray[np.bool_]:
+        """Rows that no surrogate may learn from, (n,)."""
+        return self.ok & self.held_out
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Force at n points with its own uncertainty, as a low-rank Gaussian.
+
+    mean (n, m) [N]; factor (n, m, r) [N]; diagonal (n, m) [N^2].
+    Covariance at point i: ``factor[i] @ factor[i].T + diag(diagonal[i])``.
+    """
+
+    mean: Array
+    factor: Array
+    diagonal: Array
+
+    def sd(self) -> Array:
+        """Standard deviation of each bin, (n, m) [N]."""
+        return np.sqrt(np.einsum("nmr,nmr->nm", self.factor, self.factor) + self.diagonal)
+
+
+@runtime_checkable
+class Surrogate(Protocol):
+    """All that inference and sensitivity know of a model: a box, bins, and predictions in them."""
+
+    @property
+    def space(self) -> ParameterSpace: ...
+
+    @property
+    def edges_s(self) -> Array: ...
+
+    @property
+    def provenance(self) -> Mapping[str, Any]: ...
+
+    def predict(self, theta: ArrayLike) -> Prediction:
+        """Force at theta (n, d), vectorised. Raises InputError outside the box."""
+        ...
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a result was made from; stands in every file that bayeskin writes."""
+
+    version: str
+    config_sha256: str = ""
+    recording_sha256: str = ""
+    model_hash: str = ""
+    seed: int = 0
+    extra: Mapping[str, Any] = field(default_factory=dict)
