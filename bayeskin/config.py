@@ -1,0 +1,228 @@
+"""The configuration of a run: TOML in, checked values out, one line on what is wrong.
+
+Every key has a default except ``recording.file``. Units stand in the names (``bin_width_s``); bounds
+of a parameter are in its own SI unit, as `DEFAULT_PRIORS` lists them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from bayeskin.errors import InputError
+from bayeskin.types import Parameter, ParameterSpace
+
+_ARTICLE = "Lavigne et al., Poromechanical modelling of human skin, literature range"
+DEFAULT_PRIORS = ParameterSpace(
+    (
+        Parameter("E_c", "Pa", 10e3, 2e6, "log-uniform", "Young's modulus of the cutis", _ARTICLE),
+        Parameter("E_s", "Pa", 1e3, 500e3, "log-uniform", "Young's modulus of the subcutis", _ARTICLE),
+        Parameter("k_c", "m^2", 1e-16, 1e-11, "log-uniform", "permeability of the cutis", _ARTICLE),
+        Parameter("k_s", "m^2", 1e-16, 1e-11, "log-uniform", "permeability of the subcutis", _ARTICLE),
+        Parameter("p_init", "Pa", -670.0, 2144.0, "uniform", "initial interstitial pressure", _ARTICLE),
+    )
+)
+
+Positive = Annotated[int, Field(gt=0)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class RecordingConfig(_Section):
+    """Which recording, and the pad motion that drives the model if not the recording's own."""
+
+    file: str
+    protocol: str | None = None  # a PadMotion in bayeskin's HDF5
+
+
+class ModelConfig(_Section):
+    """Which force the model reports, and on which mesh: the generator's bricks or a gmsh file."""
+
+    observation: Literal["reaction", "article"] = "reaction"
+    mesh: str = "bricks"
+
+    @model_validator(mode="after")
+    def _article_needs_its_mesh(self) -> ModelConfig:
+        if self.observation == "article" and self.mesh == "bricks":
+            raise ValueError(
+                "mesh: found 'bricks'; expected the article's gmsh file with observation 'article'"
+            )
+        return self
+
+
+class PriorConfig(_Section):
+    """What replaces the default prior of one parameter; what is not given stays as it was."""
+
+    lower: float | None = None
+    upper: float | None = None
+    prior: Literal["uniform", "log-uniform"] | None = None
+
+
+class DesignConfig(_Section):
+    """Full runs: training points of each wave, held-out points of each wave, worker processes."""
+
+    points: Annotated[list[Positive], Field(min_length=1)] = [128, 96, 64]
+    held_out: Positive = 16
+    workers: Positive = 2
+
+
+class SurrogateConfig(_Section):
+    """Kind of surrogate, or a shipped one that spares the design."""
+
+    kind: Literal["auto", "gp", "chaos"] = "auto"
+    file: str | None = None
+
+
+class FitConfig(_Section):
+    """The stretches of the recording that are fitted (default: all of it) and the bins of its means."""
+
+    windows_s: list[tuple[float, float]] | None = None
+    bin_width_s: Annotated[float, Field(gt=0)] = 0.5
+
+    @model_validator(mode="after")
+    def _windows_have_an_inside(self) -> FitConfig:
+        if self.windows_s is not None and not self.windows_s:
+            raise ValueError("windows_s: found an empty list; expected at least one [start, end]")
+        for start, end in self.windows_s or ():
+            if not start < end:
+                raise ValueError(f"windows_s: found [{start:g}, {end:g}]; expected start below end")
+        return self
+
+
+class SampleConfig(_Section):
+    """Independent ensembles of walkers, and when to stop."""
+
+    ensembles: Annotated[int, Field(ge=2)] = 4
+    walkers: Annotated[int, Field(ge=4)] = 40
+    effective_samples: Positive = 5000
+    max_steps: Positive = 20000
+
+
+class MapConfig(_Section):
+    """Starts of the search for the most probable point, and evaluations that each may spend."""
+
+    starts: Positive = 8
+    evaluations: Positive = 20000
+
+
+class SobolConfig(_Section):
+    """Samples a matrix of the pick-freeze estimate on the Gaussian process."""
+
+    samples: Positive = 2048
+
+
+class Config(_Section):
+    """A whole run. `load_config` makes it from a file."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    recording: RecordingConfig
+    seed: Annotated[int, Field(ge=0)] = 1
+    model: ModelConfig = ModelConfig()
+    parameters: dict[str, PriorConfig] = {}
+    design: DesignConfig = DesignConfig()
+    surrogate: SurrogateConfig = SurrogateConfig()
+    fit: FitConfig = FitConfig()
+    sample: SampleConfig = SampleConfig()
+    map: MapConfig = MapConfig()
+    sobol: SobolConfig = SobolConfig()
+
+    @property
+    def sha256(self) -> str:
+        """Hash of all that can change a result; the number of workers cannot."""
+        plain = self.model_dump(mode="json", exclude={"design": {"workers"}})
+        return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+def load_config(path: Path | str) -> Config:
+    """Reads and checks a configuration; ``name`` defaults to the file's name without its suffix.
+
+    Raises InputError for a file that is absent or not TOML, an unknown key, a value of the wrong kind
+    or range, bounds upside down.
+    """
+    path = Path(path)
+    try:
+        plain = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(path, "no such file", "a TOML configuration") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(path, f"{error}", "a TOML configuration") from None
+    plain.setdefault("name", path.stem)
+    try:
+        config = Config.model_validate_json(json.dumps(plain, default=str))
+    except ValidationError as error:
+        raise _input_error(path, error) from None
+    parameter_space(config, path)
+    return config
+
+
+def parameter_space(config: Config, where: object = "configuration") -> ParameterSpace:
+    """The prior box: the defaults with the configuration's changes.
+
+    Raises InputError for an unknown parameter, bounds upside down, or a log prior that reaches zero.
+    """
+    unknown = sorted(set(config.parameters) - set(DEFAULT_PRIORS.names))
+    if unknown:
+        expected = _one_of(DEFAULT_PRIORS.names)
+        raise InputError(f"{where}: parameters.{unknown[0]}", "an unknown parameter", expected)
+    return ParameterSpace(
+        tuple(_overridden(p, config.parameters.get(p.name), where) for p in DEFAULT_PRIORS.parameters)
+    )
+
+
+def resolve(config_path: Path | str, file: str) -> Path:
+    """A file that a configuration names: beside the configuration unless absolute."""
+    return Path(config_path).resolve().parent / file
+
+
+def _overridden(default: Parameter, change: PriorConfig | None, where: object) -> Parameter:
+    if change is None:
+        return default
+    lower = default.lower if change.lower is None else change.lower
+    upper = default.upper if change.upper is None else change.upper
+    prior = change.prior or default.prior
+    at = f"{where}: parameters.{default.name}"
+    if not lower < upper:
+        raise InputError(at, f"lower {lower:g}, upper {upper:g} {default.unit}", "lower below upper")
+    if prior == "log-uniform" and lower <= 0:
+        raise InputError(f"{at}.lower", f"{lower:g} with a log-uniform prior", "a bound above zero")
+    return Parameter(default.name, default.unit, lower, upper, prior, default.description, "configuration")
+
+
+def _input_error(path: Path, error: ValidationError) -> InputError:
+    """The first complaint of pydantic as the project's one line."""
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    kind, given = first["type"], first["input"]
+    if kind == "extra_forbidden":
+        return InputError(f"{path}: {key}", "an unknown key", _one_of(_keys_beside(first["loc"])))
+    if kind == "missing":
+        return InputError(f"{path}: {key}", "nothing", "this key: it has no default")
+    if kind == "value_error":  # ours, "key: found X; expected Y"
+        own, _, rest = str(first["ctx"]["error"]).partition(": found ")
+        found, _, expected = rest.partition("; expected ")
+        return InputError(f"{path}: {key}.{own}", found, expected)
+    expected = first["msg"].removeprefix("Input should be ").removeprefix("Value should be ")
+    shown = "a table" if isinstance(given, Mapping) else json.dumps(given, default=str)
+    return InputError(f"{path}: {key}", shown, expected[0].lower() + expected[1:])
+
+
+def _keys_beside(location: tuple[Any, ...]) -> tuple[str, ...]:
+    """Names of the keys allowed in the table that `location` points into."""
+    section: Any = Config
+    for part in location[:-1]:
+        if section is Config and part == "parameters":
+            return tuple(PriorConfig.model_fields)
+        section = section.model_fields[part].annotation
+    return tuple(section.model_fields)
+
+
+def _one_of(names: tuple[str, ...]) -> str:
+    return "one of " + ", ".join(names)
