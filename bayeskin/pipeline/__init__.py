@@ -1,0 +1,1 @@
+"""The stages of a run, from a recording to its report, each resumable."""

@@ -1,0 +1,143 @@
+"""Runs stages in order: what is done and unchanged is skipped, what was interrupted goes on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import bayeskin
+from bayeskin.config import Config, load_config
+from bayeskin.errors import InputError
+from bayeskin.pipeline import folder
+from bayeskin.pipeline.folder import Record
+
+
+class Reporter(Protocol):
+    """Who is told how a run goes on."""
+
+    def log(self, message: str) -> None: ...
+
+    def progress(self, label: str, done: float, total: float) -> None: ...
+
+
+class Silent:
+    """A Reporter that tells nobody."""
+
+    def log(self, message: str) -> None: ...
+
+    def progress(self, label: str, done: float, total: float) -> None: ...
+
+
+@dataclass(frozen=True)
+class Run:
+    """A configuration and the folder of its outputs."""
+
+    config: Config
+    config_path: Path
+    folder: Path
+    reporter: Reporter
+
+    def at(self, stage: str, file: str) -> Path:
+        """Path of a stage's output."""
+        return self.folder / stage / file
+
+    def beside(self, file: str) -> Path:
+        """Path of a file that the configuration names; raises InputError when there is none."""
+        path = self.config_path.resolve().parent / file
+        if not path.is_file():
+            raise InputError(self.config_path, f"no file {path}", "the files that the configuration names")
+        return path
+
+    def summary(self, stage: str) -> Mapping[str, Any]:
+        """What a stage that is done said of itself."""
+        record = folder.read_record(self.folder / stage)
+        return record.summary if record is not None else {}
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage: the sections of the configuration, the files and the earlier stages that it reads.
+
+    `work` writes its outputs into the stage's folder and returns its summary.
+    """
+
+    name: str
+    does: str
+    needs: tuple[str, ...]
+    sections: tuple[str, ...]
+    work: Callable[[Run], Mapping[str, Any]]
+    files: Callable[[Run], Iterable[Path]] = field(default=lambda run: ())
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a stage ended: its record, and whether it had been done before."""
+
+    stage: str
+    skipped: bool
+    record: Record
+
+
+def open_run(config_path: Path, reporter: Reporter, folder: Path | None = None) -> Run:
+    """A run from its configuration; its folder lies beside the configuration unless given."""
+    config = load_config(config_path)
+    return Run(config, config_path, folder or config_path.resolve().parent / config.name, reporter)
+
+
+def run_stages(run: Run, stages: Mapping[str, Stage], last: str | None = None) -> list[Outcome]:
+    """Runs the stages that `last` needs, in order, and itself; all of them when `last` is None.
+
+    Raises InputError for bad input, or when another process works in the run's folder. An interruption
+    leaves each stage's folder such that the same call goes on from there.
+    """
+    wanted = _needed(stages, last)
+    with folder.locked(run.folder):
+        return [_run_stage(run, stage) for name, stage in stages.items() if name in wanted]
+
+
+def _needed(stages: Mapping[str, Stage], last: str | None) -> set[str]:
+    if last is None:
+        return set(stages)
+    return {last}.union(*(_needed(stages, name) for name in stages[last].needs))
+
+
+def _inputs_sha256(run: Run, stage: Stage) -> str:
+    records = {name: folder.read_record(run.folder / name) for name in stage.needs}
+    config = run.config.model_dump(mode="json", exclude={"design": {"workers"}})
+    return folder.sha256_of(
+        {
+            "version": bayeskin.__version__,
+            "config": {section: config[section] for section in stage.sections},
+            "files": [folder.sha256_of_file(path) for path in stage.files(run)],
+            "stages": {name: record.sha256 for name, record in records.items() if record is not None},
+        }
+    )
+
+
+def _run_stage(run: Run, stage: Stage) -> Outcome:
+    inputs, where = _inputs_sha256(run, stage), run.folder / stage.name
+    record = folder.current_record(where, inputs)
+    if record is not None:
+        run.reporter.log(f"{stage.name}: done before, unchanged")
+        return Outcome(stage.name, True, record)
+    run.reporter.log(f"{stage.name}: {stage.does}")
+    spent, started = folder.begin(where, inputs), time.perf_counter()
+    try:
+        summary = stage.work(run)
+    except BaseException:
+        seconds = spent + time.perf_counter() - started
+        folder.write_record(where, Record(inputs, done=False, seconds=seconds))
+        raise
+    seconds = spent + time.perf_counter() - started
+    provenance = {
+        "version": bayeskin.__version__,
+        "config_sha256": run.config.sha256,
+        "seed": run.config.seed,
+    }
+    record = Record(inputs, True, seconds, folder.output_hashes(where), folder.plain(summary), provenance)
+    folder.write_record(where, record)
+    run.reporter.log(f"{stage.name}: {seconds:.1f} s")
+    return Outcome(stage.name, False, record)
