@@ -1,7 +1,7 @@
 """The configuration of a run: TOML in, checked values out, one line on what is wrong.
 
 Every key has a default except ``recording.file``. Units stand in the names (``bin_width_s``); bounds
-of a parameter are in its own SI unit, as `DEFAULT_PRIORS` lists them.
+of a parameter are in its own SI unit, as in `bayeskin.design.default_space`.
 """
 
 from __future__ import annotations
@@ -15,19 +15,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from bayeskin.design import default_space
 from bayeskin.errors import InputError
 from bayeskin.types import Parameter, ParameterSpace
-
-_ARTICLE = "Lavigne et al., Poromechanical modelling of human skin, literature range"
-DEFAULT_PRIORS = ParameterSpace(
-    (
-        Parameter("E_c", "Pa", 10e3, 2e6, "log-uniform", "Young's modulus of the cutis", _ARTICLE),
-        Parameter("E_s", "Pa", 1e3, 500e3, "log-uniform", "Young's modulus of the subcutis", _ARTICLE),
-        Parameter("k_c", "m^2", 1e-16, 1e-11, "log-uniform", "permeability of the cutis", _ARTICLE),
-        Parameter("k_s", "m^2", 1e-16, 1e-11, "log-uniform", "permeability of the subcutis", _ARTICLE),
-        Parameter("p_init", "Pa", -670.0, 2144.0, "uniform", "initial interstitial pressure", _ARTICLE),
-    )
-)
 
 Positive = Annotated[int, Field(gt=0)]
 
@@ -168,18 +158,14 @@ def parameter_space(config: Config, where: object = "configuration") -> Paramete
 
     Raises InputError for an unknown parameter, bounds upside down, or a log prior that reaches zero.
     """
-    unknown = sorted(set(config.parameters) - set(DEFAULT_PRIORS.names))
+    default = default_space()
+    unknown = sorted(set(config.parameters) - set(default.names))
     if unknown:
-        expected = _one_of(DEFAULT_PRIORS.names)
-        raise InputError(f"{where}: parameters.{unknown[0]}", "an unknown parameter", expected)
+        where = f"{where}: parameters.{unknown[0]}"
+        raise InputError(where, "an unknown parameter", _one_of(default.names))
     return ParameterSpace(
-        tuple(_overridden(p, config.parameters.get(p.name), where) for p in DEFAULT_PRIORS.parameters)
+        tuple(_overridden(p, config.parameters.get(p.name), where) for p in default.parameters)
     )
-
-
-def resolve(config_path: Path | str, file: str) -> Path:
-    """A file that a configuration names: beside the configuration unless absolute."""
-    return Path(config_path).resolve().parent / file
 
 
 def _overridden(default: Parameter, change: PriorConfig | None, where: object) -> Parameter:

@@ -9,19 +9,21 @@ import pytest
 import bayeskin
 
 PACKAGE = Path(bayeskin.__file__).parent
-BASE = {"errors", "types", "storage", "shipped"}
-SIBLINGS = {"recordings", "model", "design", "surrogates", "config"}
+BASE = {"errors", "types", "storage", "shipped", "workers"}
+SIBLINGS = {"recordings", "model", "design", "surrogates"}
 BELOW = {
     "errors": set(),
     "types": set(),
     "storage": {"types", "errors"},
     "shipped": {"errors"},
+    "workers": {"errors"},
     **dict.fromkeys(SIBLINGS, BASE),
+    "config": BASE | {"design"},
     "runner": BASE | SIBLINGS,
     "inference": BASE,  # a Surrogate is all that these two know of a model
     "sensitivity": BASE,
     "report": BASE | {"recordings", "inference", "sensitivity"},
-    "pipeline": BASE | SIBLINGS | {"runner", "inference", "sensitivity", "report"},
+    "pipeline": BASE | SIBLINGS | {"config", "runner", "inference", "sensitivity", "report"},
 }
 BELOW["cli"] = BELOW["pipeline"] | {"pipeline"}
 

@@ -1,0 +1,188 @@
+"""The command line: parse, call, exit code. 0 done, 1 the answer is not to be trusted, 2 wrong input."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+import bayeskin
+from bayeskin.errors import InputError
+
+DONE, NOT_TRUSTED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout.")
+a_config = click.argument("config", type=click.Path(path_type=Path))
+
+
+class Terminal:
+    """Tells a person on stderr how a run goes on; bars only where somebody can see them move."""
+
+    def __init__(self) -> None:
+        self.console = Console(stderr=True, highlight=False)
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        self.bars = Progress(
+            *columns, console=self.console, transient=True, disable=not self.console.is_terminal
+        )
+        self.tasks: dict[str, Any] = {}
+
+    def __enter__(self) -> Terminal:
+        self.bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bars.stop()
+
+    def log(self, message: str) -> None:
+        self.console.print(message, markup=False)
+
+    def progress(self, label: str, done: float, total: float) -> None:
+        if label not in self.tasks:
+            self.tasks[label] = self.bars.add_task(label, total=total)
+        self.bars.update(self.tasks[label], completed=done, total=total, visible=done < total)
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(bayeskin.__version__, prog_name="bayeskin")
+def cli() -> None:
+    """What living skin is made of, from an extensometer test, and how sure one can be.
+
+    \b
+    Start here:
+      bayeskin import test.xlsx -o runs/test.h5     what is in a recording
+      bayeskin run runs/demo.toml                   everything, on the recording that is shipped
+    """
+
+
+@cli.command("import")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("-o", "out", required=True, type=click.Path(path_type=Path), help="HDF5 file to write.")
+@as_json
+def import_(file: Path, out: Path, as_json: bool) -> None:
+    """Read a recording (xlsx, csv, tsv, h5) and write it in SI units as HDF5.
+
+    Finds the columns and their units and says what it took for what, and which phases, noise, spikes and
+    steps it sees.
+
+    \b
+    Example:
+      bayeskin import Healthy_skin.xlsx -o runs/healthy-skin.h5
+    """
+    from bayeskin.pipeline import single
+
+    _answer(single.import_recording(file, out), as_json)
+
+
+@cli.command()
+@click.argument("config", required=False, type=click.Path(path_type=Path))
+@click.option(
+    "--recording", type=click.Path(path_type=Path), help="Recording whose displacement drives the run."
+)
+@click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A parameter, in SI units.")
+@click.option("--mesh", help="'bricks' or a gmsh file; default as in CONFIG.")
+@click.option("--observation", type=click.Choice(["reaction", "article"]), help="Default as in CONFIG.")
+@click.option("-o", "out", required=True, type=click.Path(path_type=Path), help="File to write: .csv or .h5.")
+@click.option("--fields", type=click.Path(path_type=Path), help="Folder for fields over time (ParaView).")
+@as_json
+def simulate(as_json: bool, **options: Any) -> None:
+    """One run of the full model on a recording's displacement (default: the demo's).
+
+    Parameters that are not set stand at the median of their prior. The CSV has the columns
+    time_s, displacement_m, force_n.
+
+    \b
+    Example:
+      bayeskin simulate --set E_c=300e3 --set k_s=1e-13 -o force.csv --fields fields/
+    """
+    from bayeskin.pipeline import single
+
+    with Terminal() as terminal:
+        document = single.simulate(reporter=terminal, **options)
+    _answer(document, as_json)
+
+
+def _stage_command(name: str, text: str) -> None:
+    @cli.command(name, help=f"{text}\n\nWhat it needs of earlier stages is done first.\n\n"
+                            f"\b\nExample:\n  bayeskin {name} runs/demo.toml")  # fmt: skip
+    @a_config
+    @as_json
+    def command(config: Path, as_json: bool) -> None:
+        _run(config, name, as_json)
+
+
+_stage_command("design", "Run the full model at the design's points, wave by wave.")
+_stage_command("train", "Train the surrogate on the design and validate it on held-out points.")
+_stage_command("map", "Find the most probable point and check it by the full model.")
+_stage_command("sample", "Sample the posterior until it can be trusted; bands on the predicted force.")
+_stage_command("sobol", "Sobol indices of the force over time.")
+_stage_command("report", "Figures and summary.json of a run.")
+
+
+@cli.command()
+@a_config
+@as_json
+def run(config: Path, as_json: bool) -> None:
+    """All stages of a configuration in order, skipping what is done and unchanged.
+
+    Outputs go to a folder beside CONFIG with the configuration's name. Interrupted at any moment, the same
+    command goes on.
+
+    \b
+    Example:
+      bayeskin run runs/demo.toml
+    """
+    _run(config, None, as_json)
+
+
+def _run(config: Path, last: str | None, as_json: bool) -> None:
+    from bayeskin.pipeline import stages
+
+    with Terminal() as terminal:
+        document = stages.run(config, last, terminal)
+    _answer(document, as_json)
+
+
+def _answer(document: Mapping[str, Any], as_json: bool) -> None:
+    """Prints a command's answer; exits with 1 when it says of itself that it failed."""
+    if as_json:
+        click.echo(json.dumps(document, indent=2, allow_nan=False))
+    else:
+        click.echo(document["text"])
+    if not document["ok"]:
+        raise click.exceptions.Exit(NOT_TRUSTED)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the `bayeskin` command."""
+    sys.exit(_exit_code(lambda: cli.main(arguments, prog_name="bayeskin", standalone_mode=False)))
+
+
+def _exit_code(call: Callable[[], Any]) -> int:
+    try:
+        return int(call() or DONE)
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        return WRONG_INPUT
+    except click.ClickException as error:
+        return _complain(error.format_message(), WRONG_INPUT)
+    except InputError as error:
+        return _complain(str(error), WRONG_INPUT)
+    except (KeyboardInterrupt, click.Abort):
+        return _complain("interrupted; the same command goes on from here", INTERRUPTED)
+    except BrokenPipeError:  # the reader of our stdout left, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except OSError as error:
+        return _complain(str(error), WRONG_INPUT)
+
+
+def _complain(message: str, code: int) -> int:
+    click.echo(f"bayeskin: {' '.join(message.split())}", err=True)
+    return code
