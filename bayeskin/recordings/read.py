@@ -1,0 +1,166 @@
+"""Recordings from the files that laboratories keep them in, refused in one line where they are unsound."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bayeskin import storage
+from bayeskin.errors import InputError
+from bayeskin.recordings.headers import UNITS, Column
+from bayeskin.recordings.tables import Table, read_text, read_workbook
+from bayeskin.types import Array, Recording
+
+_WORKBOOKS = {".xlsx", ".xlsm"}
+_TEXTS = {".csv", ".tsv", ".txt"}
+_STORED = {".h5", ".hdf5"}
+_MIN_SAMPLES = 100
+
+# What an extensometer test on living skin can be: (smallest, largest) duration, travel and peak force, in
+# SI. Wide on purpose: they only choose a unit that a header leaves out, where a single one fits.
+_PLAUSIBLE = {"time": (5.0, 7200.0), "displacement": (5e-5, 0.1), "force": (0.01, 100.0)}
+_PLAUSIBLE_INTERVAL_S = (1e-6, 0.2)
+# Beyond these no skin test goes: the unit in the header is not the one of the numbers.
+_LARGEST = {"displacement": (0.1, "m"), "force": (1e3, "N")}
+_SMALLEST_TRAVEL_M = 1e-5
+
+
+def read_recording(path: Path | str, *, sheet: str | None = None) -> Recording:
+    """Reads time, displacement and force from an xlsx, csv, tsv, txt or bayeskin h5 file.
+
+    Columns are found by their headers, in English or French, and units by the headers too (s, ms, min; m,
+    mm, um; N, mN); `notes` of the result says what was taken for what. Values become SI and are otherwise
+    as measured, but for a clock that does not start at zero, which is shifted to (and noted).
+
+    Parameters
+    ----------
+    path : the file
+    sheet : name of the sheet of a workbook in which several have the columns
+
+    Raises
+    ------
+    InputError : the file cannot be read, or is no recording of a skin test; says where, what and why.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(path, f"an unreadable file ({error.strerror})", "a recording") from None
+    kind = path.suffix.lower()
+    if kind in _STORED:
+        return _read_stored(path)
+    if kind in _WORKBOOKS:
+        table = read_workbook(path, data, sheet)
+    elif kind in _TEXTS:
+        table = read_text(path, data)
+    else:
+        endings = ", ".join(sorted(_WORKBOOKS | _TEXTS | _STORED))
+        raise InputError(path, f"ending {kind!r}", f"one of {endings}")
+    with np.errstate(over="ignore"):  # absurd numbers become infinite, and are refused as such
+        return _to_recording(path.stem, table, hashlib.sha256(data).hexdigest())
+
+
+def _read_stored(path: Path) -> Recording:
+    try:
+        recording = storage.load(path, Recording)
+        arrays = [np.asarray(a) for a in (recording.time_s, recording.displacement_m, recording.force_n)]
+        sound = len({a.shape for a in arrays}) == 1 and all(
+            a.ndim == 1 and a.dtype.kind == "f" for a in arrays
+        )
+    except InputError:
+        raise
+    except Exception as error:  # HDF5 raises of every kind on a damaged file
+        raise InputError(path, f"a damaged file ({type(error).__name__})", "a bayeskin Recording") from None
+    if not sound:
+        raise InputError(path, "arrays of other shapes or kinds", "three arrays of numbers of one length")
+    _refuse_unsound(str(path), 0, *arrays)
+    return recording
+
+
+def _to_recording(name: str, table: Table, sha256: str) -> Recording:
+    notes = list(table.notes)
+    values = {}
+    for quantity, column in table.columns.items():
+        raw = table.values[quantity]
+        _refuse_infinite(f"{table.where}, row", table.first_row, column.header, raw)
+        unit = column.unit or _guess_unit(table, column, raw)
+        values[quantity] = raw * UNITS[quantity][unit]
+        stated = "" if column.unit else ", the unit that fits the numbers (the header gives none)"
+        notes.append(f"column {column.header!r} taken as {quantity}, {unit}{stated}")
+    taken = {column.index for column in table.columns.values()}
+    ignored = [h.strip() for i, h in enumerate(table.headers) if i not in taken and h.strip()]
+    if ignored:
+        notes.append("columns ignored: " + ", ".join(map(repr, ignored)))
+    time_s, displacement_m, force_n = values["time"], values["displacement"], values["force"]
+    _refuse_unsound(table.where, table.first_row, time_s, displacement_m, force_n)
+    recording = Recording(time_s, displacement_m, force_n, name, sha256)
+    return replace(recording, time_s=time_s - time_s[0], notes=(*notes, *_remarks_on_clock(time_s)))
+
+
+def _remarks_on_clock(time_s: Array) -> list[str]:
+    remarks = []
+    if time_s[0] != 0.0:
+        remarks.append(f"time starts at {time_s[0]:g} s in the file; shifted to 0")
+    intervals = np.diff(time_s)
+    gap, usual = int(np.argmax(intervals)), float(np.median(intervals))
+    if intervals[gap] > 5 * usual:
+        remarks.append(
+            f"a gap of {intervals[gap]:.3g} s after {time_s[gap]:.3f} s (samples are {usual:.3g} s apart)"
+        )
+    return remarks
+
+
+def _guess_unit(table: Table, column: Column, raw: Array) -> str:
+    """The one unit under which the numbers can be a skin test's; raises InputError if none or several."""
+    quantity = column.quantity
+    size = float(np.ptp(raw) if quantity != "force" else np.max(np.abs(raw)))
+    low, high = _PLAUSIBLE[quantity]
+    fitting = [unit for unit, factor in UNITS[quantity].items() if low <= size * factor <= high]
+    if quantity == "time":
+        interval = float(np.median(np.abs(np.diff(raw)))) if len(raw) > 1 else 0.0
+        shortest, longest = _PLAUSIBLE_INTERVAL_S
+        fitting = [u for u in fitting if shortest <= interval * UNITS[quantity][u] <= longest]
+    if len(fitting) == 1:
+        return fitting[0]
+    accepted = ", ".join(UNITS[quantity])
+    found = f"no unit, and numbers up to {size:g} that fit {' and '.join(fitting) or 'none'}"
+    raise InputError(
+        f"{table.where}, column {column.header!r}", found, f"the unit in the header ({accepted})"
+    )
+
+
+def _refuse_infinite(where: str, first_row: int, what: str, values: Array) -> None:
+    bad = np.flatnonzero(~np.isfinite(values))
+    if len(bad):
+        place = f"{where} {first_row + bad[0]}, column {what!r}"
+        raise InputError(place, f"{values[bad[0]]}", "a finite number")
+
+
+def _refuse_unsound(where: str, first_row: int, time_s: Array, displacement_m: Array, force_n: Array) -> None:
+    """Raises InputError unless the arrays (n,) can be a skin test: long enough, clock forward, sizes sane."""
+    named = {"time": time_s, "displacement": displacement_m, "force": force_n}
+    if len(time_s) < _MIN_SAMPLES:
+        raise InputError(where, f"{len(time_s)} samples", f"at least {_MIN_SAMPLES}")
+    for name, values in named.items():
+        _refuse_infinite(f"{where}, row", first_row, name, values)
+    back = np.flatnonzero(np.diff(time_s) <= 0)
+    if len(back):
+        before, after = time_s[back[0]], time_s[back[0] + 1]
+        found = f"time {after:.6g} s after {before:.6g} s"
+        raise InputError(
+            f"{where}, row {first_row + back[0] + 1}", found, "times that increase from row to row"
+        )
+    for name, (largest, unit) in _LARGEST.items():
+        peak = int(np.argmax(np.abs(named[name])))
+        value = abs(named[name][peak])
+        if value > largest:
+            found = f"a {name} of {value:.4g} {unit}"
+            expected = f"at most {largest:g} {unit} (is the column in {'mm' if unit == 'm' else 'mN'}?)"
+            raise InputError(f"{where}, row {first_row + peak}", found, expected)
+    travel = float(np.ptp(displacement_m))
+    if travel < _SMALLEST_TRAVEL_M:
+        found = f"a displacement that changes by {travel:.3g} m in all"
+        raise InputError(where, found, f"at least {_SMALLEST_TRAVEL_M:g} m (is its unit right?)")

@@ -1,0 +1,169 @@
+"""Phases of a test - rest, load, hold, unload - from the displacement alone.
+
+A polyline through the displacement gives the pieces; each corner is then placed where straight lines
+fitted to both sides of it meet, so that neither the resolution of the LVDT nor the rounding of the
+corner by the drive moves it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from bayeskin.errors import InputError
+from bayeskin.recordings.polyline import simplify
+from bayeskin.types import Array, Phase, PhaseKind, Recording
+
+_STILL_SHARE = 0.03  # a piece that moves less than this share of the travel is still: drift, overshoot
+_REST_SHARE = 0.05  # still and this near to the lowest level: a rest, else a hold
+_SHORTEST_STILL_S = 0.2  # a turning point's dwell, shorter than this, is no phase
+_SPEED_CHANGE = 1.5  # loading that changes its speed by more has a corner there
+_TRIM_S = 0.5  # left out of a line fit at the rounded end of a piece, but never more than a tenth of it
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Samples start..stop of one direction: -1, 0 (still) or 1."""
+
+    start: int
+    stop: int
+    direction: int
+
+
+def resolution_m(displacement_m: Array) -> float:
+    """How finely displacement was recorded [m]: the larger of its least step and its noise's sd."""
+    levels = np.unique(displacement_m)
+    step = float(np.min(np.diff(levels))) if len(levels) > 1 else 0.0
+    second = np.diff(displacement_m, 2)
+    limit = max(5 * 1.4826 * float(np.median(np.abs(second))), 2 * step)
+    noise = float(np.sqrt(np.mean(second[np.abs(second) <= limit] ** 2) / 6.0))
+    return max(step, noise)
+
+
+def segment(recording: Recording) -> tuple[Phase, ...]:
+    """Phases that tile the recording, from the displacement alone.
+
+    Cycle 1 begins with the first loading; loading that follows an unloading or a rest begins the next
+    one, loading that follows a hold goes on with its own. A still phase within 5 % of the travel from the
+    lowest level is a rest, any other a hold. Turning points where the drive dwells for less than 0.2 s
+    have no phase of their own.
+
+    Raises
+    ------
+    InputError : the displacement shows one phase only.
+    """
+    time_s = recording.time_s
+    smooth = median_filter(recording.displacement_m, 5, mode="nearest")
+    travel = float(np.ptp(smooth))
+    tolerance = max(0.005 * travel, 4 * resolution_m(recording.displacement_m))
+    if travel < 5 * tolerance:
+        raise InputError(
+            recording.name,
+            f"a displacement that moves {travel:.3g} m, little more than its noise",
+            "loading and unloading",
+        )
+    knots = simplify(time_s, smooth, tolerance, np.empty(0, dtype=np.int64))
+    pieces = _merge(_pieces(time_s, smooth, knots, _STILL_SHARE * travel), time_s, smooth)
+    if len(pieces) < 2:
+        raise InputError(
+            recording.name, "a displacement with one phase only", "a load, a hold or an unload more"
+        )
+    corners = [_corner_s(time_s, smooth, a, b) for a, b in zip(pieces[:-1], pieces[1:], strict=True)]
+    edges = [float(time_s[0]), *corners, float(time_s[-1])]
+    return _name_phases(pieces, edges, smooth)
+
+
+def _pieces(time_s: Array, smooth: Array, knots: Array, still_m: float) -> list[_Piece]:
+    moved = np.diff(smooth[knots])
+    directions = np.where(np.abs(moved) < still_m, 0, np.sign(moved)).astype(int)
+    return [_Piece(int(a), int(b), int(d)) for a, b, d in zip(knots[:-1], knots[1:], directions, strict=True)]
+
+
+def _merge(pieces: list[_Piece], time_s: Array, smooth: Array) -> list[_Piece]:
+    """Pieces of one direction made one; still ones between moving ones dropped where too short."""
+    joined = _join(pieces, time_s, smooth)
+    kept = [
+        piece
+        for i, piece in enumerate(joined)
+        if piece.direction
+        or i in (0, len(joined) - 1)
+        or time_s[piece.stop] - time_s[piece.start] >= _SHORTEST_STILL_S
+    ]
+    if kept and kept[0].direction == 0 and time_s[kept[0].stop] - time_s[0] < _SHORTEST_STILL_S:
+        kept = kept[1:]
+    return _join(kept, time_s, smooth)
+
+
+def _join(pieces: list[_Piece], time_s: Array, smooth: Array) -> list[_Piece]:
+    joined: list[_Piece] = []
+    for piece in pieces:
+        last = joined[-1] if joined else None
+        if (
+            last is not None
+            and last.direction == piece.direction
+            and not _speeds_differ(last, piece, time_s, smooth)
+        ):
+            joined[-1] = _Piece(last.start, piece.stop, last.direction)
+        else:
+            joined.append(piece)
+    return joined
+
+
+def _speeds_differ(a: _Piece, b: _Piece, time_s: Array, smooth: Array) -> bool:
+    if a.direction == 0:
+        return False
+    fast, slow = sorted((abs(_line(time_s, smooth, p.start, p.stop)[0]) for p in (a, b)), reverse=True)
+    return fast > _SPEED_CHANGE * slow
+
+
+def _line(time_s: Array, smooth: Array, start: int, stop: int) -> tuple[float, float]:
+    """Slope and intercept of the least-squares line through samples start..stop."""
+    if stop - start < 2:
+        stop = min(start + 2, len(time_s) - 1)
+        start = max(0, stop - 2)
+    t, y = time_s[start : stop + 1], smooth[start : stop + 1]
+    middle = t.mean()
+    slope = float(np.dot(t - middle, y) / np.dot(t - middle, t - middle))
+    return slope, float(y.mean() - slope * middle)
+
+
+def _near_half(time_s: Array, piece: _Piece, at_end: bool) -> tuple[int, int]:
+    """The half of a piece that is nearest to a corner, without the corner's rounding."""
+    length = time_s[piece.stop] - time_s[piece.start]
+    trim = min(0.1 * length, _TRIM_S)
+    near, far = trim, max(0.5 * length, trim)
+    if at_end:
+        window = (time_s[piece.stop] - far, time_s[piece.stop] - near)
+    else:
+        window = (time_s[piece.start] + near, time_s[piece.start] + far)
+    start, stop = np.searchsorted(time_s, window)
+    return int(start), int(min(stop, len(time_s) - 1))
+
+
+def _corner_s(time_s: Array, smooth: Array, before: _Piece, after: _Piece) -> float:
+    """Where the lines through both sides of a corner meet; the polyline's knot if they do not meet near."""
+    slope_a, intercept_a = _line(time_s, smooth, *_near_half(time_s, before, at_end=True))
+    slope_b, intercept_b = _line(time_s, smooth, *_near_half(time_s, after, at_end=False))
+    knot = 0.5 * float(time_s[before.stop] + time_s[after.start])
+    reach = 0.25 * min(time_s[before.stop] - time_s[before.start], time_s[after.stop] - time_s[after.start])
+    if slope_a == slope_b:
+        return knot
+    meeting = (intercept_b - intercept_a) / (slope_a - slope_b)
+    return float(meeting) if abs(meeting - knot) <= max(reach, _SHORTEST_STILL_S) else knot
+
+
+def _name_phases(pieces: list[_Piece], edges: list[float], smooth: Array) -> tuple[Phase, ...]:
+    levels = [float(np.median(smooth[p.start : p.stop + 1])) for p in pieces]
+    low, travel = float(np.min(smooth)), float(np.ptp(smooth))
+    phases: list[Phase] = []
+    cycle = 0
+    for i, (piece, level) in enumerate(zip(pieces, levels, strict=True)):
+        kind: PhaseKind = "load" if piece.direction > 0 else "unload"
+        if piece.direction == 0:
+            kind = "rest" if level < low + _REST_SHARE * travel else "hold"
+        elif kind == "load" and not (phases and phases[-1].kind in ("hold", "load")):
+            cycle += 1
+        phases.append(Phase(kind, cycle, edges[i], edges[i + 1]))
+    return tuple(phases)
