@@ -1,0 +1,291 @@
+"""Where the full model is run: the prior box, points that fill it, and the part that data leave plausible.
+
+A design grows in waves. Wave 0 fills the prior box with a scrambled Sobol' sequence; each later wave
+fills what history matching against the recording has not ruled out, so that the surrogate is best
+where the posterior can be. Nothing here runs a model or touches a file.
+
+References: Sobol' (1967) with the scrambling of Matousek (1998) and Owen (1998), by `scipy.stats.qmc`;
+Craig, Goldstein, Seheult & Smith (1997), Pressure matching for hydrocarbon reservoirs; Vernon,
+Goldstein & Bower (2010), Galaxy formation: a Bayesian uncertainty analysis, Bayesian Analysis 5(4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayeskin.errors import InputError
+from bayeskin.types import Array, Parameter, ParameterSpace, Prediction, frozen_array
+
+Predict = Callable[[Array], Prediction]
+
+SURROGATE_SDS = 3.0  # Pukelsheim (1994): 3 sd hold at least 95 % of any unimodal error
+ENOUGH_SURVIVORS = 256  # a fraction known to about 6 %, and a bounding box to about 1 % of its width
+FIRST_CANDIDATES, MOST_CANDIDATES, ROUNDS = 2**13, 2**16, 8
+CHUNK = 256  # predictions carry a factor (n, m, r): a few ten MB at this n
+
+
+@dataclass(frozen=True)
+class Wave:
+    """Points to run, training ones first.
+
+    theta (n, d); held_out (n,) bool; `record` says how they were chosen (plain numbers and text).
+    """
+
+    space: ParameterSpace
+    theta: Array
+    held_out: NDArray[np.bool_]
+    number: int
+    seed: int
+    record: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "theta", frozen_array(self.theta))
+        object.__setattr__(self, "held_out", frozen_array(self.held_out, bool))
+
+
+def default_space() -> ParameterSpace:
+    """The five sampled parameters of the base model with their default priors (d = 5, SI units).
+
+    Source of each range: Lavigne et al., "Poromechanical modelling of the time-dependent response of
+    in vivo human skin during extension", and the literature cited there.
+    """
+    article = "Lavigne et al., initial material parameters"
+    stiffness = f"within the 5 kPa..196 MPa of Payan & Ohayon (2017) in {article}; narrowed to a skin test"
+    permeability = f"literature range 1e-16..1e-11 m^2 in {article}"
+    pressure = f"Wiig & Reed (1983), Hargens et al. (1981) in {article}"
+    return ParameterSpace(
+        (
+            Parameter("E_c", "Pa", 10e3, 2e6, "log-uniform", "Young's modulus of the cutis", stiffness),
+            Parameter("E_s", "Pa", 1e3, 500e3, "log-uniform", "Young's modulus of the subcutis", stiffness),
+            Parameter("k_c", "m^2", 1e-16, 1e-11, "log-uniform", "permeability of the cutis", permeability),
+            Parameter(
+                "k_s", "m^2", 1e-16, 1e-11, "log-uniform", "permeability of the subcutis", permeability
+            ),
+            Parameter("p_init", "Pa", -670.0, 2144.0, "uniform", "initial interstitial pressure", pressure),
+        )
+    )
+
+
+def sobol_points(space: ParameterSpace, n: int, seed: int | Sequence[int], skip: int = 0) -> Array:
+    """Points `skip` to ``skip + n`` of a scrambled Sobol' sequence that fills the prior, (n, d) in SI.
+
+    A longer sequence of the same seed starts with the shorter one, so a design can be extended.
+    Raises InputError for a negative count or seed.
+    """
+    unit = _sobol_unit(space.dim, n, seed, skip)
+    return np.clip(space.from_unit(unit), space.lower, space.upper)  # exp(log(x)) may leave by one ulp
+
+
+def first_wave(space: ParameterSpace, n: int, held_out: int, seed: int) -> Wave:
+    """Wave 0: `n` training and `held_out` test points over the whole box, from independent sequences."""
+    theta = [sobol_points(space, count, [seed, 0, part]) for part, count in enumerate((n, held_out))]
+    record = {
+        "rule": "scrambled Sobol' points over the whole prior box",
+        "kept_fraction": 1.0,
+        "lower": dict(zip(space.names, space.lower.tolist(), strict=True)),
+        "upper": dict(zip(space.names, space.upper.tolist(), strict=True)),
+    }
+    return _wave(space, theta, 0, seed, record)
+
+
+def misfit_bounds(mean: Array, sd: Array, force_n: ArrayLike, weights: ArrayLike) -> tuple[Array, Array]:
+    """What the full model's RMS misfit [N] to the recording can be, at least and at most; each (n,).
+
+    mean, sd (n, m): a surrogate's prediction; force_n (m,): the recording's bin means; weights (m,):
+    weight of each bin, 0 where it is not fitted (a boolean mask will do). By the triangle inequality
+    the model's misfit differs from D = rms(force - mean) by no more than rms(model - mean), which
+    exceeds `SURROGATE_SDS` times S = rms(sd) hardly ever, however the error correlates over bins.
+    """
+    weight = np.asarray(weights, dtype=float)
+    used = weight > 0
+    if not used.any():
+        raise InputError("weights of the bins", "no bin with a weight above zero", "at least one fitted bin")
+    share = weight[used] / weight[used].sum()
+    misfit = np.sqrt((np.asarray(force_n)[used] - mean[:, used]) ** 2 @ share)
+    spread = np.sqrt(sd[:, used] ** 2 @ share)
+    return misfit - SURROGATE_SDS * spread, misfit + SURROGATE_SDS * spread
+
+
+def plausible(
+    mean: Array, sd: Array, force_n: ArrayLike, weights: ArrayLike, floor_n: float, factor: float = 1.5
+) -> NDArray[np.bool_]:
+    """Which of n candidates can still be among the good fits, (n,); never empty.
+
+    History matching (Craig et al. 1997; Vernon et al. 2010) rules out a point whose misfit is many
+    sd of noise and surrogate error. The skin model has a misfit to real recordings at every point,
+    so in those units it would rule out all. The yardstick here is therefore the best attainable
+    misfit: with (low, high) = `misfit_bounds`, keep ``low <= factor * max(min(high), floor_n)``,
+    that is, all that may be within `factor` of the best, where a misfit below the noise floor
+    `floor_n` [N] (RMS noise of the fitted bins) counts as the floor. Arguments as `misfit_bounds`.
+    """
+    low, high = misfit_bounds(mean, sd, force_n, weights)
+    return low <= factor * max(high.min(), floor_n)
+
+
+def next_wave(
+    space: ParameterSpace,
+    predict: Predict,
+    force_n: ArrayLike,
+    weights: ArrayLike,
+    floor_n: float,
+    n: int,
+    held_out: int,
+    wave: int,
+    seed: int,
+    factor: float = 1.5,
+) -> Wave:
+    """`n` training and `held_out` test points that fill the plausible part of the box.
+
+    `predict` maps theta (n, d) to a Prediction of the bins of force_n (m,); the rest as `plausible`.
+    Both sets are scrambled Sobol' sequences over a region round the plausible part, filtered and
+    taken in the sequence's order, so they fill it; the test points' sequence is an independent one.
+    Fewer are returned where the plausible part is too thin to find more. The record states the share
+    of the prior's volume that was kept and the bounding box of what was kept.
+    """
+
+    def bounds(unit: Array) -> tuple[Array, Array]:
+        theta = np.clip(space.from_unit(unit), space.lower, space.upper)
+        parts = [predict(theta[i : i + CHUNK]) for i in range(0, len(theta), CHUNK)]
+        pairs = [misfit_bounds(part.mean, part.sd(), force_n, weights) for part in parts]
+        low, high = zip(*pairs, strict=True) if pairs else ((np.empty(0),), (np.empty(0),))
+        return np.concatenate(low), np.concatenate(high)
+
+    survey = _survey(space.dim, bounds, factor, floor_n, [seed, wave, 2])
+    theta = [
+        np.clip(space.from_unit(unit), space.lower, space.upper)
+        for part, count in enumerate((n, held_out))
+        for unit in [_fill(survey, bounds, count, [seed, wave, part])]
+    ]
+    record = {
+        "rule": f"lowest possible rms misfit <= {factor:g} x max(best attainable, noise floor); "
+        f"surrogate error counted at {SURROGATE_SDS:g} sd",
+        "floor_n": float(floor_n),
+        "best_n": survey.best_n,
+        "limit_n": survey.limit_n,
+        "kept_fraction": survey.kept_fraction,
+        "lower": dict(zip(space.names, space.from_unit(survey.lower).tolist(), strict=True)),
+        "upper": dict(zip(space.names, space.from_unit(survey.upper).tolist(), strict=True)),
+    }
+    return _wave(space, theta, wave, seed, record)
+
+
+@dataclass(frozen=True)
+class _Region:
+    """A box in the unit cube's coordinates: centre (d,), orthonormal axes (d, d) as columns, half (d,)."""
+
+    centre: Array
+    axes: Array
+    half: Array
+
+    @property
+    def volume(self) -> float:
+        return float(np.prod(2.0 * self.half))
+
+    def points(self, count: int, seed: Sequence[int], skip: int = 0) -> Array:
+        """The sequence's points `skip` to ``skip + count`` that lie in the unit cube too, (<= count, d)."""
+        local = (2.0 * _sobol_unit(len(self.half), count, seed, skip) - 1.0) * self.half
+        unit = self.centre + local @ self.axes.T
+        return unit[np.all((unit >= 0.0) & (unit <= 1.0), axis=1)]
+
+
+@dataclass(frozen=True)
+class _Survey:
+    """What history matching left: where to draw, the limit [N] to pass, and the size of what passes."""
+
+    region: _Region
+    best_n: float
+    limit_n: float
+    kept_fraction: float
+    lower: Array
+    upper: Array
+
+
+def _survey(
+    dim: int,
+    bounds: Callable[[Array], tuple[Array, Array]],
+    factor: float,
+    floor_n: float,
+    seed: Sequence[int],
+) -> _Survey:
+    """Closes in on the plausible part until enough candidates of one draw survive."""
+    region = _Region(np.full(dim, 0.5), np.eye(dim), np.full(dim, 0.5))
+    count, best, fraction = FIRST_CANDIDATES, np.inf, 1.0
+    kept, kept_low = np.empty((0, dim)), np.empty(0)
+    for turn in range(ROUNDS):
+        unit = region.points(count, [*seed, turn])
+        low, high = bounds(unit)
+        best = float(np.min(high, initial=best))
+        limit = factor * max(best, floor_n)
+        alive = int(np.sum(low <= limit))
+        fraction = region.volume * alive / count if alive else fraction
+        kept, kept_low = np.concatenate([kept, unit]), np.concatenate([kept_low, low])
+        kept, kept_low = kept[kept_low <= limit], kept_low[kept_low <= limit]
+        if alive >= ENOUGH_SURVIVORS:
+            break
+        closer = _enclosing(kept, spacing=(region.volume / count) ** (1.0 / dim))
+        if closer.volume < 0.5 * region.volume:
+            region = closer
+        else:  # a bent part fills its box badly: look harder in the same box
+            count = min(4 * count, MOST_CANDIDATES)
+    return _Survey(region, best, limit, fraction, kept.min(axis=0), kept.max(axis=0))
+
+
+def _enclosing(unit: Array, spacing: float) -> _Region:
+    """The smaller of two boxes round the points (n, d): along the coordinates or the principal axes.
+
+    Widened by a tenth and by the distance of neighbouring candidates, since the points are a sample.
+    """
+    dim = unit.shape[1]
+    principal = np.linalg.svd(unit - unit.mean(axis=0), full_matrices=True)[2].T
+    regions = []
+    for axes, within in ((np.eye(dim), 1.0), (principal, np.inf)):
+        low, high = (unit @ axes).min(axis=0), (unit @ axes).max(axis=0)
+        margin = 0.05 * (high - low) + spacing
+        low, high = (
+            (low - margin, high + margin)
+            if np.isinf(within)
+            else (np.maximum(low - margin, 0.0), np.minimum(high + margin, 1.0))
+        )
+        regions.append(_Region(axes @ (0.5 * (low + high)), axes, 0.5 * (high - low)))
+    return min(regions, key=lambda region: region.volume)
+
+
+def _fill(
+    survey: _Survey, bounds: Callable[[Array], tuple[Array, Array]], count: int, seed: Sequence[int]
+) -> Array:
+    """The first `count` points of a sequence over the region that pass the limit, (<= count, d)."""
+    found, drawn, batch = np.empty((0, len(survey.lower))), 0, 2**11
+    while len(found) < count and drawn < ROUNDS * MOST_CANDIDATES:
+        unit = survey.region.points(batch, seed, skip=drawn)
+        found = np.concatenate([found, unit[bounds(unit)[0] <= survey.limit_n]])
+        drawn += batch
+    return found[:count]
+
+
+def _wave(
+    space: ParameterSpace, theta: list[Array], number: int, seed: int, record: Mapping[str, Any]
+) -> Wave:
+    """Training and held-out points (n, d) joined, with their numbers in the record."""
+    training, testing = (len(part) for part in theta)
+    counted = {"wave": number, "seed": seed, "training": training, "held_out": testing, **record}
+    return Wave(
+        space, np.concatenate(theta), np.arange(training + testing) >= training, number, seed, counted
+    )
+
+
+def _sobol_unit(dim: int, n: int, seed: int | Sequence[int], skip: int = 0) -> Array:
+    """Points `skip` to ``skip + n`` of a scrambled Sobol' sequence in the unit cube, (n, dim)."""
+    from scipy.stats import qmc  # takes a second to import, which a worker process need not pay
+
+    if n < 0 or skip < 0 or np.min(seed) < 0:
+        raise InputError("Sobol' points", f"n = {n}, skip = {skip}, seed = {seed}", "none of them negative")
+    engine = qmc.Sobol(dim, scramble=True, seed=np.random.default_rng(seed))
+    if skip:
+        return engine.fast_forward(skip).random(n)
+    # SciPy warns when a sequence starts with a number of points other than a power of two.
+    return engine.random(1 << max(n - 1, 0).bit_length())[:n]

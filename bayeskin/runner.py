@@ -1,0 +1,273 @@
+"""Runs a design through the full model in local processes, into one HDF5 file, whatever interrupts it.
+
+While a wave runs, each finished run goes into a journal beside the file (`bayeskin.journal`); when
+all are there, a new file with all rows is written, replaces the old one, and the journal goes. So the
+file is whole at every moment, and a process killed at any moment loses only the runs in progress.
+Rows stand in the order of the points, whoever finished first.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from functools import partial
+from glob import escape
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bayeskin import storage
+from bayeskin.design import Wave
+from bayeskin.errors import InputError
+from bayeskin.journal import Journal, Run
+from bayeskin.types import Array, Design, ParameterSpace, Simulation
+from bayeskin.workers import Lost, run_parallel
+
+Simulate = Callable[[Mapping[str, float]], Simulation]
+Progress = Callable[[int, int, int, float], None]
+
+
+class _Outcome(NamedTuple):
+    """What a worker sends back; `force_n` is None when the run failed."""
+
+    force_n: Array | None
+    message: str
+    seconds: float
+    model_hash: str
+
+
+def run_design(
+    path: Path | str,
+    wave: Wave,
+    edges_s: ArrayLike,
+    simulate: Simulate,
+    model_hash: str,
+    workers: int = 2,
+    progress: Progress | None = None,
+) -> Design:
+    """Runs the points of `wave` that are in no file yet and returns the design with all its waves.
+
+    simulate maps ``{name: value}`` to a Simulation; it must be picklable, and its results carry
+    `model_hash`. edges_s (m+1,): the bins whose mean force is kept. A point is known by its bytes,
+    so a repeated one is not run again. A run that fails, raises, or kills its worker `ATTEMPTS`
+    times becomes a row with ``ok`` False and a message. Called again after an interruption of any
+    kind, it goes on. progress(done, total, failed, eta_s) counts this wave's points; eta_s is NaN
+    until there is something to estimate from. Ctrl-C ends the workers, keeps what is finished and
+    raises KeyboardInterrupt.
+
+    Raises InputError, with nothing written, when the file holds another parameter space, model or
+    bins, when a point lies outside the box, when another process runs the same file, or when
+    `simulate` is of another model.
+    """
+    path, edges = Path(path), np.asarray(edges_s, dtype=float)
+    points = _distinct(wave)
+    identity, bins = _identity(wave.space, edges, model_hash), len(edges) - 1
+    with Journal(path.with_name(f"{path.name}.journal"), identity, bins) as journal:
+        _remove_stale(path)
+        before = load_design(path) if path.exists() else None
+        if before is not None:
+            _check_same(path, before, wave.space, edges, model_hash)
+        known = _rows_ok(before) | {key: run.ok for key, run in journal.runs.items()}
+        todo = [row for key, row in points.items() if key not in known]
+        report = _reporter(progress, len(points), [known[key] for key in points if key in known])
+        report(None)
+        task = partial(_bin_means_of, simulate, wave.space.names, edges)
+        with closing(run_parallel(task, todo, workers)) as results:
+            for index, outcome in results:
+                run = _as_run(path, todo[index], outcome, bins, model_hash)
+                journal.append(run)
+                report(run)
+        stored = set(_rows_ok(before))
+        fresh = [journal.runs[key] for key in points if key not in stored]
+        design = _extended(before, wave, edges, model_hash, fresh)
+        if fresh:
+            _write(path, design, [*(load_waves(path) if before else ()), dict(wave.record)])
+        journal.forget(stored | set(points))
+    return design
+
+
+def add_points(
+    path: Path | str,
+    theta: ArrayLike,
+    simulate: Simulate,
+    reason: str,
+    workers: int = 2,
+    progress: Progress | None = None,
+) -> Design:
+    """Adds training points (n, d) that no rule drew, such as a MAP estimate, as the next wave.
+
+    `reason` goes into the wave's record. Resumes as `run_design` does. Raises InputError as
+    `run_design` and `load_design` do.
+    """
+    design = load_design(path)
+    theta = np.atleast_2d(np.asarray(theta, dtype=float))
+    number = int(design.wave.max()) + 1
+    record = {"wave": number, "seed": design.seed, "training": len(theta), "held_out": 0, "rule": reason}
+    wave = Wave(design.space, theta, np.zeros(len(theta), bool), number, design.seed, record)
+    return run_design(path, wave, design.edges_s, simulate, design.model_hash, workers, progress)
+
+
+def load_design(path: Path | str) -> Design:
+    """The finished waves in a design file. Raises InputError when there is no such file."""
+    return storage.load(path, Design)
+
+
+def load_waves(path: Path | str) -> tuple[dict[str, Any], ...]:
+    """How the points of each wave were chosen, oldest first. Raises InputError as `load_design`."""
+    load_design(path)
+    with h5py.File(path, "r") as handle:
+        return tuple(json.loads(handle.attrs.get("waves", "[]")))
+
+
+def _bin_means_of(simulate: Simulate, names: tuple[str, ...], edges: Array, theta: Array) -> _Outcome:
+    """One run, in a worker: bin means [N] (m,) or the reason why there are none. Raises nothing."""
+    start = time.perf_counter()
+    force_n, message, model_hash = None, "", ""
+    try:
+        run = simulate(dict(zip(names, theta.tolist(), strict=True)))
+        model_hash, message = run.model_hash, run.message
+        if run.status == "ok":
+            force_n, message = _checked_means(run, edges)
+        elif not message:
+            message = "the run failed without saying why"
+    except Exception as error:
+        message = f"{type(error).__name__}: {error}"
+    return _Outcome(force_n, message, time.perf_counter() - start, model_hash)
+
+
+def _checked_means(run: Simulation, edges: Array) -> tuple[Array | None, str]:
+    """Bin means [N] (m,), refused where the run does not cover the bins or is not finite."""
+    slack = 1e-9 * (edges[-1] - edges[0])
+    if run.time_s[0] > edges[0] + slack or run.time_s[-1] < edges[-1] - slack:
+        covered = f"{run.time_s[0]:g}..{run.time_s[-1]:g} s"
+        return None, f"the run covers {covered}, the bins {edges[0]:g}..{edges[-1]:g} s: use the bins' motion"
+    if not np.isfinite(run.force_n).all():
+        return None, "the force is not finite: tighten the tolerances or narrow the prior box"
+    return run.bin_means(edges), run.message
+
+
+def _as_run(path: Path, theta: Array, outcome: _Outcome | Lost, bins: int, model_hash: str) -> Run:
+    if isinstance(outcome, Lost):
+        return Run(theta, np.full(bins, np.nan), False, outcome.reason, math.nan)
+    if outcome.model_hash not in ("", model_hash):
+        raise InputError(path, f"a run of model {outcome.model_hash}", f"runs of model {model_hash}")
+    ok = outcome.force_n is not None
+    force_n = outcome.force_n if outcome.force_n is not None else np.full(bins, np.nan)
+    return Run(theta, force_n, ok, outcome.message, outcome.seconds)
+
+
+def _reporter(progress: Progress | None, total: int, known: list[bool]) -> Callable[[Run | None], None]:
+    """Turns finished runs into calls of `progress`; `known` says of earlier ones whether they are ok."""
+    start, states = time.monotonic(), list(known)
+
+    def report(run: Run | None) -> None:
+        if run is not None:
+            states.append(run.ok)
+        done_now = len(states) - len(known)
+        each_s = (time.monotonic() - start) / done_now if done_now else math.nan
+        if progress is not None:
+            progress(len(states), total, states.count(False), each_s * (total - len(states)))
+
+    return report
+
+
+def _rows_ok(design: Design | None) -> dict[bytes, bool]:
+    """Whether each stored point's run was ok, by the bytes of theta."""
+    if design is None:
+        return {}
+    return {row.tobytes(): bool(ok) for row, ok in zip(design.theta, design.ok, strict=True)}
+
+
+def _distinct(wave: Wave) -> dict[bytes, Array]:
+    """The wave's points by their bytes, repeats once, in order."""
+    theta = wave.theta
+    if theta.ndim != 2 or theta.shape[1] != wave.space.dim or len(theta) != len(wave.held_out):
+        raise InputError("points of a design", f"shape {theta.shape}", f"(n, {wave.space.dim})")
+    outside = np.flatnonzero(~wave.space.contains(theta))
+    if len(outside):
+        row = outside[0]
+        raise InputError(
+            f"points of a design: row {row}", theta[row].tolist(), "a point inside the prior box"
+        )
+    return {row.tobytes(): row for row in theta}
+
+
+def _identity(space: ParameterSpace, edges: Array, model_hash: str) -> str:
+    """Hash of all that results depend on beside theta; wording of a description is not part of it."""
+    parts = [_box(space), edges.tobytes().hex(), model_hash]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def _box(space: ParameterSpace) -> list[list[Any]]:
+    return [[p.name, p.unit, float(p.lower), float(p.upper), p.prior] for p in space.parameters]
+
+
+def _check_same(path: Path, design: Design, space: ParameterSpace, edges: Array, model_hash: str) -> None:
+    """Raises InputError unless the file's design can be extended by runs of this one."""
+    if design.model_hash != model_hash:
+        raise InputError(path, f"a design of model {design.model_hash}", f"model {model_hash}")
+    if _box(design.space) != _box(space):
+        raise InputError(path, f"parameters {_box(design.space)}", f"{_box(space)}")
+    if not np.array_equal(design.edges_s, edges):
+        found, wanted = len(design.edges_s) - 1, len(edges) - 1
+        raise InputError(
+            path, f"{found} time bins to {design.edges_s[-1]:g} s", f"{wanted} bins to {edges[-1]:g} s"
+        )
+
+
+def _extended(before: Design | None, wave: Wave, edges: Array, model_hash: str, fresh: list[Run]) -> Design:
+    """The design with `fresh` runs of `wave` as its last rows."""
+    held_out = dict(zip((t.tobytes() for t in wave.theta[::-1]), wave.held_out[::-1], strict=True))
+    new = Design(
+        space=wave.space,
+        edges_s=edges,
+        theta=np.array([run.theta for run in fresh]).reshape(-1, wave.space.dim),
+        force_n=np.array([run.force_n for run in fresh]).reshape(-1, len(edges) - 1),
+        wave=np.full(len(fresh), wave.number, dtype=np.int64),
+        held_out=np.array([held_out[run.theta.tobytes()] for run in fresh], dtype=bool),
+        ok=np.array([run.ok for run in fresh], dtype=bool),
+        messages=tuple(run.message for run in fresh),
+        seconds=np.array([run.seconds for run in fresh], dtype=float),
+        seed=wave.seed,
+        model_hash=model_hash,
+    )
+    if before is None:
+        return new
+    rows = ("theta", "force_n", "wave", "held_out", "ok", "seconds")
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(before, name), getattr(new, name)]) for name in rows
+    }
+    joined["messages"] = before.messages + new.messages
+    return Design(
+        space=before.space, edges_s=before.edges_s, seed=before.seed, model_hash=model_hash, **joined
+    )
+
+
+def _write(path: Path, design: Design, waves: list[dict[str, Any]]) -> None:
+    """Replaces the file by one with all rows and the waves' records, at once."""
+    staged = _staged(path)
+    storage.save(staged, design)
+    with h5py.File(staged, "r+") as handle:
+        handle.attrs["waves"] = json.dumps(waves)
+    with open(staged, "rb") as written:
+        os.fsync(written.fileno())
+    os.replace(staged, path)
+
+
+def _staged(path: Path) -> Path:
+    return path.with_name(f".{path.name}.staged")
+
+
+def _remove_stale(path: Path) -> None:
+    """Removes what a process killed while it wrote may have left; only the journal's holder may."""
+    for stale in path.parent.glob(f"*{escape(_staged(path).name)}*"):
+        stale.unlink(missing_ok=True)
+    path.with_name(f".{path.name}.journal.partial").unlink(missing_ok=True)

@@ -1,0 +1,406 @@
+"""A design's file: the same rows whatever the workers, the order, the failures or the kills."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import toy_runs
+from toy import SPACE, toy_bin_means, toy_simulate
+from toy_runs import COARSE_S, WAVE
+
+from bayeskin import runner, storage
+from bayeskin.design import Wave, first_wave
+from bayeskin.errors import InputError
+from bayeskin.journal import Journal, Run
+from bayeskin.runner import add_points, load_design, load_waves, run_design
+from bayeskin.types import Design
+
+HERE = Path(__file__).parent
+SHORT = replace(WAVE, theta=WAVE.theta[:4], held_out=WAVE.held_out[:4])
+
+
+def run(
+    path: Path, wave: Wave = WAVE, simulate: object = toy_simulate, workers: int = 1, **options: object
+) -> Design:
+    return run_design(path, wave, COARSE_S, simulate, "toy", workers, **options)
+
+
+def assert_same_rows(found: Design, expected: Design) -> None:
+    """Equal bit by bit, durations excepted."""
+    for name in ("edges_s", "theta", "force_n", "wave", "held_out", "ok"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+    assert found.space == expected.space
+    assert (found.messages, found.seed, found.model_hash) == (
+        expected.messages, expected.seed, expected.model_hash,
+    )  # fmt: skip
+
+
+def assert_one_file(path: Path) -> None:
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Design:
+    """The program of toy_runs, never interrupted, with one worker."""
+    path = tmp_path_factory.mktemp("whole") / "design.h5"
+    toy_runs.main(str(path), workers=1, seconds=0.0)
+    assert_one_file(path)
+    return load_design(path)
+
+
+def test_rows_are_the_points_and_the_models_bin_means(whole: Design) -> None:
+    n = len(WAVE.theta)
+    np.testing.assert_array_equal(whole.theta[:n], WAVE.theta)
+    np.testing.assert_array_equal(whole.held_out[:n], WAVE.held_out)
+    assert whole.ok.all()
+    # The toy is sampled every 0.5 s and interpolated, hence not to the last digit.
+    exact = toy_bin_means(whole.theta, COARSE_S)
+    np.testing.assert_allclose(whole.force_n, exact, atol=2e-3 * exact.max())
+    simulated = toy_simulate(dict(zip(SPACE.names, whole.theta[5].tolist(), strict=True)))
+    np.testing.assert_array_equal(whole.force_n[5], simulated.bin_means(COARSE_S))
+
+
+def test_order_and_workers_leave_no_trace(tmp_path: Path, whole: Design) -> None:
+    path = tmp_path / "design.h5"
+    toy_runs.main(str(path), workers=3, seconds=0.02)
+    assert_same_rows(load_design(path), whole)
+    assert_one_file(path)
+
+
+def kill_until_done(path: Path, workers: int, kills: int, rng: np.random.Generator) -> None:
+    """Starts the program, kills it at a random moment, again and again; at last lets it finish."""
+    paths = os.pathsep.join([str(HERE), str(HERE.parent)])
+    command = [sys.executable, str(HERE / "toy_runs.py"), str(path), str(workers), "0.15"]
+    environment = {**os.environ, "PYTHONPATH": paths}
+    for _ in range(kills):
+        program = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)
+        time.sleep(rng.uniform(0.4, 1.6))
+        program.kill()
+        program.communicate()
+    subprocess.run(command, env=environment, check=True)
+
+
+def test_a_design_killed_at_random_moments_ends_as_if_it_had_not_been(tmp_path: Path, whole: Design) -> None:
+    kill_until_done(tmp_path / "design.h5", workers=2, kills=4, rng=np.random.default_rng(0))
+    assert_same_rows(load_design(tmp_path / "design.h5"), whole)
+    assert_one_file(tmp_path / "design.h5")
+
+
+@pytest.mark.slow
+def test_fifty_kills_leave_no_trace(tmp_path: Path, whole: Design) -> None:
+    rng = np.random.default_rng(1)
+    for attempt in range(5):
+        path = tmp_path / str(attempt) / "design.h5"
+        kill_until_done(path, workers=1 + attempt % 2, kills=10, rng=rng)
+        assert_same_rows(load_design(path), whole)
+        assert_one_file(path)
+
+
+class Killed(BaseException):
+    """Stands for a kill: nothing in the package may catch it."""
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+@pytest.mark.parametrize("step", ["storage.save", "os.replace", "Journal.forget"])
+def test_a_kill_at_each_step_of_the_fold_loses_nothing(
+    tmp_path: Path, whole: Design, monkeypatch: pytest.MonkeyPatch, step: str, when: str
+) -> None:
+    owner, name = {
+        "storage.save": (runner.storage, "save"),
+        "os.replace": (runner.os, "replace"),
+        "Journal.forget": (Journal, "forget"),
+    }[step]
+    original = getattr(owner, name)
+
+    def dies(*args: object, **options: object) -> None:
+        if when == "after":
+            original(*args, **options)
+        raise Killed
+
+    path, calls = tmp_path / "design.h5", tmp_path / "calls"
+    calls.mkdir()
+    simulate = partial(toy_runs.counted, folder=str(calls))
+    first = replace(WAVE, theta=WAVE.theta[:3], held_out=WAVE.held_out[:3])
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, dies)
+        with pytest.raises(Killed):
+            run(path, first, simulate)
+    if path.exists():
+        load_design(path)  # whole at every moment
+    design = run(path, first, simulate)
+    assert_same_rows(design, load_design(path))
+    np.testing.assert_array_equal(design.force_n, whole.force_n[:3])
+    assert len(load_waves(path)) == 1
+    assert len(list(calls.iterdir())) == 3, "no point is run twice"
+
+
+def test_a_worker_that_dies_loses_only_its_own_point_which_is_run_again(
+    tmp_path: Path, whole: Design
+) -> None:
+    simulate = partial(toy_runs.deadly, folder=str(tmp_path), deaths=2)
+    design = run(tmp_path / "out" / "design.h5", SHORT, simulate, workers=2)
+    assert len(list(tmp_path.glob("*.*"))) == 2 * np.sum(SHORT.theta[:, 0] > 3e5) > 0, "workers did die"
+    np.testing.assert_array_equal(design.force_n, whole.force_n[: len(SHORT.theta)])
+    assert design.ok.all()
+
+
+def test_a_point_that_kills_three_workers_is_a_failed_row(tmp_path: Path) -> None:
+    simulate = partial(toy_runs.deadly, folder=str(tmp_path), deaths=99)
+    design = run(tmp_path / "out" / "design.h5", SHORT, simulate)
+    stiff = SHORT.theta[:, 0] > 3e5
+    assert stiff.any()
+    np.testing.assert_array_equal(design.ok, ~stiff)
+    for row in np.flatnonzero(stiff):
+        assert "signal 9" in design.messages[row]
+        assert len(list(tmp_path.glob(f"{float(SHORT.theta[row, 0])!r}.*"))) == 3
+
+
+def test_failed_runs_are_rows_with_their_message(tmp_path: Path) -> None:
+    path = tmp_path / "design.h5"
+    design = run(path, first_wave(SPACE, 24, 0, seed=1), toy_runs.failing)
+    e_c, e_s = design.theta[:, 0], design.theta[:, 1]
+    expected = np.where(
+        e_c < 3e4, "Newton stalled",
+        np.where(e_c > 7e5, "ZeroDivisionError: singular tangent", np.where(e_s < 5e3, "not finite", "")),
+    )  # fmt: skip
+    assert set(expected) == {"Newton stalled", "ZeroDivisionError: singular tangent", "not finite", ""}
+    assert all(want in found for want, found in zip(expected, design.messages, strict=True))
+    np.testing.assert_array_equal(design.ok, expected == "")
+    assert np.isnan(design.force_n[~design.ok]).all()
+    assert np.isfinite(design.force_n[design.ok]).all()
+    assert not (design.training & ~design.ok).any()
+    assert_same_rows(load_design(path), design)
+    seen = []
+    run(path, first_wave(SPACE, 24, 0, seed=1), toy_runs.failing, progress=lambda *now: seen.append(now[:3]))
+    assert seen == [(24, 24, int((~design.ok).sum()))], "failures are remembered, not run again"
+
+
+def test_a_longer_wave_runs_only_what_is_new(tmp_path: Path, whole: Design) -> None:
+    path, calls = tmp_path / "design.h5", tmp_path / "calls"
+    calls.mkdir()
+    simulate = partial(toy_runs.counted, folder=str(calls))
+    run(path, first_wave(SPACE, 5, 0, seed=3), simulate)
+    repeated = replace(WAVE, theta=np.tile(WAVE.theta, (2, 1)), held_out=np.tile(WAVE.held_out, 2))
+    design = run(path, repeated, simulate)
+    assert len(list(calls.iterdir())) == len(WAVE.theta)
+    np.testing.assert_array_equal(design.theta, WAVE.theta)
+    np.testing.assert_array_equal(design.force_n, whole.force_n[: len(WAVE.theta)])
+
+
+def test_added_points_are_training_points_of_the_next_wave(whole: Design, tmp_path: Path) -> None:
+    assert whole.wave.tolist() == [0] * len(WAVE.theta) + [1]
+    assert not whole.held_out[-1]
+    path = tmp_path / "design.h5"
+    run(path)
+    add_points(path, whole.theta[-1:], toy_simulate, "most probable point", workers=1)
+    again = add_points(path, whole.theta[-1:], toy_simulate, "again", workers=1)
+    assert_same_rows(again, whole)
+    assert [w["rule"] for w in load_waves(path)] == [WAVE.record["rule"], "most probable point"]
+
+
+def test_progress_counts_and_estimates(tmp_path: Path) -> None:
+    seen = []
+    run(tmp_path / "design.h5", progress=lambda *now: seen.append(now))
+    n = len(WAVE.theta)
+    assert [s[:3] for s in seen] == [(i, n, 0) for i in range(n + 1)]
+    assert np.isnan(seen[0][3])
+    assert seen[1][3] > 0
+    assert seen[-1][3] == 0
+
+
+def test_workers_have_one_thread_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    design = run(tmp_path / "design.h5", first_wave(SPACE, 1, 0, seed=1), toy_runs.threads)
+    assert design.messages == ("1,1,1",)
+    assert os.environ["OMP_NUM_THREADS"] == "7"
+    assert "MKL_NUM_THREADS" not in os.environ
+
+
+RUN = Run(WAVE.theta[0], np.arange(3.0) / 7.0, True, "", 1.5)
+LOST = Run(WAVE.theta[1], np.full(3, np.nan), False, "Newton stalled é\n", float("nan"))
+
+
+def test_a_journal_gives_back_what_it_was_given(tmp_path: Path) -> None:
+    path = tmp_path / "j"
+    with Journal(path, "a", bins=3) as journal:
+        journal.append(RUN)
+        journal.append(LOST)
+    with Journal(path, "a", bins=3) as journal:
+        for before, after in zip((RUN, LOST), journal.runs.values(), strict=True):
+            for x, y in zip(before, after, strict=True):
+                np.testing.assert_array_equal(x, y)
+        journal.forget({RUN.theta.tobytes()})
+    with Journal(path, "a", bins=3) as journal:
+        assert list(journal.runs) == [LOST.theta.tobytes()]
+        journal.forget(set(journal.runs))
+    assert not path.exists()
+
+
+def test_a_journal_cut_at_any_byte_keeps_the_whole_lines_and_can_be_continued(tmp_path: Path) -> None:
+    path = tmp_path / "j"
+    with Journal(path, "a", bins=3) as journal:
+        journal.append(RUN)
+        first = path.stat().st_size
+        journal.append(LOST)
+    text = path.read_bytes()
+    for cut in range(first, len(text)):
+        path.write_bytes(text[:cut])
+        with Journal(path, "a", bins=3) as journal:
+            whole_but_for_its_end = cut == len(text) - 1
+            assert len(journal.runs) == (2 if whole_but_for_its_end else 1)
+            journal.append(LOST)
+        with Journal(path, "a", bins=3) as journal:
+            assert list(journal.runs) == [RUN.theta.tobytes(), LOST.theta.tobytes()]
+
+
+def test_a_flipped_bit_in_a_journal_costs_that_run_only(tmp_path: Path) -> None:
+    path = tmp_path / "j"
+    with Journal(path, "a", bins=3) as journal:
+        journal.append(RUN)
+        first = path.stat().st_size
+        journal.append(LOST)
+    text = path.read_bytes()
+    for at in range(0, first - 1):
+        path.write_bytes(text[:at] + bytes([text[at] ^ 1]) + text[at + 1 :])
+        with Journal(path, "a", bins=3) as journal:
+            assert list(journal.runs) == [LOST.theta.tobytes()]
+
+
+def test_a_damaged_journal_beside_a_design_is_run_again(tmp_path: Path, whole: Design) -> None:
+    path = tmp_path / "design.h5"
+
+    def interrupted(done: int, *_: object) -> None:
+        if done == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(path, progress=interrupted)
+    journal = tmp_path / "design.h5.journal"
+    lines = journal.read_bytes().splitlines(keepends=True)
+    assert len(lines) == 5
+    journal.write_bytes(lines[0] + b"\0" * 4096 + lines[2][:-300])
+    design = run(path)
+    np.testing.assert_array_equal(design.force_n, whole.force_n[: len(WAVE.theta)])
+    assert_one_file(path)
+
+
+def test_one_process_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "design.h5"
+    held = Journal(tmp_path / "design.h5.journal", "a", bins=3)
+    with pytest.raises(InputError, match="another process"):
+        run(path)
+    assert not path.exists()
+    held.__exit__()
+    run(path)
+
+
+def test_a_file_of_another_design_is_refused_and_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "design.h5"
+    run(path, first_wave(SPACE, 2, 0, seed=1))
+    before = path.read_bytes()
+    wider = replace(SPACE.parameters[0], upper=3e6)
+    other = first_wave(replace(SPACE, parameters=(wider, *SPACE.parameters[1:])), 2, 0, seed=1)
+    with pytest.raises(InputError, match="parameters"):
+        run(path, other)
+    with pytest.raises(InputError, match="model"):
+        run_design(path, WAVE, COARSE_S, toy_simulate, "another")
+    with pytest.raises(InputError, match="bins"):
+        run_design(path, WAVE, COARSE_S[:-1], toy_simulate, "toy")
+    outside = replace(WAVE, theta=WAVE.theta * np.array([1, 1, 1, 1e6, 1]))
+    with pytest.raises(InputError, match="row 0"):
+        run(path, outside)
+    assert path.read_bytes() == before
+    assert_one_file(path)
+    path.write_bytes(b"not HDF5")
+    with pytest.raises(InputError):
+        run(path)
+    assert path.read_bytes() == b"not HDF5"
+
+
+def test_unfinished_runs_of_another_model_are_refused_and_kept(tmp_path: Path) -> None:
+    journal = tmp_path / "design.h5.journal"
+    with Journal(journal, "of another design", len(COARSE_S) - 1) as other:
+        other.append(RUN)
+    before = journal.read_bytes()
+    with pytest.raises(InputError, match="another model"):
+        run(tmp_path / "design.h5")
+    assert journal.read_bytes() == before
+
+
+def test_a_simulate_of_another_model_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="model toy"):
+        run_design(tmp_path / "design.h5", WAVE, COARSE_S, toy_simulate, "another")
+    assert not list(tmp_path.iterdir())
+
+
+def test_bins_beyond_the_run_are_failures_not_extrapolations(tmp_path: Path) -> None:
+    wave = first_wave(SPACE, 1, 0, seed=1)
+    design = run_design(tmp_path / "d.h5", wave, np.linspace(0, 200, 5), toy_simulate, "toy")
+    assert "covers 0..130 s" in design.messages[0]
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks processes up in /proc")
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_their_parent(tmp_path: Path, ending: signal.Signals) -> None:
+    script = (
+        "import sys, toy_runs; from functools import partial\n"
+        "if __name__ == '__main__':\n"
+        "    simulate = partial(toy_runs.stuck, folder=sys.argv[1])\n"
+        "    toy_runs.run_design(sys.argv[2], toy_runs.WAVE, toy_runs.COARSE_S, simulate, 'toy')\n"
+    )
+    (tmp_path / "program.py").write_text(script)
+    command = [sys.executable, str(tmp_path / "program.py"), str(tmp_path), str(tmp_path / "out" / "d.h5")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent)])}
+    program = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    patience = time.monotonic() + 60
+    while len(pids := [int(p.stem) for p in tmp_path.glob("*.pid")]) < 2 and time.monotonic() < patience:
+        time.sleep(0.05)
+    assert len(pids) == 2
+    program.send_signal(ending)
+    _, complaint = program.communicate(timeout=60)
+    while any(alive(pid) for pid in pids) and time.monotonic() < patience:
+        time.sleep(0.05)
+    assert not any(alive(pid) for pid in pids)
+    if ending == signal.SIGINT:
+        assert complaint.rstrip().endswith("KeyboardInterrupt")
+        assert not list((tmp_path / "out").iterdir())
+
+
+def test_workers_that_cannot_start_are_the_users_to_mend(tmp_path: Path) -> None:
+    script = (
+        "from toy_runs import *\n"
+        "def homemade(theta): return toy_simulate(theta)\n"
+        f"run_design({str(tmp_path / 'd.h5')!r}, WAVE, COARSE_S, homemade, 'toy', 1)\n"
+    )
+    (tmp_path / "unguarded.py").write_text(script)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent)])}
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "unguarded.py")], env=environment, capture_output=True, text=True
+    )
+    assert "InputError: worker processes" in done.stderr.splitlines()[-1]
+    assert "__main__" in done.stderr.splitlines()[-1]
+
+
+def test_a_design_file_is_an_ordinary_file_of_the_project(tmp_path: Path, whole: Design) -> None:
+    storage.save(tmp_path / "copy.h5", whole)
+    assert_same_rows(load_design(tmp_path / "copy.h5"), whole)
+    assert load_waves(tmp_path / "copy.h5") == ()
+    with pytest.raises(InputError, match="no such file"):
+        load_design(tmp_path / "absent.h5")
