@@ -1,1 +1,27 @@
+"""Figures of every result, as PNG and SVG."""
 
+from bayeskin.report.fields import SurfaceField, figure_fields
+from bayeskin.report.fit import figure_fit
+from bayeskin.report.posterior import figure_posterior
+from bayeskin.report.prior import figure_prior_predictive
+from bayeskin.report.recording import figure_recording
+from bayeskin.report.save import save_figure
+from bayeskin.report.sobol import figure_sobol
+from bayeskin.report.traces import figure_traces
+from bayeskin.report.validation import figure_map_check, figure_validation
+from bayeskin.report.waves import figure_waves
+
+__all__ = [
+    "SurfaceField",
+    "figure_fields",
+    "figure_fit",
+    "figure_map_check",
+    "figure_posterior",
+    "figure_prior_predictive",
+    "figure_recording",
+    "figure_sobol",
+    "figure_traces",
+    "figure_validation",
+    "figure_waves",
+    "save_figure",
+]

@@ -1,0 +1,171 @@
+"""The posterior: how wide the recording leaves each parameter, and which of them trade off."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import ArrayLike
+
+from bayeskin.errors import InputError
+from bayeskin.report.style import (
+    ACCENT,
+    GREY,
+    MODEL,
+    axis_values,
+    list_symbols,
+    styled,
+)
+from bayeskin.report.timeline import LEVELS
+from bayeskin.report.triangle import label_edges, triangle
+from bayeskin.types import Array, Parameter, ParameterSpace
+
+_BINS = 60
+_TINTS = ["#C6DDEC", "#7FB3D5"]  # of the 90 % and the 50 % region
+_AS_PRIOR = 0.9  # a 90 % interval at least this wide, relative to the prior's, counts as not informed
+
+
+@styled
+def figure_posterior(
+    space: ParameterSpace,
+    draws: ArrayLike,
+    map_theta: Mapping[str, float],
+    names: Sequence[str] | None = None,
+) -> Figure:
+    """Corner plot: marginals with the prior's outline, 50 % and 90 % regions of each pair, the MAP.
+
+    draws (s, d) in the order of `space`; map_theta by name (may be empty); names picks a subset.
+    Raises InputError for a name that the space does not have.
+    """
+    draws = np.asarray(draws, dtype=float)
+    chosen = list(space.names if names is None else names)
+    for name in chosen:
+        if name not in space.names:
+            raise InputError("names of the corner plot", repr(name), f"one of {', '.join(space.names)}")
+    parameters = [space.parameters[space.names.index(name)] for name in chosen]
+    columns = [axis_values(p, draws[:, space.names.index(p.name)]) for p in parameters]
+    best = [axis_values(p, map_theta[p.name]) if p.name in map_theta else np.nan for p in parameters]
+    ranges = [_axis_range(p, column) for p, column in zip(parameters, columns, strict=True)]
+    caption = (
+        f"{len(draws)} posterior draws. Regions hold 50 % and 90 % of them (smoothed histogram); "
+        "a pair without structure beyond the draws' own scatter is tinted evenly. "
+        "Above each marginal: median and 90 % interval. Dashed: prior."
+    )
+    d = len(parameters)
+    figure, axes = triangle(parameters, 0.34, _finding(parameters, columns), caption)
+    for i in range(d):
+        _draw_marginal(axes[i][i], parameters[i], columns[i], float(best[i]), ranges[i])
+        for j in range(i):
+            _draw_pair(axes[i][j], (columns[j], columns[i]), (float(best[j]), float(best[i])),
+                       (ranges[j], ranges[i]))  # fmt: skip
+    label_edges(figure, axes, parameters, parameters)
+    _draw_key(axes, bool(map_theta))
+    return figure
+
+
+def mass_levels(density: Array, fractions: Sequence[float]) -> list[float]:
+    """Heights of a gridded density whose super-level sets hold the given fractions of its mass."""
+    heights = np.sort(density, axis=None)[::-1]
+    mass = np.cumsum(heights) / heights.sum()
+    return [float(heights[np.searchsorted(mass, fraction)]) for fraction in fractions]
+
+
+def smoothed_histogram(
+    x: Array, y: Array, x_range: Array, y_range: Array
+) -> tuple[Array, Array, Array, bool]:
+    """Density (60, 60) of a pair with its cell centres, and whether it is flat but for sampling scatter.
+
+    Smoothed by a normal kernel with the draws' own covariance, so that a ridge stays narrow, at 0.7
+    of Scott's bandwidth; mirrored at the edges, where a prior may cut the density off.
+    """
+    counts, x_edges, y_edges = np.histogram2d(x, y, bins=_BINS, range=[x_range, y_range])
+    scale = _BINS / np.array([np.ptp(x_range), np.ptp(y_range)])
+    kernel = 0.5 * len(x) ** (-1 / 3) * np.cov(x, y) * np.outer(scale, scale) + 0.7 * np.eye(2)
+    padded = np.pad(counts, _BINS // 2, mode="symmetric")
+    fx, fy = np.fft.fftfreq(2 * _BINS)[:, None], np.fft.rfftfreq(2 * _BINS)
+    damping = np.exp(
+        -2 * np.pi**2 * (kernel[0, 0] * fx**2 + 2 * kernel[0, 1] * fx * fy + kernel[1, 1] * fy**2)
+    )
+    smooth = np.fft.irfft2(np.fft.rfft2(padded) * damping, padded.shape)
+    inside = slice(_BINS // 2, -(_BINS // 2))
+    density = np.maximum(smooth[inside, inside], 0.0)
+    scatter = np.sqrt(_BINS**2 / (4 * np.pi * np.sqrt(np.linalg.det(kernel)) * len(x)))  # if uniform
+    flat = bool(density.std() < 2.5 * scatter * density.mean())
+    return 0.5 * (x_edges[1:] + x_edges[:-1]), 0.5 * (y_edges[1:] + y_edges[:-1]), density, flat
+
+
+def _axis_range(parameter: Parameter, values: Array) -> Array:
+    low, high = axis_values(parameter, [parameter.lower, parameter.upper])
+    tails = np.quantile(values, [0.001, 0.999])
+    if np.ptp(tails) > 0.35 * (high - low):
+        return np.array([low, high])
+    margin = 0.15 * np.ptp(tails) or 0.02 * (high - low)
+    return np.array([max(tails[0] - margin, low), min(tails[1] + margin, high)])
+
+
+def _draw_marginal(ax: Axes, p: Parameter, values: Array, best: float, span: Array) -> None:
+    ax.hist(values, bins=_BINS // 2, range=(span[0], span[1]), density=True, color=MODEL, alpha=0.45)
+    low, high = axis_values(p, [p.lower, p.upper])
+    ax.plot([low, low, high, high], np.array([0, 1, 1, 0]) / (high - low), color=GREY, lw=0.9, ls=(0, (4, 2)))
+    if np.isfinite(best):
+        ax.axvline(best, color=ACCENT, lw=0.9)
+    a, middle, b = np.quantile(values, [0.05, 0.5, 0.95])
+    digits = max(0, min(6, 1 - int(np.floor(np.log10(max(b - a, 1e-6))))))
+    text = rf"${middle:.{digits}f}_{{{a - middle:+.{digits}f}}}^{{{b - middle:+.{digits}f}}}$"
+    ax.set_title(text, loc="center", pad=3)
+    ax.set_xlim(span[0], span[1])
+    ax.margins(y=0.1)
+    ax.set_ylim(bottom=0)
+    ax.set_yticks([])
+    ax.spines["left"].set_visible(False)
+
+
+def _draw_pair(ax: Axes, values: tuple[Array, Array], best: tuple[float, float],
+               spans: tuple[Array, Array]) -> None:  # fmt: skip
+    if all(np.ptp(v) > 0 for v in values):
+        x, y, density, flat = smoothed_histogram(values[0], values[1], spans[0], spans[1])
+        inner, outer = mass_levels(density, LEVELS)
+        if flat:
+            ax.set_facecolor(_TINTS[0])
+        elif 0 < outer < inner < density.max():
+            levels = [outer, inner, 1.01 * density.max()]
+            ax.contourf(x, y, density.T, levels=levels, colors=_TINTS)
+            ax.contour(x, y, density.T, levels=levels[:2], colors=MODEL, linewidths=0.6)
+    else:
+        ax.plot(values[0], values[1], ".", ms=2, color=MODEL)
+    if np.all(np.isfinite(best)):
+        ax.plot(*best, "P", ms=4.5, mfc=ACCENT, mec="white", mew=0.5)
+    ax.set(xlim=spans[0], ylim=spans[1])
+
+
+def _draw_key(axes: list[list[Axes]], has_map: bool) -> None:
+    handles: list[Line2D | Patch] = [
+        Patch(facecolor=_TINTS[1], edgecolor=MODEL, lw=0.6, label="50 % region"),
+        Patch(facecolor=_TINTS[0], edgecolor=MODEL, lw=0.6, label="90 % region"),
+        Line2D([], [], color=GREY, lw=0.9, ls=(0, (4, 2)), label="prior"),
+    ]
+    if len(axes) == 1:
+        handles = handles[2:]
+    if has_map:
+        handles.append(Line2D([], [], color=ACCENT, marker="P", ms=4.5, lw=0, label="MAP"))
+    # The room above the diagonal is free: the key stands right of the first marginal.
+    axes[0][0].legend(handles=handles, loc="upper left", bbox_to_anchor=(1.05, 1.0))
+
+
+def _finding(parameters: Sequence[Parameter], columns: Sequence[Array]) -> str:
+    as_prior: list[str] = []
+    informed: list[str] = []
+    for p, values in zip(parameters, columns, strict=True):
+        low, high = axis_values(p, [p.lower, p.upper])
+        width = np.subtract(*np.quantile(values, [0.95, 0.05])) / (0.9 * (high - low))
+        (as_prior if width > _AS_PRIOR else informed).append(p.name)
+    if not as_prior:
+        return f"The recording narrows {list_symbols(informed)} against the prior"
+    if not informed:
+        return f"The recording leaves {list_symbols(as_prior)} as wide as the prior"
+    narrowed, left = list_symbols(informed), list_symbols(as_prior)
+    return f"The recording narrows {narrowed}; it leaves {left} as the prior had it"

@@ -1,0 +1,182 @@
+"""One look for every figure: palette, type sizes, titles that state the finding, how names are set.
+
+Figures are made with matplotlib's object interface; nothing here touches pyplot, and the
+settings hold only while a figure is drawn or saved.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, ParamSpec, TypeVar
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.ticker import LogLocator, NullFormatter
+from numpy.typing import ArrayLike
+
+from bayeskin.types import Array, Parameter
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+COLUMN_IN, PAGE_IN = 3.5, 7.2  # widths of one and of two journal columns
+
+# Okabe & Ito (2008), told apart with every common colour blindness; then Tol's muted set.
+INK, GREY, FAINT = "#222222", "#767676", "#D0D0D0"
+RECORDED, MODEL, ACCENT = INK, "#0072B2", "#D55E00"
+PARTS = {"parameters": "#0072B2", "surrogate": "#D55E00", "noise": "#8C8C8C", "all": INK}
+_NAMED = {"E_c": "#0072B2", "E_s": "#D55E00", "k_c": "#56B4E9", "k_s": "#E69F00", "p_init": "#009E73"}
+_FURTHER = ("#CC79A7", "#332288", "#882255", "#999933", "#44AA99", "#AA4499", "#661100", "#888888")
+_GREEK = ("alpha", "beta", "gamma", "delta", "eta", "lambda", "mu", "nu", "rho", "sigma", "tau", "phi")
+
+STYLE: dict[str, Any] = {
+    "figure.facecolor": "white", "savefig.facecolor": "white", "figure.dpi": 100,
+    "font.family": "DejaVu Sans",  # ships with matplotlib: the same letters on every machine
+    "font.size": 7.5, "axes.titlesize": 7.5, "axes.labelsize": 7.5, "figure.titlesize": 9,
+    "xtick.labelsize": 7, "ytick.labelsize": 7, "legend.fontsize": 7, "figure.titleweight": "bold",
+    "text.usetex": False, "text.color": INK, "axes.labelcolor": INK, "axes.edgecolor": GREY,
+    "xtick.color": GREY, "ytick.color": GREY, "xtick.labelcolor": INK, "ytick.labelcolor": INK,
+    "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.6,
+    "xtick.major.width": 0.6, "ytick.major.width": 0.6, "xtick.minor.width": 0.4, "ytick.minor.width": 0.4,
+    "xtick.major.size": 3, "ytick.major.size": 3, "xtick.minor.size": 1.5, "ytick.minor.size": 1.5,
+    "axes.titlelocation": "left", "axes.titlepad": 5, "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "lines.linewidth": 1.1, "lines.markersize": 3, "patch.linewidth": 0,
+    "legend.frameon": False, "legend.handlelength": 1.4, "legend.borderaxespad": 0.2,
+    "legend.labelspacing": 0.3,
+    "svg.hashsalt": "bayeskin", "svg.fonttype": "path", "path.simplify": True,
+}  # fmt: skip
+# Everything else at matplotlib's own default, so that a user's matplotlibrc changes nothing; but never
+# the backend, which belongs to the caller.
+SETTINGS: dict[Any, Any] = {
+    key: value for key, value in (dict(mpl.rcParamsDefault) | STYLE).items() if "backend" not in key
+}
+
+
+def styled(draw: Callable[P, R]) -> Callable[P, R]:
+    """Runs a drawing function under the project's settings, whatever the caller's are."""
+
+    @functools.wraps(draw)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
+        with mpl.rc_context(SETTINGS):
+            return draw(*args, **kwargs)
+
+    return wrapper
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure that lays out its own axes."""
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.set(w_pad=0.04, h_pad=0.04, wspace=0.03, hspace=0.03)  # type: ignore[call-arg]
+    return figure
+
+
+def state_finding(figure: Figure, finding: str, caption: str = "") -> tuple[Text, Text]:
+    """Heads the figure with what it shows, and foots it with how to read it; both wrapped to its width."""
+    width = figure.get_figwidth()
+    bold = re.sub(r"\$(.+?)\$", r"$\\boldsymbol{\1}$", finding)
+    bold = re.sub(r"(?<![\w{])-(?=\d)", "−", bold)
+    head = figure.suptitle("\n".join(_wrap(bold, int(13 * width))), x=0.01, ha="left", linespacing=1.25)
+    foot = figure.supxlabel(
+        "\n".join(_wrap(caption, int(19.5 * width))),
+        x=0.01,
+        ha="left",
+        fontsize=6.5,
+        color=GREY,
+        linespacing=1.3,
+    )
+    return head, foot
+
+
+def _wrap(text: str, columns: int) -> list[str]:
+    """Lines of at most `columns` printed characters; the markup of a symbol is not printed."""
+    lines: list[list[str]] = [[]]
+    room = columns
+    for word in text.split():
+        printed = len(re.sub(r"\\[a-z]+|[$_{}]", "", word)) + 1
+        if printed > room and lines[-1]:
+            lines.append([])
+            room = columns
+        lines[-1].append(word)
+        room -= printed
+    return [" ".join(line) for line in lines]
+
+
+def panel_title(ax: Axes, letter: str, text: str = "") -> Text:
+    """A bold panel letter and a short title at the panel's upper left."""
+    return ax.set_title(rf"$\mathbf{{{letter}}}$  {text}".rstrip())
+
+
+def plain_log(axis: Axis) -> None:
+    """A log axis with numbers as people write them, at 1, 2 and 5 where a decade has room."""
+    low, high = axis.get_view_interval()
+    narrow = low > 0 and high / low < 60
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if narrow else (1.0,)))
+    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def symbol(name: str) -> str:
+    """A parameter's name as it is printed: ``E_c`` set as a symbol, ``gap_width`` as words."""
+    name = re.sub(rf"^([A-Z](?=[a-z\d]$)|[a-z](?=\d$)|(?:{'|'.join(_GREEK)})(?=\d$))", r"\1_", name)
+    head, _, tail = name.partition("_")
+    if re.fullmatch(r"[A-Za-z]", head) or head in _GREEK:
+        base = rf"\{head}" if head in _GREEK else head
+        if not re.fullmatch(r"\w*", tail):
+            return name.replace("_", " ")
+        sub = tail.replace("_", ",") if len(tail) <= 1 else rf"\mathrm{{{tail.replace('_', ',')}}}"
+        return rf"${base}_{{{sub}}}$" if tail else rf"${base}$"
+    return name.replace("_", " ")
+
+
+def unit_text(unit: str) -> str:
+    """A unit as it is printed: ``m^2`` becomes m²; a pure number has none."""
+    raised = {"-": "⁻", **dict(zip("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹", strict=True))}
+    text = re.sub(r"\^(-?\d+)", lambda match: "".join(raised[c] for c in match.group(1)), unit)
+    return "" if text in ("-", "1") else text
+
+
+def parameter_label(parameter: Parameter) -> str:
+    """Axis label of a parameter; log10 of its value in SI where the prior is log-uniform."""
+    unit, name = unit_text(parameter.unit), symbol(parameter.name)
+    space = " " if name.startswith("$") else "\n"  # words take a line of their own
+    if len(name) > 12:
+        name = name.replace(" ", space, 1)
+    if parameter.prior == "log-uniform":
+        return f"log$_{{10}}$ {name}" + (f"{space}/ {unit}" if unit else "")
+    power = _power(parameter)
+    unit = " ".join(part for part in (unit_text(f"10^{power}") if power else "", unit) if part)
+    return name + (f"{space}[{unit}]" if unit else "")
+
+
+def parameter_colors(names: Sequence[str]) -> list[str]:
+    """A colour for each parameter, the same in every figure for the article's own."""
+    spare = [name for name in names if name not in _NAMED]
+    further = {name: _FURTHER[i % len(_FURTHER)] for i, name in enumerate(spare)}
+    return [_NAMED.get(name) or further[name] for name in names]
+
+
+def axis_values(parameter: Parameter, values: ArrayLike) -> Array:
+    """Values of one parameter as they stand on its axis, the one that `parameter_label` names."""
+    values = np.asarray(values, dtype=float)
+    return np.log10(values) if parameter.prior == "log-uniform" else values / 10.0 ** _power(parameter)
+
+
+def _power(parameter: Parameter) -> int:
+    """Power of ten (a multiple of 3) taken out of an axis whose numbers would be long."""
+    reach = max(abs(parameter.lower), abs(parameter.upper))
+    return 3 * int(np.floor(np.log10(reach) / 3)) if reach > 0 and not 0.01 <= reach < 1e4 else 0
+
+
+def list_symbols(names: Sequence[str]) -> str:
+    """``E_c, E_s and k_c`` as printed."""
+    printed = [symbol(name) for name in names]
+    return printed[0] if len(printed) == 1 else ", ".join(printed[:-1]) + " and " + printed[-1]
