@@ -48,6 +48,14 @@ def assert_one_file(path: Path) -> None:
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
+@pytest.fixture
+def serial(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No worker processes, where a test is about something else: they take a second to start."""
+    monkeypatch.setattr(
+        runner, "run_parallel", lambda function, items, _: ((i, function(x)) for i, x in enumerate(items))
+    )
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Design:
     """The program of toy_runs, never interrupted, with one worker."""
@@ -109,6 +117,7 @@ class Killed(BaseException):
     """Stands for a kill: nothing in the package may catch it."""
 
 
+@pytest.mark.usefixtures("serial")
 @pytest.mark.parametrize("when", ["before", "after"])
 @pytest.mark.parametrize("step", ["storage.save", "os.replace", "Journal.forget"])
 def test_a_kill_at_each_step_of_the_fold_loses_nothing(
@@ -164,6 +173,7 @@ def test_a_point_that_kills_three_workers_is_a_failed_row(tmp_path: Path) -> Non
         assert len(list(tmp_path.glob(f"{float(SHORT.theta[row, 0])!r}.*"))) == 3
 
 
+@pytest.mark.usefixtures("serial")
 def test_failed_runs_are_rows_with_their_message(tmp_path: Path) -> None:
     path = tmp_path / "design.h5"
     design = run(path, first_wave(SPACE, 24, 0, seed=1), toy_runs.failing)
@@ -184,11 +194,12 @@ def test_failed_runs_are_rows_with_their_message(tmp_path: Path) -> None:
     assert seen == [(24, 24, int((~design.ok).sum()))], "failures are remembered, not run again"
 
 
+@pytest.mark.usefixtures("serial")
 def test_a_longer_wave_runs_only_what_is_new(tmp_path: Path, whole: Design) -> None:
     path, calls = tmp_path / "design.h5", tmp_path / "calls"
     calls.mkdir()
     simulate = partial(toy_runs.counted, folder=str(calls))
-    run(path, first_wave(SPACE, 5, 0, seed=3), simulate)
+    run(path, SHORT, simulate)
     repeated = replace(WAVE, theta=np.tile(WAVE.theta, (2, 1)), held_out=np.tile(WAVE.held_out, 2))
     design = run(path, repeated, simulate)
     assert len(list(calls.iterdir())) == len(WAVE.theta)
@@ -196,6 +207,7 @@ def test_a_longer_wave_runs_only_what_is_new(tmp_path: Path, whole: Design) -> N
     np.testing.assert_array_equal(design.force_n, whole.force_n[: len(WAVE.theta)])
 
 
+@pytest.mark.usefixtures("serial")
 def test_added_points_are_training_points_of_the_next_wave(whole: Design, tmp_path: Path) -> None:
     assert whole.wave.tolist() == [0] * len(WAVE.theta) + [1]
     assert not whole.held_out[-1]
@@ -207,6 +219,7 @@ def test_added_points_are_training_points_of_the_next_wave(whole: Design, tmp_pa
     assert [w["rule"] for w in load_waves(path)] == [WAVE.record["rule"], "most probable point"]
 
 
+@pytest.mark.usefixtures("serial")
 def test_progress_counts_and_estimates(tmp_path: Path) -> None:
     seen = []
     run(tmp_path / "design.h5", progress=lambda *now: seen.append(now))
@@ -276,6 +289,7 @@ def test_a_flipped_bit_in_a_journal_costs_that_run_only(tmp_path: Path) -> None:
             assert list(journal.runs) == [LOST.theta.tobytes()]
 
 
+@pytest.mark.usefixtures("serial")
 def test_a_damaged_journal_beside_a_design_is_run_again(tmp_path: Path, whole: Design) -> None:
     path = tmp_path / "design.h5"
 
@@ -294,6 +308,7 @@ def test_a_damaged_journal_beside_a_design_is_run_again(tmp_path: Path, whole: D
     assert_one_file(path)
 
 
+@pytest.mark.usefixtures("serial")
 def test_one_process_at_a_time(tmp_path: Path) -> None:
     path = tmp_path / "design.h5"
     held = Journal(tmp_path / "design.h5.journal", "a", bins=3)
@@ -304,6 +319,7 @@ def test_one_process_at_a_time(tmp_path: Path) -> None:
     run(path)
 
 
+@pytest.mark.usefixtures("serial")
 def test_a_file_of_another_design_is_refused_and_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "design.h5"
     run(path, first_wave(SPACE, 2, 0, seed=1))
@@ -337,12 +353,14 @@ def test_unfinished_runs_of_another_model_are_refused_and_kept(tmp_path: Path) -
     assert journal.read_bytes() == before
 
 
+@pytest.mark.usefixtures("serial")
 def test_a_simulate_of_another_model_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="model toy"):
         run_design(tmp_path / "design.h5", WAVE, COARSE_S, toy_simulate, "another")
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("serial")
 def test_bins_beyond_the_run_are_failures_not_extrapolations(tmp_path: Path) -> None:
     wave = first_wave(SPACE, 1, 0, seed=1)
     design = run_design(tmp_path / "d.h5", wave, np.linspace(0, 200, 5), toy_simulate, "toy")

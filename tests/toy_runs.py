@@ -14,12 +14,19 @@ from pathlib import Path
 import numpy as np
 from toy import EDGES_S, SPACE, toy_simulate
 
-from bayeskin.design import first_wave
+from bayeskin.design import Wave
 from bayeskin.runner import add_points, run_design
 from bayeskin.types import Simulation
 
 COARSE_S = EDGES_S[::10]
-WAVE = first_wave(SPACE, 8, 3, seed=3)
+WAVE = Wave(  # random, not Sobol': each worker imports this file, and SciPy's qmc takes a second
+    SPACE,
+    SPACE.from_unit(np.random.default_rng(3).uniform(size=(11, 5))),
+    np.arange(11) >= 8,
+    number=0,
+    seed=3,
+    record={"rule": "random"},
+)
 
 
 def slow(theta: Mapping[str, float], seconds: float) -> Simulation:
