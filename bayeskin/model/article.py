@@ -1,0 +1,188 @@
+"""The article's own formulation, reproduced because its numbers rest on it; it is not a reaction.
+
+Its released script differs from the total-Lagrangian model in four ways:
+
+- after each step the mesh's corners move with the increment, and all gradients of the next step are
+  taken on that moved, straight-edged mesh, while the displacement stays total: the "F" in its
+  stress is I + du/dx on the start of the step, where a total-Lagrangian F is I + du/dX;
+- momentum balances the Cauchy stress of that F, t_eff - p I, and fluid mass the small-strain rate
+  div(du)/dt + S dp/dt - div((k/mu_f) grad p), both integrated over the start-of-step mesh;
+- force is the integral of t_xx - p over the pad's top face, whose normal is z, and is not doubled;
+- backward Euler on every 50th sample of the recording.
+
+Source: the script released with the article, physics unchanged (design: observation `article`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import skfem
+
+from bayeskin.model import article_forms as forms
+from bayeskin.model.newton import Equations, NewtonSolver
+from bayeskin.model.problem import Material, Problem
+from bayeskin.types import Array
+
+SOLVER_TOLERANCE = 1e-5  # of the largest displacement and pressure
+FACE_QUADRATURE_DEGREE = 6
+
+
+@dataclass(frozen=True)
+class PadFace:
+    """Quadrature on the pad's triangles: cells (f,), reference points and gradients, weights.
+
+    gradients (f, q, a, 3) of the cell's quadratic shape functions on the reference tetrahedron;
+    value_p (f, q, 4); corners (f, 3) node numbers; weight (q,) summing to 1/2.
+    """
+
+    cells: np.ndarray
+    gradients: Array
+    value_p: Array
+    corners: np.ndarray
+    weight: Array
+
+
+@dataclass
+class ArticleModel:
+    """The article's equations on one mesh and material; the state is x (dofs,) and the moved corners."""
+
+    problem: Problem
+    material: Material
+    solver: NewtonSolver = field(default_factory=lambda: NewtonSolver(symmetric=False))
+
+    def __post_init__(self) -> None:
+        space, mesh = self.problem.space, self.problem.mesh.geometry
+        quadratic = skfem.ElementTetP2()
+        points, self._weight = skfem.quadrature.get_quadrature(quadratic.refdom, 4)
+        self._ref_u = _reference_gradients(quadratic, points)
+        self._ref_p = _reference_gradients(skfem.ElementTetP1(), points)
+        self._face = _pad_face(mesh, self.problem.mesh.facets["pad"])
+        self._cells = np.ascontiguousarray(mesh.t.T)
+        # displacement nodes 0..corners-1 are the mesh's vertices in scikit-fem's numbering
+        assert np.array_equal(space.nodes_u[:, :4], self._cells)
+
+    def step(self, x: Array, corners: Array, dt: float, pad_displacement_m: float, guess: Array
+             ) -> tuple[Array, float] | None:
+        """New x (dofs,) and the force [N] after a step dt [s] that starts at x on `corners` (n, 3)."""
+        jacobian = corners[self._cells[:, 1:]] - corners[self._cells[:, :1]]  # (e, 3 edges, 3)
+        inverse = np.linalg.inv(jacobian)  # rows: coordinates; columns: edges
+        volume = np.linalg.det(jacobian)
+        grad_u = np.einsum("qaj,eij->eqai", self._ref_u, inverse, optimize=True)
+        grad_p = np.einsum("qaj,eij->eqai", self._ref_p, inverse, optimize=True)
+        weight = np.abs(volume)[:, None] * self._weight
+        equations = self._equations(x, grad_u, grad_p, weight, dt)
+        target = self.problem.prescribe(guess, pad_displacement_m)
+        new = self.solver.solve(equations, target)
+        if new is None:
+            return None
+        return new, self._force(new, corners, inverse)
+
+    def move(self, corners: Array, old: Array, new: Array) -> Array:
+        """Corners (n, 3) after the increment from old to new x."""
+        n = len(corners)
+        return corners + (new - old)[: 3 * n].reshape(n, 3)
+
+    def _equations(self, old: Array, grad_u: Array, grad_p: Array, weight: Array, dt: float) -> Equations:
+        s, m, pattern = self.problem.space, self.material, self.problem.pattern
+
+        def residual(x: Array) -> Array | None:
+            out = np.zeros(s.dofs)
+            smallest = forms.residual(
+                x, old, s.nodes_u, s.nodes_p, grad_u, grad_p, s.value_p, weight,
+                m.mu, m.lam, m.mobility, m.storage, dt, out,
+            )
+            return out[pattern.free] if smallest > 0.0 and np.isfinite(out).all() else None
+
+        def tangent(x: Array):  # type: ignore[no-untyped-def]
+            data = np.zeros(pattern.size)
+            forms.tangent(
+                x, s.nodes_u, s.nodes_p, grad_u, grad_p, s.value_p, weight,
+                m.mu, m.lam, m.mobility, m.storage, dt, pattern.position, data,
+            )
+            return pattern.matrices(data)
+
+        n = 3 * s.n_nodes
+        size_u = max(float(np.abs(old[:n]).max()), 1e-4)
+        size_p = max(float(np.abs(old[n:]).max()), 1e-3 * float(m.mu.min()))
+        size = np.where(np.arange(s.dofs) < n, size_u, size_p)
+        scale = np.where(np.arange(s.dofs) < n, 1.0, float(m.mu.max()) / 2e-3)
+        return Equations(
+            pattern.free, residual, tangent, 1.0 / (SOLVER_TOLERANCE * size[pattern.free]), scale[pattern.free]
+        )
+
+    def _force(self, x: Array, corners: Array, inverse: Array) -> float:
+        """Integral of t_xx - p over the pad's face [N], gradients on the start-of-step mesh."""
+        s, m, face = self.problem.space, self.material, self._face
+        u = x[: 3 * s.n_nodes].reshape(-1, 3)
+        local_u = u[s.nodes_u[face.cells]]
+        local_p = x[3 * s.n_nodes + s.nodes_p[face.cells]]
+        gradients = np.einsum("fqaj,fij->fqai", face.gradients, inverse[face.cells])
+        f = np.eye(3) + np.einsum("fai,fqaj->fqij", local_u, gradients)
+        j = np.linalg.det(f)
+        mu, lam = m.mu[face.cells][:, None], m.lam[face.cells][:, None]
+        t_xx = (mu * (np.einsum("fqj,fqj->fq", f[:, :, 0], f[:, :, 0]) - 1.0) + lam * np.log(j)) / j
+        pressure = np.einsum("fqb,fb->fq", face.value_p, local_p)
+        a, b, c = (corners[face.corners[:, k]] for k in range(3))
+        twice_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        return float(np.einsum("f,q,fq->", twice_area, face.weight, t_xx - pressure))
+
+
+def run(
+    model: ArticleModel,
+    time_s: Array,
+    displacement_m: Array,
+    p_init: float,
+    on_step: Callable[[float, Array, float], None],
+) -> str:
+    """Backward Euler over the given samples (n,); calls `on_step(time_s, x, force_n)` for each.
+
+    Returns "" or, for a run that failed, one line with the step, the time and a remedy.
+    """
+    space = model.problem.space
+    x = np.zeros(space.dofs)
+    x[3 * space.n_nodes :] = p_init
+    corners = model.problem.mesh.geometry.p.T.copy()
+    rate, old_speed = np.zeros(space.dofs), np.nan
+    for n in range(1, len(time_s)):
+        dt = float(time_s[n] - time_s[n - 1])
+        speed = (displacement_m[n] - displacement_m[n - 1]) / dt
+        steady = np.isfinite(old_speed) and abs(speed - old_speed) < 0.2 * abs(speed) + 1e-5
+        pad = 0.5 * float(displacement_m[n])
+        guess = x + dt * rate if steady else x
+        found = model.step(x, corners, dt, pad, guess)
+        if found is None:  # once more with a tangent of this very step
+            model.solver.forget()
+            found = model.step(x, corners, dt, pad, x)
+        if found is None:
+            return (
+                f"step {n} at t = {time_s[n]:.2f} s did not converge; the article's formulation has "
+                "fixed steps: try stiffer or more permeable parameters"
+            )
+        new, force = found
+        corners = model.move(corners, x, new)
+        rate, x, old_speed = (new - x) / dt, new, speed
+        on_step(float(time_s[n]), x, force)
+    return ""
+
+
+def _reference_gradients(element: skfem.Element, points: Array) -> Array:
+    """Gradients of the shape functions on the reference cell, (q, a, 3)."""
+    count = 10 if isinstance(element, skfem.ElementTetP2) else 4
+    return np.ascontiguousarray(np.stack([element.lbasis(points, a)[1] for a in range(count)]).transpose(2, 0, 1))
+
+
+def _pad_face(mesh: skfem.MeshTet, facets: np.ndarray) -> PadFace:
+    triangle, weight = skfem.quadrature.get_quadrature(skfem.ElementTriP1().refdom, FACE_QUADRATURE_DEGREE)
+    barycentric = np.stack([1.0 - triangle.sum(axis=0), *triangle])  # (3, q)
+    corners, cells = mesh.facets[:, facets].T, mesh.f2t[0, facets]
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
+    gradients, values = [], []
+    for nodes, cell in zip(corners, cells, strict=True):
+        local = [int(np.flatnonzero(mesh.t[:, cell] == node)[0]) for node in nodes]
+        points = vertices[local].T @ barycentric
+        gradients.append(_reference_gradients(skfem.ElementTetP2(), points))
+        values.append(np.stack([skfem.ElementTetP1().lbasis(points, b)[0] for b in range(4)]).T)
+    return PadFace(cells, np.stack(gradients), np.stack(values), corners, weight)

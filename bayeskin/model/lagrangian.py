@@ -1,0 +1,232 @@
+"""Time integration of the total-Lagrangian model: second order, adaptive, landing on every corner.
+
+Alexander's two-stage singly diagonally implicit Runge-Kutta method (SIAM J. Numer. Anal. 14, 1977):
+gamma = 1 - 1/sqrt(2), stiffly accurate and L-stable, so that a corner of the protocol, where the
+pressure rate jumps, needs no history. Each stage is one solve of `forms.residual` with a history
+J*, p*. The local error of the fluid mass, filtered through the tangent (Hosea & Shampine 1996),
+gives an error of the force in newtons, which steers the step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bayeskin.model import forms
+from bayeskin.model.newton import Equations, NewtonSolver
+from bayeskin.model.problem import Material, Problem
+from bayeskin.types import Array, PadMotion
+
+GAMMA = 1.0 - np.sqrt(0.5)
+FIRST_STEP_S = 0.5
+SHORTEST_STEP_S = 1e-4
+GROWTH, SHRINK = 2.5, 0.25
+STEPS_PER_PHASE = 5  # so that a cubic between steps follows the curvature of a ramp
+CUTIS_THICKNESS_M, SUBCUTIS_THICKNESS_M = 2e-3, 8e-3
+PAD_WIDTH_M, PAD_EDGE_M = 8e-3, 18e-3  # both halves of the pad; distance of its inner edge from x = 0
+SOLVER_TOLERANCE = 1e-5  # of the largest displacement and pressure
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything that the next step needs: x (dofs,), J and p (e, q) at the quadrature points."""
+
+    time_s: float
+    x: Array
+    volume: Array
+    pressure: Array
+
+
+@dataclass(frozen=True)
+class Step:
+    """One accepted step: its end state, the force there [N] and the estimated local error [N]."""
+
+    state: State
+    force_n: float
+    error_n: float
+    corner: bool
+
+
+@dataclass
+class LagrangianModel:
+    """The equations of one run: a problem, a material and a motion; knows nothing of step control."""
+
+    problem: Problem
+    material: Material
+    motion: PadMotion
+    solver: NewtonSolver = field(default_factory=NewtonSolver)
+    full_residual: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.full_residual = np.zeros(self.problem.space.dofs)
+
+    def pad_displacement(self, time_s: float) -> float:
+        """Half the LVDT displacement [m]."""
+        return 0.5 * float(self.motion.at(time_s))
+
+    def initial_state(self, p_init: float) -> State:
+        space = self.problem.space
+        x = np.zeros(space.dofs)
+        x[3 * space.n_nodes :] = p_init
+        shape = space.weight.shape
+        return State(0.0, x, np.ones(shape), np.full(shape, float(p_init)))
+
+    def residual(self, x: Array, h: float, old: State) -> tuple[Array, Array, Array] | None:
+        """Residual (dofs,), J and p (e, q); None where a cell has turned inside out."""
+        s, m = self.problem.space, self.material
+        out = np.zeros(s.dofs)
+        volume, pressure = np.empty(s.weight.shape), np.empty(s.weight.shape)
+        smallest = forms.residual(
+            x, s.nodes_u, s.nodes_p, s.grad_u, s.grad_p, s.value_p, s.weight,
+            m.mu, m.lam, m.mobility, m.storage, h, old.volume, old.pressure, out, volume, pressure,
+        )
+        if not smallest > 0.0 or not np.isfinite(out).all():
+            return None
+        return out, volume, pressure
+
+    def equations(self, h: float, old: State) -> Equations:
+        s, m, pattern = self.problem.space, self.material, self.problem.pattern
+        last: dict[str, Array] = {}
+
+        def residual(x: Array) -> Array | None:
+            found = self.residual(x, h, old)
+            if found is None:
+                return None
+            last["residual"], last["volume"], last["pressure"] = found
+            self.full_residual = found[0]
+            return found[0][pattern.free]
+
+        def tangent(x: Array):  # type: ignore[no-untyped-def]
+            data = np.zeros(pattern.size)
+            forms.tangent(
+                x, s.nodes_u, s.nodes_p, s.grad_u, s.grad_p, s.value_p, s.weight,
+                m.mu, m.lam, m.mobility, m.storage, h, old.pressure, pattern.position, data,
+            )
+            return pattern.matrices(data)
+
+        n = 3 * s.n_nodes
+        size_u = np.abs(self.problem_scale(old.x[:n]))
+        size_p = max(float(np.abs(old.x[n:]).max()), 1e-3 * float(m.mu.min()))
+        weight = np.concatenate([np.full(n, 1.0 / size_u), np.full(s.n_corners, 1.0 / size_p)])
+        scale = np.where(np.arange(s.dofs) < n, 1.0, float(m.mu.max()) / CUTIS_THICKNESS_M)
+        return Equations(
+            pattern.free, residual, tangent, weight[pattern.free] / SOLVER_TOLERANCE, scale[pattern.free]
+        )
+
+    def nominal_force(self) -> float:
+        """Scale of the force [N]: both layers pulled over the pad's width from the plane x = 0."""
+        young = self.material.mu * (3 * self.material.lam + 2 * self.material.mu)
+        young = young / (self.material.lam + self.material.mu)
+        cutis = self.problem.mesh.cutis
+        tension = young[cutis].max() * CUTIS_THICKNESS_M + young[~cutis].max() * SUBCUTIS_THICKNESS_M
+        return float(tension * PAD_WIDTH_M * self.problem_scale(np.zeros(1)) / PAD_EDGE_M)
+
+    def problem_scale(self, u: Array) -> float:
+        """Largest displacement of the protocol [m], against which a correction is small."""
+        return max(0.5 * float(np.abs(self.motion.displacement_m).max()), float(np.abs(u).max()), 1e-9)
+
+    def solve_stage(self, time_s: float, h: float, old: State, guess: Array, jump: bool) -> State | None:
+        """One implicit stage ending at time_s; `jump`: the guess knows nothing of the pads' motion."""
+        equations = self.equations(h, old)
+        target = self.problem.prescribe(guess, self.pad_displacement(time_s))
+        if jump:
+            free_fixed = self.solver.renew(equations, guess)
+            start = equations.residual(guess)
+            if start is None:
+                return None
+            fixed, free = self.problem.pattern.fixed, self.problem.pattern.free
+            rest = start + free_fixed @ (target[fixed] - guess[fixed])
+            target[free] = guess[free] - self.solver.back_substitute(rest)
+        x = self.solver.solve(equations, target)
+        if x is None:
+            return None
+        found = self.residual(x, h, old)
+        if found is None:
+            return None
+        self.full_residual = found[0]
+        return State(time_s, x, found[1], found[2])
+
+    def force_of_mass_error(self, state: State, mass: Array, h: float, old: State) -> float:
+        """Change of the reaction [N] that an error of the fluid mass (e, q) makes, to first order."""
+        s, free = self.problem.space, self.problem.pattern.free
+        right = np.zeros(s.dofs)
+        contribution = np.einsum("eq,qb->eb", s.weight * mass, s.value_p)
+        np.subtract.at(right, 3 * s.n_nodes + s.nodes_p, contribution)
+        moved = state.x.copy()
+        moved[free] += self.solver.back_substitute(right[free])
+        found = self.residual(moved, h, old)
+        if found is None:
+            return np.inf
+        before = self.problem.reaction(self.full_residual)
+        return abs(self.problem.reaction(found[0]) - before)
+
+
+def advance(model: LagrangianModel, state: State, h: float, before: State | None) -> Step | None:
+    """One step of length h [s] from `state`; `before` is the state one step earlier in this phase."""
+    first, second = GAMMA * h, (1.0 - GAMMA) * h
+
+    def extrapolated(time_s: float) -> Array:
+        if before is None:
+            return state.x
+        return state.x + (state.x - before.x) * (time_s - state.time_s) / (state.time_s - before.time_s)
+
+    t1 = state.time_s + first
+    one = model.solve_stage(t1, first, state, extrapolated(t1), before is None)
+    if one is None:
+        return None
+    rate_v, rate_p = (one.volume - state.volume) / first, (one.pressure - state.pressure) / first
+    history = State(t1, one.x, state.volume + second * rate_v, state.pressure + second * rate_p)
+    t2 = state.time_s + h
+    guess = one.x + (one.x - state.x) * (second / first) if before is None else extrapolated(t2)
+    two = model.solve_stage(t2, first, history, guess, False)
+    if two is None:
+        return None
+    force = model.problem.reaction(model.full_residual)
+    mass = (two.volume - history.volume) - (one.volume - state.volume)
+    error = model.force_of_mass_error(two, mass, first, history)
+    return Step(two, force, error, corner=False)
+
+
+def integrate(
+    model: LagrangianModel,
+    p_init: float,
+    tolerance: float,
+    on_step: Callable[[Step], None],
+) -> str:
+    """Runs the whole motion; calls `on_step` for the start and for each accepted step.
+
+    tolerance : estimated local error of the force a step, relative to the nominal force.
+    Returns "" or, for a run that failed, one line with the step, the time and a remedy.
+    """
+    state = model.initial_state(p_init)
+    on_step(Step(state, 0.0, 0.0, corner=True))
+    allowed_n, count = tolerance * model.nominal_force(), 0
+    for start, end in zip(model.motion.time_s[:-1], model.motion.time_s[1:], strict=True):
+        before, h = None, min(FIRST_STEP_S, 0.5 * (end - start))
+        longest = (end - start) / STEPS_PER_PHASE
+        while state.time_s < end - 1e-9:
+            h = _landing(h, end - state.time_s, longest)
+            step = advance(model, state, h, before)
+            excess = step.error_n / allowed_n if step else np.inf
+            if step is None or (excess > 1.0 and h > SHORTEST_STEP_S):
+                h *= 0.5 if step is None else max(SHRINK, 0.9 / np.sqrt(excess))
+                before = None if step is None else before
+                if h < SHORTEST_STEP_S:
+                    return (
+                        f"step {count + 1} at t = {state.time_s:.3f} s did not converge down to "
+                        f"{SHORTEST_STEP_S:g} s; try a finer mesh or parameters nearer to a skin's"
+                    )
+                continue
+            before, state, count = state, step.state, count + 1
+            on_step(Step(state, step.force_n, step.error_n, corner=abs(state.time_s - end) < 1e-9))
+            h *= min(GROWTH, 0.9 / np.sqrt(max(excess, 1e-6)))
+        state = State(float(end), state.x, state.volume, state.pressure)
+    return ""
+
+
+def _landing(h: float, left: float, longest: float) -> float:
+    """The next step: at most `longest`, and equal last steps rather than a sliver at the corner."""
+    h = min(h, longest)
+    return left / np.ceil(left / h - 1e-9) if left < 2.0 * h else h

@@ -1,0 +1,161 @@
+"""The quarter of the upper arm as a mesh: graded bricks of our own, or a gmsh file.
+
+Both are made flat (x 0..105 mm, y 0..84 mm, z 0..10 mm) and rolled onto the arm:
+``theta = y / (R + z)``, ``y' = (R + z) sin(theta)``, ``z' = (R + z) cos(theta)``, R = 48 mm.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import meshio
+import numpy as np
+import skfem
+
+from bayeskin.errors import InputError
+from bayeskin.types import Array
+
+ARM_RADIUS_M = 48e-3
+LENGTH_M = (105e-3, 84e-3, 10e-3)
+CUTIS_BOTTOM_M = 8e-3
+BOUNDARIES = ("pad", "guard", "symmetry_x", "symmetry_y", "bottom")
+GMSH_NAMES = {
+    "right_patch": "pad",
+    "u_right": "guard",
+    "left": "symmetry_x",
+    "back": "symmetry_y",
+    "bottom": "bottom",
+}
+GMSH_LAYERS = {"bottom_layer": "subcutis", "top_layer": "cutis"}
+
+
+@dataclass(frozen=True)
+class SkinMesh:
+    """A rolled mesh with the facets of each boundary and the cells of the cutis.
+
+    geometry : scikit-fem mesh, coordinates in metres, already rolled
+    facets : indices of `geometry.facets` for each name in BOUNDARIES
+    cutis : (cells,) True in the cutis, False in the subcutis
+    name : for messages and records
+    """
+
+    geometry: skfem.Mesh
+    facets: dict[str, np.ndarray]
+    cutis: np.ndarray
+    name: str
+
+    @property
+    def hash(self) -> str:
+        """sha256 over coordinates, cells, boundaries and layers."""
+        digest = hashlib.sha256()
+        for array in (self.geometry.doflocs, self.geometry.t, self.cutis, *map(self.facets.get, BOUNDARIES)):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+
+def roll(points: Array, radius_m: float = ARM_RADIUS_M) -> Array:
+    """Flat coordinates (3, n) [m] onto the arm, (3, n) [m] (the article's script, after loading)."""
+    x, y, z = points
+    theta = y / (radius_m + z)
+    return np.stack([x, (radius_m + z) * np.sin(theta), (radius_m + z) * np.cos(theta)])
+
+
+def brick_mesh(refinement: int = 1) -> SkinMesh:
+    """Graded bricks whose lines follow the pads' edges; 27-node geometry, so the arm is curved.
+
+    `refinement` divides every element's edges: 1 gives 231 bricks, 2 gives 1,848.
+    """
+    lines = [_refine(axis, refinement) for axis in _COARSE_LINES_M]
+    flat = skfem.MeshHex.init_tensor(*lines)
+    facets = _flat_boundaries(flat.p[:, flat.facets].mean(axis=1))
+    cutis = flat.p[2, flat.t].mean(axis=0) > CUTIS_BOTTOM_M
+    curved = skfem.MeshHex2.from_mesh(flat)
+    rolled = skfem.MeshHex2(roll(curved.doflocs), curved.t)
+    return SkinMesh(rolled, facets, cutis, f"bricks, refinement {refinement}")
+
+
+# Lines of the coarsest bricks [mm]: pad edges at x = 18, 26, 27, 35 and y = 4, 5, 12; layers at z = 8.
+_COARSE_LINES_M = tuple(
+    1e-3 * np.array(axis)
+    for axis in (
+        (0.0, 9.0, 15.0, 18.0, 22.0, 26.0, 27.0, 31.0, 35.0, 42.0, 63.0, 105.0),
+        (0.0, 4.0, 5.0, 8.5, 12.0, 18.0, 38.0, 84.0),
+        (0.0, 5.0, 8.0, 10.0),
+    )
+)
+
+
+def _refine(lines: Array, parts: int) -> Array:
+    inner = [np.linspace(a, b, parts, endpoint=False) for a, b in pairwise(lines)]
+    return np.append(np.concatenate(inner), lines[-1])
+
+
+def _flat_boundaries(centre: Array) -> dict[str, np.ndarray]:
+    """Facets of each boundary from the facet centres (3, facets) of the flat mesh [m]."""
+    x, y, z = 1e3 * centre
+    top = np.isclose(z, 10.0)
+    pad = top & (x > 18) & (x < 26) & (y < 4)
+    guard = top & (x > 18) & (x < 35) & (y < 12) & ((y > 5) | (x > 27))
+    sets = {
+        "pad": pad,
+        "guard": guard,
+        "symmetry_x": np.isclose(x, 0.0),
+        "symmetry_y": np.isclose(y, 0.0),
+        "bottom": np.isclose(z, 0.0),
+    }
+    return {name: np.flatnonzero(inside) for name, inside in sets.items()}
+
+
+def read_gmsh(path: Path | str) -> SkinMesh:
+    """A flat gmsh file with the article's names for boundaries and layers, rolled after loading.
+
+    Raises InputError if the file is absent or unreadable, holds no tetrahedra, or lacks a name.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(path, "no such file", "a gmsh mesh")
+    try:
+        raw = meshio.read(path, file_format="gmsh")
+    except (Exception, SystemExit) as error:  # meshio raises whatever its parser met
+        raise InputError(path, f"not readable as gmsh ({type(error).__name__})", "a gmsh 4.1 mesh") from None
+    missing = [n for n in (*GMSH_NAMES, *GMSH_LAYERS) if n not in raw.field_data]
+    if missing:
+        raise InputError(path, f"no boundary or layer named {', '.join(missing)}", "the article's names")
+    tetrahedra, volume_tags = _cells(raw, "tetra")
+    triangles, surface_tags = _cells(raw, "triangle")
+    if not len(tetrahedra):
+        raise InputError(path, "no tetrahedra", "a volume mesh")
+    used, compact = np.unique(tetrahedra, return_inverse=True)
+    flat = skfem.MeshTet(raw.points[used].T, compact.reshape(tetrahedra.shape).T)
+    number = np.full(len(raw.points), -1)
+    number[used] = np.arange(len(used))
+    facets = {}
+    for gmsh_name, name in GMSH_NAMES.items():
+        nodes = number[triangles[surface_tags == raw.field_data[gmsh_name][0]]]
+        facets[name] = _facet_indices(flat, nodes)
+        if not len(facets[name]):
+            raise InputError(path, f"boundary {gmsh_name} without triangles", "at least one")
+    cutis = volume_tags == raw.field_data["top_layer"][0]
+    rolled = skfem.MeshTet(roll(flat.p), flat.t)
+    return SkinMesh(rolled, facets, cutis, path.name)
+
+
+def _cells(raw: meshio.Mesh, kind: str) -> tuple[np.ndarray, np.ndarray]:
+    pairs = [
+        (block.data, tags)
+        for block, tags in zip(raw.cells, raw.cell_data["gmsh:physical"], strict=True)
+        if block.type == kind
+    ]
+    width = {"tetra": 4, "triangle": 3}[kind]
+    if not pairs:
+        return np.empty((0, width), int), np.empty(0, int)
+    return np.concatenate([d for d, _ in pairs]), np.concatenate([t for _, t in pairs])
+
+
+def _facet_indices(mesh: skfem.Mesh, nodes: np.ndarray) -> np.ndarray:
+    """Indices of the facets with the corner nodes given, (n, 3)."""
+    keys = {tuple(sorted(f)): i for i, f in enumerate(mesh.facets.T.tolist())}
+    return np.array(sorted(keys[tuple(sorted(n))] for n in nodes.tolist()), dtype=int)

@@ -1,0 +1,147 @@
+"""Nonlinear solves that keep one factorised tangent: Newton when needed, Broyden in between.
+
+A factorisation costs as much as some tens of residuals and back-substitutions, and the tangent
+changes slowly along the protocol. So the kept one serves as approximate inverse, corrected by
+Broyden's rank-one updates (C. T. Kelley, Iterative Methods for Linear and Nonlinear Equations,
+SIAM 1995, section 7.3), and is renewed when it no longer contracts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.sparse as sp
+
+from bayeskin.model.linear import Factorisation, factorisation
+from bayeskin.types import Array
+
+MAX_RENEWALS = 8
+MAX_BROYDEN = 12
+SLOW = 0.4  # a contraction worse than this is dearer than a new tangent
+SMALLEST_DAMPING = 1 / 64
+
+
+@dataclass(frozen=True)
+class Equations:
+    """What one solve needs: functions of the whole vector x (dofs,), rows and columns free only.
+
+    residual : x -> (free,) or None where a cell has turned inside out
+    tangent : x -> free-free matrix and free-fixed matrix
+    weight : (free,) one over the tolerance of each unknown; a step is small where |weight step| < 1
+    scale : (free,) size of each unknown in the linear solves, so that the matrix is balanced
+    """
+
+    free: np.ndarray
+    residual: Callable[[Array], Array | None]
+    tangent: Callable[[Array], tuple[sp.csr_matrix, sp.csr_matrix]]
+    weight: Array
+    scale: Array
+
+
+@dataclass
+class NewtonSolver:
+    """Carries the factorised tangent from solve to solve, and counts what was spent."""
+
+    symmetric: bool = True  # the tangent is nearly so: its symmetric part is factorised
+    counts: dict[str, int] = field(
+        default_factory=lambda: {"iterations": 0, "residuals": 0, "factorisations": 0, "solves": 0}
+    )
+    last_residual: float = np.nan
+    _factors: Factorisation = field(init=False)
+    _ready: bool = False
+
+    def __post_init__(self) -> None:
+        self._factors = factorisation(self.symmetric)
+
+    def forget(self) -> None:
+        """Makes the next solve begin with a tangent of its own."""
+        self._ready = False
+
+    def release(self) -> None:
+        """Frees the factors."""
+        self._factors.release()
+        self._ready = False
+
+    def renew(self, equations: Equations, x: Array) -> sp.csr_matrix:
+        """Factorises the tangent at x; returns its free-fixed part, for prescribed increments."""
+        free_free, free_fixed = equations.tangent(x)
+        self._factors.factorise(free_free, equations.scale)
+        self.counts["factorisations"] += 1
+        self._ready = True
+        return free_fixed
+
+    def back_substitute(self, right: Array) -> Array:
+        """Solves with the tangent factorised last, (free,)."""
+        self.counts["solves"] += 1
+        return self._factors.solve(right)
+
+    def solve(self, equations: Equations, guess: Array) -> Array | None:
+        """The solution from a guess whose fixed dofs are already right; None if none was found."""
+        x, fresh = guess.copy(), False
+        if not self._ready:
+            self.renew(equations, x)
+            fresh = True
+        for _ in range(MAX_RENEWALS):
+            x_new, converged = self._broyden(equations, x, fresh)
+            if converged:
+                return x_new
+            if x_new is None and fresh:
+                return None
+            x = x if x_new is None else x_new
+            if self._residual(equations, x) is None:
+                return None
+            self.renew(equations, x)
+            fresh = True
+        return None
+
+    def _residual(self, equations: Equations, x: Array) -> Array | None:
+        self.counts["residuals"] += 1
+        return equations.residual(x)
+
+    def _broyden(self, equations: Equations, x: Array, fresh: bool) -> tuple[Array | None, bool]:
+        """Steps with the kept tangent: (x, True) converged, (x, False) slow, (None, False) lost."""
+        right = self._residual(equations, x)
+        if right is None:
+            return None, False
+        steps = [-self.back_substitute(right) * equations.weight]  # in units of the tolerance
+        previous, free = np.inf, equations.free
+        for iteration in range(MAX_BROYDEN):
+            self.counts["iterations"] += 1
+            size = float(np.abs(steps[-1]).max())
+            if not np.isfinite(size) or (size > 2.0 * previous and iteration > 1):
+                return (x if fresh else None), False
+            trial = x.copy()
+            trial[free] += steps[-1] / equations.weight
+            right = self._residual(equations, trial)
+            if right is None:
+                return (self._damped(equations, x, steps[-1] / equations.weight) if fresh else None), False
+            x = trial
+            if size < 1.0:
+                self.last_residual = float(np.abs(right).max())
+                return x, True
+            if iteration > 1 and size > SLOW * previous:
+                return x, False
+            previous = size
+            steps.append(self._updated_step(equations, steps, right))
+        return x, False
+
+    def _updated_step(self, equations: Equations, steps: list[Array], right: Array) -> Array:
+        """Next step from the history of steps (Kelley's matrix-free form of Broyden's update)."""
+        z = -self.back_substitute(right) * equations.weight
+        for old, new in zip(steps[:-1], steps[1:], strict=True):
+            z += new * (old @ z) / (old @ old)
+        last = steps[-1]
+        return z / (1.0 - (last @ z) / (last @ last))
+
+    def _damped(self, equations: Equations, x: Array, step: Array) -> Array | None:
+        """The first of x + step/2, /4, ... that keeps every cell upright, or None."""
+        damping = 0.5
+        while damping >= SMALLEST_DAMPING:
+            trial = x.copy()
+            trial[equations.free] += damping * step
+            if self._residual(equations, trial) is not None:
+                return trial
+            damping *= 0.5
+        return None

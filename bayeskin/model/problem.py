@@ -1,0 +1,102 @@
+"""The test as a boundary-value problem: which dofs are prescribed, which layer has which constants."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayeskin.model.mesh import SkinMesh
+from bayeskin.model.space import Sparsity, TaylorHood, sparsity, taylor_hood
+from bayeskin.types import Array
+
+PARAMETERS = ("E_c", "E_s", "k_c", "k_s", "p_init")
+
+
+@dataclass(frozen=True)
+class Constants:
+    """What the article fixes (its section "Initial parameters values"); SI."""
+
+    nu_c: float = 0.48
+    nu_s: float = 0.3
+    porosity_c: float = 0.2
+    porosity_s: float = 0.4
+    viscosity_pa_s: float = 5e-3
+    bulk_fluid_pa: float = 2.2e9
+    bulk_solid_pa: float = 1e10
+
+
+@dataclass(frozen=True)
+class Material:
+    """Constants of each cell, all (e,): Lame mu and lam [Pa], mobility k/mu_f [m^2/(Pa s)], storage [1/Pa]."""
+
+    mu: Array
+    lam: Array
+    mobility: Array
+    storage: Array
+
+
+def material(theta: Mapping[str, float], cutis: np.ndarray, fixed: Constants | None = None) -> Material:
+    """Cell constants from the sampled parameters (E_c, E_s [Pa], k_c, k_s [m^2]) and the fixed ones."""
+    c = fixed or Constants()
+
+    def by_layer(in_cutis: float, in_subcutis: float) -> Array:
+        return np.where(cutis, in_cutis, in_subcutis).astype(float)
+
+    young, nu = by_layer(theta["E_c"], theta["E_s"]), by_layer(c.nu_c, c.nu_s)
+    porosity = by_layer(c.porosity_c, c.porosity_s)
+    return Material(
+        mu=young / (2 * (1 + nu)),
+        lam=young * nu / ((1 + nu) * (1 - 2 * nu)),
+        mobility=by_layer(theta["k_c"], theta["k_s"]) / c.viscosity_pa_s,
+        storage=porosity / c.bulk_fluid_pa + (1 - porosity) / c.bulk_solid_pa,
+    )
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A mesh with its space, prescribed dofs and sparsity; shared by every run on that mesh.
+
+    pad, pads : displacement nodes of the central pad; of pad and guard together
+    """
+
+    mesh: SkinMesh
+    space: TaylorHood
+    pattern: Sparsity
+    pad: np.ndarray
+    pads: np.ndarray
+
+    @property
+    def pad_x(self) -> np.ndarray:
+        """x dofs of the central pad, where the reaction is summed."""
+        return 3 * self.pad
+
+    def prescribe(self, x: Array, pad_displacement_m: float) -> Array:
+        """A copy of x (dofs,) with every prescribed dof at its value: u_x of the pads, zero elsewhere."""
+        out = x.copy()
+        out[self.pattern.fixed] = 0.0
+        out[3 * self.pads] = pad_displacement_m
+        return out
+
+    def reaction(self, residual: Array) -> float:
+        """Force on the whole pad [N]: consistent nodal reactions along x, doubled for the y-symmetry."""
+        return float(2.0 * residual[self.pad_x].sum())
+
+
+def build_problem(mesh: SkinMesh) -> Problem:
+    """Space, prescribed dofs and sparsity of a mesh (design: pads move along x, bottom u_z = 0)."""
+    space = taylor_hood(mesh)
+    pad, guard = space.facet_nodes("pad"), space.facet_nodes("guard")
+    pads = np.union1d(pad, guard)
+    fixed = np.unique(
+        np.concatenate(
+            [
+                (3 * pads[:, None] + np.arange(3)).ravel(),
+                3 * space.facet_nodes("symmetry_x"),
+                3 * space.facet_nodes("symmetry_y") + 1,
+                3 * space.facet_nodes("bottom") + 2,
+            ]
+        )
+    )
+    return Problem(mesh, space, sparsity(space, fixed), pad, pads)
