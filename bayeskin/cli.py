@@ -64,8 +64,9 @@ def cli() -> None:
 @cli.command("import")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("-o", "out", required=True, type=click.Path(path_type=Path), help="HDF5 file to write.")
+@click.option("--sheet", help="Sheet of a workbook, where several hold the columns.")
 @as_json
-def import_(file: Path, out: Path, as_json: bool) -> None:
+def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
     """Read a recording (xlsx, csv, tsv, h5) and write it in SI units as HDF5.
 
     Finds the columns and their units and says what it took for what, and which phases, noise, spikes and
@@ -77,7 +78,7 @@ def import_(file: Path, out: Path, as_json: bool) -> None:
     """
     from bayeskin.pipeline import single
 
-    _answer(single.import_recording(file, out), as_json)
+    _answer(single.import_recording(file, out, sheet), as_json)
 
 
 @cli.command()

@@ -27,10 +27,10 @@ class _Section(BaseModel):
 
 
 class RecordingConfig(_Section):
-    """Which recording, and the pad motion that drives the model if not the recording's own."""
+    """Which recording, and whether the model follows its displacement closely or its corners, rounded."""
 
     file: str
-    protocol: str | None = None  # a PadMotion in bayeskin's HDF5
+    protocol: Literal["recorded", "idealised"] = "recorded"
 
 
 class ModelConfig(_Section):
