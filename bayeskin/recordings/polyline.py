@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +17,7 @@ def simplify(x: Array, y: Array, tolerance: float, fixed: NDArray[np.int64]) -> 
     """
     keep = {0, len(x) - 1, *map(int, fixed)}
     ends = sorted(keep)
-    pieces = list(zip(ends[:-1], ends[1:], strict=True))
+    pieces = list(pairwise(ends))
     while pieces:
         a, b = pieces.pop()
         if b - a < 2:

@@ -8,8 +8,10 @@ corner by the drive moves it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from bayeskin.errors import InputError
@@ -70,12 +72,12 @@ def segment(recording: Recording) -> tuple[Phase, ...]:
         raise InputError(
             recording.name, "a displacement with one phase only", "a load, a hold or an unload more"
         )
-    corners = [_corner_s(time_s, smooth, a, b) for a, b in zip(pieces[:-1], pieces[1:], strict=True)]
+    corners = [_corner_s(time_s, smooth, a, b) for a, b in pairwise(pieces)]
     edges = [float(time_s[0]), *corners, float(time_s[-1])]
     return _name_phases(pieces, edges, smooth)
 
 
-def _pieces(time_s: Array, smooth: Array, knots: Array, still_m: float) -> list[_Piece]:
+def _pieces(time_s: Array, smooth: Array, knots: NDArray[np.int64], still_m: float) -> list[_Piece]:
     moved = np.diff(smooth[knots])
     directions = np.where(np.abs(moved) < still_m, 0, np.sign(moved)).astype(int)
     return [_Piece(int(a), int(b), int(d)) for a, b, d in zip(knots[:-1], knots[1:], directions, strict=True)]

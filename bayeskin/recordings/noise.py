@@ -1,0 +1,257 @@
+"""What a recording's noise is, phase by phase: its sd, its correlation, its spikes, its zero steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayeskin.errors import InputError
+from bayeskin.recordings.correlation import (
+    WHITE,
+    NoiseShape,
+    effective_windows,
+    expected_products,
+    fit_shape,
+    lagged_products,
+    residual_windows,
+)
+from bayeskin.recordings.spikes import Despiked, despike
+from bayeskin.recordings.steps import Step, find_steps
+from bayeskin.types import Array, Phase, PhaseKind, Recording, _FreezesArrays
+
+_WINDOW_S = 2.5  # over which the force under the noise is a parabola
+_AFTER_BREAK_S = 1.0  # left out after a corner or step, where the force moves faster than that
+_LAG_S = 1.0
+_LEAST_WINDOW = 20  # samples
+
+
+@dataclass(frozen=True)
+class PhaseNoise(_FreezesArrays):
+    """Noise of the force in one phase.
+
+    sd_n is that of the noise faster than about a second, spikes apart: a white part and one with
+    correlation time correlation_time_s (that one is pooled over all phases of the kind). A spike passes
+    spike_threshold_n from the running median; spikes_above of them are upward. step_times_s and
+    step_sizes_n (steps,) are shifts of the load cell's zero; their false-alarm rate is 1 % a recording.
+    """
+
+    kind: PhaseKind
+    cycle: int
+    start_s: float
+    end_s: float
+    sd_n: float
+    white_sd_n: float
+    correlated_sd_n: float
+    correlation_time_s: float
+    spikes: int
+    spikes_above: int
+    spike_threshold_n: float
+    step_times_s: Array
+    step_sizes_n: Array
+
+
+@dataclass(frozen=True)
+class LocalSd:
+    """The noise's sd along one phase: log sd (k,) at window centres time_s (k,), and the phase's own."""
+
+    time_s: Array
+    log_sd: Array
+    phase_sd_n: float
+
+    def at(self, time_s: Array) -> Array:
+        """sd [N] at the times given, same shape."""
+        if not len(self.time_s):
+            return np.full(np.shape(time_s), self.phase_sd_n)
+        return np.exp(np.interp(time_s, self.time_s, self.log_sd))
+
+
+@dataclass(frozen=True)
+class NoiseAnalysis:
+    """A recording's force without spikes; its noise: correlation by kind of phase, sd by phase, steps."""
+
+    despiked: Despiked
+    shapes: Mapping[PhaseKind, NoiseShape]
+    local: tuple[LocalSd, ...]
+    steps: tuple[tuple[Step, ...], ...]  # by phase
+    bounds: NDArray[np.int64]  # (phases + 1,) sample indices
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Residual windows (k, size) of one phase, which of their samples are no spikes, and their middles."""
+
+    residual: Array
+    kept: NDArray[np.bool_]
+    middle_s: Array
+
+
+def phase_noise(recording: Recording, phases: Sequence[Phase]) -> tuple[PhaseNoise, ...]:
+    """The noise of each phase, in the order of `phases`.
+
+    Raises
+    ------
+    InputError : no phase is long enough (about 30 samples) to tell noise from force.
+    """
+    return summarise(analyse(recording, phases), phases)
+
+
+def summarise(analysis: NoiseAnalysis, phases: Sequence[Phase]) -> tuple[PhaseNoise, ...]:
+    """The noise of each phase from a recording's analysis."""
+    out = []
+    for i, (phase, (start, stop)) in enumerate(zip(phases, pairwise(analysis.bounds), strict=True)):
+        shape, sd = analysis.shapes[phase.kind], analysis.local[i].phase_sd_n
+        signs = analysis.despiked.events(start, stop)
+        out.append(
+            PhaseNoise(
+                kind=phase.kind,
+                cycle=phase.cycle,
+                start_s=phase.start_s,
+                end_s=phase.end_s,
+                sd_n=sd,
+                white_sd_n=sd * float(np.sqrt(shape.white_share)),
+                correlated_sd_n=sd * float(np.sqrt(1 - shape.white_share)),
+                correlation_time_s=shape.time_s if shape.white_share < 1 else 0.0,
+                spikes=len(signs),
+                spikes_above=int(np.sum(signs > 0)),
+                spike_threshold_n=analysis.despiked.threshold_sd
+                * float(np.median(analysis.despiked.sd_n[start:stop])),
+                step_times_s=np.array([s.time_s for s in analysis.steps[i]]),
+                step_sizes_n=np.array([s.size_n for s in analysis.steps[i]]),
+            )
+        )
+    return tuple(out)
+
+
+def analyse(recording: Recording, phases: Sequence[Phase]) -> NoiseAnalysis:
+    """Spikes, correlation, local sd and steps; the second round knows the steps that the first one found."""
+    time_s = recording.time_s
+    bounds = np.searchsorted(time_s, [*(p.start_s for p in phases), np.inf])
+    bounds[0] = 0
+    first = _round(recording, phases, bounds, np.empty(0, dtype=np.int64))
+    steps = _all_steps(time_s, first, phases)
+    indices = np.searchsorted(time_s, [step.time_s for found in steps for step in found])
+    last = _round(recording, phases, bounds, indices) if len(indices) else first
+    return NoiseAnalysis(last.despiked, last.shapes, last.local, steps, bounds)
+
+
+def _all_steps(
+    time_s: Array, analysis: NoiseAnalysis, phases: Sequence[Phase]
+) -> tuple[tuple[Step, ...], ...]:
+    """Steps of each phase; soon after a corner the force itself moves too fast to tell.
+
+    A step raises the sd of the windows about it, so a phase counts as no noisier than its kind usually is.
+    """
+    usual = {
+        phase.kind: np.concatenate(
+            [x.log_sd for x, p in zip(analysis.local, phases, strict=True) if p.kind == phase.kind]
+        )
+        for phase in phases
+    }
+    found = []
+    for phase, local, (a, b) in zip(phases, analysis.local, pairwise(analysis.bounds), strict=True):
+        start = (
+            a if a == 0 else int(np.searchsorted(time_s, time_s[min(a, len(time_s) - 1)] + _AFTER_BREAK_S))
+        )
+        inside = slice(start, max(start, b))
+        of_kind = usual[phase.kind]
+        sd_n = min(local.phase_sd_n, float(np.exp(np.median(of_kind)))) if len(of_kind) else local.phase_sd_n
+        shape, force_n = analysis.shapes[phase.kind], analysis.despiked.force_n
+        found.append(find_steps(time_s[inside], force_n[inside], sd_n, shape, len(time_s)))
+    return tuple(found)
+
+
+def _round(
+    recording: Recording, phases: Sequence[Phase], bounds: NDArray[np.int64], steps: NDArray[np.int64]
+) -> NoiseAnalysis:
+    time_s = recording.time_s
+    interval_s = float(np.median(np.diff(time_s)))
+    breaks = np.unique(np.concatenate([bounds, steps]))
+    despiked = despike(time_s, recording.force_n, breaks.tolist())
+    longest = int(np.max(np.diff(breaks)))
+    size = min(round(_WINDOW_S / interval_s), int(0.7 * longest))
+    if size < _LEAST_WINDOW:
+        found = f"{longest} samples in the longest phase"
+        raise InputError(
+            recording.name, found, f"at least {round(_LEAST_WINDOW / 0.7) + 1}, to know its noise"
+        )
+    windows = [
+        _phase_windows(time_s, despiked, breaks[(breaks >= a) & (breaks <= b)], size, interval_s)
+        for a, b in pairwise(bounds)
+    ]
+    shapes = _shapes_by_kind(phases, windows, interval_s, size)
+    local = _local_sds(phases, windows, shapes, interval_s, size)
+    return NoiseAnalysis(despiked, shapes, local, (), bounds)
+
+
+def _phase_windows(
+    time_s: Array, despiked: Despiked, breaks: NDArray[np.int64], size: int, interval_s: float
+) -> _Windows:
+    """Residual windows between the breaks of one phase, none soon after a break of the force's slope."""
+    residual, kept, middle = [np.empty((0, size))], [np.empty((0, size), dtype=bool)], [np.empty(0)]
+    for a, b in pairwise(breaks):
+        a = a if a == 0 else a + min(round(_AFTER_BREAK_S / interval_s), (b - a) // 5)
+        count = (b - a) // size
+        start = a + (b - a - count * size) // 2
+        inside = slice(start, start + count * size)
+        residual.append(residual_windows(despiked.force_n[inside], size))
+        kept.append((despiked.spike[inside] == 0).reshape(count, size))
+        middle.append(time_s[inside].reshape(count, size).mean(axis=1))
+    return _Windows(np.concatenate(residual), np.concatenate(kept), np.concatenate(middle))
+
+
+def _shapes_by_kind(
+    phases: Sequence[Phase], windows: Sequence[_Windows], interval_s: float, size: int
+) -> dict[PhaseKind, NoiseShape]:
+    """Correlation of each kind of phase, from all its windows; that of all together where it has none."""
+    lags = min(round(_LAG_S / interval_s), size // 2) + 1
+
+    def fit(chosen: Sequence[_Windows]) -> NoiseShape:
+        used = [w for w in chosen if len(w.residual)]
+        products = [lagged_products(w.residual, w.kept, lags) for w in used]
+        relative = [p / p[0] for p in products if p[0] > 0]
+        weights = [int(np.count_nonzero(w.kept)) for w, p in zip(used, products, strict=True) if p[0] > 0]
+        if not relative:
+            return WHITE
+        correlogram = np.average(relative, axis=0, weights=weights)
+        return fit_shape(correlogram, sum(weights), interval_s, size)
+
+    kinds = {phase.kind for phase in phases}
+    of_kind = {k: [w for w, p in zip(windows, phases, strict=True) if p.kind == k] for k in kinds}
+    return {k: fit(own if any(len(w.residual) for w in own) else windows) for k, own in of_kind.items()}
+
+
+def _local_sds(
+    phases: Sequence[Phase],
+    windows: Sequence[_Windows],
+    shapes: Mapping[PhaseKind, NoiseShape],
+    interval_s: float,
+    size: int,
+) -> tuple[LocalSd, ...]:
+    local: list[LocalSd | None] = []
+    for phase, w in zip(phases, windows, strict=True):
+        correlation = shapes[phase.kind].at(interval_s * np.arange(size))
+        left = float(expected_products(correlation, 1)[0])  # share of the variance that a parabola leaves
+        variance = np.sum(w.residual**2 * w.kept, axis=1) / np.maximum(w.kept.sum(axis=1), 1) / left
+        local.append(_shrunk(w.middle_s, variance, effective_windows(shapes[phase.kind], interval_s, size)))
+    usual = float(np.median([sd.phase_sd_n for sd in local if sd is not None]))
+    return tuple(sd or LocalSd(np.empty(0), np.empty(0), usual) for sd in local)
+
+
+def _shrunk(middle_s: Array, variance: Array, freedom: float) -> LocalSd | None:
+    """Window variances (k,) drawn towards their phase's as far as their scatter is what chance gives."""
+    positive = variance > 0
+    if not positive.any():
+        return None
+    middle_s, log = middle_s[positive], np.log(variance[positive])
+    centre = float(np.log(np.mean(np.exp(log)))) if len(log) < 5 else float(np.log(_capped_mean(np.exp(log))))
+    excess = max(0.0, float(np.var(log)) - 2.0 / freedom)
+    trust = excess / (excess + 2.0 / freedom)
+    return LocalSd(middle_s, 0.5 * (centre + trust * (log - centre)), float(np.exp(0.5 * centre)))
+
+
+def _capped_mean(values: Array) -> float:
+    return float(np.mean(np.minimum(values, 3 * np.median(values))))

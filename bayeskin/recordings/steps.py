@@ -1,0 +1,86 @@
+"""Steps of the load cell's zero: sudden lasting shifts of the force inside a phase.
+
+The mean of half a second after each moment minus that of half a second before it, less what the slope on
+both sides accounts for, is a linear filter of the force. Its sd under the noise is known, but a load
+cell also wanders; that sd, or where it is larger the filter's own spread over the phase once the step is
+taken out, is one unit, and a step is what passes the level that noise passes once in a hundred recordings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+from bayeskin.recordings.correlation import NoiseShape, weighted_covariance
+from bayeskin.types import Array
+
+FAMILY_WISE = 0.01  # probability that noise alone shows any step in a whole recording
+_WINDOW_S = 0.5
+_GAP_S = 0.05  # a step of the zero is not infinitely fast
+_MOST = 50  # in one phase
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of the load cell's zero: when [s], by how much [N], and its size in sds of its estimate."""
+
+    time_s: float
+    size_n: float
+    significance: float
+
+
+def step_filter(interval_s: float) -> Array:
+    """Weights (odd size,) that give a step's size at their middle, and zero on any straight line."""
+    window = max(3, round(_WINDOW_S / interval_s))
+    gap = max(1, round(_GAP_S / interval_s))
+    near = np.full(window, 1.0 / window)
+    reach = (window + 2 * gap + 1) / window  # distance of the near windows in units of that of near to far
+    right = np.concatenate([np.zeros(gap), (1 + 0.5 * reach) * near, -0.5 * reach * near])
+    return np.concatenate([-right[::-1], [0.0], right])
+
+
+def find_steps(time_s: Array, force_n: Array, sd_n: float, shape: NoiseShape, tests: int) -> tuple[Step, ...]:
+    """Steps in one phase's force without spikes (n,), in time order.
+
+    sd_n and shape are the noise of an undisturbed phase, `tests` the samples of the whole recording, over
+    which the probability of a false step is kept. None is looked for within 1.05 s of the phase's ends.
+    """
+    interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
+    weights = step_filter(interval_s)
+    half = len(weights) // 2
+    if len(force_n) <= 2 * len(weights):
+        return ()
+    correlation = shape.at(interval_s * np.arange(len(weights)))
+    expected = sd_n * float(np.sqrt(weighted_covariance(weights, weights, correlation)))
+    threshold = float(norm.isf(0.5 * FAMILY_WISE / tests))
+    window = max(3, round(_WINDOW_S / interval_s))
+    left, steps = force_n.copy(), []
+    jump = np.convolve(left, weights[::-1], mode="valid")
+    free = np.ones(len(jump), dtype=bool)
+    for _ in range(_MOST):
+        at = int(np.argmax(np.where(free, np.abs(jump), 0.0)))
+        first = _first_after(left, at + half, window)
+        size = float(jump[np.clip(first - half, 0, len(jump) - 1)])
+        height = abs(float(jump[at]))
+        left[first:] -= size
+        jump = np.convolve(left, weights[::-1], mode="valid")
+        unit = max(expected, 1.4826 * float(np.median(np.abs(jump - np.median(jump)))))
+        if not free[at] or height <= threshold * unit:
+            break
+        free[max(0, at - window) : at + window + 1] = False
+        steps.append(Step(float(time_s[first]), size, height / unit))
+    return tuple(sorted(steps, key=lambda step: step.time_s))
+
+
+def _first_after(values: Array, near: int, window: int) -> int:
+    """Index of the first sample after the step near `near`: least squares of a line plus one step."""
+    start, stop = max(0, near - window), min(len(values), near + window)
+    size = stop - start
+    line = np.linalg.qr(np.vander(np.linspace(-1, 1, size), 2))[0]
+    splits = np.arange(size // 4, size - size // 4)
+    steps = (np.arange(size) >= splits[:, None]).astype(float)
+    steps -= (steps @ line) @ line.T
+    gain = (steps @ values[start:stop]) ** 2 / np.sum(steps**2, axis=1)
+    return int(start + splits[np.argmax(gain)])
