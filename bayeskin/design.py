@@ -24,7 +24,7 @@ from bayeskin.types import Array, Parameter, ParameterSpace, Prediction, frozen_
 Predict = Callable[[Array], Prediction]
 
 SURROGATE_SDS = 3.0  # Pukelsheim (1994): 3 sd hold at least 95 % of any unimodal error
-ENOUGH_SURVIVORS = 256  # a fraction known to about 6 %, and a bounding box to about 1 % of its width
+ENOUGH = 256  # survivors: a fraction known to about 6 %, a bounding box to about 1 % of its width
 FIRST_CANDIDATES, MOST_CANDIDATES, ROUNDS = 2**13, 2**16, 8
 CHUNK = 256  # predictions carry a factor (n, m, r): a few ten MB at this n
 
@@ -77,8 +77,7 @@ def sobol_points(space: ParameterSpace, n: int, seed: int | Sequence[int], skip:
     A longer sequence of the same seed starts with the shorter one, so a design can be extended.
     Raises InputError for a negative count or seed.
     """
-    unit = _sobol_unit(space.dim, n, seed, skip)
-    return np.clip(space.from_unit(unit), space.lower, space.upper)  # exp(log(x)) may leave by one ulp
+    return _within(space, _sobol_unit(space.dim, n, seed, skip))
 
 
 def first_wave(space: ParameterSpace, n: int, held_out: int, seed: int) -> Wave:
@@ -149,18 +148,16 @@ def next_wave(
     """
 
     def bounds(unit: Array) -> tuple[Array, Array]:
-        theta = np.clip(space.from_unit(unit), space.lower, space.upper)
+        theta = _within(space, unit)
         parts = [predict(theta[i : i + CHUNK]) for i in range(0, len(theta), CHUNK)]
         pairs = [misfit_bounds(part.mean, part.sd(), force_n, weights) for part in parts]
         low, high = zip(*pairs, strict=True) if pairs else ((np.empty(0),), (np.empty(0),))
         return np.concatenate(low), np.concatenate(high)
 
     survey = _survey(space.dim, bounds, factor, floor_n, [seed, wave, 2])
-    theta = [
-        np.clip(space.from_unit(unit), space.lower, space.upper)
-        for part, count in enumerate((n, held_out))
-        for unit in [_fill(survey, bounds, count, [seed, wave, part])]
-    ]
+    units = [_fill(survey, bounds, count, [seed, wave, part]) for part, count in enumerate((n, held_out))]
+    theta = [_within(space, unit) for unit in units]
+    kept = _within(space, np.concatenate([survey.survivors, *units]))
     record = {
         "rule": f"lowest possible rms misfit <= {factor:g} x max(best attainable, noise floor); "
         f"surrogate error counted at {SURROGATE_SDS:g} sd",
@@ -168,8 +165,8 @@ def next_wave(
         "best_n": survey.best_n,
         "limit_n": survey.limit_n,
         "kept_fraction": survey.kept_fraction,
-        "lower": dict(zip(space.names, space.from_unit(survey.lower).tolist(), strict=True)),
-        "upper": dict(zip(space.names, space.from_unit(survey.upper).tolist(), strict=True)),
+        "lower": dict(zip(space.names, kept.min(axis=0).tolist(), strict=True)),
+        "upper": dict(zip(space.names, kept.max(axis=0).tolist(), strict=True)),
     }
     return _wave(space, theta, wave, seed, record)
 
@@ -201,8 +198,7 @@ class _Survey:
     best_n: float
     limit_n: float
     kept_fraction: float
-    lower: Array
-    upper: Array
+    survivors: Array  # (n, d) in the unit cube
 
 
 def _survey(
@@ -214,8 +210,8 @@ def _survey(
 ) -> _Survey:
     """Closes in on the plausible part until enough candidates of one draw survive."""
     region = _Region(np.full(dim, 0.5), np.eye(dim), np.full(dim, 0.5))
-    count, best, fraction = FIRST_CANDIDATES, np.inf, 1.0
-    kept, kept_low = np.empty((0, dim)), np.empty(0)
+    count, best, fraction = FIRST_CANDIDATES, np.inf, np.nan
+    near, near_low = np.empty((0, dim)), np.empty(0)
     for turn in range(ROUNDS):
         unit = region.points(count, [*seed, turn])
         low, high = bounds(unit)
@@ -223,34 +219,32 @@ def _survey(
         limit = factor * max(best, floor_n)
         alive = int(np.sum(low <= limit))
         fraction = region.volume * alive / count if alive else fraction
-        kept, kept_low = np.concatenate([kept, unit]), np.concatenate([kept_low, low])
-        kept, kept_low = kept[kept_low <= limit], kept_low[kept_low <= limit]
-        if alive >= ENOUGH_SURVIVORS:
+        near, near_low = np.concatenate([near, unit]), np.concatenate([near_low, low])
+        # A handful of survivors says nothing about directions that the data leave free: never
+        # close in on fewer than ENOUGH points, survivors or not.
+        first = np.argsort(near_low, kind="stable")[: max(ENOUGH, int(np.sum(near_low <= limit)))]
+        near, near_low = near[first], near_low[first]
+        if alive >= ENOUGH:
             break
-        closer = _enclosing(kept, spacing=(region.volume / count) ** (1.0 / dim))
+        closer = _enclosing(near)
         if closer.volume < 0.5 * region.volume:
             region = closer
         else:  # a bent part fills its box badly: look harder in the same box
             count = min(4 * count, MOST_CANDIDATES)
-    return _Survey(region, best, limit, fraction, kept.min(axis=0), kept.max(axis=0))
+    return _Survey(region, best, limit, fraction, near[near_low <= limit])
 
 
-def _enclosing(unit: Array, spacing: float) -> _Region:
+def _enclosing(unit: Array) -> _Region:
     """The smaller of two boxes round the points (n, d): along the coordinates or the principal axes.
 
-    Widened by a tenth and by the distance of neighbouring candidates, since the points are a sample.
+    A tenth wider on each side, since the points are a sample of what they stand for.
     """
-    dim = unit.shape[1]
-    principal = np.linalg.svd(unit - unit.mean(axis=0), full_matrices=True)[2].T
+    principal = np.linalg.svd(unit - unit.mean(axis=0), full_matrices=False)[2].T
     regions = []
-    for axes, within in ((np.eye(dim), 1.0), (principal, np.inf)):
+    for axes, least, most in ((np.eye(unit.shape[1]), 0.0, 1.0), (principal, -np.inf, np.inf)):
         low, high = (unit @ axes).min(axis=0), (unit @ axes).max(axis=0)
-        margin = 0.05 * (high - low) + spacing
-        low, high = (
-            (low - margin, high + margin)
-            if np.isinf(within)
-            else (np.maximum(low - margin, 0.0), np.minimum(high + margin, 1.0))
-        )
+        margin = 0.1 * (high - low)
+        low, high = np.maximum(low - margin, least), np.minimum(high + margin, most)
         regions.append(_Region(axes @ (0.5 * (low + high)), axes, 0.5 * (high - low)))
     return min(regions, key=lambda region: region.volume)
 
@@ -259,7 +253,7 @@ def _fill(
     survey: _Survey, bounds: Callable[[Array], tuple[Array, Array]], count: int, seed: Sequence[int]
 ) -> Array:
     """The first `count` points of a sequence over the region that pass the limit, (<= count, d)."""
-    found, drawn, batch = np.empty((0, len(survey.lower))), 0, 2**11
+    found, drawn, batch = np.empty((0, len(survey.region.half))), 0, 2**11
     while len(found) < count and drawn < ROUNDS * MOST_CANDIDATES:
         unit = survey.region.points(batch, seed, skip=drawn)
         found = np.concatenate([found, unit[bounds(unit)[0] <= survey.limit_n]])
@@ -276,6 +270,11 @@ def _wave(
     return Wave(
         space, np.concatenate(theta), np.arange(training + testing) >= training, number, seed, counted
     )
+
+
+def _within(space: ParameterSpace, unit: Array) -> Array:
+    """Theta in SI of points in the unit cube, same shape, inside the box to the last digit."""
+    return np.clip(space.from_unit(unit), space.lower, space.upper)  # exp(log(x)) may leave by one ulp
 
 
 def _sobol_unit(dim: int, n: int, seed: int | Sequence[int], skip: int = 0) -> Array:
