@@ -1,0 +1,128 @@
+"""A trained surrogate to and from one HDF5 file with its manifest inside: arrays and text, no code."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from bayeskin import __version__, storage
+from bayeskin.errors import InputError
+from bayeskin.surrogates.chaos import LatentChaos
+from bayeskin.surrogates.gp import LatentGPs
+from bayeskin.surrogates.shapes import ShapeTransform
+from bayeskin.surrogates.surrogate import Latents, ShapeSurrogate
+from bayeskin.surrogates.validate import Validation
+from bayeskin.types import ParameterSpace, frozen_array
+
+FORMAT = "bayeskin surrogate"
+FORMAT_VERSION = 1
+LATENTS: dict[str, type[LatentGPs] | type[LatentChaos]] = {"gp": LatentGPs, "chaos": LatentChaos}
+
+
+def manifest_of(surrogate: ShapeSurrogate, validation: Validation) -> dict[str, Any]:
+    """What a reader wants to know before using a surrogate: origin, box, and its measured error."""
+    return {
+        **surrogate.provenance,
+        "training_rows": validation.training_rows,
+        "components": validation.components,
+        "error_rows": validation.rows,
+        "error_source": validation.source,
+        "relative_error": validation.relative_error,
+        "coverage_90": validation.coverage_90,
+        "median_point_relative_error": float(np.median(validation.point_relative)),
+        "worst_point_relative_error": float(np.max(validation.point_relative)),
+        "parameters": {
+            p.name: {"unit": p.unit, "lower": p.lower, "upper": p.upper, "prior": p.prior}
+            for p in surrogate.space.parameters
+        },
+    }
+
+
+def save_surrogate(path: Path | str, surrogate: ShapeSurrogate, manifest: Mapping[str, Any]) -> None:
+    """Writes the surrogate and, beside it as ``.json``, its manifest; whole or not at all."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with h5py.File(partial, "w") as handle:
+            storage.write(handle.create_group("space"), surrogate.space)
+            storage.write(handle.create_group("transform"), surrogate.transform)
+            storage.write(handle.create_group("latents"), surrogate.latents)
+            handle.create_dataset("edges_s", data=surrogate.edges_s)
+            digest = contents_hash(handle)
+            text = json.dumps({**manifest, "arrays_sha256": digest}, indent=2, sort_keys=True)
+            handle.attrs.update(
+                format=FORMAT, format_version=FORMAT_VERSION, version=__version__, arrays_sha256=digest,
+                kind=surrogate.provenance["kind"], manifest=text,
+                provenance=json.dumps(dict(surrogate.provenance)),
+            )  # fmt: skip
+        with open(partial, "rb") as written:
+            os.fsync(written.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    path.with_suffix(".json").write_text(text + "\n")
+
+
+def load_surrogate(path: Path | str) -> ShapeSurrogate:
+    """Reads what `save_surrogate` wrote; predictions are the same bit for bit on the same machine.
+
+    Raises InputError if the file is absent, truncated, foreign, of another format version, or if its
+    contents do not match the hash stored with them.
+    """
+    path = Path(path)
+    expected = "a surrogate that bayeskin wrote"
+    if not path.is_file():
+        raise InputError(path, "no such file", expected)
+    try:
+        with h5py.File(path, "r") as handle:
+            _refuse_unfit(path, handle)
+            latents: Latents = storage.read(handle["latents"], LATENTS[handle.attrs["kind"]], path)
+            return ShapeSurrogate(
+                storage.read(handle["space"], ParameterSpace, path), frozen_array(handle["edges_s"][()]),
+                storage.read(handle["transform"], ShapeTransform, path), latents,
+                json.loads(handle.attrs["provenance"]),
+            )  # fmt: skip
+    except (OSError, KeyError, RuntimeError) as error:
+        raise InputError(path, f"not readable as one ({error})".replace("\n", " "), expected) from None
+
+
+def load_manifest(path: Path | str) -> dict[str, Any]:
+    """The manifest inside a surrogate's file. Raises InputError as `load_surrogate` does."""
+    load_surrogate(path)
+    with h5py.File(path, "r") as handle:
+        manifest: dict[str, Any] = json.loads(handle.attrs["manifest"])
+    return manifest
+
+
+def _refuse_unfit(path: Path, handle: h5py.File) -> None:
+    if handle.attrs.get("format") != FORMAT:
+        raise InputError(path, "an HDF5 file of another origin", "a surrogate that bayeskin wrote")
+    version = int(handle.attrs["format_version"])
+    if version != FORMAT_VERSION:
+        raise InputError(path, f"format version {version}", f"format version {FORMAT_VERSION}")
+    if contents_hash(handle) != handle.attrs["arrays_sha256"]:
+        raise InputError(path, "contents that differ from their stored hash", "an unaltered file")
+
+
+def contents_hash(handle: h5py.File) -> str:
+    """SHA-256 over every dataset and attribute below the root, in the order of their names."""
+    digest = hashlib.sha256()
+    names: list[str] = []
+    handle.visit(names.append)
+    for name in sorted(names):
+        node = handle[name]
+        for key in sorted(node.attrs):
+            digest.update(f"{name}@{key}={node.attrs[key]!s};".encode())
+        if isinstance(node, h5py.Dataset):
+            values = np.ascontiguousarray(node[()])
+            digest.update(f"{name}:{values.dtype.str}{values.shape};".encode())
+            digest.update(values.tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,80 @@
+"""Force histories as an amplitude and a shape, and the shape as a few principal components.
+
+Forces span decades over a prior box, so a history ``y`` (m,) is split in ``a = log RMS(y)`` and
+``s = y / RMS(y)``. A latent vector is ``[a, z_1 .. z_K]`` with ``s = mean + z @ components``. What the
+components leave out is kept as a variance of each bin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayeskin.errors import InputError
+from bayeskin.types import Array, Prediction, _FreezesArrays
+
+SMALLEST_AMPLITUDE = 1e-9  # of the largest: a history of zeros has no logarithm
+
+
+@dataclass(frozen=True)
+class ShapeTransform(_FreezesArrays):
+    """mean (m,) and components (K, m) of shapes; truncation (m,) variance of a shape's remainder."""
+
+    mean: Array
+    components: Array
+    truncation: Array
+
+    def keep(self, count: int, shapes: Array) -> ShapeTransform:
+        """The first `count` components; what they leave of `shapes` (n, m) becomes the truncation."""
+        components = self.components[:count]
+        centred = shapes - self.mean
+        rest = centred - (centred @ components.T) @ components
+        freedom = max(len(shapes) - 1 - count, 1)
+        return ShapeTransform(self.mean, components, np.sum(rest**2, axis=0) / freedom)
+
+    def encode(self, force_n: Array) -> Array:
+        """Latent vectors (n, 1 + K) of histories (n, m)."""
+        amplitude, shapes = split(force_n)
+        return np.column_stack([amplitude, (shapes - self.mean) @ self.components.T])
+
+    def decode(self, latent: Array, sd: Array) -> Prediction:
+        """Force of latent vectors with independent errors, mean and sd (n, 1 + K) each.
+
+        Delta method: d force = force da + exp(a) components dz. Every column of the factor, like the
+        mean itself, is a combination of the rows [mean; components], so one product gives them all.
+        """
+        n, count = latent.shape
+        scale = np.exp(latent[:, 0])
+        weights = np.zeros((n, count, 1 + count))
+        weights[:, 0, 0] = scale
+        weights[:, 1:, 0] = scale[:, None] * latent[:, 1:]
+        weights[:, :, 1] = weights[:, :, 0] * sd[:, :1]
+        diagonal = np.arange(1, count)
+        weights[:, diagonal, 1 + diagonal] = scale[:, None] * sd[:, 1:]
+        basis = np.vstack([self.mean, self.components]).T
+        return Prediction(
+            mean=weights[:, :, 0] @ basis.T,
+            factor=np.matmul(basis, weights[:, :, 1:]),
+            diagonal=scale[:, None] ** 2 * self.truncation,
+        )
+
+
+def split(force_n: Array) -> tuple[Array, Array]:
+    """log RMS (n,) and shape (n, m) of histories (n, m). Raises InputError if all of them are zero."""
+    rms = np.sqrt(np.mean(force_n**2, axis=1))
+    if not rms.max() > 0.0:
+        raise InputError("design: force_n", "zero force in every run", "forces that differ from zero")
+    rms = np.maximum(rms, SMALLEST_AMPLITUDE * rms.max())
+    return np.log(rms), force_n / rms[:, None]
+
+
+def all_components(shapes: Array, weights: Array) -> tuple[ShapeTransform, Array]:
+    """Every principal component of shapes (n, m), rows weighted by (n,), and their variances (K,)."""
+    share = weights / weights.sum()
+    mean = share @ shapes
+    _, singular, components = np.linalg.svd(np.sqrt(share)[:, None] * (shapes - mean), full_matrices=False)
+    # the sign of a component is arbitrary: fixed, so that the same design gives the same surrogate
+    signs = np.sign(components[np.arange(len(components)), np.argmax(np.abs(components), axis=1)])
+    signs[signs == 0] = 1.0
+    return ShapeTransform(mean, components * signs[:, None], np.zeros_like(mean)), singular**2

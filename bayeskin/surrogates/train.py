@@ -1,0 +1,162 @@
+"""From a design to a surrogate and what is known of its error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayeskin import __version__
+from bayeskin.errors import InputError
+from bayeskin.surrogates.chaos import LatentChaos, SparseFit, fit_sparse
+from bayeskin.surrogates.gp import LatentFit, LatentGPs, fit_latent
+from bayeskin.surrogates.shapes import ShapeTransform, all_components, split
+from bayeskin.surrogates.surrogate import Latents, ShapeSurrogate
+from bayeskin.surrogates.validate import Validation, compare, validate
+from bayeskin.types import Array, Design, ParameterSpace
+
+Kind = Literal["gp", "chaos"]
+F = TypeVar("F", LatentFit, SparseFit)
+MOST_COMPONENTS = 12
+TRUNCATION_SHARE = 0.02  # of the latents' squared error: 1 % more of the error, rooted
+UNLEARNABLE = 0.9  # of a component's variance left as error: it predicts nothing, so it is truncation
+MARGIN = 0.15  # of the region's width: rows just outside it support the surrogate at its faces
+FOLDS = 4
+
+
+def train(
+    design: Design,
+    kind: Literal["auto", "gp", "chaos"] = "auto",
+    seed: int = 0,
+    focus: Array | None = None,
+    region: tuple[Array, Array] | None = None,
+) -> tuple[ShapeSurrogate, Validation]:
+    """Trains on the design's training rows; the held-out rows only measure the error.
+
+    kind: "auto" takes the one with the smaller held-out error, or, without held-out rows, the smaller
+    error over four folds drawn with `seed`. focus: weights (n,) of the design's rows in the principal
+    components and in the error that decides. region: lower and upper corner (d,) in the design's unit
+    cube; the surrogate then answers only inside, and learns from rows in and slightly around it.
+    Raises InputError for too few rows or force that is not finite.
+    """
+    space = design.space if region is None else narrowed(design.space, *region)
+    focus = np.ones(len(design.theta)) if focus is None else np.asarray(focus, dtype=float)
+    if focus.shape != (len(design.theta),) or not (np.all(focus >= 0.0) and np.all(np.isfinite(focus))):
+        raise InputError("focus", f"shape {focus.shape}", f"{len(design.theta)} finite weights >= 0")
+    unit = space.to_unit(design.theta)
+    training = design.training & np.all((unit >= -MARGIN) & (unit <= 1.0 + MARGIN), axis=1) & (focus > 0.0)
+    testing = design.testing & space.contains(design.theta) & (focus > 0.0)
+    _refuse_unusable(design, space, training)
+    kinds: tuple[Kind, ...] = ("gp", "chaos") if kind == "auto" else (kind,)
+    if kind == "auto" and not testing.any():
+        kinds = (_best_of_folds(kinds, space, design, unit, training, focus, seed),)
+    provenance = {
+        "version": __version__,
+        "design_seed": design.seed,
+        "model_hash": design.model_hash,
+        "seed": seed,
+        "waves": int(design.wave.max(initial=0)) + 1,
+    }
+    results = []
+    for name in kinds:
+        surrogate = _fit(name, space, design, unit, training, focus, provenance)
+        results.append((surrogate, _measure(surrogate, design, training, testing, focus)))
+    return min(results, key=lambda result: result[1].relative_error)
+
+
+def narrowed(space: ParameterSpace, lower: Array, upper: Array) -> ParameterSpace:
+    """The part of a space between two corners (d,) of its unit cube. Raises InputError if empty."""
+    low, high = np.clip(np.asarray(lower, dtype=float), 0, 1), np.clip(np.asarray(upper, dtype=float), 0, 1)
+    if low.shape != (space.dim,) or high.shape != (space.dim,) or not np.all(low < high):
+        cube = f"two corners of the {space.dim}-dimensional unit cube"
+        raise InputError("region", f"{lower} to {upper}", cube)
+    corners = zip(space.parameters, space.from_unit(low), space.from_unit(high), strict=True)
+    return ParameterSpace(tuple(replace(p, lower=float(a), upper=float(b)) for p, a, b in corners))
+
+
+def _refuse_unusable(design: Design, space: ParameterSpace, training: NDArray[np.bool_]) -> None:
+    fewest = space.dim + 3
+    if training.sum() < fewest:
+        found = f"{training.sum()} finished training rows in the box"
+        raise InputError("design", found, f"at least {fewest}")
+    wrong = np.flatnonzero(design.ok & ~np.isfinite(design.force_n).all(axis=1))
+    if len(wrong):
+        where = f"design: row {wrong[0]}"
+        raise InputError(where, "force that is not finite", "finite force in every finished run")
+
+
+def _fit(
+    kind: Kind, space: ParameterSpace, design: Design, unit: Array, rows: NDArray[np.bool_],
+    focus: Array, provenance: dict[str, Any],
+) -> ShapeSurrogate:  # fmt: skip
+    """One surrogate of one kind on the rows given."""
+    latents: Latents
+    if kind == "gp":
+        transform, targets, gp_fits = _fit_latents(fit_latent, unit[rows], design.force_n[rows], focus[rows])
+        latents = LatentGPs.assemble(unit[rows], targets, gp_fits)
+    else:
+        # polynomials leave [-1, 1] steeply: rows in the margin would rule the fit
+        rows = rows & space.contains(design.theta)
+        transform, targets, chaos_fits = _fit_latents(
+            fit_sparse, unit[rows], design.force_n[rows], focus[rows]
+        )
+        latents = LatentChaos.assemble(unit[rows], targets, chaos_fits)
+    return ShapeSurrogate(space, design.edges_s, transform, latents, {**provenance, "kind": kind})
+
+
+def _fit_latents(
+    fit_one: Callable[[Array, Array], F], unit: Array, force_n: Array, weights: Array
+) -> tuple[ShapeTransform, Array, list[F]]:
+    """Fits the amplitude, then components until what is left is negligible beside the error made."""
+    amplitude, shapes = split(force_n)
+    full, variances = all_components(shapes, weights)
+    scores = (shapes - full.mean) @ full.components.T
+    fits = [fit_one(unit, amplitude)]
+    error = fits[0].error * shapes.shape[1]  # a shape's squares sum to the number of bins
+    left = float(variances.sum())
+    for k in range(min(MOST_COMPONENTS, len(unit) // 3, int(np.sum(variances > 1e-14 * left)))):
+        if left <= max(TRUNCATION_SHARE * error, 1e-14 * shapes.shape[1]):
+            break
+        fit = fit_one(unit, scores[:, k])
+        if fit.error > UNLEARNABLE * variances[k]:
+            break
+        fits.append(fit)
+        error += fit.error
+        left -= float(variances[k])
+    transform = full.keep(len(fits) - 1, shapes)
+    return transform, transform.encode(force_n), fits
+
+
+def _measure(
+    surrogate: ShapeSurrogate, design: Design, training: NDArray[np.bool_], testing: NDArray[np.bool_],
+    focus: Array,
+) -> Validation:  # fmt: skip
+    if testing.any():
+        return validate(surrogate, design.theta[testing], design.force_n[testing], focus[testing])
+    if surrogate.provenance["kind"] == "chaos":
+        training = training & surrogate.space.contains(design.theta)
+    return compare(
+        surrogate, surrogate.leave_one_out(), design.theta[training], design.force_n[training],
+        "leave-one-out", focus[training],
+    )  # fmt: skip
+
+
+def _best_of_folds(
+    kinds: tuple[Kind, ...], space: ParameterSpace, design: Design, unit: Array,
+    training: NDArray[np.bool_], focus: Array, seed: int,
+) -> Kind:  # fmt: skip
+    """The kind with the smaller squared error over folds that neither its fit nor its choices have seen."""
+    rows = np.flatnonzero(training & space.contains(design.theta))
+    order = np.random.default_rng(seed).permutation(rows)
+    errors = dict.fromkeys(kinds, 0.0)
+    for k in range(FOLDS):
+        out = np.zeros_like(training)
+        out[order[k::FOLDS]] = True
+        for kind in kinds:
+            surrogate = _fit(kind, space, design, unit, training & ~out, focus, {})
+            miss = surrogate.predict(design.theta[out]).mean - design.force_n[out]
+            errors[kind] += float(focus[out] @ np.sum(miss**2, axis=1))
+    return min(kinds, key=lambda kind: errors[kind])
