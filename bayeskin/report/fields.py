@@ -45,6 +45,7 @@ def figure_fields(
     """Small multiples: one row a field, one column a time, one colour bar a row.
 
     points_m (t, p, 3) deformed positions of the surface's nodes; faces (f, 3) or (f, 4) node numbers;
+    only nodes of `faces` are framed, so that the faces near the pad alone give a closer view;
     `finding` heads the figure. Each face is painted in the mean of its nodes' values.
     Raises InputError if the shapes do not fit each other.
     """
@@ -66,8 +67,8 @@ def figure_fields(
         bar = figure.colorbar(scale, ax=axes, shrink=0.75, aspect=14, pad=0.01)
         bar.set_label(f"{field.label} [{field.unit}]")
         bar.outline.set_visible(False)  # type: ignore[operator]
-    _axes_triad(figure.axes[0], shown)
-    state_finding(figure, finding, "Quarter model, deformed, to scale; the axes drawn are 20 mm long.")
+    length_mm = _axes_triad(figure.axes[0], shown)
+    state_finding(figure, finding, f"Quarter model, deformed, to scale; axes drawn {length_mm:g} mm long.")
     return figure
 
 
@@ -118,10 +119,15 @@ def _frame(ax: Any, points_mm: Array) -> None:
     ax.set_axis_off()
 
 
-def _axes_triad(ax: Any, points_mm: Array) -> None:
-    origin, length = points_mm.min(axis=(0, 1)), 20.0
+def _axes_triad(ax: Any, points_mm: Array) -> float:
+    """Draws x, y and z below the surface's corner; returns their length [mm]."""
+    low, high = points_mm.min(axis=(0, 1)), points_mm.max(axis=(0, 1))
+    extent = float(np.max(high - low)) or 1.0
+    length = max(step for step in (0.1, 1.0, 2.0, 5.0, 10.0, 20.0) if step <= max(0.2 * extent, 0.1))
+    origin = np.array([low[0], low[1], min(low[2], high[2] - 0.45 * extent)])
     for direction, name in zip(np.eye(3), "xyz", strict=True):
         tip = origin + length * direction
         ax.plot(*np.column_stack([origin, tip]), color=GREY, lw=1.0, clip_on=False, in_layout=False)
         label = origin + 1.35 * length * direction
         ax.text(*label, name, in_layout=False, color=GREY, fontsize=7, ha="center", va="center")
+    return length

@@ -24,7 +24,7 @@ from bayeskin.report.timeline import LEVELS
 from bayeskin.report.triangle import label_edges, triangle
 from bayeskin.types import Array, Parameter, ParameterSpace
 
-_BINS = 60
+_BINS = 80
 _TINTS = ["#C6DDEC", "#7FB3D5"]  # of the 90 % and the 50 % region
 _AS_PRIOR = 0.9  # a 90 % interval at least this wide, relative to the prior's, counts as not informed
 
@@ -77,7 +77,7 @@ def mass_levels(density: Array, fractions: Sequence[float]) -> list[float]:
 def smoothed_histogram(
     x: Array, y: Array, x_range: Array, y_range: Array
 ) -> tuple[Array, Array, Array, bool]:
-    """Density (60, 60) of a pair with its cell centres, and whether it is flat but for sampling scatter.
+    """Density (80, 80) of a pair with its cell centres, and whether it is flat but for sampling scatter.
 
     Smoothed by a normal kernel with the draws' own covariance, so that a ridge stays narrow, at 0.7
     of Scott's bandwidth; mirrored at the edges, where a prior may cut the density off.

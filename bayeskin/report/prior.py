@@ -40,7 +40,7 @@ def figure_prior_predictive(binned: BinnedForce, draws_n: ArrayLike) -> Figure:
     recorded_peak = float(np.nanmax(binned.force_n))
     threshold = 10.0 ** np.floor(np.log10(0.2 * (np.nanmax(np.abs(binned.force_n)) or 1.0)))
     fan.set_yscale("symlog", linthresh=threshold)
-    fan.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    fan.yaxis.set_major_formatter(lambda value, _: f"{value:g}".replace("-", "−"))
     bottom = min(float(np.quantile(draws, tails[1], axis=0).min()), float(np.nanmin(binned.force_n)), 0.0)
     fan.set_ylim(1.3 * bottom - 0.3 * threshold, 6 * max(float(draws.max()), recorded_peak, threshold))
     fan.set(xlabel="time [s]", ylabel="force [N]")

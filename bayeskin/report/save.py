@@ -20,11 +20,16 @@ def save_figure(figure: Figure, path_stem: Path | str, provenance: str) -> tuple
 
     `provenance` stands in the metadata of both files (PNG text chunk, SVG ``dc:description``).
     Neither file carries a date, and SVG identifiers are salted with a constant. Both formats are
-    rendered before either file is replaced.
+    rendered before either file is replaced. The figure's layout is final from then on.
     """
     stem = Path(path_stem)
     stem.parent.mkdir(parents=True, exist_ok=True)
     png, svg = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
+    # Laid out once, with Agg measuring the text, so that both files show the same figure.
+    FigureCanvasAgg(figure)
+    if figure.get_layout_engine() is not None:
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
     rendered = {png: _render(figure, "png", provenance), svg: _render(figure, "svg", provenance)}
     for path, content in rendered.items():
         _replace(path, content)
@@ -34,9 +39,6 @@ def save_figure(figure: Figure, path_stem: Path | str, provenance: str) -> tuple
 def _render(figure: Figure, form: str, provenance: str) -> bytes:
     metadata: dict[str, str | None] = {"Description": provenance}
     metadata |= {"Software": "bayeskin"} if form == "png" else {"Creator": "bayeskin", "Date": None}
-    # The layout depends on the renderer that measures the text: measure with Agg for both formats.
-    FigureCanvasAgg(figure)
-    figure.draw_without_rendering()
     buffer = io.BytesIO()
     figure.savefig(buffer, format=form, dpi=DOTS_PER_INCH, metadata=metadata)
     return buffer.getvalue()

@@ -136,12 +136,12 @@ def _note(ax: Axes, text: str) -> None:
 def _tau(series: Array) -> float:
     """Integrated autocorrelation time of (n, w), in steps; NaN if too short or constant."""
     n = len(series)
-    centred = series - series.mean(axis=0)
-    if n < 4 or np.ptp(series, axis=0).min() == 0:
+    if n < 4 or np.ptp(series) == 0:
         return float("nan")
-    spectrum = np.abs(np.fft.rfft(centred, 2 ** int(np.ceil(np.log2(2 * n))), axis=0)) ** 2
-    covariance = np.fft.irfft(spectrum, axis=0)[:n]
-    taus = 2.0 * np.cumsum((covariance / covariance[0]).mean(axis=1)) - 1.0
+    # About the ensemble's mean, not each walker's own: a walker that is stuck then counts as correlation.
+    spectrum = np.abs(np.fft.rfft(series - series.mean(), 2 ** int(np.ceil(np.log2(2 * n))), axis=0)) ** 2
+    covariance = np.fft.irfft(spectrum.mean(axis=1))[:n]
+    taus = 2.0 * np.cumsum(covariance / covariance[0]) - 1.0
     beyond = np.arange(n) >= 5.0 * taus
     return float(taus[np.argmax(beyond) if beyond.any() else n - 1])
 
@@ -155,8 +155,8 @@ def _split_rhat(x: Array) -> Array:
     halves = np.concatenate([x[:, :half], x[:, n - half :]]).reshape(2 * e, half * w, d)
     within = halves.var(axis=1, ddof=1).mean(axis=0)
     between = halves.mean(axis=1).var(axis=0, ddof=1)
-    positive = within > 0
-    return np.where(positive, np.sqrt(1.0 + between / np.where(positive, within, 1.0)), np.nan)
+    moves = np.ptp(halves, axis=(0, 1)) > 0  # not `within > 0`, which rounding can make of a constant
+    return np.where(moves, np.sqrt(1.0 + between / np.where(within > 0, within, np.inf)), np.nan)
 
 
 def _finding(space: ParameterSpace, running: RunningConvergence, lengths: float, limit: float) -> str:

@@ -1,0 +1,545 @@
+"""Every result has a figure: complete for typical input, sound for degenerate input, the same bytes twice."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib import rcParams
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from toy import EDGES_S, MOTION, SPACE, toy_bin_means, toy_force
+
+from bayeskin import report
+from bayeskin.errors import InputError
+from bayeskin.report import posterior, style, timeline, traces, triangle, validation
+from bayeskin.types import BinnedForce, Design, Parameter, ParameterSpace, Phase, Prediction, Recording
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+TRUTH = np.array([1.2e5, 1.8e4, 3e-14, 4e-13, 300.0])
+EDGES = EDGES_S[::4]
+BINS = len(EDGES) - 1
+PHASES = tuple(
+    Phase(kind, cycle, start, end)
+    for kind, cycle, start, end in [
+        ("rest", 0, 0.0, 5.0), ("load", 1, 5.0, 15.0), ("hold", 1, 15.0, 45.0), ("unload", 1, 45.0, 55.0),
+        ("rest", 1, 55.0, 65.0), ("load", 2, 65.0, 75.0), ("hold", 2, 75.0, 105.0),
+        ("unload", 2, 105.0, 115.0), ("rest", 2, 115.0, 130.0),
+    ]
+)  # fmt: skip
+TIME_S = 0.5 * (EDGES[1:] + EDGES[:-1])
+DISPLACEMENT_M = MOTION.at(TIME_S)
+
+
+@pytest.fixture(scope="module")
+def force_n() -> np.ndarray:
+    return 1e-3 * toy_bin_means(TRUTH, EDGES)[0]
+
+
+@pytest.fixture(scope="module")
+def binned(force_n: np.ndarray) -> BinnedForce:
+    starts = np.array([p.start_s for p in PHASES])
+    phase = np.searchsorted(starts, TIME_S, side="right") - 1
+    noisy = force_n + 0.006 * np.random.default_rng(2).normal(size=BINS)
+    return BinnedForce(EDGES, noisy, np.full(BINS, 0.006**2), np.full(BINS - 1, 0.3), phase, PHASES)
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    time_s = np.arange(0.0, 130.0, 0.02)
+    noise = 0.02 * np.random.default_rng(3).normal(size=len(time_s))
+    return Recording(time_s, MOTION.at(time_s), 1e-3 * toy_force(TRUTH, time_s)[0] + noise, "arm", "0" * 64)
+
+
+@pytest.fixture(scope="module")
+def draws() -> np.ndarray:
+    """2,000 points: E_c, E_s and k_s narrow and correlated, k_c and p_init spread over the prior."""
+    rng = np.random.default_rng(4)
+    unit = rng.random((2000, 5))
+    ridge = rng.normal(size=2000)
+    unit[:, 0] = 0.5 + 0.02 * ridge
+    unit[:, 1] = 0.5 - 0.04 * ridge + 0.005 * rng.normal(size=2000)
+    unit[:, 3] = 0.6 + 0.05 * rng.normal(size=2000)
+    return SPACE.from_unit(unit)
+
+
+def labels(figure: Figure) -> list[str]:
+    return [text for ax in figure.axes for text in (ax.get_xlabel(), ax.get_ylabel()) if text]
+
+
+def headline(figure: Figure) -> str:
+    return figure.get_suptitle().replace("\n", " ")
+
+
+def drawn(figure: Figure) -> Figure:
+    figure.draw_without_rendering()
+    return figure
+
+
+# --- what holds for every figure ------------------------------------------------------------------
+
+
+def test_both_formats_are_written_with_their_provenance(tmp_path: Path, binned: BinnedForce) -> None:
+    figure = report.figure_prior_predictive(binned, np.tile(binned.force_n, (4, 1)))
+    png, svg = report.save_figure(figure, tmp_path / "deep" / "prior.v2", "bayeskin 0.1 seed 7")
+    assert (png.name, svg.name) == ("prior.v2.png", "prior.v2.svg")
+    assert imread(png).shape[1] == 1440  # 7.2 in at 200 dpi
+    assert b"bayeskin 0.1 seed 7" in png.read_bytes()
+    assert "bayeskin 0.1 seed 7" in svg.read_text()
+    assert "dc:date" not in svg.read_text()
+    assert sorted(p.name for p in png.parent.iterdir()) == ["prior.v2.png", "prior.v2.svg"]
+
+
+@pytest.mark.parametrize("kind", ["prior", "posterior", "fields"])
+def test_the_same_input_gives_the_same_bytes(
+    tmp_path: Path, kind: str, binned: BinnedForce, draws: np.ndarray
+) -> None:
+    def figure() -> Figure:
+        if kind == "prior":
+            return report.figure_prior_predictive(binned, np.tile(binned.force_n, (4, 1)))
+        if kind == "posterior":
+            return report.figure_posterior(SPACE, draws[:300], {}, names=("E_s",))
+        points, quads = surface()
+        return report.figure_fields(
+            (5.0,), points[:1], quads, [report.SurfaceField("u", "mm", points[:1, :, 0])], ""
+        )
+
+    one = figure()
+    written = [report.save_figure(f, tmp_path / str(i), "x") for i, f in enumerate((one, figure(), one))]
+    assert len({tuple(path.read_bytes() for path in paths) for paths in written}) == 1
+
+
+def test_a_failed_rendering_leaves_the_earlier_files(tmp_path: Path, binned: BinnedForce) -> None:
+    good = report.figure_prior_predictive(binned, np.tile(binned.force_n, (4, 1)))
+    before = [p.read_bytes() for p in report.save_figure(good, tmp_path / "a", "x")]
+    bad = Figure()
+    bad.text(0.5, 0.5, r"$\unknowncommand$")
+    with pytest.raises(ValueError, match="unknowncommand"):
+        report.save_figure(bad, tmp_path / "a", "x")
+    assert [(tmp_path / f"a.{form}").read_bytes() for form in ("png", "svg")] == before
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_the_callers_settings_neither_matter_nor_change(tmp_path: Path, binned: BinnedForce) -> None:
+    def svg(name: str) -> bytes:
+        figure = report.figure_prior_predictive(binned, np.tile(binned.force_n, (4, 1)))
+        return report.save_figure(figure, tmp_path / name, "x")[1].read_bytes()
+
+    plain = svg("plain")
+    before = dict(rcParams)
+    try:
+        rcParams.update({"font.size": 23.0, "axes.grid": True, "text.usetex": True})
+        altered = svg("altered")
+        assert rcParams["font.size"] == 23.0
+    finally:
+        rcParams.update({key: before[key] for key in ("font.size", "axes.grid", "text.usetex")})
+    assert altered == plain
+
+
+# --- recording ------------------------------------------------------------------------------------
+
+
+def test_recording_shows_phases_cycles_and_loops(recording: Recording, binned: BinnedForce) -> None:
+    figure = drawn(report.figure_recording(recording, binned))
+    assert labels(figure) == ["displacement [mm]", "time [s]", "force [N]", "displacement [mm]", "force [N]"]
+    motion, force, loops = figure.axes
+    assert {t.get_text() for t in motion.texts} == {"cycle 1", "cycle 2"}
+    assert len(force.patches) == sum(p.kind != "rest" for p in PHASES)
+    assert [line.get_label() for line in loops.get_lines()] == ["cycle 1", "cycle 2"]
+    assert np.ptp(motion.get_lines()[0].get_ydata()) == pytest.approx(9.0)
+    assert headline(figure).startswith("arm: 2 cycles to 9 mm")
+
+
+def test_recording_of_nothing_but_rest(recording: Recording, binned: BinnedForce) -> None:
+    still = dataclasses.replace(recording, displacement_m=np.zeros_like(recording.time_s))
+    rest = dataclasses.replace(
+        binned, phase=np.zeros(BINS, dtype=int), phases=(Phase("rest", 0, 0.0, 130.0),)
+    )
+    assert headline(drawn(report.figure_recording(still, rest))).startswith("arm: 0 cycles to 0 mm")
+
+
+# --- fit ------------------------------------------------------------------------------------------
+
+
+def test_fit_tells_the_parts_of_the_uncertainty_apart(binned: BinnedForce, force_n: np.ndarray) -> None:
+    ensemble = force_n * (1 + 0.01 * np.random.default_rng(5).normal(size=(50, 1)))
+    fitted = TIME_S < 60
+    figure = drawn(
+        report.figure_fit(
+            binned, DISPLACEMENT_M, ensemble, 0.01 * np.abs(force_n), np.full(BINS, 0.006), fitted
+        )
+    )
+    force, residual, parts, loop, _ = figure.axes
+    assert {line.get_label() for line in parts.get_lines()} == {"parameters", "surrogate", "noise", "all"}
+    assert residual.get_ylabel() == "residual [mN]"
+    assert len(residual.collections) == 2  # the 50 % and the 90 % band
+    shown = next(line for line in residual.get_lines() if line.get_label() == "recorded")
+    expected = 1e3 * (binned.force_n - np.median(ensemble, axis=0))[fitted]
+    np.testing.assert_allclose(shown.get_ydata(), expected)
+    bar = next(line for line in force.get_lines() if line.get_linewidth() == 3)
+    np.testing.assert_allclose(bar.get_xdata(), [0.0, 60.0])
+    assert {line.get_label() for line in loop.get_lines()} == {"recorded", "posterior median"}
+    assert "where it was fitted" in headline(figure)
+
+
+def test_fit_of_one_draw_without_surrogate_error_or_fitted_bins(
+    binned: BinnedForce, force_n: np.ndarray
+) -> None:
+    noise = np.full(BINS, 0.006)
+    figure = report.figure_fit(
+        binned, DISPLACEMENT_M, force_n, np.zeros(BINS), noise, np.zeros(BINS, dtype=bool)
+    )
+    assert headline(drawn(figure)).startswith("Predicted without fitting")
+
+
+def test_fit_without_any_uncertainty_and_with_a_phase_kind_missing(
+    binned: BinnedForce, force_n: np.ndarray
+) -> None:
+    no_hold = tuple(dataclasses.replace(p, kind="rest") if p.kind == "hold" else p for p in PHASES)
+    bins = dataclasses.replace(binned, phases=no_hold)
+    exact = np.tile(force_n, (3, 1))
+    nothing = np.zeros(BINS)
+    figure = drawn(
+        report.figure_fit(bins, DISPLACEMENT_M, exact, nothing, nothing, np.ones(BINS, dtype=bool))
+    )
+    kinds = [line.get_label() for line in figure.axes[4].get_lines() if not line.get_label().startswith("_")]
+    assert kinds == ["rest", "load", "unload"]
+    assert "elsewhere" not in headline(figure)
+
+
+def test_predictive_bands_hold_what_they_promise() -> None:
+    """Parameters, surrogate and noise, all normal: sd 3, 4 and 12 add to 13."""
+    spread = np.random.default_rng(6).normal(size=(4000, 1)) * 3.0
+    bands = timeline.predictive_bands(spread, np.array([4.0]), np.array([12.0]))
+    half = 0.5 * (bands.high_n - bands.low_n)[:, 0]
+    np.testing.assert_allclose(half, [0.6745 * 13, 1.6449 * 13], rtol=0.02)
+    parts = [float(bands.parts_n[name][0]) for name in ("parameters", "surrogate", "noise", "all")]
+    np.testing.assert_allclose(parts, 1.6449 * np.array([3.0, 4.0, 12.0, 13.0]), rtol=0.03)
+
+
+def test_runs_of_true_cover_the_mask_exactly() -> None:
+    assert timeline.runs_of([True, True, False, True]) == [(0, 2), (3, 4)]
+    assert timeline.runs_of([False, False]) == []
+
+
+# --- posterior ------------------------------------------------------------------------------------
+
+
+def test_posterior_says_what_the_recording_leaves_open(draws: np.ndarray) -> None:
+    figure = drawn(report.figure_posterior(SPACE, draws, dict(zip(SPACE.names, TRUTH, strict=True))))
+    assert len(figure.axes) == 15
+    assert "log$_{10}$ $E_{c}$ / Pa" in labels(figure)
+    assert "$p_{\\mathrm{init}}$ [Pa]" in labels(figure)
+    narrowed, left = headline(figure).split("leaves")
+    assert "E_{s}" in narrowed
+    assert "k_{c}" in left
+    assert "init" in left
+    flat = next(ax for ax in figure.axes if ax.get_subplotspec().get_geometry()[2:] == (22, 22))
+    assert not flat.collections  # p_init over k_c: tinted evenly, no contour of sampling scatter
+
+
+def test_posterior_of_a_chosen_pair_and_of_one(draws: np.ndarray) -> None:
+    assert len(drawn(report.figure_posterior(SPACE, draws, {}, names=("E_s", "k_s"))).axes) == 3
+    assert len(drawn(report.figure_posterior(SPACE, draws, {}, names=("p_init",))).axes) == 1
+    with pytest.raises(InputError, match="E_q"):
+        report.figure_posterior(SPACE, draws, {}, names=("E_q",))
+
+
+def test_posterior_that_does_not_move() -> None:
+    constant = np.tile(TRUTH, (50, 1))
+    assert len(drawn(report.figure_posterior(SPACE, constant, {"E_c": 1.2e5})).axes) == 15
+
+
+def test_posterior_of_eleven_parameters(draws: np.ndarray) -> None:
+    further = tuple(Parameter(f"gap_{c}_length", "m", 1e-6, 3e-4, "uniform") for c in "abcdef")
+    wide = np.column_stack([draws, np.random.default_rng(7).uniform(1e-6, 3e-4, (2000, 6))])
+    space = ParameterSpace(SPACE.parameters + further)
+    figure = report.figure_posterior(space, wide, {})
+    assert len(figure.axes) == 66
+    assert figure.get_figwidth() > style.PAGE_IN
+
+
+def test_regions_hold_their_share_of_a_correlated_normal() -> None:
+    rng = np.random.default_rng(8)
+    x = rng.normal(size=20_000)
+    y = 0.95 * x + np.sqrt(1 - 0.95**2) * rng.normal(size=20_000)
+    span = np.array([-4.0, 4.0])
+    x_mid, y_mid, density, flat = posterior.smoothed_histogram(x, y, span, span)
+    assert not flat
+    cell = density[np.searchsorted(x_mid, x).clip(0, 79), np.searchsorted(y_mid, y).clip(0, 79)]
+    for share, level in zip((0.5, 0.9), posterior.mass_levels(density, (0.5, 0.9)), strict=True):
+        assert np.mean(cell >= level) == pytest.approx(share, abs=0.05)
+
+
+def test_mass_levels_of_a_known_density() -> None:
+    """Of exp(-r^2/2) the region that holds a share s of the mass is bounded at the height 1 - s."""
+    axis = np.linspace(-6, 6, 241)
+    density = np.exp(-0.5 * (axis[:, None] ** 2 + axis**2))
+    np.testing.assert_allclose(posterior.mass_levels(density, (0.5, 0.9)), [0.5, 0.1], atol=0.002)
+
+
+def test_numbers_stay_clear_of_the_corners() -> None:
+    assert triangle.inner_ticks(0.0, 10.0, 4) == [2.0, 4.0, 6.0, 8.0]
+    assert triangle.inner_ticks(-16.0, -11.0, 4) == [-15.0, -14.0, -13.0, -12.0]
+    for low, high in [(3.75, 4.52), (-670.0, 2144.0), (0.0, 1e-6), (4.26, 4.2601)]:
+        ticks = triangle.inner_ticks(low, high, 3)
+        assert 2 <= len(ticks) <= 3
+        assert low < ticks[0] < ticks[-1] < high
+
+
+@pytest.mark.parametrize(
+    ("name", "printed"),
+    [
+        ("E_c", "$E_{c}$"), ("p_init", r"$p_{\mathrm{init}}$"),
+        ("tau_1", r"$\tau_{1}$"), ("tau1", r"$\tau_{1}$"),
+        ("F0", "$F_{0}$"), ("Fc", "$F_{c}$"), ("g", "$g$"), ("loss_of_force", "loss of force"),
+        ("gap", "gap"), ("noise_sd", "noise sd"), ("mu", r"$\mu$"),
+    ],
+)  # fmt: skip
+def test_names_are_set_as_symbols_or_words(name: str, printed: str) -> None:
+    assert style.symbol(name) == printed
+
+
+def test_units_are_printed_with_raised_powers() -> None:
+    assert style.unit_text("m^2") == "m²"
+    assert style.unit_text("mm N^-1 s^-1") == "mm N⁻¹ s⁻¹"
+    assert style.unit_text("-") == ""
+
+
+# --- traces ---------------------------------------------------------------------------------------
+
+
+def autoregressive(rho: float, steps: int, rng: np.random.Generator) -> np.ndarray:
+    """Stationary AR(1) (4 ensembles, steps, 12 walkers); its autocorrelation time is (1+rho)/(1-rho)."""
+    x = np.empty((4, steps, 12))
+    x[:, 0] = rng.normal(size=(4, 12))
+    for k in range(1, steps):
+        x[:, k] = rho * x[:, k - 1] + np.sqrt(1 - rho**2) * rng.normal(size=(4, 12))
+    return x
+
+
+@pytest.fixture(scope="module")
+def chains() -> np.ndarray:
+    rng = np.random.default_rng(9)
+    unit = np.stack(
+        [0.5 + 0.05 * autoregressive(rho, 800, rng) for rho in (0.5, 0.6, 0.3, 0.2, 0.0)], axis=-1
+    )
+    return SPACE.from_unit(unit)
+
+
+def test_traces_of_independent_ensembles_that_agree(chains: np.ndarray) -> None:
+    figure = drawn(report.figure_traces(SPACE, chains))
+    assert len(figure.axes) == 15
+    assert [line.get_label() for line in figure.axes[0].get_lines()] == ["1", "2", "3", "4"]
+    assert labels(figure).count("step") == 3
+    assert headline(figure).startswith("Converged")
+
+
+def test_traces_of_an_ensemble_that_disagrees(chains: np.ndarray) -> None:
+    moved = chains.copy()
+    moved[2, ..., 3] *= 3.0
+    finding = headline(report.figure_traces(SPACE, moved))
+    assert finding.startswith("Not converged")
+    assert "k_{s}" in finding
+
+
+def test_traces_of_chains_that_are_constant_or_too_short(chains: np.ndarray) -> None:
+    pair = ParameterSpace(SPACE.parameters[:2])
+    still = np.broadcast_to(TRUTH[:2], (2, 40, 6, 2))
+    assert headline(drawn(report.figure_traces(pair, still))).startswith("No parameter moves")
+    assert drawn(report.figure_traces(pair, chains[:1, :3, :, :2]))
+
+
+def test_a_walker_that_is_stuck_counts_as_correlation() -> None:
+    x = autoregressive(0.5, 1000, np.random.default_rng(17))[..., None]
+    free = traces.running_convergence(x).tau_steps[-1, 0, 0]
+    x[0, :, 3] = 2.0
+    assert traces.running_convergence(x).tau_steps[-1, 0, 0] > 10 * free
+
+
+def test_running_autocorrelation_time_is_that_of_the_process() -> None:
+    chains = autoregressive(0.8, 6000, np.random.default_rng(10))[..., None]
+    running = traces.running_convergence(chains)
+    np.testing.assert_allclose(running.tau_steps[-1, :, 0], 9.0, rtol=0.12)
+    assert running.step[-1] == 6000
+
+
+def test_split_rhat_is_its_closed_form() -> None:
+    """Two halves at +1 and -1 around which nothing but unit noise: R-hat^2 = 1 + 2 to sampling error."""
+    rng = np.random.default_rng(11)
+    x = rng.normal(size=(1, 2000, 20, 1))
+    x[:, :1000] += 1.0
+    x[:, 1000:] -= 1.0
+    assert traces.running_convergence(x).rhat[-1, 0] == pytest.approx(np.sqrt(3.0), rel=0.02)
+
+
+# --- Sobol ----------------------------------------------------------------------------------------
+
+
+def interval(values: np.ndarray) -> np.ndarray:
+    return np.stack([values - 0.02, values, values + 0.02])
+
+
+def test_sobol_names_the_leading_and_the_inert_parameters() -> None:
+    share = np.array([0.53, 0.41, 0.0, 0.06, 0.0])
+    series = interval(np.tile(share, (BINS, 1)))
+    series[:, :3] = np.nan  # no force before the test, no variance
+    figure = drawn(
+        report.figure_sobol(
+            SPACE.names, TIME_S, DISPLACEMENT_M, series, series, interval(share), interval(share),
+            "posterior",
+        )
+    )  # fmt: skip
+    assert "Inputs: posterior." in figure.get_supxlabel()
+    assert "E_{c}" in headline(figure)
+    assert "53 %" in headline(figure)
+    assert "below 0.5 %" in headline(figure)
+    first, total, bars = figure.axes
+    assert (first.get_ylabel(), total.get_ylabel()) == ("first-order index", "total index")
+    assert [t.get_text() for t in bars.get_yticklabels()] == [style.symbol(n) for n in SPACE.names]
+    assert len(bars.patches) == 10
+
+
+def test_sobol_of_a_force_that_never_varies() -> None:
+    nothing = np.full((3, BINS, 5), np.nan)
+    figure = report.figure_sobol(
+        SPACE.names, TIME_S, 0 * DISPLACEMENT_M, nothing, nothing, nothing[:, 0], nothing[:, 0], "prior"
+    )
+    assert headline(drawn(figure)).startswith("The force does not vary")
+
+
+# --- surrogate ------------------------------------------------------------------------------------
+
+
+def calibrated(true_n: np.ndarray, rng: np.random.Generator) -> Prediction:
+    """A prediction whose errors are exactly what it claims: 2 % common to a run, 1 % a bin of its own."""
+    factor = 0.02 * np.abs(true_n)[..., None]
+    own = 0.01 * np.abs(true_n)
+    error = factor[..., 0] * rng.normal(size=(len(true_n), 1)) + own * rng.normal(size=true_n.shape)
+    return Prediction(true_n + error, factor, own**2)
+
+
+def held_out(n: int) -> np.ndarray:
+    return 1e-3 * toy_bin_means(SPACE.from_unit(np.random.default_rng(12).random((n, 5))), EDGES)
+
+
+def test_validation_shows_amplitude_coverage_waves_and_noise_floor() -> None:
+    true = held_out(40)
+    errors = np.random.default_rng(13).lognormal(-3.0, 0.3, (3, 40))
+    prediction = calibrated(true, np.random.default_rng(14))
+    figure = drawn(report.figure_validation(EDGES, true, prediction, np.full(BINS, 0.006), errors))
+    assert "peak of the full model [N]" in labels(figure)
+    assert "nominal coverage" in labels(figure)
+    assert "error [mN]" in labels(figure)
+    names = {line.get_label() for line in figure.axes[3].get_lines()}
+    assert {"RMS error", "noise floor of the recording"} <= names
+    assert "90 % intervals hold" in headline(figure)
+
+
+def test_validation_of_one_run_in_one_wave_without_error() -> None:
+    true = held_out(1)
+    exact = Prediction(true, np.zeros((*true.shape, 1)), np.zeros_like(true))
+    assert drawn(report.figure_validation(EDGES, true, exact, np.zeros(BINS), np.zeros((1, 1))))
+
+
+def test_coverage_of_a_calibrated_prediction_is_nominal() -> None:
+    true = held_out(400)
+    nominal = np.array([0.5, 0.9])
+    share, error = validation.coverage(true, calibrated(true, np.random.default_rng(15)), nominal)
+    assert np.all(np.abs(share - nominal) < 3 * error)
+    assert np.all(error < 0.03)
+    half = calibrated(true, np.random.default_rng(15))
+    narrow = Prediction(half.mean, 0.5 * half.factor, 0.25 * half.diagonal)
+    assert validation.coverage(true, narrow, nominal)[0][1] == pytest.approx(
+        0.589, abs=0.04
+    )  # 0.5 x 1.645 sd
+
+
+def test_map_check_is_in_millinewton_and_in_sd(binned: BinnedForce, force_n: np.ndarray) -> None:
+    sd = 0.002 * (TIME_S > 5)
+    figure = drawn(report.figure_map_check(binned, force_n, force_n + 0.004 * (TIME_S > 5), sd))
+    assert [ax.get_ylabel() for ax in figure.axes] == ["force [N]", "error [mN]", "error [surrogate sd]"]
+    assert "at most 2 of its sd" in headline(figure)
+    assert drawn(report.figure_map_check(binned, force_n, force_n, np.zeros(BINS)))
+
+
+# --- design, prior --------------------------------------------------------------------------------
+
+
+def design(waves: int, space: ParameterSpace = SPACE) -> Design:
+    rng = np.random.default_rng(16)
+    wave = np.repeat(np.arange(waves), 30)
+    n = len(wave)
+    unit = 0.5 + (rng.random((n, space.dim)) - 0.5) * 0.5 ** wave[:, None]
+    ok = np.arange(n) != 7
+    return Design(
+        space, EDGES, space.from_unit(unit), np.zeros((n, BINS)), wave, rng.random(n) < 0.2, ok, ("",) * n,
+        np.ones(n), 0, "toy",
+    )  # fmt: skip
+
+
+def test_waves_show_every_pair_and_the_volume_kept() -> None:
+    figure = drawn(report.figure_waves(design(3), [1.0, 0.1, 0.008]))
+    assert len(figure.axes) == 10 + 1
+    assert figure.axes[-1].get_ylabel() == "volume kept [%]"
+    assert headline(figure) == "90 runs in 3 waves close in on 0.8 % of the prior box; 1 failed"
+    key = [t.get_text() for t in figure.axes[0].get_legend().get_texts()]
+    assert key == ["wave 0", "wave 1", "wave 2", "held out", "failed"]
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+def test_one_wave_of_any_dimension(dim: int) -> None:
+    space = ParameterSpace(SPACE.parameters[:dim])
+    assert "1 wave fill the prior box" in headline(drawn(report.figure_waves(design(1, space), [1.0])))
+
+
+def test_prior_predictive_places_the_recorded_peak(binned: BinnedForce) -> None:
+    scale = np.array([0.5, 0.5, 0.5, 2.0])[:, None]
+    figure = drawn(report.figure_prior_predictive(binned, scale * binned.force_n))
+    assert "above 75 % of the prior's" in headline(figure)
+    assert figure.axes[0].get_yscale() == "symlog"
+    silent = dataclasses.replace(binned, force_n=np.zeros(BINS))
+    assert drawn(report.figure_prior_predictive(silent, np.zeros((3, BINS))))
+
+
+# --- fields ---------------------------------------------------------------------------------------
+
+
+def surface() -> tuple[np.ndarray, np.ndarray]:
+    x, y = np.meshgrid(np.linspace(0, 0.105, 8), np.linspace(0, 0.084, 7), indexing="ij")
+    points = np.stack([x, 0.058 * np.sin(y / 0.058), 0.058 * np.cos(y / 0.058)], axis=-1).reshape(-1, 3)
+    node = np.arange(56).reshape(8, 7)
+    quads = np.stack([node[:-1, :-1], node[1:, :-1], node[1:, 1:], node[:-1, 1:]], axis=-1).reshape(-1, 4)
+    return np.stack([points, points + np.array([1e-3, 0, 0])]), quads
+
+
+@pytest.mark.parametrize("corners", [3, 4])
+def test_fields_are_small_multiples_with_one_scale_a_row(corners: int) -> None:
+    points, quads = surface()
+    ramp = np.stack([0 * points[0, :, 0], points[0, :, 0]])
+    rows = [
+        report.SurfaceField("displacement", "mm", ramp),
+        report.SurfaceField("pressure", "kPa", 5 * ramp, signed=True),
+    ]
+    figure = drawn(report.figure_fields((5.0, 15.0), points, quads[:, :corners], rows, "It moves"))
+    assert len(figure.axes) == 2 * 2 + 2
+    assert headline(figure) == "It moves"
+    low, high = figure.axes[5].get_ylim()
+    assert low == -high == pytest.approx(-5 * 0.105)
+    assert figure.axes[2].get_ylabel() == "displacement [mm]"
+
+
+def test_fields_that_are_zero_and_shapes_that_do_not_fit() -> None:
+    points, quads = surface()
+    zero = report.SurfaceField("pressure", "kPa", np.zeros(points.shape[:2]), signed=True)
+    assert drawn(report.figure_fields((5.0, 15.0), points, quads, [zero], "Nothing"))
+    wrong = report.SurfaceField("pressure", "kPa", np.zeros((2, 3)))
+    with pytest.raises(InputError, match="pressure"):
+        report.figure_fields((5.0, 15.0), points, quads, [wrong], "")
+    with pytest.raises(InputError, match="points"):
+        report.figure_fields((5.0,), points, quads, [zero], "")
+    with pytest.raises(InputError, match="faces"):
+        report.figure_fields((5.0, 15.0), points, quads + 40, [zero], "")
