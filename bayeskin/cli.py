@@ -90,7 +90,6 @@ def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
 @click.option("--mesh", help="'bricks' or a gmsh file; default as in CONFIG.")
 @click.option("--observation", type=click.Choice(["reaction", "article"]), help="Default as in CONFIG.")
 @click.option("-o", "out", required=True, type=click.Path(path_type=Path), help="File to write: .csv or .h5.")
-@click.option("--fields", type=click.Path(path_type=Path), help="Folder for fields over time (ParaView).")
 @as_json
 def simulate(as_json: bool, **options: Any) -> None:
     """One run of the full model on a recording's displacement (default: the demo's).
@@ -100,12 +99,12 @@ def simulate(as_json: bool, **options: Any) -> None:
 
     \b
     Example:
-      bayeskin simulate --set E_c=300e3 --set k_s=1e-13 -o force.csv --fields fields/
+      bayeskin simulate --set E_c=300e3 --set k_s=1e-13 -o force.csv
     """
     from bayeskin.pipeline import single
 
     with Terminal() as terminal:
-        document = single.simulate(reporter=terminal, **options)
+        document = single.simulate_once(reporter=terminal, **options)
     _answer(document, as_json)
 
 

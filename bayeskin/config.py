@@ -30,14 +30,16 @@ class RecordingConfig(_Section):
     """Which recording, and whether the model follows its displacement closely or its corners, rounded."""
 
     file: str
-    protocol: Literal["recorded", "idealised"] = "recorded"
+    protocol: Literal["recorded", "idealised"] = "idealised"
 
 
 class ModelConfig(_Section):
-    """Which force the model reports, and on which mesh: the generator's bricks or a gmsh file."""
+    """Which force the model reports, on which mesh (the generator's bricks or a gmsh file), how finely."""
 
     observation: Literal["reaction", "article"] = "reaction"
     mesh: str = "bricks"
+    refinement: Positive = 1  # of the bricks
+    article_steps: Literal["fixed", "growing"] = "fixed"
 
     @model_validator(mode="after")
     def _article_needs_its_mesh(self) -> ModelConfig:
@@ -87,6 +89,22 @@ class FitConfig(_Section):
         return self
 
 
+class NoiseConfig(_Section):
+    """Bounds of the log-uniform priors on the noise: sd [N], correlation time [s], tail index."""
+
+    sd_n: tuple[float, float] | None = None
+    tau_s: tuple[float, float] | None = None
+    nu: tuple[float, float] | None = None
+
+    @model_validator(mode="after")
+    def _bounds_are_the_right_way_up(self) -> NoiseConfig:
+        for name, bounds in self:
+            if bounds is not None and not 0 < bounds[0] < bounds[1]:
+                found = f"[{bounds[0]:g}, {bounds[1]:g}]"
+                raise ValueError(f"{name}: found {found}; expected lower below upper, both above zero")
+        return self
+
+
 class SampleConfig(_Section):
     """Independent ensembles of walkers, and when to stop."""
 
@@ -120,6 +138,7 @@ class Config(_Section):
     design: DesignConfig = DesignConfig()
     surrogate: SurrogateConfig = SurrogateConfig()
     fit: FitConfig = FitConfig()
+    noise: NoiseConfig = NoiseConfig()
     sample: SampleConfig = SampleConfig()
     map: MapConfig = MapConfig()
     sobol: SobolConfig = SobolConfig()

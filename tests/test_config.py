@@ -54,6 +54,11 @@ def test_the_hash_follows_the_content_and_ignores_the_workers(tmp_path: Path) ->
         (SMALLEST + "[fit]\nbin_width_s = 0.0\n", "fit.bin_width_s", "found 0.0; expected greater than 0"),
         (SMALLEST + "[fit]\nwindows_s = [[75.0, 18.8]]\n", "fit.windows_s", "start below end"),
         (SMALLEST + "[fit]\nwindows_s = [[75.0]]\n", "fit.windows_s.0.1", "found nothing"),
+        (
+            SMALLEST + "[noise]\nsd_n = [0.3, 1e-4]\n",
+            "noise.sd_n",
+            "found [0.3, 0.0001]; expected lower below",
+        ),
         (SMALLEST + "[design]\npoints = []\n", "design.points", "at least 1 item"),
         (
             SMALLEST + '[design]\npoints = ["many"]\n',

@@ -1,0 +1,183 @@
+"""Second stage: full runs, wave by wave, each wave drawn where the last surrogate cannot rule the force out."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayeskin import report, storage
+from bayeskin.config import parameter_space
+from bayeskin.design import Wave, first_wave, next_wave
+from bayeskin.errors import InputError
+from bayeskin.inference.noise_model import bins_in_windows
+from bayeskin.model.simulate import simulate
+from bayeskin.pipeline.engine import Run, Stage
+from bayeskin.pipeline.folder import sha256_of, write_json
+from bayeskin.pipeline.model import model_spec
+from bayeskin.pipeline.provenance import caption
+from bayeskin.pipeline.shipping import check_fits, shipped_files
+from bayeskin.runner import load_design, run_design
+from bayeskin.surrogates import load_manifest, train
+from bayeskin.types import Array, BinnedForce, Design, PadMotion, ParameterSpace
+
+FEWEST_PER_PARAMETER = 4  # training runs below which no surrogate of a parameter space is worth its name
+
+
+def fitted_bins(run: Run, binned: BinnedForce) -> Array:
+    """Which bins enter the fit, (m,) bool."""
+    return bins_in_windows(binned, run.config.fit.windows_s) >= 0
+
+
+def noise_floor_n(binned: BinnedForce, fitted: Array) -> float:
+    """RMS [N] of what noise leaves in the fitted bins' means."""
+    return float(np.sqrt(np.mean(binned.variance_n2[fitted])))
+
+
+def focus(design: Design, binned: BinnedForce, fitted: Array) -> Array:
+    """Weights (n,) by which a surrogate is made best where the posterior can be.
+
+    The inverse of a run's mean square distance to the recording, which noise keeps from zero.
+    """
+    square = np.mean((design.force_n[:, fitted] - binned.force_n[fitted]) ** 2, axis=1)
+    weight = 1.0 / (noise_floor_n(binned, fitted) ** 2 + square)
+    return np.where(design.ok, weight, 0.0) / np.max(weight[design.ok])
+
+
+def _work(run: Run) -> Mapping[str, Any]:
+    binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
+    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    if run.config.surrogate.file is not None:
+        files = shipped_files(run)
+        design, records = load_design(files.design), load_manifest(files.surrogate)["waves"]
+        check_fits(run, files, design, binned, motion)
+    else:
+        design, records = _run_waves(run, binned, motion)
+    storage.save(run.at("design", "design.h5"), design)
+    write_json(run.at("design", "waves.json"), records)
+    _draw(run, design, binned, records)
+    return _summary(design, records)
+
+
+def _run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design, list[Mapping[str, Any]]]:
+    """All waves of the configuration. Runs are kept by what they depend on, so none is made twice."""
+    spec, space, config = model_spec(run), parameter_space(run.config, run.config_path), run.config.design
+    identity = sha256_of([spec.hash, vars(motion), binned.edges_s, [vars(p) for p in space.parameters]])
+    runs_file = run.folder / "runs" / f"{identity[:16]}.h5"
+    waves: list[Wave] = []
+    for number, count in enumerate(config.points):
+        drawn = run.at("design", f"wave-{number}.json")
+        if not drawn.is_file():
+            wave = _draw_wave(run, number, count, space, binned, waves, runs_file)
+            write_json(drawn, {"theta": wave.theta, "held_out": wave.held_out, "record": wave.record})
+        waves.append(_load_wave(drawn, space, number, run.config.seed))
+        label = f"wave {number + 1} of {len(config.points)}"
+        run.reporter.log(f"{label}: {len(waves[-1].theta)} full runs")
+        run_design(
+            runs_file, waves[-1], binned.edges_s, partial(simulate, spec, motion), spec.hash, config.workers,
+            lambda done, total, failed, eta_s, label=label: run.reporter.progress(label, done, total),
+        )  # fmt: skip
+    return _rows_of(load_design(runs_file), waves), [wave.record for wave in waves]
+
+
+def _draw_wave(
+    run: Run,
+    number: int,
+    count: int,
+    space: ParameterSpace,
+    binned: BinnedForce,
+    before: Sequence[Wave],
+    runs_file: Path,
+) -> Wave:
+    config = run.config
+    if not before:
+        return first_wave(space, count, config.design.held_out, config.seed)
+    design, fitted = enough(_rows_of(load_design(runs_file), before)), fitted_bins(run, binned)
+    surrogate, _ = train(design, config.surrogate.kind, config.seed, focus(design, binned, fitted))
+    floor_n = noise_floor_n(binned, fitted)
+    wave = next_wave(
+        space, surrogate.predict, binned.force_n, fitted, floor_n, count, config.design.held_out,
+        number, config.seed,
+    )  # fmt: skip
+    kept = wave.record["kept_fraction"]
+    run.reporter.log(f"wave {number + 1}: drawn in {kept:.2g} of the prior's volume")
+    return wave
+
+
+def _load_wave(path: Path, space: ParameterSpace, number: int, seed: int) -> Wave:
+    stored = json.loads(path.read_text())
+    held_out = np.array(stored["held_out"], dtype=bool)
+    return Wave(space, np.array(stored["theta"], dtype=float), held_out, number, seed, stored["record"])
+
+
+def _rows_of(runs: Design, waves: Sequence[Wave]) -> Design:
+    """The rows of `runs` at the waves' points, in the waves' order and with the waves' labels."""
+    row_of = {theta.tobytes(): row for row, theta in enumerate(runs.theta)}
+    points = np.concatenate([wave.theta for wave in waves])
+    rows = np.array([row_of[theta.tobytes()] for theta in points])
+    return dataclasses.replace(
+        runs,
+        theta=points,
+        wave=np.concatenate([np.full(len(wave.theta), wave.number) for wave in waves]),
+        held_out=np.concatenate([wave.held_out for wave in waves]),
+        messages=tuple(runs.messages[row] for row in rows),
+        **{name: getattr(runs, name)[rows] for name in ("force_n", "ok", "seconds")},
+    )
+
+
+def enough(design: Design) -> Design:
+    """The design, if a surrogate can be made of it; raises InputError that names the commonest failure."""
+    needed = FEWEST_PER_PARAMETER * design.space.dim
+    found = int(design.training.sum())
+    if found >= needed and design.testing.any():
+        return design
+    failures = Counter(text for text, ok in zip(design.messages, design.ok, strict=True) if not ok)
+    why = f"; most often: {failures.most_common(1)[0][0]}" if failures else ""
+    raise InputError("design", f"{found} training runs that succeeded{why}", f"at least {needed}")
+
+
+def _summary(design: Design, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    failures = Counter(text for text, ok in zip(design.messages, design.ok, strict=True) if not ok)
+    return {
+        "runs": len(design.theta),
+        "training": int(design.training.sum()),
+        "held_out": int(design.testing.sum()),
+        "failed": int((~design.ok).sum()),
+        "failures": dict(failures.most_common(5)),
+        "seconds_of_runs": float(np.nansum(design.seconds)),
+        "median_seconds_a_run": float(np.nanmedian(design.seconds)),
+        "model_hash": design.model_hash,
+        "waves": list(records),
+    }
+
+
+def _draw(run: Run, design: Design, binned: BinnedForce, records: Sequence[Mapping[str, Any]]) -> None:
+    kept = [record["kept_fraction"] for record in records]
+    first = design.force_n[design.ok & (design.wave == 0)]
+    figures = {
+        "waves": report.figure_waves(design, kept),
+        "prior_predictive": report.figure_prior_predictive(binned, first),
+    }
+    for name, figure in figures.items():
+        report.save_figure(figure, run.at("design", name), caption(run))
+
+
+def _files(run: Run) -> Iterable[Path]:
+    files = [run.beside(run.config.model.mesh)] if run.config.model.mesh != "bricks" else []
+    return [*files, *(shipped_files(run) if run.config.surrogate.file is not None else ())]
+
+
+STAGE = Stage(
+    "design",
+    "runs the full model at the design's points",
+    ("recording",),
+    ("seed", "model", "parameters", "design", "surrogate", "fit"),
+    _work,
+    _files,
+)

@@ -1,0 +1,66 @@
+"""Surrogates that come ready: NAME.h5 with its manifest inside, and its design NAME-design.h5 beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bayeskin.errors import InputError
+from bayeskin.pipeline.engine import Run
+from bayeskin.pipeline.folder import sha256_of
+from bayeskin.pipeline.model import model_spec
+from bayeskin.shipped import shipped
+from bayeskin.surrogates import load_manifest
+from bayeskin.types import BinnedForce, Design, PadMotion
+
+
+class ShippedFiles(NamedTuple):
+    """The two files of a surrogate that comes ready."""
+
+    surrogate: Path
+    design: Path
+
+
+def shipped_files(run: Run) -> ShippedFiles:
+    """The files that ``surrogate.file`` names: beside the configuration, or among those shipped."""
+    name = run.config.surrogate.file
+    assert name is not None
+    own = run.config_path.resolve().parent / name
+    path = own if own.is_file() else shipped(f"surrogates/{name}")
+    files = ShippedFiles(path, path.with_name(f"{path.stem}-design.h5"))
+    if not files.design.is_file():
+        raise InputError(f"{run.config_path}: surrogate.file", f"no {files.design}", "its design beside it")
+    return files
+
+
+def origin(run: Run, motion: PadMotion, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What a manifest must say beside the surrogate's own facts, so that it is used where it belongs."""
+    model = run.config.model
+    return {
+        "observation": model.observation,
+        "mesh": Path(model.mesh).name,
+        "motion_sha256": motion_sha256(motion),
+        "waves": list(records),
+    }
+
+
+def check_fits(run: Run, files: ShippedFiles, design: Design, binned: BinnedForce, motion: PadMotion) -> None:
+    """Raises InputError unless model, protocol and bins of the surrogate are this run's."""
+    said = load_manifest(files.surrogate)
+    where = f"{run.config_path}: surrogate.file {files.surrogate.name}"
+    if {design.model_hash, said.get("model_hash")} != {model_spec(run).hash}:
+        raise InputError(where, "a surrogate of another model", "one of this configuration's model")
+    if said.get("motion_sha256") != motion_sha256(motion):
+        raise InputError(where, "a surrogate of another protocol", "one of this recording's protocol")
+    if len(design.edges_s) != len(binned.edges_s) or not np.allclose(design.edges_s, binned.edges_s):
+        found = f"{len(design.edges_s) - 1} bins to {design.edges_s[-1]:g} s"
+        expected = f"the recording's {len(binned.edges_s) - 1} bins to {binned.edges_s[-1]:g} s"
+        raise InputError(where, found, expected)
+
+
+def motion_sha256(motion: PadMotion) -> str:
+    """Hash of a protocol's corners, to a microsecond and a nanometre."""
+    return sha256_of([np.round(motion.time_s, 6), np.round(motion.displacement_m, 9)])

@@ -1,0 +1,99 @@
+"""Third stage: the surrogate, with its error on held-out runs after each wave."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayeskin import report, storage
+from bayeskin.config import parameter_space
+from bayeskin.errors import InputError
+from bayeskin.pipeline.design import enough, fitted_bins, focus
+from bayeskin.pipeline.engine import Run, Stage
+from bayeskin.pipeline.provenance import caption
+from bayeskin.pipeline.shipping import origin, shipped_files
+from bayeskin.surrogates import (
+    ShapeSurrogate,
+    Validation,
+    load_manifest,
+    load_surrogate,
+    manifest_of,
+    save_surrogate,
+    train,
+)
+from bayeskin.types import Array, BinnedForce, Design, PadMotion
+
+
+def trained(run: Run, design: Design, binned: BinnedForce) -> tuple[ShapeSurrogate, Validation]:
+    """The configuration's surrogate of a design, best near the recording."""
+    config = run.config
+    weights = focus(design, binned, fitted_bins(run, binned))
+    return train(enough(design), config.surrogate.kind, config.seed, weights)
+
+
+def _work(run: Run) -> Mapping[str, Any]:
+    design = storage.load(run.at("design", "design.h5"), Design)
+    binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
+    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    if run.config.surrogate.file is not None:
+        ready = shipped_files(run).surrogate
+        surrogate, manifest = load_surrogate(ready), load_manifest(ready)
+        _check_inside_box(run, surrogate)
+    else:
+        surrogate, validation = trained(run, design, binned)
+        records = json.loads(run.at("design", "waves.json").read_text())
+        manifest = {**manifest_of(surrogate, validation), **origin(run, motion, records)}
+    save_surrogate(run.at("train", "surrogate.h5"), surrogate, manifest)
+    _draw(run, design, binned, surrogate)
+    return {name: value for name, value in manifest.items() if name not in ("waves", "parameters")}
+
+
+def _check_inside_box(run: Run, surrogate: ShapeSurrogate) -> None:
+    """Raises InputError for a prior that reaches beyond the box of a surrogate that came ready."""
+    space = parameter_space(run.config, run.config_path)
+    for ours, box in zip(space.parameters, surrogate.space.parameters, strict=True):
+        if ours.lower < box.lower or ours.upper > box.upper:
+            raise InputError(
+                f"{run.config_path}: parameters.{ours.name}",
+                f"{ours.lower:g} to {ours.upper:g} {ours.unit}",
+                f"a part of {box.lower:g} to {box.upper:g}, the box of surrogate.file",
+            )
+
+
+def _draw(run: Run, design: Design, binned: BinnedForce, surrogate: ShapeSurrogate) -> None:
+    testing = design.testing
+    truth, prediction = design.force_n[testing], surrogate.predict(design.theta[testing])
+    noise_sd_n = np.sqrt(binned.variance_n2)
+    errors = _errors_by_wave(run, design, binned, prediction.mean)
+    figure = report.figure_validation(design.edges_s, truth, prediction, noise_sd_n, errors)
+    report.save_figure(figure, run.at("train", "validation"), caption(run))
+
+
+def _errors_by_wave(run: Run, design: Design, binned: BinnedForce, last_n: Array) -> Array:
+    """Relative RMS error (waves, held-out points) of surrogates trained on the waves up to each.
+
+    The last row is of `last_n`, the surrogate in use; held-out points of later waves count in all rows.
+    """
+    testing, waves = design.testing, np.unique(design.wave[design.ok])
+    truth = design.force_n[testing]
+    rows = []
+    for wave in waves[:-1]:
+        early = design.wave <= wave
+        part = dataclasses.replace(design, ok=design.ok & early)
+        rows.append(trained(run, part, binned)[0].predict(design.theta[testing]).mean)
+    scale = np.sqrt(np.mean(truth**2, axis=1))
+    return np.array([np.sqrt(np.mean((mean - truth) ** 2, axis=1)) / scale for mean in [*rows, last_n]])
+
+
+STAGE = Stage(
+    "train",
+    "trains the surrogate",
+    ("recording", "design"),
+    ("seed", "parameters", "surrogate", "fit", "model"),
+    _work,
+    lambda run: shipped_files(run) if run.config.surrogate.file is not None else (),
+)
