@@ -1,0 +1,326 @@
+"""Sobol' indices of the force over time: which parameters it informs, and when.
+
+Two estimators that work on any vectorised function ``theta (n, d) -> force (n, m)``:
+
+- `pick_freeze`: first order by Saltelli et al. (2010), Comput. Phys. Commun. 181, 259, table 2(b); total
+  by Jansen (1999), table 2(f). Intervals by bootstrap over rows, the same rows of every evaluation.
+- `projection`: least-squares projection on Legendre polynomials orthonormal under the input
+  distribution; the indices are sums of squared coefficients (Sudret 2008, Reliab. Eng. Syst. Saf. 93, 964).
+
+Indices aggregated over time are those of the whole history as one output: each bin weighs by its
+variance and width (Lamboni et al. 2011; Gamboa et al. 2014).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.stats import qmc
+
+from bayeskin.errors import InputError
+from bayeskin.types import Array, ParameterSpace, Surrogate, _FreezesArrays
+
+Function = Callable[[Array], Array]
+NEGLIGIBLE_VARIANCE = 1e-8  # of the largest bin's: an index there would be rounding
+MEANINGFUL_VARIANCE = 1e-3  # of the largest bin's: bins that can inform a parameter
+UNINFORMED_TOTAL = 0.01
+REPLICATES = 200
+ERROR_DRAWS = 16
+ERROR_SAMPLES = 256  # rows on which a draw's effect on the indices is measured
+ERROR_LENGTH = 0.3  # of the box: about the spacing of a hundred runs in five dimensions
+ERROR_FEATURES = 128
+MOST_TERMS = 600
+HYPERBOLIC_NORM = 0.75
+CHUNK = 512
+
+
+@dataclass(frozen=True)
+class SobolResult(_FreezesArrays):
+    """First-order and total indices (d, m), NaN in bins whose force hardly varies.
+
+    Intervals (2, d, m) hold the 5 % and 95 % limits. `aggregated` are those of the whole history, (d,)
+    and (2, d). variance_n2 (m,) of the force; `distribution` says what the parameters were drawn from;
+    `unexplained` is the share of variance that a projection leaves (NaN for pick-freeze).
+    """
+
+    names: tuple[str, ...]
+    edges_s: Array
+    first: Array
+    total: Array
+    first_interval: Array
+    total_interval: Array
+    first_aggregated: Array
+    total_aggregated: Array
+    first_aggregated_interval: Array
+    total_aggregated_interval: Array
+    variance_n2: Array
+    unexplained: float
+    samples: int
+    method: Literal["pick-freeze", "projection"]
+    distribution: str
+
+
+class _Parts(NamedTuple):
+    """Variance (r, m) and the parts of it, first and total (r, d, m), in r replicates."""
+
+    variance: Array
+    first: Array
+    total: Array
+
+
+def sobol(
+    surrogate: Surrogate,
+    rng: np.random.Generator,
+    samples: int = 2048,
+    space: ParameterSpace | None = None,
+    method: Literal["pick-freeze", "projection"] = "pick-freeze",
+) -> SobolResult:
+    """Indices of a surrogate's force; the intervals hold the surrogate's own error too.
+
+    `space` is the input distribution: the surrogate's box by default, or a narrower one inside it.
+    `samples` is rounded up to a power of two. Raises InputError if `space` leaves the surrogate's box.
+    """
+    space = surrogate.space if space is None else space
+    if space.names != surrogate.space.names or not surrogate.space.contains([space.lower, space.upper]).all():
+        raise InputError("sobol: space", describe(space), f"a box within {describe(surrogate.space)}")
+    draws = error_draws(surrogate, ERROR_DRAWS, rng)
+    estimate = pick_freeze if method == "pick-freeze" else projection
+    return estimate(
+        lambda theta: surrogate.predict(theta).mean, space, surrogate.edges_s, rng, samples, draws
+    )
+
+
+def error_draws(surrogate: Surrogate, count: int, rng: np.random.Generator) -> list[Function]:
+    """Functions that differ from the surrogate's mean by draws of its error.
+
+    A draw multiplies each column of the predicted factor (and the root of the diagonal) by its own
+    smooth random field of unit variance over the box, so that the error is that of a function, not noise
+    from point to point, which would be counted as interaction. The fields have a Gaussian correlation
+    over `ERROR_LENGTH` of the box (random Fourier features, Rahimi & Recht 2007).
+    """
+    rank = surrogate.predict(surrogate.space.from_unit(np.full((1, surrogate.space.dim), 0.5))).factor.shape[
+        2
+    ]
+
+    def draw() -> Function:
+        waves = rng.normal(0.0, 1.0 / ERROR_LENGTH, (surrogate.space.dim, (rank + 1) * ERROR_FEATURES))
+        shift = rng.uniform(0.0, 2.0 * np.pi, (rank + 1) * ERROR_FEATURES)
+
+        def function(theta: Array) -> Array:
+            field = np.cos(surrogate.space.to_unit(theta) @ waves + shift)
+            field = field.reshape(len(theta), rank + 1, ERROR_FEATURES).sum(axis=2) * np.sqrt(
+                2 / ERROR_FEATURES
+            )
+            at = surrogate.predict(theta)
+            shifted = at.mean + np.matmul(at.factor, field[:, :rank, None])[:, :, 0]
+            return np.asarray(shifted + field[:, rank:] * np.sqrt(at.diagonal))
+
+        return function
+
+    return [draw() for _ in range(count)]
+
+
+def pick_freeze(
+    function: Function,
+    space: ParameterSpace,
+    edges_s: Array,
+    rng: np.random.Generator,
+    samples: int = 2048,
+    draws: Sequence[Function] = (),
+) -> SobolResult:
+    """Indices from ``samples (d + 2)`` evaluations at scrambled Sobol' points.
+
+    Intervals: `REPLICATES` bootstrap replicates, each moved by what one of `draws` changes.
+    """
+    points = _sobol_points(2 * space.dim, samples, rng)
+    values = _evaluate_pairs(function, space, points)
+    n = len(points)
+    counts = rng.multinomial(n, np.full(n, 1.0 / n), size=REPLICATES) / n
+    spread = _pick_freeze_parts(values, counts)
+    if draws:
+        few = slice(0, min(ERROR_SAMPLES, n))
+        even = np.full((1, few.stop), 1.0 / few.stop)
+        base = _pick_freeze_parts([rows[few] for rows in values], even)
+        moved = [_pick_freeze_parts(_evaluate_pairs(draw, space, points[few]), even) for draw in draws]
+        picks = np.arange(REPLICATES) % len(draws)
+        shifts = (np.concatenate([getattr(m, part) for m in moved])[picks] for part in _Parts._fields)
+        spread = _Parts(*(a + b - c for a, b, c in zip(spread, shifts, base, strict=True)))
+    best = _pick_freeze_parts(values, np.full((1, n), 1.0 / n))
+    return _result(space, edges_s, best, spread, n, "pick-freeze", float("nan"))
+
+
+def projection(
+    function: Function,
+    space: ParameterSpace,
+    edges_s: Array,
+    rng: np.random.Generator,
+    samples: int = 2048,
+    draws: Sequence[Function] = (),
+) -> SobolResult:
+    """Indices from the coefficients of a Legendre expansion regressed on `samples` evaluations.
+
+    The amplitude-and-shape form of a surrogate is a product, whose expansion is not that of its factors:
+    the force itself is projected. Intervals are over `draws` only (NaN without them): the coefficients
+    of a given function have no sampling error beyond `unexplained`, measured on as many fresh points.
+    """
+    unit, fresh = (_sobol_points(space.dim, samples, rng) for _ in range(2))
+    indices = _expansion_terms(space.dim, len(unit) // 4)
+    basis = _legendre(unit, indices)
+    gram = cho_factor(basis.T @ basis)
+
+    def coefficients(values: Array) -> Array:
+        return np.asarray(cho_solve(gram, basis.T @ values))
+
+    found = coefficients(_in_chunks(function, space.from_unit(unit)))
+    truth = _in_chunks(function, space.from_unit(fresh))
+    widths = np.diff(edges_s)
+    missed = float(np.mean((truth - _legendre(fresh, indices) @ found) ** 2, axis=0) @ widths)
+    scatter = float(np.var(truth, axis=0) @ widths)
+    moved = [_expansion_parts(coefficients(_in_chunks(f, space.from_unit(unit))), indices) for f in draws]
+    spread = _Parts(*(np.concatenate(part) for part in zip(*moved, strict=True))) if moved else None
+    unexplained = missed / scatter if scatter > 0.0 else float("nan")
+    best = _expansion_parts(found, indices)
+    return _result(space, edges_s, best, spread, len(unit), "projection", unexplained)
+
+
+def uninformed(result: SobolResult) -> tuple[str, ...]:
+    """Parameters whose total index stays below 0.01 in every bin of meaningful variance."""
+    matters = result.variance_n2 >= MEANINGFUL_VARIANCE * np.max(result.variance_n2, initial=0.0)
+    matters &= ~np.isnan(result.total).any(axis=0)
+    if not matters.any():
+        return ()
+    highest = result.total[:, matters].max(axis=1)
+    return tuple(name for name, top in zip(result.names, highest, strict=True) if top < UNINFORMED_TOTAL)
+
+
+def sentence(result: SobolResult) -> str:
+    """What the force does not inform, in words."""
+    names = uninformed(result)
+    if np.isnan(result.total).all():
+        return "The force does not vary over the parameters' distribution: it informs none of them."
+    if not names:
+        return "The force informs every parameter: each total Sobol' index reaches 0.01 in some bin."
+    listed = names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
+    verb = "its total Sobol' index stays" if len(names) == 1 else "their total Sobol' indices stay"
+    return f"The force does not inform {listed}: {verb} below 0.01 in every bin whose force varies."
+
+
+def describe(space: ParameterSpace) -> str:
+    """The input distribution in words."""
+    boxes = (f"{p.name} {p.prior} {p.lower:g} to {p.upper:g} {p.unit}".rstrip() for p in space.parameters)
+    return "independent: " + "; ".join(boxes)
+
+
+def _sobol_points(dim: int, samples: int, rng: np.random.Generator) -> Array:
+    """Scrambled Sobol' points, a power of two of them, (n, dim)."""
+    return np.asarray(qmc.Sobol(dim, seed=rng).random_base2(max(samples - 1, 1).bit_length()))
+
+
+def _in_chunks(function: Function, theta: Array) -> Array:
+    """function(theta), (n, m), without the memory that all of it at once would take."""
+    return np.concatenate([function(theta[i : i + CHUNK]) for i in range(0, len(theta), CHUNK)])
+
+
+def _evaluate_pairs(function: Function, space: ParameterSpace, points: Array) -> list[Array]:
+    """[f(A), f(B), f(A with column 1 of B), ...], each (n, m), centred on the mean of f(A) and f(B)."""
+    a, b = points[:, : space.dim], points[:, space.dim :]
+    mixed = [np.where(np.arange(space.dim) == i, b, a) for i in range(space.dim)]
+    values = [_in_chunks(function, space.from_unit(unit)) for unit in (a, b, *mixed)]
+    centre = 0.5 * (values[0].mean(axis=0) + values[1].mean(axis=0))
+    return [value - centre for value in values]
+
+
+def _pick_freeze_parts(values: Sequence[Array], weights: Array) -> _Parts:
+    """Parts of the variance with the rows weighted by each of weights (r, n)."""
+    a, b, *mixed = values
+    mean = weights @ (0.5 * (a + b))
+    variance = weights @ (0.5 * (a**2 + b**2)) - mean**2
+    first = np.stack([weights @ (b * (ab - a)) for ab in mixed], axis=1)
+    total = np.stack([weights @ (0.5 * (a - ab) ** 2) for ab in mixed], axis=1)
+    return _Parts(variance, first, total)
+
+
+def _expansion_terms(dim: int, most: int) -> NDArray[np.int64]:
+    """Degrees (P, dim) of the largest hyperbolic set of at most `most` (and `MOST_TERMS`) terms."""
+    degree, terms = 0, np.zeros((1, dim), dtype=np.int64)
+    while True:
+        degree += 1
+        cost = np.arange(degree + 1.0) ** HYPERBOLIC_NORM
+        larger, spent = np.zeros((1, 0), dtype=np.int64), np.zeros(1)
+        for _ in range(dim):
+            sums = spent[:, None] + cost
+            row, power = np.nonzero(sums <= cost[-1] * (1.0 + 1e-12))
+            larger, spent = np.column_stack([larger[row], power]), sums[row, power]
+        if len(larger) > min(most, MOST_TERMS):
+            return terms
+        terms = larger
+
+
+def _legendre(unit: Array, indices: NDArray[np.int64]) -> Array:
+    """Legendre products orthonormal over the unit cube, (n, P)."""
+    degree = int(indices.max())
+    powers = legvander(2.0 * unit - 1.0, degree) * np.sqrt(2.0 * np.arange(degree + 1) + 1.0)
+    values = [powers[:, j, column] for j, column in enumerate(indices.T)]
+    return np.asarray(np.prod(values, axis=0))
+
+
+def _expansion_parts(coefficients: Array, indices: NDArray[np.int64]) -> _Parts:
+    """Parts of the variance from the coefficients (P, m) of orthonormal terms (P, d)."""
+    square = coefficients**2
+    used = (indices > 0).astype(float)
+    alone = used * (used.sum(axis=1, keepdims=True) == 1)
+    return _Parts((used.any(axis=1) @ square)[None], (alone.T @ square)[None], (used.T @ square)[None])
+
+
+def _ratios(parts: _Parts, usable: NDArray[np.bool_], widths: Array) -> tuple[Array, Array, Array, Array]:
+    """First and total indices (r, d, m), and aggregated over the history (r, d)."""
+    variance = np.where(usable, parts.variance, np.nan)[:, None]
+    history = parts.variance @ widths
+    whole = np.where(history > 0.0, history, np.nan)[:, None]
+    return (
+        parts.first / variance,
+        parts.total / variance,
+        parts.first @ widths / whole,
+        parts.total @ widths / whole,
+    )
+
+
+def _result(
+    space: ParameterSpace,
+    edges_s: Array,
+    best: _Parts,
+    spread: _Parts | None,
+    samples: int,
+    method: Literal["pick-freeze", "projection"],
+    unexplained: float,
+) -> SobolResult:
+    widths = np.diff(edges_s)
+    usable = best.variance[0] > NEGLIGIBLE_VARIANCE * best.variance[0].max()
+    first, total, first_whole, total_whole = (ratio[0] for ratio in _ratios(best, usable, widths))
+    if spread is None:
+        limits = [np.full((2, *ratio.shape), np.nan) for ratio in (first, total, first_whole, total_whole)]
+    else:
+        limits = [np.quantile(ratio, [0.05, 0.95], axis=0) for ratio in _ratios(spread, usable, widths)]
+    return SobolResult(
+        names=space.names,
+        edges_s=np.asarray(edges_s, dtype=float),
+        first=first,
+        total=total,
+        first_interval=limits[0],
+        total_interval=limits[1],
+        first_aggregated=first_whole,
+        total_aggregated=total_whole,
+        first_aggregated_interval=limits[2],
+        total_aggregated_interval=limits[3],
+        variance_n2=best.variance[0],
+        unexplained=unexplained,
+        samples=samples,
+        method=method,
+        distribution=describe(space),
+    )
