@@ -1,1 +1,60 @@
+"""Posterior inference: noise, likelihood, maximum, draws, checks. Sees a Surrogate, never a model."""
 
+from bayeskin.inference.bands import (
+    Bands,
+    ForceDraws,
+    Rmse,
+    bands,
+    bands_of,
+    coverage,
+    predictive_draws,
+    rmse,
+)
+from bayeskin.inference.check import MapCheck, RefinedMap, check_map, refine_map
+from bayeskin.inference.convergence import Convergence, Limits, Verdict
+from bayeskin.inference.identify import Identifiability, Learned, Ridge, identifiability
+from bayeskin.inference.inference_data import (
+    draws_of,
+    load_inference_data,
+    save_inference_data,
+    to_inference_data,
+)
+from bayeskin.inference.noise_model import NoisePriors
+from bayeskin.inference.optimise import MapResult, StartResult, find_map
+from bayeskin.inference.problem import LogPosterior
+from bayeskin.inference.sample import Posterior, SampleSettings, load_chains, sample
+
+__all__ = [
+    "Bands",
+    "Convergence",
+    "ForceDraws",
+    "Identifiability",
+    "Learned",
+    "Limits",
+    "LogPosterior",
+    "MapCheck",
+    "MapResult",
+    "NoisePriors",
+    "Posterior",
+    "RefinedMap",
+    "Ridge",
+    "Rmse",
+    "SampleSettings",
+    "StartResult",
+    "Verdict",
+    "bands",
+    "bands_of",
+    "check_map",
+    "coverage",
+    "draws_of",
+    "find_map",
+    "identifiability",
+    "load_chains",
+    "load_inference_data",
+    "predictive_draws",
+    "refine_map",
+    "rmse",
+    "sample",
+    "save_inference_data",
+    "to_inference_data",
+]

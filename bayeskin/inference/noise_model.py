@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -117,7 +118,7 @@ def noise_chain(binned: BinnedForce, windows: Windows | None = None, omit: int |
     starts = np.concatenate([[True], np.diff(window[bins]) != 0])
     # A product of neighbours' correlations bridges omitted bins, as a Markov chain's does.
     neighbour = np.clip(np.nan_to_num(binned.correlation), -0.999, 0.999)
-    bridge = [np.prod(neighbour[a:b]) for a, b in zip(bins[:-1], bins[1:], strict=True)]
+    bridge = [np.prod(neighbour[a:b]) for a, b in pairwise(bins)]
     covariance = np.zeros(len(bins))
     covariance[1:] = np.array(bridge) * np.sqrt(variance[1:] * variance[:-1])
     of_kind = [kinds.index(binned.phases[p].kind) for p in binned.phase[bins]]

@@ -1,0 +1,155 @@
+"""What the posterior predicts for the force, how uncertain and from what, and how far off it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bayeskin.errors import InputError
+from bayeskin.inference.noise_model import (
+    KINDS,
+    NoiseChain,
+    Windows,
+    bins_in_windows,
+    draw_noise,
+    noise_chain,
+)
+from bayeskin.inference.problem import LogPosterior
+from bayeskin.types import Array, BinnedForce, _FreezesArrays
+
+LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
+_CHUNK = 256
+
+
+@dataclass(frozen=True)
+class ForceDraws(_FreezesArrays):
+    """Posterior predictive on all bins, (s, m) each [N]: model mean, surrogate error's sd, noisy force."""
+
+    mean_n: Array
+    surrogate_sd_n: Array
+    noise_sd_n: Array
+    force_n: Array
+
+
+@dataclass(frozen=True)
+class Bands(_FreezesArrays):
+    """Predictive bands over the bins, (m,) each [N], and the parts of their variance.
+
+    `sd_parameter_n` spread of the model's mean over the draws; `sd_surrogate_n` root of the mean variance
+    of the surrogate; `sd_noise_n` likewise of the noise (its Gaussian core, see `noise_model`).
+    quantiles_n (5, m): 5, 25, 50, 75 and 95 % of the predicted force, all parts in.
+    """
+
+    time_s: Array
+    mean_n: Array
+    sd_parameter_n: Array
+    sd_surrogate_n: Array
+    sd_noise_n: Array
+    quantiles_n: Array
+
+    @property
+    def sd_total_n(self) -> Array:
+        return np.sqrt(self.sd_parameter_n**2 + self.sd_surrogate_n**2 + self.sd_noise_n**2)
+
+    def interval(self, level: float) -> tuple[Array, Array]:
+        """Lower and upper edge (m,) [N] of the 50 % (0.5) or 90 % (0.9) band."""
+        if level not in (0.5, 0.9):
+            raise InputError("level of the band", level, "0.5 or 0.9")
+        low, high = (1, 3) if level == 0.5 else (0, 4)
+        return self.quantiles_n[low], self.quantiles_n[high]
+
+
+@dataclass(frozen=True)
+class Rmse:
+    """Root mean square of recorded minus predicted force [N]: all bins, by phase kind, by window."""
+
+    whole_n: float
+    by_kind_n: Mapping[str, float]
+    by_window_n: tuple[float, ...]
+
+
+def predictive_draws(log_posterior: LogPosterior, theta: ArrayLike, rng: np.random.Generator) -> ForceDraws:
+    """One predicted recording for each draw theta (s, D) in SI, on all bins, fitted or not.
+
+    The noise is drawn afresh, not conditioned on the residual. Phases of a kind that was not fitted take
+    the largest of the fitted kinds' sd.
+    """
+    theta = np.atleast_2d(np.asarray(theta, dtype=float))
+    fitted, chain = log_posterior.chain, _whole_chain(log_posterior.binned)
+    parts = [_predictive(log_posterior, fitted, chain, theta[a : a + _CHUNK], rng)
+             for a in range(0, len(theta), _CHUNK)]  # fmt: skip
+    return ForceDraws(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def bands(log_posterior: LogPosterior, theta: ArrayLike, rng: np.random.Generator) -> Bands:
+    """Predictive bands from posterior draws theta (s, D) in SI; a thousand draws are plenty."""
+    return bands_of(log_posterior.binned.time_s, predictive_draws(log_posterior, theta, rng))
+
+
+def bands_of(time_s: Array, draws: ForceDraws) -> Bands:
+    """The bands of draws that are there already."""
+    return Bands(
+        time_s=time_s,
+        mean_n=draws.mean_n.mean(axis=0),
+        sd_parameter_n=draws.mean_n.std(axis=0),
+        sd_surrogate_n=np.sqrt((draws.surrogate_sd_n**2).mean(axis=0)),
+        sd_noise_n=np.sqrt((draws.noise_sd_n**2).mean(axis=0)),
+        quantiles_n=np.quantile(draws.force_n, LEVELS, axis=0),
+    )
+
+
+def coverage(binned: BinnedForce, low_n: Array, high_n: Array, windows: Windows | None = None) -> float:
+    """Share of recorded bins (in the windows, or all) that lie between two edges (m,) [N]."""
+    inside = bins_in_windows(binned, windows) >= 0
+    hit = (binned.force_n >= low_n) & (binned.force_n <= high_n)
+    return float(hit[inside].mean()) if inside.any() else float("nan")
+
+
+def rmse(binned: BinnedForce, force_n: ArrayLike, windows: Windows | None = None) -> Rmse:
+    """How far a predicted force (m,) [N] is from the recorded one; NaN for a window without bins.
+
+    `by_kind_n` is over the whole recording; `by_window_n` follows `windows`, one by one.
+    """
+    square = (binned.force_n - np.asarray(force_n, dtype=float)) ** 2
+    usable = bins_in_windows(binned, None) >= 0
+    kind = np.array([phase.kind for phase in binned.phases])[binned.phase]
+    by_kind: dict[str, float] = {
+        k: _root_mean(square[usable & (kind == k)]) for k in KINDS if (kind == k).any()
+    }
+    index = [bins_in_windows(binned, [window]) for window in windows or ()]
+    return Rmse(_root_mean(square[usable]), by_kind, tuple(_root_mean(square[i == 0]) for i in index))
+
+
+def _root_mean(square: Array) -> float:
+    return float(np.sqrt(square.mean())) if len(square) else float("nan")
+
+
+def _whole_chain(binned: BinnedForce) -> NoiseChain:
+    """All bins, those without a recorded force included, with no variance of their own there."""
+    filled = BinnedForce(
+        edges_s=binned.edges_s,
+        force_n=np.zeros_like(binned.force_n),
+        variance_n2=np.nan_to_num(binned.variance_n2, nan=0.0, posinf=0.0),
+        correlation=binned.correlation,
+        phase=binned.phase,
+        phases=binned.phases,
+    )
+    return noise_chain(filled)
+
+
+def _predictive(
+    log_posterior: LogPosterior, fitted: NoiseChain, chain: NoiseChain, theta: Array, rng: np.random.Generator
+) -> tuple[Array, Array, Array, Array]:
+    noise = log_posterior.split(theta)[1]
+    sd = noise[:, : len(fitted.kinds)]
+    columns = [sd[:, fitted.kinds.index(k)] if k in fitted.kinds else sd.max(axis=1) for k in chain.kinds]
+    noise = np.column_stack([*columns, noise[:, -2:]])
+    prediction = log_posterior.predict(theta)
+    latent = rng.standard_normal((len(theta), prediction.factor.shape[2]))
+    force = prediction.mean + np.einsum("nmr,nr->nm", prediction.factor, latent)
+    force += draw_noise(chain, noise, prediction.diagonal, rng)
+    noise_sd = np.sqrt(noise[:, chain.kind] ** 2 + chain.variance_n2)
+    return prediction.mean, prediction.sd(), noise_sd, force

@@ -1,0 +1,79 @@
+"""Chains on disk: emcee's HDF5 form, replaced as a whole, and refused when it is another posterior's."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import emcee
+import h5py
+import numpy as np
+
+from bayeskin.errors import InputError
+
+
+def save(
+    path: Path, backend: emcee.backends.Backend, names: tuple[str, ...], identity: Mapping[str, str]
+) -> None:
+    """Writes a chain so that `emcee.backends.HDFBackend(path)` reads it.
+
+    emcee itself appends in place at every step; a process killed while it does so leaves a file that
+    nothing opens. Here the earlier file stays until the new one is complete and on disk.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        emcee.backends.HDFBackend(str(partial)).reset(backend.nwalkers, backend.ndim)
+        with h5py.File(partial, "r+") as handle:
+            group = handle["mcmc"]
+            for name in ("chain", "log_prob"):
+                group[name].resize(backend.iteration, axis=0)
+                group[name][...] = getattr(backend, name)
+            group["accepted"][...] = backend.accepted
+            group.attrs["iteration"] = backend.iteration
+            for index, part in enumerate(backend.random_state):
+                group.attrs[f"random_state_{index}"] = part
+            group.attrs["bayeskin"] = json.dumps({"names": list(names), "identity": dict(identity)})
+        with open(partial, "rb") as written:
+            os.fsync(written.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load(path: Path, names: tuple[str, ...], identity: Mapping[str, str]) -> emcee.backends.Backend:
+    """The chain in `path` as an in-memory backend, its random state included.
+
+    Raises InputError when the file is not readable, has other parameters, or differs in any entry of
+    `identity` (entries that `identity` lacks are not compared).
+    """
+    try:
+        with h5py.File(path, "r") as handle:
+            found = json.loads(handle["mcmc"].attrs["bayeskin"])
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(path, f"not a chain of bayeskin ({error})", "ensemble_N.h5 of `sample`") from None
+    if tuple(found["names"]) != names:
+        raise InputError(path, f"a chain of {', '.join(found['names'])}", f"one of {', '.join(names)}")
+    for entry, value in identity.items():
+        if found["identity"].get(entry) != value:
+            raise InputError(
+                path, f"a chain with another {entry} ({found['identity'].get(entry, 'none')[:12]})",
+                f"the same {entry} ({value[:12]}); sample into another folder",
+            )  # fmt: skip
+    return _in_memory(emcee.backends.HDFBackend(str(path), read_only=True))
+
+
+def _in_memory(disk: emcee.backends.HDFBackend) -> emcee.backends.Backend:
+    walkers, dim = (int(v) for v in disk.shape)
+    memory = emcee.backends.Backend()
+    memory.reset(walkers, dim)
+    memory.chain = np.array(disk.get_chain())
+    memory.log_prob = np.array(disk.get_log_prob())
+    memory.accepted = np.array(disk.accepted)
+    memory.iteration = int(disk.iteration)
+    memory.random_state = tuple(
+        part.item() if isinstance(part, np.generic) else part for part in disk.random_state
+    )
+    return memory

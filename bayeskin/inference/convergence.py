@@ -1,0 +1,179 @@
+"""Whether a posterior may be trusted: autocorrelation, effective samples, R-hat across ensembles.
+
+Walkers of one ensemble are coupled, so none of them counts as a chain. Autocorrelation times are of the
+walkers' mean autocorrelation in each ensemble (Goodman & Weare 2010); R-hat compares ensembles, which
+share nothing but the target: each half of each ensemble's run, its walkers pooled and thinned by the
+autocorrelation time, is one chain of nearly independent draws (rank-normalised, bulk and folded; Vehtari
+et al. 2021, Bayesian Analysis 16:667).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import emcee
+import numpy as np
+from scipy.special import ndtri
+from scipy.stats import rankdata
+
+from bayeskin.types import Array, _FreezesArrays
+
+_RESOLVED = 2000  # samples a series keeps for its autocorrelation time
+_BURN_IN_LENGTHS = 10  # autocorrelation times that the start is forgotten in
+_RARELY = 0.1  # a walker that moves less often than this share of its ensemble's median is stuck
+_BELOW = 5.0  # and so is one whose log density lies this many robust sd below its ensemble's
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Below these no posterior is called trusted."""
+
+    effective_samples: float = 5000.0  # in all, of the parameter that has fewest
+    lengths: float = 50.0  # autocorrelation times that each ensemble's run after burn-in spans
+    rhat: float = 1.01
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether to trust, and each criterion with its number; failed ones first."""
+
+    trusted: bool
+    reasons: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Convergence(_FreezesArrays):
+    """State of a run of E ensembles: tau_steps (E, D); ess, rhat (D,); acceptance (E,).
+
+    `stuck` lists (ensemble, walker). A parameter that does not move has NaN throughout.
+    """
+
+    steps: int
+    burn_in: int
+    thin: int
+    tau_steps: Array
+    ess: Array
+    rhat: Array
+    acceptance: Array
+    stuck: tuple[tuple[int, int], ...]
+    verdict: Verdict
+
+    def progress(self, limits: Limits) -> float:
+        """Share of the way to the limits that is done, 0..1."""
+        kept = self.steps - self.burn_in
+        parts = (_lowest(self.ess) / limits.effective_samples, kept / (limits.lengths * self._tau))
+        return float(np.clip(np.nan_to_num(min(parts)), 0.0, 1.0))
+
+    @property
+    def _tau(self) -> float:
+        return _highest(self.tau_steps)
+
+
+def assess(chains: Array, log_prob: Array, names: tuple[str, ...], limits: Limits) -> Convergence:
+    """Convergence of chains (E, n, W, D) in sampling coordinates with log densities (E, n, W)."""
+    steps = chains.shape[1]
+    # The second half's time, since a start that is not yet forgotten would lengthen it.
+    settled = _highest(autocorrelation_steps(chains[:, steps // 2 :]))
+    burn_in = (
+        int(min(math.ceil(_BURN_IN_LENGTHS * settled), steps // 2)) if np.isfinite(settled) else steps // 2
+    )
+    kept = chains[:, burn_in:]
+    tau = autocorrelation_steps(kept)
+    longest = _highest(tau)
+    thin = int(min(max(1, math.ceil(longest)), kept.shape[1])) if np.isfinite(longest) else 1
+    ess = np.sum(kept.shape[1] * kept.shape[2] / tau, axis=0)
+    thinned = kept[:, ::thin]
+    rhat = np.array([split_rhat(thinned[..., j].reshape(len(chains), -1)) for j in range(chains.shape[3])])
+    moved = np.any(np.diff(kept, axis=1) != 0.0, axis=3).mean(axis=1)
+    stuck = _stuck(moved, log_prob[:, burn_in:])
+    verdict = _verdict(kept.shape[1], tau, ess, rhat, stuck, names, limits)
+    return Convergence(steps, burn_in, thin, tau, ess, rhat, moved.mean(axis=1), stuck, verdict)
+
+
+def autocorrelation_steps(chains: Array) -> Array:
+    """Integrated autocorrelation time (E, D) [steps] of chains (E, n, W, D); NaN where nothing moves."""
+    every = max(1, chains.shape[1] // _RESOLVED)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        times = [every * emcee.autocorr.integrated_time(c[::every], tol=0) for c in chains]
+    return np.maximum(np.array(times), 1.0)
+
+
+def split_rhat(draws: Array) -> float:
+    """Rank-normalised split R-hat of draws (chains, n): the larger of bulk and folded; NaN if constant."""
+    half = draws.shape[1] // 2
+    if half < 2 or np.ptp(draws) == 0.0:
+        return math.nan
+    halves = np.concatenate([draws[:, :half], draws[:, -half:]])
+    folded = np.abs(halves - np.median(halves))
+    return max(_rhat(_rank_normal(halves)), _rhat(_rank_normal(folded)))
+
+
+def _rank_normal(draws: Array) -> Array:
+    ranks = rankdata(draws, axis=None).reshape(draws.shape)
+    return ndtri((ranks - 0.375) / (draws.size + 0.25))
+
+
+def _rhat(draws: Array) -> float:
+    n = draws.shape[1]
+    within = draws.var(axis=1, ddof=1).mean()
+    between = draws.mean(axis=1).var(ddof=1)
+    return math.sqrt((n - 1) / n + between / within) if within > 0 else math.inf
+
+
+def _stuck(moved: Array, log_prob: Array) -> tuple[tuple[int, int], ...]:
+    rarely = moved <= _RARELY * np.median(moved, axis=1, keepdims=True)
+    level = np.median(log_prob, axis=1)
+    centre = np.median(log_prob, axis=(1, 2))[:, None]
+    spread = 1.4826 * np.median(np.abs(log_prob - centre[:, None]), axis=(1, 2))[:, None]
+    low = level < centre - _BELOW * np.maximum(spread, 1e-9)
+    return tuple((int(e), int(w)) for e, w in np.argwhere(rarely | low))
+
+
+def _verdict(
+    kept: int, tau: Array, ess: Array, rhat: Array, stuck: tuple[tuple[int, int], ...],
+    names: tuple[str, ...], limits: Limits,
+) -> Verdict:  # fmt: skip
+    longest, fewest, worst = _highest(tau), _lowest(ess), _highest(rhat)
+    lengths = kept / longest
+    checks = [
+        (
+            lengths >= limits.lengths,
+            f"{lengths:.0f} autocorrelation lengths a run of {kept} steps "
+            f"({_of(names, tau.max(axis=0), 'max')}, {longest:.0f} steps); {limits.lengths:.0f} needed",
+        ),
+        (
+            fewest >= limits.effective_samples,
+            f"{fewest:.0f} effective samples of {_of(names, ess, 'min')}; "
+            f"{limits.effective_samples:.0f} needed",
+        ),
+        (
+            worst <= limits.rhat,
+            f"R-hat across {len(tau)} ensembles {worst:.4f} of {_of(names, rhat, 'max')}; "
+            f"at most {limits.rhat:g} allowed",
+        ),
+        (
+            not stuck,
+            f"{len(stuck)} stuck walkers"
+            + "".join(f", ensemble {e} walker {w}" for e, w in stuck[:3])
+            + "; none allowed",
+        ),
+    ]
+    if len(tau) < 2:
+        checks.append((False, "one ensemble only; at least 2 independent ones needed"))
+    checks.sort(key=lambda check: bool(check[0]))
+    return Verdict(all(bool(ok) for ok, _ in checks), tuple(text for _, text in checks))
+
+
+def _of(names: tuple[str, ...], values: Array, which: str) -> str:
+    if np.isnan(values).any():
+        return names[int(np.flatnonzero(np.isnan(values))[0])]
+    return names[int(np.argmax(values) if which == "max" else np.argmin(values))]
+
+
+def _highest(values: Array) -> float:
+    return math.nan if np.isnan(values).any() else float(np.max(values))
+
+
+def _lowest(values: Array) -> float:
+    return math.nan if np.isnan(values).any() else float(np.min(values))

@@ -1,0 +1,161 @@
+"""The posterior as an ArviZ InferenceData, and its NetCDF file."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bayeskin.errors import InputError
+from bayeskin.inference.bands import predictive_draws
+from bayeskin.inference.problem import LogPosterior
+from bayeskin.inference.sample import Posterior
+from bayeskin.types import Array, Parameter, ParameterSpace, Provenance
+
+if TYPE_CHECKING:
+    import arviz
+
+_PRIOR_DRAWS = 2000
+_ENGINE = "h5netcdf"
+
+
+def to_inference_data(
+    log_posterior: LogPosterior,
+    posterior: Posterior,
+    provenance: Provenance,
+    rng: np.random.Generator,
+    predictive: int = 1000,
+) -> arviz.InferenceData:
+    """Posterior (SI; chain = ensemble), lp, log-likelihood by phase, predictions, prior, data, attributes.
+
+    `predictive` draws, evenly taken from all ensembles, go into posterior_predictive: `force` with noise
+    and surrogate error, the model's `mean`, the `surrogate_sd` [N]. The log-likelihood is that of
+    `LogPosterior.block_log_likelihood`, so that az.loo leaves out one phase at a time. Groups differ in
+    their number of draws, as ArviZ allows.
+    """
+    import arviz as az  # takes seconds, which only those who ask for it should wait
+
+    space, (ensembles, n, _) = posterior.space, posterior.draws.shape
+    prior = space.from_unit(rng.uniform(size=(_PRIOR_DRAWS, space.dim)))
+    constant = _constant(log_posterior)
+    idata = az.from_dict(
+        posterior={name: posterior.draws[..., j] for j, name in enumerate(space.names)},
+        sample_stats={"lp": posterior.log_prob},
+        log_likelihood={
+            "phases": log_posterior.block_log_likelihood(posterior.flat).reshape(ensembles, n, -1)
+        },
+        posterior_predictive=_predictive(log_posterior, posterior, predictive, rng),
+        prior={name: prior[None, :, j] for j, name in enumerate(space.names)},
+        observed_data={"force": log_posterior.binned.force_n},
+        constant_data=constant,
+        coords={"time": log_posterior.binned.time_s, "phase": _labels(log_posterior)},
+        dims={"phases": ["phase"], **{k: ["time"] for k in ("force", "mean", "surrogate_sd", *constant)}},
+        attrs=_attributes(posterior, provenance),
+    )
+    for group in ("posterior", "prior"):
+        for p in space.parameters:
+            idata[group][p.name].attrs = {"units": p.unit, "long_name": p.description}
+    return idata
+
+
+def save_inference_data(path: Path | str, idata: arviz.InferenceData) -> None:
+    """Writes NetCDF (h5netcdf), whole or not at all; an earlier file stays until then."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        idata.to_netcdf(str(partial), engine=_ENGINE)
+        with open(partial, "rb") as written:
+            os.fsync(written.fileno())
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load_inference_data(path: Path | str) -> arviz.InferenceData:
+    """Reads what `save_inference_data` wrote. Raises InputError when absent or not NetCDF of ArviZ."""
+    import arviz as az
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(path, "no such file", "a posterior in NetCDF")
+    try:
+        idata = az.from_netcdf(str(path), engine=_ENGINE)
+    except (OSError, ValueError) as error:
+        raise InputError(path, f"not readable ({error})", "a posterior in NetCDF") from None
+    if "posterior" not in idata.groups():
+        raise InputError(path, f"groups {', '.join(idata.groups()) or 'none'}", "a group 'posterior'")
+    return idata
+
+
+def draws_of(idata: arviz.InferenceData) -> tuple[ParameterSpace, Array]:
+    """The priors and the draws (s, D) in SI that an InferenceData of `to_inference_data` holds."""
+    stored = idata["posterior"].attrs.get("parameters")
+    if stored is None:
+        raise InputError("InferenceData", "no attribute 'parameters'", "one made by bayeskin")
+    space = ParameterSpace(tuple(Parameter(**entry) for entry in json.loads(stored)))
+    return space, np.stack([idata["posterior"][name].values.ravel() for name in space.names], axis=-1)
+
+
+def _predictive(
+    log_posterior: LogPosterior, posterior: Posterior, wanted: int, rng: np.random.Generator
+) -> dict[str, Array]:
+    ensembles, n, dim = posterior.draws.shape
+    few = min(n, max(1, wanted // ensembles))
+    taken = posterior.draws[:, np.linspace(0, n - 1, few).astype(int)].reshape(-1, dim)
+    drawn = predictive_draws(log_posterior, taken, rng)
+    columns = {"force": drawn.force_n, "mean": drawn.mean_n, "surrogate_sd": drawn.surrogate_sd_n}
+    return {name: value.reshape(ensembles, few, -1) for name, value in columns.items()}
+
+
+def _constant(log_posterior: LogPosterior) -> dict[str, Any]:
+    binned = log_posterior.binned
+    fitted = np.zeros(len(binned.force_n), dtype=np.int8)
+    fitted[log_posterior.chain.bins] = 1
+    return {
+        "bin_start": binned.edges_s[:-1],
+        "bin_end": binned.edges_s[1:],
+        "variance": binned.variance_n2,
+        "phase_index": binned.phase,
+        "fitted": fitted,
+    }
+
+
+def _labels(log_posterior: LogPosterior) -> list[str]:
+    phases = [log_posterior.binned.phases[b] for b in log_posterior.blocks]
+    names = [f"{p.kind} {p.cycle}" for p in phases]
+    return [
+        name if names.count(name) == 1 else f"{name} at {p.start_s:g} s"
+        for name, p in zip(names, phases, strict=True)
+    ]
+
+
+def _attributes(posterior: Posterior, provenance: Provenance) -> dict[str, Any]:
+    """Texts and numbers only, which NetCDF holds; lists and mappings as JSON."""
+    c = posterior.convergence
+    by_name: Sequence[tuple[str, Array]] = (
+        ("ess", c.ess), ("rhat", c.rhat), ("tau_steps", c.tau_steps.max(axis=0)),
+    )  # fmt: skip
+    return {
+        "bayeskin_version": provenance.version,
+        "config_sha256": provenance.config_sha256,
+        "recording_sha256": provenance.recording_sha256,
+        "model_hash": provenance.model_hash,
+        "seed": posterior.seed,
+        "provenance": json.dumps(dict(provenance.extra), sort_keys=True, default=str),
+        "parameters": json.dumps([dataclasses.asdict(p) for p in posterior.space.parameters]),
+        "trusted": int(c.verdict.trusted),
+        "verdict": json.dumps(c.verdict.reasons),
+        "steps": c.steps,
+        "burn_in": c.burn_in,
+        "thin": c.thin,
+        **{
+            key: json.dumps(dict(zip(posterior.space.names, map(float, values), strict=True)))
+            for key, values in by_name
+        },
+    }

@@ -1,0 +1,209 @@
+"""The posterior as a function: vectors in sampling coordinates in, log densities out.
+
+Sampling coordinates are log(theta) for a log-uniform parameter and theta itself for a uniform one. Each
+stated prior is then uniform between its transformed bounds (the Jacobian d theta / d log theta = theta
+cancels the 1/theta of the log-uniform density), so the prior of a vector is a constant in the box, and
+the most probable vector is the most likely one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayeskin.errors import InputError
+from bayeskin.inference.likelihood import log_likelihood
+from bayeskin.inference.noise_model import NoiseChain, NoisePriors, noise_chain, noise_space
+from bayeskin.types import Array, BinnedForce, ParameterSpace, Prediction, Surrogate
+
+_CHUNK = 256  # points predicted at once, so that factors of many bins stay small in memory
+
+
+@dataclass(frozen=True)
+class LogPosterior:
+    """Posterior of material and noise parameters given one recording's bins.
+
+    `fit_windows` [s] says which bins are fitted (those wholly inside one), None means all.
+    `material` replaces the surrogate's own prior; its box must lie in the surrogate's.
+    Raises InputError when surrogate, bins, windows or priors do not belong together.
+    """
+
+    surrogate: Surrogate
+    binned: BinnedForce
+    fit_windows: tuple[tuple[float, float], ...] | None = None
+    noise_priors: NoisePriors = field(default_factory=NoisePriors)
+    material: ParameterSpace | None = None
+
+    def __post_init__(self) -> None:
+        ours, theirs = self.binned.edges_s, self.surrogate.edges_s
+        if len(ours) != len(theirs) or not np.allclose(ours, theirs, rtol=0, atol=1e-6):
+            raise InputError(
+                "surrogate", f"{len(theirs) - 1} bins up to {theirs[-1]:g} s",
+                f"the recording's {len(ours) - 1} bins up to {ours[-1]:g} s",
+            )  # fmt: skip
+        if self.material is not None:
+            _check_inside(self.material, self.surrogate.space)
+        _ = self.chain  # bad windows are refused here, not at the first evaluation
+
+    @cached_property
+    def chain(self) -> NoiseChain:
+        """The fitted bins in order."""
+        return noise_chain(self.binned, self.fit_windows)
+
+    @cached_property
+    def space(self) -> ParameterSpace:
+        """Priors of all sampled parameters: the material's, then the noise's."""
+        material = self.material or self.surrogate.space
+        return ParameterSpace(
+            material.parameters + noise_space(self.chain.kinds, self.noise_priors).parameters
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.space.names
+
+    @property
+    def dim(self) -> int:
+        return self.space.dim
+
+    @cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper corner of the box in sampling coordinates, (D,) each."""
+        return self.to_sampling(self.space.lower), self.to_sampling(self.space.upper)
+
+    @cached_property
+    def _is_log(self) -> NDArray[np.bool_]:
+        return self.space.is_log
+
+    def to_sampling(self, theta: ArrayLike) -> Array:
+        """Sampling coordinates of SI values, (..., D)."""
+        theta = np.asarray(theta, dtype=float)
+        return np.where(self._is_log, np.log(np.where(self._is_log, theta, 1.0)), theta)
+
+    def from_sampling(self, vectors: ArrayLike) -> Array:
+        """SI values of sampling coordinates, (..., D); never beyond the box by rounding."""
+        vectors = np.asarray(vectors, dtype=float)
+        theta = np.where(self._is_log, np.exp(np.where(self._is_log, vectors, 0.0)), vectors)
+        return np.clip(theta, self.space.lower, self.space.upper)
+
+    def split(self, theta: ArrayLike) -> tuple[Array, Array]:
+        """Material (n, d) and noise (n, q) columns of SI values (n, D)."""
+        theta = np.atleast_2d(np.asarray(theta, dtype=float))
+        d = self.surrogate.space.dim
+        return theta[:, :d], theta[:, d:]
+
+    def predict(self, theta: ArrayLike) -> Prediction:
+        """The surrogate's prediction on all bins at SI values (n, D), (n, d) or (d,)."""
+        theta = np.atleast_2d(np.asarray(theta, dtype=float))
+        return self.surrogate.predict(theta[:, : self.surrogate.space.dim])
+
+    def log_prob(self, vectors: ArrayLike) -> Array:
+        """Log posterior density (n,) at vectors (n, D) in sampling coordinates, up to the evidence.
+
+        -inf outside the box and wherever the density is not a number; never an exception.
+        """
+        vectors = np.atleast_2d(np.asarray(vectors, dtype=float))
+        low, high = self.bounds
+        out = np.full(len(vectors), -np.inf)
+        inside = np.flatnonzero(np.all((vectors >= low) & (vectors <= high), axis=1))
+        log_prior = -float(np.sum(np.log(high - low)))
+        for part in _chunks(inside):
+            value = self.log_likelihood(self.from_sampling(vectors[part])) + log_prior
+            out[part] = np.where(np.isnan(value), -np.inf, value)
+        return out
+
+    def log_likelihood(self, theta: ArrayLike) -> Array:
+        """Log-likelihood (n,) at SI values (n, D) in the box."""
+        return log_likelihood(self.chain, self.predict(theta), self.split(theta)[1])
+
+    @cached_property
+    def blocks(self) -> tuple[int, ...]:
+        """Phases (index) that have fitted bins."""
+        return tuple(int(p) for p in np.unique(self.binned.phase[self.chain.bins]))
+
+    def block_log_likelihood(self, theta: ArrayLike) -> Array:
+        """log p(y_b | y without b, theta) of each phase b in `blocks`, (n, b), at SI values (n, D).
+
+        Importance weights of these give leave-one-phase-out scores of correlated data, which those of
+        p(y_b | theta) do not (Buerkner, Gabry & Vehtari 2021, Computational Statistics 36:1243). They do
+        not sum to the log-likelihood.
+        """
+        theta = np.atleast_2d(np.asarray(theta, dtype=float))
+        if len(self.blocks) == 1:
+            return self._in_chunks([self.chain], theta)
+        others = [noise_chain(self.binned, self.fit_windows, omit=b) for b in self.blocks]
+        each = self._in_chunks([self.chain, *others], theta)
+        return each[:, :1] - each[:, 1:]
+
+    def _in_chunks(self, chains: list[NoiseChain], theta: Array) -> Array:
+        out = np.empty((len(theta), len(chains)))
+        for part in _chunks(np.arange(len(theta))):
+            prediction, noise = self.predict(theta[part]), self.split(theta[part])[1]
+            for column, chain in enumerate(chains):
+                out[part, column] = log_likelihood(chain, prediction, noise)
+        return out
+
+    def named(self, theta: ArrayLike) -> dict[str, float]:
+        """One SI vector (D,) as a mapping."""
+        return {name: float(v) for name, v in zip(self.names, np.asarray(theta), strict=True)}
+
+    def vector(self, theta: Mapping[str, float]) -> Array:
+        """A mapping of all parameters to SI values as a vector (D,) in sampling coordinates."""
+        missing = [name for name in self.names if name not in theta]
+        if missing:
+            raise InputError("theta", f"no {', '.join(missing)}", f"all of {', '.join(self.names)}")
+        return self.to_sampling([theta[name] for name in self.names])
+
+    @cached_property
+    def identity(self) -> dict[str, str]:
+        """What this posterior was made from, as hashes: a chain goes on only with the same ones."""
+        b = self.binned
+        arrays = (b.edges_s, b.force_n, b.variance_n2, b.correlation, b.phase)
+        return {
+            "parameters": _sha256(repr(self.space)),
+            "surrogate": _sha256(
+                json.dumps(dict(self.surrogate.provenance), sort_keys=True, default=str),
+                *self._probe(),
+            ),
+            "recording": _sha256(repr(b.phases), *(np.ascontiguousarray(a).tobytes() for a in arrays)),
+            "fit windows": _sha256(repr(self.fit_windows)),
+        }
+
+    def _probe(self) -> tuple[str, ...]:
+        # Provenance may miss what changed (a patched file): the prediction itself does not. Five digits,
+        # because the order of sums differs between machines.
+        unit = np.array([[0.5], [0.31], [0.69]]) * np.ones(self.surrogate.space.dim)
+        prediction = self.surrogate.predict(self.surrogate.space.from_unit(unit))
+        numbers = (prediction.mean.mean(1), prediction.mean.std(1), prediction.sd().mean(1))
+        return tuple(f"{value:.5g}" for row in numbers for value in row)
+
+
+def _chunks(index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    return [index[a : a + _CHUNK] for a in range(0, len(index), _CHUNK)]
+
+
+def _check_inside(material: ParameterSpace, box: ParameterSpace) -> None:
+    if material.names != box.names:
+        raise InputError(
+            "priors", ", ".join(material.names), f"those of the surrogate: {', '.join(box.names)}"
+        )
+    for ours, theirs in zip(material.parameters, box.parameters, strict=True):
+        if ours.lower < theirs.lower or ours.upper > theirs.upper or not ours.lower < ours.upper:
+            raise InputError(
+                f"prior of {ours.name}", f"{ours.lower:g}..{ours.upper:g} {ours.unit}",
+                f"a part of the surrogate's box, {theirs.lower:g}..{theirs.upper:g}",
+            )  # fmt: skip
+
+
+def _sha256(*parts: str | bytes) -> str:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part if isinstance(part, bytes) else part.encode())
+        digest.update(b"\0")
+    return digest.hexdigest()

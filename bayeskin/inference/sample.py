@@ -1,0 +1,207 @@
+"""Posterior draws from independent ensembles, which go on where they stopped and stop by themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import emcee
+import numpy as np
+
+from bayeskin.errors import InputError
+from bayeskin.inference import chains as store
+from bayeskin.inference.convergence import Convergence, Limits, assess
+from bayeskin.inference.moves import SnookerMove
+from bayeskin.inference.problem import LogPosterior
+from bayeskin.types import Array, ParameterSpace, _FreezesArrays
+
+_FIRST_CHECK = 500
+_REFRESH = 100  # steps between two words of progress
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class SampleSettings:
+    """Independent ensembles, walkers in each, and when to stop."""
+
+    ensembles: int = 4
+    walkers: int = 40
+    max_steps: int = 20000
+    limits: Limits = field(default_factory=Limits)
+
+
+@dataclass(frozen=True)
+class Posterior(_FreezesArrays):
+    """Draws after burn-in, thinned by the autocorrelation time: each is worth about one sample.
+
+    draws (E, n, D) in SI, columns of `space`, steps in order with an ensemble's walkers side by side;
+    log_prob (E, n). `convergence.verdict` says whether to trust them.
+    """
+
+    space: ParameterSpace
+    draws: Array
+    log_prob: Array
+    convergence: Convergence
+    seed: int
+
+    @property
+    def flat(self) -> Array:
+        """All draws, (E n, D)."""
+        return self.draws.reshape(-1, self.draws.shape[-1])
+
+
+def sample(
+    log_posterior: LogPosterior,
+    folder: Path | str,
+    seed: int,
+    start: Mapping[str, float],
+    settings: SampleSettings | None = None,
+    progress: Progress | None = None,
+) -> Posterior:
+    """Runs ensembles from around `start` (the MAP, SI by name) until the verdict is trust, or to max_steps.
+
+    `folder` keeps one file an ensemble, ``ensemble_0.h5`` ..., in emcee's own HDF5 form with its random
+    state, each replaced as a whole after every stretch. An interrupted run goes on from there and gives
+    the draws that an uninterrupted one gives. Raises InputError when the files there belong to another
+    posterior, seed or number of walkers; they stay as they are.
+    """
+    settings = settings or SampleSettings()
+    _check(settings, log_posterior.dim)
+    origin = log_posterior.vector(start)
+    files = [Path(folder) / f"ensemble_{e}.h5" for e in range(settings.ensembles)]
+    identity = {**log_posterior.identity, "seed": str(seed), "walkers": str(settings.walkers)}
+    backends = [store.load(f, log_posterior.names, identity) if f.exists() else None for f in files]
+    seeds = np.random.SeedSequence(seed).spawn(settings.ensembles)
+    convergence: Convergence | None = None
+    runs = [
+        _Ensemble(
+            log_posterior, settings.walkers, s, origin if e == 0 else _elsewhere(log_posterior, origin, s), b
+        )
+        for e, (s, b) in enumerate(zip(seeds, backends, strict=True))
+    ]
+    goal = 0
+    while True:
+        goal = _next_check(goal, settings.max_steps)
+        for e, run in enumerate(runs):
+            for at in run.advance(goal):
+                _tell(
+                    progress, convergence, settings, f"ensemble {e + 1} of {len(runs)}, step {at} of {goal}"
+                )
+            if run.changed:
+                store.save(files[e], run.backend, log_posterior.names, identity)
+                run.changed = False
+        chains = np.stack([r.backend.chain[:goal] for r in runs])
+        log_prob = np.stack([r.backend.log_prob[:goal] for r in runs])
+        convergence = assess(chains, log_prob, log_posterior.names, settings.limits)
+        _tell(progress, convergence, settings, convergence.verdict.reasons[0])
+        if convergence.verdict.trusted or goal >= settings.max_steps:
+            return _posterior(log_posterior, chains, log_prob, convergence, seed)
+
+
+def load_chains(folder: Path | str, log_posterior: LogPosterior) -> Array:
+    """Whole chains (E, n, W, D) in SI that `sample` left in `folder`, to their common length."""
+    files = sorted(Path(folder).glob("ensemble_*.h5"), key=lambda f: int(f.stem.split("_")[1]))
+    if not files:
+        raise InputError(folder, "no chains", "files ensemble_0.h5, ...")
+    parts = [store.load(f, log_posterior.names, log_posterior.identity).chain for f in files]
+    steps = min(len(p) for p in parts)
+    return log_posterior.from_sampling(np.stack([p[:steps] for p in parts]))
+
+
+class _Ensemble:
+    """One ensemble and its chain in memory."""
+
+    def __init__(
+        self, log_posterior: LogPosterior, walkers: int, seed: np.random.SeedSequence,
+        origin: Array, backend: emcee.backends.Backend | None,
+    ) -> None:  # fmt: skip
+        self.changed = False
+        if backend is None:
+            backend = emcee.backends.Backend()
+            backend.reset(walkers, log_posterior.dim)
+            coords = initial_walkers(log_posterior, origin, walkers, np.random.default_rng(seed))
+            generator = np.random.RandomState(seed.generate_state(8))
+            self.state = emcee.State(coords, random_state=generator.get_state())
+        else:
+            self.state = backend.get_last_sample()
+        self.backend = backend
+        moves = [(emcee.moves.StretchMove(), 0.2), (emcee.moves.DEMove(), 0.6), (SnookerMove(), 0.2)]
+        self.sampler = emcee.EnsembleSampler(
+            walkers, log_posterior.dim, log_posterior.log_prob, moves=moves, backend=backend, vectorize=True
+        )
+
+    def advance(self, goal: int) -> Iterator[int]:
+        """Steps to `goal`, if not there yet; yields the step now and then."""
+        missing = goal - self.backend.iteration
+        if missing <= 0:
+            return
+        self.changed = True
+        for state in self.sampler.sample(self.state, iterations=missing, skip_initial_state_check=True):
+            self.state = state
+            if self.backend.iteration % _REFRESH == 0:
+                yield self.backend.iteration
+
+
+def initial_walkers(
+    log_posterior: LogPosterior, origin: Array, walkers: int, rng: np.random.Generator
+) -> Array:
+    """Walkers (W, D) strewn between `origin` (sampling coordinates) and draws of the prior.
+
+    Each lies a random share of the way, so that the ensemble spans both and is over-dispersed. Points
+    without a density are drawn again. Raises InputError when the density vanishes nearly everywhere.
+    """
+    low, high = log_posterior.bounds
+    out = np.empty((0, log_posterior.dim))
+    for _ in range(100):
+        share = rng.uniform(0.02, 1.0, (walkers, 1))
+        trial = origin + share * (rng.uniform(low, high, (walkers, len(low))) - origin)
+        out = np.concatenate([out, trial[np.isfinite(log_posterior.log_prob(trial))]])
+        if len(out) >= walkers:
+            return out[:walkers]
+    raise InputError(
+        "start", "no density at nearly all points of the prior", "a surrogate with finite values"
+    )
+
+
+def _elsewhere(log_posterior: LogPosterior, origin: Array, seed: np.random.SeedSequence) -> Array:
+    """Halfway to a point of the prior: ensembles that all set out from one place could not disagree."""
+    low, high = log_posterior.bounds
+    return 0.5 * (origin + np.random.default_rng([1, *seed.generate_state(4)]).uniform(low, high))
+
+
+def _next_check(steps: int, max_steps: int) -> int:
+    # Fixed by the step count alone, so that an interruption cannot move the point where a run stops.
+    return min(max(_FIRST_CHECK, steps + max(_FIRST_CHECK // 2, steps // 5)), max_steps)
+
+
+def _check(settings: SampleSettings, dim: int) -> None:
+    if settings.walkers < 2 * dim + 2:
+        raise InputError(
+            "sample.walkers",
+            settings.walkers,
+            f"at least {2 * dim + 2}, twice the {dim} parameters and 2 more",
+        )
+    if settings.ensembles < 1 or settings.max_steps < 10:
+        raise InputError(
+            "sample", f"{settings.ensembles} ensembles, {settings.max_steps} steps", "1 and 10 at least"
+        )
+
+
+def _tell(progress: Progress | None, state: Convergence | None, settings: SampleSettings, text: str) -> None:
+    if progress:
+        progress(state.progress(settings.limits) if state else 0.0, text)
+
+
+def _posterior(
+    log_posterior: LogPosterior, chains: Array, log_prob: Array, convergence: Convergence, seed: int
+) -> Posterior:
+    kept = slice(convergence.burn_in, None, convergence.thin)
+    ensembles, _, _, dim = chains.shape
+    return Posterior(
+        space=log_posterior.space,
+        draws=log_posterior.from_sampling(chains[:, kept].reshape(ensembles, -1, dim)),
+        log_prob=log_prob[:, kept].reshape(ensembles, -1),
+        convergence=convergence,
+        seed=seed,
+    )
