@@ -90,7 +90,7 @@ def load_surrogate(path: Path | str) -> ShapeSurrogate:
                 storage.read(handle["transform"], ShapeTransform, path), latents,
                 json.loads(handle.attrs["provenance"]),
             )  # fmt: skip
-    except (OSError, KeyError, RuntimeError) as error:
+    except (OSError, KeyError, RuntimeError, json.JSONDecodeError) as error:
         raise InputError(path, f"not readable as one ({error})".replace("\n", " "), expected) from None
 
 

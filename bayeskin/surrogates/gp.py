@@ -1,10 +1,6 @@
 """Gaussian processes, one a latent: a polynomial trend, a kernel of a linear map of the inputs, a nugget.
 
-The kernel sees ``|W (x - x')|`` with a full matrix W, because the force of a layered solid depends on
-products and ratios of its parameters, which are oblique directions of a log-scaled box. Hyperparameters
-maximise the restricted likelihood (the trend's coefficients and the variance integrated out), with a
-weak normal prior on W's off-diagonal. Rasmussen & Williams (2006), ch. 2.7 and 5.4; leave-one-out in
-closed form: Dubrule (1983), Math. Geology 15, 687.
+Universal kriging: Rasmussen & Williams (2006), ch. 2.7.
 """
 
 from __future__ import annotations
@@ -15,198 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 from scipy.linalg.blas import dtrmm
-from scipy.linalg.lapack import dpotrf, dpotri, dtrtri
-from scipy.optimize import minimize
+from scipy.linalg.lapack import dtrtri
 
+from bayeskin.surrogates.hyperparameters import SMALLEST_NUGGET, LatentFit
+from bayeskin.surrogates.kernels import kernel, squared_distances, trend_basis, trend_degree
 from bayeskin.types import Array, _FreezesArrays
 
-KERNELS = ("matern52", "gaussian")
-SMALLEST_NUGGET = 1e-8  # of the kernel's variance: keeps the factorisation accurate to 1e-6
-LENGTHS = (0.05, 50.0)  # of the box's width
-ROWS_TO_FIT = 320  # more rows sharpen the conditioning, hardly the hyperparameters, at cubic cost
-DIAGONAL_WIDTH, OBLIQUE_WIDTH = 3.0, 0.25  # prior standard deviations of W's entries
-ALIGNED_STEPS, OBLIQUE_STEPS = 15, 40
-FOLDS = 3
-FOLD_WORK = 640  # rows times search steps of a fold: few rows mislead the search more, and cost less
-NORMAL_90 = 1.6448536269514722  # 90 % of a standard normal lies within
 CHUNK = 256  # points whose kernel rows stay in the cache
-
-
-def trend_basis(unit: Array, degree: int) -> Array:
-    """Monomials up to `degree` (0, 1 or 2) of ``2 unit - 1``, (n, p)."""
-    x = 2.0 * unit - 1.0
-    columns = [np.ones((len(x), 1))]
-    if degree >= 1:
-        columns.append(x)
-    if degree >= 2:
-        left, right = np.triu_indices(x.shape[1])
-        columns.append(x[:, left] * x[:, right])
-    return np.hstack(columns)
-
-
-def trend_degree(rows: int, dim: int) -> int:
-    """The richest trend that leaves at least three rows a coefficient."""
-    sizes = (1, 1 + dim, (dim + 1) * (dim + 2) // 2)
-    return max([degree for degree, size in enumerate(sizes) if rows >= 3 * size], default=0)
-
-
-def kernel(name: str, squared: Array) -> tuple[Array, Array]:
-    """Kernel and its derivative by the squared distance, at squared distances of any shape."""
-    if name == "gaussian":
-        value = np.exp(-0.5 * squared)
-        return value, -0.5 * value
-    root = np.sqrt(5.0 * squared)
-    decay = np.exp(-root)
-    return (1.0 + root + (5.0 / 3.0) * squared) * decay, (-5.0 / 6.0) * (1.0 + root) * decay
-
-
-def squared_distances(left: Array, right: Array) -> Array:
-    """|left_i - right_j|^2, (n, k)."""
-    squared = left @ right.T
-    squared *= -2.0
-    squared += np.einsum("ij,ij->i", left, left)[:, None]
-    squared += np.einsum("ij,ij->i", right, right)
-    return np.maximum(squared, 0.0, out=squared)
-
-
-class LatentFit(NamedTuple):
-    """Hyperparameters of one latent, and what cross-validation says of them.
-
-    error: mean squared error of rows whose hyperparameters were fitted without them; inflation: ratio of
-    that error's 90 % quantile to what the predicted variance promises.
-    """
-
-    kernel: str
-    linear_map: Array  # (d, d), lower triangular
-    nugget: float
-    error: float
-    inflation: float
-
-
-class _Data(NamedTuple):
-    """inputs (n, d) centred on the cube, trend basis (n, p), target (n,) of unit variance."""
-
-    inputs: Array
-    basis: Array
-    target: Array
-
-    def rows(self, chosen: NDArray[np.bool_]) -> _Data:
-        return _Data(self.inputs[chosen], self.basis[chosen], self.target[chosen])
-
-
-class _Likelihood(NamedTuple):
-    value: float
-    by_map: Array
-    by_log_nugget: float
-    residual: Array  # (n,) leave-one-out residuals
-    spread: Array  # (n,) their standard deviations over the process's
-    variance: float
-
-
-def _likelihood(name: str, linear_map: Array, nugget: float, data: _Data) -> _Likelihood:
-    """Negative restricted log-likelihood, variance profiled out, and its gradient by W and log nugget."""
-    inputs, basis, target = data
-    n, p = basis.shape
-    mapped = inputs @ linear_map.T
-    squared = squared_distances(mapped, mapped)
-    np.fill_diagonal(squared, 0.0)
-    covariance, slope = kernel(name, squared)
-    covariance.flat[:: n + 1] += nugget
-    lower, info = dpotrf(covariance.T, lower=1, clean=1, overwrite_a=1)
-    if info:
-        raise np.linalg.LinAlgError(f"kernel matrix is not positive definite (row {info})")
-    log_root = np.log(np.diag(lower)).sum()
-    triangle, _ = dpotri(lower, lower=1, overwrite_c=1)
-    inverse = triangle + triangle.T
-    inverse.flat[:: n + 1] *= 0.5
-    weighted = inverse @ basis
-    gram = np.linalg.cholesky(basis.T @ weighted)
-    half = solve_triangular(gram, weighted.T, lower=True)
-    projected = inverse - half.T @ half  # K^-1 - K^-1 H (H^T K^-1 H)^-1 H^T K^-1
-    q = projected @ target
-    variance = max(float(target @ q) / (n - p), 1e-300)
-    value = 0.5 * (n - p) * np.log(variance) + log_root + np.log(np.diag(gram)).sum()
-    diagonal = np.diag(projected)
-    trace = float(diagonal.sum() - q @ q / variance)
-    pull = (projected - np.outer(q / variance, q)) * slope
-    # sum_ij pull_ij (x_i - x_j)(x_i - x_j)^T without forming the differences
-    spread = 2.0 * (inputs.T @ (pull.sum(axis=1)[:, None] * inputs) - inputs.T @ pull @ inputs)
-    return _Likelihood(
-        float(value), linear_map @ spread, 0.5 * nugget * trace, q / diagonal, diagonal**-0.5, variance
-    )
-
-
-def _search(
-    name: str, data: _Data, free: NDArray[np.bool_], start: tuple[Array, float], iterations: int
-) -> tuple[Array, float]:
-    """Linear map, entries `free` (d, d) searched, and nugget of the most probable hyperparameters."""
-    dim = len(free)
-    eye = np.eye(dim, dtype=bool)
-    width = np.where(eye, DIAGONAL_WIDTH, OBLIQUE_WIDTH)[free]
-
-    def objective(x: Array) -> tuple[float, Array]:
-        linear_map = np.zeros((dim, dim))
-        linear_map[free] = x[:-1]
-        at = _likelihood(name, linear_map, float(np.exp(x[-1])), data)
-        prior = 0.5 * float(np.sum((x[:-1] / width) ** 2))
-        return at.value + prior, np.append(at.by_map[free] + x[:-1] / width**2, at.by_log_nugget)
-
-    lowest = np.where(eye, 1.0 / LENGTHS[1], -1.0 / LENGTHS[0])[free]
-    bounds = [(low, 1.0 / LENGTHS[0]) for low in lowest] + [(np.log(SMALLEST_NUGGET), 0.0)]
-    x = minimize(
-        objective,
-        np.append(start[0][free], np.log(start[1])),
-        jac=True,
-        method="L-BFGS-B",
-        bounds=bounds,
-        options={"maxiter": iterations},
-    ).x
-    linear_map = np.zeros((dim, dim))
-    linear_map[free] = x[:-1]
-    return linear_map, float(np.exp(x[-1]))
-
-
-def fit_latent(unit: Array, target: Array) -> LatentFit:
-    """Fits one latent (n,) at unit-cube points (n, d), the form of the kernel chosen by cross-validation."""
-    dim = unit.shape[1]
-    stride = -(-len(unit) // ROWS_TO_FIT)
-    unit, target = unit[::stride], target[::stride]
-    deviation = float(target.std())
-    if deviation <= 1e-12 * max(abs(float(target.mean())), 1e-300):
-        return LatentFit("gaussian", np.eye(dim), 1.0, 0.0, 1.0)
-    basis = trend_basis(unit, trend_degree(len(unit), dim))
-    data = _Data(unit - 0.5, basis, (target - target.mean()) / deviation)
-    fits = []
-    for name in KERNELS:
-        # axis-aligned lengths first, the oblique map from there: the second search is not convex
-        at = _search(name, data, np.eye(dim, dtype=bool), (np.eye(dim), 1e-4), ALIGNED_STEPS)
-        at = _search(name, data, np.tri(dim, dtype=bool), at, OBLIQUE_STEPS)
-        fits.append(_cross_validate(name, data, np.tri(dim, dtype=bool), at))
-    best = min(fits, key=lambda fit: fit.error)
-    return best._replace(error=best.error * deviation**2)
-
-
-def _cross_validate(name: str, data: _Data, free: NDArray[np.bool_], at: tuple[Array, float]) -> LatentFit:
-    """Leave-one-out errors with hyperparameters refitted, from `at` on, without the row's fold.
-
-    With the hyperparameters of all rows the closed form is too hopeful by up to a factor of two to four
-    in the standard deviation when rows are few.
-    """
-    fold = np.arange(len(data.target)) % FOLDS
-    steps = min(max(FOLD_WORK // len(fold), 5), 20)
-    residual, ratio = np.empty(len(fold)), np.empty(len(fold))
-    for k in range(FOLDS):
-        kept = data.rows(fold != k)
-        linear_map, nugget = _search(name, kept, free, at, steps)
-        variance = _likelihood(name, linear_map, nugget, kept).variance
-        all_rows = _likelihood(name, linear_map, nugget, data)
-        out = fold == k
-        residual[out] = all_rows.residual[out]
-        ratio[out] = residual[out] / (all_rows.spread[out] * np.sqrt(variance))
-    inflation = float(np.quantile(np.abs(ratio), 0.9)) / NORMAL_90
-    return LatentFit(name, at[0], at[1], float(np.mean(residual**2)), inflation)
 
 
 class _Conditioned(NamedTuple):

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from bayeskin import __version__
 from bayeskin.errors import InputError
 from bayeskin.surrogates.chaos import LatentChaos, SparseFit, fit_sparse
-from bayeskin.surrogates.gp import LatentFit, LatentGPs, fit_latent
+from bayeskin.surrogates.gp import LatentGPs
+from bayeskin.surrogates.hyperparameters import LatentFit, fit_latent
 from bayeskin.surrogates.shapes import ShapeTransform, all_components, split
 from bayeskin.surrogates.surrogate import Latents, ShapeSurrogate
 from bayeskin.surrogates.validate import Validation, compare, validate
