@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import bayeskin
 from bayeskin.errors import InputError
@@ -27,7 +27,12 @@ class Terminal:
 
     def __init__(self) -> None:
         self.console = Console(stderr=True, highlight=False)
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[note]}"),
+        )
         self.bars = Progress(
             *columns, console=self.console, transient=True, disable=not self.console.is_terminal
         )
@@ -43,10 +48,10 @@ class Terminal:
     def log(self, message: str) -> None:
         self.console.print(message, markup=False)
 
-    def progress(self, label: str, done: float, total: float) -> None:
+    def progress(self, label: str, share: float, note: str = "") -> None:
         if label not in self.tasks:
-            self.tasks[label] = self.bars.add_task(label, total=total)
-        self.bars.update(self.tasks[label], completed=done, total=total, visible=done < total)
+            self.tasks[label] = self.bars.add_task(label, total=1.0, note=note)
+        self.bars.update(self.tasks[label], completed=share, note=note, visible=share < 1.0)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})

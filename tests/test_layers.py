@@ -18,8 +18,9 @@ BELOW = {
     "shipped": {"errors"},
     "workers": {"errors"},
     **dict.fromkeys(SIBLINGS, BASE),
+    "journal": BASE,
     "config": BASE | {"design"},
-    "runner": BASE | SIBLINGS,
+    "runner": BASE | SIBLINGS | {"journal"},
     "inference": BASE,  # a Surrogate is all that these two know of a model
     "sensitivity": BASE,
     "report": BASE | {"recordings", "inference", "sensitivity"},

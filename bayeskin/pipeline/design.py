@@ -1,4 +1,4 @@
-"""Second stage: full runs, wave by wave, each wave drawn where the last surrogate cannot rule the force out."""
+"""Second stage: full runs in waves, each drawn where the last surrogate cannot rule the force out."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayeskin import report, storage
 from bayeskin.config import parameter_space
 from bayeskin.design import Wave, first_wave, next_wave
-from bayeskin.errors import InputError
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.model.simulate import simulate
-from bayeskin.pipeline.engine import Run, Stage
+from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
 from bayeskin.pipeline.folder import sha256_of, write_json
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
@@ -30,17 +30,17 @@ from bayeskin.types import Array, BinnedForce, Design, PadMotion, ParameterSpace
 FEWEST_PER_PARAMETER = 4  # training runs below which no surrogate of a parameter space is worth its name
 
 
-def fitted_bins(run: Run, binned: BinnedForce) -> Array:
+def fitted_bins(run: Run, binned: BinnedForce) -> NDArray[np.bool_]:
     """Which bins enter the fit, (m,) bool."""
     return bins_in_windows(binned, run.config.fit.windows_s) >= 0
 
 
-def noise_floor_n(binned: BinnedForce, fitted: Array) -> float:
+def noise_floor_n(binned: BinnedForce, fitted: NDArray[np.bool_]) -> float:
     """RMS [N] of what noise leaves in the fitted bins' means."""
     return float(np.sqrt(np.mean(binned.variance_n2[fitted])))
 
 
-def focus(design: Design, binned: BinnedForce, fitted: Array) -> Array:
+def focus(design: Design, binned: BinnedForce, fitted: NDArray[np.bool_]) -> Array:
     """Weights (n,) by which a surrogate is made best where the posterior can be.
 
     The inverse of a run's mean square distance to the recording, which noise keeps from zero.
@@ -81,9 +81,14 @@ def _run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design
         run.reporter.log(f"{label}: {len(waves[-1].theta)} full runs")
         run_design(
             runs_file, waves[-1], binned.edges_s, partial(simulate, spec, motion), spec.hash, config.workers,
-            lambda done, total, failed, eta_s, label=label: run.reporter.progress(label, done, total),
+            partial(_tell, run, label),
         )  # fmt: skip
     return _rows_of(load_design(runs_file), waves), [wave.record for wave in waves]
+
+
+def _tell(run: Run, label: str, done: int, total: int, failed: int, eta_s: float) -> None:
+    left = f", {eta_s / 60:.0f} min left" if np.isfinite(eta_s) else ""
+    run.reporter.progress(label, done / max(total, 1), f"{done} of {total} runs, {failed} failed{left}")
 
 
 def _draw_wave(
@@ -132,14 +137,14 @@ def _rows_of(runs: Design, waves: Sequence[Wave]) -> Design:
 
 
 def enough(design: Design) -> Design:
-    """The design, if a surrogate can be made of it; raises InputError that names the commonest failure."""
+    """The design, if a surrogate can be made of it; raises CannotGoOn that names the commonest failure."""
     needed = FEWEST_PER_PARAMETER * design.space.dim
     found = int(design.training.sum())
     if found >= needed and design.testing.any():
         return design
     failures = Counter(text for text, ok in zip(design.messages, design.ok, strict=True) if not ok)
     why = f"; most often: {failures.most_common(1)[0][0]}" if failures else ""
-    raise InputError("design", f"{found} training runs that succeeded{why}", f"at least {needed}")
+    raise CannotGoOn(f"{found} training runs succeeded of at least {needed}{why}; narrow the prior box")
 
 
 def _summary(design: Design, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

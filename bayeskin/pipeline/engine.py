@@ -20,7 +20,7 @@ class Reporter(Protocol):
 
     def log(self, message: str) -> None: ...
 
-    def progress(self, label: str, done: float, total: float) -> None: ...
+    def progress(self, label: str, share: float, note: str = "") -> None: ...
 
 
 class Silent:
@@ -28,7 +28,11 @@ class Silent:
 
     def log(self, message: str) -> None: ...
 
-    def progress(self, label: str, done: float, total: float) -> None: ...
+    def progress(self, label: str, share: float, note: str = "") -> None: ...
+
+
+class CannotGoOn(Exception):
+    """A stage whose computation failed: why, and what to do. The engine makes an Outcome of it."""
 
 
 @dataclass(frozen=True)
@@ -74,11 +78,19 @@ class Stage:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a stage ended: its record, and whether it had been done before."""
+    """How a stage ended: its record, and whether it had been done before.
+
+    ``record.done`` is False when the computation failed; ``record.summary["message"]`` then says why.
+    """
 
     stage: str
     skipped: bool
     record: Record
+
+    @property
+    def ok(self) -> bool:
+        """Whether the stage was done and says of itself that its answer can be relied on."""
+        return self.record.done and bool(self.record.summary.get("ok", True))
 
 
 def open_run(config_path: Path, reporter: Reporter, folder: Path | None = None) -> Run:
@@ -90,12 +102,19 @@ def open_run(config_path: Path, reporter: Reporter, folder: Path | None = None) 
 def run_stages(run: Run, stages: Mapping[str, Stage], last: str | None = None) -> list[Outcome]:
     """Runs the stages that `last` needs, in order, and itself; all of them when `last` is None.
 
-    Raises InputError for bad input, or when another process works in the run's folder. An interruption
-    leaves each stage's folder such that the same call goes on from there.
+    Ends with the stage that failed, if one does. An interruption leaves each stage's folder such that the
+    same call goes on from there. Raises InputError for bad input, or when another process works in the
+    run's folder.
     """
     wanted = _needed(stages, last)
+    outcomes: list[Outcome] = []
     with folder.locked(run.folder):
-        return [_run_stage(run, stage) for name, stage in stages.items() if name in wanted]
+        for name, stage in stages.items():
+            if name in wanted:
+                outcomes.append(_run_stage(run, stage))
+                if not outcomes[-1].record.done:
+                    break
+    return outcomes
 
 
 def _needed(stages: Mapping[str, Stage], last: str | None) -> set[str]:
@@ -125,19 +144,28 @@ def _run_stage(run: Run, stage: Stage) -> Outcome:
         return Outcome(stage.name, True, record)
     run.reporter.log(f"{stage.name}: {stage.does}")
     spent, started = folder.begin(where, inputs), time.perf_counter()
+    summary: Mapping[str, Any] = {}
+    done = False
     try:
         summary = stage.work(run)
-    except BaseException:
-        seconds = spent + time.perf_counter() - started
-        folder.write_record(where, Record(inputs, done=False, seconds=seconds))
-        raise
-    seconds = spent + time.perf_counter() - started
-    provenance = {
-        "version": bayeskin.__version__,
-        "config_sha256": run.config.sha256,
-        "seed": run.config.seed,
-    }
-    record = Record(inputs, True, seconds, folder.output_hashes(where), folder.plain(summary), provenance)
-    folder.write_record(where, record)
-    run.reporter.log(f"{stage.name}: {seconds:.1f} s")
+        done = True
+    except CannotGoOn as failure:
+        summary = {"ok": False, "message": str(failure)}
+        run.reporter.log(f"{stage.name}: failed: {failure}")
+    finally:
+        record = Record(
+            inputs_sha256=inputs,
+            done=done,
+            seconds=spent + time.perf_counter() - started,
+            outputs=folder.output_hashes(where) if done else {},
+            summary=folder.plain(summary),
+            provenance=_provenance(run),
+        )
+        folder.write_record(where, record)
+    run.reporter.log(f"{stage.name}: {record.seconds:.1f} s")
     return Outcome(stage.name, False, record)
+
+
+def _provenance(run: Run) -> dict[str, Any]:
+    config = run.config
+    return {"version": bayeskin.__version__, "config_sha256": config.sha256, "seed": config.seed}

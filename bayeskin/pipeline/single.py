@@ -58,7 +58,7 @@ def simulate_once(
     source = read_recording(recording or run.beside(run.config.recording.file))
     motion = pad_motion(spec.observation, source, segment(source), run.config.recording.protocol)
     reporter.log(f"simulating {motion.time_s[-1]:.1f} s, {spec.observation} on {Path(spec.mesh).name}")
-    simulation = simulate(spec, motion, theta, lambda done: reporter.progress("simulation", done, 1.0))
+    simulation = simulate(spec, motion, theta, lambda share: reporter.progress("simulation", share))
     if simulation.status == "ok":
         write_simulation(out, simulation)
     return _answer(simulation, spec, out)

@@ -1,0 +1,137 @@
+"""Fourth stage: the most probable point, checked by the full model until the surrogate is right there."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayeskin import inference, report, storage
+from bayeskin.inference import MapCheck, RefinedMap
+from bayeskin.model.simulate import simulate
+from bayeskin.pipeline.calibration import log_posterior_of, rmse_table
+from bayeskin.pipeline.engine import Run, Stage
+from bayeskin.pipeline.model import model_spec
+from bayeskin.pipeline.provenance import caption
+from bayeskin.pipeline.training import trained
+from bayeskin.surrogates import load_manifest, load_surrogate, manifest_of, save_surrogate
+from bayeskin.types import Array, BinnedForce, Design, PadMotion, Simulation, Surrogate
+
+
+class _FullModel:
+    """Full runs for the check, kept, so that an interrupted search does not make one twice."""
+
+    def __init__(self, run: Run) -> None:
+        self.run, self.spec = run, model_spec(run)
+        self.motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+        self.count = 0
+
+    def __call__(self, theta: Mapping[str, float]) -> Simulation:
+        kept = self.run.at("map", f"full-run-{self.count}.h5")
+        self.count += 1
+        if kept.is_file():
+            stored = storage.load(kept, Simulation)
+            if dict(stored.theta) == dict(theta):
+                return stored
+        self.run.reporter.log("map: full run at " + ", ".join(f"{k} = {v:.4g}" for k, v in theta.items()))
+        label = f"full run {self.count}"
+        tell = self.run.reporter.progress
+        simulation = simulate(self.spec, self.motion, theta, lambda share: tell(label, share))
+        storage.save(kept, simulation)
+        return simulation
+
+
+class _Retraining:
+    """The design with each checked point in it, and the surrogate trained again."""
+
+    def __init__(self, run: Run, design: Design, binned: BinnedForce) -> None:
+        self.run, self.design, self.binned = run, design, binned
+        self.surrogate = load_surrogate(run.at("train", "surrogate.h5"))
+        self.manifest = load_manifest(run.at("train", "surrogate.h5"))
+
+    def __call__(self, theta: Mapping[str, float], simulation: Simulation) -> Surrogate:
+        self.run.reporter.log("map: the surrogate was off there; the point joins the design")
+        self.design = _with_run(self.design, theta, simulation)
+        self.surrogate, validation = trained(self.run, self.design, self.binned)
+        self.manifest = {**self.manifest, **manifest_of(self.surrogate, validation)}
+        return self.surrogate
+
+
+def _with_run(design: Design, theta: Mapping[str, float], simulation: Simulation) -> Design:
+    """The design with one more training row, a wave of its own."""
+    row = np.array([[theta[name] for name in design.space.names]])
+    return dataclasses.replace(
+        design,
+        theta=np.concatenate([design.theta, row]),
+        force_n=np.concatenate([design.force_n, simulation.bin_means(design.edges_s)[None]]),
+        wave=np.append(design.wave, design.wave.max() + 1),
+        held_out=np.append(design.held_out, False),
+        ok=np.append(design.ok, True),
+        messages=(*design.messages, simulation.message),
+        seconds=np.append(design.seconds, simulation.stats["seconds"]),
+    )
+
+
+def _find(run: Run) -> Mapping[str, Any]:
+    config = run.config
+    binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
+    retraining = _Retraining(run, storage.load(run.at("design", "design.h5"), Design), binned)
+    refined = inference.refine_map(
+        log_posterior_of(run, retraining.surrogate, binned), _FullModel(run), retraining, config.seed,
+        config.map.starts, config.map.evaluations,
+    )  # fmt: skip
+    save_surrogate(run.at("map", "surrogate.h5"), retraining.surrogate, retraining.manifest)
+    storage.save(run.at("map", "design.h5"), retraining.design)
+    _draw_check(run, binned, refined)
+    return _found(refined, binned)
+
+
+def _found(refined: RefinedMap, binned: BinnedForce) -> dict[str, Any]:
+    best, check = refined.map, refined.checks[-1]
+    full = check.simulation.status == "ok"
+    return {
+        "ok": refined.passes,
+        "theta": dict(best.theta),
+        "log_posterior": best.value,
+        "agreement": best.agreement,
+        "message": best.message,
+        "checks": [_checked(one) for one in refined.checks],
+        "rmse_of_full_model": rmse_table(refined.log_posterior, _full_n(check, binned)) if full else None,
+    }
+
+
+def _checked(check: MapCheck) -> dict[str, Any]:
+    return {
+        "passes": check.passes,
+        "message": check.message,
+        "theta": dict(check.theta),
+        "rms_n": check.rms_n,
+        "max_n": check.max_n,
+        "rms_z": check.rms_z,
+        "mahalanobis": check.mahalanobis,
+        "seconds_of_full_run": check.simulation.stats["seconds"],
+    }
+
+
+def _full_n(check: MapCheck, binned: BinnedForce) -> Array:
+    return check.simulation.bin_means(binned.edges_s)
+
+
+def _draw_check(run: Run, binned: BinnedForce, refined: RefinedMap) -> None:
+    check, surrogate = refined.checks[-1], refined.log_posterior.surrogate
+    if check.simulation.status != "ok":
+        return
+    prediction = surrogate.predict(np.array([list(check.theta.values())]))
+    figure = report.figure_map_check(binned, _full_n(check, binned), prediction.mean[0], prediction.sd()[0])
+    report.save_figure(figure, run.at("map", "map_check"), caption(run))
+
+
+STAGE = Stage(
+    "map",
+    "finds the most probable point and checks it by the full model",
+    ("recording", "design", "train"),
+    ("seed", "map", "fit", "noise", "parameters", "model", "surrogate"),
+    _find,
+)

@@ -1,0 +1,146 @@
+"""Fifth stage: the posterior, its verdict, and what it predicts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import bayeskin
+from bayeskin import inference, report, storage
+from bayeskin.config import Config
+from bayeskin.inference import LogPosterior, Posterior
+from bayeskin.pipeline.calibration import refined_posterior, rmse_table
+from bayeskin.pipeline.engine import Run, Stage
+from bayeskin.pipeline.folder import sha256_of
+from bayeskin.pipeline.model import model_spec
+from bayeskin.pipeline.provenance import caption
+from bayeskin.types import Array, PadMotion, Provenance, Recording
+
+PREDICTIVE_DRAWS = 1000
+
+
+def _sample(run: Run) -> Mapping[str, Any]:
+    config = run.config
+    log_posterior, best = refined_posterior(run), run.summary("map")["theta"]
+    chains = _chains_folder(run, log_posterior)
+    posterior = inference.sample(
+        log_posterior, chains, config.seed, best, _settings(config), partial(_tell_sampling, run)
+    )
+    recording = storage.load(run.at("recording", "recording.h5"), Recording)
+    provenance = Provenance(
+        bayeskin.__version__, config.sha256, recording.sha256, model_spec(run).hash, config.seed,
+        {"surrogate": dict(log_posterior.surrogate.provenance)},
+    )  # fmt: skip
+    rng = np.random.default_rng([config.seed, 1])
+    idata = inference.to_inference_data(log_posterior, posterior, provenance, rng, PREDICTIVE_DRAWS)
+    inference.save_inference_data(run.at("sample", "posterior.nc"), idata)
+    drawn = inference.predictive_draws(log_posterior, _some(posterior), rng)
+    _draw_posterior(run, log_posterior, posterior, best, drawn)
+    return _sampled(log_posterior, posterior, drawn)
+
+
+def _chains_folder(run: Run, log_posterior: LogPosterior) -> Path:
+    """Where chains are kept by what they are of, so that a change of when to stop does not lose them."""
+    identity = {**log_posterior.identity, "seed": run.config.seed, "walkers": run.config.sample.walkers}
+    return run.folder / "chains" / sha256_of(identity)[:16]
+
+
+def _settings(config: Config) -> inference.SampleSettings:
+    limits = inference.Limits(effective_samples=float(config.sample.effective_samples))
+    return inference.SampleSettings(
+        config.sample.ensembles, config.sample.walkers, config.sample.max_steps, limits
+    )
+
+
+def _tell_sampling(run: Run, share: float, text: str) -> None:
+    run.reporter.progress("sampling", share, text)
+
+
+def _sampled(
+    log_posterior: LogPosterior, posterior: Posterior, drawn: inference.ForceDraws
+) -> dict[str, Any]:
+    c = posterior.convergence
+    bands = inference.bands_of(log_posterior.binned.time_s, drawn)
+    low, high = bands.interval(0.9)
+    learned = inference.identifiability(posterior.space, posterior.flat)
+    return {
+        "ok": c.verdict.trusted,
+        "verdict": "trusted" if c.verdict.trusted else "not trusted",
+        "reasons": list(c.verdict.reasons),
+        "steps": c.steps,
+        "draws": len(posterior.flat),
+        "parameters": _table(posterior),
+        "identifiability": [one.statement for one in learned.parameters],
+        "ridges": [one.statement for one in learned.ridges],
+        "rmse": rmse_table(log_posterior, bands.mean_n),
+        "coverage_90": inference.coverage(log_posterior.binned, low, high),
+        "coverage_90_fitted": inference.coverage(log_posterior.binned, low, high, log_posterior.fit_windows),
+        "rms_sd_n": {
+            part: float(np.sqrt(np.mean(getattr(bands, f"sd_{part}_n") ** 2)))
+            for part in ("parameter", "surrogate", "noise")
+        },
+    }
+
+
+def _some(posterior: Posterior) -> Array:
+    """Draws for predictions, evenly taken from all ensembles, (s, D)."""
+    flat = posterior.flat
+    return flat[np.linspace(0, len(flat) - 1, min(PREDICTIVE_DRAWS, len(flat))).astype(int)]
+
+
+def _table(posterior: Posterior) -> dict[str, dict[str, Any]]:
+    c, table = posterior.convergence, {}
+    for j, p in enumerate(posterior.space.parameters):
+        draws = posterior.flat[:, j]
+        low, median, high = np.quantile(draws, [0.05, 0.5, 0.95])
+        table[p.name] = {
+            "unit": p.unit, "mean": draws.mean(), "sd": draws.std(ddof=1), "median": median,
+            "low_90": low, "high_90": high, "ess": c.ess[j], "rhat": c.rhat[j],
+            "prior": {"kind": p.prior, "lower": p.lower, "upper": p.upper},
+        }  # fmt: skip
+    return table
+
+
+def _draw_posterior(
+    run: Run,
+    log_posterior: LogPosterior,
+    posterior: Posterior,
+    best: Mapping[str, float],
+    drawn: inference.ForceDraws,
+) -> None:
+    binned = log_posterior.binned
+    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    fitted = np.isin(np.arange(len(binned.force_n)), log_posterior.chain.bins)
+    convergence = posterior.convergence
+    whole = inference.load_chains(_chains_folder(run, log_posterior), log_posterior)
+    kept = whole[: run.config.sample.ensembles, convergence.burn_in : convergence.steps]
+    figures = {
+        "posterior": report.figure_posterior(posterior.space, posterior.flat, best),
+        "fit": report.figure_fit(
+            binned,
+            motion.at(binned.time_s),
+            fitted,
+            mean_n=drawn.mean_n,
+            surrogate_sd_n=drawn.surrogate_sd_n,
+            noise_sd_n=drawn.noise_sd_n,
+            force_n=drawn.force_n,
+        ),
+        "traces": report.figure_traces(
+            posterior.space, kept, convergence.verdict, _settings(run.config).limits
+        ),
+    }
+    for name, figure in figures.items():
+        report.save_figure(figure, run.at("sample", name), caption(run))
+
+
+STAGE = Stage(
+    "sample",
+    "samples the posterior",
+    ("recording", "map"),
+    ("seed", "sample", "fit", "noise", "parameters", "model"),
+    _sample,
+)

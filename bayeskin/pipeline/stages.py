@@ -1,0 +1,123 @@
+"""All stages in their order, what a run's summary says, and the answers of the commands that run them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bayeskin.pipeline import design, indices, maximum, posterior, recording, training
+from bayeskin.pipeline.engine import Outcome, Reporter, Run, Stage, open_run, run_stages
+from bayeskin.pipeline.folder import plain, read_record, write_json
+
+BEFORE_REPORT = (
+    recording.STAGE, design.STAGE, training.STAGE, maximum.STAGE, posterior.STAGE, indices.STAGE,
+)  # fmt: skip
+
+
+def _report(run: Run) -> Mapping[str, Any]:
+    """The answer of a run, for people and programs, from what its stages said."""
+    said = {stage.name: run.summary(stage.name) for stage in BEFORE_REPORT}
+    sampled, found = said["sample"], said["map"]
+    checked = found["checks"][-1]
+    doubts = [] if found["ok"] else [checked["message"]]
+    doubts += [] if sampled["ok"] else [sampled["reasons"][0]]
+    records = {stage.name: read_record(run.folder / stage.name) for stage in BEFORE_REPORT}
+    summary = {
+        "ok": not doubts,
+        "verdict": "not trusted" if doubts else "trusted",
+        "because": doubts or list(sampled["reasons"]),
+        "name": run.config.name,
+        "recording": {key: said["recording"][key] for key in ("name", "sha256", "samples", "duration_s")},
+        "model": {"observation": run.config.model.observation, "mesh": run.config.model.mesh},
+        "posterior": sampled["parameters"],
+        "identifiability": [*sampled["identifiability"], *sampled["ridges"]],
+        "map": {"theta": found["theta"], "message": found["message"], "surrogate_error": checked},
+        "rmse": {
+            "posterior_mean": sampled["rmse"],
+            "full_model_at_map": found["rmse_of_full_model"],
+        },
+        "coverage_90": {"whole": sampled["coverage_90"], "fitted": sampled["coverage_90_fitted"]},
+        "rms_sd_n": sampled["rms_sd_n"],
+        "sobol": said["sobol"],
+        "surrogate": said["train"],
+        "design": {key: said["design"][key] for key in ("runs", "failed", "seconds_of_runs")},
+        "seconds": {name: record.seconds for name, record in records.items() if record is not None},
+    }
+    write_json(run.at("report", "summary.json"), summary)
+    write_json(run.folder / "summary.json", summary)
+    return summary
+
+
+REPORT = Stage(
+    "report", "writes summary.json", tuple(stage.name for stage in BEFORE_REPORT), ("model",), _report
+)
+STAGES = {stage.name: stage for stage in (*BEFORE_REPORT, REPORT)}
+
+
+def run(
+    config: Path, last: str | None, reporter: Reporter, stages: Mapping[str, Stage] = STAGES
+) -> dict[str, Any]:
+    """Runs a configuration to the stage `last` (None: to the end) and gives the command's answer."""
+    opened = open_run(config, reporter)
+    outcomes = run_stages(opened, stages, last)
+    answer = outcomes[-1]
+    return plain(
+        {
+            **answer.record.summary,
+            "ok": answer.ok,
+            "stage": answer.stage,
+            "folder": opened.folder,
+            "skipped": [outcome.stage for outcome in outcomes if outcome.skipped],
+            "text": _in_words(answer, outcomes, opened.folder),
+        }
+    )
+
+
+def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str:
+    said = answer.record.summary
+    if not answer.record.done:
+        return f"{answer.stage}: failed: {said['message']}"
+    if answer.stage == "report":
+        return _summary_in_words(said, folder)
+    seconds = sum(outcome.record.seconds for outcome in outcomes)
+    head = f"{answer.stage}: done, {seconds:.1f} s to here"
+    lines = {
+        "design": lambda: f"{said['runs']} runs, {said['failed']} failed",
+        "train": lambda: (
+            f"{said['kind']}, relative error {said['relative_error']:.3g} ({said['error_source']})"
+        ),
+        "map": lambda: f"{said['message']}\n{said['checks'][-1]['message']}",
+        "sample": lambda: "\n".join([said["verdict"], *said["reasons"], *_table(said["parameters"])]),
+        "sobol": lambda: "\n".join(one["sentence"] for one in said.values()),
+    }
+    return f"{head}\n{lines[answer.stage]()}\noutputs in {folder / answer.stage}"
+
+
+def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
+    error = said["map"]["surrogate_error"]
+    rmse = said["rmse"]["full_model_at_map"] or said["rmse"]["posterior_mean"]
+    off = [f"{1e3 * rmse['whole_n']:.2f} mN over the whole recording"]
+    if rmse["not_fitted_n"] is not None:
+        off.append(
+            f"{1e3 * rmse['fitted_n']:.2f} mN where fitted, {1e3 * rmse['not_fitted_n']:.2f} mN elsewhere"
+        )
+    return "\n".join(
+        [
+            f"{said['name']}: {said['verdict']}: {'; '.join(said['because'])}",
+            *_table(said["posterior"]),
+            *said["identifiability"],
+            f"model at the most probable point: RMSE {', '.join(off)}",
+            error["message"],
+            f"outputs in {folder}, {sum(said['seconds'].values()):.0f} s in all",
+        ]
+    )
+
+
+def _table(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    rows = [("", "unit", "mean", "sd", "median", "5 %", "95 %")]
+    rows += [
+        (name, p["unit"], *(f"{p[key]:.4g}" for key in ("mean", "sd", "median", "low_90", "high_90")))
+        for name, p in parameters.items()
+    ]
+    return ["  ".join(f"{cell:>{10 if i else 9}}" for i, cell in enumerate(row)) for row in rows]

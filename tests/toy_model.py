@@ -1,0 +1,35 @@
+"""The toy behind the full model's own signature, importable by worker processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from toy import SPACE, toy_force
+
+from bayeskin.model.simulate import ModelSpec
+from bayeskin.types import PadMotion, Simulation, frozen_array
+
+
+SCALE = 1e-3  # the toy is a thousand times too stiff for a skin test
+
+
+def simulate(
+    spec: ModelSpec,
+    motion: PadMotion,
+    theta: Mapping[str, float],
+    on_progress: Callable[[float], None] | None = None,
+) -> Simulation:
+    time_s = np.unique(np.concatenate([np.linspace(0, motion.time_s[-1], 261), motion.time_s]))
+    row = np.array([[theta[name] for name in SPACE.names]])
+    return Simulation(
+        theta=dict(theta),
+        time_s=time_s,
+        displacement_m=motion.at(time_s),
+        force_n=SCALE * toy_force(row, time_s, motion)[0],
+        corner=frozen_array(np.isin(time_s, motion.time_s), bool),
+        status="ok",
+        message="",
+        stats={"seconds": 0.0, "steps": 261.0, "dofs": 1.0, "peak_force_n": 1.0},
+        model_hash=spec.hash,
+    )
