@@ -309,6 +309,15 @@ def test_a_damaged_journal_beside_a_design_is_run_again(tmp_path: Path, whole: D
 
 
 @pytest.mark.usefixtures("serial")
+def test_what_a_killed_process_was_writing_is_cleared_away(tmp_path: Path) -> None:
+    path = tmp_path / "design.h5"
+    for name in (".design.h5.staged", "..design.h5.staged.4711.partial", ".design.h5.journal.partial"):
+        (tmp_path / name).write_bytes(b"half a file")
+    run(path)
+    assert_one_file(path)
+
+
+@pytest.mark.usefixtures("serial")
 def test_one_process_at_a_time(tmp_path: Path) -> None:
     path = tmp_path / "design.h5"
     held = Journal(tmp_path / "design.h5.journal", "a", bins=3)
@@ -386,18 +395,24 @@ def test_workers_end_with_their_parent(tmp_path: Path, ending: signal.Signals) -
     (tmp_path / "program.py").write_text(script)
     command = [sys.executable, str(tmp_path / "program.py"), str(tmp_path), str(tmp_path / "out" / "d.h5")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent)])}
-    program = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    program = subprocess.Popen(
+        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
     patience = time.monotonic() + 60
     while len(pids := [int(p.stem) for p in tmp_path.glob("*.pid")]) < 2 and time.monotonic() < patience:
         time.sleep(0.05)
     assert len(pids) == 2
-    program.send_signal(ending)
+    if ending == signal.SIGINT:
+        os.killpg(program.pid, ending)  # a terminal's Ctrl-C reaches the workers as well
+    else:
+        program.send_signal(ending)
     _, complaint = program.communicate(timeout=60)
     while any(alive(pid) for pid in pids) and time.monotonic() < patience:
         time.sleep(0.05)
     assert not any(alive(pid) for pid in pids)
     if ending == signal.SIGINT:
         assert complaint.rstrip().endswith("KeyboardInterrupt")
+        assert complaint.count("Traceback") == 1, "the workers are silent"
         assert not list((tmp_path / "out").iterdir())
 
 
