@@ -38,19 +38,21 @@ Mask = NDArray[np.bool_]
 def figure_fit(
     binned: BinnedForce,
     displacement_m: ArrayLike,
-    draws_n: ArrayLike,
+    fitted: ArrayLike,
+    *,
+    mean_n: ArrayLike,
     surrogate_sd_n: ArrayLike,
     noise_sd_n: ArrayLike,
-    fitted: ArrayLike,
+    force_n: ArrayLike,
 ) -> Figure:
     """Recorded bins against the posterior predictive, the residual, and where the uncertainty comes from.
 
-    displacement_m (m,) LVDT displacement of each bin; draws_n (s, m) mean force at posterior draws;
-    surrogate_sd_n (m,) or (s, m); noise_sd_n (m,) of a bin's mean; fitted (m,) bool, bins in the likelihood.
+    displacement_m (m,) LVDT displacement of each bin; fitted (m,) bool, bins in the likelihood. The four
+    others are posterior predictive draws, (s, m) each, as `predictive_bands` describes them.
     """
     displacement_mm = 1e3 * np.asarray(displacement_m, dtype=float)
     chosen = np.asarray(fitted, dtype=bool)
-    bands = predictive_bands(draws_n, surrogate_sd_n, noise_sd_n)
+    bands = predictive_bands(mean_n, surrogate_sd_n, noise_sd_n, force_n)
     figure = new_figure(PAGE_IN, 5.0)
     grid = figure.add_gridspec(3, 2, width_ratios=(2.1, 1), height_ratios=(1.7, 1.2, 0.9))
     force = figure.add_subplot(grid[0, 0])
@@ -70,7 +72,7 @@ def figure_fit(
         panel_title(ax, letter, title)
     caption = (
         f"Bands are pointwise and include parameters, surrogate error and noise; "
-        f"{np.atleast_2d(np.asarray(draws_n)).shape[0]} posterior draws. "
+        f"{np.atleast_2d(np.asarray(force_n)).shape[0]} posterior draws. "
         "Residual: recorded minus posterior median. Open points, where there are any, were not fitted."
     )
     state_finding(figure, _finding(binned, bands, chosen), caption)

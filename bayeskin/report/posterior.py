@@ -53,7 +53,8 @@ def figure_posterior(
     caption = (
         f"{len(draws)} posterior draws. Regions hold 50 % and 90 % of them (smoothed histogram); "
         "a pair without structure beyond the draws' own scatter is tinted evenly. "
-        "Above each marginal: median and 90 % interval. Dashed: prior."
+        "Above each marginal: median and 90 % interval. Dashed: prior. "
+        f"As the prior had it: a 90 % interval at least {_AS_PRIOR:g} times the prior's."
     )
     d = len(parameters)
     figure, axes = triangle(parameters, 0.34, _finding(parameters, columns), caption)
@@ -108,7 +109,7 @@ def _axis_range(parameter: Parameter, values: Array) -> Array:
 
 
 def _draw_marginal(ax: Axes, p: Parameter, values: Array, best: float, span: Array) -> None:
-    ax.hist(values, bins=_BINS // 2, range=(span[0], span[1]), density=True, color=MODEL, alpha=0.45)
+    ax.hist(values, bins=_BINS // 3, range=(span[0], span[1]), density=True, color=MODEL, alpha=0.45)
     low, high = axis_values(p, [p.lower, p.upper])
     ax.plot([low, low, high, high], np.array([0, 1, 1, 0]) / (high - low), color=GREY, lw=0.9, ls=(0, (4, 2)))
     if np.isfinite(best):

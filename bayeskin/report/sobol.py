@@ -120,4 +120,4 @@ def _finding(names: Sequence[str], first: Array, total: Array) -> str:
     leading = " and ".join(f"{symbol(names[j])} ({100 * first[j]:.0f} %)" for j in order[:2])
     inert = [symbol(names[j]) for j in range(len(names)) if np.isfinite(total[j]) and total[j] < 0.005]
     tail = f"; {' and '.join(inert)} below 0.5 %, interactions included" if inert else ""
-    return f"Most of the force's variance comes from {leading}{tail}"
+    return f"Largest shares of the force's variance: {leading}{tail}"

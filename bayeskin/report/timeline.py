@@ -34,30 +34,31 @@ class ForceBands:
     parts_n: dict[str, Array]
 
 
-def predictive_bands(draws_n: ArrayLike, surrogate_sd_n: ArrayLike, noise_sd_n: ArrayLike) -> ForceBands:
-    """Intervals of parameters + surrogate error + noise, pointwise in each bin.
+def predictive_bands(
+    mean_n: ArrayLike, surrogate_sd_n: ArrayLike, noise_sd_n: ArrayLike, force_n: ArrayLike
+) -> ForceBands:
+    """Pointwise intervals in each bin from posterior predictive draws, (s, m) each [N].
 
-    draws_n (s, m): mean force at s posterior draws; surrogate_sd_n (m,) or (s, m); noise_sd_n (m,).
-    The predictive distribution is the equal mixture over draws of normals; its quantiles are taken
-    from 21 equally probable values of each normal (its variance 4 % short, its 90 % interval 0.4 %).
+    mean_n: the model's mean at each draw; surrogate_sd_n, noise_sd_n: sd of surrogate error and noise at
+    it (or (m,), the same at all); force_n: the force drawn with all of them in. The intervals are
+    quantiles of force_n; what the surrogate and the noise would give alone is taken as normal.
     """
-    draws = np.atleast_2d(np.asarray(draws_n, dtype=float))
-    surrogate = np.broadcast_to(np.asarray(surrogate_sd_n, dtype=float), draws.shape)
-    noise = np.broadcast_to(np.asarray(noise_sd_n, dtype=float), draws.shape[1:])
-    sd = np.sqrt(surrogate**2 + noise**2)
-    normal = ndtri((np.arange(21) + 0.5) / 21)
-    mixture = (draws[:, None, :] + normal[:, None] * sd[:, None, :]).reshape(-1, draws.shape[1])
+    mean, force = (np.atleast_2d(np.asarray(values, dtype=float)) for values in (mean_n, force_n))
     tails = np.array([(1 - level) / 2 for level in LEVELS])
-    low, high = np.quantile(mixture, tails, axis=0), np.quantile(mixture, 1 - tails, axis=0)
+    low, high = np.quantile(force, tails, axis=0), np.quantile(force, 1 - tails, axis=0)
+    parameter_low, parameter_high = np.quantile(mean, [tails[1], 1 - tails[1]], axis=0)
     z = ndtri(0.5 + LEVELS[1] / 2)
-    parameter_low, parameter_high = np.quantile(draws, [tails[1], 1 - tails[1]], axis=0)
+    surrogate, noise = (
+        z * np.sqrt(np.mean(np.atleast_2d(np.asarray(sd, dtype=float)) ** 2, axis=0))
+        for sd in (surrogate_sd_n, noise_sd_n)
+    )
     parts = {
         "parameters": 0.5 * (parameter_high - parameter_low),
-        "surrogate": z * np.sqrt(np.mean(surrogate**2, axis=0)),
-        "noise": z * noise,
+        "surrogate": surrogate,
+        "noise": noise,
         "all": 0.5 * (high[1] - low[1]),
     }
-    return ForceBands(np.median(draws, axis=0), low, high, parts)
+    return ForceBands(np.median(mean, axis=0), low, high, parts)
 
 
 def shade_phases(ax: Axes, phases: Sequence[Phase], cycles: bool = False) -> None:

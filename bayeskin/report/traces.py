@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
+from bayeskin.inference.convergence import Limits, Verdict, autocorrelation_steps, split_rhat
 from bayeskin.report.style import (
     FAINT,
     GREY,
@@ -21,7 +22,6 @@ from bayeskin.report.style import (
     parameter_label,
     state_finding,
     styled,
-    symbol,
 )
 from bayeskin.types import Array, ParameterSpace
 
@@ -40,58 +40,53 @@ class RunningConvergence:
 def running_convergence(chains: ArrayLike, checkpoints: int = 8) -> RunningConvergence:
     """Autocorrelation time of each ensemble and split R-hat across ensembles, as the run grew.
 
-    chains (e, n, w, d). tau: Sokal's windowed estimate (window 5 tau) of the autocorrelation averaged
-    over an ensemble's walkers (Goodman & Weare 2010, as in emcee). R-hat: Gelman et al. (2013), eq.
-    11.4, of each half of each ensemble as one chain, all its walkers pooled: walkers of one ensemble
-    are coupled and never count as chains of their own. NaN where a parameter does not move.
+    chains (e, n, w, d) in sampling coordinates, burn-in taken off: what `inference.convergence` judges by,
+    of the first part of the run up to each checkpoint. NaN where a parameter does not move.
     """
     x = np.asarray(chains, dtype=float)
     e, n, _, d = x.shape
     steps = np.unique(np.linspace(n / checkpoints, n, checkpoints).astype(int))
     steps = steps[steps >= 4] if n >= 4 else np.array([n])
-    tau = np.array([[[_tau(x[i, :k, :, j]) for j in range(d)] for i in range(e)] for k in steps])
-    return RunningConvergence(steps.astype(float), tau, np.array([_split_rhat(x[:, :k]) for k in steps]))
+    tau = np.array([autocorrelation_steps(x[:, :k]) if k >= 4 else np.full((e, d), np.nan) for k in steps])
+    longest = np.max(np.nan_to_num(tau, nan=1.0), axis=(1, 2))
+    # Thinned by the longest autocorrelation time, as the verdict's own.
+    thinned = [x[:, : k : max(1, int(np.ceil(t)))] for k, t in zip(steps, longest, strict=True)]
+    rhat = np.array([[split_rhat(part[..., j].reshape(e, -1)) for j in range(d)] for part in thinned])
+    return RunningConvergence(steps.astype(float), tau, rhat)
 
 
 @styled
-def figure_traces(
-    space: ParameterSpace, chains: ArrayLike, *, lengths_needed: float = 50.0, rhat_limit: float = 1.01
-) -> Figure:
-    """Each parameter over the run: walkers' median and 90 % by ensemble, running tau, running R-hat.
+def figure_traces(space: ParameterSpace, chains: ArrayLike, verdict: Verdict, limits: Limits) -> Figure:
+    """Each parameter over the run: walkers' median by ensemble, running autocorrelation time and R-hat.
 
-    chains (e, n, w, d): ensembles, steps, walkers, parameters. `lengths_needed` autocorrelation times
-    must fit in the run, and R-hat must fall below `rhat_limit`: the limits of the verdict.
+    chains (e, n, w, d): ensembles, steps after burn-in, walkers, parameters of `space` in SI; `verdict`
+    heads the figure and `limits` are drawn in it.
     """
-    x = np.asarray(chains, dtype=float)
+    columns = enumerate(space.parameters)
+    x = np.stack([axis_values(p, np.asarray(chains)[..., j]) for j, p in columns], axis=-1)
     running = running_convergence(x)
     e, n, w, d = x.shape
     figure = new_figure(PAGE_IN, 0.9 + 0.88 * d)
     grid = figure.add_gridspec(d, 3, width_ratios=(2.6, 1, 1))
-    step = np.arange(1, n + 1)
-    for j, parameter in enumerate(space.parameters):
-        trace, tau, rhat = (figure.add_subplot(grid[j, k]) for k in range(3))
-        _draw_trace(trace, step, axis_values(parameter, x[..., j]))
-        trace.set_ylabel(parameter_label(parameter))
-        _draw_tau(tau, running, j, lengths_needed)
-        _draw_rhat(rhat, running, j, rhat_limit)
-        if j == 0:
-            for ax, letter, title in zip(
-                (trace, tau, rhat), "abc",
-                ("median walker of ensemble", "autocorrelation time", "split R-hat"), strict=True,
-            ):  # fmt: skip
-                panel_title(ax, letter, title)
-            trace.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=min(e, 4), columnspacing=0.9)
+    axes = [[figure.add_subplot(grid[j, k]) for k in range(3)] for j in range(d)]
+    for j, (trace, tau, rhat) in enumerate(axes):
+        _draw_trace(trace, np.arange(1, n + 1), x[..., j])
+        trace.set_ylabel(parameter_label(space.parameters[j]))
+        _draw_tau(tau, running, j, limits.lengths)
+        _draw_rhat(rhat, running, j, limits.rhat)
         for ax in (trace, tau, rhat):
             ax.tick_params(labelbottom=j == d - 1)
-            if j == d - 1:
-                ax.set_xlabel("step")
+    for k, title in enumerate(("median walker of ensemble", "autocorrelation time", "split R-hat")):
+        panel_title(axes[0][k], "abc"[k], title)
+        axes[-1][k].set_xlabel("step")
+    axes[0][0].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=min(e, 4), columnspacing=0.9)
     figure.align_ylabels()
     caption = (
         f"{e} independent ensemble{'s' * (e != 1)} of {w} walkers, {n} steps after burn-in. "
         f"Line: median walker; band: 5th to 95th percentile of all walkers. "
-        f"Dashed: the limits, tau below steps / {lengths_needed:g} and R-hat below {rhat_limit:g}."
+        f"Dashed: the limits, tau below steps / {limits.lengths:g} and R-hat below {limits.rhat:g}."
     )
-    state_finding(figure, _finding(space, running, lengths_needed, rhat_limit), caption)
+    state_finding(figure, ("Trusted: " if verdict.trusted else "Not trusted: ") + verdict.reasons[0], caption)
     return figure
 
 
@@ -131,42 +126,3 @@ def _draw_rhat(ax: Axes, running: RunningConvergence, j: int, limit: float) -> N
 
 def _note(ax: Axes, text: str) -> None:
     ax.text(0.97, 0.96, text, transform=ax.transAxes, ha="right", va="top", color=INK, fontsize=7)
-
-
-def _tau(series: Array) -> float:
-    """Integrated autocorrelation time of (n, w), in steps; NaN if too short or constant."""
-    n = len(series)
-    if n < 4 or np.ptp(series) == 0:
-        return float("nan")
-    # About the ensemble's mean, not each walker's own: a walker that is stuck then counts as correlation.
-    spectrum = np.abs(np.fft.rfft(series - series.mean(), 2 ** int(np.ceil(np.log2(2 * n))), axis=0)) ** 2
-    covariance = np.fft.irfft(spectrum.mean(axis=1))[:n]
-    taus = 2.0 * np.cumsum(covariance / covariance[0]) - 1.0
-    beyond = np.arange(n) >= 5.0 * taus
-    return float(taus[np.argmax(beyond) if beyond.any() else n - 1])
-
-
-def _split_rhat(x: Array) -> Array:
-    """Split R-hat (d,) of (e, n, w, d); NaN for a parameter without variance."""
-    e, n, w, d = x.shape
-    half = n // 2
-    if half < 2:
-        return np.full(d, np.nan)
-    halves = np.concatenate([x[:, :half], x[:, n - half :]]).reshape(2 * e, half * w, d)
-    within = halves.var(axis=1, ddof=1).mean(axis=0)
-    between = halves.mean(axis=1).var(axis=0, ddof=1)
-    moves = np.ptp(halves, axis=(0, 1)) > 0  # not `within > 0`, which rounding can make of a constant
-    return np.where(moves, np.sqrt(1.0 + between / np.where(within > 0, within, np.inf)), np.nan)
-
-
-def _finding(space: ParameterSpace, running: RunningConvergence, lengths: float, limit: float) -> str:
-    tau, rhat = running.tau_steps[-1], running.rhat[-1]
-    if not np.isfinite(rhat).any():
-        return "No parameter moves: the chains say nothing about convergence"
-    worst = int(np.nanargmax(rhat))
-    longest = np.nanmax(np.append(tau, 0.0))
-    done = np.nanmax(rhat) < limit and longest * lengths <= running.step[-1]
-    return (
-        f"{'Converged' if done else 'Not converged'}: the run is {running.step[-1] / max(longest, 1e-9):.0f} "
-        f"autocorrelation times long; largest R-hat {rhat[worst]:.3f}, of {symbol(space.names[worst])}"
-    )
