@@ -83,11 +83,15 @@ def drawn(figure: Figure) -> Figure:
 # --- what holds for every figure ------------------------------------------------------------------
 
 
-def test_both_formats_are_written_with_their_provenance(tmp_path: Path, binned: BinnedForce) -> None:
-    figure = report.figure_prior_predictive(binned, np.tile(binned.force_n, (4, 1)))
+def one_panel(draws: np.ndarray) -> Figure:
+    return report.figure_posterior(SPACE, draws[:300], {}, names=("E_s",))
+
+
+def test_both_formats_are_written_with_their_provenance(tmp_path: Path, draws: np.ndarray) -> None:
+    figure = one_panel(draws)
     png, svg = report.save_figure(figure, tmp_path / "deep" / "prior.v2", "bayeskin 0.1 seed 7")
     assert (png.name, svg.name) == ("prior.v2.png", "prior.v2.svg")
-    assert imread(png).shape[1] == 1440  # 7.2 in at 200 dpi
+    assert imread(png).shape[1] == 700  # 3.5 in at 200 dpi
     assert b"bayeskin 0.1 seed 7" in png.read_bytes()
     assert "bayeskin 0.1 seed 7" in svg.read_text()
     assert "dc:date" not in svg.read_text()
@@ -102,7 +106,7 @@ def test_the_same_input_gives_the_same_bytes(
         if kind == "prior":
             return report.figure_prior_predictive(binned, np.tile(binned.force_n, (4, 1)))
         if kind == "posterior":
-            return report.figure_posterior(SPACE, draws[:300], {}, names=("E_s",))
+            return report.figure_posterior(SPACE, draws[:300], {}, names=("E_c", "E_s"))
         points, quads = surface()
         return report.figure_fields(
             (5.0,), points[:1], quads, [report.SurfaceField("u", "mm", points[:1, :, 0])], ""
@@ -113,8 +117,8 @@ def test_the_same_input_gives_the_same_bytes(
     assert len({tuple(path.read_bytes() for path in paths) for paths in written}) == 1
 
 
-def test_a_failed_rendering_leaves_the_earlier_files(tmp_path: Path, binned: BinnedForce) -> None:
-    good = report.figure_prior_predictive(binned, np.tile(binned.force_n, (4, 1)))
+def test_a_failed_rendering_leaves_the_earlier_files(tmp_path: Path, draws: np.ndarray) -> None:
+    good = one_panel(draws)
     before = [p.read_bytes() for p in report.save_figure(good, tmp_path / "a", "x")]
     bad = Figure()
     bad.text(0.5, 0.5, r"$\unknowncommand$")
@@ -124,10 +128,9 @@ def test_a_failed_rendering_leaves_the_earlier_files(tmp_path: Path, binned: Bin
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_the_callers_settings_neither_matter_nor_change(tmp_path: Path, binned: BinnedForce) -> None:
+def test_the_callers_settings_neither_matter_nor_change(tmp_path: Path, draws: np.ndarray) -> None:
     def svg(name: str) -> bytes:
-        figure = report.figure_prior_predictive(binned, np.tile(binned.force_n, (4, 1)))
-        return report.save_figure(figure, tmp_path / name, "x")[1].read_bytes()
+        return report.save_figure(one_panel(draws), tmp_path / name, "x")[1].read_bytes()
 
     plain = svg("plain")
     before = dict(rcParams)
