@@ -1,4 +1,4 @@
-"""Recordings: read, cut into phases, their noise measured, binned for the likelihood, turned into protocols."""
+"""Recordings: read, cut into phases, their noise measured, binned, and turned into protocols."""
 
 from bayeskin.recordings.bins import bin_recording, uniform_edges
 from bayeskin.recordings.describe import describe, describe_json

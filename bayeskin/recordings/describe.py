@@ -41,11 +41,10 @@ def describe(recording: Recording, phases: Sequence[Phase], noise: Sequence[Phas
     ]
     lines += [_row(phase) for phase in facts["phases"]]
     steps = [(step, phase) for phase in facts["phases"] for step in phase["steps"]]
-    lines += ["", "steps of the load cell's zero: " + ("" if steps else "none")]
-    lines += [
-        f"  {step['time_s']:8.2f} s  {1e3 * step['size_n']:+6.1f} mN  in the {phase['kind']} of cycle {phase['cycle']}"
-        for step, phase in steps
-    ]
+    lines += ["", "steps of the load cell's zero:" + ("" if steps else " none")]
+    for step, phase in steps:
+        size, where = f"{1e3 * step['size_n']:+6.1f} mN", f"in the {phase['kind']} of cycle {phase['cycle']}"
+        lines.append(f"  {step['time_s']:8.2f} s  {size}  {where}")
     return "\n".join(lines)
 
 

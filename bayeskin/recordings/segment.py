@@ -7,7 +7,7 @@ corner by the drive moves it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -67,7 +67,9 @@ def segment(recording: Recording) -> tuple[Phase, ...]:
             "loading and unloading",
         )
     knots = simplify(time_s, smooth, tolerance, np.empty(0, dtype=np.int64))
-    pieces = _merge(_pieces(time_s, smooth, knots, _STILL_SHARE * travel), time_s, smooth)
+    pieces = _merge(
+        _fragments(time_s, smooth, knots, _STILL_SHARE * travel), time_s, smooth, _STILL_SHARE * travel
+    )
     if len(pieces) < 2:
         raise InputError(
             recording.name, "a displacement with one phase only", "a load, a hold or an unload more"
@@ -77,47 +79,45 @@ def segment(recording: Recording) -> tuple[Phase, ...]:
     return _name_phases(pieces, edges, smooth)
 
 
-def _pieces(time_s: Array, smooth: Array, knots: NDArray[np.int64], still_m: float) -> list[_Piece]:
-    moved = np.diff(smooth[knots])
-    directions = np.where(np.abs(moved) < still_m, 0, np.sign(moved)).astype(int)
-    return [_Piece(int(a), int(b), int(d)) for a, b, d in zip(knots[:-1], knots[1:], directions, strict=True)]
+def _fragments(time_s: Array, smooth: Array, knots: NDArray[np.int64], still_m: float) -> list[_Piece]:
+    """The polyline's pieces; one that moves little is still unless it moves about as fast as a ramp."""
+    moved = np.abs(np.diff(smooth[knots]))
+    speed = moved / np.diff(time_s[knots])
+    ramps = speed[moved >= still_m]
+    still = (moved < still_m) & (speed < 0.5 * ramps.min(initial=np.inf))
+    directions = np.where(still, 0, np.sign(np.diff(smooth[knots]))).astype(int)
+    return [_Piece(int(a), int(b), int(d)) for (a, b), d in zip(pairwise(knots), directions, strict=True)]
 
 
-def _merge(pieces: list[_Piece], time_s: Array, smooth: Array) -> list[_Piece]:
-    """Pieces of one direction made one; still ones between moving ones dropped where too short."""
-    joined = _join(pieces, time_s, smooth)
+def _merge(fragments: list[_Piece], time_s: Array, smooth: Array, still_m: float) -> list[_Piece]:
+    """Pieces of one direction made one; small returns (overshoot) become still, short dwells disappear."""
+    pieces = [
+        replace(piece, direction=0) if abs(smooth[piece.stop] - smooth[piece.start]) < still_m else piece
+        for piece in _join(fragments, time_s, smooth, still_m)
+    ]
+    pieces = _join(pieces, time_s, smooth, still_m)
     kept = [
         piece
-        for i, piece in enumerate(joined)
-        if piece.direction
-        or i in (0, len(joined) - 1)
-        or time_s[piece.stop] - time_s[piece.start] >= _SHORTEST_STILL_S
+        for piece in pieces
+        if piece.direction or time_s[piece.stop] - time_s[piece.start] >= _SHORTEST_STILL_S
     ]
-    if kept and kept[0].direction == 0 and time_s[kept[0].stop] - time_s[0] < _SHORTEST_STILL_S:
-        kept = kept[1:]
-    return _join(kept, time_s, smooth)
+    return _join(kept, time_s, smooth, still_m)
 
 
-def _join(pieces: list[_Piece], time_s: Array, smooth: Array) -> list[_Piece]:
+def _join(pieces: list[_Piece], time_s: Array, smooth: Array, still_m: float) -> list[_Piece]:
+    """Neighbours of one direction made one, unless both are ramps and their speeds differ."""
     joined: list[_Piece] = []
     for piece in pieces:
-        last = joined[-1] if joined else None
-        if (
-            last is not None
-            and last.direction == piece.direction
-            and not _speeds_differ(last, piece, time_s, smooth)
-        ):
-            joined[-1] = _Piece(last.start, piece.stop, last.direction)
-        else:
-            joined.append(piece)
+        if joined and joined[-1].direction == piece.direction:
+            speeds, moved = [], []
+            for each in (joined[-1], piece):
+                moved.append(abs(smooth[each.stop] - smooth[each.start]))
+                speeds.append(moved[-1] / (time_s[each.stop] - time_s[each.start]))
+            if piece.direction == 0 or min(moved) < still_m or max(speeds) <= _SPEED_CHANGE * min(speeds):
+                joined[-1] = replace(piece, start=joined[-1].start)
+                continue
+        joined.append(piece)
     return joined
-
-
-def _speeds_differ(a: _Piece, b: _Piece, time_s: Array, smooth: Array) -> bool:
-    if a.direction == 0:
-        return False
-    fast, slow = sorted((abs(_line(time_s, smooth, p.start, p.stop)[0]) for p in (a, b)), reverse=True)
-    return fast > _SPEED_CHANGE * slow
 
 
 def _line(time_s: Array, smooth: Array, start: int, stop: int) -> tuple[float, float]:

@@ -25,6 +25,7 @@ _WINDOW_S = 0.5
 _SCALE_S = 2.5  # noise differs from one moment of a hold to another: its sd is local over this
 _TAIL_SD = 2.0
 _PASSES = 3  # spikes crowd: each pass takes the median of what the last one left
+_FINEST = 1e-4
 _HUBER = 2.5
 # E min(z^2, k^2) of a standard normal z: what makes the winsorised variance consistent.
 _CONSISTENT = 1 - 2 * norm.sf(_HUBER) - 2 * _HUBER * norm.pdf(_HUBER) + 2 * _HUBER**2 * norm.sf(_HUBER)
@@ -60,7 +61,8 @@ def despike(time_s: Array, force_n: Array, breaks: Sequence[int]) -> Despiked:
     half = max(2, round(0.5 * _WINDOW_S / interval_s))
     block = max(50, round(_SCALE_S / interval_s))
     threshold = float(norm.isf(0.5 * FAMILY_WISE / len(force_n)))
-    least = _least_step(force_n) / np.sqrt(12.0)  # a resolved force has at least its rounding's noise
+    # A force has at least its rounding's noise, and no load cell is better than this share of its range.
+    least = max(_least_step(force_n) / np.sqrt(12.0), _FINEST * float(np.ptp(force_n)), 1e-12)
     median, sd, spike = np.empty_like(force_n), np.empty_like(force_n), np.zeros(len(force_n), dtype=np.int8)
     for a, b in pairwise(breaks):
         x = force_n[a:b]
@@ -95,7 +97,7 @@ def huber_sd(residual: Array, start_sd: float) -> float:
 
 def _least_step(force_n: Array) -> float:
     levels = np.unique(force_n)
-    return float(np.min(np.diff(levels))) if len(levels) > 1 else 1e-12
+    return float(np.min(np.diff(levels))) if len(levels) > 1 else 0.0
 
 
 def _local_sd(residual: Array, kept: NDArray[np.bool_], block: int, least: float) -> Array:

@@ -1,0 +1,296 @@
+"""Noise laid on a known force is measured as it was laid; bin means know their own variance."""
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.linalg import toeplitz
+from skin_test import (
+    INTERVAL_S,
+    KINDS,
+    MOTION,
+    TIME_S,
+    article_recording,
+    coloured,
+    recording,
+    true_force,
+    with_spikes,
+)
+
+from bayeskin.errors import InputError
+from bayeskin.recordings import (
+    NoiseAnalysis,
+    analyse,
+    bin_recording,
+    describe,
+    describe_json,
+    phase_noise,
+    segment,
+    summarise,
+    uniform_edges,
+)
+from bayeskin.recordings.correlation import (
+    NoiseShape,
+    expected_products,
+    fit_shape,
+    parabola_basis,
+    residual_windows,
+    weighted_covariance,
+)
+from bayeskin.recordings.spikes import despike, huber_sd, running_median
+from bayeskin.recordings.steps import step_filter
+from bayeskin.types import Phase, Recording
+
+EDGES_S = uniform_edges(float(TIME_S[-1]))
+FORCE_N = true_force()
+PHASES = segment(recording(FORCE_N))
+# White sd [mN], correlated sd [mN], correlation time [s]: from no correlation to most of a bin.
+NOISES = [(2.0, 0.0, 0.1), (1.0, 1.0, 0.1), (1.0, 2.0, 0.05), (1.5, 1.0, 0.3)]
+SEEDS = range(8)
+
+
+@cache
+def noisy(white_mn: float, slow_mn: float, time_s: float, seed: int) -> tuple[Recording, NoiseAnalysis]:
+    rng = np.random.default_rng([seed, 77])
+    noise = coloured(rng, len(TIME_S), 1e-3 * white_mn, 1e-3 * slow_mn, time_s)
+    made = recording(FORCE_N + noise)
+    return made, analyse(made, PHASES)
+
+
+def true_bin_means() -> np.ndarray:
+    sums = np.concatenate([[0.0], np.cumsum(0.5 * INTERVAL_S * (FORCE_N[1:] + FORCE_N[:-1]))])
+    return np.diff(np.interp(EDGES_S, TIME_S, sums)) / np.diff(EDGES_S)
+
+
+def test_the_parabola_takes_from_a_correlation_what_its_projector_takes() -> None:
+    size, shape = 60, NoiseShape(0.3, 0.12)
+    basis = parabola_basis(size)
+    left = np.eye(size) - basis @ basis.T
+    covariance = left @ toeplitz(shape.at(INTERVAL_S * np.arange(size))) @ left
+    means = [np.mean(np.diagonal(covariance, h)) for h in range(20)]
+    np.testing.assert_allclose(
+        expected_products(shape.at(INTERVAL_S * np.arange(size)), 20), means, atol=1e-12
+    )
+
+
+def test_parabolas_leave_no_residual() -> None:
+    x = np.arange(200.0)
+    np.testing.assert_allclose(residual_windows(3 - 2 * x + 0.1 * x**2, 50), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("shape", [NoiseShape(0.5, 0.1), NoiseShape(0.1, 0.3), NoiseShape(0.8, 0.05)])
+def test_a_shape_is_recovered_from_its_own_expected_products(shape: NoiseShape) -> None:
+    size, lags = 250, 101
+    products = expected_products(shape.at(INTERVAL_S * np.arange(size)), lags)
+    found = fit_shape(products / products[0], 10_000, INTERVAL_S, size)
+    assert found.white_share == pytest.approx(shape.white_share, abs=0.03)
+    assert found.time_s == pytest.approx(shape.time_s, rel=0.1)
+
+
+def test_the_variance_of_a_mean_of_ar1_noise_is_the_textbooks() -> None:
+    n, a = 50, np.exp(-INTERVAL_S / 0.08)
+    textbook = ((1 + a) / (1 - a) - 2 * a * (1 - a**n) / (n * (1 - a) ** 2)) / n
+    mean = np.full(n, 1 / n)
+    correlation = NoiseShape(0.0, 0.08).at(INTERVAL_S * np.arange(n))
+    assert weighted_covariance(mean, mean, correlation) == pytest.approx(textbook, rel=1e-12)
+
+
+def test_the_running_median_follows_any_monotone_force_to_its_ends() -> None:
+    rise = np.exp(np.linspace(0, 5, 400))
+    follows = running_median(rise, 25)
+    np.testing.assert_allclose(follows[8:-8], rise[8:-8], rtol=1e-12)
+
+
+def test_the_winsorised_sd_is_consistent_and_robust() -> None:
+    rng = np.random.default_rng(3)
+    z = rng.normal(size=200_000)
+    assert huber_sd(z, 3.0) == pytest.approx(1.0, rel=0.01)
+    z[:2000] += 30.0
+    assert huber_sd(z, 1.0) == pytest.approx(1.0, rel=0.05)
+
+
+@pytest.mark.parametrize("noise", NOISES)
+def test_sd_and_correlation_are_found(noise: tuple[float, float, float]) -> None:
+    white, slow, time_s = noise
+    analyses = [noisy(*noise, seed)[1] for seed in SEEDS]
+    sds = [p.sd_n for a in analyses for p in summarise(a, PHASES)]
+    true_sd = 1e-3 * np.hypot(np.hypot(white, slow), 1 / np.sqrt(12.0))  # the rounding to 1 mN is noise too
+    assert np.mean(sds) == pytest.approx(true_sd, rel=0.07)
+    holds = [a.shapes["hold"] for a in analyses]
+    slow_share = np.mean([1 - shape.white_share for shape in holds])
+    assert slow_share == pytest.approx(slow**2 / (1e3 * true_sd) ** 2, abs=0.06)
+    if slow:
+        assert np.median([shape.time_s for shape in holds]) == pytest.approx(time_s, rel=0.35)
+
+
+@pytest.mark.parametrize("noise", NOISES)
+def test_bin_means_know_their_variance_and_their_neighbours(noise: tuple[float, float, float]) -> None:
+    truth = true_bin_means()
+    z, stated = [], []
+    for seed in SEEDS:
+        made, analysis = noisy(*noise, seed)
+        binned = bin_recording(made, PHASES, EDGES_S, analysis)
+        z.append((binned.force_n - truth) / np.sqrt(binned.variance_n2))
+        stated.append(binned.correlation)
+    assert np.mean(np.square(z)) == pytest.approx(1.0, abs=0.13)
+    found = np.mean([np.mean(row[1:] * row[:-1]) / np.mean(row**2) for row in z])
+    assert found == pytest.approx(np.mean(stated), abs=0.06)
+
+
+def test_bin_means_of_gaussian_noise_are_as_good_as_plain_means() -> None:
+    truth, robust, plain = true_bin_means(), [], []
+    for seed in SEEDS:
+        made, analysis = noisy(*NOISES[0], seed)
+        robust.append(bin_recording(made, PHASES, EDGES_S, analysis).force_n - truth)
+        plain.append(
+            made.force_n[:-1].reshape(-1, 50).mean(axis=1) + 0.5 * np.diff(FORCE_N[::50]) / 50 - truth
+        )
+    assert np.var(plain) / np.var(robust) > 0.95
+
+
+def test_bin_means_of_straight_forces_are_exact_over_corners_and_between_samples() -> None:
+    made = Recording(TIME_S, MOTION.at(TIME_S), 40.0 * MOTION.at(TIME_S), "made", "")
+    edges = np.arange(0.0037, 129.0, 0.5)
+    fine = np.unique(np.concatenate([edges, MOTION.time_s]))
+    f = 40.0 * MOTION.at(fine)
+    sums = np.concatenate([[0.0], np.cumsum(0.5 * (f[1:] + f[:-1]) * np.diff(fine))])
+    exact = np.diff(np.interp(edges, fine, sums)) / 0.5
+    np.testing.assert_allclose(bin_recording(made, PHASES, edges).force_n, exact, atol=1e-12)
+
+
+def test_spikes_are_counted_and_leave_the_means_alone() -> None:
+    rng = np.random.default_rng(11)
+    starts = np.sort(rng.choice(np.arange(100, 12900, 20), 150, replace=False))
+    noise = coloured(rng, len(TIME_S), 1e-3, 1e-3, 0.1)
+    clean, spiked = recording(FORCE_N + noise), recording(with_spikes(rng, FORCE_N + noise, starts, 0.02))
+    found = phase_noise(spiked, PHASES)
+    assert sum(p.spikes for p in found) == pytest.approx(150, abs=6)
+    assert sum(p.spikes_above for p in found) >= sum(p.spikes for p in found) - 2
+    assert [p.spike_threshold_n for p in found] == pytest.approx([4.6 * 1.3e-3] * 9, rel=0.3)
+    assert np.mean([p.sd_n for p in found]) == pytest.approx(np.sqrt(2.08e-6), rel=0.12)
+    means = [bin_recording(r, PHASES, EDGES_S).force_n for r in (clean, spiked)]
+    raw_bias = np.mean(spiked.force_n - clean.force_n)
+    assert raw_bias > 5e-4
+    assert abs(np.mean(means[1] - means[0])) < 0.05 * raw_bias
+    assert np.sqrt(np.mean((means[1] - means[0]) ** 2)) < 3e-4
+
+
+def test_noise_alone_shows_next_to_no_spikes_and_no_steps() -> None:
+    found = [summarise(noisy(*noise, seed)[1], PHASES) for noise in NOISES for seed in SEEDS]
+    assert sum(p.spikes for phases in found for p in phases) <= 8
+    assert sum(len(p.step_times_s) for phases in found for p in phases) == 0
+
+
+def test_the_step_filter_reads_a_step_and_is_blind_to_lines() -> None:
+    weights = step_filter(INTERVAL_S)
+    at = np.arange(len(weights)) - len(weights) // 2
+    assert weights @ np.ones(len(at)) == pytest.approx(0.0, abs=1e-12)
+    assert weights @ at == pytest.approx(0.0, abs=1e-9)
+    assert weights @ (at >= 0) == pytest.approx(1.0)
+
+
+def test_steps_are_found_with_their_times_and_sizes() -> None:
+    errors, ratios = [], []
+    for seed in range(4):
+        rng = np.random.default_rng([seed, 5])
+        times = np.array([2.6, 25.0, 35.0, 85.0, 122.0]) + rng.uniform(-0.4, 0.4, 5)
+        sizes = 0.015 * np.array([1, -1, 1.5, 1, -2])
+        force = FORCE_N + coloured(rng, len(TIME_S), 1e-3, 1e-3, 0.1)
+        made = recording(
+            force + sum(b * np.clip((TIME_S - a) / 0.03, 0, 1) for a, b in zip(times, sizes, strict=True))
+        )
+        found = phase_noise(made, PHASES)
+        np.testing.assert_allclose(np.mean([p.sd_n for p in found]), np.sqrt(2.08e-6), rtol=0.1)
+        at = np.concatenate([p.step_times_s for p in found])
+        assert len(at) == 5
+        errors.append(at - times - 0.015)
+        ratios.append(np.concatenate([p.step_sizes_n for p in found]) / sizes)
+    assert np.max(np.abs(errors)) < 0.03
+    np.testing.assert_allclose(ratios, 1.0, atol=0.3)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.06)
+
+
+def test_a_step_is_no_spike_and_stays_in_the_means() -> None:
+    step = 0.05 * (TIME_S >= 30.2)
+    rng = np.random.default_rng(2)
+    noise = coloured(rng, len(TIME_S), 1e-3, 0.0, 0.1)
+    means = bin_recording(recording(FORCE_N + step + noise), PHASES, EDGES_S).force_n - true_bin_means()
+    np.testing.assert_allclose(means[60], 0.03, atol=1.5e-3)  # the bin 30.0-30.5 s has it for 0.3 s
+    np.testing.assert_allclose(means[61:80].mean(), 0.05, atol=5e-4)
+
+
+def test_a_recording_of_any_sampling_is_analysed() -> None:
+    for interval_s in (0.002, 0.05):
+        time_s = interval_s * np.arange(int(130 / interval_s) + 1)
+        noise = 2e-3 * np.random.default_rng(8).normal(size=len(time_s))
+        made = recording(true_force(time_s) + noise, MOTION, time_s)
+        phases = segment(made)
+        assert [p.kind for p in phases] == KINDS
+        sds = [p.sd_n for p in phase_noise(made, phases)]
+        assert np.median(sds) == pytest.approx(2e-3, rel=0.1)
+
+
+def test_despiking_never_crosses_a_break() -> None:
+    jump = np.where(np.arange(400) < 203, 0.0, 1.0)
+    out = despike(INTERVAL_S * np.arange(400), jump, [0, 203, 400])
+    np.testing.assert_array_equal(out.force_n, jump)
+
+
+@pytest.mark.parametrize(
+    ("edges", "said"),
+    [
+        (np.array([0.0, 0.0, 1.0]), "edges that do not increase"), (np.array([0.0, 140.0]), "0 to 140 s"),
+        (np.array([-1.0, 1.0]), "-1 to 1 s"), (np.array([0.0, 1.0, 1.005]), "in 1-1.005 s"),
+    ],
+)  # fmt: skip
+def test_edges_that_do_not_fit_are_refused(edges: np.ndarray, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        bin_recording(recording(FORCE_N), PHASES, edges)
+
+
+def test_uniform_edges_are_whole_bins_from_zero() -> None:
+    np.testing.assert_allclose(uniform_edges(2.3), [0, 0.5, 1.0, 1.5, 2.0])
+    assert len(uniform_edges(0.3, 0.1)) == 4
+    assert uniform_edges(recording(FORCE_N))[-1] == 130.0
+
+
+def test_a_recording_too_coarse_to_tell_noise_is_refused() -> None:
+    time_s = np.arange(0.0, 130.0, 1.0)
+    made = recording(true_force(time_s), MOTION, time_s)
+    phases = tuple(Phase("hold", 1, a, a + 10.0) for a in np.arange(0.0, 130.0, 10.0))
+    with pytest.raises(InputError, match="to know its noise"):
+        phase_noise(made, phases)
+
+
+def test_the_description_says_what_was_found() -> None:
+    made, analysis = noisy(*NOISES[1], 0)
+    noise = summarise(analysis, PHASES)
+    text = describe(made, PHASES, noise)
+    assert "13001 samples at 100 Hz" in text
+    assert text.count("\n   load ") + text.count("\n unload ") == 4
+    facts = describe_json(made, PHASES, noise)
+    assert json.loads(json.dumps(facts)) == facts
+    assert [p["kind"] for p in facts["phases"]] == KINDS
+
+
+def test_the_articles_recording_has_one_sided_spikes_and_steps_of_its_zero() -> None:
+    real = article_recording()
+    phases = segment(real)
+    analysis = analyse(real, phases)
+    noise = summarise(analysis, phases)
+    still = [p for p in noise if p.kind in ("rest", "hold")]
+    assert sum(p.spikes for p in still) > 150
+    assert sum(p.spikes_above for p in still) > 0.95 * sum(p.spikes for p in still)
+    assert all(1e-3 < p.sd_n < 6e-3 for p in still)
+    steps = {
+        round(float(t)): float(s) for p in noise for t, s in zip(p.step_times_s, p.step_sizes_n, strict=True)
+    }
+    assert {3, 66, 231, 287, 319} <= set(steps)
+    assert steps[3] > 0 > steps[66]
+    binned = bin_recording(real, phases, uniform_edges(real), analysis)
+    assert len(binned.force_n) == 694
+    raw = real.force_n[:34700].reshape(694, 50)
+    assert np.median(np.abs(binned.force_n - raw.mean(axis=1))) < 1e-3
+    assert (binned.variance_n2 > 0).all()
+    assert (np.abs(binned.correlation) < 1).all()

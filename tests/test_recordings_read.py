@@ -1,0 +1,325 @@
+"""A file becomes a recording in SI, or one line that says which row is wrong, and how."""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import openpyxl
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from skin_test import article_recording
+
+from bayeskin import storage
+from bayeskin.errors import InputError
+from bayeskin.recordings import read_recording
+from bayeskin.recordings.headers import parse_header
+from bayeskin.types import Recording
+
+SAMPLES = 200
+TIME = 0.05 * np.arange(SAMPLES)
+TRAVEL_MM = np.round(np.clip(TIME - 1.0, 0.0, 5.0), 4)
+FORCE_N = np.round(0.08 * TRAVEL_MM - 0.02, 5)
+ROWS = [list(map(str, row)) for row in zip(TIME.round(4), TRAVEL_MM, FORCE_N, strict=True)]
+HEADER = ["Temps (s)", "Déplacement (mm)", "RF (N)"]
+
+
+def written(path: Path, rows: Sequence[Sequence[str]], delimiter: str = ",", encoding: str = "utf-8") -> Path:
+    path.write_bytes("\n".join(delimiter.join(row) for row in rows).encode(encoding))
+    return path
+
+
+def workbook(path: Path, **sheets: Sequence[Sequence[object]]) -> Path:
+    book = openpyxl.Workbook()
+    book.remove(book.active)
+    for name, rows in sheets.items():
+        sheet = book.create_sheet(name)
+        for row in rows:
+            sheet.append(list(row))
+    book.save(path)
+    return path
+
+
+NUMBERS = [[float(cell) for cell in row] for row in ROWS]
+
+
+def assert_is_the_test(recording: Recording) -> None:
+    np.testing.assert_allclose(recording.time_s, TIME, atol=1e-12)
+    np.testing.assert_allclose(recording.displacement_m, 1e-3 * TRAVEL_MM, atol=1e-15)
+    np.testing.assert_allclose(recording.force_n, FORCE_N, atol=1e-15)
+
+
+def assert_sound_or_refused_in_one_line(path: Path) -> None:
+    refusal, recording = "", None
+    try:
+        recording = read_recording(path)
+    except InputError as error:
+        refusal = str(error)
+    assert "\n" not in refusal
+    if recording is not None:
+        assert len(recording.time_s) == len(recording.force_n) == len(recording.displacement_m) >= 100
+        assert np.isfinite([recording.time_s, recording.displacement_m, recording.force_n]).all()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+@pytest.mark.parametrize(
+    ("name", "delimiter", "comma"),
+    [
+        ("a.csv", ",", False),
+        ("a.csv", ";", False),
+        ("a.csv", ";", True),
+        ("a.tsv", "\t", True),
+        ("a.txt", "  ", True),
+    ],
+)
+def test_text_in_any_usual_dress_gives_the_same_recording(
+    tmp_path: Path, name: str, delimiter: str, comma: bool, encoding: str
+) -> None:
+    rows = [[cell.replace(".", ",") for cell in row] for row in ROWS] if comma else ROWS
+    path = written(tmp_path / name, [HEADER, *rows], delimiter, encoding)
+    recording = read_recording(path)
+    assert_is_the_test(recording)
+    assert recording.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert "column 'Déplacement (mm)' taken as displacement, mm" in recording.notes
+
+
+@pytest.mark.parametrize(
+    ("header", "quantity", "unit"),
+    [
+        ("Temps (s)", "time", "s"), ("time_s", "time", "s"), ("t [ms]", "time", "ms"),
+        ("Time, min", "time", "min"),
+        ("Déplacement (mm)", "displacement", "mm"), ("DEPLACEMENT [MM]", "displacement", "mm"),
+        ("displacement_m", "displacement", "m"), ("disp (µm)", "displacement", "um"),
+        ("LVDT mm", "displacement", "mm"), ("Réaction", "force", ""),
+        ("RF (N)", "force", "N"), ("force_n", "force", "N"), ("Effort [mN]", "force", "mN"),
+        ("Displacement rate (mm/s)", "displacement", "mm/s"),
+    ],
+)  # fmt: skip
+def test_headers_name_quantity_and_unit(header: str, quantity: str, unit: str) -> None:
+    column = parse_header(0, header)
+    assert column is not None
+    assert (column.quantity, column.unit) == (quantity, unit)
+
+
+@pytest.mark.parametrize("header", ["Temperature (C)", "pressure", "", "n", "Force per displacement (N/mm)"])
+def test_other_headers_name_nothing(header: str) -> None:
+    assert parse_header(0, header) is None
+
+
+def test_units_become_si(tmp_path: Path) -> None:
+    rows = [[str(1e3 * t), str(1e3 * u), str(1e3 * f)] for t, u, f in NUMBERS]
+    assert_is_the_test(
+        read_recording(written(tmp_path / "a.csv", [["t [ms]", "disp (µm)", "Effort_mN"], *rows]))
+    )
+
+
+def test_units_may_stand_in_a_row_of_their_own_below_a_preamble(tmp_path: Path) -> None:
+    rows = [["operator", "A"], [], ["Time", "Displacement", "Force"], ["[s]", "[mm]", "[N]"], *ROWS]
+    assert_is_the_test(read_recording(written(tmp_path / "a.csv", rows, ";")))
+
+
+def test_a_unit_left_out_is_taken_where_only_one_fits_and_asked_for_where_not(tmp_path: Path) -> None:
+    recording = read_recording(written(tmp_path / "a.csv", [["time", "disp", "force"], *ROWS]))
+    assert_is_the_test(recording)
+    assert any("the unit that fits the numbers" in note for note in recording.notes)
+    ambiguous = [[t, u, str(50 * float(f))] for t, u, f in ROWS]  # up to 19: newtons, or millinewtons
+    with pytest.raises(InputError, match=r"'force'.* fit N and mN; expected the unit in the header"):
+        read_recording(written(tmp_path / "b.csv", [["time", "disp", "force"], *ambiguous]))
+
+
+def test_further_columns_and_rates_are_named_and_ignored(tmp_path: Path) -> None:
+    rows = [[*row, "1", "2"] for row in ROWS]
+    path = written(tmp_path / "a.csv", [[*HEADER, "Displacement rate (mm/s)", "note"], *rows])
+    recording = read_recording(path)
+    assert_is_the_test(recording)
+    assert "columns ignored: 'Displacement rate (mm/s)', 'note'" in recording.notes
+
+
+def test_a_clock_that_starts_late_is_shifted_and_noted(tmp_path: Path) -> None:
+    rows = [[str(float(t) + 12.5), u, f] for t, u, f in ROWS]
+    recording = read_recording(written(tmp_path / "a.csv", [HEADER, *rows]))
+    np.testing.assert_allclose(recording.time_s, TIME, atol=1e-9)
+    assert any("starts at 12.5 s" in note for note in recording.notes)
+
+
+def test_workbooks_are_read_from_the_one_sheet_with_the_columns(tmp_path: Path) -> None:
+    path = workbook(tmp_path / "a.xlsx", Notes=[["hello"]], Test=[HEADER, *NUMBERS])
+    assert_is_the_test(read_recording(path))
+    both = workbook(tmp_path / "b.xlsx", A=[HEADER, *NUMBERS], B=[HEADER, *NUMBERS])
+    with pytest.raises(InputError, match=r"2 of the sheets \['A', 'B'\]"):
+        read_recording(both)
+    assert_is_the_test(read_recording(both, sheet="B"))
+    with pytest.raises(InputError, match="a sheet 'C'"):
+        read_recording(both, sheet="C")
+
+
+def test_a_formula_without_a_stored_value_is_refused_with_its_row(tmp_path: Path) -> None:
+    rows: list[list[object]] = [list(row) for row in NUMBERS]
+    rows[7][2] = "=1+1"
+    path = workbook(tmp_path / "a.xlsx", Test=[HEADER, *rows])
+    with pytest.raises(InputError, match=r"row 9, column 'RF \(N\)': found an empty cell, or a formula"):
+        read_recording(path)
+
+
+def test_h5_keeps_the_recording(tmp_path: Path) -> None:
+    recording = read_recording(written(tmp_path / "a.csv", [HEADER, *ROWS]))
+    storage.save(tmp_path / "a.h5", recording)
+    again = read_recording(tmp_path / "a.h5")
+    assert_is_the_test(again)
+    assert (again.sha256, again.notes, again.name) == (recording.sha256, recording.notes, "a")
+
+
+def spoiled(row: int, column: int, text: str) -> list[list[str]]:
+    rows = [list(r) for r in ROWS]
+    rows[row][column] = text
+    return [HEADER, *rows]
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ([HEADER[:2], *[row[:2] for row in ROWS]], r"row 1: .*expected a force column"),
+        (
+            [[*HEADER, "Force (N)"], *[[*row, "0"] for row in ROWS]],
+            r"'RF \(N\)' and 'Force \(N\)', each a force",
+        ),
+        (
+            [["Temps (s)", "Displacement (inch)", "RF (N)"], *ROWS],
+            r"'Displacement \(inch\)'; expected .* m, mm, um",
+        ),
+        (spoiled(3, 1, "abc"), r"row 5, column 'Déplacement \(mm\)': found 'abc'; expected a number"),
+        (spoiled(3, 1, ""), r"row 5, .*found an empty cell"),
+        (spoiled(3, 2, "nan"), r"row 5, column 'RF \(N\)': found nan; expected a finite number"),
+        (spoiled(3, 2, "-inf"), r"row 5, .*found -inf"),
+        (spoiled(9, 0, "0.4"), r"row 11: found time 0.4 s after 0.4 s; expected times that increase"),
+        (spoiled(9, 0, "0.1"), r"row 11: found time 0.1 s after 0.4 s"),
+        (
+            [["Temps (s)", "Disp (m)", "RF (N)"], *ROWS],
+            r"found a displacement of .* m; .*is the column in mm\?",
+        ),
+        (
+            [["Temps (s)", "Disp (um)", "RF (N)"], *ROWS],
+            r"found a displacement that changes by .*is its unit right",
+        ),
+        (spoiled(3, 2, "2000"), r"row 5: found a force of 2000 N; .*is the column in mN\?"),
+        ([HEADER, *ROWS[:60]], r"found 60 samples; expected at least 100"),
+        ([HEADER], r"no row below the header"),
+        ([*[HEADER], *ROWS[:20], ROWS[20][:2], *ROWS[21:]], r"row 22: found 2 cells; expected 3 cells"),
+        ([*[HEADER], *ROWS[:20], [*ROWS[20], "7"], *ROWS[21:]], r"row 22: found 4 cells; expected 3 cells"),
+        ([*[HEADER], *ROWS[:20], [], *ROWS[21:]], r"row 22: found an empty row before row 23"),
+        (ROWS, r"no header"),
+        ([["some", "text"]], r"no header"),
+    ],
+)
+def test_a_fault_is_named_with_its_place(tmp_path: Path, rows: list[list[str]], said: str) -> None:
+    path = written(tmp_path / "fault.csv", rows, ";")
+    with pytest.raises(InputError, match=said) as caught:
+        read_recording(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "said"),
+    [
+        ("a.csv", b"", "an empty file"), ("a.csv", b" \n\n", "an empty file"),
+        ("a.csv", b"\x00\x01\x81", "not text"),
+        ("a.xlsx", b"PK\x03\x04 no workbook", "an xlsx workbook"), ("a.xlsx", b"", "an xlsx workbook"),
+        ("a.h5", b"\x89HDF\r\n\x1a\n", "HDF5"), ("a.pdf", b"%PDF", "ending '.pdf'"),
+    ],
+)  # fmt: skip
+def test_files_that_are_nothing_are_refused(tmp_path: Path, name: str, data: bytes, said: str) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=said):
+        read_recording(tmp_path / name)
+
+
+def test_a_file_that_is_absent_or_a_folder_is_refused(tmp_path: Path) -> None:
+    for path in (tmp_path / "absent.csv", tmp_path):
+        with pytest.raises(InputError, match="unreadable"):
+            read_recording(path)
+
+
+@pytest.mark.parametrize("ending", [".xlsx", ".h5"])
+def test_a_file_cut_short_anywhere_is_refused(tmp_path: Path, ending: str) -> None:
+    whole = workbook(tmp_path / "whole.xlsx", Test=[HEADER, *NUMBERS])
+    if ending == ".h5":
+        storage.save(tmp_path / "whole.h5", read_recording(whole))
+    data = (tmp_path / f"whole{ending}").read_bytes()
+    for share in (0.02, 0.3, 0.6, 0.9, 0.99):
+        (tmp_path / f"cut{ending}").write_bytes(data[: int(share * len(data))])
+        with pytest.raises(InputError):
+            read_recording(tmp_path / f"cut{ending}")
+
+
+def test_a_workbook_with_wrong_bytes_in_it_is_read_or_refused(tmp_path: Path) -> None:
+    whole = workbook(tmp_path / "whole.xlsx", Test=[HEADER, *NUMBERS])
+    data = np.frombuffer(whole.read_bytes(), dtype=np.uint8)
+    rng = np.random.default_rng(5)
+    for _ in range(40):
+        bad = data.copy()
+        bad[rng.integers(len(bad), size=20)] = rng.integers(256, size=20)
+        (tmp_path / "bad.xlsx").write_bytes(bad.tobytes())
+        assert_sound_or_refused_in_one_line(tmp_path / "bad.xlsx")
+
+
+CELL = st.one_of(
+    st.floats().map(str),
+    st.integers().map(str),
+    st.sampled_from(["", " ", "1,5", '"', "'", "=A1", "nan", "s", "mm", "N"]),
+    st.text(max_size=6),
+)
+TABLE = st.builds(
+    lambda header, rows, delimiter, end: end.join([header, *(delimiter.join(row) for row in rows)]).encode(
+        "utf-8", "surrogatepass"
+    ),
+    st.sampled_from(
+        ["t;disp;force", "Temps (s),Deplacement (mm),RF (N)", "time\tu\tforce", "t disp f", "force;time;d;x"]
+    ),
+    st.lists(st.lists(CELL, max_size=5), max_size=8),
+    st.sampled_from(";,\t "),
+    st.sampled_from(["\n", "\r\n", "\r"]),
+)
+
+
+@given(
+    data=st.one_of(st.binary(max_size=300), st.text(max_size=300).map(str.encode), TABLE), long=st.booleans()
+)
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_any_bytes_at_all_are_a_recording_or_an_input_error(tmp_path: Path, data: bytes, long: bool) -> None:
+    path = tmp_path / "fuzz.csv"
+    tail = "\n".join(";".join(row) for row in ROWS).encode()
+    path.write_bytes(data + b"\n" + tail if long else data)
+    assert_sound_or_refused_in_one_line(path)
+
+
+@given(
+    st.lists(st.floats(-50, 50, allow_subnormal=False), min_size=100, max_size=120),
+    st.sampled_from([",", ";", "\t"]),
+    st.booleans(),
+)
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_what_is_written_is_what_is_read(
+    tmp_path: Path, force: list[float], delimiter: str, comma: bool
+) -> None:
+    rows = [[repr(0.1 * i), repr(0.05 * i), repr(f)] for i, f in enumerate(force)]
+    if comma and delimiter != ",":
+        rows = [[cell.replace(".", ",") for cell in row] for row in rows]
+    recording = read_recording(written(tmp_path / "a.csv", [HEADER, *rows], delimiter))
+    assert recording.force_n.tolist() == force
+
+
+def test_the_articles_recording_is_read_whole() -> None:
+    recording = article_recording()
+    assert len(recording.time_s) == 34740
+    assert recording.time_s[0] == 0.0
+    assert recording.time_s[-1] == pytest.approx(347.39)
+    assert recording.displacement_m.max() == pytest.approx(9.46e-3)
+    assert recording.force_n[0] == -0.077
+    assert recording.notes == tuple(
+        f"column {name} taken as {what}"
+        for name, what in (
+            ("'Temps (s)'", "time, s"), ("'Deplacement (mm)'", "displacement, mm"), ("'RF (N)'", "force, N")
+        )
+    )  # fmt: skip
