@@ -48,30 +48,36 @@ def legendre_basis(unit: Array, indices: Indices) -> Array:
 
 
 class SparseFit(NamedTuple):
-    """Indices (k, d) of the terms of one latent and their cross-validated mean squared error."""
+    """Indices (k, d) of the terms of one latent; cross-validated squared error, its mean and weighted mean."""
 
     indices: Indices
+    variance: float
     error: float
 
 
-def fit_sparse(unit: Array, target: Array) -> SparseFit:
-    """The terms for one latent (n,) at unit-cube points (n, d); the degree grows while the error falls."""
+def fit_sparse(unit: Array, target: Array, weights: Array) -> SparseFit:
+    """The terms for one latent (n,) at unit-cube points (n, d); the degree grows while the error falls.
+
+    weights (n,) of the rows in that error; the regression knows no weights.
+    """
     n, dim = unit.shape
     fold = np.arange(n) % FOLDS
     most = max(min(n // 3, MOST_TERMS), 1)
-    best, worse = SparseFit(np.zeros((1, dim), dtype=np.int64), np.inf), 0
+    best, worse = SparseFit(np.zeros((1, dim), dtype=np.int64), np.inf, np.inf), 0
     for degree in range(1, HIGHEST_DEGREE + 1):
         indices = multi_indices(dim, degree)
         if len(indices) > MOST_CANDIDATES or worse == 2:
             break
         basis = legendre_basis(unit, indices)
-        errors = np.zeros(min(most, len(indices)))
+        missed = np.empty((n, min(most, len(indices))))
         for k in range(FOLDS):
-            errors += _pursue(basis, target, fold != k, len(errors))[1] / n
-        terms = int(np.argmin(errors)) + 1
-        if errors[terms - 1] < best.error:
-            chosen = _pursue(basis, target, np.ones(n, dtype=bool), terms)[0]
-            best, worse = SparseFit(indices[chosen], float(errors[terms - 1])), 0
+            missed[fold == k] = _pursue(basis, target, fold != k, missed.shape[1])[1]
+        errors = np.average(missed**2, axis=0, weights=weights)
+        step = int(np.argmin(errors))
+        if errors[step] < best.error:
+            chosen = _pursue(basis, target, np.ones(n, dtype=bool), step + 1)[0]
+            variance = float(np.mean(missed[:, step] ** 2))
+            best, worse = SparseFit(indices[chosen], variance, float(errors[step])), 0
         else:
             worse += 1
     return best
@@ -80,8 +86,8 @@ def fit_sparse(unit: Array, target: Array) -> SparseFit:
 def _pursue(basis: Array, target: Array, learn: NDArray[np.bool_], most: int) -> tuple[list[int], Array]:
     """Orthogonal matching pursuit on the rows `learn`, from the constant on.
 
-    Returns the terms in the order chosen, and after each (most,) the sum of squared errors of the other
-    rows. Candidates are kept orthogonal to the chosen terms over the learning rows; the other rows go
+    Returns the terms in the order chosen, and after each the errors of the other rows (rows, most).
+    Candidates are kept orthogonal to the chosen terms over the learning rows; the other rows go
     through the same combinations, so that their errors come without a solve.
     """
     learned, other = basis[learn], basis[~learn]
@@ -90,14 +96,14 @@ def _pursue(basis: Array, target: Array, learn: NDArray[np.bool_], most: int) ->
     residual, missed = target[learn], target[~learn]
     squares = np.ones(len(scale))
     chosen: list[int] = []
-    errors = np.empty(most)
+    errors = np.empty((len(missed), most))
     for step in range(most):
         usable = squares > 1e-10
         usable[chosen] = False
         gain = np.where(usable, (residual @ learned) ** 2 / np.where(usable, squares, 1.0), -1.0)
         pick = int(np.argmax(gain)) if chosen else 0
         if not usable[pick]:
-            errors[step:] = missed @ missed
+            errors[:, step:] = missed[:, None]
             break
         length = np.linalg.norm(learned[:, pick])
         direction, follow = learned[:, pick] / length, other[:, pick] / length
@@ -108,7 +114,7 @@ def _pursue(basis: Array, target: Array, learn: NDArray[np.bool_], most: int) ->
         learned -= np.outer(direction, overlap)
         other -= np.outer(follow, overlap)
         squares -= overlap**2
-        errors[step] = missed @ missed
+        errors[:, step] = missed
     return chosen, errors
 
 
@@ -141,7 +147,7 @@ class LatentChaos(_FreezesArrays):
         active = np.stack(
             [(indices[:, None] == fit.indices[None]).all(axis=2).any(axis=1) for fit in fits], axis=1
         )
-        return cls(unit, targets, indices, active, np.array([fit.error for fit in fits]))
+        return cls(unit, targets, indices, active, np.array([fit.variance for fit in fits]))
 
     @cached_property
     def _solved(self) -> list[_Solved]:

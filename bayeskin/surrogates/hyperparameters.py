@@ -33,8 +33,8 @@ NORMAL_90 = 1.6448536269514722  # 90 % of a standard normal lies within
 class LatentFit(NamedTuple):
     """Hyperparameters of one latent, and what cross-validation says of them.
 
-    error: mean squared error of rows whose hyperparameters were fitted without them; inflation: ratio of
-    that error's 90 % quantile to what the predicted variance promises.
+    error: weighted mean squared error of rows whose hyperparameters were fitted without them; inflation:
+    ratio of those errors' 90 % quantile to what the predicted variance promises.
     """
 
     kernel: str
@@ -127,11 +127,14 @@ def _search(
     return linear_map, float(np.exp(x[-1]))
 
 
-def fit_latent(unit: Array, target: Array) -> LatentFit:
-    """Fits one latent (n,) at unit-cube points (n, d), the form of the kernel chosen by cross-validation."""
+def fit_latent(unit: Array, target: Array, weights: Array) -> LatentFit:
+    """Fits one latent (n,) at unit-cube points (n, d); the kernel has the least cross-validated error.
+
+    weights (n,) of the rows in that error; the likelihood knows no weights.
+    """
     dim = unit.shape[1]
     stride = -(-len(unit) // ROWS_TO_FIT)
-    unit, target = unit[::stride], target[::stride]
+    unit, target, weights = unit[::stride], target[::stride], weights[::stride]
     deviation = float(target.std())
     if deviation <= 1e-12 * max(abs(float(target.mean())), 1e-300):
         return LatentFit("gaussian", np.eye(dim), 1.0, 0.0, 1.0)
@@ -142,12 +145,14 @@ def fit_latent(unit: Array, target: Array) -> LatentFit:
         # axis-aligned lengths first, the oblique map from there: the second search is not convex
         at = _search(name, data, np.eye(dim, dtype=bool), (np.eye(dim), 1e-4), ALIGNED_STEPS)
         at = _search(name, data, np.tri(dim, dtype=bool), at, OBLIQUE_STEPS)
-        fits.append(_cross_validate(name, data, np.tri(dim, dtype=bool), at))
+        fits.append(_cross_validate(name, data, np.tri(dim, dtype=bool), at, weights))
     best = min(fits, key=lambda fit: fit.error)
     return best._replace(error=best.error * deviation**2)
 
 
-def _cross_validate(name: str, data: _Data, free: NDArray[np.bool_], at: tuple[Array, float]) -> LatentFit:
+def _cross_validate(
+    name: str, data: _Data, free: NDArray[np.bool_], at: tuple[Array, float], weights: Array
+) -> LatentFit:
     """Leave-one-out errors with hyperparameters refitted, from `at` on, without the row's fold.
 
     With the hyperparameters of all rows the closed form is too hopeful by up to a factor of two to four
@@ -165,4 +170,4 @@ def _cross_validate(name: str, data: _Data, free: NDArray[np.bool_], at: tuple[A
         residual[out] = all_rows.residual[out]
         ratio[out] = residual[out] / (all_rows.spread[out] * np.sqrt(variance))
     inflation = float(np.quantile(np.abs(ratio), 0.9)) / NORMAL_90
-    return LatentFit(name, at[0], at[1], float(np.mean(residual**2)), inflation)
+    return LatentFit(name, at[0], at[1], float(np.average(residual**2, weights=weights)), inflation)

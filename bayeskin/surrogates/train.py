@@ -109,19 +109,19 @@ def _fit(
 
 
 def _fit_latents(
-    fit_one: Callable[[Array, Array], F], unit: Array, force_n: Array, weights: Array
+    fit_one: Callable[[Array, Array, Array], F], unit: Array, force_n: Array, weights: Array
 ) -> tuple[ShapeTransform, Array, list[F]]:
     """Fits the amplitude, then components until what is left is negligible beside the error made."""
     amplitude, shapes = split(force_n)
     full, variances = all_components(shapes, weights)
     scores = (shapes - full.mean) @ full.components.T
-    fits = [fit_one(unit, amplitude)]
+    fits = [fit_one(unit, amplitude, weights)]
     error = fits[0].error * shapes.shape[1]  # a shape's squares sum to the number of bins
     left = float(variances.sum())
     for k in range(min(MOST_COMPONENTS, len(unit) // 3, int(np.sum(variances > 1e-14 * left)))):
         if left <= max(TRUNCATION_SHARE * error, 1e-14 * shapes.shape[1]):
             break
-        fit = fit_one(unit, scores[:, k])
+        fit = fit_one(unit, scores[:, k], weights)
         if fit.error > UNLEARNABLE * variances[k]:
             break
         fits.append(fit)

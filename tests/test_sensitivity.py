@@ -1,0 +1,215 @@
+"""Sobol' indices against closed forms (Ishigami, Sobol' g), and on a relaxing spring."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from toy import SPACE
+
+from bayeskin.errors import InputError
+from bayeskin.sensitivity import (
+    error_draws,
+    pick_freeze,
+    projection,
+    sentence,
+    sobol,
+    uninformed,
+)
+from bayeskin.types import Parameter, ParameterSpace, Prediction
+
+ONE_BIN = np.array([0.0, 1.0])
+METHODS = [pick_freeze, projection]
+
+
+def box(dim, lower, upper):
+    return ParameterSpace(tuple(Parameter(f"x{i}", "", lower, upper, "uniform") for i in range(dim)))
+
+
+def ishigami(x):
+    return (np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0]))[:, None]
+
+
+def ishigami_indices():
+    one, two, both = 0.5 * (1 + 0.1 * np.pi**4 / 5) ** 2, 49 / 8, 8 * 0.01 * np.pi**8 / 225
+    whole = one + two + both
+    return np.array([one, two, 0]) / whole, np.array([one + both, two, both]) / whole
+
+
+G_WEIGHTS = np.array([0.0, 1.0, 4.5, 9.0, 99.0])
+
+
+def sobol_g(x):
+    return np.prod((np.abs(4 * x - 2) + G_WEIGHTS) / (1 + G_WEIGHTS), axis=1)[:, None]
+
+
+def sobol_g_indices():
+    part = 1 / (3 * (1 + G_WEIGHTS) ** 2)
+    variance = np.prod(1 + part) - 1
+    return part / variance, part * np.prod(1 + part) / (1 + part) / variance
+
+
+def relaxing_force(theta, time_s):
+    """Force [N] (n, m) of two springs, of which one relaxes at a rate that k_s sets; k_c, p_init inert."""
+    e_c, e_s, _, k_s, _ = np.atleast_2d(theta).T
+    rate = 0.05 * (1.0 + np.log10(k_s * 1e16))
+    stiffness = 0.3 * e_c[:, None] + 3.0 * e_s[:, None] * (0.3 + 0.7 * np.exp(-rate[:, None] * time_s))
+    return 1e-6 * stiffness * np.minimum(time_s, 1.0)
+
+
+@dataclass(frozen=True)
+class KnownSurrogate:
+    """`relaxing_force`, with an error of `share` of it."""
+
+    share: float
+    space = SPACE
+    edges_s = np.linspace(0.0, 20.0, 21)
+    provenance = {}  # noqa: RUF012
+
+    def predict(self, theta):
+        mean = relaxing_force(theta, self.edges_s[1:])
+        return Prediction(mean, self.share * mean[:, :, None], np.zeros_like(mean))
+
+
+@pytest.mark.parametrize("estimate", METHODS)
+def test_ishigami(estimate):
+    result = estimate(ishigami, box(3, -np.pi, np.pi), ONE_BIN, np.random.default_rng(1), 4096)
+    first, total = ishigami_indices()
+    tolerance = {"pick-freeze": 0.02, "projection": 1e-6}[result.method]
+    np.testing.assert_allclose(result.first[:, 0], first, atol=tolerance)
+    np.testing.assert_allclose(result.total[:, 0], total, atol=tolerance)
+    np.testing.assert_allclose(result.first_aggregated, result.first[:, 0])
+
+
+@pytest.mark.parametrize("estimate", METHODS)
+def test_sobol_g(estimate):
+    """Kinked, so that a polynomial converges slowly: it says so in `unexplained`."""
+    result = estimate(sobol_g, box(5, 0.0, 1.0), ONE_BIN, np.random.default_rng(2), 4096)
+    first, total = sobol_g_indices()
+    np.testing.assert_allclose(result.first[:, 0], first, atol=0.03)
+    np.testing.assert_allclose(result.total[:, 0], total, atol=0.03)
+    if result.method == "projection":
+        assert 1e-4 < result.unexplained < 0.1
+
+
+def test_intervals_hold_the_truth_and_narrow_as_the_root_of_the_samples():
+    first, total = ishigami_indices()
+    widths = []
+    for samples in (1024, 4096):
+        result = pick_freeze(ishigami, box(3, -np.pi, np.pi), ONE_BIN, np.random.default_rng(3), samples)
+        for truth, (low, high) in ((first, result.first_interval), (total, result.total_interval)):
+            assert np.all((low[:, 0] <= truth) & (truth <= high[:, 0]))
+        widths.append(np.mean(result.first_interval[1] - result.first_interval[0]))
+    assert widths[0] / widths[1] == pytest.approx(2.0, rel=0.25)
+
+
+def test_ninety_percent_intervals_cover_at_least_ninety_percent_of_independent_runs():
+    """Bootstrap treats scrambled Sobol' points as independent, which is on the safe side."""
+    first, _ = ishigami_indices()
+    results = [
+        pick_freeze(ishigami, box(3, -np.pi, np.pi), ONE_BIN, np.random.default_rng(seed), 256)
+        for seed in range(30)
+    ]
+    covered = [(r.first_interval[0, :, 0] <= first) & (first <= r.first_interval[1, :, 0]) for r in results]
+    assert np.mean(covered) >= 0.85
+
+
+def test_bins_without_variance_are_not_a_number():
+    def function(x):
+        return np.column_stack([np.ones(len(x)), ishigami(x)[:, 0], 3.0 + 1e-6 * x[:, 0]])
+
+    for estimate in METHODS:
+        result = estimate(function, box(3, -np.pi, np.pi), np.arange(4.0), np.random.default_rng(0), 256)
+        assert np.isnan(result.first[:, [0, 2]]).all()
+        assert np.isnan(result.total[:, [0, 2]]).all()
+        assert np.isfinite(result.first[:, 1]).all()
+        assert np.isfinite(result.total_aggregated).all()
+
+
+def test_a_constant_function_informs_nothing():
+    result = pick_freeze(
+        lambda x: np.ones((len(x), 2)), box(2, 0.0, 1.0), np.arange(3.0), np.random.default_rng(0), 64
+    )
+    assert np.isnan(result.total_aggregated).all()
+    assert uninformed(result) == ()
+    assert "none of them" in sentence(result)
+
+
+def test_aggregated_indices_weigh_bins_by_variance_and_width():
+    def function(x):
+        return np.column_stack([x[:, 0], 2.0 * x[:, 1]])
+
+    result = projection(function, box(2, 0.0, 1.0), np.array([0.0, 1.0, 4.0]), np.random.default_rng(0), 256)
+    np.testing.assert_allclose(result.first, np.eye(2), atol=1e-10)
+    np.testing.assert_allclose(result.first_aggregated, [1 / 13, 12 / 13], rtol=1e-8)  # 1 * 1 : 4 * 3
+
+
+def test_the_two_methods_agree_on_a_relaxing_spring():
+    surrogate = KnownSurrogate(0.0)
+    one = sobol(surrogate, np.random.default_rng(0), 1024, method="pick-freeze")
+    two = sobol(surrogate, np.random.default_rng(0), 1024, method="projection")
+    np.testing.assert_allclose(one.total_aggregated, two.total_aggregated, atol=0.02)
+    assert two.unexplained < 1e-3
+    assert uninformed(one) == uninformed(two) == ("k_c", "p_init")
+    assert sentence(one).startswith("The force does not inform k_c and p_init: their total Sobol' indices")
+
+
+def test_inert_parameters_have_a_total_index_of_zero():
+    result = sobol(KnownSurrogate(0.0), np.random.default_rng(0), 128)
+    assert np.nanmax(np.abs(result.total[[2, 4]])) < 1e-12
+
+
+def test_intervals_widen_with_the_surrogates_error():
+    widths = []
+    for share in (0.0, 0.1):
+        result = sobol(KnownSurrogate(share), np.random.default_rng(0), 512, method="projection")
+        widths.append(np.max(result.total_aggregated_interval[1] - result.total_aggregated_interval[0]))
+    assert widths[0] < 1e-10
+    assert widths[1] > 0.005
+
+
+def test_error_draws_have_the_predicted_spread_and_are_smooth():
+    surrogate = KnownSurrogate(0.1)
+    unit = np.full((2, 5), 0.5)
+    unit[1, 0] += 1e-3
+    theta = SPACE.from_unit(unit)
+    mean = surrogate.predict(theta).mean
+    draws = np.array([f(theta) for f in error_draws(surrogate, 200, np.random.default_rng(1))])
+    spread = (draws[:, :, 12] - mean[:, 12]) / mean[:, 12]
+    assert spread[:, 0].std() == pytest.approx(0.1, rel=0.15)
+    assert np.abs(spread[:, 1] - spread[:, 0]).max() < 0.01
+
+
+def test_the_input_distribution_is_stated_and_can_be_narrower():
+    narrow = ParameterSpace(
+        tuple(replace(p, lower=float(a), upper=float(b)) for p, a, b in zip(
+            SPACE.parameters, SPACE.from_unit(np.full(5, 0.4)), SPACE.from_unit(np.full(5, 0.6)), strict=True
+        ))
+    )  # fmt: skip
+    surrogate = KnownSurrogate(0.0)
+    result = sobol(surrogate, np.random.default_rng(0), 64, space=narrow)
+    assert f"E_c log-uniform {narrow.lower[0]:g} to {narrow.upper[0]:g} Pa" in result.distribution
+    wide = ParameterSpace((replace(SPACE.parameters[0], upper=1e7), *SPACE.parameters[1:]))
+    with pytest.raises(InputError, match="sobol: space"):
+        sobol(surrogate, np.random.default_rng(0), 64, space=wide)
+
+
+def test_the_same_seed_gives_the_same_numbers():
+    one, two = (sobol(KnownSurrogate(0.01), np.random.default_rng(0), 64) for _ in range(2))
+    assert np.array_equal(one.total_interval, two.total_interval, equal_nan=True)
+    three = sobol(KnownSurrogate(0.01), np.random.default_rng(1), 64)
+    assert not np.array_equal(one.total_aggregated, three.total_aggregated)
+
+
+def test_salib_gives_the_same_indices():
+    """An independent package, where it is installed."""
+    saltelli = pytest.importorskip("SALib.sample.sobol", reason="SALib is not installed")
+    from SALib.analyze import sobol as analyze
+
+    problem = {"num_vars": 3, "names": ["x0", "x1", "x2"], "bounds": [[-np.pi, np.pi]] * 3}
+    theirs = analyze.analyze(
+        problem, ishigami(saltelli.sample(problem, 1024, calc_second_order=False, seed=1))[:, 0],
+        calc_second_order=False, seed=1,
+    )  # fmt: skip
+    ours = pick_freeze(ishigami, box(3, -np.pi, np.pi), ONE_BIN, np.random.default_rng(1), 1024)
+    np.testing.assert_allclose(ours.first[:, 0], theirs["S1"], atol=0.05)
+    np.testing.assert_allclose(ours.total[:, 0], theirs["ST"], atol=0.05)
