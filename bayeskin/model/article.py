@@ -64,9 +64,13 @@ class ArticleModel:
         # displacement nodes 0..corners-1 are the mesh's vertices in scikit-fem's numbering
         assert np.array_equal(space.nodes_u[:, :4], self._cells)
 
-    def step(self, x: Array, corners: Array, dt: float, pad_displacement_m: float, guess: Array
-             ) -> tuple[Array, float] | None:
-        """New x (dofs,) and the force [N] after a step dt [s] that starts at x on `corners` (n, 3)."""
+    def step(
+        self, x: Array, corners: Array, dt: float, pad_displacement_m: float, guess: Array | None
+    ) -> tuple[Array, float] | None:
+        """New x (dofs,) and the force [N] after a step dt [s] that starts at x on `corners` (n, 3).
+
+        Without a guess (the pads' speed has just changed) the step begins from the linear response.
+        """
         jacobian = corners[self._cells[:, 1:]] - corners[self._cells[:, :1]]  # (e, 3 edges, 3)
         inverse = np.linalg.inv(jacobian)  # rows: coordinates; columns: edges
         volume = np.linalg.det(jacobian)
@@ -74,8 +78,10 @@ class ArticleModel:
         grad_p = np.einsum("qaj,eij->eqai", self._ref_p, inverse, optimize=True)
         weight = np.abs(volume)[:, None] * self._weight
         equations = self._equations(x, grad_u, grad_p, weight, dt)
-        target = self.problem.prescribe(guess, pad_displacement_m)
-        new = self.solver.solve(equations, target)
+        start: Array | None = self.problem.prescribe(x if guess is None else guess, pad_displacement_m)
+        if guess is None:
+            start = self.solver.respond(equations, x, start, self.problem.pattern.fixed)
+        new = None if start is None else self.solver.solve(equations, start)
         if new is None:
             return None
         return new, self._force(new, corners, inverse)
@@ -151,11 +157,9 @@ def run(
         speed = (displacement_m[n] - displacement_m[n - 1]) / dt
         steady = np.isfinite(old_speed) and abs(speed - old_speed) < 0.2 * abs(speed) + 1e-5
         pad = 0.5 * float(displacement_m[n])
-        guess = x + dt * rate if steady else x
-        found = model.step(x, corners, dt, pad, guess)
-        if found is None:  # once more with a tangent of this very step
-            model.solver.forget()
-            found = model.step(x, corners, dt, pad, x)
+        found = model.step(x, corners, dt, pad, x + dt * rate if steady else None)
+        if found is None and steady:
+            found = model.step(x, corners, dt, pad, None)
         if found is None:
             return (
                 f"step {n} at t = {time_s[n]:.2f} s did not converge; the article's formulation has "

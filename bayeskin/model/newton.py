@@ -18,8 +18,8 @@ from bayeskin.model.linear import Factorisation, factorisation
 from bayeskin.types import Array
 
 MAX_RENEWALS = 8
-MAX_BROYDEN = 12
-SLOW = 0.4  # a contraction worse than this is dearer than a new tangent
+MAX_BROYDEN = 25
+SLOW = 0.7  # a factorisation costs some twenty iterations: slower contraction than this is dearer
 SMALLEST_DAMPING = 1 / 64
 
 
@@ -55,10 +55,6 @@ class NewtonSolver:
     def __post_init__(self) -> None:
         self._factors = factorisation(self.symmetric)
 
-    def forget(self) -> None:
-        """Makes the next solve begin with a tangent of its own."""
-        self._ready = False
-
     def release(self) -> None:
         """Frees the factors."""
         self._factors.release()
@@ -71,6 +67,21 @@ class NewtonSolver:
         self.counts["factorisations"] += 1
         self._ready = True
         return free_fixed
+
+    def respond(self, equations: Equations, x: Array, target: Array, fixed: np.ndarray) -> Array | None:
+        """First guess when the fixed dofs jump from x to `target`: the linear response of the free ones.
+
+        Renews the tangent at x. None if x itself is inside out.
+        """
+        free_fixed = self.renew(equations, x)
+        right = self._residual(equations, x)
+        if right is None:
+            return None
+        guess = target.copy()
+        guess[equations.free] = x[equations.free] - self.back_substitute(
+            right + free_fixed @ (target[fixed] - x[fixed])
+        )
+        return guess
 
     def back_substitute(self, right: Array) -> Array:
         """Solves with the tangent factorised last, (free,)."""

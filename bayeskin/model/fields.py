@@ -1,0 +1,130 @@
+"""Fields of a run for ParaView: an XDMF series with its HDF5 data beside it.
+
+Written on the corners and cells of the reference mesh (warp by `displacement` in ParaView):
+
+- displacement [m] and pressure [Pa] at the corners;
+- porosity ``1 - (1 - porosity_0) / J`` (the solid's mass balance), effective stress
+  ``P_eff F^T / J`` and total stress ``effective - p I`` [Pa], and fluid velocity
+  ``v_l = -k / (mu_f porosity) grad p + v_s`` [m/s] (the article's Darcy law, with the fluid's
+  viscosity mu_f), as means over each cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import meshio
+import numpy as np
+import skfem
+
+from bayeskin.model.problem import Constants, Problem, material
+from bayeskin.types import Array
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Fields at one time. c corners, e cells.
+
+    displacement (c, 3) [m], pressure (c,) [Pa], porosity (e,), effective_stress and total_stress
+    (e, 3, 3) Cauchy [Pa], fluid_velocity (e, 3) [m/s]
+    """
+
+    displacement: Array
+    pressure: Array
+    porosity: Array
+    effective_stress: Array
+    total_stress: Array
+    fluid_velocity: Array
+
+
+def fields_of(problem: Problem, theta: Mapping[str, float], x: Array, rate: Array) -> Fields:
+    """Fields from the unknowns x (dofs,) and their rate (dofs,) [per s]."""
+    s, c = problem.space, Constants()
+    cells = material(theta, problem.mesh.cutis)
+    u, v = (a[: 3 * s.n_nodes].reshape(-1, 3)[s.nodes_u] for a in (x, rate))
+    p = x[3 * s.n_nodes + s.nodes_p]
+    f = np.eye(3) + np.einsum("eai,eqaj->eqij", u, s.grad_u)
+    j = np.linalg.det(f)
+    inverse = np.linalg.inv(f)
+    mu, lam = cells.mu[:, None, None, None], cells.lam[:, None, None, None]
+    left = np.einsum("eqik,eqjk->eqij", f, f)
+    log_j = np.log(j)[..., None, None]
+    effective = (mu * (left - np.eye(3)) + lam * log_j * np.eye(3)) / j[..., None, None]
+    pressure = np.einsum("qb,eb->eq", s.value_p, p)
+    total = effective - pressure[..., None, None] * np.eye(3)
+    initial = np.where(problem.mesh.cutis, c.porosity_c, c.porosity_s)[:, None]
+    porosity = 1.0 - (1.0 - initial) / j
+    gradient = np.einsum("eqji,eqbj,eb->eqi", inverse, s.grad_p, p)
+    weight = s.weight / s.weight.sum(axis=1, keepdims=True)
+    darcy = -(cells.mobility[:, None] / porosity)[..., None] * gradient
+    corner_u = _at_corners(problem, x)
+    corner_p = np.zeros(len(corner_u))
+    corner_p[_corner_numbers(problem)] = x[3 * s.n_nodes + s.nodes_p]
+    return Fields(
+        displacement=corner_u,
+        pressure=corner_p,
+        porosity=np.einsum("eq,eq->e", weight, porosity),
+        effective_stress=np.einsum("eq,eqij->eij", weight, effective),
+        total_stress=np.einsum("eq,eqij->eij", weight, total),
+        fluid_velocity=np.einsum("eq,eqi->ei", weight, darcy) + v.mean(axis=1),
+    )
+
+
+class FieldWriter:
+    """Collects a run's states and writes them as one XDMF series; give `on_state` to `simulate`."""
+
+    def __init__(self, directory: Path | str, problem: Problem, theta: Mapping[str, float]) -> None:
+        self.path = Path(directory) / "fields.xdmf"
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._problem, self._theta = problem, dict(theta)
+        self._states: list[tuple[float, Array]] = []
+
+    def on_state(self, time_s: float, x: Array, force_n: float) -> None:
+        """Keeps a state of the run."""
+        self._states.append((time_s, x.copy()))
+
+    def write(self) -> Path:
+        """Writes the series; returns the path of the XDMF file."""
+        mesh = self._problem.mesh.geometry
+        kind = "hexahedron" if isinstance(mesh, skfem.MeshHex) else "tetra"
+        corners = _corner_numbers(self._problem)
+        order = list(_VTK_HEXAHEDRON) if kind == "hexahedron" else list(range(4))
+        points = mesh.doflocs.T[: corners.max() + 1]
+        with meshio.xdmf.TimeSeriesWriter(self.path) as writer:
+            writer.write_points_cells(points, [(kind, corners[:, order])])
+            for (before_s, before), (time_s, x) in zip(
+                [self._states[0], *self._states[:-1]], self._states, strict=True
+            ):
+                rate = (x - before) / (time_s - before_s) if time_s > before_s else np.zeros_like(x)
+                fields = fields_of(self._problem, self._theta, x, rate)
+                writer.write_data(
+                    time_s,
+                    point_data={"displacement": fields.displacement, "pressure": fields.pressure},
+                    cell_data={
+                        "porosity": [fields.porosity],
+                        "effective_stress": [fields.effective_stress.reshape(-1, 9)],
+                        "total_stress": [fields.total_stress.reshape(-1, 9)],
+                        "fluid_velocity": [fields.fluid_velocity],
+                        "cutis": [self._problem.mesh.cutis.astype(float)],
+                    },
+                )
+        return self.path
+
+
+# scikit-fem's corner order of a brick, rearranged to VTK's
+_VTK_HEXAHEDRON = (0, 3, 6, 2, 1, 5, 7, 4)
+
+
+def _corner_numbers(problem: Problem) -> np.ndarray:
+    """Vertex numbers of each cell's corners in the order of `nodes_p`, (e, 4 or 8)."""
+    return problem.mesh.geometry.t.T
+
+
+def _at_corners(problem: Problem, x: Array) -> Array:
+    """Displacement (c, 3) at the vertices: the first shape functions of a cell belong to its corners."""
+    s, corners = problem.space, _corner_numbers(problem)
+    out = np.zeros((corners.max() + 1, 3))
+    out[corners] = x[: 3 * s.n_nodes].reshape(-1, 3)[s.nodes_u[:, : corners.shape[1]]]
+    return out
