@@ -13,6 +13,7 @@ each tau of a grid.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +21,7 @@ from scipy.linalg import matmul_toeplitz
 from scipy.optimize import nnls
 from scipy.signal import correlate
 
-from bayeskin.types import Array
+from bayeskin.types import Array, frozen_array
 
 _DEGREE = 2
 _GRID = 40  # correlation times tried, up to this share of a window:
@@ -93,17 +94,25 @@ def fit_shape(correlogram: Array, samples: int, interval_s: float, size: int) ->
     `size`. White unless a correlated part lowers the misfit by more than white noise would let it: the
     estimates of white noise's correlations scatter with variance 1 / samples.
     """
-    lags = len(correlogram)
-    lag_s = interval_s * np.arange(size)
-    white = expected_products(np.where(lag_s == 0, 1.0, 0.0), lags)
+    taus, dictionary = _dictionary(interval_s, size, len(correlogram))
+    white = dictionary[0]
     only = correlogram - white * float(white @ correlogram) / float(white @ white)
     least, best = float(only @ only) - _CHANCE / samples, WHITE
-    for tau in np.geomspace(interval_s, _LONGEST * size * interval_s, _GRID):
-        basis = np.column_stack([white, expected_products(np.exp(-lag_s / tau), lags)])
-        amplitude, misfit = nnls(basis, correlogram)
+    for tau, slow in zip(taus, dictionary[1:], strict=True):
+        amplitude, misfit = nnls(np.column_stack([white, slow]), correlogram)
         if misfit**2 < least:
             least, best = misfit**2, NoiseShape(float(amplitude[0] / amplitude.sum()), float(tau))
     return best
+
+
+@lru_cache(maxsize=8)
+def _dictionary(interval_s: float, size: int, lags: int) -> tuple[Array, Array]:
+    """The correlation times tried (k,), and the expected products of white noise and of each (k + 1, lags)."""
+    lag_s = interval_s * np.arange(size)
+    taus = np.geomspace(interval_s, _LONGEST * size * interval_s, _GRID)
+    correlations = [np.where(lag_s == 0, 1.0, 0.0), *(np.exp(-lag_s / tau) for tau in taus)]
+    products = np.array([expected_products(correlation, lags) for correlation in correlations])
+    return frozen_array(taus), frozen_array(products)
 
 
 def weighted_covariance(a: Array, b: Array, correlation: Array) -> float:

@@ -80,9 +80,11 @@ def running_median(values: Array, half: int) -> Array:
     half = min(half, (len(values) - 1) // 2)
     if half < 1:
         return values.copy()
-    few = min(5, len(values))
     ended = values.copy()
-    ended[0], ended[-1] = np.median(values[:few]), np.median(values[-few:])
+    for end in (slice(None), slice(None, None, -1)):  # a spike may stand on the end: its level by robust line
+        inward = values[end]
+        if len(inward) >= 9:
+            ended[end][0] = 1.5 * np.median(inward[:5]) - 0.5 * np.median(inward[4:9])
     padded = np.pad(ended, half, mode="reflect", reflect_type="odd")
     return median_filter(padded, 2 * half + 1)[half:-half]
 
