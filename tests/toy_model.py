@@ -10,7 +10,6 @@ from toy import SPACE, toy_force
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.types import PadMotion, Simulation, frozen_array
 
-
 SCALE = 1e-3  # the toy is a thousand times too stiff for a skin test
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bayeskin.config import parameter_space
 from bayeskin.errors import InputError
 from bayeskin.pipeline.engine import Run
 from bayeskin.pipeline.folder import sha256_of
@@ -48,7 +49,7 @@ def origin(run: Run, motion: PadMotion, records: Sequence[Mapping[str, Any]]) ->
 
 
 def check_fits(run: Run, files: ShippedFiles, design: Design, binned: BinnedForce, motion: PadMotion) -> None:
-    """Raises InputError unless model, protocol and bins of the surrogate are this run's."""
+    """Raises InputError unless model, protocol and bins are this run's, and its priors lie in the box."""
     said = load_manifest(files.surrogate)
     where = f"{run.config_path}: surrogate.file {files.surrogate.name}"
     if {design.model_hash, said.get("model_hash")} != {model_spec(run).hash}:
@@ -59,6 +60,14 @@ def check_fits(run: Run, files: ShippedFiles, design: Design, binned: BinnedForc
         found = f"{len(design.edges_s) - 1} bins to {design.edges_s[-1]:g} s"
         expected = f"the recording's {len(binned.edges_s) - 1} bins to {binned.edges_s[-1]:g} s"
         raise InputError(where, found, expected)
+    for ours in parameter_space(run.config, run.config_path).parameters:
+        box = said["parameters"][ours.name]
+        if ours.lower < box["lower"] or ours.upper > box["upper"]:
+            raise InputError(
+                f"{run.config_path}: parameters.{ours.name}",
+                f"{ours.lower:g} to {ours.upper:g} {ours.unit}",
+                f"a part of {box['lower']:g} to {box['upper']:g}, the box of surrogate.file",
+            )
 
 
 def motion_sha256(motion: PadMotion) -> str:

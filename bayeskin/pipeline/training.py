@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 
 from bayeskin import report, storage
-from bayeskin.config import parameter_space
-from bayeskin.errors import InputError
 from bayeskin.pipeline.design import enough, fitted_bins, focus
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.provenance import caption
@@ -42,7 +40,6 @@ def _work(run: Run) -> Mapping[str, Any]:
     if run.config.surrogate.file is not None:
         ready = shipped_files(run).surrogate
         surrogate, manifest = load_surrogate(ready), load_manifest(ready)
-        _check_inside_box(run, surrogate)
     else:
         surrogate, validation = trained(run, design, binned)
         records = json.loads(run.at("design", "waves.json").read_text())
@@ -50,18 +47,6 @@ def _work(run: Run) -> Mapping[str, Any]:
     save_surrogate(run.at("train", "surrogate.h5"), surrogate, manifest)
     _draw(run, design, binned, surrogate)
     return {name: value for name, value in manifest.items() if name not in ("waves", "parameters")}
-
-
-def _check_inside_box(run: Run, surrogate: ShapeSurrogate) -> None:
-    """Raises InputError for a prior that reaches beyond the box of a surrogate that came ready."""
-    space = parameter_space(run.config, run.config_path)
-    for ours, box in zip(space.parameters, surrogate.space.parameters, strict=True):
-        if ours.lower < box.lower or ours.upper > box.upper:
-            raise InputError(
-                f"{run.config_path}: parameters.{ours.name}",
-                f"{ours.lower:g} to {ours.upper:g} {ours.unit}",
-                f"a part of {box.lower:g} to {box.upper:g}, the box of surrogate.file",
-            )
 
 
 def _draw(run: Run, design: Design, binned: BinnedForce, surrogate: ShapeSurrogate) -> None:

@@ -1,0 +1,306 @@
+"""The command line: one line and exit code 2 for wrong input, one JSON document, nothing written over."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+import toy_model
+from toy import MOTION, SPACE, toy_force
+
+from bayeskin import cli, storage
+from bayeskin.design import first_wave
+from bayeskin.model.simulate import ModelSpec
+from bayeskin.pipeline import single, stages
+from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
+from bayeskin.pipeline.shipping import motion_sha256
+from bayeskin.recordings import idealised_motion, read_recording, segment
+from bayeskin.surrogates import manifest_of, save_surrogate, train
+from bayeskin.types import Design, Recording, Simulation
+
+THETA = np.array([[200e3, 30e3, 1e-14, 1e-13, 300.0]])
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sound recording as CSV."""
+    path = tmp_path_factory.mktemp("measured") / "measured.csv"
+    time_s = np.arange(0.0, 130.001, 0.1)
+    noise_n = 0.003 * np.random.default_rng(5).standard_normal(len(time_s))
+    force_n = toy_model.SCALE * toy_force(THETA, time_s)[0] + noise_n
+    write_csv(path, "time (s),displacement (mm),force (N)", time_s, 1e3 * MOTION.at(time_s), force_n)
+    return path
+
+
+def write_csv(path: Path, header: str, *columns: np.ndarray) -> None:
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=header, comments="", fmt="%.9g")
+
+
+@pytest.fixture
+def bayeskin(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Runs the command; gives exit code, stdout and stderr."""
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as stop:
+            cli.main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return int(stop.value.code or 0), captured.out, captured.err
+
+    return call
+
+
+Command = Callable[..., tuple[int, str, str]]
+
+
+def assert_refused(answer: tuple[int, str, str], *says: str) -> None:
+    """Exit code 2, nothing on stdout, and one line that names the fault."""
+    code, out, err = answer
+    line = err.splitlines()[-1]
+    assert code == 2
+    assert out == ""
+    assert line.startswith("bayeskin: ")
+    assert "Traceback" not in err
+    assert [text for text in err.splitlines() if text.startswith("bayeskin: ")] == [line]
+    for part in says:
+        assert part in line
+
+
+def test_import_writes_the_recording_and_says_what_it_found(
+    bayeskin: Command, measured: Path, tmp_path: Path
+) -> None:
+    code, out, err = bayeskin("import", measured, "-o", tmp_path / "r.h5", "--json")
+    said = json.loads(out)
+    stored = storage.load(tmp_path / "r.h5", Recording)
+    assert (code, err) == (0, "")
+    assert said["samples"] == len(stored.time_s) == 1301
+    assert [phase["kind"] for phase in said["phases"]][:4] == ["rest", "load", "hold", "unload"]
+    assert stored.displacement_m.max() == pytest.approx(9e-3)
+
+
+def without_force(path: Path) -> None:
+    write_csv(path, "time (s),displacement (mm)", np.arange(200) * 0.1, np.arange(200) * 0.01)
+
+
+def with_two_forces(path: Path) -> None:
+    ramp = np.arange(200) * 0.1
+    write_csv(path, "time (s),displacement (mm),force (N),force (N)", ramp, ramp, ramp, 2 * ramp)
+
+
+def one_phase(path: Path) -> None:
+    ramp = np.arange(500) * 0.1
+    write_csv(path, "time (s),displacement (mm),force (N)", ramp, 0.1 * ramp, 0.01 * ramp)
+
+
+def backwards(path: Path) -> None:
+    ramp = np.arange(500) * 0.1
+    write_csv(path, "time (s),displacement (mm),force (N)", ramp[::-1], ramp, ramp)
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (without_force, "force"),
+        (with_two_forces, "force"),
+        (one_phase, "one phase only"),
+        (backwards, "increase"),
+        (lambda path: path.write_text(""), "empty"),
+        (lambda path: path.write_text("time (s),displacement (mm),force (N)\n0,0,abc\n"), "abc"),
+        (lambda path: None, "unreadable"),
+        (lambda path: path.mkdir(), "unreadable"),
+    ],
+    ids=["no force", "two forces", "one phase", "time backwards", "empty", "text", "absent", "a folder"],
+)
+def test_an_unsound_recording_is_refused_and_the_earlier_output_kept(
+    bayeskin: Command, tmp_path: Path, make: Callable[[Path], object], says: str
+) -> None:
+    make(tmp_path / "bad.csv")
+    (tmp_path / "out.h5").write_bytes(b"earlier")
+    assert_refused(bayeskin("import", tmp_path / "bad.csv", "-o", tmp_path / "out.h5"), "bad", says)
+    assert (tmp_path / "out.h5").read_bytes() == b"earlier"
+
+
+def test_simulate_writes_the_columns_that_scripts_rely_on(
+    bayeskin: Command, measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(single, "simulate", toy_model.simulate)
+    common = ("simulate", "--recording", measured, "--set", "E_c=200e3", "--json")
+    code, out, _ = bayeskin(*common, "-o", tmp_path / "force.csv")
+    said = json.loads(out)
+    assert (code, said["status"], said["theta"]["E_c"]) == (0, "ok", 200e3)
+    assert said["theta"]["p_init"] == pytest.approx(SPACE.from_unit(np.full(5, 0.5))[4])
+    lines = (tmp_path / "force.csv").read_text().splitlines()
+    assert lines[0] == "time_s,displacement_m,force_n"
+    bayeskin(*common, "-o", tmp_path / "force.h5")
+    stored = storage.load(tmp_path / "force.h5", Simulation)
+    assert [float(x) for x in lines[-1].split(",")] == [
+        stored.time_s[-1], stored.displacement_m[-1], stored.force_n[-1],
+    ]  # fmt: skip
+
+
+def test_a_simulation_that_fails_exits_with_1_and_writes_nothing(
+    bayeskin: Command, measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*arguments: object, **options: object) -> Simulation:
+        run = toy_model.simulate(*arguments, **options)  # type: ignore[arg-type]
+        return replace(run, status="failed", message="no convergence at 3 s; take smaller steps")
+
+    monkeypatch.setattr(single, "simulate", failing)
+    (tmp_path / "force.csv").write_text("earlier")
+    code, out, _ = bayeskin("simulate", "--recording", measured, "-o", tmp_path / "force.csv", "--json")
+    assert code == 1
+    assert "smaller steps" in json.loads(out)["message"]
+    assert (tmp_path / "force.csv").read_text() == "earlier"
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--set", "E_c"], "NAME=VALUE"),
+        (["--set", "E_x=3"], "E_x"),
+        (["--set", "E_c=stiff"], "'stiff'"),
+        (["--set", "E_c=-3"], "positive"),
+        (["--set", "E_c=nan"], "finite"),
+        (["--mesh", "absent.msh"], "no such file"),
+        (["--observation", "article", "--mesh", "bricks"], "gmsh"),
+        (["--observation", "power"], "--observation"),
+        (["--depth", "3"], "--depth"),
+    ],
+)
+def test_wrong_options_are_refused(
+    bayeskin: Command, measured: Path, tmp_path: Path, options: list[str], says: str
+) -> None:
+    out = tmp_path / "force.csv"
+    assert_refused(bayeskin("simulate", "--recording", measured, *options, "-o", out), says)
+    assert not out.exists()
+
+
+def test_an_output_of_an_unknown_kind_is_refused(bayeskin: Command, measured: Path, tmp_path: Path) -> None:
+    assert_refused(bayeskin("simulate", "--recording", measured, "-o", tmp_path / "f.xls"), ".csv or .h5")
+    assert_refused(bayeskin("import", measured, "-o", tmp_path / "r.csv"), "ending .h5")
+
+
+def test_a_mesh_without_the_named_boundaries_is_refused(
+    bayeskin: Command, measured: Path, tmp_path: Path
+) -> None:
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=float)
+    meshio.Mesh(points, [("tetra", [[0, 1, 2, 3]])]).write(tmp_path / "bare.msh", file_format="gmsh")
+    answer = bayeskin(
+        "simulate", "--recording", measured, "--mesh", tmp_path / "bare.msh", "-o", tmp_path / "f.csv"
+    )
+    assert_refused(answer, "bare.msh", "right_patch")
+
+
+@pytest.mark.parametrize("command", ["design", "train", "map", "sample", "sobol", "report", "run"])
+def test_every_stage_refuses_a_wrong_configuration(bayeskin: Command, tmp_path: Path, command: str) -> None:
+    path = tmp_path / "case.toml"
+    path.write_text('[recording]\nfile = "r.csv"\ncolour = 3\n')
+    assert_refused(bayeskin(command, path), "case.toml: recording.colour", "unknown key")
+    path.write_text('[recording]\nfile = "r.csv"\n[parameters.k_c]\nlower = 1e-11\nupper = 1e-16\n')
+    assert_refused(bayeskin(command, path), "case.toml: parameters.k_c", "lower below upper")
+    path.write_text('[recording]\nfile = "r.csv"\n')
+    assert_refused(bayeskin(command, path), "case.toml", "r.csv")
+    assert_refused(bayeskin(command, tmp_path / "absent.toml"), "no such file")
+    assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) in (
+        ["case.toml"],
+        [".lock", "case.toml"],
+    )
+
+
+@pytest.fixture(scope="module")
+def ready(measured: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the recording and a surrogate of its protocol, as shipped ones are."""
+    folder = tmp_path_factory.mktemp("ready")
+    (folder / "measured.csv").write_bytes(measured.read_bytes())
+    recording = read_recording(measured)
+    motion, spec = idealised_motion(recording, segment(recording)), ModelSpec()
+    edges_s = np.arange(0.0, 130.5, 0.5)
+    wave = first_wave(SPACE, 24, 4, seed=1)
+    force_n = [
+        toy_model.simulate(spec, motion, dict(zip(SPACE.names, row, strict=True))).bin_means(edges_s)
+        for row in wave.theta
+    ]
+    n = len(wave.theta)
+    design = Design(
+        SPACE, edges_s, wave.theta, np.array(force_n), np.zeros(n, dtype=np.int64), wave.held_out,
+        np.ones(n, dtype=bool), ("",) * n, np.zeros(n), 1, spec.hash,
+    )  # fmt: skip
+    surrogate, validation = train(design, "chaos")
+    manifest = {
+        **manifest_of(surrogate, validation),
+        "motion_sha256": motion_sha256(motion),
+        "waves": [dict(wave.record)],
+    }
+    save_surrogate(folder / "ready.h5", surrogate, manifest)
+    storage.save(folder / "ready-design.h5", design)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("extra", "says"),
+    [
+        ("[parameters.E_c]\nupper = 4e6\n", "a part of 10000 to 2e+06"),
+        ("[fit]\nbin_width_s = 1.0\n", "130 bins"),
+        ("[model]\nrefinement = 2\n", "another model"),
+        ("[surrogate]\nfile = 'absent.h5'\n", "surrogates/absent.h5"),
+    ],
+    ids=["parameters outside its box", "other bins", "other model", "absent"],
+)
+def test_a_surrogate_is_used_only_where_it_belongs(
+    bayeskin: Command, ready: Path, extra: str, says: str
+) -> None:
+    named = "" if "[surrogate]" in extra else '[surrogate]\nfile = "ready.h5"\n'
+    (ready / "case.toml").write_text(f'[recording]\nfile = "measured.csv"\n{named}{extra}')
+    assert_refused(bayeskin("design", ready / "case.toml"), says)
+    assert not (ready / "case" / "design" / "design.h5").exists()
+
+
+def test_a_surrogate_of_another_protocol_is_refused(bayeskin: Command, ready: Path, tmp_path: Path) -> None:
+    for file in ready.glob("ready*"):
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    slower = read_recording(ready / "measured.csv")
+    storage.save(tmp_path / "slower.h5", replace(slower, time_s=1.02 * slower.time_s))
+    (tmp_path / "case.toml").write_text('[recording]\nfile = "slower.h5"\n[surrogate]\nfile = "ready.h5"\n')
+    assert_refused(bayeskin("design", tmp_path / "case.toml"), "another protocol")
+
+
+def one_stage(work: Callable[[Run], dict[str, object]]) -> dict[str, Stage]:
+    return {"report": Stage("report", "reports", (), (), work)}
+
+
+def test_the_exit_code_says_whether_the_answer_can_be_relied_on(
+    bayeskin: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "case.toml").write_text('[recording]\nfile = "r.csv"\n')
+
+    def failing(run: Run) -> dict[str, object]:
+        raise CannotGoOn("3 training runs of 20; narrow the prior box")
+
+    def interrupted(run: Run) -> dict[str, object]:
+        raise KeyboardInterrupt
+
+    original = stages.run
+    for work, expected in ((failing, 1), (interrupted, 130)):
+        monkeypatch.setattr(
+            stages, "run", lambda c, last, r, work=work: original(c, last, r, one_stage(work))
+        )
+        code, out, err = bayeskin("run", tmp_path / "case.toml", "--json")
+        assert code == expected
+        if expected == 1:
+            assert json.loads(out)["ok"] is False
+            assert "narrow the prior box" in json.loads(out)["text"]
+        else:
+            assert out == ""
+            assert err.splitlines()[-1] == "bayeskin: interrupted; the same command goes on from here"
+
+
+def test_help_teaches_each_command_by_an_example(bayeskin: Command) -> None:
+    for name in cli.cli.commands:
+        code, out, _ = bayeskin(name, "--help")
+        assert code == 0
+        assert "--json" in out
+        assert f"bayeskin {name} " in out.split("Example:")[1]
