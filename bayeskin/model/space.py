@@ -80,7 +80,7 @@ def taylor_hood(mesh: SkinMesh) -> TaylorHood:
         nodes_p=np.ascontiguousarray(corner.element_dofs.T),
         grad_u=gradients(basis),
         grad_p=gradients(corner),
-        value_p=np.ascontiguousarray(np.stack([np.broadcast_to(s[0].value, basis.dx.shape)[0] for s in corner.basis]).T),
+        value_p=np.ascontiguousarray(np.stack([np.array(shape[0])[0] for shape in corner.basis]).T),
         weight=np.ascontiguousarray(basis.dx),
         points_u=basis.doflocs,
         n_nodes=basis.N,
