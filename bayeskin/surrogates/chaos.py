@@ -48,7 +48,7 @@ def legendre_basis(unit: Array, indices: Indices) -> Array:
 
 
 class SparseFit(NamedTuple):
-    """Indices (k, d) of the terms of one latent; cross-validated squared error, its mean and weighted mean."""
+    """Indices (k, d) of the terms of one latent; cross-validated error squared: mean, weighted mean."""
 
     indices: Indices
     variance: float

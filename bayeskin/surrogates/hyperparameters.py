@@ -128,7 +128,7 @@ def _search(
 
 
 def fit_latent(unit: Array, target: Array, weights: Array) -> LatentFit:
-    """Fits one latent (n,) at unit-cube points (n, d); the kernel has the least cross-validated error.
+    """Fits one latent (n,) at unit-cube points (n, d); the kernel has the least leave-one-out error.
 
     weights (n,) of the rows in that error; the likelihood knows no weights.
     """
@@ -140,13 +140,15 @@ def fit_latent(unit: Array, target: Array, weights: Array) -> LatentFit:
         return LatentFit("gaussian", np.eye(dim), 1.0, 0.0, 1.0)
     basis = trend_basis(unit, trend_degree(len(unit), dim))
     data = _Data(unit - 0.5, basis, (target - target.mean()) / deviation)
-    fits = []
+    found = []
     for name in KERNELS:
         # axis-aligned lengths first, the oblique map from there: the second search is not convex
         at = _search(name, data, np.eye(dim, dtype=bool), (np.eye(dim), 1e-4), ALIGNED_STEPS)
         at = _search(name, data, np.tri(dim, dtype=bool), at, OBLIQUE_STEPS)
-        fits.append(_cross_validate(name, data, np.tri(dim, dtype=bool), at, weights))
-    best = min(fits, key=lambda fit: fit.error)
+        residual = _likelihood(name, *at, data).residual
+        found.append((float(np.average(residual**2, weights=weights)), name, at))
+    _, name, at = min(found, key=lambda kernel: kernel[0])
+    best = _cross_validate(name, data, np.tri(dim, dtype=bool), at, weights)
     return best._replace(error=best.error * deviation**2)
 
 

@@ -22,7 +22,7 @@ from bayeskin.types import Array, Design, ParameterSpace
 Kind = Literal["gp", "chaos"]
 F = TypeVar("F", LatentFit, SparseFit)
 MOST_COMPONENTS = 12
-TRUNCATION_SHARE = 0.02  # of the latents' squared error: 1 % more of the error, rooted
+TRUNCATION_SHARE = 0.1  # of the latents' squared error: 5 % more error, for fewer latents to predict
 UNLEARNABLE = 0.9  # of a component's variance left as error: it predicts nothing, so it is truncation
 MARGIN = 0.15  # of the region's width: rows just outside it support the surrogate at its faces
 FOLDS = 4
