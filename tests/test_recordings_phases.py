@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from skin_test import (
     CORNERS_S,
@@ -112,6 +112,7 @@ def test_a_staircase_is_one_cycle_and_a_change_of_speed_a_corner() -> None:
     ),
     st.sampled_from([0.01, 0.02, 0.05]),
 )
+@example([(2.0, 2.64453125, 1.69140625, 1.0), (2.0, 1.0, 1.0, 1.0)], 0.02)  # a fast ramp's rounded end
 @settings(max_examples=40, deadline=None)
 def test_any_protocol_of_load_hold_unload_rest_is_recovered(
     cycles: list[tuple[float, float, float, float]], interval_s: float

@@ -107,7 +107,7 @@ def fit_shape(correlogram: Array, samples: int, interval_s: float, size: int) ->
 
 @lru_cache(maxsize=8)
 def _dictionary(interval_s: float, size: int, lags: int) -> tuple[Array, Array]:
-    """The correlation times tried (k,), and the expected products of white noise and of each (k + 1, lags)."""
+    """The correlation times tried (k,); the expected products of white noise and of each (k + 1, lags)."""
     lag_s = interval_s * np.arange(size)
     taus = np.geomspace(interval_s, _LONGEST * size * interval_s, _GRID)
     correlations = [np.where(lag_s == 0, 1.0, 0.0), *(np.exp(-lag_s / tau) for tau in taus)]

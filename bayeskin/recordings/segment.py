@@ -21,7 +21,8 @@ from bayeskin.types import Array, Phase, PhaseKind, Recording
 _STILL_SHARE = 0.03  # a piece that moves less than this share of the travel is still: drift, overshoot
 _REST_SHARE = 0.05  # still and this near to the lowest level: a rest, else a hold
 _SHORTEST_STILL_S = 0.2  # a turning point's dwell, shorter than this, is no phase
-_SPEED_CHANGE = 1.5  # loading that changes its speed by more has a corner there
+_SPEED_CHANGE = 1.5  # loading that changes its speed by more has a corner there,
+_SHORTEST_RAMP_S = 0.5  # if both parts last at least this long
 _TRIM_S = 0.5  # left out of a line fit at the rounded end of a piece, but never more than a tenth of it
 
 
@@ -108,16 +109,26 @@ def _join(pieces: list[_Piece], time_s: Array, smooth: Array, still_m: float) ->
     """Neighbours of one direction made one, unless both are ramps and their speeds differ."""
     joined: list[_Piece] = []
     for piece in pieces:
-        if joined and joined[-1].direction == piece.direction:
-            speeds, moved = [], []
-            for each in (joined[-1], piece):
-                moved.append(abs(smooth[each.stop] - smooth[each.start]))
-                speeds.append(moved[-1] / (time_s[each.stop] - time_s[each.start]))
-            if piece.direction == 0 or min(moved) < still_m or max(speeds) <= _SPEED_CHANGE * min(speeds):
-                joined[-1] = replace(piece, start=joined[-1].start)
-                continue
-        joined.append(piece)
+        last = joined[-1] if joined else None
+        if (
+            last is not None
+            and last.direction == piece.direction
+            and not _apart(last, piece, time_s, smooth, still_m)
+        ):
+            joined[-1] = replace(piece, start=last.start)
+        else:
+            joined.append(piece)
     return joined
+
+
+def _apart(a: _Piece, b: _Piece, time_s: Array, smooth: Array, still_m: float) -> bool:
+    """Whether two neighbours are ramps of their own: long, far-reaching and of different speeds."""
+    moved = np.array([abs(smooth[p.stop] - smooth[p.start]) for p in (a, b)])
+    lasted = np.array([time_s[p.stop] - time_s[p.start] for p in (a, b)])
+    speed = moved / lasted
+    if a.direction == 0 or moved.min() < still_m or lasted.min() < _SHORTEST_RAMP_S:
+        return False
+    return bool(speed.max() > _SPEED_CHANGE * speed.min())
 
 
 def _line(time_s: Array, smooth: Array, start: int, stop: int) -> tuple[float, float]:
