@@ -16,6 +16,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 import bayeskin
 from bayeskin.errors import InputError
 
+# Its matrices are small: threads of linear algebra would cost more than they give. Read when numpy loads.
+for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
 DONE, NOT_TRUSTED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout.")
@@ -95,6 +99,7 @@ def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
 @click.option("--mesh", help="'bricks' or a gmsh file; default as in CONFIG.")
 @click.option("--observation", type=click.Choice(["reaction", "article"]), help="Default as in CONFIG.")
 @click.option("-o", "out", required=True, type=click.Path(path_type=Path), help="File to write: .csv or .h5.")
+@click.option("--fields", type=click.Path(path_type=Path), help="Folder for the fields over time (ParaView).")
 @as_json
 def simulate(as_json: bool, **options: Any) -> None:
     """One run of the full model on a recording's displacement (default: the demo's).
@@ -104,7 +109,7 @@ def simulate(as_json: bool, **options: Any) -> None:
 
     \b
     Example:
-      bayeskin simulate --set E_c=300e3 --set k_s=1e-13 -o force.csv
+      bayeskin simulate --set E_c=300e3 --set k_s=1e-13 -o force.csv --fields fields
     """
     from bayeskin.pipeline import single
 

@@ -142,6 +142,30 @@ def test_simulate_writes_the_columns_that_scripts_rely_on(
     ]  # fmt: skip
 
 
+def test_simulate_hands_the_states_of_the_run_to_the_fields(
+    bayeskin: Command, measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Writer:
+        def __init__(self, directory: Path, problem: object, theta: dict[str, float]) -> None:
+            self.path, self.states = directory / "fields.xdmf", 0
+
+        def on_state(self, time_s: float, x: object, force_n: float) -> None:
+            self.states += 1
+
+        def write(self) -> Path:
+            self.path.parent.mkdir()
+            self.path.write_text(f"{self.states} states")
+            return self.path
+
+    monkeypatch.setattr(single, "simulate", toy_model.simulate)
+    monkeypatch.setattr(single, "FieldWriter", Writer)
+    monkeypatch.setattr(single, "problem_of", lambda mesh, refinement: None)
+    arguments = ("--recording", measured, "-o", tmp_path / "f.csv", "--fields", tmp_path / "fields", "--json")
+    code, out, _ = bayeskin("simulate", *arguments)
+    assert (code, json.loads(out)["fields"]) == (0, str(tmp_path / "fields" / "fields.xdmf"))
+    assert (tmp_path / "fields" / "fields.xdmf").read_text() == "1 states"
+
+
 def test_a_simulation_that_fails_exits_with_1_and_writes_nothing(
     bayeskin: Command, measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,7 +18,10 @@ def simulate(
     motion: PadMotion,
     theta: Mapping[str, float],
     on_progress: Callable[[float], None] | None = None,
+    on_state: Callable[[float, object, float], None] | None = None,
 ) -> Simulation:
+    if on_state is not None:
+        on_state(0.0, None, 0.0)
     time_s = np.unique(np.concatenate([np.linspace(0, motion.time_s[-1], 261), motion.time_s]))
     row = np.array([[theta[name] for name in SPACE.names]])
     return Simulation(

@@ -11,7 +11,8 @@ from typing import Any
 from bayeskin import storage
 from bayeskin.config import load_config, parameter_space
 from bayeskin.errors import InputError
-from bayeskin.model.simulate import ModelSpec, simulate
+from bayeskin.model.fields import FieldWriter
+from bayeskin.model.simulate import ModelSpec, problem_of, simulate
 from bayeskin.pipeline.engine import Reporter, Run
 from bayeskin.pipeline.folder import plain
 from bayeskin.pipeline.model import model_spec
@@ -43,8 +44,9 @@ def simulate_once(
     settings: Sequence[str] = (),
     mesh: str | None = None,
     observation: str | None = None,
+    fields: Path | None = None,
 ) -> dict[str, Any]:
-    """One full run on a recording's displacement, into `out` (.csv or .h5).
+    """One full run on a recording's displacement, into `out` (.csv or .h5), and its fields into a folder.
 
     What is not given is the configuration's, or the demo's. Parameters that `settings` ("NAME=VALUE", SI)
     leave out stand at the median of their prior. A run that fails is told, and nothing is written.
@@ -58,10 +60,16 @@ def simulate_once(
     source = read_recording(recording or run.beside(run.config.recording.file))
     motion = pad_motion(spec.observation, source, segment(source), run.config.recording.protocol)
     reporter.log(f"simulating {motion.time_s[-1]:.1f} s, {spec.observation} on {Path(spec.mesh).name}")
-    simulation = simulate(spec, motion, theta, lambda share: reporter.progress("simulation", share))
+    writer = FieldWriter(fields, problem_of(spec.mesh, spec.refinement), theta) if fields else None
+    simulation = simulate(
+        spec, motion, theta, lambda share: reporter.progress("simulation", share),
+        writer.on_state if writer else None,
+    )  # fmt: skip
+    written: Path | None = None
     if simulation.status == "ok":
+        written = writer.write() if writer else None
         write_simulation(out, simulation)
-    return _answer(simulation, spec, out)
+    return _answer(simulation, spec, out, written)
 
 
 def write_simulation(out: Path, simulation: Simulation) -> None:
@@ -96,18 +104,21 @@ def _theta(space: ParameterSpace, settings: Sequence[str]) -> dict[str, float]:
     return theta
 
 
-def _answer(simulation: Simulation, spec: ModelSpec, out: Path) -> dict[str, Any]:
+def _answer(simulation: Simulation, spec: ModelSpec, out: Path, fields_file: Path | None) -> dict[str, Any]:
     ok, stats = simulation.status == "ok", simulation.stats
     if ok:
         text = (
             f"{stats['steps']:.0f} steps of {stats['dofs']:.0f} unknowns in {stats['seconds']:.1f} s, "
             f"peak force {stats['peak_force_n']:.4g} N, written to {out}"
         )
+        text += f", fields to {fields_file}" if fields_file else ""
     else:
         text = f"failed: {simulation.message}"
-    fields = {"ok": ok, "status": simulation.status, "message": simulation.message, "theta": simulation.theta}
+    answer = {"ok": ok, "status": simulation.status, "message": simulation.message, "theta": simulation.theta}
     model = {"observation": spec.observation, "mesh": spec.mesh, "model_hash": simulation.model_hash}
-    return plain({**fields, **model, "stats": stats, "out": out if ok else None, "text": text})
+    return plain(
+        {**answer, **model, "stats": stats, "out": out if ok else None, "fields": fields_file, "text": text}
+    )
 
 
 def _check_suffix(out: Path, suffixes: tuple[str, ...]) -> None:
