@@ -10,10 +10,16 @@ import numpy as np
 
 from bayeskin.errors import InputError
 from bayeskin.inference.problem import LogPosterior
+from bayeskin.inference.straighten import find_shear
 from bayeskin.types import Array
 
 _AGREE = 0.1  # nats: starts this close to the best found the same maximum, whatever stays flat around it
-_WORST = -1e300  # of a point without a density; NLopt asks for finite values
+# NLopt 2.11 has a class of its own above its errors; earlier ones raise Python's.
+_ERRORS = (nlopt.RoundoffLimited, getattr(nlopt, "exception", RuntimeError), RuntimeError, MemoryError)
+_WORST = -1e30  # of a point without a density; NLopt asks for finite values
+_LEVELS = 3.0  # log amplitudes either side of the recorded force's that are searched
+_STEP = 1e-6  # of a unit coordinate, for central differences
+_STEEP = 1e4  # nats a box width outside the prior
 _STATUS = {
     nlopt.SUCCESS: "converged",
     nlopt.STOPVAL_REACHED: "converged",
@@ -21,7 +27,6 @@ _STATUS = {
     nlopt.XTOL_REACHED: "converged",
     nlopt.MAXEVAL_REACHED: "stopped at the evaluation limit",
     nlopt.MAXTIME_REACHED: "stopped at the time limit",
-    nlopt.ROUNDOFF_LIMITED: "limited by rounding",
 }
 
 
@@ -63,16 +68,17 @@ def find_map(
     """Maximum of the posterior density in sampling coordinates.
 
     Each start runs controlled random search (NLopt GN_CRS2_LM; Kaelo & Ali 2006) on at most half of
-    `evaluations`, then BOBYQA and Sbplx from there. NLopt's failures become a start's status. The
-    search draws from NLopt's own generator, which is seeded here for each start. Raises InputError
-    when there is no start to make.
+    `evaluations`, then L-BFGS and Sbplx from there, in straightened coordinates (`straighten`). NLopt's
+    failures become a start's status. The search draws from NLopt's own generator, seeded for each start.
+    Raises InputError when there is no start to make.
     """
     if starts < 1 or evaluations < 4:
         raise InputError("map", f"{starts} starts, {evaluations} evaluations", "at least 1 start of 4")
+    space = _SearchSpace(log_posterior)
     seeds = np.random.SeedSequence(seed).generate_state(starts)
     results: list[StartResult] = []
     for index, state in enumerate(seeds):
-        results.append(_one_start(log_posterior, int(state), evaluations))
+        results.append(_one_start(space, int(state), evaluations))
         if progress:
             progress((index + 1) / starts, f"start {index + 1} of {starts}: {results[-1].value:.2f}")
     best = max(results, key=lambda r: r.value)
@@ -80,46 +86,81 @@ def find_map(
     return MapResult(best.theta, best.value, tuple(results), agreement)
 
 
-def _one_start(log_posterior: LogPosterior, seed: int, evaluations: int) -> StartResult:
+def _one_start(search_space: _SearchSpace, seed: int, evaluations: int) -> StartResult:
     nlopt.srand(seed)
-    unit = np.random.default_rng(seed).uniform(size=log_posterior.dim)
-    search = _Search(log_posterior)
-    status = search.run(nlopt.GN_CRS2_LM, unit, evaluations // 2, 1e-4)
-    for algorithm in (nlopt.LN_BOBYQA, nlopt.LN_SBPLX):
-        status = search.run(algorithm, search.best, evaluations // 4, 1e-9)
-    low, high = log_posterior.bounds
-    theta = log_posterior.from_sampling(low + search.best * (high - low))
+    unit = np.random.default_rng(seed).uniform(size=search_space.log_posterior.dim)
+    search = _Search(search_space)
+    search.run(nlopt.GN_CRS2_LM, unit, evaluations // 2, 1e-3)
+    status = "failed: no density found"
+    for algorithm in (nlopt.LD_LBFGS, nlopt.LN_SBPLX):
+        if np.isfinite(search.value):
+            status = search.run(algorithm, search.best, evaluations // 4, 1e-6)
+    log_posterior = search_space.log_posterior
+    theta = log_posterior.from_sampling(search_space.points(search.best[None])[0][0])
     return StartResult(log_posterior.named(theta), search.value, status, search.evaluations)
+
+
+class _SearchSpace:
+    """The unit cube over straightened coordinates; beyond the prior box the density is continued."""
+
+    def __init__(self, log_posterior: LogPosterior) -> None:
+        self.log_posterior, self.shear = log_posterior, find_shear(log_posterior)
+        self.low, self.high = (np.array(bound) for bound in log_posterior.bounds)
+        if self.shear is not None:
+            group = self.shear.group
+            level = (self.low[group].mean(), self.high[group].mean())
+            self.low[group], self.high[group] = self.low[group] - level[1], self.high[group] - level[0]
+            first = int(np.argmax(group))
+            self.low[first], self.high[first] = -_LEVELS, _LEVELS
+
+    def points(self, unit: Array) -> tuple[Array, Array]:
+        """Sampling coordinates (n, D) in the prior box, and how far out they were (n,), in box widths."""
+        x = self.low + unit * (self.high - self.low)
+        if self.shear is not None:
+            x = self.shear.back(x)
+        low, high = self.log_posterior.bounds
+        inside = np.clip(x, low, high)
+        return inside, np.linalg.norm((x - inside) / (high - low), axis=1)
+
+    def values(self, unit: Array) -> Array:
+        """Log densities (n,); less a steep cone outside the prior box, finite throughout."""
+        inside, outside = self.points(unit)
+        return np.maximum(self.log_posterior.log_prob(inside) - _STEEP * outside, _WORST)
 
 
 class _Search:
     """The objective on the unit cube, with the best point seen: NLopt drops it when it fails."""
 
-    def __init__(self, log_posterior: LogPosterior) -> None:
-        self.log_posterior = log_posterior
-        self.best = np.full(log_posterior.dim, 0.5)
+    def __init__(self, space: _SearchSpace) -> None:
+        self.space = space
+        self.best = np.full(len(space.low), 0.5)
         self.value = -np.inf
         self.evaluations = 0
 
-    def __call__(self, unit: Array, _gradient: Array) -> float:
-        low, high = self.log_posterior.bounds
-        value = float(self.log_posterior.log_prob((low + unit * (high - low))[None])[0])
-        self.evaluations += 1
-        if value > self.value:
-            self.best, self.value = np.array(unit), value
-        return max(value, _WORST)
+    def __call__(self, unit: Array, gradient: Array) -> float:
+        trials = unit[None]
+        if gradient.size:
+            step = _STEP * np.eye(len(unit))
+            trials = np.concatenate([trials, unit + step, unit - step])
+        values = self.space.values(trials)
+        self.evaluations += len(trials)
+        if gradient.size:
+            up, down = values[1:].reshape(2, -1)
+            gradient[:] = (up - down) / (2 * _STEP)
+        if values[0] > max(self.value, _WORST):
+            self.best, self.value = np.array(unit), float(values[0])
+        return float(values[0])
 
     def run(self, algorithm: int, start: Array, evaluations: int, tolerance: float) -> str:
         opt = nlopt.opt(algorithm, len(start))
         opt.set_max_objective(self)
         opt.set_lower_bounds(np.zeros(len(start)))
         opt.set_upper_bounds(np.ones(len(start)))
-        opt.set_maxeval(max(evaluations, 1))
+        each = 2 * len(start) + 1 if algorithm == nlopt.LD_LBFGS else 1
+        opt.set_maxeval(max(evaluations // each, 1))
         opt.set_ftol_abs(tolerance)
         try:
             opt.optimize(np.clip(start, 0.0, 1.0))
-        except nlopt.RoundoffLimited:
-            return _STATUS[nlopt.ROUNDOFF_LIMITED]
-        except (RuntimeError, ValueError, MemoryError) as error:  # all that NLopt raises of its own
+        except _ERRORS as error:
             return f"failed: {str(error) or type(error).__name__}"
         return _STATUS.get(opt.last_optimize_result(), "stopped")

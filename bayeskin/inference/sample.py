@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,8 +12,9 @@ import numpy as np
 from bayeskin.errors import InputError
 from bayeskin.inference import chains as store
 from bayeskin.inference.convergence import Convergence, Limits, assess
-from bayeskin.inference.moves import SnookerMove
+from bayeskin.inference.moves import mixed_moves
 from bayeskin.inference.problem import LogPosterior
+from bayeskin.inference.straighten import Shear, find_shear
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
 _FIRST_CHECK = 500
@@ -68,18 +69,11 @@ def sample(
     """
     settings = settings or SampleSettings()
     _check(settings, log_posterior.dim)
-    origin = log_posterior.vector(start)
     files = [Path(folder) / f"ensemble_{e}.h5" for e in range(settings.ensembles)]
     identity = {**log_posterior.identity, "seed": str(seed), "walkers": str(settings.walkers)}
     backends = [store.load(f, log_posterior.names, identity) if f.exists() else None for f in files]
-    seeds = np.random.SeedSequence(seed).spawn(settings.ensembles)
+    runs = _ensembles(log_posterior, log_posterior.vector(start), seed, settings.walkers, backends)
     convergence: Convergence | None = None
-    runs = [
-        _Ensemble(
-            log_posterior, settings.walkers, s, origin if e == 0 else _elsewhere(log_posterior, origin, s), b
-        )
-        for e, (s, b) in enumerate(zip(seeds, backends, strict=True))
-    ]
     goal = 0
     while True:
         goal = _next_check(goal, settings.max_steps)
@@ -113,22 +107,22 @@ class _Ensemble:
     """One ensemble and its chain in memory."""
 
     def __init__(
-        self, log_posterior: LogPosterior, walkers: int, seed: np.random.SeedSequence,
-        origin: Array, backend: emcee.backends.Backend | None,
-    ) -> None:  # fmt: skip
+        self,
+        log_posterior: LogPosterior,
+        shear: Shear | None,
+        backend: emcee.backends.Backend,
+        state: emcee.State,
+    ) -> None:
         self.changed = False
-        if backend is None:
-            backend = emcee.backends.Backend()
-            backend.reset(walkers, log_posterior.dim)
-            coords = initial_walkers(log_posterior, origin, walkers, np.random.default_rng(seed))
-            generator = np.random.RandomState(seed.generate_state(8))
-            self.state = emcee.State(coords, random_state=generator.get_state())
-        else:
-            self.state = backend.get_last_sample()
         self.backend = backend
-        moves = [(emcee.moves.StretchMove(), 0.2), (emcee.moves.DEMove(), 0.6), (SnookerMove(), 0.2)]
+        self.state = state
         self.sampler = emcee.EnsembleSampler(
-            walkers, log_posterior.dim, log_posterior.log_prob, moves=moves, backend=backend, vectorize=True
+            backend.nwalkers,
+            log_posterior.dim,
+            log_posterior.log_prob,
+            moves=mixed_moves(shear),
+            backend=backend,
+            vectorize=True,
         )
 
     def advance(self, goal: int) -> Iterator[int]:
@@ -141,6 +135,34 @@ class _Ensemble:
             self.state = state
             if self.backend.iteration % _REFRESH == 0:
                 yield self.backend.iteration
+
+
+def _ensembles(
+    log_posterior: LogPosterior,
+    origin: Array,
+    seed: int,
+    walkers: int,
+    backends: Sequence[emcee.backends.Backend | None],
+) -> list[_Ensemble]:
+    """Ensembles that go on from their chains, or start anew, each with a random stream of its own."""
+    shear = find_shear(log_posterior)
+    runs = []
+    for e, (backend, own) in enumerate(
+        zip(backends, np.random.SeedSequence(seed).spawn(len(backends)), strict=True)
+    ):
+        if backend is None:
+            backend = emcee.backends.Backend()
+            backend.reset(walkers, log_posterior.dim)
+            rng = np.random.default_rng(own)
+            # Ensembles that all set out from one place could not disagree.
+            centre = origin if e == 0 else 0.5 * (origin + rng.uniform(*log_posterior.bounds))
+            coords = initial_walkers(log_posterior, centre, walkers, rng)
+            generator = np.random.RandomState(own.generate_state(8))  # emcee's kind
+            state = emcee.State(coords, random_state=generator.get_state())
+        else:
+            state = backend.get_last_sample()
+        runs.append(_Ensemble(log_posterior, shear, backend, state))
+    return runs
 
 
 def initial_walkers(
@@ -162,12 +184,6 @@ def initial_walkers(
     raise InputError(
         "start", "no density at nearly all points of the prior", "a surrogate with finite values"
     )
-
-
-def _elsewhere(log_posterior: LogPosterior, origin: Array, seed: np.random.SeedSequence) -> Array:
-    """Halfway to a point of the prior: ensembles that all set out from one place could not disagree."""
-    low, high = log_posterior.bounds
-    return 0.5 * (origin + np.random.default_rng([1, *seed.generate_state(4)]).uniform(low, high))
 
 
 def _next_check(steps: int, max_steps: int) -> int:
