@@ -199,7 +199,7 @@ class Simulation(_FreezesArrays):
         """Mean force [N] over each bin, (m,): composite trapezoid on eleven points a bin."""
         edges = np.asarray(edges_s, dtype=float)
         fine = edges[:-1, None] + np.linspace(0.0, 1.0, 11) * np.diff(edges)[:, None]
-        return np.trapezoid(self.at(fine), dx=0.1, axis=1)
+        return np.asarray(np.trapezoid(self.at(fine), dx=0.1, axis=1))
 
 
 @dataclass(frozen=True)

@@ -36,9 +36,7 @@ def bar(kind: str, cells: int = 3, width: float = 1.0, distort: float = 0.0) -> 
 def model(mesh: SkinMesh, fixed: np.ndarray, pad: np.ndarray, permeability: float = 1e-12) -> LagrangianModel:
     space = taylor_hood(mesh)
     n = len(mesh.cutis)
-    material = Material(
-        np.full(n, MU), np.full(n, LAM), np.full(n, permeability / 5e-3), np.full(n, 1e-12)
-    )
+    material = Material(np.full(n, MU), np.full(n, LAM), np.full(n, permeability / 5e-3), np.full(n, 1e-12))
     return LagrangianModel(Problem(mesh, space, sparsity(space, fixed), pad, pad), material, STILL)
 
 
@@ -168,7 +166,9 @@ def test_consolidation_follows_terzaghis_series(kind):
     time_factor = coefficient * past[-1].time_s
     s = 1.0 - corners[0] / length
     odd = 2 * np.arange(200)[:, None] + 1
-    series = (4 / (odd * np.pi) * np.sin(odd * np.pi * s / 2) * np.exp(-((odd * np.pi / 2) ** 2) * time_factor)).sum(0)
+    series = (
+        4 / (odd * np.pi) * np.sin(odd * np.pi * s / 2) * np.exp(-((odd * np.pi / 2) ** 2) * time_factor)
+    ).sum(0)
     assert series.max() > 0.2
     np.testing.assert_allclose(past[-1].x[3 * n :] / -load, series, atol=2e-3)
 
@@ -187,7 +187,9 @@ def test_time_integration_is_of_second_order():
     closed = np.flatnonzero(np.isclose(space.points_u[0], 0.0))
     end = np.flatnonzero(np.isclose(space.points_u[0], 1.0))
     drained = 3 * n + np.flatnonzero(np.isclose(_corner_points(space)[0], 1.0))
-    fixed = np.unique(np.concatenate([3 * closed, 3 * np.arange(n) + 1, 3 * np.arange(n) + 2, 3 * end, drained]))
+    fixed = np.unique(
+        np.concatenate([3 * closed, 3 * np.arange(n) + 1, 3 * np.arange(n) + 2, 3 * end, drained])
+    )
     permeability = 1e-9
     duration = 0.3 / (permeability / 5e-3 * (LAM + 2 * MU))
 
@@ -203,4 +205,4 @@ def test_time_integration_is_of_second_order():
     errors = [np.abs(pressure(steps) - reference).max() for steps in (4, 8, 16)]
     rates = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     assert np.all(rates > 1.7), rates
-    assert GAMMA == pytest.approx(1 - 1 / np.sqrt(2))
+    assert pytest.approx(1 - 1 / np.sqrt(2)) == GAMMA

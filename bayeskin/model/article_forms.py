@@ -11,30 +11,30 @@ On the mesh at the start of the step, with "F" = I + grad u of the total displac
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-from bayeskin.model.forms import _gather, _kinematics
+from bayeskin.model.forms import _compiled, _gather, _kinematics
 
 
-@numba.njit(cache=True)
+@_compiled
 def residual(x, old, nodes_u, nodes_p, grad_u, grad_p, value_p, weight, mu, lam, mobility, storage, dt, out):
     """Adds the residual (dofs,) to `out`; returns the smallest det F (not positive: inside out)."""
     n_nodes = (x.shape[0] - nodes_p.max() - 1) // 3  # the pressures follow the displacements
     na, nb = nodes_u.shape[1], nodes_p.shape[1]
     u, p = np.empty((na, 3)), np.empty(nb)
     u_old, p_old = np.empty((na, 3)), np.empty(nb)
+    f, inverse, stress, flux = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     smallest = np.inf
     for e in range(nodes_u.shape[0]):
         _gather(x, nodes_u[e], nodes_p[e], n_nodes, u, p)
         _gather(old, nodes_u[e], nodes_p[e], n_nodes, u_old, p_old)
         for q in range(weight.shape[1]):
-            f, _, j = _kinematics(u, grad_u[e, q])
+            j = _kinematics(u, grad_u[e, q], f, inverse)
             if not j > 0.0:
                 return j
             smallest = min(smallest, j)
             pressure, change, rate = 0.0, 0.0, 0.0
-            flux = np.zeros(3)
+            flux[:] = 0.0
             for b in range(nb):
                 pressure += value_p[q, b] * p[b]
                 change += value_p[q, b] * (p[b] - p_old[b])
@@ -43,7 +43,6 @@ def residual(x, old, nodes_u, nodes_p, grad_u, grad_p, value_p, weight, mu, lam,
             for a in range(na):
                 for i in range(3):
                     rate += (u[a, i] - u_old[a, i]) * grad_u[e, q, a, i]
-            stress = np.empty((3, 3))
             for i in range(3):
                 for k in range(3):
                     stress[i, k] = mu[e] / j * (f[i, 0] * f[k, 0] + f[i, 1] * f[k, 1] + f[i, 2] * f[k, 2])
@@ -65,8 +64,10 @@ def residual(x, old, nodes_u, nodes_p, grad_u, grad_p, value_p, weight, mu, lam,
     return smallest
 
 
-@numba.njit(cache=True)
-def tangent(x, nodes_u, nodes_p, grad_u, grad_p, value_p, weight, mu, lam, mobility, storage, dt, position, data):
+@_compiled
+def tangent(
+    x, nodes_u, nodes_p, grad_u, grad_p, value_p, weight, mu, lam, mobility, storage, dt, position, data
+):
     """Adds the consistent tangent of `residual` to the sparse `data` at `position` (e, nd, nd).
 
     dt = -t tr(F^-1 dF) + mu/J (dF F^T + F dF^T) + lambda/J tr(F^-1 dF) I
@@ -75,12 +76,13 @@ def tangent(x, nodes_u, nodes_p, grad_u, grad_p, value_p, weight, mu, lam, mobil
     na, nb = nodes_u.shape[1], nodes_p.shape[1]
     u, p = np.empty((na, 3)), np.empty(nb)
     cell = np.empty((3 * na + nb, 3 * na + nb))
+    f, inverse = np.empty((3, 3)), np.empty((3, 3))
     g, along, loaded = np.empty((na, 3)), np.empty((na, 3)), np.empty((na, 3))
     for e in range(nodes_u.shape[0]):
         _gather(x, nodes_u[e], nodes_p[e], n_nodes, u, p)
         cell[:] = 0.0
         for q in range(weight.shape[1]):
-            f, inverse, j = _kinematics(u, grad_u[e, q])
+            j = _kinematics(u, grad_u[e, q], f, inverse)
             w = weight[e, q]
             shear, spherical = mu[e] / j, (lam[e] * np.log(j) - mu[e]) / j
             for a in range(na):

@@ -11,6 +11,7 @@ Written on the corners and cells of the reference mesh (warp by `displacement` i
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,7 +93,8 @@ class FieldWriter:
         corners = _corner_numbers(self._problem)
         order = list(_VTK_HEXAHEDRON) if kind == "hexahedron" else list(range(4))
         points = mesh.doflocs.T[: corners.max() + 1]
-        with meshio.xdmf.TimeSeriesWriter(self.path) as writer:
+        # meshio opens the HDF5 file by its bare name, so the folder must be the current one
+        with contextlib.chdir(self.path.parent), meshio.xdmf.TimeSeriesWriter(self.path.name) as writer:
             writer.write_points_cells(points, [(kind, corners[:, order])])
             for (before_s, before), (time_s, x) in zip(
                 [self._states[0], *self._states[:-1]], self._states, strict=True

@@ -19,9 +19,10 @@ from bayeskin.model.newton import Equations, NewtonSolver
 from bayeskin.model.problem import Material, Problem
 from bayeskin.types import Array, PadMotion
 
+SMALLEST_MOTION_M = 1e-4  # so that a protocol without motion has a scale too
 GAMMA = 1.0 - np.sqrt(0.5)
 FIRST_STEP_S = 1.0
-SHORTEST_STEP_S = 1e-4
+SHORTEST_STEP = 1e-3  # of the phase; a run that asks for less has failed
 GROWTH, SHRINK = 2.5, 0.25
 EXTRAPOLATION_POINTS = 3
 STEPS_PER_PHASE = 5  # so that a cubic between steps follows the curvature of a ramp
@@ -80,8 +81,23 @@ class LagrangianModel:
         out = np.zeros(s.dofs)
         volume, pressure = np.empty(s.weight.shape), np.empty(s.weight.shape)
         smallest = forms.residual(
-            x, s.nodes_u, s.nodes_p, s.grad_u, s.grad_p, s.value_p, s.weight,
-            m.mu, m.lam, m.mobility, m.storage, h, old.volume, old.pressure, out, volume, pressure,
+            x,
+            s.nodes_u,
+            s.nodes_p,
+            s.grad_u,
+            s.grad_p,
+            s.value_p,
+            s.weight,
+            m.mu,
+            m.lam,
+            m.mobility,
+            m.storage,
+            h,
+            old.volume,
+            old.pressure,
+            out,
+            volume,
+            pressure,
         )
         if not smallest > 0.0 or not np.isfinite(out).all():
             return None
@@ -102,8 +118,21 @@ class LagrangianModel:
         def tangent(x: Array):  # type: ignore[no-untyped-def]
             data = np.zeros(pattern.size)
             forms.tangent(
-                x, s.nodes_u, s.nodes_p, s.grad_u, s.grad_p, s.value_p, s.weight,
-                m.mu, m.lam, m.mobility, m.storage, h, old.pressure, pattern.position, data,
+                x,
+                s.nodes_u,
+                s.nodes_p,
+                s.grad_u,
+                s.grad_p,
+                s.value_p,
+                s.weight,
+                m.mu,
+                m.lam,
+                m.mobility,
+                m.storage,
+                h,
+                old.pressure,
+                pattern.position,
+                data,
             )
             return pattern.matrices(data)
 
@@ -126,17 +155,16 @@ class LagrangianModel:
 
     def problem_scale(self, u: Array) -> float:
         """Largest displacement of the protocol [m], against which a correction is small."""
-        return max(0.5 * float(np.abs(self.motion.displacement_m).max()), float(np.abs(u).max()), 1e-9)
+        return max(
+            0.5 * float(np.abs(self.motion.displacement_m).max()), float(np.abs(u).max()), SMALLEST_MOTION_M
+        )
 
     def solve_stage(self, time_s: float, h: float, old: State, guess: Array, jump: bool) -> State | None:
         """One implicit stage ending at time_s; `jump`: the guess knows nothing of the pads' motion."""
         equations = self.equations(h, old)
         target = self.problem.prescribe(guess, self.pad_displacement(time_s))
-        if jump:
-            target = self.solver.respond(equations, guess, target, self.problem.pattern.fixed)
-            if target is None:
-                return None
-        x = self.solver.solve(equations, target)
+        start = self.solver.respond(equations, guess, target, self.problem.pattern.fixed) if jump else target
+        x = None if start is None else self.solver.solve(equations, start)
         if x is None:
             return None
         found = self.residual(x, h, old)
@@ -206,18 +234,18 @@ def integrate(
     allowed_n, count = tolerance * model.nominal_force(), 0
     for start, end in zip(model.motion.time_s[:-1], model.motion.time_s[1:], strict=True):
         past, h = [state], min(FIRST_STEP_S, 0.5 * (end - start))
-        longest = (end - start) / STEPS_PER_PHASE
+        longest, shortest = (end - start) / STEPS_PER_PHASE, SHORTEST_STEP * (end - start)
         while state.time_s < end - 1e-9:
             h = _landing(h, end - state.time_s, longest)
             step = advance(model, past, h)
             excess = step.error_n / allowed_n if step else np.inf
-            if step is None or (excess > 1.0 and h > SHORTEST_STEP_S):
+            if step is None or (excess > 1.0 and h > shortest):
                 h *= 0.5 if step is None else max(SHRINK, 0.9 / np.sqrt(excess))
                 past = past if step else [state]
-                if h < SHORTEST_STEP_S:
+                if h < shortest:
                     return (
                         f"step {count + 1} at t = {state.time_s:.3f} s did not converge down to "
-                        f"{SHORTEST_STEP_S:g} s; try a finer mesh or parameters nearer to a skin's"
+                        f"{shortest:.2g} s; try a finer mesh or parameters nearer to a skin's"
                     )
                 continue
             state, count = step.state, count + 1

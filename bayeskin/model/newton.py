@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
@@ -44,7 +45,6 @@ class Equations:
 class NewtonSolver:
     """Carries the factorised tangent from solve to solve, and counts what was spent."""
 
-    symmetric: bool = True  # the tangent is nearly so: its symmetric part is factorised
     counts: dict[str, int] = field(
         default_factory=lambda: {"iterations": 0, "residuals": 0, "factorisations": 0, "solves": 0}
     )
@@ -53,7 +53,7 @@ class NewtonSolver:
     _ready: bool = False
 
     def __post_init__(self) -> None:
-        self._factors = factorisation(self.symmetric)
+        self._factors = factorisation()
 
     def release(self) -> None:
         """Frees the factors."""
@@ -141,7 +141,7 @@ class NewtonSolver:
     def _updated_step(self, equations: Equations, steps: list[Array], right: Array) -> Array:
         """Next step from the history of steps (Kelley's matrix-free form of Broyden's update)."""
         z = -self.back_substitute(right) * equations.weight
-        for old, new in zip(steps[:-1], steps[1:], strict=True):
+        for old, new in pairwise(steps):
             z += new * (old @ z) / (old @ old)
         last = steps[-1]
         return z / (1.0 - (last @ z) / (last @ last))

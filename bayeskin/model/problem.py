@@ -29,7 +29,7 @@ class Constants:
 
 @dataclass(frozen=True)
 class Material:
-    """Constants of each cell, all (e,): Lame mu and lam [Pa], mobility k/mu_f [m^2/(Pa s)], storage [1/Pa]."""
+    """Constants of each cell (e,): Lame mu, lam [Pa], mobility k/mu_f [m^2/(Pa s)], storage [1/Pa]."""
 
     mu: Array
     lam: Array

@@ -106,7 +106,9 @@ def simulate(
     if spec.observation == "reaction":
         model = lagrangian.LagrangianModel(problem, cells, motion)
         message = lagrangian.integrate(
-            model, theta["p_init"], spec.tolerance,
+            model,
+            theta["p_init"],
+            spec.tolerance,
             lambda s: record(s.state.time_s, s.state.x, s.force_n, s.corner, s.error_n),
         )
         solver = model.solver
@@ -114,7 +116,10 @@ def simulate(
         old = article.ArticleModel(problem, cells)
         samples = article_samples(motion, spec.article_steps)
         message = article.run(
-            old, samples, motion.at(samples), theta["p_init"],
+            old,
+            samples,
+            motion.at(samples),
+            theta["p_init"],
             lambda t, x, f: record(t, x, f, bool(np.abs(motion.time_s - t).min() < 1e-6)),
         )
         solver = old.solver

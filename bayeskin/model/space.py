@@ -134,8 +134,14 @@ def sparsity(space: TaylorHood, fixed: np.ndarray) -> Sparsity:
     for block in (free_free, free_fixed):
         block.sort_indices()
     position = _positions(
-        cells, number, is_fixed,
-        free_free.indptr, free_free.indices, free_fixed.indptr, free_fixed.indices, free_free.nnz,
+        cells,
+        number,
+        is_fixed,
+        free_free.indptr,
+        free_free.indices,
+        free_fixed.indptr,
+        free_fixed.indices,
+        free_free.nnz,
     )
     return Sparsity(free, fixed, free_free.astype(float), free_fixed.astype(float), position)
 
