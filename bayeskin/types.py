@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -189,10 +190,11 @@ class Simulation(_FreezesArrays):
         query = np.asarray(time_s, dtype=float)
         out = np.interp(query, self.time_s, self.force_n)
         breaks = np.unique(np.concatenate([[0], np.flatnonzero(self.corner), [len(self.time_s) - 1]]))
-        for a, b in zip(breaks[:-1], breaks[1:], strict=True):
+        for a, b in pairwise(breaks):
             inside = (query >= self.time_s[a]) & (query <= self.time_s[b])
             if b - a >= 2 and inside.any():
-                out[inside] = PchipInterpolator(self.time_s[a : b + 1], self.force_n[a : b + 1])(query[inside])
+                steps = slice(a, b + 1)
+                out[inside] = PchipInterpolator(self.time_s[steps], self.force_n[steps])(query[inside])
         return out
 
     def bin_means(self, edges_s: ArrayLike) -> Array:
