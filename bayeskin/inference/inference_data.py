@@ -95,7 +95,7 @@ def load_inference_data(path: Path | str) -> arviz.InferenceData:
 
 def draws_of(idata: arviz.InferenceData) -> tuple[ParameterSpace, Array]:
     """The priors and the draws (s, D) in SI that an InferenceData of `to_inference_data` holds."""
-    stored = idata["posterior"].attrs.get("parameters")
+    stored = idata.attrs.get("parameters")
     if stored is None:
         raise InputError("InferenceData", "no attribute 'parameters'", "one made by bayeskin")
     space = ParameterSpace(tuple(Parameter(**entry) for entry in json.loads(stored)))
