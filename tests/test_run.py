@@ -1,0 +1,147 @@
+"""A whole run on a recording of the toy: every stage does its part, goes on, and is skipped when done."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import toy_model
+from toy import MOTION, SPACE, toy_force
+
+from bayeskin import report, storage
+from bayeskin.inference import load_inference_data
+from bayeskin.pipeline import design, maximum, stages
+from bayeskin.pipeline.engine import Silent
+from bayeskin.pipeline.indices import nearby
+from bayeskin.runner import load_design
+from bayeskin.types import Recording
+
+TRUE = {"E_c": 200e3, "E_s": 30e3, "k_c": 1e-14, "k_s": 1e-13, "p_init": 300.0}
+CONFIG = """
+[recording]
+file = "measured.h5"
+[fit]
+bin_width_s = 1.0
+windows_s = [[0.0, 75.0]]
+[design]
+points = [24, 12]
+held_out = 6
+workers = 1
+[sample]
+ensembles = 2
+walkers = 24
+max_steps = {steps}
+effective_samples = 100
+[map]
+starts = 2
+evaluations = 1000
+[sobol]
+samples = 64
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which the run was interrupted at the full model's check, and then finished."""
+    where = tmp_path_factory.mktemp("toy")
+    time_s = np.arange(0.0, 130.001, 0.1)
+    force_n = toy_model.SCALE * toy_force(np.array([list(TRUE.values())]), time_s)[0]
+    noise_n = 0.003 * np.random.default_rng(5).standard_normal(len(time_s))
+    recording = Recording(time_s, MOTION.at(time_s), force_n + noise_n, "toy", "0" * 64)
+    storage.save(where / "measured.h5", recording)
+    (where / "case.toml").write_text(CONFIG.format(steps=200))
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def drawn(figure: object, stem: Path, provenance: str) -> None:
+        stem.with_suffix(".png").write_text(provenance)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "save_figure", drawn)  # rendering is most of a small run's time
+        patch.setattr(design, "simulate", toy_model.simulate)
+        patch.setattr(maximum, "simulate", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            stages.run(where / "case.toml", None, Silent())
+        patch.setattr(maximum, "simulate", toy_model.simulate)
+        patch.setattr(design, "simulate", interrupted)  # must not be needed again
+        answer = stages.run(where / "case.toml", None, Silent())
+    (where / "answer.json").write_text(json.dumps(answer, allow_nan=False))
+    return where
+
+
+def test_an_interrupted_run_goes_on_without_repeating_what_was_done(folder: Path) -> None:
+    answer = json.loads((folder / "answer.json").read_text())
+    assert answer["skipped"] == ["recording", "design", "train"]
+    again = stages.run(folder / "case.toml", None, Silent())
+    assert again["skipped"] == list(stages.STAGES)
+    assert again["posterior"] == answer["posterior"]
+
+
+def test_the_summary_answers_what_a_reader_asks(folder: Path) -> None:
+    summary = json.loads((folder / "case" / "summary.json").read_text())
+    assert list(summary["posterior"])[:5] == list(SPACE.names)
+    for name, row in summary["posterior"].items():
+        assert row["low_90"] < row["median"] < row["high_90"], name
+    assert summary["verdict"] == "not trusted"  # 200 steps cannot be enough, and it says so
+    assert "needed" in summary["because"][0]
+    assert summary["rmse"]["full_model_at_map"]["fitted_n"] > 0
+    assert summary["rmse"]["full_model_at_map"]["not_fitted_n"] > 0
+    assert summary["rmse"]["full_model_at_map"]["article_holds_n"] is None  # the toy ends before
+    assert [line.split(":")[0] for line in summary["identifiability"]][:5] == list(SPACE.names)
+    assert set(summary["seconds"]) == set(stages.STAGES) - {"report"}
+    for table in summary["sobol"].values():
+        assert "uniform" in table["distribution"]
+        assert table["aggregated"]["E_c"]["total"] > 0.1
+
+
+def test_the_design_holds_each_wave_with_its_labels(folder: Path) -> None:
+    stored = load_design(folder / "case" / "design" / "design.h5")
+    training, testing = stored.training, stored.testing
+    assert [int((training & (stored.wave == w)).sum()) for w in (0, 1)] == [24, 12]
+    assert [int((testing & (stored.wave == w)).sum()) for w in (0, 1)] == [6, 6]
+    records = json.loads((folder / "case" / "design" / "waves.json").read_text())
+    assert records[1]["kept_fraction"] < records[0]["kept_fraction"] == 1.0
+
+
+def test_each_stage_draws_its_figures_and_says_where_they_come_from(folder: Path) -> None:
+    expected = {
+        "recording": ["recording"],
+        "design": ["waves", "prior_predictive"],
+        "train": ["validation"],
+        "map": ["map_check"],
+        "sample": ["posterior", "fit", "traces"],
+        "sobol": ["sobol_prior_gp", "sobol_prior_chaos", "sobol_near_map"],
+    }
+    for stage, names in expected.items():
+        for name in names:
+            assert "bayeskin 0" in (folder / "case" / stage / f"{name}.png").read_text()
+
+
+def test_the_posterior_is_an_inference_data_with_its_origin(folder: Path) -> None:
+    idata = load_inference_data(folder / "case" / "sample" / "posterior.nc")
+    assert {"posterior", "log_likelihood", "posterior_predictive", "observed_data"} <= set(idata.groups())
+    assert idata.attrs["recording_sha256"] == "0" * 64
+    assert idata["constant_data"]["fitted"].values.sum() == 75
+
+
+def test_longer_sampling_repeats_no_stage_before_it_and_keeps_the_chains(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(report, "save_figure", lambda *arguments: None)
+    chains = list((folder / "case" / "chains").iterdir())
+    (folder / "case.toml").write_text(CONFIG.format(steps=250))
+    answer = stages.run(folder / "case.toml", "sample", Silent())
+    assert answer["skipped"] == ["recording", "design", "train", "map"]
+    assert answer["steps"] == 250
+    assert list((folder / "case" / "chains").iterdir()) == chains
+
+
+def test_nearby_is_a_tenth_either_way_inside_the_prior() -> None:
+    near = nearby(SPACE, {"E_c": 2e6, "E_s": 1e4, "k_c": 1e-16, "k_s": 1e-13, "p_init": 0.0})
+    np.testing.assert_allclose(near.lower[:4], [1.8e6, 0.9e4, 1e-16, 0.9e-13])
+    np.testing.assert_allclose(near.upper[:4], [2e6, 1.1e4, 1.1e-16, 1.1e-13])
+    assert np.all(near.lower < near.upper)
+    assert SPACE.contains([near.lower, near.upper]).all()
