@@ -1,6 +1,10 @@
 # `make run` and `make test` are all that a fresh machine needs: each makes the virtual environment it uses.
 PYTHON ?= python3
 VENV := .venv
+# The matrices are small: threads of linear algebra cost more than they give.
+export OMP_NUM_THREADS ?= 1
+export MKL_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: run test
 run: $(VENV)/.installed
@@ -10,7 +14,7 @@ test: $(VENV)/.installed-dev
 	$(VENV)/bin/ruff check
 	$(VENV)/bin/ruff format --check
 	$(VENV)/bin/mypy
-	$(VENV)/bin/python -m pytest -n 2
+	$(VENV)/bin/python -m pytest -n 2 --dist loadfile
 
 # Editable, so that what stands in the checkout is what runs; made again when the dependencies change.
 $(VENV)/.installed: pyproject.toml
