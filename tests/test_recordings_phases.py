@@ -66,7 +66,7 @@ def test_corners_are_found_to_two_hundredths_of_a_second(noise_m: float, seed: i
 
 def test_ripple_and_overshoot_make_no_phases_of_their_own() -> None:
     u = MOTION.at(TIME_S)
-    u = u + 2e-5 * np.sin(2 * np.pi * u / 0.375e-3)  # 24 periods: the holds stay where they were
+    u = u + 4e-5 * np.sin(2 * np.pi * u / 0.375e-3)  # 24 periods: the holds stay where they were
     for top_s in (15.03, 75.0):
         after = TIME_S - top_s
         u = u + np.where(after > 0, 1.5e-4 * np.exp(-np.clip(after, 0, None) / 0.1), 0.0) * (after < 5)
