@@ -104,6 +104,9 @@ def test_an_interrupted_stage_keeps_its_files_unless_its_inputs_change(tmp_path:
         ran(a_run(tmp_path), "twice", these)
     assert ran(a_run(tmp_path), "twice", these) == ["twice"]
     assert a_run(tmp_path).summary("twice") == {"went_on": True}
+    (tmp_path / "case" / "twice" / "half.txt").write_text("half of something else")
+    with pytest.raises(KeyboardInterrupt):
+        ran(a_run(tmp_path, text="other inputs"), "twice", these)
     (tmp_path / "case" / "twice" / "stage.json").unlink()
     with pytest.raises(KeyboardInterrupt):  # nothing says what the half file was made from: it is not used
         ran(a_run(tmp_path), "twice", these)
