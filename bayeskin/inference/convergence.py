@@ -92,11 +92,18 @@ def assess(chains: Array, log_prob: Array, names: tuple[str, ...], limits: Limit
 
 
 def autocorrelation_steps(chains: Array) -> Array:
-    """Integrated autocorrelation time (E, D) [steps] of chains (E, n, W, D); NaN where nothing moves."""
+    """Integrated autocorrelation time (E, D) [steps] of chains (E, n, W, D); NaN where nothing moves.
+
+    Walkers that never move have no autocorrelation and are left out; `_stuck` is what reports them.
+    """
     every = max(1, chains.shape[1] // _RESOLVED)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        times = [every * emcee.autocorr.integrated_time(c[::every], tol=0) for c in chains]
-    return np.maximum(np.array(times), 1.0)
+    times = np.full((len(chains), chains.shape[3]), np.nan)
+    for e, chain in enumerate(chains[:, ::every]):
+        moving = np.any(chain != chain[0], axis=(0, 2))
+        if moving.any():
+            with np.errstate(invalid="ignore", divide="ignore"):
+                times[e] = every * emcee.autocorr.integrated_time(chain[:, moving], tol=0)
+    return np.maximum(times, 1.0)
 
 
 def split_rhat(draws: Array) -> float:
