@@ -48,9 +48,7 @@ def covariance(chain: NoiseChain, noise: Array, diagonal: Array) -> Array:
     return scale[:, None] * out * scale
 
 
-def drawn(
-    binned: BinnedForce, prediction: Prediction, noise: Array, rng: np.random.Generator
-) -> BinnedForce:
+def drawn(binned: BinnedForce, prediction: Prediction, noise: Array, rng: np.random.Generator) -> BinnedForce:
     """The recording with a force drawn from the model at the first point."""
     error = draw_noise(noise_chain(binned), noise[:1], prediction.diagonal[:1], rng)[0]
     latent = prediction.factor[0] @ rng.standard_normal(prediction.factor.shape[2])
@@ -115,9 +113,7 @@ def test_fit_windows_share_nothing_but_the_surrogate_error() -> None:
     assert log_likelihood(both, prediction, noise) == pytest.approx(parts, rel=1e-12)
 
 
-def heights_over(
-    binned: BinnedForce, prediction: Prediction, noise: Array, i: int, z: Array
-) -> Array:
+def heights_over(binned: BinnedForce, prediction: Prediction, noise: Array, i: int, z: Array) -> Array:
     """log of likelihood times prior of the latents z (n, r), by the rank-0 likelihood of shifted means."""
     n, bins = len(z), prediction.mean.shape[1]
     shifted = Prediction(

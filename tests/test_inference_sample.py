@@ -29,9 +29,7 @@ SHORT = SampleSettings(ensembles=2, walkers=16, max_steps=60)
 def unit_normal_variance(moves: object, dim: int, steps: int) -> tuple[float, float]:
     """Mean variance of a unit normal as the moves leave it, with its standard error from 20 batches."""
     random = np.random.RandomState(1)
-    sampler = emcee.EnsembleSampler(
-        30, dim, lambda x: -0.5 * (x**2).sum(axis=1), moves=moves, vectorize=True
-    )
+    sampler = emcee.EnsembleSampler(30, dim, lambda x: -0.5 * (x**2).sum(axis=1), moves=moves, vectorize=True)
     sampler.run_mcmc(emcee.State(random.randn(30, dim), random_state=random.get_state()), steps)
     square = (sampler.get_chain()[steps // 10 :] ** 2).mean(axis=(1, 2))
     batches = [b.mean() for b in np.array_split(square, 20)]

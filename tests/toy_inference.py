@@ -113,7 +113,9 @@ def empty_recording(edges_s: Array = EDGES_S) -> BinnedForce:
 
 
 def toy_problem(
-    seed: int = 5, windows: tuple[tuple[float, float], ...] | None = None, surrogate: ToySurrogate | None = None
+    seed: int = 5,
+    windows: tuple[tuple[float, float], ...] | None = None,
+    surrogate: ToySurrogate | None = None,
 ) -> LogPosterior:
     """A recording drawn from the toy at TRUTH: surrogate error, noise and all, as the likelihood has it."""
     rng = np.random.default_rng(seed)

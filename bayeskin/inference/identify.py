@@ -107,6 +107,6 @@ def _statement(
 
 def _ridge(space: ParameterSpace, i: int, j: int, correlation: float) -> Ridge:
     first, second = space.names[i], space.names[j]
-    how = "only their contrast is free" if correlation > 0 else "one makes up for the other"
+    how = "they rise and fall together" if correlation > 0 else "one makes up for the other"
     statement = f"{first} and {second} form a ridge (correlation {correlation:+.2f}): {how}"
     return Ridge(first, second, correlation, statement)

@@ -17,6 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 
+import numba as nb
 import numpy as np
 from scipy.optimize import nnls
 
@@ -26,7 +27,7 @@ from bayeskin.types import Array, NDArray, _FreezesArrays
 _POINTS = 2048  # of the prior, that the amplitude is learnt from
 _CHUNK = 256
 _MIN_SHARE = 0.02  # mean share of the amplitude that puts a parameter into the group
-_DEGREE = 3
+_DEGREE = 5
 _NEWTON = 4  # steps onto the ridge
 
 
@@ -70,21 +71,29 @@ class Shear(_FreezesArrays):
     def height(self, rest: Array) -> Array:
         """h (n,) at P x (n, D)."""
         height = log_sum(rest[:, self.group] + self.log_weight[self.group])
-        return height + self.polynomial(rest) @ self.coefficients
+        return height + self.coefficients @ self.polynomial(rest)
 
     @property
     def _first(self) -> int:
         return int(np.argmax(self.group))
 
     def polynomial(self, rest: Array) -> Array:
-        """The polynomial's terms (n, t) at P x (n, D)."""
-        # Flat beyond the points it was fitted to, where a cubic runs away.
+        """The polynomial's terms (t, n) at P x (n, D)."""
+        # Flat beyond the points it was fitted to, where a polynomial runs away.
         unit = np.clip((rest - self.centre) / self.scale, -1.0, 1.0)
-        terms = np.ones((len(rest), len(self.powers)))
-        for column in np.flatnonzero(self.powers.any(axis=0)):
-            table = unit[:, column, None] ** np.arange(_DEGREE + 1)
-            terms *= table[:, self.powers[:, column]]
-        return terms
+        return _monomials(np.ascontiguousarray(unit.T), self.powers)
+
+
+@nb.njit(cache=True)
+def _monomials(unit: Array, powers: NDArray[np.int64]) -> Array:
+    """Products over columns of unit (D, n) raised to powers (t, D): (t, n)."""
+    terms = np.ones((len(powers), unit.shape[1]))
+    for t in range(len(powers)):
+        for j in range(len(unit)):
+            for _ in range(powers[t, j]):
+                for i in range(unit.shape[1]):
+                    terms[t, i] *= unit[j, i]
+    return terms
 
 
 def log_sum(values: Array) -> Array:
@@ -180,7 +189,7 @@ def _corrected(log_posterior: LogPosterior, plain: Shear, x: Array, material: in
         scale=np.maximum(0.5 * (top - bottom), 1e-9),
     )
     missing = -(level + plain.height(rest))
-    coefficients = np.asarray(np.linalg.lstsq(shear.polynomial(rest), missing, rcond=None)[0], dtype=float)
+    coefficients = np.asarray(np.linalg.lstsq(shear.polynomial(rest).T, missing, rcond=None)[0], dtype=float)
     return replace(shear, coefficients=coefficients)
 
 
