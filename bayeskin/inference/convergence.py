@@ -70,20 +70,14 @@ class Convergence(_FreezesArrays):
         return _highest(self.tau_steps)
 
 
-def assess(
-    chains: Array, log_prob: Array, names: tuple[str, ...], limits: Limits, learning: int = 0
-) -> Convergence:
-    """Convergence of chains (E, n, W, D) in sampling coordinates with log densities (E, n, W).
-
-    The first `learning` steps, in which the moves still changed, are burn-in whatever else is.
-    """
+def assess(chains: Array, log_prob: Array, names: tuple[str, ...], limits: Limits) -> Convergence:
+    """Convergence of chains (E, n, W, D) in sampling coordinates with log densities (E, n, W)."""
     steps = chains.shape[1]
     # The second half's time, since a start that is not yet forgotten would lengthen it.
     settled = _highest(autocorrelation_steps(chains[:, steps // 2 :]))
     burn_in = (
         int(min(math.ceil(_BURN_IN_LENGTHS * settled), steps // 2)) if np.isfinite(settled) else steps // 2
     )
-    burn_in = max(burn_in, learning)
     kept = chains[:, burn_in:]
     tau = autocorrelation_steps(kept)
     longest = _highest(tau)

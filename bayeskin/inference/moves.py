@@ -1,14 +1,12 @@
-"""The moves of an ensemble, in straightened coordinates: local ones, and leaps of a learnt mixture."""
+"""The moves of an ensemble: stretch, differential evolution and snooker, in straightened coordinates."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import emcee
 import numpy as np
 
-from bayeskin.inference.mixture import Mixture
 from bayeskin.inference.straighten import Shear
 from bayeskin.types import Array
 
@@ -39,35 +37,17 @@ class SnookerMove(emcee.moves.red_blue.RedBlueMove):
         return proposal, factor
 
 
-_LEAPS = 0.4  # share of independent proposals, once there is a mixture
-
-
-def mixed_moves(shear: Shear | None, mixture: Mixture | None = None) -> list[tuple[emcee.moves.Move, float]]:
+def mixed_moves(shear: Shear | None) -> list[tuple[emcee.moves.Move, float]]:
     """The moves with their shares; with a shear they propose along straightened ridges.
-
-    `mixture` is in straightened coordinates too, and adds independent proposals.
 
     The chain itself stays in sampling coordinates. A shear keeps volumes, so that a move's acceptance
     ratio is the one it has without.
     """
     # Mostly differential evolution, which mixes fastest; the others keep it from any one scale.
     kinds = ((emcee.moves.DEMove, 0.8), (emcee.moves.StretchMove, 0.1), (SnookerMove, 0.1))
-    local = [(kind() if shear is None else _straightened(kind)(shear), share) for kind, share in kinds]
-    if mixture is None:
-        return local
-    leaps = emcee.moves.MHMove(_independent(shear, mixture))
-    return [*((move, (1.0 - _LEAPS) * share) for move, share in local), (leaps, _LEAPS)]
-
-
-def _independent(shear: Shear | None, mixture: Mixture) -> Callable[[Array, Any], tuple[Array, Array]]:
-    def propose(walkers: Array, random: Any) -> tuple[Array, Array]:
-        """Proposals (n, d) and the log of their Hastings factors (n,), q(old) / q(new)."""
-        new = mixture.draw(len(walkers), random)
-        old = walkers if shear is None else shear.straight(walkers)
-        factor = mixture.log_density(old) - mixture.log_density(new)
-        return (new if shear is None else shear.back(new)), factor
-
-    return propose
+    if shear is None:
+        return [(kind(), share) for kind, share in kinds]
+    return [(_straightened(kind)(shear), share) for kind, share in kinds]
 
 
 def _straightened(kind: type) -> type:

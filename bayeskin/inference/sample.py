@@ -12,14 +12,12 @@ import numpy as np
 from bayeskin.errors import InputError
 from bayeskin.inference import chains as store
 from bayeskin.inference.convergence import Convergence, Limits, assess
-from bayeskin.inference.mixture import fit_mixture
 from bayeskin.inference.moves import mixed_moves
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.straighten import Shear, find_shear
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
 _FIRST_CHECK = 500
-_LEARN = (500, 1000, 2000)  # steps at which an ensemble's mixture is fitted, on the run's second half
 _REFRESH = 100  # steps between two words of progress
 Progress = Callable[[float, str], None]
 
@@ -89,7 +87,7 @@ def sample(
                 run.changed = False
         chains = np.stack([r.backend.chain[:goal] for r in runs])
         log_prob = np.stack([r.backend.log_prob[:goal] for r in runs])
-        convergence = assess(chains, log_prob, log_posterior.names, settings.limits, _learnt_at(goal - 1))
+        convergence = assess(chains, log_prob, log_posterior.names, settings.limits)
         _tell(progress, convergence, settings, convergence.verdict.reasons[0])
         if convergence.verdict.trusted or goal >= settings.max_steps:
             return _posterior(log_posterior, chains, log_prob, convergence, seed)
@@ -114,39 +112,29 @@ class _Ensemble:
         shear: Shear | None,
         backend: emcee.backends.Backend,
         state: emcee.State,
-        seed: int,
     ) -> None:
         self.changed = False
         self.backend = backend
         self.state = state
-        self._log_posterior, self._shear, self._seed = log_posterior, shear, seed
+        self.sampler = emcee.EnsembleSampler(
+            backend.nwalkers,
+            log_posterior.dim,
+            log_posterior.log_prob,
+            moves=mixed_moves(shear),
+            backend=backend,
+            vectorize=True,
+        )
 
     def advance(self, goal: int) -> Iterator[int]:
         """Steps to `goal`, if not there yet; yields the step now and then."""
-        while self.backend.iteration < goal:
-            self.changed = True
-            stop = min([goal, *(at for at in _LEARN if at > self.backend.iteration)])
-            missing = stop - self.backend.iteration
-            sampler = self._sampler()
-            for state in sampler.sample(self.state, iterations=missing, skip_initial_state_check=True):
-                self.state = state
-                if self.backend.iteration % _REFRESH == 0:
-                    yield self.backend.iteration
-
-    def _sampler(self) -> emcee.EnsembleSampler:
-        """A sampler whose moves depend on the chain up to the last step of learning, and on nothing else."""
-        learnt_at, mixture = _learnt_at(self.backend.iteration), None
-        if learnt_at:
-            past = self.backend.chain[learnt_at // 2 : learnt_at].reshape(-1, self._log_posterior.dim)
-            mixture = fit_mixture(past if self._shear is None else self._shear.straight(past), self._seed)
-        return emcee.EnsembleSampler(
-            self.backend.nwalkers,
-            self._log_posterior.dim,
-            self._log_posterior.log_prob,
-            moves=mixed_moves(self._shear, mixture),
-            backend=self.backend,
-            vectorize=True,
-        )
+        missing = goal - self.backend.iteration
+        if missing <= 0:
+            return
+        self.changed = True
+        for state in self.sampler.sample(self.state, iterations=missing, skip_initial_state_check=True):
+            self.state = state
+            if self.backend.iteration % _REFRESH == 0:
+                yield self.backend.iteration
 
 
 def _ensembles(
@@ -173,13 +161,8 @@ def _ensembles(
             state = emcee.State(coords, random_state=generator.get_state())
         else:
             state = backend.get_last_sample()
-        runs.append(_Ensemble(log_posterior, shear, backend, state, int(own.generate_state(1)[0])))
+        runs.append(_Ensemble(log_posterior, shear, backend, state))
     return runs
-
-
-def _learnt_at(steps: int) -> int:
-    """The last step of learning at or before `steps`; 0 if there was none."""
-    return max((at for at in _LEARN if at <= steps), default=0)
 
 
 def initial_walkers(
