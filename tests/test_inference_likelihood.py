@@ -86,7 +86,7 @@ def test_neighbours_covary_as_both_noises_say() -> None:
 
 
 def test_an_omitted_bin_is_a_marginalised_bin() -> None:
-    """Where the noise is one Ornstein-Uhlenbeck process, leaving bins out takes rows out of its covariance."""
+    """Where the noise is one Ornstein-Uhlenbeck process, omitted bins leave its covariance."""
     rng = np.random.default_rng(2)
     binned = dataclasses.replace(irregular_recording(40, rng), variance_n2=np.zeros(40))
     force = np.array(binned.force_n)

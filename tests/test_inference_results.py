@@ -9,10 +9,10 @@ import matplotlib as mpl
 import nlopt
 import numpy as np
 import pytest
+import toy
 from scipy import stats
 from toy_inference import EDGES_S, NOISE, SCALE, TRUTH, ToySurrogate, full_run, line_problem, toy_problem
 
-import toy
 from bayeskin.errors import InputError
 from bayeskin.inference import (
     Convergence,
@@ -144,8 +144,9 @@ def test_the_loop_ends_after_a_failed_run_and_after_its_rounds() -> None:
     assert (len(tried.checks), tried.passes) == (3, False)
 
 
-def test_the_parts_of_the_bands_are_what_they_are_called() -> None:
-    problem = toy_problem()
+@pytest.mark.parametrize("sd_n", [5e-4, 1e-2])  # a surrogate far better and far worse than the noise
+def test_the_parts_of_the_bands_are_what_they_are_called(sd_n: float) -> None:
+    problem = toy_problem(surrogate=ToySurrogate(sd_n=sd_n))
     draws = around_truth(600, 0.01)
     draws[:, -1] = 100.0
     found = bands(problem, draws, np.random.default_rng(0))
