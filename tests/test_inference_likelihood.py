@@ -245,3 +245,9 @@ def test_a_surrogate_of_other_bins_or_a_wider_prior_is_refused() -> None:
     material = dataclasses.replace(problem.surrogate.space, parameters=(wide, *problem.space.parameters[1:5]))
     with pytest.raises(InputError, match="prior of E_c"):
         dataclasses.replace(problem, material=material)
+
+
+def test_windows_are_the_same_as_lists_and_as_tuples() -> None:
+    one = toy_problem(windows=((15.0, 45.0),))
+    other = dataclasses.replace(one, fit_windows=[[15, 45]])
+    assert one.identity == other.identity

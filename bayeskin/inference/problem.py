@@ -49,6 +49,9 @@ class LogPosterior:
             )  # fmt: skip
         if self.material is not None:
             _check_inside(self.material, self.surrogate.space)
+        if self.fit_windows is not None:  # lists from a file and tuples are the same windows
+            windows = tuple((float(start), float(end)) for start, end in self.fit_windows)
+            object.__setattr__(self, "fit_windows", windows)
         _ = self.chain  # bad windows are refused here, not at the first evaluation
 
     @cached_property
