@@ -18,7 +18,8 @@ from toy_inference import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
 from bayeskin.errors import InputError
 from bayeskin.inference import Limits, LogPosterior, SampleSettings, identifiability, load_chains, sample
 from bayeskin.inference.convergence import assess, autocorrelation_steps, split_rhat
-from bayeskin.inference.moves import SnookerMove, mixed_moves
+from bayeskin.inference.coordinates import MoveCoordinates
+from bayeskin.inference.moves import SnookerMove, SubspaceMove, mixed_moves
 from bayeskin.inference.straighten import Shear, find_shear
 from bayeskin.types import Array
 
@@ -44,8 +45,14 @@ def curved_shear(dim: int) -> Shear:
     return Shear(group, weight, powers, np.array([0.7]), np.zeros(dim), np.full(dim, 2.0))
 
 
+def walled(shear: Shear | None) -> MoveCoordinates:
+    return MoveCoordinates(shear, np.full(5, -9.0), np.full(5, 9.0))
+
+
 @pytest.mark.parametrize(
-    "moves", [SnookerMove(), mixed_moves(curved_shear(5))], ids=["snooker", "mixture, straightened"]
+    "moves",
+    [SnookerMove(), SubspaceMove(), mixed_moves(walled(curved_shear(5))), mixed_moves(walled(None))],
+    ids=["snooker", "subspace", "all, straightened", "all, normal scores"],
 )
 def test_a_move_keeps_a_unit_normal(moves: object) -> None:
     mean, error = unit_normal_variance(moves, 5, 2000)

@@ -55,7 +55,13 @@ def toy_simulate(theta: Mapping[str, float]) -> Simulation:
     time_s = np.unique(np.concatenate([np.linspace(0, MOTION.time_s[-1], 261), MOTION.time_s]))
     row = np.array([[theta[name] for name in SPACE.names]])
     return Simulation(
-        theta=dict(theta), time_s=time_s, displacement_m=MOTION.at(time_s),
-        force_n=toy_force(row, time_s)[0], corner=frozen_array(np.isin(time_s, MOTION.time_s), bool),
-        status="ok", message="", stats={"seconds": 0.0}, model_hash="toy",
+        theta=dict(theta),
+        time_s=time_s,
+        displacement_m=MOTION.at(time_s),
+        force_n=toy_force(row, time_s)[0],
+        corner=frozen_array(np.isin(time_s, MOTION.time_s), bool),
+        status="ok",
+        message="",
+        stats={"seconds": 0.0},
+        model_hash="toy",
     )

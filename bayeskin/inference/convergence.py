@@ -70,14 +70,18 @@ class Convergence(_FreezesArrays):
         return _highest(self.tau_steps)
 
 
-def assess(chains: Array, log_prob: Array, names: tuple[str, ...], limits: Limits) -> Convergence:
-    """Convergence of chains (E, n, W, D) in sampling coordinates with log densities (E, n, W)."""
+def assess(
+    chains: Array, log_prob: Array, names: tuple[str, ...], limits: Limits, settled: int = 0
+) -> Convergence:
+    """Convergence of chains (E, n, W, D) in sampling coordinates with log densities (E, n, W).
+
+    The first `settled` steps, after which nothing interferes with the chains, are burn-in whatever else is.
+    """
     steps = chains.shape[1]
     # The second half's time, since a start that is not yet forgotten would lengthen it.
-    settled = _highest(autocorrelation_steps(chains[:, steps // 2 :]))
-    burn_in = (
-        int(min(math.ceil(_BURN_IN_LENGTHS * settled), steps // 2)) if np.isfinite(settled) else steps // 2
-    )
+    late = _highest(autocorrelation_steps(chains[:, steps // 2 :]))
+    forgotten = math.ceil(_BURN_IN_LENGTHS * late) if np.isfinite(late) else steps
+    burn_in = max(min(forgotten, steps // 2), settled)
     kept = chains[:, burn_in:]
     tau = autocorrelation_steps(kept)
     longest = _highest(tau)

@@ -1,4 +1,4 @@
-"""The moves of an ensemble: stretch, differential evolution and snooker, in straightened coordinates."""
+"""The moves of an ensemble, in coordinates made for them: differential evolution, stretch, snooker."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from typing import Any
 import emcee
 import numpy as np
 
-from bayeskin.inference.straighten import Shear
+from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.types import Array
 
+_CROSSOVER = (0.15, 0.3, 1.0)  # shares of the coordinates that a step moves
+_JUMP, _JITTER = 0.1, 1e-5  # share of steps of full length, from mode to mode; noise that fills space
 _GAMMA = 1.7  # of about 2.38 / sqrt(2), optimal for the difference of two projected points
 
 
@@ -37,30 +39,49 @@ class SnookerMove(emcee.moves.red_blue.RedBlueMove):
         return proposal, factor
 
 
-def mixed_moves(shear: Shear | None) -> list[tuple[emcee.moves.Move, float]]:
-    """The moves with their shares; with a shear they propose along straightened ridges.
+class SubspaceMove(emcee.moves.red_blue.RedBlueMove):
+    """Differential evolution in a random few of the coordinates: y + gamma (a - b) there, a and b others.
 
-    The chain itself stays in sampling coordinates. A shear keeps volumes, so that a move's acceptance
-    ratio is the one it has without.
+    A step in all coordinates at once is accepted as rarely as its worst one; where parameters are nearly
+    independent a step in a few goes further. Source: Vrugt et al. (2009), International Journal of
+    Nonlinear Sciences and Numerical Simulation 10:273, equation 4, with fixed crossover rates.
     """
+
+    def get_proposal(self, walkers: Array, complement: list[Array], random: Any) -> tuple[Array, Array]:
+        """Proposals (n, d) for `walkers` (n, d) and the log of their Hastings factors, which is 0 (n,)."""
+        others = np.concatenate(complement)
+        count, dim = walkers.shape
+        picks = random.random_sample((count, len(others))).argsort(axis=1)[:, :2]
+        first, second = others[picks.T]
+        rate = random.choice(_CROSSOVER, size=count)[:, None]
+        moved = random.random_sample((count, dim)) < rate
+        moved[np.arange(count), random.randint(dim, size=count)] = True
+        gamma = np.where(random.random_sample(count) < _JUMP, 1.0, 2.38 / np.sqrt(2.0 * moved.sum(axis=1)))
+        step = gamma[:, None] * (first - second) + _JITTER * random.standard_normal((count, dim))
+        return walkers + moved * step, np.zeros(count)
+
+
+def mixed_moves(coordinates: MoveCoordinates) -> list[tuple[emcee.moves.Move, float]]:
+    """The moves with their shares, all made in `coordinates`."""
     # Mostly differential evolution, which mixes fastest; the others keep it from any one scale.
-    kinds = ((emcee.moves.DEMove, 0.8), (emcee.moves.StretchMove, 0.1), (SnookerMove, 0.1))
-    if shear is None:
-        return [(kind(), share) for kind, share in kinds]
-    return [(_straightened(kind)(shear), share) for kind, share in kinds]
+    kinds = ((SubspaceMove, 0.8), (emcee.moves.StretchMove, 0.1), (SnookerMove, 0.1))
+    return [(_local(kind)(coordinates), share) for kind, share in kinds]
 
 
-def _straightened(kind: type) -> type:
-    class Straightened(kind):  # type: ignore[misc]
-        def __init__(self, shear: Shear) -> None:
+def _local(kind: type) -> type:
+    """A move of emcee's, made in other coordinates."""
+
+    class Local(kind):  # type: ignore[misc]
+        def __init__(self, coordinates: MoveCoordinates) -> None:
             super().__init__()
-            self.shear = shear
+            self.coordinates = coordinates
 
         def get_proposal(self, walkers: Array, complement: list[Array], random: Any) -> tuple[Array, Array]:
-            straight = self.shear.straight(np.concatenate([walkers, *complement]))
+            mapped = self.coordinates.forward(np.concatenate([walkers, *complement]))
             ends = np.cumsum([len(walkers), *map(len, complement[:-1])])
-            first, *others = np.split(straight, ends)
+            first, *others = np.split(mapped, ends)
             proposal, factor = super().get_proposal(first, others, random)
-            return self.shear.back(proposal), factor
+            volume = self.coordinates.log_volume(proposal) - self.coordinates.log_volume(first)
+            return self.coordinates.back(proposal), factor + volume
 
-    return Straightened
+    return Local

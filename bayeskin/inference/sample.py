@@ -12,12 +12,15 @@ import numpy as np
 from bayeskin.errors import InputError
 from bayeskin.inference import chains as store
 from bayeskin.inference.convergence import Convergence, Limits, assess
+from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.inference.moves import mixed_moves
 from bayeskin.inference.problem import LogPosterior
-from bayeskin.inference.straighten import Shear, find_shear
+from bayeskin.inference.straighten import find_shear
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
 _FIRST_CHECK = 500
+# Steps at which walkers that lag behind are brought back; all that came before is burn-in.
+_RESCUES = (200, 400, 800, 1600)
 _REFRESH = 100  # steps between two words of progress
 Progress = Callable[[float, str], None]
 
@@ -87,7 +90,8 @@ def sample(
                 run.changed = False
         chains = np.stack([r.backend.chain[:goal] for r in runs])
         log_prob = np.stack([r.backend.log_prob[:goal] for r in runs])
-        convergence = assess(chains, log_prob, log_posterior.names, settings.limits)
+        settled = max((at for at in _RESCUES if at < goal), default=0)
+        convergence = assess(chains, log_prob, log_posterior.names, settings.limits, settled)
         _tell(progress, convergence, settings, convergence.verdict.reasons[0])
         if convergence.verdict.trusted or goal >= settings.max_steps:
             return _posterior(log_posterior, chains, log_prob, convergence, seed)
@@ -109,32 +113,55 @@ class _Ensemble:
     def __init__(
         self,
         log_posterior: LogPosterior,
-        shear: Shear | None,
+        coordinates: MoveCoordinates,
         backend: emcee.backends.Backend,
         state: emcee.State,
+        seed: np.random.SeedSequence,
     ) -> None:
         self.changed = False
         self.backend = backend
         self.state = state
+        self._seed = seed
         self.sampler = emcee.EnsembleSampler(
             backend.nwalkers,
             log_posterior.dim,
             log_posterior.log_prob,
-            moves=mixed_moves(shear),
+            moves=mixed_moves(coordinates),
             backend=backend,
             vectorize=True,
         )
 
     def advance(self, goal: int) -> Iterator[int]:
         """Steps to `goal`, if not there yet; yields the step now and then."""
-        missing = goal - self.backend.iteration
-        if missing <= 0:
-            return
-        self.changed = True
-        for state in self.sampler.sample(self.state, iterations=missing, skip_initial_state_check=True):
-            self.state = state
-            if self.backend.iteration % _REFRESH == 0:
-                yield self.backend.iteration
+        while self.backend.iteration < goal:
+            self.changed = True
+            if self.backend.iteration in _RESCUES:
+                self._rescue()
+            stop = min([goal, *(at for at in _RESCUES if at > self.backend.iteration)])
+            missing = stop - self.backend.iteration
+            for state in self.sampler.sample(self.state, iterations=missing, skip_initial_state_check=True):
+                self.state = state
+                if self.backend.iteration % _REFRESH == 0:
+                    yield self.backend.iteration
+
+    def _rescue(self) -> None:
+        """Puts walkers whose density lags behind their ensemble's where one of the others has been.
+
+        A walker lags if its mean log density over the last half of the run lies two interquartile ranges
+        below the lower quartile (Vrugt et al. 2009, section 3.3). What is drawn depends on the step alone.
+        """
+        at = self.backend.iteration
+        level = self.backend.log_prob[at // 2 : at].mean(axis=0)
+        low, high = np.quantile(level, [0.25, 0.75])
+        lagging = level < low - 2.0 * (high - low)
+        good = np.flatnonzero(~lagging)
+        rng = np.random.default_rng([*self._seed.generate_state(4), at])
+        steps = rng.integers(at // 2, at, lagging.sum())
+        picks = rng.choice(good, lagging.sum())
+        coords, log_prob = self.state.coords.copy(), self.state.log_prob.copy()
+        coords[lagging] = self.backend.chain[steps, picks]
+        log_prob[lagging] = self.backend.log_prob[steps, picks]
+        self.state = emcee.State(coords, log_prob=log_prob, random_state=self.state.random_state)
 
 
 def _ensembles(
@@ -145,7 +172,7 @@ def _ensembles(
     backends: Sequence[emcee.backends.Backend | None],
 ) -> list[_Ensemble]:
     """Ensembles that go on from their chains, or start anew, each with a random stream of its own."""
-    shear = find_shear(log_posterior)
+    coordinates = MoveCoordinates(find_shear(log_posterior), *log_posterior.bounds)
     runs = []
     for e, (backend, own) in enumerate(
         zip(backends, np.random.SeedSequence(seed).spawn(len(backends)), strict=True)
@@ -161,7 +188,7 @@ def _ensembles(
             state = emcee.State(coords, random_state=generator.get_state())
         else:
             state = backend.get_last_sample()
-        runs.append(_Ensemble(log_posterior, shear, backend, state))
+        runs.append(_Ensemble(log_posterior, coordinates, backend, state, own))
     return runs
 
 
