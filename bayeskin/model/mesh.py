@@ -49,10 +49,12 @@ class SkinMesh:
 
     @property
     def hash(self) -> str:
-        """sha256 over coordinates, cells, boundaries and layers."""
+        """sha256 over coordinates (to a nanometre: sines differ between machines), cells, boundaries, layers."""
+        nanometres = np.round(1e9 * self.geometry.doflocs).astype(np.int64)
+        whole = (self.geometry.t, self.cutis, *(self.facets[name] for name in BOUNDARIES))
         digest = hashlib.sha256()
-        for array in (self.geometry.doflocs, self.geometry.t, self.cutis, *map(self.facets.get, BOUNDARIES)):
-            digest.update(np.ascontiguousarray(array).tobytes())
+        for array in (nanometres, *(np.asarray(part, dtype=np.int64) for part in whole)):
+            digest.update(f"{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
 
