@@ -49,7 +49,7 @@ class SkinMesh:
 
     @property
     def hash(self) -> str:
-        """sha256 over coordinates (to a nanometre: sines differ between machines), cells, boundaries, layers."""
+        """sha256 over cells, boundaries, layers, and coordinates to a nanometre (sines differ by machine)."""
         nanometres = np.round(1e9 * self.geometry.doflocs).astype(np.int64)
         whole = (self.geometry.t, self.cutis, *(self.facets[name] for name in BOUNDARIES))
         digest = hashlib.sha256()
