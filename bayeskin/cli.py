@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -50,7 +51,7 @@ class Terminal:
         self.bars.stop()
 
     def log(self, message: str) -> None:
-        self.console.print(message, markup=False)
+        self.console.print(message, markup=False, soft_wrap=True)
 
     def progress(self, label: str, share: float, note: str = "") -> None:
         if label not in self.tasks:
@@ -171,6 +172,7 @@ def _answer(document: Mapping[str, Any], as_json: bool) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `bayeskin` command."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a scheduler's end is an interruption too
     sys.exit(_exit_code(lambda: cli.main(arguments, prog_name="bayeskin", standalone_mode=False)))
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -320,6 +323,23 @@ def test_the_exit_code_says_whether_the_answer_can_be_relied_on(
         else:
             assert out == ""
             assert err.splitlines()[-1] == "bayeskin: interrupted; the same command goes on from here"
+
+
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
+def test_a_command_that_is_interrupted_says_how_to_go_on(measured: Path, tmp_path: Path, ending: int) -> None:
+    code = (
+        "import sys, time; from bayeskin import cli; from bayeskin.pipeline import single\n"
+        "def slow(*_): print('at work', flush=True); time.sleep(60)\n"
+        "single.import_recording = slow; cli.main(['import', *sys.argv[1:]])"
+    )
+    command = [sys.executable, "-c", code, str(measured), "-o", str(tmp_path / "r.h5")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    process.stdout.readline()
+    process.send_signal(ending)
+    _, said = process.communicate()
+    assert process.returncode == 130
+    assert said.strip() == "bayeskin: interrupted; the same command goes on from here"
 
 
 def test_help_teaches_each_command_by_an_example(bayeskin: Command) -> None:
