@@ -77,7 +77,7 @@ def article_run(until_s: float, theta: dict[str, float] = CALIBRATED, steps: str
 
 
 def test_articles_force_on_the_first_ramp_is_its_scripts():
-    found, time_s, force_n = article_run(until_s=14.0)
+    found, time_s, force_n = article_run(until_s=17.0)
     np.testing.assert_allclose(found.time_s, time_s)
     np.testing.assert_allclose(found.force_n, force_n, atol=1e-5)
 

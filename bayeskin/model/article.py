@@ -26,7 +26,7 @@ from bayeskin.model.newton import Equations, NewtonSolver
 from bayeskin.model.problem import Material, Problem
 from bayeskin.types import Array
 
-SOLVER_TOLERANCE = 1e-4  # of the largest displacement and pressure, before the last correction
+SOLVER_TOLERANCE = 1e-5  # of the largest displacement and pressure, before the last correction
 FACE_QUADRATURE_DEGREE = 6
 
 
@@ -51,7 +51,7 @@ class ArticleModel:
 
     problem: Problem
     material: Material
-    solver: NewtonSolver = field(default_factory=NewtonSolver)
+    solver: NewtonSolver = field(default_factory=lambda: NewtonSolver(symmetric=False))
 
     def __post_init__(self) -> None:
         space, mesh = self.problem.space, self.problem.mesh.geometry

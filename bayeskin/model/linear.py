@@ -1,8 +1,8 @@
 """One sparse factorisation, kept and reused: MKL PARDISO where it is installed, else SuperLU.
 
 A symmetric factorisation of the tangent's symmetric part costs half of an unsymmetric one and
-serves as well as an approximate inverse (`newton` corrects it); unknowns are scaled first, because
-displacements [m] and pressures [Pa] lie many decades apart.
+serves as well as an approximate inverse where the rest is small (`newton` corrects it). Unknowns
+are scaled first, because displacements [m] and pressures [Pa] lie many decades apart.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ except (ImportError, OSError):  # no wheel for this processor, or no MKL beside 
     pypardiso = None
 
 SOLVER_NAME = "MKL PARDISO" if pypardiso is not None else "SuperLU"
-_SYMMETRIC_INDEFINITE = -2
+_UNSYMMETRIC, _SYMMETRIC_INDEFINITE = 11, -2
 
 
 class Factorisation(Protocol):
@@ -35,10 +35,11 @@ class Factorisation(Protocol):
 
 
 class _Pardiso:
-    def __init__(self) -> None:
-        self._solver = pypardiso.PyPardisoSolver(mtype=_SYMMETRIC_INDEFINITE)
+    def __init__(self, symmetric: bool) -> None:
+        self._symmetric = symmetric
+        self._solver = pypardiso.PyPardisoSolver(mtype=_SYMMETRIC_INDEFINITE if symmetric else _UNSYMMETRIC)
         # own parameters: METIS ordering, scaling and matching, no refinement unless pivots were perturbed
-        for number, value in {1: 1, 2: 2, 8: 0, 10: 8, 11: 1, 13: 1}.items():
+        for number, value in {1: 1, 2: 2, 8: 0, 10: 8 if symmetric else 13, 11: 1, 13: 1}.items():
             self._solver.set_iparm(number, value)
         self._matrix: sp.csr_matrix | None = None
 
@@ -48,13 +49,17 @@ class _Pardiso:
             self._prepare(matrix)
         self._scale = scale
         data = matrix.data * scale[self._row] * scale[matrix.indices]
-        data = 0.5 * (data[self._upper] + data[self._mirrored])
+        if self._symmetric:
+            data = 0.5 * (data[self._upper] + data[self._mirrored])
         self._matrix = sp.csr_matrix((data, self._indices, self._indptr), shape=matrix.shape)
         self._solver.set_phase(12 if first else 22)  # the pattern is analysed once
         self._solver._call_pardiso(self._matrix, np.zeros((matrix.shape[0], 1)))
 
     def _prepare(self, matrix: sp.csr_matrix) -> None:
         self._row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+        self._indices, self._indptr = matrix.indices, matrix.indptr
+        if not self._symmetric:
+            return
         place = sp.csr_matrix((np.arange(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
         self._upper = np.flatnonzero(matrix.indices >= self._row)
         self._mirrored = place.T.tocsr().data[self._upper]
@@ -95,6 +100,6 @@ class _SuperLU:
         self._factors = None
 
 
-def factorisation() -> Factorisation:
-    """A fresh, empty factorisation of the best solver at hand."""
-    return _Pardiso() if pypardiso is not None else _SuperLU()
+def factorisation(symmetric: bool) -> Factorisation:
+    """A fresh, empty factorisation of the best solver at hand, of the symmetric part only or of all."""
+    return _Pardiso(symmetric) if pypardiso is not None else _SuperLU()

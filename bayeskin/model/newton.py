@@ -45,6 +45,7 @@ class Equations:
 class NewtonSolver:
     """Carries the factorised tangent from solve to solve, and counts what was spent."""
 
+    symmetric: bool = True  # the tangent nearly is, so its symmetric part is what is factorised
     counts: dict[str, int] = field(
         default_factory=lambda: {"iterations": 0, "residuals": 0, "factorisations": 0, "solves": 0}
     )
@@ -53,7 +54,7 @@ class NewtonSolver:
     _ready: bool = False
 
     def __post_init__(self) -> None:
-        self._factors = factorisation()
+        self._factors = factorisation(self.symmetric)
 
     def release(self) -> None:
         """Frees the factors."""
