@@ -105,13 +105,11 @@ class LagrangianModel:
 
     def equations(self, h: float, old: State) -> Equations:
         s, m, pattern = self.problem.space, self.material, self.problem.pattern
-        last: dict[str, Array] = {}
 
         def residual(x: Array) -> Array | None:
             found = self.residual(x, h, old)
             if found is None:
                 return None
-            last["residual"], last["volume"], last["pressure"] = found
             self.full_residual = found[0]
             return found[0][pattern.free]
 
