@@ -10,6 +10,7 @@ import hashlib
 import json
 import tomllib
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -198,7 +199,7 @@ def _overridden(default: Parameter, change: PriorConfig | None, where: object) -
         raise InputError(at, f"lower {lower:g}, upper {upper:g} {default.unit}", "lower below upper")
     if prior == "log-uniform" and lower <= 0:
         raise InputError(f"{at}.lower", f"{lower:g} with a log-uniform prior", "a bound above zero")
-    return Parameter(default.name, default.unit, lower, upper, prior, default.description, "configuration")
+    return replace(default, lower=lower, upper=upper, prior=prior, source="configuration")
 
 
 def _input_error(path: Path, error: ValidationError) -> InputError:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -58,14 +58,14 @@ def default_space() -> ParameterSpace:
     stiffness = f"within the 5 kPa..196 MPa of Payan & Ohayon (2017) in {article}; narrowed to a skin test"
     permeability = f"literature range 1e-16..1e-11 m^2 in {article}"
     pressure = f"Wiig & Reed (1983), Hargens et al. (1981) in {article}"
+    cutis, subcutis = "of the cutis", "of the subcutis"
+    log: Literal["log-uniform"] = "log-uniform"
     return ParameterSpace(
         (
-            Parameter("E_c", "Pa", 10e3, 2e6, "log-uniform", "Young's modulus of the cutis", stiffness),
-            Parameter("E_s", "Pa", 1e3, 500e3, "log-uniform", "Young's modulus of the subcutis", stiffness),
-            Parameter("k_c", "m^2", 1e-16, 1e-11, "log-uniform", "permeability of the cutis", permeability),
-            Parameter(
-                "k_s", "m^2", 1e-16, 1e-11, "log-uniform", "permeability of the subcutis", permeability
-            ),
+            Parameter("E_c", "Pa", 10e3, 2e6, log, f"Young's modulus {cutis}", stiffness, 1),
+            Parameter("E_s", "Pa", 1e3, 500e3, log, f"Young's modulus {subcutis}", stiffness, 1),
+            Parameter("k_c", "m^2", 1e-16, 1e-11, log, f"permeability {cutis}", permeability, -1),
+            Parameter("k_s", "m^2", 1e-16, 1e-11, log, f"permeability {subcutis}", permeability, -1),
             Parameter("p_init", "Pa", -670.0, 2144.0, "uniform", "initial interstitial pressure", pressure),
         )
     )

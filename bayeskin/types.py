@@ -37,7 +37,11 @@ class _FreezesArrays:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One sampled parameter: its symbol, SI unit, prior and where the prior comes from."""
+    """One sampled parameter: its symbol, SI unit, prior and where the prior comes from.
+
+    stress_power : with all parameters multiplied by c**stress_power, the force is multiplied by c
+        (1 for a modulus, -1 for a permeability, whose viscosity is fixed; 0: stays as it is)
+    """
 
     name: str
     unit: str
@@ -46,6 +50,7 @@ class Parameter:
     prior: Literal["uniform", "log-uniform"]
     description: str = ""
     source: str = ""
+    stress_power: int = 0
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from bayeskin.model.lagrangian import GAMMA, LagrangianModel, State, advance
 from bayeskin.model.mesh import SkinMesh
 from bayeskin.model.problem import Material, Problem
+from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.model.space import sparsity, taylor_hood
 from bayeskin.types import PadMotion
 
@@ -206,3 +207,12 @@ def test_time_integration_is_of_second_order():
     rates = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     assert np.all(rates > 1.7), rates
     assert pytest.approx(1 - 1 / np.sqrt(2)) == GAMMA
+
+
+def test_forces_scale_with_stresses():
+    """Moduli times c, permeabilities over c: c times the force (what `surrogates.similarity` rests on)."""
+    motion = PadMotion(np.array([0.0, 5.0, 20.0, 25.0]), np.array([0.0, 5e-3, 5e-3, 0.0]))
+    soft = {"E_c": 1e5, "E_s": 1e4, "k_c": 1e-13, "k_s": 1e-12, "p_init": 700.0}
+    stiff = {"E_c": 8e5, "E_s": 8e4, "k_c": 1.25e-14, "k_s": 1.25e-13, "p_init": -300.0}
+    one, eight = simulate(ModelSpec(), motion, soft), simulate(ModelSpec(), motion, stiff)
+    np.testing.assert_allclose(eight.at(one.time_s), 8.0 * one.force_n, atol=2e-3 * eight.force_n.max())

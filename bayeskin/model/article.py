@@ -19,14 +19,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.sparse as sp
 import skfem
 
-from bayeskin.model import article_forms as forms
-from bayeskin.model.newton import Equations, NewtonSolver
+from bayeskin.model import article_law, assembly
+from bayeskin.model.newton import EXTRAPOLATION_POINTS, Equations, NewtonSolver, extrapolate
 from bayeskin.model.problem import Material, Problem
 from bayeskin.types import Array
 
-SOLVER_TOLERANCE = 1e-5  # of the largest displacement and pressure, before the last correction
+SOLVER_TOLERANCE = 1e-4  # of the largest displacement and pressure, before the last correction
 FACE_QUADRATURE_DEGREE = 6
 
 
@@ -61,6 +62,10 @@ class ArticleModel:
         self._ref_p = _reference_gradients(skfem.ElementTetP1(), points)
         self._face = _pad_face(mesh, self.problem.mesh.facets["pad"])
         self._cells = np.ascontiguousarray(mesh.t.T)
+        shape = space.weight.shape
+        self._points, self._response = assembly.points(shape), assembly.response(shape)
+        self._linearised = assembly.linearised(shape)
+        self._data = np.empty(self.problem.pattern.size)  # overwritten by each tangent
         # displacement nodes 0..corners-1 are the mesh's vertices in scikit-fem's numbering
         assert np.array_equal(space.nodes_u[:, :4], self._cells)
 
@@ -74,8 +79,10 @@ class ArticleModel:
         jacobian = corners[self._cells[:, 1:]] - corners[self._cells[:, :1]]  # (e, 3 edges, 3)
         inverse = np.linalg.inv(jacobian)  # rows: coordinates; columns: edges
         volume = np.linalg.det(jacobian)
-        grad_u = np.einsum("qaj,eij->eqai", self._ref_u, inverse, optimize=True)
-        grad_p = np.einsum("qaj,eij->eqai", self._ref_p, inverse, optimize=True)
+        grad_u, grad_p = (
+            np.ascontiguousarray(np.einsum("qaj,eij->eqia", on_cell, inverse, optimize=True))
+            for on_cell in (self._ref_u, self._ref_p)
+        )
         weight = np.abs(volume)[:, None] * self._weight
         equations = self._equations(x, grad_u, grad_p, weight, dt)
         target = self.problem.prescribe(x if guess is None else guess, pad_displacement_m)
@@ -94,45 +101,44 @@ class ArticleModel:
 
     def _equations(self, old: Array, grad_u: Array, grad_p: Array, weight: Array, dt: float) -> Equations:
         s, m, pattern = self.problem.space, self.material, self.problem.pattern
+        at, found, by = self._points, self._response, self._linearised
+
+        def evaluate(x: Array) -> None:
+            assembly.evaluate(
+                x, s.nodes_u, s.nodes_p, grad_u, grad_p, s.value_p, at.deformation, at.pressure, at.gradient
+            )
+
+        evaluate(old)
+        divergence_old = np.trace(at.deformation, axis1=2, axis2=3)
+        pressure_old = at.pressure.copy()
 
         def residual(x: Array) -> Array | None:
+            evaluate(x)
+            smallest = article_law.respond(
+                at.deformation, at.pressure, at.gradient, m.mu, m.lam, m.mobility, m.storage, dt,
+                divergence_old, pressure_old, found.stress, found.content, found.flux,
+            )  # fmt: skip
+            if not smallest > 0.0:
+                return None
             out = np.zeros(s.dofs)
-            smallest = forms.residual(
-                x,
-                old,
-                s.nodes_u,
-                s.nodes_p,
-                grad_u,
-                grad_p,
-                s.value_p,
-                weight,
-                m.mu,
-                m.lam,
-                m.mobility,
-                m.storage,
-                dt,
-                out,
-            )
-            return out[pattern.free] if smallest > 0.0 and np.isfinite(out).all() else None
+            assembly.residual(
+                s.nodes_u, s.nodes_p, grad_u, grad_p, s.value_p, weight,
+                found.stress, found.content, found.flux, out,
+            )  # fmt: skip
+            return out[pattern.free] if np.isfinite(out).all() else None
 
-        def tangent(x: Array):  # type: ignore[no-untyped-def]
-            data = np.zeros(pattern.size)
-            forms.tangent(
-                x,
-                s.nodes_u,
-                s.nodes_p,
-                grad_u,
-                grad_p,
-                s.value_p,
-                weight,
-                m.mu,
-                m.lam,
-                m.mobility,
-                m.storage,
-                dt,
-                pattern.position,
-                data,
-            )
+        def tangent(x: Array) -> tuple[sp.csr_matrix, sp.csr_matrix]:
+            evaluate(x)
+            article_law.linearise(
+                at.deformation, m.mu, m.lam, m.mobility, m.storage, dt,
+                by.stress_f, by.stress_p, by.content_f, by.content_p, by.flux_g,
+            )  # fmt: skip
+            data = self._data
+            data[:] = 0.0
+            assembly.tangent(
+                grad_u, grad_p, s.value_p, weight, by.stress_f, by.stress_p, by.content_f, by.content_p,
+                by.flux_f, by.flux_g, pattern.position, data,
+            )  # fmt: skip
             return pattern.matrices(data)
 
         n = 3 * s.n_nodes
@@ -180,14 +186,16 @@ def run(
     x = np.zeros(space.dofs)
     x[3 * space.n_nodes :] = p_init
     corners = model.problem.mesh.geometry.p.T.copy()
-    rate, old_speed = np.zeros(space.dofs), np.nan
+    past, old_speed = [(0.0, x)], np.nan  # states since the pads' speed last changed
     for n in range(1, len(time_s)):
         dt = float(time_s[n] - time_s[n - 1])
         speed = (displacement_m[n] - displacement_m[n - 1]) / dt
-        steady = np.isfinite(old_speed) and abs(speed - old_speed) < 0.2 * abs(speed) + 1e-5
+        if not abs(speed - old_speed) < 0.2 * abs(speed) + 1e-5:
+            past = past[-1:]
         pad = 0.5 * float(displacement_m[n])
-        found = model.step(x, corners, dt, pad, x + dt * rate if steady else None)
-        if found is None and steady:
+        guess = extrapolate(past, float(time_s[n])) if len(past) > 1 else None
+        found = model.step(x, corners, dt, pad, guess)
+        if found is None and guess is not None:
             found = model.step(x, corners, dt, pad, None)
         if found is None:
             return (
@@ -196,7 +204,8 @@ def run(
             )
         new, force = found
         corners = model.move(corners, x, new)
-        rate, x, old_speed = (new - x) / dt, new, speed
+        x, old_speed = new, speed
+        past = [*past, (float(time_s[n]), x)][-EXTRAPOLATION_POINTS:]
         on_step(float(time_s[n]), x, force)
     return ""
 

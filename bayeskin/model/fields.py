@@ -46,7 +46,7 @@ def fields_of(problem: Problem, theta: Mapping[str, float], x: Array, rate: Arra
     cells = material(theta, problem.mesh.cutis)
     u, v = (a[: 3 * s.n_nodes].reshape(-1, 3)[s.nodes_u] for a in (x, rate))
     p = x[3 * s.n_nodes + s.nodes_p]
-    f = np.eye(3) + np.einsum("eai,eqaj->eqij", u, s.grad_u)
+    f = np.eye(3) + np.einsum("eai,eqja->eqij", u, s.grad_u)
     j = np.linalg.det(f)
     inverse = np.linalg.inv(f)
     mu, lam = cells.mu[:, None, None, None], cells.lam[:, None, None, None]
@@ -57,7 +57,7 @@ def fields_of(problem: Problem, theta: Mapping[str, float], x: Array, rate: Arra
     total = effective - pressure[..., None, None] * np.eye(3)
     initial = np.where(problem.mesh.cutis, c.porosity_c, c.porosity_s)[:, None]
     porosity = 1.0 - (1.0 - initial) / j
-    gradient = np.einsum("eqji,eqbj,eb->eqi", inverse, s.grad_p, p)
+    gradient = np.einsum("eqji,eqjb,eb->eqi", inverse, s.grad_p, p)
     weight = s.weight / s.weight.sum(axis=1, keepdims=True)
     darcy = -(cells.mobility[:, None] / porosity)[..., None] * gradient
     corner_u = _at_corners(problem, x)

@@ -2,9 +2,9 @@
 
 Alexander's two-stage singly diagonally implicit Runge-Kutta method (SIAM J. Numer. Anal. 14, 1977):
 gamma = 1 - 1/sqrt(2), stiffly accurate and L-stable, so that a corner of the protocol, where the
-pressure rate jumps, needs no history. Each stage is one solve of `forms.residual` with a history
-J*, p*. The local error of the fluid mass, filtered through the tangent (Hosea & Shampine 1996),
-gives an error of the force in newtons, which steers the step.
+pressure rate jumps, needs no history. Each stage is one solve with a history J*, p*. The local error of
+the fluid mass, filtered through the tangent (Hosea & Shampine 1996), gives an error of the force in
+newtons, which steers the step.
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.sparse as sp
 
-from bayeskin.model import forms
-from bayeskin.model.newton import Equations, NewtonSolver
+from bayeskin.model import assembly, poroelastic
+from bayeskin.model.newton import EXTRAPOLATION_POINTS, Equations, NewtonSolver, extrapolate
 from bayeskin.model.problem import Material, Problem
 from bayeskin.types import Array, PadMotion
 
@@ -24,7 +25,6 @@ GAMMA = 1.0 - np.sqrt(0.5)
 FIRST_STEP_S = 1.0
 SHORTEST_STEP = 1e-3  # of the phase; a run that asks for less has failed
 GROWTH, SHRINK = 2.5, 0.25
-EXTRAPOLATION_POINTS = 3
 STEPS_PER_PHASE = 5  # so that a cubic between steps follows the curvature of a ramp
 CUTIS_THICKNESS_M, SUBCUTIS_THICKNESS_M = 2e-3, 8e-3
 PAD_WIDTH_M, PAD_EDGE_M = 8e-3, 18e-3  # both halves of the pad; distance of its inner edge from x = 0
@@ -63,6 +63,10 @@ class LagrangianModel:
 
     def __post_init__(self) -> None:
         self.full_residual = np.zeros(self.problem.space.dofs)
+        shape = self.problem.space.weight.shape
+        self._points, self._response = assembly.points(shape), assembly.response(shape)
+        self._linearised = assembly.linearised(shape)
+        self._data = np.empty(self.problem.pattern.size)  # overwritten by each tangent
 
     def pad_displacement(self, time_s: float) -> float:
         """Half the LVDT displacement [m]."""
@@ -77,31 +81,44 @@ class LagrangianModel:
 
     def residual(self, x: Array, h: float, old: State) -> tuple[Array, Array, Array] | None:
         """Residual (dofs,), J and p (e, q); None where a cell has turned inside out."""
-        s, m = self.problem.space, self.material
-        out = np.zeros(s.dofs)
-        volume, pressure = np.empty(s.weight.shape), np.empty(s.weight.shape)
-        smallest = forms.residual(
-            x,
-            s.nodes_u,
-            s.nodes_p,
-            s.grad_u,
-            s.grad_p,
-            s.value_p,
-            s.weight,
-            m.mu,
-            m.lam,
-            m.mobility,
-            m.storage,
-            h,
-            old.volume,
-            old.pressure,
-            out,
-            volume,
-            pressure,
-        )
-        if not smallest > 0.0 or not np.isfinite(out).all():
+        s, m, at, found = self.problem.space, self.material, self._points, self._response
+        volume = np.empty(s.weight.shape)
+        self._evaluate(x)
+        smallest = poroelastic.respond(
+            at.deformation, at.pressure, at.gradient, m.mu, m.lam, m.mobility, m.storage, h,
+            old.volume, old.pressure, found.stress, found.content, found.flux, volume,
+        )  # fmt: skip
+        if not smallest > 0.0:
             return None
-        return out, volume, pressure
+        out = np.zeros(s.dofs)
+        assembly.residual(
+            s.nodes_u, s.nodes_p, s.grad_u, s.grad_p, s.value_p, s.weight,
+            found.stress, found.content, found.flux, out,
+        )  # fmt: skip
+        return (out, volume, at.pressure.copy()) if np.isfinite(out).all() else None
+
+    def tangent(self, x: Array, h: float, old: State) -> tuple[sp.csr_matrix, sp.csr_matrix]:
+        """Derivative of the residual's free rows by the free and by the fixed unknowns."""
+        s, m, at, by = self.problem.space, self.material, self._points, self._linearised
+        data = self._data
+        data[:] = 0.0
+        self._evaluate(x)
+        poroelastic.linearise(
+            at.deformation, at.pressure, at.gradient, m.mu, m.lam, m.mobility, m.storage, h, old.pressure,
+            by.stress_f, by.stress_p, by.content_f, by.content_p, by.flux_f, by.flux_g,
+        )  # fmt: skip
+        assembly.tangent(
+            s.grad_u, s.grad_p, s.value_p, s.weight, by.stress_f, by.stress_p, by.content_f, by.content_p,
+            by.flux_f, by.flux_g, self.problem.pattern.position, data,
+        )  # fmt: skip
+        return self.problem.pattern.matrices(data)
+
+    def _evaluate(self, x: Array) -> None:
+        s, at = self.problem.space, self._points
+        assembly.evaluate(
+            x, s.nodes_u, s.nodes_p, s.grad_u, s.grad_p, s.value_p,
+            at.deformation, at.pressure, at.gradient,
+        )  # fmt: skip
 
     def equations(self, h: float, old: State) -> Equations:
         s, m, pattern = self.problem.space, self.material, self.problem.pattern
@@ -113,34 +130,17 @@ class LagrangianModel:
             self.full_residual = found[0]
             return found[0][pattern.free]
 
-        def tangent(x: Array):  # type: ignore[no-untyped-def]
-            data = np.zeros(pattern.size)
-            forms.tangent(
-                x,
-                s.nodes_u,
-                s.nodes_p,
-                s.grad_u,
-                s.grad_p,
-                s.value_p,
-                s.weight,
-                m.mu,
-                m.lam,
-                m.mobility,
-                m.storage,
-                h,
-                old.pressure,
-                pattern.position,
-                data,
-            )
-            return pattern.matrices(data)
-
         n = 3 * s.n_nodes
         size_u = np.abs(self.problem_scale(old.x[:n]))
         size_p = max(float(np.abs(old.x[n:]).max()), 1e-3 * float(m.mu.min()))
         weight = np.concatenate([np.full(n, 1.0 / size_u), np.full(s.n_corners, 1.0 / size_p)])
         scale = np.where(np.arange(s.dofs) < n, 1.0, float(m.mu.max()) / CUTIS_THICKNESS_M)
         return Equations(
-            pattern.free, residual, tangent, weight[pattern.free] / SOLVER_TOLERANCE, scale[pattern.free]
+            pattern.free,
+            residual,
+            lambda x: self.tangent(x, h, old),
+            weight[pattern.free] / SOLVER_TOLERANCE,
+            scale[pattern.free],
         )
 
     def nominal_force(self) -> float:
@@ -191,13 +191,13 @@ def advance(model: LagrangianModel, past: list[State], h: float) -> Step | None:
     first, second = GAMMA * h, (1.0 - GAMMA) * h
     state = past[-1]
     t1 = state.time_s + first
-    one = model.solve_stage(t1, first, state, extrapolate(past, t1), len(past) == 1)
+    one = model.solve_stage(t1, first, state, _guess(past, t1), len(past) == 1)
     if one is None:
         return None
     rate_v, rate_p = (one.volume - state.volume) / first, (one.pressure - state.pressure) / first
     history = State(t1, one.x, state.volume + second * rate_v, state.pressure + second * rate_p)
     t2 = state.time_s + h
-    two = model.solve_stage(t2, first, history, extrapolate([*past, one], t2), False)
+    two = model.solve_stage(t2, first, history, _guess([*past, one], t2), False)
     if two is None:
         return None
     force = model.problem.reaction(model.full_residual)
@@ -206,14 +206,8 @@ def advance(model: LagrangianModel, past: list[State], h: float) -> Step | None:
     return Step(two, force, error, corner=False)
 
 
-def extrapolate(past: list[State], time_s: float) -> Array:
-    """Unknowns (dofs,) at a later time by the polynomial through the last (at most three) states."""
-    last = past[-EXTRAPOLATION_POINTS:]
-    guess = np.zeros_like(last[-1].x)
-    for i, state in enumerate(last):
-        others = [o.time_s for j, o in enumerate(last) if j != i]
-        guess += state.x * np.prod([(time_s - t) / (state.time_s - t) for t in others])
-    return guess
+def _guess(past: list[State], time_s: float) -> Array:
+    return extrapolate([(state.time_s, state.x) for state in past], time_s)
 
 
 def integrate(

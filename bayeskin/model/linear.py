@@ -1,12 +1,14 @@
 """One sparse factorisation, kept and reused: MKL PARDISO where it is installed, else SuperLU.
 
-A symmetric factorisation of the tangent's symmetric part costs half of an unsymmetric one and
-serves as well as an approximate inverse where the rest is small (`newton` corrects it). Unknowns
-are scaled first, because displacements [m] and pressures [Pa] lie many decades apart.
+The factors only ever serve as an approximate inverse, which `newton` corrects by true residuals in
+double precision. So PARDISO factorises in single precision, in half the time and memory, and of a
+tangent that nearly is symmetric only the symmetric part, in half of the rest. Unknowns are scaled
+first, because displacements [m] and pressures [Pa] lie many decades apart.
 """
 
 from __future__ import annotations
 
+import ctypes
 from typing import Protocol
 
 import numpy as np
@@ -21,7 +23,11 @@ except (ImportError, OSError):  # no wheel for this processor, or no MKL beside 
     pypardiso = None
 
 SOLVER_NAME = "MKL PARDISO" if pypardiso is not None else "SuperLU"
-_UNSYMMETRIC, _SYMMETRIC_INDEFINITE = 11, -2
+_STRUCTURALLY_SYMMETRIC, _SYMMETRIC_INDEFINITE = 1, -2
+_ANALYSE_AND_FACTORISE, _FACTORISE, _SOLVE, _RELEASE = 12, 22, 33, -1
+# by number in Intel's manual: own settings; METIS ordering; pivots perturbed below 1e-8; scaling and
+# matching; single precision; indices from 0
+_SETTINGS = {1: 1, 2: 2, 10: 8, 11: 1, 13: 1, 28: 1, 35: 1}
 
 
 class Factorisation(Protocol):
@@ -35,50 +41,77 @@ class Factorisation(Protocol):
 
 
 class _Pardiso:
+    """Calls MKL itself: pypardiso's own methods know double precision only."""
+
     def __init__(self, symmetric: bool) -> None:
         self._symmetric = symmetric
-        self._solver = pypardiso.PyPardisoSolver(mtype=_SYMMETRIC_INDEFINITE if symmetric else _UNSYMMETRIC)
-        # own parameters: METIS ordering, scaling and matching, no refinement unless pivots were perturbed
-        for number, value in {1: 1, 2: 2, 8: 0, 10: 8 if symmetric else 13, 11: 1, 13: 1}.items():
-            self._solver.set_iparm(number, value)
-        self._matrix: sp.csr_matrix | None = None
+        self._type = _SYMMETRIC_INDEFINITE if symmetric else _STRUCTURALLY_SYMMETRIC
+        self._pardiso = pypardiso.PyPardisoSolver().libmkl["pardiso"]  # with argument types of our own
+        self._handle = np.zeros(64, np.int64)
+        self._settings = np.zeros(64, np.int32)
+        for number, value in _SETTINGS.items():
+            self._settings[number - 1] = value
+        self._data: np.ndarray | None = None
 
     def factorise(self, matrix: sp.csr_matrix, scale: Array) -> None:
-        first = self._matrix is None
+        first = self._data is None
         if first:
             self._prepare(matrix)
         self._scale = scale
         data = matrix.data * scale[self._row] * scale[matrix.indices]
         if self._symmetric:
             data = 0.5 * (data[self._upper] + data[self._mirrored])
-        self._matrix = sp.csr_matrix((data, self._indices, self._indptr), shape=matrix.shape)
-        self._solver.set_phase(12 if first else 22)  # the pattern is analysed once
-        self._solver._call_pardiso(self._matrix, np.zeros((matrix.shape[0], 1)))
+        self._data = data.astype(np.float32)
+        self._call(_ANALYSE_AND_FACTORISE if first else _FACTORISE)  # the pattern is analysed once
 
     def _prepare(self, matrix: sp.csr_matrix) -> None:
         self._row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-        self._indices, self._indptr = matrix.indices, matrix.indptr
+        self._indices = matrix.indices.astype(np.int32)
+        self._indptr = matrix.indptr.astype(np.int32)
         if not self._symmetric:
             return
         place = sp.csr_matrix((np.arange(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
         self._upper = np.flatnonzero(matrix.indices >= self._row)
         self._mirrored = place.T.tocsr().data[self._upper]
-        self._indices = matrix.indices[self._upper]
+        self._indices = self._indices[self._upper]
         count = np.bincount(self._row[self._upper], minlength=matrix.shape[0])
-        self._indptr = np.concatenate([[0], np.cumsum(count)]).astype(matrix.indptr.dtype)
+        self._indptr = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
 
     def solve(self, right: Array) -> Array:
-        if self._matrix is None:
+        if self._data is None:
             raise RuntimeError("solve before factorise")
-        self._solver.set_phase(33)
-        scaled = np.ascontiguousarray(right * self._scale)[:, None]
-        return self._solver._call_pardiso(self._matrix, scaled)[:, 0] * self._scale
+        scaled = right * self._scale
+        size = float(np.abs(scaled).max())
+        if not size > 0.0:
+            return np.zeros_like(scaled)
+        # to size one, so that nothing underflows in single precision
+        return self._call(_SOLVE, (scaled / size).astype(np.float32)).astype(float) * (size * self._scale)
 
     def release(self) -> None:
         """Gives MKL's memory back; Python's collector knows nothing of it."""
-        if self._matrix is not None:
-            self._solver.free_memory(everything=True)
-            self._matrix = None
+        if self._data is not None:
+            self._call(_RELEASE)
+            self._data = None
+
+    def _call(self, phase: int, right: np.ndarray | None = None) -> np.ndarray:
+        n = len(self._indptr) - 1
+        right = np.zeros(n, np.float32) if right is None else right
+        solution, error = np.zeros(n, np.float32), ctypes.c_int32(0)
+
+        def number(value: int) -> object:
+            return ctypes.byref(ctypes.c_int32(value))
+
+        def pointer(array: np.ndarray | None) -> ctypes.c_void_p | None:
+            return None if array is None else array.ctypes.data_as(ctypes.c_void_p)
+
+        self._pardiso(
+            pointer(self._handle), number(1), number(1), number(self._type), number(phase), number(n),
+            pointer(self._data), pointer(self._indptr), pointer(self._indices), None, number(1),
+            pointer(self._settings), number(0), pointer(right), pointer(solution), ctypes.byref(error),
+        )  # fmt: skip
+        if error.value != 0:
+            raise RuntimeError(f"MKL PARDISO gave error {error.value} in phase {phase}")
+        return solution
 
 
 class _SuperLU:

@@ -8,7 +8,7 @@ SIAM 1995, section 7.3), and is renewed when it no longer contracts.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -22,6 +22,7 @@ MAX_RENEWALS = 8
 MAX_BROYDEN = 25
 SLOW = 0.7  # a factorisation costs some twenty iterations: slower contraction than this is dearer
 SMALLEST_DAMPING = 1 / 64
+EXTRAPOLATION_POINTS = 3
 
 
 @dataclass(frozen=True)
@@ -157,3 +158,13 @@ class NewtonSolver:
                 return trial
             damping *= 0.5
         return None
+
+
+def extrapolate(past: Sequence[tuple[float, Array]], time_s: float) -> Array:
+    """Unknowns (dofs,) at a later time by the polynomial through (at most) the last three (time, x)."""
+    last = past[-EXTRAPOLATION_POINTS:]
+    guess = np.zeros_like(last[-1][1])
+    for i, (own, x) in enumerate(last):
+        others = [other for j, (other, _) in enumerate(last) if j != i]
+        guess += x * np.prod([(time_s - other) / (own - other) for other in others])
+    return guess

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,7 +25,7 @@ class TaylorHood:
     pressure a corner [Pa]. e cells, q quadrature points a cell, a and b shape functions.
 
     nodes_u (e, a), nodes_p (e, b) : numbers of nodes and of corners
-    grad_u (e, q, a, 3), grad_p (e, q, b, 3) : gradients [1/m]; value_p (q, b)
+    grad_u (e, q, 3, a), grad_p (e, q, 3, b) : gradients [1/m]; value_p (q, b)
     weight (e, q) : quadrature weight times volume element [m^3]
     points_u (3, nodes) : coordinates of the displacement nodes [m]
     """
@@ -72,7 +73,7 @@ def taylor_hood(mesh: SkinMesh) -> TaylorHood:
 
     def gradients(b: skfem.CellBasis) -> Array:
         stacked = np.stack([shape[0].grad for shape in b.basis])  # (a, 3, e, q)
-        return np.ascontiguousarray(stacked.transpose(2, 3, 0, 1))
+        return np.ascontiguousarray(stacked.transpose(2, 3, 1, 0))
 
     return TaylorHood(
         mesh=mesh,
@@ -107,13 +108,11 @@ class Sparsity:
         return self.free_free.nnz + self.free_fixed.nnz
 
     def matrices(self, data: Array) -> tuple[sp.csr_matrix, sp.csr_matrix]:
-        """Free-free and free-fixed tangents from concatenated data (size,)."""
+        """Free-free and free-fixed tangents on concatenated data (size,); indices are shared, not checked."""
         n = self.free_free.nnz
-        a, b = self.free_free, self.free_fixed
-        return (
-            sp.csr_matrix((data[:n], a.indices, a.indptr), shape=a.shape),
-            sp.csr_matrix((data[n:], b.indices, b.indptr), shape=b.shape),
-        )
+        blocks = copy(self.free_free), copy(self.free_fixed)
+        blocks[0].data, blocks[1].data = data[:n], data[n:]
+        return blocks
 
 
 def sparsity(space: TaylorHood, fixed: np.ndarray) -> Sparsity:

@@ -22,7 +22,7 @@ from bayeskin.surrogates.validate import Validation
 from bayeskin.types import ParameterSpace, frozen_array
 
 FORMAT = "bayeskin surrogate"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2  # 2: inputs are those of `Similarity`
 LATENTS: dict[str, type[LatentGPs] | type[LatentChaos]] = {"gp": LatentGPs, "chaos": LatentChaos}
 
 

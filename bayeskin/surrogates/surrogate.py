@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from bayeskin.errors import InputError
 from bayeskin.surrogates.shapes import ShapeTransform
+from bayeskin.surrogates.similarity import Similarity
 from bayeskin.types import Array, ParameterSpace, Prediction, _FreezesArrays
 
 ROUNDING = 1e-12  # relative: a corner of the box computed as exp(log(corner)) still lies in it
@@ -23,7 +24,7 @@ class Latents(Protocol):
     def inputs(self) -> Array: ...
 
     def predict(self, unit: Array) -> tuple[Array, Array]:
-        """Mean and variance (n, q) at unit-cube points (n, d)."""
+        """Mean and variance (n, q) at inputs (n, dim) of `Similarity`."""
         ...
 
     def leave_one_out(self) -> tuple[Array, Array]:
@@ -33,7 +34,7 @@ class Latents(Protocol):
 
 @dataclass(frozen=True)
 class ShapeSurrogate(_FreezesArrays):
-    """Satisfies `types.Surrogate`: force as exp(amplitude) times a shape, whose latents are predicted.
+    """Satisfies `types.Surrogate`: force as a scale times exp(amplitude) times a shape of predicted latents.
 
     `space` is the box in which it answers; edges_s (m+1,).
     """
@@ -51,12 +52,15 @@ class ShapeSurrogate(_FreezesArrays):
         """
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
-        mean, variance = self.latents.predict(self.space.to_unit(theta))
-        return self.transform.decode(mean, np.sqrt(variance))
+        mean, variance = self.latents.predict(Similarity(self.space).inputs(theta))
+        return self._decode(theta, mean, variance)
 
-    def leave_one_out(self) -> Prediction:
-        """Force at each training row as the other rows predict it (hyperparameters or terms kept)."""
-        mean, variance = self.latents.leave_one_out()
+    def leave_one_out(self, theta: Array) -> Prediction:
+        """Force at the training rows, theta (n, d), as the others predict it; hyperparameters kept."""
+        return self._decode(theta, *self.latents.leave_one_out())
+
+    def _decode(self, theta: Array, mean: Array, variance: Array) -> Prediction:
+        mean[:, 0] += Similarity(self.space).log_scale(theta)
         return self.transform.decode(mean, np.sqrt(variance))
 
 

@@ -15,7 +15,8 @@ from bayeskin.surrogates.chaos import LatentChaos, SparseFit, fit_sparse
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.hyperparameters import LatentFit, fit_latent
 from bayeskin.surrogates.shapes import ShapeTransform, all_components, split
-from bayeskin.surrogates.surrogate import Latents, ShapeSurrogate
+from bayeskin.surrogates.similarity import Similarity
+from bayeskin.surrogates.surrogate import ROUNDING, Latents, ShapeSurrogate
 from bayeskin.surrogates.validate import Validation, compare, validate
 from bayeskin.types import Array, Design, ParameterSpace
 
@@ -47,13 +48,13 @@ def train(
     focus = np.ones(len(design.theta)) if focus is None else np.asarray(focus, dtype=float)
     if focus.shape != (len(design.theta),) or not (np.all(focus >= 0.0) and np.all(np.isfinite(focus))):
         raise InputError("focus", f"shape {focus.shape}", f"{len(design.theta)} finite weights >= 0")
-    unit = space.to_unit(design.theta)
-    training = design.training & np.all((unit >= -MARGIN) & (unit <= 1.0 + MARGIN), axis=1) & (focus > 0.0)
+    inputs = Similarity(space).inputs(design.theta)
+    training = design.training & _within(inputs, MARGIN) & (focus > 0.0)
     testing = design.testing & space.contains(design.theta) & (focus > 0.0)
     _refuse_unusable(design, space, training)
     kinds: tuple[Kind, ...] = ("gp", "chaos") if kind == "auto" else (kind,)
     if kind == "auto" and not testing.any():
-        kinds = (_best_of_folds(kinds, space, design, unit, training, focus, seed),)
+        kinds = (_best_of_folds(kinds, space, design, training, focus, seed),)
     provenance = {
         "version": __version__,
         "design_seed": design.seed,
@@ -63,7 +64,7 @@ def train(
     }
     results = []
     for name in kinds:
-        surrogate = _fit(name, space, design, unit, training, focus, provenance)
+        surrogate = _fit(name, space, design, training, focus, provenance)
         results.append((surrogate, _measure(surrogate, design, training, testing, focus)))
     return min(results, key=lambda result: result[1].relative_error)
 
@@ -89,46 +90,60 @@ def _refuse_unusable(design: Design, space: ParameterSpace, training: NDArray[np
         raise InputError(where, "force that is not finite", "finite force in every finished run")
 
 
+def _within(inputs: Array, margin: float) -> NDArray[np.bool_]:
+    return np.asarray(np.all((inputs >= -margin) & (inputs <= 1.0 + margin), axis=1))
+
+
 def _fit(
-    kind: Kind, space: ParameterSpace, design: Design, unit: Array, rows: NDArray[np.bool_],
-    focus: Array, provenance: dict[str, Any],
+    kind: Kind, space: ParameterSpace, design: Design, rows: NDArray[np.bool_], focus: Array,
+    provenance: dict[str, Any],
 ) -> ShapeSurrogate:  # fmt: skip
     """One surrogate of one kind on the rows given."""
+    inputs = Similarity(space).inputs(design.theta)
+    if kind == "chaos":
+        rows = rows & _within(inputs, ROUNDING)  # polynomials leave [-1, 1] steeply: a margin would rule
+    inputs, log_scale, force_n = (
+        inputs[rows],
+        Similarity(space).log_scale(design.theta[rows]),
+        design.force_n[rows],
+    )
     latents: Latents
     if kind == "gp":
-        transform, targets, gp_fits = _fit_latents(fit_latent, unit[rows], design.force_n[rows], focus[rows])
-        latents = LatentGPs.assemble(unit[rows], targets, gp_fits)
+        transform, targets, gp_fits = _fit_latents(fit_latent, inputs, log_scale, force_n, focus[rows])
+        latents = LatentGPs.assemble(inputs, targets, gp_fits)
     else:
-        # polynomials leave [-1, 1] steeply: rows in the margin would rule the fit
-        rows = rows & space.contains(design.theta)
-        transform, targets, chaos_fits = _fit_latents(
-            fit_sparse, unit[rows], design.force_n[rows], focus[rows]
-        )
-        latents = LatentChaos.assemble(unit[rows], targets, chaos_fits)
+        transform, targets, chaos_fits = _fit_latents(fit_sparse, inputs, log_scale, force_n, focus[rows])
+        latents = LatentChaos.assemble(inputs, targets, chaos_fits)
     return ShapeSurrogate(space, design.edges_s, transform, latents, {**provenance, "kind": kind})
 
 
 def _fit_latents(
-    fit_one: Callable[[Array, Array, Array], F], unit: Array, force_n: Array, weights: Array
+    fit_one: Callable[[Array, Array, Array], F],
+    inputs: Array,
+    log_scale: Array,
+    force_n: Array,
+    weights: Array,
 ) -> tuple[ShapeTransform, Array, list[F]]:
     """Fits the amplitude, then components until what is left is negligible beside the error made."""
     amplitude, shapes = split(force_n)
     full, variances = all_components(shapes, weights)
     scores = (shapes - full.mean) @ full.components.T
-    fits = [fit_one(unit, amplitude, weights)]
+    fits = [fit_one(inputs, amplitude - log_scale, weights)]
     error = fits[0].error * shapes.shape[1]  # a shape's squares sum to the number of bins
     left = float(variances.sum())
-    for k in range(min(MOST_COMPONENTS, len(unit) // 3, int(np.sum(variances > 1e-14 * left)))):
+    for k in range(min(MOST_COMPONENTS, len(inputs) // 3, int(np.sum(variances > 1e-14 * left)))):
         if left <= max(TRUNCATION_SHARE * error, 1e-14 * shapes.shape[1]):
             break
-        fit = fit_one(unit, scores[:, k], weights)
+        fit = fit_one(inputs, scores[:, k], weights)
         if fit.error > UNLEARNABLE * variances[k]:
             break
         fits.append(fit)
         error += fit.error
         left -= float(variances[k])
     transform = full.keep(len(fits) - 1, shapes)
-    return transform, transform.encode(force_n), fits
+    targets = transform.encode(force_n)
+    targets[:, 0] -= log_scale
+    return transform, targets, fits
 
 
 def _measure(
@@ -138,16 +153,17 @@ def _measure(
     if testing.any():
         return validate(surrogate, design.theta[testing], design.force_n[testing], focus[testing])
     if surrogate.provenance["kind"] == "chaos":
-        training = training & surrogate.space.contains(design.theta)
+        training = training & _within(Similarity(surrogate.space).inputs(design.theta), ROUNDING)
+    theta = design.theta[training]
     return compare(
-        surrogate, surrogate.leave_one_out(), design.theta[training], design.force_n[training],
+        surrogate, surrogate.leave_one_out(theta), theta, design.force_n[training],
         "leave-one-out", focus[training],
     )  # fmt: skip
 
 
 def _best_of_folds(
-    kinds: tuple[Kind, ...], space: ParameterSpace, design: Design, unit: Array,
-    training: NDArray[np.bool_], focus: Array, seed: int,
+    kinds: tuple[Kind, ...], space: ParameterSpace, design: Design, training: NDArray[np.bool_],
+    focus: Array, seed: int,
 ) -> Kind:  # fmt: skip
     """The kind with the smaller squared error over folds that neither its fit nor its choices have seen."""
     rows = np.flatnonzero(training & space.contains(design.theta))
@@ -157,7 +173,7 @@ def _best_of_folds(
         out = np.zeros_like(training)
         out[order[k::FOLDS]] = True
         for kind in kinds:
-            surrogate = _fit(kind, space, design, unit, training & ~out, focus, {})
+            surrogate = _fit(kind, space, design, training & ~out, focus, {})
             miss = surrogate.predict(design.theta[out]).mean - design.force_n[out]
             errors[kind] += float(focus[out] @ np.sum(miss**2, axis=1))
     return min(kinds, key=lambda kind: errors[kind])

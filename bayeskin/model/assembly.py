@@ -1,0 +1,244 @@
+"""From unknowns to quadrature points and back: compiled, and ignorant of any constitutive law.
+
+Down: F = I + grad u, p and grad p at the points. Up: with a law's stress P, fluid content m and flux Q
+there, the residual
+
+    R_u = int P : grad w ,     R_p = - int ( q m + grad q . Q )
+
+and, with the law's derivatives, its tangent. Gradients are stored component by component, so that the
+inner loops run over shape functions.
+"""
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from bayeskin.types import Array
+
+compiled = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
+
+
+@dataclass(frozen=True)
+class Points:
+    """What a law is given at e cells' q quadrature points: F (e, q, 3, 3), p (e, q), grad p (e, q, 3)."""
+
+    deformation: Array
+    pressure: Array
+    gradient: Array
+
+
+@dataclass(frozen=True)
+class Response:
+    """What a law answers: stress (e, q, 3, 3), fluid content (e, q), and flux (e, q, 3) over the step."""
+
+    stress: Array
+    content: Array
+    flux: Array
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Derivatives of a `Response`; deformations and stresses as rows of nine.
+
+    stress_f (e, q, 9, 9), stress_p (e, q, 9), content_f (e, q, 9), content_p (e, q),
+    flux_f (e, q, 3, 9), flux_g (e, q, 3, 3) by the pressure's gradient
+    """
+
+    stress_f: Array
+    stress_p: Array
+    content_f: Array
+    content_p: Array
+    flux_f: Array
+    flux_g: Array
+
+
+def points(shape: tuple[int, ...]) -> Points:
+    """Empty arrays for (e, q) points; they are reused, because fresh pages cost as much as the sums."""
+    return Points(np.empty((*shape, 3, 3)), np.empty(shape), np.empty((*shape, 3)))
+
+
+def response(shape: tuple[int, ...]) -> Response:
+    """Empty arrays for (e, q) points."""
+    return Response(np.empty((*shape, 3, 3)), np.empty(shape), np.empty((*shape, 3)))
+
+
+def linearised(shape: tuple[int, ...]) -> Linearised:
+    """Arrays of zeros for (e, q) points."""
+    sizes = ((9, 9), (9,), (9,), (), (3, 9), (3, 3))
+    return Linearised(*(np.zeros((*shape, *size)) for size in sizes))
+
+
+@compiled
+def evaluate(x, nodes_u, nodes_p, grad_u, grad_p, value_p, deformation, pressure, gradient):
+    """Fills F, p and grad p at the points from the unknowns x (dofs,)."""
+    n_nodes = (x.shape[0] - nodes_p.max() - 1) // 3  # the pressures follow the displacements
+    na, nb = nodes_u.shape[1], nodes_p.shape[1]
+    u, p = np.empty((3, na)), np.empty(nb)
+    for e in range(nodes_u.shape[0]):
+        for a in range(na):
+            for i in range(3):
+                u[i, a] = x[3 * nodes_u[e, a] + i]
+        for b in range(nb):
+            p[b] = x[3 * n_nodes + nodes_p[e, b]]
+        for q in range(value_p.shape[0]):
+            for i in range(3):
+                for j in range(3):
+                    total = 1.0 if i == j else 0.0
+                    for a in range(na):
+                        total += u[i, a] * grad_u[e, q, j, a]
+                    deformation[e, q, i, j] = total
+            total = 0.0
+            for b in range(nb):
+                total += value_p[q, b] * p[b]
+            pressure[e, q] = total
+            for i in range(3):
+                total = 0.0
+                for b in range(nb):
+                    total += grad_p[e, q, i, b] * p[b]
+                gradient[e, q, i] = total
+
+
+@compiled
+def residual(nodes_u, nodes_p, grad_u, grad_p, value_p, weight, stress, content, flux, out):
+    """Adds the residual (dofs,) to `out`."""
+    n_nodes = (out.shape[0] - nodes_p.max() - 1) // 3
+    na, nb = nodes_u.shape[1], nodes_p.shape[1]
+    force, fluid = np.empty((3, na)), np.empty(nb)
+    for e in range(nodes_u.shape[0]):
+        force[:] = 0.0
+        fluid[:] = 0.0
+        for q in range(weight.shape[1]):
+            w = weight[e, q]
+            for i in range(3):
+                s0, s1, s2 = w * stress[e, q, i, 0], w * stress[e, q, i, 1], w * stress[e, q, i, 2]
+                for a in range(na):
+                    force[i, a] += s0 * grad_u[e, q, 0, a] + s1 * grad_u[e, q, 1, a] + s2 * grad_u[e, q, 2, a]
+            m, q0, q1, q2 = w * content[e, q], w * flux[e, q, 0], w * flux[e, q, 1], w * flux[e, q, 2]
+            for b in range(nb):
+                fluid[b] += (
+                    m * value_p[q, b]
+                    + q0 * grad_p[e, q, 0, b]
+                    + q1 * grad_p[e, q, 1, b]
+                    + q2 * grad_p[e, q, 2, b]
+                )
+        for a in range(na):
+            for i in range(3):
+                out[3 * nodes_u[e, a] + i] += force[i, a]
+        for b in range(nb):
+            out[3 * n_nodes + nodes_p[e, b]] -= fluid[b]
+
+
+@compiled
+def tangent(
+    grad_u,
+    grad_p,
+    value_p,
+    weight,
+    stress_f,
+    stress_p,
+    content_f,
+    content_p,
+    flux_f,
+    flux_g,
+    position,
+    data,
+):
+    """Adds the tangent to the sparse `data` at `position` (e, nd, nd), -1 where a row is not wanted."""
+    na, nb = grad_u.shape[3], grad_p.shape[3]
+    solid = np.empty((3, na, 3, na))  # component and node of the row, component and node of the column
+    column = np.empty((3, na, nb))
+    row = np.empty((nb, 3, na))
+    fluid = np.empty((nb, nb))
+    half = np.empty(9)
+    for e in range(grad_u.shape[0]):
+        solid[:] = 0.0
+        column[:] = 0.0
+        row[:] = 0.0
+        fluid[:] = 0.0
+        for q in range(weight.shape[1]):
+            w = weight[e, q]
+            for i in range(3):
+                for a in range(na):
+                    g0, g1, g2 = w * grad_u[e, q, 0, a], w * grad_u[e, q, 1, a], w * grad_u[e, q, 2, a]
+                    for k in range(9):
+                        half[k] = (
+                            g0 * stress_f[e, q, 3 * i, k]
+                            + g1 * stress_f[e, q, 3 * i + 1, k]
+                            + g2 * stress_f[e, q, 3 * i + 2, k]
+                        )
+                    for k in range(3):
+                        h0, h1, h2 = half[3 * k], half[3 * k + 1], half[3 * k + 2]
+                        for b in range(na):
+                            solid[i, a, k, b] += (
+                                h0 * grad_u[e, q, 0, b] + h1 * grad_u[e, q, 1, b] + h2 * grad_u[e, q, 2, b]
+                            )
+                    by_p = (
+                        g0 * stress_p[e, q, 3 * i]
+                        + g1 * stress_p[e, q, 3 * i + 1]
+                        + g2 * stress_p[e, q, 3 * i + 2]
+                    )
+                    for b in range(nb):
+                        column[i, a, b] += by_p * value_p[q, b]
+            for b in range(nb):
+                v = w * value_p[q, b]
+                s0, s1, s2 = w * grad_p[e, q, 0, b], w * grad_p[e, q, 1, b], w * grad_p[e, q, 2, b]
+                for k in range(9):
+                    half[k] = (
+                        v * content_f[e, q, k]
+                        + s0 * flux_f[e, q, 0, k]
+                        + s1 * flux_f[e, q, 1, k]
+                        + s2 * flux_f[e, q, 2, k]
+                    )
+                for k in range(3):
+                    h0, h1, h2 = half[3 * k], half[3 * k + 1], half[3 * k + 2]
+                    for a in range(na):
+                        row[b, k, a] -= (
+                            h0 * grad_u[e, q, 0, a] + h1 * grad_u[e, q, 1, a] + h2 * grad_u[e, q, 2, a]
+                        )
+                m = v * content_p[e, q]
+                g0 = s0 * flux_g[e, q, 0, 0] + s1 * flux_g[e, q, 1, 0] + s2 * flux_g[e, q, 2, 0]
+                g1 = s0 * flux_g[e, q, 0, 1] + s1 * flux_g[e, q, 1, 1] + s2 * flux_g[e, q, 2, 1]
+                g2 = s0 * flux_g[e, q, 0, 2] + s1 * flux_g[e, q, 1, 2] + s2 * flux_g[e, q, 2, 2]
+                for c in range(nb):
+                    fluid[b, c] -= (
+                        m * value_p[q, c]
+                        + g0 * grad_p[e, q, 0, c]
+                        + g1 * grad_p[e, q, 1, c]
+                        + g2 * grad_p[e, q, 2, c]
+                    )
+        for a in range(na):
+            for i in range(3):
+                for b in range(na):
+                    for k in range(3):
+                        _add(data, position[e, 3 * a + i, 3 * b + k], solid[i, a, k, b])
+                for b in range(nb):
+                    _add(data, position[e, 3 * a + i, 3 * na + b], column[i, a, b])
+                    _add(data, position[e, 3 * na + b, 3 * a + i], row[b, i, a])
+        for b in range(nb):
+            for c in range(nb):
+                _add(data, position[e, 3 * na + b, 3 * na + c], fluid[b, c])
+
+
+@compiled
+def _add(data, place, value):
+    if place >= 0:
+        data[place] += value
+
+
+@compiled
+def inverse_and_determinant(f, inverse):
+    """Fills the inverse (3, 3) of F (3, 3); returns its determinant."""
+    for i in range(3):
+        i1, i2 = (i + 1) % 3, (i + 2) % 3
+        for k in range(3):
+            k1, k2 = (k + 1) % 3, (k + 2) % 3
+            inverse[k, i] = f[i1, k1] * f[i2, k2] - f[i1, k2] * f[i2, k1]
+    j = f[0, 0] * inverse[0, 0] + f[0, 1] * inverse[1, 0] + f[0, 2] * inverse[2, 0]
+    for i in range(3):
+        for k in range(3):
+            inverse[i, k] /= j
+    return j
