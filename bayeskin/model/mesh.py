@@ -131,7 +131,8 @@ def read_gmsh(path: Path | str) -> SkinMesh:
     if not len(tetrahedra):
         raise InputError(path, "no tetrahedra", "a volume mesh")
     used, compact = np.unique(tetrahedra, return_inverse=True)
-    flat = skfem.MeshTet(raw.points[used].T, compact.reshape(tetrahedra.shape).T)
+    corners = np.ascontiguousarray(compact.reshape(tetrahedra.shape).T)
+    flat = skfem.MeshTet(np.ascontiguousarray(raw.points[used].T), corners)
     number = np.full(len(raw.points), -1)
     number[used] = np.arange(len(used))
     facets = {}
