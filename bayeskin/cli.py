@@ -101,6 +101,8 @@ def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
 @click.option("--observation", type=click.Choice(["reaction", "article"]), help="Default as in CONFIG.")
 @click.option("-o", "out", required=True, type=click.Path(path_type=Path), help="File to write: .csv or .h5.")
 @click.option("--fields", type=click.Path(path_type=Path), help="Folder for the fields over time (ParaView).")
+@click.option("--figures", type=click.Path(path_type=Path), help="Folder for a figure of the fields.")
+@click.option("--at", "at_s", multiple=True, type=float, metavar="SECONDS", help="A time that it shows.")
 @as_json
 def simulate(as_json: bool, **options: Any) -> None:
     """One run of the full model on a recording's displacement (default: the demo's).
@@ -108,9 +110,14 @@ def simulate(as_json: bool, **options: Any) -> None:
     Parameters that are not set stand at the median of their prior. The CSV has the columns
     time_s, displacement_m, force_n.
 
+    The figure (fields.png, fields.svg) shows displacement, pressure and fluid velocity near the pads at the
+    times given by --at, which can be repeated, or at four moments: the end of the first loading, the middle
+    of its hold, the end of its unloading, and the middle of the last phase.
+
     \b
-    Example:
+    Examples:
       bayeskin simulate --set E_c=300e3 --set k_s=1e-13 -o force.csv --fields fields
+      bayeskin simulate -o force.csv --figures figures --at 14.4 --at 30 --at 54.4
     """
     from bayeskin.pipeline import single
 

@@ -12,7 +12,9 @@ Written on the corners and cells of the reference mesh (warp by `displacement` i
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,12 +75,34 @@ def fields_of(problem: Problem, theta: Mapping[str, float], x: Array, rate: Arra
     )
 
 
+class StatesAt:
+    """Keeps a run's unknowns at chosen times, linear between its steps; give `on_state` to `simulate`.
+
+    states : unknowns (dofs,) at those of times_s (increasing) that the run has reached
+    """
+
+    def __init__(self, times_s: Sequence[float], problem: Problem, p_init_pa: float) -> None:
+        self.times_s = tuple(times_s)
+        self.states: list[Array] = []
+        start = np.zeros(problem.space.dofs)
+        start[3 * problem.space.n_nodes :] = p_init_pa
+        self._before = 0.0, start
+
+    def on_state(self, time_s: float, x: Array, force_n: float) -> None:
+        """Takes the next state of the run."""
+        before_s, before = self._before
+        while len(self.states) < len(self.times_s) and self.times_s[len(self.states)] <= time_s:
+            span = time_s - before_s
+            share = (self.times_s[len(self.states)] - before_s) / span if span > 0.0 else 1.0
+            self.states.append((1.0 - share) * before + share * x)
+        self._before = time_s, x.copy()
+
+
 class FieldWriter:
     """Collects a run's states and writes them as one XDMF series; give `on_state` to `simulate`."""
 
     def __init__(self, directory: Path | str, problem: Problem, theta: Mapping[str, float]) -> None:
         self.path = Path(directory) / "fields.xdmf"
-        self.path.parent.mkdir(parents=True, exist_ok=True)
         self._problem, self._theta = problem, dict(theta)
         self._states: list[tuple[float, Array]] = []
 
@@ -86,15 +110,24 @@ class FieldWriter:
         """Keeps a state of the run."""
         self._states.append((time_s, x.copy()))
 
-    def write(self) -> Path:
-        """Writes the series; returns the path of the XDMF file."""
+    def write(self) -> tuple[Path, Path]:
+        """Writes the series, whole or not at all; returns the paths of the XDMF and of the HDF5 file."""
+        paths = self.path, self.path.with_suffix(".h5")
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=self.path.parent, prefix=".fields.") as partial:
+            self._write_into(Path(partial))
+            for path in reversed(paths):
+                os.replace(Path(partial) / path.name, path)
+        return paths
+
+    def _write_into(self, directory: Path) -> None:
         mesh = self._problem.mesh.geometry
         kind = "hexahedron" if isinstance(mesh, skfem.MeshHex) else "tetra"
         corners = _corner_numbers(self._problem)
         order = list(_VTK_HEXAHEDRON) if kind == "hexahedron" else list(range(4))
         points = mesh.doflocs.T[: corners.max() + 1]
         # meshio opens the HDF5 file by its bare name, so the folder must be the current one
-        with contextlib.chdir(self.path.parent), meshio.xdmf.TimeSeriesWriter(self.path.name) as writer:
+        with contextlib.chdir(directory), meshio.xdmf.TimeSeriesWriter(self.path.name) as writer:
             writer.write_points_cells(points, [(kind, corners[:, order])])
             for (before_s, before), (time_s, x) in zip(
                 [self._states[0], *self._states[:-1]], self._states, strict=True
@@ -112,7 +145,6 @@ class FieldWriter:
                         "cutis": [self._problem.mesh.cutis.astype(float)],
                     },
                 )
-        return self.path
 
 
 # scikit-fem's corner order of a brick, rearranged to VTK's

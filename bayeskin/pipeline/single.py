@@ -11,11 +11,12 @@ from typing import Any
 from bayeskin import storage
 from bayeskin.config import load_config, parameter_space
 from bayeskin.errors import InputError
-from bayeskin.model.fields import FieldWriter
 from bayeskin.model.simulate import ModelSpec, problem_of, simulate
 from bayeskin.pipeline.engine import Reporter, Run
+from bayeskin.pipeline.field_outputs import FieldOutputs, moments_of
 from bayeskin.pipeline.folder import plain
 from bayeskin.pipeline.model import model_spec
+from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.recording import pad_motion
 from bayeskin.recordings import describe, describe_json, phase_noise, read_recording, segment
 from bayeskin.shipped import shipped
@@ -45,31 +46,41 @@ def simulate_once(
     mesh: str | None = None,
     observation: str | None = None,
     fields: Path | None = None,
+    figures: Path | None = None,
+    at_s: Sequence[float] = (),
 ) -> dict[str, Any]:
-    """One full run on a recording's displacement, into `out` (.csv or .h5), and its fields into a folder.
+    """One full run on a recording's displacement, into `out` (.csv or .h5); its fields into folders.
 
     What is not given is the configuration's, or the demo's. Parameters that `settings` ("NAME=VALUE", SI)
-    leave out stand at the median of their prior. A run that fails is told, and nothing is written.
+    leave out stand at the median of their prior. The figure shows the fields at the times `at_s`, or at four
+    moments of the protocol. A run that fails is told, and nothing is written.
     Raises InputError for bad input.
     """
     _check_suffix(out, (".csv", ".h5"))
+    _check_folders(fields, figures, at_s)
     config_path = config or shipped("runs/demo.toml")
     run = Run(load_config(config_path), config_path, Path(), reporter)
     theta = _theta(parameter_space(run.config, config_path), settings)
     spec = model_spec(run, mesh, observation)
     source = read_recording(recording or run.beside(run.config.recording.file))
-    motion = pad_motion(spec.observation, source, segment(source), run.config.recording.protocol)
+    phases = segment(source)
+    motion = pad_motion(spec.observation, source, phases, run.config.recording.protocol)
+    moments = moments_of(phases, motion, at_s)
     reporter.log(f"simulating {motion.time_s[-1]:.1f} s, {spec.observation} on {Path(spec.mesh).name}")
-    writer = FieldWriter(fields, problem_of(spec.mesh, spec.refinement), theta) if fields else None
+    outputs = None
+    if fields or figures:
+        problem = problem_of(spec.mesh, spec.refinement)
+        outputs = FieldOutputs(problem, theta, motion, moments, fields, figures)
     simulation = simulate(
         spec, motion, theta, lambda share: reporter.progress("simulation", share),
-        writer.on_state if writer else None,
+        outputs.on_state if outputs else None,
     )  # fmt: skip
-    written: Path | None = None
+    files: list[Path] = []
     if simulation.status == "ok":
-        written = writer.write() if writer else None
+        shown = outputs.write(caption(run)) if outputs else []
         write_simulation(out, simulation)
-    return _answer(simulation, spec, out, written)
+        files = [out, *shown]
+    return _answer(simulation, spec, files)
 
 
 def write_simulation(out: Path, simulation: Simulation) -> None:
@@ -104,23 +115,35 @@ def _theta(space: ParameterSpace, settings: Sequence[str]) -> dict[str, float]:
     return theta
 
 
-def _answer(simulation: Simulation, spec: ModelSpec, out: Path, fields_file: Path | None) -> dict[str, Any]:
+def _answer(simulation: Simulation, spec: ModelSpec, files: Sequence[Path]) -> dict[str, Any]:
+    """What a run says of itself; `files` are those that it wrote, the force first."""
     ok, stats = simulation.status == "ok", simulation.stats
+    text = f"failed: {simulation.message}"
     if ok:
         text = (
             f"{stats['steps']:.0f} steps of {stats['dofs']:.0f} unknowns in {stats['seconds']:.1f} s, "
-            f"peak force {stats['peak_force_n']:.4g} N, written to {out}"
+            f"peak force {stats['peak_force_n']:.4g} N, written to {', '.join(map(str, files))}"
         )
-        text += f", fields to {fields_file}" if fields_file else ""
-    else:
-        text = f"failed: {simulation.message}"
     answer = {"ok": ok, "status": simulation.status, "message": simulation.message, "theta": simulation.theta}
     model = {"observation": spec.observation, "mesh": spec.mesh, "model_hash": simulation.model_hash}
-    return plain(
-        {**answer, **model, "stats": stats, "out": out if ok else None, "fields": fields_file, "text": text}
-    )
+    written = {
+        "out": files[0] if files else None,
+        "fields": next((file for file in files if file.suffix == ".xdmf"), None),
+        "figures": [file for file in files if file.suffix in (".png", ".svg")],
+        "files": files,
+    }
+    return plain({**answer, **model, "stats": stats, **written, "text": text})
 
 
 def _check_suffix(out: Path, suffixes: tuple[str, ...]) -> None:
     if out.suffix not in suffixes:
         raise InputError(f"-o {out}", f"ending {out.suffix!r}", f"ending {' or '.join(suffixes)}")
+
+
+def _check_folders(fields: Path | None, figures: Path | None, at_s: Sequence[float]) -> None:
+    for option, folder in (("--fields", fields), ("--figures", figures)):
+        above = [path for path in (folder, *folder.parents) if path.exists()] if folder else []
+        if above and not above[0].is_dir():
+            raise InputError(f"{option} {folder}", f"{above[0]} is a file", "a folder")
+    if at_s and figures is None:
+        raise InputError(f"--at {at_s[0]:g}", "no --figures", "--figures DIR with it")

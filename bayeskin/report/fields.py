@@ -1,20 +1,20 @@
-"""Fields on the deformed surface of the quarter model, at chosen times."""
+"""Fields on the deformed surface of the quarter model: one row a time, one column a field."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import LinearSegmentedColormap, LogNorm, Normalize
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike
 
 from bayeskin.errors import InputError
-from bayeskin.report.style import GREY, PAGE_IN, new_figure, state_finding, styled
+from bayeskin.report.style import GREY, INK, PAGE_IN, new_figure, plain_log, state_finding, styled
 from bayeskin.types import Array
 
 # Grey stands for nothing: a white surface would vanish on the page.
@@ -22,112 +22,179 @@ _SEQUENTIAL = LinearSegmentedColormap.from_list("grey-blue", ["#E6E6E6", "#86B8D
 _DIVERGING = LinearSegmentedColormap.from_list(
     "blue-grey-red", ["#08284F", "#0072B2", "#86B8D9", "#E6E6E6", "#EDA377", "#D55E00", "#5C2000"]
 )
+_ELEVATION, _AZIMUTH = np.radians(38.0), np.radians(-112.0)  # the top and both planes of symmetry are seen
+_DECADES = 2.0  # of a vector's colour scale; below it neither colour nor arrow
+_LABEL_IN = 0.95
+_ARROW_MM, _SPACING_MM = 4.5, 5.5
 
 
 @dataclass(frozen=True)
 class SurfaceField:
-    """One row of the figure: values_by_node (t, p) in `unit`; `signed` fields get a diverging scale."""
+    """One column of the figure: values (t, f) of the small faces in `unit`.
+
+    `signed` fields get a scale centred on zero. With directions (t, f, 3) the values are lengths of
+    vectors, whose scale is logarithmic and whose directions are drawn as arrows.
+    """
 
     label: str
     unit: str
-    values_by_node: Array
+    values: Array
     signed: bool = False
+    directions: Array | None = None
 
 
 @styled
 def figure_fields(
-    times_s: Sequence[float],
+    row_labels: Sequence[str],
     points_m: ArrayLike,
     faces: ArrayLike,
-    rows: Sequence[SurfaceField],
+    part: ArrayLike,
+    strong: Sequence[int],
+    columns: Sequence[SurfaceField],
     finding: str,
+    caption: str = "",
 ) -> Figure:
-    """Small multiples: one row a field, one column a time, one colour bar a row.
+    """Small multiples: one row a time, one column a field, one colour bar a column, one frame for all.
 
-    points_m (t, p, 3) deformed positions of the surface's nodes; faces (f, 3) or (f, 4) node numbers;
-    only nodes of `faces` are framed, so that the faces near the pad alone give a closer view;
-    `finding` heads the figure. Each face is painted in the mean of its nodes' values.
+    row_labels (t,); points_m (t, v, 3) deformed positions of the surface's points; faces (f, 3) or (f, 4)
+    numbers of points; part (f,) number of the part that a face belongs to: parts are outlined, those in
+    `strong` with a thick line. `finding` heads the figure, `caption` foots it.
     Raises InputError if the shapes do not fit each other.
     """
-    points, nodes = np.asarray(points_m, dtype=float), np.asarray(faces, dtype=int)
-    _check(times_s, points, nodes, rows)
-    columns = len(times_s)
-    shown = 1e3 * points[:, np.unique(nodes)]
-    width = min(PAGE_IN, 1.2 + 2.0 * columns)
-    figure = new_figure(width, 0.55 + 1.65 * len(rows))
-    grid = figure.add_gridspec(len(rows), columns)
-    for i, field in enumerate(rows):
+    points, nodes, parts = np.asarray(points_m, dtype=float), np.asarray(faces, dtype=int), np.asarray(part)
+    _check(row_labels, points, nodes, parts, columns)
+    flat = 1e3 * points @ _view()  # (t, v, 3): right, up, toward the viewer
+    low, high = flat.min(axis=(0, 1)), flat.max(axis=(0, 1))
+    panel_in = (PAGE_IN - _LABEL_IN) / max(len(columns), 3)
+    height_in = len(row_labels) * (panel_in * (high - low)[1] / (high - low)[0] + 0.06)
+    figure = new_figure(_LABEL_IN + panel_in * len(columns), height_in + 1.15)
+    widths = [_LABEL_IN, *[panel_in] * len(columns)]
+    axes = figure.subplots(len(row_labels), 1 + len(columns), squeeze=False, width_ratios=widths)
+    for j, field in enumerate(columns, start=1):
         scale = _scale(field)
-        axes = [figure.add_subplot(grid[i, k], projection="3d") for k in range(columns)]
-        for k, ax in enumerate(axes):
-            _draw_surface(ax, 1e3 * points[k], nodes, field.values_by_node[k], scale)
-            _frame(ax, shown)
-            if i == 0:
-                ax.set_title(f"{times_s[k]:g} s", loc="center", pad=0)
-        bar = figure.colorbar(scale, ax=axes, shrink=0.75, aspect=14, pad=0.01)
+        for i, ax in enumerate(axes[:, j]):
+            _paint(ax, flat[i], nodes, field.values[i], scale)
+            _outline(ax, flat[i], nodes, parts, strong)
+            if field.directions is not None:
+                _arrows(ax, flat[i][nodes].mean(axis=1), field, i, scale)
+            _frame(ax, low, high, field.values[i])
+        axes[0, j].set_title(field.label, loc="center")
+        extend = "min" if field.directions is not None else "neither"
+        bar = figure.colorbar(
+            scale, ax=axes[:, j], location="bottom", shrink=0.8, aspect=28, pad=0.02, extend=extend
+        )
         bar.set_label(f"{field.label} [{field.unit}]")
         bar.outline.set_visible(False)  # type: ignore[operator]
-    length_mm = _axes_triad(figure.axes[0], shown)
-    state_finding(figure, finding, f"Quarter model, deformed, to scale; axes drawn {length_mm:g} mm long.")
+        if field.directions is not None:
+            plain_log(bar.ax.xaxis)
+    for label, ax in zip(row_labels, axes[:, 0], strict=True):
+        ax.set_axis_off()
+        ax.text(0.0, 0.5, label, va="center")
+    _triad(axes[0, 1], low, high)
+    state_finding(figure, finding, caption)
     return figure
 
 
-def _check(times_s: Sequence[float], points: Array, faces: Array, rows: Sequence[SurfaceField]) -> None:
-    if points.ndim != 3 or points.shape[0] != len(times_s) or points.shape[2] != 3:
-        raise InputError("points of the surface", f"shape {points.shape}", f"({len(times_s)}, p, 3)")
+def _check(
+    row_labels: Sequence[str], points: Array, faces: Array, part: Array, columns: Sequence[SurfaceField]
+) -> None:
+    if points.ndim != 3 or points.shape[0] != len(row_labels) or points.shape[2] != 3:
+        raise InputError("points of the surface", f"shape {points.shape}", f"({len(row_labels)}, v, 3)")
     if faces.ndim != 2 or faces.shape[1] not in (3, 4) or faces.max(initial=0) >= points.shape[1]:
-        raise InputError("faces of the surface", f"shape {faces.shape}", "(f, 3) or (f, 4) numbers of nodes")
-    for field in rows:
-        if np.shape(field.values_by_node) != points.shape[:2]:
-            raise InputError(field.label, f"shape {np.shape(field.values_by_node)}", str(points.shape[:2]))
+        raise InputError("faces of the surface", f"shape {faces.shape}", "(f, 3) or (f, 4) numbers of points")
+    if part.shape != faces.shape[:1]:
+        raise InputError("parts of the surface", f"shape {part.shape}", str(faces.shape[:1]))
+    expected = (len(row_labels), len(faces))
+    for field in columns:
+        if np.shape(field.values) != expected:
+            raise InputError(field.label, f"shape {np.shape(field.values)}", str(expected))
+        if field.directions is not None and np.shape(field.directions) != (*expected, 3):
+            raise InputError(field.label, f"shape {np.shape(field.directions)}", str((*expected, 3)))
+
+
+def _view() -> Array:
+    """Columns: the page's right and up, and the direction toward the viewer; a parallel projection."""
+    e, a = _ELEVATION, _AZIMUTH
+    right = (-np.sin(a), np.cos(a), 0.0)
+    up = (-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e))
+    toward = (np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e))
+    return np.array([right, up, toward]).T
 
 
 def _scale(field: SurfaceField) -> ScalarMappable:
-    values = field.values_by_node[np.isfinite(field.values_by_node)]
+    values = field.values[np.isfinite(field.values)]
     reach = float(np.max(np.abs(values), initial=0.0)) or 1.0
     if field.signed:
         return ScalarMappable(Normalize(-reach, reach), _DIVERGING)
+    if field.directions is not None:
+        return ScalarMappable(LogNorm(reach / 10**_DECADES, reach, clip=True), _SEQUENTIAL)
     return ScalarMappable(Normalize(min(0.0, float(np.min(values, initial=0.0))), reach), _SEQUENTIAL)
 
 
-def _draw_surface(ax: Any, points_mm: Array, faces: Array, values: Array, scale: ScalarMappable) -> None:
-    colors = scale.to_rgba(values[faces].mean(axis=1))
-    patch = Poly3DCollection(points_mm[faces], facecolors=colors, edgecolors=colors, linewidths=0.2)
-    patch.set_rasterized(True)  # thousands of faces would make an SVG of megabytes
-    patch.set(clip_on=False, in_layout=False)
-    ax.add_collection3d(patch)
-    outline = Line3DCollection(points_mm[_boundary(faces)], colors=GREY, linewidths=0.5)
-    outline.set(clip_on=False, in_layout=False)
-    ax.add_collection3d(outline)
-
-
-def _boundary(faces: Array) -> Array:
-    """Edges (b, 2) that belong to one face only."""
-    edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    unique, counts = np.unique(edges, axis=0, return_counts=True)
-    return unique[counts == 1]
-
-
-def _frame(ax: Any, points_mm: Array) -> None:
-    low, high = points_mm.min(axis=(0, 1)), points_mm.max(axis=(0, 1))
-    reach = np.where(high > low, high - low, 1.0)
-    ax.set(
-        xlim=(low[0], low[0] + reach[0]), ylim=(low[1], low[1] + reach[1]), zlim=(low[2], low[2] + reach[2])
+def _paint(ax: Axes, flat_mm: Array, faces: Array, values: Array, scale: ScalarMappable) -> None:
+    order = np.argsort(flat_mm[faces, 2].mean(axis=1))  # the nearest last
+    colors = scale.to_rgba(values[order])
+    patch = PolyCollection(
+        list(flat_mm[faces[order], :2]), facecolors=colors, edgecolors=colors, linewidths=0.3
     )
-    ax.set_box_aspect(reach, zoom=0.98)
-    ax.view_init(elev=42, azim=140)
-    ax.set_axis_off()
+    patch.set_rasterized(True)  # thousands of faces would make an SVG of megabytes
+    ax.add_collection(patch)
 
 
-def _axes_triad(ax: Any, points_mm: Array) -> float:
-    """Draws x, y and z below the surface's corner; returns their length [mm]."""
-    low, high = points_mm.min(axis=(0, 1)), points_mm.max(axis=(0, 1))
-    extent = float(np.max(high - low)) or 1.0
-    length = max(step for step in (0.1, 1.0, 2.0, 5.0, 10.0, 20.0) if step <= max(0.2 * extent, 0.1))
-    origin = np.array([low[0], low[1], min(low[2], high[2] - 0.45 * extent)])
-    for direction, name in zip(np.eye(3), "xyz", strict=True):
-        tip = origin + length * direction
-        ax.plot(*np.column_stack([origin, tip]), color=GREY, lw=1.0, clip_on=False, in_layout=False)
-        label = origin + 1.35 * length * direction
-        ax.text(*label, name, in_layout=False, color=GREY, fontsize=7, ha="center", va="center")
-    return length
+def _outline(ax: Axes, flat_mm: Array, faces: Array, part: Array, strong: Sequence[int]) -> None:
+    edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    unique, first, inverse = np.unique(edges, axis=0, return_index=True, return_inverse=True)
+    owner = np.repeat(part, faces.shape[1])
+    inverse = inverse.ravel()
+    bounds = np.bincount(inverse) == 1
+    bounds[inverse[owner != owner[first][inverse]]] = True
+    thick = np.zeros(len(unique), dtype=bool)
+    thick[inverse[np.isin(owner, strong)]] = True
+    for chosen, color, width in ((bounds & ~thick, GREY, 0.5), (bounds & thick, "white", 1.8)):
+        ax.plot(*_broken_line(flat_mm[unique[chosen], :2]), color=color, lw=width, solid_capstyle="round")
+    ax.plot(*_broken_line(flat_mm[unique[bounds & thick], :2]), color=INK, lw=0.8, solid_capstyle="round")
+
+
+def _broken_line(segments: Array) -> tuple[Array, Array]:
+    """Segments (s, 2, 2) as one line with gaps, which makes one path in an SVG."""
+    gaps = np.full((len(segments), 1, 2), np.nan)
+    x, y = np.concatenate([segments, gaps], axis=1).reshape(-1, 2).T
+    return x, y
+
+
+def _arrows(ax: Axes, centres_mm: Array, field: SurfaceField, row: int, scale: ScalarMappable) -> None:
+    """Arrows of one length in space, spread over the page, where the colour scale reaches."""
+    assert field.directions is not None
+    chosen: list[int] = []
+    for k in np.flatnonzero(field.values[row] > (scale.norm.vmin or 0.0)):
+        gaps = np.linalg.norm(centres_mm[chosen, :2] - centres_mm[k, :2], axis=1)
+        if np.all(gaps > _SPACING_MM):
+            chosen.append(int(k))
+    if not chosen:
+        return
+    vectors = field.directions[row, chosen]
+    along = _ARROW_MM * (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)) @ _view()[:, :2]
+    seen = np.linalg.norm(along, axis=1) > 0.3 * _ARROW_MM  # what points at the viewer shows no direction
+    ax.quiver(
+        *centres_mm[chosen, :2][seen].T, *along[seen].T, angles="xy", scale_units="xy", scale=1.0,
+        pivot="mid", units="xy", width=0.5, headwidth=4.0, headlength=4.5, headaxislength=4.0,
+        color=INK, edgecolor="white", linewidth=0.4,
+    )  # fmt: skip
+
+
+def _frame(ax: Axes, low: Array, high: Array, values: Array) -> None:
+    margin = 0.01 * float(high[0] - low[0])
+    ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
+    ax.set(xticks=[], yticks=[])
+    ax.spines[:].set_visible(False)
+    reach = f"{values.min():.3g} to {values.max():.3g}".replace("-", "−")
+    ax.text(1.0, 0.0, reach, transform=ax.transAxes, ha="right", va="bottom", fontsize=6.5, color=GREY)
+
+
+def _triad(ax: Axes, low: Array, high: Array) -> None:
+    """Draws x, y and z, 5 mm long, at the panel's upper left."""
+    origin = np.array([low[0] + 0.05 * (high - low)[0], low[1] + 0.78 * (high - low)[1]])
+    for direction, name in zip(_view()[:, :2], "xyz", strict=True):
+        ax.plot(*np.column_stack([origin, origin + 5.0 * direction]), color=GREY, lw=0.8)
+        x, y = origin + 7.5 * direction
+        ax.text(x, y, name, color=GREY, fontsize=6.5, ha="center", va="center")

@@ -1,0 +1,135 @@
+"""What is seen of the quarter near the pads: its top and its two planes of symmetry, with the fields on them.
+
+Facets of the mesh are divided into small faces, on whose corners the fields are the finite elements' own.
+The fluid's velocity past the solid is ``v_l - v_s = -k / (mu_f porosity) grad p`` (Darcy), with the mean
+porosity of a facet: at the pads' corners, where the strain is singular, a point's own falls below zero. The
+velocity lies in the faces: no fluid crosses the top or a plane of symmetry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import skfem
+
+from bayeskin.model.mesh import ARM_RADIUS_M, LENGTH_M
+from bayeskin.model.problem import Constants, Problem, material
+from bayeskin.types import Array
+
+NEAR_M = (63e-3, 30e-3)  # along the arm and around it: about twice as far as the pads reach
+DIVISIONS = 6  # of the edges of a brick
+PARTS = ("subcutis", "cutis", "top", "pad", "guard")
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Small faces of the seen facets near the pads. f faces, v points, g facets, k points a facet.
+
+    faces (f, 3 or 4) numbers of points; part (f,) index into PARTS (a layer on the planes of symmetry);
+    plane (f,) 0 the top, 1 the plane y = 0, 2 the plane x = 0; point (g, k) numbers of each facet's points;
+    small (f / g, 3 or 4) small faces of one facet, by the facet's points
+    """
+
+    faces: np.ndarray
+    part: np.ndarray
+    plane: np.ndarray
+    point: np.ndarray
+    small: np.ndarray
+    quadratic: skfem.FacetBasis
+    linear: skfem.FacetBasis
+
+
+@dataclass(frozen=True)
+class SurfaceState:
+    """Fields at one time: deformed points (v, 3) [m], and means over the small faces (f,).
+
+    displacement_m magnitude (f,), pressure_pa (f,), velocity_m_s (f, 3) of the fluid past the solid
+    """
+
+    points_m: Array
+    displacement_m: Array
+    pressure_pa: Array
+    velocity_m_s: Array
+
+
+def seen_surface(problem: Problem) -> Surface:
+    """The surface near the pads; facets of bricks are divided, the smaller ones of tetrahedra stay whole."""
+    mesh = problem.mesh.geometry
+    bricks = isinstance(mesh, skfem.MeshHex)
+    quadratic, linear = (
+        (skfem.ElementHex2(), skfem.ElementHex1()) if bricks else (skfem.ElementTetP2(), skfem.ElementTetP1())
+    )
+    local, small = _divided_square(DIVISIONS) if bricks else _TRIANGLE
+    facets, plane = _seen_facets(problem)
+    basis = skfem.FacetBasis(mesh, quadratic, facets=facets, quadrature=(local, np.ones(local.shape[1])))
+    corners = basis.global_coordinates().value.transpose(1, 2, 0)  # (g, k, 3)
+    _, point = np.unique(np.round(corners.reshape(-1, 3), 8), axis=0, return_inverse=True)
+    point = point.reshape(corners.shape[:2])
+    part = np.where(plane == 0, PARTS.index("top"), problem.mesh.cutis[mesh.f2t[0, facets]])
+    for name in ("pad", "guard"):
+        part[np.isin(facets, problem.mesh.facets[name])] = PARTS.index(name)
+    return Surface(
+        faces=point[:, small].reshape(-1, small.shape[1]),
+        part=np.repeat(part, len(small)),
+        plane=np.repeat(plane, len(small)),
+        point=point,
+        small=small,
+        quadratic=basis,
+        linear=basis.with_element(linear),
+    )
+
+
+def surface_state(problem: Problem, theta: Mapping[str, float], surface: Surface, x: Array) -> SurfaceState:
+    """Fields on the surface from the unknowns x (dofs,)."""
+    n, c = 3 * problem.space.n_nodes, Constants()
+    u = [surface.quadratic.interpolate(x[i:n:3]) for i in range(3)]
+    p = surface.linear.interpolate(x[n:])
+    moved = np.stack([component.value for component in u], axis=-1)  # (g, k, 3)
+    f = np.eye(3) + np.stack([component.grad for component in u]).transpose(2, 3, 0, 1)
+    cells = surface.quadratic.tind
+    initial = np.where(problem.mesh.cutis, c.porosity_c, c.porosity_s)[cells, None]
+    porosity = (1.0 - (1.0 - initial) / np.linalg.det(f)).mean(axis=1, keepdims=True)
+    mobility = material(theta, problem.mesh.cutis).mobility[cells, None]
+    gradient = np.einsum("gkji,jgk->gki", np.linalg.inv(f), p.grad)
+    corners = surface.quadratic.global_coordinates().value.transpose(1, 2, 0) + moved
+    points = np.empty((surface.point.max() + 1, 3))
+    points[surface.point] = corners
+    return SurfaceState(
+        points_m=points,
+        displacement_m=_face_means(surface, np.linalg.norm(moved, axis=-1)),
+        pressure_pa=_face_means(surface, p.value),
+        velocity_m_s=_face_means(surface, -(mobility / porosity)[..., None] * gradient),
+    )
+
+
+def _face_means(surface: Surface, values: Array) -> Array:
+    """Means over the small faces (f, ...) from values at each facet's points (g, k, ...)."""
+    return values[:, surface.small].mean(axis=2).reshape(-1, *values.shape[2:])
+
+
+_TRIANGLE = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.array([[0, 1, 2]])
+
+
+def _divided_square(n: int) -> tuple[Array, np.ndarray]:
+    """Points (2, (n+1)^2) of the unit square and the n^2 squares between them (n^2, 4)."""
+    ticks = np.linspace(0.0, 1.0, n + 1)
+    number = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
+    squares = np.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], axis=-1)
+    return np.stack(np.meshgrid(ticks, ticks, indexing="ij")).reshape(2, -1), squares.reshape(-1, 4)
+
+
+def _seen_facets(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Facets near the pads, and the plane of each."""
+    mesh, named = problem.mesh.geometry, problem.mesh.facets
+    corners = mesh.doflocs[:, mesh.facets]  # (3, corners, facets)
+    radius = np.hypot(corners[1], corners[2])
+    outside = ARM_RADIUS_M + LENGTH_M[2]
+    top = mesh.boundary_facets()
+    top = top[np.all(np.isclose(radius[:, top], outside, rtol=0.0, atol=1e-6), axis=0)]
+    sets = (top, named["symmetry_y"], named["symmetry_x"])
+    facets, plane = np.concatenate(sets), np.repeat(np.arange(3), [len(part) for part in sets])
+    x, y, z = corners.mean(axis=1)
+    near = (x < NEAR_M[0]) & (np.arctan2(y, z) * outside < NEAR_M[1])
+    return facets[near[facets]], plane[near[facets]]
