@@ -18,8 +18,8 @@ from bayeskin.model.mesh import ARM_RADIUS_M, LENGTH_M
 from bayeskin.model.problem import Constants, Problem, material
 from bayeskin.types import Array
 
-NEAR_M = (63e-3, 30e-3)  # along the arm and around it: about twice as far as the pads reach
-DIVISIONS = 6  # of the edges of a brick
+NEAR_M = (63e-3, 38e-3)  # along the arm and around it: well beyond the pads, and where bricks end
+DIVISIONS = {"brick": 6, "tetrahedron": 3}  # of the edges of a facet
 PARTS = ("subcutis", "cutis", "top", "pad", "guard")
 
 
@@ -29,7 +29,7 @@ class Surface:
 
     faces (f, 3 or 4) numbers of points; part (f,) index into PARTS (a layer on the planes of symmetry);
     plane (f,) 0 the top, 1 the plane y = 0, 2 the plane x = 0; point (g, k) numbers of each facet's points;
-    small (f / g, 3 or 4) small faces of one facet, by the facet's points
+    small (s, 3 or 4) small faces of one facet, by the facet's points; near (g, s) those that are seen
     """
 
     faces: np.ndarray
@@ -37,6 +37,7 @@ class Surface:
     plane: np.ndarray
     point: np.ndarray
     small: np.ndarray
+    near: np.ndarray
     quadratic: skfem.FacetBasis
     linear: skfem.FacetBasis
 
@@ -55,13 +56,15 @@ class SurfaceState:
 
 
 def seen_surface(problem: Problem) -> Surface:
-    """The surface near the pads; facets of bricks are divided, the smaller ones of tetrahedra stay whole."""
+    """The surface near the pads; each facet divided into small faces."""
     mesh = problem.mesh.geometry
     bricks = isinstance(mesh, skfem.MeshHex)
     quadratic, linear = (
         (skfem.ElementHex2(), skfem.ElementHex1()) if bricks else (skfem.ElementTetP2(), skfem.ElementTetP1())
     )
-    local, small = _divided_square(DIVISIONS) if bricks else _TRIANGLE
+    local, small = (
+        _divided_square(DIVISIONS["brick"]) if bricks else _divided_triangle(DIVISIONS["tetrahedron"])
+    )
     facets, plane = _seen_facets(problem)
     basis = skfem.FacetBasis(mesh, quadratic, facets=facets, quadrature=(local, np.ones(local.shape[1])))
     corners = basis.global_coordinates().value.transpose(1, 2, 0)  # (g, k, 3)
@@ -70,12 +73,14 @@ def seen_surface(problem: Problem) -> Surface:
     part = np.where(plane == 0, PARTS.index("top"), problem.mesh.cutis[mesh.f2t[0, facets]])
     for name in ("pad", "guard"):
         part[np.isin(facets, problem.mesh.facets[name])] = PARTS.index(name)
+    near = _near(corners[:, small].mean(axis=2))
     return Surface(
-        faces=point[:, small].reshape(-1, small.shape[1]),
-        part=np.repeat(part, len(small)),
-        plane=np.repeat(plane, len(small)),
+        faces=point[:, small][near],
+        part=np.broadcast_to(part[:, None], near.shape)[near],
+        plane=np.broadcast_to(plane[:, None], near.shape)[near],
         point=point,
         small=small,
+        near=near,
         quadratic=basis,
         linear=basis.with_element(linear),
     )
@@ -106,10 +111,7 @@ def surface_state(problem: Problem, theta: Mapping[str, float], surface: Surface
 
 def _face_means(surface: Surface, values: Array) -> Array:
     """Means over the small faces (f, ...) from values at each facet's points (g, k, ...)."""
-    return values[:, surface.small].mean(axis=2).reshape(-1, *values.shape[2:])
-
-
-_TRIANGLE = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.array([[0, 1, 2]])
+    return values[:, surface.small].mean(axis=2)[surface.near]
 
 
 def _divided_square(n: int) -> tuple[Array, np.ndarray]:
@@ -120,8 +122,23 @@ def _divided_square(n: int) -> tuple[Array, np.ndarray]:
     return np.stack(np.meshgrid(ticks, ticks, indexing="ij")).reshape(2, -1), squares.reshape(-1, 4)
 
 
+def _divided_triangle(n: int) -> tuple[Array, np.ndarray]:
+    """Points (2, (n+1)(n+2)/2) of the unit triangle and the n^2 triangles between them (n^2, 3)."""
+    number = {(i, j): k for k, (i, j) in enumerate((i, j) for i in range(n + 1) for j in range(n + 1 - i))}
+    upright = [((i, j), (i + 1, j), (i, j + 1)) for i, j in number if i + j < n]
+    hanging = [((i + 1, j), (i + 1, j + 1), (i, j + 1)) for i, j in number if i + j < n - 1]
+    triangles = [[number[corner] for corner in corners] for corners in upright + hanging]
+    return np.array(list(number)).T / n, np.array(triangles)
+
+
+def _near(points: Array) -> np.ndarray:
+    """Which of the points (..., 3) of the mesh lie near the pads (...,)."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    return (x < NEAR_M[0]) & (np.arctan2(y, z) * np.hypot(y, z) < NEAR_M[1])
+
+
 def _seen_facets(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Facets near the pads, and the plane of each."""
+    """Facets that reach near the pads, and the plane of each."""
     mesh, named = problem.mesh.geometry, problem.mesh.facets
     corners = mesh.doflocs[:, mesh.facets]  # (3, corners, facets)
     radius = np.hypot(corners[1], corners[2])
@@ -130,6 +147,5 @@ def _seen_facets(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     top = top[np.all(np.isclose(radius[:, top], outside, rtol=0.0, atol=1e-6), axis=0)]
     sets = (top, named["symmetry_y"], named["symmetry_x"])
     facets, plane = np.concatenate(sets), np.repeat(np.arange(3), [len(part) for part in sets])
-    x, y, z = corners.mean(axis=1)
-    near = (x < NEAR_M[0]) & (np.arctan2(y, z) * outside < NEAR_M[1])
-    return facets[near[facets]], plane[near[facets]]
+    near = _near(corners[:, :, facets].transpose(2, 1, 0)).any(axis=1)
+    return facets[near], plane[near]

@@ -64,7 +64,8 @@ def figure_fields(
     points, nodes, parts = np.asarray(points_m, dtype=float), np.asarray(faces, dtype=int), np.asarray(part)
     _check(row_labels, points, nodes, parts, columns)
     flat = 1e3 * points @ _view()  # (t, v, 3): right, up, toward the viewer
-    low, high = flat.min(axis=(0, 1)), flat.max(axis=(0, 1))
+    shown = flat[:, np.unique(nodes)]
+    low, high = shown.min(axis=(0, 1)), shown.max(axis=(0, 1))
     panel_in = (PAGE_IN - _LABEL_IN) / max(len(columns), 3)
     height_in = len(row_labels) * (panel_in * (high - low)[1] / (high - low)[0] + 0.06)
     figure = new_figure(_LABEL_IN + panel_in * len(columns), height_in + 1.15)
