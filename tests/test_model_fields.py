@@ -1,16 +1,21 @@
-"""Fields for ParaView: values known at rest and in a uniform stretch, files that meshio reads back."""
+"""Fields: values known at rest and in a uniform stretch, files that meshio reads back, suction and reflux."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
 
 import meshio
 import numpy as np
 import pytest
+from skin_test import supplement
 
-from bayeskin.model.fields import FieldWriter, fields_of
+from bayeskin.model.fields import FieldWriter, StatesAt, fields_of
+from bayeskin.model.mesh import read_gmsh
 from bayeskin.model.problem import material
-from bayeskin.model.simulate import problem_of
+from bayeskin.model.simulate import ModelSpec, problem_of, simulate
+from bayeskin.model.surface import PARTS, _divided_triangle, seen_surface, surface_state
+from bayeskin.types import PadMotion
 
 THETA = {"E_c": 6e4, "E_s": 2e4, "k_c": 1e-14, "k_s": 5e-13, "p_init": 0.0}
 
@@ -56,9 +61,7 @@ def test_in_a_uniform_stretch_stress_and_porosity_are_the_closed_forms(problem):
 def test_fluid_runs_down_the_pressure_gradient_relative_to_the_solid(problem):
     space = problem.space
     x, rate = np.zeros(space.dofs), np.zeros(space.dofs)
-    points = np.zeros((space.n_corners, 3))
-    points[space.nodes_p] = space.points_u.T[space.nodes_u[:, :8]]
-    x[3 * space.n_nodes :] = 1e5 * points[:, 0]
+    x[3 * space.n_nodes :] = 1e5 * corners_of(problem)[:, 0]
     rate[0 : 3 * space.n_nodes : 3] = 2e-3
     fields = fields_of(problem, THETA, x, rate)
     for layer, k, porosity in ((problem.mesh.cutis, 1e-14, 0.2), (~problem.mesh.cutis, 5e-13, 0.4)):
@@ -66,18 +69,142 @@ def test_fluid_runs_down_the_pressure_gradient_relative_to_the_solid(problem):
         np.testing.assert_allclose(fields.fluid_velocity[layer][:, 0], expected, rtol=1e-9)
 
 
-def test_the_series_is_read_back_with_its_times_and_volume(problem, tmp_path):
+def corners_of(problem):
+    """Vertices (c, 3) of the undeformed mesh, in the order of the pressures."""
+    space = problem.space
+    points = np.zeros((space.n_corners, 3))
+    points[space.nodes_p] = space.points_u.T[space.nodes_u[:, :8]]
+    return points
+
+
+def test_the_series_is_read_back_with_its_times_displacements_and_pressures(problem, tmp_path):
     writer = FieldWriter(tmp_path / "fields", problem, THETA)
+    gradient, corners = np.array([[0.1, 0, 0.02], [0, -0.03, 0], [0, 0, -0.04]]), corners_of(problem)
+    pressure = 1e4 * corners[:, 0] - 2e4 * corners[:, 1]
     for time_s in (0.0, 1.0, 2.5):
-        writer.on_state(time_s, stretched(problem, np.diag([0.1 * time_s, 0, 0])), 0.0)
-    path = writer.write()
+        writer.on_state(time_s, stretched(problem, time_s * gradient, time_s * pressure), 0.0)
+    assert not (tmp_path / "fields").exists(), "a run that fails leaves no folder"
+    paths = writer.write()
+    assert sorted((tmp_path / "fields").iterdir()) == sorted(paths)
+    with contextlib.chdir(paths[0].parent), meshio.xdmf.TimeSeriesReader(paths[0].name) as reader:
+        points, _ = reader.read_points_cells()
+        steps = [reader.read_data(k) for k in range(reader.num_steps)]
+    assert [time_s for time_s, _, _ in steps] == [0.0, 1.0, 2.5]
+    to_ours = np.array([np.abs(corners - point).sum(axis=1).argmin() for point in points])
+    np.testing.assert_allclose(corners[to_ours], points, atol=1e-12)
+    for time_s, at_points, at_cells in steps:
+        np.testing.assert_allclose(at_points["displacement"], time_s * points @ gradient.T, atol=1e-12)
+        np.testing.assert_allclose(at_points["pressure"], time_s * pressure[to_ours], atol=1e-9)
+        np.testing.assert_array_equal(at_cells["cutis"][0], problem.mesh.cutis)
+    effective, total = (
+        steps[-1][2][name][0].reshape(-1, 3, 3) for name in ("effective_stress", "total_stress")
+    )
+    assert np.ptp(effective[:, 0, 0]) > 0
+    np.testing.assert_allclose((effective - total)[:, 0, 1], 0.0, atol=1e-9)
+
+
+def test_bricks_of_the_series_are_not_turned_inside_out_in_vtk_order(problem, tmp_path):
+    writer = FieldWriter(tmp_path, problem, THETA)
+    writer.on_state(0.0, np.zeros(problem.space.dofs), 0.0)
+    path, _ = writer.write()
     with contextlib.chdir(path.parent), meshio.xdmf.TimeSeriesReader(path.name) as reader:
         points, cells = reader.read_points_cells()
-        times, last = zip(
-            *[(t, p) for t, p, _ in map(reader.read_data, range(reader.num_steps))], strict=True
+    corner = points[cells[0].data]  # VTK: 0 1 2 3 around the bottom, 4 5 6 7 above them
+    local = np.array([[-1, 1, 1, -1, -1, 1, 1, -1], [-1, -1, 1, 1, -1, -1, 1, 1], [-1] * 4 + [1] * 4]).T
+    gauss, volume = local / np.sqrt(3), np.zeros(len(corner))
+    for at in np.vstack([local, gauss]):  # trilinear shape functions at corners and Gauss points
+        factor = 1 + local * at
+        slope = local * np.stack(
+            [factor[:, 1] * factor[:, 2], factor[:, 0] * factor[:, 2], factor[:, 0] * factor[:, 1]], axis=1
         )
-    assert list(times) == [0.0, 1.0, 2.5]
-    np.testing.assert_allclose(last[-1]["displacement"][:, 0], 0.25 * points[:, 0], atol=1e-15)
-    corner = points[cells[0].data]
-    a, b, c = (corner[:, k] - corner[:, 0] for k in (1, 3, 4))
-    assert np.all(np.einsum("ei,ei->e", np.cross(a, b), c) > 0), "VTK wants right-handed bricks"
+        jacobian = np.linalg.det(np.einsum("eci,cj->eij", corner, slope / 8))
+        assert jacobian.min() > 0
+        volume += jacobian * bool(np.any(np.all(at == gauss, axis=1)))
+    assert volume.sum() == pytest.approx(0.105 * 0.084 * 0.01, rel=0.05)  # straight edges across the arc
+
+
+def test_states_at_chosen_times_are_linear_between_steps(problem):
+    states = StatesAt((0.0, 0.5, 2.0, 2.5, 9.0), problem, 700.0)
+    start, end = np.zeros(problem.space.dofs), np.ones(problem.space.dofs)
+    start[3 * problem.space.n_nodes :] = 700.0
+    states.on_state(1.0, end, 0.0)  # the article's formulation does not report its start
+    states.on_state(3.0, 3 * end, 0.0)
+    for state, expected in zip(states.states, (start, 0.5 * (start + end), 2 * end, 2.5 * end), strict=True):
+        np.testing.assert_allclose(state, expected)
+
+
+# --- the surface near the pads ---------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def surface(problem):
+    return seen_surface(problem)
+
+
+def area_mm2(corners):
+    """Areas of flat faces (f, 3 or 4, 3) [m]."""
+    halves = [(1, 2), (2, 3)] if corners.shape[1] == 4 else [(1, 2)]
+    sides = corners - corners[:, :1]
+    return 1e6 * sum(0.5 * np.linalg.norm(np.cross(sides[:, a], sides[:, b]), axis=1) for a, b in halves)
+
+
+def test_the_surface_has_the_areas_of_pads_and_layers(problem, surface):
+    rest = surface_state(problem, THETA, surface, np.zeros(problem.space.dofs))
+    area = area_mm2(rest.points_m[surface.faces])
+    known = {"pad": 8 * 4, "guard": 17 * 7 + 8 * 5, "top": 63 * 38 - 32 - 159}
+    for name, expected in known.items():
+        assert area[surface.part == PARTS.index(name)].sum() == pytest.approx(expected, rel=2e-3)
+    front = surface.plane == 1
+    for layer, thickness in (("subcutis", 8), ("cutis", 2)):
+        assert area[front & (surface.part == PARTS.index(layer))].sum() == pytest.approx(63 * thickness)
+
+
+def test_on_the_surface_fields_of_a_uniform_stretch_are_the_closed_forms(problem, surface):
+    gradient, slope_pa_m = np.diag([0.2, -0.05, 0.03]), 2e5
+    pressure = slope_pa_m * corners_of(problem)[:, 0]
+    state = surface_state(problem, THETA, surface, stretched(problem, gradient, pressure))
+    rest = surface_state(problem, THETA, surface, np.zeros(problem.space.dofs))
+    corners = rest.points_m[surface.faces]
+    np.testing.assert_allclose(state.points_m, rest.points_m @ (np.eye(3) + gradient), atol=1e-9)
+    moved = np.linalg.norm(corners @ gradient, axis=-1).mean(axis=1)
+    np.testing.assert_allclose(state.displacement_m, moved, atol=1e-9)
+    np.testing.assert_allclose(state.pressure_pa, slope_pa_m * corners[..., 0].mean(axis=1), atol=1e-3)
+    j = np.linalg.det(np.eye(3) + gradient)
+    for layer, k, initial in (("cutis", 1e-14, 0.2), ("subcutis", 5e-13, 0.4)):
+        expected = -k / (5e-3 * (1 - (1 - initial) / j)) * slope_pa_m / 1.2
+        inside = surface.part == PARTS.index(layer)
+        np.testing.assert_allclose(state.velocity_m_s[inside, 0], expected, rtol=1e-6)
+        np.testing.assert_allclose(state.velocity_m_s[inside, 1:], 0.0, atol=1e-6 * abs(expected))
+
+
+def test_small_triangles_of_a_tetrahedrons_facet_tile_it():
+    points, triangles = _divided_triangle(3)
+    assert triangles.shape == (9, 3)
+    corners = np.pad(points.T[triangles], ((0, 0), (0, 0), (0, 1)))
+    np.testing.assert_allclose(area_mm2(corners), 1e6 * 0.5 / 9)
+    assert np.unique(triangles).size == points.shape[1] == 10
+
+
+def test_stretch_draws_fluid_in_front_of_the_pads_and_release_drives_it_back(problem, surface):
+    """The article's reading of its fields: suction where the skin is stretched, reflux on release."""
+    motion = PadMotion(np.array([0.0, 8.0, 20.0, 28.0]), 1e-3 * np.array([0.0, 8.0, 8.0, 0.0]))
+    states = StatesAt((8.0, 20.0, 28.0), problem, 0.0)
+    run = simulate(ModelSpec(tolerance=1e-2), motion, THETA, on_state=states.on_state)
+    assert run.status == "ok"
+    rest = surface_state(problem, THETA, surface, np.zeros(problem.space.dofs))
+    x_mm = 1e3 * rest.points_m[surface.faces, 0].mean(axis=1)
+    cut = surface.plane == 1
+    ahead, below, behind = cut & (x_mm < 18), cut & (x_mm > 18) & (x_mm < 35), cut & (x_mm > 35)
+    loaded, held, released = (surface_state(problem, THETA, surface, x) for x in states.states)
+    for state in (loaded, held):
+        assert state.pressure_pa[ahead].mean() < 0 < state.pressure_pa[behind].mean()
+        assert state.velocity_m_s[below, 0].mean() < 0, "toward what is stretched"
+    assert abs(held.pressure_pa).max() < abs(loaded.pressure_pa).max()
+    assert released.pressure_pa[ahead].mean() > 0 > released.pressure_pa[behind].mean()
+    assert released.velocity_m_s[below, 0].mean() > 0, "back, away from it"
+
+
+def test_reading_a_mesh_warns_of_nothing(caplog):
+    with caplog.at_level(logging.WARNING):
+        read_gmsh(supplement("data/Mesh_SKIN.msh"))
+    assert caplog.records == []

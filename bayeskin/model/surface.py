@@ -67,7 +67,7 @@ def seen_surface(problem: Problem) -> Surface:
     )
     facets, plane = _seen_facets(problem)
     basis = skfem.FacetBasis(mesh, quadratic, facets=facets, quadrature=(local, np.ones(local.shape[1])))
-    corners = basis.global_coordinates().value.transpose(1, 2, 0)  # (g, k, 3)
+    corners = np.asarray(basis.global_coordinates()).transpose(1, 2, 0)  # (g, k, 3)
     _, point = np.unique(np.round(corners.reshape(-1, 3), 8), axis=0, return_inverse=True)
     point = point.reshape(corners.shape[:2])
     part = np.where(plane == 0, PARTS.index("top"), problem.mesh.cutis[mesh.f2t[0, facets]])
@@ -91,20 +91,20 @@ def surface_state(problem: Problem, theta: Mapping[str, float], surface: Surface
     n, c = 3 * problem.space.n_nodes, Constants()
     u = [surface.quadratic.interpolate(x[i:n:3]) for i in range(3)]
     p = surface.linear.interpolate(x[n:])
-    moved = np.stack([component.value for component in u], axis=-1)  # (g, k, 3)
+    moved = np.stack(u, axis=-1)  # (g, k, 3)
     f = np.eye(3) + np.stack([component.grad for component in u]).transpose(2, 3, 0, 1)
     cells = surface.quadratic.tind
     initial = np.where(problem.mesh.cutis, c.porosity_c, c.porosity_s)[cells, None]
     porosity = (1.0 - (1.0 - initial) / np.linalg.det(f)).mean(axis=1, keepdims=True)
     mobility = material(theta, problem.mesh.cutis).mobility[cells, None]
     gradient = np.einsum("gkji,jgk->gki", np.linalg.inv(f), p.grad)
-    corners = surface.quadratic.global_coordinates().value.transpose(1, 2, 0) + moved
+    corners = np.asarray(surface.quadratic.global_coordinates()).transpose(1, 2, 0) + moved
     points = np.empty((surface.point.max() + 1, 3))
     points[surface.point] = corners
     return SurfaceState(
         points_m=points,
         displacement_m=_face_means(surface, np.linalg.norm(moved, axis=-1)),
-        pressure_pa=_face_means(surface, p.value),
+        pressure_pa=_face_means(surface, np.asarray(p)),
         velocity_m_s=_face_means(surface, -(mobility / porosity)[..., None] * gradient),
     )
 
