@@ -36,12 +36,22 @@ class DrivenProblem(Problem):
         return out
 
 
-class DrivenModel(LagrangianModel):
-    """The model with an external load, solved `precision` times more tightly than in production."""
+class TightModel(LagrangianModel):
+    """The model, solved `precision` times more tightly than in production."""
 
-    def __init__(self, problem, material, load: Load | None = None, precision: float = 1e5):
+    precision = 1e3
+
+    def equations(self, h, old):
+        usual = super().equations(h, old)
+        return replace(usual, weight=usual.weight * self.precision)
+
+
+class DrivenModel(TightModel):
+    """The model with an external load and boundary values of any kind."""
+
+    def __init__(self, problem, material, load: Load | None = None):
         super().__init__(problem, material, STILL)
-        self.load, self.precision, self.time_s = load, precision, 0.0
+        self.load, self.time_s = load, 0.0
 
     def pad_displacement(self, time_s):
         return time_s
@@ -49,10 +59,6 @@ class DrivenModel(LagrangianModel):
     def solve_stage(self, time_s, h, old, guess, jump):
         self.time_s = time_s
         return super().solve_stage(time_s, h, old, guess, jump)
-
-    def equations(self, h, old):
-        usual = super().equations(h, old)
-        return replace(usual, weight=usual.weight * self.precision)
 
     def residual(self, x, h, old):
         found = super().residual(x, h, old)
@@ -81,13 +87,13 @@ def driven(
     return DrivenModel(DrivenProblem(mesh, space, sparsity(space, fixed), pad, pad, values), material, load)
 
 
-def march(model: LagrangianModel, start: State, times: Array):
-    """Yields the Step that ends at each of `times`."""
+def march(model: LagrangianModel, start: State, times: Array, corner_s: float = np.nan):
+    """Yields the Step that ends at each of `times`; nothing is extrapolated over the corner."""
     past = [start]
     for end in times:
         step = advance(model, past, end - past[-1].time_s)
         assert step is not None, f"no convergence at {end}"
-        past = [*past, step.state][-3:]
+        past = [step.state] if np.isclose(end, corner_s) else [*past, step.state][-3:]
         yield step
 
 
@@ -126,7 +132,7 @@ class Point:
     storage: float
 
     def stress(self, f: Array, p: Array) -> Array:
-        """First Piola-Kirchhoff stress (n, 3, 3) from F (n, 3, 3) and p (n,): from the energy's derivative."""
+        """First Piola-Kirchhoff stress (n, 3, 3): the energy's derivative by F (n, 3, 3), and p (n,)."""
         turned = np.swapaxes(np.linalg.inv(f), 1, 2)
         j = np.linalg.det(f)
         return self.mu * (f - turned) + ((self.lam * np.log(j) - p * j)[:, None, None]) * turned
@@ -146,9 +152,9 @@ def by_layer(cutis: Array, upper: Point, lower: Point) -> Material:
 
 @dataclass(frozen=True)
 class Manufactured:
-    """Exact fields: u (3, n), p (n,) with their gradients at points X (3, n) and time t, all analytic in both.
+    """Exact fields, analytic functions of points X (3, n) and time t.
 
-    displacement, gradient -> (3, n), (n, 3, 3); pressure, pressure_gradient -> (n,), (n, 3)
+    displacement (3, n), its gradient (n, 3, 3); pressure (n,), its gradient (n, 3)
     """
 
     displacement: Callable[[Array, complex], Array]
