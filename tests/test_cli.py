@@ -9,22 +9,26 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
 import pytest
 import toy_model
+from matplotlib.figure import Figure
+from matplotlib.image import imread
 from toy import MOTION, SPACE, toy_force
 
-from bayeskin import cli, storage
+from bayeskin import cli, report, storage
 from bayeskin.design import first_wave
-from bayeskin.model.simulate import ModelSpec
+from bayeskin.model.simulate import ModelSpec, OnState, problem_of
 from bayeskin.pipeline import single, stages
 from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
+from bayeskin.pipeline.field_outputs import FieldOutputs
 from bayeskin.pipeline.shipping import motion_sha256
 from bayeskin.recordings import idealised_motion, read_recording, segment
 from bayeskin.surrogates import manifest_of, save_surrogate, train
-from bayeskin.types import Design, Recording, Simulation
+from bayeskin.types import Design, PadMotion, Recording, Simulation
 
 THETA = np.array([[200e3, 30e3, 1e-14, 1e-13, 300.0]])
 
@@ -145,28 +149,100 @@ def test_simulate_writes_the_columns_that_scripts_rely_on(
     ]  # fmt: skip
 
 
-def test_simulate_hands_the_states_of_the_run_to_the_fields(
-    bayeskin: Command, measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """A stand-in for the full model that stretches all uniformly; lists the names of the runs it made."""
+    made: list[str] = []
+
+    def stretch(
+        spec: ModelSpec,
+        motion: PadMotion,
+        theta: dict[str, float],
+        on_progress: object,
+        on_state: OnState | None,
+    ) -> Simulation:
+        made.append(spec.mesh)
+        space = problem_of(spec.mesh, spec.refinement).space
+        for time_s in motion.time_s if on_state else ():
+            x = np.zeros(space.dofs)
+            x[0 : 3 * space.n_nodes : 3] = 10.0 * motion.at(time_s) * space.points_u[0]
+            x[3 * space.n_nodes :] = -1e5 * motion.at(time_s)
+            on_state(float(time_s), x, 0.0)
+        return toy_model.simulate(spec, motion, theta)
+
+    monkeypatch.setattr(single, "simulate", stretch)
+    return made
+
+
+def test_force_fields_and_figure_come_of_one_run(
+    bayeskin: Command, measured: Path, tmp_path: Path, runs: list[str]
 ) -> None:
-    class Writer:
-        def __init__(self, directory: Path, problem: object, theta: dict[str, float]) -> None:
-            self.path, self.states = directory / "fields.xdmf", 0
+    outputs = ("-o", tmp_path / "f.csv", "--fields", tmp_path / "a" / "fields", "--figures", tmp_path / "b")
+    code, out, err = bayeskin("simulate", "--recording", measured, *outputs, "--at", 15, "--json")
+    said = json.loads(out)
+    assert (code, runs) == (0, ["bricks"])
+    assert err.splitlines() == ["simulating 130.0 s, reaction on bricks"]
+    assert sorted(said["files"]) == sorted(str(path) for path in tmp_path.rglob("*.*"))
+    assert said["fields"] == str(tmp_path / "a" / "fields" / "fields.xdmf")
+    assert said["figures"] == [str(tmp_path / "b" / name) for name in ("fields.png", "fields.svg")]
+    assert imread(said["figures"][0]).shape[1] > 1000
 
-        def on_state(self, time_s: float, x: object, force_n: float) -> None:
-            self.states += 1
 
-        def write(self) -> Path:
-            self.path.parent.mkdir()
-            self.path.write_text(f"{self.states} states")
-            return self.path
+def drawn_fields(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Where what the figure of fields is given will be found."""
+    given: dict[str, Any] = {}
+    names = ("labels", "points_m", "faces", "part", "strong", "columns", "finding", "caption")
 
-    monkeypatch.setattr(single, "simulate", toy_model.simulate)
-    monkeypatch.setattr(single, "FieldWriter", Writer)
-    monkeypatch.setattr(single, "problem_of", lambda mesh, refinement: None)
-    arguments = ("--recording", measured, "-o", tmp_path / "f.csv", "--fields", tmp_path / "fields", "--json")
-    code, out, _ = bayeskin("simulate", *arguments)
-    assert (code, json.loads(out)["fields"]) == (0, str(tmp_path / "fields" / "fields.xdmf"))
-    assert (tmp_path / "fields" / "fields.xdmf").read_text() == "1 states"
+    def figure(*arguments: object) -> Figure:
+        given.update(zip(names, arguments, strict=True))
+        return Figure()
+
+    monkeypatch.setattr(report, "figure_fields", figure)
+    return given
+
+
+def test_the_figure_of_fields_shows_four_moments_or_those_asked_for(
+    bayeskin: Command, measured: Path, tmp_path: Path, runs: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = drawn_fields(monkeypatch)
+    common = ("simulate", "--recording", measured, "-o", tmp_path / "f.csv", "--figures", tmp_path / "b")
+    assert bayeskin(*common)[0] == 0
+    first = [label.splitlines() for label in given["labels"]]
+    assert [(what, pads) for _, what, pads in first] == [
+        ("end of loading 1", "pads at 4.50 mm"), ("middle of hold 1", "pads at 4.50 mm"),
+        ("end of unloading 1", "pads at 0.00 mm"), ("middle of rest 2", "pads at 0.00 mm"),
+    ]  # fmt: skip
+    assert given["columns"][1].values[:, 0] == pytest.approx([-0.9, -0.9, 0.0, 0.0])
+    assert given["finding"].startswith("Pressure from -0.9 kPa (15 s, end of loading 1) to ")
+    assert bayeskin(*common, "--at", 60, "--at", 10, "--at", 10, "--at", 0)[0] == 0
+    assert [label.splitlines()[:2] for label in given["labels"]] == [
+        ["0 s", "rest 0"], ["10 s", "loading 1"], ["60 s", "rest 1"],
+    ]  # fmt: skip
+    assert given["columns"][1].values[:, 0] == pytest.approx([0.0, -0.45, 0.0], abs=1e-6)
+    assert given["columns"][0].values[1].max() == pytest.approx(0.045 * 63, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--figures", "figures", "--at", "131"], ("--at 131", "0 to 130 s")),
+        (["--figures", "figures", "--at", "-1"], ("--at -1", "0 to 130 s")),
+        (["--figures", "figures", "--at", "nan"], ("--at nan", "0 to 130 s")),
+        (["--figures", "figures", "--at", "soon"], ("--at", "soon")),
+        (["--at", "3"], ("--at 3", "--figures DIR")),
+        (["--figures", "file/figures"], ("--figures file/figures", "file is a file")),
+        (["--fields", "file"], ("--fields file", "file is a file")),
+    ],
+)
+def test_wrong_options_of_the_outputs_are_refused_before_the_run(
+    bayeskin: Command, measured: Path, tmp_path: Path, runs: list[str], monkeypatch: pytest.MonkeyPatch,
+    options: list[str], says: tuple[str, ...],
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    assert_refused(bayeskin("simulate", "--recording", measured, "-o", "f.csv", *options), *says)
+    assert runs == []
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_simulation_that_fails_exits_with_1_and_writes_nothing(
@@ -177,11 +253,15 @@ def test_a_simulation_that_fails_exits_with_1_and_writes_nothing(
         return replace(run, status="failed", message="no convergence at 3 s; take smaller steps")
 
     monkeypatch.setattr(single, "simulate", failing)
+    monkeypatch.setattr(FieldOutputs, "on_state", lambda *state: None)
     (tmp_path / "force.csv").write_text("earlier")
-    code, out, _ = bayeskin("simulate", "--recording", measured, "-o", tmp_path / "force.csv", "--json")
+    outputs = ("-o", tmp_path / "force.csv", "--fields", tmp_path / "a", "--figures", tmp_path / "b")
+    code, out, _ = bayeskin("simulate", "--recording", measured, *outputs, "--json")
     assert code == 1
     assert "smaller steps" in json.loads(out)["message"]
+    assert json.loads(out)["files"] == []
     assert (tmp_path / "force.csv").read_text() == "earlier"
+    assert [path.name for path in tmp_path.iterdir()] == ["force.csv"]
 
 
 @pytest.mark.parametrize(
