@@ -115,7 +115,7 @@ def simulate(as_json: bool, **options: Any) -> None:
     of its hold, the end of its unloading, and the middle of the last phase.
 
     \b
-    Examples:
+    Example:
       bayeskin simulate --set E_c=300e3 --set k_s=1e-13 -o force.csv --fields fields
       bayeskin simulate -o force.csv --figures figures --at 14.4 --at 30 --at 54.4
     """
