@@ -152,6 +152,7 @@ class ArticleModel:
             tangent,
             1.0 / (SOLVER_TOLERANCE * size[pattern.free]),
             scale[pattern.free],
+            np.array([np.log2(dt), float(np.abs(old[self.problem.pattern.fixed]).max()) / size_u]),
         )
 
     def _force(self, x: Array, corners: Array, inverse: Array) -> float:

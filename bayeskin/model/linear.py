@@ -1,4 +1,4 @@
-"""One sparse factorisation, kept and reused: MKL PARDISO where it is installed, else SuperLU.
+"""A few sparse factorisations, kept and reused: MKL PARDISO where it is installed, else SuperLU.
 
 The factors only ever serve as an approximate inverse, which `newton` corrects by true residuals in
 double precision. So PARDISO factorises in single precision, in half the time and memory, and of a
@@ -27,21 +27,31 @@ _STRUCTURALLY_SYMMETRIC, _SYMMETRIC_INDEFINITE = 1, -2
 _ANALYSE_AND_FACTORISE, _FACTORISE, _SOLVE, _RELEASE = 12, 22, 33, -1
 # by number in Intel's manual: own settings; METIS ordering; pivots perturbed below 1e-8; scaling and
 # matching; single precision; indices from 0
-_SETTINGS = {1: 1, 2: 2, 10: 8, 11: 1, 13: 1, 28: 1, 35: 1}
+_SETTINGS = {1: 1, 2: 2, 10: 8, 11: 1, 13: 1, 18: -1, 28: 1, 35: 1}
+_ENTRIES_OF_FACTOR = 18  # asked for by -1
+MOST, MEMORY_BYTES = 10, 250_000_000  # factorisations kept, and what they may take
 
 
-class Factorisation(Protocol):
-    """Solves with the matrix last given to `factorise`; all its matrices share one sparsity pattern."""
+class Factorisations(Protocol):
+    """Numbered factorisations (from 0 on) of matrices that all share one sparsity pattern.
 
-    def factorise(self, matrix: sp.csr_matrix, scale: Array) -> None: ...
+    room : how many may be kept, by their memory; known after the first
+    """
 
-    def solve(self, right: Array) -> Array: ...
+    @property
+    def room(self) -> int: ...
+
+    def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None: ...
+
+    def solve(self, number: int, right: Array) -> Array:
+        """Solves with the matrix last given to `factorise` under this number."""
+        ...
 
     def release(self) -> None: ...
 
 
 class _Pardiso:
-    """Calls MKL itself: pypardiso's own methods know double precision only."""
+    """Calls MKL itself: pypardiso's own methods know double precision and one factorisation only."""
 
     def __init__(self, symmetric: bool) -> None:
         self._symmetric = symmetric
@@ -51,18 +61,22 @@ class _Pardiso:
         self._settings = np.zeros(64, np.int32)
         for number, value in _SETTINGS.items():
             self._settings[number - 1] = value
-        self._data: np.ndarray | None = None
+        self._stored: dict[int, tuple[np.ndarray, Array]] = {}  # entries as MKL was given them; scales
 
-    def factorise(self, matrix: sp.csr_matrix, scale: Array) -> None:
-        first = self._data is None
+    @property
+    def room(self) -> int:
+        bytes_each = 4 * int(self._settings[_ENTRIES_OF_FACTOR - 1])
+        return int(np.clip(MEMORY_BYTES // max(bytes_each, 1), 1, MOST))
+
+    def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None:
+        first = not self._stored
         if first:
             self._prepare(matrix)
-        self._scale = scale
         data = matrix.data * scale[self._row] * scale[matrix.indices]
         if self._symmetric:
             data = 0.5 * (data[self._upper] + data[self._mirrored])
-        self._data = data.astype(np.float32)
-        self._call(_ANALYSE_AND_FACTORISE if first else _FACTORISE)  # the pattern is analysed once
+        self._stored[number] = data.astype(np.float32), scale
+        self._call(number, _ANALYSE_AND_FACTORISE if first else _FACTORISE)  # the pattern is analysed once
 
     def _prepare(self, matrix: sp.csr_matrix) -> None:
         self._row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
@@ -77,37 +91,39 @@ class _Pardiso:
         count = np.bincount(self._row[self._upper], minlength=matrix.shape[0])
         self._indptr = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
 
-    def solve(self, right: Array) -> Array:
-        if self._data is None:
-            raise RuntimeError("solve before factorise")
-        scaled = right * self._scale
+    def solve(self, number: int, right: Array) -> Array:
+        scale = self._stored[number][1]
+        scaled = right * scale
         size = float(np.abs(scaled).max())
         if not size > 0.0:
             return np.zeros_like(scaled)
         # to size one, so that nothing underflows in single precision
-        return self._call(_SOLVE, (scaled / size).astype(np.float32)).astype(float) * (size * self._scale)
+        found = self._call(number, _SOLVE, (scaled / size).astype(np.float32))
+        return found.astype(float) * (size * scale)
 
     def release(self) -> None:
         """Gives MKL's memory back; Python's collector knows nothing of it."""
-        if self._data is not None:
-            self._call(_RELEASE)
-            self._data = None
+        if self._stored:
+            self._call(0, _RELEASE)
+            self._stored.clear()
 
-    def _call(self, phase: int, right: np.ndarray | None = None) -> np.ndarray:
+    def _call(self, number: int, phase: int, right: np.ndarray | None = None) -> np.ndarray:
         n = len(self._indptr) - 1
         right = np.zeros(n, np.float32) if right is None else right
         solution, error = np.zeros(n, np.float32), ctypes.c_int32(0)
+        entries = next(iter(self._stored.values()))[0] if phase == _RELEASE else self._stored[number][0]
 
-        def number(value: int) -> object:
+        def integer(value: int) -> object:
             return ctypes.byref(ctypes.c_int32(value))
 
-        def pointer(array: np.ndarray | None) -> ctypes.c_void_p | None:
-            return None if array is None else array.ctypes.data_as(ctypes.c_void_p)
+        def pointer(array: np.ndarray) -> ctypes.c_void_p:
+            return array.ctypes.data_as(ctypes.c_void_p)
 
         self._pardiso(
-            pointer(self._handle), number(1), number(1), number(self._type), number(phase), number(n),
-            pointer(self._data), pointer(self._indptr), pointer(self._indices), None, number(1),
-            pointer(self._settings), number(0), pointer(right), pointer(solution), ctypes.byref(error),
+            pointer(self._handle), integer(MOST), integer(number + 1), integer(self._type),
+            integer(phase), integer(n), pointer(entries), pointer(self._indptr), pointer(self._indices), None,
+            integer(1), pointer(self._settings), integer(0), pointer(right), pointer(solution),
+            ctypes.byref(error),
         )  # fmt: skip
         if error.value != 0:
             raise RuntimeError(f"MKL PARDISO gave error {error.value} in phase {phase}")
@@ -116,23 +132,27 @@ class _Pardiso:
 
 class _SuperLU:
     def __init__(self) -> None:
-        self._factors: spla.SuperLU | None = None
+        self._stored: dict[int, tuple[spla.SuperLU, Array]] = {}
 
-    def factorise(self, matrix: sp.csr_matrix, scale: Array) -> None:
+    @property
+    def room(self) -> int:
+        entries = max((factors.nnz for factors, _ in self._stored.values()), default=1)
+        return int(np.clip(MEMORY_BYTES // (12 * entries), 1, MOST))
+
+    def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None:
         diagonal = sp.diags(scale)
-        self._scale = scale
         scaled = (diagonal @ matrix @ diagonal).tocsc()
-        self._factors = spla.splu(scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        factors = spla.splu(scaled, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        self._stored[number] = factors, scale
 
-    def solve(self, right: Array) -> Array:
-        if self._factors is None:
-            raise RuntimeError("solve before factorise")
-        return self._factors.solve(right * self._scale) * self._scale
+    def solve(self, number: int, right: Array) -> Array:
+        factors, scale = self._stored[number]
+        return np.asarray(factors.solve(right * scale) * scale)
 
     def release(self) -> None:
-        self._factors = None
+        self._stored.clear()
 
 
-def factorisation(symmetric: bool) -> Factorisation:
-    """A fresh, empty factorisation of the best solver at hand, of the symmetric part only or of all."""
+def factorisations(symmetric: bool) -> Factorisations:
+    """By the best solver at hand; of the symmetric part only, or of all of a matrix."""
     return _Pardiso(symmetric) if pypardiso is not None else _SuperLU()

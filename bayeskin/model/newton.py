@@ -1,9 +1,10 @@
-"""Nonlinear solves that keep one factorised tangent: Newton when needed, Broyden in between.
+"""Nonlinear solves that keep factorised tangents: Newton when needed, Broyden in between.
 
 A factorisation costs as much as some tens of residuals and back-substitutions, and the tangent
-changes slowly along the protocol. So the kept one serves as approximate inverse, corrected by
-Broyden's rank-one updates (C. T. Kelley, Iterative Methods for Linear and Nonlinear Equations,
-SIAM 1995, section 7.3), and is renewed when it no longer contracts.
+changes slowly along the protocol, whose cycles come back to where it was before. So a few are kept, each
+under the place where it was made (`Equations.place`), and the nearest serves as approximate inverse,
+corrected by Broyden's rank-one updates (C. T. Kelley, Iterative Methods for Linear and Nonlinear
+Equations, SIAM 1995, section 7.3). When none contracts well, a new one is made.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ from itertools import pairwise
 import numpy as np
 import scipy.sparse as sp
 
-from bayeskin.model.linear import Factorisation, factorisation
+from bayeskin.model.linear import Factorisations, factorisations
 from bayeskin.types import Array
 
 MAX_RENEWALS = 8
 MAX_BROYDEN = 25
-SLOW = 0.7  # a factorisation costs some twenty iterations: slower contraction than this is dearer
+DEAR = 8.0  # iterations left from which a factorisation, worth some twenty-five but kept, is cheaper
 SMALLEST_DAMPING = 1 / 64
+SAME_PLACE = 0.2  # a factorisation this near to a new one is replaced by it
 EXTRAPOLATION_POINTS = 3
 
 
@@ -33,6 +35,7 @@ class Equations:
     tangent : x -> free-free matrix and free-fixed matrix
     weight : (free,) one over the tolerance of each unknown; a step is small where |weight step| < 1
     scale : (free,) size of each unknown in the linear solves, so that the matrix is balanced
+    place : coordinates, each of order one, in which near equations have near tangents
     """
 
     free: np.ndarray
@@ -40,6 +43,7 @@ class Equations:
     tangent: Callable[[Array], tuple[sp.csr_matrix, sp.csr_matrix]]
     weight: Array
     scale: Array
+    place: Array
 
 
 @dataclass
@@ -51,24 +55,39 @@ class NewtonSolver:
         default_factory=lambda: {"iterations": 0, "residuals": 0, "factorisations": 0, "solves": 0}
     )
     last_residual: float = np.nan
-    _factors: Factorisation = field(init=False)
-    _ready: bool = False
+    _factors: Factorisations = field(init=False)
+    _places: dict[int, Array] = field(default_factory=dict)  # number of a kept factorisation: its place
+    _used: dict[int, int] = field(default_factory=dict)  # and when it last served
+    _current: int = 0
 
     def __post_init__(self) -> None:
-        self._factors = factorisation(self.symmetric)
+        self._factors = factorisations(self.symmetric)
 
     def release(self) -> None:
         """Frees the factors."""
         self._factors.release()
-        self._ready = False
+        self._places.clear()
 
     def renew(self, equations: Equations, x: Array) -> sp.csr_matrix:
         """Factorises the tangent at x; returns its free-fixed part, for prescribed increments."""
         free_free, free_fixed = equations.tangent(x)
-        self._factors.factorise(free_free, equations.scale)
+        self._current = self._number_for(equations.place)
+        self._places[self._current] = equations.place
+        self._factors.factorise(self._current, free_free, equations.scale)
         self.counts["factorisations"] += 1
-        self._ready = True
         return free_fixed
+
+    def _number_for(self, place: Array) -> int:
+        """Of the kept one at this place, else a free number, else of the one that has not served longest."""
+        nearest = self._nearest(place)
+        if nearest is not None and np.abs(self._places[nearest] - place).sum() < SAME_PLACE:
+            return nearest
+        if len(self._places) < self._factors.room:
+            return len(self._places)
+        return min(self._places, key=lambda number: self._used[number])
+
+    def _nearest(self, place: Array) -> int | None:
+        return min(self._places, key=lambda n: float(np.abs(self._places[n] - place).sum()), default=None)
 
     def respond(self, equations: Equations, x: Array, target: Array, fixed: np.ndarray) -> Array | None:
         """First guess when the fixed dofs jump from x to `target`: the linear response of the free ones.
@@ -88,14 +107,17 @@ class NewtonSolver:
     def back_substitute(self, right: Array) -> Array:
         """Solves with the tangent factorised last, (free,)."""
         self.counts["solves"] += 1
-        return self._factors.solve(right)
+        self._used[self._current] = self.counts["solves"]
+        return self._factors.solve(self._current, right)
 
     def solve(self, equations: Equations, guess: Array) -> Array | None:
         """The solution from a guess whose fixed dofs are already right; None if none was found."""
-        x, fresh = guess.copy(), False
-        if not self._ready:
+        x, nearest = guess.copy(), self._nearest(equations.place)
+        fresh = nearest is None
+        if nearest is None:
             self.renew(equations, x)
-            fresh = True
+        else:
+            self._current = nearest
         for _ in range(MAX_RENEWALS):
             x_new, converged = self._broyden(equations, x, fresh)
             if converged:
@@ -119,11 +141,12 @@ class NewtonSolver:
         if right is None:
             return None, False
         steps = [-self.back_substitute(right) * equations.weight]  # in units of the tolerance
-        previous, free = np.inf, equations.free
+        sizes: list[float] = []
+        free = equations.free
         for iteration in range(MAX_BROYDEN):
             self.counts["iterations"] += 1
             size = float(np.abs(steps[-1]).max())
-            if not np.isfinite(size) or (size > 2.0 * previous and iteration > 1):
+            if not np.isfinite(size) or (iteration > 1 and size > 2.0 * sizes[-1]):
                 return (x if fresh else None), False
             trial = x.copy()
             trial[free] += steps[-1] / equations.weight
@@ -134,9 +157,9 @@ class NewtonSolver:
             if size < 1.0:
                 self.last_residual = float(np.abs(right).max())
                 return x, True
-            if iteration > 1 and size > SLOW * previous:
+            if iteration > 1 and _iterations_left(size, sizes) > DEAR:
                 return x, False
-            previous = size
+            sizes.append(size)
             steps.append(self._updated_step(equations, steps, right))
         return x, False
 
@@ -160,11 +183,22 @@ class NewtonSolver:
         return None
 
 
+def _iterations_left(size: float, before: list[float]) -> float:
+    """Until a step is below 1 at the mean contraction of the last two (Broyden's method goes by fits)."""
+    contraction = np.sqrt(size / before[-2])
+    return float(np.log(size) / -np.log(contraction)) if contraction < 1.0 else np.inf
+
+
 def extrapolate(past: Sequence[tuple[float, Array]], time_s: float) -> Array:
     """Unknowns (dofs,) at a later time by the polynomial through (at most) the last three (time, x)."""
     last = past[-EXTRAPOLATION_POINTS:]
-    guess = np.zeros_like(last[-1][1])
-    for i, (own, x) in enumerate(last):
-        others = [other for j, (other, _) in enumerate(last) if j != i]
-        guess += x * np.prod([(time_s - other) / (own - other) for other in others])
-    return guess
+    weights = extrapolation_weights([time for time, _ in last], time_s)
+    return np.asarray(sum(weight * x for weight, (_, x) in zip(weights, last, strict=True)))
+
+
+def extrapolation_weights(times_s: Sequence[float], time_s: float) -> list[float]:
+    """Weights of values at `times_s` in their polynomial's value at another time (Lagrange)."""
+    return [
+        float(np.prod([(time_s - other) / (own - other) for other in times_s if other != own]))
+        for own in times_s
+    ]
