@@ -71,6 +71,7 @@ def octant(cells: int) -> SkinMesh:
     shell = inner + across.p[0] * (inner / np.linalg.norm(inner, axis=0) - inner)
     for turn in range(3):
         flat = flat + skfem.MeshHex(np.roll(shell, turn, axis=0), across.t)
+    flat = skfem.MeshHex(np.ascontiguousarray(flat.p), np.ascontiguousarray(flat.t))
     curved = skfem.MeshHex2.from_mesh(flat)
     outside = np.linalg.norm(flat.p, axis=0) > 1 - 1e-6
     facets = np.flatnonzero(outside[flat.facets].all(axis=0))
@@ -81,7 +82,7 @@ def octant(cells: int) -> SkinMesh:
     return SkinMesh(mesh, {"surface": facets}, np.zeros(mesh.nelements, bool), "octant")
 
 
-CRYER = [(4, 0.03), pytest.param(6, 0.014, marks=pytest.mark.slow)]
+CRYER = [(4, 0.03), pytest.param(6, 0.016, marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize(("cells", "bound"), CRYER)
