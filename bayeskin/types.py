@@ -7,7 +7,7 @@ Arrays in these types are read-only; a change makes a new object (`dataclasses.r
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -175,7 +175,8 @@ class Simulation(_FreezesArrays):
 
     time_s, displacement_m, force_n (n,): accepted steps, corners of the protocol among them.
     `displacement_m` is the LVDT displacement. `corner` (n,) is True at the protocol's corners,
-    where the slope of the force jumps. `stats` holds counts and seconds (floats).
+    where the slope of the force jumps. `stats` holds counts and seconds (floats). gradient_n (n, r):
+    derivatives of the force by the logarithms of the parameters `gradient_names`, if they were asked for.
     """
 
     theta: Mapping[str, float]
@@ -187,6 +188,8 @@ class Simulation(_FreezesArrays):
     message: str
     stats: Mapping[str, float]
     model_hash: str
+    gradient_names: tuple[str, ...] = ()
+    gradient_n: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def at(self, time_s: ArrayLike) -> Array:
         """Force [N] between steps: monotone cubic (PCHIP) inside each phase, continuous at corners."""
@@ -207,6 +210,11 @@ class Simulation(_FreezesArrays):
         edges = np.asarray(edges_s, dtype=float)
         fine = edges[:-1, None] + np.linspace(0.0, 1.0, 11) * np.diff(edges)[:, None]
         return np.asarray(np.trapezoid(self.at(fine), dx=0.1, axis=1))
+
+    def gradient_bin_means(self, edges_s: ArrayLike) -> Array:
+        """Mean of each column of `gradient_n` over each bin [N], (m, r)."""
+        columns = [replace(self, force_n=column).bin_means(edges_s) for column in self.gradient_n.T]
+        return np.stack(columns, axis=1)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ an error of the force in newtons, which steers the step.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -50,13 +50,29 @@ class State:
 
 
 @dataclass(frozen=True)
+class Stage:
+    """One solved implicit equation J - J* ... = h* div(...).
+
+    state : its end; length_s : h*; history : with J*, p*, which are the weighted sum of `sources`;
+    residual : (dofs,) at the end, zero to the solver's tolerance but for the reactions
+    """
+
+    state: State
+    length_s: float
+    history: State
+    sources: tuple[tuple[float, State], ...]
+    residual: Array
+
+
+@dataclass(frozen=True)
 class Step:
-    """One accepted step: its end state, the force there [N] and the estimated local error [N]."""
+    """One accepted step: end state, force there [N], estimated local error [N], and how it was solved."""
 
     state: State
     force_n: float
     error_n: float
     corner: bool
+    stages: tuple[Stage, ...] = ()
 
 
 @dataclass
@@ -75,6 +91,9 @@ class LagrangianModel:
         self._points, self._response = assembly.points(shape), assembly.response(shape)
         self._linearised = assembly.linearised(shape)
         self._data = np.empty(self.problem.pattern.size)  # overwritten by each tangent
+        # the reaction's derivative (free,) by the free unknowns, at the last tangent
+        self.pad_gradient = np.zeros(len(self.problem.pattern.free))
+        self._on_pad = np.isin(self.problem.pattern.fixed, self.problem.pad_x).astype(float)
         self._travel: Array | None = None  # change of the unknowns a metre of the pads' travel
 
     def remember_travel(self, past: list[State]) -> None:
@@ -94,9 +113,11 @@ class LagrangianModel:
         shape = space.weight.shape
         return State(0.0, x, np.ones(shape), np.full(shape, float(p_init)))
 
-    def residual(self, x: Array, h: float, old: State) -> tuple[Array, Array, Array] | None:
-        """Residual (dofs,), J and p (e, q); None where a cell has turned inside out."""
-        s, m, at, found = self.problem.space, self.material, self._points, self._response
+    def residual(
+        self, x: Array, h: float, old: State, material: Material | None = None
+    ) -> tuple[Array, Array, Array] | None:
+        """Residual (dofs,), J and p (e, q), of this or another material; None if a cell is inside out."""
+        s, m, at, found = self.problem.space, material or self.material, self._points, self._response
         volume = np.empty(s.weight.shape)
         self._evaluate(x)
         smallest = poroelastic.respond(
@@ -126,7 +147,9 @@ class LagrangianModel:
             s.grad_u, s.grad_p, s.value_p, s.weight, by.stress_f, by.stress_p, by.content_f, by.content_p,
             by.flux_f, by.flux_g, self.problem.pattern.position, data,
         )  # fmt: skip
-        return self.problem.pattern.matrices(data)
+        free_free, free_fixed = self.problem.pattern.matrices(data)
+        self.pad_gradient = 2.0 * (free_fixed @ self._on_pad)
+        return free_free, free_fixed
 
     def _evaluate(self, x: Array) -> None:
         s, at = self.problem.space, self._points
@@ -173,9 +196,25 @@ class LagrangianModel:
             0.5 * float(np.abs(self.motion.displacement_m).max()), float(np.abs(u).max()), SMALLEST_MOTION_M
         )
 
-    def solve_stage(self, time_s: float, h: float, old: State, guess: Array, jump: bool) -> State | None:
-        """One implicit stage ending at time_s; `jump`: the guess knows nothing of the pads' motion."""
-        equations, fixed = self.equations(h, old), self.problem.pattern.fixed
+    def solve_stage(
+        self,
+        time_s: float,
+        length_s: float,
+        sources: tuple[tuple[float, State], ...],
+        guess: Array,
+        jump: bool,
+    ) -> Stage | None:
+        """One implicit equation for time_s; `jump`: the guess knows nothing of the pads' motion.
+
+        The last source's unknowns are where the pads have been.
+        """
+        old = State(
+            sources[-1][1].time_s,
+            sources[-1][1].x,
+            np.asarray(sum(weight * state.volume for weight, state in sources)),
+            np.asarray(sum(weight * state.pressure for weight, state in sources)),
+        )
+        equations, fixed = self.equations(length_s, old), self.problem.pattern.fixed
         target = self.problem.prescribe(guess, self.pad_displacement(time_s))
         x = None
         if not jump:
@@ -188,12 +227,16 @@ class LagrangianModel:
         if x is None and jump:
             start = self.solver.respond(equations, guess, target, fixed)
             x = None if start is None else self.solver.solve(equations, start)
-        return None if x is None else State(time_s, x, self._volume, self._pressure)
+        if x is None:
+            return None
+        state = State(time_s, x, self._volume, self._pressure)
+        return Stage(state, length_s, old, sources, self.full_residual)
 
-    def finish(self, state: State, mass: Array, h: float, old: State) -> Step:
-        """The step that ended in `state` with the local error `mass` (e, q) of the fluid mass."""
-        force = self.problem.reaction(self.full_residual)
-        return Step(state, force, self.force_of_mass_error(state, mass, h, old), corner=False)
+    def finish(self, stages: tuple[Stage, ...], mass: Array) -> Step:
+        """The step made of `stages`, with the local error `mass` (e, q) of the fluid mass."""
+        force, last = self.problem.reaction(self.full_residual), stages[-1]
+        error = self.force_of_mass_error(last.state, mass, last.length_s, last.history)
+        return Step(last.state, force, error, corner=False, stages=stages)
 
     def force_of_mass_error(self, state: State, mass: Array, h: float, old: State) -> float:
         """Change of the reaction [N] that an error of the fluid mass (e, q) makes, to first order."""
@@ -218,45 +261,38 @@ def advance(model: LagrangianModel, past: list[State], h: float) -> Step | None:
 
 
 def _runge_kutta(model: LagrangianModel, past: list[State], h: float) -> Step | None:
-    first, second = GAMMA * h, (1.0 - GAMMA) * h
+    first = GAMMA * h
     state = past[-1]
-    t1 = state.time_s + first
-    one = model.solve_stage(t1, first, state, _guess(past, t1), len(past) == 1)
+    t1, t2 = state.time_s + first, state.time_s + h
+    one = model.solve_stage(t1, first, ((1.0, state),), _guess(past, t1), len(past) == 1)
     if one is None:
         return None
-    rate_v, rate_p = (one.volume - state.volume) / first, (one.pressure - state.pressure) / first
-    history = State(t1, one.x, state.volume + second * rate_v, state.pressure + second * rate_p)
-    t2 = state.time_s + h
-    two = model.solve_stage(t2, first, history, _guess([*past, one], t2), False)
+    ahead = (1.0 - GAMMA) / GAMMA
+    sources = ((1.0 - ahead, state), (ahead, one.state))
+    two = model.solve_stage(t2, first, sources, _guess([*past, one.state], t2), False)
     if two is None:
         return None
-    mass = (two.volume - history.volume) - (one.volume - state.volume)
-    return model.finish(two, mass, first, history)
+    mass = (two.state.volume - two.history.volume) - (one.state.volume - state.volume)
+    return model.finish((one, two), mass)
 
 
 def _backward_difference(model: LagrangianModel, past: list[State], h: float) -> Step | None:
     older, old, state = past[-3:]
     before, earlier = state.time_s - old.time_s, old.time_s - older.time_s
     ratio = h / before
-    length = h * (1.0 + ratio) / (1.0 + 2.0 * ratio)
-    new, past_weight = (1.0 + ratio) ** 2 / (1.0 + 2.0 * ratio), -(ratio**2) / (1.0 + 2.0 * ratio)
-    history = State(
-        state.time_s,
-        state.x,
-        new * state.volume + past_weight * old.volume,
-        new * state.pressure + past_weight * old.pressure,
-    )
+    spread = 1.0 + 2.0 * ratio
+    sources = ((-(ratio**2) / spread, old), ((1.0 + ratio) ** 2 / spread, state))
     time_s = state.time_s + h
-    found = model.solve_stage(time_s, length, history, _guess(past, time_s), False)
-    if found is None:
+    stage = model.solve_stage(time_s, h * (1.0 + ratio) / spread, sources, _guess(past, time_s), False)
+    if stage is None:
         return None
     # both the quadratic extrapolation and the formula err by a multiple of the third derivative
-    corrector = (1.0 + ratio) ** 2 * h**3 / (6.0 * ratio * (1.0 + 2.0 * ratio))
+    corrector = (1.0 + ratio) ** 2 * h**3 / (6.0 * ratio * spread)
     predictor = h * (h + before) * (h + before + earlier) / 6.0
     weights = extrapolation_weights([s.time_s for s in past[-3:]], time_s)
     extrapolated = sum(w * s.volume for w, s in zip(weights, past[-3:], strict=True))
-    mass = (found.volume - extrapolated) * corrector / (corrector + predictor)
-    return model.finish(found, mass, length, history)
+    mass = (stage.state.volume - extrapolated) * corrector / (corrector + predictor)
+    return model.finish((stage,), mass)
 
 
 def _guess(past: list[State], time_s: float) -> Array:
@@ -295,10 +331,9 @@ def integrate(
                 continue
             state, count = step.state, count + 1
             past = [*past, state][-EXTRAPOLATION_POINTS:]
-            on_step(Step(state, step.force_n, step.error_n, corner=abs(state.time_s - end) < 1e-9))
+            on_step(replace(step, corner=abs(state.time_s - end) < 1e-9))
             h *= min(GROWTH, 0.9 / np.sqrt(max(excess, 1e-6)))
         model.remember_travel(past)
-        state = State(float(end), state.x, state.volume, state.pressure)
     return ""
 
 

@@ -44,7 +44,7 @@ class Factorisations(Protocol):
     def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None: ...
 
     def solve(self, number: int, right: Array) -> Array:
-        """Solves with the matrix last given to `factorise` under this number."""
+        """Solves with the matrix last given to `factorise` under this number; right (n,) or (n, r)."""
         ...
 
     def release(self) -> None: ...
@@ -92,14 +92,12 @@ class _Pardiso:
         self._indptr = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
 
     def solve(self, number: int, right: Array) -> Array:
-        scale = self._stored[number][1]
+        scale = self._stored[number][1].reshape((-1,) + (1,) * (right.ndim - 1))
         scaled = right * scale
-        size = float(np.abs(scaled).max())
-        if not size > 0.0:
-            return np.zeros_like(scaled)
-        # to size one, so that nothing underflows in single precision
-        found = self._call(number, _SOLVE, (scaled / size).astype(np.float32))
-        return found.astype(float) * (size * scale)
+        # each column to size one, so that nothing underflows in single precision
+        size = np.maximum(np.abs(scaled).max(axis=0), np.finfo(float).tiny)
+        found = self._call(number, _SOLVE, np.asfortranarray(scaled / size, dtype=np.float32))
+        return np.asarray(found.astype(float) * (size * scale))
 
     def release(self) -> None:
         """Gives MKL's memory back; Python's collector knows nothing of it."""
@@ -110,7 +108,7 @@ class _Pardiso:
     def _call(self, number: int, phase: int, right: np.ndarray | None = None) -> np.ndarray:
         n = len(self._indptr) - 1
         right = np.zeros(n, np.float32) if right is None else right
-        solution, error = np.zeros(n, np.float32), ctypes.c_int32(0)
+        solution, error = np.zeros_like(right), ctypes.c_int32(0)
         entries = next(iter(self._stored.values()))[0] if phase == _RELEASE else self._stored[number][0]
 
         def integer(value: int) -> object:
@@ -122,7 +120,7 @@ class _Pardiso:
         self._pardiso(
             pointer(self._handle), integer(MOST), integer(number + 1), integer(self._type),
             integer(phase), integer(n), pointer(entries), pointer(self._indptr), pointer(self._indices), None,
-            integer(1), pointer(self._settings), integer(0), pointer(right), pointer(solution),
+            integer(right.size // n), pointer(self._settings), integer(0), pointer(right), pointer(solution),
             ctypes.byref(error),
         )  # fmt: skip
         if error.value != 0:
@@ -147,6 +145,7 @@ class _SuperLU:
 
     def solve(self, number: int, right: Array) -> Array:
         factors, scale = self._stored[number]
+        scale = scale.reshape((-1,) + (1,) * (right.ndim - 1))
         return np.asarray(factors.solve(right * scale) * scale)
 
     def release(self) -> None:

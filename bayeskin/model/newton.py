@@ -104,8 +104,13 @@ class NewtonSolver:
         )
         return guess
 
+    def toward(self, place: Array) -> None:
+        """Takes the factorisation nearest to a place for the coming back-substitutions."""
+        nearest = self._nearest(place)
+        self._current = self._current if nearest is None else nearest
+
     def back_substitute(self, right: Array) -> Array:
-        """Solves with the tangent factorised last, (free,)."""
+        """Solves with the tangent factorised or taken last, (free,) or (free, r)."""
         self.counts["solves"] += 1
         self._used[self._current] = self.counts["solves"]
         return self._factors.solve(self._current, right)

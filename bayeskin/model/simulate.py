@@ -14,12 +14,13 @@ import numpy as np
 
 from bayeskin.errors import InputError
 from bayeskin.model import article, lagrangian
+from bayeskin.model.gradients import DIFFERENTIATED, ForceGradients
 from bayeskin.model.linear import SOLVER_NAME
 from bayeskin.model.mesh import SkinMesh, brick_mesh, read_gmsh
 from bayeskin.model.problem import PARAMETERS, Constants, Problem, build_problem, material
 from bayeskin.types import Array, Observation, PadMotion, Simulation, frozen_array
 
-PHYSICS_VERSION = 1  # raised whenever a change of the code changes the force that a run gives
+PHYSICS_VERSION = 1  # raised when a change of the code changes a force by more than its tolerance
 ARTICLE_STEP_S = 0.5  # every 50th sample of a 100 Hz recording
 ARTICLE_HOLD_STEPS = (0.5, 8.0, 1.3)  # first, longest, growth: see ModelSpec.article_steps
 
@@ -73,18 +74,23 @@ def simulate(
     theta: Mapping[str, float],
     on_progress: Callable[[float], None] | None = None,
     on_state: OnState | None = None,
+    gradients: bool = False,
 ) -> Simulation:
     """Runs the full model over the whole motion.
 
     theta : E_c, E_s [Pa], k_c, k_s [m^2], p_init [Pa]
     on_progress : called with the fraction of the motion that is done
     on_state : called with time [s], all unknowns (dofs,) and force [N] of each accepted step
+    gradients : also the force's derivatives by the logarithms of `gradients.DIFFERENTIATED`, `reaction` only
 
     A run that does not converge is a Simulation with status "failed", its steps so far, and a
     message with the step, the time and a remedy. Raises InputError for a parameter that is
     missing, unknown, not finite, or not positive where it must be.
     """
     _check(theta)
+    if gradients and spec.observation != "reaction":
+        raise InputError("gradients", f"observation {spec.observation!r}", "observation 'reaction'")
+    slopes: ForceGradients | None = None
     problem = problem_of(spec.mesh, spec.refinement)
     times, forces = [0.0], [0.0]
     corners, errors = [True], [0.0]
@@ -105,12 +111,17 @@ def simulate(
     cells = material(theta, problem.mesh.cutis)
     if spec.observation == "reaction":
         model = lagrangian.LagrangianModel(problem, cells, motion)
-        message = lagrangian.integrate(
-            model,
-            theta["p_init"],
-            spec.tolerance,
-            lambda s: record(s.state.time_s, s.state.x, s.force_n, s.corner, s.error_n),
-        )
+        slopes = ForceGradients(model, theta) if gradients else None
+
+        def on_step(step: lagrangian.Step) -> None:
+            if slopes is not None and step.stages:
+                slopes.follow(step)
+            record(step.state.time_s, step.state.x, step.force_n, step.corner, step.error_n)
+
+        try:
+            message = lagrangian.integrate(model, theta["p_init"], spec.tolerance, on_step)
+        except FloatingPointError as error:
+            message = str(error)
         solver = model.solver
     else:
         old = article.ArticleModel(problem, cells)
@@ -134,6 +145,7 @@ def simulate(
         "peak_force_n": peak,
         "last_residual": float(solver.last_residual),
         **{name: float(count) for name, count in solver.counts.items()},
+        **({"seconds_of_gradients": slopes.seconds} if slopes else {}),
     }
     return Simulation(
         theta={name: float(theta[name]) for name in PARAMETERS},
@@ -145,6 +157,8 @@ def simulate(
         message=message,
         stats=stats,
         model_hash=spec.hash,
+        gradient_names=DIFFERENTIATED if slopes else (),
+        gradient_n=np.array(slopes.force_n) if slopes else np.zeros((0, 0)),
     )
 
 

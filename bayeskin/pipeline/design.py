@@ -24,10 +24,10 @@ from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.shipping import check_fits, shipped_files
 from bayeskin.runner import load_design, run_design
-from bayeskin.surrogates import load_manifest, train
+from bayeskin.surrogates import Similarity, load_manifest, train
 from bayeskin.types import Array, BinnedForce, Design, PadMotion, ParameterSpace
 
-FEWEST_PER_PARAMETER = 4  # training runs below which no surrogate of a parameter space is worth its name
+FEWEST_PER_INPUT = 4  # training runs below which no surrogate is worth its name
 
 
 def fitted_bins(run: Run, binned: BinnedForce) -> NDArray[np.bool_]:
@@ -138,7 +138,7 @@ def _rows_of(runs: Design, waves: Sequence[Wave]) -> Design:
 
 def enough(design: Design) -> Design:
     """The design, if a surrogate can be made of it; raises CannotGoOn that names the commonest failure."""
-    needed = FEWEST_PER_PARAMETER * design.space.dim
+    needed = FEWEST_PER_INPUT * Similarity(design.space).dim
     found = int(design.training.sum())
     if found >= needed and design.testing.any():
         return design

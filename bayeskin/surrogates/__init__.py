@@ -1,11 +1,12 @@
 """Surrogates of the full model: trained on a design, honest about their error, stored without code."""
 
 from bayeskin.surrogates.files import load_manifest, load_surrogate, manifest_of, save_surrogate
+from bayeskin.surrogates.similarity import Similarity
 from bayeskin.surrogates.surrogate import ShapeSurrogate
 from bayeskin.surrogates.train import train
 from bayeskin.surrogates.validate import Validation, validate
 
 __all__ = [
-    "ShapeSurrogate", "Validation", "load_manifest", "load_surrogate", "manifest_of", "save_surrogate",
-    "train", "validate",
+    "ShapeSurrogate", "Similarity", "Validation", "load_manifest", "load_surrogate", "manifest_of",
+    "save_surrogate", "train", "validate",
 ]  # fmt: skip
