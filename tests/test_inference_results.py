@@ -26,6 +26,7 @@ from bayeskin.inference import (
     identifiability,
     load_inference_data,
     optimise,
+    polish_map,
     predictive_draws,
     refine_map,
     rmse,
@@ -307,3 +308,35 @@ def test_a_broken_write_leaves_the_earlier_file(
     for bad in (path, tmp_path / "none.nc"):
         with pytest.raises(InputError):
             load_inference_data(bad)
+
+
+def full_run_with_derivatives(theta):
+    """The toy with its derivatives by central differences of logarithms."""
+    run, names, h = full_run(theta), ("E_c", "E_s", "k_c", "k_s"), 1e-4
+
+    def shifted(name, sign):
+        return full_run({**theta, name: theta[name] * np.exp(sign * h)}).force_n
+
+    columns = [(shifted(name, 1) - shifted(name, -1)) / (2 * h) for name in names]
+    return dataclasses.replace(run, gradient_names=names, gradient_n=np.stack(columns, axis=1))
+
+
+def test_polish_climbs_the_full_model_from_where_a_wrong_surrogate_left_it():
+    wrong = toy_problem(surrogate=ToySurrogate(bias_n=5e-3))
+    start = dict(find_map(wrong, seed=1, starts=1, evaluations=4000).theta)
+    polished = polish_map(wrong, full_run_with_derivatives, start)
+    assert polished.gained > 5.0, polished.message
+    assert "converged" in polished.message
+    right = find_map(toy_problem(surrogate=ToySurrogate(sd_n=1e-7)), seed=1, starts=2, evaluations=8000)
+    exact = toy_problem(surrogate=ToySurrogate(sd_n=1e-7))
+    values = exact.log_prob(np.stack([exact.vector(polished.theta), exact.vector(right.theta)]))
+    assert values[0] > values[1] - 0.5
+
+
+def test_polish_ends_at_a_full_run_that_fails():
+    problem = toy_problem()
+    start = dict(find_map(problem, seed=1, starts=1, evaluations=4000).theta)
+    failing = dataclasses.replace(full_run(TRUTH), status="failed", message="step 3")
+    polished = polish_map(problem, lambda theta: failing, start)
+    assert polished.theta == start
+    assert "step 3" in polished.message

@@ -53,7 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     storage.save(where / "measured.h5", recording)
     (where / "case.toml").write_text(CONFIG.format(steps=200))
 
-    def interrupted(*_: object) -> None:
+    def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     def drawn(figure: object, stem: Path, provenance: str) -> None:

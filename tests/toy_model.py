@@ -19,19 +19,30 @@ def simulate(
     theta: Mapping[str, float],
     on_progress: Callable[[float], None] | None = None,
     on_state: Callable[[float, object, float], None] | None = None,
+    gradients: bool = False,
 ) -> Simulation:
     if on_state is not None:
         on_state(0.0, None, 0.0)
     time_s = np.unique(np.concatenate([np.linspace(0, motion.time_s[-1], 261), motion.time_s]))
-    row = np.array([[theta[name] for name in SPACE.names]])
+    names = SPACE.names[:4] if gradients else ()
+    force, step = _force(theta, time_s, motion), 1.001
+    slopes = [
+        (_force({**theta, name: theta[name] * step}, time_s, motion) - force) / np.log(step) for name in names
+    ]
     return Simulation(
         theta=dict(theta),
         time_s=time_s,
         displacement_m=motion.at(time_s),
-        force_n=SCALE * toy_force(row, time_s, motion)[0],
+        force_n=force,
         corner=frozen_array(np.isin(time_s, motion.time_s), bool),
         status="ok",
         message="",
         stats={"seconds": 0.0, "steps": 261.0, "dofs": 1.0, "peak_force_n": 1.0},
         model_hash=spec.hash,
+        gradient_names=names,
+        gradient_n=np.array(slopes).T if names else np.zeros((0, 0)),
     )
+
+
+def _force(theta: Mapping[str, float], time_s: np.ndarray, motion: PadMotion) -> np.ndarray:
+    return SCALE * toy_force(np.array([[theta[name] for name in SPACE.names]]), time_s, motion)[0]

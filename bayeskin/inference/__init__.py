@@ -21,6 +21,7 @@ from bayeskin.inference.inference_data import (
 )
 from bayeskin.inference.noise_model import NoisePriors
 from bayeskin.inference.optimise import MapResult, StartResult, find_map
+from bayeskin.inference.polish import Polished, polish_map
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.sample import Posterior, SampleSettings, load_chains, sample
 
@@ -35,6 +36,7 @@ __all__ = [
     "MapCheck",
     "MapResult",
     "NoisePriors",
+    "Polished",
     "Posterior",
     "RefinedMap",
     "Ridge",
@@ -51,6 +53,7 @@ __all__ = [
     "identifiability",
     "load_chains",
     "load_inference_data",
+    "polish_map",
     "predictive_draws",
     "refine_map",
     "rmse",

@@ -86,6 +86,19 @@ def find_map(
     return MapResult(best.theta, best.value, tuple(results), agreement)
 
 
+def climb(log_posterior: LogPosterior, start: Mapping[str, float], evaluations: int = 4000) -> StartResult:
+    """The local maximum near `start` (all parameters, SI; moved into the box if outside it)."""
+    space = _SearchSpace(log_posterior)
+    low, high = log_posterior.bounds
+    search = _Search(space)
+    search.best = space.unit(np.clip(log_posterior.vector(start), low, high)[None])[0]
+    status = "failed: no density found"
+    for algorithm in (nlopt.LD_LBFGS, nlopt.LN_SBPLX, nlopt.LD_LBFGS):
+        status = search.run(algorithm, search.best, evaluations // 3, 1e-6)
+    theta = log_posterior.from_sampling(space.points(search.best[None])[0][0])
+    return StartResult(log_posterior.named(theta), search.value, status, search.evaluations)
+
+
 def _one_start(search_space: _SearchSpace, seed: int, evaluations: int) -> StartResult:
     nlopt.srand(seed)
     unit = np.random.default_rng(seed).uniform(size=search_space.log_posterior.dim)
@@ -121,6 +134,11 @@ class _SearchSpace:
         low, high = self.log_posterior.bounds
         inside = np.clip(x, low, high)
         return inside, np.linalg.norm((x - inside) / (high - low), axis=1)
+
+    def unit(self, x: Array) -> Array:
+        """Unit-cube coordinates (n, D) of sampling coordinates."""
+        straight = x if self.shear is None else self.shear.straight(x)
+        return np.clip((straight - self.low) / (self.high - self.low), 0.0, 1.0)
 
     def values(self, unit: Array) -> Array:
         """Log densities (n,); less a steep cone outside the prior box, finite throughout."""

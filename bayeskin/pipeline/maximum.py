@@ -21,15 +21,15 @@ from bayeskin.types import Array, BinnedForce, Design, PadMotion, Simulation, Su
 
 
 class _FullModel:
-    """Full runs for the check, kept, so that an interrupted search does not make one twice."""
+    """Full runs, with `gradients` or without, kept, so that an interrupted search makes none twice."""
 
-    def __init__(self, run: Run) -> None:
-        self.run, self.spec = run, model_spec(run)
+    def __init__(self, run: Run, gradients: bool = False) -> None:
+        self.run, self.spec, self.gradients = run, model_spec(run), gradients
         self.motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
         self.count = 0
 
     def __call__(self, theta: Mapping[str, float]) -> Simulation:
-        kept = self.run.at("map", f"full-run-{self.count}.h5")
+        kept = self.run.at("map", f"{'polish' if self.gradients else 'full'}-run-{self.count}.h5")
         self.count += 1
         if kept.is_file():
             stored = storage.load(kept, Simulation)
@@ -38,7 +38,9 @@ class _FullModel:
         self.run.reporter.log("map: full run at " + ", ".join(f"{k} = {v:.4g}" for k, v in theta.items()))
         label = f"full run {self.count}"
         tell = self.run.reporter.progress
-        simulation = simulate(self.spec, self.motion, theta, lambda share: tell(label, share))
+        simulation = simulate(
+            self.spec, self.motion, theta, lambda share: tell(label, share), gradients=self.gradients
+        )
         storage.save(kept, simulation)
         return simulation
 
@@ -85,7 +87,22 @@ def _find(run: Run) -> Mapping[str, Any]:
     save_surrogate(run.at("map", "surrogate.h5"), retraining.surrogate, retraining.manifest)
     storage.save(run.at("map", "design.h5"), retraining.design)
     _draw_check(run, binned, refined)
-    return _found(refined, binned)
+    return {**_found(refined, binned), "polished": _polish(run, refined)}
+
+
+def _polish(run: Run, refined: RefinedMap) -> dict[str, Any] | None:
+    """The maximum of the full model itself, where it has derivatives."""
+    if run.config.model.observation != "reaction" or not refined.passes:
+        return None
+    full = _FullModel(run, gradients=True)
+    found = inference.polish_map(refined.log_posterior, full, refined.map.theta)
+    return {
+        "theta": dict(found.theta),
+        "log_posterior": found.value,
+        "gained": found.gained,
+        "full_runs": len(found.runs),
+        "message": found.message,
+    }
 
 
 def _found(refined: RefinedMap, binned: BinnedForce) -> dict[str, Any]:

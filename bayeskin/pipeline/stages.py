@@ -32,7 +32,12 @@ def _report(run: Run) -> Mapping[str, Any]:
         "model": {"observation": run.config.model.observation, "mesh": run.config.model.mesh},
         "posterior": sampled["parameters"],
         "identifiability": [*sampled["identifiability"], *sampled["ridges"]],
-        "map": {"theta": found["theta"], "message": found["message"], "surrogate_error": checked},
+        "map": {
+            "theta": found["theta"],
+            "message": found["message"],
+            "surrogate_error": checked,
+            "polished": found["polished"],
+        },
         "rmse": {
             "posterior_mean": sampled["rmse"],
             "full_model_at_map": found["rmse_of_full_model"],
@@ -87,11 +92,19 @@ def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str
         "train": lambda: (
             f"{said['kind']}, relative error {said['relative_error']:.3g} ({said['error_source']})"
         ),
-        "map": lambda: f"{said['message']}\n{said['checks'][-1]['message']}",
+        "map": lambda: "\n".join(
+            [said["message"], said["checks"][-1]["message"], *_polish(said["polished"])]
+        ),
         "sample": lambda: "\n".join([said["verdict"], *said["reasons"], *_table(said["parameters"])]),
         "sobol": lambda: "\n".join(one["sentence"] for one in said.values()),
     }
     return f"{head}\n{lines[answer.stage]()}\noutputs in {folder / answer.stage}"
+
+
+def _polish(polished: Mapping[str, Any] | None) -> list[str]:
+    if polished is None:
+        return []
+    return [f"polished on the full model: {polished['gained']:.2f} nats gained, {polished['message']}"]
 
 
 def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
