@@ -1,0 +1,113 @@
+"""The article's local sensitivity estimates (its appendix), for its force and for the reaction.
+
+Its metric is the mean over 18 s to 50 s of the force relative to the calibrated point's; theta_i is the
+metric's slope by a relative change of parameter i, and S_i = theta_i^2 / sum theta^2. Printed side by side:
+
+- the article's table, recomputed from its own force histories (`data/Sobol_indice.xlsx`), +-10 %;
+- our `article` observation on its mesh and steps, +-10 % (nine runs to 50 s, some minutes);
+- our `reaction`, by the derivatives that one run carries.
+
+Run with the supplement's folder in BAYESKIN_SUPPLEMENT:  python benchmarks/local_sobol.py
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import openpyxl
+
+from bayeskin.model import ModelSpec, simulate
+from bayeskin.types import Array, PadMotion
+
+NAMES = ("E_c", "E_s", "k_c", "k_s")
+SHEETS = {"E_c": "E1", "E_s": "E2", "k_c": "k1", "k_s": "k2"}
+POINT = {"E_c": 684250.48, "E_s": 47789.13, "k_c": 9.428584e-15, "k_s": 5.0299945e-13, "p_init": 700.0}
+WINDOW_S = (18.0, 50.0)
+CHANGE = 0.1
+
+
+def main() -> int:
+    """Prints the table; exit code 2 without the supplement."""
+    folder = os.environ.get("BAYESKIN_SUPPLEMENT")
+    if not folder:
+        print("BAYESKIN_SUPPLEMENT: found nothing; expected the supplement's folder", file=sys.stderr)
+        return 2
+    supplement = Path(folder)
+    mesh = str(supplement / "data" / "Mesh_SKIN.msh")
+    motion = _motion(supplement)
+    columns = {
+        "article's files": _of_files(supplement),
+        "article, ours": _of_article(mesh, motion),
+        "reaction, its mesh": _of_reaction(ModelSpec(mesh=mesh), motion),
+        "reaction, bricks": _of_reaction(ModelSpec(), motion),
+    }
+    print(f"{'':>6}" + "".join(f"{name:>34}" for name in columns))
+    for i, name in enumerate(NAMES):
+        cells = (f"theta {slopes[i]:+.4f}  S {share:.3f}" for slopes, share in _shares(columns, i))
+        print(f"{name:>6}" + "".join(f"{cell:>34}" for cell in cells))
+    return 0
+
+
+def _shares(columns: dict[str, Array], i: int) -> list[tuple[Array, float]]:
+    return [(slopes, float(slopes[i] ** 2 / np.sum(slopes**2))) for slopes in columns.values()]
+
+
+def _motion(supplement: Path) -> PadMotion:
+    table = np.loadtxt(supplement / "reference" / "article_forward.csv", delimiter=",", skiprows=1)
+    time_s, pad_m = np.concatenate([[[0.0, 0.0]], table[table[:, 0] <= WINDOW_S[1], :2]]).T
+    return PadMotion(time_s, 2.0 * pad_m)
+
+
+def _of_files(supplement: Path) -> Array:
+    book = openpyxl.load_workbook(supplement / "data" / "Sobol_indice.xlsx", data_only=True, read_only=True)
+
+    def force(sheet: str) -> tuple[Array, Array]:
+        rows = [row[:2] for row in book[sheet].iter_rows(min_row=2, values_only=True) if row[0] is not None]
+        time_s, force_n = np.array(rows, dtype=float).T
+        return time_s, force_n
+
+    time_s, reference = force("reference")
+    held = (time_s >= WINDOW_S[0]) & (time_s <= WINDOW_S[1])
+
+    def slope(sheet: str) -> float:
+        up, down = (np.mean(force(sheet + sign)[1][held] / reference[held]) for sign in "pm")
+        return float((up - down) / (2 * CHANGE))
+
+    return np.array([slope(SHEETS[name]) for name in NAMES])
+
+
+def _of_article(mesh: str, motion: PadMotion) -> Array:
+    spec = ModelSpec("article", mesh)
+
+    def force(theta: dict[str, float]) -> Array:
+        print(", ".join(f"{k} {v:.4g}" for k, v in theta.items()), file=sys.stderr)
+        run = simulate(spec, motion, theta)
+        if run.status != "ok":
+            raise SystemExit(run.message)
+        return run.force_n[(run.time_s >= WINDOW_S[0]) & (run.time_s <= WINDOW_S[1])]
+
+    reference = force(POINT)
+
+    def slope(name: str) -> float:
+        up, down = (
+            np.mean(force({**POINT, name: POINT[name] * (1 + sign * CHANGE)}) / reference) for sign in (1, -1)
+        )
+        return float((up - down) / (2 * CHANGE))
+
+    return np.array([slope(name) for name in NAMES])
+
+
+def _of_reaction(spec: ModelSpec, motion: PadMotion) -> Array:
+    corners = np.flatnonzero(np.abs(np.diff(np.diff(motion.displacement_m) / np.diff(motion.time_s))) > 1e-4)
+    kept = np.concatenate([[0], 1 + corners, [len(motion.time_s) - 1]])
+    run = simulate(spec, PadMotion(motion.time_s[kept], motion.displacement_m[kept]), POINT, gradients=True)
+    edges = np.linspace(*WINDOW_S, 65)
+    force, gradient = run.bin_means(edges), run.gradient_bin_means(edges)
+    return np.asarray(np.mean(gradient / force[:, None], axis=0))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
