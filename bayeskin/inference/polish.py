@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from bayeskin.inference.optimise import climb
 from bayeskin.inference.problem import LogPosterior
@@ -41,13 +41,17 @@ class LinearForce:
     gradient_n: Array
     provenance: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
+    @property
+    def moves(self) -> NDArray[np.bool_]:
+        """Whether each parameter has a derivative, (d,)."""
+        return np.any(self.gradient_n != 0.0, axis=0)
+
     def predict(self, theta: ArrayLike) -> Prediction:
         """Force at theta (n, d)."""
         ratio = np.atleast_2d(np.asarray(theta, dtype=float)) / self.theta
         moduli = np.array([p.stress_power == 1 for p in self.space.parameters])
-        known = np.any(self.gradient_n != 0.0, axis=0)
-        change = np.where(moduli, ratio - 1.0, np.log(np.where(known & ~moduli, ratio, 1.0)))
-        mean = self.force_n + np.where(known, change, 0.0) @ self.gradient_n.T
+        change = np.where(moduli, ratio - 1.0, np.log(np.where(self.moves & ~moduli, ratio, 1.0)))
+        mean = self.force_n + np.where(self.moves, change, 0.0) @ self.gradient_n.T
         return Prediction(mean, np.zeros((*mean.shape, 1)), np.zeros(mean.shape))
 
 
@@ -115,14 +119,19 @@ def _linearised(log_posterior: LogPosterior, run: Simulation) -> LogPosterior:
 def _maximum(
     about: LogPosterior, centre: Mapping[str, float], trust: float
 ) -> tuple[dict[str, float], float]:
-    """Maximum within `trust` of the centre's material parameters, noise free."""
-    narrowed = []
-    for p in about.surrogate.space.parameters:
+    """Maximum within `trust` of the centre's material parameters, noise free.
+
+    A parameter without derivative, such as p_init, stays where it is: nothing here moves the force by it.
+    """
+    linear, narrowed = about.surrogate, []
+    assert isinstance(linear, LinearForce)
+    for p, moves in zip(linear.space.parameters, linear.moves, strict=True):
+        reach = trust if moves else RUN_ITSELF
         middle = float(np.clip(centre[p.name], p.lower, p.upper))
         if p.prior == "log-uniform":
-            low, high = middle * np.exp(-trust), middle * np.exp(trust)
+            low, high = middle * np.exp(-reach), middle * np.exp(reach)
         else:
-            low, high = middle - trust * (p.upper - p.lower), middle + trust * (p.upper - p.lower)
+            low, high = middle - reach * (p.upper - p.lower), middle + reach * (p.upper - p.lower)
         narrowed.append(replace(p, lower=max(low, p.lower), upper=min(high, p.upper)))
     found = climb(replace(about, material=ParameterSpace(tuple(narrowed))), centre)
     return dict(found.theta), _density(about, found.theta)
