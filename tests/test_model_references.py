@@ -6,12 +6,14 @@ are marked slow; the first ramp and the start of the hold are checked each time.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import openpyxl
 import pytest
 from skin_test import supplement
 
-from bayeskin.model import ModelSpec, simulate
+from bayeskin.model import ModelSpec, article, simulate
 from bayeskin.model.article import ArticleModel
 from bayeskin.model.mesh import read_gmsh
 from bayeskin.model.problem import build_problem, material
@@ -133,3 +135,36 @@ def test_growing_steps_keep_every_step_of_a_ramp_and_thin_out_the_holds():
     assert growing[-1] == 90
     for start, end in ((10.0, 20.0), (80.0, 90.0)):
         assert {t for t in fixed if start <= t <= end} <= set(growing)
+
+
+class ScriptedForces:
+    """Stands in for `ArticleModel`: the forces of its steps are given."""
+
+    def __init__(self, forces: list[float]) -> None:
+        self.forces = iter(forces)
+        space = SimpleNamespace(dofs=4, n_nodes=1)
+        mesh = SimpleNamespace(geometry=SimpleNamespace(p=np.zeros((3, 1))))
+        self.problem = SimpleNamespace(space=space, mesh=mesh)
+        self.material = SimpleNamespace(mu=np.array([1e5]))
+
+    def step(self, x, corners, dt, pad, guess):
+        return x, next(self.forces)
+
+    def move(self, corners, old, new):
+        return corners
+
+
+@pytest.mark.parametrize(
+    ("forces", "stable"),
+    [
+        ([0.1, 0.2, 0.19, 0.18, 0.17, 0.16], True),  # a load and its relaxation
+        ([0.1, 0.2, 0.1995, 0.1997, 0.1994, 0.1996], True),  # rounding
+        ([0.1, 0.2, 0.17, 0.19, 0.15, 0.2], False),
+        ([1e-9, -1e-9, 2e-9, -3e-9, 2e-9, -1e-9], True),  # nothing has happened yet
+    ],
+)
+def test_an_article_run_whose_force_swings_has_failed(forces, stable):
+    time_s = np.arange(0.0, 3.5, 0.5)
+    pads = np.array([0.0, 1e-3, 2e-3, 2e-3, 2e-3, 2e-3, 2e-3])
+    message = article.run(ScriptedForces(forces), time_s, pads, 0.0, lambda *_: None)
+    assert (message == "") is stable, message

@@ -10,6 +10,9 @@ Its released script differs from the total-Lagrangian model in four ways:
 - force is the integral of t_xx - p over the pad's top face, whose normal is z, and is not doubled;
 - backward Euler on every 50th sample of the recording.
 
+Where the subcutis is soft beside the cutis (E_s below some 0.03 E_c), this updating is unstable: the force
+swings from step to step at a steady speed of the pads, and soon no step converges. Such a run has failed.
+
 Source: the script released with the article, physics unchanged (design: observation `article`).
 """
 
@@ -29,6 +32,9 @@ from bayeskin.types import Array
 
 SOLVER_TOLERANCE = 1e-4  # of the largest displacement and pressure, before the last correction
 FACE_QUADRATURE_DEGREE = 6
+PAD_AREA_M2 = 32e-6  # the quarter's share of the pad
+SMALLEST_STRESS = 1e-3  # of the shear modulus, below which no force is told from rounding
+SWING = 0.05  # of the largest force so far, to and fro at a steady speed: no relaxation does that
 
 
 @dataclass(frozen=True)
@@ -188,11 +194,13 @@ def run(
     x[3 * space.n_nodes :] = p_init
     corners = model.problem.mesh.geometry.p.T.copy()
     past, old_speed = [(0.0, x)], np.nan  # states since the pads' speed last changed
+    forces = [0.0]  # at those states
+    largest = SMALLEST_STRESS * float(model.material.mu.max()) * PAD_AREA_M2
     for n in range(1, len(time_s)):
         dt = float(time_s[n] - time_s[n - 1])
         speed = (displacement_m[n] - displacement_m[n - 1]) / dt
         if not abs(speed - old_speed) < 0.2 * abs(speed) + 1e-5:
-            past = past[-1:]
+            past, forces = past[-1:], forces[-1:]
         pad = 0.5 * float(displacement_m[n])
         guess = extrapolate(past, float(time_s[n])) if len(past) > 1 else None
         found = model.step(x, corners, dt, pad, guess)
@@ -205,6 +213,13 @@ def run(
             )
         new, force = found
         corners = model.move(corners, x, new)
+        largest, forces = max(largest, abs(force)), [*forces, force][-3:]
+        turns = np.diff(forces)
+        if len(turns) == 2 and turns[0] * turns[1] < 0 and np.abs(turns).min() > SWING * largest:
+            return (
+                f"the force swings by {np.abs(turns).min():.2g} N a step at t = {time_s[n]:.2f} s, at a "
+                "steady speed of the pads: the article's updated mesh is unstable; try a stiffer subcutis"
+            )
         x, old_speed = new, speed
         past = [*past, (float(time_s[n]), x)][-EXTRAPOLATION_POINTS:]
         on_step(float(time_s[n]), x, force)

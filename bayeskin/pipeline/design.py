@@ -28,6 +28,7 @@ from bayeskin.surrogates import Similarity, load_manifest, train
 from bayeskin.types import Array, BinnedForce, Design, PadMotion, ParameterSpace
 
 FEWEST_PER_INPUT = 4  # training runs below which no surrogate is worth its name
+FEWEST_COUNTING = 5  # training runs an input, weighted, below which components and errors are anecdotes
 
 
 def fitted_bins(run: Run, binned: BinnedForce) -> NDArray[np.bool_]:
@@ -43,11 +44,18 @@ def noise_floor_n(binned: BinnedForce, fitted: NDArray[np.bool_]) -> float:
 def focus(design: Design, binned: BinnedForce, fitted: NDArray[np.bool_]) -> Array:
     """Weights (n,) by which a surrogate is made best where the posterior can be.
 
-    The inverse of a run's mean square distance to the recording, which noise keeps from zero.
+    The inverse of a run's mean square distance to the recording, which noise keeps from zero; evened out
+    where too few runs would count.
     """
     square = np.mean((design.force_n[:, fitted] - binned.force_n[fitted]) ** 2, axis=1)
-    weight = 1.0 / (noise_floor_n(binned, fitted) ** 2 + square)
-    return np.where(design.ok, weight, 0.0) / np.max(weight[design.ok])
+    inverse = 1.0 / (noise_floor_n(binned, fitted) ** 2 + square)
+    inverse = np.where(design.ok, inverse, 0.0) / np.max(inverse[design.ok])
+    needed = FEWEST_COUNTING * Similarity(design.space).dim
+    for evenness in (1.0, 0.5, 0.25, 0.125):
+        weight = inverse**evenness
+        if weight[design.training].sum() ** 2 / np.sum(weight[design.training] ** 2) >= needed:
+            return weight
+    return design.ok.astype(float)
 
 
 def _work(run: Run) -> Mapping[str, Any]:
