@@ -1,0 +1,267 @@
+"""Error of the `reaction` against cells and time steps, up to references; chooses mesh and tolerance.
+
+Three points of the prior box (A, C, soft: benchmarks/healthy_skin.py). Errors are differences of two force
+histories every 0.1 s, RMS and largest, over the reference's peak.
+
+- Time: tolerances on bricks-1 against 1e-6 with the nonlinear solver 1000 times tighter, at least 40 steps a
+  phase, and steps as short as need be. The tolerance is chosen on the demo's protocol and tested on the
+  healthy-skin one.
+- Space: bricks-1, bricks-2 and the article's mesh over the whole healthy-skin protocol; finer ones over its
+  first cycle, among them the reference, bricks-1-edges-2, whose cells beside the pads' edges (where the
+  stress is singular) are divided twice toward them. The first loading alone, on finer ones still, tells
+  how far the reference itself is from converged. The article's meshes are those of the supplement, the folder
+  above its `data/` that BAYESKIN_SUPPLEMENT names; unset, they are left out.
+- The normal stress sigma_xx - p over the pad's top face, not doubled, at each step of the space runs: the
+  total-Lagrangian analogue of the article's force, beside the reaction.
+
+    OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/discretisation_study.py
+
+`--first-cycle` takes the first cycle only of every protocol. A stopped study goes on: finished runs are rows
+of benchmarks/results/discretisation.csv, their histories lie beside it. Writes the tables between the markers
+of docs/discretisation.md and docs/figures/discretisation.{png,svg}.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import time
+from contextlib import ExitStack
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from unittest import mock
+
+import healthy_skin
+import numpy as np
+import rows
+import skfem
+from discretisation_figure import figure_discretisation
+from discretisation_tables import (
+    LOADING,
+    SPACE_REFERENCE,
+    Error,
+    Result,
+    Run,
+    error,
+    peak_table,
+    space_errors,
+    space_table,
+    time_table,
+    verdict,
+    whole_table,
+)
+
+from bayeskin import storage
+from bayeskin.errors import InputError
+from bayeskin.model import lagrangian, simulate
+from bayeskin.model.problem import Problem, material
+from bayeskin.model.simulate import ModelSpec, problem_of
+from bayeskin.report import save_figure
+from bayeskin.types import Array, PadMotion, Simulation
+
+TOLERANCES = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)
+TIME_REFERENCE, TIME_CHECK = 1e-6, 1e-5
+SETTINGS = {
+    "as run": {},
+    "reference": {"SOLVER_TOLERANCE": 1e-7, "SHORTEST_STEP": 1e-6, "STEPS_PER_PHASE": 40},
+}
+WHOLE_MESHES = ("bricks-1", "bricks-2", "Mesh_SKIN.msh")
+CYCLE_MESHES = ("bricks-1-edges-1", "Symmetric_skin_XY_RF.msh", "bricks-3")
+LOADING_MESHES = ("bricks-2-edges-1", "bricks-1-edges-3")
+DOCS = Path(__file__).parents[1] / "docs"
+ROWS = rows.Rows(
+    rows.RESULTS / "discretisation.csv",
+    ("protocol", "point", "mesh", "tolerance", "settings", "model_hash"),
+    (
+        "status",
+        "cells",
+        "dofs",
+        "steps",
+        "factorisations",
+        "iterations",
+        "cpu_s",
+        "peak_n",
+        "code",
+        "message",
+    ),
+)
+
+
+def motions() -> dict[str, PadMotion]:
+    whole = {"healthy": healthy_skin.HEALTHY_SKIN, "demo": healthy_skin.demo_motion()}
+    cycles = {f"{name}, first cycle": healthy_skin.first_cycle(motion) for name, motion in whole.items()}
+    loading = PadMotion(np.array([0.0, 9.4]), np.array([0.0, 9.45e-3]))
+    return whole | cycles | {LOADING: loading}
+
+
+def perform(run: Run, table: rows.Rows) -> Result:
+    """Runs it, or takes it from the table and the histories beside it."""
+    try:
+        with healthy_skin.spec_on(run.mesh, run.tolerance) as spec:
+            inputs = vars(run) | {"model_hash": spec.hash}
+            stem = table.path.parent / "discretisation" / rows.digest(inputs)
+            row = table.find(**inputs)
+            if row is None or (row["status"] == "ok" and not stem.with_suffix(".stress.h5").is_file()):
+                row = _simulate(run, spec, table, stem)
+    except InputError as error:  # a mesh that is not there or cannot be read
+        return Result(run, {"status": "not run", "message": str(error)})
+    if row["status"] != "ok":
+        return Result(run, row)
+    histories = [storage.load(stem.with_suffix(end), Simulation) for end in (".force.h5", ".stress.h5")]
+    return Result(run, row, *histories)
+
+
+def _simulate(run: Run, spec: ModelSpec, table: rows.Rows, stem: Path) -> rows.Row:
+    rows.say(f"{run.protocol}, point {run.point}, {run.mesh}, tolerance {run.tolerance:g}, {run.settings}")
+    theta, problem = healthy_skin.POINTS[run.point], problem_of(spec.mesh, spec.refinement)
+    face = FaceStress(problem, theta)
+    stress: list[float] = []
+    with ExitStack() as patches:
+        for name, value in SETTINGS[run.settings].items():
+            patches.enter_context(mock.patch.object(lagrangian, name, value))
+        started = time.process_time()
+        found = simulate(
+            spec, motions()[run.protocol], theta, rows.progress(run.mesh),
+            lambda _time, x, _force: stress.append(face.force_n(x)),
+        )  # fmt: skip
+        seconds = time.process_time() - started
+    storage.save(stem.with_suffix(".force.h5"), found)
+    storage.save(stem.with_suffix(".stress.h5"), replace(found, force_n=np.array(stress)))
+    return table.append(
+        **vars(run),
+        model_hash=spec.hash,
+        status=found.status,
+        cells=problem.mesh.geometry.nelements,
+        dofs=problem.space.dofs,
+        steps=int(found.stats["steps"]),
+        factorisations=int(found.stats["factorisations"]),
+        iterations=int(found.stats["iterations"]),
+        cpu_s=round(seconds, 2),
+        peak_n=found.stats["peak_force_n"],
+        code=rows.code_digest(),
+        message=found.message,
+    )
+
+
+class FaceStress:
+    """Integral of sigma_xx - p over the pad's top face [N], whose area its clamping leaves as it is."""
+
+    def __init__(self, problem: Problem, theta: dict[str, float]) -> None:
+        mesh, bricks = problem.mesh.geometry, isinstance(problem.mesh.geometry, skfem.MeshHex)
+        quadratic = skfem.ElementHex2() if bricks else skfem.ElementTetP2()
+        linear = skfem.ElementHex1() if bricks else skfem.ElementTetP1()
+        self._u = skfem.FacetBasis(mesh, quadratic, facets=problem.mesh.facets["pad"], intorder=6)
+        self._p = self._u.with_element(linear)
+        self._n = 3 * problem.space.n_nodes
+        cells = material(theta, problem.mesh.cutis)
+        self._mu, self._lam = (c[self._u.tind][:, None] for c in (cells.mu, cells.lam))
+
+    def force_n(self, x: Array) -> float:
+        """From the unknowns x (dofs,)."""
+        gradient = np.stack([self._u.interpolate(x[i : self._n : 3]).grad for i in range(3)])
+        f = np.eye(3) + gradient.transpose(2, 3, 0, 1)  # (facets, points, 3, 3)
+        j = np.linalg.det(f)
+        stretch = np.sum(f[..., 0, :] ** 2, axis=-1)
+        stress = (self._mu * (stretch - 1.0) + self._lam * np.log(j)) / j
+        return float(np.sum((stress - np.asarray(self._p.interpolate(x[self._n :]))) * self._u.dx))
+
+
+def time_study(
+    asked: argparse.Namespace, table: rows.Rows
+) -> tuple[dict[str, dict[tuple[float, str], Error]], dict[str, dict[str, Error]]]:
+    """Errors by protocol, then by tolerance and point; and the reference's own by protocol and point."""
+    suffix = ", first cycle" if asked.first_cycle else ""
+    names = ("demo" + suffix, "healthy" + suffix)
+    found: dict[str, dict[tuple[float, str], Error]] = {name: {} for name in names}
+    own: dict[str, dict[str, Error]] = {name: {} for name in names}
+    for name, point in product(names, asked.points):
+        reference, check = (
+            perform(Run(name, point, tolerance=t, settings="reference"), table)
+            for t in (TIME_REFERENCE, TIME_CHECK)
+        )
+        if not (reference.force and check.force):
+            rows.say(f"no reference: {reference.row['message'] or check.row['message']}")
+            continue
+        own[name][point] = error(check.force, reference.force)
+        for tolerance in asked.tolerances:
+            result = perform(Run(name, point, tolerance=tolerance), table)
+            if result.force:
+                found[name][tolerance, point] = error(result.force, reference.force)
+    return found, own
+
+
+def space_study(asked: argparse.Namespace, table: rows.Rows) -> list[Result]:
+    """All runs in space, the reference's among them; cheap ones first."""
+    cycle = "healthy, first cycle"
+    whole = cycle if asked.first_cycle else "healthy"
+    runs = [Run(whole, point, mesh) for mesh in WHOLE_MESHES for point in asked.points]
+    runs += [Run(cycle, point, mesh) for mesh in (*CYCLE_MESHES, SPACE_REFERENCE) for point in asked.points]
+    every = ("bricks-1", "bricks-2", "bricks-1-edges-1", SPACE_REFERENCE, *LOADING_MESHES)
+    runs += [Run(LOADING, "C", mesh) for mesh in every if "C" in asked.points]
+    supplement = healthy_skin.supplement_mesh("") is not None
+    kept = [
+        r for r in runs if r.mesh in asked.meshes and (supplement or r.mesh not in healthy_skin.GMSH_MESHES)
+    ]
+    return [perform(run, table) for run in kept]
+
+
+def write_block(path: Path, text: str) -> None:
+    """Puts `text` between the markers of the document, whole or not at all."""
+    whole = path.read_text()
+    pattern = re.compile(r"(<!-- study -->\n).*(<!-- /study -->)", re.DOTALL)
+    if not pattern.search(whole):
+        raise SystemExit(f"{path}: no markers <!-- study --> and <!-- /study -->")
+    staged = path.with_name(f".{path.name}.partial")
+    staged.write_text(pattern.sub(lambda m: f"{m[1]}\n{text}\n\n{m[2]}", whole))
+    staged.replace(path)
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    every = (*WHOLE_MESHES, *CYCLE_MESHES, SPACE_REFERENCE, *LOADING_MESHES)
+    parser.add_argument("--first-cycle", action="store_true", help="of every protocol only the first cycle")
+    parser.add_argument("--points", nargs="+", default=list(healthy_skin.POINTS), choices=healthy_skin.POINTS)
+    parser.add_argument("--tolerances", nargs="*", type=float, default=TOLERANCES, help="none: no time study")
+    parser.add_argument("--meshes", nargs="*", default=every, choices=every, help="none: no space study")
+    parser.add_argument("--time-target", type=float, default=5e-4, help="RMS over peak (default 5e-4)")
+    parser.add_argument("--mesh-target", type=float, default=0.03, help="RMS over peak (default 0.03)")
+    parser.add_argument("--results", type=Path, default=rows.RESULTS)
+    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of discretisation.md")
+    return parser.parse_args()
+
+
+def main() -> None:
+    asked = arguments()
+    table = replace(ROWS, path=asked.results / ROWS.path.name)
+    times, own = time_study(asked, table) if asked.tolerances else ({}, {})
+    results = space_study(asked, table) if asked.meshes else []
+    rows.warn_of_mixed_code(table.read())
+    parts = [
+        f"Time, `{name}`:\n\n{time_table(errors, own[name], asked.points)}" for name, errors in times.items()
+    ]
+    if results:
+        parts.append(
+            f"Space, first cycle, against {SPACE_REFERENCE}:\n\n{space_table(results, asked.points)}"
+        )
+        parts.append(f"Space, whole protocol, against bricks-2:\n\n{whole_table(results, asked.points)}")
+        parts.append(f"Reaction and face stress at point C:\n\n{peak_table(results)}")
+    parts.append(verdict(times, results, asked.time_target, asked.mesh_target))
+    block = "\n\n".join(parts)
+    print(block)
+    write_block(asked.docs / "discretisation.md", block)
+    cells = {r.run.mesh: int(r.row["cells"]) for r in results if r.force}
+    at_c = [r for r in results if r.run.point == "C" and r.force and r.run.protocol != LOADING]
+    figure = figure_discretisation(
+        {(cells[m], m, p): e.rms for (m, p), e in space_errors(results).items() if m != SPACE_REFERENCE},
+        {name: {key: e.rms for key, e in errors.items()} for name, errors in times.items()},
+        [(r.run.mesh, r.force, r.face_stress) for r in at_c],
+        asked.time_target,
+    )
+    save_figure(figure, asked.docs / "figures" / "discretisation", "benchmarks/discretisation_study.py")
+
+
+if __name__ == "__main__":
+    main()

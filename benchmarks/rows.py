@@ -1,0 +1,121 @@
+"""A benchmark's finished rows: a CSV that grows by whole lines, so that a stopped benchmark goes on."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bayeskin.model
+
+RESULTS = Path(__file__).parent / "results"
+Row = dict[str, str]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A CSV with the columns `key` (all inputs of a row and the model's hash) and then `values`.
+
+    A line is written by one call of the system; a line that a crash cut short is no row.
+    """
+
+    path: Path
+    key: tuple[str, ...]
+    values: tuple[str, ...]
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        return (*self.key, *self.values)
+
+    def read(self) -> list[Row]:
+        """All whole rows; of several with one key, the last. A file with other columns is refused."""
+        if not self.path.is_file():
+            return []
+        lines = self.path.read_text().splitlines(keepends=True)
+        parsed = list(csv.reader(line for line in lines if line.endswith("\n")))
+        if not parsed or tuple(parsed[0]) != self.columns:
+            raise SystemExit(f"{self.path}: other columns than {', '.join(self.columns)}; move it away")
+        rows = [dict(zip(self.columns, row, strict=True)) for row in parsed if len(row) == len(self.columns)]
+        return list({self.key_of(row): row for row in rows[1:]}.values())
+
+    def key_of(self, row: Mapping[str, Any]) -> tuple[str, ...]:
+        return tuple(_text(row[name]) for name in self.key)
+
+    def find(self, **inputs: Any) -> Row | None:
+        """The row of these inputs, or None."""
+        return next((row for row in self.read() if self.key_of(row) == self.key_of(inputs)), None)
+
+    def append(self, **row: Any) -> Row:
+        """Adds one row at once; returns it as it will be read."""
+        text = {name: _text(row[name]).replace("\n", " ") for name in self.columns}
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        before = self.path.read_bytes() if self.path.is_file() else b""
+        buffer = io.StringIO()
+        if before and not before.endswith(b"\n"):
+            buffer.write("\n")  # closes a line that was cut short; it has too few columns to be a row
+        writer = csv.writer(buffer, lineterminator="\n")
+        if not before:
+            writer.writerow(self.columns)
+        writer.writerow(text.values())
+        handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        try:
+            os.write(handle, buffer.getvalue().encode())
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+        return text
+
+
+def _text(value: Any) -> str:
+    return format(value, ".10g") if isinstance(value, float) else str(value)
+
+
+def digest(inputs: Mapping[str, Any]) -> str:
+    """Short name of a row's inputs, for a file beside the CSV."""
+    text = json.dumps({name: _text(value) for name, value in inputs.items()}, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def code_digest() -> str:
+    """Of the model's source: times, and errors below the tolerance, depend on more than the model hash."""
+    folder = Path(bayeskin.model.__file__).parent
+    whole = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(folder.glob("*.py"))))
+    return whole.hexdigest()[:12]
+
+
+def warn_of_mixed_code(rows: Sequence[Row]) -> None:
+    """Says so when the rows of one table come from more than one state of the model's source."""
+    found = sorted({row["code"] for row in rows})
+    if len(found) > 1:
+        say(f"warning: rows from {len(found)} states of bayeskin/model ({', '.join(found)}) in one table")
+
+
+def say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def progress(label: str, every_s: float = 20.0) -> Callable[[float], None]:
+    """Prints on stderr how much of a run is done, now and then."""
+    last = time.monotonic()
+
+    def show(fraction: float) -> None:
+        nonlocal last
+        if time.monotonic() - last > every_s:
+            last = time.monotonic()
+            say(f"  {label}: {100 * fraction:.0f} %")
+
+    return show
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table; numbers as they were formatted."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -1,0 +1,85 @@
+"""The benchmarks' own parts: rows that survive a crash, meshes, and the stress on the pad's face."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bayeskin.model.problem import build_problem
+from bayeskin.types import Simulation
+
+
+@pytest.fixture
+def benchmark(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    return importlib.import_module
+
+
+def test_a_row_is_found_by_its_inputs_and_a_line_cut_short_is_no_row(benchmark, tmp_path):
+    rows = benchmark("rows").Rows(tmp_path / "rows.csv", ("point", "tolerance"), ("error", "message"))
+    rows.append(point="A", tolerance=1e-3, error=0.5, message='said "no, never"')
+    with open(rows.path, "a") as handle:
+        handle.write("B,0.0")
+    assert rows.find(point="B", tolerance=1e-3) is None
+    rows.append(point="B", tolerance=1e-3, error=0.25, message="")
+    assert rows.find(point="A", tolerance=1e-3)["message"] == 'said "no, never"'
+    assert rows.find(point="B", tolerance=1e-3)["error"] == "0.25"
+    assert len(rows.read()) == 2
+
+
+def test_edge_levels_add_lines_beside_the_pads_edges_only(benchmark):
+    skin = benchmark("healthy_skin")
+    for coarse, fine, edges in zip(skin.brick_lines(0), skin.brick_lines(2), skin.EDGES_M, strict=True):
+        assert np.isin(coarse, fine).all()
+        new = np.setdiff1d(fine, coarse)
+        nearest = np.abs(new[:, None] - edges).min(axis=1)
+        assert len(new)
+        assert nearest.max() <= 0.25 * np.diff(coarse).max()
+
+
+def test_face_stress_at_rest_is_minus_the_pressure_times_the_pads_area(benchmark):
+    skin, study = benchmark("healthy_skin"), benchmark("discretisation_study")
+    mesh = importlib.import_module("bayeskin.model.mesh").brick_mesh()
+    problem = build_problem(mesh)
+    x = np.zeros(problem.space.dofs)
+    x[3 * problem.space.n_nodes :] = 700.0
+    face = study.FaceStress(problem, skin.POINTS["C"])
+    assert face.force_n(x) == pytest.approx(-700.0 * 8e-3 * 4e-3, rel=1e-6)
+
+
+def test_face_stress_of_a_uniform_strain_is_the_laws(benchmark):
+    skin, study = benchmark("healthy_skin"), benchmark("discretisation_study")
+    mesh = importlib.import_module("bayeskin.model.mesh").brick_mesh()
+    problem = build_problem(mesh)
+    f = np.array([[1.2, 0.1, 0.05], [0.0, 0.95, 0.0], [0.02, 0.0, 1.05]])
+    x = np.zeros(problem.space.dofs)
+    x[: 3 * problem.space.n_nodes] = ((f - np.eye(3)) @ problem.space.points_u).T.ravel()
+    e, nu, j = 684e3, 0.48, np.linalg.det(f)
+    mu, lam = e / (2 * (1 + nu)), e * nu / ((1 + nu) * (1 - 2 * nu))
+    stress = (mu * (f @ f.T - np.eye(3)) + lam * np.log(j) * np.eye(3)) / j
+    face = study.FaceStress(problem, skin.POINTS["C"])
+    assert face.force_n(x) == pytest.approx(stress[0, 0] * 8e-3 * 4e-3, rel=1e-6)
+
+
+def test_error_of_a_scaled_history_is_gone_after_one_factor(benchmark):
+    study = benchmark("discretisation_study")
+    time_s = np.linspace(0.0, 10.0, 51)
+
+    def history(force_n):
+        return Simulation({}, time_s, time_s, force_n, np.zeros(51, bool), "ok", "", {}, "")
+
+    found = study.error(history(1.02 * time_s), history(time_s))
+    assert found.largest == pytest.approx(0.02)
+    assert found.rms == pytest.approx(0.02 * np.sqrt(1 / 3), rel=1e-2)
+    assert found.scale == pytest.approx(1 / 1.02)
+    assert found.rms_scaled < 1e-12
+
+
+def test_the_tolerance_chosen_is_the_loosest_below_which_all_are_good(benchmark):
+    study = benchmark("discretisation_tables")
+    rms = {1e-1: 1e-4, 1e-2: 9e-4, 1e-3: 2e-4, 1e-4: 1e-5}  # the loosest is good by chance
+    errors = {(t, "A"): study.Error(e, e, 1.0, 1.0, e) for t, e in rms.items()}
+    assert study.choose(errors, 5e-4) == 1e-3
