@@ -139,7 +139,7 @@ def _simulate(run: Run, spec: ModelSpec, table: rows.Rows, stem: Path) -> rows.R
         iterations=int(found.stats["iterations"]),
         cpu_s=round(seconds, 2),
         peak_n=found.stats["peak_force_n"],
-        code=rows.code_digest(),
+        code=rows.CODE,
         message=found.message,
     )
 

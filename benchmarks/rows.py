@@ -84,11 +84,14 @@ def digest(inputs: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def code_digest() -> str:
-    """Of the model's source: times, and errors below the tolerance, depend on more than the model hash."""
+def _code_digest() -> str:
     folder = Path(bayeskin.model.__file__).parent
     whole = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(folder.glob("*.py"))))
     return whole.hexdigest()[:12]
+
+
+# The model's source as it was loaded: times, and small errors, depend on more than the model hash.
+CODE = _code_digest()
 
 
 def warn_of_mixed_code(rows: Sequence[Row]) -> None:

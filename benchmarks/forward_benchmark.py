@@ -1,0 +1,298 @@
+"""What one full run costs, stage by stage, beside the floor that its factorisations and solves set.
+
+The `reaction` at point C over the whole healthy-skin protocol (benchmarks/healthy_skin.py), default
+tolerance, on the default bricks and, where BAYESKIN_SUPPLEMENT names the folder above the supplement's
+`data/`, on the article's mesh. Each run has a fresh process with one thread, and a short run before it that
+compiles. CPU seconds by stage:
+
+    evaluation       from unknowns to quadrature points
+    law              stress, fluid content and flux there, and their derivatives
+    residual         its assembly
+    tangent          its assembly
+    analysis         the first factorisation, with the ordering
+    factorisation    the others
+    solve            back-substitution
+    rest             everything else (Python, NumPy)
+
+The floor is one factorisation and one solve, each measured alone (median) on the run's last tangent, times
+how many the run asked for. The article's script takes about 3,600 CPU s for its 694 steps on one core; that
+is a stated number, it is not run here.
+
+    python benchmarks/forward_benchmark.py
+
+Finished runs are rows of benchmarks/results/forward.csv, which a later start does not repeat; a change of the
+model's source does. Prints medians, draws docs/figures/forward.{png,svg}.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import healthy_skin
+import numpy as np
+import rows
+import scipy.sparse as sp
+from matplotlib.figure import Figure
+
+from bayeskin.model import assembly, linear, newton, poroelastic, simulate
+from bayeskin.model.linear import SOLVER_NAME, Factorisations
+from bayeskin.model.simulate import ModelSpec, problem_of
+from bayeskin.report import save_figure
+from bayeskin.report.style import INK, PAGE_IN, new_figure, state_finding, styled
+from bayeskin.types import Array, PadMotion
+from bayeskin.workers import Lost, run_parallel
+
+ARTICLE_CPU_S = 3600.0  # stated, for 694 steps; see above
+STAGES = ("evaluation", "law", "residual", "tangent", "analysis", "factorisation", "solve", "rest")
+COLOURS = ("#56B4E9", "#0072B2", "#009E73", "#E69F00", "#882255", "#D55E00", "#CC79A7", "#B0B0B0")
+FACTORISATIONS_ALONE, SOLVES_ALONE = 5, 30
+MESHES = ("bricks-1", "Mesh_SKIN.msh")
+FIGURES = Path(__file__).parents[1] / "docs" / "figures"
+ROWS = rows.Rows(
+    rows.RESULTS / "forward.csv",
+    ("protocol", "mesh", "tolerance", "repeat", "model_hash", "code"),
+    (
+        "status", "linear_solver", "cells", "dofs", "steps", "iterations", "cpu_s",
+        *(f"{stage}_s" for stage in STAGES), *(f"{stage}_count" for stage in STAGES[:-1]),
+        "one_factorisation_s", "one_solve_s", "floor_s", "factor_bytes", "matrix_entries",
+        "peak_memory_bytes",
+    ),
+)  # fmt: skip
+
+
+@dataclass
+class Clock:
+    """CPU seconds and calls by stage."""
+
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(STAGES, 0))
+
+    def timed(self, stage: str, action: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapper(*args: Any) -> Any:
+            started = time.process_time()
+            try:
+                return action(*args)
+            finally:
+                self.seconds[stage] += time.process_time() - started
+                self.counts[stage] += 1
+
+        return wrapper
+
+
+class TimedFactorisations:
+    """Factorisations on a clock; keeps the last matrix."""
+
+    def __init__(self, inner: Factorisations, clock: Clock) -> None:
+        self.inner, self.last = inner, None
+        self.first = clock.timed("analysis", inner.factorise)
+        self.later = clock.timed("factorisation", inner.factorise)
+        self.solve, self.release = clock.timed("solve", inner.solve), inner.release
+
+    @property
+    def room(self) -> int:
+        return self.inner.room
+
+    def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None:
+        (self.later if self.last else self.first)(number, matrix, scale)
+        self.last = matrix, scale
+
+
+@contextmanager
+def on_the_clock(clock: Clock) -> Iterator[list[TimedFactorisations]]:
+    """Puts the model's stages on a clock, from outside; yields a list that will hold its factorisations."""
+    made: list[TimedFactorisations] = []
+
+    def factorisations(symmetric: bool) -> TimedFactorisations:
+        made.append(TimedFactorisations(linear.factorisations(symmetric), clock))
+        return made[-1]
+
+    stages = (
+        (assembly, "evaluate", "evaluation"), (assembly, "residual", "residual"),
+        (assembly, "tangent", "tangent"), (poroelastic, "respond", "law"), (poroelastic, "linearise", "law"),
+    )  # fmt: skip
+    with ExitStack() as patches:
+        patches.enter_context(mock.patch.object(newton, "factorisations", factorisations))
+        for module, name, stage in stages:
+            action = clock.timed(stage, getattr(module, name))
+            patches.enter_context(mock.patch.object(module, name, action))
+        yield made
+
+
+def measure(item: tuple[str, str, int]) -> dict[str, Any]:
+    """One row for (protocol, mesh, repeat); runs in a process of its own."""
+    protocol, mesh, repeat = item
+    motion = healthy_skin.HEALTHY_SKIN
+    motion = healthy_skin.first_cycle(motion) if protocol == "first cycle" else motion
+    theta = healthy_skin.POINTS["C"]
+    with healthy_skin.spec_on(mesh, ModelSpec().tolerance) as spec:
+        compiling = PadMotion(np.array([0.0, 1.0]), np.array([0.0, 1e-4]))
+        simulate(ModelSpec(tolerance=1.0), compiling, theta)
+        problem = problem_of(spec.mesh, spec.refinement)  # a process builds it once, for all of its runs
+        clock = Clock()
+        with on_the_clock(clock) as made:
+            started = time.process_time()
+            found = simulate(spec, motion, theta, rows.progress(mesh))
+            cpu_s = time.process_time() - started
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    clock.seconds["rest"] = cpu_s - sum(clock.seconds.values())
+    matrix, scale = made[0].last
+    factorisation_s, solve_s, factor_bytes = alone(matrix, scale)
+    factorisations = clock.counts["factorisation"] + clock.counts["analysis"]
+    return {
+        "protocol": protocol, "mesh": mesh, "repeat": repeat, "tolerance": spec.tolerance,
+        "model_hash": found.model_hash, "code": rows.CODE, "status": found.status,
+        "linear_solver": SOLVER_NAME, "cells": problem.mesh.geometry.nelements, "dofs": problem.space.dofs,
+        "steps": int(found.stats["steps"]), "iterations": int(found.stats["iterations"]), "cpu_s": cpu_s,
+        **{f"{stage}_s": seconds for stage, seconds in clock.seconds.items()},
+        **{f"{stage}_count": count for stage, count in clock.counts.items()},
+        "one_factorisation_s": factorisation_s, "one_solve_s": solve_s,
+        "floor_s": factorisations * factorisation_s + clock.counts["solve"] * solve_s,
+        "factor_bytes": factor_bytes, "matrix_entries": matrix.nnz, "peak_memory_bytes": memory,
+    }  # fmt: skip
+
+
+def alone(matrix: sp.csr_matrix, scale: Array) -> tuple[float, float, int]:
+    """CPU seconds of one factorisation and of one solve, and the factors' bytes."""
+    factors, right = linear.factorisations(True), np.random.default_rng(0).normal(size=matrix.shape[0])
+    factors.factorise(0, matrix, scale)  # analyses the pattern too
+    factorisation_s = _median_s(lambda: factors.factorise(0, matrix, scale), FACTORISATIONS_ALONE)
+    solve_s = _median_s(lambda: factors.solve(0, right), SOLVES_ALONE)
+    size = _bytes_of(factors)
+    factors.release()
+    return factorisation_s, solve_s, size
+
+
+def _median_s(action: Callable[[], Any], times: int) -> float:
+    seconds = []
+    for _ in range(times):
+        started = time.process_time()
+        action()
+        seconds.append(time.process_time() - started)
+    return float(np.median(seconds))
+
+
+def _bytes_of(factors: Any) -> int:
+    """PARDISO: entries of the factor by its own count, in single precision. SuperLU: values and indices."""
+    if SOLVER_NAME == "SuperLU":
+        return 12 * int(factors._stored[0][0].nnz)
+    return 4 * int(factors._settings[linear._ENTRIES_OF_FACTOR - 1])
+
+
+def medians(found: Sequence[rows.Row]) -> dict[str, dict[str, float]]:
+    """Medians over repeats of every number, by mesh."""
+    numbers = [name for name in ROWS.values if name not in ("status", "linear_solver")]
+    return {
+        mesh: {n: float(np.median([float(r[n]) for r in found if r["mesh"] == mesh])) for n in numbers}
+        for mesh in dict.fromkeys(r["mesh"] for r in found)
+    }
+
+
+def table(found: dict[str, dict[str, float]], whole: bool) -> str:
+    lines = [["CPU s", *(f"{m['cpu_s']:.2f}" for m in found.values())]]
+    if whole:
+        ratios = [f"{ARTICLE_CPU_S / m['cpu_s']:.0f}" for m in found.values()]
+        lines.append([f"the article's {ARTICLE_CPU_S:.0f} CPU s over that", *ratios])
+    lines.append(["cells, unknowns", *(f"{m['cells']:.0f}, {m['dofs']:.0f}" for m in found.values())])
+    lines.append(["steps, iterations", *(f"{m['steps']:.0f}, {m['iterations']:.0f}" for m in found.values())])
+    for stage in STAGES:
+        calls = [f" ({m[f'{stage}_count']:.0f} calls)" if stage != "rest" else "" for m in found.values()]
+        lines.append(
+            [
+                f"{stage} [s]",
+                *(f"{m[f'{stage}_s']:.2f}{n}" for m, n in zip(found.values(), calls, strict=True)),
+            ]
+        )
+    ms = [(1e3 * m["one_factorisation_s"], 1e3 * m["one_solve_s"]) for m in found.values()]
+    lines.append(["one factorisation, one solve, alone [ms]", *(f"{a:.0f}, {b:.1f}" for a, b in ms)])
+    lines.append(["floor: those times their numbers [s]", *(f"{m['floor_s']:.2f}" for m in found.values())])
+    lines.append(["CPU s over the floor", *(f"{m['cpu_s'] / m['floor_s']:.2f}" for m in found.values())])
+    lines.append(["factors [MB]", *(f"{m['factor_bytes'] / 1e6:.1f}" for m in found.values())])
+    rate = [2 * m["factor_bytes"] / m["one_solve_s"] / 1e9 for m in found.values()]
+    lines.append(["factors read twice a solve [GB/s]", *(f"{r:.1f}" for r in rate)])
+    memory = [m["peak_memory_bytes"] / 2**20 for m in found.values()]
+    lines.append(["peak memory of the process [MiB]", *(f"{b:.0f}" for b in memory)])
+    return rows.markdown(["", *found], lines)
+
+
+@styled
+def figure_forward(found: dict[str, dict[str, float]]) -> Figure:
+    """Stages as shares of the run on each mesh, with the floor."""
+    figure = new_figure(PAGE_IN, 0.75 + 0.55 * len(found) + 0.6)
+    ax = figure.subplots()
+    for y, m in enumerate(found.values()):
+        left = 0.0
+        for stage, colour in zip(STAGES, COLOURS, strict=True):
+            share = 100 * m[f"{stage}_s"] / m["cpu_s"]
+            ax.barh(y, share, 0.55, left, color=colour, label=stage if y == 0 else None)
+            left += share
+        floor = 100 * m["floor_s"] / m["cpu_s"]
+        ax.plot([floor, floor], [y - 0.38, y + 0.38], color=INK, lw=1.4, label="floor" if y == 0 else None)
+    names = [f"{mesh.removesuffix('.msh')}\n{m['cpu_s']:.1f} s" for mesh, m in found.items()]
+    ax.set(
+        yticks=range(len(found)), yticklabels=names, xlabel="share of the run's CPU time [%]", xlim=(0, 100)
+    )
+    ax.invert_yaxis()
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.05))
+    state_finding(
+        figure, _finding(found),
+        "One run at point C over the healthy-skin protocol, one thread; analysis: the first factorisation. "
+        "Floor: the time of the factorisations and solves alone.",
+    )  # fmt: skip
+    return figure
+
+
+def _finding(found: dict[str, dict[str, float]]) -> str:
+    mesh, m = list(found.items())[-1]
+    return (
+        f"On {mesh.removesuffix('.msh')} ({m['dofs']:,.0f} unknowns) a run takes {m['cpu_s']:.0f} CPU s, "
+        f"{m['cpu_s'] / m['floor_s']:.1f} times its factorisations and solves alone"
+    )
+
+
+def arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--meshes", nargs="+", default=MESHES, choices=MESHES)
+    parser.add_argument(
+        "--first-cycle", action="store_true", help="of the protocol; no ratio to the article's"
+    )
+    parser.add_argument("--results", type=Path, default=rows.RESULTS)
+    parser.add_argument("--figures", type=Path, default=FIGURES)
+    return parser.parse_args()
+
+
+def main() -> None:
+    asked = arguments()
+    results = replace(ROWS, path=asked.results / ROWS.path.name)
+    protocol = "first cycle" if asked.first_cycle else "whole"
+    supplement = healthy_skin.supplement_mesh("") is not None
+    found = []
+    for mesh in [m for m in asked.meshes if supplement or m not in healthy_skin.GMSH_MESHES]:
+        with healthy_skin.spec_on(mesh, ModelSpec().tolerance) as spec:
+            same = {"tolerance": spec.tolerance, "model_hash": spec.hash, "code": rows.CODE}
+        for repeat in range(asked.repeats):
+            row = results.find(protocol=protocol, mesh=mesh, repeat=repeat, **same)
+            if row is None:
+                rows.say(f"{mesh}, {protocol}, repeat {repeat}")
+                _, measured = next(run_parallel(measure, [(protocol, mesh, repeat)], 1))
+                if isinstance(measured, Lost):
+                    raise SystemExit(f"{mesh}: {measured.reason}")
+                row = results.append(**measured)
+            found.append(row)
+    by_mesh = medians(found)
+    print(table(by_mesh, whole=not asked.first_cycle))
+    save_figure(figure_forward(by_mesh), asked.figures / "forward", "benchmarks/forward_benchmark.py")
+
+
+if __name__ == "__main__":
+    main()
