@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from bayeskin.errors import InputError
+from bayeskin.inference import Bands, Verdict
 from bayeskin.pipeline import folder
 from bayeskin.pipeline.engine import Run, Silent, Stage, open_run, run_stages
+from bayeskin.pipeline.posterior import with_surrogate_error
 
 CONFIG = 'seed = {seed}\n[recording]\nfile = "input.txt"\n'
 
@@ -138,3 +140,20 @@ def test_json_knows_no_nan_and_no_numpy(tmp_path: Path) -> None:
         folder.write_json(tmp_path / "x.json", {"a": object()})
     assert json.loads((tmp_path / "x.json").read_text()) == expected
     assert list(tmp_path.iterdir()) == [tmp_path / "x.json"]
+
+
+def bands_with(surrogate_n: float, noise_n: float) -> Bands:
+    constant = {"parameter": 0.0, "surrogate": surrogate_n, "noise": noise_n}
+    blank = {f.name: np.zeros(4) for f in dataclasses.fields(Bands)}
+    return Bands(**{**blank, **{f"sd_{part}_n": np.full(4, sd) for part, sd in constant.items()}})
+
+
+def test_a_posterior_in_the_surrogates_error_is_not_trusted():
+    converged = Verdict(True, ("5000 effective samples",))
+    good = with_surrogate_error(converged, bands_with(1e-3, 3e-3), np.arange(4))
+    assert good.trusted
+    assert good.reasons[0] == "5000 effective samples"
+    bad = with_surrogate_error(converged, bands_with(23e-3, 8e-3), np.arange(4))
+    assert not bad.trusted
+    assert bad.reasons[0].startswith("surrogate's sd 23 mN where fitted; at most the noise's 8 mN")
+    assert not with_surrogate_error(Verdict(False, ("stuck",)), bands_with(0.0, 1.0), np.arange(4)).trusted

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import bayeskin
 from bayeskin import inference, report, storage
 from bayeskin.config import Config
-from bayeskin.inference import LogPosterior, Posterior
+from bayeskin.inference import LogPosterior, Posterior, Verdict
 from bayeskin.pipeline.calibration import refined_posterior, rmse_table
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import sha256_of
@@ -67,10 +68,11 @@ def _sampled(
     bands = inference.bands_of(log_posterior.binned.time_s, drawn)
     low, high = bands.interval(0.9)
     learned = inference.identifiability(posterior.space, posterior.flat)
+    verdict = with_surrogate_error(c.verdict, bands, log_posterior.chain.bins)
     return {
-        "ok": c.verdict.trusted,
-        "verdict": "trusted" if c.verdict.trusted else "not trusted",
-        "reasons": list(c.verdict.reasons),
+        "ok": verdict.trusted,
+        "verdict": "trusted" if verdict.trusted else "not trusted",
+        "reasons": list(verdict.reasons),
         "steps": c.steps,
         "draws": len(posterior.flat),
         "parameters": _table(posterior),
@@ -84,6 +86,20 @@ def _sampled(
             for part in ("parameter", "surrogate", "noise")
         },
     }
+
+
+def with_surrogate_error(verdict: Verdict, bands: inference.Bands, fitted: NDArray[np.int64]) -> Verdict:
+    """The verdict with one more criterion: what the surrogate leaves open in the fitted bins.
+
+    Where its sd exceeds the noise's, a bad fit hides in it, and the posterior goes where it is largest.
+    """
+    surrogate, noise = (
+        float(np.sqrt(np.mean(sd[fitted] ** 2))) for sd in (bands.sd_surrogate_n, bands.sd_noise_n)
+    )
+    said = f"surrogate's sd {1e3 * surrogate:.3g} mN where fitted; at most the noise's {1e3 * noise:.3g} mN"
+    if surrogate <= noise:
+        return Verdict(verdict.trusted, (*verdict.reasons, said))
+    return Verdict(False, (f"{said}: run the full model where the posterior is", *verdict.reasons))
 
 
 def _some(posterior: Posterior) -> Array:
