@@ -88,7 +88,7 @@ def test_articles_force_on_the_first_ramp_is_its_scripts():
 @pytest.mark.slow
 def test_articles_force_over_the_whole_recording_is_its_scripts():
     found, _, force_n = article_run(until_s=1e9)
-    assert np.sqrt(np.mean((found.force_n - force_n) ** 2)) < 1e-3
+    assert np.sqrt(np.mean((found.force_n - force_n) ** 2)) < 1e-4  # 2.7e-5 N; 1e-3 N is what is asked for
 
 
 @pytest.mark.slow

@@ -107,7 +107,7 @@ class ArticleModel:
 
     def _equations(self, old: Array, grad_u: Array, grad_p: Array, weight: Array, dt: float) -> Equations:
         s, m, pattern = self.problem.space, self.material, self.problem.pattern
-        at, found, by = self._points, self._response, self._linearised
+        at, found = self._points, self._response
 
         def evaluate(x: Array) -> None:
             assembly.evaluate(
@@ -135,16 +135,17 @@ class ArticleModel:
 
         def tangent(x: Array) -> tuple[sp.csr_matrix, sp.csr_matrix]:
             evaluate(x)
-            article_law.linearise(
-                at.deformation, m.mu, m.lam, m.mobility, m.storage, dt,
-                by.stress_f, by.stress_p, by.content_f, by.content_p, by.flux_g,
-            )  # fmt: skip
             data = self._data
             data[:] = 0.0
-            assembly.tangent(
-                grad_u, grad_p, s.value_p, weight, by.stress_f, by.stress_p, by.content_f, by.content_p,
-                by.flux_f, by.flux_g, pattern.position, data,
-            )  # fmt: skip
+            for c, by in assembly.chunks(self._linearised, len(weight)):
+                article_law.linearise(
+                    at.deformation[c], m.mu[c], m.lam[c], m.mobility[c], m.storage[c], dt,
+                    by.stress_f, by.stress_p, by.content_f, by.content_p, by.flux_g,
+                )  # fmt: skip
+                assembly.tangent(
+                    grad_u[c], grad_p[c], s.value_p, weight[c], by.stress_f, by.stress_p, by.content_f,
+                    by.content_p, by.flux_f, by.flux_g, pattern.position[c], data,
+                )  # fmt: skip
             return pattern.matrices(data)
 
         n = 3 * s.n_nodes

@@ -12,13 +12,15 @@ inner loops run over shape functions.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
 
 import numba
 import numpy as np
 
 from bayeskin.types import Array
 
+CHUNK = 512  # cells
 compiled = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
@@ -66,10 +68,17 @@ def response(shape: tuple[int, ...]) -> Response:
     return Response(np.empty((*shape, 3, 3)), np.empty(shape), np.empty((*shape, 3)))
 
 
-def linearised(shape: tuple[int, ...]) -> Linearised:
-    """Arrays of zeros for (e, q) points."""
+def linearised(shape: tuple[int, int]) -> Linearised:
+    """Arrays of zeros for the points of `CHUNK` cells at a time: of all cells they would fill the memory."""
     sizes = ((9, 9), (9,), (9,), (), (3, 9), (3, 3))
-    return Linearised(*(np.zeros((*shape, *size)) for size in sizes))
+    return Linearised(*(np.zeros((min(CHUNK, shape[0]), shape[1], *size)) for size in sizes))
+
+
+def chunks(by: Linearised, cells: int) -> Iterator[tuple[slice, Linearised]]:
+    """Slices of the cells, and as much of the arrays as each needs."""
+    for start in range(0, cells, CHUNK):
+        part = slice(start, min(start + CHUNK, cells))
+        yield part, Linearised(*(getattr(by, f.name)[: part.stop - start] for f in fields(by)))
 
 
 @compiled

@@ -135,18 +135,19 @@ class LagrangianModel:
 
     def tangent(self, x: Array, h: float, old: State) -> tuple[sp.csr_matrix, sp.csr_matrix]:
         """Derivative of the residual's free rows by the free and by the fixed unknowns."""
-        s, m, at, by = self.problem.space, self.material, self._points, self._linearised
-        data = self._data
+        s, m, at, data = self.problem.space, self.material, self._points, self._data
         data[:] = 0.0
         self._evaluate(x)
-        poroelastic.linearise(
-            at.deformation, at.pressure, at.gradient, m.mu, m.lam, m.mobility, m.storage, h, old.pressure,
-            by.stress_f, by.stress_p, by.content_f, by.content_p, by.flux_f, by.flux_g,
-        )  # fmt: skip
-        assembly.tangent(
-            s.grad_u, s.grad_p, s.value_p, s.weight, by.stress_f, by.stress_p, by.content_f, by.content_p,
-            by.flux_f, by.flux_g, self.problem.pattern.position, data,
-        )  # fmt: skip
+        for c, by in assembly.chunks(self._linearised, len(s.weight)):
+            poroelastic.linearise(
+                at.deformation[c], at.pressure[c], at.gradient[c], m.mu[c], m.lam[c], m.mobility[c],
+                m.storage[c], h, old.pressure[c],
+                by.stress_f, by.stress_p, by.content_f, by.content_p, by.flux_f, by.flux_g,
+            )  # fmt: skip
+            assembly.tangent(
+                s.grad_u[c], s.grad_p[c], s.value_p, s.weight[c], by.stress_f, by.stress_p, by.content_f,
+                by.content_p, by.flux_f, by.flux_g, self.problem.pattern.position[c], data,
+            )  # fmt: skip
         free_free, free_fixed = self.problem.pattern.matrices(data)
         self.pad_gradient = 2.0 * (free_fixed @ self._on_pad)
         return free_free, free_fixed

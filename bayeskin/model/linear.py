@@ -29,7 +29,7 @@ _ANALYSE_AND_FACTORISE, _FACTORISE, _SOLVE, _RELEASE = 12, 22, 33, -1
 # matching; single precision; indices from 0
 _SETTINGS = {1: 1, 2: 2, 10: 8, 11: 1, 13: 1, 18: -1, 28: 1, 35: 1}
 _ENTRIES_OF_FACTOR = 18  # asked for by -1
-MOST, MEMORY_BYTES = 10, 250_000_000  # factorisations kept, and what they may take
+MOST, MEMORY_BYTES = 10, 320_000_000  # factorisations kept, and what they may take
 
 
 class Factorisations(Protocol):
