@@ -81,7 +81,7 @@ def polish_map(
     """
     best, value, trust = dict(start), -np.inf, TRUST
     local: LogPosterior | None = None
-    trial, first, promised = dict(start), -np.inf, np.inf
+    trial, first = dict(start), -np.inf
     runs: list[tuple[float, Simulation]] = []
     for _ in range(rounds):
         run = full_run({name: trial[name] for name in log_posterior.surrogate.space.names})
@@ -96,11 +96,10 @@ def polish_map(
             trust = trust if len(runs) == 1 else min(2.0 * trust, TRUST)
         else:
             trust *= 0.25
-        if local is None or trust < SMALLEST_TRUST or promised < ENOUGH:
+        if local is None or trust < SMALLEST_TRUST:
             break
-        trial, there = _maximum(local, best, trust)
-        promised = there - value
-        if promised < ENOUGH:
+        trial, promised = _maximum(local, best, trust)
+        if promised - value < ENOUGH:
             return Polished(best, value, value - first, runs, f"converged after {len(runs)} full runs")
     return Polished(best, value, value - first, runs, f"stopped after {len(runs)} full runs")
 

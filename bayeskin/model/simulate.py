@@ -36,7 +36,7 @@ class ModelSpec:
     refinement : of the bricks; 1 gives 231 of them
     tolerance : estimated local error of the reaction a step, relative to the nominal force
     article_steps : "fixed" (0.5 s throughout, as the article) or "growing" (0.5 s while the pads
-        move and just after, longer in holds and rests: three times cheaper, its error measured)
+        move and just after, longer in holds and rests: a third of the steps)
     """
 
     observation: Observation = "reaction"

@@ -12,6 +12,7 @@ grains takes from the law (some 1e-4 at E = 1 MPa) shows in the held-out error l
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -27,12 +28,12 @@ class Similarity:
 
     space: ParameterSpace
 
-    @property
+    @cached_property
     def _powers(self) -> Array:
         """Stress powers (d,) of the parameters that can be scaled: the positive ones."""
         return np.array([p.stress_power if p.lower > 0.0 else 0 for p in self.space.parameters], dtype=float)
 
-    @property
+    @cached_property
     def _reference(self) -> int | None:
         found = np.flatnonzero(self._powers == 1.0)
         return int(found[0]) if len(found) else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -45,6 +46,11 @@ class ShapeSurrogate(_FreezesArrays):
     latents: Latents
     provenance: Mapping[str, Any]
 
+    @cached_property
+    def similarity(self) -> Similarity:
+        """What makes inputs of parameters."""
+        return Similarity(self.space)
+
     def predict(self, theta: ArrayLike) -> Prediction:
         """Force at theta (n, d) or (d,), with its uncertainty.
 
@@ -52,7 +58,7 @@ class ShapeSurrogate(_FreezesArrays):
         """
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
-        mean, variance = self.latents.predict(Similarity(self.space).inputs(theta))
+        mean, variance = self.latents.predict(self.similarity.inputs(theta))
         return self._decode(theta, mean, variance)
 
     def leave_one_out(self, theta: Array) -> Prediction:
@@ -60,7 +66,7 @@ class ShapeSurrogate(_FreezesArrays):
         return self._decode(theta, *self.latents.leave_one_out())
 
     def _decode(self, theta: Array, mean: Array, variance: Array) -> Prediction:
-        mean[:, 0] += Similarity(self.space).log_scale(theta)
+        mean[:, 0] += self.similarity.log_scale(theta)
         return self.transform.decode(mean, np.sqrt(variance))
 
 

@@ -99,7 +99,8 @@ def _fit(
     provenance: dict[str, Any],
 ) -> ShapeSurrogate:  # fmt: skip
     """One surrogate of one kind on the rows given."""
-    inputs = Similarity(space).inputs(design.theta)
+    similarity = Similarity(space)
+    inputs = similarity.inputs(design.theta)
     if kind == "chaos":
         rows = rows & _within(inputs, ROUNDING)  # polynomials leave [-1, 1] steeply: a margin would rule
     inputs, log_scale, force_n = (
@@ -153,7 +154,7 @@ def _measure(
     if testing.any():
         return validate(surrogate, design.theta[testing], design.force_n[testing], focus[testing])
     if surrogate.provenance["kind"] == "chaos":
-        training = training & _within(Similarity(surrogate.space).inputs(design.theta), ROUNDING)
+        training = training & _within(surrogate.similarity.inputs(design.theta), ROUNDING)
     theta = design.theta[training]
     return compare(
         surrogate, surrogate.leave_one_out(theta), theta, design.force_n[training],
