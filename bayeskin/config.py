@@ -40,7 +40,6 @@ class ModelConfig(_Section):
     observation: Literal["reaction", "article"] = "reaction"
     mesh: str = "bricks"
     refinement: Positive = 1  # of the bricks
-    article_steps: Literal["fixed", "growing"] = "fixed"
 
     @model_validator(mode="after")
     def _article_needs_its_mesh(self) -> ModelConfig:

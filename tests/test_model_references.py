@@ -17,7 +17,6 @@ from bayeskin.model import ModelSpec, article, simulate
 from bayeskin.model.article import ArticleModel
 from bayeskin.model.mesh import read_gmsh
 from bayeskin.model.problem import build_problem, material
-from bayeskin.model.simulate import article_samples
 from bayeskin.types import PadMotion
 
 POINTS = {
@@ -68,11 +67,11 @@ def article_reference() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.concatenate([start, table]).T[:3]
 
 
-def article_run(until_s: float, theta: dict[str, float] = CALIBRATED, steps: str = "fixed"):
+def article_run(until_s: float, theta: dict[str, float] = CALIBRATED):
     time_s, pad_m, force_n = article_reference()
     kept = time_s <= until_s
     motion = PadMotion(time_s[kept], 2 * pad_m[kept])
-    spec = ModelSpec("article", str(supplement("data/Mesh_SKIN.msh")), article_steps=steps)
+    spec = ModelSpec("article", str(supplement("data/Mesh_SKIN.msh")))
     found = simulate(spec, motion, theta)
     assert found.status == "ok", found.message
     return found, time_s[kept], force_n[kept]
@@ -123,18 +122,6 @@ def test_articles_tangent_is_the_derivative_of_its_residual():
     difference = (equations.residual(x + h * step) - equations.residual(x - h * step)) / (2 * h)
     for rows in (free < n, free >= n):
         assert np.abs(difference - exact)[rows].max() < 1e-6 * np.abs(exact[rows]).max()
-
-
-def test_growing_steps_keep_every_step_of_a_ramp_and_thin_out_the_holds():
-    motion = PadMotion(np.array([0.0, 10.0, 20.0, 80.0, 90.0]), 1e-3 * np.array([0, 0, 10, 10, 0.0]))
-    fixed, growing = article_samples(motion, "fixed"), article_samples(motion, "growing")
-    assert len(fixed) == 181
-    assert len(growing) < 75
-    assert set(growing) <= set(fixed)
-    assert growing[0] == 0
-    assert growing[-1] == 90
-    for start, end in ((10.0, 20.0), (80.0, 90.0)):
-        assert {t for t in fixed if start <= t <= end} <= set(growing)
 
 
 class ScriptedForces:

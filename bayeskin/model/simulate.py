@@ -17,12 +17,12 @@ from bayeskin.model import article, lagrangian
 from bayeskin.model.gradients import DIFFERENTIATED, ForceGradients
 from bayeskin.model.linear import SOLVER_NAME
 from bayeskin.model.mesh import SkinMesh, brick_mesh, read_gmsh
+from bayeskin.model.newton import NewtonSolver
 from bayeskin.model.problem import PARAMETERS, Constants, Problem, build_problem, material
 from bayeskin.types import Array, Observation, PadMotion, Simulation, frozen_array
 
-PHYSICS_VERSION = 1  # raised when a change of the code changes a force by more than its tolerance
+PHYSICS_VERSION = 2  # raised when a change of the code changes a force by more than its tolerance
 ARTICLE_STEP_S = 0.5  # every 50th sample of a 100 Hz recording
-ARTICLE_HOLD_STEPS = (0.5, 8.0, 1.3)  # first, longest, growth: see ModelSpec.article_steps
 
 OnState = Callable[[float, Array, float], None]  # time_s, x (dofs,), force_n
 
@@ -34,16 +34,14 @@ class ModelSpec:
     observation : "reaction" (what a load cell on the pad measures) or "article" (its released code)
     mesh : "bricks" (our graded bricks) or the path of a gmsh file with the article's names
     refinement : of the bricks; 1 gives 231 of them
-    tolerance : estimated local error of the reaction a step, relative to the nominal force
-    article_steps : "fixed" (0.5 s throughout, as the article) or "growing" (0.5 s while the pads
-        move and just after, longer in holds and rests: a third of the steps)
+    tolerance : estimated local error of the reaction a step, relative to the nominal force; the
+        article's steps are its own
     """
 
     observation: Observation = "reaction"
     mesh: str = "bricks"
     refinement: int = 1
     tolerance: float = 1e-3
-    article_steps: str = "fixed"
 
     def __post_init__(self) -> None:
         if self.observation == "article" and self.mesh == "bricks":
@@ -52,8 +50,11 @@ class ModelSpec:
     @property
     def hash(self) -> str:
         """sha256 of all that the force depends on besides motion and parameters."""
-        spec = asdict(self) | {"mesh": _mesh(self.mesh, self.refinement).hash}
-        text = json.dumps([PHYSICS_VERSION, spec, asdict(Constants())], sort_keys=True)
+        steps = ARTICLE_STEP_S if self.observation == "article" else self.tolerance
+        mesh = _mesh(self.mesh, self.refinement).hash
+        text = json.dumps(
+            [PHYSICS_VERSION, self.observation, mesh, steps, asdict(Constants())], sort_keys=True
+        )
         return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -90,69 +91,29 @@ def simulate(
     _check(theta)
     if gradients and spec.observation != "reaction":
         raise InputError("gradients", f"observation {spec.observation!r}", "observation 'reaction'")
-    slopes: ForceGradients | None = None
-    problem = problem_of(spec.mesh, spec.refinement)
-    times, forces = [0.0], [0.0]
-    corners, errors = [True], [0.0]
-    end = float(motion.time_s[-1])
-
-    def record(time_s: float, x: Array, force_n: float, corner: bool, error_n: float = 0.0) -> None:
-        if time_s > 0.0:
-            times.append(time_s)
-            forces.append(force_n)
-            corners.append(corner)
-            errors.append(error_n)
-        if on_state is not None:
-            on_state(time_s, x, force_n)
-        if on_progress is not None:
-            on_progress(time_s / end)
-
     started = time.perf_counter()
-    cells = material(theta, problem.mesh.cutis)
-    if spec.observation == "reaction":
-        model = lagrangian.LagrangianModel(problem, cells, motion)
-        slopes = ForceGradients(model, theta) if gradients else None
-
-        def on_step(step: lagrangian.Step) -> None:
-            if slopes is not None and step.stages:
-                slopes.follow(step)
-            record(step.state.time_s, step.state.x, step.force_n, step.corner, step.error_n)
-
-        try:
-            message = lagrangian.integrate(model, theta["p_init"], spec.tolerance, on_step)
-        except FloatingPointError as error:
-            message = str(error)
-        solver = model.solver
-    else:
-        old = article.ArticleModel(problem, cells)
-        samples = article_samples(motion, spec.article_steps)
-        message = article.run(
-            old,
-            samples,
-            motion.at(samples),
-            theta["p_init"],
-            lambda t, x, f: record(t, x, f, bool(np.abs(motion.time_s - t).min() < 1e-6)),
-        )
-        solver = old.solver
+    problem = problem_of(spec.mesh, spec.refinement)
+    history = _History(motion, on_progress, on_state)
+    run = _run_reaction if spec.observation == "reaction" else _run_article
+    message, solver, slopes = run(spec, problem, motion, theta, history, gradients)
     solver.release()
-    force = np.array(forces)
-    peak = float(np.abs(force).max())
+    force = np.array(history.forces_n)
     stats = {
         "seconds": time.perf_counter() - started,
-        "steps": float(len(times) - 1),
+        "steps": float(len(force) - 1),
         "dofs": float(problem.space.dofs),
-        "time_error_n": float(np.sum(errors)),  # sum of local estimates: pessimistic
-        "peak_force_n": peak,
+        "time_error_n": float(np.sum(history.errors_n)),  # sum of local estimates: pessimistic
+        "peak_force_n": float(np.abs(force).max()),
         "last_residual": float(solver.last_residual),
         **{name: float(count) for name, count in solver.counts.items()},
         **({"seconds_of_gradients": slopes.seconds} if slopes else {}),
     }
     return Simulation(
         theta={name: float(theta[name]) for name in PARAMETERS},
-        time_s=np.array(times),
-        displacement_m=motion.at(times),
+        time_s=np.array(history.times_s),
+        displacement_m=motion.at(history.times_s),
         force_n=force,
-        corner=frozen_array(corners, bool),
+        corner=frozen_array(history.corners, bool),
         status="failed" if message else "ok",
         message=message,
         stats=stats,
@@ -162,21 +123,69 @@ def simulate(
     )
 
 
-def article_samples(motion: PadMotion, steps: str) -> Array:
-    """Times of the article's backward-Euler steps (n,) [s], starting at 0."""
-    fixed = np.arange(0.0, motion.time_s[-1] + 1e-9, ARTICLE_STEP_S)
-    if steps == "fixed":
-        return fixed
-    moving = np.abs(np.diff(motion.at(fixed))) > 2e-5
-    first, longest, growth = ARTICLE_HOLD_STEPS
-    chosen, i, stride = [0], 0, first
-    while i < len(moving):
-        stride = first if moving[i] else min(stride * growth, longest)
-        jump = max(1, round(stride / ARTICLE_STEP_S))
-        upcoming = np.flatnonzero(moving[i : i + jump])
-        i = min(i + (jump if moving[i] or not len(upcoming) else int(upcoming[0])), len(moving))
-        chosen.append(i)
-    return fixed[chosen]
+class _History:
+    """Accepted steps so far, from the state of rest on; tells whoever listens of each."""
+
+    def __init__(
+        self, motion: PadMotion, on_progress: Callable[[float], None] | None, on_state: OnState | None
+    ) -> None:
+        self._end_s, self._on_progress, self._on_state = float(motion.time_s[-1]), on_progress, on_state
+        self.times_s, self.forces_n, self.errors_n, self.corners = [0.0], [0.0], [0.0], [True]
+
+    def add(self, time_s: float, x: Array, force_n: float, corner: bool, error_n: float = 0.0) -> None:
+        if time_s > 0.0:
+            self.times_s.append(time_s)
+            self.forces_n.append(force_n)
+            self.corners.append(corner)
+            self.errors_n.append(error_n)
+        if self._on_state is not None:
+            self._on_state(time_s, x, force_n)
+        if self._on_progress is not None:
+            self._on_progress(time_s / self._end_s)
+
+
+_Ended = tuple[str, NewtonSolver, ForceGradients | None]  # message, empty for a run that finished
+
+
+def _run_reaction(
+    spec: ModelSpec,
+    problem: Problem,
+    motion: PadMotion,
+    theta: Mapping[str, float],
+    history: _History,
+    gradients: bool,
+) -> _Ended:
+    model = lagrangian.LagrangianModel(problem, material(theta, problem.mesh.cutis), motion)
+    slopes = ForceGradients(model, theta) if gradients else None
+
+    def on_step(step: lagrangian.Step) -> None:
+        if slopes is not None and step.stages:
+            slopes.follow(step)
+        history.add(step.state.time_s, step.state.x, step.force_n, step.corner, step.error_n)
+
+    try:
+        message = lagrangian.integrate(model, theta["p_init"], spec.tolerance, on_step)
+    except FloatingPointError as error:
+        message = str(error)
+    return message, model.solver, slopes
+
+
+def _run_article(
+    spec: ModelSpec,
+    problem: Problem,
+    motion: PadMotion,
+    theta: Mapping[str, float],
+    history: _History,
+    _: bool,
+) -> _Ended:
+    model = article.ArticleModel(problem, material(theta, problem.mesh.cutis))
+    samples = np.arange(0.0, motion.time_s[-1] + 1e-9, ARTICLE_STEP_S)
+
+    def on_step(time_s: float, x: Array, force_n: float) -> None:
+        history.add(time_s, x, force_n, bool(np.abs(motion.time_s - time_s).min() < 1e-6))
+
+    message = article.run(model, samples, motion.at(samples), theta["p_init"], on_step)
+    return message, model.solver, None
 
 
 def _check(theta: Mapping[str, float]) -> None:
@@ -191,4 +200,4 @@ def _check(theta: Mapping[str, float]) -> None:
             raise InputError("parameters", name, f"one of {', '.join(PARAMETERS)}")
 
 
-__all__ = ["SOLVER_NAME", "ModelSpec", "article_samples", "problem_of", "simulate"]
+__all__ = ["SOLVER_NAME", "ModelSpec", "problem_of", "simulate"]

@@ -19,5 +19,4 @@ def model_spec(run: Run, mesh: str | None = None, observation: str | None = None
         observation=observation or model.observation,  # type: ignore[arg-type]
         mesh=mesh,
         refinement=model.refinement,
-        article_steps=model.article_steps,
     )

@@ -1,0 +1,79 @@
+"""The full model against other programs over the whole recording: how far off, and in what CPU time.
+
+- `reaction` against an independent solver at three points (`reference/reaction_independent_A.csv`, B, C);
+- `article` against its released script (`reference/article_forward.csv`).
+
+Run with the supplement's folder in BAYESKIN_SUPPLEMENT, some eight minutes:  python benchmarks/references.py
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from bayeskin.model import ModelSpec, simulate
+from bayeskin.types import Array, PadMotion
+
+POINTS = {
+    "A": {"E_c": 60e3, "E_s": 20e3, "k_c": 1e-14, "k_s": 5e-13, "p_init": 700.0},
+    "B": {"E_c": 200e3, "E_s": 5e3, "k_c": 1e-13, "k_s": 5e-12, "p_init": 700.0},
+    "C": {"E_c": 684250.48, "E_s": 47789.13, "k_c": 9.428584e-15, "k_s": 5.0299945e-13, "p_init": 700.0},
+}
+CORNER_M_S = 1e-4  # change of the pads' speed that makes a corner of the protocol
+
+
+def main() -> int:
+    """Prints one line a comparison; exit code 2 without the supplement."""
+    folder = os.environ.get("BAYESKIN_SUPPLEMENT")
+    if not folder:
+        print("BAYESKIN_SUPPLEMENT: found nothing; expected the supplement's folder", file=sys.stderr)
+        return 2
+    mesh, reference = str(Path(folder) / "data" / "Mesh_SKIN.msh"), Path(folder) / "reference"
+    for case, theta in POINTS.items():
+        time_s, pad_m, force_n = _read(reference / f"reaction_independent_{case}.csv")
+        speed = np.diff(pad_m) / np.diff(time_s)
+        corners = 1 + np.flatnonzero(np.abs(np.diff(speed)) > CORNER_M_S)
+        kept = np.concatenate([[0], corners, [len(time_s) - 1]])
+        motion = PadMotion(time_s[kept], 2.0 * pad_m[kept])
+        _compare(f"reaction {case}", ModelSpec(mesh=mesh), motion, theta, time_s, force_n)
+    time_s, pad_m, force_n = _read(reference / "article_forward.csv")
+    motion = PadMotion(time_s, 2.0 * pad_m)
+    _compare("article", ModelSpec("article", mesh), motion, POINTS["C"], time_s, force_n)
+    return 0
+
+
+def _read(path: Path) -> tuple[Array, Array, Array]:
+    """Time [s], displacement of a pad [m] and force [N], from the start at rest."""
+    table = np.loadtxt(path, delimiter=",", skiprows=1)[:, :3]
+    time_s, pad_m, force_n = table.T if table[0, 0] == 0.0 else np.vstack([np.zeros(3), table]).T
+    return time_s, pad_m, force_n
+
+
+def _compare(
+    label: str,
+    spec: ModelSpec,
+    motion: PadMotion,
+    theta: dict[str, float],
+    time_s: Array,
+    force_n: Array,
+) -> None:
+    started = time.process_time()
+    run = simulate(spec, motion, theta)
+    cpu_s = time.process_time() - started
+    if run.status != "ok":
+        raise SystemExit(f"{label}: {run.message}")
+    off = run.at(time_s) - force_n
+    rmse, most, peak = np.sqrt(np.mean(off**2)), np.abs(off).max(), np.abs(force_n).max()
+    print(
+        f"{label:>24}: RMSE {1e3 * rmse:.4f} mN ({100 * rmse / peak:.3f} % of the peak), at most "
+        f"{1e3 * most:.4f} mN, {len(run.time_s) - 1} steps, {cpu_s:.0f} CPU s",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
