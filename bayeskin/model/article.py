@@ -69,8 +69,7 @@ class ArticleModel:
         self._face = _pad_face(mesh, self.problem.mesh.facets["pad"])
         self._cells = np.ascontiguousarray(mesh.t.T)
         shape = space.weight.shape
-        self._points, self._response = assembly.points(shape), assembly.response(shape)
-        self._linearised = assembly.linearised(shape)
+        self._chunks = assembly.chunks(shape)
         self._data = np.empty(self.problem.pattern.size)  # overwritten by each tangent
         # displacement nodes 0..corners-1 are the mesh's vertices in scikit-fem's numbering
         assert np.array_equal(space.nodes_u[:, :4], self._cells)
@@ -107,39 +106,45 @@ class ArticleModel:
 
     def _equations(self, old: Array, grad_u: Array, grad_p: Array, weight: Array, dt: float) -> Equations:
         s, m, pattern = self.problem.space, self.material, self.problem.pattern
-        at, found = self._points, self._response
 
-        def evaluate(x: Array) -> None:
+        def evaluate(x: Array, chunk: assembly.Chunk) -> None:
+            c, at = chunk.cells, chunk.at
             assembly.evaluate(
-                x, s.nodes_u, s.nodes_p, grad_u, grad_p, s.value_p, at.deformation, at.pressure, at.gradient
-            )
+                x, s.n_nodes, s.nodes_u[c], s.nodes_p[c], grad_u[c], grad_p[c], s.value_p,
+                at.deformation, at.pressure, at.gradient,
+            )  # fmt: skip
 
-        evaluate(old)
-        divergence_old = np.trace(at.deformation, axis1=2, axis2=3)
-        pressure_old = at.pressure.copy()
+        divergence_old, pressure_old = np.empty(weight.shape), np.empty(weight.shape)
+        for chunk in self._chunks:
+            evaluate(old, chunk)
+            divergence_old[chunk.cells] = np.trace(chunk.at.deformation, axis1=2, axis2=3)
+            pressure_old[chunk.cells] = chunk.at.pressure
 
         def residual(x: Array) -> Array | None:
-            evaluate(x)
-            smallest = article_law.respond(
-                at.deformation, at.pressure, at.gradient, m.mu, m.lam, m.mobility, m.storage, dt,
-                divergence_old, pressure_old, found.stress, found.content, found.flux,
-            )  # fmt: skip
-            if not smallest > 0.0:
-                return None
             out = np.zeros(s.dofs)
-            assembly.residual(
-                s.nodes_u, s.nodes_p, grad_u, grad_p, s.value_p, weight,
-                found.stress, found.content, found.flux, out,
-            )  # fmt: skip
+            for chunk in self._chunks:
+                c, at, found = chunk.cells, chunk.at, chunk.found
+                evaluate(x, chunk)
+                smallest = article_law.respond(
+                    at.deformation, at.pressure, at.gradient, m.mu[c], m.lam[c], m.mobility[c], m.storage[c],
+                    dt, divergence_old[c], pressure_old[c], found.stress, found.content, found.flux,
+                )  # fmt: skip
+                if not smallest > 0.0:
+                    return None
+                assembly.residual(
+                    s.n_nodes, s.nodes_u[c], s.nodes_p[c], grad_u[c], grad_p[c], s.value_p, weight[c],
+                    found.stress, found.content, found.flux, out,
+                )  # fmt: skip
             return out[pattern.free] if np.isfinite(out).all() else None
 
         def tangent(x: Array) -> tuple[sp.csr_matrix, sp.csr_matrix]:
-            evaluate(x)
             data = self._data
             data[:] = 0.0
-            for c, by in assembly.chunks(self._linearised, len(weight)):
+            for chunk in self._chunks:
+                c, at, by = chunk.cells, chunk.at, chunk.by
+                evaluate(x, chunk)
                 article_law.linearise(
-                    at.deformation[c], m.mu[c], m.lam[c], m.mobility[c], m.storage[c], dt,
+                    at.deformation, m.mu[c], m.lam[c], m.mobility[c], m.storage[c], dt,
                     by.stress_f, by.stress_p, by.content_f, by.content_p, by.flux_g,
                 )  # fmt: skip
                 assembly.tangent(

@@ -12,15 +12,15 @@ inner loops run over shape functions.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numba
 import numpy as np
 
 from bayeskin.types import Array
 
-CHUNK = 512  # cells
+CHUNK = 256  # cells
 compiled = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
@@ -58,33 +58,35 @@ class Linearised:
     flux_g: Array
 
 
-def points(shape: tuple[int, ...]) -> Points:
-    """Empty arrays for (e, q) points; they are reused, because fresh pages cost as much as the sums."""
-    return Points(np.empty((*shape, 3, 3)), np.empty(shape), np.empty((*shape, 3)))
+@dataclass(frozen=True)
+class Chunk:
+    """Some cells, few enough that what is computed of them stays in the cache, and room for it."""
+
+    cells: slice
+    at: Points
+    found: Response
+    by: Linearised
 
 
-def response(shape: tuple[int, ...]) -> Response:
-    """Empty arrays for (e, q) points."""
-    return Response(np.empty((*shape, 3, 3)), np.empty(shape), np.empty((*shape, 3)))
+def chunks(shape: tuple[int, int]) -> list[Chunk]:
+    """All (e, q) points, chunk by chunk; the chunks share one room, so each is done with before the next."""
+    size = min(CHUNK, shape[0]), shape[1]
+    room = (
+        Points(np.empty((*size, 3, 3)), np.empty(size), np.empty((*size, 3))),
+        Response(np.empty((*size, 3, 3)), np.empty(size), np.empty((*size, 3))),
+        Linearised(*(np.zeros((*size, *tail)) for tail in ((9, 9), (9,), (9,), (), (3, 9), (3, 3)))),
+    )
+    ends = ((start, min(start + CHUNK, shape[0])) for start in range(0, shape[0], CHUNK))
+    return [Chunk(slice(a, b), *(_first(b - a, arrays) for arrays in room)) for a, b in ends]
 
 
-def linearised(shape: tuple[int, int]) -> Linearised:
-    """Arrays of zeros for the points of `CHUNK` cells at a time: of all cells they would fill the memory."""
-    sizes = ((9, 9), (9,), (9,), (), (3, 9), (3, 3))
-    return Linearised(*(np.zeros((min(CHUNK, shape[0]), shape[1], *size)) for size in sizes))
-
-
-def chunks(by: Linearised, cells: int) -> Iterator[tuple[slice, Linearised]]:
-    """Slices of the cells, and as much of the arrays as each needs."""
-    for start in range(0, cells, CHUNK):
-        part = slice(start, min(start + CHUNK, cells))
-        yield part, Linearised(*(getattr(by, f.name)[: part.stop - start] for f in fields(by)))
+def _first(count: int, arrays: Any) -> Any:
+    return type(arrays)(*(getattr(arrays, f.name)[:count] for f in fields(arrays)))
 
 
 @compiled
-def evaluate(x, nodes_u, nodes_p, grad_u, grad_p, value_p, deformation, pressure, gradient):
-    """Fills F, p and grad p at the points from the unknowns x (dofs,)."""
-    n_nodes = (x.shape[0] - nodes_p.max() - 1) // 3  # the pressures follow the displacements
+def evaluate(x, n_nodes, nodes_u, nodes_p, grad_u, grad_p, value_p, deformation, pressure, gradient):
+    """Fills F, p and grad p at the points from the unknowns x (dofs,): 3 n_nodes displacements, pressures."""
     na, nb = nodes_u.shape[1], nodes_p.shape[1]
     u, p = np.empty((3, na)), np.empty(nb)
     for e in range(nodes_u.shape[0]):
@@ -112,9 +114,8 @@ def evaluate(x, nodes_u, nodes_p, grad_u, grad_p, value_p, deformation, pressure
 
 
 @compiled
-def residual(nodes_u, nodes_p, grad_u, grad_p, value_p, weight, stress, content, flux, out):
+def residual(n_nodes, nodes_u, nodes_p, grad_u, grad_p, value_p, weight, stress, content, flux, out):
     """Adds the residual (dofs,) to `out`."""
-    n_nodes = (out.shape[0] - nodes_p.max() - 1) // 3
     na, nb = nodes_u.shape[1], nodes_p.shape[1]
     force, fluid = np.empty((3, na)), np.empty(nb)
     for e in range(nodes_u.shape[0]):

@@ -33,7 +33,7 @@ GAMMA = 1.0 - np.sqrt(0.5)
 FIRST_STEP_S = 1.0
 SHORTEST_STEP = 1e-3  # of the phase; a run that asks for less has failed
 GROWTH, SHRINK = 2.0, 0.25  # zero-stable while steps grow less than 2.41-fold
-STEPS_PER_PHASE = 5  # so that a cubic between steps follows the curvature of a ramp
+STEPS_PER_PHASE = 5  # fewer, longer ones cost as much: their guesses are worse, their tangents further apart
 CUTIS_THICKNESS_M, SUBCUTIS_THICKNESS_M = 2e-3, 8e-3
 PAD_WIDTH_M, PAD_EDGE_M = 8e-3, 18e-3  # both halves of the pad; distance of its inner edge from x = 0
 SOLVER_TOLERANCE = 1e-4  # of the largest displacement and pressure, before the last correction
@@ -88,8 +88,7 @@ class LagrangianModel:
     def __post_init__(self) -> None:
         self.full_residual = np.zeros(self.problem.space.dofs)
         shape = self.problem.space.weight.shape
-        self._points, self._response = assembly.points(shape), assembly.response(shape)
-        self._linearised = assembly.linearised(shape)
+        self._chunks = assembly.chunks(shape)
         self._data = np.empty(self.problem.pattern.size)  # overwritten by each tangent
         # the reaction's derivative (free,) by the free unknowns, at the last tangent
         self.pad_gradient = np.zeros(len(self.problem.pattern.free))
@@ -117,30 +116,33 @@ class LagrangianModel:
         self, x: Array, h: float, old: State, material: Material | None = None
     ) -> tuple[Array, Array, Array] | None:
         """Residual (dofs,), J and p (e, q), of this or another material; None if a cell is inside out."""
-        s, m, at, found = self.problem.space, material or self.material, self._points, self._response
-        volume = np.empty(s.weight.shape)
-        self._evaluate(x)
-        smallest = poroelastic.respond(
-            at.deformation, at.pressure, at.gradient, m.mu, m.lam, m.mobility, m.storage, h,
-            old.volume, old.pressure, found.stress, found.content, found.flux, volume,
-        )  # fmt: skip
-        if not smallest > 0.0:
-            return None
-        out = np.zeros(s.dofs)
-        assembly.residual(
-            s.nodes_u, s.nodes_p, s.grad_u, s.grad_p, s.value_p, s.weight,
-            found.stress, found.content, found.flux, out,
-        )  # fmt: skip
-        return (out, volume, at.pressure.copy()) if np.isfinite(out).all() else None
+        s, m = self.problem.space, material or self.material
+        volume, pressure, out = np.empty(s.weight.shape), np.empty(s.weight.shape), np.zeros(s.dofs)
+        for chunk in self._chunks:
+            c, at, found = chunk.cells, chunk.at, chunk.found
+            self._evaluate(x, chunk)
+            pressure[c] = at.pressure
+            smallest = poroelastic.respond(
+                at.deformation, at.pressure, at.gradient, m.mu[c], m.lam[c], m.mobility[c], m.storage[c], h,
+                old.volume[c], old.pressure[c], found.stress, found.content, found.flux, volume[c],
+            )  # fmt: skip
+            if not smallest > 0.0:
+                return None
+            assembly.residual(
+                s.n_nodes, s.nodes_u[c], s.nodes_p[c], s.grad_u[c], s.grad_p[c], s.value_p, s.weight[c],
+                found.stress, found.content, found.flux, out,
+            )  # fmt: skip
+        return (out, volume, pressure) if np.isfinite(out).all() else None
 
     def tangent(self, x: Array, h: float, old: State) -> tuple[sp.csr_matrix, sp.csr_matrix]:
         """Derivative of the residual's free rows by the free and by the fixed unknowns."""
-        s, m, at, data = self.problem.space, self.material, self._points, self._data
+        s, m, data = self.problem.space, self.material, self._data
         data[:] = 0.0
-        self._evaluate(x)
-        for c, by in assembly.chunks(self._linearised, len(s.weight)):
+        for chunk in self._chunks:
+            c, at, by = chunk.cells, chunk.at, chunk.by
+            self._evaluate(x, chunk)
             poroelastic.linearise(
-                at.deformation[c], at.pressure[c], at.gradient[c], m.mu[c], m.lam[c], m.mobility[c],
+                at.deformation, at.pressure, at.gradient, m.mu[c], m.lam[c], m.mobility[c],
                 m.storage[c], h, old.pressure[c],
                 by.stress_f, by.stress_p, by.content_f, by.content_p, by.flux_f, by.flux_g,
             )  # fmt: skip
@@ -152,10 +154,10 @@ class LagrangianModel:
         self.pad_gradient = 2.0 * (free_fixed @ self._on_pad)
         return free_free, free_fixed
 
-    def _evaluate(self, x: Array) -> None:
-        s, at = self.problem.space, self._points
+    def _evaluate(self, x: Array, chunk: assembly.Chunk) -> None:
+        s, c, at = self.problem.space, chunk.cells, chunk.at
         assembly.evaluate(
-            x, s.nodes_u, s.nodes_p, s.grad_u, s.grad_p, s.value_p,
+            x, s.n_nodes, s.nodes_u[c], s.nodes_p[c], s.grad_u[c], s.grad_p[c], s.value_p,
             at.deformation, at.pressure, at.gradient,
         )  # fmt: skip
 

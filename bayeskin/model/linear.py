@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 from typing import Protocol
 
+import numba
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
@@ -28,8 +29,8 @@ _ANALYSE_AND_FACTORISE, _FACTORISE, _SOLVE, _RELEASE = 12, 22, 33, -1
 # by number in Intel's manual: own settings; METIS ordering; pivots perturbed below 1e-8; scaling and
 # matching; single precision; indices from 0
 _SETTINGS = {1: 1, 2: 2, 10: 8, 11: 1, 13: 1, 18: -1, 28: 1, 35: 1}
-_ENTRIES_OF_FACTOR = 18  # asked for by -1
-MOST, MEMORY_BYTES = 10, 320_000_000  # factorisations kept, and what they may take
+_PERTURBED_PIVOTS, _ENTRIES_OF_FACTOR = 14, 18  # the latter asked for by -1
+MOST, MEMORY_BYTES = 10, 480_000_000  # factorisations kept, and what they may take
 
 
 class Factorisations(Protocol):
@@ -61,7 +62,8 @@ class _Pardiso:
         self._settings = np.zeros(64, np.int32)
         for number, value in _SETTINGS.items():
             self._settings[number - 1] = value
-        self._stored: dict[int, tuple[np.ndarray, Array]] = {}  # entries as MKL was given them; scales
+        self._scale: dict[int, Array] = {}  # of each factorisation
+        self._entries: dict[int, np.ndarray] = {}  # as MKL was given them, where it asks for them again
 
     @property
     def room(self) -> int:
@@ -69,30 +71,29 @@ class _Pardiso:
         return int(np.clip(MEMORY_BYTES // max(bytes_each, 1), 1, MOST))
 
     def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None:
-        first = not self._stored
+        first = not self._scale
         if first:
             self._prepare(matrix)
-        data = matrix.data * scale[self._row] * scale[matrix.indices]
-        if self._symmetric:
-            data = 0.5 * (data[self._upper] + data[self._mirrored])
-        self._stored[number] = data.astype(np.float32), scale
+        entries = np.empty(len(self._indices), np.float32)
+        _scaled_mean(self._indptr, self._indices, self._own, self._mirrored, matrix.data, scale, entries)
+        self._scale[number], self._entries[number] = scale, entries
         self._call(number, _ANALYSE_AND_FACTORISE if first else _FACTORISE)  # the pattern is analysed once
+        if self._settings[_PERTURBED_PIVOTS - 1] == 0:  # else each solve is refined with the entries
+            self._entries[number] = np.empty(0, np.float32)
 
     def _prepare(self, matrix: sp.csr_matrix) -> None:
-        self._row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
-        self._indices = matrix.indices.astype(np.int32)
-        self._indptr = matrix.indptr.astype(np.int32)
-        if not self._symmetric:
-            return
-        place = sp.csr_matrix((np.arange(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
-        self._upper = np.flatnonzero(matrix.indices >= self._row)
-        self._mirrored = place.T.tocsr().data[self._upper]
-        self._indices = self._indices[self._upper]
-        count = np.bincount(self._row[self._upper], minlength=matrix.shape[0])
-        self._indptr = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
+        numbers = np.arange(matrix.nnz, dtype=np.int32)
+        pattern = sp.csr_matrix((numbers, matrix.indices, matrix.indptr), shape=matrix.shape)
+        self._own = self._mirrored = numbers
+        if self._symmetric:
+            row = np.repeat(np.arange(matrix.shape[0], dtype=np.int32), np.diff(matrix.indptr))
+            upper = matrix.indices >= row
+            self._own, self._mirrored = numbers[upper], pattern.T.tocsr().data[upper]
+            pattern = sp.triu(pattern, format="csr")
+        self._indices, self._indptr = pattern.indices.astype(np.int32), pattern.indptr.astype(np.int32)
 
     def solve(self, number: int, right: Array) -> Array:
-        scale = self._stored[number][1].reshape((-1,) + (1,) * (right.ndim - 1))
+        scale = self._scale[number].reshape((-1,) + (1,) * (right.ndim - 1))
         scaled = right * scale
         # each column to size one, so that nothing underflows in single precision
         size = np.maximum(np.abs(scaled).max(axis=0), np.finfo(float).tiny)
@@ -101,15 +102,16 @@ class _Pardiso:
 
     def release(self) -> None:
         """Gives MKL's memory back; Python's collector knows nothing of it."""
-        if self._stored:
+        if self._scale:
             self._call(0, _RELEASE)
-            self._stored.clear()
+            self._scale.clear()
+            self._entries.clear()
 
     def _call(self, number: int, phase: int, right: np.ndarray | None = None) -> np.ndarray:
         n = len(self._indptr) - 1
         right = np.zeros(n, np.float32) if right is None else right
         solution, error = np.zeros_like(right), ctypes.c_int32(0)
-        entries = next(iter(self._stored.values()))[0] if phase == _RELEASE else self._stored[number][0]
+        entries = self._entries[number]
 
         def integer(value: int) -> object:
             return ctypes.byref(ctypes.c_int32(value))
@@ -126,6 +128,14 @@ class _Pardiso:
         if error.value != 0:
             raise RuntimeError(f"MKL PARDISO gave error {error.value} in phase {phase}")
         return solution
+
+
+@numba.njit(cache=True)
+def _scaled_mean(indptr, indices, own, mirrored, data, scale, out):  # type: ignore[no-untyped-def]
+    """Fills the entries `out` of a CSR matrix with the means of two entries each of `data`, scaled."""
+    for row in range(len(indptr) - 1):
+        for k in range(indptr[row], indptr[row + 1]):
+            out[k] = 0.5 * (data[own[k]] + data[mirrored[k]]) * scale[row] * scale[indices[k]]
 
 
 class _SuperLU:

@@ -93,8 +93,8 @@ def taylor_hood(mesh: SkinMesh) -> TaylorHood:
 class Sparsity:
     """Where each entry of each cell matrix goes: free rows only, columns split in free and fixed.
 
-    free (f,), fixed (c,) : dof numbers; position (e, nd, nd) : index into the concatenated data of
-    the free-free matrix (f, f) and the free-fixed matrix (f, c), or -1 for a fixed row.
+    free (f,), fixed (c,) : dof numbers; free_free (f, f), free_fixed (f, c) : patterns, their data (bytes)
+    without meaning; position (e, nd, nd) : index into the concatenated data of both, or -1 for a fixed row.
     """
 
     free: np.ndarray
@@ -142,7 +142,7 @@ def sparsity(space: TaylorHood, fixed: np.ndarray) -> Sparsity:
         free_fixed.indices,
         free_free.nnz,
     )
-    return Sparsity(free, fixed, free_free.astype(float), free_fixed.astype(float), position)
+    return Sparsity(free, fixed, free_free, free_fixed, position)
 
 
 @numba.njit(cache=True)
