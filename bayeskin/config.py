@@ -39,7 +39,7 @@ class ModelConfig(_Section):
 
     observation: Literal["reaction", "article"] = "reaction"
     mesh: str = "bricks"
-    refinement: Positive = 1  # of the bricks
+    refinement: Positive = 1  # of the bricks, toward the pads' edges
 
     @model_validator(mode="after")
     def _article_needs_its_mesh(self) -> ModelConfig:

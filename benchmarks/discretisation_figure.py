@@ -49,7 +49,7 @@ def figure_discretisation(
     state_finding(
         figure, _finding(histories),
         "a, b: RMS difference from the reference over the reference's peak, at three points of the prior "
-        "box; a over the first cycle. Squares: cells divided toward the pads' edges; triangles: the "
+        "box; a over the first cycle. Squares: bricks-1, all halved; triangles: the "
         "article's. c, d: first cycle; the face stress is the integral of sigma_xx - p over the pad's face.",
     )  # fmt: skip
     return figure
@@ -69,11 +69,11 @@ def _finding(histories: Sequence[tuple[str, Simulation, Simulation]]) -> str:
 
 def _draw_space(ax: Axes, space: Mapping[tuple[int, str, str], float]) -> None:
     for (cells, mesh, point), rms in sorted(space.items()):
-        marker = "^" if mesh.endswith(".msh") else "s" if "edges" in mesh else "o"
+        marker = "^" if mesh.endswith(".msh") else "s" if "halved" in mesh else "o"
         ax.plot(cells, 100 * rms, marker, color=COLOURS[point], ms=4)
     for point, colour in COLOURS.items():
         even = {
-            key: rms for key, rms in space.items() if key[1].startswith("bricks") and "edges" not in key[1]
+            key: rms for key, rms in space.items() if key[1].startswith("bricks") and "halved" not in key[1]
         }
         line = sorted((cells, 100 * rms) for (cells, _, p), rms in even.items() if p == point)
         if line:

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import rows
 
+from bayeskin.model import ModelSpec
+from bayeskin.model.lagrangian import STEPS_PER_PHASE
 from bayeskin.types import Simulation
 
 SPACE_TOLERANCE = 3e-4
-SPACE_REFERENCE = "bricks-1-edges-2"
+SPACE_REFERENCE = "bricks-3"
 LOADING = "first loading"
 TimeErrors = Mapping[tuple[float, str], "Error"]  # by tolerance and point
 
@@ -164,6 +166,15 @@ def verdict(
             f"Tolerance: {tolerance:g} is the loosest whose RMS error on the protocol `{chosen_on}` is below "
             f"{100 * time_target:g} % of the peak at all points; on `{tested_on}` it gives at most "
             f"{100 * worst:.3f} %."
+        )
+        default = ModelSpec().tolerance
+        found = [
+            max((e.rms for (t, _), e in errors.items() if t == default), default=np.nan)
+            for errors in (chosen_from, tested)
+        ]
+        lines.append(
+            f"The default is {default:g}: at most {100 * found[0]:.3f} and {100 * found[1]:.3f} %, in as many steps "
+            f"as looser ones, because no phase has fewer than {STEPS_PER_PHASE}."
         )
     elif times:
         lines.append(f"Tolerance: none tried is below {100 * time_target:g} % of the peak.")

@@ -10,7 +10,6 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
 from unittest import mock
 
@@ -18,6 +17,7 @@ import numpy as np
 
 from bayeskin import storage
 from bayeskin.model import mesh as mesh_module
+from bayeskin.model.mesh import brick_lines
 from bayeskin.model.simulate import ModelSpec, _mesh, problem_of
 from bayeskin.recordings import idealised_motion, segment
 from bayeskin.types import Array, PadMotion, Recording
@@ -36,8 +36,6 @@ POINTS = {
     }.items()
 }
 GMSH_MESHES = ("Mesh_SKIN.msh", "Symmetric_skin_XY_RF.msh")
-EDGES_M = (1e-3 * np.array([18, 26, 27, 35]), 1e-3 * np.array([4, 5, 12]), 1e-3 * np.array([10]))
-TOWARD_EDGE = 0.25  # where a cell beside an edge of the pads is divided: a quarter of its width from it
 
 
 def first_cycle(motion: PadMotion) -> PadMotion:
@@ -59,40 +57,31 @@ def supplement_mesh(name: str) -> Path | None:
 
 @contextmanager
 def spec_on(mesh: str, tolerance: float) -> Iterator[ModelSpec]:
-    """The `reaction` on a mesh: "bricks-2", "bricks-1-edges-2", or a gmsh file of the supplement.
-
-    "edges-n" divides the cells beside the pads' edges n times toward them, before the refinement.
-    """
-    bricks = re.fullmatch(r"bricks-(\d+)(?:-edges-(\d+))?", mesh)
+    """The `reaction` on a mesh: "bricks-2", "bricks-1-halved" (every edge of every brick), or a gmsh file of
+    the supplement."""
+    bricks = re.fullmatch(r"bricks-(\d+)(-halved)?", mesh)
     if not bricks:
         path = supplement_mesh(mesh)
         if path is None:
             raise SystemExit(f"{mesh}: BAYESKIN_SUPPLEMENT is not set")
         yield ModelSpec(mesh=str(path), tolerance=tolerance)
         return
-    refinement, levels = int(bricks[1]), int(bricks[2] or 0)
-    with mock.patch.object(mesh_module, "_COARSE_LINES_M", brick_lines(levels)):
+    spec = ModelSpec(refinement=int(bricks[1]), tolerance=tolerance)
+    if not bricks[2]:
+        yield spec
+        return
+    with mock.patch.object(mesh_module, "brick_lines", halved_lines):
         _forget_meshes()
         try:
-            yield ModelSpec(refinement=refinement, tolerance=tolerance)
+            yield spec
         finally:
             _forget_meshes()
 
 
-def brick_lines(levels: int) -> tuple[Array, ...]:
-    """Lines of the coarsest bricks with `levels` more on either side of each edge of the pads [m]."""
-    lines = mesh_module._COARSE_LINES_M
-    for _ in range(levels):
-        lines = tuple(_divided(axis, edges) for axis, edges in zip(lines, EDGES_M, strict=True))
-    return lines
-
-
-def _divided(lines: Array, edges: Array) -> Array:
-    new = []
-    for a, b in pairwise(lines):
-        new += [a + TOWARD_EDGE * (b - a)] if np.isclose(edges, a).any() else []
-        new += [b - TOWARD_EDGE * (b - a)] if np.isclose(edges, b).any() else []
-    return np.sort(np.concatenate([lines, new]))
+def halved_lines(refinement: int) -> tuple[Array, ...]:
+    """Lines of the bricks with one more in the middle of every cell [m]."""
+    lines = brick_lines(refinement)
+    return tuple(np.sort(np.concatenate([axis, 0.5 * (axis[1:] + axis[:-1])])) for axis in lines)
 
 
 def _forget_meshes() -> None:

@@ -30,14 +30,11 @@ def test_a_row_is_found_by_its_inputs_and_a_line_cut_short_is_no_row(benchmark, 
     assert len(rows.read()) == 2
 
 
-def test_edge_levels_add_lines_beside_the_pads_edges_only(benchmark):
+def test_halved_bricks_have_every_line_and_the_middles(benchmark):
     skin = benchmark("healthy_skin")
-    for coarse, fine, edges in zip(skin.brick_lines(0), skin.brick_lines(2), skin.EDGES_M, strict=True):
-        assert np.isin(coarse, fine).all()
-        new = np.setdiff1d(fine, coarse)
-        nearest = np.abs(new[:, None] - edges).min(axis=1)
-        assert len(new)
-        assert nearest.max() <= 0.25 * np.diff(coarse).max()
+    for axis, halved in zip(skin.brick_lines(2), skin.halved_lines(2), strict=True):
+        np.testing.assert_allclose(halved[::2], axis)
+        np.testing.assert_allclose(halved[1::2], 0.5 * (axis[1:] + axis[:-1]))
 
 
 def test_face_stress_at_rest_is_minus_the_pressure_times_the_pads_area(benchmark):

@@ -8,7 +8,7 @@ from skin_test import supplement
 
 from bayeskin.errors import InputError
 from bayeskin.model import ModelSpec, simulate
-from bayeskin.model.mesh import ARM_RADIUS_M, brick_mesh, read_gmsh, roll
+from bayeskin.model.mesh import ARM_RADIUS_M, brick_lines, brick_mesh, read_gmsh, roll
 from bayeskin.model.problem import build_problem
 from bayeskin.types import PadMotion
 
@@ -24,9 +24,17 @@ def test_rolling_keeps_arc_lengths_and_radii():
     np.testing.assert_array_equal(x, flat[0])
 
 
-def test_coarsest_bricks_are_231_and_refined_ones_eight_times_as_many():
-    assert brick_mesh(1).geometry.nelements == 231
-    assert brick_mesh(2).geometry.nelements == 8 * 231
+def test_bricks_are_refined_beside_the_pads_edges_only():
+    assert brick_mesh(1).geometry.nelements == 448
+    assert brick_mesh(2).geometry.nelements == 1540
+    edges_m = (1e-3 * np.array([18, 26, 27, 35]), 1e-3 * np.array([4, 5, 12]), 1e-3 * np.array([10]))
+    for coarse, fine, edges in zip(brick_lines(1), brick_lines(3), edges_m, strict=True):
+        assert np.isin(edges, coarse).all()
+        assert np.isin(coarse, fine).all()
+        new = np.setdiff1d(fine, coarse)
+        nearest = np.abs(new[:, None] - edges).min(axis=1)
+        assert len(new)
+        assert nearest.max() <= 0.25 * np.diff(coarse).max()
 
 
 def test_bricks_have_the_rolled_volume_pads_and_layers():

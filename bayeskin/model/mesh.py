@@ -66,12 +66,13 @@ def roll(points: Array, radius_m: float = ARM_RADIUS_M) -> Array:
 
 
 def brick_mesh(refinement: int = 1) -> SkinMesh:
-    """Graded bricks whose lines follow the pads' edges; 27-node geometry, so the arm is curved.
+    """Bricks graded toward the pads' edges; 27-node geometry, so the arm is curved.
 
-    `refinement` divides every element's edges: 1 gives 231 bricks, 2 gives 1,848.
+    There a clamped surface meets a free one and the stress is singular, so that is where they are small
+    and where `refinement` divides them: 1 gives 448 bricks, 2 gives 1,540, each finer one a further line on
+    either side of every edge, a quarter of the cell's width from it.
     """
-    lines = [_refine(axis, refinement) for axis in _COARSE_LINES_M]
-    flat = skfem.MeshHex.init_tensor(*lines)
+    flat = skfem.MeshHex.init_tensor(*brick_lines(refinement))
     facets = _flat_boundaries(flat.p[:, flat.facets].mean(axis=1))
     cutis = flat.p[2, flat.t].mean(axis=0) > CUTIS_BOTTOM_M
     curved = skfem.MeshHex2.from_mesh(flat)
@@ -79,20 +80,28 @@ def brick_mesh(refinement: int = 1) -> SkinMesh:
     return SkinMesh(rolled, facets, cutis, f"bricks, refinement {refinement}")
 
 
-# Lines of the coarsest bricks [mm]: pad edges at x = 18, 26, 27, 35 and y = 4, 5, 12; layers at z = 8.
-_COARSE_LINES_M = tuple(
-    1e-3 * np.array(axis)
-    for axis in (
-        (0.0, 9.0, 15.0, 18.0, 22.0, 26.0, 27.0, 31.0, 35.0, 42.0, 63.0, 105.0),
-        (0.0, 4.0, 5.0, 8.5, 12.0, 18.0, 38.0, 84.0),
-        (0.0, 5.0, 8.0, 10.0),
-    )
+# Lines of the coarsest bricks, and those among them that are edges of the pads [mm]; layers at z = 8.
+_COARSE_LINES_MM = (
+    (0.0, 9.0, 16.5, 18.0, 19.5, 24.5, 26.0, 27.0, 28.5, 33.5, 35.0, 37.0, 45.0, 65.0, 105.0),
+    (0.0, 3.0, 4.0, 5.0, 8.5, 12.0, 18.0, 38.0, 84.0),
+    (0.0, 5.0, 8.0, 9.5, 10.0),
 )
+_EDGES_MM = ((18.0, 26.0, 27.0, 35.0), (4.0, 5.0, 12.0), (10.0,))
+_TOWARD_EDGE = 0.25  # where a cell beside an edge is divided: a quarter of its width from it
 
 
-def _refine(lines: Array, parts: int) -> Array:
-    inner = [np.linspace(a, b, parts, endpoint=False) for a, b in pairwise(lines)]
-    return np.append(np.concatenate(inner), lines[-1])
+def brick_lines(refinement: int) -> tuple[Array, ...]:
+    """Coordinates of the bricks' faces along x, y and z before rolling [m]."""
+    lines = _COARSE_LINES_MM
+    for _ in range(refinement - 1):
+        lines = tuple(_divided(axis, edges) for axis, edges in zip(lines, _EDGES_MM, strict=True))
+    return tuple(1e-3 * np.array(axis) for axis in lines)
+
+
+def _divided(lines: tuple[float, ...], edges: tuple[float, ...]) -> tuple[float, ...]:
+    new = [a + _TOWARD_EDGE * (b - a) for a, b in pairwise(lines) if a in edges]
+    new += [b - _TOWARD_EDGE * (b - a) for a, b in pairwise(lines) if b in edges]
+    return tuple(sorted({*lines, *new}))
 
 
 def _flat_boundaries(centre: Array) -> dict[str, np.ndarray]:

@@ -33,7 +33,7 @@ class ModelSpec:
 
     observation : "reaction" (what a load cell on the pad measures) or "article" (its released code)
     mesh : "bricks" (our graded bricks) or the path of a gmsh file with the article's names
-    refinement : of the bricks; 1 gives 231 of them
+    refinement : of the bricks, toward the edges of the pads; 1 gives 448 of them
     tolerance : estimated local error of the reaction a step, relative to the nominal force; the
         article's steps are its own
     """
