@@ -59,10 +59,17 @@ class PriorConfig(_Section):
 
 
 class DesignConfig(_Section):
-    """Full runs: training points of each wave, held-out points of each wave, worker processes."""
+    """Full runs: training points of each wave, held-out points of each wave, worker processes.
+
+    With `coarse`, a refinement below the model's, the waves run on coarser bricks, and the model itself at
+    `fine_points` and `fine_held_out` of their points, to correct what the coarser ones gave.
+    """
 
     points: Annotated[list[Positive], Field(min_length=1)] = [128, 96, 64]
     held_out: Positive = 16
+    coarse: Positive | None = None
+    fine_points: Positive = 16
+    fine_held_out: Positive = 6
     workers: Positive = 2
 
 
@@ -143,6 +150,14 @@ class Config(_Section):
     map: MapConfig = MapConfig()
     sobol: SobolConfig = SobolConfig()
 
+    @model_validator(mode="after")
+    def _coarse_is_coarser(self) -> Config:
+        coarse, model = self.design.coarse, self.model
+        if coarse is not None and (model.mesh != "bricks" or coarse >= model.refinement):
+            found = f"{coarse} with model.mesh {model.mesh!r}, model.refinement {model.refinement}"
+            raise ValueError(f"design.coarse: found {found}; expected bricks of a higher refinement")
+        return self
+
     @property
     def sha256(self) -> str:
         """Hash of all that can change a result; the number of workers cannot."""
@@ -213,7 +228,8 @@ def _input_error(path: Path, error: ValidationError) -> InputError:
     if kind == "value_error":  # ours, "key: found X; expected Y"
         own, _, rest = str(first["ctx"]["error"]).partition(": found ")
         found, _, expected = rest.partition("; expected ")
-        return InputError(f"{path}: {key}.{own}", found, expected)
+        where = f"{key}.{own}" if key else own
+        return InputError(f"{path}: {where}", found, expected)
     expected = first["msg"].removeprefix("Input should be ").removeprefix("Value should be ")
     shown = "a table" if isinstance(given, Mapping) else json.dumps(given, default=str)
     return InputError(f"{path}: {key}", shown, expected[0].lower() + expected[1:])

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayeskin.errors import InputError
-from bayeskin.types import Array, Parameter, ParameterSpace, Prediction, frozen_array
+from bayeskin.types import Array, Design, Parameter, ParameterSpace, Prediction, frozen_array
 
 Predict = Callable[[Array], Prediction]
 
@@ -169,6 +169,36 @@ def next_wave(
         "upper": dict(zip(space.names, kept.max(axis=0).tolist(), strict=True)),
     }
     return _wave(space, theta, wave, seed, record)
+
+
+def fine_wave(design: Design, inputs: Array, n: int, held_out: int, seed: int) -> Wave:
+    """`n` training and `held_out` held-out points of a design at which a finer model is run too.
+
+    They spread out over `inputs` (rows, k), coordinates in which forces are alike: the first half over the
+    last wave, where the posterior can be, the rest over all. Held-out points are held out of both models.
+    """
+
+    def chosen(among: NDArray[np.bool_], count: int) -> list[int]:
+        rows = np.flatnonzero(among)
+        late = np.flatnonzero(design.wave[rows] == design.wave[rows].max(initial=0))
+        first = late[spread_out(inputs[rows[late]], (count + 1) // 2)]
+        return list(rows[spread_out(inputs[rows], count, first.tolist())])
+
+    training, testing = chosen(design.training, n), chosen(design.testing, held_out)
+    record = {"rule": "points of the coarse design, spread out over its last wave and over all of it"}
+    theta = [design.theta[training], design.theta[testing]]
+    return _wave(design.space, theta, 0, seed, record)
+
+
+def spread_out(points: Array, count: int, first: Sequence[int] = ()) -> list[int]:
+    """Rows of `points` (n, d), at most `count`: `first`, then each the farthest from all before it."""
+    chosen = list(first)
+    if not chosen and len(points):
+        chosen = [int(np.argmin(np.sum((points - points.mean(axis=0)) ** 2, axis=1)))]
+    while len(chosen) < min(count, len(points)):
+        square = np.sum((points[:, None] - points[chosen]) ** 2, axis=2).min(axis=1)
+        chosen.append(int(np.argmax(square)))
+    return chosen[:count]
 
 
 @dataclass(frozen=True)

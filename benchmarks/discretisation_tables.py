@@ -173,8 +173,8 @@ def verdict(
             for errors in (chosen_from, tested)
         ]
         lines.append(
-            f"The default is {default:g}: at most {100 * found[0]:.3f} and {100 * found[1]:.3f} %, in as many steps "
-            f"as looser ones, because no phase has fewer than {STEPS_PER_PHASE}."
+            f"The default is {default:g}: at most {100 * found[0]:.3f} and {100 * found[1]:.3f} %, in as "
+            f"many steps as looser ones, because no phase has fewer than {STEPS_PER_PHASE}."
         )
     elif times:
         lines.append(f"Tolerance: none tried is below {100 * time_target:g} % of the peak.")

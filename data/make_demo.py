@@ -27,7 +27,7 @@ SEED = 20
 
 def main() -> None:
     motion = PadMotion(CORNERS_S, HEIGHTS_M)
-    simulation = simulate(ModelSpec(refinement=2), motion, TRUTH)
+    simulation = simulate(ModelSpec(refinement=3), motion, TRUTH)
     if simulation.status != "ok":
         raise SystemExit(simulation.message)
     rng = np.random.default_rng(SEED)

@@ -11,6 +11,7 @@ from bayeskin.model.simulate import ModelSpec
 from bayeskin.types import PadMotion, Simulation, frozen_array
 
 SCALE = 1e-3  # the toy is a thousand times too stiff for a skin test
+MESH_ERROR = 0.03  # of refinement 1, quartered by each more
 
 
 def simulate(
@@ -25,9 +26,12 @@ def simulate(
         on_state(0.0, None, 0.0)
     time_s = np.unique(np.concatenate([np.linspace(0, motion.time_s[-1], 261), motion.time_s]))
     names = SPACE.names[:4] if gradients else ()
-    force, step = _force(theta, time_s, motion), 1.001
+    force, step = finer(spec.refinement, theta) * _force(theta, time_s, motion), 1.001
     slopes = [
-        (_force({**theta, name: theta[name] * step}, time_s, motion) - force) / np.log(step) for name in names
+        finer(spec.refinement, theta)
+        * (_force({**theta, name: theta[name] * step}, time_s, motion) - _force(theta, time_s, motion))
+        / np.log(step)
+        for name in names
     ]
     return Simulation(
         theta=dict(theta),
@@ -42,6 +46,12 @@ def simulate(
         gradient_names=names,
         gradient_n=np.array(slopes).T if names else np.zeros((0, 0)),
     )
+
+
+def finer(refinement: int, theta: Mapping[str, float]) -> float:
+    """Factor on the force of the coarsest mesh: nearly the same everywhere, as the full model's."""
+    share = 1.0 - 4.0 ** (1 - refinement)
+    return float(1.0 - MESH_ERROR * share * (1.0 + 0.1 * np.log10(theta["E_c"] / theta["E_s"])))
 
 
 def _force(theta: Mapping[str, float], time_s: np.ndarray, motion: PadMotion) -> np.ndarray:

@@ -92,7 +92,7 @@ _TOWARD_EDGE = 0.25  # where a cell beside an edge is divided: a quarter of its 
 
 def brick_lines(refinement: int) -> tuple[Array, ...]:
     """Coordinates of the bricks' faces along x, y and z before rolling [m]."""
-    lines = _COARSE_LINES_MM
+    lines: tuple[tuple[float, ...], ...] = _COARSE_LINES_MM
     for _ in range(refinement - 1):
         lines = tuple(_divided(axis, edges) for axis, edges in zip(lines, _EDGES_MM, strict=True))
     return tuple(1e-3 * np.array(axis) for axis in lines)

@@ -1,4 +1,7 @@
-"""Second stage: full runs in waves, each drawn where the last surrogate cannot rule the force out."""
+"""Second stage: full runs in waves, each drawn where the last surrogate cannot rule the force out.
+
+With `design.coarse` the waves run a coarser model, and then some of their points the model itself.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +18,12 @@ from numpy.typing import NDArray
 
 from bayeskin import report, storage
 from bayeskin.config import parameter_space
-from bayeskin.design import Wave, first_wave, next_wave
+from bayeskin.design import Wave, fine_wave, first_wave, next_wave
 from bayeskin.inference.noise_model import bins_in_windows
-from bayeskin.model.simulate import simulate
+from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
 from bayeskin.pipeline.folder import sha256_of, write_json
-from bayeskin.pipeline.model import model_spec
+from bayeskin.pipeline.model import model_spec, waves_spec
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.shipping import check_fits, shipped_files
 from bayeskin.runner import load_design, run_design
@@ -65,19 +68,22 @@ def _work(run: Run) -> Mapping[str, Any]:
         files = shipped_files(run)
         design, records = load_design(files.design), load_manifest(files.surrogate)["waves"]
         check_fits(run, files, design, binned, motion)
+        fine = load_design(files.fine) if files.fine is not None else None
     else:
         design, records = _run_waves(run, binned, motion)
+        fine = _run_fine(run, design, motion) if run.config.design.coarse is not None else None
     storage.save(run.at("design", "design.h5"), design)
+    if fine is not None:
+        storage.save(run.at("design", "fine.h5"), fine)
     write_json(run.at("design", "waves.json"), records)
     _draw(run, design, binned, records)
-    return _summary(design, records)
+    return {**_summary(design, records), **({} if fine is None else {"fine": _counts(fine)})}
 
 
 def _run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design, list[Mapping[str, Any]]]:
     """All waves of the configuration. Runs are kept by what they depend on, so none is made twice."""
-    spec, space, config = model_spec(run), parameter_space(run.config, run.config_path), run.config.design
-    identity = sha256_of([spec.hash, vars(motion), binned.edges_s, [vars(p) for p in space.parameters]])
-    runs_file = run.folder / "runs" / f"{identity[:16]}.h5"
+    spec, space, config = waves_spec(run), parameter_space(run.config, run.config_path), run.config.design
+    runs_file = _runs_file(run, spec, motion, binned.edges_s, space)
     waves: list[Wave] = []
     for number, count in enumerate(config.points):
         drawn = run.at("design", f"wave-{number}.json")
@@ -86,12 +92,33 @@ def _run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design
             write_json(drawn, {"theta": wave.theta, "held_out": wave.held_out, "record": wave.record})
         waves.append(_load_wave(drawn, space, number, run.config.seed))
         label = f"wave {number + 1} of {len(config.points)}"
-        run.reporter.log(f"{label}: {len(waves[-1].theta)} full runs")
-        run_design(
-            runs_file, waves[-1], binned.edges_s, partial(simulate, spec, motion), spec.hash, config.workers,
-            partial(_tell, run, label),
-        )  # fmt: skip
+        _run_wave(run, label, runs_file, waves[-1], binned.edges_s, spec, motion)
     return _rows_of(load_design(runs_file), waves), [wave.record for wave in waves]
+
+
+def _run_fine(run: Run, design: Design, motion: PadMotion) -> Design:
+    """The configuration's model at some points of the coarser one's design."""
+    spec, config = model_spec(run), run.config.design
+    inputs = Similarity(design.space).inputs(design.theta)
+    wave = fine_wave(design, inputs, config.fine_points, config.fine_held_out, run.config.seed)
+    runs_file = _runs_file(run, spec, motion, design.edges_s, design.space)
+    _run_wave(run, "fine model", runs_file, wave, design.edges_s, spec, motion)
+    return _rows_of(load_design(runs_file), [wave])
+
+
+def _runs_file(run: Run, spec: ModelSpec, motion: PadMotion, edges_s: Array, space: ParameterSpace) -> Path:
+    identity = sha256_of([spec.hash, vars(motion), edges_s, [vars(p) for p in space.parameters]])
+    return run.folder / "runs" / f"{identity[:16]}.h5"
+
+
+def _run_wave(
+    run: Run, label: str, runs_file: Path, wave: Wave, edges_s: Array, spec: ModelSpec, motion: PadMotion
+) -> None:
+    run.reporter.log(f"{label}: {len(wave.theta)} full runs")
+    run_design(
+        runs_file, wave, edges_s, partial(simulate, spec, motion), spec.hash, run.config.design.workers,
+        partial(_tell, run, label),
+    )  # fmt: skip
 
 
 def _tell(run: Run, label: str, done: int, total: int, failed: int, eta_s: float) -> None:
@@ -156,6 +183,10 @@ def enough(design: Design) -> Design:
 
 
 def _summary(design: Design, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    return {**_counts(design), "waves": list(records)}
+
+
+def _counts(design: Design) -> dict[str, Any]:
     failures = Counter(text for text, ok in zip(design.messages, design.ok, strict=True) if not ok)
     return {
         "runs": len(design.theta),
@@ -166,7 +197,6 @@ def _summary(design: Design, records: Sequence[Mapping[str, Any]]) -> dict[str, 
         "seconds_of_runs": float(np.nansum(design.seconds)),
         "median_seconds_a_run": float(np.nanmedian(design.seconds)),
         "model_hash": design.model_hash,
-        "waves": list(records),
     }
 
 
@@ -183,7 +213,7 @@ def _draw(run: Run, design: Design, binned: BinnedForce, records: Sequence[Mappi
 
 def _files(run: Run) -> Iterable[Path]:
     files = [run.beside(run.config.model.mesh)] if run.config.model.mesh != "bricks" else []
-    return [*files, *(shipped_files(run) if run.config.surrogate.file is not None else ())]
+    return [*files, *(shipped_files(run).present if run.config.surrogate.file is not None else ())]
 
 
 STAGE = Stage(

@@ -12,20 +12,23 @@ from bayeskin import report, storage
 from bayeskin.config import parameter_space
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.provenance import caption
+from bayeskin.pipeline.training import fine_design
 from bayeskin.sensitivity import SobolResult, sentence, sobol, uninformed
-from bayeskin.surrogates import load_surrogate, train
+from bayeskin.surrogates import correct, load_surrogate, train
 from bayeskin.types import Design, PadMotion, Parameter, ParameterSpace
 
 NEARBY = 0.1  # the article moves each parameter by 10 % of its calibrated value, either way
 
 
 def _work(run: Run) -> Mapping[str, Any]:
-    design = storage.load(run.at("map", "design.h5"), Design)
+    design, fine = storage.load(run.at("map", "design.h5"), Design), fine_design(run, "map")
     space, samples = parameter_space(run.config, run.config_path), run.config.sobol.samples
     near = nearby(space, run.summary("map")["theta"])
     rng = np.random.default_rng([run.config.seed, 2])
     # Over the whole prior no part of it may count more, so these two are trained without focus.
     gp, chaos = (train(design, kind, run.config.seed)[0] for kind in ("gp", "chaos"))
+    if fine is not None:
+        gp, chaos = (correct(surrogate, fine)[0] for surrogate in (gp, chaos))
     local = load_surrogate(run.at("map", "surrogate.h5"))
     results = {
         "prior_gp": sobol(gp, rng, samples, space),
@@ -91,6 +94,6 @@ STAGE = Stage(
     "sobol",
     "Sobol' indices of the force over time",
     ("recording", "map"),
-    ("seed", "sobol", "parameters"),
+    ("seed", "sobol", "parameters", "design"),
     _work,
 )

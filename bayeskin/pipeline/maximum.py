@@ -15,7 +15,7 @@ from bayeskin.pipeline.calibration import log_posterior_of, rmse_table
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
-from bayeskin.pipeline.training import trained
+from bayeskin.pipeline.training import corrected, fine_design, trained
 from bayeskin.surrogates import load_manifest, load_surrogate, manifest_of, save_surrogate
 from bayeskin.types import Array, BinnedForce, Design, PadMotion, Simulation, Surrogate
 
@@ -46,17 +46,23 @@ class _FullModel:
 
 
 class _Retraining:
-    """The design with each checked point in it, and the surrogate trained again."""
+    """The design with each checked point in it, and the surrogate trained, or corrected, again."""
 
-    def __init__(self, run: Run, design: Design, binned: BinnedForce) -> None:
-        self.run, self.design, self.binned = run, design, binned
+    def __init__(self, run: Run, binned: BinnedForce) -> None:
+        self.run, self.binned = run, binned
+        self.design = storage.load(run.at("design", "design.h5"), Design)
+        self.fine = fine_design(run, "design")
         self.surrogate = load_surrogate(run.at("train", "surrogate.h5"))
         self.manifest = load_manifest(run.at("train", "surrogate.h5"))
 
     def __call__(self, theta: Mapping[str, float], simulation: Simulation) -> Surrogate:
         self.run.reporter.log("map: the surrogate was off there; the point joins the design")
-        self.design = _with_run(self.design, theta, simulation)
-        self.surrogate, validation = trained(self.run, self.design, self.binned)
+        if self.fine is None:
+            self.design = _with_run(self.design, theta, simulation)
+            self.surrogate, validation = trained(self.run, self.design, self.binned)
+        else:
+            self.fine = _with_run(self.fine, theta, simulation)
+            self.surrogate, validation = corrected(self.run, self.surrogate, self.fine, self.binned)
         self.manifest = {**self.manifest, **manifest_of(self.surrogate, validation)}
         return self.surrogate
 
@@ -79,13 +85,15 @@ def _with_run(design: Design, theta: Mapping[str, float], simulation: Simulation
 def _find(run: Run) -> Mapping[str, Any]:
     config = run.config
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
-    retraining = _Retraining(run, storage.load(run.at("design", "design.h5"), Design), binned)
+    retraining = _Retraining(run, binned)
     refined = inference.refine_map(
         log_posterior_of(run, retraining.surrogate, binned), _FullModel(run), retraining, config.seed,
         config.map.starts, config.map.evaluations,
     )  # fmt: skip
     save_surrogate(run.at("map", "surrogate.h5"), retraining.surrogate, retraining.manifest)
     storage.save(run.at("map", "design.h5"), retraining.design)
+    if retraining.fine is not None:
+        storage.save(run.at("map", "fine.h5"), retraining.fine)
     _draw_check(run, binned, refined)
     return {**_found(refined, binned), "polished": _polish(run, refined)}
 
@@ -149,6 +157,6 @@ STAGE = Stage(
     "map",
     "finds the most probable point and checks it by the full model",
     ("recording", "design", "train"),
-    ("seed", "map", "fit", "noise", "parameters", "model", "surrogate"),
+    ("seed", "map", "fit", "noise", "parameters", "model", "surrogate", "design"),
     _find,
 )

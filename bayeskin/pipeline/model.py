@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline.engine import Run
 
@@ -20,3 +22,9 @@ def model_spec(run: Run, mesh: str | None = None, observation: str | None = None
         mesh=mesh,
         refinement=model.refinement,
     )
+
+
+def waves_spec(run: Run) -> ModelSpec:
+    """The model that the design's waves run: the configuration's, or a coarser one that it corrects."""
+    coarse = run.config.design.coarse
+    return model_spec(run) if coarse is None else replace(model_spec(run), refinement=coarse)

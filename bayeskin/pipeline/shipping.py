@@ -1,4 +1,5 @@
-"""Surrogates that come ready: NAME.h5 with its manifest inside, and its design NAME-design.h5 beside it."""
+"""Surrogates that come ready: NAME.h5 with its manifest inside, its design NAME-design.h5 beside it, and
+NAME-fine.h5, the fine model's runs, where the design is a coarser one's."""
 
 from __future__ import annotations
 
@@ -12,17 +13,22 @@ from bayeskin.config import parameter_space
 from bayeskin.errors import InputError
 from bayeskin.pipeline.engine import Run
 from bayeskin.pipeline.folder import sha256_of
-from bayeskin.pipeline.model import model_spec
+from bayeskin.pipeline.model import model_spec, waves_spec
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_manifest
 from bayeskin.types import BinnedForce, Design, PadMotion
 
 
 class ShippedFiles(NamedTuple):
-    """The two files of a surrogate that comes ready."""
+    """The files of a surrogate that comes ready; `fine` only with a coarser model's design."""
 
     surrogate: Path
     design: Path
+    fine: Path | None
+
+    @property
+    def present(self) -> tuple[Path, ...]:
+        return tuple(path for path in self if path is not None)
 
 
 def shipped_files(run: Run) -> ShippedFiles:
@@ -31,9 +37,11 @@ def shipped_files(run: Run) -> ShippedFiles:
     assert name is not None
     own = run.config_path.resolve().parent / name
     path = own if own.is_file() else shipped(f"surrogates/{name}")
-    files = ShippedFiles(path, path.with_name(f"{path.stem}-design.h5"))
-    if not files.design.is_file():
-        raise InputError(f"{run.config_path}: surrogate.file", f"no {files.design}", "its design beside it")
+    fine = None if run.config.design.coarse is None else path.with_name(f"{path.stem}-fine.h5")
+    files = ShippedFiles(path, path.with_name(f"{path.stem}-design.h5"), fine)
+    for file in files.present[1:]:
+        if not file.is_file():
+            raise InputError(f"{run.config_path}: surrogate.file", f"no {file}", "its design beside it")
     return files
 
 
@@ -52,7 +60,7 @@ def check_fits(run: Run, files: ShippedFiles, design: Design, binned: BinnedForc
     """Raises InputError unless model, protocol and bins are this run's, and its priors lie in the box."""
     said = load_manifest(files.surrogate)
     where = f"{run.config_path}: surrogate.file {files.surrogate.name}"
-    if {design.model_hash, said.get("model_hash")} != {model_spec(run).hash}:
+    if (design.model_hash, said.get("model_hash")) != (waves_spec(run).hash, model_spec(run).hash):
         raise InputError(where, "a surrogate of another model", "one of this configuration's model")
     if said.get("motion_sha256") != motion_sha256(motion):
         raise InputError(where, "a surrogate of another protocol", "one of this recording's protocol")

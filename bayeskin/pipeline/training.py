@@ -17,6 +17,7 @@ from bayeskin.pipeline.shipping import origin, shipped_files
 from bayeskin.surrogates import (
     ShapeSurrogate,
     Validation,
+    correct,
     load_manifest,
     load_surrogate,
     manifest_of,
@@ -33,8 +34,20 @@ def trained(run: Run, design: Design, binned: BinnedForce) -> tuple[ShapeSurroga
     return train(enough(design), config.surrogate.kind, config.seed, weights)
 
 
+def corrected(
+    run: Run, surrogate: ShapeSurrogate, fine: Design, binned: BinnedForce
+) -> tuple[ShapeSurrogate, Validation]:
+    """A coarser model's surrogate, corrected by runs of the configuration's model."""
+    return correct(surrogate, fine, focus(fine, binned, fitted_bins(run, binned)))
+
+
+def fine_design(run: Run, stage: str) -> Design | None:
+    """The configuration's model at points of a coarser one's design, as a stage left it; None without."""
+    return None if run.config.design.coarse is None else storage.load(run.at(stage, "fine.h5"), Design)
+
+
 def _work(run: Run) -> Mapping[str, Any]:
-    design = storage.load(run.at("design", "design.h5"), Design)
+    design, fine = storage.load(run.at("design", "design.h5"), Design), fine_design(run, "design")
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     if run.config.surrogate.file is not None:
@@ -42,34 +55,42 @@ def _work(run: Run) -> Mapping[str, Any]:
         surrogate, manifest = load_surrogate(ready), load_manifest(ready)
     else:
         surrogate, validation = trained(run, design, binned)
+        if fine is not None:
+            surrogate, validation = corrected(run, surrogate, fine, binned)
         records = json.loads(run.at("design", "waves.json").read_text())
         manifest = {**manifest_of(surrogate, validation), **origin(run, motion, records)}
     save_surrogate(run.at("train", "surrogate.h5"), surrogate, manifest)
-    _draw(run, design, binned, surrogate)
+    _draw(run, design, fine, binned, surrogate)
     return {name: value for name, value in manifest.items() if name not in ("waves", "parameters")}
 
 
-def _draw(run: Run, design: Design, binned: BinnedForce, surrogate: ShapeSurrogate) -> None:
-    testing = design.testing
-    truth, prediction = design.force_n[testing], surrogate.predict(design.theta[testing])
+def _draw(
+    run: Run, design: Design, fine: Design | None, binned: BinnedForce, surrogate: ShapeSurrogate
+) -> None:
+    held_out = design if fine is None else fine
+    testing = held_out.testing
+    truth, prediction = held_out.force_n[testing], surrogate.predict(held_out.theta[testing])
     noise_sd_n = np.sqrt(binned.variance_n2)
-    errors = _errors_by_wave(run, design, binned, prediction.mean)
-    figure = report.figure_validation(design.edges_s, truth, prediction, noise_sd_n, errors)
+    errors = _errors_by_wave(run, design, binned, held_out, prediction.mean)
+    figure = report.figure_validation(
+        design.edges_s, truth, prediction, noise_sd_n, errors, corrected=fine is not None
+    )
     report.save_figure(figure, run.at("train", "validation"), caption(run))
 
 
-def _errors_by_wave(run: Run, design: Design, binned: BinnedForce, last_n: Array) -> Array:
+def _errors_by_wave(run: Run, design: Design, binned: BinnedForce, held_out: Design, last_n: Array) -> Array:
     """Relative RMS error (waves, held-out points) of surrogates trained on the waves up to each.
 
     The last row is of `last_n`, the surrogate in use; held-out points of later waves count in all rows.
+    With a fine model's held-out points, the row before the last is of the uncorrected surrogate.
     """
-    testing, waves = design.testing, np.unique(design.wave[design.ok])
-    truth = design.force_n[testing]
+    testing, waves = held_out.testing, np.unique(design.wave[design.ok])
+    truth, theta = held_out.force_n[testing], held_out.theta[held_out.testing]
     rows = []
-    for wave in waves[:-1]:
+    for wave in waves[:-1] if held_out is design else waves:
         early = design.wave <= wave
         part = dataclasses.replace(design, ok=design.ok & early)
-        rows.append(trained(run, part, binned)[0].predict(design.theta[testing]).mean)
+        rows.append(trained(run, part, binned)[0].predict(theta).mean)
     scale = np.sqrt(np.mean(truth**2, axis=1))
     return np.array([np.sqrt(np.mean((mean - truth) ** 2, axis=1)) / scale for mean in [*rows, last_n]])
 
@@ -78,7 +99,7 @@ STAGE = Stage(
     "train",
     "trains the surrogate",
     ("recording", "design"),
-    ("seed", "parameters", "surrogate", "fit", "model"),
+    ("seed", "parameters", "surrogate", "fit", "model", "design"),
     _work,
-    lambda run: shipped_files(run) if run.config.surrogate.file is not None else (),
+    lambda run: shipped_files(run).present if run.config.surrogate.file is not None else (),
 )

@@ -34,12 +34,14 @@ def figure_validation(
     prediction: Prediction,
     noise_sd_n: ArrayLike,
     wave_error: ArrayLike,
+    corrected: bool = False,
 ) -> Figure:
     """Held-out runs against the surrogate: amplitude, error over time, coverage, error by wave.
 
     true_n (n, m) bin means of the full model's held-out runs; prediction at the same points;
     noise_sd_n (m,) of the recording's bins (its noise floor); wave_error (w, q): relative error of q
-    held-out points after each of w waves (NaN where a point was not there).
+    held-out points after each of w waves (NaN where a point was not there); with `corrected` the last is of
+    the waves' surrogate with a finer model's correction.
     """
     edges, true = np.asarray(edges_s, dtype=float), np.atleast_2d(np.asarray(true_n, dtype=float))
     noise = np.asarray(noise_sd_n, dtype=float)
@@ -49,7 +51,7 @@ def figure_validation(
     over_time = figure.add_subplot(grid[1, :])
     _draw_amplitude(amplitude, true, prediction)
     _draw_coverage(cover, true, prediction)
-    _draw_waves(waves, np.atleast_2d(np.asarray(wave_error, dtype=float)))
+    _draw_waves(waves, np.atleast_2d(np.asarray(wave_error, dtype=float)), corrected)
     error = np.abs(prediction.mean - true)
     _draw_error(over_time, 0.5 * (edges[1:] + edges[:-1]), error, prediction.sd(), noise)
     titles = ("error of the peak force", "coverage of intervals", "error by wave", "error over time")
@@ -169,7 +171,7 @@ def _draw_coverage(ax: Axes, true: Array, prediction: Prediction) -> None:
     ax.set(xlim=(0, 1.01), ylim=(0, 1.03), xlabel="nominal coverage", ylabel="actual coverage")
 
 
-def _draw_waves(ax: Axes, wave_error: Array) -> None:
+def _draw_waves(ax: Axes, wave_error: Array, corrected: bool) -> None:
     for wave, row in enumerate(wave_error):
         errors = 100 * row[np.isfinite(row)]
         if len(errors) == 0:
@@ -179,7 +181,8 @@ def _draw_waves(ax: Axes, wave_error: Array) -> None:
         ax.plot(wave, middle, "o", color=MODEL, ms=4.5)
         ax.text(wave + 0.12, middle, f"{middle:.2g}", va="center", fontsize=6.5)
     ax.set_xlim(-0.5, len(wave_error) - 0.2)
-    ax.set_xticks(range(len(wave_error)))
+    labels = [str(wave) for wave in range(len(wave_error))]
+    ax.set_xticks(range(len(labels)), [*labels[:-1], "corrected"] if corrected else labels)
     if np.nanmin(np.where(wave_error > 0, wave_error, np.nan), initial=np.inf) < np.inf:
         ax.set_yscale("log")
         plain_log(ax.yaxis)

@@ -18,11 +18,12 @@ from bayeskin.surrogates.chaos import LatentChaos
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.shapes import ShapeTransform
 from bayeskin.surrogates.surrogate import Latents, ShapeSurrogate
+from bayeskin.surrogates.two_fidelities import CorrectedLatents
 from bayeskin.surrogates.validate import Validation
 from bayeskin.types import ParameterSpace, frozen_array
 
 FORMAT = "bayeskin surrogate"
-FORMAT_VERSION = 2  # 2: inputs are those of `Similarity`
+FORMAT_VERSION = 3  # 2: inputs are those of `Similarity`; 3: latents may have a correction
 LATENTS: dict[str, type[LatentGPs] | type[LatentChaos]] = {"gp": LatentGPs, "chaos": LatentChaos}
 
 
@@ -54,7 +55,11 @@ def save_surrogate(path: Path | str, surrogate: ShapeSurrogate, manifest: Mappin
         with h5py.File(partial, "w") as handle:
             storage.write(handle.create_group("space"), surrogate.space)
             storage.write(handle.create_group("transform"), surrogate.transform)
-            storage.write(handle.create_group("latents"), surrogate.latents)
+            latents = surrogate.latents
+            if isinstance(latents, CorrectedLatents):
+                storage.write(handle.create_group("correction"), latents.correction)
+                latents = latents.coarse
+            storage.write(handle.create_group("latents"), latents)
             handle.create_dataset("edges_s", data=surrogate.edges_s)
             digest = contents_hash(handle)
             text = json.dumps({**manifest, "arrays_sha256": digest}, indent=2, sort_keys=True)
@@ -85,6 +90,9 @@ def load_surrogate(path: Path | str) -> ShapeSurrogate:
         with h5py.File(path, "r") as handle:
             _refuse_unfit(path, handle)
             latents: Latents = storage.read(handle["latents"], LATENTS[handle.attrs["kind"]], path)
+            if "correction" in handle:
+                correction = storage.read(handle["correction"], LatentGPs, path)
+                latents = CorrectedLatents(latents, correction)
             return ShapeSurrogate(
                 storage.read(handle["space"], ParameterSpace, path), frozen_array(handle["edges_s"][()]),
                 storage.read(handle["transform"], ShapeTransform, path), latents,
