@@ -18,12 +18,14 @@ histories every 0.1 s, RMS and largest, over the reference's peak.
 
 `--first-cycle` takes the first cycle only of every protocol. A stopped study goes on: finished runs are rows
 of benchmarks/results/discretisation.csv, their histories lie beside it. Writes the tables between the markers
-of docs/discretisation.md and docs/figures/discretisation.{png,svg}.
+of docs/discretisation.md, docs/figures/discretisation.{png,svg}, and the meshes' errors into
+bayeskin/model/discretisation.json, from which `bayeskin simulate` states them.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import time
 from contextlib import ExitStack
@@ -40,10 +42,12 @@ from discretisation_figure import figure_discretisation
 from discretisation_tables import (
     LOADING,
     SPACE_REFERENCE,
+    SPACE_TOLERANCE,
     Error,
     Result,
     Run,
     error,
+    mesh_errors,
     peak_table,
     space_errors,
     space_table,
@@ -54,7 +58,7 @@ from discretisation_tables import (
 
 from bayeskin import storage
 from bayeskin.errors import InputError
-from bayeskin.model import lagrangian, simulate
+from bayeskin.model import accuracy, lagrangian, simulate
 from bayeskin.model.problem import Problem, material
 from bayeskin.model.simulate import ModelSpec, problem_of
 from bayeskin.report import save_figure
@@ -217,6 +221,17 @@ def write_block(path: Path, text: str) -> None:
     staged.replace(path)
 
 
+def write_mesh_errors(errors: dict[str, dict[str, float]]) -> None:
+    """Into the package, by the mesh's hash, where `bayeskin simulate` finds them."""
+    by_hash = {}
+    for name, found in errors.items():
+        with healthy_skin.spec_on(name, SPACE_TOLERANCE) as spec:
+            rounded = {key: float(f"{value:.3g}") for key, value in found.items()}
+            by_hash[problem_of(spec.mesh, spec.refinement).mesh.hash] = {"mesh": name, **rounded}
+    path = Path(accuracy.__file__).with_name(accuracy.FILE)
+    path.write_text(json.dumps(by_hash, indent=2) + "\n")
+
+
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -250,6 +265,8 @@ def main() -> None:
             parts.append(f"Space, whole protocol, against bricks-2:\n\n{whole_table(results, asked.points)}")
         parts.append(f"Reaction and face stress at point C:\n\n{peak_table(results)}")
     parts.append(verdict(times, results, asked.time_target, asked.mesh_target))
+    if results and not asked.first_cycle:
+        write_mesh_errors(mesh_errors(results))
     block = "\n\n".join(parts)
     print(block)
     write_block(asked.docs / "discretisation.md", block)

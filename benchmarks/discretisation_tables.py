@@ -109,6 +109,22 @@ def space_table(results: Sequence[Result], points: Sequence[str]) -> str:
     return rows.markdown(header, lines)
 
 
+def mesh_errors(results: Sequence[Result]) -> dict[str, dict[str, float]]:
+    """RMS and largest error by mesh, the worst of the points; the reference's own by the finest's loading."""
+    errors = space_errors(results)
+    found = {
+        mesh: {"rms": max(e.rms for e in of), "largest": max(e.largest for e in of)}
+        for mesh in dict.fromkeys(mesh for mesh, _ in errors if mesh != SPACE_REFERENCE)
+        for of in [[e for (name, _), e in errors.items() if name == mesh]]
+    }
+    loads = {r.run.mesh: r for r in results if r.force and r.run.protocol == LOADING}
+    if SPACE_REFERENCE in loads:
+        finest = max(loads.values(), key=lambda r: int(r.row["cells"])).force
+        own = error(loads[SPACE_REFERENCE].force, finest)
+        found[SPACE_REFERENCE] = {"rms": own.rms, "largest": own.largest}
+    return found
+
+
 def whole_table(results: Sequence[Result], points: Sequence[str]) -> str:
     """Over the whole protocol, against bricks-2, the finest that ran it."""
     done = {(r.run.mesh, r.run.point): r.force for r in results if r.force and r.run.protocol == "healthy"}

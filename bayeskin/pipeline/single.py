@@ -11,6 +11,7 @@ from typing import Any
 from bayeskin import storage
 from bayeskin.config import load_config, parameter_space
 from bayeskin.errors import InputError
+from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec, problem_of, simulate
 from bayeskin.pipeline.engine import Reporter, Run
 from bayeskin.pipeline.field_outputs import FieldOutputs, moments_of
@@ -124,6 +125,7 @@ def _answer(simulation: Simulation, spec: ModelSpec, files: Sequence[Path]) -> d
             f"{stats['steps']:.0f} steps of {stats['dofs']:.0f} unknowns in {stats['seconds']:.1f} s, "
             f"peak force {stats['peak_force_n']:.4g} N, written to {', '.join(map(str, files))}"
         )
+        text += "".join(f"\n{line}" for line in _accuracy(simulation, spec))
     answer = {"ok": ok, "status": simulation.status, "message": simulation.message, "theta": simulation.theta}
     model = {"observation": spec.observation, "mesh": spec.mesh, "model_hash": simulation.model_hash}
     written = {
@@ -133,6 +135,17 @@ def _answer(simulation: Simulation, spec: ModelSpec, files: Sequence[Path]) -> d
         "files": files,
     }
     return plain({**answer, **model, "stats": stats, **written, "text": text})
+
+
+def _accuracy(simulation: Simulation, spec: ModelSpec) -> list[str]:
+    """One line on the estimated error of a reaction; the article's force has none: it does not converge."""
+    if spec.observation == "article":
+        return ["no estimated error: the article's force depends on its mesh and converges on none"]
+    peak_n = simulation.stats["peak_force_n"]
+    time_share = simulation.stats["time_error_n"] / peak_n if peak_n > 0.0 else 0.0
+    found = mesh_error(problem_of(spec.mesh, spec.refinement).mesh.hash)
+    mesh = "unknown, the mesh is not in the study" if found is None else f"{100 * found.rms:.2g} % RMS"
+    return [f"estimated error, of the peak: time steps {100 * time_share:.2g} %, mesh {mesh}"]
 
 
 def _check_suffix(out: Path, suffixes: tuple[str, ...]) -> None:

@@ -1,0 +1,127 @@
+"""Posteriors of one recording by a coarse model, by the fine one, and by the coarse one corrected.
+
+The demo's recording, three times: the design on the default bricks only; the same design corrected by a few
+runs of bricks refined toward the pads' edges; a design of those fine runs only. The corrected posterior is to
+be the fine one's, at a fraction of its runs. Compared parameter by parameter and where the recording says most,
+in the stiffness that the peak force follows, about 3.8e-6 E_c + 9.9e-6 E_s [N, Pa].
+
+    OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/two_fidelities.py
+
+Some 40 minutes on two cores; a stopped benchmark goes on. Prints the table and writes
+docs/figures/two_fidelities.{png,svg}; the runs lie in benchmarks/results/two_fidelities.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import rows
+from matplotlib.figure import Figure
+
+from bayeskin.inference import load_inference_data
+from bayeskin.pipeline import stages
+from bayeskin.report import save_figure
+from bayeskin.report.style import INK, PAGE_IN, new_figure, panel_title, state_finding, styled
+from bayeskin.types import Array
+
+FOLDER = rows.RESULTS / "two_fidelities"
+FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "two_fidelities"
+COMMON = """
+[recording]
+file = "../../../data/demo.h5"
+[sample]
+effective_samples = 3000
+[design]
+points = [32, 24]
+held_out = 8
+"""
+CASES = {
+    "coarse": COMMON,
+    "corrected": COMMON + "coarse = 1\nfine_points = 12\nfine_held_out = 6\n[model]\nrefinement = 2\n",
+    "fine": COMMON + "[model]\nrefinement = 2\n",
+}
+COLOURS = {"coarse": "#D55E00", "corrected": "#0072B2", "fine": INK}
+PEAK_N_PER_PA = (3.8e-6, 9.9e-6)  # by E_c and by E_s
+QUANTITIES = ("stiffness", "E_c", "E_s", "k_c", "k_s")
+
+
+class Teller:
+    """Says on stderr how a run goes on."""
+
+    def log(self, message: str) -> None:
+        rows.say(message)
+
+    def progress(self, label: str, share: float, note: str = "") -> None:
+        print(f"\r  {label}: {100 * share:3.0f} % {note}", end="", file=sys.stderr, flush=True)
+
+
+def sampled(case: str) -> tuple[dict[str, Array], str]:
+    """Draws of every quantity, and the run's verdict."""
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    path = FOLDER / f"{case}.toml"
+    path.write_text(CASES[case])
+    rows.say(f"{case}:")
+    answer = stages.run(path, "sample", Teller())
+    posterior = load_inference_data(FOLDER / case / "sample" / "posterior.nc").posterior
+    draws = {name: np.ravel(posterior[name].to_numpy()) for name in QUANTITIES[1:]}
+    draws["stiffness"] = PEAK_N_PER_PA[0] * draws["E_c"] + PEAK_N_PER_PA[1] * draws["E_s"]
+    return draws, answer["verdict"]
+
+
+def table(draws: dict[str, dict[str, Array]]) -> str:
+    """Medians and 90 % intervals; in brackets how far the median is from the fine one in its sd, and the sds'
+    ratio, both of logarithms."""
+    lines = []
+    for name in QUANTITIES:
+        fine = np.log(draws["fine"][name])
+        cells = []
+        for case in CASES:
+            low, middle, high = np.quantile(draws[case][name], [0.05, 0.5, 0.95])
+            shift = (np.log(middle) - np.median(fine)) / fine.std()
+            width = np.log(draws[case][name]).std() / fine.std()
+            cells.append(f"{middle:.4g} [{low:.4g}, {high:.4g}] ({shift:+.2f}, x {width:.2f})")
+        lines.append([name, *cells])
+    return rows.markdown(["", *CASES], lines)
+
+
+@styled
+def figure(draws: dict[str, dict[str, Array]]) -> Figure:
+    """One panel a quantity, one line a posterior."""
+    drawn = new_figure(PAGE_IN, 2.4)
+    axes = drawn.subplots(1, 3)
+    for ax, name, letter, unit in zip(axes, QUANTITIES, "abc", ("N", "Pa", "Pa"), strict=False):
+        everything = np.concatenate([draws[case][name] for case in CASES])
+        edges = np.linspace(*np.quantile(everything, [0.001, 0.999]), 61)
+        for case, colour in COLOURS.items():
+            density = np.histogram(draws[case][name], edges, density=True)[0]
+            ax.stairs(density, edges, color=colour, label=case, lw=1.0)
+        panel_title(ax, letter, name)
+        ax.set(xlabel=f"{name} [{unit}]", yticks=[])
+    axes[0].legend(loc="upper left")
+    shifts = {
+        case: (np.median(draws[case]["stiffness"]) - np.median(draws["fine"]["stiffness"]))
+        / draws["fine"]["stiffness"].std()
+        for case in CASES
+    }
+    state_finding(
+        drawn,
+        f"In the stiffness the coarse posterior is {shifts['coarse']:+.1f} sd from the fine one, "
+        f"the corrected one {shifts['corrected']:+.1f} sd",
+        "Posteriors of the demo's recording. Stiffness: 3.8e-6 E_c + 9.9e-6 E_s; the peak force follows it.",
+    )
+    return drawn
+
+
+def main() -> None:
+    found = {case: sampled(case) for case in CASES}
+    draws = {case: of for case, (of, _) in found.items()}
+    print(table(draws))
+    for case, (_, verdict) in found.items():
+        print(f"{case}: {verdict}")
+    save_figure(figure(draws), FIGURE, "benchmarks/two_fidelities.py")
+
+
+if __name__ == "__main__":
+    main()
