@@ -2,8 +2,8 @@
 
 The demo's recording, three times: the design on the default bricks only; the same design corrected by a few
 runs of bricks refined toward the pads' edges; a design of those fine runs only. The corrected posterior is to
-be the fine one's, at a fraction of its runs. Compared parameter by parameter and where the recording says most,
-in the stiffness that the peak force follows, about 3.8e-6 E_c + 9.9e-6 E_s [N, Pa].
+be the fine one's, at a fraction of its runs. Compared parameter by parameter and where the recording says
+most, in the stiffness that the peak force follows, about 3.8e-6 E_c + 9.9e-6 E_s [N, Pa].
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/two_fidelities.py
 

@@ -1,4 +1,4 @@
-"""Makes data/demo.h5: the full model on a mesh twice as fine as the shipped surrogate's, plus noise.
+"""Makes data/demo.h5: the full model on a finer mesh than the shipped surrogate's, plus noise.
 
 Run from the repository's root: ``python data/make_demo.py``. What it draws is stated in data/README.md.
 """
@@ -27,7 +27,7 @@ SEED = 20
 
 def main() -> None:
     motion = PadMotion(CORNERS_S, HEIGHTS_M)
-    simulation = simulate(ModelSpec(refinement=3), motion, TRUTH)
+    simulation = simulate(ModelSpec(refinement=2), motion, TRUTH)
     if simulation.status != "ok":
         raise SystemExit(simulation.message)
     rng = np.random.default_rng(SEED)
