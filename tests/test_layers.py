@@ -20,6 +20,7 @@ BELOW = {
     **dict.fromkeys(SIBLINGS, BASE),
     "journal": BASE,
     "config": BASE | {"design"},
+    "mechanisms": BASE | {"model"},
     "runner": BASE | SIBLINGS | {"journal"},
     "inference": BASE,  # a Surrogate is all that these two know of a model
     "sensitivity": BASE,

@@ -1,0 +1,34 @@
+"""The catalogue of mechanisms: one file each, found by being there.
+
+A module of this package with a `MECHANISM` is in the catalogue, and so is every entry point of the group
+"bayeskin.mechanisms" of any installed package.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from importlib.metadata import entry_points
+
+from bayeskin.errors import InputError
+from bayeskin.mechanisms.mechanism import Mechanism, bin_means, observed
+
+ENTRY_POINTS = "bayeskin.mechanisms"
+
+
+def catalogue() -> dict[str, Mechanism]:
+    """All mechanisms by name, in the order of their names.
+
+    Raises InputError if two have the same name, or share a parameter's.
+    """
+    modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
+    found = [module.MECHANISM for module in modules if hasattr(module, "MECHANISM")]
+    found += [entry.load() for entry in entry_points(group=ENTRY_POINTS)]
+    for names in ([m.name for m in found], [p.name for m in found for p in m.parameters]):
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise InputError("mechanisms", f"{twice[0]} twice", "different names")
+    return {m.name: m for m in sorted(found, key=lambda m: m.name)}
+
+
+__all__ = ["ENTRY_POINTS", "Mechanism", "bin_means", "catalogue", "observed"]

@@ -1,0 +1,28 @@
+"""Force and displacement are stamped by different clocks: F(t - d)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values
+from bayeskin.types import PadMotion, Parameter
+
+
+def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
+    """The force of d seconds before; before the recording's start, and after its end, that of the end."""
+    end_s = motion.time_s[-1]
+    return lambda time_s: force(np.clip(time_s - values["delay"][:, None], 0.0, end_s))
+
+
+MECHANISM = Mechanism(
+    name="clock-delay",
+    parameters=(Parameter("delay", "s", -1.0, 1.0, "uniform", "time by which the force is stamped late"),),
+    neutral={"delay": 0.0},
+    statement=lambda v: (
+        f"The force is stamped {1e3 * abs(v['delay']):.0f} ms {'late' if v['delay'] > 0 else 'early'} "
+        "beside the displacement."
+    ),
+    group=("clock-delay",),
+    place=Place.CLOCK,
+    observe=observe,
+)

@@ -1,0 +1,62 @@
+"""Dry friction of the slide, with presliding: Dahl's model.
+
+Along the displacement u of the drive, with sliding friction Fc and presliding length l,
+
+    dF/du = (Fc - F sgn(u')) / l     so that, moving on in one direction s from F(u0),
+    F = s Fc + (F(u0) - s Fc) exp(-|u - u0| / l)
+
+Rate-independent: a hold keeps what the motion before it left. At t = 0 it is z0 Fc. Where the friction
+creeps (`friction-creep`), the same equation has the term - F / tau, and each straight stretch of the
+protocol its exponential in time.
+
+Source: P. Dahl, A solid friction model, Aerospace Corp. TOR-158(3107-18), 1968.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.types import Array, PadMotion, Parameter
+
+
+def friction(
+    motion: PadMotion, time_s: Array, sliding_n: Array, length_m: Array, start: Array, per_s: Array
+) -> Array:
+    """Friction (n, t) [N] at times (t,) or (n, t); parameters (n,), `per_s` = 1/tau, 0 without creep."""
+    speed = np.diff(motion.displacement_m) / np.diff(motion.time_s)
+    rate = np.abs(speed) / length_m[:, None] + per_s[:, None]  # (n, k-1)
+    ends = sliding_n[:, None] * speed / (length_m[:, None] * np.where(rate > 0.0, rate, 1.0))
+    at_corner = [start * sliding_n]
+    for j, lasts_s in enumerate(np.diff(motion.time_s)):
+        at_corner.append(ends[:, j] + (at_corner[-1] - ends[:, j]) * np.exp(-rate[:, j] * lasts_s))
+    began = np.stack(at_corner[:-1], axis=1)
+    time_s = np.broadcast_to(time_s, (len(sliding_n), np.shape(time_s)[-1]))
+    stretch = np.clip(np.searchsorted(motion.time_s, time_s, side="right") - 1, 0, len(speed) - 1)
+    rate, ends, began = (np.take_along_axis(values, stretch, axis=1) for values in (rate, ends, began))
+    since_s = np.maximum(time_s - motion.time_s[stretch], 0.0)
+    return np.asarray(ends + (began - ends) * np.exp(-rate * since_s))
+
+
+def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
+    """Adds the friction, without creep."""
+    sliding, length, start = (values[name] for name in ("Fc", "presliding", "friction_start"))
+    return added(force, lambda t: friction(motion, t, sliding, length, start, np.zeros_like(sliding)))
+
+
+MECHANISM = Mechanism(
+    name="device-friction",
+    parameters=(
+        Parameter("Fc", "N", 0.0, 0.1, "uniform", "sliding friction of the drive"),
+        Parameter("presliding", "m", 5e-6, 3e-4, "log-uniform", "displacement over which friction turns"),
+        Parameter("friction_start", "-", -1.0, 1.0, "uniform", "friction at t = 0, of the sliding one"),
+    ),
+    neutral={"Fc": 0.0, "presliding": 5e-5, "friction_start": 0.0},
+    statement=lambda v: (
+        f"The slide rubs: {1e3 * v['Fc']:.0f} mN against each motion, turning over within "
+        f"{1e3 * v['presliding']:.2g} mm after a reversal and kept during holds."
+    ),
+    group=("device-friction", "viscous-drag", "force-offset"),
+    place=Place.DRIVE,
+    observe=observe,
+)

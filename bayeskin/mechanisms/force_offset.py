@@ -1,0 +1,24 @@
+"""The load cell's zero is not the skin's zero: F + F0."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.types import PadMotion, Parameter
+
+
+def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
+    """Adds F0 [N]."""
+    return added(force, lambda time_s: values["F0"][:, None] * np.ones_like(time_s))
+
+
+MECHANISM = Mechanism(
+    name="force-offset",
+    parameters=(Parameter("F0", "N", -0.15, 0.05, "uniform", "force reported at zero force"),),
+    neutral={"F0": 0.0},
+    statement=lambda v: f"The load cell reads {1e3 * v['F0']:+.0f} mN when the skin pulls with none.",
+    group=("force-offset", "pre-stretch", "device-friction"),
+    place=Place.CELL,
+    observe=observe,
+)

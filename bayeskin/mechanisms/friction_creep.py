@@ -1,0 +1,39 @@
+"""The friction that a stop locks in relaxes: dF/dt = ... - F / tau in `device-friction`'s equation.
+
+Alone it has nothing to act on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayeskin.mechanisms.device_friction import friction
+from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.types import Array, PadMotion, Parameter
+
+
+def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
+    """Adds what creep takes from the friction."""
+    if "Fc" not in values:
+        return force
+    sliding, length, start = (values[name] for name in ("Fc", "presliding", "friction_start"))
+    per_s = 1.0 / values["friction_tau"]
+
+    def crept(time_s: Array) -> Array:
+        kept = friction(motion, time_s, sliding, length, start, np.zeros_like(per_s))
+        return friction(motion, time_s, sliding, length, start, per_s) - kept
+
+    return added(force, crept)
+
+
+MECHANISM = Mechanism(
+    name="friction-creep",
+    parameters=(
+        Parameter("friction_tau", "s", 3.0, 1000.0, "log-uniform", "time in which friction relaxes"),
+    ),
+    neutral={"friction_tau": np.inf},
+    statement=lambda v: f"Friction that a stop locks in relaxes within {v['friction_tau']:.3g} s.",
+    group=("friction-creep", "solid-viscoelasticity", "strain-dependent-permeability"),
+    place=Place.DRIVE,
+    observe=observe,
+)

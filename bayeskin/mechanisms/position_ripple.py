@@ -1,0 +1,47 @@
+"""Ripple of the screw or the gear, locked to the position, while the drive moves.
+
+F + a sin(2 pi u / L + phi)   where du/dt is not 0
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.mechanisms.viscous_drag import speed_of
+from bayeskin.types import Array, PadMotion, Parameter
+
+AT_REST_M_S = 2e-5  # slower than this is no motion
+
+
+def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
+    """Adds the ripple."""
+    period, amplitude, phase = (
+        values[f"ripple_{part}"][:, None] for part in ("period", "amplitude", "phase")
+    )
+
+    def ripple(time_s: Array) -> Array:
+        moves = np.abs(speed_of(motion, time_s)) > AT_REST_M_S
+        return np.asarray(amplitude * np.sin(2.0 * np.pi * motion.at(time_s) / period + phase) * moves)
+
+    return added(force, ripple)
+
+
+MECHANISM = Mechanism(
+    name="position-ripple",
+    parameters=(
+        Parameter("ripple_period", "m", 1e-4, 1e-3, "log-uniform", "travel in which the ripple repeats"),
+        Parameter("ripple_amplitude", "N", 0.0, 0.015, "uniform", "half of the ripple from top to bottom"),
+        Parameter(
+            "ripple_phase", "rad", -np.pi, np.pi, "uniform", "phase of the ripple at zero displacement"
+        ),
+    ),
+    neutral={"ripple_period": 5e-4, "ripple_amplitude": 0.0, "ripple_phase": 0.0},
+    statement=lambda v: (
+        f"While it moves, the drive ripples by {1e3 * v['ripple_amplitude']:.1f} mN every "
+        f"{1e3 * v['ripple_period']:.2g} mm of its travel."
+    ),
+    group=("position-ripple",),
+    place=Place.DRIVE,
+    observe=observe,
+)

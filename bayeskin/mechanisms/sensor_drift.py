@@ -1,0 +1,22 @@
+"""The load cell drifts: F + r t. Cf. OIML R 60, which limits the creep of load cells."""
+
+from __future__ import annotations
+
+from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.types import PadMotion, Parameter
+
+
+def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
+    """Adds r t."""
+    return added(force, lambda time_s: values["drift"][:, None] * time_s)
+
+
+MECHANISM = Mechanism(
+    name="sensor-drift",
+    parameters=(Parameter("drift", "N/s", -3e-4, 3e-4, "uniform", "drift of the load cell's zero"),),
+    neutral={"drift": 0.0},
+    statement=lambda v: f"The load cell drifts by {6e4 * v['drift']:+.2g} mN a minute.",
+    group=("sensor-drift",),
+    place=Place.CELL,
+    observe=observe,
+)

@@ -1,0 +1,50 @@
+"""Steps of the load cell's zero at two moments: F + sum_i s_i H(t - t_i).
+
+Moments are counted as shares of the recording, so that one prior fits all.
+"""
+
+from __future__ import annotations
+
+from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.types import Array, PadMotion, Parameter
+
+EVENTS = (1, 2)
+
+
+def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
+    """Adds the steps."""
+
+    def steps(time_s: Array) -> Array:
+        share = time_s / motion.time_s[-1]
+        return sum(
+            values[f"event_{i}_step"][:, None] * (share >= values[f"event_{i}_at"][:, None]) for i in EVENTS
+        )
+
+    return added(force, steps)
+
+
+MECHANISM = Mechanism(
+    name="sensor-events",
+    parameters=tuple(
+        parameter
+        for i in EVENTS
+        for parameter in (
+            Parameter(
+                f"event_{i}_at", "-", 0.0, 1.0, "uniform", "moment of a step, as share of the recording"
+            ),
+            Parameter(f"event_{i}_step", "N", -0.05, 0.05, "uniform", "step of the load cell's zero"),
+        )
+    ),
+    neutral={f"event_{i}_{part}": value for i in EVENTS for part, value in (("at", 0.5), ("step", 0.0))},
+    statement=lambda v: (
+        "The load cell's zero jumps: "
+        + ", ".join(
+            f"by {1e3 * v[f'event_{i}_step']:+.0f} mN after {100 * v[f'event_{i}_at']:.0f} % of the recording"
+            for i in EVENTS
+        )
+        + "."
+    ),
+    group=("sensor-events",),
+    place=Place.CELL,
+    observe=observe,
+)

@@ -1,0 +1,31 @@
+"""Drag of the drive proportional to its speed: F + c du/dt."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.types import Array, PadMotion, Parameter
+
+
+def speed_of(motion: PadMotion, time_s: Array) -> Array:
+    """Speed of the LVDT [m/s] at times of any shape; at a corner that of the stretch which begins there."""
+    speed = np.append(np.diff(motion.displacement_m) / np.diff(motion.time_s), 0.0)
+    stretch = np.searchsorted(motion.time_s, time_s, side="right") - 1
+    return np.asarray(np.where(stretch >= 0, speed[stretch], 0.0))
+
+
+def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
+    """Adds c du/dt."""
+    return added(force, lambda time_s: values["drag"][:, None] * speed_of(motion, time_s))
+
+
+MECHANISM = Mechanism(
+    name="viscous-drag",
+    parameters=(Parameter("drag", "N s/m", 0.0, 40.0, "uniform", "drag of the drive by its speed"),),
+    neutral={"drag": 0.0},
+    statement=lambda v: f"The drive drags with {v['drag']:.0f} mN at each mm/s, in the direction of motion.",
+    group=("viscous-drag", "device-friction"),
+    place=Place.DRIVE,
+    observe=observe,
+)

@@ -1,0 +1,208 @@
+"""Instrument mechanisms: off at their neutral values, else what their equation says."""
+
+from __future__ import annotations
+
+import sys
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from bayeskin.errors import InputError
+from bayeskin.mechanisms import bin_means, catalogue, observed
+from bayeskin.types import PadMotion
+
+MOTION = PadMotion(
+    np.array([0.0, 5.0, 14.4, 45.0, 54.4, 65.0, 74.4, 105.0, 114.4, 130.0]),
+    1e-3 * np.array([0.0, 0.0, 9.4, 9.4, 0.0, 0.0, 9.4, 9.4, 0.0, 0.0]),
+)
+TIMES_S = np.linspace(0.0, 130.0, 1301)
+ALL = catalogue()
+
+
+def skin(time_s: np.ndarray) -> np.ndarray:
+    """A force that follows the displacement, one row."""
+    return np.atleast_2d(40.0 * MOTION.at(time_s) * (1.0 + 20.0 * MOTION.at(time_s)))
+
+
+def values_of(*names: str, **chosen: float) -> dict[str, np.ndarray]:
+    """Parameters of mechanisms at the middle of their priors, but for those chosen; one sample."""
+    middle = {
+        p.name: np.sqrt(p.lower * p.upper) if p.prior == "log-uniform" else 0.5 * (p.lower + p.upper)
+        for name in names
+        for p in ALL[name].parameters
+    }
+    return {name: np.array([value]) for name, value in (middle | chosen).items()}
+
+
+def reported(*names: str, time_s: np.ndarray = TIMES_S, **chosen: float) -> np.ndarray:
+    """What the load cell reports beyond the skin's force, (t,)."""
+    force = observed([ALL[n] for n in names], values_of(*names, **chosen), MOTION, skin)
+    return (force(time_s) - skin(time_s))[0]
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_neutral_mechanism_changes_nothing(name):
+    neutral = {key: np.full(3, value) for key, value in ALL[name].neutral.items()}
+    assert set(neutral) == {p.name for p in ALL[name].parameters}
+    force = observed([ALL[name]], neutral, MOTION, skin)(TIMES_S)
+    np.testing.assert_allclose(force, np.repeat(skin(TIMES_S), len(force), axis=0), rtol=0, atol=1e-15)
+
+
+OFF_NEUTRAL = {"F0": 0.03, "drift": 1e-4, "delay": 0.3, "event_1_step": 0.02, "friction_start": 0.5}
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_mechanism_off_its_neutral_value_shows_and_can_be_told(name):
+    base = ("device-friction",) if name == "friction-creep" else ()
+    values = values_of(*base, name)
+    chosen = {key: value for key, value in OFF_NEUTRAL.items() if key in values}
+    without = reported(*base, friction_start=0.5) if base else 0.0
+    assert np.abs(reported(*base, name, **chosen) - without).max() > 1e-3
+    assert name in ALL[name].group
+    told = ALL[name].statement({key: float(value[0]) for key, value in values.items()})
+    assert told.endswith(".")
+
+
+@pytest.mark.parametrize("pair", list(combinations(ALL, 2)), ids="+".join)
+def test_any_two_run_together_row_by_row_and_in_any_order(pair):
+    rng = np.random.default_rng(1)
+    values = {p.name: rng.uniform(p.lower, p.upper, 4) for name in pair for p in ALL[name].parameters}
+    together = observed([ALL[n] for n in pair], values, MOTION, skin)(TIMES_S)
+    assert np.isfinite(together).all()
+    np.testing.assert_array_equal(
+        together, observed([ALL[n] for n in reversed(pair)], values, MOTION, skin)(TIMES_S)
+    )
+    for i in range(4):
+        one = {name: column[i : i + 1] for name, column in values.items()}
+        alone = observed([ALL[n] for n in pair], one, MOTION, skin)(TIMES_S)
+        np.testing.assert_allclose(alone[0], together[i], rtol=1e-12, atol=1e-15)
+
+
+def test_friction_makes_a_loop_of_twice_its_sliding_value_and_holds_keep_it():
+    """Dahl's loop: after a presliding length or ten, the branch of each direction lies Fc from the middle."""
+    found = reported("device-friction", Fc=0.05, presliding=2e-5, friction_start=0.0)
+    up = found[(TIMES_S > 8) & (TIMES_S < 14)]
+    down = found[(TIMES_S > 48) & (TIMES_S < 54)]
+    np.testing.assert_allclose(up, 0.05, rtol=1e-6)
+    np.testing.assert_allclose(down, -0.05, rtol=1e-6)
+    held = found[(TIMES_S > 14.5) & (TIMES_S < 44.9)]
+    np.testing.assert_allclose(held, 0.05, rtol=1e-6)
+    np.testing.assert_allclose(found[TIMES_S < 5], 0.0, atol=1e-15)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.floats(0.0, 0.1),
+    st.floats(5e-6, 3e-4),
+    st.floats(-1.0, 1.0),
+    st.floats(3.0, 1000.0),
+)
+def test_friction_and_its_creep_solve_their_equation(sliding, length, start, tau):
+    found = reported(
+        "device-friction", "friction-creep",
+        Fc=sliding, presliding=length, friction_start=start, friction_tau=tau,
+    )  # fmt: skip
+    force, expected = start * sliding, []
+    for (a, b), (low, high) in zip(
+        zip(MOTION.time_s[:-1], MOTION.time_s[1:], strict=True),
+        zip(MOTION.displacement_m[:-1], MOTION.displacement_m[1:], strict=True),
+        strict=True,
+    ):
+        v = (high - low) / (b - a)
+        at = TIMES_S[np.logical_and(a <= TIMES_S, b > TIMES_S)]
+        solved = solve_ivp(
+            lambda t, f, v=v: (sliding * v - f * abs(v)) / length - f / tau,
+            (a, b), [force], method="Radau", t_eval=[*at, b], rtol=1e-9, atol=1e-12,
+        )  # fmt: skip
+        expected += list(solved.y[0][: len(at)])
+        force = solved.y[0][-1]
+    np.testing.assert_allclose(found[: len(expected)], expected, rtol=0, atol=2e-6)
+
+
+def test_drag_is_proportional_to_the_speed():
+    found = reported("viscous-drag", drag=20.0)
+    np.testing.assert_allclose(found, 20.0 * np.gradient(MOTION.at(TIMES_S), TIMES_S), atol=0.011)
+    assert found[100] == pytest.approx(0.02)
+    assert found[300] == 0.0
+
+
+def test_ripple_repeats_with_the_position_and_only_while_moving():
+    found = reported("position-ripple", ripple_period=4e-4, ripple_amplitude=0.01, ripple_phase=0.3)
+    moving = (TIMES_S > 5) & (TIMES_S < 14.4)
+    expected = 0.01 * np.sin(2 * np.pi * MOTION.at(TIMES_S) / 4e-4 + 0.3)
+    np.testing.assert_allclose(found[moving], expected[moving], atol=1e-15)
+    assert np.all(found[(TIMES_S > 14.5) & (TIMES_S < 44)] == 0.0)
+
+
+def test_a_delayed_force_is_that_of_before():
+    before_s = TIMES_S - 0.45
+    kept = before_s > 0.0  # and never on a corner, where the drag jumps
+    late = reported("clock-delay", delay=0.45) + skin(TIMES_S)[0]
+    np.testing.assert_allclose(late[kept], skin(before_s)[0, kept], atol=1e-12)
+    both = reported("clock-delay", "viscous-drag", delay=0.45, drag=20.0) + skin(TIMES_S)[0]
+    drag = reported("viscous-drag", drag=20.0, time_s=np.maximum(before_s, 0.0))
+    np.testing.assert_allclose(both[kept], (late + drag)[kept], atol=1e-12)  # the clock comes last
+
+
+def test_events_and_drift_add_what_they_say():
+    found = reported("sensor-events", event_1_at=0.25, event_1_step=0.03, event_2_at=0.5, event_2_step=-0.01)
+    np.testing.assert_allclose(found[[324, 326, 649, 651]], [0.0, 0.03, 0.03, 0.02], atol=1e-15)
+    np.testing.assert_allclose(reported("sensor-drift", drift=1e-4), 1e-4 * TIMES_S)
+    np.testing.assert_allclose(reported("force-offset", F0=-0.02), -0.02)
+
+
+def test_bin_means_are_exact_across_corners():
+    edges = np.arange(0.0, 130.5, 0.5)
+    fine = np.union1d(np.linspace(0.0, 130.0, 130_001), MOTION.time_s)
+    integral = np.concatenate(
+        [[0.0], np.cumsum(0.5 * np.diff(fine) * (skin(fine)[0, 1:] + skin(fine)[0, :-1]))]
+    )
+    expected = np.diff(np.interp(edges, fine, integral)) / 0.5
+    np.testing.assert_allclose(bin_means(skin, MOTION, edges)[0], expected, atol=1e-9)
+
+
+PLUGIN = """
+from bayeskin.mechanisms.mechanism import Mechanism, Place, added
+from bayeskin.types import Parameter
+MECHANISM = Mechanism(
+    name="{name}", parameters=(Parameter("{parameter}", "N", 0.0, 1.0, "uniform"),),
+    neutral={{"{parameter}": 0.0}},
+    statement=lambda v: "A magnet.", group=("magnet",), place=Place.CELL,
+    observe=lambda values, motion, force: added(force, lambda t: values["{parameter}"][:, None] + 0 * t),
+)
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Installs a package beside bayeskin that brings a mechanism of its own."""
+
+    def install(name: str, parameter: str) -> None:
+        (tmp_path / "magnet.py").write_text(PLUGIN.format(name=name, parameter=parameter))
+        info = tmp_path / "magnet-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: magnet\nVersion: 1.0\n")
+        (info / "entry_points.txt").write_text("[bayeskin.mechanisms]\nmagnet = magnet:MECHANISM\n")
+        monkeypatch.syspath_prepend(str(tmp_path))
+
+    yield install
+    sys.modules.pop("magnet", None)
+
+
+def test_another_package_adds_a_mechanism(plugin):
+    plugin("magnet", "pull")
+    assert set(catalogue()) == {*ALL, "magnet"}
+    force = observed([catalogue()["magnet"]], {"pull": np.array([0.2])}, MOTION, skin)
+    np.testing.assert_allclose(force(TIMES_S), skin(TIMES_S) + 0.2)
+
+
+@pytest.mark.parametrize(("name", "parameter"), [("force-offset", "pull"), ("magnet", "F0")])
+def test_two_of_one_name_are_refused(plugin, name, parameter):
+    plugin(name, parameter)
+    with pytest.raises(InputError, match="twice"):
+        catalogue()
