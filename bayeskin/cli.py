@@ -97,6 +97,7 @@ def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
     "--recording", type=click.Path(path_type=Path), help="Recording whose displacement drives the run."
 )
 @click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A parameter, in SI units.")
+@click.option("--mechanism", "mechanisms", multiple=True, metavar="NAME", help="Physics to add; repeatable.")
 @click.option("--mesh", help="'bricks' or a gmsh file; default as in CONFIG.")
 @click.option("--observation", type=click.Choice(["reaction", "article"]), help="Default as in CONFIG.")
 @click.option("-o", "out", required=True, type=click.Path(path_type=Path), help="File to write: .csv or .h5.")
@@ -107,8 +108,8 @@ def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
 def simulate(as_json: bool, **options: Any) -> None:
     """One run of the full model on a recording's displacement (default: the demo's).
 
-    Parameters that are not set stand at the median of their prior. The CSV has the columns
-    time_s, displacement_m, force_n.
+    Parameters that are not set stand at the median of their prior, a mechanism's among them. The CSV has the
+    columns time_s, displacement_m, force_n.
 
     The figure (fields.png, fields.svg) shows displacement, pressure and fluid velocity near the pads at the
     times given by --at, which can be repeated, or at four moments: the end of the first loading, the middle
@@ -118,6 +119,7 @@ def simulate(as_json: bool, **options: Any) -> None:
     Example:
       bayeskin simulate --set E_c=300e3 --set k_s=1e-13 -o force.csv --fields fields
       bayeskin simulate -o force.csv --figures figures --at 14.4 --at 30 --at 54.4
+      bayeskin simulate -o force.csv --mechanism device-friction --set Fc=0.03
     """
     from bayeskin.pipeline import single
 

@@ -149,6 +149,32 @@ def test_simulate_writes_the_columns_that_scripts_rely_on(
     ]  # fmt: skip
 
 
+def test_simulate_adds_the_mechanisms_that_are_named(
+    bayeskin: Command, measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(single, "simulate", toy_model.simulate)
+    common = ("simulate", "--recording", measured, "--set", "E_c=200e3")
+    mechanisms = (
+        "--mechanism",
+        "force-offset",
+        "--mechanism",
+        "viscous-drag",
+        "--set",
+        "F0=0.02",
+        "--set",
+        "drag=10",
+    )
+    bayeskin(*common, "-o", tmp_path / "base.h5")
+    code, out, _ = bayeskin(*common, *mechanisms, "-o", tmp_path / "more.h5", "--json")
+    assert (code, json.loads(out)["theta"]["F0"]) == (0, 0.02)
+    base, more = (storage.load(tmp_path / f"{name}.h5", Simulation) for name in ("base", "more"))
+    beyond = more.force_n - base.at(more.time_s)
+    moving = np.abs(np.gradient(more.displacement_m, more.time_s)) > 8e-4
+    assert len(more.time_s) > 1300
+    np.testing.assert_allclose(np.abs(beyond[moving] - 0.02).max(), 10 * 0.9e-3, atol=1e-4)
+    np.testing.assert_allclose(np.median(beyond), 0.02, atol=1e-6)
+
+
 @pytest.fixture
 def runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """A stand-in for the full model that stretches all uniformly; lists the names of the runs it made."""
@@ -276,6 +302,10 @@ def test_a_simulation_that_fails_exits_with_1_and_writes_nothing(
         (["--observation", "article", "--mesh", "bricks"], "gmsh"),
         (["--observation", "power"], "--observation"),
         (["--depth", "3"], "--depth"),
+        (["--mechanism", "magnet"], "one of clock-delay, device-friction"),
+        (["--mechanism", "device-friction", "--set", "presliding=0"], "finite positive"),
+        (["--mechanism", "force-offset", "--set", "F0=inf"], "a finite number"),
+        (["--set", "F0=0.1"], "F0"),
     ],
 )
 def test_wrong_options_are_refused(

@@ -25,7 +25,7 @@ BELOW = {
     "inference": BASE,  # a Surrogate is all that these two know of a model
     "sensitivity": BASE,
     "report": BASE | {"recordings", "inference", "sensitivity"},
-    "pipeline": BASE | SIBLINGS | {"config", "runner", "inference", "sensitivity", "report"},
+    "pipeline": BASE | SIBLINGS | {"mechanisms", "config", "runner", "inference", "sensitivity", "report"},
 }
 BELOW["cli"] = BELOW["pipeline"] | {"pipeline"}
 

@@ -41,7 +41,7 @@ def simulate(
         corner=frozen_array(np.isin(time_s, motion.time_s), bool),
         status="ok",
         message="",
-        stats={"seconds": 0.0, "steps": 261.0, "dofs": 1.0, "peak_force_n": 1.0},
+        stats={"seconds": 0.0, "steps": 261.0, "dofs": 1.0, "peak_force_n": 1.0, "time_error_n": 1e-4},
         model_hash=spec.hash,
         gradient_names=names,
         gradient_n=np.array(slopes).T if names else np.zeros((0, 0)),

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from bayeskin import storage
 from bayeskin.config import load_config, parameter_space
 from bayeskin.errors import InputError
+from bayeskin.mechanisms import Mechanism, catalogue, observed
 from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec, problem_of, simulate
 from bayeskin.pipeline.engine import Reporter, Run
@@ -21,7 +25,9 @@ from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.recording import pad_motion
 from bayeskin.recordings import describe, describe_json, phase_noise, read_recording, segment
 from bayeskin.shipped import shipped
-from bayeskin.types import ParameterSpace, Simulation
+from bayeskin.types import PadMotion, Parameter, ParameterSpace, Simulation
+
+REPORTED_EVERY_S = 0.1  # with mechanisms, whose force changes within a step of the model
 
 
 def import_recording(file: Path, out: Path, sheet: str | None = None) -> dict[str, Any]:
@@ -44,6 +50,7 @@ def simulate_once(
     config: Path | None = None,
     recording: Path | None = None,
     settings: Sequence[str] = (),
+    mechanisms: Sequence[str] = (),
     mesh: str | None = None,
     observation: str | None = None,
     fields: Path | None = None,
@@ -53,15 +60,22 @@ def simulate_once(
     """One full run on a recording's displacement, into `out` (.csv or .h5); its fields into folders.
 
     What is not given is the configuration's, or the demo's. Parameters that `settings` ("NAME=VALUE", SI)
-    leave out stand at the median of their prior. The figure shows the fields at the times `at_s`, or at four
-    moments of the protocol. A run that fails is told, and nothing is written.
+    leave out stand at the median of their prior; those of the `mechanisms` named are among them. The
+    figure shows the fields at the times `at_s`, or at four moments of the protocol. A run that fails is
+    told, and nothing is written.
     Raises InputError for bad input.
     """
     _check_suffix(out, (".csv", ".h5"))
     _check_folders(fields, figures, at_s)
     config_path = config or shipped("runs/demo.toml")
     run = Run(load_config(config_path), config_path, Path(), reporter)
-    theta = _theta(parameter_space(run.config, config_path), settings)
+    added = _mechanisms(mechanisms)
+    base = parameter_space(run.config, config_path)
+    more = tuple(p for mechanism in added for p in mechanism.parameters)
+    values = _values(ParameterSpace((*base.parameters, *more)), settings)
+    for parameter in more:
+        _refuse_senseless(parameter, values[parameter.name])
+    theta = {name: values[name] for name in base.names}
     spec = model_spec(run, mesh, observation)
     source = read_recording(recording or run.beside(run.config.recording.file))
     phases = segment(source)
@@ -78,6 +92,7 @@ def simulate_once(
     )  # fmt: skip
     files: list[Path] = []
     if simulation.status == "ok":
+        simulation = _reported(simulation, added, values, motion)
         shown = outputs.write(caption(run)) if outputs else []
         write_simulation(out, simulation)
         files = [out, *shown]
@@ -103,7 +118,42 @@ def write_simulation(out: Path, simulation: Simulation) -> None:
         partial.unlink(missing_ok=True)
 
 
-def _theta(space: ParameterSpace, settings: Sequence[str]) -> dict[str, float]:
+def _mechanisms(names: Sequence[str]) -> list[Mechanism]:
+    known = catalogue()
+    for name in names:
+        if name not in known:
+            raise InputError(f"--mechanism {name}", "an unknown mechanism", f"one of {', '.join(known)}")
+    return [known[name] for name in dict.fromkeys(names)]
+
+
+def _refuse_senseless(parameter: Parameter, value: float) -> None:
+    positive = parameter.prior == "log-uniform"
+    if not np.isfinite(value) or (positive and value <= 0.0):
+        expected = "a finite positive number" if positive else "a finite number"
+        raise InputError(f"--set {parameter.name}", f"{value:g}", expected)
+
+
+def _reported(
+    simulation: Simulation, mechanisms: Sequence[Mechanism], values: Mapping[str, float], motion: PadMotion
+) -> Simulation:
+    """The same run as an instrument with `mechanisms` reports it, at more times than the model's steps."""
+    if not mechanisms:
+        return simulation
+    every = np.arange(0.0, simulation.time_s[-1], REPORTED_EVERY_S)
+    time_s = np.union1d(simulation.time_s, every)
+    columns = {name: np.array([value]) for name, value in values.items()}
+    force = observed(mechanisms, columns, motion, lambda t: np.atleast_2d(simulation.at(t)))
+    return replace(
+        simulation,
+        theta=dict(values),
+        time_s=time_s,
+        displacement_m=motion.at(time_s),
+        force_n=force(time_s)[0],
+        corner=np.isin(time_s, simulation.time_s[simulation.corner]),
+    )
+
+
+def _values(space: ParameterSpace, settings: Sequence[str]) -> dict[str, float]:
     theta = dict(zip(space.names, space.from_unit([0.5] * space.dim).tolist(), strict=True))
     for setting in settings:
         name, equals, value = setting.partition("=")
