@@ -61,6 +61,7 @@ from bayeskin.errors import InputError
 from bayeskin.model import accuracy, lagrangian, simulate
 from bayeskin.model.problem import Problem, material
 from bayeskin.model.simulate import ModelSpec, problem_of
+from bayeskin.model.surface import facet_mapping
 from bayeskin.report import save_figure
 from bayeskin.types import Array, PadMotion, Simulation
 
@@ -155,7 +156,9 @@ class FaceStress:
         mesh, bricks = problem.mesh.geometry, isinstance(problem.mesh.geometry, skfem.MeshHex)
         quadratic = skfem.ElementHex2() if bricks else skfem.ElementTetP2()
         linear = skfem.ElementHex1() if bricks else skfem.ElementTetP1()
-        self._u = skfem.FacetBasis(mesh, quadratic, facets=problem.mesh.facets["pad"], intorder=6)
+        self._u = skfem.FacetBasis(
+            mesh, quadratic, facet_mapping(mesh), facets=problem.mesh.facets["pad"], intorder=6
+        )
         self._p = self._u.with_element(linear)
         self._n = 3 * problem.space.n_nodes
         cells = material(theta, problem.mesh.cutis)

@@ -245,7 +245,7 @@ def test_the_figure_of_fields_shows_four_moments_or_those_asked_for(
         ["0 s", "rest 0"], ["10 s", "loading 1"], ["60 s", "rest 1"],
     ]  # fmt: skip
     assert given["columns"][1].values[:, 0] == pytest.approx([0.0, -0.45, 0.0], abs=1e-6)
-    assert given["columns"][0].values[1].max() == pytest.approx(0.045 * 63, rel=0.03)
+    assert given["columns"][0].values[1].max() == pytest.approx(0.045 * 65, rel=0.03)
 
 
 @pytest.mark.parametrize(

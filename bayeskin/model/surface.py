@@ -13,12 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import skfem
+from skfem.mapping import MappingIsoparametric
 
 from bayeskin.model.mesh import ARM_RADIUS_M, LENGTH_M
 from bayeskin.model.problem import Constants, Problem, material
 from bayeskin.types import Array
 
-NEAR_M = (63e-3, 38e-3)  # along the arm and around it: well beyond the pads, and where bricks end
+NEAR_M = (65e-3, 38e-3)  # along the arm and around it: well beyond the pads, and where bricks end
 DIVISIONS = {"brick": 6, "tetrahedron": 3}  # of the edges of a facet
 PARTS = ("subcutis", "cutis", "top", "pad", "guard")
 
@@ -55,6 +56,24 @@ class SurfaceState:
     velocity_m_s: Array
 
 
+class _BrickMapping(MappingIsoparametric):
+    """Inverts to 1e-10 of a brick: scikit-fem's own 1e-12 is below rounding in thin curved ones."""
+
+    def invF(
+        self,
+        x: Array,
+        tind: np.ndarray | None = None,
+        newton_max_iters: int = 50,
+        newton_tol: float = 1e-10,
+    ) -> Array:
+        return np.asarray(super().invF(x, tind, newton_max_iters, newton_tol))
+
+
+def facet_mapping(mesh: skfem.Mesh) -> skfem.Mapping | None:
+    """The mapping with which scikit-fem can place points on facets; None for its own."""
+    return _BrickMapping(mesh, mesh.elem(), mesh.bndelem) if isinstance(mesh, skfem.MeshHex) else None
+
+
 def seen_surface(problem: Problem) -> Surface:
     """The surface near the pads; each facet divided into small faces."""
     mesh = problem.mesh.geometry
@@ -66,7 +85,9 @@ def seen_surface(problem: Problem) -> Surface:
         _divided_square(DIVISIONS["brick"]) if bricks else _divided_triangle(DIVISIONS["tetrahedron"])
     )
     facets, plane = _seen_facets(problem)
-    basis = skfem.FacetBasis(mesh, quadratic, facets=facets, quadrature=(local, np.ones(local.shape[1])))
+    basis = skfem.FacetBasis(
+        mesh, quadratic, facet_mapping(mesh), facets=facets, quadrature=(local, np.ones(local.shape[1]))
+    )
     corners = np.asarray(basis.global_coordinates()).transpose(1, 2, 0)  # (g, k, 3)
     _, point = np.unique(np.round(corners.reshape(-1, 3), 8), axis=0, return_inverse=True)
     point = point.reshape(corners.shape[:2])
