@@ -61,7 +61,6 @@ from bayeskin.errors import InputError
 from bayeskin.model import accuracy, lagrangian, simulate
 from bayeskin.model.problem import Problem, material
 from bayeskin.model.simulate import ModelSpec, problem_of
-from bayeskin.model.surface import facet_mapping
 from bayeskin.report import save_figure
 from bayeskin.types import Array, PadMotion, Simulation
 
@@ -157,7 +156,7 @@ class FaceStress:
         quadratic = skfem.ElementHex2() if bricks else skfem.ElementTetP2()
         linear = skfem.ElementHex1() if bricks else skfem.ElementTetP1()
         self._u = skfem.FacetBasis(
-            mesh, quadratic, facet_mapping(mesh), facets=problem.mesh.facets["pad"], intorder=6
+            mesh, quadratic, problem.mesh.facet_mapping(), facets=problem.mesh.facets["pad"], intorder=6
         )
         self._p = self._u.with_element(linear)
         self._n = 3 * problem.space.n_nodes

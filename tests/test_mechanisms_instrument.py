@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import bin_means, catalogue, observed
+from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.types import PadMotion
 
 MOTION = PadMotion(
@@ -21,7 +22,7 @@ MOTION = PadMotion(
     1e-3 * np.array([0.0, 0.0, 9.4, 9.4, 0.0, 0.0, 9.4, 9.4, 0.0, 0.0]),
 )
 TIMES_S = np.linspace(0.0, 130.0, 1301)
-ALL = catalogue()
+ALL = {name: m for name, m in catalogue().items() if isinstance(m.act, Instrument)}
 
 
 def skin(time_s: np.ndarray) -> np.ndarray:
@@ -167,13 +168,16 @@ def test_bin_means_are_exact_across_corners():
 
 
 PLUGIN = """
-from bayeskin.mechanisms.mechanism import Mechanism, Place, added
+from bayeskin.mechanisms.mechanism import Instrument, Mechanism, Place, added
 from bayeskin.types import Parameter
 MECHANISM = Mechanism(
     name="{name}", parameters=(Parameter("{parameter}", "N", 0.0, 1.0, "uniform"),),
     neutral={{"{parameter}": 0.0}},
-    statement=lambda v: "A magnet.", group=("magnet",), place=Place.CELL,
-    observe=lambda values, motion, force: added(force, lambda t: values["{parameter}"][:, None] + 0 * t),
+    statement=lambda v: "A magnet.", group=("magnet",),
+    act=Instrument(
+        Place.CELL,
+        lambda values, motion, force: added(force, lambda t: values["{parameter}"][:, None] + 0 * t),
+    ),
 )
 """
 
@@ -196,7 +200,7 @@ def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_another_package_adds_a_mechanism(plugin):
     plugin("magnet", "pull")
-    assert set(catalogue()) == {*ALL, "magnet"}
+    assert "magnet" in catalogue()
     force = observed([catalogue()["magnet"]], {"pull": np.array([0.2])}, MOTION, skin)
     np.testing.assert_allclose(force(TIMES_S), skin(TIMES_S) + 0.2)
 

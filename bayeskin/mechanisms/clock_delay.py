@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values
+from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values
 from bayeskin.types import PadMotion, Parameter
 
 
@@ -23,6 +23,5 @@ MECHANISM = Mechanism(
         "beside the displacement."
     ),
     group=("clock-delay",),
-    place=Place.CLOCK,
-    observe=observe,
+    act=Instrument(Place.CLOCK, observe),
 )

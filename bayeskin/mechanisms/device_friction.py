@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
 from bayeskin.types import Array, PadMotion, Parameter
 
 
@@ -57,6 +57,5 @@ MECHANISM = Mechanism(
         f"{1e3 * v['presliding']:.2g} mm after a reversal and kept during holds."
     ),
     group=("device-friction", "viscous-drag", "force-offset"),
-    place=Place.DRIVE,
-    observe=observe,
+    act=Instrument(Place.DRIVE, observe),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
 from bayeskin.types import PadMotion, Parameter
 
 
@@ -19,6 +19,5 @@ MECHANISM = Mechanism(
     neutral={"F0": 0.0},
     statement=lambda v: f"The load cell reads {1e3 * v['F0']:+.0f} mN when the skin pulls with none.",
     group=("force-offset", "pre-stretch", "device-friction"),
-    place=Place.CELL,
-    observe=observe,
+    act=Instrument(Place.CELL, observe),
 )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayeskin.mechanisms.device_friction import friction
-from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
 from bayeskin.types import Array, PadMotion, Parameter
 
 
@@ -34,6 +34,5 @@ MECHANISM = Mechanism(
     neutral={"friction_tau": np.inf},
     statement=lambda v: f"Friction that a stop locks in relaxes within {v['friction_tau']:.3g} s.",
     group=("friction-creep", "solid-viscoelasticity", "strain-dependent-permeability"),
-    place=Place.DRIVE,
-    observe=observe,
+    act=Instrument(Place.DRIVE, observe),
 )

@@ -1,7 +1,8 @@
 """What a mechanism is: physics that the base model leaves out, off at its neutral value.
 
-Instrument mechanisms act on the force that comes out of the skin, sample by sample of a posterior: each
-takes a force as a function of time and gives the force that the load cell then reports.
+Tissue mechanisms change the model's equations (`bayeskin.model.tissue`). Instrument mechanisms act on the
+force that comes out of the skin, sample by sample of a posterior: each takes a force as a function of time
+and gives the one that the load cell then reports.
 """
 
 from __future__ import annotations
@@ -9,9 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 
 import numpy as np
 
+from bayeskin.model.problem import Problem
+from bayeskin.model.tissue import Bind, TissueLaw
 from bayeskin.types import Array, PadMotion, Parameter
 
 Values = Mapping[str, Array]  # each parameter (n,), SI; those of all mechanisms that are on
@@ -29,6 +33,21 @@ class Place(IntEnum):
 
 
 @dataclass(frozen=True)
+class Instrument:
+    """What an instrument mechanism does to a force."""
+
+    place: Place
+    observe: Observe
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """What a tissue mechanism does to the model: `bind` takes the values of its parameters and a problem."""
+
+    bind: Callable[[Mapping[str, float], Problem], TissueLaw]
+
+
+@dataclass(frozen=True)
 class Mechanism:
     """One entry of the catalogue.
 
@@ -42,17 +61,22 @@ class Mechanism:
     neutral: Mapping[str, float]
     statement: Callable[[Mapping[str, float]], str]
     group: tuple[str, ...]
-    place: Place
-    observe: Observe
+    act: Instrument | Tissue
 
 
 def observed(
     mechanisms: Iterable[Mechanism], values: Values, motion: PadMotion, force: ForceOfTime
 ) -> ForceOfTime:
-    """The force that is reported when `mechanisms` act on `force`, whatever order they are given in."""
-    for mechanism in sorted(mechanisms, key=lambda m: (m.place, m.name)):
-        force = mechanism.observe(values, motion, force)
+    """The force that is reported when the instrument's among `mechanisms` act on it, in any order given."""
+    acts = [(m.act.place, m.name, m.act) for m in mechanisms if isinstance(m.act, Instrument)]
+    for _, _, act in sorted(acts, key=lambda one: one[:2]):
+        force = act.observe(values, motion, force)
     return force
+
+
+def laws(mechanisms: Iterable[Mechanism], values: Mapping[str, float]) -> list[Bind]:
+    """What `simulate` is given for the tissue's among `mechanisms`."""
+    return [partial(m.act.bind, values) for m in mechanisms if isinstance(m.act, Tissue)]
 
 
 def added(force: ForceOfTime, more: ForceOfTime) -> ForceOfTime:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
 from bayeskin.mechanisms.viscous_drag import speed_of
 from bayeskin.types import Array, PadMotion, Parameter
 
@@ -42,6 +42,5 @@ MECHANISM = Mechanism(
         f"{1e3 * v['ripple_period']:.2g} mm of its travel."
     ),
     group=("position-ripple",),
-    place=Place.DRIVE,
-    observe=observe,
+    act=Instrument(Place.DRIVE, observe),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
 from bayeskin.types import PadMotion, Parameter
 
 
@@ -17,6 +17,5 @@ MECHANISM = Mechanism(
     neutral={"drift": 0.0},
     statement=lambda v: f"The load cell drifts by {6e4 * v['drift']:+.2g} mN a minute.",
     group=("sensor-drift",),
-    place=Place.CELL,
-    observe=observe,
+    act=Instrument(Place.CELL, observe),
 )

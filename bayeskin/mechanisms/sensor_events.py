@@ -5,7 +5,7 @@ Moments are counted as shares of the recording, so that one prior fits all.
 
 from __future__ import annotations
 
-from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
 from bayeskin.types import Array, PadMotion, Parameter
 
 EVENTS = (1, 2)
@@ -45,6 +45,5 @@ MECHANISM = Mechanism(
         + "."
     ),
     group=("sensor-events",),
-    place=Place.CELL,
-    observe=observe,
+    act=Instrument(Place.CELL, observe),
 )

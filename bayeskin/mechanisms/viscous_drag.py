@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Place, Values, added
+from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
 from bayeskin.types import Array, PadMotion, Parameter
 
 
@@ -26,6 +26,5 @@ MECHANISM = Mechanism(
     neutral={"drag": 0.0},
     statement=lambda v: f"The drive drags with {v['drag']:.0f} mN at each mm/s, in the direction of motion.",
     group=("viscous-drag", "device-friction"),
-    place=Place.DRIVE,
-    observe=observe,
+    act=Instrument(Place.DRIVE, observe),
 )

@@ -26,6 +26,7 @@ from bayeskin.model.newton import (
     extrapolation_weights,
 )
 from bayeskin.model.problem import Material, Problem
+from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Array, PadMotion
 
 SMALLEST_MOTION_M = 1e-4  # so that a protocol without motion has a scale too
@@ -82,6 +83,7 @@ class LagrangianModel:
     problem: Problem
     material: Material
     motion: PadMotion
+    laws: tuple[TissueLaw, ...] = ()
     solver: NewtonSolver = field(default_factory=NewtonSolver)
     full_residual: Array = field(init=False)
 
@@ -93,6 +95,9 @@ class LagrangianModel:
         # the reaction's derivative (free,) by the free unknowns, at the last tangent
         self.pad_gradient = np.zeros(len(self.problem.pattern.free))
         self._on_pad = np.isin(self.problem.pattern.fixed, self.problem.pad_x).astype(float)
+        self._surfaces = [
+            (term, *self.problem.pattern.places(term.matrix)) for law in self.laws for term in law.surfaces
+        ]
         self._travel: Array | None = None  # change of the unknowns a metre of the pads' travel
 
     def remember_travel(self, past: list[State]) -> None:
@@ -128,10 +133,14 @@ class LagrangianModel:
             )  # fmt: skip
             if not smallest > 0.0:
                 return None
+            for law in self.laws:
+                law.respond(chunk)
             assembly.residual(
                 s.n_nodes, s.nodes_u[c], s.nodes_p[c], s.grad_u[c], s.grad_p[c], s.value_p, s.weight[c],
                 found.stress, found.content, found.flux, out,
             )  # fmt: skip
+        for term, _, _ in self._surfaces:
+            out += (h if term.per_second else 1.0) * (term.matrix @ x)
         return (out, volume, pressure) if np.isfinite(out).all() else None
 
     def tangent(self, x: Array, h: float, old: State) -> tuple[sp.csr_matrix, sp.csr_matrix]:
@@ -146,10 +155,14 @@ class LagrangianModel:
                 m.storage[c], h, old.pressure[c],
                 by.stress_f, by.stress_p, by.content_f, by.content_p, by.flux_f, by.flux_g,
             )  # fmt: skip
+            for law in self.laws:
+                law.linearise(chunk)
             assembly.tangent(
                 s.grad_u[c], s.grad_p[c], s.value_p, s.weight[c], by.stress_f, by.stress_p, by.content_f,
                 by.content_p, by.flux_f, by.flux_g, self.problem.pattern.position[c], data,
             )  # fmt: skip
+        for term, place, value in self._surfaces:
+            np.add.at(data, place, (h if term.per_second else 1.0) * value)
         free_free, free_fixed = self.problem.pattern.matrices(data)
         self.pad_gradient = 2.0 * (free_fixed @ self._on_pad)
         return free_free, free_fixed

@@ -14,6 +14,7 @@ from pathlib import Path
 import meshio
 import numpy as np
 import skfem
+from skfem.mapping import MappingIsoparametric
 
 from bayeskin.errors import InputError
 from bayeskin.types import Array
@@ -57,6 +58,24 @@ class SkinMesh:
             digest.update(f"{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
+    def facet_mapping(self) -> skfem.Mapping | None:
+        """With which scikit-fem's FacetBasis can place points on facets; None for its own."""
+        mesh = self.geometry
+        return _BrickMapping(mesh, mesh.elem(), mesh.bndelem) if isinstance(mesh, skfem.MeshHex) else None
+
+
+class _BrickMapping(MappingIsoparametric):
+    """Inverts to 1e-10 of a brick: scikit-fem's own 1e-12 is below rounding in thin curved ones."""
+
+    def invF(
+        self,
+        x: Array,
+        tind: np.ndarray | None = None,
+        newton_max_iters: int = 50,
+        newton_tol: float = 1e-10,
+    ) -> Array:
+        return np.asarray(super().invF(x, tind, newton_max_iters, newton_tol))
+
 
 def roll(points: Array, radius_m: float = ARM_RADIUS_M) -> Array:
     """Flat coordinates (3, n) [m] onto the arm, (3, n) [m] (the article's script, after loading)."""
@@ -82,7 +101,8 @@ def brick_mesh(refinement: int = 1) -> SkinMesh:
 
 # Lines of the coarsest bricks, and those among them that are edges of the pads [mm]; layers at z = 8.
 _COARSE_LINES_MM = (
-    (0.0, 9.0, 16.5, 18.0, 19.5, 24.5, 26.0, 27.0, 28.5, 33.5, 35.0, 37.0, 45.0, 65.0, 105.0),
+    # coarse beyond the guard: there a soft cutis on a stiff subcutis would fold, and fine bricks try to
+    (0.0, 9.0, 16.5, 18.0, 19.5, 24.5, 26.0, 27.0, 28.5, 33.0, 35.0, 40.0, 48.0, 65.0, 105.0),
     (0.0, 3.0, 4.0, 5.0, 8.5, 12.0, 18.0, 38.0, 84.0),
     (0.0, 5.0, 8.0, 9.5, 10.0),
 )

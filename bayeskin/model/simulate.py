@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,9 +19,11 @@ from bayeskin.model.linear import SOLVER_NAME
 from bayeskin.model.mesh import SkinMesh, brick_mesh, read_gmsh
 from bayeskin.model.newton import NewtonSolver
 from bayeskin.model.problem import PARAMETERS, Constants, Problem, build_problem, material
+from bayeskin.model.tissue import Bind, TissueLaw
 from bayeskin.types import Array, Observation, PadMotion, Simulation, frozen_array
 
 PHYSICS_VERSION = 2  # raised when a change of the code changes a force by more than its tolerance
+OPENED_S, REST_S = 1e3, 1e6  # pads that were opened before the test: by then, and when it starts
 ARTICLE_STEP_S = 0.5  # every 50th sample of a 100 Hz recording
 
 OnState = Callable[[float, Array, float], None]  # time_s, x (dofs,), force_n
@@ -76,6 +78,7 @@ def simulate(
     on_progress: Callable[[float], None] | None = None,
     on_state: OnState | None = None,
     gradients: bool = False,
+    laws: Sequence[Bind] = (),
 ) -> Simulation:
     """Runs the full model over the whole motion.
 
@@ -83,6 +86,8 @@ def simulate(
     on_progress : called with the fraction of the motion that is done
     on_state : called with time [s], all unknowns (dofs,) and force [N] of each accepted step
     gradients : also the force's derivatives by the logarithms of `gradients.DIFFERENTIATED`, `reaction` only
+    laws : physics beyond the base model, `reaction` only; with pads that were opened before the test the
+        force is relative to that at its start, where all is at rest
 
     A run that does not converge is a Simulation with status "failed", its steps so far, and a
     message with the step, the time and a remedy. Raises InputError for a parameter that is
@@ -91,11 +96,17 @@ def simulate(
     _check(theta)
     if gradients and spec.observation != "reaction":
         raise InputError("gradients", f"observation {spec.observation!r}", "observation 'reaction'")
+    if laws and spec.observation != "reaction":
+        raise InputError("tissue mechanisms", f"observation {spec.observation!r}", "observation 'reaction'")
     started = time.perf_counter()
     problem = problem_of(spec.mesh, spec.refinement)
     history = _History(motion, on_progress, on_state)
-    run = _run_reaction if spec.observation == "reaction" else _run_article
-    message, solver, slopes = run(spec, problem, motion, theta, history, gradients)
+    if spec.observation == "reaction":
+        bound = tuple(bind(problem) for bind in laws)
+        message, solver, slopes = _run_reaction(spec, problem, bound, motion, theta, history, gradients)
+    else:
+        message, solver = _run_article(problem, motion, theta, history)
+        slopes = None
     solver.release()
     force = np.array(history.forces_n)
     stats = {
@@ -119,8 +130,12 @@ def simulate(
         stats=stats,
         model_hash=spec.hash,
         gradient_names=DIFFERENTIATED if slopes else (),
-        gradient_n=np.array(slopes.force_n) if slopes else np.zeros((0, 0)),
+        gradient_n=_beyond_start(slopes.force_n[-len(force) :]) if slopes else np.zeros((0, 0)),
     )
+
+
+def _beyond_start(rows: Sequence[Array]) -> Array:
+    return np.array(rows) - rows[0]
 
 
 class _History:
@@ -144,24 +159,29 @@ class _History:
             self._on_progress(time_s / self._end_s)
 
 
-_Ended = tuple[str, NewtonSolver, ForceGradients | None]  # message, empty for a run that finished
-
-
 def _run_reaction(
     spec: ModelSpec,
     problem: Problem,
+    laws: tuple[TissueLaw, ...],
     motion: PadMotion,
     theta: Mapping[str, float],
     history: _History,
     gradients: bool,
-) -> _Ended:
-    model = lagrangian.LagrangianModel(problem, material(theta, problem.mesh.cutis), motion)
+) -> tuple[str, NewtonSolver, ForceGradients | None]:
+    """Fills the history; returns a message, empty for a run that finished."""
+    motion, before_s = _with_opening(motion, sum(law.opening_m for law in laws))
+    model = lagrangian.LagrangianModel(problem, material(theta, problem.mesh.cutis), motion, laws)
     slopes = ForceGradients(model, theta) if gradients else None
+    at_start: list[float] = []
 
     def on_step(step: lagrangian.Step) -> None:
         if slopes is not None and step.stages:
             slopes.follow(step)
-        history.add(step.state.time_s, step.state.x, step.force_n, step.corner, step.error_n)
+        time_s = step.state.time_s - before_s
+        if time_s > -1e-6:
+            at_start.append(step.force_n)
+            force_n = step.force_n - at_start[0]
+            history.add(max(time_s, 0.0), step.state.x, force_n, step.corner, step.error_n)
 
     try:
         message = lagrangian.integrate(model, theta["p_init"], spec.tolerance, on_step)
@@ -170,14 +190,17 @@ def _run_reaction(
     return message, model.solver, slopes
 
 
+def _with_opening(motion: PadMotion, opening_m: float) -> tuple[PadMotion, float]:
+    """The motion of pads that were slowly moved apart before and left to rest; and when the test starts."""
+    if opening_m == 0.0:
+        return motion, 0.0
+    time_s = np.concatenate([[0.0, OPENED_S], REST_S + motion.time_s])
+    return PadMotion(time_s, np.concatenate([[0.0, opening_m], opening_m + motion.displacement_m])), REST_S
+
+
 def _run_article(
-    spec: ModelSpec,
-    problem: Problem,
-    motion: PadMotion,
-    theta: Mapping[str, float],
-    history: _History,
-    _: bool,
-) -> _Ended:
+    problem: Problem, motion: PadMotion, theta: Mapping[str, float], history: _History
+) -> tuple[str, NewtonSolver]:
     model = article.ArticleModel(problem, material(theta, problem.mesh.cutis))
     samples = np.arange(0.0, motion.time_s[-1] + 1e-9, ARTICLE_STEP_S)
 
@@ -185,7 +208,7 @@ def _run_article(
         history.add(time_s, x, force_n, bool(np.abs(motion.time_s - time_s).min() < 1e-6))
 
     message = article.run(model, samples, motion.at(samples), theta["p_init"], on_step)
-    return message, model.solver, None
+    return message, model.solver
 
 
 def _check(theta: Mapping[str, float]) -> None:

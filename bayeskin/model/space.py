@@ -55,6 +55,10 @@ class TaylorHood:
         """Displacement nodes on a named boundary, sorted."""
         return np.unique(self._basis().get_dofs(self.mesh.facets[name]).all())
 
+    def quadrature_points(self) -> Array:
+        """Coordinates (3, e, q) [m]."""
+        return np.asarray(self._basis().global_coordinates())
+
     def _basis(self) -> skfem.CellBasis:
         return skfem.Basis(self.mesh.geometry, _element(self.mesh)[0], intorder=QUADRATURE_DEGREE)
 
@@ -113,6 +117,29 @@ class Sparsity:
         blocks = copy(self.free_free), copy(self.free_fixed)
         blocks[0].data, blocks[1].data = data[:n], data[n:]
         return blocks
+
+    def places(self, matrix: sp.csr_matrix) -> tuple[np.ndarray, Array]:
+        """Where the entries of a matrix over all unknowns stand in the concatenated data, and their values.
+
+        Rows of fixed unknowns are left out; every other entry must couple unknowns of one cell.
+        """
+        number = np.full(matrix.shape[0], -1)
+        number[self.free] = np.arange(len(self.free))
+        entries = matrix.tocoo()
+        wanted = number[entries.row] >= 0
+        row, column, value = entries.row[wanted], entries.col[wanted], entries.data[wanted]
+        is_free = number[column] >= 0
+        number[self.fixed] = np.arange(len(self.fixed))
+        place = np.empty(len(row), dtype=np.int64)
+        for block, mine, offset in (
+            (self.free_free, is_free, 0),
+            (self.free_fixed, ~is_free, self.free_free.nnz),
+        ):
+            numbered = sp.csr_matrix((np.arange(1, block.nnz + 1), block.indices, block.indptr), block.shape)
+            found = np.asarray(numbered[number[row[mine]], number[column[mine]]]).ravel()
+            assert (found > 0).all()
+            place[mine] = offset + found - 1
+        return place, np.asarray(value)
 
 
 def sparsity(space: TaylorHood, fixed: np.ndarray) -> Sparsity:

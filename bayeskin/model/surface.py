@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import skfem
-from skfem.mapping import MappingIsoparametric
 
 from bayeskin.model.mesh import ARM_RADIUS_M, LENGTH_M
 from bayeskin.model.problem import Constants, Problem, material
@@ -56,24 +55,6 @@ class SurfaceState:
     velocity_m_s: Array
 
 
-class _BrickMapping(MappingIsoparametric):
-    """Inverts to 1e-10 of a brick: scikit-fem's own 1e-12 is below rounding in thin curved ones."""
-
-    def invF(
-        self,
-        x: Array,
-        tind: np.ndarray | None = None,
-        newton_max_iters: int = 50,
-        newton_tol: float = 1e-10,
-    ) -> Array:
-        return np.asarray(super().invF(x, tind, newton_max_iters, newton_tol))
-
-
-def facet_mapping(mesh: skfem.Mesh) -> skfem.Mapping | None:
-    """The mapping with which scikit-fem can place points on facets; None for its own."""
-    return _BrickMapping(mesh, mesh.elem(), mesh.bndelem) if isinstance(mesh, skfem.MeshHex) else None
-
-
 def seen_surface(problem: Problem) -> Surface:
     """The surface near the pads; each facet divided into small faces."""
     mesh = problem.mesh.geometry
@@ -86,7 +67,11 @@ def seen_surface(problem: Problem) -> Surface:
     )
     facets, plane = _seen_facets(problem)
     basis = skfem.FacetBasis(
-        mesh, quadratic, facet_mapping(mesh), facets=facets, quadrature=(local, np.ones(local.shape[1]))
+        mesh,
+        quadratic,
+        problem.mesh.facet_mapping(),
+        facets=facets,
+        quadrature=(local, np.ones(local.shape[1])),
     )
     corners = np.asarray(basis.global_coordinates()).transpose(1, 2, 0)  # (g, k, 3)
     _, point = np.unique(np.round(corners.reshape(-1, 3), 8), axis=0, return_inverse=True)

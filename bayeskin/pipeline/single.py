@@ -14,7 +14,7 @@ import numpy as np
 from bayeskin import storage
 from bayeskin.config import load_config, parameter_space
 from bayeskin.errors import InputError
-from bayeskin.mechanisms import Mechanism, catalogue, observed
+from bayeskin.mechanisms import Mechanism, catalogue, laws, observed
 from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec, problem_of, simulate
 from bayeskin.pipeline.engine import Reporter, Run
@@ -88,7 +88,7 @@ def simulate_once(
         outputs = FieldOutputs(problem, theta, motion, moments, fields, figures)
     simulation = simulate(
         spec, motion, theta, lambda share: reporter.progress("simulation", share),
-        outputs.on_state if outputs else None,
+        outputs.on_state if outputs else None, laws=laws(added, values),
     )  # fmt: skip
     files: list[Path] = []
     if simulation.status == "ok":

@@ -1,0 +1,57 @@
+"""The subcutis sticks to the muscle's fascia: springs along the bottom face against tangential motion.
+
+Traction -s (u - (u . n) n) on the bottom, n normal to it; 0 is free, 1e9 Pa/m stuck.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+import scipy.sparse as sp
+
+from bayeskin.mechanisms.mechanism import Mechanism, Tissue
+from bayeskin.model.problem import Problem
+from bayeskin.model.tissue import SurfaceTerm, TissueLaw, displacement_rows, surface_mass
+from bayeskin.types import Array, Parameter
+
+
+def tangential(point: Array, i: int, j: int) -> Array:
+    """Entry (i, j) of I - n (x) n at points (3, ...) of a face round the arm's axis."""
+    radius = np.hypot(point[1], point[2])
+    normal = [np.zeros_like(radius), point[1] / radius, point[2] / radius]
+    return float(i == j) - normal[i] * normal[j]
+
+
+class BottomAdherence(TissueLaw):
+    """Springs of a stiffness [Pa/m] on the bottom face."""
+
+    def __init__(self, stiffness: float, problem: Problem) -> None:
+        bottom, space = problem.mesh.facets["bottom"], problem.space
+
+        def spring(i: int, j: int) -> sp.csr_matrix:
+            mass = surface_mass(problem, bottom, True, partial(tangential, i=i, j=j))
+            return displacement_rows(space, mass, i, j)
+
+        pairs = [(0, 0), (1, 1), (1, 2), (2, 1), (2, 2)]
+        self.surfaces = tuple(SurfaceTerm(stiffness * spring(i, j)) for i, j in pairs)
+
+
+def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
+    """The law of `adherence`."""
+    return BottomAdherence(values["adherence"], problem)
+
+
+MECHANISM = Mechanism(
+    name="bottom-adherence",
+    parameters=(
+        Parameter(
+            "adherence", "Pa/m", 0.0, 1e9, "uniform", "springs between subcutis and fascia", stress_power=1
+        ),
+    ),
+    neutral={"adherence": 0.0},
+    statement=lambda v: f"The subcutis sticks to the fascia below with {1e-6 * v['adherence']:.3g} kPa a mm.",
+    group=("bottom-adherence",),
+    act=Tissue(bind),
+)

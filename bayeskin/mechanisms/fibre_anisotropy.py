@@ -1,0 +1,52 @@
+"""The cutis is stiffer along the Langer lines, in pull and in push.
+
+The law of `fibres` with k2 = 0 and k1 = (ratio - 1) E_c / 4, so that Young's modulus along the lines is about
+`ratio` times E_c at small strain; the lines lie at an angle to x in the skin's plane. In one uniaxial test it
+cannot be told from E_c.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bayeskin.mechanisms.fibres import Fibres
+from bayeskin.mechanisms.mechanism import Mechanism, Tissue
+from bayeskin.model.problem import Problem
+from bayeskin.model.tissue import TissueLaw
+from bayeskin.types import Parameter
+
+
+def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
+    """Fibres in the cutis at `langer_angle` to x in the planes that are parallel to the surface."""
+    points = problem.space.quadrature_points()
+    around = np.arctan2(points[1], points[2])  # the tangent there is (0, cos, -sin)
+    angle = values["langer_angle"]
+    direction = np.stack(
+        [
+            np.full_like(around, np.cos(angle)),
+            np.sin(angle) * np.cos(around),
+            -np.sin(angle) * np.sin(around),
+        ],
+        axis=-1,
+    )
+    k1 = np.where(problem.mesh.cutis, 0.25 * (values["langer_ratio"] - 1.0) * values["E_c"], 0.0)
+    return Fibres(np.ascontiguousarray(direction), k1, 0.0, tension_only=False)
+
+
+MECHANISM = Mechanism(
+    name="fibre-anisotropy",
+    parameters=(
+        Parameter("langer_ratio", "-", 1.0, 5.0, "uniform", "stiffness along the Langer lines over across"),
+        Parameter("langer_angle", "rad", 0.0, np.pi / 2, "uniform", "of the Langer lines to the pull"),
+    ),
+    neutral={"langer_ratio": 1.0, "langer_angle": 0.0},
+    statement=lambda v: (
+        f"The cutis is {v['langer_ratio']:.1f} times as stiff along lines at "
+        f"{np.degrees(v['langer_angle']):.0f} degrees to the pull; "
+        "one uniaxial test cannot tell this from a stiffer cutis."
+    ),
+    group=("fibre-anisotropy",),
+    act=Tissue(bind),
+)

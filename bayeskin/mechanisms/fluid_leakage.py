@@ -1,0 +1,49 @@
+"""Fluid leaves through the surface beside the pads: outflow c p per area, by its interstitial pressure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bayeskin.mechanisms.mechanism import Mechanism, Tissue
+from bayeskin.model.mesh import ARM_RADIUS_M, LENGTH_M
+from bayeskin.model.problem import Problem
+from bayeskin.model.tissue import SurfaceTerm, TissueLaw, pressure_rows, surface_mass
+from bayeskin.types import Parameter
+
+
+def open_surface(problem: Problem) -> np.ndarray:
+    """Facets of the top that no pad covers."""
+    mesh, named = problem.mesh.geometry, problem.mesh.facets
+    outside = mesh.boundary_facets()
+    corners = mesh.p[:, mesh.facets[:, outside]]
+    top = np.isclose(np.hypot(corners[1], corners[2]), ARM_RADIUS_M + LENGTH_M[2]).all(axis=0)
+    return np.setdiff1d(outside[top], np.concatenate([named["pad"], named["guard"]]))
+
+
+class FluidLeakage(TissueLaw):
+    """Outflow of a conductance [m/(Pa s)]; the fluid's balance has the sign of `assembly`."""
+
+    def __init__(self, conductance: float, problem: Problem) -> None:
+        mass = surface_mass(problem, open_surface(problem), False)
+        self.surfaces = (SurfaceTerm(-conductance * pressure_rows(problem.space, mass), per_second=True),)
+
+
+def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
+    """The law of `leakage`."""
+    return FluidLeakage(values["leakage"], problem)
+
+
+MECHANISM = Mechanism(
+    name="fluid-leakage",
+    parameters=(
+        Parameter("leakage", "m/(Pa s)", 0.0, 1e-8, "uniform", "conductance of the surface", stress_power=-1),
+    ),
+    neutral={"leakage": 0.0},
+    statement=lambda v: (
+        f"Fluid leaves through the surface, {6e7 * v['leakage']:.3g} micrometres a minute at each kPa."
+    ),
+    group=("fluid-leakage",),
+    act=Tissue(bind),
+)

@@ -1,0 +1,40 @@
+"""The skin is under tension when the test starts.
+
+The pads were moved apart before and all came to rest, drained; the load cell was zeroed there.
+
+Range: tensions of 28 to 92 kPa in the upper arm, Flynn, Taberner & Nielsen, Biomech. Model. Mechanobiol. 10
+(2011), 27-38.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from bayeskin.mechanisms.mechanism import Mechanism, Tissue
+from bayeskin.model.problem import Problem
+from bayeskin.model.tissue import TissueLaw
+from bayeskin.types import Parameter
+
+HALF_GAUGE_M = 18e-3  # from the plane of symmetry to the pad
+
+
+class PreStretch(TissueLaw):
+    """Pads opened by a share of the half gauge length, each."""
+
+    def __init__(self, share: float) -> None:
+        self.opening_m = 2.0 * share * HALF_GAUGE_M
+
+
+def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
+    """The law of `opening`."""
+    return PreStretch(values["opening"])
+
+
+MECHANISM = Mechanism(
+    name="pre-stretch",
+    parameters=(Parameter("opening", "-", 0.0, 0.15, "uniform", "of the pads, of the half gauge length"),),
+    neutral={"opening": 0.0},
+    statement=lambda v: f"The skin was stretched by {100 * v['opening']:.1f} % when the test began.",
+    group=("pre-stretch", "force-offset", "strain-stiffening"),
+    act=Tissue(bind),
+)
