@@ -103,6 +103,16 @@ def test_an_honest_surrogate_passes_the_check_and_a_moved_one_does_not() -> None
     assert set(moved.theta) == set(TRUTH)
 
 
+def test_a_maximum_where_the_surrogate_claims_more_than_the_noise_does_not_pass() -> None:
+    sd_n = ToySurrogate().predict(np.array([list(TRUTH.values())])).sd()[0]
+    claimed_n = float(np.sqrt(np.mean(sd_n**2)))
+    assert check_map(ToySurrogate(), full_run, TRUTH, noise_sd_n=1.01 * claimed_n).passes
+    vague = check_map(ToySurrogate(bias_n=claimed_n), full_run, TRUTH, noise_sd_n=0.99 * claimed_n)
+    assert not vague.passes
+    assert vague.rms_z < 2.0
+    assert "more than the noise's" in vague.message
+
+
 def test_the_mahalanobis_distance_takes_correlations_in() -> None:
     surrogate = ToySurrogate(bias_n=3e-3)
     check = check_map(surrogate, full_run, TRUTH)
