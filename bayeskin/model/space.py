@@ -135,6 +135,8 @@ class Sparsity:
             (self.free_free, is_free, 0),
             (self.free_fixed, ~is_free, self.free_free.nnz),
         ):
+            if not mine.any():
+                continue
             numbered = sp.csr_matrix((np.arange(1, block.nnz + 1), block.indices, block.indptr), block.shape)
             found = np.asarray(numbered[number[row[mine]], number[column[mine]]]).ravel()
             assert (found > 0).all()

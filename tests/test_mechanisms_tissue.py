@@ -1,0 +1,237 @@
+"""Tissue mechanisms: off at their neutral values, consistent tangents, and closed forms away from neutral."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from test_model_physics import LAM, MU, bar, model
+
+from bayeskin.errors import InputError
+from bayeskin.mechanisms import catalogue, laws
+from bayeskin.mechanisms.fibres import Fibres, add_stress
+from bayeskin.mechanisms.fluid_leakage import open_surface
+from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.model import ModelSpec, simulate
+from bayeskin.model.lagrangian import LagrangianModel, advance
+from bayeskin.model.mesh import brick_mesh
+from bayeskin.model.problem import build_problem, material
+from bayeskin.model.space import taylor_hood
+from bayeskin.model.tissue import TissueLaw
+from bayeskin.types import PadMotion
+
+TISSUE = {name: m for name, m in catalogue().items() if isinstance(m.act, Tissue)}
+THETA = {"E_c": 60e3, "E_s": 20e3, "k_c": 1e-14, "k_s": 5e-13, "p_init": 0.0}
+STILL = PadMotion(np.array([0.0, 1.0]), np.zeros(2))
+STRONG = {
+    "k1": 3e4, "k2": 5.0, "dispersion": 0.1, "M_k": 30.0, "adherence": 1e7, "leakage": 1e-9,
+    "langer_ratio": 3.0, "langer_angle": 0.7, "opening": 0.05,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return build_problem(brick_mesh(1))
+
+
+def skin(problem, *names, **values):
+    """The model with mechanisms at the values given, else strong ones."""
+    bound = [bind(problem) for bind in laws([TISSUE[n] for n in names], THETA | STRONG | values)]
+    return LagrangianModel(problem, material(THETA, problem.mesh.cutis), STILL, tuple(bound))
+
+
+def unknowns(problem, seed, size=1.0):
+    """A rough but upright state."""
+    rng, n = np.random.default_rng(seed), 3 * problem.space.n_nodes
+    return size * np.concatenate(
+        [2e-5 * rng.standard_normal(n), 1e3 * rng.standard_normal(problem.space.n_corners)]
+    )
+
+
+@pytest.mark.parametrize("name", TISSUE)
+def test_a_neutral_mechanism_leaves_the_residual_as_it_is(problem, name):
+    x = unknowns(problem, 1)
+    base, off = (skin(problem), skin(problem, name, **TISSUE[name].neutral))
+    assert off.laws[0].opening_m == 0.0
+    expected, found = (m.residual(x, 0.7, m.initial_state(300.0))[0] for m in (base, off))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", set(TISSUE) - {"pre-stretch"})
+def test_a_mechanism_off_its_neutral_value_changes_the_residual(problem, name):
+    x = unknowns(problem, 1)
+    base, on = skin(problem), skin(problem, name)
+    expected, found = (m.residual(x, 0.7, m.initial_state(300.0))[0] for m in (base, on))
+    n = 3 * problem.space.n_nodes
+    changed = [
+        np.abs(found - expected)[rows].max() / np.abs(expected)[rows].max()
+        for rows in (slice(n), slice(n, None))
+    ]
+    assert max(changed) > 1e-4
+    assert name in TISSUE[name].group
+    assert TISSUE[name].statement(THETA | STRONG).endswith(".")
+
+
+def test_the_tangent_of_all_together_is_the_derivative_of_the_residual(problem):
+    everything = skin(problem, *TISSUE)
+    x, step = unknowns(problem, 2), unknowns(problem, 3)
+    equations = everything.equations(0.7, everything.initial_state(300.0))
+    free, fixed = problem.pattern.free, problem.pattern.fixed
+    free_free, free_fixed = equations.tangent(x)
+    exact = free_free @ step[free] + free_fixed @ step[fixed]
+    h = 1e-4
+    difference = (equations.residual(x + h * step) - equations.residual(x - h * step)) / (2 * h)
+    n = 3 * problem.space.n_nodes
+    for rows in (free < n, free >= n):
+        assert np.abs(difference - exact)[rows].max() < 2e-6 * np.abs(exact[rows]).max()
+
+
+@pytest.mark.parametrize(("kappa", "tension_only"), [(0.0, True), (0.2, True), (1 / 3, True), (0.0, False)])
+def test_fibre_stress_is_the_derivative_of_the_energy(kappa, tension_only):
+    rng = np.random.default_rng(4)
+    k1, k2 = 2e4, 8.0
+    for _ in range(20):
+        f = np.eye(3) + 0.15 * rng.standard_normal((3, 3))
+        a = rng.standard_normal(3)
+        a /= np.linalg.norm(a)
+
+        def energy(f, a=a):
+            strain = kappa * (np.sum(f**2) - 3) + (1 - 3 * kappa) * (np.sum((f @ a) ** 2) - 1)
+            if tension_only and strain <= 0:
+                return 0.0
+            return k1 / (2 * k2) * np.expm1(k2 * strain**2)
+
+        stress = np.zeros((1, 1, 3, 3))
+        add_stress(f[None, None], a[None, None], np.array([k1]), k2, kappa, tension_only, stress)
+        h = 1e-6
+        for i in range(3):
+            for j in range(3):
+                d = np.zeros((3, 3))
+                d[i, j] = h
+                slope = (energy(f + d) - energy(f - d)) / (2 * h)
+                assert stress[0, 0, i, j] == pytest.approx(slope, rel=1e-5, abs=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["bricks", "tetrahedra"])
+@pytest.mark.parametrize(("stretch", "tension_only"), [(1.3, True), (0.8, True), (0.8, False)])
+def test_a_drained_bar_with_fibres_along_it_follows_the_closed_form(kind, stretch, tension_only):
+    mesh = bar(kind, cells=2)
+    space = taylor_hood(mesh)
+    x0, y0, z0 = (np.flatnonzero(np.isclose(c, 0.0)) for c in space.points_u)
+    end = np.flatnonzero(np.isclose(space.points_u[0], 1.0))
+    drained = 3 * space.n_nodes + np.arange(space.n_corners)
+    base = model(mesh, np.concatenate([3 * x0, 3 * y0 + 1, 3 * z0 + 2, 3 * end, drained]), end)
+    k1, k2 = 0.5 * MU, 1.2
+    direction = np.zeros((*space.weight.shape, 3))
+    direction[..., 0] = 1.0
+    fibres = Fibres(direction, np.full(len(space.weight), k1), k2, 0.0, tension_only)
+    motion = PadMotion(np.array([0.0, 1.0]), np.array([0.0, 2 * (stretch - 1)]))
+    held = LagrangianModel(base.problem, base.material, motion, (fibres,))
+    past = [held.initial_state(0.0)]
+    for _ in range(4):
+        step = advance(held, past, 0.25)
+        past.append(step.state)
+
+    def side(across):
+        return MU * (across - 1 / across) + LAM * np.log(stretch * across**2) / across
+
+    across = brentq(side, 0.3, 2.0)
+    expected = MU * (stretch - 1 / stretch) + LAM * np.log(stretch * across**2) / stretch
+    strain = stretch**2 - 1
+    if strain > 0 or not tension_only:
+        expected += 2 * k1 * strain * np.exp(k2 * strain**2) * stretch
+    assert step.force_n / 2.0 == pytest.approx(expected, rel=3e-5)
+
+
+def test_anisotropy_multiplies_youngs_modulus_along_the_lines():
+    """At small strain W'' of the fibres is E_c (ratio - 1) along them."""
+    ratio, e_c, h = 3.0, 60e3, 1e-5
+    f = np.diag([1 + h, 1.0, 1.0])
+    stress = np.zeros((1, 1, 3, 3))
+    k1 = np.array([0.25 * (ratio - 1) * e_c])
+    add_stress(f[None, None], np.array([[[1.0, 0, 0]]]), k1, 0.0, 0.0, False, stress)
+    assert stress[0, 0, 0, 0] / h == pytest.approx((ratio - 1) * e_c, rel=1e-3)
+
+
+def test_langer_lines_lie_in_the_skins_plane(problem):
+    bound = TISSUE["fibre-anisotropy"].act.bind(THETA | STRONG, problem)
+    points = problem.space.quadrature_points()
+    radial = np.stack([0 * points[0], points[1], points[2]], axis=-1)
+    np.testing.assert_allclose(np.linalg.norm(bound._direction, axis=-1), 1.0)
+    np.testing.assert_allclose(np.sum(bound._direction * radial, axis=-1), 0.0, atol=1e-16)
+
+
+def test_permeability_follows_the_volume(problem):
+    """A uniform expansion J = 1.03: the flux of a pressure gradient is exp(0.03 M) of the base's."""
+    stretch = 1.03 ** (1 / 3)
+    x = np.zeros(problem.space.dofs)
+    n = 3 * problem.space.n_nodes
+    x[:n] = ((stretch - 1.0) * problem.space.points_u).T.ravel()
+    x[n:] = 1e3 * np.random.default_rng(5).standard_normal(problem.space.n_corners)
+    held = [skin(problem), skin(problem, "strain-dependent-permeability", M_k=-40.0)]
+    still = [
+        (m.residual(np.where(np.arange(len(x)) < n, x, 0.0), 1e6, m.initial_state(0.0))[0]) for m in held
+    ]
+    flow = [(m.residual(x, 1e6, m.initial_state(0.0))[0] - s)[n:] for m, s in zip(held, still, strict=True)]
+    storage = (held[0].residual(x, 0.0, held[0].initial_state(0.0))[0] - still[0])[n:]
+    np.testing.assert_allclose(
+        flow[1] - storage, np.exp(-40 * 0.03) * (flow[0] - storage), rtol=1e-9, atol=1e-18
+    )
+
+
+def test_springs_below_answer_a_shift_along_the_arm_by_their_stiffness(problem):
+    x = np.zeros(problem.space.dofs)
+    x[0 : 3 * problem.space.n_nodes : 3] = 1e-4
+    found = [
+        m.residual(x, 1.0, m.initial_state(0.0))[0]
+        for m in (skin(problem), skin(problem, "bottom-adherence"))
+    ]
+    force = (found[1] - found[0])[: 3 * problem.space.n_nodes].reshape(-1, 3)
+    assert force[:, 0].sum() == pytest.approx(STRONG["adherence"] * 1e-4 * 0.105 * 0.084, rel=1e-3)
+    np.testing.assert_allclose(force[:, 1:], 0.0, atol=1e-12)
+
+
+def test_springs_below_let_the_skin_lift(problem):
+    """Displacements along the radius meet no spring."""
+    x = np.zeros(problem.space.dofs)
+    y, z = problem.space.points_u[1:]
+    u = 1e-4 * np.stack([0 * y, y, z]) / np.hypot(y, z)
+    x[: 3 * problem.space.n_nodes] = u.T.ravel()
+    term = sum(t.matrix for t in skin(problem, "bottom-adherence").laws[0].surfaces)
+    assert np.abs(term @ x).max() < 1e-3 * STRONG["adherence"] * 1e-4 * 0.105 * 0.084 / 100
+
+
+def test_leakage_of_a_uniform_pressure_is_conductance_times_the_open_area(problem):
+    x = np.zeros(problem.space.dofs)
+    n = 3 * problem.space.n_nodes
+    x[n:] = 2e3
+    found = [
+        m.residual(x, 5.0, m.initial_state(2e3))[0] for m in (skin(problem), skin(problem, "fluid-leakage"))
+    ]
+    area = 1e-6 * (105 * 84 - 8 * 4 - (17 * 7 + 8 * 5))
+    assert -(found[1] - found[0])[n:].sum() == pytest.approx(STRONG["leakage"] * 5.0 * 2e3 * area, rel=1e-3)
+    assert not set(open_surface(problem)) & set(problem.mesh.facets["pad"])
+
+
+def test_pre_stretched_skin_pulls_as_skin_that_was_pulled_slowly_before():
+    """Of drained skin, whose force follows the displacement alone: F(u) = G(u + d) - G(d)."""
+    theta = THETA | {"k_c": 1e-11, "k_s": 1e-11}
+    opening_m = 2 * STRONG["opening"] * 18e-3
+    motion = PadMotion(np.array([0.0, 10.0]), np.array([0.0, 4e-3]))
+    whole = PadMotion(np.array([0.0, 10.0, 20.0]), np.array([0.0, opening_m, opening_m + 4e-3]))
+    spec = ModelSpec()
+    found = simulate(spec, motion, theta, laws=laws([TISSUE["pre-stretch"]], STRONG))
+    slow = simulate(spec, whole, theta)
+    times = np.linspace(0.0, 10.0, 6)
+    assert found.status == "ok"
+    assert found.time_s[0] == 0.0
+    assert found.force_n[0] == 0.0
+    expected = slow.at(10.0 + times) - slow.at(np.array([10.0]))
+    np.testing.assert_allclose(found.at(times), expected, atol=0.01 * expected.max())
+
+
+def test_tissue_mechanisms_need_the_reaction(tmp_path):
+    with pytest.raises(InputError, match="observation 'reaction'"):
+        simulate(ModelSpec("article", "some.msh"), STILL, THETA, laws=[partial(lambda problem: TissueLaw())])
