@@ -59,7 +59,7 @@ def test_a_neutral_mechanism_leaves_the_residual_as_it_is(problem, name):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("name", set(TISSUE) - {"pre-stretch"})
+@pytest.mark.parametrize("name", sorted(set(TISSUE) - {"pre-stretch"}))
 def test_a_mechanism_off_its_neutral_value_changes_the_residual(problem, name):
     x = unknowns(problem, 1)
     base, on = skin(problem), skin(problem, name)

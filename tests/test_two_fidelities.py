@@ -135,7 +135,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     time_s = np.arange(0.0, 130.001, 0.1)
     force_n = toy_model.SCALE * toy_force(np.array([list(TRUE.values())]), time_s)[0]
     force_n = toy_model.finer(3, TRUE) * force_n
-    force_n += 0.003 * np.random.default_rng(5).standard_normal(len(time_s))
+    force_n += 0.02 * np.random.default_rng(5).standard_normal(len(time_s))
     storage.save(where / "measured.h5", Recording(time_s, MOTION.at(time_s), force_n, "toy", "0" * 64))
     (where / "case.toml").write_text(CONFIG)
 

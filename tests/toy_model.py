@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from toy import SPACE, toy_force
@@ -21,6 +21,7 @@ def simulate(
     on_progress: Callable[[float], None] | None = None,
     on_state: Callable[[float, object, float], None] | None = None,
     gradients: bool = False,
+    laws: Sequence[object] = (),
 ) -> Simulation:
     if on_state is not None:
         on_state(0.0, None, 0.0)

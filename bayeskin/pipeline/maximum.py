@@ -13,7 +13,7 @@ from bayeskin.inference import MapCheck, RefinedMap
 from bayeskin.model.simulate import simulate
 from bayeskin.pipeline.calibration import log_posterior_of, rmse_table
 from bayeskin.pipeline.engine import Run, Stage
-from bayeskin.pipeline.model import model_spec
+from bayeskin.pipeline.model import model_spec, waves_spec
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.training import corrected, fine_design, trained
 from bayeskin.surrogates import load_manifest, load_surrogate, manifest_of, save_surrogate
@@ -57,14 +57,20 @@ class _Retraining:
 
     def __call__(self, theta: Mapping[str, float], simulation: Simulation) -> Surrogate:
         self.run.reporter.log("map: the surrogate was off there; the point joins the design")
-        if self.fine is None:
-            self.design = _with_run(self.design, theta, simulation)
+        wave = simulation if self.fine is None else self._coarse(theta)
+        if wave.status == "ok":
+            self.design = _with_run(self.design, theta, wave)
             self.surrogate, validation = trained(self.run, self.design, self.binned)
-        else:
+        if self.fine is not None:
             self.fine = _with_run(self.fine, theta, simulation)
             self.surrogate, validation = corrected(self.run, self.surrogate, self.fine, self.binned)
         self.manifest = {**self.manifest, **manifest_of(self.surrogate, validation)}
         return self.surrogate
+
+    def _coarse(self, theta: Mapping[str, float]) -> Simulation:
+        """The waves' own model at the same point: their surrogate has to learn there too."""
+        motion = storage.load(self.run.at("recording", "motion.h5"), PadMotion)
+        return simulate(waves_spec(self.run), motion, theta)
 
 
 def _with_run(design: Design, theta: Mapping[str, float], simulation: Simulation) -> Design:
