@@ -267,6 +267,7 @@ def main() -> None:
             parts.append(f"Space, whole protocol, against bricks-2:\n\n{whole_table(results, asked.points)}")
         parts.append(f"Reaction and face stress at point C:\n\n{peak_table(results)}")
     parts.append(verdict(times, results, asked.time_target, asked.mesh_target))
+    parts.append("![Errors in space and time, two observations of force by mesh](figures/discretisation.png)")
     if results and not asked.first_cycle:
         write_mesh_errors(mesh_errors(results))
     block = "\n\n".join(parts)
