@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from test_model_physics import LAM, MU, bar, model
+from test_model_physics import LAM, MU, drained_bar
 
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import catalogue, laws
@@ -18,7 +18,6 @@ from bayeskin.model import ModelSpec, simulate
 from bayeskin.model.lagrangian import LagrangianModel, advance
 from bayeskin.model.mesh import brick_mesh
 from bayeskin.model.problem import build_problem, material
-from bayeskin.model.space import taylor_hood
 from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import PadMotion
 
@@ -117,12 +116,8 @@ def test_fibre_stress_is_the_derivative_of_the_energy(kappa, tension_only):
 @pytest.mark.parametrize("kind", ["bricks", "tetrahedra"])
 @pytest.mark.parametrize(("stretch", "tension_only"), [(1.3, True), (0.8, True), (0.8, False)])
 def test_a_drained_bar_with_fibres_along_it_follows_the_closed_form(kind, stretch, tension_only):
-    mesh = bar(kind, cells=2)
-    space = taylor_hood(mesh)
-    x0, y0, z0 = (np.flatnonzero(np.isclose(c, 0.0)) for c in space.points_u)
-    end = np.flatnonzero(np.isclose(space.points_u[0], 1.0))
-    drained = 3 * space.n_nodes + np.arange(space.n_corners)
-    base = model(mesh, np.concatenate([3 * x0, 3 * y0 + 1, 3 * z0 + 2, 3 * end, drained]), end)
+    base = drained_bar(kind)
+    space = base.problem.space
     k1, k2 = 0.5 * MU, 1.2
     direction = np.zeros((*space.weight.shape, 3))
     direction[..., 0] = 1.0

@@ -34,8 +34,10 @@ class BottomAdherence(TissueLaw):
             mass = surface_mass(problem, bottom, True, partial(tangential, i=i, j=j))
             return displacement_rows(space, mass, i, j)
 
-        pairs = [(0, 0), (1, 1), (1, 2), (2, 1), (2, 2)]
-        self.surfaces = tuple(SurfaceTerm(stiffness * spring(i, j)) for i, j in pairs)
+        matrix = spring(0, 0)
+        for i, j in ((1, 1), (1, 2), (2, 1), (2, 2)):
+            matrix = matrix + spring(i, j)
+        self.surfaces = (SurfaceTerm(stiffness * matrix),)
 
 
 def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
