@@ -1,6 +1,10 @@
 """The likelihood against exact normals, numerical integration and its own noise."""
 
 import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -251,3 +255,25 @@ def test_windows_are_the_same_as_lists_and_as_tuples() -> None:
     one = toy_problem(windows=((15.0, 45.0),))
     other = dataclasses.replace(one, fit_windows=[[15, 45]])
     assert one.identity == other.identity
+
+
+SCRIPT = """
+import hashlib
+import numpy as np
+from toy_inference import toy_problem
+posterior = toy_problem()
+low, high = posterior.bounds
+values = posterior.log_prob(np.random.default_rng(1).uniform(low, high, (200, posterior.dim)))
+print(hashlib.sha256(values.tobytes()).hexdigest())
+"""
+
+
+def test_it_is_the_same_to_the_last_bit_whether_just_compiled_or_loaded(tmp_path: Path) -> None:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).parent)}
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", SCRIPT], env=environment, check=True, capture_output=True, text=True
+        ).stdout
+        for _ in range(2)
+    ]
+    assert found[0] == found[1] != ""

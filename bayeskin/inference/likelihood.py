@@ -26,6 +26,8 @@ _REWEIGHTED = 2  # steps of reweighted least squares before Newton, which needs 
 _DECREMENT = 1e-8  # of the log density, at which the mode is found
 # Sums may be reordered for SIMD; infinities and NaN keep their meaning.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
+# The helpers are put into `_kernel` before it is compiled: as functions of their own, the process that compiles
+# them and one that loads them from numba's cache would run differently reordered sums.
 
 
 def log_likelihood(chain: NoiseChain, prediction: Prediction, noise: Array) -> Array:
@@ -67,7 +69,7 @@ def _kernel(
     return out
 
 
-@nb.njit(cache=True, fastmath=_FAST)
+@nb.njit(fastmath=_FAST, inline="always")
 def _whiten(
     mean: Array, factor: Array, diagonal: Array, noise: Array,
     bins: NDArray[np.int64], force: Array, variance: Array, covariance: Array,
@@ -105,7 +107,7 @@ def _whiten(
     return log_scale - math.log(product)
 
 
-@nb.njit(cache=True, fastmath=_FAST)
+@nb.njit(fastmath=_FAST, inline="always")
 def _marginal(white: Array, design: Array, nu: float) -> float:
     """Log of the integral over z of N(z; 0, I) prod_j t_nu(white_j - design[:, j] z)."""
     rank, k = design.shape
@@ -150,14 +152,14 @@ def _marginal(white: Array, design: Array, nu: float) -> float:
     return k * _log_norm(nu) - value
 
 
-@nb.njit(cache=True, fastmath=_FAST)
+@nb.njit(fastmath=_FAST, inline="always")
 def _log_norm(nu: float) -> float:
     if math.isinf(nu):
         return -0.5 * math.log(2.0 * math.pi)
     return math.lgamma(0.5 * (nu + 1.0)) - math.lgamma(0.5 * nu) - 0.5 * math.log(nu * math.pi)
 
 
-@nb.njit(cache=True, fastmath=_FAST)
+@nb.njit(fastmath=_FAST, inline="always")
 def _energy(white: Array, design: Array, z: Array, nu: float, eps: Array) -> float:
     """Minus the log of the integrand, without constants; fills `eps` (k,)."""
     rank, k = design.shape
@@ -181,7 +183,7 @@ def _energy(white: Array, design: Array, z: Array, nu: float, eps: Array) -> flo
     return 0.5 * square + 0.5 * (nu + 1.0) * (logs + math.log(product))
 
 
-@nb.njit(cache=True, fastmath=_FAST)
+@nb.njit(fastmath=_FAST, inline="always")
 def _weights(eps: Array, nu: float, step: int, newton: bool, pull: Array, bend: Array) -> None:
     """Weights of the gradient (`pull`) and of the curvature (`bend`), (k,); both 1 for the Gaussian."""
     for j in range(len(eps)):
@@ -194,7 +196,7 @@ def _weights(eps: Array, nu: float, step: int, newton: bool, pull: Array, bend: 
             bend[j] = weight * (nu - square) / (nu + square) if newton else weight
 
 
-@nb.njit(cache=True, fastmath=_FAST)
+@nb.njit(fastmath=_FAST, inline="always")
 def _normal_equations(
     design: Array, z: Array, eps: Array, pull: Array, bend: Array, gradient: Array, curvature: Array
 ) -> None:
@@ -212,7 +214,7 @@ def _normal_equations(
             curvature[a, b] = total
 
 
-@nb.njit(cache=True)
+@nb.njit(inline="always")
 def _cholesky(matrix: Array) -> bool:
     """Factors the lower triangle in place; False when it is not positive definite."""
     for a in range(len(matrix)):
@@ -229,7 +231,7 @@ def _cholesky(matrix: Array) -> bool:
     return True
 
 
-@nb.njit(cache=True)
+@nb.njit(inline="always")
 def _solve(lower: Array, vector: Array) -> float:
     """Solves in place with the Cholesky factor; returns vector' matrix^-1 vector."""
     rank, norm = len(vector), 0.0
