@@ -47,23 +47,26 @@ class DrivenModel(TightModel):
         super().__init__(problem, material, STILL)
         self.load, self.time_s = load, 0.0
 
-    def pad_displacement(self, time_s):
+    def pad_displacement(self, time_s, lost_m=0.0):
         return time_s
+
+    def _pad_of(self, state):
+        return state.time_s
 
     def solve_stage(self, time_s, h, old, guess, jump):
         self.time_s = time_s
         return super().solve_stage(time_s, h, old, guess, jump)
 
-    def residual(self, x, h, old):
-        found = super().residual(x, h, old)
+    def residual(self, x, h, old, elapsed_s=None, changed=None):
+        found = super().residual(x, h, old, elapsed_s, changed)
         if found is None or self.load is None:
             return found
-        return found[0] - self.load(self.time_s, h), *found[1:]
+        return found._replace(residual=found.residual - self.load(self.time_s, h))
 
     def state_at(self, x: Array) -> State:
         """The state at x (dofs,) with a history that is x itself."""
-        _, volume, pressure = super().residual(x, 1.0, self.initial_state(0.0))
-        return State(0.0, x, volume, pressure)
+        found = super().residual(x, 1.0, self.initial_state(0.0))
+        return State(0.0, x, found.volume, found.pressure)
 
 
 def driven(

@@ -26,8 +26,8 @@ _REWEIGHTED = 2  # steps of reweighted least squares before Newton, which needs 
 _DECREMENT = 1e-8  # of the log density, at which the mode is found
 # Sums may be reordered for SIMD; infinities and NaN keep their meaning.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
-# The helpers are put into `_kernel` before it is compiled: as functions of their own, the process that compiles
-# them and one that loads them from numba's cache would run differently reordered sums.
+# The helpers are put into `_kernel` before it is compiled: as functions of their own, the process that
+# compiles them and one that loads them from numba's cache would run differently reordered sums.
 
 
 def log_likelihood(chain: NoiseChain, prediction: Prediction, noise: Array) -> Array:

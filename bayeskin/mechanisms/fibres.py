@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayeskin.model.assembly import Chunk, compiled
-from bayeskin.model.tissue import TissueLaw
+from bayeskin.model.tissue import Passage, TissueLaw
 from bayeskin.types import Array
 
 
@@ -80,10 +80,10 @@ class Fibres(TissueLaw):
     ) -> None:
         self._direction, self._k1, self._rest = direction, k1, (float(k2), float(kappa), tension_only)
 
-    def respond(self, chunk: Chunk) -> None:
+    def respond(self, chunk: Chunk, passage: Passage) -> None:
         c = chunk.cells
         add_stress(chunk.at.deformation, self._direction[c], self._k1[c], *self._rest, chunk.found.stress)
 
-    def linearise(self, chunk: Chunk) -> None:
+    def linearise(self, chunk: Chunk, passage: Passage) -> None:
         c = chunk.cells
         add_derivatives(chunk.at.deformation, self._direction[c], self._k1[c], *self._rest, chunk.by.stress_f)

@@ -10,12 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import partial
 
 import numpy as np
 
-from bayeskin.model.problem import Problem
-from bayeskin.model.tissue import Bind, TissueLaw
+from bayeskin.model.tissue import Bind
 from bayeskin.types import Array, PadMotion, Parameter
 
 Values = Mapping[str, Array]  # each parameter (n,), SI; those of all mechanisms that are on
@@ -27,24 +25,30 @@ GAUSS_POINTS = 4  # between neighbouring edges and corners
 class Place(IntEnum):
     """Where in the instrument a mechanism acts, from the skin outward; it sees what those before it made."""
 
-    DRIVE = 0
-    CELL = 1
-    CLOCK = 2
+    PADS = 0
+    DRIVE = 1
+    CELL = 2
+    CLOCK = 3
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """What an instrument mechanism does to a force."""
+    """What an instrument mechanism does to a force.
+
+    bind : set where it changes the displacement that the skin sees: the full model solves it along, and
+        `observe` is its shortcut for the force of a surrogate
+    """
 
     place: Place
     observe: Observe
+    bind: Bind | None = None
 
 
 @dataclass(frozen=True)
 class Tissue:
-    """What a tissue mechanism does to the model: `bind` takes the values of its parameters and a problem."""
+    """What a tissue mechanism does to the full model."""
 
-    bind: Callable[[Mapping[str, float], Problem], TissueLaw]
+    bind: Bind
 
 
 @dataclass(frozen=True)
@@ -74,9 +78,14 @@ def observed(
     return force
 
 
-def laws(mechanisms: Iterable[Mechanism], values: Mapping[str, float]) -> list[Bind]:
-    """What `simulate` is given for the tissue's among `mechanisms`."""
-    return [partial(m.act.bind, values) for m in mechanisms if isinstance(m.act, Tissue)]
+def solved(mechanisms: Iterable[Mechanism]) -> list[Mechanism]:
+    """Those that the full model solves; what is left acts on its force."""
+    return [m for m in mechanisms if m.act.bind is not None]
+
+
+def laws(mechanisms: Iterable[Mechanism]) -> list[Bind]:
+    """What `simulate` is given for `mechanisms`."""
+    return [m.act.bind for m in mechanisms if m.act.bind is not None]
 
 
 def added(force: ForceOfTime, more: ForceOfTime) -> ForceOfTime:

@@ -13,7 +13,7 @@ import numpy as np
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
 from bayeskin.model.assembly import Chunk, compiled, inverse_and_determinant
 from bayeskin.model.problem import Problem
-from bayeskin.model.tissue import TissueLaw
+from bayeskin.model.tissue import Passage, TissueLaw
 from bayeskin.types import Parameter
 
 
@@ -55,10 +55,10 @@ class StrainDependentPermeability(TissueLaw):
     def __init__(self, exponent: float) -> None:
         self._exponent = exponent
 
-    def respond(self, chunk: Chunk) -> None:
+    def respond(self, chunk: Chunk, passage: Passage) -> None:
         scale(chunk.at.deformation, self._exponent, chunk.found.flux)
 
-    def linearise(self, chunk: Chunk) -> None:
+    def linearise(self, chunk: Chunk, passage: Passage) -> None:
         at, by = chunk.at, chunk.by
         scale_derivatives(at.deformation, at.gradient, self._exponent, by.flux_f, by.flux_g)
 

@@ -15,7 +15,7 @@ error is the product of the errors of v and of the factorisation.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -23,7 +23,8 @@ import numpy as np
 
 from bayeskin.model.lagrangian import LagrangianModel, Stage, State, Step
 from bayeskin.model.newton import EXTRAPOLATION_POINTS, extrapolate
-from bayeskin.model.problem import material
+from bayeskin.model.problem import Material, material
+from bayeskin.model.tissue import Bind, TissueLaw
 from bayeskin.types import Array
 
 DIFFERENTIATED = ("E_c", "E_s", "k_c", "k_s")
@@ -35,26 +36,27 @@ ANDERSON_DEPTH = 4
 
 @dataclass(frozen=True)
 class _Slopes:
-    """Derivatives of a `State` by r logarithms: x (dofs, r), volume and pressure (r, e, q)."""
+    """Derivatives of a `State` by r logarithms: x (dofs, r), J and p (r, e, q), memories (r, e, q, k)."""
 
     time_s: float
     x: Array
     volume: Array
     pressure: Array
+    memory: tuple[Array, ...]
 
 
 class ForceGradients:
     """Follows a run, step by accepted step; `force_n` then holds the derivatives of each step's force."""
 
-    def __init__(self, model: LagrangianModel, theta: Mapping[str, float]) -> None:
+    def __init__(self, model: LagrangianModel, theta: Mapping[str, float], laws: Sequence[Bind] = ()) -> None:
         self._model = model
-        cutis = model.problem.mesh.cutis
-        self._materials = [
-            material({**theta, name: theta[name] * np.exp(EPSILON)}, cutis) for name in DIFFERENTIATED
+        self._changed = [
+            _changed(model, {**theta, name: theta[name] * np.exp(EPSILON)}, laws) for name in DIFFERENTIATED
         ]
         r, shape = len(DIFFERENTIATED), model.problem.space.weight.shape
         zeros = np.zeros((r, *shape))
-        self._start = _Slopes(0.0, np.zeros((model.problem.space.dofs, r)), zeros, zeros)
+        memory = tuple(np.zeros((r, *shape, law.remembers)) for law in model.laws)
+        self._start = _Slopes(0.0, np.zeros((model.problem.space.dofs, r)), zeros, zeros, memory)
         self._known: dict[int, tuple[State, _Slopes]] = {}  # by identity; the state keeps its number alive
         self._phase: list[_Slopes] = [self._start]  # ends of this phase's stages
         self._travel: Array | None = None
@@ -98,14 +100,16 @@ class ForceGradients:
         sources = [(weight, self._of(state)) for weight, state in stage.sources]
         volume_old = np.asarray(sum(weight * slopes.volume for weight, slopes in sources))
         pressure_old = np.asarray(sum(weight * slopes.pressure for weight, slopes in sources))
-        equations = model.equations(stage.length_s, stage.history)
+        memory_old = sources[-1][1].memory
+        equations = model.equations(stage.length_s, stage.history, stage.elapsed_s)
         model.solver.toward(equations.place)
         weight = equations.weight[:, None]
         x = self._guess(stage)
         x[model.problem.pattern.fixed] = 0.0
         tried: list[tuple[Array, Array]] = []  # unknowns and the corrections that they asked for
         for _ in range(MOST_CORRECTIONS):
-            residual, volume, pressure = self._directional(stage, x, volume_old, pressure_old)
+            along = _Slopes(stage.history.time_s, x, volume_old, pressure_old, memory_old)
+            residual, volume, pressure, memory = self._directional(stage, along)
             correction = -model.solver.back_substitute(residual[free])
             tried = [*tried, (x[free] * weight, correction * weight)][-ANDERSON_DEPTH:]
             change = _accelerated(tried) / weight
@@ -116,28 +120,41 @@ class ForceGradients:
             ):
                 break
         force = 2.0 * residual[model.problem.pad_x].sum(axis=0) + model.pad_gradient @ change
-        return _Slopes(stage.state.time_s, x, volume, pressure), force
+        return _Slopes(stage.state.time_s, x, volume, pressure, memory), force
 
-    def _directional(
-        self, stage: Stage, x: Array, volume_old: Array, pressure_old: Array
-    ) -> tuple[Array, Array, Array]:
-        """Derivatives of the residual (dofs, r), of J and of p (r, e, q) along x and all that it rests on."""
+    def _directional(self, stage: Stage, along: _Slopes) -> tuple[Array, Array, Array, tuple[Array, ...]]:
+        """Derivatives of the residual (dofs, r), J, p and memories at the stage's end.
+
+        `along` has those of its unknowns and of its history.
+        """
         model, base, history = self._model, stage.state, stage.history
-        residuals, volumes, pressures = [], [], []
-        for r, changed in enumerate(self._materials):
+        residuals, volumes, pressures, memories = [], [], [], []
+        for r, changed in enumerate(self._changed):
             old = State(
                 history.time_s,
                 history.x,
-                history.volume + EPSILON * volume_old[r],
-                history.pressure + EPSILON * pressure_old[r],
+                history.volume + EPSILON * along.volume[r],
+                history.pressure + EPSILON * along.pressure[r],
+                tuple(m + EPSILON * d[r] for m, d in zip(history.memory, along.memory, strict=True)),
             )
-            found = model.residual(base.x + EPSILON * x[:, r], stage.length_s, old, changed)
+            x = base.x + EPSILON * along.x[:, r]
+            found = model.residual(x, stage.length_s, old, stage.elapsed_s, changed)
             if found is None:  # the cells were upright a moment ago, at the same unknowns to a millionth
                 raise FloatingPointError(f"no derivative at t = {base.time_s:.3f} s: a cell is all but flat")
-            residuals.append((found[0] - stage.residual) / EPSILON)
-            volumes.append((found[1] - base.volume) / EPSILON)
-            pressures.append((found[2] - base.pressure) / EPSILON)
-        return np.stack(residuals, axis=1), np.stack(volumes), np.stack(pressures)
+            residuals.append((found.residual - stage.residual) / EPSILON)
+            volumes.append((found.volume - base.volume) / EPSILON)
+            pressures.append((found.pressure - base.pressure) / EPSILON)
+            memories.append([(m - b) / EPSILON for m, b in zip(found.memory, base.memory, strict=True)])
+        memory = tuple(np.stack(rows) for rows in zip(*memories, strict=True))
+        return np.stack(residuals, axis=1), np.stack(volumes), np.stack(pressures), memory
+
+
+def _changed(
+    model: LagrangianModel, theta: Mapping[str, float], laws: Sequence[Bind]
+) -> tuple[Material, tuple[TissueLaw, ...]]:
+    """The model's material and laws at other parameters."""
+    bound = sorted((bind(theta, model.problem) for bind in laws), key=lambda law: law.rank)
+    return material(theta, model.problem.mesh.cutis), tuple(bound)
 
 
 def _accelerated(tried: list[tuple[Array, Array]]) -> Array:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -26,7 +27,7 @@ from bayeskin.model.newton import (
     extrapolation_weights,
 )
 from bayeskin.model.problem import Material, Problem
-from bayeskin.model.tissue import TissueLaw
+from bayeskin.model.tissue import Passage, TissueLaw
 from bayeskin.types import Array, PadMotion
 
 SMALLEST_MOTION_M = 1e-4  # so that a protocol without motion has a scale too
@@ -37,29 +38,47 @@ GROWTH, SHRINK = 2.0, 0.25  # zero-stable while steps grow less than 2.41-fold
 STEPS_PER_PHASE = 5  # fewer, longer ones cost as much: their guesses are worse, their tangents further apart
 CUTIS_THICKNESS_M, SUBCUTIS_THICKNESS_M = 2e-3, 8e-3
 PAD_WIDTH_M, PAD_EDGE_M = 8e-3, 18e-3  # both halves of the pad; distance of its inner edge from x = 0
+SERIES_TOLERANCE = 1e-5  # of the largest displacement, in what is lost before the skin
+MOST_SECANTS = 8
 SOLVER_TOLERANCE = 1e-4  # of the largest displacement and pressure, before the last correction
 
 
 @dataclass(frozen=True)
 class State:
-    """Everything that the next step needs: x (dofs,), J and p (e, q) at the quadrature points."""
+    """Everything that the next step needs: x (dofs,), J and p (e, q) at the quadrature points.
+
+    memory : (e, q, k) of each law; lost : (k,) of each element in series with the skin
+    """
 
     time_s: float
     x: Array
     volume: Array
     pressure: Array
+    memory: tuple[Array, ...] = ()
+    lost: tuple[Array, ...] = ()
+
+
+class Evaluated(NamedTuple):
+    """The residual (dofs,) at some unknowns, with J and p (e, q) and each law's memory (e, q, k) there."""
+
+    residual: Array
+    volume: Array
+    pressure: Array
+    memory: tuple[Array, ...]
 
 
 @dataclass(frozen=True)
 class Stage:
     """One solved implicit equation J - J* ... = h* div(...).
 
-    state : its end; length_s : h*; history : with J*, p*, which are the weighted sum of `sources`;
-    residual : (dofs,) at the end, zero to the solver's tolerance but for the reactions
+    state : its end; length_s : h*; elapsed_s : since the last of `sources`; history : with J*, p*, which are
+    the weighted sum of `sources`; residual : (dofs,) at the end, zero to the solver's tolerance but for the
+    reactions
     """
 
     state: State
     length_s: float
+    elapsed_s: float
     history: State
     sources: tuple[tuple[float, State], ...]
     residual: Array
@@ -78,16 +97,26 @@ class Step:
 
 @dataclass
 class LagrangianModel:
-    """The equations of one run: a problem, a material and a motion; knows nothing of step control."""
+    """The equations of one run: a problem, a material and a motion; knows nothing of step control.
+
+    starts_s, zero_n : when the test starts and the force then; what lies in series with the skin acts from
+    then on, on the force beyond that
+    """
 
     problem: Problem
     material: Material
     motion: PadMotion
     laws: tuple[TissueLaw, ...] = ()
     solver: NewtonSolver = field(default_factory=NewtonSolver)
+    starts_s: float = 0.0
+    zero_n: float = 0.0
     full_residual: Array = field(init=False)
 
     def __post_init__(self) -> None:
+        self.laws = tuple(sorted(self.laws, key=lambda law: law.rank))
+        self._series = [law.series for law in self.laws if law.series is not None]
+        for element in self._series:
+            self.motion = element.moved(self.motion)
         self.full_residual = np.zeros(self.problem.space.dofs)
         shape = self.problem.space.weight.shape
         self._chunks = assembly.chunks(shape)
@@ -102,27 +131,42 @@ class LagrangianModel:
 
     def remember_travel(self, past: list[State]) -> None:
         """Keeps how the unknowns went with the pads, to guess how they set out again."""
-        way_m = self.pad_displacement(past[-1].time_s) - self.pad_displacement(past[-2].time_s)
+        way_m = self._pad_of(past[-1]) - self._pad_of(past[-2])
         if abs(way_m) > 1e-3 * self.problem_scale(np.zeros(1)):
             self._travel = (past[-1].x - past[-2].x) / way_m
 
-    def pad_displacement(self, time_s: float) -> float:
-        """Half the LVDT displacement [m]."""
-        return 0.5 * float(self.motion.at(time_s))
+    def pad_displacement(self, time_s: float, lost_m: float = 0.0) -> float:
+        """Half the LVDT displacement [m] that is not lost before it reaches the pads."""
+        return 0.5 * (float(self.motion.at(time_s)) - lost_m)
+
+    def _pad_of(self, state: State) -> float:
+        """Where the pads were then [m]."""
+        return float(state.x[3 * self.problem.pads[0]])
 
     def initial_state(self, p_init: float) -> State:
         space = self.problem.space
         x = np.zeros(space.dofs)
         x[3 * space.n_nodes :] = p_init
         shape = space.weight.shape
-        return State(0.0, x, np.ones(shape), np.full(shape, float(p_init)))
+        memory = tuple(np.zeros((*shape, law.remembers)) for law in self.laws)
+        lost = tuple(np.zeros(element.remembers) for element in self._series)
+        return State(0.0, x, np.ones(shape), np.full(shape, float(p_init)), memory, lost)
 
     def residual(
-        self, x: Array, h: float, old: State, material: Material | None = None
-    ) -> tuple[Array, Array, Array] | None:
-        """Residual (dofs,), J and p (e, q), of this or another material; None if a cell is inside out."""
-        s, m = self.problem.space, material or self.material
+        self,
+        x: Array,
+        h: float,
+        old: State,
+        elapsed_s: float | None = None,
+        changed: tuple[Material, tuple[TissueLaw, ...]] | None = None,
+    ) -> Evaluated | None:
+        """Residual with a history `old` (memory: `elapsed_s` earlier, else h); None if a cell is inside out.
+
+        `changed` takes the place of this model's material and laws.
+        """
+        s, (m, laws) = self.problem.space, changed or (self.material, self.laws)
         volume, pressure, out = np.empty(s.weight.shape), np.empty(s.weight.shape), np.zeros(s.dofs)
+        passages = self._passages(old, h if elapsed_s is None else elapsed_s)
         for chunk in self._chunks:
             c, at, found = chunk.cells, chunk.at, chunk.found
             self._evaluate(x, chunk)
@@ -133,19 +177,23 @@ class LagrangianModel:
             )  # fmt: skip
             if not smallest > 0.0:
                 return None
-            for law in self.laws:
-                law.respond(chunk)
+            for law, passage in zip(laws, passages, strict=True):
+                law.respond(chunk, _part(passage, c))
             assembly.residual(
                 s.n_nodes, s.nodes_u[c], s.nodes_p[c], s.grad_u[c], s.grad_p[c], s.value_p, s.weight[c],
                 found.stress, found.content, found.flux, out,
             )  # fmt: skip
         for term, _, _ in self._surfaces:
             out += (h if term.per_second else 1.0) * (term.matrix @ x)
-        return (out, volume, pressure) if np.isfinite(out).all() else None
+        memory = tuple(passage.after for passage in passages)
+        return Evaluated(out, volume, pressure, memory) if np.isfinite(out).all() else None
 
-    def tangent(self, x: Array, h: float, old: State) -> tuple[sp.csr_matrix, sp.csr_matrix]:
+    def tangent(
+        self, x: Array, h: float, old: State, elapsed_s: float | None = None
+    ) -> tuple[sp.csr_matrix, sp.csr_matrix]:
         """Derivative of the residual's free rows by the free and by the fixed unknowns."""
         s, m, data = self.problem.space, self.material, self._data
+        passages = self._passages(old, h if elapsed_s is None else elapsed_s)
         data[:] = 0.0
         for chunk in self._chunks:
             c, at, by = chunk.cells, chunk.at, chunk.by
@@ -155,8 +203,8 @@ class LagrangianModel:
                 m.storage[c], h, old.pressure[c],
                 by.stress_f, by.stress_p, by.content_f, by.content_p, by.flux_f, by.flux_g,
             )  # fmt: skip
-            for law in self.laws:
-                law.linearise(chunk)
+            for law, passage in zip(self.laws, passages, strict=True):
+                law.linearise(chunk, _part(passage, c))
             assembly.tangent(
                 s.grad_u[c], s.grad_p[c], s.value_p, s.weight[c], by.stress_f, by.stress_p, by.content_f,
                 by.content_p, by.flux_f, by.flux_g, self.problem.pattern.position[c], data,
@@ -174,15 +222,18 @@ class LagrangianModel:
             at.deformation, at.pressure, at.gradient,
         )  # fmt: skip
 
-    def equations(self, h: float, old: State) -> Equations:
+    def _passages(self, old: State, elapsed_s: float) -> list[Passage]:
+        return [Passage(elapsed_s, before, np.empty_like(before)) for before in old.memory]
+
+    def equations(self, h: float, old: State, elapsed_s: float | None = None) -> Equations:
         s, m, pattern = self.problem.space, self.material, self.problem.pattern
 
         def residual(x: Array) -> Array | None:
-            found = self.residual(x, h, old)
+            found = self.residual(x, h, old, elapsed_s)
             if found is None:
                 return None
-            self.full_residual, self._volume, self._pressure = found  # the last are at the solution
-            return found[0][pattern.free]
+            self.full_residual, self._found = found.residual, found  # the last are at the solution
+            return found.residual[pattern.free]
 
         n = 3 * s.n_nodes
         size_u = np.abs(self.problem_scale(old.x[:n]))
@@ -192,7 +243,7 @@ class LagrangianModel:
         return Equations(
             pattern.free,
             residual,
-            lambda x: self.tangent(x, h, old),
+            lambda x: self.tangent(x, h, old, elapsed_s),
             weight[pattern.free] / SOLVER_TOLERANCE,
             scale[pattern.free],
             np.array([np.log2(h), self.pad_displacement(old.time_s) / size_u]),
@@ -224,49 +275,88 @@ class LagrangianModel:
 
         The last source's unknowns are where the pads have been.
         """
+        last = sources[-1][1]
         old = State(
-            sources[-1][1].time_s,
-            sources[-1][1].x,
+            last.time_s,
+            last.x,
             np.asarray(sum(weight * state.volume for weight, state in sources)),
             np.asarray(sum(weight * state.pressure for weight, state in sources)),
+            last.memory,
+            last.lost,
         )
-        equations, fixed = self.equations(length_s, old), self.problem.pattern.fixed
-        target = self.problem.prescribe(guess, self.pad_displacement(time_s))
+        equations = self.equations(length_s, old, time_s - old.time_s)
+        lost_m = sum(float(memory[0]) for memory in old.lost)
+        x = self._solve(equations, old, guess, self.pad_displacement(time_s, lost_m), jump)
+        lost = old.lost
+        if self._series and time_s > self.starts_s + 1e-9:
+            x, lost = self._solve_in_series(equations, old, x, time_s, lost_m)
+        if x is None:
+            return None
+        state = State(time_s, x, self._found.volume, self._found.pressure, self._found.memory, lost)
+        return Stage(state, length_s, time_s - old.time_s, old, sources, self.full_residual)
+
+    def _solve(
+        self, equations: Equations, old: State, guess: Array, pad_m: float, jump: bool
+    ) -> Array | None:
+        """The unknowns with the pads at `pad_m`; None if they were not found."""
+        target = self.problem.prescribe(guess, pad_m)
         x = None
         if not jump:
             x = self.solver.solve(equations, target)
         elif self._travel is not None:
-            ride = self._travel * (self.pad_displacement(time_s) - self.pad_displacement(old.time_s))
-            x = self.solver.solve(
-                equations, self.problem.prescribe(guess + ride, self.pad_displacement(time_s))
-            )
+            ride = self._travel * (pad_m - self._pad_of(old))
+            x = self.solver.solve(equations, self.problem.prescribe(guess + ride, pad_m))
         if x is None and jump:
-            start = self.solver.respond(equations, guess, target, fixed)
+            start = self.solver.respond(equations, guess, target, self.problem.pattern.fixed)
             x = None if start is None else self.solver.solve(equations, start)
-        if x is None:
-            return None
-        state = State(time_s, x, self._volume, self._pressure)
-        return Stage(state, length_s, old, sources, self.full_residual)
+        return x
+
+    def _solve_in_series(
+        self, equations: Equations, old: State, x: Array | None, time_s: float, lost_m: float
+    ) -> tuple[Array | None, tuple[Array, ...]]:
+        """From the unknowns with `lost_m` lost: those where what is lost fits the force, by secants."""
+        allowed_m = SERIES_TOLERANCE * self.problem_scale(np.zeros(1))
+        tried: list[tuple[float, float]] = []  # lost displacement and how much more the force asks for
+        for _ in range(MOST_SECANTS):
+            if x is None:
+                break
+            force_n = self.problem.reaction(self.full_residual) - self.zero_n
+            lost = tuple(
+                element.follow(force_n, time_s - old.time_s, before)
+                for element, before in zip(self._series, old.lost, strict=True)
+            )
+            missing = sum(float(memory[0]) for memory in lost) - lost_m
+            if abs(missing) < allowed_m:
+                return x, lost
+            tried = [*tried, (lost_m, missing)][-2:]
+            slope = (tried[1][1] - tried[0][1]) / (tried[1][0] - tried[0][0]) if len(tried) > 1 else -1.0
+            lost_m -= missing / min(slope, -0.5)  # -1 where the force does not mind
+            x = self._solve(equations, old, x, self.pad_displacement(time_s, lost_m), False)
+        return None, old.lost
 
     def finish(self, stages: tuple[Stage, ...], mass: Array) -> Step:
         """The step made of `stages`, with the local error `mass` (e, q) of the fluid mass."""
         force, last = self.problem.reaction(self.full_residual), stages[-1]
-        error = self.force_of_mass_error(last.state, mass, last.length_s, last.history)
+        error = self.force_of_mass_error(last, mass)
         return Step(last.state, force, error, corner=False, stages=stages)
 
-    def force_of_mass_error(self, state: State, mass: Array, h: float, old: State) -> float:
+    def force_of_mass_error(self, stage: Stage, mass: Array) -> float:
         """Change of the reaction [N] that an error of the fluid mass (e, q) makes, to first order."""
         s, free = self.problem.space, self.problem.pattern.free
         right = np.zeros(s.dofs)
         contribution = np.einsum("eq,qb->eb", s.weight * mass, s.value_p)
         np.subtract.at(right, 3 * s.n_nodes + s.nodes_p, contribution)
-        moved = state.x.copy()
+        moved = stage.state.x.copy()
         moved[free] += self.solver.back_substitute(right[free])
-        found = self.residual(moved, h, old)
+        found = self.residual(moved, stage.length_s, stage.history, stage.elapsed_s)
         if found is None:
             return np.inf
         before = self.problem.reaction(self.full_residual)
-        return abs(self.problem.reaction(found[0]) - before)
+        return abs(self.problem.reaction(found.residual) - before)
+
+
+def _part(passage: Passage, cells: slice) -> Passage:
+    return Passage(passage.elapsed_s, passage.before[cells], passage.after[cells])
 
 
 def advance(model: LagrangianModel, past: list[State], h: float) -> Step | None:

@@ -19,7 +19,7 @@ from bayeskin.model.linear import SOLVER_NAME
 from bayeskin.model.mesh import SkinMesh, brick_mesh, read_gmsh
 from bayeskin.model.newton import NewtonSolver
 from bayeskin.model.problem import PARAMETERS, Constants, Problem, build_problem, material
-from bayeskin.model.tissue import Bind, TissueLaw
+from bayeskin.model.tissue import Bind
 from bayeskin.types import Array, Observation, PadMotion, Simulation, frozen_array
 
 PHYSICS_VERSION = 2  # raised when a change of the code changes a force by more than its tolerance
@@ -82,18 +82,19 @@ def simulate(
 ) -> Simulation:
     """Runs the full model over the whole motion.
 
-    theta : E_c, E_s [Pa], k_c, k_s [m^2], p_init [Pa]
+    theta : E_c, E_s [Pa], k_c, k_s [m^2], p_init [Pa], and the parameters of `laws`
     on_progress : called with the fraction of the motion that is done
     on_state : called with time [s], all unknowns (dofs,) and force [N] of each accepted step
     gradients : also the force's derivatives by the logarithms of `gradients.DIFFERENTIATED`, `reaction` only
     laws : physics beyond the base model, `reaction` only; with pads that were opened before the test the
-        force is relative to that at its start, where all is at rest
+        force is relative to that at its start, where all is at rest. No gradients with laws in series with
+        the skin.
 
     A run that does not converge is a Simulation with status "failed", its steps so far, and a
     message with the step, the time and a remedy. Raises InputError for a parameter that is
     missing, unknown, not finite, or not positive where it must be.
     """
-    _check(theta)
+    _check(theta, bool(laws))
     if gradients and spec.observation != "reaction":
         raise InputError("gradients", f"observation {spec.observation!r}", "observation 'reaction'")
     if laws and spec.observation != "reaction":
@@ -102,8 +103,7 @@ def simulate(
     problem = problem_of(spec.mesh, spec.refinement)
     history = _History(motion, on_progress, on_state)
     if spec.observation == "reaction":
-        bound = tuple(bind(problem) for bind in laws)
-        message, solver, slopes = _run_reaction(spec, problem, bound, motion, theta, history, gradients)
+        message, solver, slopes = _run_reaction(spec, problem, laws, motion, theta, history, gradients)
     else:
         message, solver = _run_article(problem, motion, theta, history)
         slopes = None
@@ -120,7 +120,7 @@ def simulate(
         **({"seconds_of_gradients": slopes.seconds} if slopes else {}),
     }
     return Simulation(
-        theta={name: float(theta[name]) for name in PARAMETERS},
+        theta={name: float(value) for name, value in theta.items()},
         time_s=np.array(history.times_s),
         displacement_m=motion.at(history.times_s),
         force_n=force,
@@ -162,16 +162,23 @@ class _History:
 def _run_reaction(
     spec: ModelSpec,
     problem: Problem,
-    laws: tuple[TissueLaw, ...],
+    laws: Sequence[Bind],
     motion: PadMotion,
     theta: Mapping[str, float],
     history: _History,
     gradients: bool,
 ) -> tuple[str, NewtonSolver, ForceGradients | None]:
     """Fills the history; returns a message, empty for a run that finished."""
-    motion, before_s = _with_opening(motion, sum(law.opening_m for law in laws))
-    model = lagrangian.LagrangianModel(problem, material(theta, problem.mesh.cutis), motion, laws)
-    slopes = ForceGradients(model, theta) if gradients else None
+    bound = tuple(bind(theta, problem) for bind in laws)
+    if gradients and any(law.series for law in bound):
+        raise InputError(
+            "gradients", "a mechanism in series with the skin", "mechanisms of the tissue itself"
+        )
+    motion, before_s = _with_opening(motion, sum(law.opening_m for law in bound))
+    model = lagrangian.LagrangianModel(
+        problem, material(theta, problem.mesh.cutis), motion, bound, starts_s=before_s
+    )
+    slopes = ForceGradients(model, theta, laws) if gradients else None
     at_start: list[float] = []
 
     def on_step(step: lagrangian.Step) -> None:
@@ -180,7 +187,8 @@ def _run_reaction(
         time_s = step.state.time_s - before_s
         if time_s > -1e-6:
             at_start.append(step.force_n)
-            force_n = step.force_n - at_start[0]
+            model.zero_n = at_start[0]
+            force_n = step.force_n - model.zero_n
             history.add(max(time_s, 0.0), step.state.x, force_n, step.corner, step.error_n)
 
     try:
@@ -211,15 +219,18 @@ def _run_article(
     return message, model.solver
 
 
-def _check(theta: Mapping[str, float]) -> None:
+def _check(theta: Mapping[str, float], more: bool) -> None:
+    """`more`: of laws, which alone know their parameters."""
     for name in PARAMETERS:
         if name not in theta:
             raise InputError("parameters", f"no {name}", f"all of {', '.join(PARAMETERS)}")
         value = theta[name]
         if not np.isfinite(value) or (name != "p_init" and value <= 0):
             raise InputError(f"parameters: {name}", value, "a finite positive number")
-    for name in theta:
-        if name not in PARAMETERS:
+    for name, value in theta.items():
+        if not np.isfinite(value):
+            raise InputError(f"parameters: {name}", value, "a finite number")
+        if name not in PARAMETERS and not more:
             raise InputError("parameters", name, f"one of {', '.join(PARAMETERS)}")
 
 

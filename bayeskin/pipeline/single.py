@@ -14,7 +14,7 @@ import numpy as np
 from bayeskin import storage
 from bayeskin.config import load_config, parameter_space
 from bayeskin.errors import InputError
-from bayeskin.mechanisms import Mechanism, catalogue, laws, observed
+from bayeskin.mechanisms import Mechanism, catalogue, laws, observed, solved
 from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec, problem_of, simulate
 from bayeskin.pipeline.engine import Reporter, Run
@@ -76,6 +76,7 @@ def simulate_once(
     for parameter in more:
         _refuse_senseless(parameter, values[parameter.name])
     theta = {name: values[name] for name in base.names}
+    along = {p.name: values[p.name] for mechanism in solved(added) for p in mechanism.parameters}
     spec = model_spec(run, mesh, observation)
     source = read_recording(recording or run.beside(run.config.recording.file))
     phases = segment(source)
@@ -87,8 +88,8 @@ def simulate_once(
         problem = problem_of(spec.mesh, spec.refinement)
         outputs = FieldOutputs(problem, theta, motion, moments, fields, figures)
     simulation = simulate(
-        spec, motion, theta, lambda share: reporter.progress("simulation", share),
-        outputs.on_state if outputs else None, laws=laws(added, values),
+        spec, motion, theta | along, lambda share: reporter.progress("simulation", share),
+        outputs.on_state if outputs else None, laws=laws(added),
     )  # fmt: skip
     files: list[Path] = []
     if simulation.status == "ok":
@@ -142,7 +143,9 @@ def _reported(
     every = np.arange(0.0, simulation.time_s[-1], REPORTED_EVERY_S)
     time_s = np.union1d(simulation.time_s, every)
     columns = {name: np.array([value]) for name, value in values.items()}
-    force = observed(mechanisms, columns, motion, lambda t: np.atleast_2d(simulation.at(t)))
+    within = solved(mechanisms)
+    beyond = [mechanism for mechanism in mechanisms if mechanism not in within]
+    force = observed(beyond, columns, motion, lambda t: np.atleast_2d(simulation.at(t)))
     return replace(
         simulation,
         theta=dict(values),

@@ -1,0 +1,102 @@
+"""Lost motion of the drive and compliance of the frame.
+
+The skin sees p - c F: p trails the drive u as a nut with a gap g does, from the lower end of its play,
+
+    p(t) = max(u - g, min(u, p(t-))) ,   p(0) = 0 ,
+
+so that each reversal, the first motion among them, goes without effect over g; c is the frame's compliance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values
+from bayeskin.mechanisms.series import FirstLoading, lost_in_series
+from bayeskin.model.problem import Problem
+from bayeskin.model.tissue import SeriesElement, TissueLaw
+from bayeskin.types import Array, PadMotion, Parameter
+
+
+def trailing(motion: PadMotion, gap_m: float) -> PadMotion:
+    """The motion behind the gap, with its own corners."""
+    time_s, behind = [float(motion.time_s[0])], [float(motion.displacement_m[0])]
+    for t0, t1, u0, u1 in zip(
+        motion.time_s[:-1],
+        motion.time_s[1:],
+        motion.displacement_m[:-1],
+        motion.displacement_m[1:],
+        strict=True,
+    ):
+        p0 = behind[-1]
+        p1 = max(u1 - gap_m, min(u1, p0))
+        if p1 != p0:
+            taken_up = p0 + gap_m if u1 > u0 else p0  # where the drive meets the other side
+            t = t0 + (taken_up - u0) / (u1 - u0) * (t1 - t0)
+            if t0 + 1e-9 < t < t1 - 1e-9:
+                time_s.append(float(t))
+                behind.append(p0)
+        time_s.append(float(t1))
+        behind.append(float(p1))
+    return PadMotion(np.array(time_s), np.array(behind))
+
+
+class Play(SeriesElement):
+    """Memory: what the frame yields [m]."""
+
+    remembers = 1
+
+    def __init__(self, gap_m: float, compliance: float) -> None:
+        self._gap_m, self._compliance = gap_m, compliance
+
+    def moved(self, motion: PadMotion) -> PadMotion:
+        return trailing(motion, self._gap_m)
+
+    def follow(self, force_n: float, elapsed_s: float, before: Array) -> Array:
+        return np.array([self._compliance * force_n])
+
+
+class Backlash(TissueLaw):
+    """A gap [m] and a compliance [m/N]."""
+
+    def __init__(self, gap_m: float, compliance: float) -> None:
+        self.series = Play(gap_m, compliance)
+
+
+def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
+    """The law of `gap` and `frame_compliance`."""
+    return Backlash(values["gap"], values["frame_compliance"])
+
+
+def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
+    """The shortcut of `series`, after the force is taken at the displacement behind the gap."""
+    gap, compliance = values["gap"], values["frame_compliance"]
+    behind = [trailing(motion, g) for g in gap]
+    loading = FirstLoading(motion, force, len(gap))
+
+    def trailed(time_s: Array) -> Array:
+        each = np.broadcast_to(time_s, (len(gap), np.shape(time_s)[-1]))
+        u = motion.at(each)
+        p = np.stack([one.at(row) for one, row in zip(behind, each, strict=True)])
+        change = [loading(p[:, k]) - loading(u[:, k]) for k in range(each.shape[1])]
+        return np.asarray(force(time_s) + np.stack(change, axis=1))
+
+    return lost_in_series(motion, trailed, len(gap), lambda before, now, elapsed_s, lost: compliance * now)
+
+
+MECHANISM = Mechanism(
+    name="backlash",
+    parameters=(
+        Parameter("gap", "m", 0.0, 3e-4, "uniform", "lost motion of the drive"),
+        Parameter("frame_compliance", "m/N", 0.0, 2e-3, "uniform", "of the frame", stress_power=-1),
+    ),
+    neutral={"gap": 0.0, "frame_compliance": 0.0},
+    statement=lambda v: (
+        f"The drive loses {1e3 * v['gap']:.2g} mm at each reversal, and the frame yields "
+        f"{1e3 * v['frame_compliance']:.2g} mm a newton."
+    ),
+    group=("backlash",),
+    act=Instrument(Place.PADS, observe, bind),
+)

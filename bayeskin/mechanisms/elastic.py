@@ -1,0 +1,36 @@
+"""The elastic stress that laws before left at the quadrature points, for laws that change or remember it.
+
+A chunk's stress is P = P_e - p J F^-T; what the fluid carries is no part of the solid's own.
+"""
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from bayeskin.model.assembly import compiled, inverse_and_determinant
+
+
+@compiled
+def elastic_stress(f, p, stress, inverse, elastic):
+    """Fills F^-1 and P_e (3, 3) at one point, given F, the pressure and P there; returns J."""
+    j = inverse_and_determinant(f, inverse)
+    for i in range(3):
+        for k in range(3):
+            elastic[i, k] = stress[i, k] + p * j * inverse[k, i]
+    return j
+
+
+@compiled
+def scale_elastic(factor, p, j, inverse, stress_f):
+    """Multiplies dP_e/dF by a factor, given the derivative (9, 9) of the whole stress, in place.
+
+    d(p J F^-T)/dF_mn = p J (F^-T F^-1_nm - F^-1_ni F^-1_km) is left as it is.
+    """
+    less = (factor - 1.0) * p * j
+    for i in range(3):
+        for k in range(3):
+            row = 3 * i + k
+            for m in range(3):
+                for n in range(3):
+                    stress_f[row, 3 * m + n] = factor * stress_f[row, 3 * m + n] + less * (
+                        inverse[k, i] * inverse[n, m] - inverse[n, i] * inverse[k, m]
+                    )

@@ -1,0 +1,66 @@
+"""Surrounding tissue is recruited and returns slowly: a Kelvin-Voigt element in series with the skin.
+
+    ds/dt = (c F - s) / tau ,   the skin sees u - s
+
+with the compliance c, one over the element's stiffness, so that 0 is off. Over a time in which F goes
+straight from F_0 to F_1, with z = h / tau and phi = (1 - e^-z) / z,
+
+    s_1 = e^-z s_0 + c [ (phi - e^-z) F_0 + (1 - phi) F_1 ] .
+
+Stiffness from 0.5 N/mm on; recovery over seconds to minutes: Wan Abas & Barbenel, J. Biomed. Eng. 4 (1982),
+33-38.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bayeskin.mechanisms.mechanism import Mechanism, Tissue
+from bayeskin.model.problem import Problem
+from bayeskin.model.tissue import SeriesElement, TissueLaw
+from bayeskin.types import Array, Parameter
+
+
+class KelvinVoigt(SeriesElement):
+    """Memory: what is lost [m], force [N]."""
+
+    def __init__(self, compliance: float, time_s: float) -> None:
+        self._compliance, self._time_s = compliance, time_s
+
+    def follow(self, force_n: float, elapsed_s: float, before: Array) -> Array:
+        z = elapsed_s / self._time_s
+        keep, phi = np.exp(-z), -np.expm1(-z) / z
+        force = (phi - keep) * before[1] + (1.0 - phi) * force_n
+        return np.array([keep * before[0] + self._compliance * force, force_n])
+
+
+class SlowRecovery(TissueLaw):
+    """The element of a compliance [m/N] and a time [s]."""
+
+    def __init__(self, compliance: float, time_s: float) -> None:
+        self.series = KelvinVoigt(compliance, time_s)
+
+
+def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
+    """The law of `recovery_compliance` and `recovery_time`."""
+    return SlowRecovery(values["recovery_compliance"], values["recovery_time"])
+
+
+MECHANISM = Mechanism(
+    name="slow-recovery",
+    parameters=(
+        Parameter(
+            "recovery_compliance", "m/N", 0.0, 2e-3, "uniform", "of the surrounding tissue", stress_power=-1
+        ),
+        Parameter("recovery_time", "s", 1.0, 300.0, "log-uniform", "over which it yields and returns"),
+    ),
+    neutral={"recovery_compliance": 0.0, "recovery_time": 30.0},
+    statement=lambda v: (
+        f"Tissue around the test yields, {1e3 * v['recovery_compliance']:.2g} mm for each newton within "
+        f"{v['recovery_time']:.0f} s, and returns as slowly."
+    ),
+    group=("slow-recovery", "preconditioning", "pad-slip"),
+    act=Tissue(bind),
+)

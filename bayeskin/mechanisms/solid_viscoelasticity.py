@@ -1,0 +1,135 @@
+"""The solid itself relaxes: generalised Maxwell branches on the elastic stress of both layers.
+
+With S_e the elastic second Piola-Kirchhoff stress, at equilibrium, each branch b adds
+
+    Q_b = g_b S_e - A_b ,   A_b' = (g_b S_e - A_b) / tau_b .
+
+Over a time h in which S_e goes straight from S_0 to S_1, with z = h / tau and phi = (1 - e^-z) / z, exactly
+
+    A_1 = e^-z A_0 + g [ (phi - e^-z) S_0 + (1 - phi) S_1 ] ,
+
+so that a step of the stretch relaxes by its exponential whatever the steps in time.
+
+Source: Simo, Comput. Methods Appl. Mech. Eng. 60 (1987), 153-173; recursion as Taylor, Pister & Goudreau,
+Int. J. Numer. Methods Eng. 2 (1970), 45-59.
+"""
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from bayeskin.mechanisms.elastic import elastic_stress, scale_elastic
+from bayeskin.mechanisms.mechanism import Mechanism, Tissue
+from bayeskin.model.assembly import Chunk, compiled, inverse_and_determinant
+from bayeskin.model.problem import Problem
+from bayeskin.model.tissue import Passage, Rank, TissueLaw
+from bayeskin.types import Array, Parameter
+
+
+@compiled
+def relax(deformation, pressure, before, keep, from_old, from_new, over, stress, after):
+    """Adds the branches' stress; `before`, `after` (e, q, 9 + 9 b) hold S_e and each A_b, row by row.
+
+    keep, from_old, from_new (b,) : weights of A_0, S_0, S_1 in A_1; over = sum of g_b
+    """
+    inverse, elastic, second = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for e in range(stress.shape[0]):
+        for q in range(stress.shape[1]):
+            f = deformation[e, q]
+            elastic_stress(f, pressure[e, q], stress[e, q], inverse, elastic)
+            for i in range(3):
+                for k in range(3):
+                    total = 0.0
+                    for m in range(3):
+                        total += inverse[i, m] * elastic[m, k]
+                    second[i, k] = over * total
+                    after[e, q, 3 * i + k] = total
+            for b in range(len(keep)):
+                for r in range(9):
+                    grown = (
+                        keep[b] * before[e, q, 9 * (b + 1) + r]
+                        + from_old[b] * before[e, q, r]
+                        + from_new[b] * after[e, q, r]
+                    )
+                    after[e, q, 9 * (b + 1) + r] = grown
+                    second[r // 3, r % 3] -= grown
+            for i in range(3):
+                for k in range(3):
+                    for m in range(3):
+                        stress[e, q, i, k] += f[i, m] * second[m, k]
+
+
+@compiled
+def relax_derivatives(deformation, pressure, before, keep, from_old, left, stress_f):
+    """dP = (1 + left) dP_e - dF C, `left` = sum of g_b phi_b, C the part of A_1 that the past has left."""
+    inverse, past = np.empty((3, 3)), np.empty(9)
+    for e in range(stress_f.shape[0]):
+        for q in range(stress_f.shape[1]):
+            j = inverse_and_determinant(deformation[e, q], inverse)
+            scale_elastic(1.0 + left, pressure[e, q], j, inverse, stress_f[e, q])
+            past[:] = 0.0
+            for b in range(len(keep)):
+                for r in range(9):
+                    past[r] += keep[b] * before[e, q, 9 * (b + 1) + r] + from_old[b] * before[e, q, r]
+            for i in range(3):
+                for k in range(3):
+                    for n in range(3):
+                        stress_f[e, q, 3 * i + k, 3 * i + n] -= past[3 * n + k]
+
+
+class Relaxation(TissueLaw):
+    """Branches of strength g [-] and time tau [s]."""
+
+    rank = Rank.VISCOUS
+
+    def __init__(self, strength: Sequence[float], time_s: Sequence[float]) -> None:
+        self._strength, self._time_s = np.array(strength, dtype=float), np.array(time_s, dtype=float)
+        self.remembers = 9 * (1 + len(self._strength))
+
+    def _weights(self, elapsed_s: float) -> tuple[Array, Array, Array]:
+        """Of A_0, S_0 and S_1 in A_1, (b,) each."""
+        z = elapsed_s / self._time_s
+        phi = -np.expm1(-z) / z
+        return np.exp(-z), self._strength * (phi - np.exp(-z)), self._strength * (1.0 - phi)
+
+    def respond(self, chunk: Chunk, passage: Passage) -> None:
+        at = chunk.at
+        relax(
+            at.deformation, at.pressure, passage.before, *self._weights(passage.elapsed_s),
+            float(self._strength.sum()), chunk.found.stress, passage.after,
+        )  # fmt: skip
+
+    def linearise(self, chunk: Chunk, passage: Passage) -> None:
+        at = chunk.at
+        keep, from_old, from_new = self._weights(passage.elapsed_s)
+        left = float((self._strength - from_new).sum())
+        relax_derivatives(
+            at.deformation, at.pressure, passage.before, keep, from_old, left, chunk.by.stress_f
+        )
+
+
+def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
+    """The law of two branches, in both layers."""
+    return Relaxation([values["g_1"], values["g_2"]], [values["tau_1"], values["tau_2"]])
+
+
+MECHANISM = Mechanism(
+    name="solid-viscoelasticity",
+    parameters=(
+        Parameter("g_1", "-", 0.0, 2.0, "uniform", "first branch, of the equilibrium stress"),
+        Parameter("tau_1", "s", 0.2, 15.0, "log-uniform", "relaxation time of the first branch"),
+        Parameter("g_2", "-", 0.0, 2.0, "uniform", "second branch, of the equilibrium stress"),
+        Parameter("tau_2", "s", 15.0, 300.0, "log-uniform", "relaxation time of the second branch"),
+    ),
+    neutral={"g_1": 0.0, "tau_1": 2.0, "g_2": 0.0, "tau_2": 60.0},
+    statement=lambda v: (
+        f"The solid itself relaxes: stretched at once it pulls {100 * (v['g_1'] + v['g_2']):.0f} % harder "
+        f"than at rest, of which {100 * v['g_1']:.0f} % fade within {v['tau_1']:.2g} s and "
+        f"{100 * v['g_2']:.0f} % within {v['tau_2']:.2g} s."
+    ),
+    group=("solid-viscoelasticity", "strain-dependent-permeability", "friction-creep"),
+    act=Tissue(bind),
+)
