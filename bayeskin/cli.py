@@ -139,6 +139,7 @@ def _stage_command(name: str, text: str) -> None:
 
 _stage_command("design", "Run the full model at the design's points, wave by wave.")
 _stage_command("train", "Train the surrogate on the design and validate it on held-out points.")
+_stage_command("effects", "Learn what each tissue mechanism does to the force, from full runs.")
 _stage_command("map", "Find the most probable point and check it by the full model.")
 _stage_command("sample", "Sample the posterior until it can be trusted; bands on the predicted force.")
 _stage_command("sobol", "Sobol indices of the force over time.")

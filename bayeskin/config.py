@@ -80,6 +80,14 @@ class SurrogateConfig(_Section):
     file: str | None = None
 
 
+class EffectsConfig(_Section):
+    """Tissue mechanisms (all of them by default) to learn, and full runs a part of each to do so."""
+
+    mechanisms: list[str] = []
+    points: Positive = 72
+    held_out: Positive = 20
+
+
 class FitConfig(_Section):
     """The stretches of the recording that are fitted (default: all of it) and the bins of its means."""
 
@@ -144,6 +152,7 @@ class Config(_Section):
     parameters: dict[str, PriorConfig] = {}
     design: DesignConfig = DesignConfig()
     surrogate: SurrogateConfig = SurrogateConfig()
+    effects: EffectsConfig = EffectsConfig()
     fit: FitConfig = FitConfig()
     noise: NoiseConfig = NoiseConfig()
     sample: SampleConfig = SampleConfig()

@@ -72,13 +72,18 @@ def write(group: h5py.Group, value: Any) -> None:
 
 
 def read(group: h5py.Group, cls: type[T], where: object = "") -> T:
-    """Reads a dataclass from an open HDF5 group; raises InputError when it holds another type."""
+    """Reads a dataclass from an open HDF5 group; a field that came later has its default.
+
+    Raises InputError when the group holds another type.
+    """
     found = group.attrs.get("type")
     if found != cls.__name__:
         raise InputError(where or group.name, f"type {found!r}", f"type {cls.__name__!r}")
     values = {}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         if field.name not in group and field.name not in group.attrs:
+            if field.default is not dataclasses.MISSING:
+                continue
             raise InputError(where or group.name, f"no field {field.name!r}", f"all fields of {cls.__name__}")
         values[field.name] = _read_field(group, field.name)
     return cls(**values)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -41,6 +42,7 @@ class Parameter:
 
     stress_power : with all parameters multiplied by c**stress_power, the force is multiplied by c
         (1 for a modulus, -1 for a permeability, whose viscosity is fixed; 0: stays as it is)
+    offset : a log-uniform prior is uniform in log(value + offset), so that it may reach down to 0
     """
 
     name: str
@@ -51,6 +53,7 @@ class Parameter:
     description: str = ""
     source: str = ""
     stress_power: int = 0
+    offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -78,35 +81,38 @@ class ParameterSpace:
     def upper(self) -> Array:
         return np.array([p.upper for p in self.parameters])
 
-    @property
+    @cached_property
     def is_log(self) -> NDArray[np.bool_]:
         return np.array([p.prior == "log-uniform" for p in self.parameters])
 
     def to_unit(self, theta: ArrayLike) -> Array:
         """Prior cumulative probability of each coordinate, shape (..., d); outside [0, 1] beyond the box."""
-        theta = np.asarray(theta, dtype=float)
-        log = self.is_log
-        value = np.where(log, np.log(np.where(log, theta, 1.0)), theta)
-        low, high = self._transformed_bounds()
-        return (value - low) / (high - low)
+        low, high = self.to_line(self.lower), self.to_line(self.upper)
+        return (self.to_line(theta) - low) / (high - low)
 
     def from_unit(self, unit: ArrayLike) -> Array:
         """Inverse of `to_unit`, shape (..., d)."""
-        low, high = self._transformed_bounds()
-        value = low + np.asarray(unit, dtype=float) * (high - low)
-        log = self.is_log
-        return np.where(log, np.exp(np.where(log, value, 0.0)), value)
+        low, high = self.to_line(self.lower), self.to_line(self.upper)
+        return self.from_line(low + np.asarray(unit, dtype=float) * (high - low))
+
+    def to_line(self, theta: ArrayLike) -> Array:
+        """Coordinates (..., d) in which each prior is uniform: the value, or the logarithm of it."""
+        theta = np.asarray(theta, dtype=float)
+        return np.where(self.is_log, np.log(np.where(self.is_log, theta + self._offset, 1.0)), theta)
+
+    def from_line(self, line: ArrayLike) -> Array:
+        """Inverse of `to_line`, (..., d)."""
+        line = np.asarray(line, dtype=float)
+        return np.where(self.is_log, np.exp(np.where(self.is_log, line, 0.0)) - self._offset, line)
 
     def contains(self, theta: ArrayLike) -> NDArray[np.bool_]:
         """Whether each point lies in the closed box, shape (...,)."""
         theta = np.asarray(theta, dtype=float)
         return np.all((theta >= self.lower) & (theta <= self.upper), axis=-1)
 
-    def _transformed_bounds(self) -> tuple[Array, Array]:
-        log = self.is_log
-        low = np.where(log, np.log(np.where(log, self.lower, 1.0)), self.lower)
-        high = np.where(log, np.log(np.where(log, self.upper, 1.0)), self.upper)
-        return low, high
+    @cached_property
+    def _offset(self) -> Array:
+        return np.array([p.offset for p in self.parameters])
 
 
 @dataclass(frozen=True)

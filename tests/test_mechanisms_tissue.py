@@ -27,7 +27,7 @@ AT_POINTS = sorted(set(SOLVED) - IN_SERIES - {"pre-stretch"})
 THETA = {"E_c": 60e3, "E_s": 20e3, "k_c": 1e-14, "k_s": 5e-13, "p_init": 0.0}
 STILL = PadMotion(np.array([0.0, 1.0]), np.zeros(2))
 STRONG = {
-    "k1": 3e4, "k2": 5.0, "dispersion": 0.1, "M_k": 30.0, "adherence": 1e7, "leakage": 1e-9,
+    "fibre_stress": 2e5, "k2": 5.0, "dispersion": 0.1, "M_k": 30.0, "adherence": 1e7, "leakage": 1e-9,
     "langer_ratio": 3.0, "langer_angle": 0.7, "opening": 0.05, "g_1": 0.6, "tau_1": 1.5, "g_2": 0.3,
     "tau_2": 40.0, "damage": 0.5, "damage_energy": 1.0, "recovery_compliance": 1e-3, "recovery_time": 20.0,
     "gap": 2e-4, "frame_compliance": 1e-3, "slip_rate": 1e-4, "slip_threshold": 0.02,

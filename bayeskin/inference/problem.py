@@ -80,20 +80,13 @@ class LogPosterior:
         """Lower and upper corner of the box in sampling coordinates, (D,) each."""
         return self.to_sampling(self.space.lower), self.to_sampling(self.space.upper)
 
-    @cached_property
-    def _is_log(self) -> NDArray[np.bool_]:
-        return self.space.is_log
-
     def to_sampling(self, theta: ArrayLike) -> Array:
         """Sampling coordinates of SI values, (..., D)."""
-        theta = np.asarray(theta, dtype=float)
-        return np.where(self._is_log, np.log(np.where(self._is_log, theta, 1.0)), theta)
+        return self.space.to_line(theta)
 
     def from_sampling(self, vectors: ArrayLike) -> Array:
         """SI values of sampling coordinates, (..., D); never beyond the box by rounding."""
-        vectors = np.asarray(vectors, dtype=float)
-        theta = np.where(self._is_log, np.exp(np.where(self._is_log, vectors, 0.0)), vectors)
-        return np.clip(theta, self.space.lower, self.space.upper)
+        return np.clip(self.space.from_line(vectors), self.space.lower, self.space.upper)
 
     def split(self, theta: ArrayLike) -> tuple[Array, Array]:
         """Material (n, d) and noise (n, q) columns of SI values (n, D)."""

@@ -49,7 +49,14 @@ MECHANISM = Mechanism(
     name="bottom-adherence",
     parameters=(
         Parameter(
-            "adherence", "Pa/m", 0.0, 1e9, "uniform", "springs between subcutis and fascia", stress_power=1
+            "adherence",
+            "Pa/m",
+            0.0,
+            1e9,
+            "log-uniform",
+            "springs between subcutis and fascia",
+            stress_power=1,
+            offset=1e5,
         ),
     ),
     neutral={"adherence": 0.0},

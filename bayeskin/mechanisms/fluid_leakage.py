@@ -38,7 +38,16 @@ def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
 MECHANISM = Mechanism(
     name="fluid-leakage",
     parameters=(
-        Parameter("leakage", "m/(Pa s)", 0.0, 1e-8, "uniform", "conductance of the surface", stress_power=-1),
+        Parameter(
+            "leakage",
+            "m/(Pa s)",
+            0.0,
+            1e-8,
+            "log-uniform",
+            "conductance of the surface",
+            stress_power=-1,
+            offset=1e-12,
+        ),
     ),
     neutral={"leakage": 0.0},
     statement=lambda v: (

@@ -58,6 +58,8 @@ class Mechanism:
     parameters : SI, with priors; neutral : values of these that switch it off
     statement : one plain sentence from the parameters' values, for a report
     group : names of the look-alikes that one force channel cannot tell from it, its own among them
+    parts : names of parameters that act by themselves, the first of each part the one that switches it on;
+        () is one part of all
     """
 
     name: str
@@ -66,6 +68,7 @@ class Mechanism:
     statement: Callable[[Mapping[str, float]], str]
     group: tuple[str, ...]
     act: Instrument | Tissue
+    parts: tuple[tuple[str, ...], ...] = ()
 
 
 def observed(

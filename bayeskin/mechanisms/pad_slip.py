@@ -69,7 +69,16 @@ def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTim
 MECHANISM = Mechanism(
     name="pad-slip",
     parameters=(
-        Parameter("slip_rate", "m/(N s)", 0.0, 1e-3, "uniform", "creep of the adhesive", stress_power=-1),
+        Parameter(
+            "slip_rate",
+            "m/(N s)",
+            0.0,
+            1e-3,
+            "log-uniform",
+            "creep of the adhesive",
+            stress_power=-1,
+            offset=1e-6,
+        ),
         Parameter(
             "slip_threshold", "N", 0.0, 0.3, "uniform", "force that it bears without creep", stress_power=1
         ),

@@ -52,7 +52,14 @@ MECHANISM = Mechanism(
     name="slow-recovery",
     parameters=(
         Parameter(
-            "recovery_compliance", "m/N", 0.0, 2e-3, "uniform", "of the surrounding tissue", stress_power=-1
+            "recovery_compliance",
+            "m/N",
+            0.0,
+            2e-3,
+            "log-uniform",
+            "of the surrounding tissue",
+            stress_power=-1,
+            offset=2e-5,
         ),
         Parameter("recovery_time", "s", 1.0, 300.0, "log-uniform", "over which it yields and returns"),
     ),

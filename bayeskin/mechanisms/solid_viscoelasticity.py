@@ -132,4 +132,5 @@ MECHANISM = Mechanism(
     ),
     group=("solid-viscoelasticity", "strain-dependent-permeability", "friction-creep"),
     act=Tissue(bind),
+    parts=(("g_1", "tau_1"), ("g_2", "tau_2")),
 )

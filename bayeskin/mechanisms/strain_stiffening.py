@@ -1,9 +1,11 @@
 """Collagen recruits: fibres along x in the cutis that only pull, stiffer the further they are stretched.
 
-The law is that of `fibres`; a dispersion of 1/3 makes it an isotropic Fung form.
+The law is that of `fibres`; a dispersion of 1/3 makes it an isotropic Fung form. Its k1 follows from the
+fibres' second Piola-Kirchhoff stress S where they are 25 % longer, E = 1.25^2 - 1: S = 2 k1 E exp(k2 E^2),
+about what a test of a skin's strain sees, so that k2 bends the curve and does not lift it.
 
-Range of k1 and k2: wide beside the slopes of 1 to 83 MPa of excised skin (Annaidh et al., J. Mech. Behav.
-Biomed. Mater. 5, 2012, 139-148).
+Range of S: k1 up to 1e6 Pa; slopes of 1 to 83 MPa in excised skin, taut: Annaidh et al., J. Mech. Behav.
+Biomed. Mater. 5 (2012), 139-148. A k2 above 30 locks at the strains beside the pads.
 """
 
 from __future__ import annotations
@@ -18,26 +20,42 @@ from bayeskin.model.problem import Problem
 from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Parameter
 
+STRAIN = 1.25**2 - 1.0
+
+
+def first_modulus(values: Mapping[str, float]) -> float:
+    """k1 [Pa] of the fibre stress S and of k2."""
+    return values["fibre_stress"] / (2.0 * STRAIN * float(np.exp(values["k2"] * STRAIN**2)))
+
 
 def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
     """Fibres along x in the cutis."""
     direction = np.zeros((*problem.space.weight.shape, 3))
     direction[..., 0] = 1.0
-    k1 = np.where(problem.mesh.cutis, values["k1"], 0.0)
+    k1 = np.where(problem.mesh.cutis, first_modulus(values), 0.0)
     return Fibres(direction, k1, values["k2"], values["dispersion"])
 
 
 MECHANISM = Mechanism(
     name="strain-stiffening",
     parameters=(
-        Parameter("k1", "Pa", 0.0, 1e6, "uniform", "stiffness of the fibres", stress_power=1),
-        Parameter("k2", "-", 1.0, 100.0, "log-uniform", "how fast the fibres stiffen"),
+        Parameter(
+            "fibre_stress",
+            "Pa",
+            0.0,
+            1e6,
+            "log-uniform",
+            "of fibres stretched by a quarter",
+            stress_power=1,
+            offset=1e3,
+        ),
+        Parameter("k2", "-", 1.0, 30.0, "log-uniform", "how fast the fibres stiffen"),
         Parameter("dispersion", "-", 0.0, 1 / 3, "uniform", "of the fibres: 0 all along x, 1/3 none"),
     ),
-    neutral={"k1": 0.0, "k2": 10.0, "dispersion": 0.0},
+    neutral={"fibre_stress": 0.0, "k2": 5.0, "dispersion": 0.0},
     statement=lambda v: (
-        f"Fibres of the cutis stiffen with stretch: {1e-3 * v['k1']:.3g} kPa at first, "
-        f"{1e-3 * v['k1'] * np.exp(0.04 * v['k2']):.3g} kPa where they are 10 % longer."
+        f"Fibres of the cutis stiffen with stretch: k1 = {1e-3 * first_modulus(v):.3g} kPa, "
+        f"k2 = {v['k2']:.2g}, so that they pull with {1e-3 * v['fibre_stress']:.3g} kPa where they are a quarter longer."
     ),
     group=("strain-stiffening", "pre-stretch"),
     act=Tissue(bind),

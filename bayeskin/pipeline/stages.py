@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bayeskin.pipeline import design, indices, maximum, posterior, recording, training
+from bayeskin.pipeline import design, effects, indices, maximum, posterior, recording, training
 from bayeskin.pipeline.engine import Outcome, Reporter, Run, Stage, open_run, run_stages
 from bayeskin.pipeline.folder import plain, read_record, write_json
 
@@ -57,15 +57,15 @@ def _report(run: Run) -> Mapping[str, Any]:
 REPORT = Stage(
     "report", "writes summary.json", tuple(stage.name for stage in BEFORE_REPORT), ("model",), _report
 )
-STAGES = {stage.name: stage for stage in (*BEFORE_REPORT, REPORT)}
+STAGES = {stage.name: stage for stage in (*BEFORE_REPORT, REPORT, effects.STAGE)}
 
 
 def run(
     config: Path, last: str | None, reporter: Reporter, stages: Mapping[str, Stage] = STAGES
 ) -> dict[str, Any]:
-    """Runs a configuration to the stage `last` (None: to the end) and gives the command's answer."""
+    """Runs a configuration to the stage `last` (None: to the report) and gives the command's answer."""
     opened = open_run(config, reporter)
-    outcomes = run_stages(opened, stages, last)
+    outcomes = run_stages(opened, stages, last or "report")
     answer = outcomes[-1]
     return plain(
         {
@@ -97,6 +97,7 @@ def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str
         ),
         "sample": lambda: "\n".join([said["verdict"], *said["reasons"], *_table(said["parameters"])]),
         "sobol": lambda: "\n".join(one["sentence"] for one in said.values()),
+        "effects": lambda: "\n".join(effects.in_words(name, one) for name, one in said.items()),
     }
     return f"{head}\n{lines[answer.stage]()}\noutputs in {folder / answer.stage}"
 

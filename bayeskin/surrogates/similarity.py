@@ -30,12 +30,14 @@ class Similarity:
 
     @cached_property
     def _powers(self) -> Array:
-        """Stress powers (d,) of the parameters that can be scaled: the positive ones."""
-        return np.array([p.stress_power if p.lower > 0.0 else 0 for p in self.space.parameters], dtype=float)
+        """Stress powers (d,) of the parameters that can be scaled: positive ones, or 0 with an offset."""
+        return np.array(
+            [p.stress_power if p.lower + p.offset > 0.0 else 0 for p in self.space.parameters], dtype=float
+        )
 
     @cached_property
     def _reference(self) -> int | None:
-        found = np.flatnonzero(self._powers == 1.0)
+        found = [i for i, p in enumerate(self.space.parameters) if p.stress_power == 1 and p.lower > 0.0]
         return int(found[0]) if len(found) else None
 
     @property
@@ -48,17 +50,28 @@ class Similarity:
         unit, reference, powers = self.space.to_unit(theta), self._reference, self._powers
         if reference is None:
             return unit
-        lower, upper = np.log(self._positive(self.space.lower)), np.log(self._positive(self.space.upper))
-        value = np.log(self._positive(theta)) - powers * np.log(theta[:, [reference]])
-        ends = np.stack([powers * lower[reference], powers * upper[reference]])
-        low, high = lower - ends.max(axis=0), upper - ends.min(axis=0)
-        scaled = powers != 0.0
-        width = np.where(high > low, high - low, 1.0)
-        return np.delete(np.where(scaled, (value - low) / width, unit), reference, axis=1)
+        low, width = self._range
+        value = (self._scaled(theta, theta[:, reference]) - low) / width
+        return np.delete(np.where(powers != 0.0, value, unit), reference, axis=1)
+
+    @cached_property
+    def _range(self) -> tuple[Array, Array]:
+        """Lowest of `_scaled` over the box and how far up it reaches, (d,) each."""
+        corners = np.repeat([self.space.lower, self.space.upper], 2, axis=0)
+        modulus = np.tile([self.space.lower[self._reference], self.space.upper[self._reference]], 2)
+        found = self._scaled(corners, modulus)
+        low, width = found.min(axis=0), np.ptp(found, axis=0)
+        return low, np.where(width > 0.0, width, 1.0)
+
+    def _scaled(self, theta: Array, modulus: Array) -> Array:
+        """log(theta / E^power + offset / E_mid^power), (n, d); E_mid the middle of its prior."""
+        powers, reference = self._powers, self._reference
+        assert reference is not None
+        middle = np.sqrt(self.space.lower[reference] * self.space.upper[reference])
+        offset = np.array([p.offset for p in self.space.parameters]) * middle**-powers
+        value = theta * modulus[:, None] ** -powers + offset
+        return np.log(np.where(powers != 0.0, value, 1.0))
 
     def log_scale(self, theta: Array) -> Array:
         """Logarithm (n,) of what the force is proportional to at fixed inputs."""
         return np.zeros(len(theta)) if self._reference is None else np.log(theta[:, self._reference])
-
-    def _positive(self, values: Array) -> Array:
-        return np.where(self._powers != 0.0, values, 1.0)

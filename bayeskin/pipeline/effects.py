@@ -1,0 +1,199 @@
+"""A stage by itself: what each tissue mechanism does to the force, beside the base's surrogate.
+
+Each part of a mechanism is run in the full model at points of the base's design, so that every run has one
+without it at the same base parameters; the other parts stay neutral.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from bayeskin import storage
+from bayeskin.design import Wave, fine_wave, sobol_points
+from bayeskin.errors import InputError
+from bayeskin.mechanisms import Mechanism, catalogue, laws
+from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.model.simulate import ModelSpec, simulate
+from bayeskin.pipeline.engine import Run, Stage
+from bayeskin.pipeline.folder import sha256_of
+from bayeskin.pipeline.model import model_spec
+from bayeskin.pipeline.training import base_surrogate
+from bayeskin.runner import load_design, run_design
+from bayeskin.surrogates import Effect, Similarity, Validation, manifest_of, save_surrogate, train_effect
+from bayeskin.types import Array, Design, PadMotion, Parameter, ParameterSpace, Simulation
+
+WEAKEST = 0.1  # of a strength's prior: effects below are straight lines to nothing, and lost in noise
+
+
+@dataclass(frozen=True)
+class Part:
+    """Parameters of a mechanism that act by themselves, the strength first; `name` is one word."""
+
+    name: str
+    mechanism: Mechanism
+    own: tuple[Parameter, ...]
+
+    @property
+    def neutral(self) -> float:
+        """Of the strength."""
+        return self.mechanism.neutral[self.own[0].name]
+
+
+def parts_of(mechanism: Mechanism) -> list[Part]:
+    """The parts of a mechanism, named after it and, where there are several, after their strengths."""
+    by_name = {p.name: p for p in mechanism.parameters}
+    parts = mechanism.parts or (tuple(by_name),)
+    return [
+        Part(
+            mechanism.name if len(parts) == 1 else f"{mechanism.name}-{names[0]}",
+            mechanism,
+            tuple(by_name[name] for name in names),
+        )
+        for names in parts
+    ]
+
+
+def simulate_with(
+    mechanism: str,
+    neutral: Mapping[str, float],
+    spec: ModelSpec,
+    motion: PadMotion,
+    theta: Mapping[str, float],
+) -> Simulation:
+    """A full run with one mechanism; its parameters that are not in theta are neutral."""
+    return simulate(spec, motion, {**neutral, **theta}, laws=laws([catalogue()[mechanism]]))
+
+
+def effect_wave(part: Part, design: Design, points: int, held_out: int, seed: int) -> Wave:
+    """Points of the base's design, each with values of the part's parameters from its prior."""
+    inputs = Similarity(design.space).inputs(design.theta)
+    base = fine_wave(design, inputs, points, held_out, seed)
+    own = ParameterSpace(part.own)
+    number = int(sha256_of(part.name)[:8], 16)
+    drawn = [sobol_points(own, int(np.sum(base.held_out == out)), [seed, number, int(out)]) for out in (0, 1)]
+    unit = np.empty((len(base.theta), own.dim))
+    for out, theta in enumerate(drawn):
+        unit[base.held_out == bool(out)] = own.to_unit(theta)
+    if own.parameters[0].lower == part.neutral:
+        unit[:, 0] = WEAKEST + (1.0 - WEAKEST) * unit[:, 0]
+    theta = np.concatenate([base.theta, own.from_unit(unit)], axis=1)
+    space = ParameterSpace((*design.space.parameters, *part.own))
+    rule = f"{base.record['rule']}, with Sobol' points of {', '.join(own.names)}"
+    return Wave(space, np.clip(theta, space.lower, space.upper), base.held_out, 0, seed, {"rule": rule})
+
+
+def _work(run: Run) -> Mapping[str, Any]:
+    return {part.name: _learn(run, part) for mechanism in _chosen(run) for part in parts_of(mechanism)}
+
+
+def _chosen(run: Run) -> list[Mechanism]:
+    tissue = {name: m for name, m in catalogue().items() if isinstance(m.act, Tissue)}
+    names = run.config.effects.mechanisms or list(tissue)
+    for name in names:
+        if name not in tissue:
+            where = f"{run.config_path}: effects.mechanisms"
+            raise InputError(where, name, f"some of {', '.join(tissue)}")
+    return [tissue[name] for name in names]
+
+
+def _learn(run: Run, part: Part) -> dict[str, Any]:
+    base = storage.load(run.at("design", "design.h5"), Design)
+    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    spec, config = model_spec(run), run.config
+    wave = effect_wave(part, base, config.effects.points, config.effects.held_out, config.seed)
+    identity = sha256_of(
+        [spec.hash, vars(motion), base.edges_s, part.name, [vars(p) for p in wave.space.parameters]]
+    )
+    file = run.folder / "runs" / f"{part.name}-{identity[:12]}.h5"
+    run.reporter.log(f"{part.name}: {len(wave.theta)} full runs")
+    task = partial(simulate_with, part.mechanism.name, dict(part.mechanism.neutral), spec, motion)
+    run_design(
+        file, wave, base.edges_s, task, spec.hash, config.design.workers, partial(_tell, run, part.name)
+    )
+    design = load_design(file)
+    storage.save(run.at("effects", f"{part.name}-design.h5"), design)
+    return _train(run, part, base, design)
+
+
+def _tell(run: Run, label: str, done: int, total: int, failed: int, eta_s: float) -> None:
+    left = f", {eta_s / 60:.0f} min left" if np.isfinite(eta_s) else ""
+    run.reporter.progress(label, done / max(total, 1), f"{done} of {total} runs, {failed} failed{left}")
+
+
+def _train(run: Run, part: Part, base: Design, design: Design) -> dict[str, Any]:
+    """The effect's surrogate, into the stage's folder, and what is known of its error."""
+    own = [p.name for p in part.own]
+    without = base_force(base, design)
+    try:
+        effect, validation = train_effect(
+            part.name, part.mechanism.name, part.neutral, own, without, design,
+            run.config.surrogate.kind, run.config.seed,
+        )  # fmt: skip
+    except InputError as few:
+        run.reporter.log(f"{part.name}: no surrogate: {few}")
+        return {"learnt": False, "message": str(few)}
+    said = {"learnt": True, **_errors(run, effect, validation, without, design)}
+    manifest = {**manifest_of(effect.surrogate, validation), "effect": {
+        "part": effect.part, "mechanism": effect.mechanism, "neutral": effect.neutral, "own": own,
+    }, **said}  # fmt: skip
+    save_surrogate(run.at("effects", f"{part.name}.h5"), effect.surrogate, manifest)
+    run.reporter.log(in_words(part.name, said))
+    return said
+
+
+def in_words(name: str, said: Mapping[str, Any]) -> str:
+    """One line on a part's surrogate."""
+    if not said["learnt"]:
+        return f"{name}: no surrogate: {said['message']}"
+    return (
+        f"{name}: held-out error {said['median_error_mn']:.2g} mN where the effect is "
+        f"{said['median_effect_mn']:.3g} mN and the peak 1 N (medians)"
+    )
+
+
+def base_force(base: Design, design: Design) -> Array:
+    """The base design's force (n, m) at the base parameters of each row of an effect's design."""
+    row_of = {theta.tobytes(): row for row, theta in enumerate(base.theta)}
+    theta = np.ascontiguousarray(design.theta[:, : base.space.dim])
+    return base.force_n[[row_of[one.tobytes()] for one in theta]]
+
+
+def _errors(
+    run: Run, effect: Effect, validation: Validation, without: Array, design: Design
+) -> dict[str, Any]:
+    """Of the force with the effect, on held-out rows at forces of a skin test [mN]: of the effect's surrogate
+    beside the base's own runs, and of both surrogates together."""
+    rows = design.testing
+    theta, truth = design.theta[rows], design.force_n[rows]
+    alone = without[rows] + effect.predict(theta).mean
+    both = effect.predict(theta).mean + base_surrogate(run).predict(theta[:, : -len(effect.own)]).mean
+    peak = np.abs(truth).max(axis=1)
+    to_skin = 1e3 / np.maximum(peak, 1e-12)  # mN of a force whose peak is 1 N
+
+    def rms(values: Array) -> Array:
+        return np.asarray(np.sqrt(np.mean(values**2, axis=1)) * to_skin)
+
+    return {
+        "median_effect_mn": float(np.median(rms(truth - without[rows]))),
+        "median_error_mn": float(np.median(rms(truth - alone))),
+        "p90_error_mn": float(np.quantile(rms(truth - alone), 0.9)),
+        "median_error_of_both_mn": float(np.median(rms(truth - both))),
+        "coverage_90": validation.coverage_90,
+        "rows": int(rows.sum()),
+        "failed": int((~design.ok).sum()),
+        "seconds_of_runs": float(np.nansum(design.seconds)),
+    }
+
+
+STAGE = Stage(
+    "effects",
+    "learns what each tissue mechanism does to the force",
+    ("recording", "design", "train"),
+    ("seed", "model", "parameters", "design", "surrogate", "fit", "effects"),
+    _work,
+)
