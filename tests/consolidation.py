@@ -81,10 +81,12 @@ def compression_stress(
     rate: Callable[[float], float],
     times: Array,
     cells: int = 200,
+    exponent: float = 0.0,
 ) -> Array:
     """Stress [Pa] at the drained end of a confined column whose drained end moves as given, (times,).
 
-    layers : (thickness fraction, mu, lambda, mobility) from the closed to the drained end
+    layers : (thickness fraction, mu, lambda, mobility) from the closed to the drained end; the mobility at
+        stretch l is its exp(exponent (l - 1))-fold
 
     In one dimension F = diag(l, 1, 1): the energy mu/2 (l^2 - 1 - 2 ln l) + lambda/2 (ln l)^2 gives the
     effective stress S(l) = mu (l - 1/l) + lambda ln(l) / l, equilibrium p = S(l) - P(t), and J C^-1 = 1/l:
@@ -105,7 +107,7 @@ def compression_stress(
         return mu * (stretch - 1 / stretch) + lam * np.log(stretch) / stretch
 
     def resistance(stretch: Array) -> Array:
-        return 0.5 * widths * stretch / mobility
+        return 0.5 * widths * stretch / (mobility * np.exp(exponent * (stretch - 1)))
 
     def velocity(t: float, stretch: Array) -> Array:
         half = resistance(stretch)

@@ -35,8 +35,8 @@ class TightModel(LagrangianModel):
 
     precision = 1e3
 
-    def equations(self, h, old):
-        usual = super().equations(h, old)
+    def equations(self, h, old, elapsed_s=None):
+        usual = super().equations(h, old, elapsed_s)
         return replace(usual, weight=usual.weight * self.precision)
 
 

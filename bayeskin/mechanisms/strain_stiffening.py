@@ -55,7 +55,7 @@ MECHANISM = Mechanism(
     neutral={"fibre_stress": 0.0, "k2": 5.0, "dispersion": 0.0},
     statement=lambda v: (
         f"Fibres of the cutis stiffen with stretch: k1 = {1e-3 * first_modulus(v):.3g} kPa, "
-        f"k2 = {v['k2']:.2g}, so that they pull with {1e-3 * v['fibre_stress']:.3g} kPa where they are a quarter longer."
+        f"k2 = {v['k2']:.2g}, so that they pull with {1e-3 * v['fibre_stress']:.3g} kPa a quarter longer."
     ),
     group=("strain-stiffening", "pre-stretch"),
     act=Tissue(bind),
