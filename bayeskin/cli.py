@@ -128,13 +128,19 @@ def simulate(as_json: bool, **options: Any) -> None:
     _answer(document, as_json)
 
 
+a_scheduler = click.option(
+    "--scheduler", metavar="ADDRESS", help="Dask scheduler that makes the full runs, as tcp://HOST:PORT."
+)
+
+
 def _stage_command(name: str, text: str) -> None:
     @cli.command(name, help=f"{text}\n\nWhat it needs of earlier stages is done first.\n\n"
                             f"\b\nExample:\n  bayeskin {name} runs/demo.toml")  # fmt: skip
     @a_config
+    @a_scheduler
     @as_json
-    def command(config: Path, as_json: bool) -> None:
-        _run(config, name, as_json)
+    def command(config: Path, scheduler: str | None, as_json: bool) -> None:
+        _run(config, name, scheduler, as_json)
 
 
 _stage_command("design", "Run the full model at the design's points, wave by wave.")
@@ -148,8 +154,9 @@ _stage_command("report", "Figures and summary.json of a run.")
 
 @cli.command()
 @a_config
+@a_scheduler
 @as_json
-def run(config: Path, as_json: bool) -> None:
+def run(config: Path, scheduler: str | None, as_json: bool) -> None:
     """All stages of a configuration in order, skipping what is done and unchanged.
 
     Outputs go to a folder beside CONFIG with the configuration's name. Interrupted at any moment, the same
@@ -159,14 +166,14 @@ def run(config: Path, as_json: bool) -> None:
     Example:
       bayeskin run runs/demo.toml
     """
-    _run(config, None, as_json)
+    _run(config, None, scheduler, as_json)
 
 
-def _run(config: Path, last: str | None, as_json: bool) -> None:
+def _run(config: Path, last: str | None, scheduler: str | None, as_json: bool) -> None:
     from bayeskin.pipeline import stages
 
     with Terminal() as terminal:
-        document = stages.run(config, last, terminal)
+        document = stages.run(config, last, terminal, scheduler=scheduler)
     _answer(document, as_json)
 
 

@@ -23,6 +23,9 @@ from bayeskin.types import Parameter, ParameterSpace
 Positive = Annotated[int, Field(gt=0)]
 
 
+WHO_RUNS: Any = {"design": {"workers", "scheduler"}, "slurm": True}  # no result depends on it
+
+
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
@@ -62,7 +65,8 @@ class DesignConfig(_Section):
     """Full runs: training points of each wave, held-out points of each wave, worker processes.
 
     With `coarse`, a refinement below the model's, the waves run on coarser bricks, and the model itself at
-    `fine_points` and `fine_held_out` of their points, to correct what the coarser ones gave.
+    `fine_points` and `fine_held_out` of their points, to correct what the coarser ones gave. `scheduler`,
+    the address of a Dask scheduler, has the runs made there.
     """
 
     points: Annotated[list[Positive], Field(min_length=1)] = [128, 96, 64]
@@ -71,6 +75,17 @@ class DesignConfig(_Section):
     fine_points: Positive = 16
     fine_held_out: Positive = 6
     workers: Positive = 2
+    scheduler: str | None = None
+
+
+class SlurmConfig(_Section):
+    """Full runs as jobs of SLURM through dask-jobqueue: how many, and what it is told of each."""
+
+    jobs: Positive
+    queue: str | None = None
+    account: str | None = None
+    memory: str = "2GB"
+    walltime: str = "04:00:00"
 
 
 class SurrogateConfig(_Section):
@@ -151,6 +166,7 @@ class Config(_Section):
     model: ModelConfig = ModelConfig()
     parameters: dict[str, PriorConfig] = {}
     design: DesignConfig = DesignConfig()
+    slurm: SlurmConfig | None = None
     surrogate: SurrogateConfig = SurrogateConfig()
     effects: EffectsConfig = EffectsConfig()
     fit: FitConfig = FitConfig()
@@ -169,8 +185,8 @@ class Config(_Section):
 
     @property
     def sha256(self) -> str:
-        """Hash of all that can change a result; the number of workers cannot."""
-        plain = self.model_dump(mode="json", exclude={"design": {"workers"}})
+        """Hash of all that can change a result; who makes the runs cannot."""
+        plain = self.model_dump(mode="json", exclude=WHO_RUNS)
         return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 

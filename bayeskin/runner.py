@@ -1,4 +1,4 @@
-"""Runs a design through the full model in local processes, into one HDF5 file, whatever interrupts it.
+"""Runs a design through the full model, here or on a cluster, into one HDF5 file, whatever interrupts it.
 
 While a wave runs, each finished run goes into a journal beside the file (`bayeskin.journal`); when
 all are there, a new file with all rows is written, replaces the old one, and the journal goes. So the
@@ -29,7 +29,7 @@ from bayeskin.design import Wave
 from bayeskin.errors import InputError
 from bayeskin.journal import Journal, Run
 from bayeskin.types import Array, Design, ParameterSpace, Simulation
-from bayeskin.workers import Lost, run_parallel
+from bayeskin.workers import Lost, Map, local
 
 Simulate = Callable[[Mapping[str, float]], Simulation]
 Progress = Callable[[int, int, int, float], None]
@@ -50,14 +50,15 @@ def run_design(
     edges_s: ArrayLike,
     simulate: Simulate,
     model_hash: str,
-    workers: int = 2,
+    run_all: Map | None = None,
     progress: Progress | None = None,
 ) -> Design:
     """Runs the points of `wave` that are in no file yet and returns the design with all its waves.
 
-    simulate maps ``{name: value}`` to a Simulation; it must be picklable, and its results carry
-    `model_hash`. edges_s (m+1,): the bins whose mean force is kept. A point is known by its bytes,
-    so a repeated one is not run again. A run that fails, raises, or kills its worker `ATTEMPTS`
+    run_all maps over the points (`workers.local`, two processes by default, or `cluster`); the file is the
+    same whichever it was. simulate maps ``{name: value}`` to a Simulation; it must be picklable, and its
+    results carry `model_hash`. edges_s (m+1,): the bins whose mean force is kept. A point is known by its
+    bytes, so a repeated one is not run again. A run that fails, raises, or kills its worker `ATTEMPTS`
     times becomes a row with ``ok`` False and a message. Called again after an interruption of any
     kind, it goes on. progress(done, total, failed, eta_s) counts this wave's points; eta_s is NaN
     until there is something to estimate from. Ctrl-C ends the workers, keeps what is finished and
@@ -80,8 +81,10 @@ def run_design(
         report = _reporter(progress, len(points), [known[key] for key in points if key in known])
         report(None)
         task = partial(_bin_means_of, simulate, wave.space.names, edges)
-        with closing(run_parallel(task, todo, workers)) as results:
+        with closing((run_all or local(2))(task, todo)) as results:
             for index, outcome in results:
+                if todo[index].tobytes() in journal.runs:  # a cluster may have run it twice
+                    continue
                 run = _as_run(path, todo[index], outcome, bins, model_hash)
                 journal.append(run)
                 report(run)
@@ -99,7 +102,7 @@ def add_points(
     theta: ArrayLike,
     simulate: Simulate,
     reason: str,
-    workers: int = 2,
+    run_all: Map | None = None,
     progress: Progress | None = None,
 ) -> Design:
     """Adds training points (n, d) that no rule drew, such as a MAP estimate, as the next wave.
@@ -112,7 +115,7 @@ def add_points(
     number = int(design.wave.max()) + 1
     record = {"wave": number, "seed": design.seed, "training": len(theta), "held_out": 0, "rule": reason}
     wave = Wave(design.space, theta, np.zeros(len(theta), bool), number, design.seed, record)
-    return run_design(path, wave, design.edges_s, simulate, design.model_hash, workers, progress)
+    return run_design(path, wave, design.edges_s, simulate, design.model_hash, run_all, progress)
 
 
 def load_design(path: Path | str) -> Design:
@@ -207,7 +210,7 @@ def _identity(space: ParameterSpace, edges: Array, model_hash: str) -> str:
 
 
 def _box(space: ParameterSpace) -> list[list[Any]]:
-    return [[p.name, p.unit, float(p.lower), float(p.upper), p.prior] for p in space.parameters]
+    return [[p.name, p.unit, float(p.lower), float(p.upper), p.prior, p.offset] for p in space.parameters]
 
 
 def _check_same(path: Path, design: Design, space: ParameterSpace, edges: Array, model_hash: str) -> None:

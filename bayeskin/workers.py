@@ -29,6 +29,14 @@ ONE_THREAD = {
 }
 
 
+Map = Callable[[Callable[[Any], Any], Sequence[Any]], Generator[tuple[int, Any], None, None]]
+
+
+def local(workers: int) -> Map:
+    """`run_parallel` over so many processes of this machine."""
+    return lambda function, items: run_parallel(function, items, workers)
+
+
 @dataclass(frozen=True)
 class Lost:
     """Stands for the result of an item whose worker process died `ATTEMPTS` times."""

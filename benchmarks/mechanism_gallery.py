@@ -24,7 +24,7 @@ from bayeskin.mechanisms import Mechanism, catalogue, laws, observed, solved
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.model import ModelSpec, simulate
 from bayeskin.report import save_figure
-from bayeskin.report.style import ACCENT, GREY, MODEL, PAGE_IN, new_figure, state_finding, styled
+from bayeskin.report.style import ACCENT, FAINT, MODEL, PAGE_IN, new_figure, state_finding, styled
 from bayeskin.types import Array, PadMotion
 
 ROOT = Path(__file__).parents[1]
@@ -109,29 +109,34 @@ def run(values: Mapping[str, float], mechanisms: list[Mechanism]) -> tuple[Array
 
 @styled
 def figure_mechanisms(found: Mapping[str, Shown]):
-    """Forces without and with each mechanism, a panel each."""
+    """What each mechanism adds to the force, a panel each, over the force without it."""
     columns = 4
-    rows = -(-len(found) // columns)
-    figure = new_figure(PAGE_IN, 1.25 * rows + 0.7)
-    axes = figure.subplots(rows, columns, sharex=True).ravel()
+    rows = -(-(len(found) + 1) // columns)
+    figure = new_figure(PAGE_IN, 1.2 * rows + 0.5)
+    axes = figure.subplots(rows, columns).ravel()
     for ax, (name, one) in zip(axes, found.items(), strict=False):
-        ax.plot(TIMES_S, 1e3 * one.without, color=GREY, lw=0.9, label="without")
-        ax.plot(TIMES_S, 1e3 * one.force, color=MODEL, lw=1.0, label="with")
+        behind = ax.twinx()
+        behind.fill_between(TIMES_S, one.without, color=FAINT, alpha=0.6)
+        behind.set_axis_off()
+        ax.set_zorder(1)
+        ax.patch.set_visible(False)
+        ax.plot(TIMES_S, 1e3 * (one.force - one.without), color=MODEL)
         if one.shortcut is not None:
-            ax.plot(TIMES_S, 1e3 * one.shortcut, color=ACCENT, lw=0.8, ls=(0, (3, 2)), label="shortcut")
-        ax.set_title(name)
-    for ax in axes[len(found) :]:
-        ax.set_visible(False)
-    for ax in axes[::columns]:
-        ax.set_ylabel("force [mN]")
-    for ax in axes[max(len(found) - columns, 0) : len(found)]:
-        ax.tick_params(labelbottom=True)
+            ax.plot(TIMES_S, 1e3 * (one.shortcut - one.without), color=ACCENT, ls=(0, (3, 2)))
+        ax.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
+        ax.margins(y=0.1)
+        ax.set_title(name.replace("-dependent-", "-dependent\n"))
+    for ax in axes[: len(found) : columns]:
+        ax.set_ylabel("added force [mN]")
+    for ax in axes[: len(found)][-columns:]:
         ax.set_xlabel("time [s]")
-    handles = [axes[0].plot([], [], color=c, ls=s)[0] for c, s in ((GREY, "-"), (MODEL, "-"), (ACCENT, "--"))]
-    figure.legend(
-        handles, ["without the mechanism", "with it", "its shortcut on the force alone"],
-        loc="outside lower right", ncols=3,
-    )  # fmt: skip
+    for ax in axes[len(found) :]:
+        ax.set_axis_off()
+    last = axes[len(found)]
+    last.plot([], [], color=MODEL, label="what it adds")
+    last.plot([], [], color=ACCENT, ls=(0, (3, 2)), label="by its shortcut on\nthe force alone")
+    last.fill_between([], [], color=FAINT, alpha=0.6, label="the force without,\nto another scale")
+    last.legend(loc="center left")
     state_finding(
         figure,
         "Each mechanism leaves its own mark on the force",

@@ -17,6 +17,7 @@ BELOW = {
     "storage": {"types", "errors"},
     "shipped": {"errors"},
     "workers": {"errors"},
+    "cluster": {"errors", "workers"},
     **dict.fromkeys(SIBLINGS, BASE),
     "journal": BASE,
     "config": BASE | {"design"},
@@ -25,7 +26,9 @@ BELOW = {
     "inference": BASE,  # a Surrogate is all that these two know of a model
     "sensitivity": BASE,
     "report": BASE | {"recordings", "inference", "sensitivity"},
-    "pipeline": BASE | SIBLINGS | {"mechanisms", "config", "runner", "inference", "sensitivity", "report"},
+    "pipeline": BASE
+    | SIBLINGS
+    | {"mechanisms", "config", "runner", "cluster", "inference", "sensitivity", "report"},
 }
 BELOW["cli"] = BELOW["pipeline"] | {"pipeline"}
 

@@ -116,7 +116,7 @@ def test_damage_follows_the_largest_energy_and_later_cycles_repeat():
         for s, w in zip(stretch, largest, strict=True)
     ]
     assert largest.max() > 2 * scale
-    np.testing.assert_allclose(force, expected, atol=2e-4 * max(expected))
+    np.testing.assert_allclose(force, expected, atol=5e-4 * max(expected))
 
 
 def test_the_tangent_knows_what_is_remembered(problem):

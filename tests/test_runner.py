@@ -17,12 +17,13 @@ import toy_runs
 from toy import SPACE, toy_bin_means, toy_simulate
 from toy_runs import COARSE_S, WAVE
 
-from bayeskin import runner, storage
+from bayeskin import runner, storage, workers
 from bayeskin.design import Wave, first_wave
 from bayeskin.errors import InputError
 from bayeskin.journal import Journal, Run
 from bayeskin.runner import add_points, load_design, load_waves, run_design
 from bayeskin.types import Design
+from bayeskin.workers import local
 
 HERE = Path(__file__).parent
 SHORT = replace(WAVE, theta=WAVE.theta[:4], held_out=WAVE.held_out[:4])
@@ -31,7 +32,7 @@ SHORT = replace(WAVE, theta=WAVE.theta[:4], held_out=WAVE.held_out[:4])
 def run(
     path: Path, wave: Wave = WAVE, simulate: object = toy_simulate, workers: int = 1, **options: object
 ) -> Design:
-    return run_design(path, wave, COARSE_S, simulate, "toy", workers, **options)
+    return run_design(path, wave, COARSE_S, simulate, "toy", local(workers), **options)
 
 
 def assert_same_rows(found: Design, expected: Design) -> None:
@@ -52,7 +53,7 @@ def assert_one_file(path: Path) -> None:
 def serial(monkeypatch: pytest.MonkeyPatch) -> None:
     """No worker processes, where a test is about something else: they take a second to start."""
     monkeypatch.setattr(
-        runner, "run_parallel", lambda function, items, _: ((i, function(x)) for i, x in enumerate(items))
+        workers, "run_parallel", lambda function, items, _: ((i, function(x)) for i, x in enumerate(items))
     )
 
 
@@ -213,8 +214,8 @@ def test_added_points_are_training_points_of_the_next_wave(whole: Design, tmp_pa
     assert not whole.held_out[-1]
     path = tmp_path / "design.h5"
     run(path)
-    add_points(path, whole.theta[-1:], toy_simulate, "most probable point", workers=1)
-    again = add_points(path, whole.theta[-1:], toy_simulate, "again", workers=1)
+    add_points(path, whole.theta[-1:], toy_simulate, "most probable point", local(1))
+    again = add_points(path, whole.theta[-1:], toy_simulate, "again", local(1))
     assert_same_rows(again, whole)
     assert [w["rule"] for w in load_waves(path)] == [WAVE.record["rule"], "most probable point"]
 
@@ -420,7 +421,7 @@ def test_workers_that_cannot_start_are_the_users_to_mend(tmp_path: Path) -> None
     script = (
         "from toy_runs import *\n"
         "def homemade(theta): return toy_simulate(theta)\n"
-        f"run_design({str(tmp_path / 'd.h5')!r}, WAVE, COARSE_S, homemade, 'toy', 1)\n"
+        f"run_design({str(tmp_path / 'd.h5')!r}, WAVE, COARSE_S, homemade, 'toy')\n"
     )
     (tmp_path / "unguarded.py").write_text(script)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent)])}

@@ -17,6 +17,7 @@ from toy import EDGES_S, SPACE, toy_simulate
 from bayeskin.design import Wave
 from bayeskin.runner import add_points, run_design
 from bayeskin.types import Simulation
+from bayeskin.workers import local
 
 COARSE_S = EDGES_S[::10]
 WAVE = Wave(  # random, not Sobol': each worker imports this file, and SciPy's qmc takes a second
@@ -78,8 +79,8 @@ def threads(theta: Mapping[str, float]) -> Simulation:
 def main(path: str, workers: int, seconds: float) -> None:
     """Runs a wave and one added point; safe to kill at any moment and to start again."""
     simulate = partial(slow, seconds=seconds)
-    run_design(path, WAVE, COARSE_S, simulate, "toy", workers)
-    add_points(path, SPACE.from_unit(np.full((1, 5), 0.5)), simulate, "most probable point", workers)
+    run_design(path, WAVE, COARSE_S, simulate, "toy", local(workers))
+    add_points(path, SPACE.from_unit(np.full((1, 5), 0.5)), simulate, "most probable point", local(workers))
 
 
 if __name__ == "__main__":

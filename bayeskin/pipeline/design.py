@@ -21,6 +21,7 @@ from bayeskin.config import parameter_space
 from bayeskin.design import Wave, fine_wave, first_wave, next_wave
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.model.simulate import ModelSpec, simulate
+from bayeskin.pipeline.crew import crew
 from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
 from bayeskin.pipeline.folder import sha256_of, write_json
 from bayeskin.pipeline.model import model_spec, waves_spec
@@ -115,13 +116,15 @@ def _run_wave(
     run: Run, label: str, runs_file: Path, wave: Wave, edges_s: Array, spec: ModelSpec, motion: PadMotion
 ) -> None:
     run.reporter.log(f"{label}: {len(wave.theta)} full runs")
-    run_design(
-        runs_file, wave, edges_s, partial(simulate, spec, motion), spec.hash, run.config.design.workers,
-        partial(_tell, run, label),
-    )  # fmt: skip
+    with crew(run) as run_all:
+        run_design(
+            runs_file, wave, edges_s, partial(simulate, spec, motion), spec.hash, run_all,
+            partial(tell, run, label),
+        )  # fmt: skip
 
 
-def _tell(run: Run, label: str, done: int, total: int, failed: int, eta_s: float) -> None:
+def tell(run: Run, label: str, done: int, total: int, failed: int, eta_s: float) -> None:
+    """Progress of a design, in words."""
     left = f", {eta_s / 60:.0f} min left" if np.isfinite(eta_s) else ""
     run.reporter.progress(label, done / max(total, 1), f"{done} of {total} runs, {failed} failed{left}")
 

@@ -19,6 +19,8 @@ from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, catalogue, laws
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.model.simulate import ModelSpec, simulate
+from bayeskin.pipeline.crew import crew
+from bayeskin.pipeline.design import tell
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.model import model_spec
@@ -112,17 +114,11 @@ def _learn(run: Run, part: Part) -> dict[str, Any]:
     file = run.folder / "runs" / f"{part.name}-{identity[:12]}.h5"
     run.reporter.log(f"{part.name}: {len(wave.theta)} full runs")
     task = partial(simulate_with, part.mechanism.name, dict(part.mechanism.neutral), spec, motion)
-    run_design(
-        file, wave, base.edges_s, task, spec.hash, config.design.workers, partial(_tell, run, part.name)
-    )
+    with crew(run) as run_all:
+        run_design(file, wave, base.edges_s, task, spec.hash, run_all, partial(tell, run, part.name))
     design = load_design(file)
     storage.save(run.at("effects", f"{part.name}-design.h5"), design)
     return _train(run, part, base, design)
-
-
-def _tell(run: Run, label: str, done: int, total: int, failed: int, eta_s: float) -> None:
-    left = f", {eta_s / 60:.0f} min left" if np.isfinite(eta_s) else ""
-    run.reporter.progress(label, done / max(total, 1), f"{done} of {total} runs, {failed} failed{left}")
 
 
 def _train(run: Run, part: Part, base: Design, design: Design) -> dict[str, Any]:

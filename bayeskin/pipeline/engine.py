@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import bayeskin
-from bayeskin.config import Config, load_config
+from bayeskin.config import WHO_RUNS, Config, load_config
 from bayeskin.errors import InputError
 from bayeskin.pipeline import folder
 from bayeskin.pipeline.folder import Record
@@ -125,7 +125,7 @@ def _needed(stages: Mapping[str, Stage], last: str | None) -> set[str]:
 
 def _inputs_sha256(run: Run, stage: Stage) -> str:
     records = {name: folder.read_record(run.folder / name) for name in stage.needs}
-    config = run.config.model_dump(mode="json", exclude={"design": {"workers"}})
+    config = run.config.model_dump(mode="json", exclude=WHO_RUNS)
     return folder.sha256_of(
         {
             "version": bayeskin.__version__,

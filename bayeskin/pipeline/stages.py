@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bayeskin.pipeline import design, effects, indices, maximum, posterior, recording, training
+from bayeskin.pipeline.crew import made_by
 from bayeskin.pipeline.engine import Outcome, Reporter, Run, Stage, open_run, run_stages
 from bayeskin.pipeline.folder import plain, read_record, write_json
 
@@ -61,10 +62,19 @@ STAGES = {stage.name: stage for stage in (*BEFORE_REPORT, REPORT, effects.STAGE)
 
 
 def run(
-    config: Path, last: str | None, reporter: Reporter, stages: Mapping[str, Stage] = STAGES
+    config: Path,
+    last: str | None,
+    reporter: Reporter,
+    stages: Mapping[str, Stage] = STAGES,
+    scheduler: str | None = None,
 ) -> dict[str, Any]:
-    """Runs a configuration to the stage `last` (None: to the report) and gives the command's answer."""
+    """Runs a configuration to the stage `last` (None: to the report) and gives the command's answer.
+
+    `scheduler`: the address of a Dask scheduler that makes the full runs, in the place of `design.scheduler`.
+    """
     opened = open_run(config, reporter)
+    if scheduler is not None:
+        opened = made_by(opened, scheduler)
     outcomes = run_stages(opened, stages, last or "report")
     answer = outcomes[-1]
     return plain(

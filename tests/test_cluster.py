@@ -1,0 +1,115 @@
+"""Designs over a real Dask cluster on this machine, whose workers are killed in mid-run."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import toy_runs
+from test_runner import SHORT, assert_same_rows, run
+from toy import toy_simulate
+from toy_runs import COARSE_S
+
+from bayeskin.cluster import on_scheduler, on_slurm
+from bayeskin.errors import InputError
+from bayeskin.runner import load_design, run_design
+from bayeskin.types import Design
+from bayeskin.workers import local
+
+distributed = pytest.importorskip("distributed")
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"
+    ) as cluster:
+        yield cluster
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory) -> Design:
+    return run(tmp_path_factory.mktemp("here") / "design.h5", SHORT)
+
+
+def test_the_file_is_the_same_whoever_made_the_runs(cluster, tmp_path: Path, expected: Design) -> None:
+    with on_scheduler(cluster.scheduler_address) as over:
+        found = run_design(tmp_path / "design.h5", SHORT, COARSE_S, toy_simulate, "toy", over)
+    assert_same_rows(found, expected)
+    again = run_design(tmp_path / "design.h5", SHORT, COARSE_S, toy_runs.failing, "toy", local(1))
+    assert_same_rows(again, expected)
+
+
+def test_a_worker_killed_in_mid_run_costs_its_own_point_which_is_run_again(
+    cluster, tmp_path: Path, expected: Design
+) -> None:
+    """One of the workers is killed from outside while all are busy."""
+    killed = []
+
+    def kill() -> None:
+        time.sleep(1.0)
+        killed.append(next(iter(cluster.workers.values())).pid)
+        os.kill(killed[0], signal.SIGKILL)
+
+    simulate = partial(toy_runs.slow, seconds=1.0)
+    thread = threading.Thread(target=kill)
+    thread.start()
+    with on_scheduler(cluster.scheduler_address) as over:
+        found = run_design(tmp_path / "design.h5", SHORT, COARSE_S, simulate, "toy", over)
+    thread.join()
+    assert killed
+    assert_same_rows(found, expected)
+
+
+def test_a_point_that_kills_every_worker_is_a_failed_row(cluster, tmp_path: Path) -> None:
+    simulate = partial(toy_runs.deadly, folder=str(tmp_path), deaths=99)
+    with on_scheduler(cluster.scheduler_address) as over:
+        found = run_design(tmp_path / "out" / "design.h5", SHORT, COARSE_S, simulate, "toy", over)
+    stiff = SHORT.theta[:, 0] > 3e5
+    np.testing.assert_array_equal(found.ok, ~stiff)
+    assert all("ended" in found.messages[row] for row in np.flatnonzero(stiff))
+
+
+def test_a_run_that_comes_back_twice_is_one_row(tmp_path: Path, expected: Design) -> None:
+    def twice(function, items):
+        for index, item in enumerate(items):
+            yield index, function(item)
+            yield index, function(item)
+
+    found = run_design(tmp_path / "design.h5", SHORT, COARSE_S, toy_simulate, "toy", twice)
+    assert_same_rows(found, expected)
+    assert_same_rows(load_design(tmp_path / "design.h5"), expected)
+
+
+def test_an_address_where_nobody_answers_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bayeskin.cluster.CONNECT_S", 1)
+    with pytest.raises(InputError, match="9: found no answer"), on_scheduler("tcp://127.0.0.1:9"):
+        pass
+    with pytest.raises(InputError, match="the address of a Dask scheduler"), on_scheduler("nowhere://x"):
+        pass
+
+
+def test_slurm_is_asked_for_single_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The job script that would be submitted; there is no SLURM here to run it."""
+    queue = pytest.importorskip("dask_jobqueue")
+    scripts, made = [], []
+
+    class Recorded(queue.SLURMCluster):
+        def scale(self, jobs):
+            scripts.append(self.job_script())
+            made.append(jobs)
+
+    monkeypatch.setattr(queue, "SLURMCluster", Recorded)
+    with on_slurm(3, {"queue": "long", "memory": "2GB", "walltime": "01:00:00"}):
+        pass
+    assert made[0] == 3
+    assert "#SBATCH -p long" in scripts[0]
+    assert "--nthreads 1" in scripts[0]
+    with pytest.raises(InputError, match="slurm"), on_slurm(1, {"memory": "2GB", "colour": "blue"}):
+        pass
