@@ -424,7 +424,7 @@ def test_the_exit_code_says_whether_the_answer_can_be_relied_on(
     original = stages.run
     for work, expected in ((failing, 1), (interrupted, 130)):
         monkeypatch.setattr(
-            stages, "run", lambda c, last, r, work=work: original(c, last, r, one_stage(work))
+            stages, "run", lambda c, last, r, work=work, scheduler=None: original(c, last, r, one_stage(work))
         )
         code, out, err = bayeskin("run", tmp_path / "case.toml", "--json")
         assert code == expected
