@@ -169,6 +169,28 @@ def run(config: Path, scheduler: str | None, as_json: bool) -> None:
     _run(config, None, scheduler, as_json)
 
 
+@cli.command()
+@a_config
+@as_json
+def diagnose(config: Path, as_json: bool) -> None:
+    """What the model leaves out of a configuration's recording: where, which physics, how much better.
+
+    Tries each mechanism of the catalogue that acts on the instrument, and each of the tissue's that
+    `bayeskin effects` has learnt or that is shipped with the surrogate, with all other parameters free
+    again; then sets of them. Selection and fit are repeated on the recording up to the end of its second
+    hold and tested on what follows.
+
+    \b
+    Example:
+      bayeskin diagnose runs/healthy-skin.toml --json
+    """
+    from bayeskin.pipeline import diagnosis
+
+    with Terminal() as terminal:
+        document = diagnosis.diagnose(config, terminal)
+    _answer(document, as_json)
+
+
 def _run(config: Path, last: str | None, scheduler: str | None, as_json: bool) -> None:
     from bayeskin.pipeline import stages
 

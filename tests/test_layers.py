@@ -25,10 +25,11 @@ BELOW = {
     "runner": BASE | SIBLINGS | {"journal"},
     "inference": BASE,  # a Surrogate is all that these two know of a model
     "sensitivity": BASE,
+    "mismatch": BASE | {"model", "mechanisms", "inference"},
     "report": BASE | {"recordings", "inference", "sensitivity"},
     "pipeline": BASE
     | SIBLINGS
-    | {"mechanisms", "config", "runner", "cluster", "inference", "sensitivity", "report"},
+    | {"mechanisms", "config", "runner", "cluster", "mismatch", "inference", "sensitivity", "report"},
 }
 BELOW["cli"] = BELOW["pipeline"] | {"pipeline"}
 

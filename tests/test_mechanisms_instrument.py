@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import bin_means, catalogue, observed
 from bayeskin.mechanisms.mechanism import Instrument
-from bayeskin.types import PadMotion
+from bayeskin.types import PadMotion, ParameterSpace
 
 MOTION = PadMotion(
     np.array([0.0, 5.0, 14.4, 45.0, 54.4, 65.0, 74.4, 105.0, 114.4, 130.0]),
@@ -32,11 +32,8 @@ def skin(time_s: np.ndarray) -> np.ndarray:
 
 def values_of(*names: str, **chosen: float) -> dict[str, np.ndarray]:
     """Parameters of mechanisms at the middle of their priors, but for those chosen; one sample."""
-    middle = {
-        p.name: np.sqrt(p.lower * p.upper) if p.prior == "log-uniform" else 0.5 * (p.lower + p.upper)
-        for name in names
-        for p in ALL[name].parameters
-    }
+    space = ParameterSpace(tuple(p for name in names for p in ALL[name].parameters))
+    middle = dict(zip(space.names, space.from_unit([0.5] * space.dim), strict=True))
     return {name: np.array([value]) for name, value in (middle | chosen).items()}
 
 

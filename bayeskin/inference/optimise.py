@@ -10,7 +10,7 @@ import numpy as np
 
 from bayeskin.errors import InputError
 from bayeskin.inference.problem import LogPosterior
-from bayeskin.inference.straighten import find_shear
+from bayeskin.inference.straighten import Shear, find_shear
 from bayeskin.types import Array
 
 _AGREE = 0.1  # nats: starts this close to the best found the same maximum, whatever stays flat around it
@@ -86,9 +86,17 @@ def find_map(
     return MapResult(best.theta, best.value, tuple(results), agreement)
 
 
-def climb(log_posterior: LogPosterior, start: Mapping[str, float], evaluations: int = 4000) -> StartResult:
-    """The local maximum near `start` (all parameters, SI; moved into the box if outside it)."""
-    space = _SearchSpace(log_posterior)
+def climb(
+    log_posterior: LogPosterior,
+    start: Mapping[str, float],
+    evaluations: int = 4000,
+    shear: Shear | None = None,
+) -> StartResult:
+    """The local maximum near `start` (all parameters, SI; moved into the box if outside it).
+
+    `shear`: the map that straightens this posterior, where it is known already.
+    """
+    space = _SearchSpace(log_posterior, shear)
     low, high = log_posterior.bounds
     search = _Search(space)
     search.best = space.unit(np.clip(log_posterior.vector(start), low, high)[None])[0]
@@ -116,8 +124,8 @@ def _one_start(search_space: _SearchSpace, seed: int, evaluations: int) -> Start
 class _SearchSpace:
     """The unit cube over straightened coordinates; beyond the prior box the density is continued."""
 
-    def __init__(self, log_posterior: LogPosterior) -> None:
-        self.log_posterior, self.shear = log_posterior, find_shear(log_posterior)
+    def __init__(self, log_posterior: LogPosterior, shear: Shear | None = None) -> None:
+        self.log_posterior, self.shear = log_posterior, shear or find_shear(log_posterior)
         self.low, self.high = (np.array(bound) for bound in log_posterior.bounds)
         if self.shear is not None:
             group = self.shear.group

@@ -14,8 +14,10 @@ explicit and its determinant constant whatever h is, so a poor fit of h costs sp
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -72,6 +74,20 @@ class Shear(_FreezesArrays):
         """h (n,) at P x (n, D)."""
         height = log_sum(rest[:, self.group] + self.log_weight[self.group])
         return height + self.coefficients @ self.polynomial(rest)
+
+    def among(self, own: Sequence[str], names: Sequence[str]) -> Shear:
+        """The same map for a space of more coordinates, by the names of both; it leaves the others alone."""
+        column = [own.index(name) if name in own else -1 for name in names]
+
+        def spread(values: NDArray[Any], other: float) -> NDArray[Any]:
+            wide = np.full((*values.shape[:-1], len(names)), other, dtype=values.dtype)
+            wide[..., np.array(column) >= 0] = values[..., [c for c in column if c >= 0]]
+            return wide
+
+        return Shear(
+            spread(self.group, 0), spread(self.log_weight, -np.inf), spread(self.powers, 0),
+            self.coefficients, spread(self.centre, 0.0), spread(self.scale, 1.0),
+        )  # fmt: skip
 
     @property
     def _first(self) -> int:

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values
-from bayeskin.mechanisms.series import FirstLoading, lost_in_series
+from bayeskin.mechanisms.series import lost_in_series
 from bayeskin.model.problem import Problem
 from bayeskin.model.tissue import SeriesElement, TissueLaw
 from bayeskin.types import Array, PadMotion, Parameter
@@ -71,19 +71,10 @@ def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """The shortcut of `series`, after the force is taken at the displacement behind the gap."""
-    gap, compliance = values["gap"], values["frame_compliance"]
-    behind = [trailing(motion, g) for g in gap]
-    loading = FirstLoading(motion, force, len(gap))
-
-    def trailed(time_s: Array) -> Array:
-        each = np.broadcast_to(time_s, (len(gap), np.shape(time_s)[-1]))
-        u = motion.at(each)
-        p = np.stack([one.at(row) for one, row in zip(behind, each, strict=True)])
-        change = [loading(p[:, k]) - loading(u[:, k]) for k in range(each.shape[1])]
-        return np.asarray(force(time_s) + np.stack(change, axis=1))
-
-    return lost_in_series(motion, trailed, len(gap), lambda before, now, elapsed_s, lost: compliance * now)
+    """The shortcut of `series`."""
+    gap = values["gap"]
+    none = np.zeros_like(gap)
+    return lost_in_series(motion, force, gap, values["frame_compliance"], none, none)
 
 
 MECHANISM = Mechanism(
@@ -98,5 +89,5 @@ MECHANISM = Mechanism(
         f"{1e3 * v['frame_compliance']:.2g} mm a newton."
     ),
     group=("backlash",),
-    act=Instrument(Place.PADS, observe, bind),
+    act=Instrument(Place.PADS, observe, bind, adds=False),
 )

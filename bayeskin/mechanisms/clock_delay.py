@@ -23,5 +23,5 @@ MECHANISM = Mechanism(
         "beside the displacement."
     ),
     group=("clock-delay",),
-    act=Instrument(Place.CLOCK, observe),
+    act=Instrument(Place.CLOCK, observe, adds=False),
 )

@@ -37,11 +37,13 @@ class Instrument:
 
     bind : set where it changes the displacement that the skin sees: the full model solves it along, and
         `observe` is its shortcut for the force of a surrogate
+    adds : whether what it adds to a force does not depend on that force
     """
 
     place: Place
     observe: Observe
     bind: Bind | None = None
+    adds: bool = True
 
 
 @dataclass(frozen=True)

@@ -12,35 +12,21 @@ from collections.abc import Mapping
 import numpy as np
 
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values
-from bayeskin.mechanisms.series import lost_in_series
+from bayeskin.mechanisms.series import lost_in_series, mean_beyond
 from bayeskin.model.problem import Problem
 from bayeskin.model.tissue import SeriesElement, TissueLaw
 from bayeskin.types import Array, PadMotion, Parameter
-
-
-def slid(before_n: Array, now_n: Array, elapsed_s: float, rate: Array, threshold_n: Array) -> Array:
-    """Slip [m] in a time over which the force goes straight from one value to another."""
-    onward = _mean_beyond(before_n - threshold_n, now_n - threshold_n)
-    back = _mean_beyond(-before_n - threshold_n, -now_n - threshold_n)
-    return rate * elapsed_s * (onward - back)
-
-
-def _mean_beyond(a: Array, b: Array) -> Array:
-    """Mean of what is positive on a straight line from a to b."""
-    low, high = np.minimum(a, b), np.maximum(a, b)
-    across = np.maximum(high, 0.0) ** 2 / (2.0 * np.maximum(high - low, 1e-30))
-    return np.where(low >= 0.0, 0.5 * (a + b), np.where(high <= 0.0, 0.0, across))
 
 
 class Slip(SeriesElement):
     """Memory: slip [m], force [N]."""
 
     def __init__(self, rate: float, threshold_n: float) -> None:
-        self._rate, self._threshold_n = np.array(rate), np.array(threshold_n)
+        self._rate, self._threshold_n = rate, threshold_n
 
     def follow(self, force_n: float, elapsed_s: float, before: Array) -> Array:
-        more = slid(before[1], np.array(force_n), elapsed_s, self._rate, self._threshold_n)
-        return np.array([before[0] + float(more), force_n])
+        more = self._rate * elapsed_s * mean_beyond(float(before[1]), force_n, self._threshold_n)
+        return np.array([before[0] + more, force_n])
 
 
 class PadSlip(TissueLaw):
@@ -57,13 +43,9 @@ def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
     """The shortcut of `series`."""
-    rate, threshold = values["slip_rate"], values["slip_threshold"]
-    return lost_in_series(
-        motion,
-        force,
-        len(rate),
-        lambda before, now, elapsed_s, lost: lost + slid(before, now, elapsed_s, rate, threshold),
-    )
+    rate = values["slip_rate"]
+    none = np.zeros_like(rate)
+    return lost_in_series(motion, force, none, none, rate, values["slip_threshold"])
 
 
 MECHANISM = Mechanism(
@@ -89,5 +71,5 @@ MECHANISM = Mechanism(
         f"{v['slip_threshold']:.2g} N, and do not come back."
     ),
     group=("pad-slip", "preconditioning", "slow-recovery"),
-    act=Instrument(Place.PADS, observe, bind),
+    act=Instrument(Place.PADS, observe, bind, adds=False),
 )

@@ -1,73 +1,98 @@
 """What lies between drive and skin, on the force of a surrogate: a shortcut for what the full model solves.
 
-The skin sees u - s, with s [m] what is lost. Its force is taken to follow the displacement at once,
+The skin sees p - s: p trails the drive u behind a gap, s is what yields (compliance) and what has slipped.
+Its force is taken to follow the displacement at once,
 
-    F[u - s](t) = F[u](t) + G(u(t) - s(t)) - G(u(t)) ,
+    F[p - s](t) = F[u](t) + G(p(t) - s(t)) - G(u(t)) ,
 
 G the force over the displacement of the first loading, straight on below its start. Exact for skin without
 memory; the full model tells what else there is to it.
 """
+# mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 
 from bayeskin.mechanisms.mechanism import ForceOfTime
+from bayeskin.model.assembly import compiled
 from bayeskin.types import Array, PadMotion
 
-STEP_S = 0.25
+STEPS_A_PHASE = 100
 GRID = 33  # displacements at which G is tabulated
-ITERATIONS = 4  # of a force that depends on what it makes lost, which changes it by some tenths at most
-
-Follow = Callable[
-    [Array, Array, float, Array], Array
-]  # forces before and now, elapsed [s], lost before: lost
+ITERATIONS = 8  # of a force and what it makes lost, which changes it by some tenths at most
 
 
-class FirstLoading:
-    """G of a force as a function of time, `rows` of them."""
-
-    def __init__(self, motion: PadMotion, force: ForceOfTime, rows: int) -> None:
-        u = motion.displacement_m
-        rising = np.flatnonzero(np.diff(u) > 0.0)
-        first = int(rising[0]) if len(rising) else 0
-        start, end = motion.time_s[first], motion.time_s[min(first + 1, len(u) - 1)]
-        time_s = np.linspace(start, end, GRID)
-        self._low, self._width = float(u[first]), float(max(u[min(first + 1, len(u) - 1)] - u[first], 1e-9))
-        self._table = np.broadcast_to(force(time_s) - force(np.array([start])), (rows, GRID))
-
-    def __call__(self, u: Array) -> Array:
-        """G (n,) at displacements (n,), straight on beyond the table."""
-        place = (u - self._low) / self._width * (GRID - 1)
-        left = np.clip(np.floor(place).astype(int), 0, GRID - 2)
-        rows = np.arange(len(self._table))
-        below, above = self._table[rows, left], self._table[rows, left + 1]
-        return np.asarray(below + (place - left) * (above - below))
-
-
-def lost_in_series(motion: PadMotion, force: ForceOfTime, rows: int, follow: Follow) -> ForceOfTime:
-    """The force when what `follow` says is lost on the way to the skin, (rows,) from step to step."""
-    loading = FirstLoading(motion, force, rows)
-    every = np.arange(motion.time_s[0], motion.time_s[-1], STEP_S)
-    grid_s = np.union1d(motion.time_s, every)
-    free, u = np.broadcast_to(force(grid_s), (rows, len(grid_s))), motion.at(grid_s)
-    lost, change = np.zeros_like(free), np.zeros_like(free)
-    for k in range(1, len(grid_s)):
-        elapsed_s, before = float(grid_s[k] - grid_s[k - 1]), free[:, k - 1] + change[:, k - 1]
-        at_rest = loading(np.full(len(free), u[k]))
-        now = free[:, k] + change[:, k - 1]
-        for _ in range(ITERATIONS):
-            lost[:, k] = follow(before, now, elapsed_s, lost[:, k - 1])
-            change[:, k] = loading(u[k] - lost[:, k]) - at_rest
-            now = free[:, k] + change[:, k]
+def lost_in_series(
+    motion: PadMotion,
+    force: ForceOfTime,
+    gap_m: Array,
+    compliance: Array,
+    rate: Array,
+    threshold_n: Array,
+) -> ForceOfTime:
+    """The force behind a gap [m], a compliance [m/N], and slip [m/(N s)] beyond a threshold; all (n,)."""
+    steps = np.linspace(motion.time_s[:-1], motion.time_s[1:], STEPS_A_PHASE, endpoint=False).T.ravel()
+    grid_s = np.append(steps, motion.time_s[-1])
+    u, n = motion.at(grid_s), len(gap_m)
+    rising = np.flatnonzero(np.diff(motion.displacement_m) > 0.0)
+    first = int(rising[0]) if len(rising) else 0
+    start, end = motion.time_s[first : first + 2]
+    low, high = motion.displacement_m[first : first + 2]
+    table = force(np.linspace(start, end, GRID)) - force(np.array([start]))
+    free = np.ascontiguousarray(np.broadcast_to(force(grid_s), (n, len(grid_s))))
+    change = np.zeros_like(free)
+    _march(
+        free, u, np.diff(grid_s), np.ascontiguousarray(np.broadcast_to(table, (n, GRID))), float(low),
+        float(max(high - low, 1e-9)), gap_m, compliance, rate, threshold_n, float(np.ptp(u)), change,
+    )  # fmt: skip
 
     def reported(time_s: Array) -> Array:
-        each = np.broadcast_to(time_s, (rows, np.shape(time_s)[-1]))
+        each = np.broadcast_to(time_s, (n, np.shape(time_s)[-1]))
         place = np.clip(np.searchsorted(grid_s, each, side="right") - 1, 0, len(grid_s) - 2)
         share = np.clip((each - grid_s[place]) / np.diff(grid_s)[place], 0.0, 1.0)
         left, right = (np.take_along_axis(change, place + one, axis=1) for one in (0, 1))
         return np.asarray(force(time_s) + left + share * (right - left))
 
     return reported
+
+
+@compiled
+def _march(free, u, elapsed, table, low, width, gap, compliance, rate, threshold, reach, change):
+    """Fills change (n, k) of the forces `free` (n, k) at drive displacements u (k,)."""
+    for i in range(free.shape[0]):
+        behind, slip, before = u[0], 0.0, free[i, 0]
+        for k in range(1, free.shape[1]):
+            behind = max(u[k] - gap[i], min(u[k], behind))
+            rest = _interpolated(table[i], (u[k] - low) / width)
+            added, slid = change[i, k - 1], slip
+            for _ in range(ITERATIONS):
+                now = free[i, k] + added
+                slid = slip + rate[i] * elapsed[k - 1] * mean_beyond(before, now, threshold[i])
+                slid = min(max(slid, -reach), reach)
+                lost = min(max(slid + compliance[i] * now, -reach), reach)
+                added = _interpolated(table[i], (behind - lost - low) / width) - rest
+            slip, before = slid, free[i, k] + added
+            change[i, k] = added
+
+
+@compiled
+def _interpolated(table, place):
+    """Of a table over [0, 1], straight on beyond it."""
+    place *= len(table) - 1
+    left = min(max(int(np.floor(place)), 0), len(table) - 2)
+    return table[left] + (place - left) * (table[left + 1] - table[left])
+
+
+@compiled
+def mean_beyond(before, now, threshold):
+    """Mean of sgn(F) max(|F| - threshold, 0) along a straight line between two forces."""
+    total = 0.0
+    for sign in (1.0, -1.0):
+        a, b = sign * before - threshold, sign * now - threshold
+        low, high = min(a, b), max(a, b)
+        if low >= 0.0:
+            total += sign * 0.5 * (a + b)
+        elif high > 0.0:
+            total += sign * high * high / (2.0 * (high - low))
+    return total

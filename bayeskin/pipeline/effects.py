@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,19 @@ from bayeskin.pipeline.design import tell
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.model import model_spec
+from bayeskin.pipeline.shipping import shipped_files
 from bayeskin.pipeline.training import base_surrogate
 from bayeskin.runner import load_design, run_design
-from bayeskin.surrogates import Effect, Similarity, Validation, manifest_of, save_surrogate, train_effect
+from bayeskin.surrogates import (
+    Effect,
+    Similarity,
+    Validation,
+    load_manifest,
+    load_surrogate,
+    manifest_of,
+    save_surrogate,
+    train_effect,
+)
 from bayeskin.types import Array, Design, PadMotion, Parameter, ParameterSpace, Simulation
 
 WEAKEST = 0.1  # of a strength's prior: effects below are straight lines to nothing, and lost in noise
@@ -119,6 +130,26 @@ def _learn(run: Run, part: Part) -> dict[str, Any]:
     design = load_design(file)
     storage.save(run.at("effects", f"{part.name}-design.h5"), design)
     return _train(run, part, base, design)
+
+
+def effects_of(run: Run) -> list[Effect]:
+    """Effects that this run has learnt, else those shipped beside its surrogate; [] where there are none.
+
+    Raises InputError for files of another model.
+    """
+    file = run.config.surrogate.file
+    folder = run.folder / "effects"
+    if not list(folder.glob("*.json")) and file is not None:
+        folder = shipped_files(run).surrogate.with_name(f"{Path(file).stem}-effects")
+    found = []
+    for path in sorted(path for path in folder.glob("*.h5") if not path.stem.endswith("-design")):
+        said, surrogate = load_manifest(path), load_surrogate(path)
+        if said["model_hash"] != model_spec(run).hash:
+            raise InputError(path, "an effect of another model", "one of this configuration's model")
+        about = said["effect"]
+        own = tuple(about["own"])
+        found.append(Effect(about["part"], about["mechanism"], about["neutral"], own, surrogate))
+    return found
 
 
 def _train(run: Run, part: Part, base: Design, design: Design) -> dict[str, Any]:

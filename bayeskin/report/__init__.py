@@ -2,6 +2,7 @@
 
 from bayeskin.report.fields import SurfaceField, figure_fields
 from bayeskin.report.fit import figure_fit
+from bayeskin.report.mismatch import figure_before_after, figure_candidates, figure_located
 from bayeskin.report.posterior import figure_posterior
 from bayeskin.report.prior import figure_prior_predictive
 from bayeskin.report.recording import figure_recording
@@ -13,8 +14,11 @@ from bayeskin.report.waves import figure_waves
 
 __all__ = [
     "SurfaceField",
+    "figure_before_after",
+    "figure_candidates",
     "figure_fields",
     "figure_fit",
+    "figure_located",
     "figure_map_check",
     "figure_posterior",
     "figure_prior_predictive",
