@@ -84,6 +84,7 @@ def diagnose(config: Path, reporter: Reporter) -> dict[str, Any]:
         "seconds": time.monotonic() - started,
     }
     folder = opened.folder / "diagnosis"
+    folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "diagnosis.json", answer)
     figures = _draw(bench, whole, before, after, answer, folder)
     return plain({**answer, "figures": figures, "text": _in_words(answer, folder)})
