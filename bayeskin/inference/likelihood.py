@@ -6,7 +6,9 @@ whitened by the chain, w and G, the innovations are eps(z) = w - G z, independen
 
     p(y) = prod_j 1/(s_j sqrt(1 - rho_j^2)) * int N(z; 0, I) prod_j t_nu(eps_j(z)) dz .
 
-The integral is Gaussian and exact for nu = inf. For finite nu it is Laplace's approximation about the
+N is the normal density within three sd; beyond, its logarithm falls by 50 (|z| - 3)^2 more, since a surrogate
+that were wrong by tens of its sd could explain any misfit by an error that it denies. The integral is Gaussian
+and exact for nu = inf within three sd. For finite nu it is Laplace's approximation about the
 mode, found by reweighted least squares and then Newton steps (Tierney & Kadane 1986, JASA 81:82; Lange,
 Little & Taylor 1989, JASA 84:881). Float64 throughout; one thread; one call for any number of points.
 """
@@ -22,6 +24,7 @@ from bayeskin.inference.noise_model import NoiseChain
 from bayeskin.types import Array, NDArray, Prediction
 
 _STEPS = 40  # bound on the mode search; five or six are usual
+FARTHEST, STIFF = 3.0, 100.0  # sd of the surrogate's error that z is normal to, and the stiffness beyond
 _REWEIGHTED = 2  # steps of reweighted least squares before Newton, which needs a start near the mode
 _DECREMENT = 1e-8  # of the log density, at which the mode is found
 # Sums may be reordered for SIMD; infinities and NaN keep their meaning.
@@ -137,7 +140,7 @@ def _marginal(white: Array, design: Array, nu: float) -> float:
         decrement = _solve(curvature, gradient)
         z += gradient
         value -= 0.5 * decrement
-        if gaussian or (step > 0 and decrement < _DECREMENT):
+        if step > 0 and decrement < _DECREMENT:
             break
     if not gaussian and not newton:  # Laplace takes the curvature of the density, not of its bound
         value = _energy(white, design, z, nu, eps)
@@ -166,7 +169,8 @@ def _energy(white: Array, design: Array, z: Array, nu: float, eps: Array) -> flo
     eps[:] = white
     square = 0.0
     for a in range(rank):
-        square += z[a] * z[a]
+        beyond = max(abs(z[a]) - FARTHEST, 0.0)
+        square += z[a] * z[a] + STIFF * beyond * beyond
         if z[a] != 0.0:
             for j in range(k):
                 eps[j] -= design[a, j] * z[a]
@@ -206,9 +210,12 @@ def _normal_equations(
         total = 0.0
         for j in range(k):
             total += design[a, j] * pull[j] * eps[j]
-        gradient[a] = total - z[a]
+        beyond = max(abs(z[a]) - FARTHEST, 0.0)
+        gradient[a] = total - z[a] - math.copysign(STIFF * beyond, z[a])
         for b in range(a + 1):
-            total = 1.0 if a == b else 0.0
+            total = 0.0
+            if a == b:
+                total = 1.0 + STIFF if beyond > 0.0 else 1.0
             for j in range(k):
                 total += design[a, j] * design[b, j] * bend[j]
             curvature[a, b] = total

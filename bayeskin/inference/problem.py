@@ -30,7 +30,9 @@ class LogPosterior:
     """Posterior of material and noise parameters given one recording's bins.
 
     `fit_windows` [s] says which bins are fitted (those wholly inside one), None means all.
-    `material` replaces the surrogate's own prior; its box must lie in the surrogate's.
+    `material` replaces the surrogate's own prior; its box must lie in the surrogate's. Where the
+    surrogate's sd, RMS over all bins, exceeds `sure_within_n` [N], the density is zero: a surrogate that
+    knows next to nothing there would otherwise explain anything.
     Raises InputError when surrogate, bins, windows or priors do not belong together.
     """
 
@@ -39,6 +41,7 @@ class LogPosterior:
     fit_windows: tuple[tuple[float, float], ...] | None = None
     noise_priors: NoisePriors = field(default_factory=NoisePriors)
     material: ParameterSpace | None = None
+    sure_within_n: float | None = None
 
     def __post_init__(self) -> None:
         ours, theirs = self.binned.edges_s, self.surrogate.edges_s
@@ -116,7 +119,12 @@ class LogPosterior:
 
     def log_likelihood(self, theta: ArrayLike) -> Array:
         """Log-likelihood (n,) at SI values (n, D) in the box."""
-        return log_likelihood(self.chain, self.predict(theta), self.split(theta)[1])
+        prediction = self.predict(theta)
+        found = log_likelihood(self.chain, prediction, self.split(theta)[1])
+        if self.sure_within_n is None:
+            return found
+        unsure = np.mean(prediction.sd() ** 2, axis=1) > self.sure_within_n**2
+        return np.where(unsure, -np.inf, found)
 
     @cached_property
     def blocks(self) -> tuple[int, ...]:

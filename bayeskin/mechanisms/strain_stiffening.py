@@ -5,7 +5,7 @@ fibres' second Piola-Kirchhoff stress S where they are 25 % longer, E = 1.25^2 -
 about what a test of a skin's strain sees, so that k2 bends the curve and does not lift it.
 
 Range of S: k1 up to 1e6 Pa; slopes of 1 to 83 MPa in excised skin, taut: Annaidh et al., J. Mech. Behav.
-Biomed. Mater. 5 (2012), 139-148. A k2 above 30 locks at the strains beside the pads.
+Biomed. Mater. 5 (2012), 139-148. A k2 above 50 locks at the strains beside the pads.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ MECHANISM = Mechanism(
             stress_power=1,
             offset=1e3,
         ),
-        Parameter("k2", "-", 1.0, 30.0, "log-uniform", "how fast the fibres stiffen"),
+        Parameter("k2", "-", 1.0, 50.0, "log-uniform", "how fast the fibres stiffen"),
         Parameter("dispersion", "-", 0.0, 1 / 3, "uniform", "of the fibres: 0 all along x, 1/3 none"),
     ),
     neutral={"fibre_stress": 0.0, "k2": 5.0, "dispersion": 0.0},

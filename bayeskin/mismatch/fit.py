@@ -1,31 +1,56 @@
 """A set of mechanisms refitted with everything else free, and its evidence.
 
-The evidence is Laplace's in coordinates u of the unit cube, in which every prior is uniform, with each
-eigenvalue l of the Hessian of -log p joined by the prior's own,
+The evidence is Laplace's in coordinates u of the unit cube, in which every prior is uniform. With the
+expected information I of the likelihood at the best point u*, its eigenvalues l joined by the prior's own,
 
-    log Z = log p(y | u*) + sum 1/2 log(2 pi / (max(l, 0) + 2 pi)) ,
+    log Z = log p(y | u*) + sum 1/2 log(2 pi / (l + 2 pi)) ,
 
 so that a direction that the data does not inform costs nothing, and one that they do costs the share of the
-prior that they leave (Tierney & Kadane 1986, JASA 81:82; what follows where l = 0 is exact).
+prior that they leave (Tierney & Kadane 1986, JASA 81:82; what follows where l = 0 is exact). A coordinate
+on its bound, toward which the density rises by g, has int_0^1 exp(-g t - l t^2 / 2) dt instead.
+
+The noise of a diagnosis is what an instrument does from moment to moment: its sd is bounded by what the
+recording shows within bins, and it forgets within seconds. What is larger or lasts longer is for physics to
+explain; noise that could take it up would leave nothing to find.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from bayeskin.inference import LogPosterior
-from bayeskin.inference.optimise import climb
+from bayeskin.inference import LogPosterior, NoisePriors
+from bayeskin.inference.gauss_newton import Top, gauss_newton
 from bayeskin.inference.straighten import Shear
-from bayeskin.types import Array
+from bayeskin.types import Array, BinnedForce
 
-STEP = 1e-3  # of the unit cube, for second differences
-DRAWS = 400  # of the priors of what is new, from which a climb starts
-STARTS = 2
-EVALUATIONS = 1500
+NOISE_SHARE = 5.0  # sd of the noise, at most, of the median sd of a bin's own mean
+LONGEST_S = 5.0  # of the noise's memory: breathing, and no longer
+FEWEST_TAILS = 20.0  # of the tail index: nearly normal, since spikes are gone from robust means of bins
+SURE = 0.03  # sd of the surrogate, RMS, at most, of the recorded force's range
+DRAWS = 128  # of the prior, from which climbs start
+BASE_STARTS, STARTS = 10, 3
+ROUNDS = 25
+EDGE = 1e-6  # of the unit cube: on a bound
+
+
+def instrument_noise(binned: BinnedForce) -> NoisePriors:
+    """Bounds of the noise of a diagnosis, from the scatter within the recording's own bins."""
+    typical = float(np.sqrt(np.nanmedian(binned.variance_n2)))
+    lowest = NoisePriors().sd_n[0]
+    return NoisePriors(
+        sd_n=(lowest, max(NOISE_SHARE * typical, 2.0 * lowest)),
+        tau_s=(NoisePriors().tau_s[0], LONGEST_S),
+        nu=(FEWEST_TAILS, NoisePriors().nu[1]),
+    )
+
+
+def surrogate_limit(binned: BinnedForce) -> float:
+    """RMS sd [N] of a surrogate beyond which it is not to be relied on for this recording."""
+    return SURE * float(np.nanmax(binned.force_n) - np.nanmin(binned.force_n))
 
 
 @dataclass(frozen=True)
@@ -63,6 +88,13 @@ class Fit:
         return float(values.mean()), float(values.std())
 
 
+def fit_base(log_posterior: LogPosterior, seed: int, shear: Shear | None) -> Fit:
+    """Without any mechanism: the best of climbs from the most probable of many draws of the prior."""
+    low, high = log_posterior.bounds
+    trials = np.random.default_rng(seed).uniform(low, high, (8 * DRAWS, log_posterior.dim))
+    return _best((), log_posterior, _likely(log_posterior, trials, BASE_STARTS), shear)
+
+
 def fit(
     names: Sequence[str],
     log_posterior: LogPosterior,
@@ -74,55 +106,58 @@ def fit(
 ) -> Fit:
     """The best of a few climbs from `start`, which has the values of a smaller set.
 
-    What `start` does not have begins at its value in `before`, an earlier fit; where there is none, at its
-    neutral value and at the best of many draws of its prior. `shear` straightens the ridges of this
+    What `start` does not have begins at its neutral value, and at its value in `before`, an earlier fit;
+    where there is none, at the best of many draws of its prior. `shear` straightens the ridges of this
     posterior, where it is known.
     """
-    known = {**neutral, **(before or {}), **start}
-    fresh = [] if before else [i for i, name in enumerate(log_posterior.names) if name not in start]
     low, high = log_posterior.bounds
-    known_line = np.clip(log_posterior.vector(known), low, high)
-    trials = np.tile(known_line, (DRAWS, 1))
-    rng = np.random.default_rng(seed)
-    trials[1:, fresh] = rng.uniform(low[fresh], high[fresh], (DRAWS - 1, len(fresh)))
+    starts = [np.clip(log_posterior.vector({**neutral, **start}), low, high)]
+    fresh = [i for i, name in enumerate(log_posterior.names) if name not in start]
+    if before:
+        starts.append(np.clip(log_posterior.vector({**neutral, **before, **start}), low, high))
+        if set(log_posterior.names) <= set(before) | set(start):
+            starts.append(np.clip(log_posterior.vector({**neutral, **start, **before}), low, high))
+    elif fresh:
+        rng = np.random.default_rng(seed)
+        trials = np.tile(starts[0], (DRAWS, 1))
+        trials[:, fresh] = rng.uniform(low[fresh], high[fresh], (DRAWS, len(fresh)))
+        starts += _likely(log_posterior, trials, STARTS)
+    return _best(names, log_posterior, starts, shear)
+
+
+def _likely(log_posterior: LogPosterior, trials: Array, count: int) -> list[Array]:
     values = log_posterior.log_prob(trials)
-    order = [0, *(i for i in np.argsort(-values) if i != 0)]
-    chosen = order[:STARTS] if fresh else order[:1]
-    ends = [
-        climb(log_posterior, log_posterior.named(log_posterior.from_sampling(trials[i])), EVALUATIONS, shear)
-        for i in chosen
-    ]
-    best = max(ends, key=lambda end: end.value)
-    found = Fit(tuple(names), log_posterior, best.theta, best.value, np.nan, np.zeros((0, 0)))
-    return _with_evidence(found)
+    return [trials[i] for i in np.argsort(-values)[:count] if np.isfinite(values[i])]
 
 
-def _with_evidence(found: Fit) -> Fit:
-    hessian = _hessian(found)
-    values, vectors = np.linalg.eigh(hessian)
-    values = np.maximum(values, 0.0) + 2.0 * np.pi
-    low, high = found.log_posterior.bounds
-    at_point = found.value + float(np.sum(np.log(high - low)))  # the likelihood itself
-    log_evidence = at_point + 0.5 * float(np.sum(np.log(2.0 * np.pi / values)))
-    covariance = (vectors / np.maximum(values, 12.0)) @ vectors.T
-    return replace(found, log_evidence=log_evidence, covariance=covariance)
+def _best(
+    names: Sequence[str], log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None
+) -> Fit:
+    tops = [gauss_newton(log_posterior, start, shear, ROUNDS) for start in starts]
+    top = max(tops, key=lambda one: one.value)
+    theta = log_posterior.named(log_posterior.from_sampling(top.vector))
+    return Fit(tuple(names), log_posterior, theta, top.value, *_evidence(log_posterior, top))
 
 
-def _hessian(found: Fit) -> Array:
-    """Second differences (D, D) of -log p over the unit cube, one-sided where a bound is near."""
-    log_posterior, dim = found.log_posterior, len(found.unit)
+def _evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
+    """Log evidence, and the covariance (D, D) over the unit cube."""
     low, high = log_posterior.bounds
-    centre = np.clip(found.unit, 2 * STEP, 1.0 - 2 * STEP)
-    eye = STEP * np.eye(dim)
-    pairs = [(i, j) for i in range(dim) for j in range(i)]
-    points = [centre, *(centre + s * e for e in eye for s in (1, -1))]
-    points += [
-        centre + a * eye[i] + b * eye[j] for i, j in pairs for a, b in ((1, 1), (-1, -1), (1, -1), (-1, 1))
-    ]
-    values = -log_posterior.log_prob(low + np.array(points) * (high - low))
-    hessian = np.empty((dim, dim))
-    ahead, behind = values[1 : 2 * dim + 1 : 2], values[2 : 2 * dim + 1 : 2]
-    hessian[np.diag_indices(dim)] = (ahead + behind - 2 * values[0]) / STEP**2
-    for (i, j), (pp, mm, pm, mp) in zip(pairs, values[2 * dim + 1 :].reshape(-1, 4), strict=True):
-        hessian[i, j] = hessian[j, i] = (pp + mm - pm - mp) / (4 * STEP**2)
-    return np.where(np.isfinite(hessian), hessian, 0.0)
+    unit = (top.vector - low) / (high - low)
+    uphill = np.where(unit < EDGE, -top.gradient, np.where(unit > 1.0 - EDGE, top.gradient, 0.0))
+    held = uphill > 0.0
+    free = ~held
+    values, vectors = np.linalg.eigh(top.information[np.ix_(free, free)])
+    values = np.maximum(values, 0.0) + 2.0 * np.pi
+    t = np.linspace(0.0, 1.0, 2001) ** 3  # close together where the integrand is steep
+    steep, curved = uphill[held], np.diag(top.information)[held]
+    density = np.exp(-np.outer(steep, t) - 0.5 * np.outer(curved, t**2))
+    mass = np.trapezoid(density, t, axis=1)
+    log_likelihood = top.value + float(np.sum(np.log(high - low)))
+    log_evidence = (
+        log_likelihood + 0.5 * float(np.sum(np.log(2.0 * np.pi / values))) + float(np.sum(np.log(mass)))
+    )
+    covariance = np.zeros((len(unit), len(unit)))
+    covariance[np.ix_(free, free)] = (vectors / np.maximum(values, 12.0)) @ vectors.T
+    away = np.trapezoid(density * t**2, t, axis=1) / mass  # mean square, from the bound
+    covariance[held, held] = away
+    return log_evidence, covariance

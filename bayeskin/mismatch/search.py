@@ -16,7 +16,7 @@ import numpy as np
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import Mechanism
-from bayeskin.mismatch.fit import Fit, fit
+from bayeskin.mismatch.fit import Fit, fit, fit_base
 
 PRIOR = 0.05  # of a mechanism to be at work, before the recording is seen
 MOST = 5  # mechanisms of one set
@@ -55,21 +55,23 @@ def weight(found: Fit) -> float:
 
 
 def search(
-    build: Build, known: Mapping[str, Mechanism], base: Fit, seed: int, progress: Progress | None = None
+    build: Build, known: Mapping[str, Mechanism], seed: int, progress: Progress | None = None
 ) -> Search:
-    """Forward from `base`, the fit without any mechanism, then backward."""
+    """Forward from the fit without any mechanism, then backward."""
+    alone = build(())
+    straight = find_shear(alone)
+    base = fit_base(alone, seed, straight)
     found = Search({(): base})
     neutral = {name: value for m in known.values() for name, value in m.neutral.items()}
     candidates = list(known)
-    straight = find_shear(base.log_posterior)
 
     def tried(names: Sequence[str], start: Fit, before: Fit | None = None) -> Fit:
         key = tuple(sorted(names))
         if key not in found.fits:
             wide = build(key)
             shear = straight.among(base.log_posterior.names, wide.names) if straight else None
-            alone = before.theta if before else None
-            found.fits[key] = fit(key, wide, start.theta, neutral, seed, shear, alone)
+            earlier = before.theta if before else None
+            found.fits[key] = fit(key, wide, start.theta, neutral, seed, shear, earlier)
         return found.fits[key]
 
     last: dict[str, Fit] = {}  # the latest fit with a candidate

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from bayeskin import inference, report, storage
-from bayeskin.inference import LogPosterior, NoisePriors, find_map
+from bayeskin.inference import LogPosterior
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import Instrument
-from bayeskin.mismatch.fit import Fit, fit
+from bayeskin.mismatch.fit import Fit, instrument_noise, surrogate_limit
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.search import Search, search
@@ -29,8 +29,6 @@ from bayeskin.pipeline.stages import STAGES
 from bayeskin.pipeline.training import base_surrogate
 from bayeskin.surrogates import Effect, with_effects
 from bayeskin.types import Array, BinnedForce, PadMotion, Surrogate
-
-STARTS, EVALUATIONS = 4, 6000  # of the base's own search
 
 
 @dataclass(frozen=True)
@@ -46,14 +44,16 @@ class Workbench:
 
     def posterior(self, windows: Sequence[tuple[float, float]] | None, names: Sequence[str]) -> LogPosterior:
         """The posterior with a set of mechanisms, fitted in `windows`."""
-        noise = {name: bounds for name, bounds in self.run.config.noise if bounds is not None}
+        asked = {name: bounds for name, bounds in self.run.config.noise if bounds is not None}
+        noise = replace(instrument_noise(self.binned), **asked)
         parts = [effect for effect in self.effects if effect.mechanism in names]
         skin: Surrogate = with_effects(self.base, parts)  # type: ignore[arg-type]
         instrument = tuple(self.known[n] for n in names if isinstance(self.known[n].act, Instrument))
         seen = ObservedSurrogate(skin, instrument, self.motion) if instrument else skin
         return LogPosterior(
-            seen, self.binned, None if windows is None else tuple(windows), NoisePriors(**noise)
-        )
+            seen, self.binned, None if windows is None else tuple(windows), noise,
+            sure_within_n=surrogate_limit(self.binned),
+        )  # fmt: skip
 
 
 def diagnose(config: Path, reporter: Reporter) -> dict[str, Any]:
@@ -102,11 +102,8 @@ def _workbench(run: Run) -> Workbench:
 def _searched(bench: Workbench, windows: Sequence[tuple[float, float]] | None, label: str) -> Search:
     reporter, seed = bench.run.reporter, bench.run.config.seed
     build = partial(bench.posterior, windows)
-    alone = build(())
-    start = find_map(alone, seed, STARTS, EVALUATIONS)
-    base = fit((), alone, start.theta, {}, seed)
     reporter.log(f"{label}: {len(bench.known)} mechanisms to try")
-    found = search(build, bench.known, base, seed, lambda share, note: reporter.progress(label, share, note))
+    found = search(build, bench.known, seed, lambda share, note: reporter.progress(label, share, note))
     reporter.log(f"{label}: {', '.join(found.best.names) or 'nothing'}")
     return found
 
