@@ -6,9 +6,9 @@ whitened by the chain, w and G, the innovations are eps(z) = w - G z, independen
 
     p(y) = prod_j 1/(s_j sqrt(1 - rho_j^2)) * int N(z; 0, I) prod_j t_nu(eps_j(z)) dz .
 
-N is the normal density within three sd; beyond, its logarithm falls by 50 (|z| - 3)^2 more, since a surrogate
-that were wrong by tens of its sd could explain any misfit by an error that it denies. The integral is Gaussian
-and exact for nu = inf within three sd. For finite nu it is Laplace's approximation about the
+N is the normal density within three sd; beyond, its logarithm falls by 50 (|z| - 3)^2 more, since a
+surrogate that were wrong by tens of its sd could explain any misfit by an error that it denies. The integral
+is Gaussian and exact for nu = inf within three sd. For finite nu it is Laplace's approximation about the
 mode, found by reweighted least squares and then Newton steps (Tierney & Kadane 1986, JASA 81:82; Lange,
 Little & Taylor 1989, JASA 84:881). Float64 throughout; one thread; one call for any number of points.
 """

@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,7 @@ FEWEST_TAILS = 20.0  # of the tail index: nearly normal, since spikes are gone f
 SURE = 0.03  # sd of the surrogate, RMS, at most, of the recorded force's range
 DRAWS = 128  # of the prior, from which climbs start
 BASE_STARTS, STARTS = 10, 3
-ROUNDS = 25
+FIRST_ROUNDS, ROUNDS = 4, 25  # of every climb, and of the one that is then ahead
 EDGE = 1e-6  # of the unit cube: on a bound
 
 
@@ -88,6 +89,19 @@ class Fit:
         return float(values.mean()), float(values.std())
 
 
+def stored(found: Fit) -> dict[str, Any]:
+    """A fit without its posterior, as JSON has it."""
+    plain = {"names": list(found.names), "theta": dict(found.theta), "value": found.value}
+    return {**plain, "log_evidence": found.log_evidence, "covariance": found.covariance.tolist()}
+
+
+def restored(plain: Mapping[str, Any], log_posterior: LogPosterior) -> Fit:
+    """The fit of `stored`, of the posterior that it was made from."""
+    covariance = np.asarray(plain["covariance"], dtype=float)
+    value, log_evidence = plain["value"], plain["log_evidence"]
+    return Fit(tuple(plain["names"]), log_posterior, plain["theta"], value, log_evidence, covariance)
+
+
 def fit_base(log_posterior: LogPosterior, seed: int, shear: Shear | None) -> Fit:
     """Without any mechanism: the best of climbs from the most probable of many draws of the prior."""
     low, high = log_posterior.bounds
@@ -133,8 +147,9 @@ def _likely(log_posterior: LogPosterior, trials: Array, count: int) -> list[Arra
 def _best(
     names: Sequence[str], log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None
 ) -> Fit:
-    tops = [gauss_newton(log_posterior, start, shear, ROUNDS) for start in starts]
-    top = max(tops, key=lambda one: one.value)
+    first = [gauss_newton(log_posterior, start, shear, FIRST_ROUNDS) for start in starts]
+    ahead = max(first, key=lambda one: one.value)
+    top = gauss_newton(log_posterior, ahead.vector, shear, ROUNDS)
     theta = log_posterior.named(log_posterior.from_sampling(top.vector))
     return Fit(tuple(names), log_posterior, theta, top.value, *_evidence(log_posterior, top))
 

@@ -1,8 +1,8 @@
 """Which mechanisms: forward from none, each tried with all other parameters free again.
 
 A set's weight is its evidence times the prior of its size, every mechanism being there with the probability
-`PRIOR`. After each step all but the least promising are tried beside those taken; then each taken one is left
-out again, so that what a later one has made needless goes. Probabilities are shares of weight over all sets
+`PRIOR`. After each step all others are tried beside those taken, and each taken one is left out again, so
+that what a later one has made needless goes. Probabilities are shares of weight over all sets
 that were tried: those of sets never tried count as nothing.
 """
 
@@ -19,8 +19,7 @@ from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.fit import Fit, fit, fit_base
 
 PRIOR = 0.05  # of a mechanism to be at work, before the recording is seen
-MOST = 5  # mechanisms of one set
-TRIED_AGAIN = 8  # candidates of a round that the next one tries
+MOST = 8  # steps
 ONLY_WITH = {"friction-creep": "device-friction"}
 
 Build = Callable[[Sequence[str]], LogPosterior]  # the posterior with a set of mechanisms
@@ -55,43 +54,61 @@ def weight(found: Fit) -> float:
 
 
 def search(
-    build: Build, known: Mapping[str, Mechanism], seed: int, progress: Progress | None = None
+    build: Build,
+    known: Mapping[str, Mechanism],
+    seed: int,
+    progress: Progress | None = None,
+    done: Mapping[tuple[str, ...], Fit] | None = None,
+    on_fit: Callable[[Fit], None] | None = None,
 ) -> Search:
-    """Forward from the fit without any mechanism, then backward."""
+    """Forward from the fit without any mechanism, then backward.
+
+    done : fits of an earlier search that was stopped, which are not made again; on_fit is told each new one
+    """
+    done = done or {}
     alone = build(())
     straight = find_shear(alone)
-    base = fit_base(alone, seed, straight)
-    found = Search({(): base})
     neutral = {name: value for m in known.values() for name, value in m.neutral.items()}
-    candidates = list(known)
+
+    def kept(key: tuple[str, ...], make: Callable[[], Fit]) -> Fit:
+        if key not in found.fits:
+            found.fits[key] = done[key] if key in done else make()
+            if key not in done and on_fit:
+                on_fit(found.fits[key])
+        return found.fits[key]
 
     def tried(names: Sequence[str], start: Fit, before: Fit | None = None) -> Fit:
         key = tuple(sorted(names))
-        if key not in found.fits:
-            wide = build(key)
-            shear = straight.among(base.log_posterior.names, wide.names) if straight else None
-            earlier = before.theta if before else None
-            found.fits[key] = fit(key, wide, start.theta, neutral, seed, shear, earlier)
-        return found.fits[key]
 
+        def make() -> Fit:
+            wide = build(key)
+            shear = straight.among(alone.names, wide.names) if straight else None
+            return fit(key, wide, start.theta, neutral, seed, shear, before.theta if before else None)
+
+        return kept(key, make)
+
+    found = Search({})
+    kept((), lambda: fit_base(alone, seed, straight))
     last: dict[str, Fit] = {}  # the latest fit with a candidate
-    for size in range(MOST):
+    for size in range(1, MOST + 1):
         current = found.best
-        gains: dict[str, float] = {}
-        for done, name in enumerate(candidates):
-            if name in current.names:
-                continue
+        others = [name for name in known if name not in current.names]
+        for count, name in enumerate(others):
             names = {*current.names, name, *([ONLY_WITH[name]] if name in ONLY_WITH else [])}
-            one = tried(sorted(names), current, last.get(name))
-            last[name] = one
-            gains[name] = weight(one) - weight(current)
+            last[name] = one = tried(sorted(names), current, last.get(name))
             if progress:
                 note = f"{name}: {one.log_evidence - current.log_evidence:+.1f} nats"
-                progress((done + 1) / len(candidates), f"mechanism {size + 1}: {note}")
+                progress((count + 1) / len(others), f"mechanism {size}: {note}")
+        while len(found.best.names) > 1 and (leaner := _leaner(found.best, tried)) is not None:
+            found.fits[leaner.names] = leaner
         if found.best is current:
             break
-        candidates = sorted(gains, key=lambda name: -gains[name])[:TRIED_AGAIN]
-    for name in found.best.names:
-        rest = [other for other in found.best.names if other != name]
-        tried([n for n in rest if ONLY_WITH.get(n, n) in rest or n not in ONLY_WITH], found.best)
     return found
+
+
+def _leaner(best: Fit, tried: Callable[[Sequence[str], Fit], Fit]) -> Fit | None:
+    """The best of the sets with one mechanism fewer, where that has more weight."""
+    sets = [[other for other in best.names if other != name] for name in best.names]
+    sets = [[n for n in names if n not in ONLY_WITH or ONLY_WITH[n] in names] for names in sets]
+    fewer = max((tried(names, best) for names in sets), key=weight)
+    return fewer if weight(fewer) > weight(best) else None

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import multiprocessing
+import re
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,22 +15,27 @@ from typing import Any
 
 import numpy as np
 
+import bayeskin
 from bayeskin import inference, report, storage
+from bayeskin.config import Config, RecordingConfig, SurrogateConfig
+from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import Instrument
-from bayeskin.mismatch.fit import Fit, instrument_noise, surrogate_limit
+from bayeskin.mismatch.fit import Fit, instrument_noise, restored, stored, surrogate_limit
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.observed import ObservedSurrogate
-from bayeskin.mismatch.search import Search, search
+from bayeskin.mismatch.search import Build, Search, search
 from bayeskin.mismatch.verdict import judge
-from bayeskin.pipeline.effects import effects_of
-from bayeskin.pipeline.engine import Reporter, Run, open_run, run_stages
-from bayeskin.pipeline.folder import plain, write_json
+from bayeskin.pipeline import design, recording, training
+from bayeskin.pipeline.effects import effect_files, effects_of
+from bayeskin.pipeline.engine import Reporter, Run, Silent, Stage, open_run, run_stages
+from bayeskin.pipeline.folder import plain, sha256_of, write_json
 from bayeskin.pipeline.provenance import caption
-from bayeskin.pipeline.stages import STAGES
+from bayeskin.pipeline.shipping import shipped_for
 from bayeskin.pipeline.training import base_surrogate
+from bayeskin.recordings import read_recording, segment
 from bayeskin.surrogates import Effect, with_effects
 from bayeskin.types import Array, BinnedForce, PadMotion, Surrogate
 
@@ -42,33 +51,64 @@ class Workbench:
     effects: tuple[Effect, ...]
     known: Mapping[str, Mechanism]
 
-    def posterior(self, windows: Sequence[tuple[float, float]] | None, names: Sequence[str]) -> LogPosterior:
-        """The posterior with a set of mechanisms, fitted in `windows`."""
+    def posterior(self, until_s: float | None, names: Sequence[str]) -> LogPosterior:
+        """The posterior with a set of mechanisms, fitted up to a time (None: to the end)."""
         asked = {name: bounds for name, bounds in self.run.config.noise if bounds is not None}
-        noise = replace(instrument_noise(self.binned), **asked)
         parts = [effect for effect in self.effects if effect.mechanism in names]
         skin: Surrogate = with_effects(self.base, parts)  # type: ignore[arg-type]
         instrument = tuple(self.known[n] for n in names if isinstance(self.known[n].act, Instrument))
         seen = ObservedSurrogate(skin, instrument, self.motion) if instrument else skin
         return LogPosterior(
-            seen, self.binned, None if windows is None else tuple(windows), noise,
-            sure_within_n=surrogate_limit(self.binned),
+            seen, self.binned, None if until_s is None else ((0.0, until_s),),
+            replace(instrument_noise(self.binned), **asked), sure_within_n=surrogate_limit(self.binned),
         )  # fmt: skip
 
 
-def diagnose(config: Path, reporter: Reporter) -> dict[str, Any]:
-    """The answer of `bayeskin diagnose` on a configuration's run. Raises InputError for bad input."""
+def diagnose(source: Path, reporter: Reporter) -> dict[str, Any]:
+    """The answer of `bayeskin diagnose` on a configuration's run, or on a recording by itself.
+
+    Outputs go to the run's folder, or to STEM-diagnosis beside the recording. Raises InputError for bad
+    input, among it a recording whose protocol no shipped surrogate knows.
+    """
+    opened = _opened(source, reporter)
+    stages = {stage.name: stage for stage in (recording.STAGE, design.STAGE, training.STAGE, STAGE)}
+    outcome = run_stages(opened, stages)[-1]
+    answer = {**outcome.record.summary, "ok": outcome.ok, "folder": opened.folder / STAGE.name}
+    text = _in_words(answer) if outcome.record.done else f"{outcome.stage}: failed: {answer['message']}"
+    return plain({**answer, "text": text})
+
+
+def _opened(source: Path, reporter: Reporter) -> Run:
+    if source.suffix == ".toml":
+        return open_run(source, reporter)
+    found = read_recording(source)
+    surrogate = shipped_for(recording.pad_motion("reaction", found, segment(found), "idealised"))
+    if surrogate is None:
+        raise InputError(
+            source, "a protocol that no shipped surrogate was trained on",
+            "a configuration with a design of its own: bayeskin diagnose CONFIG.toml",
+        )  # fmt: skip
+    config = Config(
+        name=re.sub(r"[^A-Za-z0-9._-]", "-", f"run-{source.stem}"),
+        recording=RecordingConfig(file=source.name), surrogate=SurrogateConfig(file=surrogate.name),
+    )  # fmt: skip
+    return Run(config, source, source.resolve().with_name(f"{source.stem}-diagnosis"), reporter)
+
+
+def _work(run: Run) -> Mapping[str, Any]:
     started = time.monotonic()
-    opened = open_run(config, reporter)
-    run_stages(opened, STAGES, "train")
-    bench = _workbench(opened)
-    whole = _searched(bench, None, "whole recording")
+    bench = _workbench(run)
     split_s = _end_of_second_hold(bench.binned)
-    begun = None if split_s is None else _searched(bench, ((0.0, split_s),), "up to the second hold's end")
-    before, after = locate(whole.base, opened.config.seed), locate(whole.best, opened.config.seed)
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as other:
+        beginning = None if split_s is None else other.submit(_search_apart, run.config_path, split_s)
+        whole = _searched(bench, None)
+        if beginning is not None:
+            run.reporter.log("waiting for the search on the recording's beginning")
+            beginning.result()
+    begun = None if split_s is None else _searched(bench, split_s)
+    before, after = locate(whole.base, run.config.seed), locate(whole.best, run.config.seed)
     found = judge(whole, bench.known, before, after)
     answer = {
-        "ok": True,
         "verdict": found.verdict,
         "located": [_window(one) for one in before.windows],
         "remaining": [_window(one) for one in after.windows],
@@ -83,11 +123,14 @@ def diagnose(config: Path, reporter: Reporter) -> dict[str, Any]:
         "held_out_set": list(begun.best.names) if begun else [],
         "seconds": time.monotonic() - started,
     }
-    folder = opened.folder / "diagnosis"
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "diagnosis.json", answer)
-    figures = _draw(bench, whole, before, after, answer, folder)
-    return plain({**answer, "figures": figures, "text": _in_words(answer, folder)})
+    write_json(run.at(STAGE.name, "diagnosis.json"), answer)
+    figures = _draw(bench, whole, before, after, answer)
+    return {**answer, "figures": [figure.name for figure in figures]}
+
+
+def _search_apart(source: Path, split_s: float) -> None:
+    """The search on the beginning, in a process of its own: its fits go to their file."""
+    _searched(_workbench(_opened(source, Silent())), split_s)
 
 
 def _workbench(run: Run) -> Workbench:
@@ -99,13 +142,39 @@ def _workbench(run: Run) -> Workbench:
     return Workbench(run, binned, motion, base_surrogate(run), tuple(effects), known)
 
 
-def _searched(bench: Workbench, windows: Sequence[tuple[float, float]] | None, label: str) -> Search:
-    reporter, seed = bench.run.reporter, bench.run.config.seed
-    build = partial(bench.posterior, windows)
-    reporter.log(f"{label}: {len(bench.known)} mechanisms to try")
-    found = search(build, bench.known, seed, lambda share, note: reporter.progress(label, share, note))
-    reporter.log(f"{label}: {', '.join(found.best.names) or 'nothing'}")
-    return found
+def _searched(bench: Workbench, until_s: float | None) -> Search:
+    """The search up to a time, going on from the fits that one stopped before has left."""
+    run, build = bench.run, partial(bench.posterior, until_s)
+    label = "whole recording" if until_s is None else f"up to {until_s:.1f} s"
+    identity = sha256_of(
+        [bayeskin.__version__, run.config.seed, build(()).identity, repr(build(()).noise_priors),
+         [repr(mechanism.parameters) for mechanism in bench.known.values()],
+         [[effect.part, dict(effect.surrogate.provenance)] for effect in bench.effects]]
+    )  # fmt: skip
+    file = run.folder / "searches" / f"{identity[:16]}.jsonl"
+    done = {one.names: one for one in _fits_in(file, build)}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with open(file, "a", encoding="utf-8") as handle:
+
+        def on_fit(found: Fit) -> None:
+            handle.write(json.dumps(stored(found)) + "\n")
+            handle.flush()
+
+        return search(
+            build, bench.known, run.config.seed,
+            lambda share, note: run.reporter.progress(label, share, note), done, on_fit,
+        )  # fmt: skip
+
+
+def _fits_in(file: Path, build: Build) -> list[Fit]:
+    """Fits of a search that was stopped; a last line that is not whole is dropped."""
+    if not file.is_file():
+        return []
+    text = file.read_text(encoding="utf-8")
+    whole = text[: text.rfind("\n") + 1]
+    if whole != text:
+        file.write_text(whole, encoding="utf-8")
+    return [restored(said, build(said["names"])) for said in map(json.loads, whole.splitlines())]
 
 
 def _end_of_second_hold(binned: BinnedForce) -> float | None:
@@ -190,7 +259,7 @@ def _fit(bench: Workbench, found: Fit, begun: Fit | None, split_s: float | None)
 
 
 def _draw(
-    bench: Workbench, found: Search, before: Located, after: Located, answer: Mapping[str, Any], folder: Path
+    bench: Workbench, found: Search, before: Located, after: Located, answer: Mapping[str, Any]
 ) -> list[Path]:
     binned = bench.binned
     figures = {
@@ -201,11 +270,11 @@ def _draw(
         ),
     }
     for name, figure in figures.items():
-        report.save_figure(figure, folder / name, caption(bench.run))
-    return [folder / f"{name}.{suffix}" for name in figures for suffix in ("png", "svg")]
+        report.save_figure(figure, bench.run.at(STAGE.name, name), caption(bench.run))
+    return [bench.run.at(STAGE.name, f"{name}.{suffix}") for name in figures for suffix in ("png", "svg")]
 
 
-def _in_words(answer: Mapping[str, Any], folder: Path) -> str:
+def _in_words(answer: Mapping[str, Any]) -> str:
     fits = answer["fit"]
     lines = [f"verdict: {answer['verdict']}"]
     lines += [
@@ -218,5 +287,19 @@ def _in_words(answer: Mapping[str, Any], folder: Path) -> str:
         rest = "" if held is None else f", {1e3 * held:.1f} mN on what follows the second hold, not fitted"
         lines.append(f"{when}: RMSE {1e3 * fits[when]['rmse']:.1f} mN{rest}")
     best = ", ".join(f"{one['name']} {one['delta_score']:+.1f}" for one in answer["candidates"][:5])
-    lines += [f"candidates alone, log evidence gained: {best}", f"outputs in {folder}"]
+    lines += [f"candidates alone, log evidence gained: {best}", f"outputs in {answer['folder']}"]
     return "\n".join(lines)
+
+
+def _files(run: Run) -> list[Path]:
+    return effect_files(run) if run.config.model.observation == "reaction" else []
+
+
+STAGE = Stage(
+    "diagnose",
+    "finds what the model leaves out",
+    ("recording", "design", "train"),
+    ("seed", "model", "parameters", "noise", "surrogate"),
+    _work,
+    _files,
+)

@@ -132,17 +132,19 @@ def _learn(run: Run, part: Part) -> dict[str, Any]:
     return _train(run, part, base, design)
 
 
-def effects_of(run: Run) -> list[Effect]:
-    """Effects that this run has learnt, else those shipped beside its surrogate; [] where there are none.
-
-    Raises InputError for files of another model.
-    """
+def effect_files(run: Run) -> list[Path]:
+    """Of the effects that this run has learnt, else of those shipped with its surrogate; [] without any."""
     file = run.config.surrogate.file
     folder = run.folder / "effects"
     if not list(folder.glob("*.json")) and file is not None:
         folder = shipped_files(run).surrogate.with_name(f"{Path(file).stem}-effects")
+    return sorted(path for path in folder.glob("*.h5") if not path.stem.endswith("-design"))
+
+
+def effects_of(run: Run) -> list[Effect]:
+    """The effects in `effect_files`. Raises InputError for files of another model."""
     found = []
-    for path in sorted(path for path in folder.glob("*.h5") if not path.stem.endswith("-design")):
+    for path in effect_files(run):
         said, surrogate = load_manifest(path), load_surrogate(path)
         if said["model_hash"] != model_spec(run).hash:
             raise InputError(path, "an effect of another model", "one of this configuration's model")

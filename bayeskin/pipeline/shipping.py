@@ -3,6 +3,7 @@ NAME-fine.h5, the fine model's runs, where the design is a coarser one's."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,6 +44,17 @@ def shipped_files(run: Run) -> ShippedFiles:
         if not file.is_file():
             raise InputError(f"{run.config_path}: surrogate.file", f"no {file}", "its design beside it")
     return files
+
+
+def shipped_for(motion: PadMotion) -> Path | None:
+    """The shipped surrogate of the reaction on the generator's bricks for a protocol, if there is one."""
+    folder = shipped("surrogates/README.md").parent
+    for path in sorted(folder.glob("*.json")):
+        said = json.loads(path.read_text(encoding="utf-8"))
+        ours = (said.get("observation"), said.get("mesh")) == ("reaction", "bricks")
+        if ours and said.get("motion_sha256") == motion_sha256(motion):
+            return path.with_suffix(".h5")
+    return None
 
 
 def origin(run: Run, motion: PadMotion, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

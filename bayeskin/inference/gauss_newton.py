@@ -1,0 +1,217 @@
+"""A local maximum of the posterior in few predictions: Gauss-Newton on the force, the noise in between.
+
+Each round makes the noise parameters the most probable ones for the present force, then takes the force as
+linear in the material parameters, by one-sided differences, and solves the robust regression of the residual
+on them and on the surrogate's own error, within the prior box. Steps of several damped lengths are tried,
+straight and along the ridge of the moduli (`straighten`); the best of them is taken if the posterior itself
+rises. The information matrix that the last round used is the posterior's curvature by Fisher scoring, with
+the t's (nu + 1) / (nu + 3) for each innovation (Lange, Little & Taylor 1989, JASA 84:881).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
+from bayeskin.inference.noise_model import NoiseChain, scales
+from bayeskin.inference.problem import LogPosterior
+from bayeskin.inference.straighten import Shear
+from bayeskin.types import Array, Prediction
+
+STEP = 1e-4  # of the box, for differences
+DAMPED = (0.0, 1e-2, 1.0, 1e2, 1e4)  # shares of the information added to its diagonal
+ENOUGH = 0.02  # nats a round
+REWEIGHTED = 4  # steps of the regression with t weights
+
+
+@dataclass(frozen=True)
+class Top:
+    """Where a climb ended: sampling coordinates (D,), log density, information (D, D) and gradient (D,).
+
+    Both are those of the log density over the unit cube; the material and the noise do not mix in the
+    information. `rounds` that were made.
+    """
+
+    vector: Array
+    value: float
+    information: Array
+    gradient: Array
+    rounds: int
+
+
+def gauss_newton(log_posterior: LogPosterior, start: Array, shear: Shear | None, rounds: int = 40) -> Top:
+    """From `start` (D,) in sampling coordinates; `shear` straightens this posterior, where it is known."""
+    low, high = log_posterior.bounds
+    x = np.clip(np.asarray(start, dtype=float), low, high)
+    value = float(log_posterior.log_prob(x[None])[0])
+    small = made = 0
+    while made < rounds and small < 2:
+        made += 1
+        before = value
+        linear = _Linear(log_posterior, x)
+        x = linear.with_noise()
+        trials = _trials(linear, x, shear)
+        values = log_posterior.log_prob(trials)
+        best = int(np.argmax(values))
+        x, value = trials[best], float(values[best])
+        small = small + 1 if value - before < ENOUGH else 0
+    last = _Linear(log_posterior, x)
+    return Top(x, value, *last.curvature(), made)
+
+
+def _trials(linear: _Linear, x: Array, shear: Shear | None) -> Array:
+    """The present point and those that the linear force proposes, (n, D), in the box."""
+    low, high = linear.log_posterior.bounds
+    trials = [x]
+    for share in DAMPED:
+        step = linear.step(x, share)
+        trials.append(x + step)
+        if shear is not None:
+            here = shear.straight(x[None])
+            ahead = (shear.straight((x + 1e-6 * step)[None]) - here) / 1e-6
+            trials.append(shear.back(here + ahead)[0])
+    return np.clip(np.array(trials), low, high)
+
+
+class _Linear:
+    """The force linear about one point of the material parameters, and the noise there."""
+
+    def __init__(self, log_posterior: LogPosterior, x: Array) -> None:
+        self.log_posterior, self.x = log_posterior, x
+        self.chain: NoiseChain = log_posterior.chain
+        self.low, self.high = log_posterior.bounds
+        self.inner = log_posterior.surrogate.space.dim
+        width = self.high - self.low
+        side = np.where(x + STEP * width <= self.high, 1.0, -1.0)[: self.inner]
+        points = np.repeat(x[None], self.inner + 1, axis=0)
+        points[1:, : self.inner] += np.diag(side * STEP * width[: self.inner])
+        found = log_posterior.predict(log_posterior.from_sampling(points))
+        self.here = Prediction(found.mean[:1], found.factor[:1], found.diagonal[:1])
+        bins = self.chain.bins
+        slope = (found.mean[1:] - found.mean[0])[:, bins] / (side * STEP)[:, None]
+        self.slope = slope.T  # (k, inner), a box width
+        self.noise = x[self.inner :]
+
+    def with_noise(self) -> Array:
+        """The point with the most probable noise for its force."""
+        low, high = self.low[self.inner :], self.high[self.inner :]
+        found = minimize(
+            self._minus, (self.noise - low) / (high - low), jac=True, method="L-BFGS-B",
+            bounds=[(0.0, 1.0)] * len(low), options={"maxiter": 6, "ftol": 1e-9},
+        )  # fmt: skip
+        unit = np.clip(found.x, 0.0, 1.0)
+        if self._values(unit[None])[0] >= self._values(((self.noise - low) / (high - low))[None])[0]:
+            self.noise = low + unit * (high - low)
+        return np.concatenate([self.x[: self.inner], self.noise])
+
+    def _values(self, unit: Array) -> Array:
+        """Log-likelihoods (n,) at noise parameters (n, q) of the unit cube."""
+        low, high = self.low[self.inner :], self.high[self.inner :]
+        rows = np.repeat(self.x[None], len(unit), axis=0)
+        rows[:, self.inner :] = low + np.clip(unit, 0.0, 1.0) * (high - low)
+        noise = self.log_posterior.split(self.log_posterior.from_sampling(rows))[1]
+        here = self.here
+        repeated = Prediction(
+            *(np.repeat(part, len(unit), axis=0) for part in (here.mean, here.factor, here.diagonal))
+        )
+        return log_likelihood(self.chain, repeated, noise)
+
+    def _differences(self, unit: Array) -> tuple[float, Array, Array]:
+        """Value, gradient (q,) and second derivatives (q,) by the noise, one inside the bounds."""
+        eye = STEP * np.eye(len(unit))
+        centre = np.clip(unit, STEP, 1.0 - STEP)
+        values = self._values(np.concatenate([unit[None], centre[None], centre + eye, centre - eye]))
+        up, down = values[2:].reshape(2, -1)
+        return float(values[0]), (up - down) / (2 * STEP), (up + down - 2 * values[1]) / STEP**2
+
+    def _minus(self, unit: Array) -> tuple[float, Array]:
+        value, gradient, _ = self._differences(unit)
+        return -value, -gradient
+
+    def _white(self, columns: Array) -> Array:
+        """Columns (k, n) in innovations of the noise at hand."""
+        _, noise = self.log_posterior.split(
+            self.log_posterior.from_sampling(np.concatenate([self.x[: self.inner], self.noise]))
+        )
+        scale, rho = scales(self.chain, noise, self.here.diagonal[:, self.chain.bins])
+        unit = columns / scale[0][:, None]
+        before = np.concatenate([np.zeros((1, columns.shape[1])), unit[:-1]])
+        self.nu = float(noise[0, -1])
+        return np.asarray((unit - rho[0][:, None] * before) / np.sqrt(1.0 - rho[0] ** 2)[:, None])
+
+    def _columns(self) -> tuple[Array, Array, Array]:
+        """Residual (k,), slopes (k, d) and the surrogate's factor (k, r), whitened."""
+        bins = self.chain.bins
+        residual = self.chain.force_n - self.here.mean[0, bins]
+        white = self._white(
+            np.concatenate([residual[:, None], self.slope, self.here.factor[0, bins]], axis=1)
+        )
+        return white[:, 0], white[:, 1 : self.inner + 1], white[:, self.inner + 1 :]
+
+    def step(self, x: Array, damping: float) -> Array:
+        """Change (D,) of the sampling coordinates that the regression asks for, within the box."""
+        residual, slopes, factor = self._columns()
+        design = np.concatenate([slopes, factor], axis=1)
+        width = (self.high - self.low)[: self.inner]
+        room_up = (self.high[: self.inner] - x[: self.inner]) / width
+        room_down = (self.low[: self.inner] - x[: self.inner]) / width
+        change: Array = np.zeros(design.shape[1])
+        for _ in range(REWEIGHTED):
+            left = residual - design @ change
+            weight = (self.nu + 1.0) / (self.nu + left**2)
+            normal = (design * weight[:, None]).T @ design
+            penalty = np.full(design.shape[1], 1e-6)
+            penalty[self.inner :] = _stiffness(change[self.inner :])
+            penalty[: self.inner] += damping * np.maximum(np.diag(normal)[: self.inner], 1e-6)
+            target = (design * weight[:, None]).T @ residual
+            change = _bounded(normal + np.diag(penalty), target, room_down, room_up, self.inner)
+        step = np.zeros(len(x))
+        step[: self.inner] = change[: self.inner] * width
+        return step
+
+    def curvature(self) -> tuple[Array, Array]:
+        """Information (D, D) and gradient (D,) of the log density over the unit cube."""
+        residual, slopes, factor = self._columns()
+        weight = (self.nu + 1.0) / (self.nu + 3.0)
+        inside = weight * factor.T @ factor + np.eye(factor.shape[1])
+        cross = weight * factor.T @ slopes
+        material = weight * slopes.T @ slopes - cross.T @ np.linalg.solve(inside, cross)
+        latent: Array = np.zeros(factor.shape[1])
+        for _ in range(REWEIGHTED):
+            pull = (self.nu + 1.0) / (self.nu + (residual - factor @ latent) ** 2)
+            curved = (factor * pull[:, None]).T @ factor + np.diag(_stiffness(latent))
+            latent = np.linalg.solve(curved, (factor * pull[:, None]).T @ residual)
+        left = residual - factor @ latent
+        steep = slopes.T @ ((self.nu + 1.0) / (self.nu + left**2) * left)
+        low, high = self.low[self.inner :], self.high[self.inner :]
+        _, noise_gradient, second = self._differences((self.noise - low) / (high - low))
+        information = np.diag(np.concatenate([np.zeros(self.inner), np.maximum(-second, 0.0)]))
+        information[: self.inner, : self.inner] = material
+        return information, np.concatenate([steep, noise_gradient])
+
+
+def _stiffness(latent: Array) -> Array:
+    """Of the prior of the surrogate's error, as a spring to zero (r,)."""
+    size = np.abs(latent)
+    return 1.0 + STIFF * np.maximum(size - FARTHEST, 0.0) / np.maximum(size, FARTHEST)
+
+
+def _bounded(normal: Array, target: Array, low: Array, high: Array, count: int) -> Array:
+    """Solution whose first `count` entries lie in [low, high]: those that leave are held at their bound."""
+    held = np.zeros(len(target), dtype=bool)
+    values: Array = np.zeros(len(target))
+    for _ in range(count + 1):
+        free = ~held
+        right = target[free] - normal[np.ix_(free, held)] @ values[held]
+        values[free] = np.asarray(np.linalg.solve(normal[np.ix_(free, free)], right), dtype=float)
+        outside = free.copy()
+        outside[:count] &= (values[:count] < low) | (values[:count] > high)
+        outside[count:] = False
+        if not outside.any():
+            break
+        held |= outside
+        values[:count] = np.clip(values[:count], low, high)
+    return values
