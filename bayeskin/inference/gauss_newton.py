@@ -183,7 +183,7 @@ class _Linear:
         for _ in range(REWEIGHTED):
             pull = (self.nu + 1.0) / (self.nu + (residual - factor @ latent) ** 2)
             curved = (factor * pull[:, None]).T @ factor + np.diag(_stiffness(latent))
-            latent = np.linalg.solve(curved, (factor * pull[:, None]).T @ residual)
+            latent = np.asarray(np.linalg.solve(curved, (factor * pull[:, None]).T @ residual), dtype=float)
         left = residual - factor @ latent
         steep = slopes.T @ ((self.nu + 1.0) / (self.nu + left**2) * left)
         low, high = self.low[self.inner :], self.high[self.inner :]
