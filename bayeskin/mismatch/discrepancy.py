@@ -81,10 +81,11 @@ def discrepancy(found: Fit, motion: PadMotion) -> Discrepancy:
     shrunk = solve_triangular(root, rest.expand.T, lower=True)
     sd = np.sqrt(np.maximum(np.sum(rest.expand**2, axis=1) - np.sum(shrunk**2, axis=0), 0.0))
     gain = 0.5 * float(reduced @ reduced) - value
-    total = float(rest.beyond_n @ rest.beyond_n)
+    beyond = rest.beyond(rest.residual_n)
+    total = float(beyond @ beyond)
     features = describe(rest.at, mean, sd) if gain > NOTICEABLE else ("nothing beyond the noise",)
     return Discrepancy(
-        rest.bins, mean, sd, parts, rest.beyond_n, rest.residual_n - rest.beyond_n,
+        rest.bins, mean, sd, parts, beyond, rest.residual_n - beyond,
         float(np.sqrt(np.mean(mean**2))),
         {name: float(part @ mean) / total if total > 0.0 else 0.0 for name, part in parts.items()},
         dict(zip(PARTS, np.exp(line[:3]).tolist(), strict=True)),
@@ -116,8 +117,8 @@ def _kernels(line: Array, squares: Array, masks: Array) -> Array:
 def _most_likely(rest: Unexplained, squares: Array, masks: Array) -> tuple[Array, float]:
     """Logarithms of sizes and lengths (6,), and minus the log marginal likelihood there."""
     reduced = rest.reduce @ rest.residual_n
-    noise = float(np.median(rest.noise_sd_n))
-    rms = max(float(np.sqrt(np.mean(rest.beyond_n**2))), noise)
+    noise = float(np.sqrt(np.median(np.diag(rest.noise_n2))))
+    rms = max(float(np.sqrt(np.mean(rest.beyond(rest.residual_n) ** 2))), noise)
 
     def value_and_slope(line: Array) -> tuple[float, Array]:
         kernels = _kernels(line, squares, masks)

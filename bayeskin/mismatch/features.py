@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayeskin.mismatch.unexplained import Place
 from bayeskin.types import Array
@@ -15,14 +16,14 @@ WORDS = {"rest": "at rest", "load": "while loading", "hold": "in holds", "unload
 
 
 def describe(at: Place, mean_n: Array, sd_n: Array) -> tuple[str, ...]:
-    """Where a discrepancy of mean and sd (k,) stands out, its sign, its trend over cycles and what it follows."""
+    """Where a discrepancy of mean and sd (k,) stands out, its sign, trend over cycles, what it follows."""
     certain = np.abs(mean_n) > CERTAIN * sd_n
     lines = [_of_kind(kind, at, mean_n, certain) for kind in WORDS]
     lines += [_over_cycles(at, mean_n, certain), *_followed(at, mean_n)]
     return tuple(line for line in lines if line)
 
 
-def _of_kind(kind: str, at: Place, mean_n: Array, certain: Array) -> str:
+def _of_kind(kind: str, at: Place, mean_n: Array, certain: NDArray[np.bool_]) -> str:
     inside = at.kind == kind
     if not inside.any() or np.mean(certain[inside]) < WIDESPREAD:
         return ""
@@ -33,7 +34,7 @@ def _of_kind(kind: str, at: Place, mean_n: Array, certain: Array) -> str:
     return f"{WORDS[kind]} the recorded force is {1e3 * abs(level):.1f} mN {side} the model's on average"
 
 
-def _over_cycles(at: Place, mean_n: Array, certain: Array) -> str:
+def _over_cycles(at: Place, mean_n: Array, certain: NDArray[np.bool_]) -> str:
     cycles = [cycle for cycle in np.unique(at.cycle) if cycle > 0]
     if len(cycles) < 2 or not certain.any():
         return ""
@@ -41,8 +42,9 @@ def _over_cycles(at: Place, mean_n: Array, certain: Array) -> str:
     ratio = size[-1] / size[0] if size[0] > 0.0 else np.inf
     if 1.0 / CHANGED < ratio < CHANGED:
         return "about as large in the last cycle as in the first"
-    return f"{'grows' if ratio > 1.0 else 'fades'} from {1e3 * size[0]:.1f} to {1e3 * size[-1]:.1f} mN RMS " + (
-        f"between cycle {cycles[0]:.0f} and cycle {cycles[-1]:.0f}"
+    return (
+        f"{'grows' if ratio > 1.0 else 'fades'} from {1e3 * size[0]:.1f} to {1e3 * size[-1]:.1f} mN RMS "
+        + (f"between cycle {cycles[0]:.0f} and cycle {cycles[-1]:.0f}")
     )
 
 

@@ -106,5 +106,3 @@ def memory(motion: PadMotion, time_s: Array, tau_s: float) -> Array:
     stretch = np.clip(np.searchsorted(motion.time_s, time_s, side="right") - 1, 0, len(speed) - 1)
     ends, began = speed[stretch] * tau_s, np.array(corners)[stretch]
     return np.asarray(ends + (began - ends) * np.exp(-(time_s - motion.time_s[stretch]) / tau_s))
-
-

@@ -1,16 +1,17 @@
 """What a fit leaves over, with all that its parameters could still take up projected out of it.
 
 With r the residual at a fit, G the derivatives of the force by the surrogate's parameters (central
-differences in sampling coordinates), e the measured noise and the surrogate's own error, of covariance
-R = L L', and d the discrepancy,
+differences in sampling coordinates), e the measured noise and the surrogate's own error, of covariance R,
+and d the discrepancy,
 
-    r = G b + d + e ,    G' R^-1 d = 0 .
+    r = G b + d + e ,    G' d = 0 .
 
 b has no prior: whatever looks like a parameter is the parameter's, and is no discrepancy (Plumlee 2017, JASA
 112:1274; without this the two compete and the parameters lose their meaning: Brynjarsdottir & O'Hagan 2014,
-Inverse Problems 30:114007). With N an orthonormal basis of what is orthogonal to L^-1 G, both the flat prior
-of b and the condition on d hold in the coordinates a = N' L^-1 r, in which the noise is the identity. The
-price: the part of a true discrepancy that parameters can imitate is not seen.
+Inverse Problems 30:114007). A parameter at a bound of its prior does not move, and has no column in G. With N
+an orthonormal basis of what is orthogonal to G, and N' R N = M M', both the flat prior of b and the condition
+on d hold in the coordinates a = M^-1 N' r, in which the noise is the identity. The price: what parameters can
+imitate of a true discrepancy is not seen.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.types import Array, PadMotion, Phase
 
 STEP = 1e-3  # of the prior box in sampling coordinates, for derivatives
-SMALLEST = 1e-6  # singular value of whitened derivatives, of the largest, that still is a direction
+AT_BOUND = 1e-3  # of the box: nearer to its bound than this a parameter does not move
+SMALLEST = 1e-6  # singular value of the derivatives, of the largest, that still is a direction
 DIRECTION = {"rest": 0.0, "load": 1.0, "hold": 0.0, "unload": -1.0}
 
 
@@ -69,32 +71,35 @@ def place(time_s: ArrayLike, phase: ArrayLike, phases: tuple[Phase, ...], motion
 class Unexplained:
     """A fit's residual and what it takes to split it; k bins, r of them taken up by parameters.
 
-    residual_n (k,) recorded minus model; force_n (k,) the model's; noise_sd_n (k,) measured noise and
-    surrogate's error; root (k, k) is L, basis (k, k - r) is N; at: where the bins stand.
+    residual_n (k,) recorded minus model; force_n (k,) the model's; noise_n2 (k, k) covariance of measured
+    noise and surrogate's error; basis (k, k - r) is N; at: where the bins stand.
     """
 
     bins: NDArray[np.int64]
     residual_n: Array
     force_n: Array
-    noise_sd_n: Array
-    root: Array
+    noise_n2: Array
     basis: Array
     at: Place
 
     @cached_property
+    def _root(self) -> Array:
+        """M, (k - r, k - r)."""
+        return np.asarray(np.linalg.cholesky(self.basis.T @ self.noise_n2 @ self.basis))
+
+    @cached_property
     def reduce(self) -> Array:
-        """N' L^-1, (k - r, k): from forces to the coordinates a."""
-        return np.asarray(solve_triangular(self.root, self.basis, lower=True, trans="T").T)
+        """M^-1 N', (k - r, k): from forces to the coordinates a."""
+        return np.asarray(solve_triangular(self._root, self.basis.T, lower=True))
 
     @cached_property
     def expand(self) -> Array:
-        """L N, (k, k - r): back to forces, orthogonal to what parameters take up."""
-        return np.asarray(self.root @ self.basis)
+        """N M, (k, k - r): back to forces, orthogonal to what parameters take up."""
+        return np.asarray(self.basis @ self._root)
 
-    @cached_property
-    def beyond_n(self) -> Array:
-        """The residual (k,) beyond what parameters could still take up [N]."""
-        return np.asarray(self.expand @ (self.reduce @ self.residual_n))
+    def beyond(self, forces_n: Array) -> Array:
+        """What parameters cannot take up of forces (k,) or (k, p), by least squares."""
+        return np.asarray(self.basis @ (self.basis.T @ forces_n))
 
 
 def unexplained(found: Fit, motion: PadMotion) -> Unexplained:
@@ -108,15 +113,15 @@ def unexplained(found: Fit, motion: PadMotion) -> Unexplained:
     noise[:, :-2] = log_posterior.noise_priors.sd_n[0]  # the measured noise alone
     scale, rho = scales(chain, noise, prediction.diagonal[:, chain.bins])
     factor = prediction.factor[0, chain.bins]
-    covariance = _markov(scale[0], rho[0]) + factor @ factor.T
-    root = np.linalg.cholesky(covariance)
-    white = solve_triangular(root, derivatives(log_posterior, found.unit)[chain.bins], lower=True)
-    left, size, _ = np.linalg.svd(white)
-    rank = int(np.sum(size > SMALLEST * size[0])) if len(size) and size[0] > 0.0 else 0
+    material = found.unit[: log_posterior.surrogate.space.dim]
+    moves = (material > AT_BOUND) & (material < 1.0 - AT_BOUND)
+    left, size, _ = np.linalg.svd(derivatives(log_posterior, found.unit)[chain.bins][:, moves])
+    rank = int(np.sum(size > SMALLEST * size.max(initial=0.0)))
     at = place(binned.time_s[chain.bins], binned.phase[chain.bins], binned.phases, motion)
     return Unexplained(
-        chain.bins, chain.force_n - force, force, np.sqrt(np.diag(covariance)), root, left[:, rank:], at
-    )
+        chain.bins, chain.force_n - force, force, _markov(scale[0], rho[0]) + factor @ factor.T,
+        left[:, rank:], at,
+    )  # fmt: skip
 
 
 def derivatives(log_posterior: LogPosterior, unit: Array) -> Array:
