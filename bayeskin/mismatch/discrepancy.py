@@ -83,7 +83,7 @@ def discrepancy(found: Fit, motion: PadMotion) -> Discrepancy:
     gain = 0.5 * float(reduced @ reduced) - value
     beyond = rest.beyond(rest.residual_n)
     total = float(beyond @ beyond)
-    features = describe(rest.at, mean, sd) if gain > NOTICEABLE else ("nothing beyond the noise",)
+    features = describe(rest, mean, sd) if gain > NOTICEABLE else ("nothing beyond the noise",)
     return Discrepancy(
         rest.bins, mean, sd, parts, beyond, rest.residual_n - beyond,
         float(np.sqrt(np.mean(mean**2))),

@@ -5,21 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bayeskin.mismatch.unexplained import Place
+from bayeskin.mismatch.unexplained import Place, Unexplained
 from bayeskin.types import Array
 
 CERTAIN = 2.0  # standard deviations from zero
 WIDESPREAD = 0.25  # of a phase kind's bins
 CHANGED = 1.5  # ratio of the last cycle's size to the first's
 FOLLOWS = 0.5  # squared correlation
+SEEN = 1e-3  # of an axis' length that must remain beyond what parameters take up
 WORDS = {"rest": "at rest", "load": "while loading", "hold": "in holds", "unload": "while unloading"}
 
 
-def describe(at: Place, mean_n: Array, sd_n: Array) -> tuple[str, ...]:
+def describe(rest: Unexplained, mean_n: Array, sd_n: Array) -> tuple[str, ...]:
     """Where a discrepancy of mean and sd (k,) stands out, its sign, trend over cycles, what it follows."""
-    certain = np.abs(mean_n) > CERTAIN * sd_n
+    at, certain = rest.at, np.abs(mean_n) > CERTAIN * sd_n
     lines = [_of_kind(kind, at, mean_n, certain) for kind in WORDS]
-    lines += [_over_cycles(at, mean_n, certain), *_followed(at, mean_n)]
+    lines += [_over_cycles(at, mean_n, certain), *_followed(rest, mean_n)]
     return tuple(line for line in lines if line)
 
 
@@ -48,21 +49,23 @@ def _over_cycles(at: Place, mean_n: Array, certain: NDArray[np.bool_]) -> str:
     )
 
 
-def _followed(at: Place, mean_n: Array) -> list[str]:
-    """What the discrepancy rises or falls along, by squared correlation."""
-    moving, still = at.direction != 0.0, at.direction == 0.0
+def _followed(rest: Unexplained, mean_n: Array) -> list[str]:
+    """What the discrepancy rises or falls along, beyond what parameters take up of it."""
+    at, everywhere = rest.at, np.ones(len(mean_n), bool)
     axes = [
-        ("displacement while the pads move", at.displacement_m, moving),
-        ("displacement over all phases", at.displacement_m, np.ones(len(mean_n), bool)),
-        ("speed and direction", at.speed_m_s, np.ones(len(mean_n), bool)),
-        ("the logarithm of time since the corner while the pads stand", np.log1p(at.since_s), still),
-        ("time", at.time_s, np.ones(len(mean_n), bool)),
+        ("displacement while the pads move", at.displacement_m, at.direction != 0.0),
+        ("displacement over all phases", at.displacement_m, everywhere),
+        ("speed and direction", at.speed_m_s, everywhere),
+        ("the logarithm of time since the corner in holds", np.log1p(at.since_s), at.kind == "hold"),
+        ("the logarithm of time since the corner at rest", np.log1p(at.since_s), at.kind == "rest"),
+        ("time", at.time_s, everywhere),
     ]
     lines = []
     for words, axis, inside in axes:
-        if inside.sum() < 3 or np.ptp(axis[inside]) == 0.0 or np.ptp(mean_n[inside]) == 0.0:
+        shape = rest.beyond(np.where(inside, axis, 0.0))[inside]
+        if np.linalg.norm(shape) <= SEEN * np.linalg.norm(axis) or np.ptp(mean_n[inside]) == 0.0:
             continue
-        r = float(np.corrcoef(axis[inside], mean_n[inside])[0, 1])
+        r = float(np.corrcoef(shape, mean_n[inside])[0, 1])
         if r * r > FOLLOWS:
             lines.append(f"{'rises' if r > 0 else 'falls'} with {words} (r² = {r * r:.2f})")
     return lines

@@ -71,7 +71,7 @@ class Form:
 
 @dataclass(frozen=True)
 class _Blocks:
-    """By phase: Gram matrices of terms (b, p, p), with the residual (b, p), its squares (b,); noise's (p, p)."""
+    """By phase: products of terms (b, p, p), with the residual (b, p), its squares (b,); noise's (p, p)."""
 
     gram: Array
     cross: Array

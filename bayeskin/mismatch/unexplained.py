@@ -119,7 +119,7 @@ def unexplained(found: Fit, motion: PadMotion) -> Unexplained:
     rank = int(np.sum(size > SMALLEST * size.max(initial=0.0)))
     at = place(binned.time_s[chain.bins], binned.phase[chain.bins], binned.phases, motion)
     return Unexplained(
-        chain.bins, chain.force_n - force, force, _markov(scale[0], rho[0]) + factor @ factor.T,
+        chain.bins, chain.force_n - force, force, chain_covariance(scale[0], rho[0]) + factor @ factor.T,
         left[:, rank:], at,
     )  # fmt: skip
 
@@ -136,7 +136,7 @@ def derivatives(log_posterior: LogPosterior, unit: Array) -> Array:
     return np.asarray((mean[:d] - mean[d:]).T / (2 * STEP))
 
 
-def _markov(scale: Array, rho: Array) -> Array:
+def chain_covariance(scale: Array, rho: Array) -> Array:
     """Covariance (k, k) of a chain of standard deviations scale (k,) and correlations with the one before."""
     correlation = np.eye(len(scale))
     for i in range(1, len(scale)):
