@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,6 +22,7 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.information import expected_gain
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.protocols import own, phases_of, protocols
+from bayeskin.report import figure_experiments
 from bayeskin.types import PadMotion, Parameter, Simulation
 
 OWN_SPEED = 9e-4  # m/s, the toy's
@@ -79,7 +81,9 @@ def test_a_dozen_draws_give_too_little_rather_than_too_much(distance: float) -> 
 
 def test_nothing_is_learnt_about_hypotheses_that_are_the_same() -> None:
     forces, noise = gaussians(0.0, 20, 0)
-    assert expected_gain([forces[0], forces[0].copy()], noise, [1.0, 3.0], 0).nats == 0.0
+    found = expected_gain([forces[0], forces[0].copy()], noise, [1.0, 3.0], 0)
+    assert found.nats == 0.0
+    assert found.named == pytest.approx(0.25**2 + 0.75**2)
 
 
 def test_a_gain_is_at_most_the_entropy_of_the_hypotheses_and_repeats() -> None:
@@ -145,6 +149,17 @@ def test_friction_is_told_from_drag_by_another_speed_and_not_by_a_repeat() -> No
     assert by_name["half displacement"].gain_nats < 0.05
     assert all(one.possible_nats == pytest.approx(np.log(2.0)) for one in table)
     assert [one.gain_nats for one in table] == sorted((one.gain_nats for one in table), reverse=True)
+
+
+def test_the_figure_shows_every_protocol_that_could_be_judged() -> None:
+    fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
+    table = choose_experiment(fits, [0.5, 0.5], KNOWN, toy.MOTION, toy_run, 0)
+    figure = figure_experiments((*table, dataclasses.replace(table[0], protocol="failed", gain_nats=np.nan)))
+    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [
+        one.protocol for one in reversed(table)
+    ]
+    assert "five times faster" in figure.get_suptitle().lower() or "quarter" in figure.get_suptitle().lower()
+    assert "None" in figure_experiments(()).get_suptitle()
 
 
 def test_failed_runs_are_counted_and_leave_a_row() -> None:

@@ -17,6 +17,7 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.terms import library, memory
 from bayeskin.mismatch.unexplained import Place, derivatives, place, unexplained
+from bayeskin.report import figure_discrepancy
 from bayeskin.types import PadMotion, ParameterSpace
 
 Extra = Callable[[Place], np.ndarray]
@@ -113,7 +114,7 @@ def test_what_looks_like_a_parameter_does_not_change_the_discrepancy(parameter: 
 
 
 def test_a_parameter_at_its_bound_takes_up_nothing() -> None:
-    """Level and relaxation time of the toy hang on four parameters; with two at their bounds one direction less."""
+    """The toy's level and relaxation hang on four parameters; two at bounds leave one direction less."""
     fit = known_fit(2, rubbing)
     raised = {"E_s": TRUTH["E_s"], "k_s": TRUTH["k_s"]}
     material = ParameterSpace(
@@ -195,3 +196,25 @@ def test_terms_are_in_si_and_averaged_over_bins() -> None:
     np.testing.assert_allclose(terms["displacement"].values, toy.MOTION.at(binned.time_s), atol=1e-6)
     np.testing.assert_allclose(terms["time"].values, binned.time_s, atol=1e-9)
     assert set(np.round(terms["speed"].values, 9)) == {-9e-4, 0.0, 9e-4}
+
+
+def test_the_figure_says_what_is_unexplained() -> None:
+    fit = known_fit(0, drifting)
+    binned = fit.log_posterior.binned
+    figure = figure_discrepancy(binned, toy.MOTION, discrepancy(fit, toy.MOTION))
+    assert figure.get_suptitle().startswith("The model leaves 3.")
+    assert "rises with time" in figure.get_supxlabel().replace("\n", " ")
+    assert [ax.get_xlabel() for ax in figure.axes] == [
+        "time [s]", "displacement [mm]", "time since the corner [s]"
+    ]  # fmt: skip
+    nothing = figure_discrepancy(binned, toy.MOTION, discrepancy(known_fit(0), toy.MOTION))
+    assert "nothing" in nothing.get_suptitle()
+
+
+def test_windows_that_were_fitted_are_all_that_is_described() -> None:
+    fit = known_fit(0, drifting)
+    half = dataclasses.replace(fit.log_posterior, fit_windows=((0.0, 45.0), (65.0, 105.0)))
+    part = dataclasses.replace(fit, log_posterior=half)
+    found = discrepancy(part, toy.MOTION)
+    assert len(found.mean_n) == len(found.bins) == 85
+    assert len(figure_discrepancy(half.binned, toy.MOTION, found).axes) == 3

@@ -26,7 +26,6 @@ from bayeskin.mismatch.unexplained import Place, Unexplained, unexplained
 from bayeskin.types import Array, PadMotion
 
 PARTS = ("displacement", "phase", "cycle")
-LONG = ("over mm", "over log time", "over log time")
 SMALLEST, LARGEST = 0.01, 10.0  # size s: of the noise's sd, of the residual's RMS
 LENGTHS = ((0.05, 2.0), (0.2, 3.0), (0.2, 3.0))  # of the displacement's range; of log(1 + t / 1 s)
 NOTICEABLE = 5.0  # nats over no discrepancy; noise alone gains less in 99 of 100 recordings
@@ -38,9 +37,9 @@ class Discrepancy:
 
     mean_n, sd_n (k,) of the discrepancy; parts_n: mean (k,) of each part, which add up to mean_n;
     beyond_n (k,) the residual beyond what parameters could still take up, and taken_n (k,) what they could;
-    size_n the RMS of mean_n; share: of the squares of beyond_n, by part, the rest being noise; size_by_part,
-    length_by_part: hyperparameters; gain_nats: log marginal likelihood over that of no discrepancy;
-    features: what it looks like, in words.
+    size_n the RMS of mean_n; share: of the squares of beyond_n those of mean_n, split by the parts' own;
+    size_by_part, length_by_part: hyperparameters; gain_nats: log marginal likelihood over that of no
+    discrepancy; features: what it looks like, in words.
     """
 
     bins: NDArray[np.int64]
@@ -82,12 +81,13 @@ def discrepancy(found: Fit, motion: PadMotion) -> Discrepancy:
     sd = np.sqrt(np.maximum(np.sum(rest.expand**2, axis=1) - np.sum(shrunk**2, axis=0), 0.0))
     gain = 0.5 * float(reduced @ reduced) - value
     beyond = rest.beyond(rest.residual_n)
-    total = float(beyond @ beyond)
+    own = {name: float(part @ part) for name, part in parts.items()}
+    whole = float(beyond @ beyond) * sum(own.values())
     features = describe(rest, mean, sd) if gain > NOTICEABLE else ("nothing beyond the noise",)
     return Discrepancy(
         rest.bins, mean, sd, parts, beyond, rest.residual_n - beyond,
         float(np.sqrt(np.mean(mean**2))),
-        {name: float(part @ mean) / total if total > 0.0 else 0.0 for name, part in parts.items()},
+        {name: float(mean @ mean) * one / whole if whole > 0.0 else 0.0 for name, one in own.items()},
         dict(zip(PARTS, np.exp(line[:3]).tolist(), strict=True)),
         dict(zip(PARTS, np.exp(line[3:]).tolist(), strict=True)),
         gain, features,

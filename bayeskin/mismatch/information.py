@@ -77,7 +77,9 @@ def expected_gain(
         nats += share * float(each.mean())
         error2 += share**2 * float(each.var(ddof=1)) / len(draws)
         named += share * float(np.exp(log_post).mean())
-    return Gain(max(nats, 0.0), float(np.sqrt(error2)), named)
+    if nats <= 0.0:  # the approximation is no better than what is known already
+        nats, named = 0.0, float(np.sum(np.exp(2.0 * log_prior)))
+    return Gain(nats, float(np.sqrt(error2)), named)
 
 
 def _compressed(forces_n: Sequence[Array], root: Array) -> list[Array]:
