@@ -12,7 +12,7 @@ from toy_inference import NOISE, TRUTH, ToySurrogate, empty_recording
 
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.noise_model import draw_noise
-from bayeskin.mismatch.discrepancy import discrepancy
+from bayeskin.mismatch.discrepancy import _masks, _squared_distances, _unlikely, discrepancy
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.terms import library, memory
@@ -89,6 +89,40 @@ def test_parts_shares_and_residual_add_up() -> None:
     assert found.share["phase"] == max(found.share.values())
     rest = unexplained(known_fit(1, creeping), toy.MOTION)
     np.testing.assert_allclose(found.beyond_n + found.taken_n, rest.residual_n, atol=1e-15)
+
+
+def test_mean_and_sd_are_those_of_a_dense_gaussian_process_with_a_flat_prior_of_parameters() -> None:
+    fit = known_fit(1, creeping)
+    found, rest = discrepancy(fit, toy.MOTION), unexplained(fit, toy.MOTION)
+    at, memory_s = rest.at, np.log1p(rest.at.since_s)
+    axes = {"displacement": at.displacement_m / 9e-3, "phase": memory_s, "cycle": memory_s}
+    same = {
+        "displacement": 0.5 + 0.5 * (at.direction[:, None] == at.direction),
+        "phase": at.kind[:, None] == at.kind,
+        "cycle": at.phase[:, None] == at.phase,
+    }
+    kernel = np.zeros((130, 130))
+    for name, x in axes.items():
+        far = ((x[:, None] - x) / found.length_by_part[name]) ** 2
+        kernel += found.size_by_part[name] ** 2 * same[name] * np.exp(-0.5 * far)
+    free = rest.basis @ rest.basis.T
+    kernel = free @ kernel @ free
+    whole = kernel + rest.noise_n2 + 10.0 * (np.eye(130) - free)
+    np.testing.assert_allclose(found.mean_n, kernel @ np.linalg.solve(whole, rest.residual_n), atol=1e-8)
+    variance = np.diag(kernel - kernel @ np.linalg.solve(whole, kernel))
+    np.testing.assert_allclose(found.sd_n, np.sqrt(variance), rtol=1e-3, atol=1e-8)
+    covariance = free @ rest.noise_n2 @ free
+    assert np.all(found.sd_n < np.sqrt(np.diag(covariance)))
+
+
+def test_slopes_of_the_likelihood_are_its_differences() -> None:
+    rest = unexplained(known_fit(1, creeping), toy.MOTION)
+    given = (rest, _squared_distances(rest.at), _masks(rest.at))
+    line = np.log([2e-3, 4e-3, 1e-3, 0.4, 0.7, 1.1])
+    for i in range(6):
+        step = 1e-4 * np.eye(6)[i]
+        difference = (_unlikely(line + step, *given)[0] - _unlikely(line - step, *given)[0]) / 2e-4
+        assert _unlikely(line, *given)[1][i] == pytest.approx(difference, rel=1e-5)
 
 
 def test_the_discrepancy_is_orthogonal_to_what_parameters_do() -> None:
@@ -172,6 +206,27 @@ def test_noise_has_no_form_and_neither_has_what_one_phase_does_alone() -> None:
     alone = propose_form(known_fit(0, in_second_cycle), toy.MOTION, 0)
     assert not alone.found
     assert alone.r2_left_out == 0.0
+
+
+def test_the_share_left_out_is_that_of_fits_without_each_phase() -> None:
+    fit = known_fit(0, lambda at: rubbing(at) + drifting(at))
+    form, rest, binned = (
+        propose_form(fit, toy.MOTION, 0),
+        unexplained(fit, toy.MOTION),
+        fit.log_posterior.binned,
+    )
+    terms = {t.name: t.values for t in library(rest, binned.edges_s, binned.phases, toy.MOTION)}
+    shapes = rest.beyond(np.stack([terms[one.name] for one in form.terms], axis=1))
+    target, errors = rest.beyond(rest.residual_n), []
+    for phase in range(len(binned.phases)):
+        inside = binned.phase == phase
+        value = np.linalg.lstsq(shapes[~inside], target[~inside], rcond=None)[0]
+        errors.append(np.sum((target[inside] - shapes[inside] @ value) ** 2))
+    assert len(form.terms) >= 2
+    assert form.r2_left_out == pytest.approx(1.0 - np.sum(errors) / np.sum(target**2), rel=1e-6)
+    whole = np.linalg.lstsq(shapes, target, rcond=None)[0]
+    np.testing.assert_allclose([one.coefficient for one in form.terms], whole, rtol=1e-6)
+    np.testing.assert_allclose(form.force_n, shapes @ whole, atol=1e-9)
 
 
 def test_the_same_seed_gives_the_same_form() -> None:

@@ -116,23 +116,24 @@ def _kernels(line: Array, squares: Array, masks: Array) -> Array:
 
 def _most_likely(rest: Unexplained, squares: Array, masks: Array) -> tuple[Array, float]:
     """Logarithms of sizes and lengths (6,), and minus the log marginal likelihood there."""
-    reduced = rest.reduce @ rest.residual_n
     noise = float(np.sqrt(np.median(np.diag(rest.noise_n2))))
     rms = max(float(np.sqrt(np.mean(rest.beyond(rest.residual_n) ** 2))), noise)
-
-    def value_and_slope(line: Array) -> tuple[float, Array]:
-        kernels = _kernels(line, squares, masks)
-        prior = rest.reduce @ kernels.sum(axis=0) @ rest.reduce.T
-        root = np.linalg.cholesky(prior + np.eye(len(prior)))
-        inverse = cho_solve((root, True), np.eye(len(prior)))
-        weight = inverse @ reduced
-        value = 0.5 * float(reduced @ weight) + float(np.sum(np.log(np.diag(root))))
-        bend = rest.reduce.T @ (inverse - np.outer(weight, weight)) @ rest.reduce
-        by_size = np.einsum("ij,pij->p", bend, kernels)
-        by_length = np.einsum("ij,pij,pij->p", bend, kernels, squares) * 0.5 * np.exp(-2.0 * line[3:])
-        return value, np.concatenate([by_size, by_length])
-
     bounds = np.log([(SMALLEST * noise, LARGEST * rms)] * 3 + list(LENGTHS))
     start = np.concatenate([np.full(3, np.log(rms / np.sqrt(3.0))), np.log([0.3, 0.8, 0.8])])
-    found = minimize(value_and_slope, start, jac=True, method="L-BFGS-B", bounds=bounds)
+    found = minimize(_unlikely, start, (rest, squares, masks), jac=True, method="L-BFGS-B", bounds=bounds)
     return found.x, float(found.fun)
+
+
+def _unlikely(line: Array, rest: Unexplained, squares: Array, masks: Array) -> tuple[float, Array]:
+    """Minus the log marginal likelihood, up to a constant, at `line` (6,) and its derivatives (6,)."""
+    reduced = rest.reduce @ rest.residual_n
+    kernels = _kernels(line, squares, masks)
+    prior = rest.reduce @ kernels.sum(axis=0) @ rest.reduce.T
+    root = np.linalg.cholesky(prior + np.eye(len(prior)))
+    inverse = cho_solve((root, True), np.eye(len(prior)))
+    weight = inverse @ reduced
+    value = 0.5 * float(reduced @ weight) + float(np.sum(np.log(np.diag(root))))
+    bend = rest.reduce.T @ (inverse - np.outer(weight, weight)) @ rest.reduce
+    by_size = np.einsum("ij,pij->p", bend, kernels)
+    by_length = np.einsum("ij,pij,pij->p", bend, kernels, squares) * 0.5 * np.exp(-2.0 * line[3:])
+    return value, np.concatenate([by_size, by_length])

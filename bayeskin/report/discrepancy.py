@@ -92,8 +92,8 @@ def figure_discrepancy(binned: BinnedForce, motion: PadMotion, found: _Discrepan
     looks = "; ".join(found.features)
     state_finding(
         figure, finding,
-        "Dots: residual beyond what any change of the parameters takes up. Lines and bands: the discrepancy and "
-        f"its 90 % interval; in b and c later cycles are fainter. {looks[:1].upper()}{looks[1:]}.",
+        "Dots: residual beyond what any change of the parameters takes up. Lines and bands: the discrepancy "
+        f"and its 90 % interval; in b and c later cycles are fainter. {looks[:1].upper()}{looks[1:]}.",
     )  # fmt: skip
     return figure
 
@@ -188,7 +188,7 @@ def figure_experiments(table: Sequence[_Experiment]) -> Figure:
     )
     state_finding(
         figure, finding,
-        "Lines: standard error over posterior draws. Numbers: probability that the right explanation is "
-        "expected to have after the test.",
+        "Lines: standard error over posterior draws. Percentages: probability that the right explanation is "
+        "expected to have after the test. Times: how long the test takes.",
     )  # fmt: skip
     return figure
