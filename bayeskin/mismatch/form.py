@@ -9,7 +9,7 @@ coefficients that predict a phase are fitted to all others. It is kept if what i
     a share of at least `WORTH` of the squared residual,
 
 and all together are proposed if they predict a third of what exceeds the noise. Where each of nine phases
-errs in a smooth way of its own, with two holds and three rests to agree by chance, one recording in six is
+errs in a smooth way of its own, with two holds and three rests to agree by chance, one recording in four is
 still given a form: it is a proposal, to be tried, and no finding.
 
 Sparse regression on a library of functions: Brunton, Proctor & Kutz 2016, PNAS 113:3932. Whole phases are
