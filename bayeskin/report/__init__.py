@@ -1,5 +1,6 @@
 """Figures of every result, as PNG and SVG."""
 
+from bayeskin.report.discrepancy import figure_discrepancy, figure_experiments
 from bayeskin.report.fields import SurfaceField, figure_fields
 from bayeskin.report.fit import figure_fit
 from bayeskin.report.mismatch import figure_before_after, figure_candidates, figure_located
@@ -16,6 +17,8 @@ __all__ = [
     "SurfaceField",
     "figure_before_after",
     "figure_candidates",
+    "figure_discrepancy",
+    "figure_experiments",
     "figure_fields",
     "figure_fit",
     "figure_located",

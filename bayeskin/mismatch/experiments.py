@@ -1,0 +1,168 @@
+"""Which further test would tell competing sets of mechanisms apart: each simulated with the posterior.
+
+Of every set, a few posterior draws are run in the full model on each protocol, and the expected information
+gain about which set is true is computed from the forces (`information`). The noise of the test to come is
+the fitted noise of the most probable set, what it leaves unexplained with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from bayeskin.errors import InputError
+from bayeskin.inference.noise_model import KINDS, noise_chain, scales
+from bayeskin.mechanisms import Mechanism, bin_means, laws, observed, solved
+from bayeskin.mechanisms.mechanism import ForceOfTime
+from bayeskin.mismatch import protocols as tests
+from bayeskin.mismatch.fit import Fit
+from bayeskin.mismatch.information import FEWEST, expected_gain
+from bayeskin.mismatch.unexplained import chain_covariance
+from bayeskin.types import Array, BinnedForce, PadMotion, Simulation
+
+DRAWS = 12  # of each hypothesis
+MOST_BINS = 800  # of a protocol; longer ones have wider bins
+SELDOM = 1e-3  # probability below which a hypothesis does not compete
+
+Progress = Callable[[float, str], None]
+
+
+class FullModel(Protocol):
+    """One full run: `bayeskin.model.simulate.simulate` with its specification already given."""
+
+    def __call__(self, motion: PadMotion, theta: Mapping[str, float], laws: Sequence[Any]) -> Simulation: ...
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A further test and what it is expected to tell.
+
+    gain_nats, standard_error: expected information about which set is true, of `possible_nats` that are to
+    be had; named: the probability that the true set is expected to have afterwards; failed: runs that did
+    not converge. With too many failed for an estimate the first three are NaN.
+    """
+
+    protocol: str
+    sentence: str
+    motion: PadMotion
+    gain_nats: float
+    standard_error: float
+    named: float
+    possible_nats: float
+    failed: int
+
+
+def choose_experiment(
+    fits: Sequence[Fit],
+    probabilities: Sequence[float],
+    known: Mapping[str, Mechanism],
+    motion: PadMotion,
+    simulate: FullModel,
+    seed: int,
+    progress: Progress | None = None,
+) -> tuple[Experiment, ...]:
+    """Protocols of the list, the most informative first, about which of the sets fitted is true.
+
+    fits : one for each hypothesis, by whose `names` mechanisms of `known` are on
+    probabilities : of the hypotheses, any positive scale; those below a thousandth do not compete
+    motion : the recording's own, which the protocols vary
+    simulate : called DRAWS times a protocol and hypothesis
+    Raises InputError when fewer than two hypotheses compete.
+    """
+    share = np.asarray(probabilities, dtype=float) / np.sum(probabilities)
+    competing = [i for i in np.argsort(-share) if share[i] > SELDOM]
+    if len(competing) < 2 or len(share) != len(fits):
+        raise InputError("hypotheses", f"{len(competing)} that compete", "two at least, each with its fit")
+    prior = share[competing] / share[competing].sum()
+    possible = -float(np.sum(prior * np.log(prior)))
+    ahead = [fits[i] for i in competing]
+    found = []
+    listed = tests.protocols(motion)
+    for done, protocol in enumerate(listed):
+        edges_s = _edges(protocol.motion, ahead[0])
+        forces = [
+            _forces(one, known, protocol.motion, edges_s, simulate, seed + i) for i, one in enumerate(ahead)
+        ]
+        failed = sum(DRAWS - len(rows) for rows in forces)
+        gain = (np.nan, np.nan, np.nan)
+        if min(len(rows) for rows in forces) >= FEWEST:
+            noise = noise_of(ahead[0], protocol.motion, edges_s)
+            of = expected_gain(forces, noise, prior, seed)
+            gain = (of.nats, of.standard_error, of.named)
+        found.append(Experiment(protocol.name, protocol.sentence, protocol.motion, *gain, possible, failed))
+        if progress:
+            progress((done + 1) / len(listed), f"{protocol.name}: {gain[0]:.2f} of {possible:.2f} nats")
+    return tuple(sorted(found, key=lambda one: (np.isnan(one.gain_nats), -one.gain_nats)))
+
+
+def _edges(motion: PadMotion, found: Fit) -> Array:
+    """Edges (m+1,) of equal bins, as wide as the recording's or wider."""
+    end_s = float(motion.time_s[-1])
+    width_s = max(float(np.median(np.diff(found.log_posterior.binned.edges_s))), end_s / MOST_BINS)
+    return np.asarray(width_s * np.arange(int(end_s / width_s + 1e-6) + 1, dtype=float))
+
+
+def _forces(
+    found: Fit,
+    known: Mapping[str, Mechanism],
+    motion: PadMotion,
+    edges_s: Array,
+    simulate: FullModel,
+    seed: int,
+) -> Array:
+    """Bin means (draws, m) at posterior draws, those of failed runs left out."""
+    log_posterior = found.log_posterior
+    added = [known[name] for name in found.names]
+    own = {p.name for mechanism in added for p in mechanism.parameters}
+    along = {p.name for mechanism in solved(added) for p in mechanism.parameters}
+    rows = []
+    for draw in found.draws(DRAWS, seed)[:, : log_posterior.surrogate.space.dim]:
+        theta = _neutral(added) | dict(zip(log_posterior.surrogate.space.names, draw.tolist(), strict=True))
+        inside = {name: value for name, value in theta.items() if name not in own or name in along}
+        run = simulate(motion, inside, laws(added))
+        if run.status == "ok":
+            values = {name: np.array([value]) for name, value in theta.items()}
+            rows.append(bin_means(observed(added, values, motion, _force_of(run)), motion, edges_s)[0])
+    return np.array(rows).reshape(len(rows), len(edges_s) - 1)
+
+
+def _force_of(run: Simulation) -> ForceOfTime:
+    return lambda time_s: np.atleast_2d(run.at(time_s))
+
+
+def _neutral(mechanisms: Sequence[Mechanism]) -> dict[str, float]:
+    return {name: value for one in mechanisms for name, value in one.neutral.items()}
+
+
+def noise_of(found: Fit, motion: PadMotion, edges_s: Array) -> Array:
+    """Covariance (m, m) [N^2] of the noise expected in another test, from a fit.
+
+    The fitted sds and correlation time, and the usual measured variance of each kind of phase, which goes
+    as 1 / width of the bins. A kind that was not recorded is as the noisiest.
+    """
+    log_posterior = found.log_posterior
+    chain, binned = log_posterior.chain, log_posterior.binned
+    wider = float(edges_s[1] - edges_s[0]) / float(np.median(np.diff(binned.edges_s)))
+    sd = {kind: found.theta[f"sd_{kind}"] for kind in chain.kinds}
+    variance = {
+        kind: float(np.median(chain.variance_n2[chain.kind == i])) / wider
+        for i, kind in enumerate(chain.kinds)
+    }
+    phases = tests.phases_of(motion)
+    middle = 0.5 * (edges_s[1:] + edges_s[:-1])
+    phase = np.searchsorted([p.end_s for p in phases[:-1]], middle, side="right")
+    of_bins = [phases[i].kind for i in phase]
+    correlation = float(np.nanmedian(binned.correlation)) if wider < 1.5 else 0.0
+    planned = BinnedForce(
+        edges_s, np.zeros(len(middle)),
+        np.array([variance.get(kind, max(variance.values())) for kind in of_bins]),
+        np.full(len(middle) - 1, correlation), phase, phases,
+    )  # fmt: skip
+    ahead = noise_chain(planned)
+    sds = [sd.get(kind, max(sd.values())) for kind in KINDS if kind in ahead.kinds]
+    noise = np.array([[*sds, found.theta["tau_noise"], np.inf]])
+    scale, rho = scales(ahead, noise, np.zeros((1, len(middle))))
+    return chain_covariance(scale[0], rho[0])

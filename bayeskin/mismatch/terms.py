@@ -1,0 +1,108 @@
+"""The library of which a mismatch's form is made: functions of where the test stands, in units of mm and s.
+
+Each is evaluated at several times inside a bin and averaged. The memory of displacement over tau is
+
+    m(t) = int_0^t exp(-(t - s) / tau) du(s) .
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayeskin.mismatch.unexplained import Place, Unexplained, place
+from bayeskin.types import Array, PadMotion, Phase
+
+POINTS = 8  # inside a bin
+TAUS_S = (1.0, 3.0, 10.0, 30.0, 100.0)
+KINDS = {"hold": "in holds", "rest": "at rest", "load": "while loading", "unload": "while unloading"}
+
+
+@dataclass(frozen=True)
+class Term:
+    """One function: name in words, unit of a force divided by it (SI), values (k,) in SI.
+
+    shown_unit and shown: unit in which a coefficient is printed, and the factor to it from SI.
+    """
+
+    name: str
+    unit: str
+    shown_unit: str
+    shown: float
+    values: Array
+
+
+_UNITS = {  # of a term, hence of its coefficient, as it is printed, and the factor
+    "1": ("N", "mN", 1e3),
+    "m": ("N/m", "mN/mm", 1.0),
+    "m^2": ("N/m^2", "mN/mm^2", 1e-3),
+    "m/s": ("N s/m", "mN s/mm", 1.0),
+    "s": ("N/s", "mN/s", 1e3),
+    "m s": ("N/(m s)", "mN/(mm s)", 1.0),
+    "N": ("1", "%", 1e2),
+    "N^2": ("1/N", "1/N", 1.0),
+    "N s": ("1/s", "%/s", 1e2),
+}
+
+
+def library(rest: Unexplained, edges_s: Array, phases: tuple[Phase, ...], motion: PadMotion) -> list[Term]:
+    """All terms on the fitted bins of a recording, the simpler ones first."""
+    start, end = edges_s[rest.bins], edges_s[rest.bins + 1]
+    share = (np.arange(POINTS) + 0.5) / POINTS
+    time_s = start[:, None] + share * (end - start)[:, None]
+    starts = np.array([p.start_s for p in phases])
+    phase = np.clip(np.searchsorted(starts, time_s, side="right") - 1, 0, len(phases) - 1)
+    at = place(time_s, phase, phases, motion)
+    return [
+        Term(name, *_UNITS[unit], np.broadcast_to(values, time_s.shape).mean(axis=1))
+        for name, unit, values in _functions(at, rest.force_n[:, None], motion)
+    ]
+
+
+def _functions(at: Place, force_n: Array, motion: PadMotion) -> Iterator[tuple[str, str, Array]]:
+    """Name, unit and values at times (k, POINTS)."""
+    u, direction = at.displacement_m, at.direction
+    done = np.maximum(at.cycle - 1.0, 0.0)
+    first = (at.cycle <= 1.0).astype(float)
+    yield "a constant", "1", np.ones_like(u)
+    yield "the direction of motion", "1", direction
+    yield "displacement", "m", u
+    yield "time", "s", at.time_s
+    yield "cycles done", "1", done
+    for kind, words in KINDS.items():
+        yield f"a constant {words}", "1", (at.kind == kind).astype(float)
+    yield "speed", "m/s", at.speed_m_s
+    yield "the model's force", "N", force_n * np.ones_like(u)
+    yield "displacement squared", "m^2", u**2
+    yield "displacement with the sign of motion", "m", u * direction
+    yield "displacement in the first cycle", "m", u * first
+    yield "displacement while loading in the first cycle", "m", u * first * (at.kind == "load")
+    yield "displacement times cycles done", "m", u * done
+    yield "displacement times time", "m s", u * at.time_s
+    yield "the model's force squared", "N^2", force_n**2 * np.ones_like(u)
+    yield "the model's force with the sign of motion", "N", force_n * direction
+    yield "the model's force times cycles done", "N", force_n * done
+    yield "the model's force times time", "N s", force_n * at.time_s
+    for tau_s in TAUS_S:
+        yield f"memory of displacement over {tau_s:g} s", "m", memory(motion, at.time_s, tau_s)
+    for kind in ("hold", "rest"):
+        inside = (at.kind == kind) & (at.cycle > 0)
+        for tau_s in TAUS_S:
+            yield (
+                f"1 − exp(−t / {tau_s:g} s) {KINDS[kind]}", "1", inside * -np.expm1(-at.since_s / tau_s)
+            )  # fmt: skip
+        for tau_s in (1.0, 10.0):
+            yield f"log(1 + t / {tau_s:g} s) {KINDS[kind]}", "1", inside * np.log1p(at.since_s / tau_s)
+
+
+def memory(motion: PadMotion, time_s: Array, tau_s: float) -> Array:
+    """The module's m(t) [m] at times of any shape, exact for straight stretches."""
+    speed = np.diff(motion.displacement_m) / np.diff(motion.time_s)
+    corners = [0.0]
+    for v, lasts_s in zip(speed, np.diff(motion.time_s), strict=True):
+        corners.append(v * tau_s + (corners[-1] - v * tau_s) * float(np.exp(-lasts_s / tau_s)))
+    stretch = np.clip(np.searchsorted(motion.time_s, time_s, side="right") - 1, 0, len(speed) - 1)
+    ends, began = speed[stretch] * tau_s, np.array(corners)[stretch]
+    return np.asarray(ends + (began - ends) * np.exp(-(time_s - motion.time_s[stretch]) / tau_s))
