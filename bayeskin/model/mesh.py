@@ -102,7 +102,7 @@ def layered_mesh(
     cutis_bottom_m: float = CUTIS_BOTTOM_M,
     radius_m: float = ARM_RADIUS_M,
 ) -> SkinMesh:
-    """Curved bricks between `lines` along x, y and z before rolling [m], or straight tetrahedra cut from them.
+    """Curved bricks between `lines` along x, y, z before rolling [m], or straight tetrahedra cut from them.
 
     The pads' edges and `cutis_bottom_m` are among the lines; rolled onto an arm of `radius_m`.
     """
