@@ -84,16 +84,14 @@ def conceal(folder: Path, seed: int, count: int, reporter: Reporter) -> dict[str
 
     made = proof.conceal(folder, seed, count, tell)
     seconds = time.monotonic() - started
-    text = (
-        f"{made} of {count} recordings made in {seconds:.0f} s, in {folder}; their keys in {folder / 'seals'}"
-    )
+    text = f"{made} of {count} recordings made in {seconds:.0f} s; keys in {folder / seals.SEALS}"
     return plain(
         {"ok": True, "folder": folder, "made": made, "count": count, "seconds": seconds, "text": text}
     )
 
 
 def diagnosing_sources() -> str:
-    """sha256 over all that a verdict depends on: the package but for proof and figures, and the surrogates."""
+    """sha256 over all that a verdict depends on: the package but for proof and figures; surrogates."""
     package = Path(bayeskin.__file__).parent
     files = [
         path

@@ -36,7 +36,7 @@ _Y_MM = (0.0, 2.5, 4.0, 5.0, 6.5, 10.0, 12.0, 15.0, 24.0, 45.0, 84.0)
 _HEIGHT_MM, _DEEP, _OUTER = 10.0, 0.5, 0.65  # subcutis divided in the middle, cutis nearer to its surface
 TOLERANCE = 5e-4  # of a step; the surrogates' runs have twice that
 ATTEMPTS = 8
-LVDT_STEP_M, CELL_STEP_N = 1e-5, 1e-4
+LVDT_STEP_M, CELL_STEP_N = 1e-5, 2.0**-13
 
 Run = Callable[[Case, Sequence[str], Change], Simulation]  # with the mechanisms named, and the change
 
@@ -116,7 +116,7 @@ class _Runs:
         self._case, self._known = case, known
         self._change = OUTSIDE[case.plan.outside].change(case.strength) if case.plan.outside else Change()
         solved = [n for n in case.plan.mechanisms if known[n].act.bind is not None]
-        same = not solved and not case.plan.outside
+        same = not solved and self._change.of_force_alone
         self._base = run(case, (), Change())
         self._solved = self._base if same else run(case, solved, self._change)
 
@@ -126,10 +126,8 @@ class _Runs:
 
     @property
     def seconds(self) -> float:
-        return float(sum(one.stats.get("seconds", 0.0) for one in {id(r): r for r in self._all()}.values()))
-
-    def _all(self) -> tuple[Simulation, ...]:
-        return self._base, self._solved
+        different = [self._base] if self._solved is self._base else [self._base, self._solved]
+        return float(sum(one.stats.get("seconds", 0.0) for one in different))
 
     def force(self, names: Sequence[str], changed: bool) -> ForceOfTime:
         """Noise-free, with the mechanisms `names` and, if `changed`, with what is outside."""

@@ -27,6 +27,10 @@ END_S = float(MOTION.time_s[-1])
 LOWEST_LAYER = 0.5  # of the subcutis' thickness
 
 
+def _as_it_is(value: Any) -> Any:
+    return value
+
+
 @dataclass(frozen=True)
 class Change:
     """What the full model is run with instead.
@@ -39,8 +43,13 @@ class Change:
     radius_m: float = ARM_RADIUS_M
     deep: float = 1.0
     laws: tuple[Bind, ...] = ()
-    moved: Callable[[PadMotion], PadMotion] = lambda motion: motion
-    reported: Callable[[ForceOfTime], ForceOfTime] = lambda force: force
+    moved: Callable[[PadMotion], PadMotion] = _as_it_is
+    reported: Callable[[ForceOfTime], ForceOfTime] = _as_it_is
+
+    @property
+    def of_force_alone(self) -> bool:
+        """Whether the full model runs as it is."""
+        return replace(self, reported=_as_it_is) == Change()
 
     def solid(self, base: Material, depth: Array) -> Material:
         """Constants of the cells (e,), whose middles lie at `depth`, as shares of the subcutis' height."""

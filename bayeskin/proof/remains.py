@@ -32,19 +32,20 @@ class Refit:
 
     def slopes(self, theta: Array) -> Array:
         """Derivatives (n, m, 4) by the logarithms of what is fitted."""
-        low, high = np.log(self._bounds())
-        rows = []
+        n, (low, high) = len(theta), np.log(self._bounds())
+        lines, moved = np.log(theta[:, :FITTED]), np.repeat(theta[None], 2 * FITTED, axis=0)
         for j in range(FITTED):
-            line = np.log(theta[:, j])
-            ends = [np.clip(line + sign * STEP, low[j], high[j]) for sign in (-1.0, 1.0)]
-            below, above = (self.force(_with(theta, j, np.exp(end))) for end in ends)
-            rows.append((above - below) / (ends[1] - ends[0])[:, None])
-        return np.stack(rows, axis=2)
+            moved[2 * j, :, j] = np.exp(np.maximum(lines[:, j] - STEP, low[j]))
+            moved[2 * j + 1, :, j] = np.exp(np.minimum(lines[:, j] + STEP, high[j]))
+        force = self.force(moved.reshape(2 * FITTED * n, -1)).reshape(FITTED, 2, n, -1)
+        width = np.stack([np.log(moved[2 * j + 1, :, j] / moved[2 * j, :, j]) for j in range(FITTED)])
+        return np.asarray(np.moveaxis((force[:, 1] - force[:, 0]) / width[..., None], 0, 2))
 
     def linear(self, effect_n: Array, theta: Array) -> Array:
         """What is left (n, m) of effects (n, m) that are small enough for straight lines about theta."""
         basis, _ = np.linalg.qr(self.slopes(theta))
-        return np.asarray(effect_n - np.einsum("nmj,nkj,nk->nm", basis, basis, effect_n))
+        taken = basis @ (np.swapaxes(basis, 1, 2) @ effect_n[:, :, None])
+        return np.asarray(effect_n - taken[:, :, 0])
 
     def residual(self, force_n: Array, theta: Array, permeabilities: Array = LEVELS) -> Array:
         """What is left (m,) of a force (m,) at the best fit, searched from theta (5,).
@@ -86,9 +87,3 @@ def windows(left_n: Array, floor_n: float, edges_s: Array) -> list[tuple[float, 
     beyond = np.concatenate([[False], np.abs(left_n) > floor_n, [False]])
     ends = np.flatnonzero(np.diff(beyond.astype(int)))
     return [(float(edges_s[a]), float(edges_s[b])) for a, b in ends.reshape(-1, 2)]
-
-
-def _with(theta: Array, column: int, values: Array) -> Array:
-    changed = theta.copy()
-    changed[:, column] = values
-    return changed

@@ -33,7 +33,7 @@ def figure_proof(board: Mapping[str, Any]) -> Figure:
     """Confusion matrix, detectability by size, and shares with their intervals, from a scoreboard."""
     rows = list(board["confusion"])
     figure = new_figure(PAGE_IN, 2.6 + 0.17 * max(len(rows), 12))
-    grid = figure.add_gridspec(2, 2, width_ratios=(1.7, 1))
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.45, 1))
     _draw_confusion(figure.add_subplot(grid[:, 0]), board["confusion"])
     _draw_detectability(figure.add_subplot(grid[0, 1]), board["detectability"])
     _draw_shares(figure.add_subplot(grid[1, 1]), board)
@@ -42,7 +42,7 @@ def figure_proof(board: Mapping[str, Any]) -> Figure:
         _finding(board),
         "a: number of recordings; pairs and effects outside the catalogue in one row each. b, c: 90 % Wilson "
         "intervals. Size: what remains of the effect after the base model's best refit, over the noise floor "
-        "of 0.5 s means; clear: 3 and more.",
+        "of 0.5 s means; c: of sizes from 3 on.",
     )
     return figure
 
@@ -96,7 +96,7 @@ def _draw_detectability(ax: Axes, classes: Sequence[Mapping[str, Any]]) -> None:
     handles, labels = ax.get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     if unique:
-        ax.legend(unique.values(), unique.keys(), loc="lower right")
+        ax.legend(unique.values(), unique.keys(), loc="upper left", bbox_to_anchor=(0.0, 1.22), ncols=2)
     ax.axvline(3.0, color=ACCENT, lw=0.6, ls=":")
     ax.set_xscale("log")
     ax.set(ylim=(-0.03, 1.03), xlabel="size [noise floors]", ylabel="share named")
@@ -106,11 +106,11 @@ def _draw_detectability(ax: Axes, classes: Sequence[Mapping[str, Any]]) -> None:
 
 def _draw_shares(ax: Axes, board: Mapping[str, Any]) -> None:
     lines = (
-        ("named right, clear", board["named"]["clear"], 0.9),
-        ("up to look-alikes, clear", board["named_up_to_look_alikes"]["clear"], 0.95),
-        ("unknown for outside, clear", board["unknown_outside"]["clear"], 0.8),
-        ("effect in interval", board["effect_in_interval"]["clear"], None),
-        ("base in interval", board["base_in_interval"]["clear"], None),
+        ("named right", board["named"]["clear"], 0.9),
+        ("to look-alikes", board["named_up_to_look_alikes"]["clear"], 0.95),
+        ("unknown outside", board["unknown_outside"]["clear"], 0.8),
+        ("effect in 90 %", board["effect_in_interval"]["clear"], None),
+        ("base in 90 %", board["base_in_interval"]["clear"], None),
         ("false alarms", board["false_alarms"], 0.05),
     )
     for place, (_, found, wanted) in enumerate(reversed(lines)):
@@ -119,6 +119,6 @@ def _draw_shares(ax: Axes, board: Mapping[str, Any]) -> None:
         if found["of"]:
             ax.hlines(place, found["low"], found["high"], color=MODEL, lw=1.0)
             ax.plot(found["share"], place, "o", color=MODEL)
-    ax.set_yticks(range(len(lines)), [f"{text} (n={found['of']})" for text, found, _ in reversed(lines)])
-    ax.set(xlim=(-0.03, 1.03), ylim=(-0.6, len(lines) - 0.4), xlabel="share (orange: to reach)")
+    ax.set_yticks(range(len(lines)), [f"{text}, {found['of']}" for text, found, _ in reversed(lines)])
+    ax.set(xlim=(-0.03, 1.03), ylim=(-0.6, len(lines) - 0.4), xlabel="share of so many; orange: to reach")
     panel_title(ax, "c")
