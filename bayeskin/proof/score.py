@@ -111,7 +111,7 @@ def judge(number: str, key: Mapping[str, Any], answer: Mapping[str, Any]) -> Jud
         right_group=bool(truth) and allowed and (right or stands_for(set(named), truth)),
         probability=max((float(one["probability"]) for one in said if one["name"] in truth), default=0.0),
         overlap=overlap(key["windows"], [(one["t0"], one["t1"]) for one in answer.get("located", [])]),
-        inside=_inside(parameters, key["values"]),
+        inside=_better(_inside(parameters, key["values"]), _inside(parameters, _exchanged(key["values"]))),
         inside_base=_inside(fit.get("theta", {}), {name: key["theta"][name] for name in BASE}),
         held_out=None if held_out is None else held_out / key["floor_n"],
     )
@@ -171,6 +171,17 @@ def _inside(said: Mapping[str, Any], truth: Mapping[str, float]) -> dict[str, bo
             continue
         found[name] = bool(low <= value <= high)
     return found
+
+
+def _exchanged(values: Mapping[str, float]) -> dict[str, float]:
+    """The same truth, its two steps of the load cell's zero in the other order."""
+    other = {"event_1_at": "event_2_at", "event_1_step": "event_2_step"}
+    other |= {second: first for first, second in other.items()}
+    return {name: values[other.get(name, name)] for name in values}
+
+
+def _better(one: dict[str, bool], other: dict[str, bool]) -> dict[str, bool]:
+    return one if sum(one.values()) >= sum(other.values()) else other
 
 
 def share(hits: Iterable[bool]) -> dict[str, Any]:
