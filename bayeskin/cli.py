@@ -191,6 +191,50 @@ def diagnose(config: Path, as_json: bool) -> None:
     _answer(document, as_json)
 
 
+@cli.command()
+@click.argument("folder", required=False, type=click.Path(path_type=Path))
+@click.option("--rediagnose", default=0, type=click.IntRange(min=0), metavar="N", help="Diagnose N again.")
+@as_json
+def prove(folder: Path | None, rediagnose: int, as_json: bool) -> None:
+    """What a diagnosis is worth: recordings with concealed effects diagnosed, then scored beside their keys.
+
+    FOLDER is a set that `bayeskin conceal` made; by default the one that is shipped. A recording that has a
+    verdict is not diagnosed again, so the command can be interrupted; keys are opened when all verdicts are
+    written. With --rediagnose, N of the recordings are diagnosed afresh, elsewhere, and the exit code is 1
+    if one has another verdict than the stored one.
+
+    \b
+    Example:
+      bayeskin prove --rediagnose 2
+    """
+    from bayeskin.pipeline import proof
+
+    with Terminal() as terminal:
+        document = proof.prove(folder, terminal, rediagnose)
+    _answer(document, as_json)
+
+
+@cli.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--seed", required=True, type=int, help="What the set is drawn from.")
+@click.option("--count", required=True, type=int, help="Recordings in the set.")
+@as_json
+def conceal(folder: Path, seed: int, count: int, as_json: bool) -> None:
+    """Make a set for `bayeskin prove`: recordings by the full model, with the effects' keys under seal.
+
+    A recording that is finished is not made again. One takes about half a minute.
+
+    \b
+    Example:
+      bayeskin conceal sets/one --seed 7 --count 24
+    """
+    from bayeskin.pipeline import proof
+
+    with Terminal() as terminal:
+        document = proof.conceal(folder, seed, count, terminal)
+    _answer(document, as_json)
+
+
 def _run(config: Path, last: str | None, scheduler: str | None, as_json: bool) -> None:
     from bayeskin.pipeline import stages
 

@@ -26,11 +26,13 @@ BELOW = {
     "inference": BASE,  # a Surrogate is all that these two know of a model
     "sensitivity": BASE,
     "mismatch": BASE | {"model", "mechanisms", "inference"},
+    "proof": BASE | SIBLINGS | {"mechanisms", "runner"},  # and nothing that diagnoses imports it
     "report": BASE | {"recordings", "inference", "sensitivity"},
     "pipeline": BASE
     | SIBLINGS
     | {"mechanisms", "config", "runner", "cluster", "mismatch", "inference", "sensitivity", "report"},
 }
+BELOW["pipeline"] |= {"proof"}
 BELOW["cli"] = BELOW["pipeline"] | {"pipeline"}
 
 
@@ -56,6 +58,9 @@ def wrong_arrows(source: str, module: tuple[str, ...], is_package: bool = False)
     return set(imported(source, module, is_package)) - BELOW[module[0]] - {module[0]}
 
 
+PROVES = {("pipeline", "proof"), ("cli",)}  # all that may know of the proof, itself apart
+
+
 SOURCES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")
 
 
@@ -66,6 +71,8 @@ def test_imports_point_downward(path: Path) -> None:
     module = relative.parent.parts if is_package else relative.with_suffix("").parts
     assert module[0] in BELOW, f"{module[0]} has no place in the layers"
     assert wrong_arrows(path.read_text(), module, is_package) == set()
+    if module[0] != "proof" and module not in PROVES:
+        assert "proof" not in set(imported(path.read_text(), module, is_package))
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ Both are made flat (x 0..105 mm, y 0..84 mm, z 0..10 mm) and rolled onto the arm
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -91,12 +92,28 @@ def brick_mesh(refinement: int = 1) -> SkinMesh:
     and where `refinement` divides them: 1 gives 448 bricks, 2 gives 1,540, each finer one a further line on
     either side of every edge, a quarter of the cell's width from it.
     """
-    flat = skfem.MeshHex.init_tensor(*brick_lines(refinement))
+    return layered_mesh(brick_lines(refinement), name=f"bricks, refinement {refinement}")
+
+
+def layered_mesh(
+    lines: Sequence[Array],
+    name: str,
+    tetrahedra: bool = False,
+    cutis_bottom_m: float = CUTIS_BOTTOM_M,
+    radius_m: float = ARM_RADIUS_M,
+) -> SkinMesh:
+    """Curved bricks between `lines` along x, y, z before rolling [m], or straight tetrahedra cut from them.
+
+    The pads' edges and `cutis_bottom_m` are among the lines; rolled onto an arm of `radius_m`.
+    """
+    flat = skfem.MeshHex.init_tensor(*lines)
+    flat = flat.to_meshtet() if tetrahedra else flat
     facets = _flat_boundaries(flat.p[:, flat.facets].mean(axis=1))
-    cutis = flat.p[2, flat.t].mean(axis=0) > CUTIS_BOTTOM_M
+    cutis = flat.p[2, flat.t].mean(axis=0) > cutis_bottom_m
+    if tetrahedra:
+        return SkinMesh(skfem.MeshTet(roll(flat.p, radius_m), flat.t), facets, cutis, name)
     curved = skfem.MeshHex2.from_mesh(flat)
-    rolled = skfem.MeshHex2(roll(curved.doflocs), curved.t)
-    return SkinMesh(rolled, facets, cutis, f"bricks, refinement {refinement}")
+    return SkinMesh(skfem.MeshHex2(roll(curved.doflocs, radius_m), curved.t), facets, cutis, name)
 
 
 # Lines of the coarsest bricks, and those among them that are edges of the pads [mm]; layers at z = 8.

@@ -18,7 +18,7 @@ from bayeskin.model.gradients import DIFFERENTIATED, ForceGradients
 from bayeskin.model.linear import SOLVER_NAME
 from bayeskin.model.mesh import SkinMesh, brick_mesh, read_gmsh
 from bayeskin.model.newton import NewtonSolver
-from bayeskin.model.problem import PARAMETERS, Constants, Problem, build_problem, material
+from bayeskin.model.problem import PARAMETERS, Constants, Material, Problem, build_problem, material
 from bayeskin.model.tissue import Bind
 from bayeskin.types import Array, Observation, PadMotion, Simulation, frozen_array
 
@@ -103,14 +103,51 @@ def simulate(
     problem = problem_of(spec.mesh, spec.refinement)
     history = _History(motion, on_progress, on_state)
     if spec.observation == "reaction":
-        message, solver, slopes = _run_reaction(spec, problem, laws, motion, theta, history, gradients)
+        solid = material(theta, problem.mesh.cutis)
+        outcome = _run_reaction(problem, solid, spec.tolerance, laws, motion, theta, history, gradients)
     else:
-        message, solver = _run_article(problem, motion, theta, history)
-        slopes = None
+        outcome = (*_run_article(problem, motion, theta, history), None)
+    return _simulation(problem, motion, theta, history, outcome, time.perf_counter() - started, spec.hash)
+
+
+def simulate_on(
+    problem: Problem,
+    solid: Material,
+    tolerance: float,
+    motion: PadMotion,
+    theta: Mapping[str, float],
+    laws: Sequence[Bind] = (),
+) -> Simulation:
+    """The reaction on any mesh and with any constants of its cells, as `simulate` gives it.
+
+    solid : of each cell, in place of what theta makes of the article's constants; the rest as `simulate`.
+    The result's model_hash is the mesh's.
+    """
+    _check(theta, bool(laws))
+    started = time.perf_counter()
+    history = _History(motion, None, None)
+    outcome = _run_reaction(problem, solid, tolerance, laws, motion, theta, history, False)
+    seconds = time.perf_counter() - started
+    return _simulation(problem, motion, theta, history, outcome, seconds, problem.mesh.hash)
+
+
+_Outcome = tuple[str, NewtonSolver, ForceGradients | None]  # message, empty for a run that finished
+
+
+def _simulation(
+    problem: Problem,
+    motion: PadMotion,
+    theta: Mapping[str, float],
+    history: _History,
+    outcome: _Outcome,
+    seconds: float,
+    model_hash: str,
+) -> Simulation:
+    message, solver, slopes = outcome
     solver.release()
     force = np.array(history.forces_n)
     stats = {
-        "seconds": time.perf_counter() - started,
+        "seconds": seconds,
         "steps": float(len(force) - 1),
         "dofs": float(problem.space.dofs),
         "time_error_n": float(np.linalg.norm(history.errors_n)),  # see `accuracy`
@@ -128,7 +165,7 @@ def simulate(
         status="failed" if message else "ok",
         message=message,
         stats=stats,
-        model_hash=spec.hash,
+        model_hash=model_hash,
         gradient_names=DIFFERENTIATED if slopes else (),
         gradient_n=_beyond_start(slopes.force_n[-len(force) :]) if slopes else np.zeros((0, 0)),
     )
@@ -160,14 +197,15 @@ class _History:
 
 
 def _run_reaction(
-    spec: ModelSpec,
     problem: Problem,
+    solid: Material,
+    tolerance: float,
     laws: Sequence[Bind],
     motion: PadMotion,
     theta: Mapping[str, float],
     history: _History,
     gradients: bool,
-) -> tuple[str, NewtonSolver, ForceGradients | None]:
+) -> _Outcome:
     """Fills the history; returns a message, empty for a run that finished."""
     bound = tuple(bind(theta, problem) for bind in laws)
     if gradients and any(law.series for law in bound):
@@ -175,9 +213,7 @@ def _run_reaction(
             "gradients", "a mechanism in series with the skin", "mechanisms of the tissue itself"
         )
     motion, before_s = _with_opening(motion, sum(law.opening_m for law in bound))
-    model = lagrangian.LagrangianModel(
-        problem, material(theta, problem.mesh.cutis), motion, bound, starts_s=before_s
-    )
+    model = lagrangian.LagrangianModel(problem, solid, motion, bound, starts_s=before_s)
     slopes = ForceGradients(model, theta, laws) if gradients else None
     at_start: list[float] = []
 
@@ -192,7 +228,7 @@ def _run_reaction(
             history.add(max(time_s, 0.0), step.state.x, force_n, step.corner, step.error_n)
 
     try:
-        message = lagrangian.integrate(model, theta["p_init"], spec.tolerance, on_step)
+        message = lagrangian.integrate(model, theta["p_init"], tolerance, on_step)
     except FloatingPointError as error:
         message = str(error)
     return message, model.solver, slopes
@@ -234,4 +270,4 @@ def _check(theta: Mapping[str, float], more: bool) -> None:
             raise InputError("parameters", name, f"one of {', '.join(PARAMETERS)}")
 
 
-__all__ = ["SOLVER_NAME", "ModelSpec", "problem_of", "simulate"]
+__all__ = ["SOLVER_NAME", "ModelSpec", "problem_of", "simulate", "simulate_on"]

@@ -6,6 +6,7 @@ from bayeskin.report.fit import figure_fit
 from bayeskin.report.mismatch import figure_before_after, figure_candidates, figure_located
 from bayeskin.report.posterior import figure_posterior
 from bayeskin.report.prior import figure_prior_predictive
+from bayeskin.report.proof import figure_proof
 from bayeskin.report.recording import figure_recording
 from bayeskin.report.save import save_figure
 from bayeskin.report.sobol import figure_sobol
@@ -25,6 +26,7 @@ __all__ = [
     "figure_map_check",
     "figure_posterior",
     "figure_prior_predictive",
+    "figure_proof",
     "figure_recording",
     "figure_sobol",
     "figure_traces",

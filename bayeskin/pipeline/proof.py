@@ -1,0 +1,217 @@
+"""The proof on a set of recordings: diagnosed one by one, verdicts kept, then scored beside their keys."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import bayeskin
+from bayeskin import proof, report
+from bayeskin.errors import InputError
+from bayeskin.pipeline import diagnosis
+from bayeskin.pipeline.engine import Reporter
+from bayeskin.pipeline.folder import plain, sha256_of, sha256_of_file, write_json
+from bayeskin.proof import seals
+from bayeskin.shipped import shipped
+
+Diagnose = Callable[[Path, Reporter], Mapping[str, Any]]
+NOT_DIAGNOSING = ("proof", "report")  # parts of the package on which no verdict depends
+SET = "data/proof/index.json"
+
+
+def prove(
+    folder: Path | None,
+    reporter: Reporter,
+    rediagnose: int = 0,
+    diagnose: Diagnose = diagnosis.diagnose,
+) -> dict[str, Any]:
+    """Diagnoses what has no verdict yet, then scores all verdicts; into `folder` (default: the shipped set).
+
+    rediagnose : so many, spread over the set, are diagnosed afresh in a temporary place and compared with
+        their stored verdicts. While anything is diagnosed, the seals cannot be opened.
+    Raises InputError for a folder without a set, or whose contents are not what its index says.
+    """
+    folder = shipped(SET).parent if folder is None else folder
+    index, sources = seals.read_index(folder), diagnosing_sources()
+    if not index:
+        raise InputError(folder, "a set without recordings", "one that `bayeskin conceal` made")
+    with proof.closed(folder):
+        for place, (number, said) in enumerate(index.items()):
+            reporter.progress("recordings", place / len(index), f"{number} of {len(index)}")
+            if _stored(folder, number, said["recording_sha256"]) is None:
+                answer = _diagnosed(folder, number, said["recording_sha256"], reporter, diagnose)
+                _store(folder, number, said["recording_sha256"], sources, answer)
+                reporter.log(f"{number}: {_in_a_word(answer)}")
+        again = {
+            number: _diagnosed(folder, number, index[number]["recording_sha256"], reporter, diagnose)
+            for number in _spread(list(index), rediagnose)
+        }
+    stored = {n: _stored(folder, n, said["recording_sha256"]) for n, said in index.items()}
+    verdicts = {number: one for number, one in stored.items() if one is not None}
+    board = proof.score(seals.read_keys(folder), {number: one["answer"] for number, one in verdicts.items()})
+    current = sum(one["sources_sha256"] == sources for one in verdicts.values())
+    if current == len(index):
+        _record(folder, sources, board)
+    compared = {number: _same(one, verdicts[number]["answer"]) for number, one in again.items()}
+    figure = report.figure_proof(board)
+    made = report.save_figure(
+        figure, folder / "scoreboard", f"bayeskin {bayeskin.__version__}, {folder.name}"
+    )
+    document = {
+        "ok": all(compared.values()),
+        "folder": folder,
+        "scoreboard": board,
+        "verdicts_of_these_sources": current,
+        "rediagnosed_the_same": compared,
+        "figures": list(made),
+    }
+    return plain({**document, "text": _in_words(document)})
+
+
+def conceal(folder: Path, seed: int, count: int, reporter: Reporter) -> dict[str, Any]:
+    """Makes a set of concealed recordings, or what is missing of it. Raises InputError as `proof.conceal`."""
+    if count < 1 or seed < 0:
+        raise InputError("--seed, --count", f"{seed}, {count}", "a seed from 0 on and at least one recording")
+    started = time.monotonic()
+
+    def tell(share: float, note: str) -> None:
+        reporter.progress("recordings", share, note)
+
+    made = proof.conceal(folder, seed, count, tell)
+    seconds = time.monotonic() - started
+    text = f"{made} of {count} recordings made in {seconds:.0f} s; keys in {folder / seals.SEALS}"
+    return plain(
+        {"ok": True, "folder": folder, "made": made, "count": count, "seconds": seconds, "text": text}
+    )
+
+
+def diagnosing_sources() -> str:
+    """sha256 over all that a verdict depends on: the package but for proof and figures; surrogates."""
+    package = Path(bayeskin.__file__).parent
+    files = [
+        path
+        for path in sorted(package.rglob("*.py"))
+        if path.relative_to(package).parts[0] not in NOT_DIAGNOSING
+        and path.name != "cli.py"
+        and path != Path(__file__)
+    ]
+    surrogate = shipped("surrogates/healthy-skin-reaction.h5")
+    files += sorted(surrogate.parent.glob("healthy-skin-reaction*.json"))
+    files += sorted(surrogate.with_name(f"{surrogate.stem}-effects").glob("*.json"))
+    return sha256_of([[path.name, sha256_of_file(path)] for path in files])
+
+
+def _diagnosed(
+    folder: Path, number: str, expected: str, reporter: Reporter, diagnose: Diagnose
+) -> dict[str, Any]:
+    """The answer on a copy of the recording, far from the set."""
+    source = seals.recording_path(folder, number)
+    if sha256_of_file(source) != expected:
+        raise InputError(source, "other contents than the index says", f"sha256 {expected[:12]}...")
+    with tempfile.TemporaryDirectory(prefix="bayeskin-prove-") as place:
+        copy = Path(shutil.copyfile(source, Path(place) / "recording.h5"))
+        answer = dict(diagnose(copy, reporter))
+    return {name: value for name, value in plain(answer).items() if name not in ("figures", "text")}
+
+
+def _verdict_path(folder: Path, number: str) -> Path:
+    return folder / seals.VERDICTS / f"{number}.json"
+
+
+def _stored(folder: Path, number: str, recording_sha256: str) -> dict[str, Any] | None:
+    """The verdict on this very recording, if there is one."""
+    path = _verdict_path(folder, number)
+    found: dict[str, Any] | None = seals.read_json(path) if path.is_file() else None
+    return found if found and found["recording_sha256"] == recording_sha256 else None
+
+
+def _store(folder: Path, number: str, recording_sha256: str, sources: str, answer: Mapping[str, Any]) -> None:
+    path = _verdict_path(folder, number)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(
+        path,
+        {
+            "recording_sha256": recording_sha256,
+            "version": bayeskin.__version__,
+            "sources_sha256": sources,
+            "answer": answer,
+        },
+    )
+
+
+def _record(folder: Path, sources: str, board: Mapping[str, Any]) -> None:
+    """Adds this scoring to those before it; one for each state of the sources and each set of verdicts."""
+    path = folder / seals.SCORINGS
+    before = seals.read_json(path) if path.is_file() else []
+    verdicts = sha256_of([sha256_of_file(p) for p in sorted((folder / seals.VERDICTS).glob("*.json"))])
+    if any((one["sources_sha256"], one["verdicts_sha256"]) == (sources, verdicts) for one in before):
+        return
+    kept = {name: value for name, value in board.items() if name not in ("each", "by_mechanism", "confusion")}
+    new = {
+        "date": datetime.now(UTC).date().isoformat(),
+        "version": bayeskin.__version__,
+        "sources_sha256": sources,
+        "verdicts_sha256": verdicts,
+        "scoreboard": kept,
+    }
+    write_json(path, [*before, new])
+
+
+def _spread(numbers: list[str], count: int) -> list[str]:
+    """`count` of the numbers, evenly over the set."""
+    count = min(count, len(numbers))
+    return [numbers[(2 * i + 1) * len(numbers) // (2 * count)] for i in range(count)]
+
+
+def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two answers have the same verdict and the same names."""
+
+    def named(answer: Mapping[str, Any]) -> list[str]:
+        return sorted(mechanism["name"] for mechanism in answer.get("mechanisms", []))
+
+    return one["verdict"] == other["verdict"] and named(one) == named(other)
+
+
+def _in_a_word(answer: Mapping[str, Any]) -> str:
+    names = ", ".join(one["name"] for one in answer.get("mechanisms", []))
+    return f"{answer['verdict']}{': ' + names if names else ''}"
+
+
+def _in_words(document: Mapping[str, Any]) -> str:
+    board = document["scoreboard"]
+    lines = [
+        f"{board['judged']} of {board['recordings']} recordings judged, "
+        f"{document['verdicts_of_these_sources']} by the present sources",
+        f"false alarms where nothing is concealed: {_share(board['false_alarms'])}",
+    ]
+    for name, text in (
+        ("named", "named right"),
+        ("named_up_to_look_alikes", "named right up to look-alikes"),
+        ("unknown_outside", "unknown for what is outside the catalogue"),
+        ("effect_in_interval", "effect's parameters in their 90 % intervals, where named right"),
+        ("base_in_interval", "base's parameters in theirs"),
+    ):
+        for size, words in (("clear", "3 x floor and more"), ("below", "below")):
+            lines.append(f"{text}, {words}: {_share(board[name][size])}")
+    for name, text in (
+        ("location_overlap", "overlap of located windows"),
+        ("held_out_over_floor", "held-out RMSE over the floor, where named right"),
+    ):
+        found = board[name]["clear"]
+        middle = "none" if found["median"] is None else f"{found['median']:.2f}"
+        lines.append(f"{text}, 3 x floor and more: median {middle} of {found['of']}")
+    for number, same in document["rediagnosed_the_same"].items():
+        lines.append(f"{number} diagnosed again: {'the same' if same else 'ANOTHER VERDICT'}")
+    return "\n".join(lines)
+
+
+def _share(found: Mapping[str, Any]) -> str:
+    if not found["of"]:
+        return "none"
+    low, high = 100 * found["low"], 100 * found["high"]
+    return f"{found['hits']} of {found['of']}, {100 * found['share']:.0f} % ({low:.0f} to {high:.0f})"

@@ -1,0 +1,246 @@
+"""Which cases are concealed in a set, drawn from its seed: what, how strongly, in which skin.
+
+Base parameters are drawn from the default box where the peak force is that of a skin test and the subcutis
+is not much stiffer than the cutis (on a stiff one a soft cutis folds), a mechanism's from their priors. Of
+many draws that one is taken whose size, by the shipped surrogates, is nearest to a target that is
+log-uniform over `SIZES`; where none comes near, the nearest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Literal
+
+import numpy as np
+
+from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed
+from bayeskin.mechanisms.mechanism import Instrument, Tissue
+from bayeskin.proof.noise import FLOORS_N
+from bayeskin.proof.outside import OUTSIDE
+from bayeskin.proof.protocol import EDGES_S, MOTION, SURROGATE
+from bayeskin.proof.remains import ALONE, Refit, rms
+from bayeskin.shipped import shipped
+from bayeskin.surrogates import Effect, load_manifest, load_surrogate
+from bayeskin.types import Array, ParameterSpace
+
+Kind = Literal["nothing", "alone", "pair", "outside"]
+SHARES: dict[Kind, float] = {"nothing": 20 / 64, "alone": 22 / 64, "pair": 7 / 64, "outside": 15 / 64}
+TETRAHEDRA = 0.36  # of the recordings
+PEAK_N = (0.1, 2.0)
+STIFFEST_BELOW = 2.0  # E_s over E_c, at most
+SIZES = (1.0, 30.0)  # of the noise floor
+NEAR = 0.2  # of a logarithm: how near to its target a size is near enough
+LEAST_SHARE = 0.25  # of a pair's size, that each of the two should have
+BATCH, BATCHES, FITTED = 64, 8, 3  # draws at a time, how often, and how many of each are fitted
+NEEDS = {"friction-creep": "device-friction"}  # what a mechanism has nothing to act on without
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What one recording is to conceal; `label` is one word for it, `numbers` its own stream of chance."""
+
+    label: str
+    kind: Kind
+    mechanisms: tuple[str, ...]
+    outside: str
+    tetrahedra: bool
+    numbers: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A plan with its numbers: theta and values of parameters (SI), strength of what is outside."""
+
+    plan: Plan
+    theta: Mapping[str, float]
+    values: Mapping[str, float] = field(default_factory=dict)
+    strength: float = 0.0
+    floor_n: float = 0.0
+    target: float = 0.0  # size aimed at, of the floor
+
+
+_Chosen = tuple[str, Kind, tuple[str, ...], str]
+
+
+def plans(seed: int, count: int) -> tuple[Plan, ...]:
+    """What each of `count` recordings conceals, in the order of their numbers. Same seed, same plans."""
+    rng = np.random.default_rng([seed, 0])
+    known = catalogue()
+    counts = _counts(count)
+    tissue = [n for n, m in known.items() if isinstance(m.act, Tissue)]
+    alone = [*_shuffled(rng, list(known)), *_cycled(rng, tissue, counts["alone"])][: counts["alone"]]
+    chosen: list[tuple[str, Kind, tuple[str, ...], str]] = [("nothing", "nothing", (), "")] * counts[
+        "nothing"
+    ]
+    for name in alone:
+        needed = (NEEDS[name],) if name in NEEDS else ()
+        chosen.append((name, "alone", (*needed, name), ""))
+    for pair in _pairs(rng, known, counts["pair"]):
+        chosen.append((" + ".join(pair), "pair", pair, ""))
+    for name in _cycled(rng, list(OUTSIDE), counts["outside"]):
+        chosen.append((name, "outside", (), name))
+    order = rng.permutation(count)
+    cut = set(rng.permutation(count)[: int(np.ceil(TETRAHEDRA * count))].tolist())
+    shuffled = enumerate(chosen[i] for i in order.tolist())
+    return tuple(
+        Plan(label, kind, mechanisms, outside, place in cut, (seed, 1, place))
+        for place, (label, kind, mechanisms, outside) in shuffled
+    )
+
+
+def _counts(count: int) -> dict[Kind, int]:
+    found = {kind: int(share * count) for kind, share in SHARES.items()}
+    short = sorted(SHARES, key=lambda kind: found[kind] - SHARES[kind] * count)
+    for kind in short[: count - sum(found.values())]:
+        found[kind] += 1
+    return found
+
+
+def _shuffled(rng: np.random.Generator, names: Sequence[str]) -> list[str]:
+    return [names[i] for i in rng.permutation(len(names))]
+
+
+def _cycled(rng: np.random.Generator, names: Sequence[str], count: int) -> list[str]:
+    found: list[str] = []
+    while len(found) < count:
+        found += _shuffled(rng, names)
+    return found[:count]
+
+
+def _pairs(rng: np.random.Generator, known: Mapping[str, Mechanism], count: int) -> list[tuple[str, str]]:
+    """One that the full model solves and one that adds to its force, no look-alikes of each other."""
+    solved = [n for n, m in known.items() if m.act.bind is not None]
+    adding = [n for n, m in known.items() if m.act.bind is None and n not in NEEDS]
+    found = []
+    for first in _cycled(rng, solved, count):
+        fitting = [n for n in adding if not set(known[n].group) & set(known[first].group)]
+        found.append((first, _shuffled(rng, fitting)[0]))
+    return found
+
+
+@dataclass(frozen=True)
+class Screen:
+    """Predicts what a case's force will be, well enough to choose its size."""
+
+    refit: Refit
+    effects: tuple[Effect, ...]
+    known: Mapping[str, Mechanism]
+
+    def force(self, names: Sequence[str], theta: Array, values: Mapping[str, Array]) -> Array:
+        """Bin means (n, m) at theta (n, 5) with mechanisms at values (n,) each."""
+        force_n = self.refit.force(theta)
+        for effect in self.effects:
+            if effect.mechanism in names:
+                own = np.stack([values[name] for name in effect.own], axis=1)
+                force_n = force_n + effect.predict(np.concatenate([theta, own], axis=1)).mean
+        reported = [self.known[n] for n in names if isinstance(self.known[n].act, Instrument)]
+        if not reported:
+            return force_n
+        straight = _Straight(force_n)
+        seen = bin_means(observed(reported, values, MOTION, straight), MOTION, EDGES_S)
+        return np.asarray(force_n + seen - bin_means(straight, MOTION, EDGES_S))
+
+
+class _Straight:
+    """Force over time, straight from one bin's middle to the next; bin means (n, m)."""
+
+    def __init__(self, mean_n: Array) -> None:
+        self._mean_n = mean_n
+
+    def __call__(self, time_s: Array) -> Array:
+        rows = np.broadcast_to(time_s, (len(self._mean_n), np.shape(time_s)[-1]))
+        place = np.clip((rows - EDGES_S[0]) / (EDGES_S[1] - EDGES_S[0]) - 0.5, 0.0, len(EDGES_S) - 2.000001)
+        left = place.astype(int)
+        low, high = (np.take_along_axis(self._mean_n, left + one, axis=1) for one in (0, 1))
+        return np.asarray(low + (place - left) * (high - low))
+
+
+@cache
+def shipped_screen() -> Screen:
+    """With the surrogates that come with bayeskin."""
+    path = shipped(SURROGATE)
+    effects = []
+    for file in sorted(path.with_name(f"{path.stem}-effects").glob("*.h5")):
+        if not file.stem.endswith("-design"):
+            about = load_manifest(file)["effect"]
+            own = tuple(about["own"])
+            effects.append(
+                Effect(about["part"], about["mechanism"], about["neutral"], own, load_surrogate(file))
+            )
+    return Screen(Refit(load_surrogate(path)), tuple(effects), catalogue())
+
+
+def draw(plan: Plan, attempt: int, screen: Screen) -> Case:
+    """The numbers of a plan; another `attempt` draws others. Same plan and attempt, same case."""
+    rng = np.random.default_rng([*plan.numbers, attempt])
+    floor_n = float(rng.uniform(*FLOORS_N))
+    target = float(np.exp(rng.uniform(*np.log(SIZES))))
+    if plan.mechanisms:
+        return _sized(plan, rng, screen, floor_n, target)
+    theta, _ = _skins(rng, screen, 1)
+    strength = 0.0
+    if plan.outside:
+        strength = float(np.exp(rng.uniform(*np.log(OUTSIDE[plan.outside].strengths))))
+    return Case(plan, _named(screen, theta[0]), {}, strength, floor_n)
+
+
+def _sized(plan: Plan, rng: np.random.Generator, screen: Screen, floor_n: float, target: float) -> Case:
+    """The draw whose size is nearest to the target; of a pair, with both parts in it.
+
+    Straight lines about theta choose a few of each batch, which are then fitted.
+    """
+    parameters = ParameterSpace(tuple(p for n in plan.mechanisms for p in screen.known[n].parameters))
+    best, found = np.inf, None
+    for _ in range(BATCHES):
+        theta, base_n = _skins(rng, screen, BATCH)
+        drawn = parameters.from_unit(rng.random((BATCH, parameters.dim)))
+        drawn = np.clip(drawn, parameters.lower, parameters.upper)
+        values = dict(zip(parameters.names, drawn.T, strict=True))
+        all_n = screen.force(plan.mechanisms, theta, values)
+        size = rms(screen.refit.linear(all_n - base_n, theta)) / floor_n
+        short = _one_sided(plan, screen, theta, values, all_n, size * floor_n)
+        short[(np.abs(all_n).max(axis=1) > PEAK_N[1]) | (all_n.max(axis=1) < PEAK_N[0])] = np.inf
+        for row in np.argsort(_far(size, target) + short)[:FITTED]:
+            fitted = rms(screen.refit.residual(all_n[row], theta[row], ALONE)) / floor_n
+            far = _far(fitted, target) + short[row]
+            if found is None or far < best:
+                best, found = far, (theta[row], {name: float(v[row]) for name, v in values.items()})
+        if best < NEAR:
+            break
+    assert found is not None
+    return Case(plan, _named(screen, found[0]), found[1], 0.0, floor_n, target)
+
+
+def _far(size: Array, target: float) -> Array:
+    return np.asarray(np.abs(np.log(np.maximum(size, 1e-9) / target)))
+
+
+def _one_sided(
+    plan: Plan, screen: Screen, theta: Array, values: Mapping[str, Array], all_n: Array, size_n: Array
+) -> Array:
+    """By how much (n,), in logarithms, a mechanism of several falls short of its share."""
+    short = np.zeros(len(theta))
+    for name in plan.mechanisms if len(plan.mechanisms) > 1 else ():
+        rest_n = screen.force([n for n in plan.mechanisms if n != name], theta, values)
+        own_n = rms(screen.refit.linear(all_n - rest_n, theta))
+        short += np.maximum(np.log(LEAST_SHARE * size_n / np.maximum(own_n, 1e-12)), 0.0)
+    return short
+
+
+def _skins(rng: np.random.Generator, screen: Screen, count: int) -> tuple[Array, Array]:
+    """theta (count, 5) from the default box where the peak is a skin test's, and the base's force there."""
+    space = screen.refit.surrogate.space
+    theta, force = np.empty((0, space.dim)), np.empty((0, len(EDGES_S) - 1))
+    while len(theta) < count:
+        more = np.clip(space.from_unit(rng.random((4 * count, space.dim))), space.lower, space.upper)
+        more_n = screen.refit.force(more)
+        peak = more_n.max(axis=1)
+        kept = (peak > PEAK_N[0]) & (peak < PEAK_N[1]) & (more[:, 1] < STIFFEST_BELOW * more[:, 0])
+        theta, force = np.concatenate([theta, more[kept]]), np.concatenate([force, more_n[kept]])
+    return theta[:count], force[:count]
+
+
+def _named(screen: Screen, theta: Array) -> dict[str, float]:
+    return dict(zip(screen.refit.surrogate.space.names, theta.tolist(), strict=True))

@@ -1,0 +1,233 @@
+"""Makes a set: each case in the full model, on another mesh and time grid than the surrogates', with noise.
+
+A recording that is finished is not made again. Where the full model fails at a case, its plan is drawn anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import bayeskin
+from bayeskin import storage
+from bayeskin.errors import InputError
+from bayeskin.mechanisms import bin_means, catalogue, laws, observed
+from bayeskin.mechanisms.mechanism import ForceOfTime
+from bayeskin.model.mesh import layered_mesh
+from bayeskin.model.problem import Problem, build_problem, material
+from bayeskin.model.simulate import simulate_on
+from bayeskin.proof import seals
+from bayeskin.proof.cases import Case, Plan, Screen, draw, plans, shipped_screen
+from bayeskin.proof.noise import noise
+from bayeskin.proof.outside import OUTSIDE, Change
+from bayeskin.proof.protocol import EDGES_S, MOTION, samples_s
+from bayeskin.proof.remains import rms, windows
+from bayeskin.types import Array, Recording, Simulation
+
+# Lines of the bricks [mm]: more of them, and graded otherwise, than those of the shipped surrogates' model.
+_X_MM = (0.0, 9.0, 16.0, 18.0, 19.0, 22.0, 25.0, 26.0, 27.0, 28.0, 31.0, 34.0, 35.0, 37.0, 43.0, 58.0, 105.0)
+_Y_MM = (0.0, 2.5, 4.0, 5.0, 6.5, 10.0, 12.0, 15.0, 24.0, 45.0, 84.0)
+_HEIGHT_MM, _DEEP, _OUTER = 10.0, 0.5, 0.65  # subcutis divided in the middle, cutis nearer to its surface
+TOLERANCE = 5e-4  # of a step; the surrogates' runs have twice that
+ATTEMPTS = 8
+LVDT_STEP_M, CELL_STEP_N = 1e-5, 2.0**-13
+
+Run = Callable[[Case, Sequence[str], Change], Simulation]  # with the mechanisms named, and the change
+
+
+@dataclass(frozen=True)
+class Concealed:
+    """A recording and its key."""
+
+    recording: Recording
+    key: Mapping[str, Any]
+
+
+@lru_cache(maxsize=3)
+def problem_of(tetrahedra: bool, cutis_bottom_m: float, radius_m: float) -> Problem:
+    """The test on the proof's own mesh."""
+    bottom = 1e3 * cutis_bottom_m
+    z = (0.0, _DEEP * bottom, bottom, bottom + _OUTER * (_HEIGHT_MM - bottom), _HEIGHT_MM)
+    lines = [1e-3 * np.array(axis) for axis in (_X_MM, _Y_MM, z)]
+    return build_problem(layered_mesh(lines, "the proof's mesh", tetrahedra, 1e-3 * float(bottom), radius_m))
+
+
+def full_run(case: Case, names: Sequence[str], change: Change) -> Simulation:
+    """The full model with the mechanisms `names` and a change."""
+    known = catalogue()
+    problem = problem_of(case.plan.tetrahedra, change.cutis_bottom_m, change.radius_m)
+    corners = problem.mesh.geometry.p[:, problem.mesh.geometry.t]
+    height = np.hypot(corners[1], corners[2]).mean(axis=0) - change.radius_m
+    solid = change.solid(
+        material(case.theta, problem.mesh.cutis, change.constants), height / change.cutis_bottom_m
+    )
+    along = {p.name: case.values[p.name] for name in names for p in known[name].parameters}
+    binds = [*laws([known[name] for name in names]), *change.laws]
+    return simulate_on(problem, solid, TOLERANCE, change.moved(MOTION), {**case.theta, **along}, binds)
+
+
+def conceal(
+    folder: Path,
+    seed: int,
+    count: int,
+    tell: Callable[[float, str], None] = lambda share, note: None,
+    run: Run = full_run,
+    screen: Screen | None = None,
+) -> int:
+    """Makes what is missing of a set of `count` recordings; returns how many it made.
+
+    tell : called with the share that is done and a note. Raises InputError for a set of another seed or
+    count, or where the full model fails at every attempt.
+    """
+    _agree(folder, seed, count)
+    screen, made = screen or shipped_screen(), 0
+    for place, plan in enumerate(plans(seed, count)):
+        number = f"{place + 1:03d}"
+        if not _finished(folder, number):
+            _write(folder, number, concealed(plan, screen, run))
+            made += 1
+        tell((place + 1) / count, f"{place + 1} of {count}")
+    return made
+
+
+def concealed(plan: Plan, screen: Screen, run: Run = full_run) -> Concealed:
+    """One plan's recording and key; drawn anew where the full model fails."""
+    for attempt in range(ATTEMPTS):
+        case = draw(plan, attempt, screen)
+        runs = _Runs(case, run)
+        if runs.ok:
+            return _recorded(case, runs, screen, attempt)
+    raise InputError(
+        f"proof: {plan.label}", f"{ATTEMPTS} runs of the full model that failed", "one that ends"
+    )
+
+
+class _Runs:
+    """The full runs that a case needs, each made once: with and without what the model solves along."""
+
+    def __init__(self, case: Case, run: Run) -> None:
+        known = catalogue()
+        self._case, self._known = case, known
+        self._change = OUTSIDE[case.plan.outside].change(case.strength) if case.plan.outside else Change()
+        solved = [n for n in case.plan.mechanisms if known[n].act.bind is not None]
+        same = not solved and self._change.of_force_alone
+        self._base = run(case, (), Change())
+        self._solved = self._base if same else run(case, solved, self._change)
+
+    @property
+    def ok(self) -> bool:
+        return self._base.status == self._solved.status == "ok"
+
+    @property
+    def seconds(self) -> float:
+        different = [self._base] if self._solved is self._base else [self._base, self._solved]
+        return float(sum(one.stats.get("seconds", 0.0) for one in different))
+
+    def force(self, names: Sequence[str], changed: bool) -> ForceOfTime:
+        """Noise-free, with the mechanisms `names` and, if `changed`, with what is outside."""
+        solved = [n for n in names if self._known[n].act.bind is not None]
+        simulation = self._solved if solved or changed else self._base
+        adding = [self._known[n] for n in names if n not in solved]
+        values = {name: np.array([value]) for name, value in self._case.values.items()}
+        force = observed(adding, values, MOTION, lambda t: np.atleast_2d(simulation.at(t)))
+        return self._change.reported(force) if changed else force
+
+
+def _recorded(case: Case, runs: _Runs, screen: Screen, attempt: int) -> Concealed:
+    plan = case.plan
+    force = runs.force(plan.mechanisms, bool(plan.outside))
+    time_s = samples_s()
+    rng = np.random.default_rng([*plan.numbers, attempt, 1])
+    measured = force(time_s)[0] + noise(rng, time_s, case.floor_n)
+    force_n = CELL_STEP_N * np.round(measured / CELL_STEP_N)
+    recording = Recording(
+        time_s=time_s,
+        displacement_m=LVDT_STEP_M * np.round(MOTION.at(time_s) / LVDT_STEP_M),
+        force_n=force_n,
+        name="recording",
+        sha256=hashlib.sha256(force_n.tobytes()).hexdigest(),
+        notes=("simulated, not measured",),
+    )
+    return Concealed(recording, _key(case, runs, screen, attempt, float(np.abs(force_n).max())))
+
+
+def _key(case: Case, runs: _Runs, screen: Screen, attempt: int, peak_n: float) -> dict[str, Any]:
+    """All that a score needs, and what remakes the case."""
+    plan, refit = case.plan, screen.refit
+    theta = np.array([case.theta[name] for name in refit.surrogate.space.names])
+
+    def means(names: Sequence[str], changed: bool) -> Array:
+        return bin_means(runs.force(names, changed), MOTION, EDGES_S)[0]
+
+    whole, base = means(plan.mechanisms, bool(plan.outside)), means((), False)
+    expected = refit.force(theta[None])[0]
+
+    def left(with_n: Array, without_n: Array) -> Array:
+        """Of an effect, when the base model is fitted again to its own force and the effect's."""
+        return refit.residual(expected + with_n - without_n, theta)
+
+    remaining = left(whole, base)
+    size_n = float(rms(remaining))
+    others = {name: [n for n in plan.mechanisms if n != name] for name in plan.mechanisms}
+    return {
+        "label": plan.label,
+        "kind": plan.kind,
+        "mechanisms": list(plan.mechanisms),
+        "outside": plan.outside,
+        "strength": case.strength,
+        "theta": dict(case.theta),
+        "values": dict(case.values),
+        "floor_n": case.floor_n,
+        "size_n": size_n,
+        "size": size_n / case.floor_n,
+        "sizes": {name: float(rms(left(whole, means(rest, False)))) for name, rest in others.items()},
+        "effect_n": float(rms(whole - base)),
+        "target": case.target,
+        "windows": windows(remaining, case.floor_n, EDGES_S),
+        "mesh_n": float(rms(refit.residual(base, theta))),
+        "tetrahedra": plan.tetrahedra,
+        "tolerance": TOLERANCE,
+        "attempt": attempt,
+        "numbers": list(plan.numbers),
+        "peak_n": peak_n,
+        "seconds": runs.seconds,
+        "version": bayeskin.__version__,
+    }
+
+
+def _agree(folder: Path, seed: int, count: int) -> None:
+    """Raises InputError where the folder holds another set."""
+    path, ours = folder / seals.SEALS / seals.SET, {"seed": seed, "count": count}
+    if path.is_file():
+        found = seals.read_json(path)
+        if found != ours:
+            expected = f"--seed {found['seed']} --count {found['count']}, or another folder"
+            raise InputError(folder, f"a set of another making than --seed {seed} --count {count}", expected)
+    else:
+        seals.write_json(path, ours)
+        seals.write_json(folder / seals.INDEX, {"recordings": {}})
+
+
+def _finished(folder: Path, number: str) -> bool:
+    said = seals.read_index(folder).get(number)
+    return said is not None and said == _hashes(folder, number)
+
+
+def _hashes(folder: Path, number: str) -> dict[str, str]:
+    return {
+        "recording_sha256": seals.sha256(seals.recording_path(folder, number)),
+        "key_sha256": seals.sha256(folder / seals.SEALS / f"{number}.json"),
+    }
+
+
+def _write(folder: Path, number: str, one: Concealed) -> None:
+    storage.save(seals.recording_path(folder, number), one.recording)
+    seals.write_json(folder / seals.SEALS / f"{number}.json", dict(one.key))
+    index = {**seals.read_index(folder), number: _hashes(folder, number)}
+    seals.write_json(folder / seals.INDEX, {"recordings": dict(sorted(index.items()))})

@@ -1,0 +1,306 @@
+"""Effects that no mechanism of the catalogue is, from the full model; written for the proof alone.
+
+Each has one strength, drawn log-uniformly between two bounds, and says what it changes: constants or layers
+of the skin, the arm, the solid's law over time or strain, the motion that the skin sees, or the force.
+"""
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.signal import lfilter
+
+from bayeskin.mechanisms.elastic import elastic_stress, scale_elastic
+from bayeskin.mechanisms.mechanism import ForceOfTime
+from bayeskin.model.assembly import Chunk, compiled
+from bayeskin.model.mesh import ARM_RADIUS_M, CUTIS_BOTTOM_M, LENGTH_M
+from bayeskin.model.problem import Constants, Material, Problem, material
+from bayeskin.model.tissue import Bind, Passage, TissueLaw
+from bayeskin.proof.protocol import MOTION
+from bayeskin.types import Array, PadMotion
+
+END_S = float(MOTION.time_s[-1])
+LOWEST_LAYER = 0.5  # of the subcutis' thickness
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
+
+
+@dataclass(frozen=True)
+class Change:
+    """What the full model is run with instead.
+
+    deep : factor on the moduli of the subcutis' lower half; reported : what becomes of the force
+    """
+
+    constants: Constants = Constants()  # noqa: RUF009 - frozen
+    cutis_bottom_m: float = CUTIS_BOTTOM_M
+    radius_m: float = ARM_RADIUS_M
+    deep: float = 1.0
+    laws: tuple[Bind, ...] = ()
+    moved: Callable[[PadMotion], PadMotion] = _as_it_is
+    reported: Callable[[ForceOfTime], ForceOfTime] = _as_it_is
+
+    @property
+    def of_force_alone(self) -> bool:
+        """Whether the full model runs as it is."""
+        return replace(self, reported=_as_it_is) == Change()
+
+    def solid(self, base: Material, depth: Array) -> Material:
+        """Constants of the cells (e,), whose middles lie at `depth`, as shares of the subcutis' height."""
+        factor = np.where(depth < LOWEST_LAYER, self.deep, 1.0)
+        return replace(base, mu=factor * base.mu, lam=factor * base.lam)
+
+
+@dataclass(frozen=True)
+class Outside:
+    """One effect: what it is, the bounds of its strength, and the change that a strength makes."""
+
+    sentence: str
+    strengths: tuple[float, float]
+    change: Callable[[float], Change]
+
+
+@compiled
+def factored(deformation, pressure, factor, stress):
+    """Multiplies the elastic part of the stress (e, q, 3, 3) by a factor."""
+    inverse, elastic = np.empty((3, 3)), np.empty((3, 3))
+    for e in range(stress.shape[0]):
+        for q in range(stress.shape[1]):
+            elastic_stress(deformation[e, q], pressure[e, q], stress[e, q], inverse, elastic)
+            for i in range(3):
+                for k in range(3):
+                    stress[e, q, i, k] += (factor - 1.0) * elastic[i, k]
+
+
+@compiled
+def factored_derivatives(deformation, pressure, factor, stress_f):
+    """The same of its derivative."""
+    inverse, elastic, none = np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
+    for e in range(stress_f.shape[0]):
+        for q in range(stress_f.shape[1]):
+            f, p = deformation[e, q], pressure[e, q]
+            j = elastic_stress(f, p, none, inverse, elastic)
+            scale_elastic(factor, p, j, inverse, stress_f[e, q])
+
+
+class Ageing(TissueLaw):
+    """Moduli of both layers times a factor that time alone decides: P_e f(t)."""
+
+    remembers = 1  # the time
+
+    def __init__(self, factor: Callable[[float], float]) -> None:
+        self._factor = factor
+
+    def _now(self, passage: Passage) -> float:
+        return self._factor(float(passage.before.flat[0]) + passage.elapsed_s)
+
+    def respond(self, chunk: Chunk, passage: Passage) -> None:
+        passage.after[...] = passage.before + passage.elapsed_s
+        factored(chunk.at.deformation, chunk.at.pressure, self._now(passage), chunk.found.stress)
+
+    def linearise(self, chunk: Chunk, passage: Passage) -> None:
+        factored_derivatives(chunk.at.deformation, chunk.at.pressure, self._now(passage), chunk.by.stress_f)
+
+
+@compiled
+def softened(deformation, pressure, loss, stress):
+    """Divides the elastic part of the stress by 1 + a (tr C - 3)."""
+    inverse, elastic = np.empty((3, 3)), np.empty((3, 3))
+    for e in range(stress.shape[0]):
+        for q in range(stress.shape[1]):
+            f = deformation[e, q]
+            elastic_stress(f, pressure[e, q], stress[e, q], inverse, elastic)
+            left = 1.0 / (1.0 + loss * max((f * f).sum() - 3.0, 0.0))
+            for i in range(3):
+                for k in range(3):
+                    stress[e, q, i, k] += (left - 1.0) * elastic[i, k]
+
+
+@compiled
+def softened_derivatives(deformation, pressure, loss, mu, lam, stress_f):
+    """dP = (1 / b) dP_e - (2 a / b^2) (P_e (x) F) : dF, b = 1 + a (tr C - 3)."""
+    inverse, elastic, zero = np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
+    for e in range(stress_f.shape[0]):
+        for q in range(stress_f.shape[1]):
+            f, p = deformation[e, q], pressure[e, q]
+            j = elastic_stress(f, p, zero, inverse, elastic)
+            strain = (f * f).sum() - 3.0
+            left = 1.0 / (1.0 + loss * max(strain, 0.0))
+            scale_elastic(left, p, j, inverse, stress_f[e, q])
+            if strain <= 0.0:
+                continue
+            spherical = lam[e] * np.log(j) - mu[e]
+            for i in range(3):
+                for k in range(3):
+                    own = mu[e] * f[i, k] + spherical * inverse[k, i]
+                    for m in range(3):
+                        for n in range(3):
+                            stress_f[e, q, 3 * i + k, 3 * m + n] -= 2.0 * loss * left**2 * own * f[m, n]
+
+
+class Softening(TissueLaw):
+    """The solid yields ever more easily the further it is stretched; loss a [-], moduli (e,) of the cells."""
+
+    def __init__(self, loss: float, mu: Array, lam: Array) -> None:
+        self._loss, self._mu, self._lam = loss, mu, lam
+
+    def respond(self, chunk: Chunk, passage: Passage) -> None:
+        softened(chunk.at.deformation, chunk.at.pressure, self._loss, chunk.found.stress)
+
+    def linearise(self, chunk: Chunk, passage: Passage) -> None:
+        c, at = chunk.cells, chunk.at
+        lame = (self._mu[c], self._lam[c])
+        softened_derivatives(at.deformation, at.pressure, self._loss, *lame, chunk.by.stress_f)
+
+
+def ageing(factor: Callable[[float], float]) -> Change:
+    """Moduli that follow a factor of the time [s]."""
+
+    def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
+        return Ageing(factor)
+
+    return Change(laws=(bind,))
+
+
+def softening(loss: float) -> Change:
+    """See `Softening`."""
+
+    def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
+        solid = material(values, problem.mesh.cutis)
+        return Softening(loss, solid.mu, solid.lam)
+
+    return Change(laws=(bind,))
+
+
+SETTING_S, LOOSENING_S = 15.0, 3.0  # a tissue that loosens while it is moved, and sets while it stands
+
+
+def thixotropy(loss: float) -> Change:
+    """Moduli less a share that grows while the drive moves and vanishes while it stands."""
+    moving = np.diff(MOTION.displacement_m) != 0.0
+    at_corner = [0.0]
+    for moves, lasts_s in zip(moving, np.diff(MOTION.time_s), strict=True):
+        end, tau = (1.0, LOOSENING_S) if moves else (0.0, SETTING_S)
+        at_corner.append(end + (at_corner[-1] - end) * float(np.exp(-lasts_s / tau)))
+
+    def factor(time_s: float) -> float:
+        i = min(max(int(np.searchsorted(MOTION.time_s, time_s)) - 1, 0), len(moving) - 1)
+        end, tau = (1.0, LOOSENING_S) if moving[i] else (0.0, SETTING_S)
+        loose = end + (at_corner[i] - end) * np.exp(-(time_s - MOTION.time_s[i]) / tau)
+        return float(1.0 - loss * loose)
+
+    return ageing(factor)
+
+
+YIELD_M = 4e-3
+
+
+def plastic_set(share: float) -> Change:
+    """The skin keeps a share of the farthest displacement beyond a yield point, for good."""
+
+    def moved(motion: PadMotion) -> PadMotion:
+        first = int(np.argmax(motion.displacement_m > YIELD_M))
+        start, end = motion.displacement_m[first - 1 : first + 1]
+        yields_s = np.interp(YIELD_M, [start, end], motion.time_s[first - 1 : first + 1])
+        time_s = np.insert(motion.time_s, first, yields_s)
+        u = motion.at(time_s)
+        return PadMotion(time_s, u - share * np.maximum(np.maximum.accumulate(u) - YIELD_M, 0.0))
+
+    return Change(moved=moved)
+
+
+def peeling(share: float) -> Change:
+    """From the third cycle on the pads' edges have come off: the skin sees a share less."""
+    third = int(np.flatnonzero(np.diff(np.sign(np.diff(MOTION.displacement_m))) > 1)[1]) + 1
+
+    def moved(motion: PadMotion) -> PadMotion:
+        late = np.arange(len(motion.time_s)) > third
+        return PadMotion(motion.time_s, motion.displacement_m * np.where(late, 1.0 - share, 1.0))
+
+    return Change(moved=moved)
+
+
+def scaled(factor: Callable[[Array, Array], Array]) -> Change:
+    """The force times a factor of time and force."""
+
+    def reported(force: ForceOfTime) -> ForceOfTime:
+        return lambda time_s: force(time_s) * factor(np.asarray(time_s), force(time_s))
+
+    return Change(reported=reported)
+
+
+BREATH_S = 4.1
+TWITCHES_S, TWITCH_S = (120.0, 240.0), 4.0
+
+
+def twitching(size_n: float) -> Change:
+    """The muscle below pulls twice, for some seconds."""
+
+    def pull(time_s: Array) -> Array:
+        return size_n * np.sum([np.exp(-0.5 * ((time_s - at) / TWITCH_S) ** 2) for at in TWITCHES_S], axis=0)
+
+    return Change(reported=lambda force: lambda time_s: force(time_s) + pull(np.asarray(time_s)))
+
+
+GRID_S = 0.01
+
+
+def slow_amplifier(time_constant_s: float) -> Change:
+    """The force passes a low-pass of first order."""
+    grid = np.arange(0.0, END_S + GRID_S, GRID_S)
+    keep = float(np.exp(-GRID_S / time_constant_s))
+
+    def reported(force: ForceOfTime) -> ForceOfTime:
+        late = lfilter([1.0 - keep], [1.0, -keep], force(grid)[0])
+        return lambda time_s: np.atleast_2d(np.interp(time_s, grid, late))
+
+    return Change(reported=reported)
+
+
+def _of(**changed: Any) -> Change:
+    return Change(constants=Constants(**changed))
+
+
+TOP_M = LENGTH_M[2]
+OUTSIDE: dict[str, Outside] = {
+    "poisson-cutis": Outside("Poisson's ratio of the cutis", (0.2, 0.4), lambda s: _of(nu_c=s)),
+    "poisson-subcutis-high": Outside("Poisson's ratio of the subcutis", (0.4, 0.48), lambda s: _of(nu_s=s)),
+    "poisson-subcutis-low": Outside("Poisson's ratio of the subcutis", (0.01, 0.15), lambda s: _of(nu_s=s)),
+    "thin-cutis": Outside(
+        "thickness of the cutis [m]", (1e-3, 1.6e-3), lambda s: Change(cutis_bottom_m=TOP_M - s)
+    ),
+    "thick-cutis": Outside(
+        "thickness of the cutis [m]", (2.5e-3, 4e-3), lambda s: Change(cutis_bottom_m=TOP_M - s)
+    ),
+    "thin-arm": Outside("radius below the subcutis [m]", (0.03, 0.042), lambda s: Change(radius_m=s)),
+    "thick-arm": Outside("radius below the subcutis [m]", (0.058, 0.09), lambda s: Change(radius_m=s)),
+    "muscle": Outside("a third layer, stiffer by a factor", (4.0, 40.0), lambda s: Change(deep=s)),
+    "soft-fat": Outside("a third layer, of moduli times", (0.03, 0.3), lambda s: Change(deep=s)),
+    "hardening": Outside(
+        "moduli grow evenly, by this share in all", (0.03, 0.4),
+        lambda s: ageing(lambda t: 1.0 + s * t / END_S),
+    ),
+    "fatigue": Outside(
+        "moduli fall by this share, most of it within a minute", (0.03, 0.4),
+        lambda s: ageing(lambda t: 1.0 - s * (1.0 - float(np.exp(-t / 60.0)))),
+    ),
+    "thixotropy": Outside("moduli lose this share while the skin is moved", (0.03, 0.4), thixotropy),
+    "strain-softening": Outside("loss of stiffness by tr C - 3", (0.3, 10.0), softening),
+    "plastic-set": Outside("share of the farthest displacement that is kept", (0.01, 0.1), plastic_set),
+    "peeling": Outside("share of the displacement that is lost from cycle 3 on", (0.01, 0.1), peeling),
+    "breathing": Outside(
+        "share of the force that comes and goes in 4.1 s", (0.01, 0.2),
+        lambda s: scaled(lambda t, f: 1.0 + s * np.sin(2.0 * np.pi * t / BREATH_S)),
+    ),
+    "bent-cell": Outside(
+        "share more that the load cell reads at 1 N", (0.05, 0.6), lambda s: scaled(lambda t, f: 1.0 + s * f)
+    ),
+    "twitches": Outside("height of two pulls of the muscle [N]", (5e-3, 0.1), twitching),
+    "slow-amplifier": Outside("time constant of the amplifier [s]", (0.3, 5.0), slow_amplifier),
+}  # fmt: skip

@@ -1,0 +1,124 @@
+"""The proof's scoreboard: what was said of what is concealed, and how large it must be to be named."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+from bayeskin.report.style import (
+    ACCENT,
+    GREY,
+    INK,
+    MODEL,
+    PAGE_IN,
+    new_figure,
+    panel_title,
+    plain_log,
+    state_finding,
+    styled,
+)
+
+_LAST = ("both", "several names", "unknown")
+_SHADES = LinearSegmentedColormap.from_list("shades", ["white", MODEL])
+_OPEN_END = 1.6  # the last class of sizes has no upper end: so many times its lower one
+
+
+@styled
+def figure_proof(board: Mapping[str, Any]) -> Figure:
+    """Confusion matrix, detectability by size, and shares with their intervals, from a scoreboard."""
+    rows = list(board["confusion"])
+    figure = new_figure(PAGE_IN, 2.6 + 0.17 * max(len(rows), 12))
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.45, 1))
+    _draw_confusion(figure.add_subplot(grid[:, 0]), board["confusion"])
+    _draw_detectability(figure.add_subplot(grid[0, 1]), board["detectability"])
+    _draw_shares(figure.add_subplot(grid[1, 1]), board)
+    state_finding(
+        figure,
+        _finding(board),
+        "a: number of recordings; pairs and effects outside the catalogue in one row each. b, c: 90 % Wilson "
+        "intervals. Size: what remains of the effect after the base model's best refit, over the noise floor "
+        "of 0.5 s means; c: of sizes from 3 on.",
+    )
+    return figure
+
+
+def _finding(board: Mapping[str, Any]) -> str:
+    named, alarms = board["named_up_to_look_alikes"]["clear"], board["false_alarms"]
+    return (
+        f"Of {named['of']} clear effects {named['hits']} are named right up to look-alikes; "
+        f"{alarms['hits']} false alarms in {alarms['of']} recordings without any"
+    )
+
+
+def _draw_confusion(ax: Axes, confusion: Mapping[str, Mapping[str, int]]) -> None:
+    rows = list(confusion)
+    said = {answer for row in confusion.values() for answer in row}
+    known = ["nothing-missing", *(row for row in rows if row not in ("nothing", "pair", "outside"))]
+    further = sorted(said - set(known) - set(_LAST))
+    columns = [name for name in (*known, *further, *_LAST) if name in said]
+    counts = np.array([[confusion[row].get(column, 0) for column in columns] for row in rows], dtype=float)
+    counts = counts.reshape(len(rows), len(columns))
+    total = np.maximum(counts.sum(axis=1, keepdims=True), 1.0)
+    ax.imshow(counts / total, cmap=_SHADES, vmin=0.0, vmax=1.0, aspect="auto")
+    for i, j in zip(*np.nonzero(counts), strict=True):
+        dark = counts[i, j] / total[i, 0] > 0.5
+        ax.text(j, i, f"{counts[i, j]:.0f}", ha="center", va="center", color="white" if dark else INK)
+    ax.set_xticks(range(len(columns)), columns, rotation=90)
+    ax.set_yticks(range(len(rows)), rows)
+    ax.set_xticks(np.arange(len(columns) + 1) - 0.5, minor=True)
+    ax.set_yticks(np.arange(len(rows) + 1) - 0.5, minor=True)
+    ax.grid(which="minor", color=GREY, lw=0.2)
+    ax.tick_params(which="both", length=0)
+    ax.set(xlabel="said", ylabel="concealed")
+    panel_title(ax, "a")
+
+
+def _draw_detectability(ax: Axes, classes: Sequence[Mapping[str, Any]]) -> None:
+    """A step for each class of sizes: its share named, with its interval."""
+    lowest = classes[0]["to"] / _OPEN_END
+    for one in classes:
+        low, high = one["from"] or lowest, one["to"] or one["from"] * _OPEN_END
+        middle = np.sqrt(low * high)
+        for name, color, label, shift in (
+            ("named", INK, "right", 0.97),
+            ("up_to_look_alikes", MODEL, "up to look-alikes", 1.03),
+        ):
+            found = one[name]
+            if not found["of"]:
+                continue
+            ax.hlines(found["share"], low, high, color=color, lw=1.3, label=label)
+            ax.vlines(middle * shift, found["low"], found["high"], color=color, lw=0.7)
+    handles, labels = ax.get_legend_handles_labels()
+    unique = dict(zip(labels, handles, strict=True))
+    if unique:
+        ax.legend(unique.values(), unique.keys(), loc="upper left", bbox_to_anchor=(0.0, 1.22), ncols=2)
+    ax.axvline(3.0, color=ACCENT, lw=0.6, ls=":")
+    ax.set_xscale("log")
+    ax.set(ylim=(-0.03, 1.03), xlabel="size [noise floors]", ylabel="share named")
+    plain_log(ax.xaxis)
+    panel_title(ax, "b")
+
+
+def _draw_shares(ax: Axes, board: Mapping[str, Any]) -> None:
+    lines = (
+        ("named right", board["named"]["clear"], 0.9),
+        ("to look-alikes", board["named_up_to_look_alikes"]["clear"], 0.95),
+        ("unknown outside", board["unknown_outside"]["clear"], 0.8),
+        ("effect in 90 %", board["effect_in_interval"]["clear"], None),
+        ("base in 90 %", board["base_in_interval"]["clear"], None),
+        ("false alarms", board["false_alarms"], 0.05),
+    )
+    for place, (_, found, wanted) in enumerate(reversed(lines)):
+        if wanted is not None:
+            ax.plot(wanted, place, "|", ms=9, mew=1.2, color=ACCENT)
+        if found["of"]:
+            ax.hlines(place, found["low"], found["high"], color=MODEL, lw=1.0)
+            ax.plot(found["share"], place, "o", color=MODEL)
+    ax.set_yticks(range(len(lines)), [f"{text}, {found['of']}" for text, found, _ in reversed(lines)])
+    ax.set(xlim=(-0.03, 1.03), ylim=(-0.6, len(lines) - 0.4), xlabel="share of so many; orange: to reach")
+    panel_title(ax, "c")

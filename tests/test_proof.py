@@ -1,0 +1,506 @@
+"""The proof: what is concealed stays so, is what its key says, and is scored by what was said of it."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import bayeskin
+from bayeskin import report, storage
+from bayeskin.design import default_space
+from bayeskin.errors import InputError
+from bayeskin.mechanisms import catalogue
+from bayeskin.model.lagrangian import LagrangianModel
+from bayeskin.model.mesh import brick_mesh
+from bayeskin.model.problem import build_problem, material
+from bayeskin.pipeline import proof as pipeline
+from bayeskin.pipeline.engine import Silent
+from bayeskin.pipeline.recording import pad_motion
+from bayeskin.pipeline.shipping import motion_sha256
+from bayeskin.proof import closed, conceal, score, seals
+from bayeskin.proof.cases import Case, Plan, Screen, draw, plans, shipped_screen
+from bayeskin.proof.conceal import concealed, full_run
+from bayeskin.proof.noise import noise
+from bayeskin.proof.outside import OUTSIDE, Change
+from bayeskin.proof.protocol import EDGES_S, KINDS, MOTION, SURROGATE, kind_at, samples_s
+from bayeskin.proof.remains import Refit, rms, windows
+from bayeskin.proof.score import CLEAR, group_of, judge, overlap, share, stands_for
+from bayeskin.recordings import bin_recording, read_recording, segment, uniform_edges
+from bayeskin.shipped import shipped
+from bayeskin.surrogates import load_manifest, load_surrogate
+from bayeskin.types import PadMotion, Prediction, Recording, Simulation
+
+SEED, COUNT = 5, 4
+PACKAGE = Path(bayeskin.__file__).parent
+THETA = {"E_c": 60e3, "E_s": 20e3, "k_c": 1e-14, "k_s": 5e-13, "p_init": 0.0}
+
+
+class QuickSkin:
+    """A surrogate of two moduli and two relaxations, each with its share of the force."""
+
+    space, edges_s, provenance = default_space(), EDGES_S, {}
+
+    def predict(self, theta) -> Prediction:
+        e_c, e_s, k_c, k_s = np.atleast_2d(theta).T[:4, :, None]
+        middle = 0.5 * (EDGES_S[1:] + EDGES_S[:-1])
+        u = MOTION.at(middle) / 1e-2
+        late = lfilter([0.1], [1.0, -0.9], u)
+        relaxing = 0.02 * (np.log(k_c / 1e-14) + 2.0 * np.log(k_s / 1e-14)) * late
+        mean = (4e-6 * e_c + 1e-5 * e_s) * u * (1.0 + 0.05 * u * e_s / (e_c + e_s)) + 0.05 * relaxing
+        return Prediction(mean, np.zeros((*mean.shape, 1)), np.zeros_like(mean))
+
+
+SKIN = Screen(Refit(QuickSkin()), (), catalogue())
+
+
+def quick_run(case: Case, names, change: Change) -> Simulation:
+    """`QuickSkin` in the place of the full model."""
+    theta = np.array([[case.theta[name] for name in SKIN.refit.surrogate.space.names]])
+    values = {name: np.array([value]) for name, value in case.values.items()}
+    force_n = SKIN.force(names, theta, values)[0]
+    time_s = np.concatenate([[0.0], 0.5 * (EDGES_S[1:] + EDGES_S[:-1]), MOTION.time_s[-1:]])
+    force_n = np.concatenate([[0.0], force_n, force_n[-1:]])
+    corner = np.ones(len(time_s), dtype=bool)  # straight between
+    return Simulation(case.theta, time_s, MOTION.at(time_s), force_n, corner, "ok", "", {}, "")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("set")
+    assert conceal(folder, SEED, COUNT, run=quick_run, screen=SKIN) == COUNT
+    return folder
+
+
+def nothing_found(path: Path, reporter) -> dict:
+    return {"verdict": "nothing-missing", "located": [], "mechanisms": [], "fit": {"after": {}}}
+
+
+# Cases
+
+
+def test_a_seed_decides_which_cases_there_are_and_another_gives_others() -> None:
+    assert plans(7, 64) == plans(7, 64)
+    assert [p.label for p in plans(7, 64)] != [p.label for p in plans(8, 64)]
+
+
+def test_a_set_of_64_has_every_mechanism_alone_and_at_least_15_effects_outside() -> None:
+    found = plans(3, 64)
+    of = {kind: [p for p in found if p.kind == kind] for kind in ("nothing", "alone", "pair", "outside")}
+    assert {kind: len(some) for kind, some in of.items()} == {
+        "nothing": 20,
+        "alone": 22,
+        "pair": 7,
+        "outside": 15,
+    }
+    assert {p.label for p in of["alone"]} == set(catalogue())
+    assert len({p.outside for p in of["outside"]}) == 15
+    assert len(OUTSIDE) >= 15
+    assert not set(OUTSIDE) & set(catalogue())
+    assert sum(p.tetrahedra for p in found) >= 64 / 3
+
+
+def test_the_order_of_a_set_tells_nothing_of_its_kinds() -> None:
+    kinds = [p.kind for p in plans(3, 64)]
+    assert max(kinds[:20].count("nothing"), kinds[-20:].count("nothing")) < 15
+
+
+def test_a_pair_is_no_pair_of_look_alikes() -> None:
+    for plan in plans(11, 256):
+        if plan.kind == "pair":
+            first, second = plan.mechanisms
+            assert second not in group_of(first)
+
+
+def test_a_draw_is_its_plan_s_alone_and_an_attempt_later_another() -> None:
+    plan = Plan("force-offset", "alone", ("force-offset",), "", False, (1, 1, 0))
+    screen = SKIN
+    case = draw(plan, 0, screen)
+    assert case == draw(plan, 0, screen)
+    assert case.theta != draw(plan, 1, screen).theta
+    space = screen.refit.surrogate.space
+    assert space.contains([case.theta[name] for name in space.names])
+    assert -0.15 <= case.values["F0"] <= 0.05
+
+
+# What remains of an effect
+
+
+def test_nothing_remains_of_what_the_base_parameters_can_do() -> None:
+    screen = SKIN
+    theta = np.array([THETA[name] for name in screen.refit.surrogate.space.names])
+    other = theta * [1.3, 0.8, 1.5, 0.7, 1.0]
+    left = screen.refit.residual(screen.refit.force(other[None])[0], theta)
+    assert rms(left) < 1e-6
+    effect = screen.refit.force((theta * [1.002, 1.0, 1.0, 1.0, 1.0])[None]) - screen.refit.force(theta[None])
+    assert rms(screen.refit.linear(effect, theta[None]))[0] < 1e-2 * rms(effect)[0]
+
+
+def test_windows_are_where_the_remaining_effect_exceeds_the_floor() -> None:
+    left = np.array([0.0, 3.0, -3.0, 0.5, 3.0])
+    assert windows(left, 1.0, np.arange(6.0)) == [(1.0, 3.0), (4.0, 5.0)]
+    assert windows(0.5 * np.ones(3), 1.0, np.arange(4.0)) == []
+
+
+# Recordings
+
+
+def test_a_recording_comes_back_with_the_protocol_of_the_shipped_surrogate(made: Path) -> None:
+    recording = read_recording(seals.recording_path(made, "001"))
+    phases = segment(recording)
+    motion = pad_motion("reaction", recording, phases, "idealised")
+    assert motion_sha256(motion) == load_manifest(shipped(SURROGATE))["motion_sha256"]
+    assert tuple(phase.kind for phase in phases) == KINDS
+    edges_s = uniform_edges(float(min(recording.time_s[-1], motion.time_s[-1])))
+    np.testing.assert_array_equal(edges_s, load_surrogate(shipped(SURROGATE)).edges_s)
+
+
+def test_noise_has_the_floor_that_the_key_states() -> None:
+    time_s, floor_n = samples_s(), 2e-3
+    means = []
+    for seed in range(8):
+        force_n = noise(np.random.default_rng(seed), time_s, floor_n)
+        recording = Recording(time_s, np.round(MOTION.at(time_s), 5), force_n, "noise", "")
+        phases = segment(recording)
+        binned = bin_recording(recording, phases, EDGES_S)
+        means.append(rms(binned.force_n))
+        assert np.sqrt(binned.variance_n2.mean()) == pytest.approx(floor_n, rel=0.3)
+    assert np.mean(means) == pytest.approx(floor_n, rel=0.1)
+
+
+def test_spikes_are_upward_and_in_holds_above_all() -> None:
+    time_s = samples_s()
+    holds = np.array([kind == "hold" for kind in KINDS])[kind_at(time_s)]
+    force_n = np.array([noise(np.random.default_rng(seed), time_s, 2e-3) for seed in range(5)])
+    assert np.sum(force_n[:, holds] > 0.015) > 100
+    assert np.sum(force_n[:, holds] < -0.015) == 0
+
+
+def test_nothing_in_a_recording_tells_what_it_conceals(made: Path) -> None:
+    found = [storage.load(seals.recording_path(made, f"{i + 1:03d}"), Recording) for i in range(COUNT)]
+    assert {one.name for one in found} == {"recording"}
+    assert len({one.notes for one in found}) == len({one.time_s.tobytes() for one in found}) == 1
+    words = {*catalogue(), *OUTSIDE, "theta", "nothing", "outside"}
+    for path in (made / "recordings").iterdir():
+        assert not any(word.encode() in path.read_bytes() for word in words)
+
+
+def test_a_set_is_the_same_when_it_is_made_again_and_what_is_there_is_not_made_again(
+    made: Path, tmp_path: Path
+) -> None:
+    plan = plans(SEED, COUNT)[2]
+    again = concealed(plan, SKIN, quick_run)
+    stored = storage.load(seals.recording_path(made, "003"), Recording)
+    np.testing.assert_array_equal(again.recording.force_n, stored.force_n)
+    assert json.loads(json.dumps(again.key)) == seals.read_keys(made)["003"]
+
+    def never(*_: object) -> Simulation:
+        raise AssertionError("a full run of what is there")
+
+    assert conceal(made, SEED, COUNT, run=never, screen=SKIN) == 0
+    with pytest.raises(InputError, match="another making"):
+        conceal(made, SEED + 1, COUNT, run=never, screen=SKIN)
+
+
+def test_a_run_that_fails_is_drawn_anew() -> None:
+    tried: list[Case] = []
+
+    def fails_first(case: Case, names, change: Change) -> Simulation:
+        tried.append(case)
+        found = quick_run(case, names, change)
+        return replace(found, status="failed") if len(tried) == 1 else found
+
+    one = concealed(Plan("nothing", "nothing", (), "", False, (9, 1, 0)), SKIN, fails_first)
+    assert one.key["attempt"] == 1
+    assert one.key["theta"] == tried[-1].theta != tried[0].theta
+    assert one.key["size"] < 1e-6
+
+
+@pytest.mark.slow
+def test_a_full_run_is_concealed_with_a_size_of_the_order_that_was_aimed_at() -> None:
+    plan = Plan("preconditioning", "alone", ("preconditioning",), "", True, (3, 1, 0))
+    key = concealed(plan, shipped_screen(), full_run).key
+    assert key["mesh_n"] < 2e-3
+    assert key["target"] / 3 < key["size"] < 3 * key["target"]  # a few mN of an effect of 0.2 N
+    assert key["sizes"]["preconditioning"] == pytest.approx(key["size_n"])
+    assert key["windows"]
+
+
+# Effects outside the catalogue
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return build_problem(brick_mesh(1))
+
+
+@pytest.mark.parametrize("name", ["hardening", "strain-softening"])
+def test_the_tangent_of_a_law_outside_is_the_derivative_of_its_residual(problem, name: str) -> None:
+    change = OUTSIDE[name].change(0.3)
+    bound = tuple(bind(THETA, problem) for bind in change.laws)
+    still = PadMotion(np.array([0.0, 1.0]), np.zeros(2))
+    model = LagrangianModel(problem, material(THETA, problem.mesh.cutis), still, bound)
+    rng, n = np.random.default_rng(0), 3 * problem.space.n_nodes
+    x, direction = (
+        np.concatenate([s * rng.standard_normal(n), 1e3 * rng.standard_normal(problem.space.n_corners)])
+        for s in (2e-5, 2e-5)
+    )
+    old, free = model.initial_state(0.0), problem.pattern.free
+    free_free, free_fixed = model.tangent(x, 0.7, old, 100.0)
+    slope = free_free @ direction[free] + free_fixed @ direction[problem.pattern.fixed]
+    step = 1e-4
+    ends = [model.residual(x + sign * step * direction, 0.7, old, 100.0).residual for sign in (1, -1)]
+    difference = (ends[0] - ends[1])[free] / (2 * step)
+    np.testing.assert_allclose(slope, difference, rtol=0, atol=1e-5 * np.abs(difference).max())
+
+
+def test_every_effect_outside_changes_something() -> None:
+    none = Change()
+    for name, outside in OUTSIDE.items():
+        low, high = outside.strengths
+        changes = [outside.change(strength) for strength in (low, high)]
+        assert 0.0 < low < high, name
+        for change in changes:
+            parts = [
+                getattr(change, part) != getattr(none, part)
+                for part in ("constants", "cutis_bottom_m", "radius_m", "deep", "laws")
+            ]
+            time_s = np.linspace(0.0, 347.0, 701)
+            force = change.reported(lambda t: np.atleast_2d(100.0 * MOTION.at(t)))(time_s)
+            parts.append(not np.allclose(force, 100.0 * MOTION.at(time_s)))
+            parts.append(not np.allclose(change.moved(MOTION).at(time_s), MOTION.at(time_s)))
+            assert sum(parts) == 1, name
+
+
+# Seals
+
+
+def test_a_key_or_a_recording_that_was_changed_shows(made: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(made, tmp_path / "copy"))
+    path = copy / "seals" / "002.json"
+    path.write_text(path.read_text().replace('"floor_n"', '"floor_N"'))
+    with pytest.raises(InputError, match=r"002\.json: found other contents"):
+        seals.read_keys(copy)
+
+
+def test_while_it_is_diagnosed_no_key_can_be_opened(made: Path, tmp_path: Path) -> None:
+    def peeks(path: Path, reporter) -> dict:
+        assert path.parent != made / "recordings"
+        with pytest.raises(PermissionError):
+            (made / "seals" / "001.json").read_text()
+        with pytest.raises(PermissionError):
+            os.listdir(made / "seals")
+        return nothing_found(path, reporter)
+
+    copy = Path(shutil.copytree(made, tmp_path / "copy"))
+    with closed(made):
+        document = pipeline.prove(copy, Silent(), diagnose=peeks)
+    assert document["scoreboard"]["judged"] == COUNT
+    assert (made / "seals" / "001.json").read_text()
+
+
+def test_a_diagnosis_in_a_process_that_refuses_the_seals_goes_through(made: Path) -> None:
+    """The diagnosing code is loaded, and a recording read and binned, where no path under seals/ opens."""
+    script = (
+        "import sys\n"
+        "def refuse(event, arguments):\n"
+        "    if event == 'open' and '/seals/' in str(arguments[0]):\n"
+        "        raise PermissionError(arguments[0])\n"
+        "sys.addaudithook(refuse)\n"
+        "from pathlib import Path\n"
+        "from bayeskin.pipeline import diagnosis\n"
+        "from bayeskin.recordings import read_recording, segment\n"
+        f"assert len(segment(read_recording(Path({str(seals.recording_path(made, '001'))!r})))) == 14\n"
+        "assert not [name for name in sys.modules if name.startswith('bayeskin.proof')]\n"
+        f"open({str(made / 'seals' / '001.json')!r})\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert ended.returncode == 1
+    assert ended.stderr.strip().splitlines()[-1].startswith("PermissionError")
+
+
+def test_what_diagnoses_mentions_neither_proof_nor_seals() -> None:
+    for path in [*(PACKAGE / "mismatch").rglob("*.py"), PACKAGE / "pipeline" / "diagnosis.py"]:
+        tree = ast.parse(path.read_text())
+        words = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+        words |= {
+            node.value
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        }
+        assert not [word for word in words if word in ("proof", "seals") or "data/proof" in word], path
+
+
+# Verdicts
+
+
+def test_prove_goes_on_where_it_was_interrupted_and_records_one_scoring(made: Path, tmp_path: Path) -> None:
+    copy, seen = Path(shutil.copytree(made, tmp_path / "copy")), []
+
+    def stops_at_third(path: Path, reporter) -> dict:
+        seen.append(path)
+        if len(seen) == 3:
+            raise KeyboardInterrupt
+        return nothing_found(path, reporter)
+
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.prove(copy, Silent(), diagnose=stops_at_third)
+    assert sorted(p.name for p in (copy / "verdicts").iterdir()) == ["001.json", "002.json"]
+    document = pipeline.prove(copy, Silent(), diagnose=stops_at_third)
+    assert len(seen) == COUNT + 1
+    assert document["ok"]
+    assert document["verdicts_of_these_sources"] == COUNT
+    pipeline.prove(copy, Silent(), diagnose=stops_at_third)
+    assert len(json.loads((copy / "scorings.json").read_text())) == 1
+    assert len(seen) == COUNT + 1
+
+
+def test_a_verdict_that_comes_out_otherwise_is_told(made: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(made, tmp_path / "copy"))
+    pipeline.prove(copy, Silent(), diagnose=nothing_found)
+    assert pipeline.prove(copy, Silent(), 2, nothing_found)["ok"]
+    told = pipeline.prove(copy, Silent(), 2, lambda path, _: {**nothing_found(path, _), "verdict": "unknown"})
+    assert not told["ok"]
+    assert "ANOTHER VERDICT" in told["text"]
+
+
+# Scores
+
+
+def key(label: str, kind: str = "alone", size: float = 5.0, **more) -> dict:
+    mechanisms = [] if kind in ("nothing", "outside") else label.split(" + ")
+    base = {
+        "label": label, "kind": kind, "mechanisms": mechanisms, "size": size, "floor_n": 2e-3,
+        "windows": [(10.0, 20.0)], "theta": THETA, "values": {},
+    }  # fmt: skip
+    return base | more
+
+
+def said(*names: str, **more) -> dict:
+    mechanisms = [{"name": name, "probability": 0.9, "group": [name], "parameters": {}} for name in names]
+    verdict = "named" if names else "nothing-missing"
+    return {"verdict": verdict, "mechanisms": mechanisms, "located": [], "fit": {"after": {}}} | more
+
+
+@pytest.mark.parametrize(
+    ("truth", "names", "right", "group"),
+    [
+        ("pad-slip", ["pad-slip"], True, True),
+        ("pad-slip", ["slow-recovery"], False, True),
+        ("pad-slip", ["backlash"], False, False),
+        ("pad-slip", ["pad-slip", "backlash"], False, False),
+        ("pad-slip", ["pad-slip", "slow-recovery"], False, False),
+        ("pad-slip", [], False, False),
+        ("pre-stretch", ["force-offset", "strain-stiffening"], False, True),
+        ("force-offset", ["strain-stiffening"], False, False),
+        ("pad-slip + sensor-drift", ["sensor-drift", "pad-slip"], True, True),
+        ("pad-slip + sensor-drift", ["sensor-drift", "preconditioning"], False, True),
+        ("pad-slip + sensor-drift", ["sensor-drift"], False, False),
+    ],
+)
+def test_a_name_is_right_alone_or_as_a_look_alike(truth, names, right, group) -> None:
+    kind = "pair" if "+" in truth else "alone"
+    found = judge("001", key(truth, kind), said(*names))
+    assert (found.right, found.right_group) == (right, group)
+
+
+def test_a_group_larger_than_what_is_known_to_look_alike_is_wrong() -> None:
+    answer = said("pad-slip")
+    answer["mechanisms"][0]["group"] = ["pad-slip", "slow-recovery", "backlash"]
+    found = judge("001", key("pad-slip"), answer)
+    assert (found.right, found.right_group) == (False, False)
+
+
+def test_the_catalogue_s_own_groups_are_allowed_and_mutual() -> None:
+    for name, mechanism in catalogue().items():
+        assert set(mechanism.group) <= group_of(name), name
+    assert stands_for({"viscous-drag"}, {"device-friction"})
+    assert stands_for({"device-friction"}, {"viscous-drag"})
+
+
+def test_steps_of_the_cell_have_no_order() -> None:
+    truth = {"event_1_at": 0.2, "event_1_step": 0.01, "event_2_at": 0.7, "event_2_step": -0.02}
+    answer = said("sensor-events")
+    swapped = {"event_1_at": 0.7, "event_1_step": -0.02, "event_2_at": 0.2, "event_2_step": 0.01}
+    answer["mechanisms"][0]["parameters"] = {
+        name: {"mean": value, "sd": 1e-3, "unit": "-"} for name, value in swapped.items()
+    }
+    assert all(judge("001", key("sensor-events", values=truth), answer).inside.values())
+
+
+def test_overlap_is_intersection_over_union_of_bins() -> None:
+    assert overlap([(0.0, 10.0)], [(5.0, 15.0)]) == pytest.approx(1 / 3)
+    assert overlap([(0.0, 10.0)], []) == 0.0
+    assert overlap([], []) is None
+
+
+def test_wilson_s_interval_is_that_of_the_books() -> None:
+    found = share([True] * 9 + [False])
+    assert (found["hits"], found["of"], found["share"]) == (9, 10, 0.9)
+    assert found["low"] == pytest.approx(0.6526, abs=2e-3)
+    assert found["high"] == pytest.approx(0.9774, abs=2e-3)
+    assert share([])["share"] is None
+
+
+def test_a_scoreboard_of_made_up_verdicts_counts_as_it_should() -> None:
+    keys, answers = made_up()
+    board = score(keys, answers)
+    assert board["judged"] == len(keys)
+    assert (board["false_alarms"]["hits"], board["false_alarms"]["of"]) == (1, 3)
+    assert (board["named"]["clear"]["hits"], board["named"]["clear"]["of"]) == (2, 4)
+    assert board["named_up_to_look_alikes"]["clear"]["hits"] == 3
+    assert (board["named"]["below"]["hits"], board["named"]["below"]["of"]) == (0, 1)
+    assert (board["unknown_outside"]["clear"]["hits"], board["unknown_outside"]["clear"]["of"]) == (1, 2)
+    assert (board["effect_in_interval"]["clear"]["hits"], board["effect_in_interval"]["clear"]["of"]) == (
+        1,
+        2,
+    )
+    assert (board["base_in_interval"]["clear"]["hits"], board["base_in_interval"]["clear"]["of"]) == (1, 2)
+    assert board["held_out_over_floor"]["clear"]["median"] == pytest.approx(1.25)
+    assert board["location_overlap"]["clear"]["median"] == 0.0
+    assert board["confusion"]["nothing"] == {"nothing-missing": 2, "sensor-drift": 1}
+    assert board["confusion"]["outside"] == {"unknown": 1, "strain-stiffening": 1}
+    assert sum(row["named"]["of"] for row in board["detectability"]) == 5
+    assert json.loads(json.dumps(board, allow_nan=False)) == board
+
+
+def made_up() -> tuple[dict, dict]:
+    fit = {
+        "after": {
+            "rmse_held_out": 2.5e-3,
+            "theta": {"E_c": {"mean": 60e3, "sd": 1e3}, "E_s": {"mean": 30e3, "sd": 1e3}, "k_c": 1e-14},
+        }
+    }
+    sure = said("force-offset", fit=fit, located=[{"t0": 10.0, "t1": 20.0}])
+    sure["mechanisms"][0]["parameters"] = {"F0": {"mean": -0.05, "sd": 0.01, "unit": "N"}}
+    off = said("sensor-drift")
+    off["mechanisms"][0]["parameters"] = {"drift": {"mean": 1e-4, "sd": 1e-6, "unit": "N/s"}}
+    pairs = [
+        (key("nothing", "nothing", 0.0, windows=[]), said()),
+        (key("nothing", "nothing", 0.0, windows=[]), said()),
+        (key("nothing", "nothing", 0.0, windows=[]), said("sensor-drift")),
+        (key("force-offset", values={"F0": -0.045}), sure),
+        (key("sensor-drift", size=CLEAR, values={"drift": 2e-4}), off),
+        (key("device-friction", size=12.0), said("viscous-drag")),
+        (key("fluid-leakage", size=4.0), said()),
+        (key("fluid-leakage", size=1.2), said()),
+        (key("thick-arm", "outside", 6.0), said(verdict="unknown")),
+        (key("peeling", "outside", 6.0), said("strain-stiffening")),
+    ]
+    numbered = {f"{i + 1:03d}": pair for i, pair in enumerate(pairs)}
+    return {n: k for n, (k, _) in numbered.items()}, {n: a for n, (_, a) in numbered.items()}
+
+
+def test_the_scoreboard_s_figure_is_drawn(tmp_path: Path) -> None:
+    png, svg = report.save_figure(report.figure_proof(score(*made_up())), tmp_path / "board", "test")
+    assert png.stat().st_size > 10_000
+    assert svg.is_file()
