@@ -32,13 +32,14 @@ class Top:
     """Where a climb ended: sampling coordinates (D,), log density, information (D, D) and gradient (D,).
 
     Both are those of the log density over the unit cube; the material and the noise do not mix in the
-    information. `rounds` that were made.
+    information. latent (r,): the surrogate's error there, in sd of each column of its factor. `rounds` made.
     """
 
     vector: Array
     value: float
     information: Array
     gradient: Array
+    latent: Array
     rounds: int
 
 
@@ -172,8 +173,8 @@ class _Linear:
         step[: self.inner] = change[: self.inner] * width
         return step
 
-    def curvature(self) -> tuple[Array, Array]:
-        """Information (D, D) and gradient (D,) of the log density over the unit cube."""
+    def curvature(self) -> tuple[Array, Array, Array]:
+        """Information (D, D) and gradient (D,) over the unit cube; the surrogate's error (r,)."""
         residual, slopes, factor = self._columns()
         weight = (self.nu + 1.0) / (self.nu + 3.0)
         inside = weight * factor.T @ factor + np.eye(factor.shape[1])
@@ -190,7 +191,7 @@ class _Linear:
         _, noise_gradient, second = self._differences((self.noise - low) / (high - low))
         information = np.diag(np.concatenate([np.zeros(self.inner), np.maximum(-second, 0.0)]))
         information[: self.inner, : self.inner] = material
-        return information, np.concatenate([steep, noise_gradient])
+        return information, np.concatenate([steep, noise_gradient]), latent
 
 
 def _stiffness(latent: Array) -> Array:

@@ -28,12 +28,13 @@ from bayeskin.inference.gauss_newton import Top, gauss_newton
 from bayeskin.inference.straighten import Shear
 from bayeskin.types import Array, BinnedForce
 
-NOISE_SHARE = 5.0  # sd of the noise, at most, of the median sd of a bin's own mean
-LONGEST_S = 5.0  # of the noise's memory: breathing, and no longer
+NOISE_SHARE = 1.5  # sd of the noise beyond that, at most, of the median sd of a bin's own mean
+LONGEST_S = 2.0  # of the noise's memory
 FEWEST_TAILS = 20.0  # of the tail index: nearly normal, since spikes are gone from robust means of bins
 SURE = 0.03  # sd of the surrogate, RMS, at most, of the recorded force's range
-DRAWS = 128  # of the prior, from which climbs start
+DRAWS = 96  # of the prior for each new parameter, from which climbs start
 BASE_STARTS, STARTS = 10, 3
+REDRAWN = 6  # times that some of the new parameters are drawn anew, about the best so far
 FIRST_ROUNDS, ROUNDS = 4, 25  # of every climb, and of the one that is then ahead
 EDGE = 1e-6  # of the unit cube: on a bound
 
@@ -58,7 +59,8 @@ def surrogate_limit(binned: BinnedForce) -> float:
 class Fit:
     """The most probable point of one set of mechanisms: values by name (SI), log density, evidence.
 
-    covariance (D, D) is that of the unit cube's coordinates, the priors' 1/12 at most.
+    covariance (D, D) is that of the unit cube's coordinates, the priors' 1/12 at most; latent (r,) the
+    surrogate's error, in sd of each column of its factor.
     """
 
     names: tuple[str, ...]
@@ -67,6 +69,14 @@ class Fit:
     value: float
     log_evidence: float
     covariance: Array
+    latent: Array
+
+    @cached_property
+    def force_n(self) -> Array:
+        """The force on all bins (m,), with the surrogate's error as the recording shows it."""
+        point = self.log_posterior.from_sampling(self.log_posterior.vector(self.theta))
+        found = self.log_posterior.predict(point)
+        return np.asarray(found.mean[0] + found.factor[0] @ self.latent)
 
     @cached_property
     def unit(self) -> Array:
@@ -92,14 +102,15 @@ class Fit:
 def stored(found: Fit) -> dict[str, Any]:
     """A fit without its posterior, as JSON has it."""
     plain = {"names": list(found.names), "theta": dict(found.theta), "value": found.value}
-    return {**plain, "log_evidence": found.log_evidence, "covariance": found.covariance.tolist()}
+    arrays = {"covariance": found.covariance.tolist(), "latent": found.latent.tolist()}
+    return {**plain, "log_evidence": found.log_evidence, **arrays}
 
 
 def restored(plain: Mapping[str, Any], log_posterior: LogPosterior) -> Fit:
     """The fit of `stored`, of the posterior that it was made from."""
-    covariance = np.asarray(plain["covariance"], dtype=float)
+    covariance, latent = (np.asarray(plain[name], dtype=float) for name in ("covariance", "latent"))
     value, log_evidence = plain["value"], plain["log_evidence"]
-    return Fit(tuple(plain["names"]), log_posterior, plain["theta"], value, log_evidence, covariance)
+    return Fit(tuple(plain["names"]), log_posterior, plain["theta"], value, log_evidence, covariance, latent)
 
 
 def fit_base(log_posterior: LogPosterior, seed: int, shear: Shear | None) -> Fit:
@@ -133,10 +144,34 @@ def fit(
             starts.append(np.clip(log_posterior.vector({**neutral, **start, **before}), low, high))
     elif fresh:
         rng = np.random.default_rng(seed)
-        trials = np.tile(starts[0], (DRAWS, 1))
-        trials[:, fresh] = rng.uniform(low[fresh], high[fresh], (DRAWS, len(fresh)))
+        count = DRAWS * len(fresh)
+        trials = np.tile(starts[0], (count, 1))
+        trials[:, fresh] = rng.uniform(low[fresh], high[fresh], (count, len(fresh)))
         starts += _likely(log_posterior, trials, STARTS)
+        top = _climbed(log_posterior, starts, shear)
+        # The moment of a step, say, has a slope only next to the right one.
+        for _ in range(REDRAWN if len(fresh) > 2 else 0):
+            trials = _about(top.vector, fresh, low, high, count, rng)
+            again = _climbed(log_posterior, _likely(log_posterior, trials, 2), shear)
+            top = max(top, again, key=lambda one: one.value)
+        starts = [top.vector]
     return _best(names, log_posterior, starts, shear)
+
+
+def _about(
+    vector: Array, fresh: Sequence[int], low: Array, high: Array, count: int, rng: np.random.Generator
+) -> Array:
+    """Points (count, D) with one or two of the new coordinates moved: near by, or anywhere in the prior."""
+    width = (high - low)[fresh]
+    changed = np.argsort(rng.uniform(size=(count, len(fresh))), axis=1) < rng.integers(1, 3, (count, 1))
+    reach = 10.0 ** rng.uniform(-3.0, -0.5, (count, 1)) * width
+    near = vector[fresh] + reach * rng.standard_normal((count, len(fresh)))
+    drawn = np.where(
+        rng.uniform(size=(count, 1)) < 0.5, near, rng.uniform(low[fresh], high[fresh], near.shape)
+    )
+    trials = np.tile(vector, (count, 1))
+    trials[:, fresh] = np.clip(np.where(changed, drawn, vector[fresh]), low[fresh], high[fresh])
+    return trials
 
 
 def _likely(log_posterior: LogPosterior, trials: Array, count: int) -> list[Array]:
@@ -144,14 +179,19 @@ def _likely(log_posterior: LogPosterior, trials: Array, count: int) -> list[Arra
     return [trials[i] for i in np.argsort(-values)[:count] if np.isfinite(values[i])]
 
 
+def _climbed(log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None) -> Top:
+    """The one ahead after a few rounds."""
+    tops = [gauss_newton(log_posterior, start, shear, FIRST_ROUNDS) for start in starts]
+    return max(tops, key=lambda one: one.value)
+
+
 def _best(
     names: Sequence[str], log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None
 ) -> Fit:
-    first = [gauss_newton(log_posterior, start, shear, FIRST_ROUNDS) for start in starts]
-    ahead = max(first, key=lambda one: one.value)
+    ahead = _climbed(log_posterior, starts, shear)
     top = gauss_newton(log_posterior, ahead.vector, shear, ROUNDS)
     theta = log_posterior.named(log_posterior.from_sampling(top.vector))
-    return Fit(tuple(names), log_posterior, theta, top.value, *_evidence(log_posterior, top))
+    return Fit(tuple(names), log_posterior, theta, top.value, *_evidence(log_posterior, top), top.latent)
 
 
 def _evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:

@@ -1,7 +1,9 @@
 """Where a recording leaves what the calibrated model allows: windows, the error of the whole search held.
 
-What is allowed is the posterior predictive without the discrepancy that the noise model could take up: the
-recording's own measured noise, the surrogate's error and the parameters' uncertainty. Mean residuals over
+What is allowed is the residual that noise alone leaves after a fit: draws of the noise, with its parameters
+of a fit that takes no mismatch for noise, less what parameters and the surrogate's error take up of each;
+and, of any window's mean, `MODEL_ERROR` of the force's range, which the mesh leaves (docs/discretisation.md:
+up to 0.10 % after one factor). Mean residuals over
 windows of every length inside each phase are counted in standard deviations of the same means of draws; the
 largest over all windows has its distribution from the draws themselves, so that one chance in `LEVEL` finds
 any window where nothing is missing (a scan statistic: Glaz, Naus & Wallenstein 2001).
@@ -9,6 +11,7 @@ any window where nothing is missing (a scan statistic: Glaz, Naus & Wallenstein 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -17,11 +20,13 @@ from numpy.typing import NDArray
 
 from bayeskin.inference.noise_model import draw_noise
 from bayeskin.mismatch.fit import Fit
-from bayeskin.types import Array
+from bayeskin.types import Array, BinnedForce
 
 DRAWS = 1000
 LEVEL = 0.05
 SHORTEST = 2  # bins
+MODEL_ERROR = 1e-3  # of the force's range
+PRIOR_PRECISION = 12.0  # of a uniform prior over the unit cube
 
 
 @dataclass(frozen=True)
@@ -46,16 +51,23 @@ class Located:
     allowed_n: Array
 
 
-def locate(found: Fit, seed: int) -> Located:
-    """Windows in which the recording differs from the model at `found`."""
+def model_error(binned: BinnedForce) -> float:
+    """What the full model itself is wrong by [N], after the best factor."""
+    return MODEL_ERROR * float(np.nanmax(binned.force_n) - np.nanmin(binned.force_n))
+
+
+def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
+    """Windows in which the recording differs from the model at `found`.
+
+    `noise` holds the noise parameters among its values: those of a fit that takes no mismatch for noise.
+    """
     log_posterior, rng = found.log_posterior, np.random.default_rng(seed)
     chain = log_posterior.chain
-    theta = found.draws(DRAWS, seed)
-    best = log_posterior.predict(log_posterior.from_sampling(log_posterior.vector(found.theta)))
-    residual = chain.force_n - best.mean[0, chain.bins]
-    spread = _allowed(found, theta, rng) - best.mean[0, chain.bins]
+    residual = chain.force_n - found.force_n[chain.bins]
+    spread = _allowed(found, noise, seed, rng)
     spans = _spans(log_posterior.binned.phase[chain.bins])
-    scale = np.array([_means(spread, *span).std() for span in spans])
+    error_n = model_error(log_posterior.binned)
+    scale = np.array([np.hypot(_means(spread, *span).std(), error_n) for span in spans])
     tall = np.zeros(len(spread))
     for span, sd in zip(spans, scale, strict=True):
         centred = _means(spread, *span)
@@ -64,7 +76,7 @@ def locate(found: Fit, seed: int) -> Located:
     windows = []
     for a, b in _chosen(spans, z, float(np.quantile(tall, 1.0 - LEVEL))):
         mean = float(residual[a:b].mean())
-        sd = float(_means(spread, a, b).std())
+        sd = float(np.hypot(_means(spread, a, b).std(), error_n))
         chance = (1 + np.sum(tall >= abs(mean) / sd)) / (1 + len(tall))
         phase = log_posterior.binned.phases[log_posterior.binned.phase[chain.bins[a]]]
         edges = log_posterior.binned.edges_s
@@ -77,17 +89,40 @@ def locate(found: Fit, seed: int) -> Located:
     return Located(tuple(windows), chain.bins, residual, spread.std(axis=0))
 
 
-def _allowed(found: Fit, theta: Array, rng: np.random.Generator) -> Array:
-    """Draws (n, k) of the force that noise, surrogate and parameters allow, without a discrepancy."""
+def _allowed(found: Fit, noise: Mapping[str, float], seed: int, rng: np.random.Generator) -> Array:
+    """Draws (n, k) of the residual that noise, parameters and what the surrogate leaves open allow."""
+    log_posterior, chain = found.log_posterior, found.log_posterior.chain
+    theta = found.draws(DRAWS, seed)
+    columns = log_posterior.split(theta)[1].copy()
+    columns[:] = [noise[name] for name in log_posterior.names[-columns.shape[1] :]]
+    point = log_posterior.from_sampling(log_posterior.vector(found.theta))[None]
+    best = log_posterior.predict(point)
+    diagonal = np.repeat(best.diagonal[:, chain.bins], DRAWS, axis=0)
+    drawn = draw_noise(chain, columns, diagonal, rng)
+    # What parameters and the surrogate's latent error leave open is what the recording does not fix: noise,
+    # seen through the fit, moves both; a fit to each draw would take that part out of it again.
+    weight = 1.0 / np.maximum(drawn.var(axis=0), 1e-18)
+    design = np.concatenate([_slopes(found), best.factor[0, chain.bins]], axis=1)
+    prior = np.concatenate([np.full(design.shape[1] - best.factor.shape[2], PRIOR_PRECISION),
+                            np.ones(best.factor.shape[2])])  # fmt: skip
+    normal = (design * weight[:, None]).T @ design + np.diag(prior)
+    taken = (design @ np.linalg.solve(normal, (design * weight[:, None]).T @ drawn.T)).T
+    return np.asarray(drawn - taken)
+
+
+def _slopes(found: Fit) -> Array:
+    """Derivatives (k, d) [N] by the material parameters that are not on a bound, over the unit cube."""
     log_posterior = found.log_posterior
-    chain, prediction = log_posterior.chain, log_posterior.predict(theta)
-    noise = log_posterior.split(theta)[1].copy()
-    noise[:, :-2] = log_posterior.noise_priors.sd_n[0]
-    noise[:, -1] = log_posterior.noise_priors.nu[1]
-    factor, diagonal = prediction.factor[:, chain.bins], prediction.diagonal[:, chain.bins]
-    latent = rng.standard_normal((len(theta), factor.shape[2]))
-    error = np.einsum("nkr,nr->nk", factor, latent)
-    return np.asarray(prediction.mean[:, chain.bins] + error + draw_noise(chain, noise, diagonal, rng))
+    low, high = log_posterior.bounds
+    inner = log_posterior.surrogate.space.dim
+    free = [i for i in range(inner) if 1e-6 < found.unit[i] < 1.0 - 1e-6]
+    if not free:
+        return np.zeros((len(log_posterior.chain.bins), 0))
+    step = 1e-4 * np.eye(len(low))[free]
+    ahead = np.clip(found.unit + step, 0.0, 1.0)
+    points = low + np.concatenate([found.unit[None], ahead]) * (high - low)
+    mean = log_posterior.predict(log_posterior.from_sampling(points)).mean[:, log_posterior.chain.bins]
+    return np.asarray((mean[1:] - mean[0]).T / 1e-4)
 
 
 def _spans(phase: NDArray[np.int64]) -> list[tuple[int, int]]:

@@ -1,8 +1,9 @@
 """What a search says: nothing missing, named mechanisms, or unknown.
 
-Nothing is missing where the model alone has most of the weight and no window is found. A mechanism is named
-where it, or its group of look-alikes together, is more probable than not, if what is named explains more than
-half of the squared residual beyond what is allowed. Otherwise the mismatch is unknown.
+A mechanism is named where it, or its group of look-alikes together, is more probable than not, and leaving it
+out costs more than the full model's own error, if what is named explains more than half of the squared
+residual beyond what is allowed. Nothing is missing where none is named and no window is found. Otherwise the
+mismatch is unknown.
 """
 
 from __future__ import annotations
@@ -14,21 +15,27 @@ from typing import Literal
 import numpy as np
 
 from bayeskin.mechanisms import Mechanism
-from bayeskin.mismatch.locate import Located
-from bayeskin.mismatch.search import Search
+from bayeskin.mismatch.fit import Fit
+from bayeskin.mismatch.locate import Located, model_error
+from bayeskin.mismatch.search import Search, weight
 
 PROBABLE = 0.5
 EXPLAINED = 0.5
+NOTICEABLE = 2.0  # of the full model's own error
 
 
 @dataclass(frozen=True)
 class Named:
-    """One mechanism of the best set: probabilities of itself and of its group, parameters' means and sds."""
+    """One mechanism of the best set: probabilities of itself and of its group, parameters' means and sds.
+
+    explains_n : RMS of what no likely set without it explains
+    """
 
     name: str
     probability: float
     group: tuple[str, ...]
     group_probability: float
+    explains_n: float
     parameters: Mapping[str, tuple[float, float, str]]
     statement: str
 
@@ -45,14 +52,28 @@ class Diagnosis:
 def judge(found: Search, known: Mapping[str, Mechanism], before: Located, after: Located) -> Diagnosis:
     """The verdict on a search; `before` and `after` are located at its base and at its best set."""
     best, explained = found.best, explained_share(before, after)
+    least = NOTICEABLE * model_error(best.log_posterior.binned)
     named = tuple(
-        one for name in best.names if (one := _named(found, known[name])).group_probability > PROBABLE
+        one
+        for name in best.names
+        if (one := _named(found, known[name])).group_probability > PROBABLE and one.explains_n > least
     )
-    if not best.names and not before.windows:
+    if not named and not before.windows:
         return Diagnosis("nothing-missing", (), 0.0)
     if named and (explained > EXPLAINED or not after.windows):
         return Diagnosis("named", named, explained)
     return Diagnosis("unknown", (), explained)
+
+
+def _rms(found: Fit) -> float:
+    bins = found.log_posterior.chain.bins
+    return float(np.sqrt(np.mean((found.log_posterior.chain.force_n - found.force_n[bins]) ** 2)))
+
+
+def explains(found: Search, name: str) -> float:
+    """RMS [N] of what the best set explains and the likeliest set tried without `name` does not."""
+    without = max((one for one in found.fits.values() if name not in one.names), key=weight)
+    return float(np.sqrt(max(_rms(without) ** 2 - _rms(found.best) ** 2, 0.0)))
 
 
 def explained_share(before: Located, after: Located) -> float:
@@ -73,5 +94,6 @@ def _named(found: Search, mechanism: Mechanism) -> Named:
     at_best = {**mechanism.neutral, **best.theta}
     return Named(
         mechanism.name, found.probability([mechanism.name]), mechanism.group,
-        found.probability(mechanism.group), values, mechanism.statement(at_best),
+        found.probability(mechanism.group), explains(found, mechanism.name), values,
+        mechanism.statement(at_best),
     )  # fmt: skip

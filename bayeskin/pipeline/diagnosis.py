@@ -106,7 +106,7 @@ def _work(run: Run) -> Mapping[str, Any]:
             run.reporter.log("waiting for the search on the recording's beginning")
             beginning.result()
     begun = None if split_s is None else _searched(bench, split_s)
-    before, after = locate(whole.base, run.config.seed), locate(whole.best, run.config.seed)
+    before, after = (locate(one, whole.best.theta, run.config.seed) for one in (whole.base, whole.best))
     found = judge(whole, bench.known, before, after)
     answer = {
         "verdict": found.verdict,
@@ -196,7 +196,8 @@ def _mechanism(one: Any) -> dict[str, Any]:
     }
     return {
         "name": one.name, "probability": one.probability, "group": list(one.group),
-        "group_probability": one.group_probability, "parameters": parameters, "statement": one.statement,
+        "group_probability": one.group_probability, "explains_n": one.explains_n,
+        "parameters": parameters, "statement": one.statement,
     }  # fmt: skip
 
 
@@ -233,28 +234,26 @@ def _theta(found: Fit) -> Array:
     return log_posterior.from_sampling(log_posterior.vector(found.theta))[None]
 
 
-def _force(found: Fit) -> Array:
-    return found.log_posterior.predict(_theta(found)).mean[0]
-
-
 def _fit(bench: Workbench, found: Fit, begun: Fit | None, split_s: float | None) -> dict[str, Any]:
     """RMSE [N] of a fit to the whole recording, by phase, of one to its beginning on the rest; coverage."""
     binned = bench.binned
-    by_phase = inference.rmse(binned, _force(found))
+    by_phase = inference.rmse(binned, found.force_n)
     held_out = None
     if begun is not None and split_s is not None:
         rest = bins_in_windows(binned, ((split_s, float(binned.edges_s[-1])),)) >= 0
-        held_out = float(np.sqrt(np.mean((binned.force_n[rest] - _force(begun)[rest]) ** 2)))
+        held_out = float(np.sqrt(np.mean((binned.force_n[rest] - begun.force_n[rest]) ** 2)))
     draws = found.draws(300, bench.run.config.seed)
     bands = inference.bands(found.log_posterior, draws, np.random.default_rng(bench.run.config.seed))
     usable = bins_in_windows(binned, None) >= 0
     return {
-        "rmse": float(np.sqrt(np.mean((binned.force_n[usable] - _force(found)[usable]) ** 2))),
+        "rmse": float(np.sqrt(np.mean((binned.force_n[usable] - found.force_n[usable]) ** 2))),
         "rmse_by_phase": dict(by_phase.by_kind_n),
         "rmse_held_out": held_out,
         "coverage90": inference.coverage(binned, *bands.interval(0.9)),
         "log_evidence": found.log_evidence,
-        "theta": dict(found.theta),
+        "theta": {
+            name: dict(zip(("mean", "sd"), found.mean_and_sd(name), strict=True)) for name in found.theta
+        },
     }
 
 
@@ -263,10 +262,10 @@ def _draw(
 ) -> list[Path]:
     binned = bench.binned
     figures = {
-        "located": report.figure_located(binned, bench.motion, before, _force(found.base)),
+        "located": report.figure_located(binned, bench.motion, before, found.base.force_n),
         "candidates": report.figure_candidates(answer["candidates"]),
         "before_after": report.figure_before_after(
-            binned, bench.motion, _force(found.base), _force(found.best)
+            binned, bench.motion, found.base.force_n, found.best.force_n
         ),
     }
     for name, figure in figures.items():
