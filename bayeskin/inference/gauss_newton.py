@@ -19,7 +19,7 @@ from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
 from bayeskin.inference.noise_model import NoiseChain, scales
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.straighten import Shear
-from bayeskin.types import Array, Prediction
+from bayeskin.types import Array, NDArray, Prediction
 
 STEP = 1e-4  # of the box, for differences
 DAMPED = (0.0, 1e-2, 1.0, 1e2, 1e4)  # shares of the information added to its diagonal
@@ -61,6 +61,35 @@ def gauss_newton(log_posterior: LogPosterior, start: Array, shear: Shear | None,
         small = small + 1 if value - before < ENOUGH else 0
     last = _Linear(log_posterior, x)
     return Top(x, value, *last.curvature(), made)
+
+
+def promise(
+    log_posterior: LogPosterior, vector: Array, trials: Array, free: NDArray[np.bool_], count: int
+) -> list[tuple[int, float, Array]]:
+    """The `count` of `trials` (n, D) along whose change of force most is to be gained from `vector` (D,).
+
+    Of each its row, the best multiple of that change, and `vector` with what is `free` (D,) moved to make
+    room, within the box; all by the force's linear approximation (a score test).
+    """
+    linear = _Linear(log_posterior, vector)
+    inner = linear.inner
+    others = free[:inner]
+    bins = linear.chain.bins
+    mean = log_posterior.predict(log_posterior.from_sampling(trials)).mean[:, bins]
+    change = linear.white((mean - linear.here.mean[:, bins]).T)
+    residual, slopes, factor = linear.columns()
+    room = np.concatenate([slopes[:, others], factor], axis=1)
+    prior = np.concatenate([np.full(int(others.sum()), 12.0), np.ones(factor.shape[1])])
+    target = np.column_stack([residual, change])
+    solved = np.linalg.solve(room.T @ room + np.diag(prior), room.T @ target)
+    left = target - room @ solved
+    length = np.maximum(np.sum(change * left[:, 1:], axis=0), 1e-12)
+    multiple = (change.T @ left[:, 0]) / length
+    chosen = np.argsort(-(multiple**2) * length)[:count]
+    return [
+        (int(i), float(multiple[i]), vector + linear.step(vector, 0.0, multiple[i] * change[:, i], others))
+        for i in chosen
+    ]
 
 
 def _trials(linear: _Linear, x: Array, shear: Shear | None) -> Array:
@@ -132,7 +161,7 @@ class _Linear:
         value, gradient, _ = self._differences(unit)
         return -value, -gradient
 
-    def _white(self, columns: Array) -> Array:
+    def white(self, columns: Array) -> Array:
         """Columns (k, n) in innovations of the noise at hand."""
         _, noise = self.log_posterior.split(
             self.log_posterior.from_sampling(np.concatenate([self.x[: self.inner], self.noise]))
@@ -143,18 +172,24 @@ class _Linear:
         self.nu = float(noise[0, -1])
         return np.asarray((unit - rho[0][:, None] * before) / np.sqrt(1.0 - rho[0] ** 2)[:, None])
 
-    def _columns(self) -> tuple[Array, Array, Array]:
+    def columns(self) -> tuple[Array, Array, Array]:
         """Residual (k,), slopes (k, d) and the surrogate's factor (k, r), whitened."""
         bins = self.chain.bins
         residual = self.chain.force_n - self.here.mean[0, bins]
-        white = self._white(
-            np.concatenate([residual[:, None], self.slope, self.here.factor[0, bins]], axis=1)
-        )
+        white = self.white(np.concatenate([residual[:, None], self.slope, self.here.factor[0, bins]], axis=1))
         return white[:, 0], white[:, 1 : self.inner + 1], white[:, self.inner + 1 :]
 
-    def step(self, x: Array, damping: float) -> Array:
-        """Change (D,) of the sampling coordinates that the regression asks for, within the box."""
-        residual, slopes, factor = self._columns()
+    def step(
+        self, x: Array, damping: float, explained: Array | float = 0.0, free: NDArray[np.bool_] | None = None
+    ) -> Array:
+        """Change (D,) of the sampling coordinates that the regression asks for, within the box.
+
+        `explained` (k,), in innovations, is taken from the residual first; only `free` ones move.
+        """
+        residual, slopes, factor = self.columns()
+        residual = residual - explained
+        if free is not None:
+            slopes = slopes * free
         design = np.concatenate([slopes, factor], axis=1)
         width = (self.high - self.low)[: self.inner]
         room_up = (self.high[: self.inner] - x[: self.inner]) / width
@@ -175,7 +210,7 @@ class _Linear:
 
     def curvature(self) -> tuple[Array, Array, Array]:
         """Information (D, D) and gradient (D,) over the unit cube; the surrogate's error (r,)."""
-        residual, slopes, factor = self._columns()
+        residual, slopes, factor = self.columns()
         weight = (self.nu + 1.0) / (self.nu + 3.0)
         inside = weight * factor.T @ factor + np.eye(factor.shape[1])
         cross = weight * factor.T @ slopes

@@ -72,6 +72,11 @@ class Mechanism:
     act: Instrument | Tissue
     parts: tuple[tuple[str, ...], ...] = ()
 
+    @property
+    def whole_or_parts(self) -> tuple[tuple[str, ...], ...]:
+        """`parts`, or the one part of all parameters."""
+        return self.parts or (tuple(p.name for p in self.parameters),)
+
 
 def observed(
     mechanisms: Iterable[Mechanism], values: Values, motion: PadMotion, force: ForceOfTime

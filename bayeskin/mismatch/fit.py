@@ -24,18 +24,18 @@ from typing import Any
 import numpy as np
 
 from bayeskin.inference import LogPosterior, NoisePriors
-from bayeskin.inference.gauss_newton import Top, gauss_newton
+from bayeskin.inference.gauss_newton import Top, gauss_newton, promise
 from bayeskin.inference.straighten import Shear
 from bayeskin.types import Array, BinnedForce
 
 NOISE_SHARE = 1.5  # sd of the noise beyond that, at most, of the median sd of a bin's own mean
 LONGEST_S = 2.0  # of the noise's memory
-FEWEST_TAILS = 20.0  # of the tail index: nearly normal, since spikes are gone from robust means of bins
+FEWEST_TAILS = 50.0  # of the tail index: nearly normal, since spikes are gone from robust means of bins
 SURE = 0.03  # sd of the surrogate, RMS, at most, of the recorded force's range
 DRAWS = 96  # of the prior for each new parameter, from which climbs start
-BASE_STARTS, STARTS = 10, 3
-REDRAWN = 6  # times that some of the new parameters are drawn anew, about the best so far
-FIRST_ROUNDS, ROUNDS = 4, 25  # of every climb, and of the one that is then ahead
+BASE_STARTS, STARTS = 10, 2
+REDRAWN = 2  # times that the parameters of a part are drawn anew, about the best so far
+FIRST_ROUNDS, ROUNDS = 7, 25  # of every climb, and of the one that is then ahead
 EDGE = 1e-6  # of the unit cube: on a bound
 
 
@@ -117,7 +117,8 @@ def fit_base(log_posterior: LogPosterior, seed: int, shear: Shear | None) -> Fit
     """Without any mechanism: the best of climbs from the most probable of many draws of the prior."""
     low, high = log_posterior.bounds
     trials = np.random.default_rng(seed).uniform(low, high, (8 * DRAWS, log_posterior.dim))
-    return _best((), log_posterior, _likely(log_posterior, trials, BASE_STARTS), shear)
+    starts = _likely(log_posterior, trials, BASE_STARTS)
+    return _best((), log_posterior, starts, shear, log_posterior.surrogate.space.dim, seed)
 
 
 def fit(
@@ -126,40 +127,81 @@ def fit(
     start: Mapping[str, float],
     neutral: Mapping[str, float],
     seed: int,
+    skin: int,
     shear: Shear | None = None,
     before: Mapping[str, float] | None = None,
+    parts: Sequence[Sequence[str]] = (),
 ) -> Fit:
     """The best of a few climbs from `start`, which has the values of a smaller set.
 
-    What `start` does not have begins at its neutral value, and at its value in `before`, an earlier fit;
-    where there is none, at the best of many draws of its prior. `shear` straightens the ridges of this
-    posterior, where it is known.
+    What `start` does not have begins at its neutral value, and at its value in `before`, an earlier fit.
+    Where there is none, it is searched for, one of `parts` (names of parameters) after the other. `shear`
+    straightens the ridges of this posterior, where it is known; the base's parameters are the first `skin`.
     """
     low, high = log_posterior.bounds
     starts = [np.clip(log_posterior.vector({**neutral, **start}), low, high)]
-    fresh = [i for i, name in enumerate(log_posterior.names) if name not in start]
     if before:
         starts.append(np.clip(log_posterior.vector({**neutral, **before, **start}), low, high))
         if set(log_posterior.names) <= set(before) | set(start):
             starts.append(np.clip(log_posterior.vector({**neutral, **start, **before}), low, high))
-    elif fresh:
+    else:
         rng = np.random.default_rng(seed)
-        count = DRAWS * len(fresh)
-        trials = np.tile(starts[0], (count, 1))
-        trials[:, fresh] = rng.uniform(low[fresh], high[fresh], (count, len(fresh)))
-        starts += _likely(log_posterior, trials, STARTS)
-        top = _climbed(log_posterior, starts, shear)
-        # The moment of a step, say, has a slope only next to the right one.
-        for _ in range(REDRAWN if len(fresh) > 2 else 0):
-            trials = _about(top.vector, fresh, low, high, count, rng)
-            again = _climbed(log_posterior, _likely(log_posterior, trials, 2), shear)
-            top = max(top, again, key=lambda one: one.value)
-        starts = [top.vector]
-    return _best(names, log_posterior, starts, shear)
+        laters = [[name for other in parts[index + 1 :] for name in other] for index in range(len(parts))]
+        rounds = list(zip(parts, laters, strict=True))
+        rounds += [(part, []) for part in parts] if len(parts) > 1 else []  # again, with the others found
+        for part, later in rounds:
+            starts = [_searched(log_posterior, starts[0], part, later, neutral, rng, shear)]
+    return _best(names, log_posterior, starts, shear, skin, seed)
+
+
+def _searched(
+    log_posterior: LogPosterior, vector: Array, part: Sequence[str], later: Sequence[str],
+    neutral: Mapping[str, float], rng: np.random.Generator, shear: Shear | None,
+) -> Array:  # fmt: skip
+    """The best point (D,) of climbs along the most promising draws of a part's parameters, and near them.
+
+    Parameters of parts that come `later` are neutral as yet.
+    """
+    low, high = log_posterior.bounds
+    columns = [log_posterior.names.index(name) for name in part]
+    without = log_posterior.named(log_posterior.from_sampling(vector))
+    without |= {name: neutral[name] for name in (*part, *later)}
+    alone = np.clip(log_posterior.vector(without), low, high)
+    trials = np.tile(alone, (DRAWS * len(columns), 1))
+    trials[:, columns] = rng.uniform(low[columns], high[columns], (len(trials), len(columns)))
+    top = _climbed(
+        log_posterior, [vector, *_promising(log_posterior, alone, trials, part, later, neutral)], shear
+    )
+    for _ in range(REDRAWN if len(columns) > 1 else 0):
+        near = _about(top.vector, columns, low, high, len(trials), rng)
+        trials[:, columns] = near[:, columns]
+        starts = _promising(log_posterior, alone, trials, part, later, neutral)
+        top = max(top, _climbed(log_posterior, [top.vector, *starts], shear), key=lambda one: one.value)
+    return top.vector
+
+
+def _promising(
+    log_posterior: LogPosterior, alone: Array, trials: Array, part: Sequence[str], later: Sequence[str],
+    neutral: Mapping[str, float],
+) -> list[Array]:  # fmt: skip
+    """The trials along which most is to be gained, each as strong as the recording asks for."""
+    low, high = log_posterior.bounds
+    names, strength = log_posterior.names, part[0]
+    parameter = log_posterior.space.parameters[names.index(strength)]
+    own = np.array([name in part for name in names])
+    free = ~own & np.array([name not in later for name in names])
+    starts = []
+    for row, multiple, moved in promise(log_posterior, alone, trials, free, STARTS):
+        for rest in (alone, moved):
+            values = log_posterior.named(log_posterior.from_sampling(np.where(own, trials[row], rest)))
+            far = neutral[strength] + multiple * (values[strength] - neutral[strength])
+            values[strength] = float(np.clip(far, parameter.lower, parameter.upper))
+            starts.append(np.clip(log_posterior.vector(values), low, high))
+    return starts
 
 
 def _about(
-    vector: Array, fresh: Sequence[int], low: Array, high: Array, count: int, rng: np.random.Generator
+    vector: Array, fresh: list[int], low: Array, high: Array, count: int, rng: np.random.Generator
 ) -> Array:
     """Points (count, D) with one or two of the new coordinates moved: near by, or anywhere in the prior."""
     width = (high - low)[fresh]
@@ -175,7 +217,7 @@ def _about(
 
 
 def _likely(log_posterior: LogPosterior, trials: Array, count: int) -> list[Array]:
-    values = log_posterior.log_prob(trials)
+    values = log_posterior.log_prob(trials) if len(trials) else np.zeros(0)
     return [trials[i] for i in np.argsort(-values)[:count] if np.isfinite(values[i])]
 
 
@@ -186,12 +228,33 @@ def _climbed(log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear 
 
 
 def _best(
-    names: Sequence[str], log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None
-) -> Fit:
+    names: Sequence[str], log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None,
+    skin: int, seed: int,
+) -> Fit:  # fmt: skip
     ahead = _climbed(log_posterior, starts, shear)
+    others = _likely(log_posterior, _other_skins(ahead.vector, log_posterior, shear, skin, seed), STARTS)
+    ahead = max(ahead, _climbed(log_posterior, [ahead.vector, *others], shear), key=lambda one: one.value)
     top = gauss_newton(log_posterior, ahead.vector, shear, ROUNDS)
     theta = log_posterior.named(log_posterior.from_sampling(top.vector))
     return Fit(tuple(names), log_posterior, theta, top.value, *_evidence(log_posterior, top), top.latent)
+
+
+def _other_skins(
+    vector: Array, log_posterior: LogPosterior, shear: Shear | None, skin: int, seed: int
+) -> Array:
+    """Points (n, D) with the base's parameters drawn anew, and stiffness such that the force fits best."""
+    low, high = log_posterior.bounds
+    trials = np.tile(vector, (8 * DRAWS, 1))
+    trials[:, :skin] = np.random.default_rng(seed).uniform(low[:skin], high[:skin], (len(trials), skin))
+    if shear is None:
+        return trials
+    bins, recorded = log_posterior.chain.bins, log_posterior.chain.force_n
+    for _ in range(3):  # the force is nearly of degree one in the moduli together
+        force = log_posterior.predict(log_posterior.from_sampling(trials)).mean[:, bins]
+        factor = (force @ recorded) / np.maximum(np.sum(force**2, axis=1), np.finfo(float).tiny)
+        trials[:, shear.group] += np.log(np.clip(factor, 1e-3, 1e3))[:, None]
+        trials = trials[np.all((trials >= low) & (trials <= high), axis=1)]
+    return trials
 
 
 def _evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:

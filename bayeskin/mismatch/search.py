@@ -67,7 +67,7 @@ def search(
     """
     done = done or {}
     alone = build(())
-    straight = find_shear(alone)
+    straight, skin = find_shear(alone), alone.surrogate.space.dim
     neutral = {name: value for m in known.values() for name, value in m.neutral.items()}
 
     def kept(key: tuple[str, ...], make: Callable[[], Fit]) -> Fit:
@@ -83,7 +83,9 @@ def search(
         def make() -> Fit:
             wide = build(key)
             shear = straight.among(alone.names, wide.names) if straight else None
-            return fit(key, wide, start.theta, neutral, seed, shear, before.theta if before else None)
+            earlier = before.theta if before else None
+            new = [part for name in key if name not in start.names for part in known[name].whole_or_parts]
+            return fit(key, wide, start.theta, neutral, seed, skin, shear, earlier, new)
 
         return kept(key, make)
 

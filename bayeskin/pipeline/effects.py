@@ -60,7 +60,7 @@ class Part:
 def parts_of(mechanism: Mechanism) -> list[Part]:
     """The parts of a mechanism, named after it and, where there are several, after their strengths."""
     by_name = {p.name: p for p in mechanism.parameters}
-    parts = mechanism.parts or (tuple(by_name),)
+    parts = mechanism.whole_or_parts
     return [
         Part(
             mechanism.name if len(parts) == 1 else f"{mechanism.name}-{names[0]}",
