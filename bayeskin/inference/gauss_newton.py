@@ -65,11 +65,11 @@ def gauss_newton(log_posterior: LogPosterior, start: Array, shear: Shear | None,
 
 def promise(
     log_posterior: LogPosterior, vector: Array, trials: Array, free: NDArray[np.bool_], count: int
-) -> list[tuple[int, float, Array]]:
+) -> list[tuple[int, float, float, Array]]:
     """The `count` of `trials` (n, D) along whose change of force most is to be gained from `vector` (D,).
 
-    Of each its row, the best multiple of that change, and `vector` with what is `free` (D,) moved to make
-    room, within the box; all by the force's linear approximation (a score test).
+    Of each its row, the nats, the best multiple of that change, and `vector` with what is `free` (D,) moved
+    to make room, within the box; all by the force's linear approximation (a score test).
     """
     linear = _Linear(log_posterior, vector)
     inner = linear.inner
@@ -85,9 +85,15 @@ def promise(
     left = target - room @ solved
     length = np.maximum(np.sum(change * left[:, 1:], axis=0), 1e-12)
     multiple = (change.T @ left[:, 0]) / length
-    chosen = np.argsort(-(multiple**2) * length)[:count]
+    gain = 0.5 * multiple**2 * length
+    chosen = np.argsort(-gain)[:count]
     return [
-        (int(i), float(multiple[i]), vector + linear.step(vector, 0.0, multiple[i] * change[:, i], others))
+        (
+            int(i),
+            float(gain[i]),
+            float(multiple[i]),
+            vector + linear.step(vector, 0.0, multiple[i] * change[:, i], others),
+        )
         for i in chosen
     ]
 

@@ -34,8 +34,8 @@ FEWEST_TAILS = 50.0  # of the tail index: nearly normal, since spikes are gone f
 SURE = 0.03  # sd of the surrogate, RMS, at most, of the recorded force's range
 DRAWS = 96  # of the prior for each new parameter, from which climbs start
 BASE_STARTS, STARTS = 10, 2
-REDRAWN = 2  # times that the parameters of a part are drawn anew, about the best so far
-FIRST_ROUNDS, ROUNDS = 7, 25  # of every climb, and of the one that is then ahead
+REDRAWN = 1  # times that the parameters of a part are drawn anew, about the best so far
+FIRST_ROUNDS, ROUNDS = 6, 25  # of every climb, and of the one that is then ahead
 EDGE = 1e-6  # of the unit cube: on a bound
 
 
@@ -113,6 +113,29 @@ def restored(plain: Mapping[str, Any], log_posterior: LogPosterior) -> Fit:
     return Fit(tuple(plain["names"]), log_posterior, plain["theta"], value, log_evidence, covariance, latent)
 
 
+def promised(
+    log_posterior: LogPosterior, start: Mapping[str, float], neutral: Mapping[str, float],
+    parts: Sequence[Sequence[str]], seed: int,
+) -> float:  # fmt: skip
+    """Nats that the most promising of draws of any part's parameters would gain on `start`, by `promise`."""
+    low, high = log_posterior.bounds
+    vector = np.clip(log_posterior.vector({**neutral, **start}), low, high)
+    rng, best = np.random.default_rng(seed), 0.0
+    new = np.array([name not in start for name in log_posterior.names])
+    for part in parts:
+        columns = [log_posterior.names.index(name) for name in part]
+        trials = _drawn(vector, columns, low, high, rng)
+        best = max(best, promise(log_posterior, vector, trials, ~new, 1)[0][1])
+    return best
+
+
+def _drawn(vector: Array, columns: list[int], low: Array, high: Array, rng: np.random.Generator) -> Array:
+    """Points (n, D) with some coordinates drawn from the prior."""
+    trials = np.tile(vector, (DRAWS * len(columns), 1))
+    trials[:, columns] = rng.uniform(low[columns], high[columns], (len(trials), len(columns)))
+    return trials
+
+
 def fit_base(log_posterior: LogPosterior, seed: int, shear: Shear | None) -> Fit:
     """Without any mechanism: the best of climbs from the most probable of many draws of the prior."""
     low, high = log_posterior.bounds
@@ -129,28 +152,22 @@ def fit(
     seed: int,
     skin: int,
     shear: Shear | None = None,
-    before: Mapping[str, float] | None = None,
     parts: Sequence[Sequence[str]] = (),
 ) -> Fit:
     """The best of a few climbs from `start`, which has the values of a smaller set.
 
-    What `start` does not have begins at its neutral value, and at its value in `before`, an earlier fit.
-    Where there is none, it is searched for, one of `parts` (names of parameters) after the other. `shear`
+    What `start` does not have begins at its neutral value, and is searched for, one of `parts` (names of
+    parameters) after the other. `shear`
     straightens the ridges of this posterior, where it is known; the base's parameters are the first `skin`.
     """
     low, high = log_posterior.bounds
     starts = [np.clip(log_posterior.vector({**neutral, **start}), low, high)]
-    if before:
-        starts.append(np.clip(log_posterior.vector({**neutral, **before, **start}), low, high))
-        if set(log_posterior.names) <= set(before) | set(start):
-            starts.append(np.clip(log_posterior.vector({**neutral, **start, **before}), low, high))
-    else:
-        rng = np.random.default_rng(seed)
-        laters = [[name for other in parts[index + 1 :] for name in other] for index in range(len(parts))]
-        rounds = list(zip(parts, laters, strict=True))
-        rounds += [(part, []) for part in parts] if len(parts) > 1 else []  # again, with the others found
-        for part, later in rounds:
-            starts = [_searched(log_posterior, starts[0], part, later, neutral, rng, shear)]
+    rng = np.random.default_rng(seed)
+    laters = [[name for other in parts[index + 1 :] for name in other] for index in range(len(parts))]
+    rounds = list(zip(parts, laters, strict=True))
+    rounds += [(part, []) for part in parts] if len(parts) > 1 else []  # again, with the others found
+    for part, later in rounds:
+        starts = [_searched(log_posterior, starts[0], part, later, neutral, rng, shear)]
     return _best(names, log_posterior, starts, shear, skin, seed)
 
 
@@ -167,8 +184,7 @@ def _searched(
     without = log_posterior.named(log_posterior.from_sampling(vector))
     without |= {name: neutral[name] for name in (*part, *later)}
     alone = np.clip(log_posterior.vector(without), low, high)
-    trials = np.tile(alone, (DRAWS * len(columns), 1))
-    trials[:, columns] = rng.uniform(low[columns], high[columns], (len(trials), len(columns)))
+    trials = _drawn(alone, columns, low, high, rng)
     top = _climbed(
         log_posterior, [vector, *_promising(log_posterior, alone, trials, part, later, neutral)], shear
     )
@@ -191,7 +207,7 @@ def _promising(
     own = np.array([name in part for name in names])
     free = ~own & np.array([name not in later for name in names])
     starts = []
-    for row, multiple, moved in promise(log_posterior, alone, trials, free, STARTS):
+    for row, _, multiple, moved in promise(log_posterior, alone, trials, free, STARTS):
         for rest in (alone, moved):
             values = log_posterior.named(log_posterior.from_sampling(np.where(own, trials[row], rest)))
             far = neutral[strength] + multiple * (values[strength] - neutral[strength])

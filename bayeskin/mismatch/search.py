@@ -1,8 +1,11 @@
 """Which mechanisms: forward from none, each tried with all other parameters free again.
 
 A set's weight is its evidence times the prior of its size, every mechanism being there with the probability
-`PRIOR`. After each step all others are tried beside those taken, and each taken one is left out again, so
-that what a later one has made needless goes. Probabilities are shares of weight over all sets
+`PRIOR`. In each step the others are ordered by what they promise beside those taken (a score test), and the
+most promising are tried; then each taken one is left out again, so that what a later one has made needless
+goes. The first step tries all, those that promise less by one climb each.
+
+Probabilities are shares of weight over all sets
 that were tried: those of sets never tried count as nothing.
 """
 
@@ -16,10 +19,11 @@ import numpy as np
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import Mechanism
-from bayeskin.mismatch.fit import Fit, fit, fit_base
+from bayeskin.mismatch.fit import Fit, fit, fit_base, promised
 
 PRIOR = 0.05  # of a mechanism to be at work, before the recording is seen
 MOST = 8  # steps
+SHORTLIST = 5  # mechanisms of a step that are tried thoroughly
 ONLY_WITH = {"friction-creep": "device-friction"}
 
 Build = Callable[[Sequence[str]], LogPosterior]  # the posterior with a set of mechanisms
@@ -77,35 +81,46 @@ def search(
                 on_fit(found.fits[key])
         return found.fits[key]
 
-    def tried(names: Sequence[str], start: Fit, before: Fit | None = None) -> Fit:
+    def tried(names: Sequence[str], start: Fit, thorough: bool = True) -> Fit:
         key = tuple(sorted(names))
 
         def make() -> Fit:
             wide = build(key)
             shear = straight.among(alone.names, wide.names) if straight else None
-            earlier = before.theta if before else None
-            new = [part for name in key if name not in start.names for part in known[name].whole_or_parts]
-            return fit(key, wide, start.theta, neutral, seed, skin, shear, earlier, new)
+            new = [p for name in key if name not in start.names for p in known[name].whole_or_parts]
+            return fit(key, wide, start.theta, neutral, seed, skin, shear, new if thorough else ())
 
         return kept(key, make)
 
     found = Search({})
     kept((), lambda: fit_base(alone, seed, straight))
-    last: dict[str, Fit] = {}  # the latest fit with a candidate
     for size in range(1, MOST + 1):
         current = found.best
-        others = [name for name in known if name not in current.names]
-        for count, name in enumerate(others):
-            names = {*current.names, name, *([ONLY_WITH[name]] if name in ONLY_WITH else [])}
-            last[name] = one = tried(sorted(names), current, last.get(name))
+        sets = {name: _with(current.names, name) for name in known if name not in current.names}
+        promises = {
+            name: promised(
+                build(names), current.theta, neutral,
+                [part for one in names if one not in current.names for part in known[one].whole_or_parts], seed,
+            )
+            for name, names in sets.items()
+        }  # fmt: skip
+        order = sorted(sets, key=lambda name: -promises[name])
+        tries = order if size == 1 else order[:SHORTLIST]
+        for count, name in enumerate(tries):
+            one = tried(sets[name], current, count < SHORTLIST)
             if progress:
                 note = f"{name}: {one.log_evidence - current.log_evidence:+.1f} nats"
-                progress((count + 1) / len(others), f"mechanism {size}: {note}")
+                progress((count + 1) / len(tries), f"mechanism {size}: {note}")
         while len(found.best.names) > 1 and (leaner := _leaner(found.best, tried)) is not None:
             found.fits[leaner.names] = leaner
         if found.best is current:
             break
     return found
+
+
+def _with(names: Sequence[str], name: str) -> tuple[str, ...]:
+    """A set with one mechanism more, and the one without which that does nothing."""
+    return tuple(sorted({*names, name, *([ONLY_WITH[name]] if name in ONLY_WITH else [])}))
 
 
 def _leaner(best: Fit, tried: Callable[[Sequence[str], Fit], Fit]) -> Fit | None:
