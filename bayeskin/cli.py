@@ -193,14 +193,15 @@ def diagnose(config: Path, as_json: bool) -> None:
 
 @cli.command()
 @click.argument("folder", required=False, type=click.Path(path_type=Path))
+@click.option("--at-most", type=click.IntRange(min=0), metavar="N", help="Diagnose N more, then score.")
 @click.option("--rediagnose", default=0, type=click.IntRange(min=0), metavar="N", help="Diagnose N again.")
 @as_json
-def prove(folder: Path | None, rediagnose: int, as_json: bool) -> None:
+def prove(folder: Path | None, at_most: int | None, rediagnose: int, as_json: bool) -> None:
     """What a diagnosis is worth: recordings with concealed effects diagnosed, then scored beside their keys.
 
     FOLDER is a set that `bayeskin conceal` made; by default the one that is shipped. A recording that has a
-    verdict is not diagnosed again, so the command can be interrupted; keys are opened when all verdicts are
-    written. With --rediagnose, N of the recordings are diagnosed afresh, elsewhere, and the exit code is 1
+    verdict is not diagnosed again, so the command can be interrupted; keys are opened when the verdicts are
+    written. With --at-most, what is judged by then is scored. With --rediagnose, N of the recordings are diagnosed afresh, elsewhere, and the exit code is 1
     if one has another verdict than the stored one.
 
     \b
@@ -210,7 +211,7 @@ def prove(folder: Path | None, rediagnose: int, as_json: bool) -> None:
     from bayeskin.pipeline import proof
 
     with Terminal() as terminal:
-        document = proof.prove(folder, terminal, rediagnose)
+        document = proof.prove(folder, terminal, rediagnose, at_most)
     _answer(document, as_json)
 
 

@@ -334,7 +334,7 @@ def full_run_with_derivatives(theta):
 def test_polish_climbs_the_full_model_from_where_a_wrong_surrogate_left_it():
     wrong = toy_problem(surrogate=ToySurrogate(bias_n=5e-3))
     start = dict(find_map(wrong, seed=1, starts=1, evaluations=4000).theta)
-    polished = polish_map(wrong, full_run_with_derivatives, start)
+    polished = polish_map(wrong, full_run_with_derivatives, start, rounds=12)
     assert polished.gained > 5.0, polished.message
     assert "converged" in polished.message
     right = find_map(toy_problem(surrogate=ToySurrogate(sd_n=1e-7)), seed=1, starts=2, evaluations=8000)

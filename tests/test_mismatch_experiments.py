@@ -134,7 +134,13 @@ def fitted(name: str, **values: float) -> Fit:
     seen = ObservedSurrogate(ToySurrogate(), (KNOWN[name],), toy.MOTION)
     log_posterior = LogPosterior(seen, empty_recording())
     return Fit(
-        (name,), log_posterior, {**TRUTH, **values, **NOISE}, 0.0, 0.0, 1e-6 * np.eye(log_posterior.dim)
+        (name,),
+        log_posterior,
+        {**TRUTH, **values, **NOISE},
+        0.0,
+        0.0,
+        1e-6 * np.eye(log_posterior.dim),
+        np.zeros(3),
     )
 
 

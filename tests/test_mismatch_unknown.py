@@ -34,7 +34,7 @@ def known_fit(seed: int, extra: Extra | None = None) -> Fit:
     if extra:
         force = force + extra(place(binned.time_s, binned.phase, binned.phases, toy.MOTION))
     log_posterior = LogPosterior(surrogate, dataclasses.replace(binned, force_n=force))
-    return Fit((), log_posterior, {**TRUTH, **NOISE}, 0.0, 0.0, 1e-6 * np.eye(log_posterior.dim))
+    return Fit((), log_posterior, {**TRUTH, **NOISE}, 0.0, 0.0, 1e-6 * np.eye(log_posterior.dim), np.zeros(3))
 
 
 def rubbing(at: Place) -> np.ndarray:

@@ -367,8 +367,10 @@ def test_prove_goes_on_where_it_was_interrupted_and_records_one_scoring(made: Pa
 def test_a_verdict_that_comes_out_otherwise_is_told(made: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(made, tmp_path / "copy"))
     pipeline.prove(copy, Silent(), diagnose=nothing_found)
-    assert pipeline.prove(copy, Silent(), 2, nothing_found)["ok"]
-    told = pipeline.prove(copy, Silent(), 2, lambda path, _: {**nothing_found(path, _), "verdict": "unknown"})
+    assert pipeline.prove(copy, Silent(), 2, diagnose=nothing_found)["ok"]
+    told = pipeline.prove(
+        copy, Silent(), 2, diagnose=lambda path, _: {**nothing_found(path, _), "verdict": "unknown"}
+    )
     assert not told["ok"]
     assert "ANOTHER VERDICT" in told["text"]
 

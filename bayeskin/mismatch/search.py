@@ -87,8 +87,8 @@ def search(
         def make() -> Fit:
             wide = build(key)
             shear = straight.among(alone.names, wide.names) if straight else None
-            new = [p for name in key if name not in start.names for p in known[name].whole_or_parts]
-            return fit(key, wide, start.theta, neutral, seed, skin, shear, new if thorough else ())
+            new = _new(known, key, start.names) if thorough else []
+            return fit(key, wide, start.theta, neutral, seed, skin, shear, new)
 
         return kept(key, make)
 
@@ -98,12 +98,9 @@ def search(
         current = found.best
         sets = {name: _with(current.names, name) for name in known if name not in current.names}
         promises = {
-            name: promised(
-                build(names), current.theta, neutral,
-                [part for one in names if one not in current.names for part in known[one].whole_or_parts], seed,
-            )
+            name: promised(build(names), current.theta, neutral, _new(known, names, current.names), seed)
             for name, names in sets.items()
-        }  # fmt: skip
+        }
         order = sorted(sets, key=lambda name: -promises[name])
         tries = order if size == 1 else order[:SHORTLIST]
         for count, name in enumerate(tries):
@@ -116,6 +113,13 @@ def search(
         if found.best is current:
             break
     return found
+
+
+def _new(
+    known: Mapping[str, Mechanism], names: Sequence[str], before: Sequence[str]
+) -> list[tuple[str, ...]]:
+    """Parts of the mechanisms that an earlier set does not have."""
+    return [part for name in names if name not in before for part in known[name].whole_or_parts]
 
 
 def _with(names: Sequence[str], name: str) -> tuple[str, ...]:

@@ -2,8 +2,8 @@
 
 A mechanism is named where it, or its group of look-alikes together, is more probable than not, and leaving it
 out costs more than the full model's own error, if what is named explains more than half of the squared
-residual beyond what is allowed. Nothing is missing where none is named and no window is found. Otherwise the
-mismatch is unknown.
+residual beyond what is allowed. Nothing is missing where none is named and no window is found, or what goes
+beyond the allowed is within the model's own error. Otherwise the mismatch is unknown.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def judge(found: Search, known: Mapping[str, Mechanism], before: Located, after:
         for name in best.names
         if (one := _named(found, known[name])).group_probability > PROBABLE and one.explains_n > least
     )
-    if not named and not before.windows:
+    if not named and (not before.windows or beyond_allowed(before) < least):
         return Diagnosis("nothing-missing", (), 0.0)
     if named and (explained > EXPLAINED or not after.windows):
         return Diagnosis("named", named, explained)
@@ -76,14 +76,16 @@ def explains(found: Search, name: str) -> float:
     return float(np.sqrt(max(_rms(without) ** 2 - _rms(found.best) ** 2, 0.0)))
 
 
+def beyond_allowed(located: Located) -> float:
+    """RMS residual [N] beyond what is allowed of it."""
+    square = np.mean(located.residual_n**2) - np.mean(located.allowed_n**2)
+    return float(np.sqrt(max(float(square), 0.0)))
+
+
 def explained_share(before: Located, after: Located) -> float:
     """Of the squared residual beyond what is allowed."""
-
-    def beyond(one: Located) -> float:
-        return max(float(np.mean(one.residual_n**2) - np.mean(one.allowed_n**2)), 0.0)
-
-    whole = beyond(before)
-    return 1.0 - beyond(after) / whole if whole > 0.0 else 0.0
+    whole = beyond_allowed(before) ** 2
+    return 1.0 - beyond_allowed(after) ** 2 / whole if whole > 0.0 else 0.0
 
 
 def _named(found: Search, mechanism: Mechanism) -> Named:

@@ -28,12 +28,16 @@ def prove(
     folder: Path | None,
     reporter: Reporter,
     rediagnose: int = 0,
+    at_most: int | None = None,
     diagnose: Diagnose = diagnosis.diagnose,
 ) -> dict[str, Any]:
     """Diagnoses what has no verdict yet, then scores all verdicts; into `folder` (default: the shipped set).
 
     rediagnose : so many, spread over the set, are diagnosed afresh in a temporary place and compared with
-        their stored verdicts. While anything is diagnosed, the seals cannot be opened.
+        their stored verdicts
+    at_most : of those without a verdict so many are diagnosed now; what is judged by then is scored
+
+    While anything is diagnosed, the seals cannot be opened.
     Raises InputError for a folder without a set, or whose contents are not what its index says.
     """
     folder = shipped(SET).parent if folder is None else folder
@@ -41,17 +45,18 @@ def prove(
     if not index:
         raise InputError(folder, "a set without recordings", "one that `bayeskin conceal` made")
     with proof.closed(folder):
-        for place, (number, said) in enumerate(index.items()):
-            reporter.progress("recordings", place / len(index), f"{number} of {len(index)}")
-            if _stored(folder, number, said["recording_sha256"]) is None:
-                answer = _diagnosed(folder, number, said["recording_sha256"], reporter, diagnose)
-                _store(folder, number, said["recording_sha256"], sources, answer)
-                reporter.log(f"{number}: {_in_a_word(answer)}")
+        hashes = {number: said["recording_sha256"] for number, said in index.items()}
+        new = [number for number, expected in hashes.items() if _stored(folder, number, expected) is None]
+        for place, number in enumerate(new[:at_most]):
+            reporter.progress("recordings", place / len(new), f"{number} of {len(index)}")
+            answer = _diagnosed(folder, number, hashes[number], reporter, diagnose)
+            _store(folder, number, hashes[number], sources, answer)
+            reporter.log(f"{number}: {_in_a_word(answer)}")
         again = {
-            number: _diagnosed(folder, number, index[number]["recording_sha256"], reporter, diagnose)
-            for number in _spread(list(index), rediagnose)
+            number: _diagnosed(folder, number, hashes[number], reporter, diagnose)
+            for number in _spread([n for n, e in hashes.items() if _stored(folder, n, e)], rediagnose)
         }
-    stored = {n: _stored(folder, n, said["recording_sha256"]) for n, said in index.items()}
+    stored = {number: _stored(folder, number, expected) for number, expected in hashes.items()}
     verdicts = {number: one for number, one in stored.items() if one is not None}
     board = proof.score(seals.read_keys(folder), {number: one["answer"] for number, one in verdicts.items()})
     current = sum(one["sources_sha256"] == sources for one in verdicts.values())
