@@ -172,8 +172,10 @@ def run(config: Path, scheduler: str | None, as_json: bool) -> None:
 @cli.command()
 @a_config
 @as_json
-def diagnose(config: Path, as_json: bool) -> None:
-    """What the model leaves out of a configuration's recording: where, which physics, how much better.
+def diagnose(source: Path, as_json: bool) -> None:
+    """What the model leaves out of a recording: where, which physics, how much better.
+
+    SOURCE is a configuration, or a recording by itself, whose protocol a shipped surrogate knows.
 
     Tries each mechanism of the catalogue that acts on the instrument, and each of the tissue's that
     `bayeskin effects` has learnt or that is shipped with the surrogate, with all other parameters free
@@ -182,12 +184,12 @@ def diagnose(config: Path, as_json: bool) -> None:
 
     \b
     Example:
-      bayeskin diagnose runs/healthy-skin.toml --json
+      bayeskin diagnose runs/healthy-skin.h5 --json
     """
     from bayeskin.pipeline import diagnosis
 
     with Terminal() as terminal:
-        document = diagnosis.diagnose(config, terminal)
+        document = diagnosis.diagnose(source, terminal)
     _answer(document, as_json)
 
 
@@ -201,8 +203,8 @@ def prove(folder: Path | None, at_most: int | None, rediagnose: int, as_json: bo
 
     FOLDER is a set that `bayeskin conceal` made; by default the one that is shipped. A recording that has a
     verdict is not diagnosed again, so the command can be interrupted; keys are opened when the verdicts are
-    written. With --at-most, what is judged by then is scored. With --rediagnose, N of the recordings are diagnosed afresh, elsewhere, and the exit code is 1
-    if one has another verdict than the stored one.
+    written. With --at-most, what is judged by then is scored. With --rediagnose, N of the recordings are
+    diagnosed afresh, elsewhere, and the exit code is 1 if one has another verdict than the stored one.
 
     \b
     Example:

@@ -1,6 +1,8 @@
 """Steps of the load cell's zero at two moments: F + sum_i s_i H(t - t_i).
 
 Moments are counted as shares of the recording, so that one prior fits all.
+
+A step in the first or last fiftieth of a recording is not asked for: it would be an offset, or nothing.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ MECHANISM = Mechanism(
         for i in EVENTS
         for parameter in (
             Parameter(
-                f"event_{i}_at", "-", 0.0, 1.0, "uniform", "moment of a step, as share of the recording"
+                f"event_{i}_at", "-", 0.02, 0.98, "uniform", "moment of a step, as share of the recording"
             ),
             Parameter(f"event_{i}_step", "N", -0.05, 0.05, "uniform", "step of the load cell's zero"),
         )

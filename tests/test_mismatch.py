@@ -1,0 +1,159 @@
+"""A concealed mechanism is found on the toy, nothing is found where nothing is; the parts of the chain."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import toy
+from toy_inference import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
+
+from bayeskin.inference import LogPosterior, NoisePriors, find_map
+from bayeskin.inference.gauss_newton import gauss_newton, promise
+from bayeskin.inference.straighten import find_shear
+from bayeskin.mechanisms import catalogue
+from bayeskin.mismatch.fit import Fit, fit, fit_base, restored, stored
+from bayeskin.mismatch.locate import locate
+from bayeskin.mismatch.observed import ObservedSurrogate
+from bayeskin.mismatch.search import search
+from bayeskin.mismatch.verdict import judge
+
+KNOWN = {
+    name: catalogue()[name] for name in ("force-offset", "sensor-drift", "viscous-drag", "sensor-events")
+}
+NEUTRAL = {name: value for one in KNOWN.values() for name, value in one.neutral.items()}
+QUIET = NoisePriors(sd_n=(1e-4, 6e-3), tau_s=(0.1, 5.0), nu=(4.0, 100.0))
+
+
+def concealing(seed: int, names: Sequence[str] = (), **values: float) -> LogPosterior:
+    """The toy's recording with mechanisms at work, and the posterior that knows of none."""
+    plain = toy_problem(seed)
+    mechanisms = tuple(KNOWN[name] for name in names)
+    theta = [*TRUTH.values(), *(values[p.name] for one in mechanisms for p in one.parameters)]
+    seen = ObservedSurrogate(ToySurrogate(), mechanisms, toy.MOTION).predict([theta]).mean[0]
+    alone = ToySurrogate().predict([list(TRUTH.values())]).mean[0]
+    binned = dataclasses.replace(plain.binned, force_n=plain.binned.force_n + seen - alone)
+    return dataclasses.replace(plain, binned=binned, noise_priors=QUIET)
+
+
+def building(alone: LogPosterior, names: Sequence[str]) -> LogPosterior:
+    mechanisms = tuple(KNOWN[name] for name in names)
+    if not mechanisms:
+        return alone
+    return dataclasses.replace(alone, surrogate=ObservedSurrogate(alone.surrogate, mechanisms, toy.MOTION))
+
+
+@pytest.mark.parametrize(
+    ("names", "values"),
+    [
+        (("force-offset",), {"F0": -0.04}),
+        (("viscous-drag",), {"drag": 30.0}),
+        (
+            ("sensor-events",),
+            {"event_1_at": 0.3, "event_1_step": 0.03, "event_2_at": 0.7, "event_2_step": -0.04},
+        ),
+    ],
+)
+def test_a_concealed_mechanism_is_named_and_its_parameters_are_right(
+    names: tuple[str, ...], values: dict[str, float]
+) -> None:
+    alone = concealing(3, names, **values)
+    found = search(lambda these: building(alone, these), KNOWN, 1)
+    before, after = (locate(one, found.best.theta, 1) for one in (found.base, found.best))
+    verdict = judge(found, KNOWN, before, after)
+    assert verdict.verdict == "named"
+    assert [one.name for one in verdict.named] == list(names)
+    assert before.windows
+    assert verdict.explained > 0.8
+    for name in (name for name in values if not name.startswith("event")):
+        mean, sd = found.best.mean_and_sd(name)
+        assert abs(values[name] - mean) < 4.0 * sd, name
+    if names == ("sensor-events",):
+        moments = sorted(found.best.theta[f"event_{i}_at"] for i in (1, 2))
+        np.testing.assert_allclose(moments, [0.3, 0.7], atol=0.02)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_is_missing_where_nothing_is(seed: int) -> None:
+    alone = concealing(seed)
+    found = search(lambda these: building(alone, these), KNOWN, 1)
+    before, after = (locate(one, found.best.theta, 1) for one in (found.base, found.best))
+    assert judge(found, KNOWN, before, after).verdict == "nothing-missing"
+
+
+def test_a_search_that_was_stopped_goes_on_without_repeating_a_fit() -> None:
+    alone = concealing(3, ("force-offset",), F0=-0.04)
+    made: list[Fit] = []
+    first = search(lambda these: building(alone, these), KNOWN, 1, on_fit=made.append)
+    kept = [json.loads(json.dumps(stored(one))) for one in made]
+    done = {tuple(one["names"]): restored(one, building(alone, one["names"])) for one in kept}
+    again: list[Fit] = []
+    second = search(lambda these: building(alone, these), KNOWN, 1, done=done, on_fit=again.append)
+    assert not again
+    assert second.best.names == first.best.names
+    np.testing.assert_array_equal(second.best.force_n, first.best.force_n)
+
+
+def test_evidence_is_that_of_a_line_in_closed_form() -> None:
+    problem = line_problem()
+    found = fit_base(problem, 1, None)
+    columns, sd = problem.surrogate.columns, 0.05  # type: ignore[attr-defined]
+    noise = (sd**2 + 1e-6) * np.eye(columns.shape[1]) + 1e-4 * np.outer(columns[1], columns[1])
+    wide = noise + columns.T @ (np.eye(2) / 3.0) @ columns  # the priors' variance, were they normal
+    force = problem.chain.force_n
+    _, log_det = np.linalg.slogdet(2.0 * np.pi * noise)
+    precision = columns @ np.linalg.solve(noise, columns.T)
+    best = np.linalg.solve(precision, columns @ np.linalg.solve(noise, force))
+    left = force - best @ columns
+    peak = -0.5 * (left @ np.linalg.solve(noise, left) + log_det)
+    exact = peak + np.log(2.0 * np.pi) - 0.5 * np.linalg.slogdet(precision)[1] - np.log(4.0)
+    assert wide.shape == noise.shape
+    assert found.log_evidence == pytest.approx(exact, abs=0.1)
+
+
+def test_climbs_reach_at_least_what_the_global_search_finds() -> None:
+    problem = toy_problem()
+    searched = find_map(problem, seed=1, starts=3, evaluations=12000)
+    assert fit_base(problem, 1, find_shear(problem)).value > searched.value - 0.2
+
+
+def test_a_climb_never_ends_below_its_start_nor_outside_the_box() -> None:
+    problem = toy_problem()
+    low, high = problem.bounds
+    for x in np.random.default_rng(4).uniform(low, high, (4, problem.dim)):
+        top = gauss_newton(problem, x, None, 6)
+        assert top.value >= problem.log_prob(x[None])[0]
+        assert np.all((top.vector >= low) & (top.vector <= high))
+
+
+def test_a_promise_points_at_the_moment_of_a_step() -> None:
+    values = {"event_1_at": 0.4, "event_1_step": 0.03, "event_2_at": 0.5, "event_2_step": 0.0}
+    alone = concealing(3, ("sensor-events",), **values)
+    wide = building(alone, ("sensor-events",))
+    vector = wide.vector({**NEUTRAL, **TRUTH, **NOISE, "nu_noise": 20.0})
+    at, step = (wide.names.index(name) for name in ("event_1_at", "event_1_step"))
+    trials = np.tile(vector, (99, 1))
+    trials[:, at], trials[:, step] = np.linspace(0.01, 0.99, 99), 0.01
+    free = np.array([not name.startswith("event") for name in wide.names])
+    row, gain, multiple, _ = promise(wide, vector, trials, free, 1)[0]
+    assert trials[row, at] == pytest.approx(0.4, abs=0.011)
+    assert gain > 20.0
+    assert multiple == pytest.approx(3.0, rel=0.3)
+
+
+def test_what_the_surrogate_does_not_know_is_not_searched() -> None:
+    problem = dataclasses.replace(toy_problem(), sure_within_n=1e-9)
+    vector = problem.vector({**TRUTH, **NOISE})
+    assert problem.log_prob(vector[None])[0] == -np.inf
+    assert np.isfinite(dataclasses.replace(problem, sure_within_n=1.0).log_prob(vector[None])[0])
+
+
+def test_a_mechanism_that_does_nothing_gains_nothing() -> None:
+    alone = concealing(2)
+    base = fit_base(alone, 1, None)
+    wide = building(alone, ("sensor-drift",))
+    more = fit(("sensor-drift",), wide, base.theta, NEUTRAL, 1, 5, None, KNOWN["sensor-drift"].whole_or_parts)
+    assert more.log_evidence < base.log_evidence + 2.0
