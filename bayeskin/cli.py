@@ -170,7 +170,7 @@ def run(config: Path, scheduler: str | None, as_json: bool) -> None:
 
 
 @cli.command()
-@a_config
+@click.argument("source", type=click.Path(path_type=Path))
 @as_json
 def diagnose(source: Path, as_json: bool) -> None:
     """What the model leaves out of a recording: where, which physics, how much better.

@@ -459,3 +459,20 @@ def test_help_teaches_each_command_by_an_example(bayeskin: Command) -> None:
         assert code == 0
         assert "--json" in out
         assert f"bayeskin {name} " in out.split("Example:")[1]
+
+
+def test_a_recording_whose_protocol_no_surrogate_knows_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    time_s = np.arange(0.0, 60.0, 0.1)
+    displacement_m = np.interp(time_s, [0.0, 5.0, 15.0, 40.0, 50.0, 60.0], [0.0, 0.0, 7e-3, 7e-3, 0.0, 0.0])
+    storage.save(
+        tmp_path / "own.h5", Recording(time_s, displacement_m, 30.0 * displacement_m, "own", "0" * 64)
+    )
+    with pytest.raises(SystemExit) as end:
+        cli.main(["diagnose", str(tmp_path / "own.h5")])
+    said = capsys.readouterr().err.strip()
+    assert end.value.code == 2
+    assert said.count("\n") == 0
+    assert "no shipped surrogate" in said
+    assert "CONFIG.toml" in said
