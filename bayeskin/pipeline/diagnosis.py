@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import re
+import threading
 import time
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -38,6 +37,7 @@ from bayeskin.pipeline.training import base_surrogate
 from bayeskin.recordings import read_recording, segment
 from bayeskin.surrogates import Effect, with_effects
 from bayeskin.types import Array, BinnedForce, PadMotion, Surrogate
+from bayeskin.workers import run_parallel
 
 
 @dataclass(frozen=True)
@@ -99,12 +99,11 @@ def _work(run: Run) -> Mapping[str, Any]:
     started = time.monotonic()
     bench = _workbench(run)
     split_s = _end_of_second_hold(bench.binned)
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as other:
-        beginning = None if split_s is None else other.submit(_search_apart, run.config_path, split_s)
-        whole = _searched(bench, None)
-        if beginning is not None:
-            run.reporter.log("waiting for the search on the recording's beginning")
-            beginning.result()
+    beside = None if split_s is None else _search_beside(run, split_s)
+    whole = _searched(bench, None)
+    if beside is not None:
+        run.reporter.log("waiting for the search on the recording's beginning")
+        beside.join()
     begun = None if split_s is None else _searched(bench, split_s)
     before, after = (locate(one, whole.best.theta, run.config.seed) for one in (whole.base, whole.best))
     found = judge(whole, bench.known, before, after)
@@ -128,8 +127,15 @@ def _work(run: Run) -> Mapping[str, Any]:
     return {**answer, "figures": [figure.name for figure in figures]}
 
 
+def _search_beside(run: Run, split_s: float) -> threading.Thread:
+    """The search on the beginning in a process of its own, which ends with this one; fits go to their file."""
+    search_it = partial(_search_apart, run.config_path)
+    thread = threading.Thread(target=lambda: list(run_parallel(search_it, [split_s], 1)), daemon=True)
+    thread.start()
+    return thread
+
+
 def _search_apart(source: Path, split_s: float) -> None:
-    """The search on the beginning, in a process of its own: its fits go to their file."""
     _searched(_workbench(_opened(source, Silent())), split_s)
 
 
