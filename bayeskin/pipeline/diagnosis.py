@@ -128,7 +128,7 @@ def _work(run: Run) -> Mapping[str, Any]:
 
 
 def _search_beside(run: Run, split_s: float) -> threading.Thread:
-    """The search on the beginning in a process of its own, which ends with this one; fits go to their file."""
+    """The search on the beginning in a process of its own that ends with this one; its fits go to a file."""
     search_it = partial(_search_apart, run.config_path)
     thread = threading.Thread(target=lambda: list(run_parallel(search_it, [split_s], 1)), daemon=True)
     thread.start()
