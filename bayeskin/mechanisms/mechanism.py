@@ -48,9 +48,14 @@ class Instrument:
 
 @dataclass(frozen=True)
 class Tissue:
-    """What a tissue mechanism does to the full model."""
+    """What a tissue mechanism does to the full model.
+
+    estimate : of the force with it, from the force without, in closed form; where there is one, surrogates
+        learn only what it leaves
+    """
 
     bind: Bind
+    estimate: Observe | None = None
 
 
 @dataclass(frozen=True)

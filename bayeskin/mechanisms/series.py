@@ -1,6 +1,7 @@
 """What lies between drive and skin, on the force of a surrogate: a shortcut for what the full model solves.
 
-The skin sees p - s: p trails the drive u behind a gap, s is what yields (compliance) and what has slipped.
+The skin sees p - s: p trails the drive u behind a gap, s is what yields at once (compliance) or slowly
+(recovery, a Kelvin-Voigt element), and what has slipped.
 Its force is taken to follow the displacement at once,
 
     F[p - s](t) = F[u](t) + G(p(t) - s(t)) - G(u(t)) ,
@@ -13,6 +14,7 @@ memory; the full model tells what else there is to it.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from bayeskin.mechanisms.mechanism import ForceOfTime
 from bayeskin.model.assembly import compiled
@@ -26,15 +28,20 @@ ITERATIONS = 8  # of a force and what it makes lost, which changes it by some te
 def lost_in_series(
     motion: PadMotion,
     force: ForceOfTime,
-    gap_m: Array,
-    compliance: Array,
-    rate: Array,
-    threshold_n: Array,
+    gap_m: ArrayLike = 0.0,
+    compliance: ArrayLike = 0.0,
+    rate: ArrayLike = 0.0,
+    threshold_n: ArrayLike = 0.0,
+    recovery: ArrayLike = 0.0,
+    recovery_s: ArrayLike = 1.0,
 ) -> ForceOfTime:
-    """The force behind a gap [m], a compliance [m/N], and slip [m/(N s)] beyond a threshold; all (n,)."""
+    """The force behind a gap [m], a compliance [m/N], slip [m/(N s)] beyond a threshold, and a compliance
+    [m/N] that yields and returns over a time [s]; each (n,) or one for all."""
+    given = np.broadcast_arrays(gap_m, compliance, rate, threshold_n, recovery, recovery_s)
+    elements = [np.array(np.atleast_1d(one), dtype=float) for one in given]
     steps = np.linspace(motion.time_s[:-1], motion.time_s[1:], STEPS_A_PHASE, endpoint=False).T.ravel()
     grid_s = np.append(steps, motion.time_s[-1])
-    u, n = motion.at(grid_s), len(gap_m)
+    u, n = motion.at(grid_s), len(elements[0])
     rising = np.flatnonzero(np.diff(motion.displacement_m) > 0.0)
     first = int(rising[0]) if len(rising) else 0
     start, end = motion.time_s[first : first + 2]
@@ -44,7 +51,7 @@ def lost_in_series(
     change = np.zeros_like(free)
     _march(
         free, u, np.diff(grid_s), np.ascontiguousarray(np.broadcast_to(table, (n, GRID))), float(low),
-        float(max(high - low, 1e-9)), gap_m, compliance, rate, threshold_n, float(np.ptp(u)), change,
+        float(max(high - low, 1e-9)), *elements, float(np.ptp(u)), change,  # type: ignore[call-arg]
     )  # fmt: skip
 
     def reported(time_s: Array) -> Array:
@@ -58,21 +65,26 @@ def lost_in_series(
 
 
 @compiled
-def _march(free, u, elapsed, table, low, width, gap, compliance, rate, threshold, reach, change):
+def _march(
+    free, u, elapsed, table, low, width, gap, compliance, rate, threshold, recovery, recovery_s, reach, change
+):  # fmt: skip
     """Fills change (n, k) of the forces `free` (n, k) at drive displacements u (k,)."""
     for i in range(free.shape[0]):
-        behind, slip, before = u[0], 0.0, free[i, 0]
+        behind, slip, yielded, before = u[0], 0.0, 0.0, free[i, 0]
         for k in range(1, free.shape[1]):
             behind = max(u[k] - gap[i], min(u[k], behind))
             rest = _interpolated(table[i], (u[k] - low) / width)
-            added, slid = change[i, k - 1], slip
+            z = elapsed[k - 1] / recovery_s[i]
+            keep, phi = np.exp(-z), -np.expm1(-z) / z
+            added, slid, slow = change[i, k - 1], slip, yielded
             for _ in range(ITERATIONS):
                 now = free[i, k] + added
                 slid = slip + rate[i] * elapsed[k - 1] * mean_beyond(before, now, threshold[i])
                 slid = min(max(slid, -reach), reach)
-                lost = min(max(slid + compliance[i] * now, -reach), reach)
+                slow = keep * yielded + recovery[i] * ((phi - keep) * before + (1.0 - phi) * now)
+                lost = min(max(slid + slow + compliance[i] * now, -reach), reach)
                 added = _interpolated(table[i], (behind - lost - low) / width) - rest
-            slip, before = slid, free[i, k] + added
+            slip, yielded, before = slid, slow, free[i, k] + added
             change[i, k] = added
 
 
