@@ -310,5 +310,6 @@ def _room(log_posterior: LogPosterior, top: Top, unit: Array, i: int) -> float:
     places = np.unique(np.clip(np.concatenate([unit[i] - away, unit[i : i + 1], unit[i] + away]), 0.0, 1.0))
     points = np.repeat(unit[None], len(places), axis=0)
     points[:, i] = places
-    values = log_posterior.log_prob(low + points * (high - low)) - top.value
+    points = np.clip(low + points * (high - low), low, high)
+    values = log_posterior.log_prob(points) - top.value
     return float(np.trapezoid(np.exp(np.minimum(values, 0.0)), places))
