@@ -149,7 +149,26 @@ _stage_command("effects", "Learn what each tissue mechanism does to the force, f
 _stage_command("map", "Find the most probable point and check it by the full model.")
 _stage_command("sample", "Sample the posterior until it can be trusted; bands on the predicted force.")
 _stage_command("sobol", "Sobol indices of the force over time.")
-_stage_command("report", "Figures and summary.json of a run.")
+
+
+@cli.command()
+@a_config
+@as_json
+def report(config: Path, as_json: bool) -> None:
+    """One HTML page of a run, from whatever stages are done.
+
+    Runs no stage: says plainly which are missing. The page is report.html in the run's folder; it needs no
+    network and no file beside it, so it can be sent as it is.
+
+    \b
+    Example:
+      bayeskin report runs/demo.toml
+    """
+    from bayeskin.pipeline import stages
+
+    with Terminal() as terminal:
+        document = stages.report(config, terminal)
+    _answer(document, as_json)
 
 
 @cli.command()
