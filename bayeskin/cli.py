@@ -169,8 +169,8 @@ def report(config: Path, as_json: bool) -> None:
 def run(config: Path, scheduler: str | None, as_json: bool) -> None:
     """All stages of a configuration in order, skipping what is done and unchanged.
 
-    Outputs go to a folder beside CONFIG with the configuration's name. Interrupted at any moment, the same
-    command goes on.
+    Outputs go to a folder beside CONFIG with the configuration's name; report.html in it is the answer to
+    read. Interrupted at any moment, the same command goes on.
 
     \b
     Example:
