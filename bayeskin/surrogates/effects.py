@@ -49,17 +49,15 @@ class Effect:
 
     def predict(self, theta: Array) -> Prediction:
         """What the effect adds, at theta (n, d) in the order of its space."""
-        found = self.surrogate.predict(theta)
-        s = strength(self.space, self.own[0], self.neutral, theta)
-        return Prediction(
-            found.mean * s[:, None], found.factor * s[:, None, None], found.diagonal * s[:, None] ** 2
-        )
+        s = strength(self.surrogate.similarity, self.own[0], self.neutral, theta)
+        return self.surrogate.predict(theta, s)
 
 
-def strength(space: ParameterSpace, name: str, neutral: float, theta: Array) -> Array:
+def strength(similarity: Similarity, name: str, neutral: float, theta: Array) -> Array:
     """s (n,) at theta (n, d): the parameter's distance from neutral, over the modulus to its power."""
+    space = similarity.space
     column = space.names.index(name)
-    scale = Similarity(space).log_scale(theta)
+    scale = similarity.log_scale(theta)
     return np.asarray((theta[:, column] - neutral) * np.exp(-space.parameters[column].stress_power * scale))
 
 
@@ -78,7 +76,7 @@ def train_effect(
     Rows whose effect is next to nothing are left out; the validation is of G. Raises InputError where too
     few rows show an effect.
     """
-    s = strength(design.space, own[0], neutral, design.theta)
+    s = strength(Similarity(design.space), own[0], neutral, design.theta)
     change = design.force_n - base
     with np.errstate(invalid="ignore"):
         size = np.sqrt(np.mean(change**2, axis=1) / np.mean(base**2, axis=1))
@@ -122,15 +120,20 @@ class WithEffects:
         """Force at theta (n, d) or (d,), with its uncertainty; errors of the parts taken as independent."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
-        names = self.space.names
         found = [self.base.predict(theta[:, : self.base.space.dim])]
-        for effect in self.effects:
-            found.append(effect.predict(theta[:, [names.index(name) for name in effect.space.names]]))
+        for effect, columns in zip(self.effects, self._columns, strict=True):
+            found.append(effect.predict(theta[:, columns]))
+        rows = [one.factor.transpose(0, 2, 1) for one in found]  # as they lie in memory
         return Prediction(
-            mean=np.sum([one.mean for one in found], axis=0),
-            factor=np.concatenate([one.factor for one in found], axis=2),
-            diagonal=np.sum([one.diagonal for one in found], axis=0),
+            mean=sum((one.mean for one in found[1:]), found[0].mean),
+            factor=np.concatenate(rows, axis=1).transpose(0, 2, 1),
+            diagonal=sum((one.diagonal for one in found[1:]), found[0].diagonal),
         )
+
+    @cached_property
+    def _columns(self) -> list[list[int]]:
+        """Of each effect, where in `space` its parameters are."""
+        return [[self.space.names.index(name) for name in effect.space.names] for effect in self.effects]
 
 
 def with_effects(base: ShapeSurrogate, effects: Sequence[Effect]) -> Surrogate:
