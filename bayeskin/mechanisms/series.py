@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayeskin.mechanisms.mechanism import ForceOfTime
-from bayeskin.model.assembly import compiled
+from bayeskin.mechanisms.lines import interpolated, strict
+from bayeskin.mechanisms.mechanism import ForceOfTime, added
 from bayeskin.types import Array, PadMotion
 
 STEPS_A_PHASE = 100
@@ -47,17 +47,10 @@ def lost_in_series(
         float(max(high - low, 1e-9)), gap_m, compliance, rate, threshold_n, float(np.ptp(u)), change,
     )  # fmt: skip
 
-    def reported(time_s: Array) -> Array:
-        each = np.broadcast_to(time_s, (n, np.shape(time_s)[-1]))
-        place = np.clip(np.searchsorted(grid_s, each, side="right") - 1, 0, len(grid_s) - 2)
-        share = np.clip((each - grid_s[place]) / np.diff(grid_s)[place], 0.0, 1.0)
-        left, right = (np.take_along_axis(change, place + one, axis=1) for one in (0, 1))
-        return np.asarray(force(time_s) + left + share * (right - left))
-
-    return reported
+    return added(force, lambda time_s: interpolated(grid_s, change, time_s))
 
 
-@compiled
+@strict
 def _march(free, u, elapsed, table, low, width, gap, compliance, rate, threshold, reach, change):
     """Fills change (n, k) of the forces `free` (n, k) at drive displacements u (k,)."""
     for i in range(free.shape[0]):
@@ -67,16 +60,19 @@ def _march(free, u, elapsed, table, low, width, gap, compliance, rate, threshold
             rest = _interpolated(table[i], (u[k] - low) / width)
             added, slid = change[i, k - 1], slip
             for _ in range(ITERATIONS):
-                now = free[i, k] + added
-                slid = slip + rate[i] * elapsed[k - 1] * mean_beyond(before, now, threshold[i])
-                slid = min(max(slid, -reach), reach)
+                now, last = free[i, k] + added, added
+                if rate[i] != 0.0:
+                    slid = slip + rate[i] * elapsed[k - 1] * mean_beyond(before, now, threshold[i])
+                    slid = min(max(slid, -reach), reach)
                 lost = min(max(slid + compliance[i] * now, -reach), reach)
                 added = _interpolated(table[i], (behind - lost - low) / width) - rest
+                if added == last:  # to the last bit: no iteration changes it any more
+                    break
             slip, before = slid, free[i, k] + added
             change[i, k] = added
 
 
-@compiled
+@strict
 def _interpolated(table, place):
     """Of a table over [0, 1], straight on beyond it."""
     place *= len(table) - 1
@@ -84,7 +80,7 @@ def _interpolated(table, place):
     return table[left] + (place - left) * (table[left + 1] - table[left])
 
 
-@compiled
+@strict
 def mean_beyond(before, now, threshold):
     """Mean of sgn(F) max(|F| - threshold, 0) along a straight line between two forces."""
     total = 0.0
