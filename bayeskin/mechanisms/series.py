@@ -12,6 +12,7 @@ memory; the full model tells what else there is to it.
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
 from bayeskin.mechanisms.lines import interpolated, strict
@@ -52,32 +53,39 @@ def lost_in_series(
 
 @strict
 def _march(free, u, elapsed, table, low, width, gap, compliance, rate, threshold, reach, change):
-    """Fills change (n, k) of the forces `free` (n, k) at drive displacements u (k,)."""
-    for i in range(free.shape[0]):
-        behind, slip, before = u[0], 0.0, free[i, 0]
-        for k in range(1, free.shape[1]):
-            behind = max(u[k] - gap[i], min(u[k], behind))
-            rest = _interpolated(table[i], (u[k] - low) / width)
-            added, slid = change[i, k - 1], slip
-            for _ in range(ITERATIONS):
-                now, last = free[i, k] + added, added
+    """Fills change (n, k) of the forces `free` (n, k) at drive displacements u (k,).
+
+    Rows side by side, because each waits for its own last iteration.
+    """
+    n = free.shape[0]
+    scale = (table.shape[1] - 1) / width
+    behind, slip, before, rest = np.full(n, u[0]), np.zeros(n), free[:, 0].copy(), np.empty(n)
+    added, slid = np.zeros(n), np.zeros(n)
+    for k in range(1, free.shape[1]):
+        for i in range(n):
+            behind[i] = max(u[k] - gap[i], min(u[k], behind[i]))
+            rest[i] = _interpolated(table, i, (u[k] - low) * scale)
+        for _ in range(ITERATIONS):
+            moved = False
+            for i in range(n):
+                now, last = free[i, k] + added[i], added[i]
                 if rate[i] != 0.0:
-                    slid = slip + rate[i] * elapsed[k - 1] * mean_beyond(before, now, threshold[i])
-                    slid = min(max(slid, -reach), reach)
-                lost = min(max(slid + compliance[i] * now, -reach), reach)
-                added = _interpolated(table[i], (behind - lost - low) / width) - rest
-                if added == last:  # to the last bit: no iteration changes it any more
-                    break
-            slip, before = slid, free[i, k] + added
-            change[i, k] = added
+                    more = rate[i] * elapsed[k - 1] * mean_beyond(before[i], now, threshold[i])
+                    slid[i] = min(max(slip[i] + more, -reach), reach)
+                lost = min(max(slid[i] + compliance[i] * now, -reach), reach)
+                added[i] = _interpolated(table, i, (behind[i] - lost - low) * scale) - rest[i]
+                moved |= added[i] != last
+            if not moved:  # to the last bit: no iteration changes them any more
+                break
+        for i in range(n):
+            slip[i], before[i], change[i, k] = slid[i], free[i, k] + added[i], added[i]
 
 
-@strict
-def _interpolated(table, place):
-    """Of a table over [0, 1], straight on beyond it."""
-    place *= len(table) - 1
-    left = min(max(int(np.floor(place)), 0), len(table) - 2)
-    return table[left] + (place - left) * (table[left + 1] - table[left])
+@numba.njit(inline="always")
+def _interpolated(table, i, place):
+    """Of row i of a table (n, g) at `place` in 0..g-1, straight on beyond it."""
+    left = min(max(int(place), 0), table.shape[1] - 2)
+    return table[i, left] + (place - left) * (table[i, left + 1] - table[i, left])
 
 
 @strict
