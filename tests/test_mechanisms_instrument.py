@@ -159,10 +159,10 @@ def test_lines_are_numpys_whatever_the_order_of_the_times():
     rng = np.random.default_rng(2)
     grid, values = np.cumsum(rng.uniform(0.1, 1.0, 40)), rng.normal(size=(5, 40))
     times = np.concatenate([rng.uniform(-1.0, grid[-1] + 1.0, (5, 300)), np.tile(grid, (5, 1))], axis=1)
-    for given in (times, np.sort(times), times[0]):
-        rows = np.broadcast_to(given, times.shape)
+    for at_s in (times, np.sort(times), times[0]):
+        rows = np.broadcast_to(at_s, times.shape)
         expected = [np.interp(time_s, grid, row) for time_s, row in zip(rows, values, strict=True)]
-        np.testing.assert_allclose(interpolated(grid, values, given), expected, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(interpolated(grid, values, at_s), expected, rtol=0, atol=1e-13)
 
 
 def test_bin_means_are_exact_across_corners():
