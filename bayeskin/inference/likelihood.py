@@ -41,7 +41,7 @@ def log_likelihood(chain: NoiseChain, prediction: Prediction, noise: Array) -> A
     """
     return _kernel(
         np.ascontiguousarray(prediction.mean, dtype=np.float64),
-        np.ascontiguousarray(prediction.factor, dtype=np.float64),
+        np.ascontiguousarray(prediction.factor.transpose(0, 2, 1), dtype=np.float64),
         np.ascontiguousarray(prediction.diagonal, dtype=np.float64),
         np.ascontiguousarray(noise, dtype=np.float64),
         chain.bins,
@@ -60,7 +60,7 @@ def _kernel(
     bins: NDArray[np.int64], force: Array, variance: Array, covariance: Array,
     gap: Array, starts: NDArray[np.bool_], kind: NDArray[np.int64],
 ) -> Array:  # fmt: skip
-    points, (k, rank) = len(mean), (len(bins), factor.shape[2])
+    points, (k, rank) = len(mean), (len(bins), factor.shape[1])
     out = np.empty(points)
     white, design = np.empty(k), np.empty((rank, k))
     for i in range(points):
@@ -79,7 +79,7 @@ def _whiten(
     gap: Array, starts: NDArray[np.bool_], kind: NDArray[np.int64], white: Array, design: Array,
 ) -> float:  # fmt: skip
     """Fills `white` (k,) and `design` (r, k); returns the sum of the innovations' log scales."""
-    k, rank, tau = len(bins), factor.shape[1], noise[-2]
+    k, rank, tau = len(bins), len(factor), noise[-2]
     log_scale, product = 0.0, 1.0
     sd_before, inverse_before, decay, gap_before = 0.0, 0.0, 0.0, -1.0
     for j in range(k):
@@ -96,12 +96,12 @@ def _whiten(
         now, before = narrow * inverse, narrow * rho * inverse_before
         white[j] = now * (force[j] - mean[b])
         for a in range(rank):
-            design[a, j] = now * factor[b, a]
+            design[a, j] = now * factor[a, b]
         if before != 0.0:
             c = bins[j - 1]
             white[j] -= before * (force[j - 1] - mean[c])
             for a in range(rank):
-                design[a, j] -= before * factor[c, a]
+                design[a, j] -= before * factor[a, c]
         product *= now
         if j % 8 == 7:  # one logarithm for eight factors
             log_scale -= math.log(product)

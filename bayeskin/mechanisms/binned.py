@@ -4,54 +4,50 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
-from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Tissue, bin_means
+from bayeskin.mechanisms.lines import interpolated
+from bayeskin.mechanisms.mechanism import Bins, ForceOfTime, Mechanism, Tissue
 from bayeskin.types import Array, PadMotion
 
 
-class StraightForce:
-    """Force over time, straight between the middles of bins (n, m) and the corners of the protocol.
+class BinnedForces:
+    """Forces over time, straight between the middles of bins and the corners of the protocol.
 
     At a corner inside a bin the force follows from the straight lines on either side, and they meet halfway.
+    bins : takes means over the same bins
     """
 
-    def __init__(self, edges_s: Array, motion: PadMotion, mean_n: Array) -> None:
-        middle = 0.5 * (edges_s[1:] + edges_s[:-1])
-        corners = motion.time_s[(motion.time_s > middle[2]) & (motion.time_s < middle[-3])]
-        right = np.searchsorted(middle, corners)
+    def __init__(self, edges_s: Array, motion: PadMotion) -> None:
+        self.bins = Bins(motion, edges_s)
+        self._middle = middle = 0.5 * (edges_s[1:] + edges_s[:-1])
+        self._corners = motion.time_s[(motion.time_s > middle[2]) & (motion.time_s < middle[-3])]
+        self._right = np.searchsorted(middle, self._corners)
         width = edges_s[1] - edges_s[0]
-        kept = np.abs(middle[:, None] - corners).min(axis=1, initial=np.inf) > 0.5 * width
-        before, after = (self._extended(middle, mean_n, right, corners, side) for side in (-1, 1))
-        times = np.concatenate([middle[kept], corners])
-        order = np.argsort(times)
-        self._times = times[order]
-        self._force = np.concatenate([mean_n[:, kept], 0.5 * (before + after)], axis=1)[:, order]
+        self._kept = np.abs(middle[:, None] - self._corners).min(axis=1, initial=np.inf) > 0.5 * width
+        times = np.concatenate([middle[self._kept], self._corners])
+        self._order = np.argsort(times)
+        self._times = times[self._order]
 
-    @staticmethod
-    def _extended(middle: Array, mean_n: Array, right: Array, corners: Array, side: int) -> Array:
+    def through(self, mean_n: Array) -> ForceOfTime:
+        """The force of bins' means (n, m)."""
+        before, after = (self._extended(mean_n, side) for side in (-1, 1))
+        force = np.concatenate([mean_n[:, self._kept], 0.5 * (before + after)], axis=1)[:, self._order]
+        return lambda time_s: interpolated(self._times, force, time_s)
+
+    def change(self, act: Callable[[ForceOfTime], ForceOfTime], mean_n: Array) -> Array:
+        """What `act` adds to the bins' means (n, m) of a force."""
+        force = self.through(mean_n)
+        return self.bins.means(act(force)) - self.bins.means(force)
+
+    def _extended(self, mean_n: Array, side: int) -> Array:
         """Straight on from two middles at least a bin away on one side of each corner, (n, c)."""
-        near = right + (1 if side > 0 else -2)
-        far = near + side
+        near = self._right + (1 if side > 0 else -2)
+        far, middle = near + side, self._middle
         slope = (mean_n[:, far] - mean_n[:, near]) / (middle[far] - middle[near])
-        return np.asarray(mean_n[:, near] + slope * (corners - middle[near]))
-
-    def __call__(self, time_s: Array) -> Array:
-        rows = np.broadcast_to(time_s, (len(self._force), np.shape(time_s)[-1]))
-        left = np.clip(np.searchsorted(self._times, rows, side="right") - 1, 0, len(self._times) - 2)
-        share = np.clip((rows - self._times[left]) / np.diff(self._times)[left], 0.0, 1.0)
-        low, high = (np.take_along_axis(self._force, left + one, axis=1) for one in (0, 1))
-        return np.asarray(low + share * (high - low))
-
-
-def change_of_bins(
-    act: Callable[[ForceOfTime], ForceOfTime], motion: PadMotion, edges_s: Array, mean_n: Array
-) -> Array:
-    """What `act` adds to the bins' means (n, m) of a force."""
-    force = StraightForce(edges_s, motion, mean_n)
-    return bin_means(act(force), motion, edges_s) - bin_means(force, motion, edges_s)
+        return np.asarray(mean_n[:, near] + slope * (self._corners - middle[near]))
 
 
 @dataclass(frozen=True)
@@ -73,7 +69,11 @@ class BinnedEstimate:
         assert act.estimate is not None
         neutral = {name: np.full(len(own), value) for name, value in self.mechanism.neutral.items()}
         values = {**neutral, **dict(zip(self.own, own.T, strict=True))}
-        return change_of_bins(partial(act.estimate, values, self.motion), self.motion, self.edges_s, mean_n)
+        return self._forces.change(partial(act.estimate, values, self.motion), mean_n)
+
+    @cached_property
+    def _forces(self) -> BinnedForces:
+        return BinnedForces(self.edges_s, self.motion)
 
 
 def estimate_of(

@@ -13,12 +13,13 @@ memory; the full model tells what else there is to it.
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayeskin.mechanisms.mechanism import ForceOfTime
-from bayeskin.model.assembly import compiled
-from bayeskin.types import Array, PadMotion
+from bayeskin.mechanisms.lines import interpolated, strict
+from bayeskin.mechanisms.mechanism import ForceOfTime, added
+from bayeskin.types import PadMotion
 
 STEPS_A_PHASE = 100
 GRID = 33  # displacements at which G is tabulated
@@ -54,49 +55,57 @@ def lost_in_series(
         float(max(high - low, 1e-9)), *elements, float(np.ptp(u)), change,  # type: ignore[call-arg]
     )  # fmt: skip
 
-    def reported(time_s: Array) -> Array:
-        each = np.broadcast_to(time_s, (n, np.shape(time_s)[-1]))
-        place = np.clip(np.searchsorted(grid_s, each, side="right") - 1, 0, len(grid_s) - 2)
-        share = np.clip((each - grid_s[place]) / np.diff(grid_s)[place], 0.0, 1.0)
-        left, right = (np.take_along_axis(change, place + one, axis=1) for one in (0, 1))
-        return np.asarray(force(time_s) + left + share * (right - left))
-
-    return reported
+    return added(force, lambda time_s: interpolated(grid_s, change, time_s))
 
 
-@compiled
+@strict
 def _march(
     free, u, elapsed, table, low, width, gap, compliance, rate, threshold, recovery, recovery_s, reach, change
 ):  # fmt: skip
-    """Fills change (n, k) of the forces `free` (n, k) at drive displacements u (k,)."""
-    for i in range(free.shape[0]):
-        behind, slip, yielded, before = u[0], 0.0, 0.0, free[i, 0]
-        for k in range(1, free.shape[1]):
-            behind = max(u[k] - gap[i], min(u[k], behind))
-            rest = _interpolated(table[i], (u[k] - low) / width)
-            z = elapsed[k - 1] / recovery_s[i]
-            keep, phi = np.exp(-z), -np.expm1(-z) / z
-            added, slid, slow = change[i, k - 1], slip, yielded
-            for _ in range(ITERATIONS):
-                now = free[i, k] + added
-                slid = slip + rate[i] * elapsed[k - 1] * mean_beyond(before, now, threshold[i])
-                slid = min(max(slid, -reach), reach)
-                slow = keep * yielded + recovery[i] * ((phi - keep) * before + (1.0 - phi) * now)
-                lost = min(max(slid + slow + compliance[i] * now, -reach), reach)
-                added = _interpolated(table[i], (behind - lost - low) / width) - rest
-            slip, yielded, before = slid, slow, free[i, k] + added
-            change[i, k] = added
+    """Fills change (n, k) of the forces `free` (n, k) at drive displacements u (k,).
+
+    Rows side by side, because each waits for its own last iteration.
+    """
+    n = free.shape[0]
+    scale = (table.shape[1] - 1) / width
+    behind, slip, before, rest = np.full(n, u[0]), np.zeros(n), free[:, 0].copy(), np.empty(n)
+    added, slid, yielded, slow = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    keep, phi = np.zeros(n), np.zeros(n)
+    for k in range(1, free.shape[1]):
+        for i in range(n):
+            behind[i] = max(u[k] - gap[i], min(u[k], behind[i]))
+            rest[i] = _interpolated(table, i, (u[k] - low) * scale)
+            if recovery[i] != 0.0:
+                z = elapsed[k - 1] / recovery_s[i]
+                keep[i], phi[i] = np.exp(-z), -np.expm1(-z) / z
+        for _ in range(ITERATIONS):
+            moved = False
+            for i in range(n):
+                now, last = free[i, k] + added[i], added[i]
+                if rate[i] != 0.0:
+                    more = rate[i] * elapsed[k - 1] * mean_beyond(before[i], now, threshold[i])
+                    slid[i] = min(max(slip[i] + more, -reach), reach)
+                if recovery[i] != 0.0:
+                    mean = (phi[i] - keep[i]) * before[i] + (1.0 - phi[i]) * now
+                    slow[i] = keep[i] * yielded[i] + recovery[i] * mean
+                lost = min(max(slid[i] + slow[i] + compliance[i] * now, -reach), reach)
+                added[i] = _interpolated(table, i, (behind[i] - lost - low) * scale) - rest[i]
+                moved |= added[i] != last
+            if not moved:  # to the last bit: no iteration changes them any more
+                break
+        for i in range(n):
+            slip[i], yielded[i], before[i] = slid[i], slow[i], free[i, k] + added[i]
+            change[i, k] = added[i]
 
 
-@compiled
-def _interpolated(table, place):
-    """Of a table over [0, 1], straight on beyond it."""
-    place *= len(table) - 1
-    left = min(max(int(np.floor(place)), 0), len(table) - 2)
-    return table[left] + (place - left) * (table[left + 1] - table[left])
+@numba.njit(inline="always")
+def _interpolated(table, i, place):
+    """Of row i of a table (n, g) at `place` in 0..g-1, straight on beyond it."""
+    left = min(max(int(place), 0), table.shape[1] - 2)
+    return table[i, left] + (place - left) * (table[i, left + 1] - table[i, left])
 
 
-@compiled
+@strict
 def mean_beyond(before, now, threshold):
     """Mean of sgn(F) max(|F| - threshold, 0) along a straight line between two forces."""
     total = 0.0

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayeskin.mechanisms import Mechanism, bin_means, observed
-from bayeskin.mechanisms.binned import change_of_bins
+from bayeskin.mechanisms import Mechanism, observed
+from bayeskin.mechanisms.binned import BinnedForces
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.types import Array, PadMotion, ParameterSpace, Prediction, Surrogate
 
@@ -53,12 +53,13 @@ class ObservedSurrogate:
 
     def _added(self, values: Mapping[str, Array], mean_n: Array) -> Array:
         """What the mechanisms add to the bins' means (n, m)."""
-        adds = [m for m in self.mechanisms if isinstance(m.act, Instrument) and m.act.adds]
-        if len(adds) == len(self.mechanisms):
-            nothing = np.zeros((len(mean_n), 1))
-            return bin_means(
-                observed(adds, values, self.motion, lambda t: nothing + np.zeros(np.shape(t)[-1])),
-                self.motion, self.edges_s,
-            )  # fmt: skip
-        act = partial(observed, self.mechanisms, values, self.motion)
-        return change_of_bins(act, self.motion, self.edges_s, mean_n)
+        if all(isinstance(m.act, Instrument) and m.act.adds for m in self.mechanisms):
+            seen = observed(
+                self.mechanisms, values, self.motion, lambda t: np.zeros((len(mean_n), np.shape(t)[-1]))
+            )
+            return self._forces.bins.means(seen)
+        return self._forces.change(partial(observed, self.mechanisms, values, self.motion), mean_n)
+
+    @cached_property
+    def _forces(self) -> BinnedForces:
+        return BinnedForces(self.edges_s, self.motion)

@@ -28,7 +28,7 @@ NOTICEABLE = 2.0  # of the full model's own error
 class Named:
     """One mechanism of the best set: probabilities of itself and of its group, parameters' means and sds.
 
-    explains_n : RMS of what no likely set without it explains
+    explains_n : RMS of what the set explains and would not without it
     """
 
     name: str
@@ -71,8 +71,12 @@ def _rms(found: Fit) -> float:
 
 
 def explains(found: Search, name: str) -> float:
-    """RMS [N] of what the best set explains and the likeliest set tried without `name` does not."""
-    without = max((one for one in found.fits.values() if name not in one.names), key=weight)
+    """RMS [N] of what the best set explains and the likeliest of its subsets tried without `name` does not.
+
+    What another mechanism could explain in its place is for the probabilities to say.
+    """
+    rest = set(found.best.names) - {name}
+    without = max((one for one in found.fits.values() if set(one.names) <= rest), key=weight)
     return float(np.sqrt(max(_rms(without) ** 2 - _rms(found.best) ** 2, 0.0)))
 
 

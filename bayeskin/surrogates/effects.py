@@ -60,18 +60,13 @@ class Effect:
 
     def predict(self, theta: Array, base: Array) -> Prediction:
         """What the effect adds to the base's force (n, m), at theta (n, d) in the order of its space."""
-        found = self.surrogate.predict(theta)
+        similarity = self.surrogate.similarity
         if self.estimate is None:
-            unit, change = strength(self.space, self.own[0], self.neutral, theta), np.zeros_like(base)
-        else:
-            change = self.estimate(theta[:, -len(self.own) :], base)
-            unit = _rms(change) * np.exp(-Similarity(self.space).log_scale(theta))
-            change = change - _rms(change)[:, None]
-        return Prediction(
-            change + found.mean * unit[:, None],
-            found.factor * unit[:, None, None],
-            found.diagonal * unit[:, None] ** 2,
-        )
+            return self.surrogate.predict(theta, strength(similarity, self.own[0], self.neutral, theta))
+        change = self.estimate(theta[:, -len(self.own) :], base)
+        size = _rms(change)
+        found = self.surrogate.predict(theta, size * np.exp(-similarity.log_scale(theta)))
+        return replace(found, mean=found.mean + change - size[:, None])
 
 
 def _rms(values: Array) -> Array:
@@ -79,10 +74,11 @@ def _rms(values: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(values**2, axis=1)))
 
 
-def strength(space: ParameterSpace, name: str, neutral: float, theta: Array) -> Array:
+def strength(similarity: Similarity, name: str, neutral: float, theta: Array) -> Array:
     """s (n,) at theta (n, d): the parameter's distance from neutral, over the modulus to its power."""
+    space = similarity.space
     column = space.names.index(name)
-    scale = Similarity(space).log_scale(theta)
+    scale = similarity.log_scale(theta)
     return np.asarray((theta[:, column] - neutral) * np.exp(-space.parameters[column].stress_power * scale))
 
 
@@ -102,7 +98,8 @@ def train_effect(
     Rows whose effect is next to nothing are left out; the validation is of G, or of H. Raises InputError
     where too few rows show an effect.
     """
-    s = strength(design.space, own[0], neutral, design.theta)
+    similarity = Similarity(design.space)
+    s = strength(similarity, own[0], neutral, design.theta)
     change = design.force_n - base
     with np.errstate(invalid="ignore"):
         size = _rms(change) / _rms(base)
@@ -114,9 +111,8 @@ def train_effect(
     else:
         guess = estimate(design.theta[:, -len(own) :], base)
         left = (change - guess)[shows] / _rms(guess)[shows, None]
-        learnt[shows] = np.exp(Similarity(design.space).log_scale(design.theta[shows]))[:, None] * (
-            1.0 + left
-        )
+        scale = np.exp(similarity.log_scale(design.theta[shows]))
+        learnt[shows] = scale[:, None] * (1.0 + left)
     seen = replace(design, force_n=learnt, ok=shows)
     surrogate, validation = train(seen, kind, seed, weights)  # type: ignore[arg-type]
     return Effect(part, mechanism, neutral, tuple(own), surrogate, estimate), validation
@@ -154,16 +150,20 @@ class WithEffects:
         """Force at theta (n, d) or (d,), with its uncertainty; errors of the parts taken as independent."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
-        names = self.space.names
         found = [self.base.predict(theta[:, : self.base.space.dim])]
-        for effect in self.effects:
-            columns = [names.index(name) for name in effect.space.names]
+        for effect, columns in zip(self.effects, self._columns, strict=True):
             found.append(effect.predict(theta[:, columns], found[0].mean))
+        rows = [one.factor.transpose(0, 2, 1) for one in found]  # as they lie in memory
         return Prediction(
-            mean=np.sum([one.mean for one in found], axis=0),
-            factor=np.concatenate([one.factor for one in found], axis=2),
-            diagonal=np.sum([one.diagonal for one in found], axis=0),
+            mean=sum((one.mean for one in found[1:]), found[0].mean),
+            factor=np.concatenate(rows, axis=1).transpose(0, 2, 1),
+            diagonal=sum((one.diagonal for one in found[1:]), found[0].diagonal),
         )
+
+    @cached_property
+    def _columns(self) -> list[list[int]]:
+        """Of each effect, where in `space` its parameters are."""
+        return [[self.space.names.index(name) for name in effect.space.names] for effect in self.effects]
 
 
 def with_effects(base: ShapeSurrogate, effects: Sequence[Effect]) -> Surrogate:

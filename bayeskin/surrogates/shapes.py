@@ -38,26 +38,18 @@ class ShapeTransform(_FreezesArrays):
         amplitude, shapes = split(force_n)
         return np.column_stack([amplitude, (shapes - self.mean) @ self.components.T])
 
-    def decode(self, latent: Array, sd: Array) -> Prediction:
-        """Force of latent vectors with independent errors, mean and sd (n, 1 + K) each.
+    def decode(self, latent: Array, sd: Array, times: Array | float = 1.0) -> Prediction:
+        """`times` (n,) the force of latent vectors with independent errors, mean and sd (n, 1 + K) each.
 
-        Delta method: d force = force da + exp(a) components dz. Every column of the factor, like the
-        mean itself, is a combination of the rows [mean; components], so one product gives them all.
+        Delta method: d force = force da + exp(a) components dz.
         """
-        n, count = latent.shape
-        scale = np.exp(latent[:, 0])
-        weights = np.zeros((n, count, 1 + count))
-        weights[:, 0, 0] = scale
-        weights[:, 1:, 0] = scale[:, None] * latent[:, 1:]
-        weights[:, :, 1] = weights[:, :, 0] * sd[:, :1]
-        diagonal = np.arange(1, count)
-        weights[:, diagonal, 1 + diagonal] = scale[:, None] * sd[:, 1:]
-        basis = np.vstack([self.mean, self.components]).T
-        return Prediction(
-            mean=weights[:, :, 0] @ basis.T,
-            factor=np.matmul(basis, weights[:, :, 1:]),
-            diagonal=scale[:, None] ** 2 * self.truncation,
-        )
+        scale = (times * np.exp(latent[:, 0]))[:, None]
+        mean = (scale * latent[:, 1:]) @ self.components
+        mean += scale * self.mean
+        columns = np.empty((*latent.shape, len(self.mean)))
+        np.multiply(mean, sd[:, :1], out=columns[:, 0])
+        np.multiply((scale * sd[:, 1:])[:, :, None], self.components, out=columns[:, 1:])
+        return Prediction(mean, columns.transpose(0, 2, 1), scale**2 * self.truncation)
 
 
 def split(force_n: Array) -> tuple[Array, Array]:
