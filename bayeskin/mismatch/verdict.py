@@ -1,9 +1,9 @@
 """What a search says: nothing missing, named mechanisms, or unknown.
 
 A mechanism is named where it, or its group of look-alikes together, has nine chances in ten, and leaving it
-out costs more than the full model's own error, if what is named explains more than half of the squared
-residual beyond what is allowed. Nothing is missing where none is named and no window is found, or what goes
-beyond the allowed is within the model's own error. Otherwise the mismatch is unknown.
+out of its set costs more than the full model's own error, if no window is left or what is named explains nine
+tenths of the squared residual beyond what is allowed. Nothing is missing where none is named and no window is
+found, or what goes beyond the allowed is within the model's own error. Otherwise the mismatch is unknown.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from bayeskin.mismatch.locate import Located, model_error
 from bayeskin.mismatch.search import Search, weight
 
 PROBABLE = 0.9
-EXPLAINED = 0.5
+EXPLAINED = 0.9
 NOTICEABLE = 2.0  # of the full model's own error
 
 
