@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtri
@@ -59,22 +60,38 @@ class _Stack(NamedTuple):
 
     def predict(self, centred: Array, basis: Array) -> tuple[Array, Array]:
         """Mean and variance (k, q) at k centred inputs (k, d) with trend basis (k, p)."""
-        (k, d), p = centred.shape, basis.shape[1]
+        k, d = centred.shape
         mapped = np.ones((len(self.latents), k, d + 2))
         np.matmul(centred, self.maps, out=mapped[:, :, :d])
-        mapped[:, :, d] = -0.5 * _squares(mapped[:, :, :d])
+        mapped[:, :, d] = -0.5 * np.einsum("qki,qki->qk", mapped[:, :, :d], mapped[:, :, :d])
         rows = correlations(self.name, mapped @ self.inputs)
         white = rows[:, :, : self.half] @ self.top
-        linear, trend = rows @ self.bottom, basis @ self.trend
-        more = linear[:, :, : -p - 1]
-        unexplained = trend[:, :, :p] - linear[:, :, -p - 1 : -1]
-        variance = 1.0 + self.nugget - _squares(white) - _squares(more) + _squares(unexplained)
-        mean = self.centre + self.deviation * (trend[:, :, p] + linear[:, :, -1])
-        return mean.T, (self.spread * np.maximum(variance, np.maximum(self.nugget, SMALLEST_NUGGET))).T
+        mean, variance = np.empty((2, len(self.latents), k))
+        _collect(white, rows @ self.bottom, basis @ self.trend, mean, variance)
+        mean = self.centre + self.deviation * mean
+        variance = np.maximum(variance + self.nugget, np.maximum(self.nugget, SMALLEST_NUGGET))
+        return mean.T, (self.spread * variance).T
 
 
-def _squares(rows: Array) -> Array:
-    return np.asarray(np.einsum("qki,qki->qk", rows, rows))
+@nb.njit(cache=True, fastmath={"reassoc", "contract"})
+def _collect(white: Array, linear: Array, trend: Array, mean: Array, variance: Array) -> None:
+    """Fills mean and variance (q, k), without nugget, from what `predict` has multiplied."""
+    half, p = white.shape[2], trend.shape[2] - 1
+    rest = linear.shape[2] - p - 1
+    for j in range(mean.shape[0]):
+        for i in range(mean.shape[1]):
+            first, second, known = white[j, i], linear[j, i], trend[j, i]
+            unexplained = second[rest:]
+            explained = 0.0
+            for a in range(half):
+                explained += first[a] * first[a]
+            for a in range(rest):
+                explained += second[a] * second[a]
+            for a in range(p):
+                left = known[a] - unexplained[a]
+                explained -= left * left
+            mean[j, i] = known[p] + unexplained[p]
+            variance[j, i] = 1.0 - explained
 
 
 def _turned(stack: Array) -> Array:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
 
 from bayeskin.errors import InputError
@@ -47,9 +48,20 @@ class ShapeTransform(_FreezesArrays):
         mean = (scale * latent[:, 1:]) @ self.components
         mean += scale * self.mean
         columns = np.empty((*latent.shape, len(self.mean)))
-        np.multiply(mean, sd[:, :1], out=columns[:, 0])
-        np.multiply((scale * sd[:, 1:])[:, :, None], self.components, out=columns[:, 1:])
+        _fill(mean, self.components, sd, scale * sd, columns)
         return Prediction(mean, columns.transpose(0, 2, 1), scale**2 * self.truncation)
+
+
+@nb.njit(cache=True)
+def _fill(mean: Array, components: Array, sd: Array, scaled_sd: Array, columns: Array) -> None:
+    """Fills columns (n, 1 + K, m): the mean times its sd, then each component times its own."""
+    for i in range(len(columns)):
+        for j in range(columns.shape[2]):
+            columns[i, 0, j] = sd[i, 0] * mean[i, j]
+        for a in range(len(components)):
+            size, row, out = scaled_sd[i, a + 1], components[a], columns[i, a + 1]
+            for j in range(len(row)):
+                out[j] = size * row[j]
 
 
 def split(force_n: Array) -> tuple[Array, Array]:
