@@ -145,12 +145,13 @@ def test_what_is_left_is_said_with_its_size_parts_and_form(remainder: Remainder)
 
 
 def test_words_say_what_is_left_only_where_something_is(remainder: Remainder) -> None:
-    fits = {"rmse": 1e-3, "rmse_held_out": None}
+    fits = {"rmse": 1e-3, "rmse_held_out": None, "full_model": {"rmse": 2.5e-3, "fit_off_by": 4e-4}}
     answer = {
         "verdict": "unknown", "mechanisms": [], "located": [], "remaining": [], "candidates": [],
         "fit": {"before": fits, "after": fits}, "folder": "x", "unexplained": None,
     }  # fmt: skip
     assert "unexplained" not in in_words(answer)
+    assert "full model: RMSE 2.5 mN, the fit is off by 0.4 mN" in in_words(answer)
     said = unexplained(remainder)
     words = in_words({**answer, "unexplained": said})
     assert f"left unexplained: {1e3 * said['size_n']:.1f} mN RMS" in words
@@ -178,7 +179,7 @@ def test_each_figure_is_written_where_it_has_something_to_show(
     rows = [{"name": "force-offset", "delta_score": 3.0, "standard_error": 1.0}]
     written = []
     for parts, left in ((contributions(best, build), remainder), ([], None)):
-        found = Found(search, empty, empty, parts, left)
+        found = Found(search, ["did not converge", None], empty, empty, parts, left)
         written.append({path.name for path in draw(Path("x"), "", BINNED, toy.MOTION, found, rows)})
     assert written[0] - written[1] == {"contributions.png", "discrepancy.png"}
     assert {Path(name).stem for name in written[1]} == {

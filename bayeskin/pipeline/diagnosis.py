@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import bayeskin
 from bayeskin import inference, storage
@@ -33,6 +34,7 @@ from bayeskin.mismatch.verdict import Diagnosis, judge
 from bayeskin.pipeline import design, recording, training
 from bayeskin.pipeline.diagnosis_outputs import (
     Found,
+    FullRun,
     Remainder,
     candidates,
     draw,
@@ -44,13 +46,15 @@ from bayeskin.pipeline.diagnosis_outputs import (
 from bayeskin.pipeline.effects import effect_files, effects_of
 from bayeskin.pipeline.engine import Reporter, Run, Silent, Stage, open_run, run_stages
 from bayeskin.pipeline.folder import plain, sha256_of, write_json
+from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
+from bayeskin.pipeline.reported import FullForce
 from bayeskin.pipeline.shipping import shipped_for
 from bayeskin.pipeline.training import base_surrogate
 from bayeskin.recordings import read_recording, segment
 from bayeskin.surrogates import Effect, with_effects
-from bayeskin.types import BinnedForce, PadMotion, Surrogate
-from bayeskin.workers import run_parallel
+from bayeskin.types import Array, BinnedForce, PadMotion, Surrogate
+from bayeskin.workers import Lost, run_parallel
 
 
 @dataclass(frozen=True)
@@ -122,6 +126,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     found = judge(whole, bench.known, before, after)
     parts = contributions(whole.best, partial(bench.posterior, None))
     remainder = _remainder(bench, found, whole.best, after)
+    full = _full_runs(bench, [whole.base, whole.best])
     answer: dict[str, Any] = {
         "verdict": found.verdict,
         "located": [window(one) for one in before.windows],
@@ -131,8 +136,8 @@ def _work(run: Run) -> Mapping[str, Any]:
         "unexplained": None if remainder is None else unexplained(remainder),
         "candidates": candidates(whole, bench.known),
         "fit": {
-            "before": _fit(bench, whole.base, begun.base if begun else None, split_s),
-            "after": _fit(bench, whole.best, begun.best if begun else None, split_s),
+            "before": _fit(bench, whole.base, full[0], begun.base if begun else None, split_s),
+            "after": _fit(bench, whole.best, full[1], begun.best if begun else None, split_s),
         },
         "best_set": list(whole.best.names),
         "held_out_set": list(begun.best.names) if begun else [],
@@ -141,7 +146,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     write_json(run.at(STAGE.name, "diagnosis.json"), answer)
     figures = draw(
         run.folder / STAGE.name, caption(run), bench.binned, bench.motion,
-        Found(whole, before, after, parts, remainder), answer["candidates"],
+        Found(whole, full, before, after, parts, remainder), answer["candidates"],
     )  # fmt: skip
     return {**answer, "figures": [figure.name for figure in figures]}
 
@@ -152,6 +157,16 @@ def _remainder(bench: Workbench, found: Diagnosis, best: Fit, after: Located) ->
         return None
     motion, seed = bench.motion, bench.run.config.seed
     return Remainder(discrepancy(best, motion), propose_form(best, motion, seed))
+
+
+def _full_runs(bench: Workbench, fits: Sequence[Fit]) -> list[FullRun]:
+    """The full model at each fit with its mechanisms; for the article's observation none."""
+    if bench.run.config.model.observation != "reaction":
+        return [None] * len(fits)
+    bench.run.reporter.log("the full model without and with what was found")
+    run_it = FullForce(model_spec(bench.run), bench.motion, bench.binned.edges_s)
+    found = dict(run_parallel(run_it, [(one.names, dict(one.theta)) for one in fits], len(fits)))
+    return [one.reason if isinstance(one := found[i], Lost) else one for i in range(len(fits))]
 
 
 def _search_beside(run: Run, split_s: float) -> threading.Thread:
@@ -216,7 +231,9 @@ def _end_of_second_hold(binned: BinnedForce) -> float | None:
     return holds[1].end_s if len(holds) > 2 else None
 
 
-def _fit(bench: Workbench, found: Fit, begun: Fit | None, split_s: float | None) -> dict[str, Any]:
+def _fit(
+    bench: Workbench, found: Fit, full: FullRun, begun: Fit | None, split_s: float | None
+) -> dict[str, Any]:
     """RMSE [N] of a fit to the whole recording, by phase, of one to its beginning on the rest; coverage."""
     binned = bench.binned
     by_phase = inference.rmse(binned, found.force_n)
@@ -231,12 +248,26 @@ def _fit(bench: Workbench, found: Fit, begun: Fit | None, split_s: float | None)
         "rmse": float(np.sqrt(np.mean((binned.force_n[usable] - found.force_n[usable]) ** 2))),
         "rmse_by_phase": dict(by_phase.by_kind_n),
         "rmse_held_out": held_out,
+        "full_model": _full(full, found.force_n, binned.force_n, usable),
         "coverage90": inference.coverage(binned, *bands.interval(0.9)),
         "log_evidence": found.log_evidence,
         "theta": {
             name: dict(zip(("mean", "sd"), found.mean_and_sd(name), strict=True)) for name in found.theta
         },
     }
+
+
+def _full(
+    full: FullRun, force_n: Array, recorded_n: Array, usable: NDArray[np.bool_]
+) -> dict[str, Any] | None:
+    """RMSE [N] of the full model itself, and how far the force of the fit is off from it."""
+    if not isinstance(full, np.ndarray):
+        return None if full is None else {"message": full}
+
+    def rms(values: Array) -> float:
+        return float(np.sqrt(np.mean(values[usable] ** 2)))
+
+    return {"rmse": rms(recorded_n - full), "fit_off_by": rms(force_n - full)}
 
 
 def _files(run: Run) -> list[Path]:

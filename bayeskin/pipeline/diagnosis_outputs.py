@@ -29,14 +29,19 @@ class Remainder:
     form: Form
 
 
+FullRun = Array | str | None  # bin means (m,) of the full model, or why a run failed; None where none is made
+
+
 @dataclass(frozen=True)
 class Found:
     """What is known of a mismatch: sets tried, residuals without and with the best, its parts of the force.
 
-    remainder : None where the verdict leaves nothing to describe
+    full : the full model without and with the best; remainder : None where the verdict leaves nothing to
+    describe
     """
 
     search: Search
+    full: Sequence[FullRun]
     before: Located
     after: Located
     parts: Sequence[Contribution]
@@ -113,11 +118,10 @@ def draw(
     candidates: Sequence[Mapping[str, Any]],
 ) -> list[Path]:  # fmt: skip
     """Writes the figures into a folder, the run in their metadata; returns their paths."""
-    before_n, after_n = found.search.base.force_n, found.search.best.force_n
     figures = {
-        "located": report.figure_located(binned, motion, found.before, before_n),
+        "located": report.figure_located(binned, motion, found.before, found.search.base.force_n),
         "candidates": report.figure_candidates(candidates),
-        "before_after": report.figure_before_after(binned, motion, before_n, after_n),
+        "before_after": report.figure_before_after(binned, motion, *_full_or_fit(found)),
         "residual_by_phase": report.figure_residual_by_phase(binned, motion, found.before, found.after),
     }
     if found.parts:
@@ -129,6 +133,12 @@ def draw(
         for name, figure in figures.items()
         for path in report.save_figure(figure, folder / name, made_by)
     ]
+
+
+def _full_or_fit(found: Found) -> list[Array]:
+    """Forces (m,) before and after: the full model's where there is a run, else the fit's."""
+    fits = (found.search.base.force_n, found.search.best.force_n)
+    return [one if isinstance(one, np.ndarray) else fit for one, fit in zip(found.full, fits, strict=True)]
 
 
 def in_words(answer: Mapping[str, Any]) -> str:
@@ -143,10 +153,21 @@ def in_words(answer: Mapping[str, Any]) -> str:
         held = fits[when]["rmse_held_out"]
         rest = "" if held is None else f", {1e3 * held:.1f} mN on what follows the second hold, not fitted"
         lines.append(f"{when}: RMSE {1e3 * fits[when]['rmse']:.1f} mN{rest}")
+        lines += _full_in_words(fits[when]["full_model"])
     lines += _left_in_words(answer["unexplained"]) if answer["unexplained"] else []
     best = ", ".join(f"{one['name']} {one['delta_score']:+.1f}" for one in answer["candidates"][:5])
     lines += [f"candidates alone, log evidence gained: {best}", f"outputs in {answer['folder']}"]
     return "\n".join(lines)
+
+
+def _full_in_words(full: Mapping[str, Any] | None) -> list[str]:
+    if full is None:
+        return []
+    if "message" in full:
+        return [f"  full model: failed: {full['message']}"]
+    return [
+        f"  full model: RMSE {1e3 * full['rmse']:.1f} mN, the fit is off by {1e3 * full['fit_off_by']:.1f} mN"
+    ]
 
 
 def _left_in_words(left: Mapping[str, Any]) -> list[str]:
