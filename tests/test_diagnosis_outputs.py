@@ -145,13 +145,17 @@ def test_what_is_left_is_said_with_its_size_parts_and_form(remainder: Remainder)
 
 
 def test_words_say_what_is_left_only_where_something_is(remainder: Remainder) -> None:
-    fits = {"rmse": 1e-3, "rmse_held_out": None, "full_model": {"rmse": 2.5e-3, "fit_off_by": 4e-4}}
+    fits = {
+        "rmse": 1e-3,
+        "rmse_held_out": None,
+        "full_model": {"rmse": 2.5e-3, "fit_off_by": 4e-4, "runs": 2},
+    }
     answer = {
         "verdict": "unknown", "mechanisms": [], "located": [], "remaining": [], "candidates": [],
         "fit": {"before": fits, "after": fits}, "folder": "x", "unexplained": None,
     }  # fmt: skip
     assert "unexplained" not in in_words(answer)
-    assert "full model: RMSE 2.5 mN, the fit is off by 0.4 mN" in in_words(answer)
+    assert "full model, 2 runs: RMSE 2.5 mN, the surrogate's fit is off by 0.4 mN" in in_words(answer)
     said = unexplained(remainder)
     words = in_words({**answer, "unexplained": said})
     assert f"left unexplained: {1e3 * said['size_n']:.1f} mN RMS" in words

@@ -27,6 +27,7 @@ from bayeskin.mismatch.contributions import contributions
 from bayeskin.mismatch.discrepancy import discrepancy
 from bayeskin.mismatch.fit import Fit, instrument_noise, restored, stored, surrogate_limit
 from bayeskin.mismatch.form import propose_form
+from bayeskin.mismatch.full_fit import FullFit, fit_full
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.search import Build, Search, search
@@ -34,7 +35,7 @@ from bayeskin.mismatch.verdict import Diagnosis, judge
 from bayeskin.pipeline import design, recording, training
 from bayeskin.pipeline.diagnosis_outputs import (
     Found,
-    FullRun,
+    FullResult,
     Remainder,
     candidates,
     draw,
@@ -55,6 +56,8 @@ from bayeskin.recordings import read_recording, segment
 from bayeskin.surrogates import Effect, with_effects
 from bayeskin.types import Array, BinnedForce, PadMotion, Surrogate
 from bayeskin.workers import Lost, run_parallel
+
+FULL_RUNS = 5  # of the full model, at most, to take up a fit of the surrogate
 
 
 @dataclass(frozen=True)
@@ -126,7 +129,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     found = judge(whole, bench.known, before, after)
     parts = contributions(whole.best, partial(bench.posterior, None))
     remainder = _remainder(bench, found, whole.best, after)
-    full = _full_runs(bench, [whole.base, whole.best])
+    full = _full_fits(run, [whole.base, whole.best])
     answer: dict[str, Any] = {
         "verdict": found.verdict,
         "located": [window(one) for one in before.windows],
@@ -159,14 +162,26 @@ def _remainder(bench: Workbench, found: Diagnosis, best: Fit, after: Located) ->
     return Remainder(discrepancy(best, motion), propose_form(best, motion, seed))
 
 
-def _full_runs(bench: Workbench, fits: Sequence[Fit]) -> list[FullRun]:
-    """The full model at each fit with its mechanisms; for the article's observation none."""
-    if bench.run.config.model.observation != "reaction":
+def _full_fits(run: Run, fits: Sequence[Fit]) -> list[FullResult]:
+    """Each fit taken up by the full model itself; for the article's observation none."""
+    if run.config.model.observation != "reaction":
         return [None] * len(fits)
-    bench.run.reporter.log("the full model without and with what was found")
-    run_it = FullForce(model_spec(bench.run), bench.motion, bench.binned.edges_s)
-    found = dict(run_parallel(run_it, [(one.names, dict(one.theta)) for one in fits], len(fits)))
+    run.reporter.log("the full model without and with what was found")
+    cases = [(one.names, dict(one.theta)) for one in fits]
+    found = dict(run_parallel(partial(_fit_full_apart, run.config_path), cases, len(fits)))
     return [one.reason if isinstance(one := found[i], Lost) else one for i in range(len(fits))]
+
+
+def _fit_full_apart(source: Path, case: tuple[Sequence[str], Mapping[str, float]]) -> FullFit | str:
+    """In a process of its own: mechanisms have no copies."""
+    bench, (names, theta) = _workbench(_opened(source, Silent())), case
+    run_it = FullForce(model_spec(bench.run), bench.motion, bench.binned.edges_s)
+    beyond = [bench.known[name] for name in names if bench.known[name].act.bind is None]
+    exact = [p.name for mechanism in beyond for p in mechanism.parameters]
+    return fit_full(
+        bench.posterior(None, names), theta, lambda point: run_it((names, point)), exact, FULL_RUNS,
+        bench.run.config.seed,
+    )  # fmt: skip
 
 
 def _search_beside(run: Run, split_s: float) -> threading.Thread:
@@ -232,7 +247,7 @@ def _end_of_second_hold(binned: BinnedForce) -> float | None:
 
 
 def _fit(
-    bench: Workbench, found: Fit, full: FullRun, begun: Fit | None, split_s: float | None
+    bench: Workbench, found: Fit, full: FullResult, begun: Fit | None, split_s: float | None
 ) -> dict[str, Any]:
     """RMSE [N] of a fit to the whole recording, by phase, of one to its beginning on the rest; coverage."""
     binned = bench.binned
@@ -248,7 +263,7 @@ def _fit(
         "rmse": float(np.sqrt(np.mean((binned.force_n[usable] - found.force_n[usable]) ** 2))),
         "rmse_by_phase": dict(by_phase.by_kind_n),
         "rmse_held_out": held_out,
-        "full_model": _full(full, found.force_n, binned.force_n, usable),
+        "full_model": _full(full, found.force_n, binned, usable),
         "coverage90": inference.coverage(binned, *bands.interval(0.9)),
         "log_evidence": found.log_evidence,
         "theta": {
@@ -258,16 +273,23 @@ def _fit(
 
 
 def _full(
-    full: FullRun, force_n: Array, recorded_n: Array, usable: NDArray[np.bool_]
+    full: FullResult, force_n: Array, binned: BinnedForce, usable: NDArray[np.bool_]
 ) -> dict[str, Any] | None:
-    """RMSE [N] of the full model itself, and how far the force of the fit is off from it."""
-    if not isinstance(full, np.ndarray):
+    """RMSE [N] of the full model where its own fit ended, and how far the surrogate's is off from it."""
+    if not isinstance(full, FullFit):
         return None if full is None else {"message": full}
 
     def rms(values: Array) -> float:
         return float(np.sqrt(np.mean(values[usable] ** 2)))
 
-    return {"rmse": rms(recorded_n - full), "fit_off_by": rms(force_n - full)}
+    return {
+        "rmse": rms(binned.force_n - full.force_n),
+        "rmse_by_phase": dict(inference.rmse(binned, full.force_n).by_kind_n),
+        "fit_off_by": rms(force_n - full.force_n),
+        "runs": full.runs,
+        "gained": full.gained,
+        "theta": dict(full.theta),
+    }
 
 
 def _files(run: Run) -> list[Path]:

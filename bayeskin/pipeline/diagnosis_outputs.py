@@ -15,6 +15,7 @@ from bayeskin.mismatch.contributions import Contribution
 from bayeskin.mismatch.discrepancy import Discrepancy
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import Form
+from bayeskin.mismatch.full_fit import FullFit
 from bayeskin.mismatch.locate import Located, Window
 from bayeskin.mismatch.search import Search
 from bayeskin.mismatch.verdict import Named
@@ -29,7 +30,7 @@ class Remainder:
     form: Form
 
 
-FullRun = Array | str | None  # bin means (m,) of the full model, or why a run failed; None where none is made
+FullResult = FullFit | str | None  # of the full model, or why its first run failed; None where none is made
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Found:
     """
 
     search: Search
-    full: Sequence[FullRun]
+    full: Sequence[FullResult]
     before: Located
     after: Located
     parts: Sequence[Contribution]
@@ -138,7 +139,8 @@ def draw(
 def _full_or_fit(found: Found) -> list[Array]:
     """Forces (m,) before and after: the full model's where there is a run, else the fit's."""
     fits = (found.search.base.force_n, found.search.best.force_n)
-    return [one if isinstance(one, np.ndarray) else fit for one, fit in zip(found.full, fits, strict=True)]
+    pairs = zip(found.full, fits, strict=True)
+    return [full.force_n if isinstance(full, FullFit) else fit for full, fit in pairs]
 
 
 def in_words(answer: Mapping[str, Any]) -> str:
@@ -165,9 +167,9 @@ def _full_in_words(full: Mapping[str, Any] | None) -> list[str]:
         return []
     if "message" in full:
         return [f"  full model: failed: {full['message']}"]
-    return [
-        f"  full model: RMSE {1e3 * full['rmse']:.1f} mN, the fit is off by {1e3 * full['fit_off_by']:.1f} mN"
-    ]
+    rmse, off = (1e3 * full[name] for name in ("rmse", "fit_off_by"))
+    runs = f"{full['runs']} run{'s' * (full['runs'] != 1)}"
+    return [f"  full model, {runs}: RMSE {rmse:.1f} mN, the surrogate's fit is off by {off:.1f} mN"]
 
 
 def _left_in_words(left: Mapping[str, Any]) -> list[str]:
