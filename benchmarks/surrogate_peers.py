@@ -3,7 +3,7 @@
 ``PYTHON benchmarks/surrogate_peers.py PACKAGE PROBLEM.npz`` prints one JSON line a method. Needs numpy and
 the package. All are given inputs on the unit cube, logarithms taken where the prior is log-uniform. Those
 that know no field outputs are given their principal components; noise is white, the cheapest case for all.
-OpenTURNS' settings gave the least error of a few tried on the first design; the others have one sensible one each.
+OpenTURNS' settings gave the least error of a few tried on the first design; the others have one each.
 """
 
 from __future__ import annotations
