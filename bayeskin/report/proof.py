@@ -96,7 +96,7 @@ def _draw_detectability(ax: Axes, classes: Sequence[Mapping[str, Any]]) -> None:
     handles, labels = ax.get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     if unique:
-        ax.legend(unique.values(), unique.keys(), loc="upper left", bbox_to_anchor=(0.0, 1.22), ncols=2)
+        ax.legend(unique.values(), unique.keys(), loc="upper right", bbox_to_anchor=(1.0, 1.24), ncols=2)
     ax.axvline(3.0, color=ACCENT, lw=0.6, ls=":")
     ax.set_xscale("log")
     ax.set(ylim=(-0.03, 1.03), xlabel="size [noise floors]", ylabel="share named")
