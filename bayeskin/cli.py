@@ -6,57 +6,21 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import bayeskin
-from bayeskin.errors import InputError
+from bayeskin.terminal import NOT_TRUSTED, Terminal, exit_code
 
 # Its matrices are small: threads of linear algebra would cost more than they give. Read when numpy loads.
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-DONE, NOT_TRUSTED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
-
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout.")
 a_config = click.argument("config", type=click.Path(path_type=Path))
-
-
-class Terminal:
-    """Tells a person on stderr how a run goes on; bars only where somebody can see them move."""
-
-    def __init__(self) -> None:
-        self.console = Console(stderr=True, highlight=False)
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[note]}"),
-        )
-        self.bars = Progress(
-            *columns, console=self.console, transient=True, disable=not self.console.is_terminal
-        )
-        self.tasks: dict[str, Any] = {}
-
-    def __enter__(self) -> Terminal:
-        self.bars.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.bars.stop()
-
-    def log(self, message: str) -> None:
-        self.console.print(message, markup=False, soft_wrap=True)
-
-    def progress(self, label: str, share: float, note: str = "") -> None:
-        if label not in self.tasks:
-            self.tasks[label] = self.bars.add_task(label, total=1.0, note=note)
-        self.bars.update(self.tasks[label], completed=share, note=note, visible=share < 1.0)
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -66,8 +30,10 @@ def cli() -> None:
 
     \b
     Start here:
-      bayeskin import test.xlsx -o runs/test.h5     what is in a recording
+      bayeskin doctor                               does it work here
       bayeskin run runs/demo.toml                   everything, on the recording that is shipped
+      bayeskin new test.xlsx -o runs/test.toml      a configuration for a recording of your own
+      bayeskin run runs/test.toml
     """
 
 
@@ -85,10 +51,33 @@ def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
     \b
     Example:
       bayeskin import Healthy_skin.xlsx -o runs/healthy-skin.h5
+      bayeskin import series.xlsx --sheet "Test 3" -o runs/test-3.h5
     """
     from bayeskin.pipeline import single
 
     _answer(single.import_recording(file, out, sheet), as_json)
+
+
+@cli.command()
+@click.argument("recording", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "out", type=click.Path(path_type=Path), help="TOML file to write; default: beside RECORDING."
+)
+@as_json
+def new(recording: Path, out: Path | None, as_json: bool) -> None:
+    """Write a commented configuration for a recording of your own.
+
+    Reads the recording, says what it found, and takes a shipped surrogate where one knows its protocol, else
+    a design of full runs. Never writes over a file.
+
+    \b
+    Example:
+      bayeskin new test.xlsx -o runs/test.toml
+      bayeskin new runs/test.h5 && bayeskin run runs/test.toml
+    """
+    from bayeskin.pipeline.new import new_config
+
+    _answer(new_config(recording, out), as_json)
 
 
 @cli.command()
@@ -135,7 +124,8 @@ a_scheduler = click.option(
 
 def _stage_command(name: str, text: str) -> None:
     @cli.command(name, help=f"{text}\n\nWhat it needs of earlier stages is done first.\n\n"
-                            f"\b\nExample:\n  bayeskin {name} runs/demo.toml")  # fmt: skip
+                            f"\b\nExample:\n  bayeskin {name} runs/demo.toml\n"
+                            f"  bayeskin {name} runs/demo.toml --json")  # fmt: skip
     @a_config
     @a_scheduler
     @as_json
@@ -149,7 +139,27 @@ _stage_command("effects", "Learn what each tissue mechanism does to the force, f
 _stage_command("map", "Find the most probable point and check it by the full model.")
 _stage_command("sample", "Sample the posterior until it can be trusted; bands on the predicted force.")
 _stage_command("sobol", "Sobol indices of the force over time.")
-_stage_command("report", "Figures and summary.json of a run.")
+
+
+@cli.command()
+@a_config
+@as_json
+def report(config: Path, as_json: bool) -> None:
+    """One HTML page of a run, from whatever stages are done.
+
+    Runs no stage: says plainly which are missing. The page is report.html in the run's folder; it needs no
+    network and no file beside it, so it can be sent as it is.
+
+    \b
+    Example:
+      bayeskin report runs/demo.toml
+      bayeskin report runs/demo.toml --json > answer.json
+    """
+    from bayeskin.pipeline import stages
+
+    with Terminal() as terminal:
+        document = stages.report(config, terminal)
+    _answer(document, as_json)
 
 
 @cli.command()
@@ -159,12 +169,13 @@ _stage_command("report", "Figures and summary.json of a run.")
 def run(config: Path, scheduler: str | None, as_json: bool) -> None:
     """All stages of a configuration in order, skipping what is done and unchanged.
 
-    Outputs go to a folder beside CONFIG with the configuration's name. Interrupted at any moment, the same
-    command goes on.
+    Outputs go to a folder beside CONFIG with the configuration's name; report.html in it is the answer to
+    read. Interrupted at any moment, the same command goes on.
 
     \b
     Example:
       bayeskin run runs/demo.toml
+      bayeskin run runs/test.toml --scheduler tcp://10.0.0.5:8786
     """
     _run(config, None, scheduler, as_json)
 
@@ -184,6 +195,7 @@ def diagnose(source: Path, as_json: bool) -> None:
 
     \b
     Example:
+      bayeskin diagnose runs/healthy-skin.toml
       bayeskin diagnose runs/healthy-skin.h5 --json
     """
     from bayeskin.pipeline import diagnosis
@@ -209,6 +221,7 @@ def prove(folder: Path | None, at_most: int | None, rediagnose: int, as_json: bo
     \b
     Example:
       bayeskin prove --rediagnose 2
+      bayeskin prove sets/one --at-most 4
     """
     from bayeskin.pipeline import proof
 
@@ -238,6 +251,25 @@ def conceal(folder: Path, seed: int, count: int, as_json: bool) -> None:
     _answer(document, as_json)
 
 
+@cli.command()
+@as_json
+def doctor(as_json: bool) -> None:
+    """Whether this installation works, in the folder that you are in.
+
+    Packages and their versions, the linear solver, threads, disk space, write access; then a short run of the
+    full model and a surrogate's prediction against stored numbers, some five seconds (once, after the
+    installation, half a minute, because parts are compiled). Exit code 1 if something is broken.
+
+    \b
+    Example:
+      bayeskin doctor
+      bayeskin doctor --json
+    """
+    from bayeskin.pipeline.doctor import examine
+
+    _answer(examine(Path.cwd()), as_json)
+
+
 def _run(config: Path, last: str | None, scheduler: str | None, as_json: bool) -> None:
     from bayeskin.pipeline import stages
 
@@ -259,28 +291,4 @@ def _answer(document: Mapping[str, Any], as_json: bool) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the `bayeskin` command."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # a scheduler's end is an interruption too
-    sys.exit(_exit_code(lambda: cli.main(arguments, prog_name="bayeskin", standalone_mode=False)))
-
-
-def _exit_code(call: Callable[[], Any]) -> int:
-    try:
-        return int(call() or DONE)
-    except click.exceptions.NoArgsIsHelpError as error:
-        error.show()
-        return WRONG_INPUT
-    except click.ClickException as error:
-        return _complain(error.format_message(), WRONG_INPUT)
-    except InputError as error:
-        return _complain(str(error), WRONG_INPUT)
-    except (KeyboardInterrupt, click.Abort):
-        return _complain("interrupted; the same command goes on from here", INTERRUPTED)
-    except BrokenPipeError:  # the reader of our stdout left, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return DONE
-    except OSError as error:
-        return _complain(str(error), WRONG_INPUT)
-
-
-def _complain(message: str, code: int) -> int:
-    click.echo(f"bayeskin: {' '.join(message.split())}", err=True)
-    return code
+    sys.exit(exit_code(lambda: cli.main(arguments, prog_name="bayeskin", standalone_mode=False)))

@@ -65,7 +65,7 @@ class ParameterSpace:
 
     parameters: tuple[Parameter, ...]
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         return tuple(p.name for p in self.parameters)
 
@@ -73,13 +73,13 @@ class ParameterSpace:
     def dim(self) -> int:
         return len(self.parameters)
 
-    @property
+    @cached_property
     def lower(self) -> Array:
-        return np.array([p.lower for p in self.parameters])
+        return frozen_array([p.lower for p in self.parameters])
 
-    @property
+    @cached_property
     def upper(self) -> Array:
-        return np.array([p.upper for p in self.parameters])
+        return frozen_array([p.upper for p in self.parameters])
 
     @cached_property
     def is_log(self) -> NDArray[np.bool_]:
@@ -87,12 +87,12 @@ class ParameterSpace:
 
     def to_unit(self, theta: ArrayLike) -> Array:
         """Prior cumulative probability of each coordinate, shape (..., d); outside [0, 1] beyond the box."""
-        low, high = self.to_line(self.lower), self.to_line(self.upper)
+        low, high = self._line
         return (self.to_line(theta) - low) / (high - low)
 
     def from_unit(self, unit: ArrayLike) -> Array:
         """Inverse of `to_unit`, shape (..., d)."""
-        low, high = self.to_line(self.lower), self.to_line(self.upper)
+        low, high = self._line
         return self.from_line(low + np.asarray(unit, dtype=float) * (high - low))
 
     def to_line(self, theta: ArrayLike) -> Array:
@@ -109,6 +109,10 @@ class ParameterSpace:
         """Whether each point lies in the closed box, shape (...,)."""
         theta = np.asarray(theta, dtype=float)
         return np.all((theta >= self.lower) & (theta <= self.upper), axis=-1)
+
+    @cached_property
+    def _line(self) -> tuple[Array, Array]:
+        return self.to_line(self.lower), self.to_line(self.upper)
 
     @cached_property
     def _offset(self) -> Array:
@@ -259,7 +263,8 @@ class Prediction:
     """Force at n points with its own uncertainty, as a low-rank Gaussian.
 
     mean (n, m) [N]; factor (n, m, r) [N]; diagonal (n, m) [N^2].
-    Covariance at point i: ``factor[i] @ factor[i].T + diag(diagonal[i])``.
+    Covariance at point i: ``factor[i] @ factor[i].T + diag(diagonal[i])``. A factor whose bins lie next to
+    each other in memory, the transposed view of an (n, r, m) array, is used without a copy.
     """
 
     mean: Array

@@ -7,21 +7,30 @@ times. E_inf [0.5, 2], E_1 [0.3, 3], E_2 [0.1, 1], tau_1 [1, 6] s, tau_2 [15, 60
 uniform. Error: ||prediction - truth|| / ||truth - its mean|| over 512 random points.
 
 Run with one thread: ``OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/surrogate_benchmark.py``.
-Prints medians over designs of other seeds; times are CPU seconds of this process.
+Prints medians over designs of other seeds beside the targets; times are CPU seconds. Other packages (extra
+`benchmark`) are measured on the same designs, one after the other in processes of their own, where they are
+installed: in this environment, or in one given by ``--peer NAME=PYTHON`` (`surrogate_peers`).
 """
 
 from __future__ import annotations
 
+import argparse
 import json
+import subprocess
+import sys
+import tempfile
 import time
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
 
+from bayeskin import __version__
 from bayeskin.inference.likelihood import log_likelihood
 from bayeskin.inference.noise_model import noise_chain
 from bayeskin.surrogates import train
-from bayeskin.types import BinnedForce, Design, Parameter, ParameterSpace, Phase
+from bayeskin.types import BinnedForce, Design, Parameter, ParameterSpace, Phase, Prediction
 
 SPACE = ParameterSpace(
     (
@@ -37,6 +46,11 @@ TIME_S = np.linspace(0.0, 120.0, 200)
 EDGES_S = np.linspace(-0.5, 1.0, 201) * 120.0  # bins are not means here; only their number matters
 RAMPS = ((0.0, 10.0, 0.0, 0.1), (80.0, 90.0, 1.0, -0.1))  # start, end [s], stretch, its rate [1/s]
 POINTS, TESTS, BATCH = 128, 512, 512
+SEEDS = 5
+Row = dict[str, Any]
+PEERS = ("openturns", "surmise", "bayesvalidrox")
+COLUMNS = ("held_out_error", "training_s", "log_likelihoods_per_s", "without_covariance_per_s")
+TARGETS = {"held_out_error": 0.015, "training_s": 2.0, "log_likelihoods_per_s": 25_000.0}
 
 
 def force(theta: np.ndarray, time_s: np.ndarray = TIME_S) -> np.ndarray:
@@ -99,12 +113,75 @@ def run(seed: int) -> dict[str, float]:
         "log_likelihoods_per_s": rate(
             lambda: log_likelihood(chain, surrogate.predict(theta), noise), len(theta)
         ),
+        "without_covariance_per_s": rate(
+            lambda: log_likelihood(chain, without_factor(surrogate.predict(theta)), noise), len(theta)
+        ),
     }
 
 
+def without_factor(prediction: Prediction) -> Prediction:
+    """The prediction as if its error were independent from bin to bin."""
+    return Prediction(prediction.mean, prediction.factor[:, :, :0], prediction.diagonal)
+
+
+def peer_rows(package: str, python: str) -> list[Row]:
+    """Medians of each of a package's methods over the designs; one line and no row where it is absent."""
+    known = f"import importlib.util, sys; sys.exit(importlib.util.find_spec({package!r}) is None)"
+    if subprocess.run([python, "-c", known], check=False).returncode:
+        print(f"{package}: not installed for {python}, skipped")
+        return []
+    script, found = Path(__file__).with_name("surrogate_peers.py"), {}  # type: ignore[var-annotated]
+    with tempfile.TemporaryDirectory() as folder:
+        for seed in range(SEEDS):
+            runs, file = design(seed), Path(folder) / f"{seed}.npz"
+            unit, out = SPACE.to_unit(runs.theta), runs.held_out
+            np.savez(
+                file, unit=unit[~out], force_n=runs.force_n[~out], test_unit=unit[out],
+                test_force_n=runs.force_n[out],
+            )  # fmt: skip
+            command = [python, str(script), package, str(file)]
+            done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+            for line in done.stdout.splitlines():
+                if line.startswith("ROW "):
+                    row = json.loads(line[4:])
+                    found.setdefault(row.pop("method"), []).append(row)
+    return [{"method": name, **medians(rows)} for name, rows in found.items()]
+
+
+def medians(rows: list[Row]) -> Row:
+    """Of each column over the designs; None where a method has no number."""
+    return {
+        key: None if value is None else float(np.median([row[key] for row in rows]))
+        for key, value in rows[0].items()
+    }
+
+
+def table(rows: list[Row]) -> str:
+    """Rows below the targets, as Markdown; in brackets how many times the first row's."""
+    lines = [["method", *COLUMNS], ["---"] * (1 + len(COLUMNS))]
+    signs = {key: ">=" if key.endswith("per_s") else "<=" for key in TARGETS}
+    targets = [f"{signs[key]} {TARGETS[key]:,g}" if key in TARGETS else "" for key in COLUMNS]
+    lines.append(["target", *targets])
+    for row in rows:
+        cells = [
+            "none" if row[key] is None else f"{float(f'{row[key]:.3g}'):,g} ({row[key] / rows[0][key]:.2g})"
+            for key in COLUMNS
+        ]
+        lines.append([row["method"], *cells])
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
 def main() -> None:
-    results = [run(seed) for seed in range(5)]
-    print(json.dumps({key: float(np.median([r[key] for r in results])) for key in results[0]}, indent=2))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--peer", action="append", default=[], metavar="NAME=PYTHON")
+    pythons = dict.fromkeys(PEERS, sys.executable)
+    pythons |= dict(one.split("=", 1) for one in parser.parse_args().peer)
+    ours = medians([run(seed) for seed in range(SEEDS)])
+    print(json.dumps(ours, indent=2))
+    rows: list[Row] = [{"method": f"bayeskin {__version__}", **ours}]
+    for package, python in pythons.items():
+        rows += peer_rows(package, python)
+    print(table(rows))
 
 
 if __name__ == "__main__":

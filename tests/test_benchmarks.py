@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from bayeskin.model.problem import build_problem
 from bayeskin.types import Simulation
@@ -80,3 +82,20 @@ def test_the_tolerance_chosen_is_the_loosest_below_which_all_are_good(benchmark)
     rms = {1e-1: 1e-4, 1e-2: 9e-4, 1e-3: 2e-4, 1e-4: 1e-5}  # the loosest is good by chance
     errors = {(t, "A"): study.Error(e, e, 1.0, 1.0, e) for t, e in rms.items()}
     assert study.choose(errors, 5e-4) == 1e-3
+
+
+def test_the_peers_likelihood_is_the_normal_with_their_covariance(benchmark):
+    peers, rng = benchmark("surrogate_peers"), np.random.default_rng(1)
+    residual, factor = 0.02 * rng.normal(size=(3, 8)), 0.02 * rng.normal(size=(3, 2, 8))
+    found = peers.log_likelihood(residual, factor)
+    for i in range(3):
+        covariance = factor[i].T @ factor[i] + peers.NOISE_N**2 * np.eye(8)
+        exact = multivariate_normal(np.zeros(8), covariance).logpdf(residual[i])
+        assert found[i] == pytest.approx(exact, rel=1e-10)
+    plain = multivariate_normal(np.zeros(8), peers.NOISE_N**2 * np.eye(8)).logpdf(residual)
+    np.testing.assert_allclose(peers.log_likelihood(residual, None), plain, rtol=1e-10)
+
+
+def test_a_package_that_is_absent_costs_one_line(benchmark, capsys):
+    assert benchmark("surrogate_benchmark").peer_rows("no_such_package", sys.executable) == []
+    assert capsys.readouterr().out.count("\n") == 1

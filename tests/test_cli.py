@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -459,6 +460,24 @@ def test_help_teaches_each_command_by_an_example(bayeskin: Command) -> None:
         assert code == 0
         assert "--json" in out
         assert f"bayeskin {name} " in out.split("Example:")[1]
+
+
+def test_a_shell_completes_commands_and_options() -> None:
+    def completed(words: str) -> list[str]:
+        setting = {
+            "_BAYESKIN_COMPLETE": "zsh_complete",
+            "COMP_WORDS": words,
+            "COMP_CWORD": str(words.count(" ")),
+        }
+        command = [sys.executable, "-c", "from bayeskin.cli import main; main()"]
+        told = subprocess.run(
+            command, env={**os.environ, **setting}, capture_output=True, text=True, check=False
+        )
+        return told.stdout.splitlines()[1::3]
+
+    assert completed("bayeskin re") == ["report"]
+    assert completed("bayeskin simulate --ob") == ["--observation"]
+    assert completed("bayeskin simulate --observation ") == ["reaction", "article"]
 
 
 def test_a_recording_whose_protocol_no_surrogate_knows_is_refused_in_one_line(

@@ -60,6 +60,14 @@ def test_a_move_keeps_a_unit_normal(moves: object) -> None:
     assert error < 0.02
 
 
+def test_a_walker_on_top_of_its_anchor_stays_where_it_is() -> None:
+    walkers, others = np.zeros((3, 2)), [np.zeros((4, 2))]
+    with np.errstate(all="raise"):
+        proposal, factor = SnookerMove().get_proposal(walkers, others, np.random.RandomState(1))
+    assert np.all(proposal == walkers)
+    assert np.all(factor == -np.inf)
+
+
 def test_a_shear_is_undone_by_its_inverse_and_keeps_volumes_in_proportion() -> None:
     shear = curved_shear(4)
     x = np.random.default_rng(0).standard_normal((50, 4))

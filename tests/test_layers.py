@@ -33,7 +33,8 @@ BELOW = {
     | {"mechanisms", "config", "runner", "cluster", "mismatch", "inference", "sensitivity", "report"},
 }
 BELOW["pipeline"] |= {"proof"}
-BELOW["cli"] = BELOW["pipeline"] | {"pipeline"}
+BELOW["terminal"] = {"errors"}
+BELOW["cli"] = BELOW["pipeline"] | {"pipeline", "terminal"}
 
 
 def imported(source: str, module: tuple[str, ...], is_package: bool) -> Iterator[str]:

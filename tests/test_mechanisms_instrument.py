@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import bin_means, catalogue, observed
+from bayeskin.mechanisms.lines import interpolated
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.types import PadMotion, ParameterSpace
 
@@ -152,6 +153,16 @@ def test_events_and_drift_add_what_they_say():
     np.testing.assert_allclose(found[[324, 326, 649, 651]], [0.0, 0.03, 0.03, 0.02], atol=1e-15)
     np.testing.assert_allclose(reported("sensor-drift", drift=1e-4), 1e-4 * TIMES_S)
     np.testing.assert_allclose(reported("force-offset", F0=-0.02), -0.02)
+
+
+def test_lines_are_numpys_whatever_the_order_of_the_times():
+    rng = np.random.default_rng(2)
+    grid, values = np.cumsum(rng.uniform(0.1, 1.0, 40)), rng.normal(size=(5, 40))
+    times = np.concatenate([rng.uniform(-1.0, grid[-1] + 1.0, (5, 300)), np.tile(grid, (5, 1))], axis=1)
+    for at_s in (times, np.sort(times), times[0]):
+        rows = np.broadcast_to(at_s, times.shape)
+        expected = [np.interp(time_s, grid, row) for time_s, row in zip(rows, values, strict=True)]
+        np.testing.assert_allclose(interpolated(grid, values, at_s), expected, rtol=0, atol=1e-13)
 
 
 def test_bin_means_are_exact_across_corners():

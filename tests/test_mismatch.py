@@ -16,6 +16,7 @@ from bayeskin.inference.gauss_newton import gauss_newton, promise
 from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import catalogue
 from bayeskin.mismatch.fit import Fit, fit, fit_base, restored, stored
+from bayeskin.mismatch.full_fit import FullFit, fit_full
 from bayeskin.mismatch.locate import locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.search import search
@@ -159,3 +160,55 @@ def test_a_mechanism_that_does_nothing_gains_nothing() -> None:
     wide = building(alone, ("sensor-drift",))
     more = fit(("sensor-drift",), wide, base.theta, NEUTRAL, 1, 5, None, KNOWN["sensor-drift"].whole_or_parts)
     assert more.log_evidence < base.log_evidence + 2.0
+
+
+class Wrong(ToySurrogate):
+    """Off by some percent of the force and of the slopes, and sure of itself."""
+
+    def predict(self, theta):
+        theta = np.atleast_2d(np.asarray(theta, dtype=float))
+        found = super().predict(np.clip(theta * 1.04, self.space.lower, self.space.upper))
+        return dataclasses.replace(found, mean=0.9 * found.mean, factor=0.0 * found.factor)
+
+
+def test_the_full_model_s_own_maximum_is_found_with_a_surrogate_s_wrong_slopes() -> None:
+    right = dataclasses.replace(concealing(0, ("force-offset",), F0=-0.04), noise_priors=QUIET)
+    right = building(right, ("force-offset",))
+    wrong = dataclasses.replace(right, surrogate=dataclasses.replace(right.surrogate, skin=Wrong()))
+    truth = [*TRUTH.values(), -0.04]
+    noise = [2e-3] * (right.dim - len(truth) - 2) + [0.5, 20.0]
+    start = gauss_newton(wrong, np.clip(right.to_sampling([*truth, *noise]), *right.bounds), None).vector
+    sure = dataclasses.replace(right.surrogate, skin=ToySurrogate(sd_n=1e-9))
+    best = gauss_newton(dataclasses.replace(right, surrogate=sure), start, None)
+    made = []
+
+    def full(theta):
+        made.append(theta)
+        return right.surrogate.predict([theta[name] for name in right.surrogate.space.names]).mean[0]
+
+    found = fit_full(wrong, wrong.named(wrong.from_sampling(start)), full, ("F0",), 12, 1)
+    assert isinstance(found, FullFit)
+    assert found.runs == len(made)
+    assert found.gained > 1.0
+    assert found.value == pytest.approx(best.value, abs=0.5)
+    np.testing.assert_allclose(found.force_n, full(found.theta), atol=1e-6)
+
+
+def test_a_full_fit_whose_runs_fail_keeps_what_it_has() -> None:
+    alone = concealing(0)
+    start = dict(
+        zip(alone.names, [*TRUTH.values(), *[2e-3] * (alone.dim - len(TRUTH) - 2), 0.5, 20.0], strict=True)
+    )
+    assert fit_full(alone, start, lambda theta: "did not converge", (), 5, 1) == "did not converge"
+    made = []
+
+    def once(theta):
+        made.append(theta)
+        if len(made) > 1:
+            return "did not converge"
+        return 1.2 * alone.surrogate.predict([theta[name] for name in alone.surrogate.space.names]).mean[0]
+
+    found = fit_full(alone, start, once, (), 5, 1)
+    assert isinstance(found, FullFit)
+    assert found.gained == 0.0
+    assert found.theta["E_c"] == pytest.approx(start["E_c"])

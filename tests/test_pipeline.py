@@ -1,5 +1,6 @@
 """A stage is run again when, and only when, what it was made from has changed."""
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -15,7 +16,16 @@ import pytest
 from bayeskin.errors import InputError
 from bayeskin.inference import Bands, Verdict
 from bayeskin.pipeline import folder
-from bayeskin.pipeline.engine import Run, Silent, Stage, open_run, run_stages
+from bayeskin.pipeline.engine import (
+    STANDINGS,
+    CannotGoOn,
+    Run,
+    Silent,
+    Stage,
+    open_run,
+    run_stages,
+    standing,
+)
 from bayeskin.pipeline.posterior import with_surrogate_error
 
 CONFIG = 'seed = {seed}\n[recording]\nfile = "input.txt"\n'
@@ -112,6 +122,35 @@ def test_an_interrupted_stage_keeps_its_files_unless_its_inputs_change(tmp_path:
     (tmp_path / "case" / "twice" / "stage.json").unlink()
     with pytest.raises(KeyboardInterrupt):  # nothing says what the half file was made from: it is not used
         ran(a_run(tmp_path), "twice", these)
+
+
+def stands(run: Run, of: dict[str, Stage] | None = None) -> list[str]:
+    return [word for word, _ in standing(run, of or stages()).values()]
+
+
+def test_how_stages_stand_is_told_without_running_them(tmp_path: Path) -> None:
+    def failing(run: Run) -> dict[str, str]:
+        raise CannotGoOn("too little")
+
+    def interrupted(run: Run) -> dict[str, str]:
+        raise KeyboardInterrupt
+
+    assert stands(a_run(tmp_path)) == ["not run"] * 4
+    assert not (tmp_path / "case").exists()
+    ran(a_run(tmp_path))
+    assert stands(a_run(tmp_path)) == ["done"] * 4
+    assert stands(a_run(tmp_path, seed=2)) == ["done", "done", "out of date", "done"]
+    assert stands(a_run(tmp_path, text="new")) == ["out of date"] * 4  # what is made from it is so too
+    run = a_run(tmp_path)
+    run.at("twice", "out.txt").write_text("cut sho")
+    assert stands(run) == ["done", "out of date", "done", "out of date"]
+    for work, word in ((failing, "failed"), (interrupted, "not finished")):
+        these = stages()
+        these["twice"] = dataclasses.replace(these["twice"], work=work)
+        with contextlib.suppress(KeyboardInterrupt):
+            ran(a_run(tmp_path), "twice", these)
+        assert stands(a_run(tmp_path)) == ["done", word, "done", "out of date"]
+    assert set(STANDINGS) == {"done", "not run", "out of date", "failed", "not finished"}
 
 
 def test_a_folder_serves_one_process_and_is_free_when_that_is_killed(tmp_path: Path) -> None:

@@ -308,6 +308,20 @@ def test_while_it_is_diagnosed_no_key_can_be_opened(made: Path, tmp_path: Path) 
     assert (made / "seals" / "001.json").read_text()
 
 
+def test_another_verdict_is_a_failure_of_the_same_sources_only(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def other(path: Path, reporter) -> dict:
+        return {**nothing_found(path, reporter), "verdict": "unknown"}
+
+    copy = Path(shutil.copytree(made, tmp_path / "copy"))
+    pipeline.prove(copy, Silent(), diagnose=nothing_found)
+    again = pipeline.prove(copy, Silent(), rediagnose=1, diagnose=other)
+    assert (again["ok"], list(again["rediagnosed_the_same"].values())) == (False, [False])
+    monkeypatch.setattr(pipeline, "diagnosing_sources", lambda: "others")
+    assert pipeline.prove(copy, Silent(), rediagnose=1, diagnose=other)["ok"]
+
+
 def test_a_diagnosis_in_a_process_that_refuses_the_seals_goes_through(made: Path) -> None:
     """The diagnosing code is loaded, and a recording read and binned, where no path under seals/ opens."""
     script = (
@@ -329,7 +343,7 @@ def test_a_diagnosis_in_a_process_that_refuses_the_seals_goes_through(made: Path
 
 
 def test_what_diagnoses_mentions_neither_proof_nor_seals() -> None:
-    for path in [*(PACKAGE / "mismatch").rglob("*.py"), PACKAGE / "pipeline" / "diagnosis.py"]:
+    for path in [*(PACKAGE / "mismatch").rglob("*.py"), *(PACKAGE / "pipeline").glob("diagnosis*.py")]:
         tree = ast.parse(path.read_text())
         words = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
         words |= {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     def drawn(figure: object, stem: Path, provenance: str) -> None:
         stem.with_suffix(".png").write_text(provenance)
+        stem.with_suffix(".svg").write_text('<svg xmlns="http://www.w3.org/2000/svg"/>')
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "save_figure", drawn)  # rendering is most of a small run's time
@@ -120,6 +122,23 @@ def test_each_stage_draws_its_figures_and_says_where_they_come_from(folder: Path
     for stage, names in expected.items():
         for name in names:
             assert "bayeskin 0" in (folder / "case" / stage / f"{name}.png").read_text()
+
+
+def test_the_page_shows_the_whole_run(folder: Path) -> None:
+    shown = (folder / "case" / "report.html").read_text()
+    drawn = [path.stem for path in (folder / "case").rglob("*.svg")]
+    assert len(drawn) == 11
+    for name in drawn:
+        assert f'-{name}"'.replace("_", "-") in shown, name
+    for parameter in SPACE.parameters:
+        assert parameter.description in unescape(shown)
+    assert "not trusted" in shown
+    assert "The stage diagnose has not been run." in shown
+    history = json.loads(shown.split('id="history-data">')[1].split("</script>")[0])
+    bands = json.loads((folder / "case" / "sample" / "bands.json").read_text())
+    assert len(history["time_s"]) == len(bands["time_s"]) == 130
+    assert sum(history["fitted"]) == 75
+    assert all(low < high for low, high in zip(history["low_90_n"], history["high_90_n"], strict=True))
 
 
 def test_the_posterior_is_an_inference_data_with_its_origin(folder: Path) -> None:

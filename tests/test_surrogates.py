@@ -18,14 +18,23 @@ from toy import EDGES_S, SPACE, toy_bin_means
 
 from bayeskin.design import default_space
 from bayeskin.errors import InputError
-from bayeskin.surrogates import load_manifest, load_surrogate, manifest_of, save_surrogate, train, validate
+from bayeskin.surrogates import (
+    Effect,
+    WithEffects,
+    load_manifest,
+    load_surrogate,
+    manifest_of,
+    save_surrogate,
+    train,
+    validate,
+)
 from bayeskin.surrogates.chaos import LatentChaos, fit_sparse, legendre_basis, multi_indices
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.hyperparameters import LatentFit, _Data, _likelihood, fit_latent
 from bayeskin.surrogates.kernels import KERNELS, kernel, squared_distances, trend_basis, trend_degree
 from bayeskin.surrogates.shapes import all_components, split
 from bayeskin.surrogates.similarity import Similarity
-from bayeskin.types import Design, ParameterSpace, Surrogate
+from bayeskin.types import Design, Parameter, ParameterSpace, Surrogate
 
 
 @cache
@@ -265,6 +274,37 @@ def test_gp_predicts_as_the_textbook_formulas(name):
     found = gp.predict(points)
     np.testing.assert_allclose(found[0][:, 0], target.mean() + target.std() * mean, rtol=1e-7)
     np.testing.assert_allclose(found[1][:, 0], target.var() * variance, rtol=1e-4)
+
+
+def test_latents_of_two_kernels_are_predicted_together_as_each_by_itself():
+    rng = np.random.default_rng(7)
+    unit, points = rng.random((41, 3)), rng.random((300, 3))
+    targets = np.sin(unit @ rng.normal(size=(3, 3)))
+    maps = np.tril(rng.normal(size=(3, 3, 3))) + 2 * np.eye(3)
+    names = ("matern52", "gaussian", "matern52")
+    fits = [LatentFit(name, map_, 1e-4, 0.0, 1.3) for name, map_ in zip(names, maps, strict=True)]
+    together = LatentGPs.assemble(unit, targets, fits).predict(points)
+    for j, fit in enumerate(fits):
+        alone = LatentGPs.assemble(unit, targets[:, j : j + 1], [fit]).predict(points)
+        for found, expected in zip(together, alone, strict=True):
+            np.testing.assert_allclose(found[:, j], expected[:, 0], rtol=1e-9)
+
+
+def test_effects_add_their_strength_times_what_they_have_learnt(gp):
+    own = Parameter("g", "1", 0.0, 1.0, "uniform")
+    space = ParameterSpace((*SPACE.parameters, own))
+    more = replace(
+        DESIGN, space=space, theta=np.column_stack([DESIGN.theta, np.linspace(0.0, 1.0, len(DESIGN.theta))])
+    )
+    effect = Effect("g", "toy", 0.2, ("g",), train(more, "gp", seed=0)[0])
+    both = WithEffects(gp[0], (effect,))
+    base, learnt = gp[0].predict(DESIGN.theta[:9]), effect.surrogate.predict(more.theta[:9])
+    s = (more.theta[:9, 5] - 0.2)[:, None]
+    assert s.min() < 0.0
+    found = both.predict(more.theta[:9])
+    np.testing.assert_allclose(found.mean, base.mean + s * learnt.mean, rtol=1e-12)
+    covariance = base.sd() ** 2 + s**2 * learnt.sd() ** 2
+    np.testing.assert_allclose(found.sd() ** 2, covariance, rtol=1e-9)
 
 
 def test_gp_leave_one_out_is_the_gp_without_the_row():

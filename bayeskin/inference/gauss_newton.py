@@ -130,6 +130,7 @@ class _Linear:
         slope = (found.mean[1:] - found.mean[0])[:, bins] / (side * STEP)[:, None]
         self.slope = slope.T  # (k, inner), a box width
         self.noise = x[self.inner :]
+        self._columns: tuple[Array, Array, Array] | None = None
 
     def with_noise(self) -> Array:
         """The point with the most probable noise for its force."""
@@ -141,6 +142,7 @@ class _Linear:
         unit = np.clip(found.x, 0.0, 1.0)
         if self._values(unit[None])[0] >= self._values(((self.noise - low) / (high - low))[None])[0]:
             self.noise = low + unit * (high - low)
+            self._columns = None
         return np.concatenate([self.x[: self.inner], self.noise])
 
     def _values(self, unit: Array) -> Array:
@@ -149,11 +151,7 @@ class _Linear:
         rows = np.repeat(self.x[None], len(unit), axis=0)
         rows[:, self.inner :] = low + np.clip(unit, 0.0, 1.0) * (high - low)
         noise = self.log_posterior.split(self.log_posterior.from_sampling(rows))[1]
-        here = self.here
-        repeated = Prediction(
-            *(np.repeat(part, len(unit), axis=0) for part in (here.mean, here.factor, here.diagonal))
-        )
-        return log_likelihood(self.chain, repeated, noise)
+        return log_likelihood(self.chain, self.here, noise)
 
     def _differences(self, unit: Array) -> tuple[float, Array, Array]:
         """Value, gradient (q,) and second derivatives (q,) by the noise, one inside the bounds."""
@@ -179,11 +177,14 @@ class _Linear:
         return np.asarray((unit - rho[0][:, None] * before) / np.sqrt(1.0 - rho[0] ** 2)[:, None])
 
     def columns(self) -> tuple[Array, Array, Array]:
-        """Residual (k,), slopes (k, d) and the surrogate's factor (k, r), whitened."""
-        bins = self.chain.bins
-        residual = self.chain.force_n - self.here.mean[0, bins]
-        white = self.white(np.concatenate([residual[:, None], self.slope, self.here.factor[0, bins]], axis=1))
-        return white[:, 0], white[:, 1 : self.inner + 1], white[:, self.inner + 1 :]
+        """Residual (k,), slopes (k, d) and the surrogate's factor (k, r), whitened by the noise at hand."""
+        if self._columns is None:
+            bins = self.chain.bins
+            residual = self.chain.force_n - self.here.mean[0, bins]
+            plain = np.concatenate([residual[:, None], self.slope, self.here.factor[0, bins]], axis=1)
+            white = self.white(plain)
+            self._columns = white[:, 0], white[:, 1 : self.inner + 1], white[:, self.inner + 1 :]
+        return self._columns
 
     def step(
         self, x: Array, damping: float, explained: Array | float = 0.0, free: NDArray[np.bool_] | None = None
@@ -204,12 +205,13 @@ class _Linear:
         for _ in range(REWEIGHTED):
             left = residual - design @ change
             weight = (self.nu + 1.0) / (self.nu + left**2)
-            normal = (design * weight[:, None]).T @ design
+            weighted = (design * weight[:, None]).T
+            normal = weighted @ design
             penalty = np.full(design.shape[1], 1e-6)
             penalty[self.inner :] = _stiffness(change[self.inner :])
             penalty[: self.inner] += damping * np.maximum(np.diag(normal)[: self.inner], 1e-6)
-            target = (design * weight[:, None]).T @ residual
-            change = _bounded(normal + np.diag(penalty), target, room_down, room_up, self.inner)
+            normal[np.diag_indices(len(normal))] += penalty
+            change = _bounded(normal, weighted @ residual, room_down, room_up, self.inner)
         step = np.zeros(len(x))
         step[: self.inner] = change[: self.inner] * width
         return step
@@ -244,16 +246,14 @@ def _stiffness(latent: Array) -> Array:
 def _bounded(normal: Array, target: Array, low: Array, high: Array, count: int) -> Array:
     """Solution whose first `count` entries lie in [low, high]: those that leave are held at their bound."""
     held = np.zeros(len(target), dtype=bool)
-    values: Array = np.zeros(len(target))
-    for _ in range(count + 1):
+    values: Array = np.asarray(np.linalg.solve(normal, target), dtype=float)
+    for _ in range(count):
+        outside = ~held[:count] & ((values[:count] < low) | (values[:count] > high))
+        if not outside.any():
+            break
+        held[:count] |= outside
+        values[:count] = np.clip(values[:count], low, high)
         free = ~held
         right = target[free] - normal[np.ix_(free, held)] @ values[held]
         values[free] = np.asarray(np.linalg.solve(normal[np.ix_(free, free)], right), dtype=float)
-        outside = free.copy()
-        outside[:count] &= (values[:count] < low) | (values[:count] > high)
-        outside[count:] = False
-        if not outside.any():
-            break
-        held |= outside
-        values[:count] = np.clip(values[:count], low, high)
     return values

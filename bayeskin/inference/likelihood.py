@@ -36,12 +36,12 @@ _FAST = {"reassoc", "contract", "nsz", "arcp"}
 def log_likelihood(chain: NoiseChain, prediction: Prediction, noise: Array) -> Array:
     """Log density of the chain's forces, (n,), in nats (forces in N).
 
-    `prediction` at n points on all the recording's bins; noise (n, q): columns of
-    `noise_space(chain.kinds)`, whose last is nu, inf allowed.
+    `prediction` on all the recording's bins, at n points or at one for all rows of the noise; noise (n, q):
+    columns of `noise_space(chain.kinds)`, whose last is nu, inf allowed.
     """
     return _kernel(
         np.ascontiguousarray(prediction.mean, dtype=np.float64),
-        np.ascontiguousarray(prediction.factor, dtype=np.float64),
+        np.ascontiguousarray(prediction.factor.transpose(0, 2, 1), dtype=np.float64),
         np.ascontiguousarray(prediction.diagonal, dtype=np.float64),
         np.ascontiguousarray(noise, dtype=np.float64),
         chain.bins,
@@ -54,105 +54,129 @@ def log_likelihood(chain: NoiseChain, prediction: Prediction, noise: Array) -> A
     )
 
 
-@nb.njit(cache=True, fastmath=_FAST)
+@nb.njit(cache=True, error_model="numpy", fastmath=_FAST)
 def _kernel(
     mean: Array, factor: Array, diagonal: Array, noise: Array,
     bins: NDArray[np.int64], force: Array, variance: Array, covariance: Array,
     gap: Array, starts: NDArray[np.bool_], kind: NDArray[np.int64],
 ) -> Array:  # fmt: skip
-    points, (k, rank) = len(mean), (len(bins), factor.shape[2])
+    points, k, rank = len(noise), len(bins), factor.shape[1]
     out = np.empty(points)
-    white, design = np.empty(k), np.empty((rank, k))
+    # Rows of zeros fill the last block of four: they add nothing, and the loops need no remainder.
+    white, design, work = np.empty(k), np.zeros((-(-rank // 4) * 4, k)), np.empty((4, k))
     for i in range(points):
+        p = i if len(mean) > 1 else 0
         log_scale = _whiten(
-            mean[i], factor[i], diagonal[i], noise[i],
-            bins, force, variance, covariance, gap, starts, kind, white, design,
+            mean[p], factor[p], diagonal[p], noise[i],
+            bins, force, variance, covariance, gap, starts, kind, white, design, work,
         )  # fmt: skip
-        out[i] = _marginal(white, design, noise[i, -1]) - log_scale
+        out[i] = _marginal(white, design, rank, noise[i, -1], work) - log_scale
     return out
 
 
 @nb.njit(fastmath=_FAST, inline="always")
 def _whiten(
     mean: Array, factor: Array, diagonal: Array, noise: Array,
-    bins: NDArray[np.int64], force: Array, variance: Array, covariance: Array,
-    gap: Array, starts: NDArray[np.bool_], kind: NDArray[np.int64], white: Array, design: Array,
+    bins: NDArray[np.int64], force: Array, variance: Array, covariance: Array, gap: Array,
+    starts: NDArray[np.bool_], kind: NDArray[np.int64], white: Array, design: Array, work: Array,
 ) -> float:  # fmt: skip
-    """Fills `white` (k,) and `design` (r, k); returns the sum of the innovations' log scales."""
-    k, rank, tau = len(bins), factor.shape[1], noise[-2]
-    log_scale, product = 0.0, 1.0
-    sd_before, inverse_before, decay, gap_before = 0.0, 0.0, 0.0, -1.0
+    """Fills `white` (k,) and the first r rows of `design`; returns the sum of the innovations' log scales."""
+    k, tau = len(bins), noise[-2]
+    now, before, plain, inverse = work[0], work[1], work[2], work[3]
+    decay, gap_before = 0.0, -1.0
     for j in range(k):
-        b = bins[j]
-        sd = noise[kind[j]]
-        inverse = 1.0 / math.sqrt(sd * sd + variance[j] + diagonal[b])
-        rho, narrow = 0.0, 1.0
-        if not starts[j]:
-            if gap[j] != gap_before:
-                gap_before = gap[j]
-                decay = math.exp(-gap_before / tau)
-            rho = (sd_before * sd * decay + covariance[j]) * inverse * inverse_before
-            narrow = 1.0 / math.sqrt(1.0 - rho * rho)
-        now, before = narrow * inverse, narrow * rho * inverse_before
-        white[j] = now * (force[j] - mean[b])
-        for a in range(rank):
-            design[a, j] = now * factor[b, a]
-        if before != 0.0:
-            c = bins[j - 1]
-            white[j] -= before * (force[j - 1] - mean[c])
-            for a in range(rank):
-                design[a, j] -= before * factor[c, a]
-        product *= now
+        if gap[j] != gap_before:
+            gap_before = gap[j]
+            decay = math.exp(-gap_before / tau)
+        before[j] = decay
+    for j in range(k):
+        now[j] = noise[kind[j]]
+        plain[j] = force[j] - mean[bins[j]]
+        inverse[j] = now[j] * now[j] + variance[j] + diagonal[bins[j]]
+    for j in range(k):
+        inverse[j] = 1.0 / math.sqrt(inverse[j])
+    for j in range(1, k):
+        shared = now[j - 1] * now[j] * before[j] + covariance[j]
+        before[j] = 0.0 if starts[j] else shared * inverse[j] * inverse[j - 1]  # rho
+    before[0], now[0] = 0.0, inverse[0]
+    for j in range(1, k):
+        narrow = 1.0 / math.sqrt(1.0 - before[j] * before[j])
+        now[j] = narrow * inverse[j]
+        before[j] *= narrow * inverse[j - 1]
+    log_scale, product = 0.0, 1.0
+    for j in range(k):
+        product *= now[j]
         if j % 8 == 7:  # one logarithm for eight factors
             log_scale -= math.log(product)
             product = 1.0
-        sd_before, inverse_before = sd, inverse
+    _innovations(plain, now, before, white)
+    whole = bins[k - 1] - bins[0] == k - 1  # no gap: no need to gather
+    for a in range(len(factor)):
+        row = factor[a]
+        if whole:
+            row = row[bins[0] : bins[0] + k]
+        else:
+            for j in range(k):
+                plain[j] = row[bins[j]]
+            row = plain
+        _innovations(row, now, before, design[a])
     return log_scale - math.log(product)
 
 
 @nb.njit(fastmath=_FAST, inline="always")
-def _marginal(white: Array, design: Array, nu: float) -> float:
+def _innovations(plain: Array, now: Array, before: Array, out: Array) -> None:
+    """Each entry of `plain` (k,) scaled, less its share of the entry before it."""
+    out[0] = now[0] * plain[0]
+    for j in range(1, len(plain)):
+        out[j] = now[j] * plain[j] - before[j] * plain[j - 1]
+
+
+@nb.njit(fastmath=_FAST, inline="always")
+def _marginal(white: Array, design: Array, rank: int, nu: float, work: Array) -> float:
     """Log of the integral over z of N(z; 0, I) prod_j t_nu(white_j - design[:, j] z)."""
-    rank, k = design.shape
     gaussian = math.isinf(nu)
-    z, gradient = np.zeros(rank), np.empty(rank)
-    best, curvature = np.zeros(rank), np.empty((rank, rank))
-    eps, pull, bend = np.empty(k), np.empty(k), np.empty(k)
+    z, best, gradient = np.zeros(len(design)), np.zeros(rank), np.empty(rank)
+    gram, curvature = np.empty((rank, len(design))), np.empty((rank, rank))
+    eps, pulled, bend, row = work[0], work[1], work[2], work[3]
     newton, lowest = False, np.inf
     value = np.inf
     for step in range(_STEPS):
-        value = _energy(white, design, z, nu, eps)
+        value = _energy(white, design, rank, z, nu, eps)
+        if step == 1 and gaussian and np.all(np.abs(z) <= FARTHEST):
+            break  # the integrand is a normal density: one step is exact
         if newton and value > lowest + 1e-9:  # Newton overshot: back, and reweight from there on
             newton, lowest = False, np.inf
-            z[:] = best
-            value = _energy(white, design, z, nu, eps)
+            z[:rank] = best
+            value = _energy(white, design, rank, z, nu, eps)
         elif step == _REWEIGHTED and not gaussian:
             newton = True
         lowest = value
-        best[:] = z
-        _weights(eps, nu, step, newton, pull, bend)
-        _normal_equations(design, z, eps, pull, bend, gradient, curvature)
-        if not _cholesky(curvature):
+        best[:] = z[:rank]
+        _weights(eps, nu, step, newton, pulled, bend)
+        _slope(design, z, pulled, gradient)
+        if step == 0 or not gaussian:
+            _gram(design, bend, row, gram)
+        if not _factored(gram, z, curvature):
             newton = False
-            _weights(eps, nu, step, False, pull, bend)
-            _normal_equations(design, z, eps, pull, bend, gradient, curvature)
-            _cholesky(curvature)
+            _weights(eps, nu, step, False, pulled, bend)
+            _gram(design, bend, row, gram)
+            _factored(gram, z, curvature)
         decrement = _solve(curvature, gradient)
-        z += gradient
+        z[:rank] += gradient
         value -= 0.5 * decrement
         if step > 0 and decrement < _DECREMENT:
             break
     if not gaussian and not newton:  # Laplace takes the curvature of the density, not of its bound
-        value = _energy(white, design, z, nu, eps)
-        _weights(eps, nu, _STEPS, True, pull, bend)
-        _normal_equations(design, z, eps, pull, bend, gradient, curvature)
-        if not _cholesky(curvature):
-            _weights(eps, nu, _STEPS, False, pull, bend)
-            _normal_equations(design, z, eps, pull, bend, gradient, curvature)
-            _cholesky(curvature)
+        value = _energy(white, design, rank, z, nu, eps)
+        _weights(eps, nu, _STEPS, True, pulled, bend)
+        _gram(design, bend, row, gram)
+        if not _factored(gram, z, curvature):
+            _weights(eps, nu, _STEPS, False, pulled, bend)
+            _gram(design, bend, row, gram)
+            _factored(gram, z, curvature)
     for a in range(rank):
         value += math.log(curvature[a, a])
-    return k * _log_norm(nu) - value
+    return len(white) * _log_norm(nu) - value
 
 
 @nb.njit(fastmath=_FAST, inline="always")
@@ -163,17 +187,18 @@ def _log_norm(nu: float) -> float:
 
 
 @nb.njit(fastmath=_FAST, inline="always")
-def _energy(white: Array, design: Array, z: Array, nu: float, eps: Array) -> float:
+def _energy(white: Array, design: Array, rank: int, z: Array, nu: float, eps: Array) -> float:
     """Minus the log of the integrand, without constants; fills `eps` (k,)."""
-    rank, k = design.shape
+    k = len(white)
     eps[:] = white
     square = 0.0
     for a in range(rank):
         beyond = max(abs(z[a]) - FARTHEST, 0.0)
         square += z[a] * z[a] + STIFF * beyond * beyond
-        if z[a] != 0.0:
-            for j in range(k):
-                eps[j] -= design[a, j] * z[a]
+    for a in range(0, len(design) if square > 0.0 else 0, 4):
+        one, two, three, four = design[a], design[a + 1], design[a + 2], design[a + 3]
+        for j in range(k):
+            eps[j] -= one[j] * z[a] + two[j] * z[a + 1] + three[j] * z[a + 2] + four[j] * z[a + 3]
     if math.isinf(nu):
         for j in range(k):
             square += eps[j] * eps[j]
@@ -188,51 +213,63 @@ def _energy(white: Array, design: Array, z: Array, nu: float, eps: Array) -> flo
 
 
 @nb.njit(fastmath=_FAST, inline="always")
-def _weights(eps: Array, nu: float, step: int, newton: bool, pull: Array, bend: Array) -> None:
-    """Weights of the gradient (`pull`) and of the curvature (`bend`), (k,); both 1 for the Gaussian."""
+def _weights(eps: Array, nu: float, step: int, newton: bool, pulled: Array, bend: Array) -> None:
+    """What the gradient sums, `pulled`, and weights of the curvature, `bend`, (k,); eps and 1 if Gaussian."""
+    if step == 0 or math.isinf(nu):
+        pulled[:] = eps
+        bend[:] = 1.0
+        return
     for j in range(len(eps)):
-        if step == 0 or math.isinf(nu):
-            pull[j] = bend[j] = 1.0
-        else:
-            square = eps[j] * eps[j]
-            weight = (nu + 1.0) / (nu + square)
-            pull[j] = weight
-            bend[j] = weight * (nu - square) / (nu + square) if newton else weight
+        square = eps[j] * eps[j]
+        weight = (nu + 1.0) / (nu + square)
+        pulled[j] = weight * eps[j]
+        bend[j] = weight * (nu - square) / (nu + square) if newton else weight
 
 
 @nb.njit(fastmath=_FAST, inline="always")
-def _normal_equations(
-    design: Array, z: Array, eps: Array, pull: Array, bend: Array, gradient: Array, curvature: Array
-) -> None:
-    """gradient = G' (pull eps) - z; lower triangle of curvature = I + G' diag(bend) G."""
-    rank, k = design.shape
-    for a in range(rank):
-        total = 0.0
-        for j in range(k):
-            total += design[a, j] * pull[j] * eps[j]
+def _slope(design: Array, z: Array, pulled: Array, gradient: Array) -> None:
+    """gradient = G' pulled - z, and the spring's pull beyond three sd."""
+    for a in range(len(gradient)):
+        row, total = design[a], 0.0
+        for j in range(len(pulled)):
+            total += row[j] * pulled[j]
         beyond = max(abs(z[a]) - FARTHEST, 0.0)
         gradient[a] = total - z[a] - math.copysign(STIFF * beyond, z[a])
-        for b in range(a + 1):
-            total = 0.0
-            if a == b:
-                total = 1.0 + STIFF if beyond > 0.0 else 1.0
+
+
+@nb.njit(fastmath=_FAST, inline="always")
+def _gram(design: Array, bend: Array, row: Array, gram: Array) -> None:
+    """Lower triangle of G' diag(bend) G, four entries at once; `row` (k,) is work."""
+    k = len(row)
+    for a in range(len(gram)):
+        own = design[a]
+        for j in range(k):
+            row[j] = own[j] * bend[j]
+        for b in range(0, a + 1, 4):
+            one, two, three, four = design[b], design[b + 1], design[b + 2], design[b + 3]
+            first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
             for j in range(k):
-                total += design[a, j] * design[b, j] * bend[j]
-            curvature[a, b] = total
+                first += row[j] * one[j]
+                second += row[j] * two[j]
+                third += row[j] * three[j]
+                fourth += row[j] * four[j]
+            gram[a, b], gram[a, b + 1], gram[a, b + 2], gram[a, b + 3] = first, second, third, fourth
 
 
 @nb.njit(inline="always")
-def _cholesky(matrix: Array) -> bool:
-    """Factors the lower triangle in place; False when it is not positive definite."""
-    for a in range(len(matrix)):
+def _factored(gram: Array, z: Array, lower: Array) -> bool:
+    """Fills `lower` with the Cholesky factor of the gram matrix and the prior's curvature; False if none."""
+    for a in range(len(lower)):
         for b in range(a + 1):
-            total = matrix[a, b]
+            total = gram[a, b]
+            if a == b:
+                total += 1.0 + STIFF if abs(z[a]) > FARTHEST else 1.0
             for c in range(b):
-                total -= matrix[a, c] * matrix[b, c]
+                total -= lower[a, c] * lower[b, c]
             if a != b:
-                matrix[a, b] = total / matrix[b, b]
+                lower[a, b] = total / lower[b, b]
             elif total > 0.0:
-                matrix[a, a] = math.sqrt(total)
+                lower[a, a] = math.sqrt(total)
             else:
                 return False
     return True

@@ -25,18 +25,23 @@ class SnookerMove(emcee.moves.red_blue.RedBlueMove):
     """
 
     def get_proposal(self, walkers: Array, complement: list[Array], random: Any) -> tuple[Array, Array]:
-        """Proposals (n, d) for `walkers` (n, d) and the log of their Hastings factors (n,)."""
+        """Proposals (n, d) for `walkers` (n, d) and the log of their Hastings factors (n,).
+
+        A walker that stands where its anchor does, as one put back beside another can, has no line and stays.
+        """
         others = np.concatenate(complement)
         picks = random.random_sample((len(walkers), len(others))).argsort(axis=1)[:, :3]
         anchor, first, second = others[picks.T]
         line = walkers - anchor
         length = np.linalg.norm(line, axis=1)
+        apart = length > 0.0
+        length = np.where(apart, length, 1.0)
         unit = line / length[:, None]
         step = _GAMMA * np.einsum("nd,nd->n", unit, first - second)
         proposal = walkers + step[:, None] * unit
         with np.errstate(divide="ignore"):
             factor = (walkers.shape[1] - 1) * np.log(np.abs(length + step) / length)
-        return proposal, factor
+        return proposal, np.where(apart, factor, -np.inf)
 
 
 class SubspaceMove(emcee.moves.red_blue.RedBlueMove):

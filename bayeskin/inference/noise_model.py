@@ -127,7 +127,8 @@ def noise_chain(binned: BinnedForce, windows: Windows | None = None, omit: int |
         force_n=binned.force_n[bins],
         variance_n2=variance,
         covariance_n2=np.where(starts, 0.0, covariance),
-        gap_s=np.diff(binned.time_s[bins], prepend=binned.time_s[bins[0]]),
+        # Equal gaps are equal to the last bit then, and share one exponential.
+        gap_s=np.round(np.diff(binned.time_s[bins], prepend=binned.time_s[bins[0]]), 12),
         starts=starts,
         kind=np.array(of_kind, dtype=np.int64),
         kinds=kinds,

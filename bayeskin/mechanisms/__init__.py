@@ -11,7 +11,7 @@ import pkgutil
 from importlib.metadata import entry_points
 
 from bayeskin.errors import InputError
-from bayeskin.mechanisms.mechanism import Mechanism, bin_means, laws, observed, solved
+from bayeskin.mechanisms.mechanism import Bins, Mechanism, bin_means, laws, observed, solved
 
 ENTRY_POINTS = "bayeskin.mechanisms"
 
@@ -31,4 +31,4 @@ def catalogue() -> dict[str, Mechanism]:
     return {m.name: m for m in sorted(found, key=lambda m: m.name)}
 
 
-__all__ = ["ENTRY_POINTS", "Mechanism", "bin_means", "catalogue", "laws", "observed", "solved"]
+__all__ = ["ENTRY_POINTS", "Bins", "Mechanism", "bin_means", "catalogue", "laws", "observed", "solved"]

@@ -72,9 +72,7 @@ def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
     """The shortcut of `series`."""
-    gap = values["gap"]
-    none = np.zeros_like(gap)
-    return lost_in_series(motion, force, gap, values["frame_compliance"], none, none)
+    return lost_in_series(motion, force, gap_m=values["gap"], compliance=values["frame_compliance"])
 
 
 MECHANISM = Mechanism(

@@ -14,8 +14,11 @@ Source: P. Dahl, A solid friction model, Aerospace Corp. TOR-158(3107-18), 1968.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from bayeskin.mechanisms.lines import stretch_of, strict
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
 from bayeskin.types import Array, PadMotion, Parameter
 
@@ -31,11 +34,23 @@ def friction(
     for j, lasts_s in enumerate(np.diff(motion.time_s)):
         at_corner.append(ends[:, j] + (at_corner[-1] - ends[:, j]) * np.exp(-rate[:, j] * lasts_s))
     began = np.stack(at_corner[:-1], axis=1)
-    time_s = np.broadcast_to(time_s, (len(sliding_n), np.shape(time_s)[-1]))
-    stretch = np.clip(np.searchsorted(motion.time_s, time_s, side="right") - 1, 0, len(speed) - 1)
-    rate, ends, began = (np.take_along_axis(values, stretch, axis=1) for values in (rate, ends, began))
-    since_s = np.maximum(time_s - motion.time_s[stretch], 0.0)
-    return np.asarray(ends + (began - ends) * np.exp(-rate * since_s))
+    times = np.ascontiguousarray(np.atleast_2d(time_s))
+    out = np.empty((len(sliding_n), times.shape[1]))
+    _relax(motion.time_s, rate, ends, began, times, out)
+    return out
+
+
+@strict
+def _relax(corner_s, rate, ends, began, times, out):  # type: ignore[no-untyped-def]
+    """Fills out (n, t) from what each stretch (n, k-1) begins at and tends to, at times (1 or n, t)."""
+    for i in range(out.shape[0]):
+        row, left = times[i if len(times) > 1 else 0], 0
+        for j in range(out.shape[1]):
+            left = stretch_of(corner_s, left, row[j])
+            start, end = began[i, left], ends[i, left]
+            if rate[i, left] > 0.0:
+                start = end + (start - end) * math.exp(-rate[i, left] * max(row[j] - corner_s[left], 0.0))
+            out[i, j] = start
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:

@@ -13,6 +13,7 @@ from enum import IntEnum
 
 import numpy as np
 
+from bayeskin.mechanisms.lines import bin_integrals
 from bayeskin.model.tissue import Bind
 from bayeskin.types import Array, PadMotion, Parameter
 
@@ -48,9 +49,14 @@ class Instrument:
 
 @dataclass(frozen=True)
 class Tissue:
-    """What a tissue mechanism does to the full model."""
+    """What a tissue mechanism does to the full model.
+
+    estimate : of the force with it, from the force without, in closed form; where there is one, surrogates
+        learn only what it leaves
+    """
 
     bind: Bind
+    estimate: Observe | None = None
 
 
 @dataclass(frozen=True)
@@ -103,14 +109,26 @@ def added(force: ForceOfTime, more: ForceOfTime) -> ForceOfTime:
     return lambda time_s: np.asarray(force(time_s) + more(time_s))
 
 
+class Bins:
+    """Means of forces over the bins between edges_s (m+1,), exact to high order between corners."""
+
+    def __init__(self, motion: PadMotion, edges_s: Array) -> None:
+        inside = motion.time_s[(motion.time_s > edges_s[0]) & (motion.time_s < edges_s[-1])]
+        cuts = np.union1d(edges_s, inside)
+        abscissa, weight = np.polynomial.legendre.leggauss(GAUSS_POINTS)
+        self._width, self._weight, self._lasts_s = np.diff(cuts), 0.5 * weight, np.diff(edges_s)
+        self._time_s = (cuts[:-1, None] + 0.5 * self._width[:, None] * (1.0 + abscissa)).ravel()
+        self._first = np.searchsorted(cuts, edges_s)
+
+    def means(self, force: ForceOfTime) -> Array:
+        """Of a force, (n, m)."""
+        found = np.ascontiguousarray(force(self._time_s)).reshape(-1, len(self._width), GAUSS_POINTS)
+        integral = np.empty((len(found), len(self._lasts_s)))
+        bin_integrals(found, self._weight, self._width, self._first, integral)
+        integral /= self._lasts_s
+        return integral
+
+
 def bin_means(force: ForceOfTime, motion: PadMotion, edges_s: Array) -> Array:
-    """Means (n, m) of a force over the bins between edges_s (m+1,), exact between corners to high order."""
-    inside = motion.time_s[(motion.time_s > edges_s[0]) & (motion.time_s < edges_s[-1])]
-    cuts = np.union1d(edges_s, inside)
-    abscissa, weight = np.polynomial.legendre.leggauss(GAUSS_POINTS)
-    width = np.diff(cuts)
-    time_s = (cuts[:-1, None] + 0.5 * width[:, None] * (1.0 + abscissa)).ravel()
-    found = force(time_s).reshape(-1, len(width), GAUSS_POINTS)
-    integral = (found @ (0.5 * weight)) * width
-    first = np.searchsorted(cuts, edges_s[:-1])
-    return np.asarray(np.add.reduceat(integral, first, axis=1) / np.diff(edges_s))
+    """Means (n, m) of a force over the bins between edges_s (m+1,), of one force only."""
+    return Bins(motion, edges_s).means(force)

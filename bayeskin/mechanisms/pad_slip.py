@@ -43,9 +43,7 @@ def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
     """The shortcut of `series`."""
-    rate = values["slip_rate"]
-    none = np.zeros_like(rate)
-    return lost_in_series(motion, force, none, none, rate, values["slip_threshold"])
+    return lost_in_series(motion, force, rate=values["slip_rate"], threshold_n=values["slip_threshold"])
 
 
 MECHANISM = Mechanism(

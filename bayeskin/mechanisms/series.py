@@ -1,6 +1,7 @@
 """What lies between drive and skin, on the force of a surrogate: a shortcut for what the full model solves.
 
-The skin sees p - s: p trails the drive u behind a gap, s is what yields (compliance) and what has slipped.
+The skin sees p - s: p trails the drive u behind a gap, s is what yields at once (compliance) or slowly
+(recovery, a Kelvin-Voigt element), and what has slipped.
 Its force is taken to follow the displacement at once,
 
     F[p - s](t) = F[u](t) + G(p(t) - s(t)) - G(u(t)) ,
@@ -12,11 +13,13 @@ memory; the full model tells what else there is to it.
 
 from __future__ import annotations
 
+import numba
 import numpy as np
+from numpy.typing import ArrayLike
 
-from bayeskin.mechanisms.mechanism import ForceOfTime
-from bayeskin.model.assembly import compiled
-from bayeskin.types import Array, PadMotion
+from bayeskin.mechanisms.lines import interpolated, strict
+from bayeskin.mechanisms.mechanism import ForceOfTime, added
+from bayeskin.types import PadMotion
 
 STEPS_A_PHASE = 100
 GRID = 33  # displacements at which G is tabulated
@@ -26,15 +29,20 @@ ITERATIONS = 8  # of a force and what it makes lost, which changes it by some te
 def lost_in_series(
     motion: PadMotion,
     force: ForceOfTime,
-    gap_m: Array,
-    compliance: Array,
-    rate: Array,
-    threshold_n: Array,
+    gap_m: ArrayLike = 0.0,
+    compliance: ArrayLike = 0.0,
+    rate: ArrayLike = 0.0,
+    threshold_n: ArrayLike = 0.0,
+    recovery: ArrayLike = 0.0,
+    recovery_s: ArrayLike = 1.0,
 ) -> ForceOfTime:
-    """The force behind a gap [m], a compliance [m/N], and slip [m/(N s)] beyond a threshold; all (n,)."""
+    """The force behind a gap [m], a compliance [m/N], slip [m/(N s)] beyond a threshold, and a compliance
+    [m/N] that yields and returns over a time [s]; each (n,) or one for all."""
+    given = np.broadcast_arrays(gap_m, compliance, rate, threshold_n, recovery, recovery_s)
+    elements = [np.array(np.atleast_1d(one), dtype=float) for one in given]
     steps = np.linspace(motion.time_s[:-1], motion.time_s[1:], STEPS_A_PHASE, endpoint=False).T.ravel()
     grid_s = np.append(steps, motion.time_s[-1])
-    u, n = motion.at(grid_s), len(gap_m)
+    u, n = motion.at(grid_s), len(elements[0])
     rising = np.flatnonzero(np.diff(motion.displacement_m) > 0.0)
     first = int(rising[0]) if len(rising) else 0
     start, end = motion.time_s[first : first + 2]
@@ -44,47 +52,60 @@ def lost_in_series(
     change = np.zeros_like(free)
     _march(
         free, u, np.diff(grid_s), np.ascontiguousarray(np.broadcast_to(table, (n, GRID))), float(low),
-        float(max(high - low, 1e-9)), gap_m, compliance, rate, threshold_n, float(np.ptp(u)), change,
+        float(max(high - low, 1e-9)), *elements, float(np.ptp(u)), change,  # type: ignore[call-arg]
     )  # fmt: skip
 
-    def reported(time_s: Array) -> Array:
-        each = np.broadcast_to(time_s, (n, np.shape(time_s)[-1]))
-        place = np.clip(np.searchsorted(grid_s, each, side="right") - 1, 0, len(grid_s) - 2)
-        share = np.clip((each - grid_s[place]) / np.diff(grid_s)[place], 0.0, 1.0)
-        left, right = (np.take_along_axis(change, place + one, axis=1) for one in (0, 1))
-        return np.asarray(force(time_s) + left + share * (right - left))
-
-    return reported
+    return added(force, lambda time_s: interpolated(grid_s, change, time_s))
 
 
-@compiled
-def _march(free, u, elapsed, table, low, width, gap, compliance, rate, threshold, reach, change):
-    """Fills change (n, k) of the forces `free` (n, k) at drive displacements u (k,)."""
-    for i in range(free.shape[0]):
-        behind, slip, before = u[0], 0.0, free[i, 0]
-        for k in range(1, free.shape[1]):
-            behind = max(u[k] - gap[i], min(u[k], behind))
-            rest = _interpolated(table[i], (u[k] - low) / width)
-            added, slid = change[i, k - 1], slip
-            for _ in range(ITERATIONS):
-                now = free[i, k] + added
-                slid = slip + rate[i] * elapsed[k - 1] * mean_beyond(before, now, threshold[i])
-                slid = min(max(slid, -reach), reach)
-                lost = min(max(slid + compliance[i] * now, -reach), reach)
-                added = _interpolated(table[i], (behind - lost - low) / width) - rest
-            slip, before = slid, free[i, k] + added
-            change[i, k] = added
+@strict
+def _march(
+    free, u, elapsed, table, low, width, gap, compliance, rate, threshold, recovery, recovery_s, reach, change
+):  # fmt: skip
+    """Fills change (n, k) of the forces `free` (n, k) at drive displacements u (k,).
+
+    Rows side by side, because each waits for its own last iteration.
+    """
+    n = free.shape[0]
+    scale = (table.shape[1] - 1) / width
+    behind, slip, before, rest = np.full(n, u[0]), np.zeros(n), free[:, 0].copy(), np.empty(n)
+    added, slid, yielded, slow = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    keep, phi = np.zeros(n), np.zeros(n)
+    for k in range(1, free.shape[1]):
+        for i in range(n):
+            behind[i] = max(u[k] - gap[i], min(u[k], behind[i]))
+            rest[i] = _interpolated(table, i, (u[k] - low) * scale)
+            if recovery[i] != 0.0:
+                z = elapsed[k - 1] / recovery_s[i]
+                keep[i], phi[i] = np.exp(-z), -np.expm1(-z) / z
+        for _ in range(ITERATIONS):
+            moved = False
+            for i in range(n):
+                now, last = free[i, k] + added[i], added[i]
+                if rate[i] != 0.0:
+                    more = rate[i] * elapsed[k - 1] * mean_beyond(before[i], now, threshold[i])
+                    slid[i] = min(max(slip[i] + more, -reach), reach)
+                if recovery[i] != 0.0:
+                    mean = (phi[i] - keep[i]) * before[i] + (1.0 - phi[i]) * now
+                    slow[i] = keep[i] * yielded[i] + recovery[i] * mean
+                lost = min(max(slid[i] + slow[i] + compliance[i] * now, -reach), reach)
+                added[i] = _interpolated(table, i, (behind[i] - lost - low) * scale) - rest[i]
+                moved |= added[i] != last
+            if not moved:  # to the last bit: no iteration changes them any more
+                break
+        for i in range(n):
+            slip[i], yielded[i], before[i] = slid[i], slow[i], free[i, k] + added[i]
+            change[i, k] = added[i]
 
 
-@compiled
-def _interpolated(table, place):
-    """Of a table over [0, 1], straight on beyond it."""
-    place *= len(table) - 1
-    left = min(max(int(np.floor(place)), 0), len(table) - 2)
-    return table[left] + (place - left) * (table[left + 1] - table[left])
+@numba.njit(inline="always")
+def _interpolated(table, i, place):
+    """Of row i of a table (n, g) at `place` in 0..g-1, straight on beyond it."""
+    left = min(max(int(place), 0), table.shape[1] - 2)
+    return table[i, left] + (place - left) * (table[i, left + 1] - table[i, left])
 
 
-@compiled
+@strict
 def mean_beyond(before, now, threshold):
     """Mean of sgn(F) max(|F| - threshold, 0) along a straight line between two forces."""
     total = 0.0

@@ -7,6 +7,8 @@ straight from F_0 to F_1, with z = h / tau and phi = (1 - e^-z) / z,
 
     s_1 = e^-z s_0 + c [ (phi - e^-z) F_0 + (1 - phi) F_1 ] .
 
+It is tissue, but acts as the instrument's series elements do, between pads and skin.
+
 Stiffness from 0.5 N/mm on; recovery over seconds to minutes: Wan Abas & Barbenel, J. Biomed. Eng. 4 (1982),
 33-38.
 """
@@ -17,10 +19,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bayeskin.mechanisms.mechanism import Mechanism, Tissue
+from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values
+from bayeskin.mechanisms.series import lost_in_series
 from bayeskin.model.problem import Problem
 from bayeskin.model.tissue import SeriesElement, TissueLaw
-from bayeskin.types import Array, Parameter
+from bayeskin.types import Array, PadMotion, Parameter
 
 
 class KelvinVoigt(SeriesElement):
@@ -48,6 +51,12 @@ def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
     return SlowRecovery(values["recovery_compliance"], values["recovery_time"])
 
 
+def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
+    """The shortcut of `series`."""
+    slow, time_s = values["recovery_compliance"], values["recovery_time"]
+    return lost_in_series(motion, force, recovery=slow, recovery_s=time_s)
+
+
 MECHANISM = Mechanism(
     name="slow-recovery",
     parameters=(
@@ -69,5 +78,5 @@ MECHANISM = Mechanism(
         f"{v['recovery_time']:.0f} s, and returns as slowly."
     ),
     group=("slow-recovery", "preconditioning", "pad-slip"),
-    act=Tissue(bind),
+    act=Instrument(Place.PADS, observe, bind, adds=False),
 )

@@ -10,6 +10,9 @@ Over a time h in which S_e goes straight from S_0 to S_1, with z = h / tau and p
 
 so that a step of the stretch relaxes by its exponential whatever the steps in time.
 
+Of the force F without branches, all points stretched alike by l = 1 + u / 2 L between the pads, S goes as
+F / l, and what the branches add is near l times what they make of F / l (`estimate`).
+
 Source: Simo, Comput. Methods Appl. Mech. Eng. 60 (1987), 153-173; recursion as Taylor, Pister & Goudreau,
 Int. J. Numer. Methods Eng. 2 (1970), 45-59.
 """
@@ -22,11 +25,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from bayeskin.mechanisms.elastic import elastic_stress, scale_elastic
-from bayeskin.mechanisms.mechanism import Mechanism, Tissue
+from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Tissue, Values
 from bayeskin.model.assembly import Chunk, compiled, inverse_and_determinant
+from bayeskin.model.lagrangian import PAD_EDGE_M
 from bayeskin.model.problem import Problem
 from bayeskin.model.tissue import Passage, Rank, TissueLaw
-from bayeskin.types import Array, Parameter
+from bayeskin.types import Array, PadMotion, Parameter
+
+STEPS_A_PHASE = 100
 
 
 @compiled
@@ -116,6 +122,46 @@ def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
     return Relaxation([values["g_1"], values["g_2"]], [values["tau_1"], values["tau_2"]])
 
 
+def estimate(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
+    """The force with branches on F / l, straight between the steps of a grid."""
+    steps = np.linspace(motion.time_s[:-1], motion.time_s[1:], STEPS_A_PHASE, endpoint=False).T.ravel()
+    grid_s = np.append(steps, motion.time_s[-1])
+    elapsed = np.diff(grid_s)
+    strength = np.stack([values["g_1"], values["g_2"]], axis=1)
+    tau_s = np.stack([values["tau_1"], values["tau_2"]], axis=1)
+    stress = np.broadcast_to(force(grid_s) / _stretch(motion, grid_s), (len(strength), len(grid_s)))
+    rate = np.diff(stress, axis=1) / elapsed
+    left = np.zeros((len(strength), len(grid_s), 2))
+    remember(np.ascontiguousarray(rate), elapsed, strength, tau_s, left)
+
+    def reported(time_s: Array) -> Array:
+        place = np.clip(np.searchsorted(grid_s, time_s, side="right") - 1, 0, len(elapsed) - 1)
+        rows = np.arange(len(strength))[:, None]
+        place = np.broadcast_to(place, (len(rows), np.shape(time_s)[-1]))
+        keep = np.exp(-(time_s - grid_s[place])[..., None] / tau_s[:, None])
+        grown = (strength * tau_s)[:, None] * rate[rows, place][..., None] * (1.0 - keep)
+        more = np.sum(keep * left[rows, place] + grown, axis=2)
+        return np.asarray(force(time_s) + _stretch(motion, time_s) * more)
+
+    return reported
+
+
+@compiled
+def remember(rate, elapsed, strength, tau_s, left):
+    """Fills left (n, k, b), the branches' share at each time, of stresses that change by rate (n, k - 1)."""
+    for i in range(rate.shape[0]):
+        for b in range(strength.shape[1]):
+            for k in range(rate.shape[1]):
+                keep = np.exp(-elapsed[k] / tau_s[i, b])
+                grown = strength[i, b] * tau_s[i, b] * rate[i, k] * (1.0 - keep)
+                left[i, k + 1, b] = keep * left[i, k, b] + grown
+
+
+def _stretch(motion: PadMotion, time_s: Array) -> Array:
+    """Mean stretch of the skin between the plane of symmetry and the pad's near edge."""
+    return np.asarray(1.0 + 0.5 * motion.at(time_s) / PAD_EDGE_M)
+
+
 MECHANISM = Mechanism(
     name="solid-viscoelasticity",
     parameters=(
@@ -131,6 +177,6 @@ MECHANISM = Mechanism(
         f"{100 * v['g_2']:.0f} % within {v['tau_2']:.2g} s."
     ),
     group=("solid-viscoelasticity", "strain-dependent-permeability", "friction-creep"),
-    act=Tissue(bind),
+    act=Tissue(bind, estimate),
     parts=(("g_1", "tau_1"), ("g_2", "tau_2")),
 )

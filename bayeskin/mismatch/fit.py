@@ -7,7 +7,9 @@ expected information I of the likelihood at the best point u*, its eigenvalues l
 
 so that a direction that the data does not inform costs nothing, and one that they do costs the share of the
 prior that they leave (Tierney & Kadane 1986, JASA 81:82; what follows where l = 0 is exact). A coordinate
-on its bound, toward which the density rises by g, has int_0^1 exp(-g t - l t^2 / 2) dt instead.
+on its bound, toward which the density rises by g, has int_0^1 exp(-g t - l t^2 / 2) dt instead. Where the
+density along a coordinate, the others held, has less room than the Gaussian of its information says (a step
+whose moment falls between two bins; a bound near by), both evidence and covariance shrink by that share.
 
 The noise of a diagnosis is what an instrument does from moment to moment: its sd is bounded by what the
 recording shows within bins, and it forgets within seconds. What is larger or lasts longer is for physics to
@@ -294,4 +296,20 @@ def _evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
     covariance[np.ix_(free, free)] = (vectors / np.maximum(values, 12.0)) @ vectors.T
     away = np.trapezoid(density * t**2, t, axis=1) / mass  # mean square, from the bound
     covariance[held, held] = away
-    return log_evidence, covariance
+    share = np.ones(len(unit))
+    for i in np.flatnonzero(free[: log_posterior.surrogate.space.dim]):
+        gaussian = np.sqrt(2.0 * np.pi / (max(top.information[i, i], 0.0) + 2.0 * np.pi))
+        share[i] = min(_room(log_posterior, top, unit, int(i)) / gaussian, 1.0)
+    return log_evidence + float(np.sum(np.log(share))), covariance * np.outer(share, share)
+
+
+def _room(log_posterior: LogPosterior, top: Top, unit: Array, i: int) -> float:
+    """Integral over one coordinate of the unit cube of the density relative to the top's, the others held."""
+    low, high = log_posterior.bounds
+    away = np.logspace(-5.0, 0.0, 26)
+    places = np.unique(np.clip(np.concatenate([unit[i] - away, unit[i : i + 1], unit[i] + away]), 0.0, 1.0))
+    points = np.repeat(unit[None], len(places), axis=0)
+    points[:, i] = places
+    points = np.clip(low + points * (high - low), low, high)
+    values = log_posterior.log_prob(points) - top.value
+    return float(np.trapezoid(np.exp(np.minimum(values, 0.0)), places))

@@ -3,7 +3,9 @@
 A set's weight is its evidence times the prior of its size, every mechanism being there with the probability
 `PRIOR`. In each step the others are ordered by what they promise beside those taken (a score test), and the
 most promising are tried; then each taken one is left out again, so that what a later one has made needless
-goes. The first step tries all, those that promise less by one climb each.
+goes. The first step tries all, those that promise less by one climb each. Where the noise of the best set is
+still as large as it may be, much is left: then other paths are followed, from single mechanisms that it does
+not have.
 
 Probabilities are shares of weight over all sets
 that were tried: those of sets never tried count as nothing.
@@ -24,6 +26,8 @@ from bayeskin.mismatch.fit import Fit, fit, fit_base, promised
 PRIOR = 0.05  # of a mechanism to be at work, before the recording is seen
 MOST = 8  # steps
 SHORTLIST = 5  # mechanisms of a step that are tried thoroughly
+PATHS = 4  # at most
+AT_BOUND = 0.999  # of the noise's range
 ONLY_WITH = {"friction-creep": "device-friction"}
 
 Build = Callable[[Sequence[str]], LogPosterior]  # the posterior with a set of mechanisms
@@ -92,27 +96,48 @@ def search(
 
         return kept(key, make)
 
-    found = Search({})
-    kept((), lambda: fit_base(alone, seed, straight))
-    for size in range(1, MOST + 1):
-        current = found.best
+    def step(current: Fit, label: str) -> Fit:
+        """The best of the sets with one mechanism more, or `current` where none has more weight."""
         sets = {name: _with(current.names, name) for name in known if name not in current.names}
         promises = {
             name: promised(build(names), current.theta, neutral, _new(known, names, current.names), seed)
             for name, names in sets.items()
         }
         order = sorted(sets, key=lambda name: -promises[name])
-        tries = order if size == 1 else order[:SHORTLIST]
+        tries = order if not current.names else order[:SHORTLIST]
+        fits = [current]
         for count, name in enumerate(tries):
-            one = tried(sets[name], current, count < SHORTLIST)
+            fits.append(tried(sets[name], current, count < SHORTLIST))
             if progress:
-                note = f"{name}: {one.log_evidence - current.log_evidence:+.1f} nats"
-                progress((count + 1) / len(tries), f"mechanism {size}: {note}")
-        while len(found.best.names) > 1 and (leaner := _leaner(found.best, tried)) is not None:
-            found.fits[leaner.names] = leaner
-        if found.best is current:
+                note = f"{name}: {fits[-1].log_evidence - current.log_evidence:+.1f} nats"
+                progress((count + 1) / len(tries), f"{label}: {note}")
+        return max(fits, key=weight)
+
+    def path(current: Fit, label: str) -> None:
+        for size in range(len(current.names) + 1, MOST + 1):
+            ahead = step(current, f"{label}, mechanism {size}")
+            if ahead is current:
+                return
+            current = ahead
+            while len(current.names) > 1 and (leaner := _leaner(current, tried)) is not None:
+                current = leaner
+
+    found = Search({})
+    path(kept((), lambda: fit_base(alone, seed, straight)), "path 1")
+    singles = sorted((one for one in found.fits.values() if len(one.names) == 1), key=weight, reverse=True)
+    for count in range(2, PATHS + 1):
+        starts = [one for one in singles[1:] if not set(one.names) <= set(found.best.names)]
+        if not _much_left(found.best) or not starts:
             break
+        singles.remove(starts[0])
+        path(starts[0], f"path {count}")
     return found
+
+
+def _much_left(best: Fit) -> bool:
+    """Whether the noise of some kind of phase is as large as it may be."""
+    names = best.log_posterior.names
+    return any(best.unit[i] > AT_BOUND for i, name in enumerate(names) if name.startswith("sd_"))
 
 
 def _new(

@@ -1,9 +1,9 @@
 """What a search says: nothing missing, named mechanisms, or unknown.
 
 A mechanism is named where it, or its group of look-alikes together, has nine chances in ten, and leaving it
-out costs more than the full model's own error, if what is named explains more than half of the squared
-residual beyond what is allowed. Nothing is missing where none is named and no window is found, or what goes
-beyond the allowed is within the model's own error. Otherwise the mismatch is unknown.
+out of its set costs more than the full model's own error, if no window is left or what is named explains nine
+tenths of the squared residual beyond what is allowed. Nothing is missing where none is named and no window is
+found, or what goes beyond the allowed is within the model's own error. Otherwise the mismatch is unknown.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from bayeskin.mismatch.locate import Located, model_error
 from bayeskin.mismatch.search import Search, weight
 
 PROBABLE = 0.9
-EXPLAINED = 0.5
+EXPLAINED = 0.9
 NOTICEABLE = 2.0  # of the full model's own error
 
 
@@ -28,7 +28,7 @@ NOTICEABLE = 2.0  # of the full model's own error
 class Named:
     """One mechanism of the best set: probabilities of itself and of its group, parameters' means and sds.
 
-    explains_n : RMS of what no likely set without it explains
+    explains_n : RMS of what the set explains and would not without it
     """
 
     name: str
@@ -71,8 +71,12 @@ def _rms(found: Fit) -> float:
 
 
 def explains(found: Search, name: str) -> float:
-    """RMS [N] of what the best set explains and the likeliest set tried without `name` does not."""
-    without = max((one for one in found.fits.values() if name not in one.names), key=weight)
+    """RMS [N] of what the best set explains and the likeliest of its subsets tried without `name` does not.
+
+    What another mechanism could explain in its place is for the probabilities to say.
+    """
+    rest = set(found.best.names) - {name}
+    without = max((one for one in found.fits.values() if set(one.names) <= rest), key=weight)
     return float(np.sqrt(max(_rms(without) ** 2 - _rms(found.best) ** 2, 0.0)))
 
 

@@ -159,8 +159,8 @@ class NewtonSolver:
             trial = x.copy()
             trial[free] += steps[-1] / equations.weight
             right = self._residual(equations, trial)
-            if right is None:
-                return (self._damped(equations, x, steps[-1] / equations.weight) if fresh else None), False
+            if right is None or (fresh and iteration == 0 and self._grows(equations, steps[0], right)):
+                return (self._damped(equations, x, steps[-1]) if fresh else None), False
             x = trial
             if size < 1.0:
                 self.last_residual = float(np.abs(right).max())
@@ -179,13 +179,24 @@ class NewtonSolver:
         last = steps[-1]
         return z / (1.0 - (last @ z) / (last @ last))
 
+    def _grows(self, equations: Equations, step: Array, right: Array, damping: float = 1.0) -> bool:
+        """Whether the same tangent asks for a longer step after this one than before it."""
+        after = -self.back_substitute(right) * equations.weight
+        allowed = (1.0 - 0.25 * damping) if damping < 1.0 else 1.0
+        return not float(np.linalg.norm(after)) <= allowed * float(np.linalg.norm(step))
+
     def _damped(self, equations: Equations, x: Array, step: Array) -> Array | None:
-        """The first of x + step/2, /4, ... that keeps every cell upright, or None."""
+        """The first of x + step/2, /4, ... after which cells are upright and steps shorter, or None.
+
+        The natural monotonicity test: P. Deuflhard, Newton Methods for Nonlinear Problems, Springer 2004,
+        section 3.3. step (free,) in units of the tolerance.
+        """
         damping = 0.5
         while damping >= SMALLEST_DAMPING:
             trial = x.copy()
-            trial[equations.free] += damping * step
-            if self._residual(equations, trial) is not None:
+            trial[equations.free] += damping * step / equations.weight
+            right = self._residual(equations, trial)
+            if right is not None and not self._grows(equations, step, right, damping):
                 return trial
             damping *= 0.5
         return None

@@ -13,31 +13,51 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import bayeskin
-from bayeskin import inference, report, storage
+from bayeskin import inference, storage
 from bayeskin.config import Config, RecordingConfig, SurrogateConfig
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import Instrument
+from bayeskin.mismatch.contributions import contributions
+from bayeskin.mismatch.discrepancy import discrepancy
 from bayeskin.mismatch.fit import Fit, instrument_noise, restored, stored, surrogate_limit
+from bayeskin.mismatch.form import propose_form
+from bayeskin.mismatch.full_fit import FullFit, fit_full
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.search import Build, Search, search
-from bayeskin.mismatch.verdict import judge
+from bayeskin.mismatch.verdict import Diagnosis, judge
 from bayeskin.pipeline import design, recording, training
+from bayeskin.pipeline.diagnosis_outputs import (
+    Found,
+    FullResult,
+    Remainder,
+    candidates,
+    draw,
+    in_words,
+    mechanism,
+    unexplained,
+    window,
+)
 from bayeskin.pipeline.effects import effect_files, effects_of
 from bayeskin.pipeline.engine import Reporter, Run, Silent, Stage, open_run, run_stages
 from bayeskin.pipeline.folder import plain, sha256_of, write_json
+from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
+from bayeskin.pipeline.reported import FullForce
 from bayeskin.pipeline.shipping import shipped_for
 from bayeskin.pipeline.training import base_surrogate
 from bayeskin.recordings import read_recording, segment
 from bayeskin.surrogates import Effect, with_effects
 from bayeskin.types import Array, BinnedForce, PadMotion, Surrogate
-from bayeskin.workers import run_parallel
+from bayeskin.workers import Lost, run_parallel
+
+FULL_RUNS = 5  # of the full model, at most, to take up a fit of the surrogate
 
 
 @dataclass(frozen=True)
@@ -74,7 +94,7 @@ def diagnose(source: Path, reporter: Reporter) -> dict[str, Any]:
     stages = {stage.name: stage for stage in (recording.STAGE, design.STAGE, training.STAGE, STAGE)}
     outcome = run_stages(opened, stages)[-1]
     answer = {**outcome.record.summary, "ok": outcome.ok, "folder": opened.folder / STAGE.name}
-    text = _in_words(answer) if outcome.record.done else f"{outcome.stage}: failed: {answer['message']}"
+    text = in_words(answer) if outcome.record.done else f"{outcome.stage}: failed: {answer['message']}"
     return plain({**answer, "text": text})
 
 
@@ -107,24 +127,61 @@ def _work(run: Run) -> Mapping[str, Any]:
     begun = None if split_s is None else _searched(bench, split_s)
     before, after = (locate(one, whole.best.theta, run.config.seed) for one in (whole.base, whole.best))
     found = judge(whole, bench.known, before, after)
-    answer = {
+    parts = contributions(whole.best, partial(bench.posterior, None))
+    remainder = _remainder(bench, found, whole.best, after)
+    full = _full_fits(run, [whole.base, whole.best])
+    answer: dict[str, Any] = {
         "verdict": found.verdict,
-        "located": [_window(one) for one in before.windows],
-        "remaining": [_window(one) for one in after.windows],
+        "located": [window(one) for one in before.windows],
+        "remaining": [window(one) for one in after.windows],
         "explained": found.explained,
-        "mechanisms": [_mechanism(one) for one in found.named],
-        "candidates": _candidates(whole, bench.known),
+        "mechanisms": [mechanism(one, parts) for one in found.named],
+        "unexplained": None if remainder is None else unexplained(remainder),
+        "candidates": candidates(whole, bench.known),
         "fit": {
-            "before": _fit(bench, whole.base, begun.base if begun else None, split_s),
-            "after": _fit(bench, whole.best, begun.best if begun else None, split_s),
+            "before": _fit(bench, whole.base, full[0], begun.base if begun else None, split_s),
+            "after": _fit(bench, whole.best, full[1], begun.best if begun else None, split_s),
         },
         "best_set": list(whole.best.names),
         "held_out_set": list(begun.best.names) if begun else [],
         "seconds": time.monotonic() - started,
     }
     write_json(run.at(STAGE.name, "diagnosis.json"), answer)
-    figures = _draw(bench, whole, before, after, answer)
+    figures = draw(
+        run.folder / STAGE.name, caption(run), bench.binned, bench.motion,
+        Found(whole, full, before, after, parts, remainder), answer["candidates"],
+    )  # fmt: skip
     return {**answer, "figures": [figure.name for figure in figures]}
+
+
+def _remainder(bench: Workbench, found: Diagnosis, best: Fit, after: Located) -> Remainder | None:
+    """What is left, where the mismatch is unknown or windows remain beside what is named."""
+    if found.verdict == "nothing-missing" or (found.verdict == "named" and not after.windows):
+        return None
+    motion, seed = bench.motion, bench.run.config.seed
+    return Remainder(discrepancy(best, motion), propose_form(best, motion, seed))
+
+
+def _full_fits(run: Run, fits: Sequence[Fit]) -> list[FullResult]:
+    """Each fit taken up by the full model itself; for the article's observation none."""
+    if run.config.model.observation != "reaction":
+        return [None] * len(fits)
+    run.reporter.log("the full model without and with what was found")
+    cases = [(one.names, dict(one.theta)) for one in fits]
+    found = dict(run_parallel(partial(_fit_full_apart, run.config_path), cases, len(fits)))
+    return [one.reason if isinstance(one := found[i], Lost) else one for i in range(len(fits))]
+
+
+def _fit_full_apart(source: Path, case: tuple[Sequence[str], Mapping[str, float]]) -> FullFit | str:
+    """In a process of its own: mechanisms have no copies."""
+    bench, (names, theta) = _workbench(_opened(source, Silent())), case
+    run_it = FullForce(model_spec(bench.run), bench.motion, bench.binned.edges_s)
+    beyond = [bench.known[name] for name in names if bench.known[name].act.bind is None]
+    exact = [p.name for mechanism in beyond for p in mechanism.parameters]
+    return fit_full(
+        bench.posterior(None, names), theta, lambda point: run_it((names, point)), exact, FULL_RUNS,
+        bench.run.config.seed,
+    )  # fmt: skip
 
 
 def _search_beside(run: Run, split_s: float) -> threading.Thread:
@@ -189,58 +246,9 @@ def _end_of_second_hold(binned: BinnedForce) -> float | None:
     return holds[1].end_s if len(holds) > 2 else None
 
 
-def _window(one: Any) -> dict[str, Any]:
-    return {
-        "t0": one.start_s, "t1": one.end_s, "phase": one.phase, "cycle": one.cycle,
-        "mean_residual": one.mean_n, "significance": one.significance,
-    }  # fmt: skip
-
-
-def _mechanism(one: Any) -> dict[str, Any]:
-    parameters = {
-        name: {"mean": mean, "sd": sd, "unit": unit} for name, (mean, sd, unit) in one.parameters.items()
-    }
-    return {
-        "name": one.name, "probability": one.probability, "group": list(one.group),
-        "group_probability": one.group_probability, "explains_n": one.explains_n,
-        "parameters": parameters, "statement": one.statement,
-    }  # fmt: skip
-
-
-def _candidates(found: Search, known: Mapping[str, Mechanism]) -> list[dict[str, Any]]:
-    """Each mechanism added to the base alone: gain of log evidence, and the standard error of that sum."""
-    rows = []
-    for name in known:
-        one = next((f for f in found.fits.values() if name in f.names and len(f.names) <= 2), None)
-        if one is None:
-            continue
-        rows.append(
-            {
-                "name": name,
-                "delta_score": one.log_evidence - found.base.log_evidence,
-                "standard_error": _score_error(found.base, one),
-            }
-        )
-    return sorted(rows, key=lambda row: -float(row["delta_score"]))
-
-
-def _score_error(base: Fit, one: Fit) -> float:
-    """Of a difference of log likelihoods, from its scatter over the phases."""
-    differences = _blocks(one) - _blocks(base)
-    return float(np.sqrt(len(differences)) * differences.std(ddof=1)) if len(differences) > 1 else 0.0
-
-
-def _blocks(found: Fit) -> Array:
-    log_posterior = found.log_posterior
-    return log_posterior.block_log_likelihood(_theta(found))[0]
-
-
-def _theta(found: Fit) -> Array:
-    log_posterior = found.log_posterior
-    return log_posterior.from_sampling(log_posterior.vector(found.theta))[None]
-
-
-def _fit(bench: Workbench, found: Fit, begun: Fit | None, split_s: float | None) -> dict[str, Any]:
+def _fit(
+    bench: Workbench, found: Fit, full: FullResult, begun: Fit | None, split_s: float | None
+) -> dict[str, Any]:
     """RMSE [N] of a fit to the whole recording, by phase, of one to its beginning on the rest; coverage."""
     binned = bench.binned
     by_phase = inference.rmse(binned, found.force_n)
@@ -255,6 +263,7 @@ def _fit(bench: Workbench, found: Fit, begun: Fit | None, split_s: float | None)
         "rmse": float(np.sqrt(np.mean((binned.force_n[usable] - found.force_n[usable]) ** 2))),
         "rmse_by_phase": dict(by_phase.by_kind_n),
         "rmse_held_out": held_out,
+        "full_model": _full(full, found.force_n, binned, usable),
         "coverage90": inference.coverage(binned, *bands.interval(0.9)),
         "log_evidence": found.log_evidence,
         "theta": {
@@ -263,37 +272,24 @@ def _fit(bench: Workbench, found: Fit, begun: Fit | None, split_s: float | None)
     }
 
 
-def _draw(
-    bench: Workbench, found: Search, before: Located, after: Located, answer: Mapping[str, Any]
-) -> list[Path]:
-    binned = bench.binned
-    figures = {
-        "located": report.figure_located(binned, bench.motion, before, found.base.force_n),
-        "candidates": report.figure_candidates(answer["candidates"]),
-        "before_after": report.figure_before_after(
-            binned, bench.motion, found.base.force_n, found.best.force_n
-        ),
+def _full(
+    full: FullResult, force_n: Array, binned: BinnedForce, usable: NDArray[np.bool_]
+) -> dict[str, Any] | None:
+    """RMSE [N] of the full model where its own fit ended, and how far the surrogate's is off from it."""
+    if not isinstance(full, FullFit):
+        return None if full is None else {"message": full}
+
+    def rms(values: Array) -> float:
+        return float(np.sqrt(np.mean(values[usable] ** 2)))
+
+    return {
+        "rmse": rms(binned.force_n - full.force_n),
+        "rmse_by_phase": dict(inference.rmse(binned, full.force_n).by_kind_n),
+        "fit_off_by": rms(force_n - full.force_n),
+        "runs": full.runs,
+        "gained": full.gained,
+        "theta": dict(full.theta),
     }
-    for name, figure in figures.items():
-        report.save_figure(figure, bench.run.at(STAGE.name, name), caption(bench.run))
-    return [bench.run.at(STAGE.name, f"{name}.{suffix}") for name in figures for suffix in ("png", "svg")]
-
-
-def _in_words(answer: Mapping[str, Any]) -> str:
-    fits = answer["fit"]
-    lines = [f"verdict: {answer['verdict']}"]
-    lines += [
-        f"  {one['name']} (probability {one['probability']:.2f}): {one['statement']}"
-        for one in answer["mechanisms"]
-    ]
-    lines.append(f"{len(answer['located'])} windows before, {len(answer['remaining'])} after")
-    for when in ("before", "after"):
-        held = fits[when]["rmse_held_out"]
-        rest = "" if held is None else f", {1e3 * held:.1f} mN on what follows the second hold, not fitted"
-        lines.append(f"{when}: RMSE {1e3 * fits[when]['rmse']:.1f} mN{rest}")
-    best = ", ".join(f"{one['name']} {one['delta_score']:+.1f}" for one in answer["candidates"][:5])
-    lines += [f"candidates alone, log evidence gained: {best}", f"outputs in {answer['folder']}"]
-    return "\n".join(lines)
 
 
 def _files(run: Run) -> list[Path]:

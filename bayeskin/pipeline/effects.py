@@ -18,6 +18,7 @@ from bayeskin import storage
 from bayeskin.design import Wave, fine_wave, sobol_points
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, catalogue, laws
+from bayeskin.mechanisms.binned import estimate_of
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline.crew import crew
@@ -55,6 +56,10 @@ class Part:
     def neutral(self) -> float:
         """Of the strength."""
         return self.mechanism.neutral[self.own[0].name]
+
+    @property
+    def own_names(self) -> tuple[str, ...]:
+        return tuple(p.name for p in self.own)
 
 
 def parts_of(mechanism: Mechanism) -> list[Part]:
@@ -144,24 +149,26 @@ def effect_files(run: Run) -> list[Path]:
 def effects_of(run: Run) -> list[Effect]:
     """The effects in `effect_files`. Raises InputError for files of another model."""
     found = []
+    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     for path in effect_files(run):
         said, surrogate = load_manifest(path), load_surrogate(path)
         if said["model_hash"] != model_spec(run).hash:
             raise InputError(path, "an effect of another model", "one of this configuration's model")
         about = said["effect"]
-        own = tuple(about["own"])
-        found.append(Effect(about["part"], about["mechanism"], about["neutral"], own, surrogate))
+        own, mechanism = tuple(about["own"]), catalogue()[about["mechanism"]]
+        estimate = estimate_of(mechanism, own, motion, surrogate.edges_s)
+        found.append(Effect(about["part"], mechanism.name, about["neutral"], own, surrogate, estimate))
     return found
 
 
 def _train(run: Run, part: Part, base: Design, design: Design) -> dict[str, Any]:
     """The effect's surrogate, into the stage's folder, and what is known of its error."""
-    own = [p.name for p in part.own]
-    without = base_force(base, design)
+    own, without = list(part.own_names), base_force(base, design)
+    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     try:
         effect, validation = train_effect(
-            part.name, part.mechanism.name, part.neutral, own, without, design,
-            run.config.surrogate.kind, run.config.seed,
+            part.name, part.mechanism.name, part.neutral, own, without, design, run.config.surrogate.kind,
+            run.config.seed, estimate_of(part.mechanism, own, motion, design.edges_s),
         )  # fmt: skip
     except InputError as few:
         run.reporter.log(f"{part.name}: no surrogate: {few}")
@@ -199,8 +206,9 @@ def _errors(
     beside the base's own runs, and of both surrogates together."""
     rows = design.testing
     theta, truth = design.theta[rows], design.force_n[rows]
-    alone = without[rows] + effect.predict(theta).mean
-    both = effect.predict(theta).mean + base_surrogate(run).predict(theta[:, : -len(effect.own)]).mean
+    alone = without[rows] + effect.predict(theta, without[rows]).mean
+    base = base_surrogate(run).predict(theta[:, : -len(effect.own)]).mean
+    both = base + effect.predict(theta, base).mean
     peak = np.abs(truth).max(axis=1)
     to_skin = 1e3 / np.maximum(peak, 1e-12)  # mN of a force whose peak is 1 N
 

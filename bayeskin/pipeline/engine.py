@@ -14,6 +14,8 @@ from bayeskin.errors import InputError
 from bayeskin.pipeline import folder
 from bayeskin.pipeline.folder import Record
 
+STANDINGS = ("done", "not run", "not finished", "failed", "out of date")
+
 
 class Reporter(Protocol):
     """Who is told how a run goes on."""
@@ -115,6 +117,29 @@ def run_stages(run: Run, stages: Mapping[str, Stage], last: str | None = None) -
                 if not outcomes[-1].record.done:
                     break
     return outcomes
+
+
+def standing(run: Run, stages: Mapping[str, Stage]) -> dict[str, tuple[str, Record | None]]:
+    """How each stage stands, without running any: one of the words of `STANDINGS`, and its record.
+
+    A stage that is done was made from this configuration, its files and earlier stages that are done, by
+    this version, and its outputs are as it left them.
+    """
+    found: dict[str, tuple[str, Record | None]] = {}
+    for name, stage in stages.items():
+        record, inputs = folder.read_record(run.folder / name), _inputs_sha256(run, stage)
+        current = all(found[need][0] == "done" for need in stage.needs)
+        if record is None:
+            found[name] = "not run", None
+        elif record.inputs_sha256 != inputs or not current:
+            found[name] = "out of date", record
+        elif folder.current_record(run.folder / name, inputs) is not None:
+            found[name] = "done", record
+        elif record.done:
+            found[name] = "out of date", record
+        else:
+            found[name] = "failed" if "message" in record.summary else "not finished", record
+    return found
 
 
 def _needed(stages: Mapping[str, Stage], last: str | None) -> set[str]:

@@ -16,7 +16,7 @@ from bayeskin.config import Config
 from bayeskin.inference import LogPosterior, Posterior, Verdict
 from bayeskin.pipeline.calibration import refined_posterior, rmse_table
 from bayeskin.pipeline.engine import Run, Stage
-from bayeskin.pipeline.folder import sha256_of
+from bayeskin.pipeline.folder import sha256_of, write_json
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
 from bayeskin.types import Array, PadMotion, Provenance, Recording
@@ -41,7 +41,20 @@ def _sample(run: Run) -> Mapping[str, Any]:
     inference.save_inference_data(run.at("sample", "posterior.nc"), idata)
     drawn = inference.predictive_draws(log_posterior, _some(posterior), rng)
     _draw_posterior(run, log_posterior, posterior, best, drawn)
-    return _sampled(log_posterior, posterior, drawn)
+    bands = inference.bands_of(log_posterior.binned.time_s, drawn)
+    write_json(run.at("sample", "bands.json"), _history(log_posterior, bands))
+    return _sampled(log_posterior, posterior, bands)
+
+
+def _history(log_posterior: LogPosterior, bands: inference.Bands) -> dict[str, Any]:
+    """The recorded bins and what is predicted for them, for whoever draws or reads them; (m,) each, SI."""
+    (low_50, high_50), (low_90, high_90) = bands.interval(0.5), bands.interval(0.9)
+    fitted = np.isin(np.arange(len(bands.time_s)), log_posterior.chain.bins)
+    return {
+        "time_s": bands.time_s, "recorded_n": log_posterior.binned.force_n, "fitted": fitted,
+        "median_n": bands.quantiles_n[2], "low_50_n": low_50, "high_50_n": high_50,
+        "low_90_n": low_90, "high_90_n": high_90,
+    }  # fmt: skip
 
 
 def _chains_folder(run: Run, log_posterior: LogPosterior) -> Path:
@@ -61,11 +74,8 @@ def _tell_sampling(run: Run, share: float, text: str) -> None:
     run.reporter.progress("sampling", share, text)
 
 
-def _sampled(
-    log_posterior: LogPosterior, posterior: Posterior, drawn: inference.ForceDraws
-) -> dict[str, Any]:
+def _sampled(log_posterior: LogPosterior, posterior: Posterior, bands: inference.Bands) -> dict[str, Any]:
     c = posterior.convergence
-    bands = inference.bands_of(log_posterior.binned.time_s, drawn)
     low, high = bands.interval(0.9)
     learned = inference.identifiability(posterior.space, posterior.flat)
     verdict = with_surrogate_error(c.verdict, bands, log_posterior.chain.bins)
@@ -114,8 +124,8 @@ def _table(posterior: Posterior) -> dict[str, dict[str, Any]]:
         draws = posterior.flat[:, j]
         low, median, high = np.quantile(draws, [0.05, 0.5, 0.95])
         table[p.name] = {
-            "unit": p.unit, "mean": draws.mean(), "sd": draws.std(ddof=1), "median": median,
-            "low_90": low, "high_90": high, "ess": c.ess[j], "rhat": c.rhat[j],
+            "meaning": p.description, "unit": p.unit, "mean": draws.mean(), "sd": draws.std(ddof=1),
+            "median": median, "low_90": low, "high_90": high, "ess": c.ess[j], "rhat": c.rhat[j],
             "prior": {"kind": p.prior, "lower": p.lower, "upper": p.upper},
         }  # fmt: skip
     return table

@@ -34,7 +34,7 @@ def prove(
     """Diagnoses what has no verdict yet, then scores all verdicts; into `folder` (default: the shipped set).
 
     rediagnose : so many, spread over the set, are diagnosed afresh in a temporary place and compared with
-        their stored verdicts
+        their stored verdicts; another verdict is a failure where the sources are those of the stored one
     at_most : of those without a verdict so many are diagnosed now; what is judged by then is scored
 
     While anything is diagnosed, the seals cannot be opened.
@@ -68,7 +68,7 @@ def prove(
         figure, folder / "scoreboard", f"bayeskin {bayeskin.__version__}, {folder.name}"
     )
     document = {
-        "ok": all(compared.values()),
+        "ok": all(same or verdicts[n]["sources_sha256"] != sources for n, same in compared.items()),
         "folder": folder,
         "scoreboard": board,
         "verdicts_of_these_sources": current,

@@ -14,7 +14,7 @@ import numpy as np
 from bayeskin import storage
 from bayeskin.config import load_config, parameter_space
 from bayeskin.errors import InputError
-from bayeskin.mechanisms import Mechanism, catalogue, laws, observed, solved
+from bayeskin.mechanisms import Mechanism, catalogue, laws, solved
 from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec, problem_of, simulate
 from bayeskin.pipeline.engine import Reporter, Run
@@ -23,6 +23,7 @@ from bayeskin.pipeline.folder import plain
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.recording import pad_motion
+from bayeskin.pipeline.reported import reported
 from bayeskin.recordings import describe, describe_json, phase_noise, read_recording, segment
 from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, Parameter, ParameterSpace, Simulation
@@ -142,10 +143,7 @@ def _reported(
         return simulation
     every = np.arange(0.0, simulation.time_s[-1], REPORTED_EVERY_S)
     time_s = np.union1d(simulation.time_s, every)
-    columns = {name: np.array([value]) for name, value in values.items()}
-    within = solved(mechanisms)
-    beyond = [mechanism for mechanism in mechanisms if mechanism not in within]
-    force = observed(beyond, columns, motion, lambda t: np.atleast_2d(simulation.at(t)))
+    force = reported(simulation, mechanisms, values, motion)
     return replace(
         simulation,
         theta=dict(values),

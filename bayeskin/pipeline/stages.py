@@ -6,17 +6,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bayeskin.pipeline import design, effects, indices, maximum, posterior, recording, training
+from bayeskin.pipeline import design, diagnosis, effects, indices, maximum, posterior, recording, training
 from bayeskin.pipeline.crew import made_by
-from bayeskin.pipeline.engine import Outcome, Reporter, Run, Stage, open_run, run_stages
+from bayeskin.pipeline.engine import Outcome, Reporter, Run, Stage, open_run, run_stages, standing
 from bayeskin.pipeline.folder import plain, read_record, write_json
+from bayeskin.pipeline.page import write_page
 
 BEFORE_REPORT = (
     recording.STAGE, design.STAGE, training.STAGE, maximum.STAGE, posterior.STAGE, indices.STAGE,
 )  # fmt: skip
 
 
-def _report(run: Run) -> Mapping[str, Any]:
+def _summarise(run: Run) -> Mapping[str, Any]:
     """The answer of a run, for people and programs, from what its stages said."""
     said = {stage.name: run.summary(stage.name) for stage in BEFORE_REPORT}
     sampled, found = said["sample"], said["map"]
@@ -56,9 +57,9 @@ def _report(run: Run) -> Mapping[str, Any]:
 
 
 REPORT = Stage(
-    "report", "writes summary.json", tuple(stage.name for stage in BEFORE_REPORT), ("model",), _report
+    "report", "writes summary.json", tuple(stage.name for stage in BEFORE_REPORT), ("model",), _summarise
 )
-STAGES = {stage.name: stage for stage in (*BEFORE_REPORT, REPORT, effects.STAGE)}
+STAGES = {stage.name: stage for stage in (*BEFORE_REPORT, REPORT, effects.STAGE, diagnosis.STAGE)}
 
 
 def run(
@@ -71,22 +72,49 @@ def run(
     """Runs a configuration to the stage `last` (None: to the report) and gives the command's answer.
 
     `scheduler`: the address of a Dask scheduler that makes the full runs, in the place of `design.scheduler`.
+    A run to the report ends with the page, also when a stage before it failed.
     """
     opened = open_run(config, reporter)
     if scheduler is not None:
         opened = made_by(opened, scheduler)
     outcomes = run_stages(opened, stages, last or "report")
     answer = outcomes[-1]
-    return plain(
-        {
-            **answer.record.summary,
-            "ok": answer.ok,
-            "stage": answer.stage,
-            "folder": opened.folder,
-            "skipped": [outcome.stage for outcome in outcomes if outcome.skipped],
-            "text": _in_words(answer, outcomes, opened.folder),
-        }
+    text = _in_words(answer, outcomes, opened.folder)
+    said = {
+        **answer.record.summary,
+        "ok": answer.ok,
+        "stage": answer.stage,
+        "folder": opened.folder,
+        "skipped": [outcome.stage for outcome in outcomes if outcome.skipped],
+    }
+    if last in (None, "report"):
+        said["page"] = write_page(opened, stages)
+        text += f"\nreport: {said['page']}"
+    return plain({**said, "text": text})
+
+
+def report(config: Path, reporter: Reporter, stages: Mapping[str, Stage] = STAGES) -> dict[str, Any]:
+    """The page of whatever stages are done, and the command's answer; runs nothing but the summary.
+
+    Raises InputError for a configuration that is wrong or whose recording is not there.
+    """
+    opened = open_run(config, reporter)
+    opened.beside(opened.config.recording.file)
+    stands = {name: one[0] for name, one in standing(opened, stages).items()}
+    missing = [name for name in stages["report"].needs if stands[name] != "done"]
+    if not missing:
+        return run(config, None, reporter, stages)
+    page = write_page(opened, stages)
+    text = "\n".join(
+        [
+            f"{opened.config.name}: not finished",
+            *(f"{name}: {stands[name]}" for name in missing),
+            f"report: {page}",
+        ]
     )
+    failed = any(stands[name] == "failed" for name in missing)
+    said = {"ok": not failed, "stage": "report", "verdict": "not finished", "missing": missing}
+    return plain({**said, "folder": opened.folder, "page": page, "text": text})
 
 
 def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str:

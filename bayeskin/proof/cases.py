@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 
 from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed
+from bayeskin.mechanisms.binned import estimate_of
 from bayeskin.mechanisms.mechanism import Instrument, Tissue
 from bayeskin.proof.noise import FLOORS_N
 from bayeskin.proof.outside import OUTSIDE
@@ -130,11 +131,12 @@ class Screen:
 
     def force(self, names: Sequence[str], theta: Array, values: Mapping[str, Array]) -> Array:
         """Bin means (n, m) at theta (n, 5) with mechanisms at values (n,) each."""
-        force_n = self.refit.force(theta)
+        force_n = base_n = self.refit.force(theta)
         for effect in self.effects:
             if effect.mechanism in names:
                 own = np.stack([values[name] for name in effect.own], axis=1)
-                force_n = force_n + effect.predict(np.concatenate([theta, own], axis=1)).mean
+                point = np.concatenate([theta, own], axis=1)
+                force_n = force_n + effect.predict(point, base_n).mean
         reported = [self.known[n] for n in names if isinstance(self.known[n].act, Instrument)]
         if not reported:
             return force_n
@@ -165,9 +167,10 @@ def shipped_screen() -> Screen:
     for file in sorted(path.with_name(f"{path.stem}-effects").glob("*.h5")):
         if not file.stem.endswith("-design"):
             about = load_manifest(file)["effect"]
-            own = tuple(about["own"])
+            own, mechanism = tuple(about["own"]), catalogue()[about["mechanism"]]
+            estimate = estimate_of(mechanism, own, MOTION, EDGES_S)
             effects.append(
-                Effect(about["part"], about["mechanism"], about["neutral"], own, load_surrogate(file))
+                Effect(about["part"], mechanism.name, about["neutral"], own, load_surrogate(file), estimate)
             )
     return Screen(Refit(load_surrogate(path)), tuple(effects), catalogue())
 

@@ -3,7 +3,13 @@
 from bayeskin.report.discrepancy import figure_discrepancy, figure_experiments
 from bayeskin.report.fields import SurfaceField, figure_fields
 from bayeskin.report.fit import figure_fit
-from bayeskin.report.mismatch import figure_before_after, figure_candidates, figure_located
+from bayeskin.report.mismatch import (
+    figure_before_after,
+    figure_candidates,
+    figure_contributions,
+    figure_located,
+    figure_residual_by_phase,
+)
 from bayeskin.report.posterior import figure_posterior
 from bayeskin.report.prior import figure_prior_predictive
 from bayeskin.report.proof import figure_proof
@@ -18,6 +24,7 @@ __all__ = [
     "SurfaceField",
     "figure_before_after",
     "figure_candidates",
+    "figure_contributions",
     "figure_discrepancy",
     "figure_experiments",
     "figure_fields",
@@ -28,6 +35,7 @@ __all__ = [
     "figure_prior_predictive",
     "figure_proof",
     "figure_recording",
+    "figure_residual_by_phase",
     "figure_sobol",
     "figure_traces",
     "figure_validation",

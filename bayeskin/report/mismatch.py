@@ -6,7 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from bayeskin.report.style import (
@@ -18,11 +21,17 @@ from bayeskin.report.style import (
     RECORDED,
     new_figure,
     panel_title,
+    plain_log,
     state_finding,
     styled,
 )
-from bayeskin.report.timeline import shade_phases
-from bayeskin.types import Array, BinnedForce, PadMotion
+from bayeskin.report.timeline import PHASE_COLORS, phase_legend, shade_phases
+from bayeskin.types import Array, BinnedForce, PadMotion, Phase, PhaseKind
+
+Z90 = 1.645
+WORDS: dict[PhaseKind, str] = {
+    "load": "while loading", "unload": "while unloading", "hold": "in holds", "rest": "at rest",
+}  # fmt: skip
 
 
 class _Window(Protocol):
@@ -32,6 +41,17 @@ class _Window(Protocol):
     def end_s(self) -> float: ...
     @property
     def mean_n(self) -> float: ...
+
+
+class _Contribution(Protocol):
+    @property
+    def name(self) -> str: ...
+    @property
+    def along(self) -> Sequence[str]: ...
+    @property
+    def force_n(self) -> Array: ...
+    @property
+    def size_n(self) -> float: ...
 
 
 class _Located(Protocol):
@@ -57,7 +77,7 @@ def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, fo
     force.plot(time_s, 1e3 * binned.force_n, ".", ms=1.5, color=RECORDED, label="recorded")
     force.plot(time_s, 1e3 * force_n, color=MODEL, label="model")
     residual.fill_between(
-        time_s[bins], -1.645e3 * located.allowed_n, 1.645e3 * located.allowed_n, color=FAINT, lw=0,
+        time_s[bins], -1e3 * Z90 * located.allowed_n, 1e3 * Z90 * located.allowed_n, color=FAINT, lw=0,
         label="allowed, 90 %",
     )  # fmt: skip
     residual.plot(time_s[bins], 1e3 * located.residual_n, color=RECORDED, lw=0.8)
@@ -101,9 +121,14 @@ def figure_candidates(candidates: Sequence[Mapping[str, Any]]) -> Figure:
     error = np.array([row["standard_error"] for row in rows])
     place = np.arange(len(rows))
     ax.barh(place, gain, color=[MODEL if value > 0 else GREY for value in gain], height=0.6)
-    ax.errorbar(gain, place, xerr=error, fmt="none", ecolor=RECORDED, elinewidth=0.7)
+    ax.errorbar(gain, place, xerr=error, fmt="o", ms=2.2, color=RECORDED, elinewidth=0.7)
     ax.axvline(0.0, color=GREY, lw=0.6)
     ax.set_yticks(place, [row["name"] for row in rows])
+    numbers = ax.secondary_yaxis("right")  # bars of a few nats do not show beside one of hundreds
+    said = [f"{round(a, 1) + 0.0:+.1f} ± {b:.1f}" for a, b in zip(gain, error, strict=True)]
+    numbers.set_yticks(place, [one.replace("-", "−") for one in said])
+    numbers.tick_params(length=0.0)
+    numbers.spines["right"].set_visible(False)
     ax.set_xlabel("log evidence gained over the base model [nats]")
     finding = (
         f"{rows[-1]['name']} alone gains most" if len(rows) and gain[-1] > 0 else "No mechanism alone gains"
@@ -140,4 +165,99 @@ def figure_before_after(binned: BinnedForce, motion: PadMotion, before_n: Array,
         panel_title(ax, letter)
     rms = [1e3 * float(np.sqrt(np.nanmean((binned.force_n - values) ** 2))) for values in (before_n, after_n)]
     state_finding(figure, f"RMS residual {rms[0]:.1f} mN before, {rms[1]:.1f} mN after", "")
+    return figure
+
+
+@styled
+def figure_residual_by_phase(
+    binned: BinnedForce, motion: PadMotion, before: _Located, after: _Located
+) -> Figure:
+    """The residual without and with the best set in each kind of phase, one line a cycle."""
+    kinds = [kind for kind in WORDS if any(phase.kind == kind for phase in binned.phases)]
+    rows = (len(kinds) + 1) // 2
+    figure = new_figure(PAGE_IN, 0.7 + 1.9 * rows)
+    panels = list(figure.subplots(rows, 2, squeeze=False).flat)
+    for spare in panels[len(kinds) :]:
+        spare.set_visible(False)
+    sizes = {}
+    for ax, kind, letter in zip(panels, kinds, "abcd", strict=False):
+        sizes[kind] = [_draw_kind(ax, kind, binned, motion, one, one is after) for one in (before, after)]
+        panel_title(ax, letter, "{}: {:.1f} → {:.1f} mN RMS".format(WORDS[kind], *sizes[kind]))
+    handles = [Line2D([], [], color=GREY, label="before"), Line2D([], [], color=MODEL, label="after")]
+    panels[0].margins(y=0.22)  # room for the key
+    panels[0].legend(handles=[*handles, Patch(color=FAINT, label="allowed, 90 %")], loc="upper left", ncols=3)
+    for ax in panels[::2]:
+        ax.set_ylabel("recorded − model [mN]")
+    most = max(sizes, key=lambda kind: sizes[kind][1])
+    state_finding(
+        figure,
+        "Most is left {}: {:.1f} mN RMS before, {:.1f} mN after".format(WORDS[most], *sizes[most]),
+        "Before: the base model's best fit. After: that with the best set of mechanisms. Later cycles are "
+        "fainter. Allowed: measured noise, the surrogate's error, the parameters' uncertainty, after.",
+    )
+    return figure
+
+
+def _draw_kind(
+    ax: Axes, kind: PhaseKind, binned: BinnedForce, motion: PadMotion, located: _Located, last: bool
+) -> float:
+    """The residual in all phases of a kind, with what is allowed if it is the last; its RMS [mN]."""
+    cycles = max(phase.cycle for phase in binned.phases)
+    residual, allowed = 1e3 * located.residual_n, 1e3 * Z90 * located.allowed_n
+    of_kind = np.zeros(len(residual), dtype=bool)
+    for index, phase in enumerate(binned.phases):
+        part = binned.phase[located.bins] == index
+        if phase.kind != kind or not part.any():
+            continue
+        of_kind |= part
+        x = _place(phase, binned.time_s[located.bins[part]], motion)
+        strength = 1.0 - 0.65 * max(phase.cycle - 1, 0) / max(cycles - 1, 1)
+        ax.plot(x, residual[part], color=MODEL if last else GREY, alpha=strength, lw=0.8)
+        if last:
+            ax.fill_between(x, -allowed[part], allowed[part], color=FAINT, lw=0, zorder=0.5)
+    if kind in ("hold", "rest"):
+        ax.set(xlabel="time since the corner [s]", xscale="log")
+        plain_log(ax.xaxis)
+    else:
+        ax.set_xlabel("displacement [mm]")
+    return float(np.sqrt(np.mean(residual[of_kind] ** 2))) if of_kind.any() else 0.0
+
+
+def _place(phase: Phase, time_s: Array, motion: PadMotion) -> Array:
+    """Where times of a phase stand on its kind's axis: displacement [mm], or time since its start [s]."""
+    if phase.kind in ("hold", "rest"):
+        return np.maximum(time_s - phase.start_s, 0.1)
+    return 1e3 * motion.at(time_s)
+
+
+@styled
+def figure_contributions(binned: BinnedForce, motion: PadMotion, parts: Sequence[_Contribution]) -> Figure:
+    """What each mechanism adds to the force, over time and over displacement; at least one."""
+    figure = new_figure(PAGE_IN, 0.9 + 1.15 * len(parts))
+    panels = figure.subplots(len(parts), 2, sharex="col", sharey="row", squeeze=False, width_ratios=(1.9, 1))
+    displacement_mm = 1e3 * motion.at(binned.time_s)
+    kind = np.array([phase.kind for phase in binned.phases])[binned.phase]
+    for (over_time, loops), part in zip(panels, parts, strict=True):
+        force_mn = 1e3 * part.force_n
+        shade_phases(over_time, binned.phases, cycles=part is parts[0])
+        over_time.plot(binned.time_s, force_mn, color=MODEL, lw=0.9)
+        for name, color in PHASE_COLORS.items():
+            inside = kind == name
+            loops.plot(displacement_mm[inside], force_mn[inside], ".", ms=2.0, color=color)
+        for ax in (over_time, loops):
+            ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
+        along = f" with {', '.join(part.along)}" if part.along else ""
+        over_time.set_title(f"{part.name}{along}: {1e3 * part.size_n:.1f} mN RMS")
+        over_time.set_ylabel("force [mN]")
+        low, high = min(force_mn.min(), 0.0), max(force_mn.max(), 0.0)
+        reach = max(high - low, 0.1)  # rounding is not to fill the panel
+        over_time.set_ylim(low - 0.08 * reach, high + 0.22 * reach)
+    phase_legend(panels[0, 1], binned.phases)
+    panels[-1, 0].set_xlabel("time [s]")
+    panels[-1, 1].set_xlabel("displacement [mm]")
+    state_finding(
+        figure,
+        f"{parts[0].name} moves the force most, by {1e3 * parts[0].size_n:.1f} mN RMS",
+        "The force at the best fit, less that without the mechanism and all else as it is.",
+    )
     return figure

@@ -6,12 +6,21 @@ With theta the base parameters, phi those of one part of a mechanism, s its stre
 
 so that moving phi_1 off its neutral value switches the effect on and nothing remains at it. G is learnt as
 any force is, amplitude and shape, from full runs with and without the mechanism at the same theta; it scales
-as forces do (`similarity`). Effects of several parts add up: what they do to each other is left to full runs.
+as forces do (`similarity`).
+
+Where a mechanism has an estimate D(F_0, phi) of its own effect, only what it leaves is learnt, in units of
+the estimate's RMS over time, |D|:
+
+    F(theta, phi) = F_0 + D + |D| (H(theta, phi) / c - 1) ,   c the force that similarity takes out,
+
+so that H / c is near one everywhere and has a logarithm, whatever the sign of what is left.
+
+Effects of several parts add up: what they do to each other is left to full runs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -26,15 +35,16 @@ from bayeskin.surrogates.train import Kind, train
 from bayeskin.surrogates.validate import Validation
 from bayeskin.types import Array, Design, ParameterSpace, Prediction, Surrogate
 
+Estimate = Callable[[Array, Array], Array]  # own parameters (n, k), force without (n, m) to its change (n, m)
 SMALLEST = 5e-4  # of the base force, RMS: below it an effect is the solver's noise
 SMALL = 5e-3  # from here on an effect's own relative error decides
 
 
 @dataclass(frozen=True)
 class Effect:
-    """One part of a mechanism: `surrogate` of G over the base's and the part's own parameters.
+    """One part of a mechanism: `surrogate` of G, or of H, over the base's and the part's own parameters.
 
-    The first own parameter is the strength, 0 effect at `neutral`.
+    The first own parameter is the strength, 0 effect at `neutral`. estimate: D, where the mechanism has one.
     """
 
     part: str
@@ -42,24 +52,33 @@ class Effect:
     neutral: float
     own: tuple[str, ...]
     surrogate: ShapeSurrogate
+    estimate: Estimate | None = None
 
     @property
     def space(self) -> ParameterSpace:
         return self.surrogate.space
 
-    def predict(self, theta: Array) -> Prediction:
-        """What the effect adds, at theta (n, d) in the order of its space."""
-        found = self.surrogate.predict(theta)
-        s = strength(self.space, self.own[0], self.neutral, theta)
-        return Prediction(
-            found.mean * s[:, None], found.factor * s[:, None, None], found.diagonal * s[:, None] ** 2
-        )
+    def predict(self, theta: Array, base: Array) -> Prediction:
+        """What the effect adds to the base's force (n, m), at theta (n, d) in the order of its space."""
+        similarity = self.surrogate.similarity
+        if self.estimate is None:
+            return self.surrogate.predict(theta, strength(similarity, self.own[0], self.neutral, theta))
+        change = self.estimate(theta[:, -len(self.own) :], base)
+        size = _rms(change)
+        found = self.surrogate.predict(theta, size * np.exp(-similarity.log_scale(theta)))
+        return replace(found, mean=found.mean + change - size[:, None])
 
 
-def strength(space: ParameterSpace, name: str, neutral: float, theta: Array) -> Array:
+def _rms(values: Array) -> Array:
+    """Over time, (n,)."""
+    return np.asarray(np.sqrt(np.mean(values**2, axis=1)))
+
+
+def strength(similarity: Similarity, name: str, neutral: float, theta: Array) -> Array:
     """s (n,) at theta (n, d): the parameter's distance from neutral, over the modulus to its power."""
+    space = similarity.space
     column = space.names.index(name)
-    scale = Similarity(space).log_scale(theta)
+    scale = similarity.log_scale(theta)
     return np.asarray((theta[:, column] - neutral) * np.exp(-space.parameters[column].stress_power * scale))
 
 
@@ -72,22 +91,31 @@ def train_effect(
     design: Design,
     kind: Kind | str = "auto",
     seed: int = 0,
+    estimate: Estimate | None = None,
 ) -> tuple[Effect, Validation]:
     """From runs with the effect, `design`, and the base's force (n, m) at the same base parameters.
 
-    Rows whose effect is next to nothing are left out; the validation is of G. Raises InputError where too
-    few rows show an effect.
+    Rows whose effect is next to nothing are left out; the validation is of G, or of H. Raises InputError
+    where too few rows show an effect.
     """
-    s = strength(design.space, own[0], neutral, design.theta)
+    similarity = Similarity(design.space)
+    s = strength(similarity, own[0], neutral, design.theta)
     change = design.force_n - base
     with np.errstate(invalid="ignore"):
-        size = np.sqrt(np.mean(change**2, axis=1) / np.mean(base**2, axis=1))
+        size = _rms(change) / _rms(base)
     shows = design.ok & (size > SMALLEST) & (np.abs(s) > 0.0)
     weights = np.where(shows, (size / (size + SMALL)) ** 2, 0.0)
-    per_strength = np.where(shows[:, None], change / np.where(shows, s, 1.0)[:, None], np.nan)
-    seen = replace(design, force_n=per_strength, ok=shows)
+    learnt = np.full_like(change, np.nan)
+    if estimate is None:
+        learnt[shows] = change[shows] / s[shows, None]
+    else:
+        guess = estimate(design.theta[:, -len(own) :], base)
+        left = (change - guess)[shows] / _rms(guess)[shows, None]
+        scale = np.exp(similarity.log_scale(design.theta[shows]))
+        learnt[shows] = scale[:, None] * (1.0 + left)
+    seen = replace(design, force_n=learnt, ok=shows)
     surrogate, validation = train(seen, kind, seed, weights)  # type: ignore[arg-type]
-    return Effect(part, mechanism, neutral, tuple(own), surrogate), validation
+    return Effect(part, mechanism, neutral, tuple(own), surrogate, estimate), validation
 
 
 @dataclass(frozen=True)
@@ -122,15 +150,20 @@ class WithEffects:
         """Force at theta (n, d) or (d,), with its uncertainty; errors of the parts taken as independent."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
-        names = self.space.names
         found = [self.base.predict(theta[:, : self.base.space.dim])]
-        for effect in self.effects:
-            found.append(effect.predict(theta[:, [names.index(name) for name in effect.space.names]]))
+        for effect, columns in zip(self.effects, self._columns, strict=True):
+            found.append(effect.predict(theta[:, columns], found[0].mean))
+        rows = [one.factor.transpose(0, 2, 1) for one in found]  # as they lie in memory
         return Prediction(
-            mean=np.sum([one.mean for one in found], axis=0),
-            factor=np.concatenate([one.factor for one in found], axis=2),
-            diagonal=np.sum([one.diagonal for one in found], axis=0),
+            mean=sum((one.mean for one in found[1:]), found[0].mean),
+            factor=np.concatenate(rows, axis=1).transpose(0, 2, 1),
+            diagonal=sum((one.diagonal for one in found[1:]), found[0].diagonal),
         )
+
+    @cached_property
+    def _columns(self) -> list[list[int]]:
+        """Of each effect, where in `space` its parameters are."""
+        return [[self.space.names.index(name) for name in effect.space.names] for effect in self.effects]
 
 
 def with_effects(base: ShapeSurrogate, effects: Sequence[Effect]) -> Surrogate:

@@ -9,16 +9,23 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dtrtri
 
 from bayeskin.surrogates.hyperparameters import SMALLEST_NUGGET, LatentFit
-from bayeskin.surrogates.kernels import kernel, squared_distances, trend_basis, trend_degree
+from bayeskin.surrogates.kernels import (
+    KERNELS,
+    correlations,
+    kernel,
+    squared_distances,
+    trend_basis,
+    trend_degree,
+)
 from bayeskin.types import Array, _FreezesArrays
 
-CHUNK = 256  # points whose kernel rows stay in the cache
+CHUNK = 128  # points whose kernel rows stay in the cache
 
 
 class _Conditioned(NamedTuple):
@@ -33,6 +40,62 @@ class _Conditioned(NamedTuple):
     centre: float
     deviation: float
     variance: float
+
+
+class _Stack(NamedTuple):
+    """All q latents of one kernel, so that one product does for all; the lower triangular in halves."""
+
+    name: str
+    latents: NDArray[np.intp]  # (q,) which
+    half: int  # of n
+    maps: Array  # (q, d, d)
+    inputs: Array  # (q, d + 2, n) mapped, 1, -1/2 their square
+    top: Array  # (q, half, half) L^-1 transposed
+    bottom: Array  # (q, n, n - half + p + 1) L^-1, root H^T K^-1 and the weights, transposed
+    trend: Array  # (q, p, p + 1) the root and b, transposed
+    nugget: Array  # (q, 1)
+    centre: Array
+    deviation: Array
+    spread: Array
+
+    def predict(self, centred: Array, basis: Array) -> tuple[Array, Array]:
+        """Mean and variance (k, q) at k centred inputs (k, d) with trend basis (k, p)."""
+        k, d = centred.shape
+        mapped = np.ones((len(self.latents), k, d + 2))
+        np.matmul(centred, self.maps, out=mapped[:, :, :d])
+        mapped[:, :, d] = -0.5 * np.einsum("qki,qki->qk", mapped[:, :, :d], mapped[:, :, :d])
+        rows = correlations(self.name, mapped @ self.inputs)
+        white = rows[:, :, : self.half] @ self.top
+        mean, variance = np.empty((2, len(self.latents), k))
+        _collect(white, rows @ self.bottom, basis @ self.trend, mean, variance)
+        mean = self.centre + self.deviation * mean
+        variance = np.maximum(variance + self.nugget, np.maximum(self.nugget, SMALLEST_NUGGET))
+        return mean.T, (self.spread * variance).T
+
+
+@nb.njit(cache=True, fastmath={"reassoc", "contract"})
+def _collect(white: Array, linear: Array, trend: Array, mean: Array, variance: Array) -> None:
+    """Fills mean and variance (q, k), without nugget, from what `predict` has multiplied."""
+    half, p = white.shape[2], trend.shape[2] - 1
+    rest = linear.shape[2] - p - 1
+    for j in range(mean.shape[0]):
+        for i in range(mean.shape[1]):
+            first, second, known = white[j, i], linear[j, i], trend[j, i]
+            unexplained = second[rest:]
+            explained = 0.0
+            for a in range(half):
+                explained += first[a] * first[a]
+            for a in range(rest):
+                explained += second[a] * second[a]
+            for a in range(p):
+                left = known[a] - unexplained[a]
+                explained -= left * left
+            mean[j, i] = known[p] + unexplained[p]
+            variance[j, i] = 1.0 - explained
+
+
+def _turned(stack: Array) -> Array:
+    return np.ascontiguousarray(stack.transpose(0, 2, 1))
 
 
 @dataclass(frozen=True)
@@ -105,25 +168,42 @@ class LatentGPs(_FreezesArrays):
         for start in range(0, len(unit), CHUNK):
             part = slice(start, start + CHUNK)
             basis = trend_basis(unit[part], self.degree)
-            for j, given in enumerate(self._conditioned):
-                mean[part, j], variance[part, j] = self._predict_latent(j, given, unit[part], basis)
+            for stack in self._stacks:
+                found = stack.predict(unit[part] - 0.5, basis)
+                mean[part, stack.latents], variance[part, stack.latents] = found
         return mean, variance
 
-    def _predict_latent(self, j: int, given: _Conditioned, unit: Array, basis: Array) -> tuple[Array, Array]:
-        mapped = (unit - 0.5) @ self.linear_maps[j].T
-        rows = kernel(self.kernels[j], squared_distances(mapped, given.mapped))[0]
-        mean = given.centre + given.deviation * (basis @ given.trend + rows @ given.weights)
-        unexplained = (basis - rows @ given.trend_weights) @ given.trend_root.T
-        white = dtrmm(1.0, given.whitener, rows.T, lower=1, overwrite_b=1)
-        variance = (
-            1.0
-            + self.nuggets[j]
-            - np.einsum("ji,ji->i", white, white)
-            + np.einsum("ij,ij->i", unexplained, unexplained)
+    @cached_property
+    def _stacks(self) -> list[_Stack]:
+        names = [name for name in KERNELS if name in self.kernels]
+        return [self._stack(name) for name in names]
+
+    def _stack(self, name: str) -> _Stack:
+        latents = np.array([j for j, kernel_name in enumerate(self.kernels) if kernel_name == name])
+        given = [self._conditioned[j] for j in latents]
+        half = len(self.inputs) // 2
+        mapped = np.stack([one.mapped for one in given])
+        square = -0.5 * np.sum(mapped**2, axis=2, keepdims=True)
+        linear = [
+            np.vstack([one.whitener[half:], one.trend_root @ one.trend_weights.T, one.weights])
+            for one in given
+        ]
+        deviation = np.array([one.deviation for one in given])
+        spread = (self.inflation[latents] * deviation) ** 2 * [one.variance for one in given]
+        return _Stack(
+            name=name,
+            latents=latents,
+            half=half,
+            maps=_turned(self.linear_maps[latents]),
+            inputs=_turned(np.concatenate([mapped, np.ones_like(square), square], axis=2)),
+            top=_turned(np.stack([one.whitener[:half, :half] for one in given])),
+            bottom=_turned(np.stack(linear)),
+            trend=np.stack([np.column_stack([one.trend_root.T, one.trend]) for one in given]),
+            nugget=self.nuggets[latents][:, None],
+            centre=np.array([one.centre for one in given])[:, None],
+            deviation=deviation[:, None],
+            spread=spread[:, None],
         )
-        floor = max(self.nuggets[j], SMALLEST_NUGGET)
-        scale = (self.inflation[j] * given.deviation) ** 2 * given.variance
-        return mean, scale * np.maximum(variance, floor)
 
     def leave_one_out(self) -> tuple[Array, Array]:
         """Mean and variance of each row given all others, (n, q) each; hyperparameters kept."""

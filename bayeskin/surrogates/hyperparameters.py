@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dpotrf, dpotri
+from scipy.linalg.blas import dsymm
+from scipy.linalg.lapack import dpotrf, dpotri, dtrtrs
 from scipy.optimize import minimize
 
 from bayeskin.surrogates.kernels import KERNELS, kernel, squared_distances, trend_basis, trend_degree
@@ -76,22 +76,23 @@ def _likelihood(name: str, linear_map: Array, nugget: float, data: _Data) -> _Li
     lower, info = dpotrf(covariance.T, lower=1, clean=1, overwrite_a=1)
     if info:
         raise np.linalg.LinAlgError(f"kernel matrix is not positive definite (row {info})")
-    log_root = np.log(np.diag(lower)).sum()
-    triangle, _ = dpotri(lower, lower=1, overwrite_c=1)
-    inverse = triangle + triangle.T
-    inverse.flat[:: n + 1] *= 0.5
-    weighted = inverse @ basis
-    gram = np.linalg.cholesky(basis.T @ weighted)
-    half = solve_triangular(gram, weighted.T, lower=True)
-    projected = inverse - half.T @ half  # K^-1 - K^-1 H (H^T K^-1 H)^-1 H^T K^-1
-    q = projected @ target
+    log_root = np.log(lower.diagonal()).sum()
+    inverse, _ = dpotri(lower, lower=1, overwrite_c=1)  # its lower triangle, all that dsymm reads
+    weighted = dsymm(1.0, inverse, np.column_stack([basis, target]), lower=1)
+    gram, _ = dpotrf(basis.T @ weighted[:, :p], lower=1, clean=1)
+    half, _ = dtrtrs(gram, weighted[:, :p].T, lower=1)
+    # with P = K^-1 - K^-1 H (H^T K^-1 H)^-1 H^T K^-1, of which only these are needed by themselves
+    q = weighted[:, p] - half.T @ (half @ target)
+    diagonal = inverse.diagonal() - np.einsum("ij,ij->j", half, half)
     variance = max(float(target @ q) / (n - p), 1e-300)
-    value = 0.5 * (n - p) * np.log(variance) + log_root + np.log(np.diag(gram)).sum()
-    diagonal = np.diag(projected)
+    value = 0.5 * (n - p) * np.log(variance) + log_root + np.log(gram.diagonal()).sum()
     trace = float(diagonal.sum() - q @ q / variance)
-    pull = (projected - np.outer(q / variance, q)) * slope
-    # sum_ij pull_ij (x_i - x_j)(x_i - x_j)^T without forming the differences
-    spread = 2.0 * (inputs.T @ (pull.sum(axis=1)[:, None] * inputs) - inputs.T @ pull @ inputs)
+    rows = np.vstack([half, q / np.sqrt(variance)])
+    inverse -= (rows.T @ rows).T  # symmetric, and column-major as it is
+    inverse *= slope.T
+    # sum_ij pull_ij (x_i - x_j)(x_i - x_j)^T with pull = (P - q q^T / variance) slope, no difference formed
+    pulled = dsymm(1.0, inverse, np.column_stack([inputs, np.ones(n)]), lower=1)
+    spread = 2.0 * (inputs.T @ (pulled[:, -1:] * inputs) - inputs.T @ pulled[:, :-1])
     return _Likelihood(
         float(value), linear_map @ spread, 0.5 * nugget * trace, q / diagonal, diagonal**-0.5, variance
     )

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
+from numpy.typing import NDArray
 
 from bayeskin.types import Array
 
@@ -16,9 +19,14 @@ def trend_basis(unit: Array, degree: int) -> Array:
     if degree >= 1:
         columns.append(x)
     if degree >= 2:
-        left, right = np.triu_indices(x.shape[1])
+        left, right = _pairs(x.shape[1])
         columns.append(x[:, left] * x[:, right])
-    return np.hstack(columns)
+    return np.concatenate(columns, axis=1)
+
+
+@lru_cache
+def _pairs(dim: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    return np.triu_indices(dim)
 
 
 def trend_degree(rows: int, dim: int) -> int:
@@ -35,6 +43,21 @@ def kernel(name: str, squared: Array) -> tuple[Array, Array]:
     root = np.sqrt(5.0 * squared)
     decay = np.exp(-root)
     return (1.0 + root + (5.0 / 3.0) * squared) * decay, (-5.0 / 6.0) * (1.0 + root) * decay
+
+
+def correlations(name: str, minus_half_squared: Array) -> Array:
+    """Kernel at squared distances given as minus their half, of any shape; the argument is overwritten."""
+    value = np.minimum(minus_half_squared, 0.0, out=minus_half_squared)
+    if name == "gaussian":
+        return np.exp(value, out=value)
+    value *= -10.0
+    root = np.sqrt(value)
+    value *= 1.0 / 3.0
+    value += root
+    value += 1.0
+    np.negative(root, out=root)
+    value *= np.exp(root, out=root)
+    return value
 
 
 def squared_distances(left: Array, right: Array) -> Array:

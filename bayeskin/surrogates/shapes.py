@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba as nb
 import numpy as np
 
 from bayeskin.errors import InputError
@@ -38,26 +39,29 @@ class ShapeTransform(_FreezesArrays):
         amplitude, shapes = split(force_n)
         return np.column_stack([amplitude, (shapes - self.mean) @ self.components.T])
 
-    def decode(self, latent: Array, sd: Array) -> Prediction:
-        """Force of latent vectors with independent errors, mean and sd (n, 1 + K) each.
+    def decode(self, latent: Array, sd: Array, times: Array | float = 1.0) -> Prediction:
+        """`times` (n,) the force of latent vectors with independent errors, mean and sd (n, 1 + K) each.
 
-        Delta method: d force = force da + exp(a) components dz. Every column of the factor, like the
-        mean itself, is a combination of the rows [mean; components], so one product gives them all.
+        Delta method: d force = force da + exp(a) components dz.
         """
-        n, count = latent.shape
-        scale = np.exp(latent[:, 0])
-        weights = np.zeros((n, count, 1 + count))
-        weights[:, 0, 0] = scale
-        weights[:, 1:, 0] = scale[:, None] * latent[:, 1:]
-        weights[:, :, 1] = weights[:, :, 0] * sd[:, :1]
-        diagonal = np.arange(1, count)
-        weights[:, diagonal, 1 + diagonal] = scale[:, None] * sd[:, 1:]
-        basis = np.vstack([self.mean, self.components]).T
-        return Prediction(
-            mean=weights[:, :, 0] @ basis.T,
-            factor=np.matmul(basis, weights[:, :, 1:]),
-            diagonal=scale[:, None] ** 2 * self.truncation,
-        )
+        scale = (times * np.exp(latent[:, 0]))[:, None]
+        mean = (scale * latent[:, 1:]) @ self.components
+        mean += scale * self.mean
+        columns = np.empty((*latent.shape, len(self.mean)))
+        _fill(mean, self.components, sd, scale * sd, columns)
+        return Prediction(mean, columns.transpose(0, 2, 1), scale**2 * self.truncation)
+
+
+@nb.njit(cache=True)
+def _fill(mean: Array, components: Array, sd: Array, scaled_sd: Array, columns: Array) -> None:
+    """Fills columns (n, 1 + K, m): the mean times its sd, then each component times its own."""
+    for i in range(len(columns)):
+        for j in range(columns.shape[2]):
+            columns[i, 0, j] = sd[i, 0] * mean[i, j]
+        for a in range(len(components)):
+            size, row, out = scaled_sd[i, a + 1], components[a], columns[i, a + 1]
+            for j in range(len(row)):
+                out[j] = size * row[j]
 
 
 def split(force_n: Array) -> tuple[Array, Array]:

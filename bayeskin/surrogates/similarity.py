@@ -52,7 +52,7 @@ class Similarity:
             return unit
         low, width = self._range
         value = (self._scaled(theta, theta[:, reference]) - low) / width
-        return np.delete(np.where(powers != 0.0, value, unit), reference, axis=1)
+        return np.asarray(np.where(powers != 0.0, value, unit)[:, np.arange(len(powers)) != reference])
 
     @cached_property
     def _range(self) -> tuple[Array, Array]:
@@ -65,12 +65,17 @@ class Similarity:
 
     def _scaled(self, theta: Array, modulus: Array) -> Array:
         """log(theta / E^power + offset / E_mid^power), (n, d); E_mid the middle of its prior."""
-        powers, reference = self._powers, self._reference
+        powers = self._powers
+        value = theta * modulus[:, None] ** -powers + self._offset
+        return np.log(np.where(powers != 0.0, value, 1.0))
+
+    @cached_property
+    def _offset(self) -> Array:
+        """Offsets (d,) over E_mid^power."""
+        reference = self._reference
         assert reference is not None
         middle = np.sqrt(self.space.lower[reference] * self.space.upper[reference])
-        offset = np.array([p.offset for p in self.space.parameters]) * middle**-powers
-        value = theta * modulus[:, None] ** -powers + offset
-        return np.log(np.where(powers != 0.0, value, 1.0))
+        return np.array([p.offset for p in self.space.parameters]) * middle**-self._powers
 
     def log_scale(self, theta: Array) -> Array:
         """Logarithm (n,) of what the force is proportional to at fixed inputs."""

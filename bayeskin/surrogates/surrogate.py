@@ -51,29 +51,31 @@ class ShapeSurrogate(_FreezesArrays):
         """What makes inputs of parameters."""
         return Similarity(self.space)
 
-    def predict(self, theta: ArrayLike) -> Prediction:
-        """Force at theta (n, d) or (d,), with its uncertainty.
+    def predict(self, theta: ArrayLike, times: Array | float = 1.0) -> Prediction:
+        """`times` (n,) the force at theta (n, d) or (d,), with its uncertainty.
 
         Raises InputError that names the first parameter outside the box.
         """
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
         mean, variance = self.latents.predict(self.similarity.inputs(theta))
-        return self._decode(theta, mean, variance)
+        return self._decode(theta, mean, variance, times)
 
     def leave_one_out(self, theta: Array) -> Prediction:
         """Force at the training rows, theta (n, d), as the others predict it; hyperparameters kept."""
         return self._decode(theta, *self.latents.leave_one_out())
 
-    def _decode(self, theta: Array, mean: Array, variance: Array) -> Prediction:
+    def _decode(self, theta: Array, mean: Array, variance: Array, times: Array | float = 1.0) -> Prediction:
         mean[:, 0] += self.similarity.log_scale(theta)
-        return self.transform.decode(mean, np.sqrt(variance))
+        return self.transform.decode(mean, np.sqrt(variance), times)
 
 
 def refuse_outside(space: ParameterSpace, theta: Array) -> None:
     """Raises InputError unless every row of theta (n, d) lies in the closed box."""
     if theta.ndim != 2 or theta.shape[1] != space.dim:
         raise InputError("theta", f"shape {theta.shape}", f"(n, {space.dim}) for {', '.join(space.names)}")
+    if np.all((theta >= space.lower) & (theta <= space.upper)):
+        return
     lower = space.lower - ROUNDING * np.abs(space.lower)
     upper = space.upper + ROUNDING * np.abs(space.upper)
     outside = ~((theta >= lower) & (theta <= upper))  # also what is not a number

@@ -1,0 +1,135 @@
+"""A configuration for somebody's own recording, with comments on what was found and what can be set."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from bayeskin.config import Config, DesignConfig, RecordingConfig
+from bayeskin.design import default_space
+from bayeskin.errors import InputError
+from bayeskin.pipeline.folder import plain
+from bayeskin.pipeline.recording import pad_motion
+from bayeskin.pipeline.shipping import shipped_for
+from bayeskin.recordings import describe, describe_json, phase_noise, read_recording, segment
+from bayeskin.types import Parameter
+
+_SECONDS_A_RUN = (4, 15)  # of one core, on the default mesh
+
+
+def new_config(file: Path, out: Path | None = None) -> dict[str, Any]:
+    """Writes a configuration that fits `file`, by default beside it, and says what was found in it.
+
+    It takes a shipped surrogate where one knows the recording's protocol, else a design of its own.
+    Raises InputError, with nothing written, for no recording of a test, or an `out` that is there already.
+    """
+    out = out or file.with_suffix(".toml")
+    if out.suffix != ".toml":
+        raise InputError(f"-o {out}", f"ending {out.suffix!r}", "ending .toml")
+    if out.exists():
+        raise InputError(f"-o {out}", "a file that is there already", "a name that is free")
+    recording = read_recording(file)
+    phases = segment(recording)
+    noise = phase_noise(recording, phases)
+    found = describe(recording, phases, noise)
+    surrogate = shipped_for(pad_motion("reaction", recording, phases, "idealised"))
+    reference = Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix()
+    text = _configuration(_name(out), reference, found, surrogate.name if surrogate else None)
+    with open(out, "x", encoding="utf-8") as handle:
+        handle.write(text)
+    way = f"the shipped surrogate {surrogate.name}" if surrogate else "a design of full runs of its own"
+    facts = describe_json(recording, phases, noise)
+    answer = {"ok": True, "out": out, "surrogate": surrogate.name if surrogate else None, **facts}
+    return plain({**answer, "text": f"{found}\n\nwritten to {out}, with {way}\nnext: bayeskin run {out}"})
+
+
+def _name(out: Path) -> str:
+    """A run's name from a file's: what a configuration does not allow becomes a hyphen."""
+    return re.sub(r"^[^A-Za-z0-9]+", "", re.sub(r"[^A-Za-z0-9._-]", "-", out.stem)) or "run"
+
+
+def _configuration(name: str, reference: str, found: str, surrogate: str | None) -> str:
+    config = Config(name=name, recording=RecordingConfig(file=reference))
+    parts = [
+        [f"name = {_quoted(name)}", f"seed = {config.seed}"],
+        _commented(found),
+        ["[recording]", f"file = {_quoted(reference)}  # relative to this file"],
+        _surrogate(surrogate) if surrogate else _design(config.design),
+        ["# What can be set besides, with its default: take the # away to change it.", *_optional(config)],
+    ]
+    return "\n\n".join("\n".join(part) for part in parts) + "\n"
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _commented(text: str) -> list[str]:
+    """Lines as TOML allows them in comments: nothing that cannot be printed."""
+    clean = ("".join(c if c.isprintable() else " " for c in line) for line in text.splitlines())
+    return ["# Found in the recording:", *(f"#   {line}".rstrip() for line in clean)]
+
+
+def _surrogate(file: str) -> list[str]:
+    return [
+        "# A shipped surrogate knows this recording's protocol, so no full runs are needed before sampling.",
+        "[surrogate]",
+        f"file = {_quoted(file)}",
+    ]
+
+
+def _design(design: DesignConfig) -> list[str]:
+    runs = sum(design.points) + len(design.points) * design.held_out
+    quick, slow = _SECONDS_A_RUN
+    low, high = (seconds * runs / (60 * design.workers) for seconds in _SECONDS_A_RUN)
+    return [
+        "# No shipped surrogate knows this recording's protocol, so the full model is run first, here:",
+        f"# {runs} runs of some {quick} to {slow} s each, {low:.0f} to {high:.0f} minutes with "
+        f"{design.workers} workers.",
+        "[design]",
+        f"points = {list(design.points)}  # training runs of each wave",
+        f"held_out = {design.held_out}  # of each wave, to measure the surrogate's error",
+        f"workers = {design.workers}  # processes",
+    ]
+
+
+def _optional(config: Config) -> list[str]:
+    sections: Sequence[tuple[str, str, Sequence[str]]] = (
+        (
+            "[model]",
+            "the force that the model reports, and its mesh",
+            (f'observation = "{config.model.observation}"',),
+        ),
+        (
+            "[fit]",
+            "without windows the whole recording is fitted",
+            ("windows_s = [[0.0, 60.0]]  # for example", f"bin_width_s = {config.fit.bin_width_s}"),
+        ),
+        (
+            "[sample]",
+            "when the posterior has been sampled enough",
+            (
+                f"effective_samples = {config.sample.effective_samples}",
+                f"max_steps = {config.sample.max_steps}",
+            ),
+        ),
+    )
+    lines = []
+    for head, what, keys in sections:
+        lines += ["", f"# {head}  # {what}", *(f"# {key}" for key in keys)]
+    for parameter in default_space().parameters:
+        lines += ["", *_prior(parameter)]
+    return lines
+
+
+def _prior(parameter: Parameter) -> list[str]:
+    return [
+        f"# [parameters.{parameter.name}]  # {parameter.description}, {parameter.unit}",
+        f"# lower = {parameter.lower!r}",
+        f"# upper = {parameter.upper!r}",
+        f"# prior = {_quoted(parameter.prior)}",
+    ]

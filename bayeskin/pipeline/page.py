@@ -1,0 +1,73 @@
+"""The report of a run: one HTML file of whatever stages are done, made afresh each time."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import bayeskin
+from bayeskin.config import parameter_space
+from bayeskin.pipeline.engine import Run, Stage, standing
+from bayeskin.pipeline.folder import Record
+from bayeskin.report.page import RunFacts, StageFacts, render_page
+
+FILE = "report.html"
+
+
+def write_page(run: Run, stages: Mapping[str, Stage]) -> Path:
+    """Writes the page into the run's folder, whole or not at all, and returns its path.
+
+    A stage that is not done, or was made from something else than now, is named and left out.
+    """
+    path = run.folder / FILE
+    run.folder.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(render_page(facts_of(run, stages)), encoding="utf-8")
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def facts_of(run: Run, stages: Mapping[str, Stage]) -> RunFacts:
+    """All that the page says, from the stages' records."""
+    config = run.config
+    space = parameter_space(config, run.config_path)
+    found = {name: _facts(run, name, *one) for name, one in standing(run, stages).items() if name != "report"}
+    return RunFacts(
+        name=config.name,
+        config_path=str(run.config_path),
+        config_text=run.config_path.read_text(encoding="utf-8"),
+        config_sha256=config.sha256,
+        version=bayeskin.__version__,
+        seed=config.seed,
+        observation=config.model.observation,
+        mesh=Path(config.model.mesh).name,
+        parameters={p.name: p.description for p in space.parameters},
+        stages=found,
+        history=_history(run) if "sample" in found and found["sample"].done else None,
+    )
+
+
+def _facts(run: Run, name: str, stands: str, record: Record | None) -> StageFacts:
+    if record is None:
+        return StageFacts(name, stands)
+    if stands == "failed":
+        return StageFacts(name, stands, record.seconds, record.summary)
+    if stands != "done":
+        return StageFacts(name, stands)
+    drawn = {
+        file.removesuffix(".svg"): run.at(name, file) for file in record.outputs if file.endswith(".svg")
+    }
+    figures = {figure: path.read_text(encoding="utf-8") for figure, path in drawn.items()}
+    return StageFacts(name, stands, record.seconds, record.summary, figures)
+
+
+def _history(run: Run) -> dict[str, Any] | None:
+    """The stage `sample`'s bands; None of a run that was sampled before the stage wrote any."""
+    file = run.at("sample", "bands.json")
+    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None

@@ -1,0 +1,144 @@
+"""The last two sections: what was checked, and where everything comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bayeskin.report.page.facts import RunFacts, StageFacts
+from bayeskin.report.page.figures import pictures
+from bayeskin.report.page.numbers import number, percent, quantity
+from bayeskin.report.page.parts import Block, Cell, Facts, Folded, Heading, Section, Source, Table, Text, row
+from bayeskin.report.page.sections import absent, cell
+
+
+def checks(facts: RunFacts) -> Section:
+    """Convergence, the full model at the most probable point, held-out runs, the design."""
+    parts = (
+        ("Sampling", _convergence(facts, facts.said("sample"))),
+        ("The full model where the posterior is highest", _full_model(facts, facts.said("map"))),
+        ("The surrogate on runs held out", _held_out(facts, facts.said("train"))),
+        ("The design", _design(facts, facts.said("design"))),
+    )
+    blocks: list[Block] = []
+    for title, found in parts:
+        blocks += [Heading(title), *found]
+    return Section("checks", "Checks", [*blocks, *pictures(facts, "effects")])
+
+
+def _convergence(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
+    if not said:
+        return absent(facts, "sample")
+    rows = [
+        row((name, Cell(f"{one['ess']:.0f}", one["ess"]), Cell(f"{one['rhat']:.4f}", one["rhat"])))
+        for name, one in said["parameters"].items()
+        if one["ess"] is not None and one["rhat"] is not None
+    ]
+    head = ("parameter", "effective samples", "R-hat across ensembles")
+    return [
+        Text([f"Sampling: {said['verdict']}, {said['steps']} steps, {said['draws']} draws kept."]),
+        Text(said["reasons"], listed=True),
+        Folded("Convergence of each parameter", [Table("Convergence", head, rows, symbols=True)]),
+        *pictures(facts, "sample", ["traces"]),
+    ]
+
+
+def _full_model(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
+    if not said:
+        return absent(facts, "map")
+    rows = [
+        row(
+            (
+                Cell(str(i), i),
+                "passes" if one["passes"] else "does not pass",
+                cell(one["rms_n"], "N"),
+                cell(one["max_n"], "N"),
+                Cell(number(one["rms_z"]), one["rms_z"]),
+                cell(one["seconds_of_full_run"], "s"),
+            )
+        )
+        for i, one in enumerate(said["checks"], start=1)
+    ]
+    head = ("run", "check", "RMS difference", "largest", "in the surrogate's sd", "time of the full run")
+    lines = [f"Most probable point: {said['message']}."]
+    if said["polished"] is not None:
+        gained, how = said["polished"]["gained"], said["polished"]["message"]
+        lines.append(f"Polished on the full model: {number(gained)} nats gained, {how}.")
+    table = Table("The full model against the surrogate at the most probable point", head, rows)
+    return [Text(lines), table, *pictures(facts, "map")]
+
+
+def _held_out(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
+    if not said:
+        return absent(facts, "train")
+    return [
+        Facts(
+            [
+                ("surrogate", f"{said['kind']}, {said['training_rows']} training runs"),
+                (f"relative error, {said['error_source']}", percent(said["relative_error"])),
+                ("median run", percent(said["median_point_relative_error"])),
+                ("worst run", percent(said["worst_point_relative_error"])),
+                ("its own 90 % band holds", percent(said["coverage_90"])),
+            ]
+        ),
+        *pictures(facts, "train"),
+    ]
+
+
+def _design(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
+    if not said:
+        return absent(facts, "design")
+    pairs = [
+        ("full runs", f"{said['runs']}, {said['failed']} failed"),
+        ("time of all runs", quantity(said["seconds_of_runs"], "s")),
+        ("median run", quantity(said["median_seconds_a_run"], "s")),
+    ]
+    blocks: list[Block] = [Facts(pairs), Folded("Waves of the design", [_waves(said["waves"])])]
+    if said["failures"]:
+        rows = [row((text, Cell(str(count), count))) for text, count in said["failures"].items()]
+        blocks.append(Table("Why full runs failed", ("message", "runs"), rows))
+    return [*blocks, *pictures(facts, "design")]
+
+
+def _waves(waves: Sequence[Mapping[str, Any]]) -> Table:
+    rows = [
+        row(
+            (
+                Cell(str(one["wave"] + 1), one["wave"]),
+                Cell(str(one["training"]), one["training"]),
+                Cell(str(one["held_out"]), one["held_out"]),
+                Cell(percent(one["kept_fraction"]), one["kept_fraction"]),
+                one["rule"],
+            )
+        )
+        for one in waves
+    ]
+    return Table("Waves", ("wave", "training runs", "held out", "of the prior's volume", "where"), rows)
+
+
+def provenance(facts: RunFacts) -> Section:
+    """Version, configuration, hashes, seed, and how each stage stands."""
+    pairs = [
+        ("bayeskin", facts.version),
+        ("configuration", facts.config_path),
+        ("its sha256", facts.config_sha256),
+        ("recording's sha256", str(facts.said("recording").get("sha256", "–"))),
+        ("model", f"{facts.observation} on {facts.mesh}"),
+        ("model's hash", str(facts.said("design").get("model_hash", "–"))),
+        ("seed", str(facts.seed)),
+    ]
+    head = ("stage", "stands", "time")
+    rows = [row((stage.name, stage.standing, _seconds(stage))) for stage in facts.stages.values()]
+    return Section(
+        "provenance",
+        "Provenance",
+        [
+            Facts(pairs),
+            Table("Stages", head, rows),
+            Source("The configuration as it stands", facts.config_text),
+        ],
+    )
+
+
+def _seconds(stage: StageFacts) -> Cell:
+    return cell(stage.seconds, "s")

@@ -1,0 +1,117 @@
+"""The section on what the model leaves out, from the diagnosis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bayeskin.report.page.facts import RunFacts
+from bayeskin.report.page.figures import pictures
+from bayeskin.report.page.numbers import number, percent, quantity
+from bayeskin.report.page.parts import Block, Cell, Folded, Section, Table, Text, row
+from bayeskin.report.page.sections import absent, cell
+
+_VERDICTS = {
+    "nothing-missing": "The model leaves nothing out that the recording shows.",
+    "named": "The recording shows physics that the model leaves out, and it has been named.",
+    "unknown": "The model leaves something out that no mechanism of the catalogue explains.",
+}
+
+
+def mismatch(facts: RunFacts) -> Section:
+    said = facts.said("diagnose")
+    blocks: list[Block] = list(absent(facts, "diagnose"))
+    if said:
+        blocks.append(Text([_VERDICTS.get(said["verdict"], said["verdict"])]))
+        if said["mechanisms"]:
+            blocks.append(_mechanisms(said["mechanisms"]))
+        blocks.append(_fits(said["fit"]))
+        blocks += pictures(facts, "diagnose")
+        if said["mechanisms"]:
+            blocks.append(Folded("Parameters of the mechanisms", [_parameters(said["mechanisms"])]))
+        blocks += [
+            Folded("All candidates", [_candidates(said["candidates"])]),
+            Folded(
+                f"Windows: {len(said['located'])} before, {len(said['remaining'])} after",
+                [_windows("Before", said["located"]), _windows("After", said["remaining"])],
+            ),
+        ]
+    return Section("mismatch", "Mismatch", blocks)
+
+
+def _mechanisms(found: Sequence[Mapping[str, Any]]) -> Table:
+    rows = [
+        row(
+            (
+                one["name"],
+                one["statement"],
+                Cell(number(one["probability"]), one["probability"]),
+                cell(one.get("explains_n"), "N"),
+                ", ".join(name for name in one["group"] if name != one["name"]) or "none",
+            )
+        )
+        for one in found
+    ]
+    head = ("mechanism", "what it does here", "probability", "explains", "look-alikes")
+    return Table("Mechanisms that were named", head, rows)
+
+
+def _parameters(found: Sequence[Mapping[str, Any]]) -> Table:
+    rows = [
+        row((one["name"], name, cell(p["mean"], p["unit"]), cell(p["sd"], p["unit"])))
+        for one in found
+        for name, p in one["parameters"].items()
+    ]
+    return Table("Parameters of the mechanisms", ("mechanism", "parameter", "mean", "sd"), rows)
+
+
+def _fits(fit: Mapping[str, Mapping[str, Any]]) -> Table:
+    kinds = list(fit["before"]["rmse_by_phase"])
+    rows = [
+        row(
+            (
+                when,
+                cell(fit[when]["rmse"], "N"),
+                cell(fit[when]["rmse_held_out"], "N"),
+                *(cell(fit[when]["rmse_by_phase"].get(kind), "N") for kind in kinds),
+                Cell(percent(fit[when]["coverage90"]), fit[when]["coverage90"]),
+            )
+        )
+        for when in ("before", "after")
+    ]
+    head = ("fit", "whole recording", "held out", *kinds, "90 % band holds")
+    return Table(
+        "RMSE without and with the mechanisms; held out: after the second hold, not fitted", head, rows
+    )
+
+
+def _candidates(candidates: Sequence[Mapping[str, Any]]) -> Table:
+    rows = [
+        row(
+            (
+                one["name"],
+                Cell(number(one["delta_score"]), one["delta_score"]),
+                Cell(number(one["standard_error"]), one["standard_error"]),
+            )
+        )
+        for one in candidates
+    ]
+    head = ("mechanism", "log evidence gained [nats]", "standard error")
+    return Table("Each mechanism added to the model alone", head, rows)
+
+
+def _windows(when: str, windows: Sequence[Mapping[str, Any]]) -> Table:
+    rows = [
+        row(
+            (
+                f"{one['phase']} of cycle {one['cycle']}",
+                cell(one["t0"], "s"),
+                cell(one["t1"], "s"),
+                Cell(quantity(one["mean_residual"], "N"), one["mean_residual"]),
+                Cell(number(one["significance"]), one["significance"]),
+            )
+        )
+        for one in windows
+    ]
+    head = ("window", "from", "to", "recorded minus model", "chance of one such by noise")
+    return Table(f"{when}: where the recording leaves what the model allows", head, rows)

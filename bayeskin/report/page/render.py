@@ -1,0 +1,53 @@
+"""From facts to HTML: the sections in their order, put into the template with its style and script inside."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+from bayeskin.report.page import checks, mismatch, sections
+from bayeskin.report.page.answer import answer
+from bayeskin.report.page.facts import RunFacts
+from bayeskin.report.page.parts import Block, Section
+
+_HERE = Path(__file__).parent
+
+
+def render_page(facts: RunFacts) -> str:
+    """One HTML document that loads nothing: text, figures, style and script are all in it.
+
+    All that comes from a configuration or a recording is escaped. The same facts give the same bytes.
+    """
+    environment = Environment(
+        loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters |= {"kind": _kind, "symbol": _symbol}
+    return environment.get_template("page.html").render(
+        facts=facts,
+        answer=answer(facts),
+        sections=_sections(facts),
+        style=Markup((_HERE / "page.css").read_text(encoding="utf-8")),
+        script=Markup((_HERE / "page.js").read_text(encoding="utf-8")),
+    )
+
+
+def _sections(facts: RunFacts) -> list[Section]:
+    upper = (sections.recording, sections.fit, sections.posterior, sections.sobol)
+    lower = (mismatch.mismatch, checks.checks, checks.provenance)
+    return [make(facts) for make in (*upper, *lower)]
+
+
+def _kind(block: Block) -> str:
+    return type(block).__name__
+
+
+def _symbol(name: str) -> Markup:
+    """A parameter's name as it is printed: ``E_c`` with a subscript, longer names as they are."""
+    found = re.fullmatch(r"([A-Za-z])_(\w+)", name)
+    if found is None:
+        return escape(name)
+    return Markup("<i>{}</i><sub>{}</sub>").format(*found.groups())

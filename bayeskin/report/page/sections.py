@@ -1,0 +1,199 @@
+"""The sections of a page below its answer: recording, fit, posterior, Sobol' indices."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from bayeskin.report.page.answer import prior_range, sentences, without_numbers
+from bayeskin.report.page.facts import RunFacts
+from bayeskin.report.page.figures import pictures
+from bayeskin.report.page.history import history_chart
+from bayeskin.report.page.numbers import interval, number, percent, quantity, scale
+from bayeskin.report.page.parts import Block, Cell, Facts, Folded, Missing, Section, Table, Text, row
+
+_WHY = {
+    "not run": "has not been run",
+    "not finished": "was begun and is not finished",
+    "failed": "failed",
+    "out of date": "is out of date: configuration, inputs or version have changed since",
+}
+_INDICES = {
+    "prior_gp": "over the prior, Gaussian process",
+    "prior_chaos": "over the prior, polynomial chaos",
+    "near_map": "near the most probable point",
+}
+
+
+def absent(facts: RunFacts, stage: str) -> list[Block]:
+    """Says plainly that a stage is not done, and how to do it; nothing when it is."""
+    known = facts.stage(stage)
+    if known.done:
+        return []
+    said = known.summary.get("message") if known.standing == "failed" else None
+    why = _WHY[known.standing] + (f": {said}" if said else "")
+    return [Missing(f"The stage {stage} {why}.", f"bayeskin {stage} {facts.config_path}")]
+
+
+def cell(value: float | None, unit: str) -> Cell:
+    """A number with its unit, sorted by its value in SI."""
+    return Cell(quantity(value, unit), value)
+
+
+def recording(facts: RunFacts) -> Section:
+    said = facts.said("recording")
+    blocks: list[Block] = list(absent(facts, "recording"))
+    if said:
+        force, moved = said["force_n"], said["displacement_m"]
+        blocks += [
+            Facts(
+                [
+                    ("name", said["name"]),
+                    ("duration", f"{number(said['duration_s'])} s, {said['samples']} samples"),
+                    ("rate", f"{number(said['sampling_hz'])} Hz"),
+                    ("cycles", str(said["cycles"])),
+                    ("displacement", interval(moved["min"], moved["max"], "m")),
+                    ("force", interval(force["min"], force["max"], "N")),
+                ]
+            ),
+            *pictures(facts, "recording"),
+            Folded("Phases and their noise", [_phases(said["phases"])]),
+        ]
+        if said["notes"]:
+            blocks.append(Folded("What was taken for what", [Text(said["notes"], listed=True)]))
+    return Section("recording", "Recording", blocks)
+
+
+def _phases(phases: Sequence[Mapping[str, Any]]) -> Table:
+    head = (
+        "phase",
+        "cycle",
+        "from",
+        "to",
+        "travel",
+        "noise sd",
+        "correlation time",
+        "spikes",
+        "steps of zero",
+    )
+    rows = [
+        row(
+            (
+                p["kind"],
+                Cell(str(p["cycle"]), p["cycle"]),
+                cell(p["start_s"], "s"),
+                cell(p["end_s"], "s"),
+                Cell(interval(p["start_m"], p["end_m"], "m"), p["end_m"] - p["start_m"]),
+                cell(p["noise_sd_n"], "N"),
+                cell(p["noise_correlation_time_s"], "s"),
+                Cell(str(p["spikes"]), p["spikes"]),
+                Cell(str(len(p["steps"])), len(p["steps"])),
+            )
+        )
+        for p in phases
+    ]
+    return Table("Phases of the recording", head, rows)
+
+
+def fit(facts: RunFacts) -> Section:
+    said = facts.said("sample")
+    blocks: list[Block] = list(absent(facts, "sample"))
+    if said:
+        if facts.history is not None:
+            blocks.append(history_chart(facts.history, facts.said("recording").get("phases", ())))
+        tables = {"posterior mean": said["rmse"], "full model, most probable point": None}
+        tables["full model, most probable point"] = facts.said("map").get("rmse_of_full_model")
+        blocks += [_rmse(tables), _bands(said), *pictures(facts, "sample", ["fit"])]
+    return Section("fit", "Fit", blocks)
+
+
+def _rmse(tables: Mapping[str, Mapping[str, Any] | None]) -> Table:
+    present = {name: one for name, one in tables.items() if one is not None}
+    kinds = list(dict.fromkeys(kind for one in present.values() for kind in one["by_kind_n"]))
+    rows = [
+        row(
+            (
+                name,
+                *(cell(one[key], "N") for key in ("whole_n", "fitted_n", "not_fitted_n")),
+                *(cell(one["by_kind_n"].get(kind), "N") for kind in kinds),
+            )
+        )
+        for name, one in present.items()
+    ]
+    return Table(
+        "RMSE between predicted and recorded force",
+        ("force of", "whole", "fitted", "not fitted", *kinds),
+        rows,
+    )
+
+
+def _bands(said: Mapping[str, Any]) -> Facts:
+    parts = said["rms_sd_n"]
+    return Facts(
+        [
+            ("90 % band holds, of all bins", percent(said["coverage_90"])),
+            ("of the fitted bins", percent(said["coverage_90_fitted"])),
+            ("sd from the parameters", quantity(parts["parameter"], "N")),
+            ("sd from the surrogate", quantity(parts["surrogate"], "N")),
+            ("sd from the noise", quantity(parts["noise"], "N")),
+        ]
+    )
+
+
+def posterior(facts: RunFacts) -> Section:
+    said = facts.said("sample")
+    blocks: list[Block] = list(absent(facts, "sample"))
+    if said:
+        blocks += [_parameters(facts, said["parameters"]), *pictures(facts, "sample", ["posterior"])]
+        if said["ridges"]:
+            blocks.insert(1, Text([f"{ridge}." for ridge in said["ridges"]], listed=True))
+    return Section("posterior", "Posterior", blocks)
+
+
+def _parameters(facts: RunFacts, table: Mapping[str, Mapping[str, Any]]) -> Table:
+    best, spoken = facts.said("map").get("theta", {}), sentences(facts)
+    numbers = ("median", "5 %", "95 %", "unit", "most probable")
+    head = ("parameter", "meaning", "prior", *numbers, "what the data says")
+    rows = []
+    for name, said in table.items():
+        values = [*(said[key] for key in ("median", "low_90", "high_90")), best.get(name)]
+        factor, unit = scale(values[:3], said["unit"])
+        shown = [Cell(number(None if v is None else factor * v), v) for v in values]
+        meaning = facts.parameters.get(name) or said.get("meaning", "")
+        sentence = without_numbers(spoken.get(name, ""))
+        rows.append(row((name, meaning, prior_range(said), *shown[:3], unit, shown[3], sentence)))
+    return Table("Parameters: prior, posterior, and what the data says of each", head, rows, symbols=True)
+
+
+def sobol(facts: RunFacts) -> Section:
+    said = facts.said("sobol")
+    blocks: list[Block] = list(absent(facts, "sobol"))
+    for name, one in said.items():
+        title = _INDICES.get(name, name)
+        blocks += [
+            Table(
+                f"Sobol' indices aggregated over time, {title}",
+                ("parameter", "first order", "90 % interval", "total", "90 % interval"),
+                [_index(parameter, index) for parameter, index in one["aggregated"].items()],
+                symbols=True,
+            ),
+            Text([one["sentence"]]),
+            *pictures(facts, "sobol", [f"sobol_{name}"]),
+            Folded(
+                f"How: {title}", [Text([f"{one['method']}, {one['samples']} samples", one["distribution"]])]
+            ),
+        ]
+    return Section("sobol", "Sobol' indices", blocks)
+
+
+def _index(name: str, index: Mapping[str, Any]) -> tuple[Cell, ...]:
+    cells: list[str | Cell] = [name]
+    for kind in ("first", "total"):
+        low, high = index[f"{kind}_90"]
+        cells += [Cell(_share(index[kind]), index[kind]), Cell(f"{_share(low)} to {_share(high)}", low)]
+    return row(cells)
+
+
+def _share(value: float | None) -> str:
+    """An index to three decimals: more of them would be the estimate's noise."""
+    return "–" if value is None else f"{round(value, 3) + 0.0:.3f}".replace("-", "−")

@@ -1,0 +1,138 @@
+"""What the stages of a finished run say, in the form that they say it, and what they draw."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from bayeskin.report.page import RunFacts, StageFacts
+from bayeskin.report.page.figures import _KNOWN
+from bayeskin.report.save import _render
+
+PARAMETERS = {"E_c": "Young's modulus of the cutis", "p_init": "initial interstitial pressure"}
+HISTORY = {
+    "time_s": [0.25, 0.75, 1.25, 1.75],
+    "recorded_n": [0.0, 0.1, None, 0.3],
+    "fitted": [True, True, False, False],
+    "median_n": [0.0, 0.11, 0.2, 0.29],
+    "low_50_n": [-0.01, 0.1, 0.19, 0.28],
+    "high_50_n": [0.01, 0.12, 0.21, 0.3],
+    "low_90_n": [-0.02, 0.09, 0.18, 0.27],
+    "high_90_n": [0.02, 0.13, 0.22, 0.31],
+}
+_RMSE = {
+    "whole_n": 0.00365, "by_kind_n": {"rest": 0.0035, "load": 0.0039}, "fitted_n": 0.0036,
+    "not_fitted_n": None, "article_holds_n": None,
+}  # fmt: skip
+_PHASE = {
+    "kind": "load", "cycle": 1, "start_s": 0.0, "end_s": 2.0, "start_m": 0.0, "end_m": 0.0094,
+    "noise_sd_n": 0.0045, "noise_correlation_time_s": 0.15, "spikes": 3, "steps": [],
+}  # fmt: skip
+_INDEX = {"first": 0.8, "first_90": [0.7, 0.9], "total": 0.85, "total_90": [0.8, -0.0001]}
+
+
+def _parameter(prior: str, low: float, median: float, high: float, unit: str = "Pa") -> dict[str, Any]:
+    return {
+        "meaning": "", "unit": unit, "mean": median, "sd": 1.0, "median": median, "low_90": low,
+        "high_90": high, "ess": 3000.0, "rhat": 1.0007,
+        "prior": {"kind": prior, "lower": 0.5 * low, "upper": 2.0 * high},
+    }  # fmt: skip
+
+
+def summaries() -> dict[str, dict[str, Any]]:
+    """By stage; a trusted posterior, and a diagnosis that named something."""
+    return {
+        "recording": {
+            "name": "forearm", "sha256": "a" * 64, "notes": ["column 'F' taken as force, N"], "samples": 6501,
+            "duration_s": 130.0, "sampling_hz": 50.0, "displacement_m": {"min": 0.0, "max": 0.0094},
+            "force_n": {"min": -0.0253, "max": 0.4095}, "cycles": 2,
+            "phases": [_PHASE, {**_PHASE, "kind": "hold", "spikes": 20}],
+        },
+        "design": {
+            "runs": 120, "failed": 1, "failures": {"Newton stalled": 1}, "seconds_of_runs": 1160.0,
+            "median_seconds_a_run": 8.9, "model_hash": "b" * 64,
+            "waves": [{"wave": 0, "training": 96, "held_out": 24, "kept_fraction": 1.0, "rule": "whole box"}],
+        },
+        "train": {
+            "kind": "gp", "training_rows": 96, "error_source": "held-out", "relative_error": 0.042,
+            "median_point_relative_error": 0.0016, "worst_point_relative_error": 0.0046, "coverage_90": 0.963,
+        },
+        "map": {
+            "ok": True, "theta": {"E_c": 62e3, "p_init": 1600.0}, "message": "2 of 4 starts reached it",
+            "rmse_of_full_model": _RMSE,
+            "polished": {"gained": 0.42, "message": "converged after 6 full runs"},
+            "checks": [
+                {"passes": True, "message": "surrogate off by 0.43 mN", "rms_n": 4.3e-4, "max_n": 8.4e-4,
+                 "rms_z": 0.66, "seconds_of_full_run": 5.98},
+            ],
+        },
+        "sample": {
+            "ok": True, "verdict": "trusted", "reasons": ["3554 effective samples of E_c; 2000 needed"],
+            "steps": 16000, "draws": 3776,
+            "parameters": {
+                "E_c": _parameter("log-uniform", 13.9e3, 50.8e3, 87e3),
+                "p_init": _parameter("uniform", -522.0, 842.0, 2021.0),
+                "sd_rest": _parameter("log-uniform", 0.0019, 0.0028, 0.0045, "N"),
+            },
+            "identifiability": [
+                "E_c: the data informs it: median 5.08e+04, 90 % interval 1.39e+04 to 8.7e+04 Pa; leans on "
+                "the prior's lower bound, 1e+04 Pa, so the prior shapes it",
+                "p_init: the data does not inform it (posterior = prior)",
+                "sd_rest: the data informs it weakly: median 0.0028, 90 % interval 0.0019 to 0.0045 N",
+            ],
+            "ridges": ["E_c and E_s form a ridge (correlation -0.87): one makes up for the other"],
+            "rmse": _RMSE, "coverage_90": 0.9462, "coverage_90_fitted": 0.9512,
+            "rms_sd_n": {"parameter": 0.0013, "surrogate": 0.0009, "noise": 0.0042},
+        },
+        "sobol": {
+            name: {
+                "sentence": "The force does not inform p_init.", "method": "pick-freeze", "samples": 2048,
+                "distribution": "independent", "aggregated": {"E_c": _INDEX, "p_init": _INDEX},
+            }
+            for name in ("prior_gp", "prior_chaos", "near_map")
+        },
+        "diagnose": {
+            "verdict": "named",
+            "located": [{"t0": 0.0, "t1": 9.5, "phase": "rest", "cycle": 0, "mean_residual": -0.0586,
+                         "significance": 0.001}],
+            "remaining": [],
+            "mechanisms": [
+                {"name": "device-friction", "probability": 0.98, "group": ["device-friction", "viscous-drag"],
+                 "group_probability": 1.0, "explains_n": 0.03, "statement": "The slide rubs: 60 mN.",
+                 "parameters": {"Fc": {"mean": 0.0601, "sd": 0.0007, "unit": "N"}}},
+            ],
+            "candidates": [{"name": "device-friction", "delta_score": 8596.9, "standard_error": 3918.4},
+                           {"name": "backlash", "delta_score": -1.5, "standard_error": 0.2}],
+            "fit": {
+                when: {"rmse": rmse, "rmse_by_phase": {"rest": rmse}, "rmse_held_out": None,
+                       "coverage90": 0.9}
+                for when, rmse in (("before", 0.08), ("after", 0.0247))
+            },
+        },
+    }  # fmt: skip
+
+
+def drawing(name: str) -> str:
+    """A small figure as the stages save them, with clipped parts and markers that it refers to by id."""
+    figure = Figure(figsize=(2, 1))
+    figure.subplots().plot([0, 1, 2], [0, 2, 1], "o-", label=name)
+    return _render(figure, "svg", f"bayeskin 0, {name}").decode()
+
+
+def facts(**changed: Any) -> RunFacts:
+    """A run whose stages are all done but `effects`."""
+    said = summaries()
+    stages = {
+        name: StageFacts(
+            name, "done", 1.5, summary, {figure: drawing(figure) for of, figure in _KNOWN if of == name}
+        )
+        for name, summary in said.items()
+    }
+    given: dict[str, Any] = {
+        "name": "forearm", "config_path": "runs/forearm.toml", "config_text": 'name = "forearm"\n',
+        "config_sha256": "c" * 64, "version": "0.1.0", "seed": 7, "observation": "reaction", "mesh": "bricks",
+        "parameters": PARAMETERS, "stages": {**stages, "effects": StageFacts("effects", "not run")},
+        "history": HISTORY,
+    }  # fmt: skip
+    return RunFacts(**{**given, **changed})

@@ -1,0 +1,255 @@
+"""What a diagnosis says and draws: parts of the force, what is left and when that is told, figures, words."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import toy
+from matplotlib.figure import Figure
+from toy_inference import NOISE, TRUTH, ToySurrogate, toy_problem
+
+from bayeskin import report
+from bayeskin.inference import LogPosterior
+from bayeskin.mechanisms import catalogue
+from bayeskin.mismatch.contributions import Contribution, contributions
+from bayeskin.mismatch.discrepancy import discrepancy
+from bayeskin.mismatch.fit import Fit
+from bayeskin.mismatch.form import propose_form
+from bayeskin.mismatch.locate import Located, Window
+from bayeskin.mismatch.observed import ObservedSurrogate
+from bayeskin.mismatch.search import Search
+from bayeskin.mismatch.verdict import Diagnosis, Named
+from bayeskin.pipeline import diagnosis
+from bayeskin.pipeline.diagnosis_outputs import Found, Remainder, draw, in_words, mechanism, unexplained
+from bayeskin.pipeline.folder import plain
+
+CREEP_S = 20.0
+VALUES = {
+    "F0": -0.04, "drift": 1e-4, "Fc": 0.05, "presliding": 5e-5, "friction_start": 0.0, "friction_tau": CREEP_S
+}  # fmt: skip
+ALONE = toy_problem(1)
+BINNED = ALONE.binned
+
+
+def build(names: Sequence[str]) -> LogPosterior:
+    if not names:
+        return ALONE
+    these = tuple(catalogue()[name] for name in names)
+    return dataclasses.replace(ALONE, surrogate=ObservedSurrogate(ToySurrogate(), these, toy.MOTION))
+
+
+def fitted(*names: str) -> Fit:
+    """The toy with mechanisms at VALUES, as if it had been fitted there."""
+    log_posterior = build(names)
+    theta = {name: {**TRUTH, **NOISE, **VALUES}[name] for name in log_posterior.names}
+    return Fit(names, log_posterior, theta, 0.0, 0.0, 1e-6 * np.eye(log_posterior.dim), np.zeros(3))
+
+
+def located(residual_n: np.ndarray, *windows: Window) -> Located:
+    return Located(windows, np.arange(len(residual_n)), residual_n, np.full(len(residual_n), 1e-3))
+
+
+WINDOW = Window(15.0, 45.0, "hold", 1, 5e-3, 1e-3)
+
+
+# Parts of the force
+
+
+def test_a_mechanism_s_part_is_what_it_adds_at_its_own_values() -> None:
+    drift, offset = contributions(fitted("force-offset", "sensor-drift"), build)[::-1]
+    assert (offset.name, drift.name) == ("force-offset", "sensor-drift")  # the larger first
+    assert offset.along == drift.along == ()
+    np.testing.assert_allclose(offset.force_n, -0.04, atol=1e-12)
+    assert offset.size_n == pytest.approx(0.04)
+    np.testing.assert_allclose(drift.force_n, 1e-4 * BINNED.time_s, atol=1e-12)
+    assert contributions(fitted(), build) == []
+
+
+def test_friction_takes_its_creep_along() -> None:
+    parts = {one.name: one for one in contributions(fitted("device-friction", "friction-creep"), build)}
+    friction, creep = parts["device-friction"], parts["friction-creep"]
+    assert friction.along == ("friction-creep",)
+    assert creep.along == ()
+    hold = (BINNED.time_s > 16.0) & (BINNED.time_s < 44.0)
+    fades = friction.force_n[hold] / friction.force_n[hold][0]
+    np.testing.assert_allclose(fades, np.exp(-(BINNED.time_s[hold] - BINNED.time_s[hold][0]) / CREEP_S))
+    kept = contributions(fitted("device-friction"), build)[0]
+    assert kept.along == ()
+    np.testing.assert_allclose(friction.force_n, kept.force_n + creep.force_n, atol=1e-12)
+
+
+def test_a_named_mechanism_states_the_size_of_its_own_part() -> None:
+    named = Named(
+        "sensor-drift", 1.0, ("sensor-drift",), 1.0, 5e-3, {"drift": (1e-4, 1e-6, "N/s")}, "It drifts."
+    )
+    parts = contributions(fitted("force-offset", "sensor-drift"), build)
+    assert mechanism(named, parts)["contribution_n"] == pytest.approx(
+        1e-4 * np.sqrt(np.mean(BINNED.time_s**2))
+    )
+
+
+# What is left
+
+
+@pytest.mark.parametrize(
+    ("verdict", "windows", "described"),
+    [
+        ("nothing-missing", (), False),
+        ("nothing-missing", (WINDOW,), False),
+        ("named", (), False),
+        ("named", (WINDOW,), True),
+        ("unknown", (), True),
+        ("unknown", (WINDOW,), True),
+    ],
+)
+def test_what_is_left_is_described_where_something_is(
+    verdict: Any, windows: tuple[Window, ...], described: bool
+) -> None:
+    bench = cast(Any, SimpleNamespace(motion=toy.MOTION, run=SimpleNamespace(config=SimpleNamespace(seed=1))))
+    after = located(np.zeros(len(BINNED.force_n)), *windows)
+    found = diagnosis._remainder(bench, Diagnosis(verdict, (), 0.0), fitted(), after)
+    assert (found is not None) == described
+
+
+def drifting() -> Fit:
+    """What a sensor's drift leaves where no mechanism is known."""
+    plain_fit, drift = fitted(), 2e-4 * BINNED.time_s
+    noisy = dataclasses.replace(BINNED, force_n=BINNED.force_n + drift)
+    return dataclasses.replace(plain_fit, log_posterior=dataclasses.replace(ALONE, binned=noisy))
+
+
+@pytest.fixture(scope="module")
+def remainder() -> Remainder:
+    fit = drifting()
+    return Remainder(discrepancy(fit, toy.MOTION), propose_form(fit, toy.MOTION, 0))
+
+
+def test_what_is_left_is_said_with_its_size_parts_and_form(remainder: Remainder) -> None:
+    said = json.loads(json.dumps(plain(unexplained(remainder)), allow_nan=False))
+    assert said["size_n"] == pytest.approx(remainder.discrepancy.size_n)
+    assert set(said["share"]) == {"displacement", "phase", "cycle"}
+    assert said["noticeable"]
+    assert said["gain_nats"] > 5.0
+    assert "rises with time" in " ".join(said["features"])
+    term = said["form"]["terms"][0]
+    assert (term["name"], term["unit"]) == ("time", "N/s")
+    assert abs(term["coefficient"] - 2e-4) < 3.0 * term["standard_error"] + 3e-5
+    assert said["form"]["sentence"] == remainder.form.sentence
+
+
+def test_words_say_what_is_left_only_where_something_is(remainder: Remainder) -> None:
+    fits = {
+        "rmse": 1e-3,
+        "rmse_held_out": None,
+        "full_model": {"rmse": 2.5e-3, "fit_off_by": 4e-4, "runs": 2},
+    }
+    answer = {
+        "verdict": "unknown", "mechanisms": [], "located": [], "remaining": [], "candidates": [],
+        "fit": {"before": fits, "after": fits}, "folder": "x", "unexplained": None,
+    }  # fmt: skip
+    assert "unexplained" not in in_words(answer)
+    assert "full model, 2 runs: RMSE 2.5 mN, the surrogate's fit is off by 0.4 mN" in in_words(answer)
+    said = unexplained(remainder)
+    words = in_words({**answer, "unexplained": said})
+    assert f"left unexplained: {1e3 * said['size_n']:.1f} mN RMS" in words
+    assert said["form"]["sentence"] in words
+    assert all(feature in words for feature in said["features"])
+    nothing = in_words({**answer, "unexplained": {**said, "noticeable": False}})
+    assert "nothing beyond noise" in nothing
+    assert "mN RMS" not in nothing
+
+
+# Figures
+
+
+def headline(figure: Figure) -> str:
+    return figure.get_suptitle().replace("\n", " ")
+
+
+def test_each_figure_is_written_where_it_has_something_to_show(
+    monkeypatch: pytest.MonkeyPatch, remainder: Remainder
+) -> None:
+    monkeypatch.setattr(report, "save_figure", lambda figure, stem, made_by: (stem.with_suffix(".png"),))
+    best = fitted("force-offset")
+    search = Search({(): fitted(), best.names: best})
+    empty = located(np.zeros(len(BINNED.force_n)))
+    rows = [{"name": "force-offset", "delta_score": 3.0, "standard_error": 1.0}]
+    written = []
+    for parts, left in ((contributions(best, build), remainder), ([], None)):
+        found = Found(search, ["did not converge", None], empty, empty, parts, left)
+        written.append({path.name for path in draw(Path("x"), "", BINNED, toy.MOTION, found, rows)})
+    assert written[0] - written[1] == {"contributions.png", "discrepancy.png"}
+    assert {Path(name).stem for name in written[1]} == {
+        "located", "candidates", "before_after", "residual_by_phase"
+    }  # fmt: skip
+
+
+def test_residuals_by_phase_have_a_line_a_cycle_and_the_rms_of_their_kind() -> None:
+    kinds = np.array([phase.kind for phase in BINNED.phases])[BINNED.phase]
+    residual = np.where(kinds == "hold", 8e-3, 2e-3)
+    before, after = located(residual, WINDOW), located(0.25 * residual)
+    figure = report.figure_residual_by_phase(BINNED, toy.MOTION, before, after)
+    assert headline(figure) == "Most is left in holds: 8.0 mN RMS before, 2.0 mN after"
+    titles = {ax.get_title(loc="left"): ax for ax in figure.axes}
+    assert [title[title.index("  ") + 2 :] for title in titles] == [
+        "while loading: 2.0 → 0.5 mN RMS",
+        "while unloading: 2.0 → 0.5 mN RMS",
+        "in holds: 8.0 → 2.0 mN RMS",
+        "at rest: 2.0 → 0.5 mN RMS",
+    ]
+    lines = [len(ax.get_lines()) for ax in figure.axes]
+    assert lines == [4, 4, 4, 6]  # before and after of two cycles; the rest before the first is one more
+    assert [ax.get_xscale() for ax in figure.axes] == ["linear", "linear", "log", "log"]
+    first, second = figure.axes[2].get_lines()[:2]
+    assert cast(float, first.get_alpha()) > cast(float, second.get_alpha())
+    np.testing.assert_allclose(np.asarray(first.get_ydata()), 8.0)
+    assert np.ptp(np.asarray(figure.axes[0].get_lines()[0].get_xdata())) == pytest.approx(8.1)  # mm
+
+
+def test_residuals_of_a_part_of_the_recording_leave_the_other_phases_out() -> None:
+    inside = np.flatnonzero(BINNED.time_s < 50.0)
+    part = Located((), inside, np.full(len(inside), 1e-3), np.full(len(inside), 1e-3))
+    figure = report.figure_residual_by_phase(BINNED, toy.MOTION, part, part)
+    assert [len(ax.get_lines()) for ax in figure.axes] == [2, 2, 2, 2]
+    moving = dataclasses.replace(
+        BINNED,
+        phases=tuple(dataclasses.replace(p, kind="hold") if p.kind == "rest" else p for p in BINNED.phases),
+    )
+    panels = report.figure_residual_by_phase(moving, toy.MOTION, part, part).axes
+    assert [ax.get_visible() for ax in panels] == [True, True, True, False]
+
+
+def test_contributions_have_a_row_each_and_rounding_does_not_fill_one() -> None:
+    parts = contributions(fitted("device-friction", "force-offset", "friction-creep"), build)
+    parts.append(Contribution("pad-slip", (), np.full(len(BINNED.force_n), 1e-17)))
+    figure = report.figure_contributions(BINNED, toy.MOTION, parts)
+    assert len(figure.axes) == 2 * len(parts)
+    assert headline(figure) == f"{parts[0].name} moves the force most, by {1e3 * parts[0].size_n:.1f} mN RMS"
+    titles = [ax.get_title(loc="left") for ax in figure.axes[::2]]
+    assert "force-offset: 40.0 mN RMS" in titles
+    assert [title for title in titles if title.startswith("device-friction with friction-creep: ")]
+    drawn = np.asarray(figure.axes[0].get_lines()[0].get_ydata())
+    np.testing.assert_allclose(drawn, 1e3 * parts[0].force_n)
+    low, high = figure.axes[-2].get_ylim()
+    assert high - low > 0.02  # mN
+
+
+def test_candidates_of_a_few_nats_are_read_off_beside_one_of_hundreds() -> None:
+    rows = [
+        {"name": "viscous-drag", "delta_score": 812.34, "standard_error": 100.0},
+        {"name": "force-offset", "delta_score": -1.26, "standard_error": 0.4},
+        {"name": "sensor-drift", "delta_score": -0.01, "standard_error": 0.0},
+    ]
+    figure = report.figure_candidates(rows)
+    figure.draw_without_rendering()
+    (numbers,) = figure.axes[0].child_axes
+    assert [label.get_text() for label in numbers.get_yticklabels()] == [
+        "+0.0 ± 0.0", "−1.3 ± 0.4", "+812.3 ± 100.0"
+    ]  # fmt: skip

@@ -1,0 +1,116 @@
+"""What `bayeskin doctor` finds: a sound installation whole, and each broken part by its name."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import tempfile
+from collections import namedtuple
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bayeskin import cli
+from bayeskin.pipeline import doctor
+
+TESTS = ("_full_model", "_surrogate")
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the runs of the models."""
+    for name in TESTS:
+        monkeypatch.setattr(doctor, name, lambda: doctor.Finding("model", True, "as stored"))
+
+
+def broken(said: dict[str, Any]) -> dict[str, str]:
+    return {one["name"]: one["found"] for one in said["findings"] if not one["ok"]}
+
+
+def test_the_models_give_the_stored_numbers_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(metadata, "requires", lambda name: ["numpy>=2.0"])
+    with pytest.raises(SystemExit) as end:
+        cli.main(["doctor", "--json"])
+    said = json.loads(capsys.readouterr().out)
+    assert broken(said) == {}
+    assert (said["ok"], end.value.code) == (True, 0)
+    names = [one["name"] for one in said["findings"]]
+    expected = ["numpy", "linear solver", "threads", "disk space", "write access", "full model", "surrogate"]
+    assert [name for name in names if name in expected] == expected
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "name"), [("FULL_MODEL_N", "full model"), ("SURROGATE_N", "surrogate")], ids=str
+)
+def test_a_model_that_gives_another_number_is_broken(
+    monkeypatch: pytest.MonkeyPatch, number: str, name: str
+) -> None:
+    monkeypatch.setattr(doctor, number, 1.01 * getattr(doctor, number))
+    finding = {"full model": doctor._full_model, "surrogate": doctor._surrogate}[name]()
+    assert (finding.name, finding.ok) == (name, False)
+    assert "within" in finding.advice
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_package_that_is_absent_or_too_old_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ["numpy>=99", "no-such-package>=1.2", "scipy>=1", "no-such-wheel>=1; platform_machine == 'arm'"]
+    monkeypatch.setattr(metadata, "requires", lambda name: asked)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        cli.main(["doctor"])
+    shown = capsys.readouterr().out
+    assert end.value.code == 1
+    assert "BROKEN  numpy" in shown
+    assert "expected >=99" in shown
+    assert "BROKEN  no-such-package: not installed" in shown
+    assert "ok      scipy" in shown
+    assert "no-such-wheel" not in shown  # needed elsewhere only
+    assert shown.splitlines()[-1] == "something is broken"
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_part_that_cannot_be_imported_is_a_finding_and_no_crash(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(metadata, "requires", lambda name: [])
+    monkeypatch.setitem(sys.modules, "bayeskin.model", None)
+    said = doctor.examine(tmp_path)
+    assert list(broken(said)) == ["linear solver"]
+    assert "ModuleNotFoundError" in broken(said)["linear solver"]
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_folder_without_room_or_access_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata, "requires", lambda name: [])
+    usage = namedtuple("usage", "total used free")
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(10, 9, 12_000_000))
+
+    def denied(**_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", denied)
+    assert broken(doctor.examine(tmp_path)) == {
+        "disk space": "0.0 GB free",
+        "write access": f"{tmp_path}: Permission denied",
+    }
+
+
+@pytest.mark.parametrize(
+    ("version", "limits", "holds"),
+    [
+        ("0.23.4", "<1,>=0.20", True), ("1.0", "<1,>=0.20", False), ("0.9", ">=0.20", False),
+        ("2.10.0", ">=2.9", True), ("2.0.0+local.7", ">=2.0", True), ("3.0", "", True),
+        ("1.0.0", ">=1.0", True), ("1", ">=1.0", True), ("1.0", "<1", False),
+    ],
+)  # fmt: skip
+def test_versions_are_compared_by_their_numbers(version: str, limits: str, holds: bool) -> None:
+    assert doctor.within(version, limits) is holds

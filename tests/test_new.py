@@ -1,0 +1,117 @@
+"""What `bayeskin new` writes: a configuration that loads, for this recording, over nothing."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bayeskin import cli, storage
+from bayeskin.config import Config, RecordingConfig, load_config, parameter_space
+from bayeskin.design import default_space
+from bayeskin.pipeline import stages
+from bayeskin.pipeline.engine import Silent, open_run
+from bayeskin.pipeline.new import new_config
+from bayeskin.shipped import shipped
+from bayeskin.types import Recording
+
+
+@pytest.fixture
+def demo(tmp_path: Path) -> Path:
+    path = tmp_path / "data" / "forearm.h5"
+    path.parent.mkdir()
+    path.write_bytes(shipped("data/demo.h5").read_bytes())
+    return path
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Path:
+    """A recording whose protocol nobody knows."""
+    time_s = np.arange(0.0, 60.0, 0.1)
+    displacement_m = np.interp(time_s, [0.0, 5.0, 15.0, 40.0, 50.0, 60.0], [0.0, 0.0, 7e-3, 7e-3, 0.0, 0.0])
+    noise_n = 0.002 * np.random.default_rng(1).standard_normal(len(time_s))
+    path = tmp_path / "own.h5"
+    note = "column 'F\x07 [N]\n]#' taken as force, N"
+    storage.save(
+        path, Recording(time_s, displacement_m, 30 * displacement_m + noise_n, "own", "0" * 64, (note,))
+    )
+    return path
+
+
+def test_a_known_protocol_takes_the_shipped_surrogate_and_the_design_stage_accepts_it(demo: Path) -> None:
+    out = demo.parent.parent / "forearm.toml"
+    said = new_config(demo, out)
+    assert (said["out"], said["surrogate"], said["cycles"]) == (str(out), "demo.h5", 2)
+    assert load_config(out) == Config(
+        name="forearm",
+        recording=RecordingConfig(file="data/forearm.h5"),
+        surrogate={"file": "demo.h5"},
+    )
+    assert open_run(out, Silent()).beside("data/forearm.h5").samefile(demo)
+    assert "#   demo: 6501 samples at 50 Hz" in out.read_text()
+    assert stages.run(out, "design", Silent())["training"] == 96
+
+
+def test_an_unknown_protocol_gets_a_design_of_its_own(own: Path) -> None:
+    said = new_config(own)
+    config = load_config(own.with_suffix(".toml"))
+    assert (said["surrogate"], config.surrogate.file) == (None, None)
+    assert config == Config(name="own", recording=RecordingConfig(file="own.h5"))
+    assert "# 336 runs of some 4 to 15 s each, 11 to 42 minutes with 2 workers." in (
+        own.with_suffix(".toml").read_text()
+    )
+
+
+def test_every_key_that_is_commented_out_is_a_default(own: Path) -> None:
+    new_config(own)
+    text = own.with_suffix(".toml").read_text()
+    with_keys = re.sub(r"^# (?=\[|\w+ = )", "", text, flags=re.MULTILINE)
+    own.with_suffix(".toml").write_text(with_keys.replace("windows_s = [[0.0, 60.0]]", ""))
+    config = load_config(own.with_suffix(".toml"))
+    assert set(tomllib.loads(with_keys)) >= {"model", "fit", "sample", "parameters", "design"}
+    default = Config(name="own", recording=RecordingConfig(file="own.h5"))
+    assert config.model_copy(update={"parameters": {}}) == default
+    space = parameter_space(config)
+    for ours, known in zip(space.parameters, default_space().parameters, strict=True):
+        assert (ours.lower, ours.upper, ours.prior) == (known.lower, known.upper, known.prior)
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    with pytest.raises(SystemExit) as end:
+        cli.main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    assert (end.value.code, captured.out, captured.err.count("\n")) == (2, "", 1)
+    return captured.err
+
+
+def test_nothing_is_written_over(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = own.with_suffix(".toml")
+    out.write_text("mine")
+    assert "own.toml: found a file that is there already" in refused(capsys, "new", own)
+    assert out.read_text() == "mine"
+
+
+def test_what_cannot_be_done_is_refused_in_one_line_and_nothing_written(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "ending .toml" in refused(capsys, "new", own, "-o", tmp_path / "own.yaml")
+    assert "unreadable" in refused(capsys, "new", tmp_path / "absent.csv")
+    assert "absent" in refused(capsys, "new", own, "-o", tmp_path / "absent" / "own.toml")
+    assert [path.name for path in tmp_path.iterdir()] == ["own.h5"]
+
+
+def test_a_name_that_toml_or_a_run_cannot_take_as_it_is(
+    own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    odd = own.rename(tmp_path / '..é "test" 3\\.h5')
+    with pytest.raises(SystemExit) as end:
+        cli.main(["new", str(odd), "--json"])
+    assert end.value.code == 0
+    out = Path(json.loads(capsys.readouterr().out)["out"])
+    config = load_config(out)
+    assert config.recording.file == odd.name
+    assert config.name == "test--3-"
