@@ -14,6 +14,8 @@ compiles. CPU seconds by stage:
     solve            back-substitution
     rest             everything else (Python, NumPy)
 
+A second run with the force's derivatives by the parameters gives what they cost beyond the run.
+
 The floor is one factorisation and one solve, each measured alone (median) on the run's last tangent, times
 how many the run asked for. The article's script takes about 3,600 CPU s for its 694 steps on one core; that
 is a stated number, it is not run here.
@@ -43,6 +45,7 @@ import scipy.sparse as sp
 from matplotlib.figure import Figure
 
 from bayeskin.model import assembly, linear, newton, poroelastic, simulate
+from bayeskin.model.gradients import ForceGradients
 from bayeskin.model.linear import SOLVER_NAME, Factorisations
 from bayeskin.model.simulate import ModelSpec, problem_of
 from bayeskin.report import save_figure
@@ -63,7 +66,7 @@ ROWS = rows.Rows(
         "status", "linear_solver", "cells", "dofs", "steps", "iterations", "cpu_s",
         *(f"{stage}_s" for stage in STAGES), *(f"{stage}_count" for stage in STAGES[:-1]),
         "one_factorisation_s", "one_solve_s", "floor_s", "factor_bytes", "matrix_entries",
-        "peak_memory_bytes",
+        "peak_memory_bytes", "gradients_s",
     ),
 )  # fmt: skip
 
@@ -134,7 +137,7 @@ def measure(item: tuple[str, str, int]) -> dict[str, Any]:
     theta = healthy_skin.POINTS["C"]
     with healthy_skin.spec_on(mesh, ModelSpec().tolerance) as spec:
         compiling = PadMotion(np.array([0.0, 1.0]), np.array([0.0, 1e-4]))
-        simulate(ModelSpec(tolerance=1.0), compiling, theta)
+        simulate(ModelSpec(tolerance=1.0), compiling, theta, gradients=True)
         problem = problem_of(spec.mesh, spec.refinement)  # a process builds it once, for all of its runs
         clock = Clock()
         with on_the_clock(clock) as made:
@@ -142,6 +145,7 @@ def measure(item: tuple[str, str, int]) -> dict[str, Any]:
             found = simulate(spec, motion, theta, rows.progress(mesh))
             cpu_s = time.process_time() - started
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        of_gradients_s = gradients_s(spec, motion, theta)
     clock.seconds["rest"] = cpu_s - sum(clock.seconds.values())
     matrix, scale = made[0].last
     factorisation_s, solve_s, factor_bytes = alone(matrix, scale)
@@ -156,7 +160,18 @@ def measure(item: tuple[str, str, int]) -> dict[str, Any]:
         "one_factorisation_s": factorisation_s, "one_solve_s": solve_s,
         "floor_s": factorisations * factorisation_s + clock.counts["solve"] * solve_s,
         "factor_bytes": factor_bytes, "matrix_entries": matrix.nnz, "peak_memory_bytes": memory,
+        "gradients_s": of_gradients_s,
     }  # fmt: skip
+
+
+def gradients_s(spec: ModelSpec, motion: PadMotion, theta: dict[str, float]) -> float:
+    """CPU seconds that the force's derivatives take along a run."""
+    clock = Clock()
+    clock.seconds["gradients"], clock.counts["gradients"] = 0.0, 0
+    follow = clock.timed("gradients", ForceGradients.follow)
+    with mock.patch.object(ForceGradients, "follow", follow):
+        simulate(spec, motion, theta, gradients=True)
+    return clock.seconds["gradients"]
 
 
 def alone(matrix: sp.csr_matrix, scale: Array) -> tuple[float, float, int]:
@@ -214,6 +229,9 @@ def table(found: dict[str, dict[str, float]], whole: bool) -> str:
     lines.append(["one factorisation, one solve, alone [ms]", *(f"{a:.0f}, {b:.1f}" for a, b in ms)])
     lines.append(["floor: those times their numbers [s]", *(f"{m['floor_s']:.2f}" for m in found.values())])
     lines.append(["CPU s over the floor", *(f"{m['cpu_s'] / m['floor_s']:.2f}" for m in found.values())])
+    lines.append(["derivatives [CPU s]", *(f"{m['gradients_s']:.2f}" for m in found.values())])
+    shares = [f"{m['gradients_s'] / m['cpu_s']:.2f}" for m in found.values()]
+    lines.append(["derivatives, of the run", *shares])
     lines.append(["factors [MB]", *(f"{m['factor_bytes'] / 1e6:.1f}" for m in found.values())])
     rate = [2 * m["factor_bytes"] / m["one_solve_s"] / 1e9 for m in found.values()]
     lines.append(["factors read twice a solve [GB/s]", *(f"{r:.1f}" for r in rate)])

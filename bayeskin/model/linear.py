@@ -93,12 +93,12 @@ class _Pardiso:
         self._indices, self._indptr = pattern.indices.astype(np.int32), pattern.indptr.astype(np.int32)
 
     def solve(self, number: int, right: Array) -> Array:
-        scale = self._scale[number].reshape((-1,) + (1,) * (right.ndim - 1))
-        scaled = right * scale
-        # each column to size one, so that nothing underflows in single precision
-        size = np.maximum(np.abs(scaled).max(axis=0), np.finfo(float).tiny)
-        found = self._call(number, _SOLVE, np.asfortranarray(scaled / size, dtype=np.float32))
-        return np.asarray(found.astype(float) * (size * scale))
+        scale = self._scale[number]
+        scaled = np.ascontiguousarray(right.T) * scale  # column after column, as MKL has them
+        # each to size one, so that nothing underflows in single precision
+        size = np.maximum(np.abs(scaled).max(axis=-1, keepdims=True), np.finfo(float).tiny)
+        found = self._call(number, _SOLVE, (scaled / size).astype(np.float32))
+        return np.asarray((found.astype(float) * (size * scale)).T)
 
     def release(self) -> None:
         """Gives MKL's memory back; Python's collector knows nothing of it."""

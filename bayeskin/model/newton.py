@@ -104,10 +104,13 @@ class NewtonSolver:
         )
         return guess
 
-    def toward(self, place: Array) -> None:
-        """Takes the factorisation nearest to a place for the coming back-substitutions."""
-        nearest = self._nearest(place)
-        self._current = self._current if nearest is None else nearest
+    def toward(self, place: Array) -> Array:
+        """Takes the factorisation nearest to a place for the coming back-substitutions.
+
+        Returns where that was made: the same array as long as it is kept.
+        """
+        self._current = min(self._places, key=lambda n: float(np.abs(self._places[n] - place).sum()))
+        return self._places[self._current]
 
     def back_substitute(self, right: Array) -> Array:
         """Solves with the tangent factorised or taken last, (free,) or (free, r)."""
