@@ -445,7 +445,10 @@ def test_a_command_that_is_interrupted_says_how_to_go_on(measured: Path, tmp_pat
         "single.import_recording = slow; cli.main(['import', *sys.argv[1:]])"
     )
     command = [sys.executable, "-c", code, str(measured), "-o", str(tmp_path / "r.h5")]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background shell ignores it
+    )  # fmt: skip
     assert process.stdout is not None
     process.stdout.readline()
     process.send_signal(ending)

@@ -377,6 +377,11 @@ def test_bins_beyond_the_run_are_failures_not_extrapolations(tmp_path: Path) -> 
     assert "covers 0..130 s" in design.messages[0]
 
 
+def interruptible() -> None:
+    """A shell that starts its commands in the background has them ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def alive(pid: int) -> bool:
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
@@ -397,8 +402,9 @@ def test_workers_end_with_their_parent(tmp_path: Path, ending: signal.Signals) -
     command = [sys.executable, str(tmp_path / "program.py"), str(tmp_path), str(tmp_path / "out" / "d.h5")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent)])}
     program = subprocess.Popen(
-        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=interruptible,
+    )  # fmt: skip
     patience = time.monotonic() + 60
     while len(pids := [int(p.stem) for p in tmp_path.glob("*.pid")]) < 2 and time.monotonic() < patience:
         time.sleep(0.05)
