@@ -159,8 +159,8 @@ def fit(
     """The best of a few climbs from `start`, which has the values of a smaller set.
 
     What `start` does not have begins at its neutral value, and is searched for, one of `parts` (names of
-    parameters) after the other. `shear`
-    straightens the ridges of this posterior, where it is known; the base's parameters are the first `skin`.
+    parameters) after the other. `shear` straightens the ridges of this posterior, where it is known; the
+    base's parameters are the first `skin`.
     """
     low, high = log_posterior.bounds
     starts = [np.clip(log_posterior.vector({**neutral, **start}), low, high)]
