@@ -86,13 +86,12 @@ def test_friction_takes_its_creep_along() -> None:
 
 
 def test_a_named_mechanism_states_the_size_of_its_own_part() -> None:
-    named = Named(
-        "sensor-drift", 1.0, ("sensor-drift",), 1.0, 5e-3, {"drift": (1e-4, 1e-6, "N/s")}, "It drifts."
-    )
+    named = Named("sensor-drift", 1.0, ("sensor-drift",), 1.0, 5e-3, "It drifts.")
     parts = contributions(fitted("force-offset", "sensor-drift"), build)
-    assert mechanism(named, parts)["contribution_n"] == pytest.approx(
-        1e-4 * np.sqrt(np.mean(BINNED.time_s**2))
-    )
+    values = {"drift": {"mean": 1e-4, "sd": 1e-6, "interval90": [9.8e-5, 1.02e-4]}}
+    said = mechanism(named, catalogue()["sensor-drift"], parts, values)
+    assert said["contribution_n"] == pytest.approx(1e-4 * np.sqrt(np.mean(BINNED.time_s**2)))
+    assert said["parameters"] == {"drift": {**values["drift"], "unit": "N/s"}}
 
 
 # What is left
@@ -149,12 +148,16 @@ def test_words_say_what_is_left_only_where_something_is(remainder: Remainder) ->
         "rmse": 1e-3,
         "rmse_held_out": None,
         "full_model": {"rmse": 2.5e-3, "fit_off_by": 4e-4, "runs": 2},
+        "sampled": {"settled": True, "rhat": 1.37, "effective": 150.0},
     }
     answer = {
         "verdict": "unknown", "mechanisms": [], "located": [], "remaining": [], "candidates": [],
         "fit": {"before": fits, "after": fits}, "folder": "x", "unexplained": None,
     }  # fmt: skip
     assert "unexplained" not in in_words(answer)
+    assert "R-hat" not in in_words(answer)
+    rough = {**fits, "sampled": {**fits["sampled"], "settled": False}}
+    assert "R-hat of the draws 1.37" in in_words({**answer, "fit": {"before": rough, "after": fits}})
     assert "full model, 2 runs: RMSE 2.5 mN, the surrogate's fit is off by 0.4 mN" in in_words(answer)
     said = unexplained(remainder)
     words = in_words({**answer, "unexplained": said})

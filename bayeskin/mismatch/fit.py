@@ -95,11 +95,6 @@ class Fit:
         low, high = self.log_posterior.bounds
         return self.log_posterior.from_sampling(low + unit * (high - low))
 
-    def mean_and_sd(self, name: str) -> tuple[float, float]:
-        """Of one parameter, SI, over the Gaussian."""
-        values = self.draws(1000, 0)[:, self.log_posterior.names.index(name)]
-        return float(values.mean()), float(values.std())
-
 
 def stored(found: Fit) -> dict[str, Any]:
     """A fit without its posterior, as JSON has it."""
@@ -142,7 +137,7 @@ def fit_base(log_posterior: LogPosterior, seed: int, shear: Shear | None) -> Fit
     """Without any mechanism: the best of climbs from the most probable of many draws of the prior."""
     low, high = log_posterior.bounds
     trials = np.random.default_rng(seed).uniform(low, high, (8 * DRAWS, log_posterior.dim))
-    starts = _likely(log_posterior, trials, BASE_STARTS)
+    starts = likely(log_posterior, trials, BASE_STARTS)
     return _best((), log_posterior, starts, shear, log_posterior.surrogate.space.dim, seed)
 
 
@@ -234,7 +229,8 @@ def _about(
     return trials
 
 
-def _likely(log_posterior: LogPosterior, trials: Array, count: int) -> list[Array]:
+def likely(log_posterior: LogPosterior, trials: Array, count: int) -> list[Array]:
+    """The most probable of trials (n, D)."""
     values = log_posterior.log_prob(trials) if len(trials) else np.zeros(0)
     return [trials[i] for i in np.argsort(-values)[:count] if np.isfinite(values[i])]
 
@@ -250,14 +246,14 @@ def _best(
     skin: int, seed: int,
 ) -> Fit:  # fmt: skip
     ahead = _climbed(log_posterior, starts, shear)
-    others = _likely(log_posterior, _other_skins(ahead.vector, log_posterior, shear, skin, seed), STARTS)
+    others = likely(log_posterior, other_skins(ahead.vector, log_posterior, shear, skin, seed), STARTS)
     ahead = max(ahead, _climbed(log_posterior, [ahead.vector, *others], shear), key=lambda one: one.value)
     top = gauss_newton(log_posterior, ahead.vector, shear, ROUNDS)
     theta = log_posterior.named(log_posterior.from_sampling(top.vector))
     return Fit(tuple(names), log_posterior, theta, top.value, *_evidence(log_posterior, top), top.latent)
 
 
-def _other_skins(
+def other_skins(
     vector: Array, log_posterior: LogPosterior, shear: Shear | None, skin: int, seed: int
 ) -> Array:
     """Points (n, D) with the base's parameters drawn anew, and stiffness such that the force fits best."""

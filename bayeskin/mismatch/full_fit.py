@@ -102,7 +102,7 @@ def fit_full(
         else:
             theta = np.array([trial[name] for name in space.names])
             if best is not None:
-                slopes = _corrected(slopes, local, theta, force)
+                slopes = _corrected(slopes, local, theta, force, exact)
             there = _anchored(log_posterior, Anchored(surrogate, theta, force, slopes))
             vector = _with_noise(there, trial)
             value = float(there.log_prob(vector[None])[0])
@@ -133,11 +133,14 @@ def _anchored(log_posterior: LogPosterior, surrogate: Anchored) -> LogPosterior:
     return replace(log_posterior, surrogate=surrogate, sure_within_n=None)
 
 
-def _corrected(slopes: Array, local: LogPosterior, theta: Array, force: Array) -> Array:
-    """Broyden's update: what the force at theta was wrong by goes to the direction that was taken."""
-    away = local.surrogate.space.to_unit(theta) - local.surrogate.space.to_unit(_of(local).theta)
+def _corrected(slopes: Array, local: LogPosterior, theta: Array, force: Array, exact: Sequence[str]) -> Array:
+    """Broyden's update: what the force at theta was wrong by goes to the direction that was taken, but for
+    the slopes that are right already."""
+    space = local.surrogate.space
+    away = space.to_unit(theta) - space.to_unit(_of(local).theta)
+    unsure = np.where(np.isin(space.names, exact), 0.0, away)
     wrong = force - local.surrogate.predict(theta).mean[0]
-    return np.asarray(slopes + np.outer(wrong, away) / max(float(away @ away), 1e-12))
+    return np.asarray(slopes + np.outer(wrong, unsure) / max(float(away @ away), 1e-12))
 
 
 def _with_noise(there: LogPosterior, trial: Mapping[str, float]) -> Array:

@@ -26,7 +26,7 @@ NOTICEABLE = 2.0  # of the full model's own error
 
 @dataclass(frozen=True)
 class Named:
-    """One mechanism of the best set: probabilities of itself and of its group, parameters' means and sds.
+    """One mechanism of the best set: probabilities of itself and of its group.
 
     explains_n : RMS of what the set explains and would not without it
     """
@@ -36,7 +36,6 @@ class Named:
     group: tuple[str, ...]
     group_probability: float
     explains_n: float
-    parameters: Mapping[str, tuple[float, float, str]]
     statement: str
 
 
@@ -94,12 +93,8 @@ def explained_share(before: Located, after: Located) -> float:
 
 def _named(found: Search, mechanism: Mechanism) -> Named:
     best = found.best
-    values = {
-        p.name: (*best.mean_and_sd(p.name), p.unit) for p in mechanism.parameters if p.name in best.theta
-    }
     at_best = {**mechanism.neutral, **best.theta}
     return Named(
         mechanism.name, found.probability([mechanism.name]), mechanism.group,
-        found.probability(mechanism.group), explains(found, mechanism.name), values,
-        mechanism.statement(at_best),
+        found.probability(mechanism.group), explains(found, mechanism.name), mechanism.statement(at_best),
     )  # fmt: skip

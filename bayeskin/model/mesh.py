@@ -116,7 +116,12 @@ def layered_mesh(
     return SkinMesh(skfem.MeshHex2(roll(curved.doflocs, radius_m), curved.t), facets, cutis, name)
 
 
-# Lines of the coarsest bricks, and those among them that are edges of the pads [mm]; layers at z = 8.
+# Lines of the bricks [mm], edges of the pads and z = 8, where the layers meet, among them.
+_COARSEST_LINES_MM = (
+    (0.0, 12.0, 18.0, 22.0, 26.0, 27.0, 35.0, 50.0, 105.0),
+    (0.0, 4.0, 5.0, 12.0, 30.0, 84.0),
+    (0.0, 8.0, 10.0),
+)
 _COARSE_LINES_MM = (
     # coarse beyond the guard: there a soft cutis on a stiff subcutis would fold, and fine bricks try to
     (0.0, 9.0, 16.5, 18.0, 19.5, 24.5, 26.0, 27.0, 28.5, 33.0, 35.0, 40.0, 48.0, 65.0, 105.0),
@@ -129,7 +134,7 @@ _TOWARD_EDGE = 0.25  # where a cell beside an edge is divided: a quarter of its 
 
 def brick_lines(refinement: int) -> tuple[Array, ...]:
     """Coordinates of the bricks' faces along x, y and z before rolling [m]."""
-    lines: tuple[tuple[float, ...], ...] = _COARSE_LINES_MM
+    lines: tuple[tuple[float, ...], ...] = _COARSE_LINES_MM if refinement else _COARSEST_LINES_MM
     for _ in range(refinement - 1):
         lines = tuple(_divided(axis, edges) for axis, edges in zip(lines, _EDGES_MM, strict=True))
     return tuple(1e-3 * np.array(axis) for axis in lines)

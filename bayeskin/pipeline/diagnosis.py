@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +21,22 @@ from bayeskin.config import Config, RecordingConfig, SurrogateConfig
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.noise_model import bins_in_windows
+from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.contributions import contributions
 from bayeskin.mismatch.discrepancy import discrepancy
+from bayeskin.mismatch.discretised import Discretised
 from bayeskin.mismatch.fit import Fit, instrument_noise, restored, stored, surrogate_limit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.full_fit import FullFit, fit_full
-from bayeskin.mismatch.locate import Located, locate
+from bayeskin.mismatch.locate import MODEL_ERROR, Located, locate
 from bayeskin.mismatch.observed import ObservedSurrogate
+from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import Build, Search, search
 from bayeskin.mismatch.verdict import Diagnosis, judge
+from bayeskin.model.accuracy import mesh_error
+from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline import design, recording, training
 from bayeskin.pipeline.diagnosis_outputs import (
     Found,
@@ -57,6 +62,8 @@ from bayeskin.surrogates import Effect, with_effects
 from bayeskin.types import Array, BinnedForce, PadMotion, Surrogate
 from bayeskin.workers import Lost, run_parallel
 
+PREDICTIVE_DRAWS = 300
+BEND = 2.0 * MODEL_ERROR  # of which half is left after one factor on the force
 FULL_RUNS = 5  # of the full model, at most, to take up a fit of the surrogate
 
 
@@ -71,11 +78,21 @@ class Workbench:
     effects: tuple[Effect, ...]
     known: Mapping[str, Mechanism]
 
+    @cached_property
+    def spec(self) -> ModelSpec:
+        """The full model."""
+        return model_spec(self.run)
+
     def posterior(self, until_s: float | None, names: Sequence[str]) -> LogPosterior:
         """The posterior with a set of mechanisms, fitted up to a time (None: to the end)."""
         asked = {name: bounds for name, bounds in self.run.config.noise if bounds is not None}
         parts = [effect for effect in self.effects if effect.mechanism in names]
         skin: Surrogate = with_effects(self.base, parts)  # type: ignore[arg-type]
+        error = mesh_error(self.spec.mesh_hash) if self.spec.observation == "reaction" else None
+        if error is not None:
+            skin = Discretised(
+                skin, self.motion, error.rms, 2.0 * MODEL_ERROR
+            )  # half is left after one factor
         instrument = tuple(self.known[n] for n in names if isinstance(self.known[n].act, Instrument))
         seen = ObservedSurrogate(skin, instrument, self.motion) if instrument else skin
         return LogPosterior(
@@ -129,18 +146,20 @@ def _work(run: Run) -> Mapping[str, Any]:
     found = judge(whole, bench.known, before, after)
     parts = contributions(whole.best, partial(bench.posterior, None))
     remainder = _remainder(bench, found, whole.best, after)
-    full = _full_fits(run, [whole.base, whole.best])
+    taken = _taken_up(bench, [whole.base, whole.best])
     answer: dict[str, Any] = {
         "verdict": found.verdict,
         "located": [window(one) for one in before.windows],
         "remaining": [window(one) for one in after.windows],
         "explained": found.explained,
-        "mechanisms": [mechanism(one, parts) for one in found.named],
+        "mechanisms": [
+            mechanism(one, bench.known[one.name], parts, taken[1].draws.summary) for one in found.named
+        ],
         "unexplained": None if remainder is None else unexplained(remainder),
         "candidates": candidates(whole, bench.known),
         "fit": {
-            "before": _fit(bench, whole.base, full[0], begun.base if begun else None, split_s),
-            "after": _fit(bench, whole.best, full[1], begun.best if begun else None, split_s),
+            "before": _fit(bench, whole.base, taken[0], begun.base if begun else None, split_s),
+            "after": _fit(bench, whole.best, taken[1], begun.best if begun else None, split_s),
         },
         "best_set": list(whole.best.names),
         "held_out_set": list(begun.best.names) if begun else [],
@@ -149,7 +168,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     write_json(run.at(STAGE.name, "diagnosis.json"), answer)
     figures = draw(
         run.folder / STAGE.name, caption(run), bench.binned, bench.motion,
-        Found(whole, full, before, after, parts, remainder), answer["candidates"],
+        Found(whole, [one.full for one in taken], before, after, parts, remainder), answer["candidates"],
     )  # fmt: skip
     return {**answer, "figures": [figure.name for figure in figures]}
 
@@ -162,26 +181,52 @@ def _remainder(bench: Workbench, found: Diagnosis, best: Fit, after: Located) ->
     return Remainder(discrepancy(best, motion), propose_form(best, motion, seed))
 
 
-def _full_fits(run: Run, fits: Sequence[Fit]) -> list[FullResult]:
-    """Each fit taken up by the full model itself; for the article's observation none."""
+@dataclass(frozen=True)
+class TakenUp:
+    """What follows a search's fit: draws of its posterior, and the full model's own fit from there."""
+
+    draws: Resampled
+    full: FullResult
+
+
+def _taken_up(bench: Workbench, fits: Sequence[Fit]) -> list[TakenUp]:
+    """Each fit sampled, and taken up by the full model itself (by the article's, not), in two processes."""
+    run = bench.run
+    run.reporter.log("posterior, and the full model, without and with what was found")
+    apart: list[partial[Any]] = [partial(_fit_full_apart, run.config_path, stored(one)) for one in fits]
+    apart += [partial(_resample_apart, run.config_path, stored(one)) for one in fits]
     if run.config.model.observation != "reaction":
-        return [None] * len(fits)
-    run.reporter.log("the full model without and with what was found")
-    cases = [(one.names, dict(one.theta)) for one in fits]
-    found = dict(run_parallel(partial(_fit_full_apart, run.config_path), cases, len(fits)))
-    return [one.reason if isinstance(one := found[i], Lost) else one for i in range(len(fits))]
+        apart = apart[len(fits) :]
+    done = dict(run_parallel(_call, apart, 2))
+    found = [done[i] for i in range(len(apart))]
+    full = found[: -len(fits)] or [None] * len(fits)
+    draws = [_resample_apart(run.config_path, stored(fits[i])) if isinstance(one, Lost) else one
+             for i, one in enumerate(found[-len(fits) :])]  # fmt: skip
+    return [TakenUp(d, f.reason if isinstance(f, Lost) else f) for d, f in zip(draws, full, strict=True)]
 
 
-def _fit_full_apart(source: Path, case: tuple[Sequence[str], Mapping[str, float]]) -> FullFit | str:
+def _call(task: partial[Any]) -> Any:
+    return task()
+
+
+def _fit_full_apart(source: Path, plain: Mapping[str, Any]) -> FullFit | str:
     """In a process of its own: mechanisms have no copies."""
-    bench, (names, theta) = _workbench(_opened(source, Silent())), case
-    run_it = FullForce(model_spec(bench.run), bench.motion, bench.binned.edges_s)
+    bench, names = _workbench(_opened(source, Silent())), plain["names"]
+    run_it = FullForce(bench.spec, bench.motion, bench.binned.edges_s)
     beyond = [bench.known[name] for name in names if bench.known[name].act.bind is None]
     exact = [p.name for mechanism in beyond for p in mechanism.parameters]
     return fit_full(
-        bench.posterior(None, names), theta, lambda point: run_it((names, point)), exact, FULL_RUNS,
+        bench.posterior(None, names), plain["theta"], lambda point: run_it((names, point)), exact, FULL_RUNS,
         bench.run.config.seed,
     )  # fmt: skip
+
+
+def _resample_apart(source: Path, plain: Mapping[str, Any]) -> Resampled:
+    bench = _workbench(_opened(source, Silent()))
+    alone, wide = bench.posterior(None, ()), bench.posterior(None, plain["names"])
+    shear = find_shear(alone)
+    among = shear.among(alone.names, wide.names) if shear else None
+    return resample(restored(plain, wide), among, alone.surrogate.space.dim, bench.run.config.seed)
 
 
 def _search_beside(run: Run, split_s: float) -> threading.Thread:
@@ -247,7 +292,7 @@ def _end_of_second_hold(binned: BinnedForce) -> float | None:
 
 
 def _fit(
-    bench: Workbench, found: Fit, full: FullResult, begun: Fit | None, split_s: float | None
+    bench: Workbench, found: Fit, taken: TakenUp, begun: Fit | None, split_s: float | None
 ) -> dict[str, Any]:
     """RMSE [N] of a fit to the whole recording, by phase, of one to its beginning on the rest; coverage."""
     binned = bench.binned
@@ -256,18 +301,22 @@ def _fit(
     if begun is not None and split_s is not None:
         rest = bins_in_windows(binned, ((split_s, float(binned.edges_s[-1])),)) >= 0
         held_out = float(np.sqrt(np.mean((binned.force_n[rest] - begun.force_n[rest]) ** 2)))
-    draws = found.draws(300, bench.run.config.seed)
-    bands = inference.bands(found.log_posterior, draws, np.random.default_rng(bench.run.config.seed))
+    draws = taken.draws.draws
+    some = draws[np.linspace(0, len(draws) - 1, PREDICTIVE_DRAWS).astype(int)]
+    bands = inference.bands(found.log_posterior, some, np.random.default_rng(bench.run.config.seed))
     usable = bins_in_windows(binned, None) >= 0
     return {
         "rmse": float(np.sqrt(np.mean((binned.force_n[usable] - found.force_n[usable]) ** 2))),
         "rmse_by_phase": dict(by_phase.by_kind_n),
         "rmse_held_out": held_out,
-        "full_model": _full(full, found.force_n, binned, usable),
+        "full_model": _full(taken.full, found.force_n, binned, usable),
         "coverage90": inference.coverage(binned, *bands.interval(0.9)),
         "log_evidence": found.log_evidence,
-        "theta": {
-            name: dict(zip(("mean", "sd"), found.mean_and_sd(name), strict=True)) for name in found.theta
+        "theta": taken.draws.summary,
+        "sampled": {
+            "settled": taken.draws.settled,
+            "rhat": taken.draws.rhat,
+            "effective": taken.draws.effective,
         },
     }
 

@@ -56,11 +56,11 @@ def window(one: Window) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def mechanism(one: Named, parts: Sequence[Contribution]) -> dict[str, Any]:
-    """An entry of a named mechanism; `parts` are those of the best set, its own among them."""
-    parameters = {
-        name: {"mean": mean, "sd": sd, "unit": unit} for name, (mean, sd, unit) in one.parameters.items()
-    }
+def mechanism(
+    one: Named, known: Mechanism, parts: Sequence[Contribution], values: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """An entry of a named mechanism, `known`; `parts` are those of the best set, `values` its parameters'."""
+    parameters = {p.name: {**values[p.name], "unit": p.unit} for p in known.parameters if p.name in values}
     return {
         "name": one.name, "probability": one.probability, "group": list(one.group),
         "group_probability": one.group_probability, "explains_n": one.explains_n,
@@ -156,6 +156,8 @@ def in_words(answer: Mapping[str, Any]) -> str:
         rest = "" if held is None else f", {1e3 * held:.1f} mN on what follows the second hold, not fitted"
         lines.append(f"{when}: RMSE {1e3 * fits[when]['rmse']:.1f} mN{rest}")
         lines += _full_in_words(fits[when]["full_model"])
+        if not fits[when]["sampled"]["settled"]:
+            lines.append(f"  intervals are rough: R-hat of the draws {fits[when]['sampled']['rhat']:.2f}")
     lines += _left_in_words(answer["unexplained"]) if answer["unexplained"] else []
     best = ", ".join(f"{one['name']} {one['delta_score']:+.1f}" for one in answer["candidates"][:5])
     lines += [f"candidates alone, log evidence gained: {best}", f"outputs in {answer['folder']}"]

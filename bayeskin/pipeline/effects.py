@@ -1,13 +1,14 @@
 """A stage by itself: what each tissue mechanism does to the force, beside the base's surrogate.
 
-Each part of a mechanism is run in the full model at points of the base's design, so that every run has one
-without it at the same base parameters; the other parts stay neutral.
+Each part of a mechanism is run with and without at the same base parameters, the other parts neutral: at
+many points on the coarsest bricks, and at some of the base's design in the full model itself, which correct
+what the coarse runs have taught.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,9 +29,10 @@ from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.shipping import shipped_files
 from bayeskin.pipeline.training import base_surrogate
-from bayeskin.runner import load_design, run_design
+from bayeskin.runner import Simulate, run_design
 from bayeskin.surrogates import (
     Effect,
+    Pair,
     Similarity,
     Validation,
     load_manifest,
@@ -40,6 +42,7 @@ from bayeskin.surrogates import (
     train_effect,
 )
 from bayeskin.types import Array, Design, PadMotion, Parameter, ParameterSpace, Simulation
+from bayeskin.workers import Map
 
 WEAKEST = 0.1  # of a strength's prior: effects below are straight lines to nothing, and lost in noise
 
@@ -90,19 +93,30 @@ def simulate_with(
 def effect_wave(part: Part, design: Design, points: int, held_out: int, seed: int) -> Wave:
     """Points of the base's design, each with values of the part's parameters from its prior."""
     inputs = Similarity(design.space).inputs(design.theta)
-    base = fine_wave(design, inputs, points, held_out, seed)
+    return _with_own(part, fine_wave(design, inputs, points, held_out, seed))
+
+
+def coarse_wave(space: ParameterSpace, points: int, seed: int) -> Wave:
+    """Points of the base's whole prior box for the coarse model, the same for all parts."""
+    theta = sobol_points(space, points, [seed, int(sha256_of("coarse")[:8], 16)])
+    return Wave(space, theta, np.zeros(points, bool), 0, seed, {"rule": "Sobol' points over the prior box"})
+
+
+def _with_own(part: Part, base: Wave) -> Wave:
+    """A wave of base parameters with values of the part's own beside them."""
     own = ParameterSpace(part.own)
     number = int(sha256_of(part.name)[:8], 16)
-    drawn = [sobol_points(own, int(np.sum(base.held_out == out)), [seed, number, int(out)]) for out in (0, 1)]
     unit = np.empty((len(base.theta), own.dim))
-    for out, theta in enumerate(drawn):
-        unit[base.held_out == bool(out)] = own.to_unit(theta)
+    for out in (False, True):
+        rows = base.held_out == out
+        theta = sobol_points(own, int(rows.sum()), [base.seed, number, int(out)])
+        unit[rows] = own.to_unit(theta)
     if own.parameters[0].lower == part.neutral:
         unit[:, 0] = WEAKEST + (1.0 - WEAKEST) * unit[:, 0]
     theta = np.concatenate([base.theta, own.from_unit(unit)], axis=1)
-    space = ParameterSpace((*design.space.parameters, *part.own))
+    space = ParameterSpace((*base.space.parameters, *part.own))
     rule = f"{base.record['rule']}, with Sobol' points of {', '.join(own.names)}"
-    return Wave(space, np.clip(theta, space.lower, space.upper), base.held_out, 0, seed, {"rule": rule})
+    return Wave(space, np.clip(theta, space.lower, space.upper), base.held_out, 0, base.seed, {"rule": rule})
 
 
 def _work(run: Run) -> Mapping[str, Any]:
@@ -120,21 +134,36 @@ def _chosen(run: Run) -> list[Mechanism]:
 
 
 def _learn(run: Run, part: Part) -> dict[str, Any]:
+    config, spec = run.config, model_spec(run)
     base = storage.load(run.at("design", "design.h5"), Design)
-    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
-    spec, config = model_spec(run), run.config
-    wave = effect_wave(part, base, config.effects.points, config.effects.held_out, config.seed)
-    identity = sha256_of(
-        [spec.hash, vars(motion), base.edges_s, part.name, [vars(p) for p in wave.space.parameters]]
-    )
-    file = run.folder / "runs" / f"{part.name}-{identity[:12]}.h5"
-    run.reporter.log(f"{part.name}: {len(wave.theta)} full runs")
-    task = partial(simulate_with, part.mechanism.name, dict(part.mechanism.neutral), spec, motion)
     with crew(run) as run_all:
-        run_design(file, wave, base.edges_s, task, spec.hash, run_all, partial(tell, run, part.name))
-    design = load_design(file)
-    storage.save(run.at("effects", f"{part.name}-design.h5"), design)
-    return _train(run, part, base, design)
+        make = partial(_runs, run, run_all, base.edges_s)
+        wave = coarse_wave(base.space, config.effects.coarse, config.seed)
+        coarse_spec = replace(spec, mesh="bricks", refinement=0)
+        without = make("coarse", coarse_spec, wave, None)
+        coarse = make(f"{part.name}, coarse", coarse_spec, _with_own(part, wave), part)
+        wave = effect_wave(part, base, config.effects.points, config.effects.held_out, config.seed)
+        fine = make(part.name, spec, wave, part)
+    storage.save(run.at("effects", f"{part.name}-design.h5"), fine)
+    return _train(run, part, Pair(coarse, base_force(without, coarse)), Pair(fine, base_force(base, fine)))
+
+
+def _runs(
+    run: Run, run_all: Map, edges_s: Array, label: str, spec: ModelSpec, wave: Wave, part: Part | None
+) -> Design:
+    """The runs of a wave with a part of a mechanism, or (None) without; none is made twice."""
+    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    known = [vars(p) for p in wave.space.parameters]
+    name = "base" if part is None else part.name
+    identity = sha256_of([spec.hash, vars(motion), edges_s, name, known])
+    task: Simulate = (
+        partial(simulate, spec, motion)
+        if part is None
+        else partial(simulate_with, part.mechanism.name, dict(part.mechanism.neutral), spec, motion)
+    )
+    run.reporter.log(f"{label}: {len(wave.theta)} full runs")
+    file = run.folder / "runs" / f"{name}-{identity[:12]}.h5"
+    return run_design(file, wave, edges_s, task, spec.hash, run_all, partial(tell, run, label))
 
 
 def effect_files(run: Run) -> list[Path]:
@@ -161,19 +190,19 @@ def effects_of(run: Run) -> list[Effect]:
     return found
 
 
-def _train(run: Run, part: Part, base: Design, design: Design) -> dict[str, Any]:
+def _train(run: Run, part: Part, coarse: Pair, fine: Pair) -> dict[str, Any]:
     """The effect's surrogate, into the stage's folder, and what is known of its error."""
-    own, without = list(part.own_names), base_force(base, design)
+    own = list(part.own_names)
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     try:
         effect, validation = train_effect(
-            part.name, part.mechanism.name, part.neutral, own, without, design, run.config.surrogate.kind,
-            run.config.seed, estimate_of(part.mechanism, own, motion, design.edges_s),
+            part.name, part.mechanism.name, part.neutral, own, coarse, fine, run.config.surrogate.kind,
+            run.config.seed, estimate_of(part.mechanism, own, motion, fine.design.edges_s),
         )  # fmt: skip
     except InputError as few:
         run.reporter.log(f"{part.name}: no surrogate: {few}")
         return {"learnt": False, "message": str(few)}
-    said = {"learnt": True, **_errors(run, effect, validation, without, design)}
+    said = {"learnt": True, **_errors(run, effect, validation, fine.without_n, fine.design)}
     manifest = {**manifest_of(effect.surrogate, validation), "effect": {
         "part": effect.part, "mechanism": effect.mechanism, "neutral": effect.neutral, "own": own,
     }, **said}  # fmt: skip

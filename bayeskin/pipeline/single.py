@@ -194,7 +194,7 @@ def _accuracy(simulation: Simulation, spec: ModelSpec) -> list[str]:
         return ["no estimated error: the article's force depends on its mesh and converges on none"]
     peak_n = simulation.stats["peak_force_n"]
     time_share = simulation.stats["time_error_n"] / peak_n if peak_n > 0.0 else 0.0
-    found = mesh_error(problem_of(spec.mesh, spec.refinement).mesh.hash)
+    found = mesh_error(spec.mesh_hash)
     mesh = "unknown, the mesh is not in the study" if found is None else f"{100 * found.rms:.2g} % RMS"
     return [f"estimated error, of the peak: time steps {100 * time_share:.2g} %, mesh {mesh}"]
 

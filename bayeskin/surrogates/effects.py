@@ -5,8 +5,8 @@ With theta the base parameters, phi those of one part of a mechanism, s its stre
     F(theta, phi) = F_0(theta) + s G(theta, phi) ,   s = (phi_1 - neutral) / E^power ,
 
 so that moving phi_1 off its neutral value switches the effect on and nothing remains at it. G is learnt as
-any force is, amplitude and shape, from full runs with and without the mechanism at the same theta; it scales
-as forces do (`similarity`).
+any force is, amplitude and shape, from runs with and without the mechanism at the same theta: many of a
+coarse model, corrected by few of the model itself (`two_fidelities`); it scales as forces do (`similarity`).
 
 Where a mechanism has an estimate D(F_0, phi) of its own effect, only what it leaves is learnt, in units of
 the estimate's RMS over time, |D|:
@@ -29,9 +29,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayeskin.errors import InputError
+from bayeskin.surrogates.screening import active_inputs
 from bayeskin.surrogates.similarity import Similarity
 from bayeskin.surrogates.surrogate import ShapeSurrogate, refuse_outside
 from bayeskin.surrogates.train import Kind, train
+from bayeskin.surrogates.two_fidelities import correct
 from bayeskin.surrogates.validate import Validation
 from bayeskin.types import Array, Design, ParameterSpace, Prediction, Surrogate
 
@@ -82,40 +84,62 @@ def strength(similarity: Similarity, name: str, neutral: float, theta: Array) ->
     return np.asarray((theta[:, column] - neutral) * np.exp(-space.parameters[column].stress_power * scale))
 
 
+@dataclass(frozen=True)
+class Pair:
+    """Runs with a mechanism, `design`, and the force (n, m) of the same model at the same base parameters
+    without it."""
+
+    design: Design
+    without_n: Array
+
+    def change(self) -> Array:
+        """What the mechanism does to the force (n, m) [N]; NaN where a run failed."""
+        return np.asarray(self.design.force_n - self.without_n)
+
+
 def train_effect(
     part: str,
     mechanism: str,
     neutral: float,
     own: Sequence[str],
-    base: Array,
-    design: Design,
+    coarse: Pair,
+    fine: Pair,
     kind: Kind | str = "auto",
     seed: int = 0,
     estimate: Estimate | None = None,
 ) -> tuple[Effect, Validation]:
-    """From runs with the effect, `design`, and the base's force (n, m) at the same base parameters.
+    """From runs of a coarse model, corrected by those of the fine one.
 
-    Rows whose effect is next to nothing are left out; the validation is of G, or of H. Raises InputError
-    where too few rows show an effect.
+    Rows whose effect is next to nothing are left out; the validation is of G, or of H, in the fine model.
+    Raises InputError where too few rows show an effect.
     """
+    (seen, weights), (corrects, its) = (_learnt(one, neutral, own, estimate) for one in (coarse, fine))
+    active = active_inputs(seen, weights)
+    surrogate, _ = train(seen, kind, seed, weights, active=active)  # type: ignore[arg-type]
+    surrogate, validation = correct(surrogate, corrects, its)
+    return Effect(part, mechanism, neutral, tuple(own), surrogate, estimate), validation
+
+
+def _learnt(
+    pair: Pair, neutral: float, own: Sequence[str], estimate: Estimate | None
+) -> tuple[Design, Array]:
+    """The design whose force is G, or H, and weights (n,) of its rows, 0 where no effect shows."""
+    design, change = pair.design, pair.change()
     similarity = Similarity(design.space)
     s = strength(similarity, own[0], neutral, design.theta)
-    change = design.force_n - base
     with np.errstate(invalid="ignore"):
-        size = _rms(change) / _rms(base)
-    shows = design.ok & (size > SMALLEST) & (np.abs(s) > 0.0)
+        size = _rms(change) / _rms(pair.without_n)
+        shows = design.ok & (size > SMALLEST) & (np.abs(s) > 0.0)
     weights = np.where(shows, (size / (size + SMALL)) ** 2, 0.0)
     learnt = np.full_like(change, np.nan)
     if estimate is None:
         learnt[shows] = change[shows] / s[shows, None]
     else:
-        guess = estimate(design.theta[:, -len(own) :], base)
+        guess = estimate(design.theta[:, -len(own) :], pair.without_n)
         left = (change - guess)[shows] / _rms(guess)[shows, None]
         scale = np.exp(similarity.log_scale(design.theta[shows]))
         learnt[shows] = scale[:, None] * (1.0 + left)
-    seen = replace(design, force_n=learnt, ok=shows)
-    surrogate, validation = train(seen, kind, seed, weights)  # type: ignore[arg-type]
-    return Effect(part, mechanism, neutral, tuple(own), surrogate, estimate), validation
+    return replace(design, force_n=learnt, ok=shows), weights
 
 
 @dataclass(frozen=True)

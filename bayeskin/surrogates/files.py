@@ -23,7 +23,8 @@ from bayeskin.surrogates.validate import Validation
 from bayeskin.types import ParameterSpace, frozen_array
 
 FORMAT = "bayeskin surrogate"
-FORMAT_VERSION = 3  # 2: inputs are those of `Similarity`; 3: latents may have a correction
+FORMAT_VERSION = 4  # 2: inputs are those of `Similarity`; 3: latents may have a correction; 4: active inputs
+READABLE = (3, 4)  # in 3 all inputs are active
 LATENTS: dict[str, type[LatentGPs] | type[LatentChaos]] = {"gp": LatentGPs, "chaos": LatentChaos}
 
 
@@ -61,6 +62,7 @@ def save_surrogate(path: Path | str, surrogate: ShapeSurrogate, manifest: Mappin
                 latents = latents.coarse
             storage.write(handle.create_group("latents"), latents)
             handle.create_dataset("edges_s", data=surrogate.edges_s)
+            handle.create_dataset("active", data=surrogate.active)
             digest = contents_hash(handle)
             text = json.dumps({**manifest, "arrays_sha256": digest}, indent=2, sort_keys=True)
             handle.attrs.update(
@@ -93,10 +95,11 @@ def load_surrogate(path: Path | str) -> ShapeSurrogate:
             if "correction" in handle:
                 correction = storage.read(handle["correction"], LatentGPs, path)
                 latents = CorrectedLatents(latents, correction)
+            active = handle["active"][()] if "active" in handle else np.arange(latents.inputs.shape[1])
             return ShapeSurrogate(
                 storage.read(handle["space"], ParameterSpace, path), frozen_array(handle["edges_s"][()]),
                 storage.read(handle["transform"], ShapeTransform, path), latents,
-                json.loads(handle.attrs["provenance"]),
+                json.loads(handle.attrs["provenance"]), frozen_array(active, np.int64),
             )  # fmt: skip
     except (OSError, KeyError, RuntimeError, json.JSONDecodeError) as error:
         raise InputError(path, f"not readable as one ({error})".replace("\n", " "), expected) from None
@@ -114,7 +117,7 @@ def _refuse_unfit(path: Path, handle: h5py.File) -> None:
     if handle.attrs.get("format") != FORMAT:
         raise InputError(path, "an HDF5 file of another origin", "a surrogate that bayeskin wrote")
     version = int(handle.attrs["format_version"])
-    if version != FORMAT_VERSION:
+    if version not in READABLE:
         raise InputError(path, f"format version {version}", f"format version {FORMAT_VERSION}")
     if contents_hash(handle) != handle.attrs["arrays_sha256"]:
         raise InputError(path, "contents that differ from their stored hash", "an unaltered file")

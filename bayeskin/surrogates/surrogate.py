@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from bayeskin.errors import InputError
 from bayeskin.surrogates.shapes import ShapeTransform
@@ -25,7 +25,7 @@ class Latents(Protocol):
     def inputs(self) -> Array: ...
 
     def predict(self, unit: Array) -> tuple[Array, Array]:
-        """Mean and variance (n, q) at inputs (n, dim) of `Similarity`."""
+        """Mean and variance (n, q) at inputs (n, k), those of `Similarity` that matter."""
         ...
 
     def leave_one_out(self) -> tuple[Array, Array]:
@@ -37,7 +37,7 @@ class Latents(Protocol):
 class ShapeSurrogate(_FreezesArrays):
     """Satisfies `types.Surrogate`: force as a scale times exp(amplitude) times a shape of predicted latents.
 
-    `space` is the box in which it answers; edges_s (m+1,).
+    `space` is the box in which it answers; edges_s (m+1,); active (k,) which of the inputs the latents see.
     """
 
     space: ParameterSpace
@@ -45,11 +45,16 @@ class ShapeSurrogate(_FreezesArrays):
     transform: ShapeTransform
     latents: Latents
     provenance: Mapping[str, Any]
+    active: NDArray[np.int64]
 
     @cached_property
     def similarity(self) -> Similarity:
         """What makes inputs of parameters."""
         return Similarity(self.space)
+
+    def inputs(self, theta: Array) -> Array:
+        """What the latents see of theta (n, d), (n, k)."""
+        return self.similarity.inputs(theta)[:, self.active]
 
     def predict(self, theta: ArrayLike, times: Array | float = 1.0) -> Prediction:
         """`times` (n,) the force at theta (n, d) or (d,), with its uncertainty.
@@ -58,7 +63,7 @@ class ShapeSurrogate(_FreezesArrays):
         """
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
-        mean, variance = self.latents.predict(self.similarity.inputs(theta))
+        mean, variance = self.latents.predict(self.inputs(theta))
         return self._decode(theta, mean, variance, times)
 
     def leave_one_out(self, theta: Array) -> Prediction:

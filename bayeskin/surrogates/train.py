@@ -35,13 +35,15 @@ def train(
     seed: int = 0,
     focus: Array | None = None,
     region: tuple[Array, Array] | None = None,
+    active: NDArray[np.int64] | None = None,
 ) -> tuple[ShapeSurrogate, Validation]:
     """Trains on the design's training rows; the held-out rows only measure the error.
 
     kind: "auto" takes the one with the smaller held-out error, or, without held-out rows, the smaller
     error over four folds drawn with `seed`. focus: weights (n,) of the design's rows in the principal
     components and in the error that decides. region: lower and upper corner (d,) in the design's unit
-    cube; the surrogate then answers only inside, and learns from rows in and slightly around it.
+    cube; the surrogate then answers only inside, and learns from rows in and slightly around it. active:
+    which inputs of `Similarity` matter (None: all).
     Raises InputError for too few rows or force that is not finite.
     """
     space = design.space if region is None else narrowed(design.space, *region)
@@ -49,12 +51,13 @@ def train(
     if focus.shape != (len(design.theta),) or not (np.all(focus >= 0.0) and np.all(np.isfinite(focus))):
         raise InputError("focus", f"shape {focus.shape}", f"{len(design.theta)} finite weights >= 0")
     inputs = Similarity(space).inputs(design.theta)
+    active = np.arange(inputs.shape[1]) if active is None else active
     training = design.training & _within(inputs, MARGIN) & (focus > 0.0)
     testing = design.testing & space.contains(design.theta) & (focus > 0.0)
     _refuse_unusable(design, space, training)
     kinds: tuple[Kind, ...] = ("gp", "chaos") if kind == "auto" else (kind,)
     if kind == "auto" and not testing.any():
-        kinds = (_best_of_folds(kinds, space, design, training, focus, seed),)
+        kinds = (_best_of_folds(kinds, space, design, training, focus, seed, active),)
     provenance = {
         "version": __version__,
         "design_seed": design.seed,
@@ -64,7 +67,7 @@ def train(
     }
     results = []
     for name in kinds:
-        surrogate = _fit(name, space, design, training, focus, provenance)
+        surrogate = _fit(name, space, design, training, focus, provenance, active)
         results.append((surrogate, _measure(surrogate, design, training, testing, focus)))
     return min(results, key=lambda result: result[1].relative_error)
 
@@ -96,7 +99,7 @@ def _within(inputs: Array, margin: float) -> NDArray[np.bool_]:
 
 def _fit(
     kind: Kind, space: ParameterSpace, design: Design, rows: NDArray[np.bool_], focus: Array,
-    provenance: dict[str, Any],
+    provenance: dict[str, Any], active: NDArray[np.int64],
 ) -> ShapeSurrogate:  # fmt: skip
     """One surrogate of one kind on the rows given."""
     similarity = Similarity(space)
@@ -104,21 +107,21 @@ def _fit(
     if kind == "chaos":
         rows = rows & _within(inputs, ROUNDING)  # polynomials leave [-1, 1] steeply: a margin would rule
     inputs, log_scale, force_n = (
-        inputs[rows],
+        inputs[rows][:, active],
         Similarity(space).log_scale(design.theta[rows]),
         design.force_n[rows],
     )
     latents: Latents
     if kind == "gp":
-        transform, targets, gp_fits = _fit_latents(fit_latent, inputs, log_scale, force_n, focus[rows])
+        transform, targets, gp_fits = fit_latents(fit_latent, inputs, log_scale, force_n, focus[rows])
         latents = LatentGPs.assemble(inputs, targets, gp_fits)
     else:
-        transform, targets, chaos_fits = _fit_latents(fit_sparse, inputs, log_scale, force_n, focus[rows])
+        transform, targets, chaos_fits = fit_latents(fit_sparse, inputs, log_scale, force_n, focus[rows])
         latents = LatentChaos.assemble(inputs, targets, chaos_fits)
-    return ShapeSurrogate(space, design.edges_s, transform, latents, {**provenance, "kind": kind})
+    return ShapeSurrogate(space, design.edges_s, transform, latents, {**provenance, "kind": kind}, active)
 
 
-def _fit_latents(
+def fit_latents(
     fit_one: Callable[[Array, Array, Array], F],
     inputs: Array,
     log_scale: Array,
@@ -164,7 +167,7 @@ def _measure(
 
 def _best_of_folds(
     kinds: tuple[Kind, ...], space: ParameterSpace, design: Design, training: NDArray[np.bool_],
-    focus: Array, seed: int,
+    focus: Array, seed: int, active: NDArray[np.int64],
 ) -> Kind:  # fmt: skip
     """The kind with the smaller squared error over folds that neither its fit nor its choices have seen."""
     rows = np.flatnonzero(training & space.contains(design.theta))
@@ -174,7 +177,7 @@ def _best_of_folds(
         out = np.zeros_like(training)
         out[order[k::FOLDS]] = True
         for kind in kinds:
-            surrogate = _fit(kind, space, design, training & ~out, focus, {})
+            surrogate = _fit(kind, space, design, training & ~out, focus, {}, active)
             miss = surrogate.predict(design.theta[out]).mean - design.force_n[out]
             errors[kind] += float(focus[out] @ np.sum(miss**2, axis=1))
     return min(kinds, key=lambda kind: errors[kind])

@@ -67,13 +67,13 @@ def correct(
     inside = surrogate.space.contains(fine.theta)
     training, testing = fine.training & inside, fine.testing & inside
     similarity = surrogate.similarity
-    fewest = similarity.dim + FEWEST_MORE
+    fewest = len(surrogate.active) + FEWEST_MORE
     if training.sum() < fewest:
         raise InputError("fine design", f"{training.sum()} finished training rows", f"at least {fewest}")
     theta, force_n = fine.theta[training], fine.force_n[training]
     own = surrogate.transform.keep(len(surrogate.transform.components), split(force_n)[1])
     transform = replace(own, truncation=np.maximum(own.truncation, surrogate.transform.truncation))
-    inputs = similarity.inputs(theta)
+    inputs = surrogate.inputs(theta)
     change = transform.encode(force_n) - coarse.predict(inputs)[0]
     change[:, 0] -= similarity.log_scale(theta)
     fits = [fit_latent(inputs, column, focus[training]) for column in change.T]

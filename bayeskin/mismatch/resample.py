@@ -1,0 +1,111 @@
+"""The posterior of one set of mechanisms sampled, from all the modes that climbs find.
+
+Laplace's Gaussian knows one mode: of permeabilities, which a force informs little, there are often several,
+and the moduli lie along a curved ridge. Two ensembles set out from the modes, each walker near one of them
+taken by its density, and move as those of a run do (`inference.moves`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import emcee
+import numpy as np
+
+from bayeskin.inference.convergence import Limits, assess
+from bayeskin.inference.coordinates import MoveCoordinates
+from bayeskin.inference.gauss_newton import gauss_newton
+from bayeskin.inference.moves import mixed_moves
+from bayeskin.inference.straighten import Shear
+from bayeskin.mismatch.fit import FIRST_ROUNDS, Fit, likely, other_skins
+from bayeskin.types import Array
+
+ENSEMBLES, FEWEST_WALKERS = 2, 40
+BURN_IN, STEPS, EVERY = 300, 900, 10  # steps forgotten, made in all, and between two that are kept
+MODES = 6  # climbs from other skins
+NEAR = 0.5  # of Laplace's sd, about a mode
+LIMITS = Limits(effective_samples=200.0, lengths=5.0, rhat=1.1)  # for intervals, not for tails
+
+
+@dataclass(frozen=True)
+class Resampled:
+    """Draws (n, D) in SI, columns `names`; rhat, the largest of all; effective, of the least known."""
+
+    names: tuple[str, ...]
+    draws: Array
+    rhat: float
+    effective: float
+
+    @property
+    def settled(self) -> bool:
+        """Whether intervals can be taken from these draws."""
+        return self.rhat <= LIMITS.rhat and self.effective >= LIMITS.effective_samples
+
+    @cached_property
+    def summary(self) -> dict[str, dict[str, Any]]:
+        """Of each parameter mean, sd and the ends of the 90 % interval."""
+        low, high = np.quantile(self.draws, [0.05, 0.95], axis=0)
+        rows = zip(self.names, self.draws.mean(axis=0), self.draws.std(axis=0), low, high, strict=True)
+        return {
+            name: {"mean": float(mean), "sd": float(sd), "interval90": [float(a), float(b)]}
+            for name, mean, sd, a, b in rows
+        }
+
+
+def resample(
+    found: Fit, shear: Shear | None, skin: int, seed: int, progress: Callable[[float], None] | None = None
+) -> Resampled:
+    """Draws of the posterior about `found`; `shear` as for `fit`, the base's parameters are the first `skin`.
+
+    `progress` is told the share that is done.
+    """
+    log_posterior = found.log_posterior
+    rng = np.random.default_rng([seed, 7])
+    starts = _starts(found, shear, skin, seed, rng)
+    walkers = max(FEWEST_WALKERS, 2 * log_posterior.dim + 2)
+    coordinates = MoveCoordinates(shear, *log_posterior.bounds)
+    chains, densities = [], []
+    for ensemble in range(ENSEMBLES):
+        sampler = emcee.EnsembleSampler(
+            walkers, log_posterior.dim, log_posterior.log_prob, moves=mixed_moves(coordinates), vectorize=True
+        )
+        random = np.random.RandomState(int(rng.integers(2**32)))
+        first = emcee.State(starts(walkers), random_state=random.get_state())
+        for step, _ in enumerate(sampler.sample(first, iterations=STEPS, skip_initial_state_check=True)):
+            if progress and step % 50 == 0:
+                progress((ensemble + step / STEPS) / ENSEMBLES)
+        chains.append(sampler.get_chain())
+        densities.append(sampler.get_log_prob())
+    whole = np.stack(chains)
+    state = assess(whole, np.stack(densities), log_posterior.names, LIMITS, BURN_IN)
+    kept = log_posterior.from_sampling(whole[:, BURN_IN::EVERY].reshape(-1, log_posterior.dim))
+    return Resampled(log_posterior.names, kept, float(np.nanmax(state.rhat)), float(np.nanmin(state.ess)))
+
+
+def _starts(
+    found: Fit, shear: Shear | None, skin: int, seed: int, rng: np.random.Generator
+) -> Callable[[int], Array]:
+    """A function that draws so many walkers (n, D) about the modes."""
+    log_posterior = found.log_posterior
+    low, high = log_posterior.bounds
+    best = low + found.unit * (high - low)
+    others = likely(log_posterior, other_skins(best, log_posterior, shear, skin, seed), MODES)
+    tops = [gauss_newton(log_posterior, start, shear, FIRST_ROUNDS) for start in others]
+    centres = np.array([best, *(top.vector for top in tops)])
+    values = np.array([found.value, *(top.value for top in tops)])
+    share = np.exp(np.maximum(values - values.max(), -20.0) / log_posterior.dim)  # a mode's width counts too
+    root = np.linalg.cholesky(found.covariance + 1e-12 * np.eye(len(low))) * (high - low)[:, None]
+
+    def draw(count: int) -> Array:
+        out = np.empty((0, len(low)))
+        while len(out) < count:
+            centre = centres[rng.choice(len(centres), count, p=share / share.sum())]
+            trial = centre + NEAR * rng.standard_normal((count, len(low))) @ root.T
+            trial = low + np.abs(np.mod((trial - low) / (high - low) + 1.0, 2.0) - 1.0) * (high - low)
+            out = np.concatenate([out, trial[np.isfinite(log_posterior.log_prob(trial))]])
+        return out[:count]
+
+    return draw

@@ -1,0 +1,103 @@
+"""Effects of mechanisms: which inputs matter, and few fine runs that correct many coarse ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from toy import EDGES_S, SPACE, toy_bin_means
+
+from bayeskin.design import sobol_points
+from bayeskin.mechanisms.strain_stiffening import first_modulus
+from bayeskin.surrogates import Pair, load_surrogate, save_surrogate, train, train_effect
+from bayeskin.surrogates.files import contents_hash
+from bayeskin.surrogates.screening import active_inputs
+from bayeskin.types import Array, Design, Parameter, ParameterSpace
+
+WIDE = ParameterSpace(
+    (*SPACE.parameters, Parameter("a", "1", 0.0, 2.0, "uniform"), Parameter("idle", "1", 0.0, 1.0, "uniform"))
+)
+
+
+def pair(rows: int, bias: float, seed: int, held_out: int = 0) -> Pair:
+    """The toy and an effect that bends with its force and with a; a coarse mesh is off by `bias` in both."""
+    theta = sobol_points(WIDE, rows, seed)
+    without = (1.0 + 0.1 * bias) * toy_bin_means(theta[:, : SPACE.dim])
+    effect = theta[:, 5:6] * (1.0 + bias * (1.0 + 0.3 * theta[:, 5:6])) * without * np.abs(without) ** 0.5
+    design = Design(
+        WIDE, EDGES_S, theta, without + effect, np.zeros(rows, int), np.arange(rows) >= rows - held_out,
+        np.ones(rows, bool), ("",) * rows, np.zeros(rows), seed, f"bias {bias}",
+    )  # fmt: skip
+    return Pair(design, without)
+
+
+COARSE, FINE = pair(128, 0.05, 1), pair(40, 0.0, 2, held_out=12)
+
+
+def error(found: Array, truth: Array) -> float:
+    return float(np.sqrt(np.mean((found - truth) ** 2) / np.mean(truth**2)))
+
+
+def test_fine_runs_take_the_coarse_mesh_s_error_out_of_an_effect() -> None:
+    rows = FINE.design.testing
+    theta, base, truth = FINE.design.theta[rows], FINE.without_n[rows], FINE.change()[rows]
+    left = []
+    for fine in (COARSE, FINE):  # corrected by itself, and by the fine model
+        effect, validation = train_effect("a", "toy", 0.0, ("a", "idle"), COARSE, fine, "gp")
+        left.append(error(effect.predict(theta, base).mean, truth))
+    assert left[0] > 0.05
+    assert left[1] < 0.012
+    assert validation.rows == rows.sum()
+    assert effect.surrogate.provenance["model_hash"] == "bias 0.0"
+
+
+def test_inputs_that_do_nothing_are_left_out() -> None:
+    change = replace(COARSE.design, force_n=COARSE.change() / COARSE.design.theta[:, 5:6].clip(1e-6))
+    weights = np.where(COARSE.design.theta[:, 5] > 0.05, 1.0, 0.0)
+    active = active_inputs(change, weights)
+    names = [WIDE.names[i] for i in active]
+    assert "idle" not in names
+    assert {"E_c", "E_s"} <= set(names)
+
+
+def test_a_surrogate_of_some_inputs_is_stored_with_them(tmp_path: Path) -> None:
+    some = np.array([0, 1, 2, 3, 5])
+    surrogate, _ = train(COARSE.design, "gp", active=some)
+    moved = COARSE.design.theta[:5].copy()
+    moved[:, 6] = 1.0 - moved[:, 6]
+    np.testing.assert_array_equal(
+        surrogate.predict(moved).mean, surrogate.predict(COARSE.design.theta[:5]).mean
+    )
+    save_surrogate(tmp_path / "s.h5", surrogate, {})
+    found = load_surrogate(tmp_path / "s.h5")
+    np.testing.assert_array_equal(found.active, some)
+    np.testing.assert_array_equal(found.predict(moved).mean, surrogate.predict(moved).mean)
+
+
+def test_a_file_of_the_format_before_has_all_inputs_active(tmp_path: Path) -> None:
+    surrogate, _ = train(COARSE.design, "gp")
+    save_surrogate(tmp_path / "s.h5", surrogate, {})
+    with h5py.File(tmp_path / "s.h5", "r+") as handle:
+        del handle["active"]
+        handle.attrs.update(format_version=3, arrays_sha256=contents_hash(handle))
+    found = load_surrogate(tmp_path / "s.h5")
+    theta = COARSE.design.theta[:5]
+    np.testing.assert_array_equal(found.predict(theta).mean, surrogate.predict(theta).mean)
+
+
+@pytest.mark.parametrize("kappa", [0.0, 0.1, 1 / 3])
+def test_fibre_stress_is_what_the_fibres_pull_with_in_skin_a_quarter_longer(kappa: float) -> None:
+    k2, asked = 7.0, 2.0e4
+    k1 = first_modulus({"fibre_stress": asked, "k2": k2, "dispersion": kappa})
+
+    def energy(c_xx: float) -> float:
+        across = 1.25**-1  # squared stretch of the other two at the same volume
+        strain = kappa * (c_xx + 2.0 * across - 3.0) + (1.0 - 3.0 * kappa) * (c_xx - 1.0)
+        return float(k1 / (2.0 * k2) * (np.exp(k2 * strain**2) - 1.0))
+
+    h = 1e-5
+    stress = 2.0 * (energy(1.25**2 + h) - energy(1.25**2 - h)) / (2.0 * h)
+    assert stress == pytest.approx(asked, rel=1e-6)
