@@ -206,6 +206,28 @@ def diagnose(source: Path, as_json: bool) -> None:
 
 
 @cli.command()
+@click.argument("source", type=click.Path(path_type=Path))
+@as_json
+def experiment(source: Path, as_json: bool) -> None:
+    """Which further test would tell look-alikes apart.
+
+    SOURCE as for `bayeskin diagnose`, which is run first where that is not done. The set that explains the
+    recording best and those with look-alikes in its place are taken as equally probable; draws of their
+    posteriors are run on nine protocols, variations of the recording's own, and the expected information
+    about which is true is computed from the forces.
+
+    \b
+    Example:
+      bayeskin experiment runs/healthy-skin.toml
+    """
+    from bayeskin.pipeline import experiment
+
+    with Terminal() as terminal:
+        document = experiment.choose(source, terminal)
+    _answer(document, as_json)
+
+
+@cli.command()
 @click.argument("folder", required=False, type=click.Path(path_type=Path))
 @click.option("--at-most", type=click.IntRange(min=0), metavar="N", help="Diagnose N more, then score.")
 @click.option("--rediagnose", default=0, type=click.IntRange(min=0), metavar="N", help="Diagnose N again.")

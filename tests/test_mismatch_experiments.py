@@ -17,7 +17,7 @@ from bayeskin.inference import LogPosterior
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mechanisms.mechanism import Instrument, Place, added
 from bayeskin.mechanisms.viscous_drag import speed_of
-from bayeskin.mismatch.experiments import choose_experiment, noise_of
+from bayeskin.mismatch.experiments import Experiment, compete, noise_of, ranked, weigh
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.information import expected_gain
 from bayeskin.mismatch.observed import ObservedSurrogate
@@ -144,9 +144,13 @@ def fitted(name: str, **values: float) -> Fit:
     )
 
 
+def judged(fits: Sequence[Fit], run: Any) -> list[Experiment]:
+    return ranked([weigh(one, fits, KNOWN, run, 0) for one in protocols(toy.MOTION)])
+
+
 def test_friction_is_told_from_drag_by_another_speed_and_not_by_a_repeat() -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    table = choose_experiment(fits, [0.5, 0.5], KNOWN, toy.MOTION, toy_run, 0)
+    table = judged(fits, toy_run)
     by_name = {one.protocol: one for one in table}
     assert table[0].protocol in ("quarter speed", "five times faster")
     assert by_name["five times faster"].gain_nats > 0.5
@@ -159,7 +163,7 @@ def test_friction_is_told_from_drag_by_another_speed_and_not_by_a_repeat() -> No
 
 def test_the_figure_shows_every_protocol_that_could_be_judged() -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    table = choose_experiment(fits, [0.5, 0.5], KNOWN, toy.MOTION, toy_run, 0)
+    table = judged(fits, toy_run)
     figure = figure_experiments((*table, dataclasses.replace(table[0], protocol="failed", gain_nats=np.nan)))
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [
         one.protocol for one in reversed(table)
@@ -176,10 +180,18 @@ def test_failed_runs_are_counted_and_leave_a_row() -> None:
         )
 
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    table = choose_experiment(fits, [0.5, 0.5], KNOWN, toy.MOTION, failing, 0)
+    table = judged(fits, failing)
     assert all(np.isnan(one.gain_nats) and one.failed == 24 for one in table)
-    with pytest.raises(InputError, match="compete"):
-        choose_experiment(fits, [1.0, 1e-5], KNOWN, toy.MOTION, toy_run, 0)
+    with pytest.raises(InputError, match="two at least"):
+        judged(fits[:1], toy_run)
+
+
+def test_sets_with_look_alikes_in_the_place_of_the_likeliest_compete() -> None:
+    likely = dataclasses.replace(fitted("rub", rubbing=4e-3), log_evidence=9.0)
+    alike = fitted("drag", dragging=DRAG)
+    both = dataclasses.replace(alike, names=("drag", "rub"), log_evidence=1.0)
+    none = dataclasses.replace(alike, names=(), log_evidence=3.0)
+    assert [one.names for one in compete([none, alike, both, likely], KNOWN)] == [("rub",), ("drag",)]
 
 
 def test_noise_of_a_test_to_come_is_that_of_the_fit() -> None:

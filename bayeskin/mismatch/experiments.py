@@ -1,13 +1,13 @@
 """Which further test would tell competing sets of mechanisms apart: each simulated with the posterior.
 
-Of every set, a few posterior draws are run in the full model on each protocol, and the expected information
-gain about which set is true is computed from the forces (`information`). The noise of the test to come is
+Of every set, a few posterior draws are run on each protocol, and the expected information gain about which
+set is true is computed from the forces (`information`). The noise of the test to come is
 the fitted noise of the most probable set, what it leaves unexplained with it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -20,14 +20,13 @@ from bayeskin.mechanisms.mechanism import ForceOfTime
 from bayeskin.mismatch import protocols as tests
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.information import FEWEST, expected_gain
+from bayeskin.mismatch.search import weight
 from bayeskin.mismatch.unexplained import chain_covariance
 from bayeskin.types import Array, BinnedForce, PadMotion, Simulation
 
 DRAWS = 12  # of each hypothesis
 MOST_BINS = 800  # of a protocol; longer ones have wider bins
-SELDOM = 1e-3  # probability below which a hypothesis does not compete
-
-Progress = Callable[[float, str], None]
+MOST_SETS = 4  # that compete
 
 
 class FullModel(Protocol):
@@ -55,47 +54,49 @@ class Experiment:
     failed: int
 
 
-def choose_experiment(
+def compete(found: Sequence[Fit], known: Mapping[str, Mechanism]) -> list[Fit]:
+    """The likeliest set of a search, and the likeliest of those tried that have, in the place of some of its
+    mechanisms, look-alikes: one for each choice of mechanisms that differs from it."""
+    best = max(found, key=weight)
+
+    def alike(other: Fit) -> bool:
+        gone, new = set(best.names) - set(other.names), set(other.names) - set(best.names)
+        groups = {name for one in gone for name in known[one].group}
+        return bool(gone) and len(gone) == len(new) and new <= groups
+
+    by_names = {other.names: other for other in found if alike(other)}
+    return [best, *sorted(by_names.values(), key=weight, reverse=True)[: MOST_SETS - 1]]
+
+
+def weigh(
+    protocol: tests.Protocol,
     fits: Sequence[Fit],
-    probabilities: Sequence[float],
     known: Mapping[str, Mechanism],
-    motion: PadMotion,
     simulate: FullModel,
     seed: int,
-    progress: Progress | None = None,
-) -> tuple[Experiment, ...]:
-    """Protocols of the list, the most informative first, about which of the sets fitted is true.
+) -> Experiment:
+    """What a protocol is expected to tell about which of the sets is true, all as probable before.
 
-    fits : one for each hypothesis, by whose `names` mechanisms of `known` are on
-    probabilities : of the hypotheses, any positive scale; those below a thousandth do not compete
-    motion : the recording's own, which the protocols vary
-    simulate : called DRAWS times a protocol and hypothesis
-    Raises InputError when fewer than two hypotheses compete.
+    fits : one for each hypothesis, by whose `names` mechanisms of `known` are on, the likeliest first
+    simulate : called DRAWS times a hypothesis
+    Raises InputError for fewer than two hypotheses.
     """
-    share = np.asarray(probabilities, dtype=float) / np.sum(probabilities)
-    competing = [i for i in np.argsort(-share) if share[i] > SELDOM]
-    if len(competing) < 2 or len(share) != len(fits):
-        raise InputError("hypotheses", f"{len(competing)} that compete", "two at least, each with its fit")
-    prior = share[competing] / share[competing].sum()
-    possible = -float(np.sum(prior * np.log(prior)))
-    ahead = [fits[i] for i in competing]
-    found = []
-    listed = tests.protocols(motion)
-    for done, protocol in enumerate(listed):
-        edges_s = _edges(protocol.motion, ahead[0])
-        forces = [
-            _forces(one, known, protocol.motion, edges_s, simulate, seed + i) for i, one in enumerate(ahead)
-        ]
-        failed = sum(DRAWS - len(rows) for rows in forces)
-        gain = (np.nan, np.nan, np.nan)
-        if min(len(rows) for rows in forces) >= FEWEST:
-            noise = noise_of(ahead[0], protocol.motion, edges_s)
-            of = expected_gain(forces, noise, prior, seed)
-            gain = (of.nats, of.standard_error, of.named)
-        found.append(Experiment(protocol.name, protocol.sentence, protocol.motion, *gain, possible, failed))
-        if progress:
-            progress((done + 1) / len(listed), f"{protocol.name}: {gain[0]:.2f} of {possible:.2f} nats")
-    return tuple(sorted(found, key=lambda one: (np.isnan(one.gain_nats), -one.gain_nats)))
+    if len(fits) < 2:
+        raise InputError("hypotheses", f"{len(fits)}", "two at least, each with its fit")
+    edges_s = _edges(protocol.motion, fits[0])
+    forces = [_forces(one, known, protocol.motion, edges_s, simulate, seed + i) for i, one in enumerate(fits)]
+    failed = sum(DRAWS - len(rows) for rows in forces)
+    gain = (np.nan, np.nan, np.nan)
+    if min(len(rows) for rows in forces) >= FEWEST:
+        of = expected_gain(forces, noise_of(fits[0], protocol.motion, edges_s), np.ones(len(fits)), seed)
+        gain = (of.nats, of.standard_error, of.named)
+    possible = float(np.log(len(fits)))
+    return Experiment(protocol.name, protocol.sentence, protocol.motion, *gain, possible, failed)
+
+
+def ranked(found: Sequence[Experiment]) -> list[Experiment]:
+    """The most informative first; those that could not be judged last."""
+    return sorted(found, key=lambda one: (np.isnan(one.gain_nats), -one.gain_nats))
 
 
 def _edges(motion: PadMotion, found: Fit) -> Array:
@@ -116,8 +117,10 @@ def _forces(
     """Bin means (draws, m) at posterior draws, those of failed runs left out."""
     log_posterior = found.log_posterior
     added = [known[name] for name in found.names]
+    within = solved(added)
+    beyond = [mechanism for mechanism in added if mechanism not in within]
     own = {p.name for mechanism in added for p in mechanism.parameters}
-    along = {p.name for mechanism in solved(added) for p in mechanism.parameters}
+    along = {p.name for mechanism in within for p in mechanism.parameters}
     rows = []
     for draw in found.draws(DRAWS, seed)[:, : log_posterior.surrogate.space.dim]:
         theta = _neutral(added) | dict(zip(log_posterior.surrogate.space.names, draw.tolist(), strict=True))
@@ -125,7 +128,7 @@ def _forces(
         run = simulate(motion, inside, laws(added))
         if run.status == "ok":
             values = {name: np.array([value]) for name, value in theta.items()}
-            rows.append(bin_means(observed(added, values, motion, _force_of(run)), motion, edges_s)[0])
+            rows.append(bin_means(observed(beyond, values, motion, _force_of(run)), motion, edges_s)[0])
     return np.array(rows).reshape(len(rows), len(edges_s) - 1)
 
 

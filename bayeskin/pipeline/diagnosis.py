@@ -107,15 +107,16 @@ def diagnose(source: Path, reporter: Reporter) -> dict[str, Any]:
     Outputs go to the run's folder, or to STEM-diagnosis beside the recording. Raises InputError for bad
     input, among it a recording whose protocol no shipped surrogate knows.
     """
-    opened = _opened(source, reporter)
+    run = opened(source, reporter)
     stages = {stage.name: stage for stage in (recording.STAGE, design.STAGE, training.STAGE, STAGE)}
-    outcome = run_stages(opened, stages)[-1]
-    answer = {**outcome.record.summary, "ok": outcome.ok, "folder": opened.folder / STAGE.name}
+    outcome = run_stages(run, stages)[-1]
+    answer = {**outcome.record.summary, "ok": outcome.ok, "folder": run.folder / STAGE.name}
     text = in_words(answer) if outcome.record.done else f"{outcome.stage}: failed: {answer['message']}"
     return plain({**answer, "text": text})
 
 
-def _opened(source: Path, reporter: Reporter) -> Run:
+def opened(source: Path, reporter: Reporter) -> Run:
+    """A configuration's run, or that of a recording by itself beside it. Raises InputError as `diagnose`."""
     if source.suffix == ".toml":
         return open_run(source, reporter)
     found = read_recording(source)
@@ -134,7 +135,7 @@ def _opened(source: Path, reporter: Reporter) -> Run:
 
 def _work(run: Run) -> Mapping[str, Any]:
     started = time.monotonic()
-    bench = _workbench(run)
+    bench = workbench(run)
     split_s = _end_of_second_hold(bench.binned)
     beside = None if split_s is None else _search_beside(run, split_s)
     whole = _searched(bench, None)
@@ -211,7 +212,7 @@ def _call(task: partial[Any]) -> Any:
 
 def _fit_full_apart(source: Path, plain: Mapping[str, Any]) -> FullFit | str:
     """In a process of its own: mechanisms have no copies."""
-    bench, names = _workbench(_opened(source, Silent())), plain["names"]
+    bench, names = workbench(opened(source, Silent())), plain["names"]
     run_it = FullForce(bench.spec, bench.motion, bench.binned.edges_s)
     beyond = [bench.known[name] for name in names if bench.known[name].act.bind is None]
     exact = [p.name for mechanism in beyond for p in mechanism.parameters]
@@ -222,7 +223,7 @@ def _fit_full_apart(source: Path, plain: Mapping[str, Any]) -> FullFit | str:
 
 
 def _resample_apart(source: Path, plain: Mapping[str, Any]) -> Resampled:
-    bench = _workbench(_opened(source, Silent()))
+    bench = workbench(opened(source, Silent()))
     alone, wide = bench.posterior(None, ()), bench.posterior(None, plain["names"])
     shear = find_shear(alone)
     among = shear.among(alone.names, wide.names) if shear else None
@@ -238,10 +239,11 @@ def _search_beside(run: Run, split_s: float) -> threading.Thread:
 
 
 def _search_apart(source: Path, split_s: float) -> None:
-    _searched(_workbench(_opened(source, Silent())), split_s)
+    _searched(workbench(opened(source, Silent())), split_s)
 
 
-def _workbench(run: Run) -> Workbench:
+def workbench(run: Run) -> Workbench:
+    """Of a run whose stages up to `train` are done."""
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     effects = effects_of(run) if run.config.model.observation == "reaction" else []
@@ -250,16 +252,27 @@ def _workbench(run: Run) -> Workbench:
     return Workbench(run, binned, motion, base_surrogate(run), tuple(effects), known)
 
 
+def fits_of(bench: Workbench) -> list[Fit]:
+    """All sets that the search on the whole recording has tried so far."""
+    build = partial(bench.posterior, None)
+    return _fits_in(_search_file(bench, build), build)
+
+
+def _search_file(bench: Workbench, build: Build) -> Path:
+    """Where a search keeps its fits, by what they are of."""
+    identity = sha256_of(
+        [bayeskin.__version__, bench.run.config.seed, build(()).identity, repr(build(()).noise_priors),
+         [repr(mechanism.parameters) for mechanism in bench.known.values()],
+         [[effect.part, dict(effect.surrogate.provenance)] for effect in bench.effects]]
+    )  # fmt: skip
+    return bench.run.folder / "searches" / f"{identity[:16]}.jsonl"
+
+
 def _searched(bench: Workbench, until_s: float | None) -> Search:
     """The search up to a time, going on from the fits that one stopped before has left."""
     run, build = bench.run, partial(bench.posterior, until_s)
     label = "whole recording" if until_s is None else f"up to {until_s:.1f} s"
-    identity = sha256_of(
-        [bayeskin.__version__, run.config.seed, build(()).identity, repr(build(()).noise_priors),
-         [repr(mechanism.parameters) for mechanism in bench.known.values()],
-         [[effect.part, dict(effect.surrogate.provenance)] for effect in bench.effects]]
-    )  # fmt: skip
-    file = run.folder / "searches" / f"{identity[:16]}.jsonl"
+    file = _search_file(bench, build)
     done = {one.names: one for one in _fits_in(file, build)}
     file.parent.mkdir(parents=True, exist_ok=True)
     with open(file, "a", encoding="utf-8") as handle:

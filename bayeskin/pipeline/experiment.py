@@ -1,0 +1,111 @@
+"""Which further test would tell the explanations of a mismatch apart, after it has been diagnosed.
+
+Runs are those of the coarsest bricks, some per cent off at an eighth of the cost: what matters is by how much
+explanations differ, and a mesh changes them alike.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayeskin import report
+from bayeskin.errors import InputError
+from bayeskin.mismatch.experiments import Experiment, compete, ranked, weigh
+from bayeskin.mismatch.fit import restored, stored
+from bayeskin.mismatch.protocols import protocols
+from bayeskin.model.simulate import ModelSpec, simulate
+from bayeskin.pipeline import diagnosis
+from bayeskin.pipeline.engine import Reporter, Silent
+from bayeskin.pipeline.folder import plain, sha256_of, write_json
+from bayeskin.pipeline.provenance import caption
+from bayeskin.types import PadMotion, Simulation
+from bayeskin.workers import Lost, run_parallel
+
+FOLDER = "experiment"
+
+
+def choose(source: Path, reporter: Reporter) -> dict[str, Any]:
+    """The answer of `bayeskin experiment` on a configuration's run, or on a recording by itself.
+
+    Diagnoses first, where that is not done. Outputs go to the run's folder `experiment`. Raises InputError
+    for bad input, among it the article's observation, which no other protocol has.
+    """
+    run = diagnosis.opened(source, reporter)
+    if run.config.model.observation != "reaction":
+        raise InputError(source, "the article's observation", "model.observation = 'reaction'")
+    diagnosis.diagnose(source, reporter)
+    bench = diagnosis.workbench(run)
+    fits = compete(diagnosis.fits_of(bench), bench.known)
+    answer: dict[str, Any] = {"sets": [list(one.names) for one in fits], "experiments": [], "ok": True}
+    if len(fits) > 1:
+        found = _weighed(source, [stored(one) for one in fits], bench.motion, run.folder / FOLDER, reporter)
+        answer["experiments"] = [_row(one) for one in ranked(found)]
+        figure = report.figure_experiments(ranked(found))
+        made = report.save_figure(figure, run.folder / FOLDER / "experiments", caption(run))
+        answer["figures"] = [path.name for path in made]
+    write_json(run.folder / FOLDER / "experiment.json", plain(answer))
+    return plain({**answer, "folder": run.folder / FOLDER, "text": _in_words(answer)})
+
+
+def _weighed(
+    source: Path, fits: Sequence[Mapping[str, Any]], motion: PadMotion, folder: Path, reporter: Reporter
+) -> list[Experiment]:
+    """Each protocol judged in one of two processes; those judged before an interruption are not again."""
+    listed = protocols(motion)
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / f"weighed-{sha256_of([list(map(dict, fits))])[:12]}.jsonl"
+    done = _read(file, listed)
+    todo = [i for i in range(len(listed)) if listed[i].name not in done]
+    for place, one in run_parallel(partial(_weigh_apart, source, fits), todo, 2):
+        if isinstance(one, Lost):
+            raise InputError(listed[todo[place]].name, one.reason, "runs that end")
+        done[one.protocol] = one
+        with open(file, "a", encoding="utf-8") as handle:
+            handle.write(json.dumps(_row(one)) + "\n")
+        told = f"{one.protocol}: {one.gain_nats:.2f} of {one.possible_nats:.2f} nats"
+        reporter.progress("experiments", len(done) / len(listed), told)
+    return list(done.values())
+
+
+def _read(file: Path, listed: Sequence[Any]) -> dict[str, Experiment]:
+    """Protocols judged before; a last line that is not whole is passed over."""
+    motions = {one.name: one.motion for one in listed}
+    found = {}
+    for line in file.read_text(encoding="utf-8").split("\n")[:-1] if file.is_file() else []:
+        row = json.loads(line)
+        found[row["protocol"]] = Experiment(**row, motion=motions[row["protocol"]])
+    return found
+
+
+def _row(one: Experiment) -> dict[str, Any]:
+    return {name: value for name, value in asdict(one).items() if name != "motion"}
+
+
+def _weigh_apart(source: Path, fits: Sequence[Mapping[str, Any]], index: int) -> Experiment:
+    """In a process of its own: mechanisms have no copies."""
+    bench = diagnosis.workbench(diagnosis.opened(source, Silent()))
+    found = [restored(one, bench.posterior(None, one["names"])) for one in fits]
+    protocol = protocols(bench.motion)[index]
+    return weigh(protocol, found, bench.known, _coarse, bench.run.config.seed)
+
+
+def _coarse(motion: PadMotion, theta: Mapping[str, float], laws: Sequence[Any]) -> Simulation:
+    return simulate(ModelSpec(refinement=0), motion, theta, laws=laws)
+
+
+def _in_words(answer: Mapping[str, Any]) -> str:
+    if not answer["experiments"]:
+        return "nothing competes: no look-alike was tried in the place of what explains the recording best"
+    lines = ["taken as equally probable: " + "; or ".join(", ".join(one) for one in answer["sets"])]
+    for one in answer["experiments"]:
+        share = one["gain_nats"] / one["possible_nats"]
+        told = f"{100 * share:.0f} % of what is to be known" if np.isfinite(share) else "could not be judged"
+        lines.append(f"  {one['protocol']}: {told}. {one['sentence']}")
+    return "\n".join(lines)
