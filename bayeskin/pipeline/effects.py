@@ -102,6 +102,15 @@ def coarse_wave(space: ParameterSpace, points: int, seed: int) -> Wave:
     return Wave(space, theta, np.zeros(points, bool), 0, seed, {"rule": "Sobol' points over the prior box"})
 
 
+def nested(wave: Wave, few: Wave) -> Wave:
+    """A coarse wave with the training points of a fine one (in as many parameters), where the difference of
+    the models is then known."""
+    more = few.theta[~few.held_out, : wave.space.dim]
+    theta = np.concatenate([wave.theta, more])
+    rule = f"{wave.record['rule']}, and points of the fine model's"
+    return replace(wave, theta=theta, held_out=np.zeros(len(theta), bool), record={"rule": rule})
+
+
 def _with_own(part: Part, base: Wave) -> Wave:
     """A wave of base parameters with values of the part's own beside them."""
     own = ParameterSpace(part.own)
@@ -136,14 +145,15 @@ def _chosen(run: Run) -> list[Mechanism]:
 def _learn(run: Run, part: Part) -> dict[str, Any]:
     config, spec = run.config, model_spec(run)
     base = storage.load(run.at("design", "design.h5"), Design)
+    coarse_spec = replace(spec, mesh="bricks", refinement=0)
+    wave = coarse_wave(base.space, config.effects.coarse, config.seed)
+    few = effect_wave(part, base, config.effects.points, config.effects.held_out, config.seed)
+    many = nested(_with_own(part, wave), few)
     with crew(run) as run_all:
         make = partial(_runs, run, run_all, base.edges_s)
-        wave = coarse_wave(base.space, config.effects.coarse, config.seed)
-        coarse_spec = replace(spec, mesh="bricks", refinement=0)
-        without = make("coarse", coarse_spec, wave, None)
-        coarse = make(f"{part.name}, coarse", coarse_spec, _with_own(part, wave), part)
-        wave = effect_wave(part, base, config.effects.points, config.effects.held_out, config.seed)
-        fine = make(part.name, spec, wave, part)
+        without = make("coarse", coarse_spec, nested(wave, few), None)
+        coarse = make(f"{part.name}, coarse", coarse_spec, many, part)
+        fine = make(part.name, spec, few, part)
     storage.save(run.at("effects", f"{part.name}-design.h5"), fine)
     return _train(run, part, Pair(coarse, base_force(without, coarse)), Pair(fine, base_force(base, fine)))
 
