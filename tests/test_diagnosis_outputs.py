@@ -152,7 +152,7 @@ def test_words_say_what_is_left_only_where_something_is(remainder: Remainder) ->
     }
     answer = {
         "verdict": "unknown", "mechanisms": [], "located": [], "remaining": [], "candidates": [],
-        "fit": {"before": fits, "after": fits}, "folder": "x", "unexplained": None,
+        "fit": {"before": fits, "after": fits}, "folder": "x", "unexplained": None, "unsure": [],
     }  # fmt: skip
     assert "unexplained" not in in_words(answer)
     assert "R-hat" not in in_words(answer)

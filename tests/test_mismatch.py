@@ -190,6 +190,37 @@ def test_a_mesh_that_is_off_by_a_factor_stays_inside_the_intervals() -> None:
         assert (low < truth < high) == inside, (low, truth, high)
 
 
+class Unsure(ToySurrogate):
+    """Claims an error of one more shape (m,)."""
+
+    def __init__(self, shape: np.ndarray) -> None:
+        super().__init__()
+        self._shape = shape
+
+    def predict(self, theta):
+        found = super().predict(theta)
+        more = np.broadcast_to(self._shape[None, :, None], (*found.mean.shape, 1))
+        return dataclasses.replace(found, factor=np.concatenate([found.factor, more], axis=2))
+
+
+def test_a_set_of_which_the_surrogate_is_unsure_does_not_count() -> None:
+    alone = concealing(0, ("viscous-drag",), drag=30.0)
+    lucky = Unsure(alone.binned.force_n - toy_problem(0).binned.force_n)
+
+    def build(names: Sequence[str]) -> LogPosterior:
+        these = building(alone, names)
+        if "sensor-drift" not in names:
+            return these
+        return dataclasses.replace(these, surrogate=dataclasses.replace(these.surrogate, skin=lucky))
+
+    known = {name: KNOWN[name] for name in ("viscous-drag", "sensor-drift")}
+    found = search(build, known, 1)
+    assert ("sensor-drift",) in found.unsure
+    assert found.unsure["sensor-drift",].log_evidence > found.base.log_evidence
+    assert found.best.names == ("viscous-drag",)
+    assert found.probability(["sensor-drift"]) == 0.0
+
+
 class Wrong(ToySurrogate):
     """Off by some percent of the force and of the slopes, and sure of itself."""
 

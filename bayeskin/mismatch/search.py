@@ -1,14 +1,17 @@
 """Which mechanisms: forward from none, each tried with all other parameters free again.
 
 A set's weight is its evidence times the prior of its size, every mechanism being there with the probability
-`PRIOR`. In each step the others are ordered by what they promise beside those taken (a score test), and the
-most promising are tried; then each taken one is left out again, so that what a later one has made needless
-goes. The first step tries all, those that promise less by one climb each. Where the noise of the best set is
-still as large as it may be, much is left: then other paths are followed, from single mechanisms that it does
-not have.
+`PRIOR`. A set does not count in which the surrogate's error exceeds half of what some mechanism adds, and
+the noise: far from the noise an uncertain surrogate explains much by its own error.
 
-Probabilities are shares of weight over all sets
-that were tried: those of sets never tried count as nothing.
+In each step the others are ordered by what they promise beside those taken (a score test), and the most
+promising are tried; then each taken one is left out again, so that what a later one has made needless goes.
+The first step tries all, those that promise less by one climb each. Where the noise of the best set is still
+as large as it may be, much is left: then other paths are followed, from single mechanisms that it does not
+have.
+
+Probabilities are shares of weight over all sets that were tried and count: those of sets never tried count
+as nothing.
 """
 
 from __future__ import annotations
@@ -22,12 +25,14 @@ from bayeskin.inference import LogPosterior
 from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.fit import Fit, fit, fit_base, promised
+from bayeskin.types import Array
 
 PRIOR = 0.05  # of a mechanism to be at work, before the recording is seen
 MOST = 8  # steps
 SHORTLIST = 5  # mechanisms of a step that are tried thoroughly
 PATHS = 4  # at most
 AT_BOUND = 0.999  # of the noise's range
+UNSURE = 0.5  # of what a mechanism adds, RMS: sd of the surrogate's error in it
 ONLY_WITH = {"friction-creep": "device-friction"}
 
 Build = Callable[[Sequence[str]], LogPosterior]  # the posterior with a set of mechanisms
@@ -36,9 +41,10 @@ Progress = Callable[[float, str], None]
 
 @dataclass
 class Search:
-    """All sets tried, by their names sorted, and the best of them."""
+    """All sets tried, by their names sorted, and the best of them; those that do not count are `unsure`."""
 
     fits: dict[tuple[str, ...], Fit] = field(default_factory=dict)
+    unsure: dict[tuple[str, ...], Fit] = field(default_factory=dict)
 
     @property
     def base(self) -> Fit:
@@ -78,14 +84,16 @@ def search(
     straight, skin = find_shear(alone), alone.surrogate.space.dim
     neutral = {name: value for m in known.values() for name, value in m.neutral.items()}
 
-    def kept(key: tuple[str, ...], make: Callable[[], Fit]) -> Fit:
-        if key not in found.fits:
-            found.fits[key] = done[key] if key in done else make()
+    def kept(key: tuple[str, ...], make: Callable[[], Fit]) -> Fit | None:
+        """The fit of a set, None where it does not count."""
+        if key not in found.fits and key not in found.unsure:
+            one = done[key] if key in done else make()
             if key not in done and on_fit:
-                on_fit(found.fits[key])
-        return found.fits[key]
+                on_fit(one)
+            (found.fits if sure(one, build) else found.unsure)[key] = one
+        return found.fits.get(key)
 
-    def tried(names: Sequence[str], start: Fit, thorough: bool = True) -> Fit:
+    def tried(names: Sequence[str], start: Fit, thorough: bool = True) -> Fit | None:
         key = tuple(sorted(names))
 
         def make() -> Fit:
@@ -107,10 +115,11 @@ def search(
         tries = order if not current.names else order[:SHORTLIST]
         fits = [current]
         for count, name in enumerate(tries):
-            fits.append(tried(sets[name], current, count < SHORTLIST))
+            one = tried(sets[name], current, count < SHORTLIST)
+            fits += [] if one is None else [one]
             if progress:
-                note = f"{name}: {fits[-1].log_evidence - current.log_evidence:+.1f} nats"
-                progress((count + 1) / len(tries), f"{label}: {note}")
+                nats = "unsure" if one is None else f"{one.log_evidence - current.log_evidence:+.1f} nats"
+                progress((count + 1) / len(tries), f"{label}: {name}: {nats}")
         return max(fits, key=weight)
 
     def path(current: Fit, label: str) -> None:
@@ -122,8 +131,10 @@ def search(
             while len(current.names) > 1 and (leaner := _leaner(current, tried)) is not None:
                 current = leaner
 
-    found = Search({})
-    path(kept((), lambda: fit_base(alone, seed, straight)), "path 1")
+    found = Search()
+    base = kept((), lambda: fit_base(alone, seed, straight))
+    assert base is not None
+    path(base, "path 1")
     singles = sorted((one for one in found.fits.values() if len(one.names) == 1), key=weight, reverse=True)
     for count in range(2, PATHS + 1):
         starts = [one for one in singles[1:] if not set(one.names) <= set(found.best.names)]
@@ -152,9 +163,32 @@ def _with(names: Sequence[str], name: str) -> tuple[str, ...]:
     return tuple(sorted({*names, name, *([ONLY_WITH[name]] if name in ONLY_WITH else [])}))
 
 
-def _leaner(best: Fit, tried: Callable[[Sequence[str], Fit], Fit]) -> Fit | None:
+def sure(found: Fit, build: Build) -> bool:
+    """Whether the surrogate knows of each mechanism at least half of what it adds, or all but the noise."""
+    whole = found.log_posterior
+    noise_n = max(found.theta[name] for name in whole.names if name.startswith("sd_"))
+    mean, variance = _predicted(whole, found)
+    for name in found.names:
+        without = build([other for other in found.names if name not in (other, ONLY_WITH.get(other))])
+        its_mean, its_variance = _predicted(without, found)
+        added = float(np.sqrt(np.mean((mean - its_mean) ** 2)))
+        unsure = float(np.sqrt(max(float(np.mean(variance - its_variance)), 0.0)))
+        if unsure > max(UNSURE * added, noise_n):
+            return False
+    return True
+
+
+def _predicted(log_posterior: LogPosterior, found: Fit) -> tuple[Array, Array]:
+    """Mean (m,) and variance (m,) of the force at a fit's values, as far as a posterior knows them."""
+    values = log_posterior.from_sampling(log_posterior.vector(found.theta))
+    prediction = log_posterior.predict(values)
+    return prediction.mean[0], prediction.sd()[0] ** 2
+
+
+def _leaner(best: Fit, tried: Callable[[Sequence[str], Fit], Fit | None]) -> Fit | None:
     """The best of the sets with one mechanism fewer, where that has more weight."""
     sets = [[other for other in best.names if other != name] for name in best.names]
     sets = [[n for n in names if n not in ONLY_WITH or ONLY_WITH[n] in names] for names in sets]
-    fewer = max((tried(names, best) for names in sets), key=weight)
-    return fewer if weight(fewer) > weight(best) else None
+    fewer = [one for names in sets if (one := tried(names, best)) is not None]
+    leanest = max(fewer, key=weight, default=best)
+    return leanest if weight(leanest) > weight(best) else None

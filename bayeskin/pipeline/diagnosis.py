@@ -158,6 +158,7 @@ def _work(run: Run) -> Mapping[str, Any]:
         ],
         "unexplained": None if remainder is None else unexplained(remainder),
         "candidates": candidates(whole, bench.known),
+        "unsure": sorted({name for names in whole.unsure for name in names if len(names) == 1}),
         "fit": {
             "before": _fit(bench, whole.base, taken[0], begun.base if begun else None, split_s),
             "after": _fit(bench, whole.best, taken[1], begun.best if begun else None, split_s),

@@ -160,7 +160,10 @@ def in_words(answer: Mapping[str, Any]) -> str:
             lines.append(f"  intervals are rough: R-hat of the draws {fits[when]['sampled']['rhat']:.2f}")
     lines += _left_in_words(answer["unexplained"]) if answer["unexplained"] else []
     best = ", ".join(f"{one['name']} {one['delta_score']:+.1f}" for one in answer["candidates"][:5])
-    lines += [f"candidates alone, log evidence gained: {best}", f"outputs in {answer['folder']}"]
+    lines += [f"candidates alone, log evidence gained: {best}"]
+    if answer["unsure"]:
+        lines.append(f"the surrogate is too unsure here of: {', '.join(answer['unsure'])}")
+    lines.append(f"outputs in {answer['folder']}")
     return "\n".join(lines)
 
 
