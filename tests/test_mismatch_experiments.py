@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.information import expected_gain
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.protocols import own, phases_of, protocols
+from bayeskin.pipeline import experiment
+from bayeskin.pipeline.engine import Silent
 from bayeskin.report import figure_experiments
 from bayeskin.types import PadMotion, Parameter, Simulation
 
@@ -205,3 +208,38 @@ def test_noise_of_a_test_to_come_is_that_of_the_fit() -> None:
     hold = slice(20, 40)
     near = np.diag(covariance[hold, hold], 1)
     np.testing.assert_allclose(near, NOISE["sd_hold"] ** 2 * np.exp(-1.0 / NOISE["tau_noise"]) + 0.2e-6)
+
+
+def test_protocols_judged_before_an_interruption_are_not_judged_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
+    made: list[int] = []
+
+    def serially(judge: Any, items: Sequence[int], workers: int) -> Iterator[tuple[int, Any]]:
+        for place, index in enumerate(items):
+            if len(made) == 4:
+                made.append(-1)
+                raise KeyboardInterrupt
+            made.append(index)
+            yield place, weigh(protocols(toy.MOTION)[index], fits, KNOWN, toy_run, 0)
+
+    monkeypatch.setattr(experiment, "run_parallel", serially)
+    asked = (
+        tmp_path / "x.toml",
+        [{"names": list(one.names)} for one in fits],
+        toy.MOTION,
+        tmp_path,
+        Silent(),
+    )
+    with pytest.raises(KeyboardInterrupt):
+        experiment._weighed(*asked)
+    found = ranked(experiment._weighed(*asked))
+    assert sorted(index for index in made if index >= 0) == list(range(9))
+    assert [one.protocol for one in found] == [one.protocol for one in judged(fits, toy_run)]
+    words = experiment._in_words(
+        {"sets": [["rub"], ["drag"]], "experiments": [experiment._row(one) for one in found]}
+    )
+    assert words.splitlines()[0] == "taken as equally probable: rub; or drag"
+    assert found[0].sentence in words.splitlines()[1]
+    assert "nothing competes" in experiment._in_words({"sets": [["rub"]], "experiments": []})
