@@ -77,6 +77,25 @@ def test_starts_on_the_ridge_agree_on_its_height() -> None:
     assert "of 2 starts" in found.message
 
 
+def test_three_kinds_of_search_end_at_one_maximum() -> None:
+    problem = toy_problem(windows=HOLDS)
+    found = find_map(problem, seed=1, starts=6, evaluations=4000)
+    assert min(start.value for start in found.starts) < found.value - 1.0  # there is a lower one besides
+    assert list(found.by_search) == list(optimise.SEARCHES)
+    assert all(found.value - value < 0.1 for value in found.by_search.values())
+    assert "by controlled random search, differential evolution, Gauss-Newton" in found.message
+
+
+@pytest.mark.parametrize("kind", optimise.SEARCHES)
+def test_each_kind_of_search_climbs_before_the_polish(kind: str) -> None:
+    problem = toy_problem(windows=HOLDS)
+    search = optimise._Search(optimise._SearchSpace(problem))
+    optimise.SEARCHES[kind](search, 3, 2000)
+    middle = problem.log_prob(np.mean(problem.bounds, axis=0)[None])[0]
+    best = find_map(problem, seed=1, starts=3, evaluations=4000).value
+    assert best - search.value < 0.2 * (best - middle)
+
+
 def test_a_failing_optimiser_is_a_status(monkeypatch: pytest.MonkeyPatch) -> None:
     class Failing(nlopt.opt):
         def optimize(self, start: Array) -> Array:
