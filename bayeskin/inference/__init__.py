@@ -13,6 +13,7 @@ from bayeskin.inference.bands import (
 from bayeskin.inference.check import MapCheck, RefinedMap, check_map, refine_map
 from bayeskin.inference.convergence import Convergence, Limits, Verdict
 from bayeskin.inference.identify import Identifiability, Learned, Ridge, identifiability
+from bayeskin.inference.importance import Corrected, Weighed, corrected, weigh
 from bayeskin.inference.inference_data import (
     draws_of,
     load_inference_data,
@@ -28,6 +29,7 @@ from bayeskin.inference.sample import Posterior, SampleSettings, load_chains, sa
 __all__ = [
     "Bands",
     "Convergence",
+    "Corrected",
     "ForceDraws",
     "Identifiability",
     "Learned",
@@ -44,9 +46,11 @@ __all__ = [
     "SampleSettings",
     "StartResult",
     "Verdict",
+    "Weighed",
     "bands",
     "bands_of",
     "check_map",
+    "corrected",
     "coverage",
     "draws_of",
     "find_map",
@@ -60,4 +64,5 @@ __all__ = [
     "sample",
     "save_inference_data",
     "to_inference_data",
+    "weigh",
 ]
