@@ -144,6 +144,13 @@ class SampleConfig(_Section):
     max_steps: Positive = 20000
 
 
+class CheckConfig(_Section):
+    """Posterior draws that the full model runs again, and how often they may join the design."""
+
+    draws: Annotated[int, Field(ge=0)] = 24
+    rounds: Annotated[int, Field(ge=0)] = 2
+
+
 class MapConfig(_Section):
     """Starts of the search for the most probable point, and evaluations that each may spend."""
 
@@ -172,6 +179,7 @@ class Config(_Section):
     fit: FitConfig = FitConfig()
     noise: NoiseConfig = NoiseConfig()
     sample: SampleConfig = SampleConfig()
+    check: CheckConfig = CheckConfig()
     map: MapConfig = MapConfig()
     sobol: SobolConfig = SobolConfig()
 

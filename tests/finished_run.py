@@ -82,6 +82,14 @@ def summaries() -> dict[str, dict[str, Any]]:
                 "sd_rest: the data informs it weakly: median 0.0028, 90 % interval 0.0019 to 0.0045 N",
             ],
             "ridges": ["E_c and E_s form a ridge (correlation -0.87): one makes up for the other"],
+            "full_model": [
+                {"draws": 24, "failed": 0, "effective": 20.1, "largest_weight": 0.07, "khat": None,
+                 "sd_of_log_ratio": 0.4, "trusted": True, "message": "full model at 24 posterior draws"},
+            ],
+            "corrected": {
+                name: {"mean": mean, "sd": 1.0, "shift_sd": 0.11, "shift_error_sd": 0.08}
+                for name, mean in (("E_c", 51e3), ("p_init", 840.0), ("sd_rest", 0.0029))
+            },
             "rmse": _RMSE, "coverage_90": 0.9462, "coverage_90_fitted": 0.9512,
             "rms_sd_n": {"parameter": 0.0013, "surrogate": 0.0009, "noise": 0.0042},
         },

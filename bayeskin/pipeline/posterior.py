@@ -15,6 +15,7 @@ from bayeskin import inference, report, storage
 from bayeskin.config import Config
 from bayeskin.inference import LogPosterior, Posterior, Verdict
 from bayeskin.pipeline.calibration import refined_posterior, rmse_table
+from bayeskin.pipeline.checking import Checked, checked_posterior, corrected_table, said_of, with_full_model
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import sha256_of, write_json
 from bayeskin.pipeline.model import model_spec
@@ -26,11 +27,9 @@ PREDICTIVE_DRAWS = 1000
 
 def _sample(run: Run) -> Mapping[str, Any]:
     config = run.config
-    log_posterior, best = refined_posterior(run), run.summary("map")["theta"]
-    chains = _chains_folder(run, log_posterior)
-    posterior = inference.sample(
-        log_posterior, chains, config.seed, best, _settings(config), partial(_tell_sampling, run)
-    )
+    best = run.summary("map")["theta"]
+    checked = checked_posterior(run, refined_posterior(run), partial(_draws_of, run, best))
+    log_posterior, posterior = checked.log_posterior, checked.posterior
     recording = storage.load(run.at("recording", "recording.h5"), Recording)
     provenance = Provenance(
         bayeskin.__version__, config.sha256, recording.sha256, model_spec(run).hash, config.seed,
@@ -40,10 +39,17 @@ def _sample(run: Run) -> Mapping[str, Any]:
     idata = inference.to_inference_data(log_posterior, posterior, provenance, rng, PREDICTIVE_DRAWS)
     inference.save_inference_data(run.at("sample", "posterior.nc"), idata)
     drawn = inference.predictive_draws(log_posterior, _some(posterior), rng)
-    _draw_posterior(run, log_posterior, posterior, best, drawn)
+    _draw_posterior(run, checked, best, drawn)
     bands = inference.bands_of(log_posterior.binned.time_s, drawn)
     write_json(run.at("sample", "bands.json"), _history(log_posterior, bands))
-    return _sampled(log_posterior, posterior, bands)
+    return _sampled(checked, bands)
+
+
+def _draws_of(run: Run, best: Mapping[str, float], log_posterior: LogPosterior) -> Posterior:
+    """Draws of a posterior, from about its most probable point."""
+    folder = _chains_folder(run, log_posterior)
+    settings, tell = _settings(run.config), partial(_tell_sampling, run)
+    return inference.sample(log_posterior, folder, run.config.seed, best, settings, tell)
 
 
 def _history(log_posterior: LogPosterior, bands: inference.Bands) -> dict[str, Any]:
@@ -74,11 +80,11 @@ def _tell_sampling(run: Run, share: float, text: str) -> None:
     run.reporter.progress("sampling", share, text)
 
 
-def _sampled(log_posterior: LogPosterior, posterior: Posterior, bands: inference.Bands) -> dict[str, Any]:
-    c = posterior.convergence
+def _sampled(checked: Checked, bands: inference.Bands) -> dict[str, Any]:
+    log_posterior, posterior, c = checked.log_posterior, checked.posterior, checked.posterior.convergence
     low, high = bands.interval(0.9)
     learned = inference.identifiability(posterior.space, posterior.flat)
-    verdict = with_surrogate_error(c.verdict, bands, log_posterior.chain.bins)
+    verdict = with_full_model(with_surrogate_error(c.verdict, bands, log_posterior.chain.bins), checked)
     return {
         "ok": verdict.trusted,
         "verdict": "trusted" if verdict.trusted else "not trusted",
@@ -88,6 +94,8 @@ def _sampled(log_posterior: LogPosterior, posterior: Posterior, bands: inference
         "parameters": _table(posterior),
         "identifiability": [one.statement for one in learned.parameters],
         "ridges": [one.statement for one in learned.ridges],
+        "full_model": [said_of(one) for one in checked.rounds],
+        "corrected": corrected_table(checked),
         "rmse": rmse_table(log_posterior, bands.mean_n),
         "coverage_90": inference.coverage(log_posterior.binned, low, high),
         "coverage_90_fitted": inference.coverage(log_posterior.binned, low, high, log_posterior.fit_windows),
@@ -132,12 +140,9 @@ def _table(posterior: Posterior) -> dict[str, dict[str, Any]]:
 
 
 def _draw_posterior(
-    run: Run,
-    log_posterior: LogPosterior,
-    posterior: Posterior,
-    best: Mapping[str, float],
-    drawn: inference.ForceDraws,
+    run: Run, checked: Checked, best: Mapping[str, float], drawn: inference.ForceDraws
 ) -> None:
+    log_posterior, posterior = checked.log_posterior, checked.posterior
     binned = log_posterior.binned
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     fitted = np.isin(np.arange(len(binned.force_n)), log_posterior.chain.bins)
@@ -159,6 +164,10 @@ def _draw_posterior(
             posterior.space, kept, convergence.verdict, _settings(run.config).limits
         ),
     }
+    if checked.rounds:
+        weighed = checked.rounds[-1]
+        moved = inference.corrected(weighed, posterior.flat)
+        figures["model_check"] = report.figure_model_check(posterior.space, posterior.flat, weighed, moved)
     for name, figure in figures.items():
         report.save_figure(figure, run.at("sample", name), caption(run))
 
@@ -167,6 +176,6 @@ STAGE = Stage(
     "sample",
     "samples the posterior",
     ("recording", "map"),
-    ("seed", "sample", "fit", "noise", "parameters", "model"),
+    ("seed", "sample", "check", "fit", "noise", "parameters", "model", "surrogate", "design"),
     _sample,
 )

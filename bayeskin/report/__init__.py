@@ -1,5 +1,6 @@
 """Figures of every result, as PNG and SVG."""
 
+from bayeskin.report.check import figure_model_check
 from bayeskin.report.discrepancy import figure_discrepancy, figure_experiments
 from bayeskin.report.fields import SurfaceField, figure_fields
 from bayeskin.report.fit import figure_fit
@@ -31,6 +32,7 @@ __all__ = [
     "figure_fit",
     "figure_located",
     "figure_map_check",
+    "figure_model_check",
     "figure_posterior",
     "figure_prior_predictive",
     "figure_proof",

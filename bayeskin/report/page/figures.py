@@ -44,6 +44,11 @@ _KNOWN = {
         "Marginal distributions of all parameters beside their priors, and pairs of them.",
     ),
     ("sample", "traces"): ("The chains", "Traces of each parameter over the sampling's steps, by ensemble."),
+    ("sample", "model_check"): (
+        "The posterior by the full model",
+        "Weights that the full model gives draws of the posterior, and what they do to each parameter's mean "
+        "and sd.",
+    ),
     ("sobol", "sobol_prior_gp"): ("Over the prior, from the Gaussian process", f"{_SOBOL}, over the prior."),
     ("sobol", "sobol_prior_chaos"): ("Over the prior, from polynomial chaos", f"{_SOBOL}, over the prior."),
     ("sobol", "sobol_near_map"): (
