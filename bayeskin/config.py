@@ -212,12 +212,32 @@ def load_config(path: Path | str) -> Config:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(path, f"{error}", "a TOML configuration") from None
     plain.setdefault("name", path.stem)
+    return config_of(plain, path)
+
+
+def config_of(plain: Mapping[str, Any], where: Path | str) -> Config:
+    """Checks a configuration's sections. Raises InputError as `load_config`, saying that it is of `where`."""
     try:
         config = Config.model_validate_json(json.dumps(plain, default=str))
     except ValidationError as error:
-        raise _input_error(path, error) from None
-    parameter_space(config, path)
+        raise _input_error(where, error) from None
+    parameter_space(config, where)
     return config
+
+
+def to_toml(config: Config) -> str:
+    """A configuration as a file that `load_config` reads back to the same; all keys, defaults too."""
+    return "\n".join(_table(config.model_dump(mode="json", exclude_none=True))) + "\n"
+
+
+def _table(plain: Mapping[str, Any], name: str = "") -> list[str]:
+    # A scalar or a list of scalars is written alike in JSON and TOML.
+    lines = [f"{key} = {json.dumps(value)}" for key, value in plain.items() if not isinstance(value, dict)]
+    for key, value in plain.items():
+        if isinstance(value, dict):
+            path = f"{name}.{key}" if name else key
+            lines += [f"[{path}]", *_table(value, path)]
+    return lines
 
 
 def parameter_space(config: Config, where: object = "configuration") -> ParameterSpace:
@@ -249,7 +269,7 @@ def _overridden(default: Parameter, change: PriorConfig | None, where: object) -
     return replace(default, lower=lower, upper=upper, prior=prior, source="configuration")
 
 
-def _input_error(path: Path, error: ValidationError) -> InputError:
+def _input_error(path: Path | str, error: ValidationError) -> InputError:
     """The first complaint of pydantic as the project's one line."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])

@@ -33,6 +33,7 @@ BELOW = {
     | {"mechanisms", "config", "runner", "cluster", "mismatch", "inference", "sensitivity", "report"},
 }
 BELOW["pipeline"] |= {"proof"}
+BELOW["scripting"] = BELOW["pipeline"] | {"pipeline"}
 BELOW["terminal"] = {"errors"}
 BELOW["cli"] = BELOW["pipeline"] | {"pipeline", "terminal"}
 

@@ -31,10 +31,7 @@ def _sample(run: Run) -> Mapping[str, Any]:
     checked = checked_posterior(run, refined_posterior(run), partial(_draws_of, run, best))
     log_posterior, posterior = checked.log_posterior, checked.posterior
     recording = storage.load(run.at("recording", "recording.h5"), Recording)
-    provenance = Provenance(
-        bayeskin.__version__, config.sha256, recording.sha256, model_spec(run).hash, config.seed,
-        {"surrogate": dict(log_posterior.surrogate.provenance)},
-    )  # fmt: skip
+    provenance = provenance_of(run, log_posterior, recording.sha256)
     rng = np.random.default_rng([config.seed, 1])
     idata = inference.to_inference_data(log_posterior, posterior, provenance, rng, PREDICTIVE_DRAWS)
     inference.save_inference_data(run.at("sample", "posterior.nc"), idata)
@@ -45,10 +42,22 @@ def _sample(run: Run) -> Mapping[str, Any]:
     return _sampled(checked, bands)
 
 
+def provenance_of(run: Run, log_posterior: LogPosterior, recording_sha256: str) -> Provenance:
+    """What a posterior was made from, its configuration included."""
+    config = run.config
+    extra = {
+        "surrogate": dict(log_posterior.surrogate.provenance),
+        "config": config.model_dump(mode="json", exclude_none=True),
+    }
+    return Provenance(
+        bayeskin.__version__, config.sha256, recording_sha256, model_spec(run).hash, config.seed, extra
+    )
+
+
 def _draws_of(run: Run, best: Mapping[str, float], log_posterior: LogPosterior) -> Posterior:
     """Draws of a posterior, from about its most probable point."""
-    folder = _chains_folder(run, log_posterior)
-    settings, tell = _settings(run.config), partial(_tell_sampling, run)
+    folder = chains_folder(run, log_posterior)
+    settings, tell = settings_of(run.config), partial(_tell_sampling, run)
     return inference.sample(log_posterior, folder, run.config.seed, best, settings, tell)
 
 
@@ -63,13 +72,13 @@ def _history(log_posterior: LogPosterior, bands: inference.Bands) -> dict[str, A
     }  # fmt: skip
 
 
-def _chains_folder(run: Run, log_posterior: LogPosterior) -> Path:
+def chains_folder(run: Run, log_posterior: LogPosterior) -> Path:
     """Where chains are kept by what they are of, so that a change of when to stop does not lose them."""
     identity = {**log_posterior.identity, "seed": run.config.seed, "walkers": run.config.sample.walkers}
     return run.folder / "chains" / sha256_of(identity)[:16]
 
 
-def _settings(config: Config) -> inference.SampleSettings:
+def settings_of(config: Config) -> inference.SampleSettings:
     limits = inference.Limits(effective_samples=float(config.sample.effective_samples))
     return inference.SampleSettings(
         config.sample.ensembles, config.sample.walkers, config.sample.max_steps, limits
@@ -147,7 +156,7 @@ def _draw_posterior(
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     fitted = np.isin(np.arange(len(binned.force_n)), log_posterior.chain.bins)
     convergence = posterior.convergence
-    whole = inference.load_chains(_chains_folder(run, log_posterior), log_posterior)
+    whole = inference.load_chains(chains_folder(run, log_posterior), log_posterior)
     kept = whole[: run.config.sample.ensembles, convergence.burn_in : convergence.steps]
     figures = {
         "posterior": report.figure_posterior(posterior.space, posterior.flat, best),
@@ -161,7 +170,7 @@ def _draw_posterior(
             force_n=drawn.force_n,
         ),
         "traces": report.figure_traces(
-            posterior.space, kept, convergence.verdict, _settings(run.config).limits
+            posterior.space, kept, convergence.verdict, settings_of(run.config).limits
         ),
     }
     if checked.rounds:
