@@ -82,6 +82,14 @@ def summaries() -> dict[str, dict[str, Any]]:
                 "sd_rest: the data informs it weakly: median 0.0028, 90 % interval 0.0019 to 0.0045 N",
             ],
             "ridges": ["E_c and E_s form a ridge (correlation -0.87): one makes up for the other"],
+            "learned": {
+                name: {"contraction": 0.6, "gain_nats": 0.9, "sentence": f"This test taught of {name}."}
+                for name in ("E_c", "p_init", "sd_rest")
+            },
+            "profiles": {
+                "E_c": {"low_90": 33e3, "high_90": 95e3, "flat": False},
+                "p_init": {"low_90": -670.0, "high_90": 2144.0, "flat": True},
+            },
             "full_model": [
                 {"draws": 24, "failed": 0, "effective": 20.1, "largest_weight": 0.07, "khat": None,
                  "sd_of_log_ratio": 0.4, "trusted": True, "message": "full model at 24 posterior draws"},

@@ -247,6 +247,13 @@ def test_a_parameter_with_its_prior_back_is_said_to_be_uninformed() -> None:
     assert e.statement.startswith("E: the data informs it: median")
 
 
+def test_a_sentence_without_statistics_says_what_the_test_taught() -> None:
+    sentences = {one.name: one.sentence for one in identifiability(SPACE, ridge_draws()).parameters}
+    assert sentences["p_init"].startswith("This test says nothing of the")
+    assert "what was assumed" in sentences["p_init"]
+    assert "times narrower than assumed" in sentences["E"]
+
+
 def test_a_ridge_is_named() -> None:
     found = identifiability(SPACE, ridge_draws()).ridges
     assert [(r.first, r.second) for r in found] == [("E", "F")]

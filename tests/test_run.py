@@ -124,7 +124,7 @@ def test_each_stage_draws_its_figures_and_says_where_they_come_from(folder: Path
         "design": ["waves", "prior_predictive"],
         "train": ["validation"],
         "map": ["map_check"],
-        "sample": ["posterior", "fit", "traces", "model_check"],
+        "sample": ["posterior", "fit", "traces", "profiles", "model_check"],
         "sobol": ["sobol_prior_gp", "sobol_prior_chaos", "sobol_near_map"],
     }
     for stage, names in expected.items():
@@ -135,7 +135,7 @@ def test_each_stage_draws_its_figures_and_says_where_they_come_from(folder: Path
 def test_the_page_shows_the_whole_run(folder: Path) -> None:
     shown = (folder / "case" / "report.html").read_text()
     drawn = [path.stem for path in (folder / "case").rglob("*.svg")]
-    assert len(drawn) == 12
+    assert len(drawn) == 13
     for name in drawn:
         assert f'-{name}"'.replace("_", "-") in shown, name
     for parameter in SPACE.parameters:

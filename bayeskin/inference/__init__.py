@@ -24,6 +24,7 @@ from bayeskin.inference.noise_model import NoisePriors
 from bayeskin.inference.optimise import MapResult, StartResult, find_map
 from bayeskin.inference.polish import Polished, polish_map
 from bayeskin.inference.problem import LogPosterior
+from bayeskin.inference.profile import Profile, profiles
 from bayeskin.inference.sample import Posterior, SampleSettings, load_chains, sample
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "NoisePriors",
     "Polished",
     "Posterior",
+    "Profile",
     "RefinedMap",
     "Ridge",
     "Rmse",
@@ -59,6 +61,7 @@ __all__ = [
     "load_inference_data",
     "polish_map",
     "predictive_draws",
+    "profiles",
     "refine_map",
     "rmse",
     "sample",

@@ -18,13 +18,15 @@ _RIDGE = 0.8
 @dataclass(frozen=True)
 class Learned:
     """One parameter: 1 - posterior over prior variance and Kullback-Leibler gain [nats], both in sampling
-    coordinates (log for log-uniform); 5, 50 and 95 % quantiles in SI; and all that in a sentence."""
+    coordinates (log for log-uniform); 5, 50 and 95 % quantiles in SI; all that in a statement, and in a
+    sentence without statistics."""
 
     name: str
     contraction: float
     gain_nats: float
     quantiles: tuple[float, float, float]
     statement: str
+    sentence: str
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,10 @@ def _learn(parameter: Parameter, unit: Array, space: ParameterSpace, column: int
     corners = np.full((3, space.dim), 0.5)
     corners[:, column] = np.quantile(unit, [0.05, 0.5, 0.95])
     low, middle, high = (float(v) for v in space.from_unit(corners)[:, column])
-    statement = _statement(parameter, unit, contraction, gain, (low, middle, high))
-    return Learned(parameter.name, contraction, gain, (low, middle, high), statement)
+    quantiles = (low, middle, high)
+    statement = _statement(parameter, unit, contraction, gain, quantiles)
+    sentence = _sentence(parameter, contraction, gain, quantiles)
+    return Learned(parameter.name, contraction, gain, quantiles, statement, sentence)
 
 
 def _statement(
@@ -103,6 +107,25 @@ def _statement(
     ]  # fmt: skip
     strength = "the data informs it" if contraction >= _WEAK else "the data informs it weakly"
     return "; ".join([f"{p.name}: {strength}: {numbers}", *leans])
+
+
+def _sentence(p: Parameter, contraction: float, gain: float, quantiles: tuple[float, float, float]) -> str:
+    unit = "" if p.unit == "1" else f" {p.unit}"
+    what = f"{p.description or 'parameter'} ({p.name})"
+    if gain < _NOTHING_NATS and abs(contraction) < _NOTHING_CONTRACTION:
+        return (
+            f"This test says nothing of the {what}: what is known of it is what was assumed, "
+            f"{p.lower:.3g} to {p.upper:.3g}{unit}."
+        )
+    low, middle, high = quantiles
+    range_ = f"{low:.3g} to {high:.3g}{unit}"
+    if contraction < _WEAK:
+        return f"This test narrows the {what} only a little: with 90 % probability it is {range_}."
+    times = 1.0 / np.sqrt(max(1.0 - contraction, 1e-12))
+    return (
+        f"The {what} is about {middle:.3g}{unit}, with 90 % probability {range_}: {times:.2g} times narrower "
+        f"than assumed before the test."
+    )
 
 
 def _ridge(space: ParameterSpace, i: int, j: int, correlation: float) -> Ridge:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,10 +36,20 @@ def _sample(run: Run) -> Mapping[str, Any]:
     idata = inference.to_inference_data(log_posterior, posterior, provenance, rng, PREDICTIVE_DRAWS)
     inference.save_inference_data(run.at("sample", "posterior.nc"), idata)
     drawn = inference.predictive_draws(log_posterior, _some(posterior), rng)
-    _draw_posterior(run, checked, best, drawn)
+    profiles = inference.profiles(log_posterior, best)
+    _draw_posterior(run, checked, best, drawn, profiles)
     bands = inference.bands_of(log_posterior.binned.time_s, drawn)
     write_json(run.at("sample", "bands.json"), _history(log_posterior, bands))
-    return _sampled(checked, bands)
+    return {**_sampled(checked, bands), "profiles": {one.name: _profiled(one) for one in profiles}}
+
+
+def _profiled(profile: inference.Profile) -> dict[str, Any]:
+    """A profile likelihood in a summary; an interval is open where the prior ends before the fit does."""
+    low, high = profile.interval
+    return {
+        "low_90": low, "high_90": high, "open_below": profile.open_below, "open_above": profile.open_above,
+        "flat": profile.flat, "values": profile.values, "drop_nats": profile.drop_nats,
+    }  # fmt: skip
 
 
 def provenance_of(run: Run, log_posterior: LogPosterior, recording_sha256: str) -> Provenance:
@@ -103,6 +113,14 @@ def _sampled(checked: Checked, bands: inference.Bands) -> dict[str, Any]:
         "parameters": _table(posterior),
         "identifiability": [one.statement for one in learned.parameters],
         "ridges": [one.statement for one in learned.ridges],
+        "learned": {
+            one.name: {
+                "contraction": one.contraction,
+                "gain_nats": one.gain_nats,
+                "sentence": one.sentence,
+            }
+            for one in learned.parameters
+        },
         "full_model": [said_of(one) for one in checked.rounds],
         "corrected": corrected_table(checked),
         "rmse": rmse_table(log_posterior, bands.mean_n),
@@ -149,7 +167,11 @@ def _table(posterior: Posterior) -> dict[str, dict[str, Any]]:
 
 
 def _draw_posterior(
-    run: Run, checked: Checked, best: Mapping[str, float], drawn: inference.ForceDraws
+    run: Run,
+    checked: Checked,
+    best: Mapping[str, float],
+    drawn: inference.ForceDraws,
+    profiles: Sequence[inference.Profile],
 ) -> None:
     log_posterior, posterior = checked.log_posterior, checked.posterior
     binned = log_posterior.binned
@@ -169,6 +191,7 @@ def _draw_posterior(
             noise_sd_n=drawn.noise_sd_n,
             force_n=drawn.force_n,
         ),
+        "profiles": report.figure_profiles(posterior.space, posterior.flat, profiles),
         "traces": report.figure_traces(
             posterior.space, kept, convergence.verdict, settings_of(run.config).limits
         ),

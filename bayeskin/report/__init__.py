@@ -13,6 +13,7 @@ from bayeskin.report.mismatch import (
 )
 from bayeskin.report.posterior import figure_posterior
 from bayeskin.report.prior import figure_prior_predictive
+from bayeskin.report.profiles import figure_profiles
 from bayeskin.report.proof import figure_proof
 from bayeskin.report.recording import figure_recording
 from bayeskin.report.save import save_figure
@@ -35,6 +36,7 @@ __all__ = [
     "figure_model_check",
     "figure_posterior",
     "figure_prior_predictive",
+    "figure_profiles",
     "figure_proof",
     "figure_recording",
     "figure_residual_by_phase",

@@ -43,6 +43,10 @@ _KNOWN = {
         "The posterior",
         "Marginal distributions of all parameters beside their priors, and pairs of them.",
     ),
+    ("sample", "profiles"): (
+        "Profile likelihoods",
+        "How well the recording can be fitted with one parameter held, over its prior, beside the posterior.",
+    ),
     ("sample", "traces"): ("The chains", "Traces of each parameter over the sampling's steps, by ensemble."),
     ("sample", "model_check"): (
         "The posterior by the full model",

@@ -147,7 +147,29 @@ def posterior(facts: RunFacts) -> Section:
         blocks += [_parameters(facts, said["parameters"]), *pictures(facts, "sample", ["posterior"])]
         if said["ridges"]:
             blocks.insert(1, Text([f"{ridge}." for ridge in said["ridges"]], listed=True))
+        blocks += [*_taught(said), *pictures(facts, "sample", ["profiles"])]
     return Section("posterior", "Posterior", blocks)
+
+
+def _taught(said: Mapping[str, Any]) -> list[Block]:
+    """What the test taught of each material parameter: in words, and by three measures."""
+    rows = []
+    for name, one in said["profiles"].items():
+        learned, unit = said["learned"][name], said["parameters"][name]["unit"]
+        fit = interval(one["low_90"], one["high_90"], unit) + (" (all of the prior)" if one["flat"] else "")
+        rows.append(
+            row(
+                (
+                    name,
+                    Cell(number(learned["contraction"]), learned["contraction"]),
+                    Cell(number(learned["gain_nats"]), learned["gain_nats"]),
+                    fit,
+                )
+            )
+        )
+    head = ("parameter", "contraction", "information gained [nats]", "90 % interval by the fit alone")
+    sentences = [said["learned"][name]["sentence"] for name in said["profiles"]]
+    return [Text(sentences, listed=True), Table("What the test taught", head, rows, symbols=True)]
 
 
 def _parameters(facts: RunFacts, table: Mapping[str, Mapping[str, Any]]) -> Table:
