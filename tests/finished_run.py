@@ -105,8 +105,14 @@ def summaries() -> dict[str, dict[str, Any]]:
             name: {
                 "sentence": "The force does not inform p_init.", "method": "pick-freeze", "samples": 2048,
                 "distribution": "independent", "aggregated": {"E_c": _INDEX, "p_init": _INDEX},
+                "pairs": {"E_c, p_init": {"second": 0.01, "second_90": [None, 0.02]}},
             }
             for name in ("prior_gp", "prior_chaos", "near_map")
+        } | {
+            "posterior": {
+                "sentence": "Shared by E_c 90 %.", "method": "Shapley effects", "samples": 2000,
+                "distribution": "the posterior", "shares": {"E_c": {"share": 0.9, "share_90": [0.8, 1.0]}},
+            }
         },
         "diagnose": {
             "verdict": "named",

@@ -104,9 +104,12 @@ def test_the_summary_answers_what_a_reader_asks(folder: Path) -> None:
     assert summary["rmse"]["full_model_at_map"]["article_holds_n"] is None  # the toy ends before
     assert [line.split(":")[0] for line in summary["identifiability"]][:5] == list(SPACE.names)
     assert set(summary["seconds"]) == {stage.name for stage in stages.BEFORE_REPORT}
+    shares = summary["sobol"].pop("posterior")["shares"]
+    assert sum(one["share"] for one in shares.values()) == pytest.approx(1.0)
     for table in summary["sobol"].values():
         assert "uniform" in table["distribution"]
         assert table["aggregated"]["E_c"]["total"] > 0.1
+        assert len(table["pairs"]) == 10
 
 
 def test_the_design_holds_each_wave_with_its_labels(folder: Path) -> None:

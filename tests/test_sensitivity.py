@@ -81,6 +81,20 @@ def test_ishigami(estimate):
 
 
 @pytest.mark.parametrize("estimate", METHODS)
+def test_second_order_of_ishigami_is_its_one_interaction(estimate):
+    result = estimate(ishigami, box(3, -np.pi, np.pi), ONE_BIN, np.random.default_rng(1), 4096)
+    first, total = ishigami_indices()
+    assert result.pairs == (("x0", "x1"), ("x0", "x2"), ("x1", "x2"))
+    tolerance = {"pick-freeze": 0.03, "projection": 1e-6}[result.method]
+    exact = [0.0, total[0] - first[0], 0.0]
+    np.testing.assert_allclose(result.second[:, 0], exact, atol=tolerance)
+    np.testing.assert_allclose(result.second_aggregated, exact, atol=tolerance)
+    if result.method == "pick-freeze":
+        low, high = result.second_aggregated_interval
+        assert np.all((low <= result.second_aggregated) & (result.second_aggregated <= high))
+
+
+@pytest.mark.parametrize("estimate", METHODS)
 def test_sobol_g(estimate):
     """Kinked, so that a polynomial converges slowly: it says so in `unexplained`."""
     result = estimate(sobol_g, box(5, 0.0, 1.0), ONE_BIN, np.random.default_rng(2), 4096)
