@@ -1,4 +1,4 @@
-"""Sixth stage: Sobol' indices of the force over the prior and near the best point; over the posterior shares."""
+"""Sixth stage: Sobol' indices of the force over the prior and near the maximum, shares over the posterior."""
 
 from __future__ import annotations
 
