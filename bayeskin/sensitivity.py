@@ -29,7 +29,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import qmc
 
 from bayeskin.errors import InputError
-from bayeskin.types import Array, ParameterSpace, Surrogate, _FreezesArrays
+from bayeskin.types import Array, Parameter, ParameterSpace, Surrogate, _FreezesArrays
 
 Function = Callable[[Array], Array]
 NEGLIGIBLE_VARIANCE = 1e-8  # of the largest bin's: an index there would be rounding
@@ -227,8 +227,12 @@ def sentence(result: SobolResult) -> str:
 
 def describe(space: ParameterSpace) -> str:
     """The input distribution in words."""
-    boxes = (f"{p.name} {p.prior} {p.lower:g} to {p.upper:g} {p.unit}".rstrip() for p in space.parameters)
-    return "independent: " + "; ".join(boxes)
+    return "independent: " + "; ".join(map(_described, space.parameters))
+
+
+def _described(p: Parameter) -> str:
+    about = f" about {p.centre:g} ({p.spread:g})" if p.peaked else ""
+    return f"{p.name} {p.prior}{about} {p.lower:g} to {p.upper:g} {p.unit}".rstrip()
 
 
 def _sobol_points(dim: int, samples: int, rng: np.random.Generator) -> Array:

@@ -36,7 +36,7 @@ def _parameter(prior: str, low: float, median: float, high: float, unit: str = "
     return {
         "meaning": "", "unit": unit, "mean": median, "sd": 1.0, "median": median, "low_90": low,
         "high_90": high, "ess": 3000.0, "rhat": 1.0007,
-        "prior": {"kind": prior, "lower": 0.5 * low, "upper": 2.0 * high},
+        "prior": {"kind": prior, "lower": 0.5 * low, "upper": 2.0 * high, "source": "an earlier study"},
     }  # fmt: skip
 
 

@@ -103,7 +103,7 @@ def _statement(
         for side, bound, mass in (
             ("lower", p.lower, np.mean(unit < _EDGE)), ("upper", p.upper, np.mean(unit > 1 - _EDGE)),
         )
-        if mass > _LEANS
+        if mass > _LEANS and not p.peaked
     ]  # fmt: skip
     strength = "the data informs it" if contraction >= _WEAK else "the data informs it weakly"
     return "; ".join([f"{p.name}: {strength}: {numbers}", *leans])

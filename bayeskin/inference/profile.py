@@ -48,7 +48,9 @@ def profiles(log_posterior: LogPosterior, best: Mapping[str, float], points: int
 
     best : all parameters (SI) of the most probable point
     """
-    shear, names = find_shear(log_posterior), log_posterior.surrogate.space.names
+    material = log_posterior.material or log_posterior.surrogate.space
+    log_posterior = replace(log_posterior, material=material.box)  # the fit's own word, no prior in it
+    shear, names = find_shear(log_posterior), material.names
     return tuple(_profile(log_posterior, best, shear, j, points) for j in range(len(names)))
 
 
@@ -95,7 +97,7 @@ def _held(log_posterior: LogPosterior, at: Array, shear: Shear | None, column: i
 
 
 def _narrowed(parameter: Parameter, value: float) -> Parameter:
-    reach = _HELD * (abs(value) if parameter.prior == "log-uniform" else parameter.upper - parameter.lower)
+    reach = _HELD * (abs(value) if parameter.in_log else parameter.upper - parameter.lower)
     lower = min(max(value - reach, parameter.lower), parameter.upper - 2 * reach)
     return replace(parameter, lower=lower, upper=lower + 2 * reach)
 

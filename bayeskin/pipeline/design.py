@@ -77,13 +77,14 @@ def _work(run: Run) -> Mapping[str, Any]:
     if fine is not None:
         storage.save(run.at("design", "fine.h5"), fine)
     write_json(run.at("design", "waves.json"), records)
-    _draw(run, design, binned, records)
+    _draw(run, design, records)
     return {**_summary(design, records), **({} if fine is None else {"fine": _counts(fine)})}
 
 
 def _run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design, list[Mapping[str, Any]]]:
     """All waves of the configuration. Runs are kept by what they depend on, so none is made twice."""
-    spec, space, config = waves_spec(run), parameter_space(run.config, run.config_path), run.config.design
+    spec, config = waves_spec(run), run.config.design
+    space = parameter_space(run.config, run.config_path).box  # a surrogate learns all of it alike
     file = runs_file(run, spec, motion, binned.edges_s, space)
     waves: list[Wave] = []
     for number, count in enumerate(config.points):
@@ -204,15 +205,9 @@ def _counts(design: Design) -> dict[str, Any]:
     }
 
 
-def _draw(run: Run, design: Design, binned: BinnedForce, records: Sequence[Mapping[str, Any]]) -> None:
+def _draw(run: Run, design: Design, records: Sequence[Mapping[str, Any]]) -> None:
     kept = [record["kept_fraction"] for record in records]
-    first = design.force_n[design.ok & (design.wave == 0)]
-    figures = {
-        "waves": report.figure_waves(design, kept),
-        "prior_predictive": report.figure_prior_predictive(binned, first),
-    }
-    for name, figure in figures.items():
-        report.save_figure(figure, run.at("design", name), caption(run))
+    report.save_figure(report.figure_waves(design, kept), run.at("design", "waves"), caption(run))
 
 
 def _files(run: Run) -> Iterable[Path]:

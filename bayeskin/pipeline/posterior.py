@@ -161,7 +161,10 @@ def _table(posterior: Posterior) -> dict[str, dict[str, Any]]:
         table[p.name] = {
             "meaning": p.description, "unit": p.unit, "mean": draws.mean(), "sd": draws.std(ddof=1),
             "median": median, "low_90": low, "high_90": high, "ess": c.ess[j], "rhat": c.rhat[j],
-            "prior": {"kind": p.prior, "lower": p.lower, "upper": p.upper},
+            "prior": {
+                "kind": p.prior, "lower": p.lower, "upper": p.upper, "source": p.source,
+                **({"centre": p.centre, "spread": p.spread} if p.peaked else {}),
+            },
         }  # fmt: skip
     return table
 

@@ -107,7 +107,7 @@ def _held_out(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
                 ("its own 90 % band holds", percent(said["coverage_90"])),
             ]
         ),
-        *pictures(facts, "train"),
+        *pictures(facts, "train", ["validation"]),
     ]
 
 

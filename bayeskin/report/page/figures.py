@@ -21,9 +21,9 @@ _KNOWN = {
         "Points at which the full model was run, by pairs of parameters; later waves lie where the recording "
         "has not ruled the force out.",
     ),
-    ("design", "prior_predictive"): (
+    ("train", "prior_predictive"): (
         "What the prior expects",
-        "Forces over time that the full model gives over the prior, with the recorded force among them.",
+        "Forces over time that the surrogate gives over the prior, with the recorded force among them.",
     ),
     ("train", "validation"): (
         "The surrogate on held-out runs",

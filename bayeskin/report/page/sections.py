@@ -149,6 +149,9 @@ def posterior(facts: RunFacts) -> Section:
         if said["ridges"]:
             blocks.insert(1, Text([f"{ridge}." for ridge in said["ridges"]], listed=True))
         blocks += [*_taught(said), *pictures(facts, "sample", ["profiles"])]
+        sources = [f"{name}: {one['prior']['source']}." for name, one in said["parameters"].items()]
+        blocks.append(Folded("Where the priors come from", [Text(sources, listed=True)]))
+        blocks += pictures(facts, "train", ["prior_predictive"])
     return Section("posterior", "Posterior", blocks)
 
 
