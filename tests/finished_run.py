@@ -69,6 +69,7 @@ def summaries() -> dict[str, dict[str, Any]]:
         },
         "sample": {
             "ok": True, "verdict": "trusted", "reasons": ["3554 effective samples of E_c; 2000 needed"],
+            "remarks": ["what the fit leaves is hardly noise"],
             "steps": 16000, "draws": 3776,
             "parameters": {
                 "E_c": _parameter("log-uniform", 13.9e3, 50.8e3, 87e3),

@@ -25,6 +25,7 @@ from bayeskin.inference import (
     find_map,
     identifiability,
     load_inference_data,
+    noise_remarks,
     optimise,
     polish_map,
     predictive_draws,
@@ -252,6 +253,23 @@ def test_a_sentence_without_statistics_says_what_the_test_taught() -> None:
     assert sentences["p_init"].startswith("This test says nothing of the")
     assert "what was assumed" in sentences["p_init"]
     assert "times narrower than assumed" in sentences["E"]
+
+
+def test_noise_parameters_at_their_bounds_are_remarked_on() -> None:
+    noise = ParameterSpace(
+        (
+            Parameter("tau_noise", "s", 0.1, 100.0, "log-uniform"),
+            Parameter("nu_noise", "1", 2.0, 100.0, "log-uniform"),
+        )
+    )
+    unit = np.random.default_rng(0).beta(1.0, 60.0, (2000, 2))
+    at_bounds = noise.from_unit(np.column_stack([1.0 - unit[:, 0], unit[:, 1]]))
+    said = noise_remarks(identifiability(noise, at_bounds))
+    assert len(said) == 1
+    assert "as long as its prior allows and with the heaviest tails" in said[0]
+    assert noise_remarks(identifiability(noise, noise.from_unit(0.3 + 0.2 * unit))) == ()
+    other_ends = noise.from_unit(np.column_stack([unit[:, 0], 1.0 - unit[:, 1]]))  # white and Gaussian
+    assert noise_remarks(identifiability(noise, other_ends)) == ()
 
 
 def test_a_ridge_is_named() -> None:

@@ -12,7 +12,7 @@ from bayeskin.inference.bands import (
 )
 from bayeskin.inference.check import MapCheck, RefinedMap, check_map, refine_map
 from bayeskin.inference.convergence import Convergence, Limits, Verdict
-from bayeskin.inference.identify import Identifiability, Learned, Ridge, identifiability
+from bayeskin.inference.identify import Identifiability, Learned, Ridge, identifiability, noise_remarks
 from bayeskin.inference.importance import Corrected, Weighed, corrected, weigh
 from bayeskin.inference.inference_data import (
     draws_of,
@@ -59,6 +59,7 @@ __all__ = [
     "identifiability",
     "load_chains",
     "load_inference_data",
+    "noise_remarks",
     "polish_map",
     "predictive_draws",
     "profiles",

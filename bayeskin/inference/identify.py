@@ -58,6 +58,28 @@ def identifiability(space: ParameterSpace, draws: ArrayLike) -> Identifiability:
     return Identifiability(learned, tuple(_ridge(space, i, j, float(correlation[i, j])) for i, j in pairs))
 
 
+def noise_remarks(found: Identifiability) -> tuple[str, ...]:
+    """What noise parameters at their bounds give away: a misfit that the likelihood takes for noise.
+
+    Noise of a load cell is neither correlated over minutes nor of infinite variance.
+    """
+    leaning = [
+        words
+        for name, side, words in (
+            ("tau_noise", "upper", "correlated for as long as its prior allows"),
+            ("nu_noise", "lower", "with the heaviest tails that its prior allows"),
+        )
+        for one in found.parameters
+        if one.name == name and f"leans on the prior's {side} bound" in one.statement
+    ]
+    if not leaning:
+        return ()
+    return (
+        f"what the fit leaves is {' and '.join(leaning)}: hardly noise, rather something that the model "
+        "leaves out, so the parameters stand for it too; bayeskin diagnose looks for it",
+    )
+
+
 def information_gain_nats(unit: ArrayLike) -> float:
     """KL divergence [nats] of draws (s,) of prior-uniform coordinates from the prior, at least 0.
 

@@ -108,6 +108,7 @@ def _sampled(checked: Checked, bands: inference.Bands) -> dict[str, Any]:
         "ok": verdict.trusted,
         "verdict": "trusted" if verdict.trusted else "not trusted",
         "reasons": list(verdict.reasons),
+        "remarks": list(inference.noise_remarks(learned)),
         "steps": c.steps,
         "draws": len(posterior.flat),
         "parameters": _table(posterior),

@@ -104,7 +104,8 @@ def _sure(facts: RunFacts) -> Verdict:
     )
     lines = [*doubts, *(said["reasons"] if not said["ok"] else [])]
     lines += [] if lines else ["Chains, surrogate and the full model at the most probable point agree."]
-    return Verdict("trusted" if trusted else "not trusted", "good" if trusted else "doubt", [*lines, fit])
+    lines += [fit, *(f"{one[0].upper()}{one[1:]}." for one in said["remarks"])]
+    return Verdict("trusted" if trusted else "not trusted", "good" if trusted else "doubt", lines)
 
 
 def _missing(facts: RunFacts) -> Verdict:
