@@ -34,7 +34,7 @@ from bayeskin.inference import (
     save_inference_data,
     to_inference_data,
 )
-from bayeskin.inference.identify import information_gain_nats
+from bayeskin.inference.identify import information_gain_nats, parts
 from bayeskin.types import Array, Parameter, ParameterSpace, Provenance, Simulation
 
 mpl.use("Agg")
@@ -253,6 +253,21 @@ def test_a_sentence_without_statistics_says_what_the_test_taught() -> None:
     assert sentences["p_init"].startswith("This test says nothing of the")
     assert "what was assumed" in sentences["p_init"]
     assert "times narrower than assumed" in sentences["E"]
+
+
+def test_two_separate_ranges_are_said_and_one_of_any_shape_is_not() -> None:
+    rng = np.random.default_rng(3)
+    two = np.concatenate([0.2 + 0.03 * rng.standard_normal(1500), 0.7 + 0.05 * rng.standard_normal(500)])
+    found = parts(two)
+    assert len(found) == 2
+    np.testing.assert_allclose(found, [(0.15, 0.25), (0.62, 0.78)], atol=0.02)
+    one = (rng.uniform(size=3000), rng.beta(2, 9, 3000), np.full(50, 0.3), 1 - rng.exponential(0.02, 3000))
+    assert [len(parts(draws)) for draws in one] == [1, 1, 1, 1]
+    few = np.concatenate([0.2 + 0.03 * rng.standard_normal(1970), 0.7 + 0.03 * rng.standard_normal(30)])
+    assert len(parts(few)) == 1
+    space = ParameterSpace((Parameter("E", "Pa", 1.0, np.exp(10.0), "log-uniform"),))
+    statement = identifiability(space, space.from_unit(two[:, None])).parameters[0].statement
+    assert "2 separate ranges fit: " in statement
 
 
 def test_noise_parameters_at_their_bounds_are_remarked_on() -> None:

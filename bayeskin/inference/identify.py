@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter1d
 
 from bayeskin.types import Array, Parameter, ParameterSpace
 
@@ -13,6 +15,9 @@ _NOTHING_NATS, _NOTHING_CONTRACTION = 0.03, 0.1  # below both, posterior and pri
 _WEAK = 0.5  # contraction below which the data narrows little
 _EDGE, _LEANS = 0.02, 0.06  # three times the mass that the prior has in its outermost 2 %
 _RIDGE = 0.8
+_VALLEY = 0.4  # of the lower of two peaks: a density between them below it parts them
+_SIDE = 0.05  # mass of a part that is worth a word
+_CELLS = 200
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,28 @@ def identifiability(space: ParameterSpace, draws: ArrayLike) -> Identifiability:
     pairs = [(i, j) for j in range(space.dim) for i in range(j) if abs(correlation[i, j]) > _RIDGE]
     pairs.sort(key=lambda pair: -abs(correlation[pair]))
     return Identifiability(learned, tuple(_ridge(space, i, j, float(correlation[i, j])) for i, j in pairs))
+
+
+def parts(unit: ArrayLike) -> list[tuple[float, float]]:
+    """Separate ranges of the prior-uniform coordinate in which draws (s,) lie; one, unless valleys part them.
+
+    Valleys of a normal kernel's density, mirrored at the ends of the unit interval; the narrower of sd and
+    quartiles sets the kernel (Silverman 1986, eq. 3.31), which two far peaks would otherwise blur.
+    """
+    unit = np.asarray(unit, dtype=float)
+    quartiles = np.diff(np.quantile(unit, [0.25, 0.75]))[0] / 1.34
+    width = 0.9 * min(unit.std(), quartiles or unit.std()) * len(unit) ** -0.2
+    counts, edges = np.histogram(unit, _CELLS, (0.0, 1.0))
+    density = gaussian_filter1d(counts.astype(float), max(width * _CELLS, 0.5), mode="reflect")
+    cuts, start = [0], 0
+    for valley in np.flatnonzero((density[1:-1] <= density[:-2]) & (density[1:-1] < density[2:])) + 1:
+        left, right = density[start:valley], density[valley:]
+        mass = counts[start:valley].sum(), counts[valley:].sum()
+        if density[valley] < _VALLEY * min(left.max(), right.max()) and min(mass) > _SIDE * len(unit):
+            cuts.append(int(valley))
+            start = int(valley)
+    pieces = [unit[(unit >= edges[a]) & (unit <= edges[b])] for a, b in pairwise([*cuts, _CELLS])]
+    return [(float(low), float(high)) for low, high in (np.quantile(one, [0.05, 0.95]) for one in pieces)]
 
 
 def noise_remarks(found: Identifiability) -> tuple[str, ...]:
@@ -127,6 +154,12 @@ def _statement(
         )
         if mass > _LEANS and not p.peaked
     ]  # fmt: skip
+    ranges = parts(unit)
+    if len(ranges) > 1 and not p.peaked:
+        box = ParameterSpace((p,))
+        ends = [box.from_unit(np.array(one)[:, None])[:, 0] for one in ranges]
+        said = " and ".join(f"{a:.3g} to {b:.3g}{of_unit}" for a, b in ends)
+        leans.append(f"{len(ranges)} separate ranges fit: {said}")
     strength = "the data informs it" if contraction >= _WEAK else "the data informs it weakly"
     return "; ".join([f"{p.name}: {strength}: {numbers}", *leans])
 

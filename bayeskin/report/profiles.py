@@ -38,7 +38,7 @@ def figure_profiles(space: ParameterSpace, draws: ArrayLike, profiles: Sequence[
         column = space.names.index(profile.name)
         _draw(ax, space.parameters[column], profile, draws[:, column])
         panel_title(ax, letter)
-    axes[0].set(ylim=(-_DEEPEST, 0.6), ylabel="log-likelihood, below its top [nats]")
+    axes[0].set(ylim=(-_DEEPEST, 0.6), ylabel="below the best fit [nats]")
     flat = [one.name for one in profiles if one.flat]
     finding = (
         f"The fit excludes no value of {list_symbols(flat)}" if flat else "The fit bounds every parameter"
