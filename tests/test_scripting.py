@@ -66,7 +66,7 @@ def posterior_phases(said: dict[str, Any]) -> int:
 def test_settings_reach_the_posterior_and_its_provenance(said: dict[str, Any]) -> None:
     assert said["stiff"]["posterior"]["E_s"].min() >= 50e3
     config = json.loads(said["stiff"].attrs["provenance"])["config"]
-    assert config["parameters"]["E_s"] == {"lower": 50e3, "upper": 500e3}
+    assert config["parameters"]["E_s"]["lower"] == 50e3
     assert (config["seed"], config["surrogate"]["file"]) == (2, "demo.h5")
 
 
