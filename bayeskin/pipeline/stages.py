@@ -35,6 +35,9 @@ def _summarise(run: Run) -> Mapping[str, Any]:
         "model": {"observation": run.config.model.observation, "mesh": run.config.model.mesh},
         "posterior": sampled["parameters"],
         "identifiability": [*sampled["identifiability"], *sampled["ridges"]],
+        "learned": sampled["learned"],
+        "full_model_at_draws": sampled["full_model"],
+        "corrected": sampled["corrected"],
         "map": {
             "theta": found["theta"],
             "message": found["message"],
