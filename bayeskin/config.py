@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -54,11 +55,39 @@ class ModelConfig(_Section):
 
 
 class PriorConfig(_Section):
-    """What replaces the default prior of one parameter; what is not given stays as it was."""
+    """What replaces the default prior of one parameter; what is not given stays as it was.
+
+    `mean` and `sd` belong to a normal prior, `median` and `factor` (of one sd) to a log-normal one; both are
+    cut to the bounds.
+    """
 
     lower: float | None = None
     upper: float | None = None
-    prior: Literal["uniform", "log-uniform"] | None = None
+    prior: Literal["uniform", "log-uniform", "normal", "log-normal"] | None = None
+    mean: float | None = None
+    sd: Annotated[float, Field(gt=0)] | None = None
+    median: Annotated[float, Field(gt=0)] | None = None
+    factor: Annotated[float, Field(gt=1)] | None = None
+    source: str = "configuration"
+
+    @model_validator(mode="after")
+    def _a_normal_prior_has_its_two_numbers(self) -> PriorConfig:
+        given = {name for name in ("mean", "sd", "median", "factor") if getattr(self, name) is not None}
+        wanted = {"normal": {"mean", "sd"}, "log-normal": {"median", "factor"}}.get(self.prior or "", set())
+        if given != wanted:
+            found = ", ".join(sorted(given)) or "none of its numbers"
+            expected = f"{' and '.join(sorted(wanted))}" if wanted else "these with a normal prior only"
+            raise ValueError(f"prior: found {found}; expected {expected}")
+        return self
+
+    @property
+    def centre_and_spread(self) -> tuple[float, float]:
+        """Of the prior on its line; of a uniform one what says nothing."""
+        if self.mean is not None and self.sd is not None:
+            return self.mean, self.sd
+        if self.median is not None and self.factor is not None:
+            return self.median, math.log(self.factor)
+        return 0.0, 1.0
 
 
 class DesignConfig(_Section):
@@ -149,6 +178,13 @@ class SampleConfig(_Section):
     max_steps: Positive = 20000
 
 
+class CheckConfig(_Section):
+    """Posterior draws that the full model runs again, and how often they may join the design."""
+
+    draws: Annotated[int, Field(ge=0)] = 24
+    rounds: Annotated[int, Field(ge=0)] = 2
+
+
 class MapConfig(_Section):
     """Starts of the search for the most probable point, and evaluations that each may spend."""
 
@@ -177,6 +213,7 @@ class Config(_Section):
     fit: FitConfig = FitConfig()
     noise: NoiseConfig = NoiseConfig()
     sample: SampleConfig = SampleConfig()
+    check: CheckConfig = CheckConfig()
     map: MapConfig = MapConfig()
     sobol: SobolConfig = SobolConfig()
 
@@ -209,12 +246,32 @@ def load_config(path: Path | str) -> Config:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(path, f"{error}", "a TOML configuration") from None
     plain.setdefault("name", path.stem)
+    return config_of(plain, path)
+
+
+def config_of(plain: Mapping[str, Any], where: Path | str) -> Config:
+    """Checks a configuration's sections. Raises InputError as `load_config`, saying that it is of `where`."""
     try:
         config = Config.model_validate_json(json.dumps(plain, default=str))
     except ValidationError as error:
-        raise _input_error(path, error) from None
-    parameter_space(config, path)
+        raise _input_error(where, error) from None
+    parameter_space(config, where)
     return config
+
+
+def to_toml(config: Config) -> str:
+    """A configuration as a file that `load_config` reads back to the same; all keys, defaults too."""
+    return "\n".join(_table(config.model_dump(mode="json", exclude_none=True))) + "\n"
+
+
+def _table(plain: Mapping[str, Any], name: str = "") -> list[str]:
+    # A scalar or a list of scalars is written alike in JSON and TOML.
+    lines = [f"{key} = {json.dumps(value)}" for key, value in plain.items() if not isinstance(value, dict)]
+    for key, value in plain.items():
+        if isinstance(value, dict):
+            path = f"{name}.{key}" if name else key
+            lines += [f"[{path}]", *_table(value, path)]
+    return lines
 
 
 def parameter_space(config: Config, where: object = "configuration") -> ParameterSpace:
@@ -241,12 +298,19 @@ def _overridden(default: Parameter, change: PriorConfig | None, where: object) -
     at = f"{where}: parameters.{default.name}"
     if not lower < upper:
         raise InputError(at, f"lower {lower:g}, upper {upper:g} {default.unit}", "lower below upper")
-    if prior == "log-uniform" and lower <= 0:
-        raise InputError(f"{at}.lower", f"{lower:g} with a log-uniform prior", "a bound above zero")
-    return replace(default, lower=lower, upper=upper, prior=prior, source="configuration")
+    if prior.startswith("log") and lower <= 0:
+        raise InputError(f"{at}.lower", f"{lower:g} with a {prior} prior", "a bound above zero")
+    centre, spread = change.centre_and_spread
+    if prior.endswith("normal") and not lower <= centre <= upper:
+        raise InputError(
+            at, f"a prior about {centre:g} {default.unit}", f"{lower:g} to {upper:g}, its bounds"
+        )
+    return replace(
+        default, lower=lower, upper=upper, prior=prior, source=change.source, centre=centre, spread=spread
+    )
 
 
-def _input_error(path: Path, error: ValidationError) -> InputError:
+def _input_error(path: Path | str, error: ValidationError) -> InputError:
     """The first complaint of pydantic as the project's one line."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])

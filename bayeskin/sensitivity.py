@@ -7,6 +7,9 @@ Two estimators that work on any vectorised function ``theta (n, d) -> force (n, 
 - `projection`: least-squares projection on Legendre polynomials orthonormal under the input
   distribution; the indices are sums of squared coefficients (Sudret 2008, Reliab. Eng. Syst. Saf. 93, 964).
 
+Second-order indices are what two parameters explain together beyond what each does alone: in pick-freeze the
+closed index of the pair less both first-order ones (Saltelli 2002, Comput. Phys. Commun. 145, 280).
+
 Indices aggregated over time are those of the whole history as one output: each bin weighs by its
 variance and width (Lamboni et al. 2011; Gamboa et al. 2014).
 """
@@ -15,6 +18,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
+from math import isqrt
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -24,7 +29,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import qmc
 
 from bayeskin.errors import InputError
-from bayeskin.types import Array, ParameterSpace, Surrogate, _FreezesArrays
+from bayeskin.types import Array, Parameter, ParameterSpace, Surrogate, _FreezesArrays
 
 Function = Callable[[Array], Array]
 NEGLIGIBLE_VARIANCE = 1e-8  # of the largest bin's: an index there would be rounding
@@ -45,7 +50,8 @@ class SobolResult(_FreezesArrays):
     """First-order and total indices (d, m), NaN in bins whose force hardly varies.
 
     Intervals (2, d, m) hold the 5 % and 95 % limits. `aggregated` are those of the whole history, (d,)
-    and (2, d). variance_n2 (m,) of the force; `distribution` says what the parameters were drawn from;
+    and (2, d). `second` are those of the pairs in the order of `pairs`, (p, m), (p,) and (2, p). variance_n2
+    (m,) of the force; `distribution` says what the parameters were drawn from;
     `unexplained` is the share of variance that a projection leaves (NaN for pick-freeze).
     """
 
@@ -59,19 +65,27 @@ class SobolResult(_FreezesArrays):
     total_aggregated: Array
     first_aggregated_interval: Array
     total_aggregated_interval: Array
+    second: Array
+    second_aggregated: Array
+    second_aggregated_interval: Array
     variance_n2: Array
     unexplained: float
     samples: int
     method: Literal["pick-freeze", "projection"]
     distribution: str
 
+    @property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        return tuple(combinations(self.names, 2))
+
 
 class _Parts(NamedTuple):
-    """Variance (r, m) and the parts of it, first and total (r, d, m), in r replicates."""
+    """Variance (r, m) and the parts of it, first and total (r, d, m), second (r, p, m), in r replicates."""
 
     variance: Array
     first: Array
     total: Array
+    second: Array
 
 
 def sobol(
@@ -134,7 +148,7 @@ def pick_freeze(
     samples: int = 2048,
     draws: Sequence[Function] = (),
 ) -> SobolResult:
-    """Indices from ``samples (d + 2)`` evaluations at scrambled Sobol' points.
+    """Indices from ``samples (d + 2 + d (d - 1) / 2)`` evaluations at scrambled Sobol' points.
 
     Intervals: `REPLICATES` bootstrap replicates, each moved by what one of `draws` changes.
     """
@@ -213,8 +227,12 @@ def sentence(result: SobolResult) -> str:
 
 def describe(space: ParameterSpace) -> str:
     """The input distribution in words."""
-    boxes = (f"{p.name} {p.prior} {p.lower:g} to {p.upper:g} {p.unit}".rstrip() for p in space.parameters)
-    return "independent: " + "; ".join(boxes)
+    return "independent: " + "; ".join(map(_described, space.parameters))
+
+
+def _described(p: Parameter) -> str:
+    about = f" about {p.centre:g} ({p.spread:g})" if p.peaked else ""
+    return f"{p.name} {p.prior}{about} {p.lower:g} to {p.upper:g} {p.unit}".rstrip()
 
 
 def _sobol_points(dim: int, samples: int, rng: np.random.Generator) -> Array:
@@ -228,9 +246,13 @@ def _in_chunks(function: Function, theta: Array) -> Array:
 
 
 def _evaluate_pairs(function: Function, space: ParameterSpace, points: Array) -> list[Array]:
-    """[f(A), f(B), f(A with column 1 of B), ...], each (n, m), centred on the mean of f(A) and f(B)."""
+    """[f(A), f(B), f(A with column 1 of B), ..., f(A with columns 1 and 2 of B), ...], each (n, m).
+
+    All centred on the mean of f(A) and f(B).
+    """
     a, b = points[:, : space.dim], points[:, space.dim :]
-    mixed = [np.where(np.arange(space.dim) == i, b, a) for i in range(space.dim)]
+    taken = [*((i,) for i in range(space.dim)), *combinations(range(space.dim), 2)]
+    mixed = [np.where(np.isin(np.arange(space.dim), columns), b, a) for columns in taken]
     values = [_in_chunks(function, space.from_unit(unit)) for unit in (a, b, *mixed)]
     centre = 0.5 * (values[0].mean(axis=0) + values[1].mean(axis=0))
     return [value - centre for value in values]
@@ -239,11 +261,20 @@ def _evaluate_pairs(function: Function, space: ParameterSpace, points: Array) ->
 def _pick_freeze_parts(values: Sequence[Array], weights: Array) -> _Parts:
     """Parts of the variance with the rows weighted by each of weights (r, n)."""
     a, b, *mixed = values
+    dim = (isqrt(8 * len(mixed) + 1) - 1) // 2  # singles and pairs: d + d (d - 1) / 2 of them
     mean = weights @ (0.5 * (a + b))
     variance = weights @ (0.5 * (a**2 + b**2)) - mean**2
-    first = np.stack([weights @ (b * (ab - a)) for ab in mixed], axis=1)
-    total = np.stack([weights @ (0.5 * (a - ab) ** 2) for ab in mixed], axis=1)
-    return _Parts(variance, first, total)
+    closed = np.stack([weights @ (b * (ab - a)) for ab in mixed], axis=1)
+    total = np.stack([weights @ (0.5 * (a - ab) ** 2) for ab in mixed[:dim]], axis=1)
+    first = closed[:, :dim]
+    left, right = _pair_columns(dim)
+    return _Parts(variance, first, total, closed[:, dim:] - first[:, left] - first[:, right])
+
+
+def _pair_columns(dim: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First and second member of each pair, in the order of `SobolResult.pairs`."""
+    left, right = np.triu_indices(dim, 1)
+    return left, right
 
 
 def _expansion_terms(dim: int, most: int) -> NDArray[np.int64]:
@@ -274,21 +305,25 @@ def _expansion_parts(coefficients: Array, indices: NDArray[np.int64]) -> _Parts:
     """Parts of the variance from the coefficients (P, m) of orthonormal terms (P, d)."""
     square = coefficients**2
     used = (indices > 0).astype(float)
-    alone = used * (used.sum(axis=1, keepdims=True) == 1)
-    return _Parts((used.any(axis=1) @ square)[None], (alone.T @ square)[None], (used.T @ square)[None])
+    count = used.sum(axis=1, keepdims=True)
+    left, right = _pair_columns(used.shape[1])
+    both = used[:, left] * used[:, right] * (count == 2)
+    alone = used * (count == 1)
+    return _Parts(
+        (used.any(axis=1) @ square)[None],
+        (alone.T @ square)[None],
+        (used.T @ square)[None],
+        (both.T @ square)[None],
+    )
 
 
-def _ratios(parts: _Parts, usable: NDArray[np.bool_], widths: Array) -> tuple[Array, Array, Array, Array]:
-    """First and total indices (r, d, m), and aggregated over the history (r, d)."""
+def _ratios(parts: _Parts, usable: NDArray[np.bool_], widths: Array) -> tuple[list[Array], list[Array]]:
+    """First, total and second-order indices (r, d or p, m), and aggregated over the history (r, d or p)."""
     variance = np.where(usable, parts.variance, np.nan)[:, None]
     history = parts.variance @ widths
     whole = np.where(history > 0.0, history, np.nan)[:, None]
-    return (
-        parts.first / variance,
-        parts.total / variance,
-        parts.first @ widths / whole,
-        parts.total @ widths / whole,
-    )
+    shares = (parts.first, parts.total, parts.second)
+    return [share / variance for share in shares], [share @ widths / whole for share in shares]
 
 
 def _result(
@@ -302,11 +337,16 @@ def _result(
 ) -> SobolResult:
     widths = np.diff(edges_s)
     usable = best.variance[0] > NEGLIGIBLE_VARIANCE * best.variance[0].max()
-    first, total, first_whole, total_whole = (ratio[0] for ratio in _ratios(best, usable, widths))
+    (first, total, second), whole = ([ratio[0] for ratio in kind] for kind in _ratios(best, usable, widths))
     if spread is None:
-        limits = [np.full((2, *ratio.shape), np.nan) for ratio in (first, total, first_whole, total_whole)]
+        limits, whole_limits = (
+            [np.full((2, *ratio.shape), np.nan) for ratio in kind] for kind in ((first, total), whole)
+        )
     else:
-        limits = [np.quantile(ratio, [0.05, 0.95], axis=0) for ratio in _ratios(spread, usable, widths)]
+        limits, whole_limits = (
+            [np.quantile(ratio, [0.05, 0.95], axis=0) for ratio in kind]
+            for kind in _ratios(spread, usable, widths)
+        )
     return SobolResult(
         names=space.names,
         edges_s=np.asarray(edges_s, dtype=float),
@@ -314,10 +354,13 @@ def _result(
         total=total,
         first_interval=limits[0],
         total_interval=limits[1],
-        first_aggregated=first_whole,
-        total_aggregated=total_whole,
-        first_aggregated_interval=limits[2],
-        total_aggregated_interval=limits[3],
+        first_aggregated=whole[0],
+        total_aggregated=whole[1],
+        first_aggregated_interval=whole_limits[0],
+        total_aggregated_interval=whole_limits[1],
+        second=second,
+        second_aggregated=whole[2],
+        second_aggregated_interval=whole_limits[2],
         variance_n2=best.variance[0],
         unexplained=unexplained,
         samples=samples,

@@ -14,6 +14,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr, ndtri
 
 Array = NDArray[np.float64]
 PhaseKind = Literal["rest", "load", "hold", "unload"]
@@ -43,17 +44,30 @@ class Parameter:
     stress_power : with all parameters multiplied by c**stress_power, the force is multiplied by c
         (1 for a modulus, -1 for a permeability, whose viscosity is fixed; 0: stays as it is)
     offset : a log-uniform prior is uniform in log(value + offset), so that it may reach down to 0
+    centre, spread : of a normal prior its mean and sd; of a log-normal one its median and the sd of the
+        logarithm; both are cut to the bounds
     """
 
     name: str
     unit: str
     lower: float
     upper: float
-    prior: Literal["uniform", "log-uniform"]
+    prior: Literal["uniform", "log-uniform", "normal", "log-normal"]
     description: str = ""
     source: str = ""
     stress_power: int = 0
     offset: float = 0.0
+    centre: float = 0.0
+    spread: float = 1.0
+
+    @property
+    def in_log(self) -> bool:
+        return self.prior.startswith("log")
+
+    @property
+    def peaked(self) -> bool:
+        """Whether some values within the bounds are likelier than others."""
+        return self.prior.endswith("normal")
 
 
 @dataclass(frozen=True)
@@ -83,20 +97,48 @@ class ParameterSpace:
 
     @cached_property
     def is_log(self) -> NDArray[np.bool_]:
-        return np.array([p.prior == "log-uniform" for p in self.parameters])
+        return np.array([p.in_log for p in self.parameters])
+
+    @cached_property
+    def box(self) -> ParameterSpace:
+        """The same bounds with nothing likelier than anything else on the line."""
+        flat: dict[bool, Literal["uniform", "log-uniform"]] = {False: "uniform", True: "log-uniform"}
+        return ParameterSpace(
+            tuple(replace(p, prior=flat[p.in_log]) if p.peaked else p for p in self.parameters)
+        )
 
     def to_unit(self, theta: ArrayLike) -> Array:
         """Prior cumulative probability of each coordinate, shape (..., d); outside [0, 1] beyond the box."""
         low, high = self._line
-        return (self.to_line(theta) - low) / (high - low)
+        line = self.to_line(theta)
+        unit = np.asarray((line - low) / (high - low))
+        for j, (centre, spread, left, share) in self._normals.items():
+            unit[..., j] = (ndtr((line[..., j] - centre) / spread) - left) / share
+        return unit
 
     def from_unit(self, unit: ArrayLike) -> Array:
         """Inverse of `to_unit`, shape (..., d)."""
         low, high = self._line
-        return self.from_line(low + np.asarray(unit, dtype=float) * (high - low))
+        unit = np.asarray(unit, dtype=float)
+        line = np.asarray(low + unit * (high - low))
+        for j, (centre, spread, left, share) in self._normals.items():
+            line[..., j] = centre + spread * ndtri(np.clip(left + unit[..., j] * share, 0.0, 1.0))
+            line[..., j] = np.clip(line[..., j], low[j], high[j])
+        return self.from_line(line)
+
+    def log_density(self, line: ArrayLike) -> Array:
+        """Log prior density (...,) on the line, at points (..., d) within the bounds."""
+        line = np.asarray(line, dtype=float)
+        low, high = self._line
+        flat = [j for j in range(self.dim) if j not in self._normals]
+        out = np.full(line.shape[:-1], -float(np.sum(np.log((high - low)[flat]))))
+        for j, (centre, spread, _, share) in self._normals.items():
+            z = (line[..., j] - centre) / spread
+            out += -0.5 * z**2 - np.log(spread * share * np.sqrt(2.0 * np.pi))
+        return out
 
     def to_line(self, theta: ArrayLike) -> Array:
-        """Coordinates (..., d) in which each prior is uniform: the value, or the logarithm of it."""
+        """Coordinates (..., d) in which each prior is uniform or normal: the value, or its logarithm."""
         theta = np.asarray(theta, dtype=float)
         return np.where(self.is_log, np.log(np.where(self.is_log, theta + self._offset, 1.0)), theta)
 
@@ -113,6 +155,18 @@ class ParameterSpace:
     @cached_property
     def _line(self) -> tuple[Array, Array]:
         return self.to_line(self.lower), self.to_line(self.upper)
+
+    @cached_property
+    def _normals(self) -> dict[int, tuple[float, float, float, float]]:
+        """By column of a normal prior: centre and spread on the line, mass below the bounds, mass within."""
+        low, high = self._line
+        out = {}
+        for j, p in enumerate(self.parameters):
+            if p.peaked:
+                centre = float(np.log(p.centre + p.offset)) if p.in_log else p.centre
+                left, right = (float(ndtr((bound - centre) / p.spread)) for bound in (low[j], high[j]))
+                out[j] = (centre, p.spread, left, right - left)
+        return out
 
     @cached_property
     def _offset(self) -> Array:

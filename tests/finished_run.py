@@ -36,7 +36,7 @@ def _parameter(prior: str, low: float, median: float, high: float, unit: str = "
     return {
         "meaning": "", "unit": unit, "mean": median, "sd": 1.0, "median": median, "low_90": low,
         "high_90": high, "ess": 3000.0, "rhat": 1.0007,
-        "prior": {"kind": prior, "lower": 0.5 * low, "upper": 2.0 * high},
+        "prior": {"kind": prior, "lower": 0.5 * low, "upper": 2.0 * high, "source": "an earlier study"},
     }  # fmt: skip
 
 
@@ -69,6 +69,7 @@ def summaries() -> dict[str, dict[str, Any]]:
         },
         "sample": {
             "ok": True, "verdict": "trusted", "reasons": ["3554 effective samples of E_c; 2000 needed"],
+            "remarks": ["what the fit leaves is hardly noise"],
             "steps": 16000, "draws": 3776,
             "parameters": {
                 "E_c": _parameter("log-uniform", 13.9e3, 50.8e3, 87e3),
@@ -82,6 +83,22 @@ def summaries() -> dict[str, dict[str, Any]]:
                 "sd_rest: the data informs it weakly: median 0.0028, 90 % interval 0.0019 to 0.0045 N",
             ],
             "ridges": ["E_c and E_s form a ridge (correlation -0.87): one makes up for the other"],
+            "learned": {
+                name: {"contraction": 0.6, "gain_nats": 0.9, "sentence": f"This test taught of {name}."}
+                for name in ("E_c", "p_init", "sd_rest")
+            },
+            "profiles": {
+                "E_c": {"low_90": 33e3, "high_90": 95e3, "flat": False},
+                "p_init": {"low_90": -670.0, "high_90": 2144.0, "flat": True},
+            },
+            "full_model": [
+                {"draws": 24, "failed": 0, "effective": 20.1, "largest_weight": 0.07, "khat": None,
+                 "sd_of_log_ratio": 0.4, "trusted": True, "message": "full model at 24 posterior draws"},
+            ],
+            "corrected": {
+                name: {"mean": mean, "sd": 1.0, "shift_sd": 0.11, "shift_error_sd": 0.08}
+                for name, mean in (("E_c", 51e3), ("p_init", 840.0), ("sd_rest", 0.0029))
+            },
             "rmse": _RMSE, "coverage_90": 0.9462, "coverage_90_fitted": 0.9512,
             "rms_sd_n": {"parameter": 0.0013, "surrogate": 0.0009, "noise": 0.0042},
         },
@@ -89,8 +106,14 @@ def summaries() -> dict[str, dict[str, Any]]:
             name: {
                 "sentence": "The force does not inform p_init.", "method": "pick-freeze", "samples": 2048,
                 "distribution": "independent", "aggregated": {"E_c": _INDEX, "p_init": _INDEX},
+                "pairs": {"E_c, p_init": {"second": 0.01, "second_90": [None, 0.02]}},
             }
             for name in ("prior_gp", "prior_chaos", "near_map")
+        } | {
+            "posterior": {
+                "sentence": "Shared by E_c 90 %.", "method": "Shapley effects", "samples": 2000,
+                "distribution": "the posterior", "shares": {"E_c": {"share": 0.9, "share_90": [0.8, 1.0]}},
+            }
         },
         "diagnose": {
             "verdict": "named",

@@ -99,3 +99,37 @@ def test_the_peers_likelihood_is_the_normal_with_their_covariance(benchmark):
 def test_a_package_that_is_absent_costs_one_line(benchmark, capsys):
     assert benchmark("surrogate_benchmark").peer_rows("no_such_package", sys.executable) == []
     assert capsys.readouterr().out.count("\n") == 1
+
+
+def test_uniform_ranks_look_uniform_and_those_of_narrow_posteriors_do_not(benchmark):
+    calibration, rng = benchmark("calibration"), np.random.default_rng(1)
+    n, levels = 300, calibration.DRAWS + 1
+    p_values = [calibration.uniformity(rng.integers(0, levels, n)) for _ in range(200)]
+    assert 0.02 < np.mean(np.array(p_values) < 0.1) < 0.2
+    z = rng.standard_normal(n)  # truth and draws of one law, the draws a third too narrow
+    ranks = (0.67 * rng.standard_normal((n, calibration.DRAWS)) < z[:, None]).sum(axis=1)
+    assert calibration.uniformity(ranks) < 1e-3
+
+
+def test_ranks_and_intervals_are_those_of_the_draws(benchmark):
+    calibration = benchmark("calibration")
+    draws = np.tile(np.linspace(0.0, 1.0, 1001)[:, None], (1, len(calibration.NAMES)))
+    theta = np.full(len(calibration.NAMES), 0.9)
+    theta[0] = 0.3
+    row = calibration.ranked(draws, theta, np.random.default_rng(0))
+    assert (row["in50_E_c"], row["in90_E_c"]) == (True, True)
+    assert (row["in50_E_s"], row["in90_E_s"]) == (False, True)
+    assert row["rank_E_c"] == pytest.approx(30, abs=15)
+    assert row["rank_E_s"] == pytest.approx(90, abs=10)
+
+
+def test_a_recording_is_made_inferred_and_ranked_in_one_row(benchmark):
+    calibration = benchmark("calibration")
+    settings = calibration.SampleSettings(2, 24, 40, calibration.Limits())
+    item = {"data": "surrogate", "seed": 1, "index": 3}
+    rows = [calibration.replicate(item, calibration.problem(), settings) for _ in range(2)]
+    assert set(rows[0]) == set(calibration.ROWS.columns)
+    assert {**rows[0], "cpu_s": 0} == {**rows[1], "cpu_s": 0}
+    assert not rows[0]["trusted"]  # 40 steps, and it says so
+    assert "needed" in rows[0]["reason"]
+    assert 0.0 <= rows[0]["band50"] <= rows[0]["band90"] <= 1.0

@@ -15,6 +15,7 @@ from toy import EDGES_S, MOTION, SPACE, toy_bin_means, toy_force
 
 from bayeskin import report
 from bayeskin.errors import InputError
+from bayeskin.inference import Corrected, Profile, Weighed
 from bayeskin.inference.convergence import Limits, Verdict
 from bayeskin.report import posterior, style, timeline, traces, triangle, validation
 from bayeskin.types import BinnedForce, Design, Parameter, ParameterSpace, Phase, Prediction, Recording
@@ -506,6 +507,32 @@ def test_waves_show_every_pair_and_the_volume_kept() -> None:
 def test_one_wave_of_any_dimension(dim: int) -> None:
     space = ParameterSpace(SPACE.parameters[:dim])
     assert "1 wave fill the prior box" in headline(drawn(report.figure_waves(design(1, space), [1.0])))
+
+
+def profile(name: str, top: float, deep: bool) -> Profile:
+    p = SPACE.parameters[SPACE.names.index(name)]
+    values = SPACE.from_unit(np.repeat(np.linspace(0, 1, 9)[:, None], 5, axis=1))[:, SPACE.names.index(name)]
+    drop = -50.0 * (np.linspace(0, 1, 9) - top) ** 2 if deep else np.zeros(9)
+    return Profile(name, values, drop, (p.lower, p.upper), not deep, not deep)
+
+
+def test_profiles_name_what_the_fit_does_not_exclude(draws: np.ndarray) -> None:
+    some = [profile("E_c", 0.5, True), profile("p_init", 0.5, False)]
+    figure = drawn(report.figure_profiles(SPACE, draws, some))
+    assert "excludes no value of" in headline(figure)
+    assert "init" in headline(figure)
+    assert "E_c" not in headline(figure)
+    assert "bounds every parameter" in headline(drawn(report.figure_profiles(SPACE, draws, some[:1])))
+
+
+def test_the_model_check_says_what_moves_most(draws: np.ndarray) -> None:
+    weights = np.array([0.4, 0.3, 0.2, 0.1])
+    found = Weighed(SPACE, draws[:4], np.log(weights), weights, 10 / 3, float("nan"), Verdict(True, ("",)))
+    moved = [Corrected(n, 1.0, 1.0, -0.8 if n == "k_s" else 0.1, 0.05) for n in SPACE.names]
+    figure = drawn(report.figure_model_check(SPACE, draws, found, moved))
+    assert "By 4 full runs 3 draws remain effective" in headline(figure)
+    assert "k_" in headline(figure)
+    assert "0.80 of its sd" in headline(figure)
 
 
 def test_prior_predictive_places_the_recorded_peak(binned: BinnedForce) -> None:

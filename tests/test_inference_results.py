@@ -25,6 +25,7 @@ from bayeskin.inference import (
     find_map,
     identifiability,
     load_inference_data,
+    noise_remarks,
     optimise,
     polish_map,
     predictive_draws,
@@ -33,7 +34,7 @@ from bayeskin.inference import (
     save_inference_data,
     to_inference_data,
 )
-from bayeskin.inference.identify import information_gain_nats
+from bayeskin.inference.identify import information_gain_nats, parts
 from bayeskin.types import Array, Parameter, ParameterSpace, Provenance, Simulation
 
 mpl.use("Agg")
@@ -75,6 +76,25 @@ def test_starts_on_the_ridge_agree_on_its_height() -> None:
     assert all(s.value > found.value - 2.0 for s in found.starts)
     assert problem.log_prob(problem.vector(found.theta))[0] == pytest.approx(found.value, abs=1e-6)
     assert "of 2 starts" in found.message
+
+
+def test_three_kinds_of_search_end_at_one_maximum() -> None:
+    problem = toy_problem(windows=HOLDS)
+    found = find_map(problem, seed=1, starts=6, evaluations=4000)
+    assert min(start.value for start in found.starts) < found.value - 1.0  # there is a lower one besides
+    assert list(found.by_search) == list(optimise.SEARCHES)
+    assert all(found.value - value < 0.1 for value in found.by_search.values())
+    assert "by controlled random search, differential evolution, Gauss-Newton" in found.message
+
+
+@pytest.mark.parametrize("kind", optimise.SEARCHES)
+def test_each_kind_of_search_climbs_before_the_polish(kind: str) -> None:
+    problem = toy_problem(windows=HOLDS)
+    search = optimise._Search(optimise._SearchSpace(problem))
+    optimise.SEARCHES[kind](search, 3, 2000)
+    middle = problem.log_prob(np.mean(problem.bounds, axis=0)[None])[0]
+    best = find_map(problem, seed=1, starts=3, evaluations=4000).value
+    assert best - search.value < 0.2 * (best - middle)
 
 
 def test_a_failing_optimiser_is_a_status(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,6 +246,45 @@ def test_a_parameter_with_its_prior_back_is_said_to_be_uninformed() -> None:
     assert e.contraction == pytest.approx(1 - 12 * 1.01 / 100, abs=0.02)
     assert e.quantiles == pytest.approx(np.exp(5 + np.array([-1.645, 0, 1.645])), rel=0.1)
     assert e.statement.startswith("E: the data informs it: median")
+
+
+def test_a_sentence_without_statistics_says_what_the_test_taught() -> None:
+    sentences = {one.name: one.sentence for one in identifiability(SPACE, ridge_draws()).parameters}
+    assert sentences["p_init"].startswith("This test says nothing of the")
+    assert "what was assumed" in sentences["p_init"]
+    assert "times narrower than assumed" in sentences["E"]
+
+
+def test_two_separate_ranges_are_said_and_one_of_any_shape_is_not() -> None:
+    rng = np.random.default_rng(3)
+    two = np.concatenate([0.2 + 0.03 * rng.standard_normal(1500), 0.7 + 0.05 * rng.standard_normal(500)])
+    found = parts(two)
+    assert len(found) == 2
+    np.testing.assert_allclose(found, [(0.15, 0.25), (0.62, 0.78)], atol=0.02)
+    one = (rng.uniform(size=3000), rng.beta(2, 9, 3000), np.full(50, 0.3), 1 - rng.exponential(0.02, 3000))
+    assert [len(parts(draws)) for draws in one] == [1, 1, 1, 1]
+    few = np.concatenate([0.2 + 0.03 * rng.standard_normal(1970), 0.7 + 0.03 * rng.standard_normal(30)])
+    assert len(parts(few)) == 1
+    space = ParameterSpace((Parameter("E", "Pa", 1.0, np.exp(10.0), "log-uniform"),))
+    statement = identifiability(space, space.from_unit(two[:, None])).parameters[0].statement
+    assert "2 separate ranges fit: " in statement
+
+
+def test_noise_parameters_at_their_bounds_are_remarked_on() -> None:
+    noise = ParameterSpace(
+        (
+            Parameter("tau_noise", "s", 0.1, 100.0, "log-uniform"),
+            Parameter("nu_noise", "1", 2.0, 100.0, "log-uniform"),
+        )
+    )
+    unit = np.random.default_rng(0).beta(1.0, 60.0, (2000, 2))
+    at_bounds = noise.from_unit(np.column_stack([1.0 - unit[:, 0], unit[:, 1]]))
+    said = noise_remarks(identifiability(noise, at_bounds))
+    assert len(said) == 1
+    assert "as long as its prior allows and with the heaviest tails" in said[0]
+    assert noise_remarks(identifiability(noise, noise.from_unit(0.3 + 0.2 * unit))) == ()
+    other_ends = noise.from_unit(np.column_stack([unit[:, 0], 1.0 - unit[:, 1]]))  # white and Gaussian
+    assert noise_remarks(identifiability(noise, other_ends)) == ()
 
 
 def test_a_ridge_is_named() -> None:

@@ -25,14 +25,26 @@ BELOW = {
     "runner": BASE | SIBLINGS | {"journal"},
     "inference": BASE,  # a Surrogate is all that these two know of a model
     "sensitivity": BASE,
+    "shapley": BASE,
     "mismatch": BASE | {"model", "mechanisms", "inference"},
     "proof": BASE | SIBLINGS | {"mechanisms", "runner"},  # and nothing that diagnoses imports it
-    "report": BASE | {"recordings", "inference", "sensitivity"},
+    "report": BASE | {"recordings", "inference", "sensitivity", "shapley"},
     "pipeline": BASE
     | SIBLINGS
-    | {"mechanisms", "config", "runner", "cluster", "mismatch", "inference", "sensitivity", "report"},
+    | {
+        "mechanisms",
+        "config",
+        "runner",
+        "cluster",
+        "mismatch",
+        "inference",
+        "sensitivity",
+        "shapley",
+        "report",
+    },
 }
 BELOW["pipeline"] |= {"proof"}
+BELOW["scripting"] = BELOW["pipeline"] | {"pipeline"}
 BELOW["terminal"] = {"errors"}
 BELOW["cli"] = BELOW["pipeline"] | {"pipeline", "terminal"}
 

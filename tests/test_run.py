@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import shutil
+from functools import partial
 from html import unescape
 from pathlib import Path
 
@@ -12,12 +15,14 @@ import toy_model
 from toy import MOTION, SPACE, toy_force
 
 from bayeskin import report, storage
-from bayeskin.inference import load_inference_data
-from bayeskin.pipeline import design, maximum, stages
-from bayeskin.pipeline.engine import Silent
+from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data
+from bayeskin.pipeline import design, maximum, refining, stages
+from bayeskin.pipeline.calibration import refined_posterior
+from bayeskin.pipeline.checking import checked_posterior, with_full_model
+from bayeskin.pipeline.engine import Silent, open_run
 from bayeskin.pipeline.indices import nearby
 from bayeskin.runner import load_design
-from bayeskin.types import Recording
+from bayeskin.types import Design, Recording, Simulation
 
 TRUE = {"E_c": 200e3, "E_s": 30e3, "k_c": 1e-14, "k_s": 1e-13, "p_init": 300.0}
 CONFIG = """
@@ -35,6 +40,8 @@ ensembles = 2
 walkers = 24
 max_steps = {steps}
 effective_samples = 100
+[check]
+draws = 6
 [map]
 starts = 2
 evaluations = 1000
@@ -64,6 +71,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "save_figure", drawn)  # rendering is most of a small run's time
         patch.setattr(design, "simulate", toy_model.simulate)
+        patch.setattr(refining, "simulate", toy_model.simulate)
         patch.setattr(maximum, "simulate", interrupted)
         with pytest.raises(KeyboardInterrupt):
             stages.run(where / "case.toml", None, Silent())
@@ -96,9 +104,12 @@ def test_the_summary_answers_what_a_reader_asks(folder: Path) -> None:
     assert summary["rmse"]["full_model_at_map"]["article_holds_n"] is None  # the toy ends before
     assert [line.split(":")[0] for line in summary["identifiability"]][:5] == list(SPACE.names)
     assert set(summary["seconds"]) == {stage.name for stage in stages.BEFORE_REPORT}
+    shares = summary["sobol"].pop("posterior")["shares"]
+    assert sum(one["share"] for one in shares.values()) == pytest.approx(1.0)
     for table in summary["sobol"].values():
         assert "uniform" in table["distribution"]
         assert table["aggregated"]["E_c"]["total"] > 0.1
+        assert len(table["pairs"]) == 10
 
 
 def test_the_design_holds_each_wave_with_its_labels(folder: Path) -> None:
@@ -113,10 +124,10 @@ def test_the_design_holds_each_wave_with_its_labels(folder: Path) -> None:
 def test_each_stage_draws_its_figures_and_says_where_they_come_from(folder: Path) -> None:
     expected = {
         "recording": ["recording"],
-        "design": ["waves", "prior_predictive"],
-        "train": ["validation"],
+        "design": ["waves"],
+        "train": ["validation", "prior_predictive"],
         "map": ["map_check"],
-        "sample": ["posterior", "fit", "traces"],
+        "sample": ["posterior", "fit", "traces", "profiles", "model_check"],
         "sobol": ["sobol_prior_gp", "sobol_prior_chaos", "sobol_near_map"],
     }
     for stage, names in expected.items():
@@ -127,7 +138,7 @@ def test_each_stage_draws_its_figures_and_says_where_they_come_from(folder: Path
 def test_the_page_shows_the_whole_run(folder: Path) -> None:
     shown = (folder / "case" / "report.html").read_text()
     drawn = [path.stem for path in (folder / "case").rglob("*.svg")]
-    assert len(drawn) == 11
+    assert len(drawn) == 13
     for name in drawn:
         assert f'-{name}"'.replace("_", "-") in shown, name
     for parameter in SPACE.parameters:
@@ -148,10 +159,68 @@ def test_the_posterior_is_an_inference_data_with_its_origin(folder: Path) -> Non
     assert idata["constant_data"]["fitted"].values.sum() == 75
 
 
+def test_the_full_model_weighs_draws_of_the_posterior(folder: Path) -> None:
+    said = json.loads((folder / "case" / "sample" / "stage.json").read_text())["summary"]
+    assert len(said["full_model"]) == 1  # chains that have not converged add nothing to the design
+    found = said["full_model"][0]
+    assert (found["draws"], found["failed"]) == (6, 0)
+    assert found["message"] in said["reasons"]
+    assert found["effective"] >= 1.0
+    assert said["corrected"] is None or set(said["corrected"]) == set(said["parameters"])
+
+
+def steeper(
+    spec: object, motion: object, theta: dict[str, float], about_pa: float, power: float
+) -> Simulation:
+    run = toy_model.simulate(spec, motion, theta)
+    return dataclasses.replace(run, force_n=(theta["E_c"] / about_pa) ** power * run.force_n)
+
+
+@pytest.mark.parametrize(("power", "rounds"), [(0.0, 1), (300.0, 3)])
+def test_draws_join_the_design_where_the_full_model_is_elsewhere(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, power: float, rounds: int
+) -> None:
+    shutil.copytree(folder, tmp_path / "run")
+    run = open_run(tmp_path / "run" / "case.toml", Silent())
+    shutil.rmtree(run.folder / "runs")  # of the model as it was
+    problem, asked = refined_posterior(run), []
+    theta = run.summary("map")["theta"]
+    monkeypatch.setattr(refining, "simulate", partial(steeper, about_pa=theta["E_c"], power=power))
+    large = {
+        name: 0.05 for name in problem.names if name.startswith("sd_")
+    }  # beside the toy surrogate's error
+    best = problem.vector({**theta, **large, "tau_noise": 1.0})
+    noise = np.random.default_rng(1).standard_normal((400, problem.dim))
+    low, high = problem.bounds
+    near = problem.from_sampling(np.clip(best + 1e-4 * (high - low) * noise, low, high))
+    trusted = dataclasses.replace(settled(problem.dim), verdict=Verdict(True, ("yes",)))
+
+    def draws_of(log_posterior: LogPosterior) -> Posterior:
+        asked.append(log_posterior.surrogate)
+        return Posterior(problem.space, near.reshape(2, 200, -1), np.zeros((2, 200)), trusted, 1)
+
+    found = checked_posterior(run, problem, draws_of)
+    before = storage.load(run.at("map", "design.h5"), Design)
+    assert len(found.rounds) == len(asked) == rounds
+    assert found.log_posterior.surrogate is asked[-1]
+    assert run.at("sample", "surrogate.h5").is_file() == (rounds > 1)
+    if rounds > 1:
+        after = storage.load(run.at("sample", "design.h5"), Design)
+        assert len(after.theta) == len(before.theta) + 6 * (rounds - 1)
+        assert not with_full_model(Verdict(True, ()), found).trusted
+
+
+def settled(dim: int) -> Convergence:
+    """A convergence whose numbers nobody asks for."""
+    each = np.ones(dim)
+    return Convergence(400, 100, 1, np.ones((2, dim)), each, each, np.ones(2), (), Verdict(True, ()))
+
+
 def test_longer_sampling_repeats_no_stage_before_it_and_keeps_the_chains(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(report, "save_figure", lambda *arguments: None)
+    monkeypatch.setattr(refining, "simulate", toy_model.simulate)
     chains = list((folder / "case" / "chains").iterdir())
     (folder / "case.toml").write_text(CONFIG.format(steps=250))
     answer = stages.run(folder / "case.toml", "sample", Silent())

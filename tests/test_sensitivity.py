@@ -81,6 +81,41 @@ def test_ishigami(estimate):
 
 
 @pytest.mark.parametrize("estimate", METHODS)
+def test_second_order_of_ishigami_is_its_one_interaction(estimate):
+    result = estimate(ishigami, box(3, -np.pi, np.pi), ONE_BIN, np.random.default_rng(1), 4096)
+    first, total = ishigami_indices()
+    assert result.pairs == (("x0", "x1"), ("x0", "x2"), ("x1", "x2"))
+    tolerance = {"pick-freeze": 0.03, "projection": 1e-6}[result.method]
+    exact = [0.0, total[0] - first[0], 0.0]
+    np.testing.assert_allclose(result.second[:, 0], exact, atol=tolerance)
+    np.testing.assert_allclose(result.second_aggregated, exact, atol=tolerance)
+    if result.method == "pick-freeze":
+        low, high = result.second_aggregated_interval
+        assert np.all((low <= result.second_aggregated) & (result.second_aggregated <= high))
+
+
+def test_indices_of_a_skin_like_force_agree_with_salib():
+    """First, total and second order, by an independent package with samples of its own."""
+    pytest.importorskip("SALib", reason="SALib is not installed")
+    from SALib.analyze import sobol as analyze
+    from SALib.sample import sobol as sample
+
+    edges = np.linspace(0.0, 20.0, 5)
+    whole = {"num_vars": 5, "names": list(SPACE.names), "bounds": [[0.0, 1.0]] * 5}
+    points = sample.sample(whole, 2048, calc_second_order=True, seed=1)
+    force = relaxing_force(SPACE.from_unit(points), edges[1:])
+    result = pick_freeze(
+        lambda theta: relaxing_force(theta, edges[1:]), SPACE, edges, np.random.default_rng(2), 2048
+    )
+    for column in range(4):
+        theirs = analyze.analyze(whole, force[:, column], calc_second_order=True, seed=1)
+        np.testing.assert_allclose(result.first[:, column], theirs["S1"], atol=0.04)
+        np.testing.assert_allclose(result.total[:, column], theirs["ST"], atol=0.04)
+        upper = theirs["S2"][np.triu_indices(5, 1)]
+        np.testing.assert_allclose(result.second[:, column], upper, atol=0.06)
+
+
+@pytest.mark.parametrize("estimate", METHODS)
 def test_sobol_g(estimate):
     """Kinked, so that a polynomial converges slowly: it says so in `unexplained`."""
     result = estimate(sobol_g, box(5, 0.0, 1.0), ONE_BIN, np.random.default_rng(2), 4096)

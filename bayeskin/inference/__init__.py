@@ -12,7 +12,8 @@ from bayeskin.inference.bands import (
 )
 from bayeskin.inference.check import MapCheck, RefinedMap, check_map, refine_map
 from bayeskin.inference.convergence import Convergence, Limits, Verdict
-from bayeskin.inference.identify import Identifiability, Learned, Ridge, identifiability
+from bayeskin.inference.identify import Identifiability, Learned, Ridge, identifiability, noise_remarks
+from bayeskin.inference.importance import Corrected, Weighed, corrected, weigh
 from bayeskin.inference.inference_data import (
     draws_of,
     load_inference_data,
@@ -23,11 +24,13 @@ from bayeskin.inference.noise_model import NoisePriors
 from bayeskin.inference.optimise import MapResult, StartResult, find_map
 from bayeskin.inference.polish import Polished, polish_map
 from bayeskin.inference.problem import LogPosterior
+from bayeskin.inference.profile import Profile, profiles
 from bayeskin.inference.sample import Posterior, SampleSettings, load_chains, sample
 
 __all__ = [
     "Bands",
     "Convergence",
+    "Corrected",
     "ForceDraws",
     "Identifiability",
     "Learned",
@@ -38,26 +41,32 @@ __all__ = [
     "NoisePriors",
     "Polished",
     "Posterior",
+    "Profile",
     "RefinedMap",
     "Ridge",
     "Rmse",
     "SampleSettings",
     "StartResult",
     "Verdict",
+    "Weighed",
     "bands",
     "bands_of",
     "check_map",
+    "corrected",
     "coverage",
     "draws_of",
     "find_map",
     "identifiability",
     "load_chains",
     "load_inference_data",
+    "noise_remarks",
     "polish_map",
     "predictive_draws",
+    "profiles",
     "refine_map",
     "rmse",
     "sample",
     "save_inference_data",
     "to_inference_data",
+    "weigh",
 ]

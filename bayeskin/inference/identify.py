@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter1d
 
 from bayeskin.types import Array, Parameter, ParameterSpace
 
@@ -13,18 +15,23 @@ _NOTHING_NATS, _NOTHING_CONTRACTION = 0.03, 0.1  # below both, posterior and pri
 _WEAK = 0.5  # contraction below which the data narrows little
 _EDGE, _LEANS = 0.02, 0.06  # three times the mass that the prior has in its outermost 2 %
 _RIDGE = 0.8
+_VALLEY = 0.4  # of the lower of two peaks: a density between them below it parts them
+_SIDE = 0.05  # mass of a part that is worth a word
+_CELLS = 200
 
 
 @dataclass(frozen=True)
 class Learned:
     """One parameter: 1 - posterior over prior variance and Kullback-Leibler gain [nats], both in sampling
-    coordinates (log for log-uniform); 5, 50 and 95 % quantiles in SI; and all that in a sentence."""
+    coordinates (log for log-uniform); 5, 50 and 95 % quantiles in SI; all that in a statement, and in a
+    sentence without statistics."""
 
     name: str
     contraction: float
     gain_nats: float
     quantiles: tuple[float, float, float]
     statement: str
+    sentence: str
 
 
 @dataclass(frozen=True)
@@ -56,6 +63,50 @@ def identifiability(space: ParameterSpace, draws: ArrayLike) -> Identifiability:
     return Identifiability(learned, tuple(_ridge(space, i, j, float(correlation[i, j])) for i, j in pairs))
 
 
+def parts(unit: ArrayLike) -> list[tuple[float, float]]:
+    """Separate ranges of the prior-uniform coordinate in which draws (s,) lie; one, unless valleys part them.
+
+    Valleys of a normal kernel's density, mirrored at the ends of the unit interval; the narrower of sd and
+    quartiles sets the kernel (Silverman 1986, eq. 3.31), which two far peaks would otherwise blur.
+    """
+    unit = np.asarray(unit, dtype=float)
+    quartiles = np.diff(np.quantile(unit, [0.25, 0.75]))[0] / 1.34
+    width = 0.9 * min(unit.std(), quartiles or unit.std()) * len(unit) ** -0.2
+    counts, edges = np.histogram(unit, _CELLS, (0.0, 1.0))
+    density = gaussian_filter1d(counts.astype(float), max(width * _CELLS, 0.5), mode="reflect")
+    cuts, start = [0], 0
+    for valley in np.flatnonzero((density[1:-1] <= density[:-2]) & (density[1:-1] < density[2:])) + 1:
+        left, right = density[start:valley], density[valley:]
+        mass = counts[start:valley].sum(), counts[valley:].sum()
+        if density[valley] < _VALLEY * min(left.max(), right.max()) and min(mass) > _SIDE * len(unit):
+            cuts.append(int(valley))
+            start = int(valley)
+    pieces = [unit[(unit >= edges[a]) & (unit <= edges[b])] for a, b in pairwise([*cuts, _CELLS])]
+    return [(float(low), float(high)) for low, high in (np.quantile(one, [0.05, 0.95]) for one in pieces)]
+
+
+def noise_remarks(found: Identifiability) -> tuple[str, ...]:
+    """What noise parameters at their bounds give away: a misfit that the likelihood takes for noise.
+
+    Noise of a load cell is neither correlated over minutes nor of infinite variance.
+    """
+    leaning = [
+        words
+        for name, side, words in (
+            ("tau_noise", "upper", "correlated for as long as its prior allows"),
+            ("nu_noise", "lower", "with the heaviest tails that its prior allows"),
+        )
+        for one in found.parameters
+        if one.name == name and f"leans on the prior's {side} bound" in one.statement
+    ]
+    if not leaning:
+        return ()
+    return (
+        f"what the fit leaves is {' and '.join(leaning)}: hardly noise, rather something that the model "
+        "leaves out, so the parameters stand for it too; bayeskin diagnose looks for it",
+    )
+
+
 def information_gain_nats(unit: ArrayLike) -> float:
     """KL divergence [nats] of draws (s,) of prior-uniform coordinates from the prior, at least 0.
 
@@ -82,8 +133,10 @@ def _learn(parameter: Parameter, unit: Array, space: ParameterSpace, column: int
     corners = np.full((3, space.dim), 0.5)
     corners[:, column] = np.quantile(unit, [0.05, 0.5, 0.95])
     low, middle, high = (float(v) for v in space.from_unit(corners)[:, column])
-    statement = _statement(parameter, unit, contraction, gain, (low, middle, high))
-    return Learned(parameter.name, contraction, gain, (low, middle, high), statement)
+    quantiles = (low, middle, high)
+    statement = _statement(parameter, unit, contraction, gain, quantiles)
+    sentence = _sentence(parameter, contraction, gain, quantiles)
+    return Learned(parameter.name, contraction, gain, quantiles, statement, sentence)
 
 
 def _statement(
@@ -99,10 +152,35 @@ def _statement(
         for side, bound, mass in (
             ("lower", p.lower, np.mean(unit < _EDGE)), ("upper", p.upper, np.mean(unit > 1 - _EDGE)),
         )
-        if mass > _LEANS
+        if mass > _LEANS and not p.peaked
     ]  # fmt: skip
+    ranges = parts(unit)
+    if len(ranges) > 1 and not p.peaked:
+        box = ParameterSpace((p,))
+        ends = [box.from_unit(np.array(one)[:, None])[:, 0] for one in ranges]
+        said = " and ".join(f"{a:.3g} to {b:.3g}{of_unit}" for a, b in ends)
+        leans.append(f"{len(ranges)} separate ranges fit: {said}")
     strength = "the data informs it" if contraction >= _WEAK else "the data informs it weakly"
     return "; ".join([f"{p.name}: {strength}: {numbers}", *leans])
+
+
+def _sentence(p: Parameter, contraction: float, gain: float, quantiles: tuple[float, float, float]) -> str:
+    unit = "" if p.unit == "1" else f" {p.unit}"
+    what = f"{p.description or 'parameter'} ({p.name})"
+    if gain < _NOTHING_NATS and abs(contraction) < _NOTHING_CONTRACTION:
+        return (
+            f"This test says nothing of the {what}: what is known of it is what was assumed, "
+            f"{p.lower:.3g} to {p.upper:.3g}{unit}."
+        )
+    low, middle, high = quantiles
+    range_ = f"{low:.3g} to {high:.3g}{unit}"
+    if contraction < _WEAK:
+        return f"This test narrows the {what} only a little: with 90 % probability it is {range_}."
+    times = 1.0 / np.sqrt(max(1.0 - contraction, 1e-12))
+    return (
+        f"The {what} is about {middle:.3g}{unit}, with 90 % probability {range_}: {times:.2g} times narrower "
+        f"than assumed before the test."
+    )
 
 
 def _ridge(space: ParameterSpace, i: int, j: int, correlation: float) -> Ridge:

@@ -1,4 +1,9 @@
-"""The most probable point: a global search from many seeds, each polished locally."""
+"""The most probable point: three kinds of global search in turn, each polished locally.
+
+Controlled random search (NLopt GN_CRS2_LM; Kaelo & Ali 2006, J. Optim. Theory Appl. 130:253), differential
+evolution (Storn & Price 1997, J. Glob. Optim. 11:341, by SciPy) and Gauss-Newton from draws of the prior
+(`gauss_newton`) share nothing but the density: where they end at one value, it is hardly a local one.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +12,10 @@ from dataclasses import dataclass
 
 import nlopt
 import numpy as np
+from scipy.optimize import differential_evolution
 
 from bayeskin.errors import InputError
+from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.straighten import Shear, find_shear
 from bayeskin.types import Array
@@ -20,6 +27,8 @@ _WORST = -1e30  # of a point without a density; NLopt asks for finite values
 _LEVELS = 3.0  # log amplitudes either side of the recorded force's that are searched
 _STEP = 1e-6  # of a unit coordinate, for central differences
 _STEEP = 1e4  # nats a box width outside the prior
+_CLIMBS = 16  # Gauss-Newton climbs from the prior that make one start
+_POPULATION = 10  # members of differential evolution, a parameter
 _STATUS = {
     nlopt.SUCCESS: "converged",
     nlopt.STOPVAL_REACHED: "converged",
@@ -32,12 +41,16 @@ _STATUS = {
 
 @dataclass(frozen=True)
 class StartResult:
-    """Where one start ended: SI values by name, log density, how the polish stopped, evaluations spent."""
+    """Where one start ended: SI values by name, log density, how the polish stopped, evaluations spent.
+
+    `search` names the global search before the polish; evaluations are those outside Gauss-Newton.
+    """
 
     theta: Mapping[str, float]
     value: float
     status: str
     evaluations: int
+    search: str = ""
 
 
 @dataclass(frozen=True)
@@ -50,10 +63,18 @@ class MapResult:
     agreement: float
 
     @property
+    def by_search(self) -> dict[str, float]:
+        """Best log density that each kind of search ended at."""
+        kinds = dict.fromkeys(start.search for start in self.starts)
+        return {kind: max(s.value for s in self.starts if s.search == kind) for kind in kinds}
+
+    @property
     def message(self) -> str:
         """One sentence: whether to rely on the maximum, and the remedy if not."""
+        reached = [kind for kind, value in self.by_search.items() if value >= self.value - _AGREE]
         found = f"{round(self.agreement * len(self.starts))} of {len(self.starts)} starts reached it"
-        if self.agreement >= 0.5:
+        found += f", by {', '.join(reached)}"
+        if len(reached) > 1 or self.agreement >= 0.5:
             return f"maximum of log posterior {self.value:.2f}: {found}"
         return f"maximum of log posterior {self.value:.2f}: only {found}; allow more evaluations a start"
 
@@ -67,10 +88,10 @@ def find_map(
 ) -> MapResult:
     """Maximum of the posterior density in sampling coordinates.
 
-    Each start runs controlled random search (NLopt GN_CRS2_LM; Kaelo & Ali 2006) on at most half of
-    `evaluations`, then L-BFGS and Sbplx from there, in straightened coordinates (`straighten`). NLopt's
-    failures become a start's status. The search draws from NLopt's own generator, seeded for each start.
-    Raises InputError when there is no start to make.
+    The starts take the kinds of `SEARCHES` in turn, each on at most half of `evaluations`, then Gauss-Newton,
+    L-BFGS and Sbplx from there, in straightened coordinates (`straighten`). NLopt's failures become a start's
+    status. NLopt draws from its own generator, seeded for each start. Raises InputError when there is no
+    start to make.
     """
     if starts < 1 or evaluations < 4:
         raise InputError("map", f"{starts} starts, {evaluations} evaluations", "at least 1 start of 4")
@@ -78,7 +99,7 @@ def find_map(
     seeds = np.random.SeedSequence(seed).generate_state(starts)
     results: list[StartResult] = []
     for index, state in enumerate(seeds):
-        results.append(_one_start(space, int(state), evaluations))
+        results.append(_one_start(space, list(SEARCHES)[index % len(SEARCHES)], int(state), evaluations))
         if progress:
             progress((index + 1) / starts, f"start {index + 1} of {starts}: {results[-1].value:.2f}")
     best = max(results, key=lambda r: r.value)
@@ -107,18 +128,41 @@ def climb(
     return StartResult(log_posterior.named(theta), search.value, status, search.evaluations)
 
 
-def _one_start(search_space: _SearchSpace, seed: int, evaluations: int) -> StartResult:
-    nlopt.srand(seed)
-    unit = np.random.default_rng(seed).uniform(size=search_space.log_posterior.dim)
+def _one_start(search_space: _SearchSpace, kind: str, seed: int, evaluations: int) -> StartResult:
     search = _Search(search_space)
-    search.run(nlopt.GN_CRS2_LM, unit, evaluations // 2, 1e-3)
-    status = "failed: no density found"
-    for algorithm in (nlopt.LD_LBFGS, nlopt.LN_SBPLX):
-        if np.isfinite(search.value):
-            status = search.run(algorithm, search.best, evaluations // 4, 1e-6)
+    SEARCHES[kind](search, seed, evaluations // 2)
     log_posterior = search_space.log_posterior
+    status = "failed: no density found"
+    if np.isfinite(search.value):
+        reached = search_space.points(search.best[None])[0][0]
+        search.offer(gauss_newton(log_posterior, reached, search_space.shear).vector)
+        for algorithm in (nlopt.LD_LBFGS, nlopt.LN_SBPLX):
+            status = search.run(algorithm, search.best, evaluations // 4, 1e-6)
     theta = log_posterior.from_sampling(search_space.points(search.best[None])[0][0])
-    return StartResult(log_posterior.named(theta), search.value, status, search.evaluations)
+    return StartResult(log_posterior.named(theta), search.value, status, search.evaluations, kind)
+
+
+def _controlled_random(search: _Search, seed: int, evaluations: int) -> None:
+    nlopt.srand(seed)
+    unit = np.random.default_rng(seed).uniform(size=len(search.best))
+    search.run(nlopt.GN_CRS2_LM, unit, evaluations, 1e-3)
+
+
+def _evolution(search: _Search, seed: int, evaluations: int) -> None:
+    dim = len(search.best)
+    generations = max(evaluations // (_POPULATION * dim) - 1, 1)
+    differential_evolution(
+        lambda columns: -search.offer_unit(columns.T), [(0.0, 1.0)] * dim, maxiter=generations,
+        popsize=_POPULATION, tol=0.0, atol=_AGREE, polish=False, updating="deferred", vectorized=True,
+        seed=np.random.default_rng(seed),
+    )  # fmt: skip
+
+
+def _climbs(search: _Search, seed: int, evaluations: int) -> None:
+    log_posterior, shear = search.space.log_posterior, search.space.shear
+    low, high = log_posterior.bounds
+    for start in np.random.default_rng(seed).uniform(low, high, (_CLIMBS, len(low))):
+        search.offer(gauss_newton(log_posterior, start, shear).vector)
 
 
 class _SearchSpace:
@@ -177,6 +221,19 @@ class _Search:
             self.best, self.value = np.array(unit), float(values[0])
         return float(values[0])
 
+    def offer(self, x: Array) -> None:
+        """One point (D,) in sampling coordinates that something else proposes."""
+        self.offer_unit(self.space.unit(x[None]))
+
+    def offer_unit(self, unit: Array) -> Array:
+        """Log densities (n,) at points (n, D) of the unit cube, the best of them kept."""
+        values = self.space.values(unit)
+        self.evaluations += len(unit)
+        best = int(np.argmax(values))
+        if values[best] > max(self.value, _WORST):
+            self.best, self.value = np.array(unit[best]), float(values[best])
+        return values
+
     def run(self, algorithm: int, start: Array, evaluations: int, tolerance: float) -> str:
         opt = nlopt.opt(algorithm, len(start))
         opt.set_max_objective(self)
@@ -190,3 +247,10 @@ class _Search:
         except _ERRORS as error:
             return f"failed: {str(error) or type(error).__name__}"
         return _STATUS.get(opt.last_optimize_result(), "stopped")
+
+
+SEARCHES: dict[str, Callable[[_Search, int, int], None]] = {
+    "controlled random search": _controlled_random,
+    "differential evolution": _evolution,
+    "Gauss-Newton from the prior": _climbs,
+}

@@ -127,7 +127,7 @@ def _maximum(
     for p, moves in zip(linear.space.parameters, linear.moves, strict=True):
         reach = trust if moves else RUN_ITSELF
         middle = float(np.clip(centre[p.name], p.lower, p.upper))
-        if p.prior == "log-uniform":
+        if p.in_log:
             low, high = middle * np.exp(-reach), middle * np.exp(reach)
         else:
             low, high = middle - reach * (p.upper - p.lower), middle + reach * (p.upper - p.lower)

@@ -1,9 +1,9 @@
 """The posterior as a function: vectors in sampling coordinates in, log densities out.
 
-Sampling coordinates are log(theta) for a log-uniform parameter and theta itself for a uniform one. Each
-stated prior is then uniform between its transformed bounds (the Jacobian d theta / d log theta = theta
-cancels the 1/theta of the log-uniform density), so the prior of a vector is a constant in the box, and
-the most probable vector is the most likely one.
+Sampling coordinates are log(theta) for a log-uniform or log-normal parameter and theta itself for a uniform
+or normal one. A log-uniform prior is then uniform between its transformed bounds (the Jacobian
+d theta / d log theta = theta cancels the 1/theta of its density): without normal priors the prior of a vector
+is a constant in the box, and the most probable vector is the most likely one.
 """
 
 from __future__ import annotations
@@ -111,8 +111,8 @@ class LogPosterior:
         low, high = self.bounds
         out = np.full(len(vectors), -np.inf)
         inside = np.flatnonzero(np.all((vectors >= low) & (vectors <= high), axis=1))
-        log_prior = -float(np.sum(np.log(high - low)))
         for part in _chunks(inside):
+            log_prior = self.space.log_density(vectors[part])
             value = self.log_likelihood(self.from_sampling(vectors[part])) + log_prior
             out[part] = np.where(np.isnan(value), -np.inf, value)
         return out

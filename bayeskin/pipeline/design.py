@@ -77,24 +77,25 @@ def _work(run: Run) -> Mapping[str, Any]:
     if fine is not None:
         storage.save(run.at("design", "fine.h5"), fine)
     write_json(run.at("design", "waves.json"), records)
-    _draw(run, design, binned, records)
+    _draw(run, design, records)
     return {**_summary(design, records), **({} if fine is None else {"fine": _counts(fine)})}
 
 
 def _run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design, list[Mapping[str, Any]]]:
     """All waves of the configuration. Runs are kept by what they depend on, so none is made twice."""
-    spec, space, config = waves_spec(run), parameter_space(run.config, run.config_path), run.config.design
-    runs_file = _runs_file(run, spec, motion, binned.edges_s, space)
+    spec, config = waves_spec(run), run.config.design
+    space = parameter_space(run.config, run.config_path).box  # a surrogate learns all of it alike
+    file = runs_file(run, spec, motion, binned.edges_s, space)
     waves: list[Wave] = []
     for number, count in enumerate(config.points):
         drawn = run.at("design", f"wave-{number}.json")
         if not drawn.is_file():
-            wave = _draw_wave(run, number, count, space, binned, waves, runs_file)
+            wave = _draw_wave(run, number, count, space, binned, waves, file)
             write_json(drawn, {"theta": wave.theta, "held_out": wave.held_out, "record": wave.record})
         waves.append(_load_wave(drawn, space, number, run.config.seed))
         label = f"wave {number + 1} of {len(config.points)}"
-        _run_wave(run, label, runs_file, waves[-1], binned.edges_s, spec, motion)
-    return _rows_of(load_design(runs_file), waves), [wave.record for wave in waves]
+        _run_wave(run, label, file, waves[-1], binned.edges_s, spec, motion)
+    return rows_of(load_design(file), waves), [wave.record for wave in waves]
 
 
 def _run_fine(run: Run, design: Design, motion: PadMotion) -> Design:
@@ -102,12 +103,13 @@ def _run_fine(run: Run, design: Design, motion: PadMotion) -> Design:
     spec, config = model_spec(run), run.config.design
     inputs = Similarity(design.space).inputs(design.theta)
     wave = fine_wave(design, inputs, config.fine_points, config.fine_held_out, run.config.seed)
-    runs_file = _runs_file(run, spec, motion, design.edges_s, design.space)
-    _run_wave(run, "fine model", runs_file, wave, design.edges_s, spec, motion)
-    return _rows_of(load_design(runs_file), [wave])
+    file = runs_file(run, spec, motion, design.edges_s, design.space)
+    _run_wave(run, "fine model", file, wave, design.edges_s, spec, motion)
+    return rows_of(load_design(file), [wave])
 
 
-def _runs_file(run: Run, spec: ModelSpec, motion: PadMotion, edges_s: Array, space: ParameterSpace) -> Path:
+def runs_file(run: Run, spec: ModelSpec, motion: PadMotion, edges_s: Array, space: ParameterSpace) -> Path:
+    """Where all runs of one model on one protocol are kept."""
     identity = sha256_of([spec.hash, vars(motion), edges_s, [vars(p) for p in space.parameters]])
     return run.folder / "runs" / f"{identity[:16]}.h5"
 
@@ -141,7 +143,7 @@ def _draw_wave(
     config = run.config
     if not before:
         return first_wave(space, count, config.design.held_out, config.seed)
-    design, fitted = enough(_rows_of(load_design(runs_file), before)), fitted_bins(run, binned)
+    design, fitted = enough(rows_of(load_design(runs_file), before)), fitted_bins(run, binned)
     surrogate, _ = train(design, config.surrogate.kind, config.seed, focus(design, binned, fitted))
     floor_n = noise_floor_n(binned, fitted)
     wave = next_wave(
@@ -159,7 +161,7 @@ def _load_wave(path: Path, space: ParameterSpace, number: int, seed: int) -> Wav
     return Wave(space, np.array(stored["theta"], dtype=float), held_out, number, seed, stored["record"])
 
 
-def _rows_of(runs: Design, waves: Sequence[Wave]) -> Design:
+def rows_of(runs: Design, waves: Sequence[Wave]) -> Design:
     """The rows of `runs` at the waves' points, in the waves' order and with the waves' labels."""
     row_of = {theta.tobytes(): row for row, theta in enumerate(runs.theta)}
     points = np.concatenate([wave.theta for wave in waves])
@@ -203,15 +205,9 @@ def _counts(design: Design) -> dict[str, Any]:
     }
 
 
-def _draw(run: Run, design: Design, binned: BinnedForce, records: Sequence[Mapping[str, Any]]) -> None:
+def _draw(run: Run, design: Design, records: Sequence[Mapping[str, Any]]) -> None:
     kept = [record["kept_fraction"] for record in records]
-    first = design.force_n[design.ok & (design.wave == 0)]
-    figures = {
-        "waves": report.figure_waves(design, kept),
-        "prior_predictive": report.figure_prior_predictive(binned, first),
-    }
-    for name, figure in figures.items():
-        report.save_figure(figure, run.at("design", name), caption(run))
+    report.save_figure(report.figure_waves(design, kept), run.at("design", "waves"), caption(run))
 
 
 def _files(run: Run) -> Iterable[Path]:

@@ -1,4 +1,4 @@
-"""Sixth stage: Sobol' indices of the force over the prior, and near the most probable point."""
+"""Sixth stage: Sobol' indices of the force over the prior and near the maximum, shares over the posterior."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from bayeskin import report, storage
+from bayeskin import inference, report, storage
 from bayeskin.config import parameter_space
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.training import fine_design
 from bayeskin.sensitivity import SobolResult, sentence, sobol, uninformed
+from bayeskin.shapley import shapley
 from bayeskin.surrogates import correct, load_surrogate, train
 from bayeskin.types import Design, PadMotion, Parameter, ParameterSpace
 
+MOST_DRAWS, CHUNK = 2000, 256
 NEARBY = 0.1  # the article moves each parameter by 10 % of its calibrated value, either way
 
 
@@ -39,7 +41,34 @@ def _work(run: Run) -> Mapping[str, Any]:
     for name, result in results.items():
         storage.save(run.at("sobol", f"{name}.h5"), result)
         report.save_figure(_figure(result, motion), run.at("sobol", f"sobol_{name}"), caption(run))
-    return {name: _table(result) for name, result in results.items()}
+    tables = {name: _table(result) for name, result in results.items()}
+    return {**tables, "posterior": _over_posterior(run, rng)}
+
+
+def _over_posterior(run: Run, rng: np.random.Generator) -> dict[str, Any]:
+    """Shapley effects over posterior draws, whose parameters are correlated."""
+    space, draws = inference.draws_of(inference.load_inference_data(run.at("sample", "posterior.nc")))
+    refined = run.at("sample", "surrogate.h5")
+    surrogate = load_surrogate(refined if refined.is_file() else run.at("map", "surrogate.h5"))
+    material = ParameterSpace(space.parameters[: surrogate.space.dim])
+    few = draws[np.linspace(0, len(draws) - 1, min(MOST_DRAWS, len(draws))).astype(int), : material.dim]
+    force = np.concatenate([surrogate.predict(few[i : i + CHUNK]).mean for i in range(0, len(few), CHUNK)])
+    found = shapley(material, few, force, surrogate.edges_s, rng, "the posterior, its correlations included")
+    order = np.argsort(-np.nan_to_num(found.effects))
+    shares = [f"{found.names[j]} {100 * found.effects[j]:.0f} %" for j in order[:3]]
+    return {
+        "sentence": (
+            f"What the posterior leaves open of the force, {1e3 * np.sqrt(found.variance_n2):.2g} mN sd over "
+            f"time, is shared by {', '.join(shares)}."
+        ),
+        "method": "Shapley effects by nearest neighbours",
+        "distribution": found.distribution,
+        "samples": found.draws,
+        "shares": {
+            name: {"share": found.effects[j], "share_90": found.interval[:, j]}
+            for j, name in enumerate(found.names)
+        },
+    }
 
 
 def nearby(space: ParameterSpace, theta: Mapping[str, float]) -> ParameterSpace:
@@ -71,6 +100,13 @@ def _table(result: SobolResult) -> dict[str, Any]:
             }
             for i, name in enumerate(result.names)
         },
+        "pairs": {
+            f"{first}, {second}": {
+                "second": result.second_aggregated[i],
+                "second_90": result.second_aggregated_interval[:, i],
+            }
+            for i, (first, second) in enumerate(result.pairs)
+        },
     }
 
 
@@ -93,7 +129,7 @@ def _figure(result: SobolResult, motion: PadMotion) -> Any:
 STAGE = Stage(
     "sobol",
     "Sobol' indices of the force over time",
-    ("recording", "map"),
+    ("recording", "map", "sample"),
     ("seed", "sobol", "parameters", "design"),
     _work,
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,11 +12,10 @@ from bayeskin.inference import MapCheck, RefinedMap
 from bayeskin.model.simulate import simulate
 from bayeskin.pipeline.calibration import log_posterior_of, rmse_table
 from bayeskin.pipeline.engine import Run, Stage
-from bayeskin.pipeline.model import model_spec, waves_spec
+from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
-from bayeskin.pipeline.training import corrected, fine_design, trained
-from bayeskin.surrogates import load_manifest, load_surrogate, manifest_of, save_surrogate
-from bayeskin.types import Array, BinnedForce, Design, PadMotion, Simulation, Surrogate
+from bayeskin.pipeline.refining import Refining
+from bayeskin.types import Array, BinnedForce, PadMotion, Simulation
 
 
 class _FullModel:
@@ -45,61 +43,15 @@ class _FullModel:
         return simulation
 
 
-class _Retraining:
-    """The design with each checked point in it, and the surrogate trained, or corrected, again."""
-
-    def __init__(self, run: Run, binned: BinnedForce) -> None:
-        self.run, self.binned = run, binned
-        self.design = storage.load(run.at("design", "design.h5"), Design)
-        self.fine = fine_design(run, "design")
-        self.surrogate = load_surrogate(run.at("train", "surrogate.h5"))
-        self.manifest = load_manifest(run.at("train", "surrogate.h5"))
-
-    def __call__(self, theta: Mapping[str, float], simulation: Simulation) -> Surrogate:
-        self.run.reporter.log("map: the surrogate was off there; the point joins the design")
-        wave = simulation if self.fine is None else self._coarse(theta)
-        if wave.status == "ok":
-            self.design = _with_run(self.design, theta, wave)
-            self.surrogate, validation = trained(self.run, self.design, self.binned)
-        if self.fine is not None:
-            self.fine = _with_run(self.fine, theta, simulation)
-            self.surrogate, validation = corrected(self.run, self.surrogate, self.fine, self.binned)
-        self.manifest = {**self.manifest, **manifest_of(self.surrogate, validation)}
-        return self.surrogate
-
-    def _coarse(self, theta: Mapping[str, float]) -> Simulation:
-        """The waves' own model at the same point: their surrogate has to learn there too."""
-        motion = storage.load(self.run.at("recording", "motion.h5"), PadMotion)
-        return simulate(waves_spec(self.run), motion, theta)
-
-
-def _with_run(design: Design, theta: Mapping[str, float], simulation: Simulation) -> Design:
-    """The design with one more training row, a wave of its own."""
-    row = np.array([[theta[name] for name in design.space.names]])
-    return dataclasses.replace(
-        design,
-        theta=np.concatenate([design.theta, row]),
-        force_n=np.concatenate([design.force_n, simulation.bin_means(design.edges_s)[None]]),
-        wave=np.append(design.wave, design.wave.max() + 1),
-        held_out=np.append(design.held_out, False),
-        ok=np.append(design.ok, True),
-        messages=(*design.messages, simulation.message),
-        seconds=np.append(design.seconds, simulation.stats["seconds"]),
-    )
-
-
 def _find(run: Run) -> Mapping[str, Any]:
     config = run.config
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
-    retraining = _Retraining(run, binned)
+    refining = Refining(run, binned, "design", "train")
     refined = inference.refine_map(
-        log_posterior_of(run, retraining.surrogate, binned), _FullModel(run), retraining, config.seed,
+        log_posterior_of(run, refining.surrogate, binned), _FullModel(run), refining.retrain, config.seed,
         config.map.starts, config.map.evaluations,
     )  # fmt: skip
-    save_surrogate(run.at("map", "surrogate.h5"), retraining.surrogate, retraining.manifest)
-    storage.save(run.at("map", "design.h5"), retraining.design)
-    if retraining.fine is not None:
-        storage.save(run.at("map", "fine.h5"), retraining.fine)
+    refining.save("map")
     _draw_check(run, binned, refined)
     return {**_found(refined, binned), "polished": _polish(run, refined)}
 
@@ -127,6 +79,7 @@ def _found(refined: RefinedMap, binned: BinnedForce) -> dict[str, Any]:
         "theta": dict(best.theta),
         "log_posterior": best.value,
         "agreement": best.agreement,
+        "by_search": best.by_search,
         "message": best.message,
         "checks": [_checked(one) for one in refined.checks],
         "rmse_of_full_model": rmse_table(refined.log_posterior, _full_n(check, binned)) if full else None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from bayeskin import inference, report, storage
 from bayeskin.config import Config
 from bayeskin.inference import LogPosterior, Posterior, Verdict
 from bayeskin.pipeline.calibration import refined_posterior, rmse_table
+from bayeskin.pipeline.checking import Checked, checked_posterior, corrected_table, said_of, with_full_model
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import sha256_of, write_json
 from bayeskin.pipeline.model import model_spec
@@ -26,24 +27,48 @@ PREDICTIVE_DRAWS = 1000
 
 def _sample(run: Run) -> Mapping[str, Any]:
     config = run.config
-    log_posterior, best = refined_posterior(run), run.summary("map")["theta"]
-    chains = _chains_folder(run, log_posterior)
-    posterior = inference.sample(
-        log_posterior, chains, config.seed, best, _settings(config), partial(_tell_sampling, run)
-    )
+    best = run.summary("map")["theta"]
+    checked = checked_posterior(run, refined_posterior(run), partial(_draws_of, run, best))
+    log_posterior, posterior = checked.log_posterior, checked.posterior
     recording = storage.load(run.at("recording", "recording.h5"), Recording)
-    provenance = Provenance(
-        bayeskin.__version__, config.sha256, recording.sha256, model_spec(run).hash, config.seed,
-        {"surrogate": dict(log_posterior.surrogate.provenance)},
-    )  # fmt: skip
+    provenance = provenance_of(run, log_posterior, recording.sha256)
     rng = np.random.default_rng([config.seed, 1])
     idata = inference.to_inference_data(log_posterior, posterior, provenance, rng, PREDICTIVE_DRAWS)
     inference.save_inference_data(run.at("sample", "posterior.nc"), idata)
     drawn = inference.predictive_draws(log_posterior, _some(posterior), rng)
-    _draw_posterior(run, log_posterior, posterior, best, drawn)
+    profiles = inference.profiles(log_posterior, best)
+    _draw_posterior(run, checked, best, drawn, profiles)
     bands = inference.bands_of(log_posterior.binned.time_s, drawn)
     write_json(run.at("sample", "bands.json"), _history(log_posterior, bands))
-    return _sampled(log_posterior, posterior, bands)
+    return {**_sampled(checked, bands), "profiles": {one.name: _profiled(one) for one in profiles}}
+
+
+def _profiled(profile: inference.Profile) -> dict[str, Any]:
+    """A profile likelihood in a summary; an interval is open where the prior ends before the fit does."""
+    low, high = profile.interval
+    return {
+        "low_90": low, "high_90": high, "open_below": profile.open_below, "open_above": profile.open_above,
+        "flat": profile.flat, "values": profile.values, "drop_nats": profile.drop_nats,
+    }  # fmt: skip
+
+
+def provenance_of(run: Run, log_posterior: LogPosterior, recording_sha256: str) -> Provenance:
+    """What a posterior was made from, its configuration included."""
+    config = run.config
+    extra = {
+        "surrogate": dict(log_posterior.surrogate.provenance),
+        "config": config.model_dump(mode="json", exclude_none=True),
+    }
+    return Provenance(
+        bayeskin.__version__, config.sha256, recording_sha256, model_spec(run).hash, config.seed, extra
+    )
+
+
+def _draws_of(run: Run, best: Mapping[str, float], log_posterior: LogPosterior) -> Posterior:
+    """Draws of a posterior, from about its most probable point."""
+    folder = chains_folder(run, log_posterior)
+    settings, tell = settings_of(run.config), partial(_tell_sampling, run)
+    return inference.sample(log_posterior, folder, run.config.seed, best, settings, tell)
 
 
 def _history(log_posterior: LogPosterior, bands: inference.Bands) -> dict[str, Any]:
@@ -57,13 +82,13 @@ def _history(log_posterior: LogPosterior, bands: inference.Bands) -> dict[str, A
     }  # fmt: skip
 
 
-def _chains_folder(run: Run, log_posterior: LogPosterior) -> Path:
+def chains_folder(run: Run, log_posterior: LogPosterior) -> Path:
     """Where chains are kept by what they are of, so that a change of when to stop does not lose them."""
     identity = {**log_posterior.identity, "seed": run.config.seed, "walkers": run.config.sample.walkers}
     return run.folder / "chains" / sha256_of(identity)[:16]
 
 
-def _settings(config: Config) -> inference.SampleSettings:
+def settings_of(config: Config) -> inference.SampleSettings:
     limits = inference.Limits(effective_samples=float(config.sample.effective_samples))
     return inference.SampleSettings(
         config.sample.ensembles, config.sample.walkers, config.sample.max_steps, limits
@@ -74,20 +99,31 @@ def _tell_sampling(run: Run, share: float, text: str) -> None:
     run.reporter.progress("sampling", share, text)
 
 
-def _sampled(log_posterior: LogPosterior, posterior: Posterior, bands: inference.Bands) -> dict[str, Any]:
-    c = posterior.convergence
+def _sampled(checked: Checked, bands: inference.Bands) -> dict[str, Any]:
+    log_posterior, posterior, c = checked.log_posterior, checked.posterior, checked.posterior.convergence
     low, high = bands.interval(0.9)
     learned = inference.identifiability(posterior.space, posterior.flat)
-    verdict = with_surrogate_error(c.verdict, bands, log_posterior.chain.bins)
+    verdict = with_full_model(with_surrogate_error(c.verdict, bands, log_posterior.chain.bins), checked)
     return {
         "ok": verdict.trusted,
         "verdict": "trusted" if verdict.trusted else "not trusted",
         "reasons": list(verdict.reasons),
+        "remarks": list(inference.noise_remarks(learned)),
         "steps": c.steps,
         "draws": len(posterior.flat),
         "parameters": _table(posterior),
         "identifiability": [one.statement for one in learned.parameters],
         "ridges": [one.statement for one in learned.ridges],
+        "learned": {
+            one.name: {
+                "contraction": one.contraction,
+                "gain_nats": one.gain_nats,
+                "sentence": one.sentence,
+            }
+            for one in learned.parameters
+        },
+        "full_model": [said_of(one) for one in checked.rounds],
+        "corrected": corrected_table(checked),
         "rmse": rmse_table(log_posterior, bands.mean_n),
         "coverage_90": inference.coverage(log_posterior.binned, low, high),
         "coverage_90_fitted": inference.coverage(log_posterior.binned, low, high, log_posterior.fit_windows),
@@ -126,23 +162,27 @@ def _table(posterior: Posterior) -> dict[str, dict[str, Any]]:
         table[p.name] = {
             "meaning": p.description, "unit": p.unit, "mean": draws.mean(), "sd": draws.std(ddof=1),
             "median": median, "low_90": low, "high_90": high, "ess": c.ess[j], "rhat": c.rhat[j],
-            "prior": {"kind": p.prior, "lower": p.lower, "upper": p.upper},
+            "prior": {
+                "kind": p.prior, "lower": p.lower, "upper": p.upper, "source": p.source,
+                **({"centre": p.centre, "spread": p.spread} if p.peaked else {}),
+            },
         }  # fmt: skip
     return table
 
 
 def _draw_posterior(
     run: Run,
-    log_posterior: LogPosterior,
-    posterior: Posterior,
+    checked: Checked,
     best: Mapping[str, float],
     drawn: inference.ForceDraws,
+    profiles: Sequence[inference.Profile],
 ) -> None:
+    log_posterior, posterior = checked.log_posterior, checked.posterior
     binned = log_posterior.binned
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     fitted = np.isin(np.arange(len(binned.force_n)), log_posterior.chain.bins)
     convergence = posterior.convergence
-    whole = inference.load_chains(_chains_folder(run, log_posterior), log_posterior)
+    whole = inference.load_chains(chains_folder(run, log_posterior), log_posterior)
     kept = whole[: run.config.sample.ensembles, convergence.burn_in : convergence.steps]
     figures = {
         "posterior": report.figure_posterior(posterior.space, posterior.flat, best),
@@ -155,10 +195,15 @@ def _draw_posterior(
             noise_sd_n=drawn.noise_sd_n,
             force_n=drawn.force_n,
         ),
+        "profiles": report.figure_profiles(posterior.space, posterior.flat, profiles),
         "traces": report.figure_traces(
-            posterior.space, kept, convergence.verdict, _settings(run.config).limits
+            posterior.space, kept, convergence.verdict, settings_of(run.config).limits
         ),
     }
+    if checked.rounds:
+        weighed = checked.rounds[-1]
+        moved = inference.corrected(weighed, posterior.flat)
+        figures["model_check"] = report.figure_model_check(posterior.space, posterior.flat, weighed, moved)
     for name, figure in figures.items():
         report.save_figure(figure, run.at("sample", name), caption(run))
 
@@ -167,6 +212,6 @@ STAGE = Stage(
     "sample",
     "samples the posterior",
     ("recording", "map"),
-    ("seed", "sample", "fit", "noise", "parameters", "model"),
+    ("seed", "sample", "check", "fit", "noise", "parameters", "model", "surrogate", "design"),
     _sample,
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from bayeskin import report, storage
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.provenance import caption
 from bayeskin.recordings import (
+    NoiseAnalysis,
     analyse,
     bin_recording,
     describe_json,
@@ -21,7 +23,7 @@ from bayeskin.recordings import (
     summarise,
     uniform_edges,
 )
-from bayeskin.types import PadMotion, Phase, Recording
+from bayeskin.types import BinnedForce, PadMotion, Phase, Recording
 
 
 def pad_motion(
@@ -35,20 +37,35 @@ def pad_motion(
     return recorded_motion(recording, phases)
 
 
-def _work(run: Run) -> Mapping[str, Any]:
-    recording = read_recording(run.beside(run.config.recording.file))
+@dataclass(frozen=True)
+class Prepared:
+    """A recording as it is fitted."""
+
+    phases: Sequence[Phase]
+    analysis: NoiseAnalysis
+    motion: PadMotion
+    binned: BinnedForce
+
+
+def prepared(run: Run, recording: Recording) -> Prepared:
+    """Phases, noise, protocol and bins of a recording as the configuration asks for them."""
     phases = segment(recording)
     analysis = analyse(recording, phases)
     motion = pad_motion(run.config.model.observation, recording, phases, run.config.recording.protocol)
     covered_s = min(recording.time_s[-1], motion.time_s[-1])
     edges_s = uniform_edges(float(covered_s), run.config.fit.bin_width_s)
+    return Prepared(phases, analysis, motion, bin_recording(recording, phases, edges_s, analysis))
+
+
+def _work(run: Run) -> Mapping[str, Any]:
+    recording = read_recording(run.beside(run.config.recording.file))
+    made = prepared(run, recording)
     storage.save(run.at("recording", "recording.h5"), recording)
-    storage.save(run.at("recording", "motion.h5"), motion)
-    binned = bin_recording(recording, phases, edges_s, analysis)
-    storage.save(run.at("recording", "binned.h5"), binned)
-    figure = report.figure_recording(recording, binned)
+    storage.save(run.at("recording", "motion.h5"), made.motion)
+    storage.save(run.at("recording", "binned.h5"), made.binned)
+    figure = report.figure_recording(recording, made.binned)
     report.save_figure(figure, run.at("recording", "recording"), caption(run))
-    return describe_json(recording, phases, summarise(analysis, phases))
+    return describe_json(recording, made.phases, summarise(made.analysis, made.phases))
 
 
 def _files(run: Run) -> Iterable[Path]:

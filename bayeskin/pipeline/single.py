@@ -129,7 +129,7 @@ def _mechanisms(names: Sequence[str]) -> list[Mechanism]:
 
 
 def _refuse_senseless(parameter: Parameter, value: float) -> None:
-    positive = parameter.prior == "log-uniform" and parameter.offset == 0.0
+    positive = parameter.in_log and parameter.offset == 0.0
     if not np.isfinite(value) or (positive and value <= 0.0):
         expected = "a finite positive number" if positive else "a finite number"
         raise InputError(f"--set {parameter.name}", f"{value:g}", expected)

@@ -29,11 +29,15 @@ def _summarise(run: Run) -> Mapping[str, Any]:
         "ok": not doubts,
         "verdict": "not trusted" if doubts else "trusted",
         "because": doubts or list(sampled["reasons"]),
+        "remarks": list(sampled["remarks"]),
         "name": run.config.name,
         "recording": {key: said["recording"][key] for key in ("name", "sha256", "samples", "duration_s")},
         "model": {"observation": run.config.model.observation, "mesh": run.config.model.mesh},
         "posterior": sampled["parameters"],
         "identifiability": [*sampled["identifiability"], *sampled["ridges"]],
+        "learned": sampled["learned"],
+        "full_model_at_draws": sampled["full_model"],
+        "corrected": sampled["corrected"],
         "map": {
             "theta": found["theta"],
             "message": found["message"],
@@ -133,7 +137,9 @@ def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str
         "map": lambda: "\n".join(
             [said["message"], said["checks"][-1]["message"], *_polish(said["polished"])]
         ),
-        "sample": lambda: "\n".join([said["verdict"], *said["reasons"], *_table(said["parameters"])]),
+        "sample": lambda: "\n".join(
+            [said["verdict"], *said["reasons"], *said["remarks"], *_table(said["parameters"])]
+        ),
         "sobol": lambda: "\n".join(one["sentence"] for one in said.values()),
         "effects": lambda: "\n".join(effects.in_words(name, one) for name, one in said.items()),
     }
@@ -159,6 +165,7 @@ def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
             f"{said['name']}: {said['verdict']}: {'; '.join(said['because'])}",
             *_table(said["posterior"]),
             *said["identifiability"],
+            *said["remarks"],
             f"model at the most probable point: RMSE {', '.join(off)}",
             error["message"],
             f"outputs in {folder}, {sum(said['seconds'].values()):.0f} s in all",

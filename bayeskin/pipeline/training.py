@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from bayeskin import report, storage
+from bayeskin.config import parameter_space
 from bayeskin.pipeline.design import enough, fitted_bins, focus
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.provenance import caption
@@ -25,6 +26,8 @@ from bayeskin.surrogates import (
     train,
 )
 from bayeskin.types import Array, BinnedForce, Design, PadMotion
+
+PRIOR_DRAWS = 256
 
 
 def trained(run: Run, design: Design, binned: BinnedForce) -> tuple[ShapeSurrogate, Validation]:
@@ -81,6 +84,11 @@ def _draw(
         design.edges_s, truth, prediction, noise_sd_n, errors, corrected=fine is not None
     )
     report.save_figure(figure, run.at("train", "validation"), caption(run))
+    space = parameter_space(run.config, run.config_path)
+    unit = np.random.default_rng([run.config.seed, 3]).uniform(size=(PRIOR_DRAWS, space.dim))
+    drawn = surrogate.predict(np.clip(space.from_unit(unit), space.lower, space.upper)).mean
+    figure = report.figure_prior_predictive(binned, drawn)
+    report.save_figure(figure, run.at("train", "prior_predictive"), caption(run))
 
 
 def _errors_by_wave(run: Run, design: Design, binned: BinnedForce, held_out: Design, last_n: Array) -> Array:

@@ -1,5 +1,6 @@
 """Figures of every result, as PNG and SVG."""
 
+from bayeskin.report.check import figure_model_check
 from bayeskin.report.discrepancy import figure_discrepancy, figure_experiments
 from bayeskin.report.fields import SurfaceField, figure_fields
 from bayeskin.report.fit import figure_fit
@@ -12,6 +13,7 @@ from bayeskin.report.mismatch import (
 )
 from bayeskin.report.posterior import figure_posterior
 from bayeskin.report.prior import figure_prior_predictive
+from bayeskin.report.profiles import figure_profiles
 from bayeskin.report.proof import figure_proof
 from bayeskin.report.recording import figure_recording
 from bayeskin.report.save import save_figure
@@ -31,8 +33,10 @@ __all__ = [
     "figure_fit",
     "figure_located",
     "figure_map_check",
+    "figure_model_check",
     "figure_posterior",
     "figure_prior_predictive",
+    "figure_profiles",
     "figure_proof",
     "figure_recording",
     "figure_residual_by_phase",

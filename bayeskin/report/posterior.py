@@ -110,8 +110,7 @@ def _axis_range(parameter: Parameter, values: Array) -> Array:
 
 def _draw_marginal(ax: Axes, p: Parameter, values: Array, best: float, span: Array) -> None:
     ax.hist(values, bins=_BINS // 3, range=(span[0], span[1]), density=True, color=MODEL, alpha=0.45)
-    low, high = axis_values(p, [p.lower, p.upper])
-    ax.plot([low, low, high, high], np.array([0, 1, 1, 0]) / (high - low), color=GREY, lw=0.9, ls=(0, (4, 2)))
+    ax.plot(*_prior_outline(p), color=GREY, lw=0.9, ls=(0, (4, 2)))
     if np.isfinite(best):
         ax.axvline(best, color=ACCENT, lw=0.9)
     a, middle, b = np.quantile(values, [0.05, 0.5, 0.95])
@@ -123,6 +122,17 @@ def _draw_marginal(ax: Axes, p: Parameter, values: Array, best: float, span: Arr
     ax.set_ylim(bottom=0)
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
+
+
+def _prior_outline(p: Parameter) -> tuple[Array, Array]:
+    """The prior's density on the parameter's axis."""
+    low, high = axis_values(p, [p.lower, p.upper])
+    if not p.peaked:
+        return np.array([low, low, high, high]), np.array([0, 1, 1, 0]) / (high - low)
+    space = ParameterSpace((p,))
+    theta = space.box.from_unit(np.linspace(0.0, 1.0, 201)[:, None])
+    place = axis_values(p, theta[:, 0])
+    return place, np.gradient(space.to_unit(theta)[:, 0], place)
 
 
 def _draw_pair(ax: Axes, values: tuple[Array, Array], best: tuple[float, float],
@@ -161,8 +171,8 @@ def _finding(parameters: Sequence[Parameter], columns: Sequence[Array]) -> str:
     as_prior: list[str] = []
     informed: list[str] = []
     for p, values in zip(parameters, columns, strict=True):
-        low, high = axis_values(p, [p.lower, p.upper])
-        width = np.subtract(*np.quantile(values, [0.95, 0.05])) / (0.9 * (high - low))
+        low, high = axis_values(p, ParameterSpace((p,)).from_unit([[0.05], [0.95]])[:, 0])
+        width = np.subtract(*np.quantile(values, [0.95, 0.05])) / (high - low)
         (as_prior if width > _AS_PRIOR else informed).append(p.name)
     if not as_prior:
         return f"The recording narrows {list_symbols(informed)} against the prior"

@@ -150,7 +150,7 @@ def parameter_label(parameter: Parameter) -> str:
     space = " " if name.startswith("$") else "\n"  # words take a line of their own
     if len(name) > 12:
         name = name.replace(" ", space, 1)
-    if parameter.prior == "log-uniform":
+    if parameter.in_log:
         return f"log$_{{10}}$ {name}" + (f"{space}/ {unit}" if unit else "")
     power = _power(parameter)
     unit = " ".join(part for part in (unit_text(f"10^{power}") if power else "", unit) if part)
@@ -167,7 +167,7 @@ def parameter_colors(names: Sequence[str]) -> list[str]:
 def axis_values(parameter: Parameter, values: ArrayLike) -> Array:
     """Values of one parameter as they stand on its axis, the one that `parameter_label` names."""
     values = np.asarray(values, dtype=float)
-    return np.log10(values) if parameter.prior == "log-uniform" else values / 10.0 ** _power(parameter)
+    return np.log10(values) if parameter.in_log else values / 10.0 ** _power(parameter)
 
 
 def _power(parameter: Parameter) -> int:

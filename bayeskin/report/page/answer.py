@@ -44,7 +44,8 @@ def learnt(sentence: str) -> tuple[str, str]:
 def prior_range(said: Mapping[str, Any]) -> str:
     """The prior of one parameter of the stage `sample`'s table."""
     prior = said["prior"]
-    return f"{prior['kind']}, {interval(prior['lower'], prior['upper'], said['unit'])}"
+    about = f" about {quantity(prior['centre'], said['unit'])}" if prior["kind"].endswith("normal") else ""
+    return f"{prior['kind']}{about}, {interval(prior['lower'], prior['upper'], said['unit'])}"
 
 
 def _made(facts: RunFacts) -> list[Made]:
@@ -73,7 +74,7 @@ def _made(facts: RunFacts) -> list[Made]:
 
 def _bar(said: Mapping[str, Any]) -> Bar:
     prior = said["prior"]
-    line = math.log if prior["kind"] == "log-uniform" and prior["lower"] > 0 else float
+    line = math.log if prior["kind"].startswith("log") and prior["lower"] > 0 else float
     low, high = line(prior["lower"]), line(prior["upper"])
     left, median, right = (100.0 * (line(said[key]) - low) / (high - low) for key in _THREE)
     return Bar(round(left, 2), round(right - left, 2), round(median, 2))
@@ -103,7 +104,8 @@ def _sure(facts: RunFacts) -> Verdict:
     )
     lines = [*doubts, *(said["reasons"] if not said["ok"] else [])]
     lines += [] if lines else ["Chains, surrogate and the full model at the most probable point agree."]
-    return Verdict("trusted" if trusted else "not trusted", "good" if trusted else "doubt", [*lines, fit])
+    lines += [fit, *(f"{one[0].upper()}{one[1:]}." for one in said["remarks"])]
+    return Verdict("trusted" if trusted else "not trusted", "good" if trusted else "doubt", lines)
 
 
 def _missing(facts: RunFacts) -> Verdict:

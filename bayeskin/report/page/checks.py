@@ -17,6 +17,7 @@ def checks(facts: RunFacts) -> Section:
     parts = (
         ("Sampling", _convergence(facts, facts.said("sample"))),
         ("The full model where the posterior is highest", _full_model(facts, facts.said("map"))),
+        ("The full model at draws of the posterior", _at_draws(facts, facts.said("sample"))),
         ("The surrogate on runs held out", _held_out(facts, facts.said("train"))),
         ("The design", _design(facts, facts.said("design"))),
     )
@@ -68,6 +69,31 @@ def _full_model(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
     return [Text(lines), table, *pictures(facts, "map")]
 
 
+def _at_draws(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
+    if not said:
+        return absent(facts, "sample")
+    if not said["full_model"]:
+        return [Text(["No draw of the posterior was run by the full model (check.draws = 0)."])]
+    lines = [f"Round {i}: {one['message']}." for i, one in enumerate(said["full_model"], start=1)]
+    blocks: list[Block] = [Text(lines, listed=len(lines) > 1)]
+    if said["corrected"] is not None:
+        rows = [
+            row(
+                (
+                    name,
+                    cell(said["parameters"][name]["mean"], said["parameters"][name]["unit"]),
+                    cell(one["mean"], said["parameters"][name]["unit"]),
+                    cell(one["sd"], said["parameters"][name]["unit"]),
+                    Cell(f"{number(one['shift_sd'])} ± {number(one['shift_error_sd'])}", one["shift_sd"]),
+                )
+            )
+            for name, one in said["corrected"].items()
+        ]
+        head = ("parameter", "mean, surrogate", "mean, full model", "sd, full model", "shift in sd")
+        blocks.append(Table("The posterior by the full model's weights", head, rows, symbols=True))
+    return [*blocks, *pictures(facts, "sample", ["model_check"])]
+
+
 def _held_out(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
     if not said:
         return absent(facts, "train")
@@ -81,7 +107,7 @@ def _held_out(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
                 ("its own 90 % band holds", percent(said["coverage_90"])),
             ]
         ),
-        *pictures(facts, "train"),
+        *pictures(facts, "train", ["validation"]),
     ]
 
 

@@ -21,9 +21,9 @@ _KNOWN = {
         "Points at which the full model was run, by pairs of parameters; later waves lie where the recording "
         "has not ruled the force out.",
     ),
-    ("design", "prior_predictive"): (
+    ("train", "prior_predictive"): (
         "What the prior expects",
-        "Forces over time that the full model gives over the prior, with the recorded force among them.",
+        "Forces over time that the surrogate gives over the prior, with the recorded force among them.",
     ),
     ("train", "validation"): (
         "The surrogate on held-out runs",
@@ -43,7 +43,16 @@ _KNOWN = {
         "The posterior",
         "Marginal distributions of all parameters beside their priors, and pairs of them.",
     ),
+    ("sample", "profiles"): (
+        "Profile likelihoods",
+        "How well the recording can be fitted with one parameter held, over its prior, beside the posterior.",
+    ),
     ("sample", "traces"): ("The chains", "Traces of each parameter over the sampling's steps, by ensemble."),
+    ("sample", "model_check"): (
+        "The posterior by the full model",
+        "Weights that the full model gives draws of the posterior, and what they do to each parameter's mean "
+        "and sd.",
+    ),
     ("sobol", "sobol_prior_gp"): ("Over the prior, from the Gaussian process", f"{_SOBOL}, over the prior."),
     ("sobol", "sobol_prior_chaos"): ("Over the prior, from polynomial chaos", f"{_SOBOL}, over the prior."),
     ("sobol", "sobol_near_map"): (

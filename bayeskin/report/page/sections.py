@@ -22,6 +22,7 @@ _INDICES = {
     "prior_gp": "over the prior, Gaussian process",
     "prior_chaos": "over the prior, polynomial chaos",
     "near_map": "near the most probable point",
+    "posterior": "over the posterior",
 }
 
 
@@ -147,7 +148,32 @@ def posterior(facts: RunFacts) -> Section:
         blocks += [_parameters(facts, said["parameters"]), *pictures(facts, "sample", ["posterior"])]
         if said["ridges"]:
             blocks.insert(1, Text([f"{ridge}." for ridge in said["ridges"]], listed=True))
+        blocks += [*_taught(said), *pictures(facts, "sample", ["profiles"])]
+        sources = [f"{name}: {one['prior']['source']}." for name, one in said["parameters"].items()]
+        blocks.append(Folded("Where the priors come from", [Text(sources, listed=True)]))
+        blocks += pictures(facts, "train", ["prior_predictive"])
     return Section("posterior", "Posterior", blocks)
+
+
+def _taught(said: Mapping[str, Any]) -> list[Block]:
+    """What the test taught of each material parameter: in words, and by three measures."""
+    rows = []
+    for name, one in said["profiles"].items():
+        learned, unit = said["learned"][name], said["parameters"][name]["unit"]
+        fit = interval(one["low_90"], one["high_90"], unit) + (" (all of the prior)" if one["flat"] else "")
+        rows.append(
+            row(
+                (
+                    name,
+                    Cell(number(learned["contraction"]), learned["contraction"]),
+                    Cell(number(learned["gain_nats"]), learned["gain_nats"]),
+                    fit,
+                )
+            )
+        )
+    head = ("parameter", "contraction", "information gained [nats]", "90 % interval by the fit alone")
+    sentences = [said["learned"][name]["sentence"] for name in said["profiles"]]
+    return [Text(sentences, listed=True), Table("What the test taught", head, rows, symbols=True)]
 
 
 def _parameters(facts: RunFacts, table: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -170,13 +196,9 @@ def sobol(facts: RunFacts) -> Section:
     blocks: list[Block] = list(absent(facts, "sobol"))
     for name, one in said.items():
         title = _INDICES.get(name, name)
+        tables = [_shares(one)] if "shares" in one else _indices(one, title)
         blocks += [
-            Table(
-                f"Sobol' indices aggregated over time, {title}",
-                ("parameter", "first order", "90 % interval", "total", "90 % interval"),
-                [_index(parameter, index) for parameter, index in one["aggregated"].items()],
-                symbols=True,
-            ),
+            *tables,
             Text([one["sentence"]]),
             *pictures(facts, "sobol", [f"sobol_{name}"]),
             Folded(
@@ -186,12 +208,49 @@ def sobol(facts: RunFacts) -> Section:
     return Section("sobol", "Sobol' indices", blocks)
 
 
+def _indices(one: Mapping[str, Any], title: str) -> list[Block]:
+    """First order and total of each parameter, and second order of each pair."""
+    pairs = [
+        row((pair, Cell(_share(index["second"]), index["second"]), _between(index["second_90"])))
+        for pair, index in one["pairs"].items()
+    ]
+    return [
+        Table(
+            f"Sobol' indices aggregated over time, {title}; inputs {one['distribution']}",
+            ("parameter", "first order", "90 % interval", "total", "90 % interval"),
+            [_index(parameter, index) for parameter, index in one["aggregated"].items()],
+            symbols=True,
+        ),
+        Folded(
+            f"Pairs: {title}",
+            [Table(f"Second order, {title}", ("pair", "second order", "90 % interval"), pairs)],
+        ),
+    ]
+
+
+def _shares(one: Mapping[str, Any]) -> Table:
+    rows = [
+        row((name, Cell(percent(share["share"]), share["share"]), _between(share["share_90"])))
+        for name, share in one["shares"].items()
+    ]
+    return Table(
+        f"Shapley effects aggregated over time; inputs {one['distribution']}",
+        ("parameter", "share of the variance", "90 % interval"),
+        rows,
+        symbols=True,
+    )
+
+
 def _index(name: str, index: Mapping[str, Any]) -> tuple[Cell, ...]:
     cells: list[str | Cell] = [name]
     for kind in ("first", "total"):
-        low, high = index[f"{kind}_90"]
-        cells += [Cell(_share(index[kind]), index[kind]), Cell(f"{_share(low)} to {_share(high)}", low)]
+        cells += [Cell(_share(index[kind]), index[kind]), _between(index[f"{kind}_90"])]
     return row(cells)
+
+
+def _between(limits: Sequence[float | None]) -> Cell:
+    low, high = limits
+    return Cell(f"{_share(low)} to {_share(high)}", low)
 
 
 def _share(value: float | None) -> str:

@@ -1,0 +1,117 @@
+"""Profile likelihoods: how well the recording can be fitted with one parameter held, all others free.
+
+Where the profile is flat, no value of the parameter can be told from another by the fit, whatever the prior
+says (practical non-identifiability; Raue et al. 2009, Bioinformatics 25:1923). Noise parameters are free
+too. From the most probable point the held value moves to either end, each maximum from that of its
+neighbour by Gauss-Newton (`gauss_newton`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayeskin.inference.gauss_newton import gauss_newton
+from bayeskin.inference.problem import LogPosterior
+from bayeskin.inference.straighten import Shear, find_shear
+from bayeskin.types import Array, Parameter, ParameterSpace, _FreezesArrays
+
+DROP = 1.353  # nats below the top that 90 % of a chi-square of one degree of freedom lie within, halved
+_HELD = 1e-9  # width of what is left of a held parameter's prior, of its own
+_ROUNDS = 12
+
+
+@dataclass(frozen=True)
+class Profile(_FreezesArrays):
+    """One parameter: values (g,) in SI over its prior, and the log-likelihood (g,) less its largest.
+
+    interval: 90 % by the likelihood ratio, SI; an end at the prior's bound is open.
+    """
+
+    name: str
+    values: Array
+    drop_nats: Array
+    interval: tuple[float, float]
+    open_below: bool
+    open_above: bool
+
+    @property
+    def flat(self) -> bool:
+        """Whether the fit excludes no value of the prior."""
+        return self.open_below and self.open_above
+
+
+def profiles(log_posterior: LogPosterior, best: Mapping[str, float], points: int = 15) -> tuple[Profile, ...]:
+    """A profile for each material parameter, `points` values evenly over its prior and the best one.
+
+    best : all parameters (SI) of the most probable point
+    """
+    material = log_posterior.material or log_posterior.surrogate.space
+    log_posterior = replace(log_posterior, material=material.box)  # the fit's own word, no prior in it
+    shear, names = find_shear(log_posterior), material.names
+    return tuple(_profile(log_posterior, best, shear, j, points) for j in range(len(names)))
+
+
+def _profile(
+    log_posterior: LogPosterior, best: Mapping[str, float], shear: Shear | None, column: int, points: int
+) -> Profile:
+    low, high = (float(bound[column]) for bound in log_posterior.bounds)
+    start = log_posterior.vector(best)
+    line = np.sort(np.append(np.linspace(low, high, points), start[column]))
+    middle = int(np.searchsorted(line, start[column]))
+    last = len(line) - 1
+    value, found = np.full(len(line), -np.inf), np.tile(start, (len(line), 1))
+    value[middle], found[middle] = _held(log_posterior, start, shear, column)
+    # Out to both ends, then across and back: what one direction missed, the other may find.
+    paths = ((middle, last), (middle, 0), (0, last), (last, 0))
+    for first, end in paths:
+        for i in range(first, end, 1 if end > first else -1):
+            j = i + (1 if end > first else -1)
+            trial = found[i].copy()
+            trial[column] = line[j]
+            reached, point = _held(log_posterior, trial, shear, column)
+            if reached > value[j]:
+                value[j], found[j] = reached, point
+    drop = value - value.max()
+    inside = _crossings(line, drop)
+    ends = np.tile(start, (len(line) + 2, 1))
+    ends[:, column] = [*line, *inside]
+    theta = log_posterior.from_sampling(ends)[:, column]
+    open_ends = (bool(drop[0] > -DROP), bool(drop[-1] > -DROP))
+    name = log_posterior.names[column]
+    return Profile(name, theta[:-2], drop, (float(theta[-2]), float(theta[-1])), *open_ends)
+
+
+def _held(log_posterior: LogPosterior, at: Array, shear: Shear | None, column: int) -> tuple[float, Array]:
+    """Log-likelihood and point of the maximum near `at` (D,) that keeps one coordinate."""
+    space = log_posterior.material or log_posterior.surrogate.space
+    theta = log_posterior.from_sampling(at[None])[0, column]
+    parameters = list(space.parameters)
+    parameters[column] = _narrowed(parameters[column], float(theta))
+    held = replace(log_posterior, material=ParameterSpace(tuple(parameters)))
+    top = gauss_newton(held, at, shear, _ROUNDS)
+    value = float(log_posterior.log_likelihood(held.from_sampling(top.vector[None]))[0])
+    return value, np.clip(top.vector, *log_posterior.bounds)
+
+
+def _narrowed(parameter: Parameter, value: float) -> Parameter:
+    reach = _HELD * (abs(value) if parameter.in_log else parameter.upper - parameter.lower)
+    lower = min(max(value - reach, parameter.lower), parameter.upper - 2 * reach)
+    return replace(parameter, lower=lower, upper=lower + 2 * reach)
+
+
+def _crossings(line: Array, drop: Array) -> tuple[float, float]:
+    """Where the profile last crosses `DROP`, on either side; the line's end where it does not."""
+    within = np.flatnonzero(drop > -DROP)
+    first, last = int(within[0]), int(within[-1])
+
+    def between(inside: int, outside: int) -> float:
+        share = (drop[inside] + DROP) / (drop[inside] - drop[outside])
+        return float(line[inside] + share * (line[outside] - line[inside]))
+
+    return (
+        float(line[0]) if first == 0 else between(first, first - 1),
+        float(line[-1]) if last == len(line) - 1 else between(last, last + 1),
+    )

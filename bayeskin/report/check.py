@@ -1,0 +1,66 @@
+"""The surrogate's posterior beside the full model's, by draws that the full model ran again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from bayeskin.inference import Corrected, Weighed
+from bayeskin.report.style import (
+    ACCENT,
+    GREY,
+    MODEL,
+    PAGE_IN,
+    new_figure,
+    panel_title,
+    state_finding,
+    styled,
+    symbol,
+)
+from bayeskin.types import ParameterSpace
+
+
+@styled
+def figure_model_check(
+    space: ParameterSpace, draws: ArrayLike, weighed: Weighed, corrected: Sequence[Corrected]
+) -> Figure:
+    """Weights of the draws run again, and each parameter's posterior (draws (n, D) in SI) by them."""
+    figure = new_figure(PAGE_IN, 2.9)
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1.7))
+    count = len(weighed.weights)
+    left.bar(np.arange(1, count + 1), np.sort(weighed.weights)[::-1], color=MODEL, alpha=0.7, width=0.8)
+    left.axhline(1 / count, color=GREY, lw=0.8)
+    left.annotate(
+        "all alike", (1, 1 / count), xycoords=("axes fraction", "data"), xytext=(0, 2),
+        textcoords="offset points", ha="right", color=GREY, fontsize=6.5,
+    )  # fmt: skip
+    left.set(xlabel="draw, heaviest first", ylabel="weight")
+    panel_title(left, "a", "weights by the full model")
+    place = np.arange(len(corrected))
+    spread = np.asarray(draws, dtype=float).std(axis=0)
+    ratio = [one.sd / max(sd, np.finfo(float).tiny) for one, sd in zip(corrected, spread, strict=True)]
+    shift = [one.shift_sd for one in corrected]
+    right.errorbar(place - 0.12, np.zeros(len(place)), yerr=1.0, fmt="o", color=MODEL, label="surrogate")
+    right.errorbar(place + 0.12, shift, yerr=ratio, fmt="o", color=ACCENT, label="full model")
+    error = [one.shift_error_sd for one in corrected]
+    right.errorbar(place + 0.12, shift, yerr=error, fmt="none", color=ACCENT, elinewidth=3.0, alpha=0.5)
+    right.axhline(0.0, color=GREY, lw=0.8)
+    right.set_xticks(place, [symbol(one.name).replace(" ", "\n") for one in corrected])
+    right.set_ylabel("mean ± sd [sd of the surrogate's]")
+    right.set_ylim(top=1.25 * right.get_ylim()[1])
+    right.legend(loc="upper right", ncols=2)
+    panel_title(right, "b", "what the weights do to the posterior")
+    largest = max(corrected, key=lambda one: abs(one.shift_sd))
+    finding = (
+        f"By {count} full runs {weighed.effective:.0f} draws remain effective; "
+        f"{symbol(largest.name)} moves most, by {abs(largest.shift_sd):.2f} of its sd"
+    )
+    caption = (
+        "Thin bars: sd of the posterior; thick: standard error of the full model's mean, from so few draws. "
+        "Each in units of the sd of the surrogate's posterior, about its mean."
+    )
+    state_finding(figure, finding, caption)
+    return figure

@@ -1,0 +1,60 @@
+"""Profile likelihoods beside the posterior: what the fit alone excludes, and what the prior adds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from bayeskin.inference.profile import DROP, Profile
+from bayeskin.report.style import (
+    GREY,
+    MODEL,
+    PAGE_IN,
+    RECORDED,
+    axis_values,
+    list_symbols,
+    new_figure,
+    panel_title,
+    parameter_label,
+    state_finding,
+    styled,
+)
+from bayeskin.types import Array, Parameter, ParameterSpace
+
+_DEEPEST = 8.0  # nats shown
+
+
+@styled
+def figure_profiles(space: ParameterSpace, draws: ArrayLike, profiles: Sequence[Profile]) -> Figure:
+    """Each profile over its prior, with the posterior's 90 % interval, draws (n, D) in SI, under it."""
+    draws = np.atleast_2d(np.asarray(draws, dtype=float))
+    figure = new_figure(PAGE_IN, 2.5)
+    axes = np.atleast_1d(figure.subplots(1, len(profiles), sharey=True))
+    for letter, ax, profile in zip("abcdefgh", axes, profiles, strict=False):
+        column = space.names.index(profile.name)
+        _draw(ax, space.parameters[column], profile, draws[:, column])
+        panel_title(ax, letter)
+    axes[0].set(ylim=(-_DEEPEST, 0.6), ylabel="below the best fit [nats]")
+    flat = [one.name for one in profiles if one.flat]
+    finding = (
+        f"The fit excludes no value of {list_symbols(flat)}" if flat else "The fit bounds every parameter"
+    )
+    caption = (
+        "Black: best fit with the parameter held, all others and the noise free. Dashed: 1.35 nats below the "
+        "top, where its 90 % interval ends. Blue: 5 to 95 % of the posterior. The axes span the prior."
+    )
+    state_finding(figure, finding, caption)
+    return figure
+
+
+def _draw(ax: Axes, parameter: Parameter, profile: Profile, draws: Array) -> None:
+    low, high = axis_values(parameter, np.quantile(draws, [0.05, 0.95]))
+    ax.axvspan(low, high, color=MODEL, alpha=0.15, lw=0)
+    ax.plot(axis_values(parameter, profile.values), profile.drop_nats, ".-", color=RECORDED, ms=3, lw=0.9)
+    ax.axhline(-DROP, color=GREY, lw=0.8, ls=(0, (4, 2)))
+    ax.set_xlim(*axis_values(parameter, [parameter.lower, parameter.upper]))
+    ax.set_xlabel(parameter_label(parameter))

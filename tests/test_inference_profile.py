@@ -1,0 +1,52 @@
+"""Profile likelihoods: a parabola where the force is linear, flat where it does not know a parameter."""
+
+import numpy as np
+import pytest
+from toy_inference import NOISE, TRUTH, line_problem, toy_problem
+
+from bayeskin.inference import find_map, profiles
+from bayeskin.inference.profile import DROP
+
+
+def test_a_linear_models_profile_is_a_parabola_of_its_standard_error() -> None:
+    problem = line_problem()
+    best = find_map(problem, seed=0, starts=3, evaluations=2000).theta
+    x = problem.surrogate.columns
+    covariance = (2.5e-3 + 1e-6) * np.eye(40) + 1e-4 * np.outer(x[1], x[1])
+    spread = np.linalg.inv(x @ np.linalg.solve(covariance, x.T))
+    for j, found in enumerate(profiles(problem, best, points=201)):
+        exact = -0.5 * (found.values - best[found.name]) ** 2 / spread[j, j]
+        near = exact > -4.0  # further out the surrogate's error leaves its three sd
+        assert near.sum() > 4
+        np.testing.assert_allclose(found.drop_nats[near], exact[near], atol=0.02)
+        half = np.sqrt(2 * DROP * spread[j, j])
+        assert found.interval == pytest.approx(
+            (best[found.name] - half, best[found.name] + half), abs=0.1 * half
+        )
+        assert not found.flat
+
+
+def test_a_parameter_without_effect_has_a_flat_profile_and_one_with_effect_has_not() -> None:
+    problem = toy_problem()
+    best = find_map(problem, seed=1, starts=3, evaluations=2000).theta
+    found = {one.name: one for one in profiles(problem, best, points=9)}
+    assert found["p_init"].flat
+    assert np.ptp(found["p_init"].drop_nats) < 0.1
+    assert found["p_init"].interval == pytest.approx((-670.0, 2144.0))
+    assert not found["E_c"].open_above
+    for name in ("E_c", "k_s"):
+        low, high = found[name].interval
+        assert low <= TRUTH[name] <= high, name
+
+
+def test_a_profile_is_nowhere_above_the_maximum_and_tops_what_holds_the_rest() -> None:
+    problem = toy_problem()
+    best = find_map(problem, seed=1, starts=3, evaluations=2000).theta
+    top = problem.log_likelihood(np.array([list(best.values())]))[0]
+    found = profiles(problem, best, points=7)[0]
+    rows = np.tile([best[name] for name in problem.names], (len(found.values), 1))
+    rows[:, 0] = found.values
+    alone = problem.log_likelihood(rows) - top
+    assert np.all(found.drop_nats >= alone - 0.1)
+    assert found.drop_nats.max() == 0.0
+    assert set(NOISE) <= set(problem.names)

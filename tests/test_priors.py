@@ -1,0 +1,104 @@
+"""Normal priors, cut to their bounds: against SciPy, a conjugate posterior, and what a configuration says."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+from toy_inference import line_problem
+
+from bayeskin.config import load_config, parameter_space
+from bayeskin.errors import InputError
+from bayeskin.inference import identifiability
+from bayeskin.sensitivity import describe
+from bayeskin.types import Parameter, ParameterSpace
+
+SPACE = ParameterSpace(
+    (
+        Parameter("E", "Pa", 1e3, 1e6, "log-normal", centre=2e4, spread=np.log(3.0)),
+        Parameter("p", "Pa", -1.0, 4.0, "normal", centre=0.5, spread=2.0),
+        Parameter("k", "m^2", 1e-16, 1e-12, "log-uniform"),
+    )
+)
+
+
+def frozen(column: int):
+    """SciPy's law of a column on its line."""
+    centre, spread = (np.log(2e4), np.log(3.0)) if column == 0 else (0.5, 2.0)
+    low, high = (np.log(1e3), np.log(1e6)) if column == 0 else (-1.0, 4.0)
+    return stats.truncnorm((low - centre) / spread, (high - centre) / spread, centre, spread)
+
+
+def test_probabilities_and_densities_are_those_of_scipy():
+    unit = np.random.default_rng(0).uniform(size=(400, 3))
+    theta = SPACE.from_unit(unit)
+    assert SPACE.contains(np.clip(theta, SPACE.lower, SPACE.upper)).all()
+    np.testing.assert_allclose(SPACE.to_unit(theta), unit, atol=1e-9)
+    line = SPACE.to_line(theta)
+    np.testing.assert_allclose(line[:, 0], frozen(0).ppf(unit[:, 0]), rtol=1e-9)
+    np.testing.assert_allclose(line[:, 1], frozen(1).ppf(unit[:, 1]), atol=1e-9)
+    expected = frozen(0).logpdf(line[:, 0]) + frozen(1).logpdf(line[:, 1]) - np.log(np.log(1e4))
+    np.testing.assert_allclose(SPACE.log_density(line), expected, rtol=1e-9)
+    assert SPACE.from_unit([[0.0, 0.0, 0.0]]) == pytest.approx(SPACE.lower[None])
+    assert SPACE.from_unit([[1.0, 1.0, 1.0]]) == pytest.approx(SPACE.upper[None])
+
+
+def test_the_box_of_a_normal_prior_is_flat_and_a_flat_one_is_its_own():
+    assert [p.prior for p in SPACE.box.parameters] == ["log-uniform", "uniform", "log-uniform"]
+    assert SPACE.box.box == SPACE.box
+    np.testing.assert_array_equal(SPACE.box.lower, SPACE.lower)
+
+
+def test_a_normal_prior_gives_the_conjugate_posterior_of_a_line():
+    problem = line_problem()
+    x = problem.surrogate.columns
+    a, b = problem.surrogate.space.parameters
+    prior = dataclasses.replace(a, prior="normal", centre=0.0, spread=0.02)
+    informed = dataclasses.replace(problem, material=ParameterSpace((prior, b)))
+    covariance = (2.5e-3 + 1e-6) * np.eye(40) + 1e-4 * np.outer(x[1], x[1])
+    information = x @ np.linalg.solve(covariance, x.T) + np.diag([1 / 0.02**2, 0.0])
+    mean = np.linalg.solve(information, x @ np.linalg.solve(covariance, problem.binned.force_n))
+    offsets = 0.01 * np.random.default_rng(1).standard_normal((50, 2))
+    rest = np.tile(informed.bounds[0][2:], (50, 1))
+    found = informed.log_prob(np.column_stack([mean + offsets, rest]))
+    exact = -0.5 * np.einsum("ni,ij,nj->n", offsets, information, offsets)
+    np.testing.assert_allclose(found - found[0], exact - exact[0], atol=0.02)
+
+
+def test_draws_of_a_normal_prior_taught_nothing():
+    draws = SPACE.from_unit(np.random.default_rng(2).uniform(size=(4000, 3)))
+    for one in identifiability(SPACE, draws).parameters:
+        assert "does not inform" in one.statement
+        assert one.contraction == pytest.approx(0.0, abs=0.05)
+
+
+def test_the_distribution_stands_in_words():
+    assert "E log-normal about 20000 (1.09861) 1000 to 1e+06 Pa" in describe(SPACE)
+
+
+def written(where: Path, text: str) -> Path:
+    (where / "case.toml").write_text(f'[recording]\nfile = "r.h5"\n[parameters.E_c]\n{text}\n')
+    return where / "case.toml"
+
+
+def test_a_configuration_states_a_prior_and_its_source(tmp_path: Path):
+    text = 'prior = "log-normal"\nmedian = 60e3\nfactor = 2.0\nsource = "indentation of the same site"'
+    e_c = parameter_space(load_config(written(tmp_path, text))).parameters[0]
+    assert (e_c.prior, e_c.centre, e_c.spread) == ("log-normal", 60e3, np.log(2.0))
+    assert e_c.source == "indentation of the same site"
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('prior = "normal"\nmean = 1e5', "prior: found mean; expected mean and sd"),
+        ('prior = "log-normal"', "prior: found none of its numbers; expected factor and median"),
+        ("mean = 1e5\nsd = 1e4", "prior: found mean, sd; expected these with a normal prior only"),
+        ('prior = "normal"\nmean = 5e6\nsd = 1e4', "found a prior about 5e+06 Pa; expected 10000 to 2e+06"),
+    ],
+)
+def test_a_prior_without_its_numbers_is_refused(tmp_path: Path, text: str, says: str):
+    with pytest.raises(InputError) as caught:
+        load_config(written(tmp_path, text))
+    assert says in str(caught.value)

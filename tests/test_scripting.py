@@ -1,0 +1,142 @@
+"""bayeskin from a script: the documented blocks run, and give what a run gives."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import arviz as az
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+import bayeskin as bk
+from bayeskin.config import config_of, load_config, to_toml
+from bayeskin.errors import InputError
+from bayeskin.inference import draws_of
+from bayeskin.pipeline import diagnosis
+from bayeskin.types import Recording
+
+mpl.use("Agg")
+ROOT = Path(__file__).parents[1]
+BLOCKS = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "scripting.md").read_text(), re.M | re.S)
+
+
+@pytest.fixture(scope="module")
+def said() -> dict[str, Any]:
+    """The names that the documentation's blocks leave, run from the checkout's root."""
+    names: dict[str, Any] = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        for block in BLOCKS:
+            exec(compile(block, "docs/scripting.md", "exec"), names)
+    return names
+
+
+def test_the_first_block_is_a_posterior_in_fifteen_lines() -> None:
+    assert len([line for line in BLOCKS[0].splitlines() if line.strip()]) <= 15
+
+
+def test_the_documented_posterior_is_an_inference_data_of_the_recording(said: dict[str, Any]) -> None:
+    posterior, recording = said["posterior"], said["recording"]
+    assert {"posterior", "prior", "posterior_predictive", "log_likelihood"} <= set(posterior.groups())
+    assert posterior.attrs["recording_sha256"] == recording.sha256
+    space, draws = draws_of(posterior)
+    assert space.contains(draws).all()
+    peak = posterior["posterior_predictive"]["mean"].max(dim="time").mean().item()
+    assert peak == pytest.approx(recording.force_n.max(), rel=0.1)
+    assert set(json.loads(posterior.attrs["map"])) == set(space.names)
+
+
+def test_arviz_compares_the_documented_posteriors_by_phase(said: dict[str, Any]) -> None:
+    loo = az.loo(said["posterior"])
+    assert loo.n_data_points == posterior_phases(said)
+    order = list(az.compare({"shipped": said["posterior"], "stiff": said["stiff"]}).index)
+    assert order == ["shipped", "stiff"]  # the demo's subcutis has 15 kPa
+
+
+def posterior_phases(said: dict[str, Any]) -> int:
+    return said["posterior"]["log_likelihood"]["phases"].sizes["phase"]
+
+
+def test_settings_reach_the_posterior_and_its_provenance(said: dict[str, Any]) -> None:
+    assert said["stiff"]["posterior"]["E_s"].min() >= 50e3
+    config = json.loads(said["stiff"].attrs["provenance"])["config"]
+    assert config["parameters"]["E_s"]["lower"] == 50e3
+    assert (config["seed"], config["surrogate"]["file"]) == (2, "demo.h5")
+
+
+def test_the_full_model_weighs_the_documented_draws(said: dict[str, Any]) -> None:
+    assert said["run"].status == "ok"
+    weighed = said["weighed"]
+    assert len(weighed.theta) == 2
+    assert weighed.weights.sum() == pytest.approx(1.0)
+    assert np.isfinite(weighed.log_ratio).all()
+
+
+def test_a_folder_keeps_the_chains_and_the_same_call_repeats_the_draws(tmp_path: Path) -> None:
+    recording = bk.load_recording(ROOT / "data" / "demo.h5")
+    small = {
+        "sample": {"ensembles": 2, "walkers": 24, "max_steps": 60},
+        "map": {"starts": 1, "evaluations": 200},
+    }
+    one = bk.calibrate(recording, folder=tmp_path, **small)  # the shipped surrogate that knows the protocol
+    files = {f: f.stat().st_mtime_ns for f in tmp_path.rglob("ensemble_*.h5")}
+    again = bk.calibrate(recording, folder=tmp_path, **small)
+    assert len(files) == 2
+    assert files == {f: f.stat().st_mtime_ns for f in tmp_path.rglob("ensemble_*.h5")}
+    np.testing.assert_array_equal(draws_of(one)[1], draws_of(again)[1])
+
+
+def test_a_diagnosis_takes_the_posteriors_settings(
+    said: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked: list[Path] = []
+    monkeypatch.setattr(diagnosis, "diagnose", lambda source, reporter: asked.append(source) or {"ok": True})
+    assert bk.diagnose(said["recording"], said["stiff"], folder=tmp_path) == {"ok": True}
+    config = load_config(asked[0])
+    assert config.parameters["E_s"].lower == 50e3
+    assert config.surrogate.file == "demo.h5"
+    assert (asked[0].parent / config.recording.file).is_file()
+
+
+def test_wrong_input_is_one_line() -> None:
+    recording = bk.load_recording(ROOT / "data" / "demo.h5")
+    with pytest.raises(InputError, match=r"settings: sample.walker: found an unknown key"):
+        bk.calibrate(recording, "demo.h5", sample={"walker": 3})
+    with pytest.raises(InputError, match="theta: found E_x; expected some of E_c"):
+        bk.simulate(recording, {"E_x": 1.0})
+    time_s = np.linspace(0.0, 60.0, 601)
+    ramp = np.interp(time_s, [0, 10, 20, 40, 50, 60], [0, 0, 5e-3, 5e-3, 0, 0])
+    other = Recording(time_s, ramp, 40 * ramp, "other", "1" * 64)
+    with pytest.raises(InputError, match="no shipped surrogate"):
+        bk.calibrate(other)
+
+
+def test_a_posterior_of_another_recording_is_refused(said: dict[str, Any]) -> None:
+    time_s = np.linspace(0.0, 60.0, 601)
+    other = Recording(time_s, 1e-4 * time_s, 0.01 * time_s, "other", "1" * 64)
+    with pytest.raises(InputError, match="that of another recording than other"):
+        bk.check(other, said["posterior"])
+
+
+def test_a_configuration_written_out_reads_back_the_same(tmp_path: Path) -> None:
+    plain = {
+        "name": "case", "recording": {"file": 'a "b".h5'}, "fit": {"windows_s": [[0.0, 10.5], [20.0, 30.0]]},
+        "parameters": {"E_c": {"lower": 2e4}, "k_c": {"upper": 1e-13}}, "slurm": {"jobs": 3},
+    }  # fmt: skip
+    config = config_of(plain, "test")
+    (tmp_path / "case.toml").write_text(to_toml(config))
+    assert load_config(tmp_path / "case.toml") == config
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    code = "import sys, bayeskin; print([m for m in ('numpy', 'arviz', 'numba') if m in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = bk.nothing
