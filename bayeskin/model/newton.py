@@ -5,6 +5,9 @@ changes slowly along the protocol, whose cycles come back to where it was before
 under the place where it was made (`Equations.place`), and the nearest serves as approximate inverse,
 corrected by Broyden's rank-one updates (C. T. Kelley, Iterative Methods for Linear and Nonlinear
 Equations, SIAM 1995, section 7.3). When none contracts well, a new one is made.
+
+Past a fold of the equilibria there is no solution near the last one, and Newton's method finds none. A body
+then moves on by itself, and `NewtonSolver.relax` follows it to where it comes to rest.
 """
 
 from __future__ import annotations
@@ -25,6 +28,9 @@ DEAR = 8.0  # iterations left from which a factorisation, worth some twenty-five
 SMALLEST_DAMPING = 1 / 64
 SAME_PLACE = 0.2  # a factorisation this near to a new one is replaced by it
 EXTRAPOLATION_POINTS = 3
+COUNTED = ("iterations", "residuals", "factorisations", "solves", "falls")
+MOST_RELAXING, RELAXED = 250, 1e5  # steps of `relax`, and the length from which its drag is nothing
+ALLOWED_CONTRACTION, WANTED_CONTRACTION, MOST_GROWTH = 0.5, 0.25, 10.0
 
 
 @dataclass(frozen=True)
@@ -51,9 +57,7 @@ class NewtonSolver:
     """Carries the factorised tangent from solve to solve, and counts what was spent."""
 
     symmetric: bool = True  # the tangent nearly is, so its symmetric part is what is factorised
-    counts: dict[str, int] = field(
-        default_factory=lambda: {"iterations": 0, "residuals": 0, "factorisations": 0, "solves": 0}
-    )
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTED, 0))
     last_residual: float = np.nan
     _factors: Factorisations = field(init=False)
     _places: dict[int, Array] = field(default_factory=dict)  # number of a kept factorisation: its place
@@ -68,9 +72,14 @@ class NewtonSolver:
         self._factors.release()
         self._places.clear()
 
-    def renew(self, equations: Equations, x: Array) -> sp.csr_matrix:
-        """Factorises the tangent at x; returns its free-fixed part, for prescribed increments."""
+    def renew(self, equations: Equations, x: Array, drag: Array | None = None) -> sp.csr_matrix:
+        """Factorises the tangent at x, with `drag` (free,) added to its diagonal.
+
+        Returns its free-fixed part, for prescribed increments.
+        """
         free_free, free_fixed = equations.tangent(x)
+        if drag is not None:
+            free_free.setdiag(free_free.diagonal() + drag)
         self._current = self._number_for(equations.place)
         self._places[self._current] = equations.place
         self._factors.factorise(self._current, free_free, equations.scale)
@@ -138,6 +147,46 @@ class NewtonSolver:
             self.renew(equations, x)
             fresh = True
         return None
+
+    def relax(self, equations: Equations, x: Array, drag: Array) -> Array | None:
+        """Where x, whose fixed dofs are already right, comes to rest in a viscous medium; None if nowhere.
+
+        drag : (free,) resistance of each unknown to motion, in units of its stiffness; none of the pressures,
+        so that the energy of the step falls. Pseudo-transient continuation (Kelley & Keyes, SIAM J. Numer.
+        Anal. 35, 1998, 508): implicit Euler steps of one Newton iteration each, as long as that contracts.
+        They grow towards rest, and what is returned solves the equations without drag.
+        """
+        right = self._residual(equations, x)
+        if right is None:
+            return None
+        self.counts["falls"] += 1
+        length, growth = 1.0, MOST_GROWTH
+        for _ in range(MOST_RELAXING):
+            trial, after, contraction = self._crawl(equations, x, right, drag / length)
+            if after is None or not contraction < ALLOWED_CONTRACTION:
+                length, growth = 0.5 * length, 1.0
+                continue
+            x, right = trial, after
+            if length > RELAXED:
+                return self.solve(equations, x)
+            length *= float(np.clip(np.sqrt(WANTED_CONTRACTION / contraction), 0.5, growth))
+            growth = MOST_GROWTH
+        return None
+
+    def _crawl(
+        self, equations: Equations, x: Array, right: Array, drag: Array
+    ) -> tuple[Array, Array | None, float]:
+        """One step against drag: where to, the residual there, and the size of the next iteration to this."""
+        self.renew(equations, x, drag)
+        step = -self.back_substitute(right)
+        trial = x.copy()
+        trial[equations.free] += step
+        after = self._residual(equations, trial)
+        if after is None:
+            return trial, None, np.inf
+        rest = self.back_substitute(after + drag * step)
+        sizes = [float(np.linalg.norm(move * equations.weight)) for move in (rest, step)]
+        return trial, after, sizes[0] / max(sizes[1], np.finfo(float).tiny)
 
     def _residual(self, equations: Equations, x: Array) -> Array | None:
         self.counts["residuals"] += 1
