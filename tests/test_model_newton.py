@@ -1,4 +1,4 @@
-"""Nonlinear solves where Newton's own step goes too far."""
+"""Nonlinear solves where Newton's own step goes too far, or leads nowhere."""
 
 from __future__ import annotations
 
@@ -23,3 +23,29 @@ def test_a_step_that_does_not_contract_is_damped(start: float) -> None:
     found = NewtonSolver().solve(equations, np.array([start, 0.5 * start]))
     assert found is not None
     np.testing.assert_allclose(found, 0.0, atol=1e-7)
+
+
+def arch(load: float) -> Equations:
+    """Stationary points of x^4 / 12 - x^2 - load x + x p - p^2 / 2: a snapping arch with a pressure p = x.
+
+    Without p: x^3 / 3 = x + load. Folds: x = -1 at load 2 / 3 and x = 1 at load -2 / 3.
+    """
+    return Equations(
+        free=np.arange(2),
+        residual=lambda x: np.array([x[0] ** 3 / 3 - 2 * x[0] - load + x[1], x[0] - x[1]]),
+        tangent=lambda x: (sp.csr_matrix([[x[0] ** 2 - 2, 1.0], [1.0, -1.0]]), sp.csr_matrix((2, 0))),
+        weight=np.full(2, 1e8),
+        scale=np.ones(2),
+        place=np.zeros(1),
+    )
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_past_a_fold_a_fall_ends_in_the_next_equilibrium(side: float) -> None:
+    load, before = side * 0.7, np.full(2, side * -1.05)
+    assert NewtonSolver().solve(arch(load), before) is None
+    solver = NewtonSolver()
+    found = solver.relax(arch(load), before, np.array([1.0, 0.0]))
+    assert found is not None
+    np.testing.assert_allclose(found, side * max(np.roots([1 / 3, 0, -1, -0.7]).real), atol=1e-7)
+    assert solver.counts["falls"] == 1

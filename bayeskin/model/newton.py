@@ -29,7 +29,7 @@ SMALLEST_DAMPING = 1 / 64
 SAME_PLACE = 0.2  # a factorisation this near to a new one is replaced by it
 EXTRAPOLATION_POINTS = 3
 COUNTED = ("iterations", "residuals", "factorisations", "solves", "falls")
-MOST_RELAXING, RELAXED = 250, 1e5  # steps of `relax`, and the length from which its drag is nothing
+MOST_RELAXING, RELAXED = 250, 1e5  # steps of `relax`, and the length at which its drag is all but nothing
 ALLOWED_CONTRACTION, WANTED_CONTRACTION, MOST_GROWTH = 0.5, 0.25, 10.0
 
 
@@ -162,31 +162,33 @@ class NewtonSolver:
         self.counts["falls"] += 1
         length, growth = 1.0, MOST_GROWTH
         for _ in range(MOST_RELAXING):
-            trial, after, contraction = self._crawl(equations, x, right, drag / length)
+            trial, after, moved, contraction = self._crawl(equations, x, right, drag / length)
             if after is None or not contraction < ALLOWED_CONTRACTION:
                 length, growth = 0.5 * length, 1.0
                 continue
             x, right = trial, after
-            if length > RELAXED:
+            if length > RELAXED and moved < 1.0:
                 return self.solve(equations, x)
-            length *= float(np.clip(np.sqrt(WANTED_CONTRACTION / contraction), 0.5, growth))
-            growth = MOST_GROWTH
+            change = np.sqrt(WANTED_CONTRACTION / contraction) if contraction > 0.0 else growth
+            length, growth = length * float(np.clip(change, 0.5, growth)), MOST_GROWTH
         return None
 
     def _crawl(
         self, equations: Equations, x: Array, right: Array, drag: Array
-    ) -> tuple[Array, Array | None, float]:
-        """One step against drag: where to, the residual there, and the size of the next iteration to this."""
+    ) -> tuple[Array, Array | None, float, float]:
+        """One step against drag: where to, the residual there, its size in units of the tolerance, and that
+        of a second iteration relative to it, 0 of a step within the tolerance, which may be mere rounding.
+        """
         self.renew(equations, x, drag)
         step = -self.back_substitute(right)
         trial = x.copy()
         trial[equations.free] += step
-        after = self._residual(equations, trial)
-        if after is None:
-            return trial, None, np.inf
+        after, moved = self._residual(equations, trial), float(np.abs(step * equations.weight).max())
+        if after is None or moved < 1.0:
+            return trial, after, moved, 0.0
         rest = self.back_substitute(after + drag * step)
         sizes = [float(np.linalg.norm(move * equations.weight)) for move in (rest, step)]
-        return trial, after, sizes[0] / max(sizes[1], np.finfo(float).tiny)
+        return trial, after, moved, sizes[0] / sizes[1]
 
     def _residual(self, equations: Equations, x: Array) -> Array | None:
         self.counts["residuals"] += 1
