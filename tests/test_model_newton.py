@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
+from bayeskin.model.lagrangian import LagrangianModel, integrate
+from bayeskin.model.mesh import layered_mesh
 from bayeskin.model.newton import Equations, NewtonSolver
+from bayeskin.model.problem import build_problem, material
+from bayeskin.types import PadMotion
 
 
 @pytest.mark.parametrize("start", [1.0, 3.0, -40.0])
@@ -49,3 +53,22 @@ def test_past_a_fold_a_fall_ends_in_the_next_equilibrium(side: float) -> None:
     assert found is not None
     np.testing.assert_allclose(found, side * max(np.roots([1 / 3, 0, -1, -0.7]).real), atol=1e-7)
     assert solver.counts["falls"] == 1
+
+
+def test_a_soft_cutis_on_a_stiff_subcutis_folds_and_the_run_goes_on() -> None:
+    """Beyond the guard it snaps; before and after the skin's reactions along x are in equilibrium."""
+    beyond_guard = (36.5, 38.0, 41.0, 46.0, 60.0, 105.0)  # finer than the project's bricks, so that it folds
+    x = (0.0, 9.0, 18.0, 26.0, 27.0, 33.0, 35.0, *beyond_guard)
+    lines = [1e-3 * np.array(axis) for axis in (x, (0.0, 4.0, 5.0, 12.0, 18.0, 84.0), (0.0, 8.0, 10.0))]
+    problem = build_problem(layered_mesh(lines, "coarse bricks"))
+    theta = {"E_c": 2.3e5, "E_s": 2.24e8, "k_c": 1.4e-16, "k_s": 2.5e-13}
+    motion = PadMotion(np.array([0.0, 9.4]), np.array([0.0, 6.7e-3]))
+    model, steps = LagrangianModel(problem, material(theta, problem.mesh.cutis), motion), []
+    assert integrate(model, 700.0, 1e-3, steps.append) == ""
+    assert steps[-1].state.time_s == pytest.approx(9.4)
+    assert model.solver.counts["falls"] >= 1
+    supports = 3 * np.union1d(problem.pads, problem.space.facet_nodes("symmetry_x"))
+    for step in steps[1:]:
+        assert step.state.volume.min() > 0.5
+        assert abs(step.stages[-1].residual[supports].sum()) < 5e-4 * step.force_n
+    model.solver.release()

@@ -29,8 +29,8 @@ SMALLEST_DAMPING = 1 / 64
 SAME_PLACE = 0.2  # a factorisation this near to a new one is replaced by it
 EXTRAPOLATION_POINTS = 3
 COUNTED = ("iterations", "residuals", "factorisations", "solves", "falls")
-MOST_RELAXING, RELAXED = 250, 1e5  # steps of `relax`, and the length at which its drag is all but nothing
-ALLOWED_CONTRACTION, WANTED_CONTRACTION, MOST_GROWTH = 0.5, 0.25, 10.0
+MOST_RELAXING, RELAXED = 400, 1e5  # steps of `relax`, and the length at which its drag is all but nothing
+ALLOWED_CONTRACTION, WANTED_CONTRACTION, MOST_GROWTH = 0.8, 0.25, 10.0
 
 
 @dataclass(frozen=True)
