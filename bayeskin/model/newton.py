@@ -139,11 +139,9 @@ class NewtonSolver:
             x_new, converged = self._broyden(equations, x, fresh)
             if converged:
                 return x_new
-            if x_new is None and fresh:
+            if x_new is None and (fresh or self._residual(equations, x) is None):
                 return None
             x = x if x_new is None else x_new
-            if self._residual(equations, x) is None:
-                return None
             self.renew(equations, x)
             fresh = True
         return None
@@ -199,7 +197,7 @@ class NewtonSolver:
         right = self._residual(equations, x)
         if right is None:
             return None, False
-        steps = [-self.back_substitute(right) * equations.weight]  # in units of the tolerance
+        steps = [self._newton_step(equations, right)]
         sizes: list[float] = []
         free = equations.free
         for iteration in range(MAX_BROYDEN):
@@ -209,8 +207,10 @@ class NewtonSolver:
                 return (x if fresh else None), False
             trial = x.copy()
             trial[free] += steps[-1] / equations.weight
-            right = self._residual(equations, trial)
-            if right is None or (fresh and iteration == 0 and self._grows(equations, steps[0], right)):
+            right, after = self._residual(equations, trial), None
+            if right is not None and fresh and iteration == 0:
+                after = self._newton_step(equations, right)
+            if right is None or (after is not None and not _shorter(after, steps[0])):
                 return (self._damped(equations, x, steps[-1]) if fresh else None), False
             x = trial
             if size < 1.0:
@@ -219,22 +219,14 @@ class NewtonSolver:
             if iteration > 1 and _iterations_left(size, sizes) > DEAR:
                 return x, False
             sizes.append(size)
-            steps.append(self._updated_step(equations, steps, right))
+            steps.append(
+                _updated_step(steps, self._newton_step(equations, right) if after is None else after)
+            )
         return x, False
 
-    def _updated_step(self, equations: Equations, steps: list[Array], right: Array) -> Array:
-        """Next step from the history of steps (Kelley's matrix-free form of Broyden's update)."""
-        z = -self.back_substitute(right) * equations.weight
-        for old, new in pairwise(steps):
-            z += new * (old @ z) / (old @ old)
-        last = steps[-1]
-        return z / (1.0 - (last @ z) / (last @ last))
-
-    def _grows(self, equations: Equations, step: Array, right: Array, damping: float = 1.0) -> bool:
-        """Whether the same tangent asks for a longer step after this one than before it."""
-        after = -self.back_substitute(right) * equations.weight
-        allowed = (1.0 - 0.25 * damping) if damping < 1.0 else 1.0
-        return not float(np.linalg.norm(after)) <= allowed * float(np.linalg.norm(step))
+    def _newton_step(self, equations: Equations, right: Array) -> Array:
+        """By the tangent factorised or taken last, (free,) in units of the tolerance."""
+        return -self.back_substitute(right) * equations.weight
 
     def _damped(self, equations: Equations, x: Array, step: Array) -> Array | None:
         """The first of x + step/2, /4, ... after which cells are upright and steps shorter, or None.
@@ -247,10 +239,25 @@ class NewtonSolver:
             trial = x.copy()
             trial[equations.free] += damping * step / equations.weight
             right = self._residual(equations, trial)
-            if right is not None and not self._grows(equations, step, right, damping):
+            if right is not None and _shorter(
+                self._newton_step(equations, right), step, 1.0 - 0.25 * damping
+            ):
                 return trial
             damping *= 0.5
         return None
+
+
+def _shorter(after: Array, before: Array, allowed: float = 1.0) -> bool:
+    """Whether one tangent asks for a step after the last one that is at most `allowed` of it."""
+    return float(np.linalg.norm(after)) <= allowed * float(np.linalg.norm(before))
+
+
+def _updated_step(steps: list[Array], z: Array) -> Array:
+    """Next step from the history and the kept tangent's own, z (Kelley's matrix-free form of Broyden's)."""
+    for old, new in pairwise(steps):
+        z = z + new * (old @ z) / (old @ old)
+    last = steps[-1]
+    return z / (1.0 - (last @ z) / (last @ last))
 
 
 def _iterations_left(size: float, before: list[float]) -> float:
