@@ -51,7 +51,19 @@ NAMES = default_space().names
 ROWS = rows.Rows(
     rows.RESULTS / "robustness.csv",
     ("protocol", "box", "seed", "index", "model_hash"),
-    (*NAMES, "status", "finite", "peak_n", "end_s", "steps", "factorisations", "cpu_s", "code", "message"),
+    (
+        *NAMES,
+        "status",
+        "finite",
+        "peak_n",
+        "end_s",
+        "steps",
+        "factorisations",
+        "falls",
+        "cpu_s",
+        "code",
+        "message",
+    ),
 )
 Item = dict[str, Any]
 
@@ -91,6 +103,7 @@ def perform(item: Item) -> Item:
         "end_s": float(found.time_s[-1]),
         "steps": int(found.stats["steps"]),
         "factorisations": int(found.stats["factorisations"]),
+        "falls": int(found.stats["falls"]),
         "cpu_s": time.process_time() - started,
         "code": rows.CODE,
         "message": found.message,
@@ -107,7 +120,7 @@ def _compile() -> None:
 def _no_run(status: str, message: str, cpu_s: float) -> Item:
     return {
         "status": status, "finite": False, "peak_n": np.nan, "end_s": np.nan, "steps": 0, "factorisations": 0,
-        "cpu_s": cpu_s, "code": rows.CODE, "message": message,
+        "falls": 0, "cpu_s": cpu_s, "code": rows.CODE, "message": message,
     }  # fmt: skip
 
 
@@ -125,7 +138,7 @@ def run_all(items: Sequence[Item], table: rows.Rows, workers: int) -> list[rows.
 
 
 def summary(found: dict[str, list[rows.Row]]) -> str:
-    header = ["box", "runs", "finished", "failed", "with NaN or infinite force"]
+    header = ["box", "runs", "finished", "failed", "with NaN or infinite force", "finished after falls"]
     header += ["CPU s a run: median", "95 %", "largest"]
     lines = []
     for box, its in found.items():
@@ -133,7 +146,10 @@ def summary(found: dict[str, list[rows.Row]]) -> str:
         seconds = np.array([float(r["cpu_s"]) for r in its])
         spread = [np.nanmedian(seconds), np.nanquantile(seconds, 0.95), np.nanmax(seconds)]
         bad = sum(r["finite"] != "True" for r in its)
-        lines.append([box, *map(str, (len(its), ok, len(its) - ok, bad)), *(f"{s:.2f}" for s in spread)])
+        fell = sum(r["status"] == "ok" and int(r["falls"]) > 0 for r in its)
+        lines.append(
+            [box, *map(str, (len(its), ok, len(its) - ok, bad, fell)), *(f"{s:.2f}" for s in spread)]
+        )
     return rows.markdown(header, lines)
 
 
@@ -209,10 +225,11 @@ def main() -> None:
         "seed": asked.seed,
         "model_hash": ModelSpec().hash,
     }
+    drawn = {box: points(space, asked.n, asked.seed) for box, space in boxes().items()}
     items = [
         {**same, "box": box, "index": index, **theta}
-        for box, space in boxes().items()
-        for index, theta in enumerate(points(space, asked.n, asked.seed))
+        for index, both in enumerate(zip(*drawn.values(), strict=True))  # a partial count has some of each
+        for box, theta in zip(drawn, both, strict=True)
     ]
     done = run_all(items, table, asked.workers)
     rows.warn_of_mixed_code(done)

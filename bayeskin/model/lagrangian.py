@@ -7,12 +7,16 @@ formula of second order (Hairer, Norsett & Wanner, Solving Ordinary Differential
 goes on with half of the solves. Either is one solve of J - J* ... = h* div(...) with its own history J*, p*
 and length h*. The local error of the fluid mass, filtered through the tangent (Hosea & Shampine 1996), gives
 an error of the force in newtons, which steers the step.
+
+A soft cutis on a stiff subcutis folds, and snaps from one equilibrium to another. A step that fails at the
+smallest length is taken as such a fall (`NewtonSolver.relax`), and the phase starts anew after it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +37,7 @@ from bayeskin.types import Array, PadMotion
 SMALLEST_MOTION_M = 1e-4  # so that a protocol without motion has a scale too
 GAMMA = 1.0 - np.sqrt(0.5)
 FIRST_STEP_S = 1.0
-SHORTEST_STEP = 1e-3  # of the phase; a run that asks for less has failed
+SHORTEST_STEP = 1e-3  # of the phase; what asks for less is a fall, or has failed
 GROWTH, SHRINK = 2.0, 0.25  # zero-stable while steps grow less than 2.41-fold
 STEPS_PER_PHASE = 5  # fewer, longer ones cost as much: their guesses are worse, their tangents further apart
 CUTIS_THICKNESS_M, SUBCUTIS_THICKNESS_M = 2e-3, 8e-3
@@ -131,6 +135,8 @@ class LagrangianModel:
 
     def remember_travel(self, past: list[State]) -> None:
         """Keeps how the unknowns went with the pads, to guess how they set out again."""
+        if len(past) < 2:
+            return
         way_m = self._pad_of(past[-1]) - self._pad_of(past[-2])
         if abs(way_m) > 1e-3 * self.problem_scale(np.zeros(1)):
             self._travel = (past[-1].x - past[-2].x) / way_m
@@ -249,6 +255,14 @@ class LagrangianModel:
             np.array([np.log2(h), self.pad_displacement(old.time_s) / size_u]),
         )
 
+    @cached_property
+    def _drag(self) -> Array:
+        """What holds a body back as it falls (free,): the diagonal of the vector Laplacian, times mu."""
+        s = self.problem.space
+        drag, per_cell = np.zeros((s.n_nodes, 3)), np.einsum("eq,eqia->ea", s.weight, s.grad_u**2)
+        np.add.at(drag, s.nodes_u, (self.material.mu[:, None] * per_cell)[..., None])
+        return np.concatenate([drag.ravel(), np.zeros(s.n_corners)])[self.problem.pattern.free]
+
     def nominal_force(self) -> float:
         """Scale of the force [N]: both layers pulled over the pad's width from the plane x = 0."""
         young = self.material.mu * (3 * self.material.lam + 2 * self.material.mu)
@@ -270,10 +284,12 @@ class LagrangianModel:
         sources: tuple[tuple[float, State], ...],
         guess: Array,
         jump: bool,
+        fall: bool = False,
     ) -> Stage | None:
         """One implicit equation for time_s; `jump`: the guess knows nothing of the pads' motion.
 
-        The last source's unknowns are where the pads have been.
+        The last source's unknowns are where the pads have been. `fall`: solved for where the guess comes to
+        rest, which may be far from it.
         """
         last = sources[-1][1]
         old = State(
@@ -286,7 +302,11 @@ class LagrangianModel:
         )
         equations = self.equations(length_s, old, time_s - old.time_s)
         lost_m = sum(float(memory[0]) for memory in old.lost)
-        x = self._solve(equations, old, guess, self.pad_displacement(time_s, lost_m), jump)
+        pad_m = self.pad_displacement(time_s, lost_m)
+        if fall:
+            x = self.solver.relax(equations, self.problem.prescribe(guess, pad_m), self._drag)
+        else:
+            x = self._solve(equations, old, guess, pad_m, jump)
         lost = old.lost
         if self._series and time_s > self.starts_s + 1e-9:
             x, lost = self._solve_in_series(equations, old, x, time_s, lost_m)
@@ -401,6 +421,16 @@ def _backward_difference(model: LagrangianModel, past: list[State], h: float) ->
     return model.finish((stage,), mass)
 
 
+def _fall(model: LagrangianModel, state: State, h: float) -> Step | None:
+    """A step across a fold of the equilibria, of backward Euler, which extrapolates no jump.
+
+    As error of the fluid mass all that moves is taken, since nothing tells which part of it is right.
+    """
+    sources = ((1.0, state),)
+    stage = model.solve_stage(state.time_s + h, h, sources, state.x, jump=False, fall=True)
+    return None if stage is None else model.finish((stage,), stage.state.volume - state.volume)
+
+
 def _guess(past: list[State], time_s: float) -> Array:
     return extrapolate([(state.time_s, state.x) for state in past], time_s)
 
@@ -423,20 +453,23 @@ def integrate(
         past, h = [state], min(FIRST_STEP_S, 0.5 * (end - start))
         longest, shortest = (end - start) / STEPS_PER_PHASE, SHORTEST_STEP * (end - start)
         while state.time_s < end - 1e-9:
-            h = _landing(h, end - state.time_s, longest)
+            h = _landing(max(h, shortest), end - state.time_s, longest)
             step = advance(model, past, h)
-            excess = step.error_n / allowed_n if step else np.inf
-            if step is None or (excess > 1.0 and h > shortest):
-                h *= 0.5 if step is None else max(SHRINK, 0.9 / np.sqrt(excess))
-                past = past if step else [state]
-                if h < shortest:
+            falls = step is None and h <= shortest
+            if falls:
+                step = _fall(model, state, h)
+                if step is None:
                     return (
                         f"step {count + 1} at t = {state.time_s:.3f} s did not converge down to "
                         f"{shortest:.2g} s; try a finer mesh or parameters nearer to a skin's"
                     )
+            excess = step.error_n / allowed_n if step else np.inf
+            if step is None or (excess > 1.0 and h > shortest):
+                h *= 0.5 if step is None else max(SHRINK, 0.9 / np.sqrt(excess))
+                past = past if step else [state]
                 continue
             state, count = step.state, count + 1
-            past = [*past, state][-EXTRAPOLATION_POINTS:]
+            past = [state] if falls else [*past, state][-EXTRAPOLATION_POINTS:]
             on_step(replace(step, corner=abs(state.time_s - end) < 1e-9))
             h *= min(GROWTH, 0.9 / np.sqrt(max(excess, 1e-6)))
         model.remember_travel(past)

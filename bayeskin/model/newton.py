@@ -5,6 +5,9 @@ changes slowly along the protocol, whose cycles come back to where it was before
 under the place where it was made (`Equations.place`), and the nearest serves as approximate inverse,
 corrected by Broyden's rank-one updates (C. T. Kelley, Iterative Methods for Linear and Nonlinear
 Equations, SIAM 1995, section 7.3). When none contracts well, a new one is made.
+
+Past a fold of the equilibria there is no solution near the last one, and Newton's method finds none. A body
+then moves on by itself, and `NewtonSolver.relax` follows it to where it comes to rest.
 """
 
 from __future__ import annotations
@@ -25,6 +28,9 @@ DEAR = 8.0  # iterations left from which a factorisation, worth some twenty-five
 SMALLEST_DAMPING = 1 / 64
 SAME_PLACE = 0.2  # a factorisation this near to a new one is replaced by it
 EXTRAPOLATION_POINTS = 3
+COUNTED = ("iterations", "residuals", "factorisations", "solves", "falls")
+MOST_RELAXING, RELAXED = 400, 1e5  # steps of `relax`, and the length at which its drag is all but nothing
+ALLOWED_CONTRACTION, WANTED_CONTRACTION, MOST_GROWTH = 0.8, 0.25, 10.0
 
 
 @dataclass(frozen=True)
@@ -51,9 +57,7 @@ class NewtonSolver:
     """Carries the factorised tangent from solve to solve, and counts what was spent."""
 
     symmetric: bool = True  # the tangent nearly is, so its symmetric part is what is factorised
-    counts: dict[str, int] = field(
-        default_factory=lambda: {"iterations": 0, "residuals": 0, "factorisations": 0, "solves": 0}
-    )
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTED, 0))
     last_residual: float = np.nan
     _factors: Factorisations = field(init=False)
     _places: dict[int, Array] = field(default_factory=dict)  # number of a kept factorisation: its place
@@ -68,9 +72,14 @@ class NewtonSolver:
         self._factors.release()
         self._places.clear()
 
-    def renew(self, equations: Equations, x: Array) -> sp.csr_matrix:
-        """Factorises the tangent at x; returns its free-fixed part, for prescribed increments."""
+    def renew(self, equations: Equations, x: Array, drag: Array | None = None) -> sp.csr_matrix:
+        """Factorises the tangent at x, with `drag` (free,) added to its diagonal.
+
+        Returns its free-fixed part, for prescribed increments.
+        """
         free_free, free_fixed = equations.tangent(x)
+        if drag is not None:
+            free_free.setdiag(free_free.diagonal() + drag)
         self._current = self._number_for(equations.place)
         self._places[self._current] = equations.place
         self._factors.factorise(self._current, free_free, equations.scale)
@@ -130,14 +139,54 @@ class NewtonSolver:
             x_new, converged = self._broyden(equations, x, fresh)
             if converged:
                 return x_new
-            if x_new is None and fresh:
+            if x_new is None and (fresh or self._residual(equations, x) is None):
                 return None
             x = x if x_new is None else x_new
-            if self._residual(equations, x) is None:
-                return None
             self.renew(equations, x)
             fresh = True
         return None
+
+    def relax(self, equations: Equations, x: Array, drag: Array) -> Array | None:
+        """Where x, whose fixed dofs are already right, comes to rest in a viscous medium; None if nowhere.
+
+        drag : (free,) resistance of each unknown to motion, in units of its stiffness; none of the pressures,
+        so that the energy of the step falls. Pseudo-transient continuation (Kelley & Keyes, SIAM J. Numer.
+        Anal. 35, 1998, 508): implicit Euler steps of one Newton iteration each, as long as that contracts.
+        They grow towards rest, and what is returned solves the equations without drag.
+        """
+        right = self._residual(equations, x)
+        if right is None:
+            return None
+        self.counts["falls"] += 1
+        length, growth = 1.0, MOST_GROWTH
+        for _ in range(MOST_RELAXING):
+            trial, after, moved, contraction = self._crawl(equations, x, right, drag / length)
+            if after is None or not contraction < ALLOWED_CONTRACTION:
+                length, growth = 0.5 * length, 1.0
+                continue
+            x, right = trial, after
+            if length > RELAXED and moved < 1.0:
+                return self.solve(equations, x)
+            change = np.sqrt(WANTED_CONTRACTION / contraction) if contraction > 0.0 else growth
+            length, growth = length * float(np.clip(change, 0.5, growth)), MOST_GROWTH
+        return None
+
+    def _crawl(
+        self, equations: Equations, x: Array, right: Array, drag: Array
+    ) -> tuple[Array, Array | None, float, float]:
+        """One step against drag: where to, the residual there, its size in units of the tolerance, and that
+        of a second iteration relative to it, 0 of a step within the tolerance, which may be mere rounding.
+        """
+        self.renew(equations, x, drag)
+        step = -self.back_substitute(right)
+        trial = x.copy()
+        trial[equations.free] += step
+        after, moved = self._residual(equations, trial), float(np.abs(step * equations.weight).max())
+        if after is None or moved < 1.0:
+            return trial, after, moved, 0.0
+        rest = self.back_substitute(after + drag * step)
+        sizes = [float(np.linalg.norm(move * equations.weight)) for move in (rest, step)]
+        return trial, after, moved, sizes[0] / sizes[1]
 
     def _residual(self, equations: Equations, x: Array) -> Array | None:
         self.counts["residuals"] += 1
@@ -148,7 +197,7 @@ class NewtonSolver:
         right = self._residual(equations, x)
         if right is None:
             return None, False
-        steps = [-self.back_substitute(right) * equations.weight]  # in units of the tolerance
+        steps = [self._newton_step(equations, right)]
         sizes: list[float] = []
         free = equations.free
         for iteration in range(MAX_BROYDEN):
@@ -158,8 +207,10 @@ class NewtonSolver:
                 return (x if fresh else None), False
             trial = x.copy()
             trial[free] += steps[-1] / equations.weight
-            right = self._residual(equations, trial)
-            if right is None or (fresh and iteration == 0 and self._grows(equations, steps[0], right)):
+            right, after = self._residual(equations, trial), None
+            if right is not None and fresh and iteration == 0:
+                after = self._newton_step(equations, right)
+            if right is None or (after is not None and not _shorter(after, steps[0])):
                 return (self._damped(equations, x, steps[-1]) if fresh else None), False
             x = trial
             if size < 1.0:
@@ -168,22 +219,14 @@ class NewtonSolver:
             if iteration > 1 and _iterations_left(size, sizes) > DEAR:
                 return x, False
             sizes.append(size)
-            steps.append(self._updated_step(equations, steps, right))
+            steps.append(
+                _updated_step(steps, self._newton_step(equations, right) if after is None else after)
+            )
         return x, False
 
-    def _updated_step(self, equations: Equations, steps: list[Array], right: Array) -> Array:
-        """Next step from the history of steps (Kelley's matrix-free form of Broyden's update)."""
-        z = -self.back_substitute(right) * equations.weight
-        for old, new in pairwise(steps):
-            z += new * (old @ z) / (old @ old)
-        last = steps[-1]
-        return z / (1.0 - (last @ z) / (last @ last))
-
-    def _grows(self, equations: Equations, step: Array, right: Array, damping: float = 1.0) -> bool:
-        """Whether the same tangent asks for a longer step after this one than before it."""
-        after = -self.back_substitute(right) * equations.weight
-        allowed = (1.0 - 0.25 * damping) if damping < 1.0 else 1.0
-        return not float(np.linalg.norm(after)) <= allowed * float(np.linalg.norm(step))
+    def _newton_step(self, equations: Equations, right: Array) -> Array:
+        """By the tangent factorised or taken last, (free,) in units of the tolerance."""
+        return -self.back_substitute(right) * equations.weight
 
     def _damped(self, equations: Equations, x: Array, step: Array) -> Array | None:
         """The first of x + step/2, /4, ... after which cells are upright and steps shorter, or None.
@@ -196,10 +239,25 @@ class NewtonSolver:
             trial = x.copy()
             trial[equations.free] += damping * step / equations.weight
             right = self._residual(equations, trial)
-            if right is not None and not self._grows(equations, step, right, damping):
+            if right is not None and _shorter(
+                self._newton_step(equations, right), step, 1.0 - 0.25 * damping
+            ):
                 return trial
             damping *= 0.5
         return None
+
+
+def _shorter(after: Array, before: Array, allowed: float = 1.0) -> bool:
+    """Whether one tangent asks for a step after the last one that is at most `allowed` of it."""
+    return float(np.linalg.norm(after)) <= allowed * float(np.linalg.norm(before))
+
+
+def _updated_step(steps: list[Array], z: Array) -> Array:
+    """Next step from the history and the kept tangent's own, z (Kelley's matrix-free form of Broyden's)."""
+    for old, new in pairwise(steps):
+        z = z + new * (old @ z) / (old @ old)
+    last = steps[-1]
+    return z / (1.0 - (last @ z) / (last @ last))
 
 
 def _iterations_left(size: float, before: list[float]) -> float:

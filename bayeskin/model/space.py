@@ -161,6 +161,7 @@ def sparsity(space: TaylorHood, fixed: np.ndarray) -> Sparsity:
     free_free, free_fixed = pattern[:, free].tocsr(), pattern[:, fixed].tocsr()
     for block in (free_free, free_fixed):
         block.sort_indices()
+        block.data = block.data.astype(np.int8)
     position = _positions(
         cells,
         number,

@@ -189,14 +189,16 @@ def _answer(simulation: Simulation, spec: ModelSpec, files: Sequence[Path]) -> d
 
 
 def _accuracy(simulation: Simulation, spec: ModelSpec) -> list[str]:
-    """One line on the estimated error of a reaction; the article's force has none: it does not converge."""
+    """The estimated error of a reaction; the article's force has none: it does not converge."""
     if spec.observation == "article":
         return ["no estimated error: the article's force depends on its mesh and converges on none"]
     peak_n = simulation.stats["peak_force_n"]
     time_share = simulation.stats["time_error_n"] / peak_n if peak_n > 0.0 else 0.0
     found = mesh_error(spec.mesh_hash)
     mesh = "unknown, the mesh is not in the study" if found is None else f"{100 * found.rms:.2g} % RMS"
-    return [f"estimated error, of the peak: time steps {100 * time_share:.2g} %, mesh {mesh}"]
+    falls = simulation.stats["falls"]
+    snapped = [f"the skin folded: it snapped to another equilibrium {falls:.0f} times"] if falls else []
+    return [*snapped, f"estimated error, of the peak: time steps {100 * time_share:.2g} %, mesh {mesh}"]
 
 
 def _check_suffix(out: Path, suffixes: tuple[str, ...]) -> None:
