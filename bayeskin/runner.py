@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 
 from bayeskin import storage
 from bayeskin.design import Wave
-from bayeskin.errors import InputError
+from bayeskin.errors import InputError, Unavailable
 from bayeskin.journal import Journal, Run
 from bayeskin.types import Array, Design, ParameterSpace, Simulation
 from bayeskin.workers import Lost, Map, local
@@ -36,12 +36,16 @@ Progress = Callable[[int, int, int, float], None]
 
 
 class _Outcome(NamedTuple):
-    """What a worker sends back; `force_n` is None when the run failed."""
+    """What a worker sends back; `force_n` is None when the run failed.
+
+    `unavailable`: where, found and expected of what the run needs and could not be had.
+    """
 
     force_n: Array | None
     message: str
     seconds: float
     model_hash: str
+    unavailable: tuple[str, str, str] | None = None
 
 
 def run_design(
@@ -66,7 +70,8 @@ def run_design(
 
     Raises InputError, with nothing written, when the file holds another parameter space, model or
     bins, when a point lies outside the box, when another process runs the same file, or when
-    `simulate` is of another model.
+    `simulate` is of another model; Unavailable when something that runs need cannot be had, such as a server,
+    which says nothing of their points, so none of them is stored.
     """
     path, edges = Path(path), np.asarray(edges_s, dtype=float)
     points = _distinct(wave)
@@ -133,7 +138,7 @@ def load_waves(path: Path | str) -> tuple[dict[str, Any], ...]:
 def _bin_means_of(simulate: Simulate, names: tuple[str, ...], edges: Array, theta: Array) -> _Outcome:
     """One run, in a worker: bin means [N] (m,) or the reason why there are none. Raises nothing."""
     start = time.perf_counter()
-    force_n, message, model_hash = None, "", ""
+    force_n, message, model_hash, unavailable = None, "", "", None
     try:
         run = simulate(dict(zip(names, theta.tolist(), strict=True)))
         model_hash, message = run.model_hash, run.message
@@ -141,9 +146,11 @@ def _bin_means_of(simulate: Simulate, names: tuple[str, ...], edges: Array, thet
             force_n, message = _checked_means(run, edges)
         elif not message:
             message = "the run failed without saying why"
+    except Unavailable as error:
+        unavailable = (error.where, error.found, error.expected)
     except Exception as error:
         message = f"{type(error).__name__}: {error}"
-    return _Outcome(force_n, message, time.perf_counter() - start, model_hash)
+    return _Outcome(force_n, message, time.perf_counter() - start, model_hash, unavailable)
 
 
 def _checked_means(run: Simulation, edges: Array) -> tuple[Array | None, str]:
@@ -160,6 +167,8 @@ def _checked_means(run: Simulation, edges: Array) -> tuple[Array | None, str]:
 def _as_run(path: Path, theta: Array, outcome: _Outcome | Lost, bins: int, model_hash: str) -> Run:
     if isinstance(outcome, Lost):
         return Run(theta, np.full(bins, np.nan), False, outcome.reason, math.nan)
+    if outcome.unavailable is not None:
+        raise Unavailable(*outcome.unavailable)
     if outcome.model_hash not in ("", model_hash):
         raise InputError(path, f"a run of model {outcome.model_hash}", f"runs of model {model_hash}")
     ok = outcome.force_n is not None

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 PhaseKind = Literal["rest", "load", "hold", "unload"]
-Observation = Literal["reaction", "article"]
+Observation = Literal["reaction", "article", "own"]
 
 
 def frozen_array(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
