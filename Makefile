@@ -6,7 +6,7 @@ export OMP_NUM_THREADS ?= 1
 export MKL_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: run test
+.PHONY: run test docs
 run: $(VENV)/.installed
 	$(VENV)/bin/bayeskin run runs/demo.toml
 
@@ -26,3 +26,7 @@ $(VENV)/.installed: pyproject.toml
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(VENV)/bin/python -m pip install --quiet --editable '.[dev]'
 	touch $@
+
+# The site in docs/_build; a warning is an error.
+docs: $(VENV)/.installed-dev
+	$(VENV)/bin/python -m sphinx -q -W --keep-going -b html docs docs/_build
