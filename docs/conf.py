@@ -28,6 +28,7 @@ exclude_patterns = ["_build"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_preserve_defaults = True
+autodoc_type_aliases = {name: name for name in ("Array", "ArrayLike")}
 
 
 class Commands(Directive):
@@ -47,7 +48,7 @@ class Commands(Directive):
 
 
 def plain_docstring(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Docstrings are plain text: `name` is code, ``name : text`` a list of terms, the rest is as it stands."""
+    """Docstrings are plain text: `name` is code, ``name : text`` a term and its meaning, the rest as it is."""
     paragraphs = [part for part in "\n".join(lines).strip().split("\n\n") if part]
     lines[:] = [line for paragraph in paragraphs for line in (*_as_rst(paragraph.splitlines()), "")]
 
