@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
@@ -265,21 +264,11 @@ def _extended(before: Design | None, wave: Wave, edges: Array, model_hash: str, 
 
 def _write(path: Path, design: Design, waves: list[dict[str, Any]]) -> None:
     """Replaces the file by one with all rows and the waves' records, at once."""
-    staged = _staged(path)
-    storage.save(staged, design)
-    with h5py.File(staged, "r+") as handle:
-        handle.attrs["waves"] = json.dumps(waves)
-    with open(staged, "rb") as written:
-        os.fsync(written.fileno())
-    os.replace(staged, path)
-
-
-def _staged(path: Path) -> Path:
-    return path.with_name(f".{path.name}.staged")
+    storage.save(path, design, {"waves": json.dumps(waves)})
 
 
 def _remove_stale(path: Path) -> None:
     """Removes what a process killed while it wrote may have left; only the journal's holder may."""
-    for stale in path.parent.glob(f"*{escape(_staged(path).name)}*"):
+    for stale in path.parent.glob(f".{escape(path.name)}.*.partial"):
         stale.unlink(missing_ok=True)
     path.with_name(f".{path.name}.journal.partial").unlink(missing_ok=True)

@@ -48,7 +48,7 @@ class Commands(Directive):
 
 
 def plain_docstring(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Docstrings are plain text: `name` is code, ``name : text`` a term and its meaning, the rest as it is."""
+    """Docstrings are plain text: `name` is code, ``name : text`` a term and its meaning."""
     paragraphs = [part for part in "\n".join(lines).strip().split("\n\n") if part]
     lines[:] = [line for paragraph in paragraphs for line in (*_as_rst(paragraph.splitlines()), "")]
 

@@ -9,7 +9,7 @@ import pytest
 import bayeskin
 
 PACKAGE = Path(bayeskin.__file__).parent
-BASE = {"errors", "types", "storage", "shipped", "workers", "umbridge"}
+BASE = {"errors", "types", "storage", "shipped", "workers", "umbridge", "probe"}
 SIBLINGS = {"recordings", "model", "design", "surrogates"}
 BELOW = {
     "errors": set(),
@@ -18,6 +18,7 @@ BELOW = {
     "shipped": {"errors"},
     "workers": {"errors"},
     "umbridge": {"errors"},
+    "probe": {"errors"},
     "cluster": {"errors", "workers"},
     **dict.fromkeys(SIBLINGS, BASE),
     "journal": BASE,

@@ -166,6 +166,8 @@ def _numbers(key: str, given: Any) -> Array:
 
 
 def _mechanisms(given: Any) -> tuple[Mechanism, ...]:
+    if given == []:
+        return ()
     known = catalogue()
     if not isinstance(given, list) or len({str(name) for name in given}) != len(given):
         raise InputError("config: mechanisms", f"{given!r:.60}", "a list of names, each once")
