@@ -9,7 +9,7 @@ import pytest
 import bayeskin
 
 PACKAGE = Path(bayeskin.__file__).parent
-BASE = {"errors", "types", "storage", "shipped", "workers", "umbridge", "probe"}
+BASE = {"errors", "types", "storage", "shipped", "workers", "umbridge", "probe", "words"}
 SIBLINGS = {"recordings", "model", "design", "surrogates"}
 BELOW = {
     "errors": set(),
@@ -19,6 +19,7 @@ BELOW = {
     "workers": {"errors"},
     "umbridge": {"errors"},
     "probe": {"errors"},
+    "words": set(),
     "cluster": {"errors", "workers"},
     **dict.fromkeys(SIBLINGS, BASE),
     "journal": BASE,

@@ -27,6 +27,7 @@ from bayeskin.pipeline.reported import reported
 from bayeskin.recordings import describe, describe_json, phase_noise, read_recording, segment
 from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, Parameter, ParameterSpace, Simulation
+from bayeskin.words import number
 
 REPORTED_EVERY_S = 0.1  # with mechanisms, whose force changes within a step of the model
 
@@ -182,7 +183,7 @@ def _answer(simulation: Simulation, spec: ModelSpec, files: Sequence[Path]) -> d
         own = spec.forward is not None
         steps = "one run" if own else f"{stats['steps']:.0f} steps of {stats['dofs']:.0f} unknowns"
         text = (
-            f"{steps} in {stats['seconds']:.1f} s, peak force {stats['peak_force_n']:.4g} N, "
+            f"{steps} in {stats['seconds']:.1f} s, peak force {number(stats['peak_force_n'], 4)} N, "
             f"written to {', '.join(map(str, files))}"
         )
         text += "".join(f"\n{line}" for line in _accuracy(simulation, spec))
@@ -206,8 +207,8 @@ def _accuracy(simulation: Simulation, spec: ModelSpec) -> list[str]:
     peak_n = simulation.stats["peak_force_n"]
     time_share = simulation.stats["time_error_n"] / peak_n if peak_n > 0.0 else 0.0
     found = mesh_error(problem_of(spec.mesh, spec.refinement).mesh.hash)
-    mesh = "unknown, the mesh is not in the study" if found is None else f"{100 * found.rms:.2g} % RMS"
-    return [f"estimated error, of the peak: time steps {100 * time_share:.2g} %, mesh {mesh}"]
+    mesh = "unknown, the mesh is not in the study" if found is None else f"{number(100 * found.rms, 2)} % RMS"
+    return [f"estimated error, of the peak: time steps {number(100 * time_share, 2)} %, mesh {mesh}"]
 
 
 def _check_suffix(out: Path, suffixes: tuple[str, ...]) -> None:
