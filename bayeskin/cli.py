@@ -60,25 +60,26 @@ def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
 
 
 @cli.command()
-@click.argument("recording", type=click.Path(path_type=Path))
+@click.argument("recording", required=False, type=click.Path(path_type=Path))
 @click.option(
     "-o", "out", type=click.Path(path_type=Path), help="TOML file to write; default: beside RECORDING."
 )
 @as_json
-def new(recording: Path, out: Path | None, as_json: bool) -> None:
-    """Write a commented configuration for a recording of your own.
+def new(recording: Path | None, out: Path | None, as_json: bool) -> None:
+    """Write a commented configuration for a recording of your own; without RECORDING the demo, to try.
 
     Reads the recording, says what it found, and takes a shipped surrogate where one knows its protocol, else
-    a design of full runs. Never writes over a file.
+    a design of full runs. Never writes over a file. The demo's recording comes with its configuration.
 
     \b
     Example:
+      bayeskin new && bayeskin run demo.toml
       bayeskin new test.xlsx -o runs/test.toml
       bayeskin new runs/test.h5 && bayeskin run runs/test.toml
     """
-    from bayeskin.pipeline.new import new_config
+    from bayeskin.pipeline.new import new_config, new_demo
 
-    _answer(new_config(recording, out), as_json)
+    _answer(new_demo(out) if recording is None else new_config(recording, out), as_json)
 
 
 @cli.command()
