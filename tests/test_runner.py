@@ -126,7 +126,7 @@ def test_a_kill_at_each_step_of_the_fold_loses_nothing(
 ) -> None:
     owner, name = {
         "storage.save": (runner.storage, "save"),
-        "os.replace": (runner.os, "replace"),
+        "os.replace": (runner.storage.os, "replace"),
         "Journal.forget": (Journal, "forget"),
     }[step]
     original = getattr(owner, name)
