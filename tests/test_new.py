@@ -17,6 +17,7 @@ from bayeskin.errors import InputError
 from bayeskin.pipeline import stages
 from bayeskin.pipeline.engine import Silent, open_run
 from bayeskin.pipeline.new import new_config, new_demo
+from bayeskin.pipeline.shipping import shipped_files
 from bayeskin.shipped import shipped
 from bayeskin.types import Recording
 
@@ -122,7 +123,8 @@ def test_without_a_recording_it_is_the_demo(tmp_path: Path) -> None:
     said = new_demo(tmp_path / "demo.toml")
     run = open_run(tmp_path / "demo.toml", Silent())
     assert said["ok"]
-    assert run.beside(run.config.recording.file) == tmp_path.resolve() / "demo.h5"
+    assert run.beside(run.config.recording.file) == tmp_path.resolve() / "demo-recording.h5"
+    assert shipped_files(run).surrogate == shipped("surrogates/demo.h5")
     assert run.config == load_config(shipped("runs/demo.toml")).model_copy(
         update={"recording": run.config.recording}
     )

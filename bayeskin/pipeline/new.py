@@ -54,7 +54,7 @@ def new_demo(out: Path | None = None) -> dict[str, Any]:
     Raises InputError, with nothing written, where one of them is there already.
     """
     out = out or Path("demo.toml")
-    recording = out.with_name("demo.h5")
+    recording = out.with_name("demo-recording.h5")  # demo.h5 is the surrogate's name
     if out.suffix != ".toml":
         raise InputError(f"-o {out}", f"ending {out.suffix!r}", "ending .toml")
     for file in (out, recording):
@@ -62,7 +62,7 @@ def new_demo(out: Path | None = None) -> dict[str, Any]:
             raise InputError(file, "a file that is there already", "a folder without one")
     text = shipped("runs/demo.toml").read_text(encoding="utf-8")
     recording.write_bytes(shipped("data/demo.h5").read_bytes())
-    out.write_text(text.replace('"../data/demo.h5"', '"demo.h5"'), encoding="utf-8")
+    out.write_text(text.replace('"../data/demo.h5"', '"demo-recording.h5"'), encoding="utf-8")
     return plain({"ok": True, "out": out, "text": f"written to {out}\nnext: bayeskin run {out}"})
 
 
