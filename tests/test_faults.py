@@ -96,20 +96,6 @@ def test_a_full_disk_is_told_and_leaves_the_earlier_file(case: Path, size: int) 
     ]
 
 
-def test_a_disk_that_fills_up_in_a_design_costs_no_finished_run(case: Path) -> None:
-    refused(bayeskin("design", case, before=files_at_most(40_000)), "")
-    (journal,) = case.parent.glob("case/runs/*.journal")
-    kept = len(journal.read_bytes().splitlines())
-    assert kept >= 5
-    assert bayeskin("design", case)[0] == 0
-    disturbed = load_design(case.parent / "case/design/design.h5")
-    shutil.rmtree(case.parent / "case")
-    assert bayeskin("design", case)[0] == 0
-    undisturbed = load_design(case.parent / "case/design/design.h5")
-    np.testing.assert_array_equal(disturbed.theta, undisturbed.theta)
-    np.testing.assert_array_equal(disturbed.force_n, undisturbed.force_n)
-
-
 def test_a_real_disk_that_is_full_is_told(case: Path) -> None:
     disk = case.parent / "disk"
     disk.mkdir()
