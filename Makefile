@@ -6,7 +6,7 @@ export OMP_NUM_THREADS ?= 1
 export MKL_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: run test
+.PHONY: run test docs test-oldest test-wheel
 run: $(VENV)/.installed
 	$(VENV)/bin/bayeskin run runs/demo.toml
 
@@ -26,3 +26,21 @@ $(VENV)/.installed: pyproject.toml
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(VENV)/bin/python -m pip install --quiet --editable '.[dev]'
 	touch $@
+
+# The site in docs/_build; a warning is an error.
+docs: $(VENV)/.installed-dev
+	$(VENV)/bin/python -m sphinx -q -W --keep-going -b html docs docs/_build
+
+# The tests with the oldest version of every package that pyproject.toml allows, in an environment of their own.
+test-oldest:
+	$(PYTHON) -m venv .venv-oldest
+	$(PYTHON) tests/oldest.py > .venv-oldest/constraints.txt
+	.venv-oldest/bin/python -m pip install --quiet -c .venv-oldest/constraints.txt --editable '.[dev]'
+	.venv-oldest/bin/python -m pytest -n 2 --dist loadfile
+
+# What a wheel installs by itself, without the checkout: the parts and the demo that it ships.
+test-wheel:
+	rm -rf .venv-wheel && $(PYTHON) -m venv .venv-wheel
+	.venv-wheel/bin/python -m pip wheel --quiet --no-deps --wheel-dir .venv-wheel/dist .
+	.venv-wheel/bin/python -m pip install --quiet .venv-wheel/dist/*.whl
+	cd .venv-wheel && bin/bayeskin doctor && bin/bayeskin new && bin/bayeskin run demo.toml

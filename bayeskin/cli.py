@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -59,25 +60,26 @@ def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
 
 
 @cli.command()
-@click.argument("recording", type=click.Path(path_type=Path))
+@click.argument("recording", required=False, type=click.Path(path_type=Path))
 @click.option(
     "-o", "out", type=click.Path(path_type=Path), help="TOML file to write; default: beside RECORDING."
 )
 @as_json
-def new(recording: Path, out: Path | None, as_json: bool) -> None:
-    """Write a commented configuration for a recording of your own.
+def new(recording: Path | None, out: Path | None, as_json: bool) -> None:
+    """Write a commented configuration for a recording of your own; without RECORDING the demo, to try.
 
     Reads the recording, says what it found, and takes a shipped surrogate where one knows its protocol, else
-    a design of full runs. Never writes over a file.
+    a design of full runs. Never writes over a file. The demo's recording comes with its configuration.
 
     \b
     Example:
+      bayeskin new && bayeskin run demo.toml
       bayeskin new test.xlsx -o runs/test.toml
       bayeskin new runs/test.h5 && bayeskin run runs/test.toml
     """
-    from bayeskin.pipeline.new import new_config
+    from bayeskin.pipeline.new import new_config, new_demo
 
-    _answer(new_config(recording, out), as_json)
+    _answer(new_demo(out) if recording is None else new_config(recording, out), as_json)
 
 
 @cli.command()
@@ -271,6 +273,34 @@ def conceal(folder: Path, seed: int, count: int, as_json: bool) -> None:
     with Terminal() as terminal:
         document = proof.conceal(folder, seed, count, terminal)
     _answer(document, as_json)
+
+
+@cli.command()
+@click.argument("config", required=False, type=click.Path(path_type=Path))
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen at.")
+@click.option("--port", default=4242, show_default=True, type=click.IntRange(0, 65535), help="0: a free one.")
+@as_json
+def serve(config: Path | None, host: str, port: int, as_json: bool) -> None:
+    """The forward model as a UM-Bridge model, for other tools of uncertainty quantification.
+
+    Serves the model of CONFIG (default: the demo's) on its recording's protocol until Ctrl-C: one input
+    vector of the parameters in SI units, one output vector of the mean force [N] in each of the recording's
+    bins. A request's config can ask for another protocol, other bins or times, and mechanisms. Only this
+    machine can reach it; with --host others can, and nothing asks who they are.
+
+    \b
+    Example:
+      bayeskin serve runs/demo.toml --port 4242
+      bayeskin serve runs/demo.toml --port 0 --json
+    """
+    from bayeskin.pipeline.serve import open_server
+
+    with Terminal() as terminal:
+        server, document = open_server(config, host, port, terminal)
+    _answer(document, as_json)
+    sys.stdout.flush()
+    with server, suppress(KeyboardInterrupt):
+        server.serve_forever()
 
 
 @cli.command()

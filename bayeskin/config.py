@@ -39,11 +39,27 @@ class RecordingConfig(_Section):
 
 
 class ModelConfig(_Section):
-    """Which force the model reports, on which mesh (the generator's bricks or a gmsh file), how finely."""
+    """Which force the model reports, on which mesh (the generator's bricks or a gmsh file), how finely.
 
-    observation: Literal["reaction", "article"] = "reaction"
+    `forward`: a model of one's own instead, "FILE.py:FUNCTION" (beside the configuration),
+    "PACKAGE.MODULE:FUNCTION" or the URL of a UM-Bridge server; its observation is "own".
+    """
+
+    observation: Literal["reaction", "article", "own"] = "reaction"
     mesh: str = "bricks"
     refinement: Positive = 1  # of the bricks, toward the pads' edges
+    forward: str | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _a_forward_model_is_ones_own(cls, given: Any) -> Any:
+        return {"observation": "own", **given} if isinstance(given, dict) and "forward" in given else given
+
+    @model_validator(mode="after")
+    def _own_needs_its_forward_model(self) -> ModelConfig:
+        if (self.observation == "own") != (self.forward is not None):
+            raise ValueError(f"observation: found {self.observation!r}; expected 'own' with model.forward")
+        return self
 
     @model_validator(mode="after")
     def _article_needs_its_mesh(self) -> ModelConfig:
@@ -59,6 +75,8 @@ class PriorConfig(_Section):
 
     `mean` and `sd` belong to a normal prior, `median` and `factor` (of one sd) to a log-normal one; both are
     cut to the bounds.
+
+    With `model.forward` these are all the parameters there are: each has bounds, and may have a unit.
     """
 
     lower: float | None = None
@@ -69,6 +87,7 @@ class PriorConfig(_Section):
     median: Annotated[float, Field(gt=0)] | None = None
     factor: Annotated[float, Field(gt=1)] | None = None
     source: str = "configuration"
+    unit: str | None = None
 
     @model_validator(mode="after")
     def _a_normal_prior_has_its_two_numbers(self) -> PriorConfig:
@@ -223,6 +242,9 @@ class Config(_Section):
         if coarse is not None and (model.mesh != "bricks" or coarse >= model.refinement):
             found = f"{coarse} with model.mesh {model.mesh!r}, model.refinement {model.refinement}"
             raise ValueError(f"design.coarse: found {found}; expected bricks of a higher refinement")
+        if model.forward is not None and (coarse is not None or self.surrogate.file is not None):
+            key = "design.coarse" if coarse is not None else "surrogate.file"
+            raise ValueError(f"{key}: found one with model.forward; expected none: it is the full model's")
         return self
 
     @property
@@ -275,10 +297,12 @@ def _table(plain: Mapping[str, Any], name: str = "") -> list[str]:
 
 
 def parameter_space(config: Config, where: object = "configuration") -> ParameterSpace:
-    """The prior box: the defaults with the configuration's changes.
+    """The prior box: the defaults with the configuration's changes, or that of a forward model of one's own.
 
     Raises InputError for an unknown parameter, bounds upside down, or a log prior that reaches zero.
     """
+    if config.model.forward is not None:
+        return _own_space(config, where)
     default = default_space()
     unknown = sorted(set(config.parameters) - set(default.names))
     if unknown:
@@ -289,9 +313,26 @@ def parameter_space(config: Config, where: object = "configuration") -> Paramete
     )
 
 
+def _own_space(config: Config, where: object) -> ParameterSpace:
+    """Those of the table, or the default ones; without the law by which the full model's forces scale."""
+    if not config.parameters:
+        return ParameterSpace(tuple(replace(p, stress_power=0) for p in default_space().parameters))
+    own = []
+    for name, given in config.parameters.items():
+        for key in ("lower", "upper"):
+            if getattr(given, key) is None:
+                at = f"{where}: parameters.{name}.{key}"
+                raise InputError(at, "nothing", "a bound, with model.forward")
+        blank = Parameter(name, given.unit or "", 0.0, 0.0, "uniform")
+        own.append(_overridden(blank, given, where))
+    return ParameterSpace(tuple(own))
+
+
 def _overridden(default: Parameter, change: PriorConfig | None, where: object) -> Parameter:
     if change is None:
         return default
+    if change.unit not in (None, default.unit):
+        raise InputError(f"{where}: parameters.{default.name}.unit", repr(change.unit), repr(default.unit))
     lower = default.lower if change.lower is None else change.lower
     upper = default.upper if change.upper is None else change.upper
     prior = change.prior or default.prior

@@ -18,3 +18,7 @@ class InputError(ValueError):
     def __init__(self, where: object, found: object, expected: object) -> None:
         self.where, self.found, self.expected = str(where), str(found), str(expected)
         super().__init__(f"{self.where}: found {self.found}; expected {self.expected}")
+
+
+class Unavailable(InputError):
+    """Something that a run needs cannot be had now, which says nothing about the run: nothing is stored."""

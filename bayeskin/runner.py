@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
@@ -26,7 +25,7 @@ from numpy.typing import ArrayLike
 
 from bayeskin import storage
 from bayeskin.design import Wave
-from bayeskin.errors import InputError
+from bayeskin.errors import InputError, Unavailable
 from bayeskin.journal import Journal, Run
 from bayeskin.types import Array, Design, ParameterSpace, Simulation
 from bayeskin.workers import Lost, Map, local
@@ -36,12 +35,16 @@ Progress = Callable[[int, int, int, float], None]
 
 
 class _Outcome(NamedTuple):
-    """What a worker sends back; `force_n` is None when the run failed."""
+    """What a worker sends back; `force_n` is None when the run failed.
+
+    `unavailable`: where, found and expected of what the run needs and could not be had.
+    """
 
     force_n: Array | None
     message: str
     seconds: float
     model_hash: str
+    unavailable: tuple[str, str, str] | None = None
 
 
 def run_design(
@@ -66,7 +69,8 @@ def run_design(
 
     Raises InputError, with nothing written, when the file holds another parameter space, model or
     bins, when a point lies outside the box, when another process runs the same file, or when
-    `simulate` is of another model.
+    `simulate` is of another model; Unavailable when something that runs need cannot be had, such as a server,
+    which says nothing of their points, so none of them is stored.
     """
     path, edges = Path(path), np.asarray(edges_s, dtype=float)
     points = _distinct(wave)
@@ -133,7 +137,7 @@ def load_waves(path: Path | str) -> tuple[dict[str, Any], ...]:
 def _bin_means_of(simulate: Simulate, names: tuple[str, ...], edges: Array, theta: Array) -> _Outcome:
     """One run, in a worker: bin means [N] (m,) or the reason why there are none. Raises nothing."""
     start = time.perf_counter()
-    force_n, message, model_hash = None, "", ""
+    force_n, message, model_hash, unavailable = None, "", "", None
     try:
         run = simulate(dict(zip(names, theta.tolist(), strict=True)))
         model_hash, message = run.model_hash, run.message
@@ -141,9 +145,11 @@ def _bin_means_of(simulate: Simulate, names: tuple[str, ...], edges: Array, thet
             force_n, message = _checked_means(run, edges)
         elif not message:
             message = "the run failed without saying why"
+    except Unavailable as error:
+        unavailable = (error.where, error.found, error.expected)
     except Exception as error:
         message = f"{type(error).__name__}: {error}"
-    return _Outcome(force_n, message, time.perf_counter() - start, model_hash)
+    return _Outcome(force_n, message, time.perf_counter() - start, model_hash, unavailable)
 
 
 def _checked_means(run: Simulation, edges: Array) -> tuple[Array | None, str]:
@@ -160,6 +166,8 @@ def _checked_means(run: Simulation, edges: Array) -> tuple[Array | None, str]:
 def _as_run(path: Path, theta: Array, outcome: _Outcome | Lost, bins: int, model_hash: str) -> Run:
     if isinstance(outcome, Lost):
         return Run(theta, np.full(bins, np.nan), False, outcome.reason, math.nan)
+    if outcome.unavailable is not None:
+        raise Unavailable(*outcome.unavailable)
     if outcome.model_hash not in ("", model_hash):
         raise InputError(path, f"a run of model {outcome.model_hash}", f"runs of model {model_hash}")
     ok = outcome.force_n is not None
@@ -256,21 +264,11 @@ def _extended(before: Design | None, wave: Wave, edges: Array, model_hash: str, 
 
 def _write(path: Path, design: Design, waves: list[dict[str, Any]]) -> None:
     """Replaces the file by one with all rows and the waves' records, at once."""
-    staged = _staged(path)
-    storage.save(staged, design)
-    with h5py.File(staged, "r+") as handle:
-        handle.attrs["waves"] = json.dumps(waves)
-    with open(staged, "rb") as written:
-        os.fsync(written.fileno())
-    os.replace(staged, path)
-
-
-def _staged(path: Path) -> Path:
-    return path.with_name(f".{path.name}.staged")
+    storage.save(path, design, {"waves": json.dumps(waves)})
 
 
 def _remove_stale(path: Path) -> None:
     """Removes what a process killed while it wrote may have left; only the journal's holder may."""
-    for stale in path.parent.glob(f"*{escape(_staged(path).name)}*"):
+    for stale in path.parent.glob(f".{escape(path.name)}.*.partial"):
         stale.unlink(missing_ok=True)
     path.with_name(f".{path.name}.journal.partial").unlink(missing_ok=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,23 +26,44 @@ _STORED = {
 }
 
 
-def save(path: Path | str, value: Any) -> None:
-    """Writes a dataclass of `bayeskin.types` to `path`, whole or not at all.
+def save(path: Path | str, value: Any, attributes: Mapping[str, str] | None = None) -> None:
+    """Writes a dataclass of `bayeskin.types` to `path`, with `attributes` at its root, whole or not at all.
 
-    The file appears under its name only when it is complete and on disk, so that an
-    interruption leaves the earlier file as it was.
+    Raises InputError where it cannot be written.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+
+    def fill(handle: h5py.File) -> None:
+        handle.attrs["format"] = FORMAT
+        handle.attrs["format_version"] = FORMAT_VERSION
+        handle.attrs.update(attributes or {})
+        write(handle, value)
+
+    write_hdf5(Path(path), fill)
+
+
+def write_hdf5(path: Path, fill: Callable[[h5py.File], None]) -> None:
+    """Writes an HDF5 file that `fill` fills, whole or not at all.
+
+    The file appears under its name only when it is complete and on disk, so that an interruption leaves the
+    earlier file as it was. It is made in memory: libhdf5 ends the process on a disk that is full.
+    Raises InputError where it cannot be written.
+    """
+    with h5py.File(path.name, "w", driver="core", backing_store=False) as handle:
+        fill(handle)
+        handle.flush()
+        image = handle.id.get_file_image()
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        with h5py.File(partial, "w") as handle:
-            handle.attrs["format"] = FORMAT
-            handle.attrs["format_version"] = FORMAT_VERSION
-            write(handle, value)
-        with open(partial, "rb") as written:
-            os.fsync(written.fileno())
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(partial, "wb") as out:
+            out.write(image)
+            out.flush()
+            os.fsync(out.fileno())
         os.replace(partial, path)
+    except OSError as error:
+        raise InputError(
+            path, f"that it cannot be written ({error.strerror})", "room and the right to"
+        ) from None
     finally:
         partial.unlink(missing_ok=True)
 

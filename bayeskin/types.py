@@ -18,7 +18,7 @@ from scipy.special import ndtr, ndtri
 
 Array = NDArray[np.float64]
 PhaseKind = Literal["rest", "load", "hold", "unload"]
-Observation = Literal["reaction", "article"]
+Observation = Literal["reaction", "article", "own"]
 
 
 def frozen_array(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:

@@ -9,7 +9,7 @@ import pytest
 import bayeskin
 
 PACKAGE = Path(bayeskin.__file__).parent
-BASE = {"errors", "types", "storage", "shipped", "workers"}
+BASE = {"errors", "types", "storage", "shipped", "workers", "umbridge", "probe", "words"}
 SIBLINGS = {"recordings", "model", "design", "surrogates"}
 BELOW = {
     "errors": set(),
@@ -17,6 +17,9 @@ BELOW = {
     "storage": {"types", "errors"},
     "shipped": {"errors"},
     "workers": {"errors"},
+    "umbridge": {"errors"},
+    "probe": {"errors"},
+    "words": set(),
     "cluster": {"errors", "workers"},
     **dict.fromkeys(SIBLINGS, BASE),
     "journal": BASE,

@@ -13,9 +13,11 @@ import pytest
 from bayeskin import cli, storage
 from bayeskin.config import Config, RecordingConfig, load_config, parameter_space
 from bayeskin.design import default_space
+from bayeskin.errors import InputError
 from bayeskin.pipeline import stages
 from bayeskin.pipeline.engine import Silent, open_run
-from bayeskin.pipeline.new import new_config
+from bayeskin.pipeline.new import new_config, new_demo
+from bayeskin.pipeline.shipping import shipped_files
 from bayeskin.shipped import shipped
 from bayeskin.types import Recording
 
@@ -115,3 +117,17 @@ def test_a_name_that_toml_or_a_run_cannot_take_as_it_is(
     config = load_config(out)
     assert config.recording.file == odd.name
     assert config.name == "test--3-"
+
+
+def test_without_a_recording_it_is_the_demo(tmp_path: Path) -> None:
+    said = new_demo(tmp_path / "demo.toml")
+    run = open_run(tmp_path / "demo.toml", Silent())
+    assert said["ok"]
+    assert run.beside(run.config.recording.file) == tmp_path.resolve() / "demo-recording.h5"
+    assert shipped_files(run).surrogate == shipped("surrogates/demo.h5")
+    assert run.config == load_config(shipped("runs/demo.toml")).model_copy(
+        update={"recording": run.config.recording}
+    )
+    with pytest.raises(InputError, match="there already"):
+        new_demo(tmp_path / "other.toml")
+    assert not (tmp_path / "other.toml").exists()

@@ -126,7 +126,7 @@ def test_a_kill_at_each_step_of_the_fold_loses_nothing(
 ) -> None:
     owner, name = {
         "storage.save": (runner.storage, "save"),
-        "os.replace": (runner.os, "replace"),
+        "os.replace": (runner.storage.os, "replace"),
         "Journal.forget": (Journal, "forget"),
     }[step]
     original = getattr(owner, name)
@@ -312,7 +312,7 @@ def test_a_damaged_journal_beside_a_design_is_run_again(tmp_path: Path, whole: D
 @pytest.mark.usefixtures("serial")
 def test_what_a_killed_process_was_writing_is_cleared_away(tmp_path: Path) -> None:
     path = tmp_path / "design.h5"
-    for name in (".design.h5.staged", "..design.h5.staged.4711.partial", ".design.h5.journal.partial"):
+    for name in (".design.h5.4711.partial", ".design.h5.journal.partial"):
         (tmp_path / name).write_bytes(b"half a file")
     run(path)
     assert_one_file(path)

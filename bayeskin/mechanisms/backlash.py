@@ -18,6 +18,7 @@ from bayeskin.mechanisms.series import lost_in_series
 from bayeskin.model.problem import Problem
 from bayeskin.model.tissue import SeriesElement, TissueLaw
 from bayeskin.types import Array, PadMotion, Parameter
+from bayeskin.words import number
 
 
 def trailing(motion: PadMotion, gap_m: float) -> PadMotion:
@@ -83,8 +84,8 @@ MECHANISM = Mechanism(
     ),
     neutral={"gap": 0.0, "frame_compliance": 0.0},
     statement=lambda v: (
-        f"The drive loses {1e3 * v['gap']:.2g} mm at each reversal, and the frame yields "
-        f"{1e3 * v['frame_compliance']:.2g} mm a newton."
+        f"The drive loses {number(1e3 * v['gap'], 2)} mm at each reversal, and the frame yields "
+        f"{number(1e3 * v['frame_compliance'], 2)} mm a newton."
     ),
     group=("backlash",),
     act=Instrument(Place.PADS, observe, bind, adds=False),

@@ -15,6 +15,7 @@ from bayeskin.mechanisms.mechanism import Mechanism, Tissue
 from bayeskin.model.problem import Problem
 from bayeskin.model.tissue import SurfaceTerm, TissueLaw, displacement_rows, surface_mass
 from bayeskin.types import Array, Parameter
+from bayeskin.words import number
 
 
 def tangential(point: Array, i: int, j: int) -> Array:
@@ -60,7 +61,9 @@ MECHANISM = Mechanism(
         ),
     ),
     neutral={"adherence": 0.0},
-    statement=lambda v: f"The subcutis sticks to the fascia below with {1e-6 * v['adherence']:.3g} kPa a mm.",
+    statement=lambda v: (
+        f"The subcutis sticks to the fascia below with {number(1e-6 * v['adherence'], 3)} kPa a mm."
+    ),
     group=("bottom-adherence",),
     act=Tissue(bind),
 )

@@ -21,6 +21,7 @@ import numpy as np
 from bayeskin.mechanisms.lines import stretch_of, strict
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
 from bayeskin.types import Array, PadMotion, Parameter
+from bayeskin.words import number
 
 
 def friction(
@@ -69,7 +70,7 @@ MECHANISM = Mechanism(
     neutral={"Fc": 0.0, "presliding": 5e-5, "friction_start": 0.0},
     statement=lambda v: (
         f"The slide rubs: {1e3 * v['Fc']:.0f} mN against each motion, turning over within "
-        f"{1e3 * v['presliding']:.2g} mm after a reversal and kept during holds."
+        f"{number(1e3 * v['presliding'], 2)} mm after a reversal and kept during holds."
     ),
     group=("device-friction", "viscous-drag", "force-offset"),
     act=Instrument(Place.DRIVE, observe),

@@ -11,6 +11,7 @@ from bayeskin.model.mesh import ARM_RADIUS_M, LENGTH_M
 from bayeskin.model.problem import Problem
 from bayeskin.model.tissue import SurfaceTerm, TissueLaw, pressure_rows, surface_mass
 from bayeskin.types import Parameter
+from bayeskin.words import number
 
 
 def open_surface(problem: Problem) -> np.ndarray:
@@ -51,7 +52,7 @@ MECHANISM = Mechanism(
     ),
     neutral={"leakage": 0.0},
     statement=lambda v: (
-        f"Fluid leaves through the surface, {6e7 * v['leakage']:.3g} micrometres a minute at each kPa."
+        f"Fluid leaves through the surface, {number(6e7 * v['leakage'], 3)} micrometres a minute at each kPa."
     ),
     group=("fluid-leakage",),
     act=Tissue(bind),

@@ -10,6 +10,7 @@ import numpy as np
 from bayeskin.mechanisms.device_friction import friction
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
 from bayeskin.types import Array, PadMotion, Parameter
+from bayeskin.words import number
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
@@ -32,7 +33,7 @@ MECHANISM = Mechanism(
         Parameter("friction_tau", "s", 3.0, 1000.0, "log-uniform", "time in which friction relaxes"),
     ),
     neutral={"friction_tau": np.inf},
-    statement=lambda v: f"Friction that a stop locks in relaxes within {v['friction_tau']:.3g} s.",
+    statement=lambda v: f"Friction that a stop locks in relaxes within {number(v['friction_tau'], 3)} s.",
     group=("friction-creep", "solid-viscoelasticity", "strain-dependent-permeability"),
     act=Instrument(Place.DRIVE, observe),
 )

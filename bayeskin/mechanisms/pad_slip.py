@@ -16,6 +16,7 @@ from bayeskin.mechanisms.series import lost_in_series, mean_beyond
 from bayeskin.model.problem import Problem
 from bayeskin.model.tissue import SeriesElement, TissueLaw
 from bayeskin.types import Array, PadMotion, Parameter
+from bayeskin.words import number
 
 
 class Slip(SeriesElement):
@@ -65,8 +66,8 @@ MECHANISM = Mechanism(
     ),
     neutral={"slip_rate": 0.0, "slip_threshold": 0.1},
     statement=lambda v: (
-        f"The pads slip on the skin, {1e3 * v['slip_rate']:.2g} mm a second for each newton beyond "
-        f"{v['slip_threshold']:.2g} N, and do not come back."
+        f"The pads slip on the skin, {number(1e3 * v['slip_rate'], 2)} mm a second for each newton beyond "
+        f"{number(v['slip_threshold'], 2)} N, and do not come back."
     ),
     group=("pad-slip", "preconditioning", "slow-recovery"),
     act=Instrument(Place.PADS, observe, bind, adds=False),

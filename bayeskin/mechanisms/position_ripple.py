@@ -10,6 +10,7 @@ import numpy as np
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
 from bayeskin.mechanisms.viscous_drag import speed_of
 from bayeskin.types import Array, PadMotion, Parameter
+from bayeskin.words import number
 
 AT_REST_M_S = 2e-5  # slower than this is no motion
 
@@ -39,7 +40,7 @@ MECHANISM = Mechanism(
     neutral={"ripple_period": 5e-4, "ripple_amplitude": 0.0, "ripple_phase": 0.0},
     statement=lambda v: (
         f"While it moves, the drive ripples by {1e3 * v['ripple_amplitude']:.1f} mN every "
-        f"{1e3 * v['ripple_period']:.2g} mm of its travel."
+        f"{number(1e3 * v['ripple_period'], 2)} mm of its travel."
     ),
     group=("position-ripple",),
     act=Instrument(Place.DRIVE, observe),

@@ -22,6 +22,7 @@ from bayeskin.model.assembly import Chunk, compiled, inverse_and_determinant
 from bayeskin.model.problem import Problem, material
 from bayeskin.model.tissue import Passage, TissueLaw
 from bayeskin.types import Array, Parameter
+from bayeskin.words import number
 
 
 @compiled
@@ -118,7 +119,7 @@ MECHANISM = Mechanism(
     neutral={"damage": 0.0, "damage_energy": 1e3},
     statement=lambda v: (
         f"The first stretch softens the skin, by {100 * v['damage']:.0f} % at most, most of it where it "
-        f"has stored {1e-3 * v['damage_energy']:.3g} kPa; later cycles repeat."
+        f"has stored {number(1e-3 * v['damage_energy'], 3)} kPa; later cycles repeat."
     ),
     group=("preconditioning", "pad-slip", "slow-recovery"),
     act=Tissue(bind),

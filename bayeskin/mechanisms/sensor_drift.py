@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
 from bayeskin.types import PadMotion, Parameter
+from bayeskin.words import number
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
@@ -15,7 +16,7 @@ MECHANISM = Mechanism(
     name="sensor-drift",
     parameters=(Parameter("drift", "N/s", -3e-4, 3e-4, "uniform", "drift of the load cell's zero"),),
     neutral={"drift": 0.0},
-    statement=lambda v: f"The load cell drifts by {6e4 * v['drift']:+.2g} mN a minute.",
+    statement=lambda v: f"The load cell drifts by {number(6e4 * v['drift'], 2, sign=True)} mN a minute.",
     group=("sensor-drift",),
     act=Instrument(Place.CELL, observe),
 )

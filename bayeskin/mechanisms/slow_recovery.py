@@ -24,6 +24,7 @@ from bayeskin.mechanisms.series import lost_in_series
 from bayeskin.model.problem import Problem
 from bayeskin.model.tissue import SeriesElement, TissueLaw
 from bayeskin.types import Array, PadMotion, Parameter
+from bayeskin.words import number
 
 
 class KelvinVoigt(SeriesElement):
@@ -74,8 +75,8 @@ MECHANISM = Mechanism(
     ),
     neutral={"recovery_compliance": 0.0, "recovery_time": 30.0},
     statement=lambda v: (
-        f"Tissue around the test yields, {1e3 * v['recovery_compliance']:.2g} mm for each newton within "
-        f"{v['recovery_time']:.0f} s, and returns as slowly."
+        f"Tissue around the test yields, {number(1e3 * v['recovery_compliance'], 2)} mm for each newton "
+        f"within {v['recovery_time']:.0f} s, and returns as slowly."
     ),
     group=("slow-recovery", "preconditioning", "pad-slip"),
     act=Instrument(Place.PADS, observe, bind, adds=False),

@@ -31,6 +31,7 @@ from bayeskin.model.lagrangian import PAD_EDGE_M
 from bayeskin.model.problem import Problem
 from bayeskin.model.tissue import Passage, Rank, TissueLaw
 from bayeskin.types import Array, PadMotion, Parameter
+from bayeskin.words import number
 
 STEPS_A_PHASE = 100
 
@@ -173,8 +174,8 @@ MECHANISM = Mechanism(
     neutral={"g_1": 0.0, "tau_1": 2.0, "g_2": 0.0, "tau_2": 60.0},
     statement=lambda v: (
         f"The solid itself relaxes: stretched at once it pulls {100 * (v['g_1'] + v['g_2']):.0f} % harder "
-        f"than at rest, of which {100 * v['g_1']:.0f} % fade within {v['tau_1']:.2g} s and "
-        f"{100 * v['g_2']:.0f} % within {v['tau_2']:.2g} s."
+        f"than at rest, of which {100 * v['g_1']:.0f} % fade within {number(v['tau_1'], 2)} s and "
+        f"{100 * v['g_2']:.0f} % within {number(v['tau_2'], 2)} s."
     ),
     group=("solid-viscoelasticity", "strain-dependent-permeability", "friction-creep"),
     act=Tissue(bind, estimate),

@@ -23,6 +23,7 @@ from bayeskin.mechanisms.mechanism import Mechanism, Tissue
 from bayeskin.model.problem import Problem
 from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Parameter
+from bayeskin.words import number
 
 STRETCH = 1.25
 
@@ -61,8 +62,8 @@ MECHANISM = Mechanism(
     ),
     neutral={"fibre_stress": 0.0, "k2": 5.0, "dispersion": 0.0},
     statement=lambda v: (
-        f"Fibres of the cutis stiffen with stretch: k1 = {1e-3 * first_modulus(v):.3g} kPa, "
-        f"k2 = {v['k2']:.2g}, so that they pull with {1e-3 * v['fibre_stress']:.3g} kPa "
+        f"Fibres of the cutis stiffen with stretch: k1 = {number(1e-3 * first_modulus(v), 3)} kPa, "
+        f"k2 = {number(v['k2'], 2)}, so that they pull with {number(1e-3 * v['fibre_stress'], 3)} kPa "
         "in skin that is a quarter longer."
     ),
     group=("strain-stiffening", "pre-stretch"),

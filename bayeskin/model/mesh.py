@@ -7,7 +7,9 @@ Both are made flat (x 0..105 mm, y 0..84 mm, z 0..10 mm) and rolled onto the arm
 from __future__ import annotations
 
 import hashlib
+import io
 from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -171,9 +173,15 @@ def read_gmsh(path: Path | str) -> SkinMesh:
     if not path.is_file():
         raise InputError(path, "no such file", "a gmsh mesh")
     try:
-        raw = meshio.read(path, file_format="gmsh")
-    except (Exception, SystemExit) as error:  # meshio raises whatever its parser met
+        with redirect_stderr(io.StringIO()), redirect_stdout(io.StringIO()):  # meshio complains at length
+            return _assembled(path, meshio.read(path, file_format="gmsh"))
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:  # a damaged file: meshio and the indices raise of every kind
         raise InputError(path, f"not readable as gmsh ({type(error).__name__})", "a gmsh 4.1 mesh") from None
+
+
+def _assembled(path: Path, raw: meshio.Mesh) -> SkinMesh:
     missing = [n for n in (*GMSH_NAMES, *GMSH_LAYERS) if n not in raw.field_data]
     if missing:
         raise InputError(path, f"no boundary or layer named {', '.join(missing)}", "the article's names")

@@ -18,6 +18,7 @@ from bayeskin.model.gradients import DIFFERENTIATED, ForceGradients
 from bayeskin.model.linear import SOLVER_NAME
 from bayeskin.model.mesh import SkinMesh, brick_mesh, read_gmsh
 from bayeskin.model.newton import NewtonSolver
+from bayeskin.model.own import identity, simulate_own
 from bayeskin.model.problem import PARAMETERS, Constants, Material, Problem, build_problem, material
 from bayeskin.model.tissue import Bind
 from bayeskin.types import Array, Observation, PadMotion, Simulation, frozen_array
@@ -33,19 +34,24 @@ OnState = Callable[[float, Array, float], None]  # time_s, x (dofs,), force_n
 class ModelSpec:
     """Which model: what force is observed, on which mesh, to what tolerance.
 
-    observation : "reaction" (what a load cell on the pad measures) or "article" (its released code)
+    observation : "reaction" (what a load cell on the pad measures), "article" (its released code), or "own"
     mesh : "bricks" (our graded bricks) or the path of a gmsh file with the article's names
     refinement : of the bricks, toward the edges of the pads; 1 gives 448 of them, 0 gives 80
     tolerance : estimated local error of the reaction a step, relative to the nominal force; the
         article's steps are its own
+    forward : with observation "own": where the model is that stands in this one's place, as
+        `bayeskin.model.own` says; mesh, refinement and tolerance are then nothing to it
     """
 
     observation: Observation = "reaction"
     mesh: str = "bricks"
     refinement: int = 1
     tolerance: float = 1e-3
+    forward: str | None = None
 
     def __post_init__(self) -> None:
+        if (self.observation == "own") != (self.forward is not None):
+            raise InputError("model.forward", self.forward, "one with observation 'own', and only there")
         if self.observation == "article" and self.mesh == "bricks":
             raise InputError("model.mesh", "bricks", "the article's gmsh mesh for observation 'article'")
 
@@ -57,6 +63,8 @@ class ModelSpec:
     @property
     def hash(self) -> str:
         """sha256 of all that the force depends on besides motion and parameters."""
+        if self.forward is not None:
+            return identity(self.forward)
         steps = ARTICLE_STEP_S if self.observation == "article" else self.tolerance
         text = json.dumps(
             [PHYSICS_VERSION, self.observation, self.mesh_hash, steps, asdict(Constants())], sort_keys=True
@@ -96,13 +104,16 @@ def simulate(
 
     A run that does not converge is a Simulation with status "failed", its steps so far, and a
     message with the step, the time and a remedy. Raises InputError for a parameter that is
-    missing, unknown, not finite, or not positive where it must be.
+    missing, unknown, not finite, or not positive where it must be; of a model of one's own as `simulate_own`.
     """
-    _check(theta, bool(laws))
+    if spec.forward is None:
+        _check(theta, bool(laws))
     if gradients and spec.observation != "reaction":
         raise InputError("gradients", f"observation {spec.observation!r}", "observation 'reaction'")
     if laws and spec.observation != "reaction":
         raise InputError("tissue mechanisms", f"observation {spec.observation!r}", "observation 'reaction'")
+    if spec.forward is not None:
+        return simulate_own(spec.forward, motion, theta)
     started = time.perf_counter()
     problem = problem_of(spec.mesh, spec.refinement)
     history = _History(motion, on_progress, on_state)

@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from bayeskin import report, storage
 from bayeskin.config import parameter_space
 from bayeskin.design import Wave, fine_wave, first_wave, next_wave
+from bayeskin.errors import InputError
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline.crew import crew
 from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
 from bayeskin.pipeline.folder import sha256_of, write_json
-from bayeskin.pipeline.model import model_spec, waves_spec
+from bayeskin.pipeline.model import model_spec, own_files, waves_spec
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.shipping import check_fits, shipped_files
 from bayeskin.runner import load_design, run_design
@@ -87,6 +88,8 @@ def _run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design
     space = parameter_space(run.config, run.config_path).box  # a surrogate learns all of it alike
     file = runs_file(run, spec, motion, binned.edges_s, space)
     waves: list[Wave] = []
+    if spec.forward is not None and not file.is_file():
+        _try_once(run, spec, motion, space)
     for number, count in enumerate(config.points):
         drawn = run.at("design", f"wave-{number}.json")
         if not drawn.is_file():
@@ -96,6 +99,20 @@ def _run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design
         label = f"wave {number + 1} of {len(config.points)}"
         _run_wave(run, label, file, waves[-1], binned.edges_s, spec, motion)
     return rows_of(load_design(file), waves), [wave.record for wave in waves]
+
+
+def _try_once(run: Run, spec: ModelSpec, motion: PadMotion, space: ParameterSpace) -> None:
+    """A model of one's own in the middle of the box. Raises InputError where it cannot be used at all."""
+    run.reporter.log(f"one run of {spec.forward}")
+    middle = dict(zip(space.names, space.from_unit([0.5] * space.dim).tolist(), strict=True))
+    try:
+        found = simulate(spec, motion, middle)
+    except InputError:
+        raise
+    except Exception as error:  # of somebody's function: it can be any
+        raise InputError(spec.forward, f"{type(error).__name__}: {error}", f"a force at {middle}") from None
+    if found.status != "ok":
+        raise InputError(spec.forward, found.message, f"a force at {middle}")
 
 
 def _run_fine(run: Run, design: Design, motion: PadMotion) -> Design:
@@ -212,7 +229,8 @@ def _draw(run: Run, design: Design, records: Sequence[Mapping[str, Any]]) -> Non
 
 def _files(run: Run) -> Iterable[Path]:
     files = [run.beside(run.config.model.mesh)] if run.config.model.mesh != "bricks" else []
-    return [*files, *(shipped_files(run).present if run.config.surrogate.file is not None else ())]
+    ready = shipped_files(run).present if run.config.surrogate.file is not None else ()
+    return [*files, *own_files(run), *ready]
 
 
 STAGE = Stage(

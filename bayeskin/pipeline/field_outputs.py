@@ -14,6 +14,7 @@ from bayeskin.model.fields import FieldWriter, StatesAt
 from bayeskin.model.problem import Problem
 from bayeskin.model.surface import PARTS, seen_surface, surface_state
 from bayeskin.types import Array, PadMotion, Phase
+from bayeskin.words import number
 
 _DOING = {"rest": "rest", "load": "loading", "hold": "hold", "unload": "unloading"}
 _CAPTION = (
@@ -117,7 +118,7 @@ def field_figure(
         ),
     ]
     labels = [
-        f"{time_s:.4g} s\n{what}\npads at {0.5e3 * motion.at(time_s):.2f} mm"
+        f"{number(time_s, 4)} s\n{what}\npads at {0.5e3 * motion.at(time_s):.2f} mm"
         for time_s, what in moments.items()
     ]
     return report.figure_fields(
@@ -136,7 +137,8 @@ def _finding(moments: Mapping[float, str], pressure_kpa: Array) -> str:
     """Where in time the extremes of the pressure stand, of values (t, f) [kPa]."""
     rows = list(moments.items())
     low, high = int(pressure_kpa.min(axis=1).argmin()), int(pressure_kpa.max(axis=1).argmax())
-    return (
-        f"Pressure from {pressure_kpa[low].min():.3g} kPa ({rows[low][0]:.4g} s, {rows[low][1]}) "
-        f"to {pressure_kpa[high].max():.3g} kPa ({rows[high][0]:.4g} s, {rows[high][1]})"
+    lowest, highest = (
+        f"{number(value, 3)} kPa ({number(rows[row][0], 4)} s, {rows[row][1]})"
+        for value, row in ((pressure_kpa[low].min(), low), (pressure_kpa[high].max(), high))
     )
+    return f"Pressure from {lowest} to {highest}"

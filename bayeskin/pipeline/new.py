@@ -16,6 +16,7 @@ from bayeskin.pipeline.folder import plain
 from bayeskin.pipeline.recording import pad_motion
 from bayeskin.pipeline.shipping import shipped_for
 from bayeskin.recordings import describe, describe_json, phase_noise, read_recording, segment
+from bayeskin.shipped import shipped
 from bayeskin.types import Parameter
 
 _SECONDS_A_RUN = (4, 15)  # of one core, on the default mesh
@@ -45,6 +46,24 @@ def new_config(file: Path, out: Path | None = None) -> dict[str, Any]:
     facts = describe_json(recording, phases, noise)
     answer = {"ok": True, "out": out, "surrogate": surrogate.name if surrogate else None, **facts}
     return plain({**answer, "text": f"{found}\n\nwritten to {out}, with {way}\nnext: bayeskin run {out}"})
+
+
+def new_demo(out: Path | None = None) -> dict[str, Any]:
+    """Puts the demo's configuration, by default demo.toml, and its recording beside it into a folder.
+
+    Raises InputError, with nothing written, where one of them is there already.
+    """
+    out = out or Path("demo.toml")
+    recording = out.with_name("demo-recording.h5")  # demo.h5 is the surrogate's name
+    if out.suffix != ".toml":
+        raise InputError(f"-o {out}", f"ending {out.suffix!r}", "ending .toml")
+    for file in (out, recording):
+        if file.exists():
+            raise InputError(file, "a file that is there already", "a folder without one")
+    text = shipped("runs/demo.toml").read_text(encoding="utf-8")
+    recording.write_bytes(shipped("data/demo.h5").read_bytes())
+    out.write_text(text.replace('"../data/demo.h5"', '"demo-recording.h5"'), encoding="utf-8")
+    return plain({"ok": True, "out": out, "text": f"written to {out}\nnext: bayeskin run {out}"})
 
 
 def _name(out: Path) -> str:

@@ -15,6 +15,7 @@ from bayeskin.errors import InputError
 from bayeskin.pipeline.engine import Run
 from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.model import model_spec, waves_spec
+from bayeskin.probe import refuse_damaged
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_manifest
 from bayeskin.types import BinnedForce, Design, PadMotion
@@ -43,6 +44,8 @@ def shipped_files(run: Run) -> ShippedFiles:
     for file in files.present[1:]:
         if not file.is_file():
             raise InputError(f"{run.config_path}: surrogate.file", f"no {file}", "its design beside it")
+    for file in files.present if own.is_file() else ():
+        refuse_damaged(file, "a surrogate that bayeskin wrote, and its design")
     return files
 
 

@@ -27,6 +27,7 @@ from bayeskin.pipeline.reported import reported
 from bayeskin.recordings import describe, describe_json, phase_noise, read_recording, segment
 from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, Parameter, ParameterSpace, Simulation
+from bayeskin.words import number
 
 REPORTED_EVERY_S = 0.1  # with mechanisms, whose force changes within a step of the model
 
@@ -71,6 +72,9 @@ def simulate_once(
     config_path = config or shipped("runs/demo.toml")
     run = Run(load_config(config_path), config_path, Path(), reporter)
     added = _mechanisms(mechanisms)
+    spec = model_spec(run, mesh, observation)
+    if spec.forward is not None and (fields or figures or added):
+        raise InputError("simulate", f"the model {spec.forward}", "no fields, figures or mechanisms with it")
     base = parameter_space(run.config, config_path)
     more = tuple(p for mechanism in added for p in mechanism.parameters)
     values = _values(ParameterSpace((*base.parameters, *more)), settings)
@@ -78,12 +82,11 @@ def simulate_once(
         _refuse_senseless(parameter, values[parameter.name])
     theta = {name: values[name] for name in base.names}
     along = {p.name: values[p.name] for mechanism in solved(added) for p in mechanism.parameters}
-    spec = model_spec(run, mesh, observation)
     source = read_recording(recording or run.beside(run.config.recording.file))
     phases = segment(source)
     motion = pad_motion(spec.observation, source, phases, run.config.recording.protocol)
     moments = moments_of(phases, motion, at_s)
-    reporter.log(f"simulating {motion.time_s[-1]:.1f} s, {spec.observation} on {Path(spec.mesh).name}")
+    reporter.log(f"simulating {motion.time_s[-1]:.1f} s, {spec.forward or _on_mesh(spec)}")
     outputs = None
     if fields or figures:
         problem = problem_of(spec.mesh, spec.refinement)
@@ -99,6 +102,11 @@ def simulate_once(
         write_simulation(out, simulation)
         files = [out, *shown]
     return _answer(simulation, spec, files)
+
+
+def _on_mesh(spec: ModelSpec) -> str:
+    """The full model in words."""
+    return f"{spec.observation} on {Path(spec.mesh).name}"
 
 
 def write_simulation(out: Path, simulation: Simulation) -> None:
@@ -172,9 +180,11 @@ def _answer(simulation: Simulation, spec: ModelSpec, files: Sequence[Path]) -> d
     ok, stats = simulation.status == "ok", simulation.stats
     text = f"failed: {simulation.message}"
     if ok:
+        own = spec.forward is not None
+        steps = "one run" if own else f"{stats['steps']:.0f} steps of {stats['dofs']:.0f} unknowns"
         text = (
-            f"{stats['steps']:.0f} steps of {stats['dofs']:.0f} unknowns in {stats['seconds']:.1f} s, "
-            f"peak force {stats['peak_force_n']:.4g} N, written to {', '.join(map(str, files))}"
+            f"{steps} in {stats['seconds']:.1f} s, peak force {number(stats['peak_force_n'], 4)} N, "
+            f"written to {', '.join(map(str, files))}"
         )
         text += "".join(f"\n{line}" for line in _accuracy(simulation, spec))
     answer = {"ok": ok, "status": simulation.status, "message": simulation.message, "theta": simulation.theta}
@@ -190,15 +200,20 @@ def _answer(simulation: Simulation, spec: ModelSpec, files: Sequence[Path]) -> d
 
 def _accuracy(simulation: Simulation, spec: ModelSpec) -> list[str]:
     """The estimated error of a reaction; the article's force has none: it does not converge."""
+    if spec.observation == "own":
+        return ["no estimated error: a model of your own"]
     if spec.observation == "article":
         return ["no estimated error: the article's force depends on its mesh and converges on none"]
     peak_n = simulation.stats["peak_force_n"]
     time_share = simulation.stats["time_error_n"] / peak_n if peak_n > 0.0 else 0.0
     found = mesh_error(spec.mesh_hash)
-    mesh = "unknown, the mesh is not in the study" if found is None else f"{100 * found.rms:.2g} % RMS"
+    mesh = "unknown, the mesh is not in the study" if found is None else f"{number(100 * found.rms, 2)} % RMS"
     falls = simulation.stats["falls"]
     snapped = [f"the skin folded: it snapped to another equilibrium {falls:.0f} times"] if falls else []
-    return [*snapped, f"estimated error, of the peak: time steps {100 * time_share:.2g} %, mesh {mesh}"]
+    return [
+        *snapped,
+        f"estimated error, of the peak: time steps {number(100 * time_share, 2)} %, mesh {mesh}",
+    ]
 
 
 def _check_suffix(out: Path, suffixes: tuple[str, ...]) -> None:

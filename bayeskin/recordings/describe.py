@@ -10,6 +10,7 @@ import numpy as np
 from bayeskin.recordings.noise import PhaseNoise
 from bayeskin.recordings.segment import resolution_m
 from bayeskin.types import Phase, Recording
+from bayeskin.words import number
 
 _HEADINGS = (
     "phase",
@@ -30,12 +31,12 @@ def describe(recording: Recording, phases: Sequence[Phase], noise: Sequence[Phas
     facts = describe_json(recording, phases, noise)
     displacement, force = facts["displacement_m"], facts["force_n"]
     lines = [
-        f"{facts['name']}: {facts['samples']} samples at {facts['sampling_hz']:.4g} Hz, "
+        f"{facts['name']}: {facts['samples']} samples at {number(facts['sampling_hz'], 4)} Hz, "
         f"{facts['duration_s']:.2f} s, {facts['cycles']} cycle{'s' * (facts['cycles'] != 1)}",
         *(f"  {note}" for note in recording.notes),
         f"  displacement {1e3 * displacement['min']:.3f} to {1e3 * displacement['max']:.3f} mm "
-        f"(resolved to {1e3 * displacement['resolution']:.2g} mm), "
-        f"force {force['min']:.4g} to {force['max']:.4g} N",
+        f"(resolved to {number(1e3 * displacement['resolution'], 2)} mm), "
+        f"force {number(force['min'], 4)} to {number(force['max'], 4)} N",
         "",
         "  ".join(f"{title:>{width}}" for title, width in zip(_HEADINGS, _WIDTHS, strict=True)),
     ]

@@ -173,6 +173,9 @@ def _round(
     despiked = despike(time_s, recording.force_n, breaks.tolist())
     longest = int(np.max(np.diff(breaks)))
     size = min(round(_WINDOW_S / interval_s), int(0.7 * longest))
+    if round(_WINDOW_S / interval_s) < _LEAST_WINDOW:
+        expected = f"at most {_WINDOW_S / _LEAST_WINDOW:.2g} s, to know their noise"
+        raise InputError(recording.name, f"samples {interval_s:.3g} s apart", expected)
     if size < _LEAST_WINDOW:
         found = f"{longest} samples in the longest phase"
         raise InputError(

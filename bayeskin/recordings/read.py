@@ -10,6 +10,7 @@ import numpy as np
 
 from bayeskin import storage
 from bayeskin.errors import InputError
+from bayeskin.probe import refuse_damaged
 from bayeskin.recordings.headers import UNITS, Column
 from bayeskin.recordings.tables import Table, read_text, read_workbook
 from bayeskin.types import Array, Recording
@@ -64,6 +65,7 @@ def read_recording(path: Path | str, *, sheet: str | None = None) -> Recording:
 
 
 def _read_stored(path: Path) -> Recording:
+    refuse_damaged(path, "a bayeskin Recording file")
     try:
         recording = storage.load(path, Recording)
         arrays = [np.asarray(a) for a in (recording.time_s, recording.displacement_m, recording.force_n)]

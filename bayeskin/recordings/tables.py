@@ -47,10 +47,9 @@ def read_text(path: Path, data: bytes) -> Table:
     InputError : no such header, a row with too many or too few cells, a cell that is no number.
     """
     text, encoding = _decode(path, data)
-    lines = text.splitlines()
-    split = _choose_split(path, lines[:_HEADER_WITHIN])
+    split = _choose_split(path, list(islice(_lines(text), _HEADER_WITHIN)))
     try:
-        table = _tabulate(str(path), split(lines))
+        table = _tabulate(str(path), split(_lines(text)))
     except csv.Error as error:
         raise InputError(path, f"text that is not a table ({error})", "rows of cells") from None
     if encoding == "utf-8":
@@ -112,6 +111,11 @@ def _decode(path: Path, data: bytes) -> tuple[str, str]:
         if "\0" not in text:
             return text, encoding.removesuffix("-sig")
     raise InputError(path, "bytes that are not text", "text in UTF-8, UTF-16 with its mark, or Windows-1252")
+
+
+def _lines(text: str) -> Iterator[str]:
+    """The lines one by one: ten million of them as a list would take a gigabyte."""
+    return (found[1] for found in re.finditer(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)", text))
 
 
 def _split_by(delimiter: str) -> Split:

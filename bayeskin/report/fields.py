@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from bayeskin.errors import InputError
 from bayeskin.report.style import GREY, INK, PAGE_IN, new_figure, plain_log, state_finding, styled
 from bayeskin.types import Array
+from bayeskin.words import number
 
 # Grey stands for nothing: a white surface would vanish on the page.
 _SEQUENTIAL = LinearSegmentedColormap.from_list("grey-blue", ["#E6E6E6", "#86B8D9", "#0072B2", "#08284F"])
@@ -188,7 +189,7 @@ def _frame(ax: Axes, low: Array, high: Array, values: Array) -> None:
     ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
     ax.set(xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
-    reach = f"{values.min():.3g} to {values.max():.3g}".replace("-", "−")
+    reach = f"{number(values.min(), 3)} to {number(values.max(), 3)}".replace("-", "−")
     ax.text(1.0, 0.0, reach, transform=ax.transAxes, ha="right", va="bottom", fontsize=6.5, color=GREY)
 
 

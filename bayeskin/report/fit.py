@@ -30,6 +30,7 @@ from bayeskin.report.timeline import (
     shade_phases,
 )
 from bayeskin.types import Array, BinnedForce
+from bayeskin.words import number
 
 Mask = NDArray[np.bool_]
 
@@ -153,7 +154,7 @@ def _finding(binned: BinnedForce, bands: ForceBands, chosen: Mask) -> str:
     inside = (binned.force_n >= bands.low_n[1]) & (binned.force_n <= bands.high_n[1])
 
     def part(mask: Mask) -> str:
-        return f"{1e3 * np.sqrt(np.nanmean(residual[mask] ** 2)):.3g} mN RMS"
+        return f"{number(1e3 * np.sqrt(np.nanmean(residual[mask] ** 2)), 3)} mN RMS"
 
     if not chosen.any():
         held = f"{100 * inside.mean():.0f} % of bins in the 90 % band"

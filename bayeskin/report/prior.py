@@ -20,6 +20,7 @@ from bayeskin.report.style import (
 )
 from bayeskin.report.timeline import LEVELS, draw_bands, phase_legend, shade_phases
 from bayeskin.types import Array, BinnedForce
+from bayeskin.words import number
 
 
 @styled
@@ -49,7 +50,9 @@ def figure_prior_predictive(binned: BinnedForce, draws_n: ArrayLike) -> Figure:
     _draw_peaks(peaks, peak_n, recorded_peak)
     panel_title(fan, "a")
     panel_title(peaks, "b", "the prior's peak forces")
-    finding = f"The recorded peak of {recorded_peak:.3g} N lies above {100 * share:.0f} % of the prior's"
+    finding = (
+        f"The recorded peak of {number(recorded_peak, 3)} N lies above {100 * share:.0f} % of the prior's"
+    )
     caption = (
         f"Black: recorded. Blue: median, 50 % and 90 % band of {len(draws)} draws from the prior; grey: "
         f"single draws. Force axis linear below {threshold:g} N and logarithmic above."

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from bayeskin.report.style import INK, PAGE_IN, RECORDED, new_figure, panel_title, state_finding, styled
 from bayeskin.report.timeline import phase_legend, shade_phases
 from bayeskin.types import Array, BinnedForce, Recording
+from bayeskin.words import number
 
 _MANY = 4000  # samples beyond which a line goes into an SVG as pixels
 
@@ -44,14 +45,14 @@ def figure_recording(recording: Recording, binned: BinnedForce) -> Figure:
     panel_title(loops, "c", "loops, bin means")
     cycles = len({p.cycle for p in phases if p.kind in ("load", "unload")})
     finding = (
-        f"{recording.name}: {cycles} cycle{'s' * (cycles != 1)} to {high:.3g} mm, "
-        f"forces from {recording.force_n.min():.3g} to {recording.force_n.max():.3g} N"
+        f"{recording.name}: {cycles} cycle{'s' * (cycles != 1)} to {number(high, 3)} mm, "
+        f"forces from {number(recording.force_n.min(), 3)} to {number(recording.force_n.max(), 3)} N"
     )
     rate_hz = 1.0 / np.median(np.diff(recording.time_s))
     width_s = np.median(np.diff(binned.edges_s))
     caption = (
-        f"a and b as recorded, nothing smoothed: {len(recording.time_s)} samples at {rate_hz:.4g} Hz. "
-        f"c: robust means over {width_s:.3g} s."
+        f"a and b as recorded, nothing smoothed: {len(recording.time_s)} samples at {number(rate_hz, 4)} Hz. "
+        f"c: robust means over {number(width_s, 3)} s."
     )
     state_finding(figure, finding, caption)
     return figure

@@ -23,6 +23,7 @@ from bayeskin.report.style import (
 )
 from bayeskin.report.timeline import phase_legend, shade_phases
 from bayeskin.types import Array, BinnedForce, Prediction
+from bayeskin.words import number
 
 _NOMINAL = np.array([0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99])
 
@@ -116,11 +117,11 @@ def figure_map_check(
         strict=True,
     ):  # fmt: skip
         panel_title(ax, letter, title)
-    in_its_sd = f" (at most {np.nanmax(np.abs(ratio)):.2g} of its sd)" if known.any() else ""
+    in_its_sd = f" (at most {number(np.nanmax(np.abs(ratio)), 2)} of its sd)" if known.any() else ""
     misfit_n = np.sqrt(np.nanmean((binned.force_n - full) ** 2))
     finding = (
-        f"At the MAP the surrogate is off by {1e3 * np.sqrt(np.mean(error**2)):.2g} mN RMS{in_its_sd}; "
-        f"the full model leaves {1e3 * misfit_n:.2g} mN to the recording"
+        f"At the MAP the surrogate is off by {number(1e3 * np.sqrt(np.mean(error**2)), 2)} mN RMS"
+        f"{in_its_sd}; the full model leaves {number(1e3 * misfit_n, 2)} mN to the recording"
     )
     state_finding(figure, finding)
     return figure
@@ -179,7 +180,7 @@ def _draw_waves(ax: Axes, wave_error: Array, corrected: bool) -> None:
         low, middle, high = np.quantile(errors, [0.05, 0.5, 0.95])
         ax.plot([wave, wave], [low, high], color=MODEL, lw=2.5, alpha=0.4, solid_capstyle="butt")
         ax.plot(wave, middle, "o", color=MODEL, ms=4.5)
-        ax.text(wave + 0.12, middle, f"{middle:.2g}", va="center", fontsize=6.5)
+        ax.text(wave + 0.12, middle, f"{number(middle, 2)}", va="center", fontsize=6.5)
     ax.set_xlim(-0.5, len(wave_error) - 0.2)
     labels = [str(wave) for wave in range(len(wave_error))]
     ax.set_xticks(range(len(labels)), [*labels[:-1], "corrected"] if corrected else labels)

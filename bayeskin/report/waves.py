@@ -22,6 +22,7 @@ from bayeskin.report.style import (
 )
 from bayeskin.report.triangle import label_edges, triangle
 from bayeskin.types import Array, Design, Parameter
+from bayeskin.words import number
 
 
 @styled
@@ -105,4 +106,4 @@ def _finding(design: Design, kept: Array) -> str:
 
 
 def _percent(fraction: float) -> str:
-    return f"{100 * fraction:.2g} %" if fraction < 0.995 else "100 %"
+    return f"{number(100 * fraction, 2)} %" if fraction < 0.995 else "100 %"

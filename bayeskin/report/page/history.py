@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from bayeskin.report.page.parts import Chart
 from bayeskin.report.timeline import runs_of
 from bayeskin.types import Array
+from bayeskin.words import number
 
 WIDTH, HEIGHT = 760, 320
 LEFT, RIGHT, TOP, BOTTOM = 54, 10, 24, 40
@@ -144,6 +145,6 @@ def _alt(series: Mapping[str, Array], fitted: Array) -> str:
     part = "" if fitted.all() else f", {int(fitted.sum())} of them fitted"
     return (
         f"Force over {series['time_s'][-1]:.0f} s: {len(recorded)} recorded means{part}, from "
-        f"{np.nanmin(recorded):.3g} to {np.nanmax(recorded):.3g} N, with the predicted median and the "
-        "50 and 90 % bands around it."
+        f"{number(np.nanmin(recorded), 3)} to {number(np.nanmax(recorded), 3)} N, with the predicted median "
+        "and the 50 and 90 % bands around it."
     )

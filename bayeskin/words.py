@@ -1,0 +1,16 @@
+"""Numbers as people write them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+_LOW, _HIGH = 1e-4, 1e7  # beyond, powers of ten are easier to read
+
+
+def number(value: float, digits: int, sign: bool = False) -> str:
+    """A number to so many significant digits, such as 280, 0.05 or 2e-14; with `sign` also a plus."""
+    if value and not _LOW <= abs(value) < _HIGH:
+        return f"{value:{'+' if sign else ''}.{digits}g}"
+    return np.format_float_positional(
+        value, precision=digits, unique=False, fractional=False, trim="-", sign=sign
+    )

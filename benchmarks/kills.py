@@ -1,0 +1,236 @@
+"""kill -9 at random times of designing, training, sampling and diagnosing: what is lost, and what comes out.
+
+    python benchmarks/kills.py --kills 14 --seed 1
+
+makes a recording with a small model of its own, runs `bayeskin` on it undisturbed, then each stage again from
+where the one before ended: started, killed from outside at a random time, looked at, started again. Prints a
+table: kills, what had been finished and was gone after a kill, and whether the end is the undisturbed one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from bayeskin import storage
+from bayeskin.pipeline.folder import current_record, read_record
+from bayeskin.types import Recording
+
+STAGES = ("design", "train", "sample", "diagnose")
+KILLS_A_ROUND = 5  # then the stage is let to its end, and begun anew
+MODEL = """
+import time
+import numpy as np
+
+def force(theta, time_s, displacement_m):
+    time.sleep(0.05)
+    decay = np.exp(-np.diff(time_s) / theta["tau"])
+    rate = np.diff(displacement_m) / np.diff(time_s)
+    element = np.zeros(len(time_s))
+    for i in range(1, len(time_s)):
+        element[i] = element[i - 1] * decay[i - 1] + rate[i - 1] * theta["tau"] * (1 - decay[i - 1])
+    return theta["stiffness"] * (displacement_m + theta["share"] * element)
+"""
+CONFIG = """
+[recording]
+file = "measured.h5"
+[model]
+forward = "model.py:force"
+[parameters.stiffness]
+lower = 10.0
+upper = 1000.0
+prior = "log-uniform"
+[parameters.share]
+lower = 0.0
+upper = 1.0
+[parameters.tau]
+lower = 1.0
+upper = 50.0
+prior = "log-uniform"
+[fit]
+bin_width_s = 1.0
+[design]
+points = [32, 24]
+held_out = 8
+[map]
+starts = 2
+evaluations = 500
+[sample]
+ensembles = 2
+walkers = 24
+effective_samples = 3000
+max_steps = 1500
+"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """What became of one stage: how often it was killed, what was lost, whether its end is the same."""
+
+    stage: str
+    kills: int
+    rounds: int
+    lost: tuple[str, ...]
+    same: bool
+
+
+def make_case(folder: Path) -> Path:
+    """A recording of the model, drifting sensor and all, its file and its configuration."""
+    folder.mkdir(parents=True)
+    known: dict[str, Any] = {}
+    exec(MODEL, known)
+    time_s = np.arange(0.0, 130.001, 0.1)
+    corners_s = [0.0, 5.0, 15.0, 45.0, 55.0, 65.0, 75.0, 105.0, 115.0, 130.1]
+    pulled_m = np.interp(time_s, corners_s, [0.0, 0.0, 9e-3, 9e-3, 0.0, 0.0, 9e-3, 9e-3, 0.0, 0.0])
+    force_n = known["force"]({"stiffness": 100.0, "share": 0.6, "tau": 8.0}, time_s, pulled_m)
+    noise_n = 2e-3 * np.random.default_rng(5).standard_normal(len(time_s))
+    recording = Recording(time_s, pulled_m, force_n + noise_n + 3e-4 * time_s, "spring", "0" * 64)
+    storage.save(folder / "measured.h5", recording)
+    (folder / "model.py").write_text(MODEL)
+    (folder / "case.toml").write_text(CONFIG)
+    return folder / "case.toml"
+
+
+def study(where: Path, kills: int, seed: int) -> Iterator[Row]:
+    """One row a stage, of at least `kills` each."""
+    rng, config = np.random.default_rng(seed), make_case(where / "undisturbed")
+    for stage in STAGES:
+        before = where / f"before-{stage}"
+        shutil.copytree(config.parent, before)
+        started = time.monotonic()
+        _finish(config, stage)
+        yield _killed(where, before, config.parent, stage, kills, rng, time.monotonic() - started)
+        shutil.rmtree(before)
+
+
+def _killed(
+    where: Path, before: Path, undisturbed: Path, stage: str, kills: int, rng: Any, lasts_s: float
+) -> Row:
+    count, rounds, lost, same = 0, 0, list[str](), True
+    while count < kills:
+        here = where / "disturbed"
+        shutil.copytree(before, here)
+        rounds += 1
+        for _ in range(min(KILLS_A_ROUND, kills - count)):
+            had = _finished(here)
+            if not _kill_after(here / "case.toml", stage, float(rng.uniform(0.0, lasts_s))):
+                break
+            count += 1
+            lost += [f"{what} {key}" for what, keys in had.items() for key in keys - _finished(here)[what]]
+        _finish(here / "case.toml", stage)
+        same = same and _result(here, stage) == _result(undisturbed, stage)
+        shutil.rmtree(here)
+    return Row(stage, count, rounds, tuple(lost), same)
+
+
+def _command(config: Path, stage: str) -> list[str]:
+    return [sys.executable, "-c", "from bayeskin.cli import main; main()", stage, str(config)]
+
+
+def _finish(config: Path, stage: str) -> None:
+    done = subprocess.run(_command(config, stage), capture_output=True, text=True, check=False)
+    if done.returncode not in (0, 1):  # 1: an answer that is not to be trusted is an answer
+        raise SystemExit(f"{stage}: {done.stderr[-2000:]}")
+
+
+def _kill_after(config: Path, stage: str, seconds: float) -> bool:
+    """Whether the stage was still running by then, and was killed."""
+    process = subprocess.Popen(_command(config, stage), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        process.wait(timeout=seconds)
+    except subprocess.TimeoutExpired:
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        return True
+    return False
+
+
+def _finished(folder: Path) -> dict[str, set[str]]:
+    """Names of all that is finished in a run's folder: it may only grow."""
+    run = folder / "case"
+    found: dict[str, set[str]] = {"run": set(), "steps": set(), "fit": set(), "stage": set()}
+    for file in run.glob("runs/*.h5"):
+        with h5py.File(file) as handle:
+            found["run"] |= {row.tobytes().hex() for row in handle["theta"][()]}
+    for journal in run.glob("runs/*.journal"):
+        found["run"] |= set(map(_point, journal.read_bytes().split(b"\n"))) - {""}
+    for chain in run.glob("chains/*/*.h5"):
+        with h5py.File(chain) as handle:
+            found["steps"] |= {f"{chain.name} {n}" for n in range(int(handle["mcmc"].attrs["iteration"]))}
+    for search in run.glob("searches/*.jsonl"):
+        text = search.read_text()
+        found["fit"] |= {f"{search.name} {line}" for line in text[: text.rfind("\n") + 1].splitlines()}
+    for record in run.glob("*/stage.json"):
+        known = read_record(record.parent)
+        if known is not None and current_record(record.parent, known.inputs_sha256) is not None:
+            found["stage"].add(record.parent.name)
+    return found
+
+
+def _point(line: bytes) -> str:
+    """The point of a journal's line; nothing of one that is cut short."""
+    try:
+        return np.array(json.loads(line.split(b" ", 2)[2])["theta"]).tobytes().hex()
+    except (IndexError, ValueError):
+        return ""
+
+
+def _result(folder: Path, stage: str) -> Any:
+    """What a stage came to, without how long it took."""
+    record = read_record(folder / "case" / stage)
+    assert record is not None
+    numbers: dict[str, Any] = {"done": record.done, "summary": _timeless(record.summary)}
+    if stage == "design":
+        with h5py.File(folder / "case" / "design" / "design.h5") as handle:
+            numbers |= {name: handle[name][()].tobytes() for name in ("theta", "force_n", "ok", "wave")}
+    for chain in sorted((folder / "case").glob("chains/*/*.h5")):
+        with h5py.File(chain) as handle:
+            numbers[chain.name] = handle["mcmc/chain"][()].tobytes()
+    return numbers
+
+
+def _timeless(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {k: _timeless(v) for k, v in value.items() if "seconds" not in k}
+    return [_timeless(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def table(rows: list[Row]) -> str:
+    """Markdown, as docs/faults.md has it."""
+    lines = ["| killed in | kills | from the start | finished things lost | end as undisturbed |"]
+    lines += ["|---|--:|--:|--:|---|"]
+    for row in rows:
+        end = "yes" if row.same else "NO"
+        lines.append(f"| `{row.stage}` | {row.kills} | {row.rounds} | {len(row.lost)} | {end} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=14, help="of each stage")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    rows = []
+    with tempfile.TemporaryDirectory() as where:
+        for row in study(Path(where), options.kills, options.seed):
+            print(row, file=sys.stderr, flush=True)
+            rows.append(row)
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,251 @@
+"""Disks that are full, folders read-only or taken, files of another origin: one line, and nothing lost.
+
+What is done to the bytes of files stands in test_fuzz.py; kill -9 at random times in benchmarks/kills.py.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from own_models import PARAMETERS, SPRING, TRUE, spring
+from toy import MOTION
+
+from bayeskin import storage
+from bayeskin.pipeline.folder import read_record
+from bayeskin.runner import load_design
+from bayeskin.types import Recording
+
+ROOT = Path(__file__).parents[1]
+MAIN = "from bayeskin.cli import main; main()"
+CONFIG = """
+[recording]
+file = "measured.h5"
+[model]
+forward = "spring.py:force"
+[fit]
+bin_width_s = 1.0
+[design]
+points = [24]
+held_out = 6
+"""
+
+
+@pytest.fixture
+def case() -> Iterator[Path]:
+    """A configuration of a small model of its own, in a folder that anybody may enter."""
+    folder = Path(tempfile.mkdtemp())
+    folder.chmod(0o755)
+    time_s = np.arange(0.0, 130.001, 0.1)
+    pulled = MOTION.at(time_s)
+    force_n = spring()(TRUE, time_s, pulled) + 2e-3 * np.random.default_rng(5).standard_normal(len(time_s))
+    storage.save(folder / "measured.h5", Recording(time_s, pulled, force_n, "spring", "0" * 64))
+    (folder / "spring.py").write_text(SPRING)
+    (folder / "case.toml").write_text(CONFIG + PARAMETERS)
+    yield folder / "case.toml"
+    shutil.rmtree(folder)
+
+
+def bayeskin(
+    *arguments: object, before: Callable[[], None] | None = None, code: str = MAIN
+) -> tuple[int, str]:
+    """Exit code and stderr of the command, as a process of its own."""
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, preexec_fn=before)
+    return done.returncode, done.stderr
+
+
+def refused(answer: tuple[int, str], says: str) -> None:
+    code, err = answer
+    assert code == 2, err
+    assert "Traceback" not in err
+    assert [line for line in err.splitlines() if line.startswith("bayeskin: ")] == [err.splitlines()[-1]]
+    assert says in err.splitlines()[-1]
+
+
+def files_at_most(size: int) -> Callable[[], None]:
+    """What a full disk does to a write, without one."""
+    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+@pytest.mark.parametrize("size", [0, 1000, 10_000])
+def test_a_full_disk_is_told_and_leaves_the_earlier_file(case: Path, size: int) -> None:
+    out = case.parent / "out.h5"
+    out.write_bytes(b"what was there before")
+    refused(bayeskin("import", case.parent / "measured.h5", "-o", out, before=files_at_most(size)), "")
+    assert out.read_bytes() == b"what was there before"
+    assert sorted(p.name for p in case.parent.iterdir()) == [
+        "case.toml",
+        "measured.h5",
+        "out.h5",
+        "spring.py",
+    ]
+
+
+def test_a_real_disk_that_is_full_is_told(case: Path) -> None:
+    disk = case.parent / "disk"
+    disk.mkdir()
+    mounted = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(disk)]
+    if subprocess.run(mounted, capture_output=True, check=False).returncode:
+        pytest.skip("no right to mount a small disk")
+    try:
+        for name in ("case.toml", "spring.py"):
+            shutil.copy(case.parent / name, disk)
+        (disk / "measured.h5").symlink_to(case.parent / "measured.h5")
+        refused(bayeskin("design", disk / "case.toml"), "No space left on device")
+        refused(bayeskin("import", disk / "measured.h5", "-o", disk / "again.h5"), "")
+        assert not (disk / "again.h5").exists()
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def without_a_superusers_rights() -> None:
+    """Nobody's rights go beyond a file's mode: PR_CAPBSET_DROP of CAP_DAC_OVERRIDE, which exec then lacks."""
+    ctypes.CDLL(None).prctl(24, 1, 0, 0, 0)
+
+
+def test_a_read_only_folder_is_told(case: Path) -> None:
+    case.parent.chmod(0o555)
+    measured = case.parent / "measured.h5"
+    try:
+        for command in (
+            ("design", case),
+            ("import", measured, "-o", case.parent / "o.h5"),
+            ("new", measured, "-o", case.parent / "o.toml"),
+        ):
+            refused(bayeskin(*command, before=without_a_superusers_rights), "Permission denied")
+        assert sorted(p.name for p in case.parent.iterdir()) == ["case.toml", "measured.h5", "spring.py"]
+    finally:
+        case.parent.chmod(0o755)
+
+
+def test_a_second_run_on_a_folder_is_refused_and_the_first_goes_on(case: Path) -> None:
+    (case.parent / "spring.py").write_text(
+        "import time\n" + SPRING.replace("    pull =", "    time.sleep(0.3)\n    pull =")
+    )
+    first = subprocess.Popen([sys.executable, "-c", MAIN, "design", str(case)], stderr=subprocess.DEVNULL)
+    while not list(case.parent.glob("case/runs/*.journal")):
+        assert first.poll() is None
+        time.sleep(0.05)
+    refused(
+        bayeskin("train", case), f"in use by another bayeskin (process {first.pid}); expected one process"
+    )
+    assert first.wait() == 0
+    assert len(load_design(case.parent / "case/design/design.h5").theta) == 30
+
+
+def altered_surrogate(path: Path) -> None:
+    with h5py.File(path, "r+") as handle:
+        handle["edges_s"][3] += 1e-9
+
+
+def later_format(path: Path) -> None:
+    with h5py.File(path, "r+") as handle:
+        handle.attrs["format_version"] = 99
+
+
+def of_somebody_else(path: Path) -> None:
+    with h5py.File(path, "w") as handle:
+        handle["x"] = np.arange(3)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        (altered_surrogate, "contents that differ from their stored hash"),
+        (later_format, "format version 99"),
+        (of_somebody_else, "another origin"),
+        (cut, "not readable as HDF5"),
+        (lambda path: path.write_bytes(b""), "not readable as HDF5"),
+    ],
+    ids=["altered", "later", "foreign", "cut", "empty"],
+)
+def test_a_surrogate_that_is_not_what_it_was_is_refused(
+    tmp_path: Path, fault: Callable[[Path], None], says: str
+) -> None:
+    for file in ("surrogates/demo.h5", "surrogates/demo-design.h5", "data/demo.h5"):
+        shutil.copy(ROOT / file, tmp_path / Path(file).name.replace("demo", "mine"))
+    shutil.copy(ROOT / "data/demo.h5", tmp_path / "measured.h5")
+    shutil.copy(ROOT / "surrogates/demo.h5", tmp_path / "mine.h5")
+    fault(tmp_path / "mine.h5")
+    config = '[recording]\nfile = "measured.h5"\n[surrogate]\nfile = "mine.h5"\n'
+    (tmp_path / "case.toml").write_text(config)
+    refused(bayeskin("train", tmp_path / "case.toml"), says)
+
+
+def test_a_surrogate_of_another_model_is_refused(tmp_path: Path) -> None:
+    shutil.copy(ROOT / "data/demo.h5", tmp_path / "measured.h5")
+    config = '[recording]\nfile = "measured.h5"\n[model]\nrefinement = 2\n[surrogate]\nfile = "demo.h5"\n'
+    (tmp_path / "case.toml").write_text(config)
+    refused(bayeskin("train", tmp_path / "case.toml"), "a surrogate of another model")
+
+
+def test_ten_million_samples_are_read_in_bounded_memory(tmp_path: Path) -> None:
+    """A tenth of it, and the slope: memory grows by at most 200 bytes a sample."""
+    peaks = []
+    for count in (100_000, 400_000):
+        time_s = np.linspace(0.0, 130.0, count)
+        noise_n = 2e-3 * np.random.default_rng(1).standard_normal(count)
+        force_n = spring()(TRUE, time_s, MOTION.at(time_s)) + noise_n
+        table = np.column_stack([time_s, 1e3 * MOTION.at(time_s), force_n])
+        path = tmp_path / f"{count}.csv"
+        np.savetxt(
+            path, table, delimiter=",", fmt="%.6f", comments="", header="time (s),displacement (mm),force (N)"
+        )
+        code = (
+            "import resource, sys; from pathlib import Path; from bayeskin.recordings import read_recording\n"
+            "read_recording(Path(sys.argv[1]))\n"
+            "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, file=sys.stderr)"
+        )
+        peaks.append(1024 * int(bayeskin(path, code=code)[1].split()[-1]))
+    assert (peaks[1] - peaks[0]) / 300_000 < 200.0
+
+
+@pytest.mark.slow
+def test_kills_lose_nothing_and_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    kills = importlib.import_module("kills")
+    rows = list(kills.study(tmp_path, 14, 1))
+    assert sum(row.kills for row in rows) >= 50
+    assert [row.lost for row in rows] == [()] * 4
+    assert all(row.same for row in rows)
+
+
+def test_one_kill_of_a_design_loses_nothing_and_is_seen_by_the_study(
+    case: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    kills = importlib.import_module("kills")
+    process = subprocess.Popen([sys.executable, "-c", MAIN, "design", str(case)], stderr=subprocess.DEVNULL)
+    while len(kills._finished(case.parent)["run"]) < 3:
+        assert process.poll() is None
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    had = kills._finished(case.parent)["run"]
+    assert bayeskin("design", case)[0] == 0
+    now = kills._finished(case.parent)
+    assert had <= now["run"]
+    assert now["stage"] == {"recording", "design"}
+    assert len(now["run"]) == 30
+    record = read_record(case.parent / "case/design")
+    assert record is not None
+    assert json.dumps(dict(record.summary))
