@@ -46,7 +46,11 @@ def test_the_hash_follows_the_content_and_ignores_the_workers(tmp_path: Path) ->
         ("", "recording", "found nothing"),
         ("colour = 1\n" + SMALLEST, "colour", "unknown key; expected one of name, recording, seed"),
         (SMALLEST + "[fit]\nbin_width = 1\n", "fit.bin_width", "expected one of windows_s, bin_width_s"),
-        (SMALLEST + "[parameters.E_c]\nlow = 1\n", "parameters.E_c.low", "one of lower, upper, prior, mean, sd, median, factor, source, unit"),
+        (
+            SMALLEST + "[parameters.E_c]\nlow = 1\n",
+            "parameters.E_c.low",
+            "one of lower, upper, prior, mean, sd, median, factor, source, unit",
+        ),
         (SMALLEST + "[parameters.E_x]\nlower = 1\n", "parameters.E_x", "one of E_c, E_s, k_c, k_s, p_init"),
         (SMALLEST + "[parameters.E_c]\nlower = 2e6\nupper = 1e4\n", "parameters.E_c", "lower below upper"),
         (SMALLEST + "[parameters.k_c]\nlower = 0.0\n", "parameters.k_c.lower", "above zero"),

@@ -260,7 +260,7 @@ def test_a_recording_too_coarse_to_tell_noise_is_refused() -> None:
     time_s = np.arange(0.0, 130.0, 1.0)
     made = recording(true_force(time_s), MOTION, time_s)
     phases = tuple(Phase("hold", 1, a, a + 10.0) for a in np.arange(0.0, 130.0, 10.0))
-    with pytest.raises(InputError, match="to know its noise"):
+    with pytest.raises(InputError, match="to know their noise"):
         phase_noise(made, phases)
 
 

@@ -23,7 +23,9 @@ from bayeskin.types import Recording
 
 mpl.use("Agg")
 ROOT = Path(__file__).parents[1]
-BLOCKS = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "scripting.md").read_text(), re.M | re.S)
+BLOCKS = re.findall(
+    r"(?<!-->\n)^```python\n(.*?)^```", (ROOT / "docs" / "scripting.md").read_text(), re.M | re.S
+)
 
 
 @pytest.fixture(scope="module")
