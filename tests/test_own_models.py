@@ -387,7 +387,12 @@ def test_the_command_serves_on_loopback_until_it_is_interrupted(case: Path) -> N
         "--port",
         "0",
     ]
-    process = subprocess.Popen([*command, "--json"], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*command, "--json"],
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background shell ignores it
+    )
     text = ""
     while not text.endswith("}\n"):
         text += process.stdout.readline()
