@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import importlib
-import json
 import os
 import resource
 import shutil
@@ -248,4 +247,3 @@ def test_one_kill_of_a_design_loses_nothing_and_is_seen_by_the_study(
     assert len(now["run"]) == 30
     record = read_record(case.parent / "case/design")
     assert record is not None
-    assert json.dumps(dict(record.summary))

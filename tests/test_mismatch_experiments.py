@@ -214,15 +214,16 @@ def test_protocols_judged_before_an_interruption_are_not_judged_again(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    made: list[int] = []
+    made: list[str] = []
+    listed = {one.name: one for one in protocols(toy.MOTION)}
 
-    def serially(judge: Any, items: Sequence[int], workers: int) -> Iterator[tuple[int, Any]]:
-        for place, index in enumerate(items):
+    def serially(judge: Any, items: Sequence[str], workers: int) -> Iterator[tuple[int, Any]]:
+        for place, name in enumerate(items):
             if len(made) == 4:
-                made.append(-1)
+                made.append("interrupted")
                 raise KeyboardInterrupt
-            made.append(index)
-            yield place, weigh(protocols(toy.MOTION)[index], fits, KNOWN, toy_run, 0)
+            made.append(name)
+            yield place, weigh(listed[name], fits, KNOWN, toy_run, 0)
 
     monkeypatch.setattr(experiment, "run_parallel", serially)
     asked = (
@@ -234,8 +235,11 @@ def test_protocols_judged_before_an_interruption_are_not_judged_again(
     )
     with pytest.raises(KeyboardInterrupt):
         experiment._weighed(*asked)
+    file = next(tmp_path.glob("*.jsonl"))
+    file.write_text(file.read_text() + '{"protocol": "torn')
     found = ranked(experiment._weighed(*asked))
-    assert sorted(index for index in made if index >= 0) == list(range(9))
+    assert sorted(made) == sorted([*listed, "interrupted"])
+    assert len(file.read_text().splitlines()) == len(listed)
     assert [one.protocol for one in found] == [one.protocol for one in judged(fits, toy_run)]
     words = experiment._in_words(
         {"sets": [["rub"], ["drag"]], "experiments": [experiment._row(one) for one in found]}

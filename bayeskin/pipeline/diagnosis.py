@@ -51,7 +51,7 @@ from bayeskin.pipeline.diagnosis_outputs import (
 )
 from bayeskin.pipeline.effects import effect_files, effects_of
 from bayeskin.pipeline.engine import Reporter, Run, Silent, Stage, open_run, run_stages
-from bayeskin.pipeline.folder import plain, sha256_of, write_json
+from bayeskin.pipeline.folder import plain, read_lines, sha256_of, write_json
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.reported import FullForce
@@ -289,14 +289,8 @@ def _searched(bench: Workbench, until_s: float | None) -> Search:
 
 
 def _fits_in(file: Path, build: Build) -> list[Fit]:
-    """Fits of a search that was stopped; a last line that is not whole is dropped."""
-    if not file.is_file():
-        return []
-    text = file.read_text(encoding="utf-8")
-    whole = text[: text.rfind("\n") + 1]
-    if whole != text:
-        file.write_text(whole, encoding="utf-8")
-    return [restored(said, build(said["names"])) for said in map(json.loads, whole.splitlines())]
+    """Fits of a search that was stopped."""
+    return [restored(said, build(said["names"])) for said in read_lines(file)]
 
 
 def _end_of_second_hold(binned: BinnedForce) -> float | None:

@@ -1,7 +1,7 @@
 """Which further test would tell the explanations of a mismatch apart, after it has been diagnosed.
 
-Runs are those of the coarsest bricks, some per cent off at an eighth of the cost: what matters is by how much
-explanations differ, and a mesh changes them alike.
+Runs are those of the coarsest bricks, which are quick: what matters is by how much explanations differ, and a
+mesh changes them nearly alike.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from bayeskin.mismatch.protocols import protocols
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline import diagnosis
 from bayeskin.pipeline.engine import Reporter, Silent
-from bayeskin.pipeline.folder import plain, sha256_of, write_json
+from bayeskin.pipeline.folder import plain, read_lines, sha256_of, write_json
 from bayeskin.pipeline.provenance import caption
 from bayeskin.types import PadMotion, Simulation
 from bayeskin.workers import Lost, run_parallel
@@ -58,14 +58,17 @@ def _weighed(
     source: Path, fits: Sequence[Mapping[str, Any]], motion: PadMotion, folder: Path, reporter: Reporter
 ) -> list[Experiment]:
     """Each protocol judged in one of two processes; those judged before an interruption are not again."""
-    listed = protocols(motion)
+    listed = {one.name: one for one in protocols(motion)}
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / f"weighed-{sha256_of([list(map(dict, fits))])[:12]}.jsonl"
-    done = _read(file, listed)
-    todo = [i for i in range(len(listed)) if listed[i].name not in done]
+    done = {
+        row["protocol"]: Experiment(**row, motion=listed[row["protocol"]].motion) for row in read_lines(file)
+    }
+    todo = [name for name in listed if name not in done]
     for place, one in run_parallel(partial(_weigh_apart, source, fits), todo, 2):
         if isinstance(one, Lost):
-            raise InputError(listed[todo[place]].name, one.reason, "runs that end")
+            reporter.log(f"{todo[place]}: {one.reason}")
+            continue
         done[one.protocol] = one
         with open(file, "a", encoding="utf-8") as handle:
             handle.write(json.dumps(_row(one)) + "\n")
@@ -74,25 +77,15 @@ def _weighed(
     return list(done.values())
 
 
-def _read(file: Path, listed: Sequence[Any]) -> dict[str, Experiment]:
-    """Protocols judged before; a last line that is not whole is passed over."""
-    motions = {one.name: one.motion for one in listed}
-    found = {}
-    for line in file.read_text(encoding="utf-8").split("\n")[:-1] if file.is_file() else []:
-        row = json.loads(line)
-        found[row["protocol"]] = Experiment(**row, motion=motions[row["protocol"]])
-    return found
-
-
 def _row(one: Experiment) -> dict[str, Any]:
     return {name: value for name, value in asdict(one).items() if name != "motion"}
 
 
-def _weigh_apart(source: Path, fits: Sequence[Mapping[str, Any]], index: int) -> Experiment:
+def _weigh_apart(source: Path, fits: Sequence[Mapping[str, Any]], name: str) -> Experiment:
     """In a process of its own: mechanisms have no copies."""
     bench = diagnosis.workbench(diagnosis.opened(source, Silent()))
     found = [restored(one, bench.posterior(None, one["names"])) for one in fits]
-    protocol = protocols(bench.motion)[index]
+    protocol = next(one for one in protocols(bench.motion) if one.name == name)
     return weigh(protocol, found, bench.known, _coarse, bench.run.config.seed)
 
 

@@ -49,6 +49,17 @@ def read_record(stage_folder: Path) -> Record | None:
         return None
 
 
+def read_lines(file: Path) -> list[dict[str, Any]]:
+    """JSON lines of a file, [] without one; a torn last line is cut off, so that more can follow."""
+    if not file.is_file():
+        return []
+    text = file.read_text(encoding="utf-8")
+    whole = text[: text.rfind("\n") + 1]
+    if whole != text:
+        file.write_text(whole, encoding="utf-8")
+    return [json.loads(line) for line in whole.splitlines()]
+
+
 def write_record(stage_folder: Path, record: Record) -> None:
     write_json(stage_folder / RECORD, vars(record))
 

@@ -7,6 +7,8 @@ squared error of rows not learnt from hardly grows.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,17 +26,18 @@ def active_inputs(design: Design, focus: Array) -> NDArray[np.int64]:
     similarity = Similarity(design.space)
     inputs, log_scale = similarity.inputs(design.theta[rows]), similarity.log_scale(design.theta[rows])
 
-    def error(columns: list[int]) -> float:
+    @cache
+    def error(*columns: int) -> float:
         force_n = design.force_n[rows]
         transform, _, fits = fit_latents(fit_latent, inputs[:, columns], log_scale, force_n, focus[rows])
         of_shapes = sum(fit.error for fit in fits[1:]) + float(transform.truncation.sum())
         return fits[0].error * force_n.shape[1] + of_shapes
 
     active = list(range(inputs.shape[1]))
-    least = error(active)
-    missed = {column: error([c for c in active if c != column]) for column in active}
+    least = error(*active)
+    missed = {column: error(*(c for c in active if c != column)) for column in active}
     for column in sorted(missed, key=lambda c: missed[c]):
         without = [c for c in active if c != column]
-        if without and (found := error(without)) <= GROWN * least:
+        if without and (found := error(*without)) <= GROWN * least:
             active, least = without, min(least, found)
     return np.array(active)
