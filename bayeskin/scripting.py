@@ -105,7 +105,7 @@ def check(recording: Recording, posterior: arviz.InferenceData, draws: int = 24)
     with _opened(recording, settings) as run:
         work = _workpiece(run, recording)
         log_posterior, flat = work.log_posterior, inference.draws_of(posterior)[1]
-        few = flat[np.linspace(0, len(flat) - 1, min(draws, len(flat))).astype(int)]
+        few = inference.evenly(flat, draws)
         spec, names, edges = model_spec(run), log_posterior.surrogate.space.names, work.binned.edges_s
         force = np.full((len(few), len(edges) - 1), np.nan)
         for row, point in enumerate(log_posterior.split(few)[0]):

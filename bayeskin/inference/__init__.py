@@ -25,7 +25,7 @@ from bayeskin.inference.optimise import MapResult, StartResult, find_map
 from bayeskin.inference.polish import Polished, polish_map
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.profile import Profile, profiles
-from bayeskin.inference.sample import Posterior, SampleSettings, load_chains, sample
+from bayeskin.inference.sample import Posterior, SampleSettings, evenly, load_chains, sample
 
 __all__ = [
     "Bands",
@@ -55,6 +55,7 @@ __all__ = [
     "corrected",
     "coverage",
     "draws_of",
+    "evenly",
     "find_map",
     "identifiability",
     "load_chains",

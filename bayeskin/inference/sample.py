@@ -107,6 +107,11 @@ def load_chains(folder: Path | str, log_posterior: LogPosterior) -> Array:
     return log_posterior.from_sampling(np.stack([p[:steps] for p in parts]))
 
 
+def evenly(draws: Array, count: int) -> Array:
+    """At most `count` of draws (n, D), evenly over all of them."""
+    return draws[np.linspace(0, len(draws) - 1, min(count, len(draws))).astype(int)]
+
+
 class _Ensemble:
     """One ensemble and its chain in memory."""
 

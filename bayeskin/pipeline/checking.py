@@ -54,8 +54,7 @@ def checked_posterior(
 def _weighed(
     run: Run, log_posterior: LogPosterior, posterior: Posterior, like: Design, turn: int
 ) -> tuple[Weighed, Design]:
-    flat = posterior.flat
-    few = flat[np.linspace(0, len(flat) - 1, min(run.config.check.draws, len(flat))).astype(int)]
+    few = inference.evenly(posterior.flat, run.config.check.draws)
     points = points_like(like, log_posterior.split(few)[0])
     runs = full_runs(run, f"check {turn + 1} of the posterior", points)
     force_n = np.where(runs.ok[:, None], runs.force_n, np.nan)

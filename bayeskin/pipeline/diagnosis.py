@@ -310,7 +310,7 @@ def _fit(
         rest = bins_in_windows(binned, ((split_s, float(binned.edges_s[-1])),)) >= 0
         held_out = float(np.sqrt(np.mean((binned.force_n[rest] - begun.force_n[rest]) ** 2)))
     draws = taken.draws.draws
-    some = draws[np.linspace(0, len(draws) - 1, PREDICTIVE_DRAWS).astype(int)]
+    some = inference.evenly(draws, PREDICTIVE_DRAWS)
     bands = inference.bands(found.log_posterior, some, np.random.default_rng(bench.run.config.seed))
     usable = bins_in_windows(binned, None) >= 0
     return {

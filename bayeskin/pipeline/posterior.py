@@ -20,7 +20,7 @@ from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import sha256_of, write_json
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
-from bayeskin.types import Array, PadMotion, Provenance, Recording
+from bayeskin.types import PadMotion, Provenance, Recording
 
 PREDICTIVE_DRAWS = 1000
 
@@ -35,7 +35,7 @@ def _sample(run: Run) -> Mapping[str, Any]:
     rng = np.random.default_rng([config.seed, 1])
     idata = inference.to_inference_data(log_posterior, posterior, provenance, rng, PREDICTIVE_DRAWS)
     inference.save_inference_data(run.at("sample", "posterior.nc"), idata)
-    drawn = inference.predictive_draws(log_posterior, _some(posterior), rng)
+    drawn = inference.predictive_draws(log_posterior, inference.evenly(posterior.flat, PREDICTIVE_DRAWS), rng)
     profiles = inference.profiles(log_posterior, best)
     _draw_posterior(run, checked, best, drawn, profiles)
     bands = inference.bands_of(log_posterior.binned.time_s, drawn)
@@ -146,12 +146,6 @@ def with_surrogate_error(verdict: Verdict, bands: inference.Bands, fitted: NDArr
     if surrogate <= noise:
         return Verdict(verdict.trusted, (*verdict.reasons, said))
     return Verdict(False, (f"{said}: run the full model where the posterior is", *verdict.reasons))
-
-
-def _some(posterior: Posterior) -> Array:
-    """Draws for predictions, evenly taken from all ensembles, (s, D)."""
-    flat = posterior.flat
-    return flat[np.linspace(0, len(flat) - 1, min(PREDICTIVE_DRAWS, len(flat))).astype(int)]
 
 
 def _table(posterior: Posterior) -> dict[str, dict[str, Any]]:
