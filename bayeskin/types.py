@@ -240,7 +240,7 @@ class Simulation(_FreezesArrays):
     time_s, displacement_m, force_n (n,): accepted steps, corners of the protocol among them.
     `displacement_m` is the LVDT displacement. `corner` (n,) is True at the protocol's corners,
     where the slope of the force jumps. `stats` holds counts and seconds (floats). gradient_n (n, r):
-    derivatives of the force by the logarithms of the parameters `gradient_names`, if they were asked for.
+    derivatives of the force by the parameters `gradient_names` that were asked for, each for its change.
     """
 
     theta: Mapping[str, float]

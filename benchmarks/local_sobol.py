@@ -20,6 +20,7 @@ import numpy as np
 import openpyxl
 
 from bayeskin.model import ModelSpec, simulate
+from bayeskin.model.gradients import logarithms
 from bayeskin.types import Array, PadMotion
 
 NAMES = ("E_c", "E_s", "k_c", "k_s")
@@ -103,7 +104,9 @@ def _of_article(mesh: str, motion: PadMotion) -> Array:
 def _of_reaction(spec: ModelSpec, motion: PadMotion) -> Array:
     corners = np.flatnonzero(np.abs(np.diff(np.diff(motion.displacement_m) / np.diff(motion.time_s))) > 1e-4)
     kept = np.concatenate([[0], 1 + corners, [len(motion.time_s) - 1]])
-    run = simulate(spec, PadMotion(motion.time_s[kept], motion.displacement_m[kept]), POINT, gradients=True)
+    run = simulate(
+        spec, PadMotion(motion.time_s[kept], motion.displacement_m[kept]), POINT, gradients=logarithms(POINT)
+    )
     edges = np.linspace(*WINDOW_S, 65)
     force, gradient = run.bin_means(edges), run.gradient_bin_means(edges)
     return np.asarray(np.mean(gradient / force[:, None], axis=0))

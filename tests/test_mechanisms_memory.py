@@ -16,7 +16,6 @@ from test_mechanisms_tissue import IN_SERIES, SOLVED, STRONG, THETA, skin, unkno
 from test_model_consolidation import EDGE_M, Point, block, by_layer, corner_points, march
 from test_model_physics import LAM, MU, drained_bar
 
-from bayeskin.errors import InputError
 from bayeskin.mechanisms import laws, observed
 from bayeskin.mechanisms.backlash import Backlash, trailing
 from bayeskin.mechanisms.pad_slip import PadSlip
@@ -326,8 +325,3 @@ def test_the_estimate_of_viscoelasticity_relaxes_a_held_stress_by_its_exponentia
             for g, tau in (("g_1", "tau_1"), ("g_2", "tau_2"))
         )  # fmt: skip
         np.testing.assert_allclose(found[row], stretch * (1.0 + left), rtol=1e-9)
-
-
-def test_no_derivatives_in_series_with_the_skin():
-    with pytest.raises(InputError, match="in series"):
-        simulate(ModelSpec(), SHORT, THETA | STRONG, gradients=True, laws=laws([SOLVED["slow-recovery"]]))

@@ -17,7 +17,7 @@ from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import catalogue
 from bayeskin.mismatch.discretised import Discretised
 from bayeskin.mismatch.fit import Fit, fit, fit_base, restored, stored
-from bayeskin.mismatch.full_fit import FullFit, fit_full
+from bayeskin.mismatch.full_fit import fit_full
 from bayeskin.mismatch.locate import locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.resample import resample
@@ -241,16 +241,24 @@ def test_the_full_model_s_own_maximum_is_found_with_a_surrogate_s_wrong_slopes()
     best = gauss_newton(dataclasses.replace(right, surrogate=sure), start, None)
     made = []
 
-    def full(theta):
-        made.append(theta)
+    def force(theta):
         return right.surrogate.predict([theta[name] for name in right.surrogate.space.names]).mean[0]
 
-    found = fit_full(wrong, wrong.named(wrong.from_sampling(start)), full, ("F0",), 12, 1)
-    assert isinstance(found, FullFit)
+    def full(theta, changes):
+        made.append(theta)
+        moved = [force({**theta, name: theta[name] + 1e-4 * by}) for name, by in changes.items()]
+        return force(theta), (np.array(moved) - force(theta)).T / 1e-4
+
+    allowed = []
+    found, about = fit_full(
+        wrong, wrong.named(wrong.from_sampling(start)), full, ("F0",), 12, 1,
+        lambda surrogate: allowed.append(surrogate) or surrogate,
+    )  # fmt: skip
+    assert any(about.surrogate is one for one in allowed)
     assert found.runs == len(made)
     assert found.gained > 1.0
     assert found.value == pytest.approx(best.value, abs=0.5)
-    np.testing.assert_allclose(found.force_n, full(found.theta), atol=1e-6)
+    np.testing.assert_allclose(found.force_n, force(found.theta), atol=1e-6)
 
 
 def test_a_full_fit_whose_runs_fail_keeps_what_it_has() -> None:
@@ -258,16 +266,16 @@ def test_a_full_fit_whose_runs_fail_keeps_what_it_has() -> None:
     start = dict(
         zip(alone.names, [*TRUTH.values(), *[2e-3] * (alone.dim - len(TRUTH) - 2), 0.5, 20.0], strict=True)
     )
-    assert fit_full(alone, start, lambda theta: "did not converge", (), 5, 1) == "did not converge"
+    assert fit_full(alone, start, lambda theta, changes: "did not converge", (), 5, 1) == "did not converge"
     made = []
 
-    def once(theta):
+    def once(theta, changes):
         made.append(theta)
         if len(made) > 1:
             return "did not converge"
-        return 1.2 * alone.surrogate.predict([theta[name] for name in alone.surrogate.space.names]).mean[0]
+        force = alone.surrogate.predict([theta[name] for name in alone.surrogate.space.names]).mean[0]
+        return 1.2 * force, np.zeros((len(force), len(changes)))
 
-    found = fit_full(alone, start, once, (), 5, 1)
-    assert isinstance(found, FullFit)
+    found, _ = fit_full(alone, start, once, (), 5, 1)
     assert found.gained == 0.0
     assert found.theta["E_c"] == pytest.approx(start["E_c"])

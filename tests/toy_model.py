@@ -20,13 +20,13 @@ def simulate(
     theta: Mapping[str, float],
     on_progress: Callable[[float], None] | None = None,
     on_state: Callable[[float, object, float], None] | None = None,
-    gradients: bool = False,
+    gradients: Mapping[str, float] | None = None,
     laws: Sequence[object] = (),
 ) -> Simulation:
     if on_state is not None:
         on_state(0.0, None, 0.0)
     time_s = np.unique(np.concatenate([np.linspace(0, motion.time_s[-1], 261), motion.time_s]))
-    names = SPACE.names[:4] if gradients else ()
+    names = tuple(gradients or ())
     force, step = finer(spec.refinement, theta) * _force(theta, time_s, motion), 1.001
     slopes = [
         finer(spec.refinement, theta)

@@ -6,14 +6,12 @@ do to each other counts for each of them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from bayeskin.inference import LogPosterior
-from bayeskin.mismatch.fit import Fit
-from bayeskin.mismatch.search import ONLY_WITH, Build
+from bayeskin.mismatch.search import ONLY_WITH
 from bayeskin.types import Array
 
 
@@ -31,17 +29,15 @@ class Contribution:
         return float(np.sqrt(np.mean(self.force_n**2)))
 
 
-def contributions(found: Fit, build: Build) -> list[Contribution]:
-    """Of each mechanism of a fit, the largest first; forces are the surrogate's means."""
-    whole, parts = _force(found.log_posterior, found.theta), []
-    for name in found.names:
-        along = tuple(other for other in found.names if ONLY_WITH.get(other) == name)
-        without = build([other for other in found.names if other not in (name, *along)])
-        parts.append(Contribution(name, along, whole - _force(without, found.theta)))
+Force = Callable[[tuple[Sequence[str], Mapping[str, float]]], Array | str]  # of a set at values: (m,)
+
+
+def contributions(names: Sequence[str], theta: Mapping[str, float], force: Force) -> list[Contribution]:
+    """Of each mechanism of a set at its values, the largest first; none where a force cannot be had."""
+    whole, parts = force((names, theta)), []
+    for name in names:
+        along = tuple(other for other in names if ONLY_WITH.get(other) == name)
+        without = force(([other for other in names if other not in (name, *along)], theta))
+        if not isinstance(whole, str) and not isinstance(without, str):
+            parts.append(Contribution(name, along, whole - without))
     return sorted(parts, key=lambda part: -part.size_n)
-
-
-def _force(log_posterior: LogPosterior, theta: Mapping[str, float]) -> Array:
-    """Mean force (m,) at the values that this posterior knows."""
-    values = log_posterior.from_sampling(log_posterior.vector(theta))
-    return np.asarray(log_posterior.predict(values).mean[0])

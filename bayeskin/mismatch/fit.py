@@ -168,6 +168,15 @@ def fit(
     return _best(names, log_posterior, starts, shear, skin, seed)
 
 
+def fit_near(
+    names: Sequence[str], log_posterior: LogPosterior, theta: Mapping[str, float], shear: Shear | None
+) -> Fit:
+    """The top that one climb from a point reaches."""
+    low, high = log_posterior.bounds
+    top = gauss_newton(log_posterior, np.clip(log_posterior.vector(theta), low, high), shear, ROUNDS)
+    return _fit_at(names, log_posterior, top)
+
+
 def _searched(
     log_posterior: LogPosterior, vector: Array, part: Sequence[str], later: Sequence[str],
     neutral: Mapping[str, float], rng: np.random.Generator, shear: Shear | None,
@@ -248,7 +257,10 @@ def _best(
     ahead = _climbed(log_posterior, starts, shear)
     others = likely(log_posterior, other_skins(ahead.vector, log_posterior, shear, skin, seed), STARTS)
     ahead = max(ahead, _climbed(log_posterior, [ahead.vector, *others], shear), key=lambda one: one.value)
-    top = gauss_newton(log_posterior, ahead.vector, shear, ROUNDS)
+    return _fit_at(names, log_posterior, gauss_newton(log_posterior, ahead.vector, shear, ROUNDS))
+
+
+def _fit_at(names: Sequence[str], log_posterior: LogPosterior, top: Top) -> Fit:
     theta = log_posterior.named(log_posterior.from_sampling(top.vector))
     return Fit(tuple(names), log_posterior, theta, top.value, *_evidence(log_posterior, top), top.latent)
 

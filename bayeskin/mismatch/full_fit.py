@@ -1,15 +1,15 @@
-"""A set of mechanisms fitted by the full model itself, with the surrogate's slopes.
+"""A set of mechanisms fitted by the full model itself, with its own slopes.
 
-About a full run F at theta_0 the force is taken as
+About a run F at theta_0 with derivatives J the force is taken as
 
-    F + S(theta) - S(theta_0) + B (u - u_0) ,
+    F + S(theta) - S(theta_0) + (J - dS/du) (u - u_0) ,
 
-S the surrogate's mean, u coordinates of the unit cube, and B what the runs so far have shown of the slopes
-that the surrogate has wrong (Broyden's rank-one updates). Each round maximises the posterior of that force,
-which has no surrogate's error in it, within a trust region of the parameters that the full model solves,
-makes a full run there, and goes on from it if the posterior of the full model itself has risen.
+S the surrogate's mean, u coordinates of the box: right to first order, with the surrogate's curvature. Each
+round maximises the posterior of that force, which has no surrogate's error in it, within a trust region of
+the parameters that the full model solves, makes a run there, and goes on from it if the posterior of the
+full model itself has risen.
 
-Space mapping, manifold mapping: Echeverria & Hemker, Comput. Methods Appl. Math. 5 (2005), 107-136.
+First-order model management: Alexandrov, Lewis, Gumbert, Green & Newman, J. Aircraft 38 (2001), 1093-1101.
 """
 
 from __future__ import annotations
@@ -29,15 +29,16 @@ TRUST, SMALLEST, LARGEST = 0.1, 0.005, 0.4  # of the prior's width, either side
 ENOUGH = 0.5  # nats still to be gained
 STARTS = 3  # climbs of a round: from the best point, and from others in the trust region
 CLIMB = 20  # rounds of each
+STEP = 1e-4  # of the box, for the surrogate's differences
 
-Full = Callable[[Mapping[str, float]], Array | str]  # all bins' means (m,), or why a run failed
+Full = Callable[[Mapping[str, float], Mapping[str, float]], tuple[Array, Array] | str]
 
 
 @dataclass(frozen=True)
 class Anchored:
-    """Satisfies `types.Surrogate`, without error: force_n (m,) at theta (d,), where a full run was made.
+    """Satisfies `types.Surrogate`, without error: force_n (m,) at theta (d,), where a run was made.
 
-    slopes_n (m, d) are added to those of `surrogate`, by coordinates of its unit cube.
+    slopes_n (m, d) are added to those of `surrogate`, by coordinates of its box.
     """
 
     surrogate: Surrogate
@@ -61,16 +62,16 @@ class Anchored:
         """Force at theta (n, d) or (d,). Raises InputError outside the box."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         mean = self.surrogate.predict(np.vstack([self.theta, theta])).mean
-        away = self.space.to_unit(theta) - self.space.to_unit(self.theta)
+        away = self.space.box.to_unit(theta) - self.space.box.to_unit(self.theta)
         force = self.force_n + mean[1:] - mean[0] + away @ self.slopes_n.T
         return Prediction(force, np.zeros((*force.shape, 1)), np.zeros(force.shape))
 
 
 @dataclass(frozen=True)
 class FullFit:
-    """theta: all parameters by name (SI) of the best full run; value: its log posterior; force_n (m,).
+    """theta: all parameters by name (SI) of the best run; value: its log posterior; force_n (m,).
 
-    runs : full runs made; gained : nats on the first of them
+    runs : made; gained : nats on the first of them
     """
 
     theta: Mapping[str, float]
@@ -82,28 +83,32 @@ class FullFit:
 
 def fit_full(
     log_posterior: LogPosterior, start: Mapping[str, float], full: Full, exact: Sequence[str], rounds: int,
-    seed: int,
-) -> FullFit | str:  # fmt: skip
-    """From `start` (all parameters), at most so many full runs; the message of the first, where that fails.
+    seed: int, allow: Callable[[Surrogate], Surrogate] = lambda surrogate: surrogate,
+) -> tuple[FullFit, LogPosterior] | str:  # fmt: skip
+    """From `start` (all parameters), at most so many runs; the message of the first, where that fails.
 
+    With the fit comes the posterior of the force about it.
+
+    full : of all parameters, and of changes of those of the force that count as one: bins' means (m,) and
+        their derivatives (m, d) for these changes, or why a run failed
     exact : parameters whose effect the surrogate has exactly, which no trust region holds
+    allow : puts the full model's own error into a surrogate that has none
     """
     surrogate, rng = log_posterior.surrogate, np.random.default_rng(seed)
     space, trial, trust = surrogate.space, dict(start), TRUST
-    slopes = np.zeros((len(surrogate.edges_s) - 1, space.dim))
     best: FullFit | None = None
     local = log_posterior
     for count in range(1, rounds + 1):
-        force = full(trial)
-        if isinstance(force, str):
+        theta = np.array([trial[name] for name in space.names])
+        found = full(trial, dict(zip(space.names, _change(space, theta), strict=True)))
+        if isinstance(found, str):
             if best is None:
-                return force
+                return found
             trust *= 0.25
         else:
-            theta = np.array([trial[name] for name in space.names])
-            if best is not None:
-                slopes = _corrected(slopes, local, theta, force, exact)
-            there = _anchored(log_posterior, Anchored(surrogate, theta, force, slopes))
+            force, slopes = found
+            anchored = Anchored(surrogate, theta, force, slopes - _slopes(surrogate, theta))
+            there = replace(log_posterior, surrogate=allow(anchored), sure_within_n=None)
             vector = _with_noise(there, trial)
             value = float(there.log_prob(vector[None])[0])
             if best is None or value > best.value:
@@ -113,7 +118,6 @@ def fit_full(
                 best, local = FullFit(named, value, force, count, value - first), there
             else:
                 trust *= 0.25
-                local = _anchored(local, replace(_of(local), slopes_n=slopes))
         best = replace(best, runs=count)
         if trust < SMALLEST:
             break
@@ -121,26 +125,23 @@ def fit_full(
         if promised - best.value < ENOUGH:
             break
     assert best is not None
-    return best
+    return best, local
 
 
-def _of(local: LogPosterior) -> Anchored:
-    assert isinstance(local.surrogate, Anchored)
-    return local.surrogate
+def _change(space: ParameterSpace, theta: Array) -> Array:
+    """Of each parameter (d,), by one coordinate of the box."""
+    unit, h = space.box.to_unit(theta), 1e-6
+    return np.asarray((space.box.from_unit(unit + h) - space.box.from_unit(unit - h)) / (2.0 * h))
 
 
-def _anchored(log_posterior: LogPosterior, surrogate: Anchored) -> LogPosterior:
-    return replace(log_posterior, surrogate=surrogate, sure_within_n=None)
-
-
-def _corrected(slopes: Array, local: LogPosterior, theta: Array, force: Array, exact: Sequence[str]) -> Array:
-    """Broyden's update: what the force at theta was wrong by goes to the direction that was taken, but for
-    the slopes that are right already."""
-    space = local.surrogate.space
-    away = space.to_unit(theta) - space.to_unit(_of(local).theta)
-    unsure = np.where(np.isin(space.names, exact), 0.0, away)
-    wrong = force - local.surrogate.predict(theta).mean[0]
-    return np.asarray(slopes + np.outer(wrong, unsure) / max(float(away @ away), 1e-12))
+def _slopes(surrogate: Surrogate, theta: Array) -> Array:
+    """Of the surrogate's mean (m, d) by coordinates of the box, by differences toward its middle."""
+    box = surrogate.space.box
+    unit = box.to_unit(theta)
+    steps = np.diag(np.where(unit > 0.5, -STEP, STEP))
+    rows = np.vstack([theta, np.clip(box.from_unit(unit + steps), box.lower, box.upper)])
+    mean = surrogate.predict(rows).mean
+    return np.asarray((mean[1:] - mean[0]).T / np.diag(steps))
 
 
 def _with_noise(there: LogPosterior, trial: Mapping[str, float]) -> Array:

@@ -36,7 +36,6 @@ class Named:
     group: tuple[str, ...]
     group_probability: float
     explains_n: float
-    statement: str
 
 
 @dataclass(frozen=True)
@@ -92,9 +91,7 @@ def explained_share(before: Located, after: Located) -> float:
 
 
 def _named(found: Search, mechanism: Mechanism) -> Named:
-    best = found.best
-    at_best = {**mechanism.neutral, **best.theta}
     return Named(
         mechanism.name, found.probability([mechanism.name]), mechanism.group,
-        found.probability(mechanism.group), explains(found, mechanism.name), mechanism.statement(at_best),
+        found.probability(mechanism.group), explains(found, mechanism.name),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Derivatives of the force history by the logarithms of the parameters, from the kept factorisations.
+"""Derivatives of the force history by any parameters, from the kept factorisations.
 
 Differentiating a solved stage R(x, J*, p*; theta) = 0 gives K dx = -dR/dtheta - dR/d(J*, p*) d(J*, p*),
 with the stage's own tangent K. For a guess v of dx the right-hand side less K v is the residual's derivative
@@ -8,15 +8,21 @@ with the stage's own tangent K. For a guess v of dx the right-hand side less K v
 so that no tangent is formed: of the base model r is found exactly and for all parameters at once
 (`directional`), with laws beyond it from two residuals a parameter. The guess combines the stages before as
 their unknowns best combine to those of this one, and is corrected by back-substitutions of r with the kept
-factorisation M nearest to the stage.
+factorisation M nearest to the stage, with laws with the stage's own, which costs less than a correction.
 
 The reaction's derivative is that of the same residual on the pad's rows. A correction would add g M^-1 r to
 it, with the reaction's derivative g by the unknowns; as M is symmetric, M^-1 g tells so before it is made.
 What is small enough is added and no correction made, so that the force's error is the product of the errors
 of v and of the factorisation.
 
+What lies in series with the skin loses a displacement s(F, theta) before it reaches the pads. With the
+stage's response y to the pads' travel alone, whose reaction is the skin's stiffness K_u, and the derivatives
+F' and x' with s held,
+
+    ds = (ds/dtheta + ds/dF F') / (1 + ds/dF K_u) ,   dF = F' - K_u ds ,   dx = x' - y ds .
+
 Forces scale with stresses: were the fluid incompressible, F(c E_c, c E_s, k_c / c, k_s / c) = c F. Of the
-base model three derivatives are therefore solved for and E_c's follows, to 3e-7 of the largest one
+base model's four derivatives three are therefore solved for and E_c's follows, to 3e-7 of the largest one
 (docs/verification.md).
 """
 
@@ -24,21 +30,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Union
 
 import numpy as np
 
+from bayeskin.errors import InputError
 from bayeskin.model.directional import TangentAction
 from bayeskin.model.lagrangian import Evaluated, LagrangianModel, Stage, State, Step
 from bayeskin.model.newton import Equations
 from bayeskin.model.problem import Material, material
 from bayeskin.model.tissue import Bind, TissueLaw
-from bayeskin.types import Array
+from bayeskin.types import Array, PadMotion
 
-DIFFERENTIATED = ("E_c", "E_s", "k_c", "k_s")
-SCALING = np.array([1.0, 1.0, -1.0, -1.0])  # F = SCALING @ dF/dlog(theta), of the base model
-EPSILON = 1e-5  # of a logarithm: truncation 1e-5, rounding 1e-9
+SCALING = {"E_c": 1.0, "E_s": 1.0, "k_c": -1.0, "k_s": -1.0}  # F = sum of these times dF/dlog, base model
+EPSILON = 1e-5  # of a parameter's change: truncation 1e-5, rounding 1e-9
 TOLERANCE = 1e-4  # of what a correction would add to the force, relative to the nominal force
 UNCORRECTED = 0.05  # times that for a bare guess, whose error adds up from stage to stage
 MOST_CORRECTIONS = 12
@@ -47,46 +54,88 @@ GUESS_POINTS = 4
 DUALS = 10  # kept
 
 
+def logarithms(theta: Mapping[str, float]) -> dict[str, float]:
+    """The changes by which `simulate` gives derivatives by the logarithms of the base's four parameters."""
+    return {name: theta[name] for name in SCALING}
+
+
+@dataclass(frozen=True)
+class _Varied:
+    """What a run is made of, where one parameter is EPSILON of its change further."""
+
+    material: Material
+    laws: tuple[TissueLaw, ...]
+    motion: PadMotion
+
+
 @dataclass(frozen=True)
 class _Slopes:
-    """Derivatives of a `State` by r logarithms: x (dofs, r), J and p (e, q, r), memories (e, q, k, r)."""
+    """Derivatives of a `State` by r parameters: x (dofs, r), J and p (e, q, r), memories (e, q, k, r), what
+    is lost in series (k, r). With such elements a last column of x is the response to the pads' travel."""
 
     state: State
     x: Array
     volume: Array
     pressure: Array
     memory: tuple[Array, ...]
+    lost: tuple[Array, ...]
+
+
+_Evaluated = Union[Evaluated, "_Differences"]
 
 
 class ForceGradients:
-    """Follows a run, step by accepted step; `force_n` then holds the derivatives of each step's force."""
+    """Follows a run, step by accepted step; `force_n` then holds the derivatives of each step's force.
 
-    def __init__(self, model: LagrangianModel, theta: Mapping[str, float], laws: Sequence[Bind] = ()) -> None:
-        self._model = model
-        names = DIFFERENTIATED if model.laws else DIFFERENTIATED[1:]  # E_c's follows
-        self._changed = [_changed(model, theta, name, EPSILON, laws) for name in names]
-        back = [_changed(model, theta, name, -EPSILON, laws) for name in names]
-        self._rates = _rates([m for m, _ in self._changed], [m for m, _ in back])
-        r, shape = len(names), model.problem.space.weight.shape
-        zeros = np.zeros((*shape, r))
-        memory = tuple(np.zeros((*shape, law.remembers, r)) for law in model.laws)
-        rest = model.initial_state(theta["p_init"])
-        self._start = _Slopes(rest, np.zeros((len(rest.x), r)), zeros, zeros, memory)
+    changes : of each parameter, by name, what counts as one; derivatives are in newtons for that
+    Raises InputError for a parameter that the run does not have.
+    """
+
+    def __init__(
+        self, model: LagrangianModel, theta: Mapping[str, float], changes: Mapping[str, float],
+        laws: Sequence[Bind] = (),
+    ) -> None:  # fmt: skip
+        unknown = [name for name in changes if name not in theta]
+        if unknown:
+            raise InputError("gradients", unknown[0], f"among {', '.join(theta)}")
+        self.names = tuple(changes)
+        self._model, self._follows = model, _follows(model, theta, changes)
+        self._solved = tuple(name for name in changes if not (self._follows and name == "E_c"))
+        self._varied = [_varied(model, theta, name, EPSILON * changes[name], laws) for name in self._solved]
+        back = [_varied(model, theta, name, -EPSILON * changes[name], laws) for name in self._solved]
+        self._rates = _rates([one.material for one in self._varied], [one.material for one in back])
+        self._in_series = any(law.series for law in model.laws)
+        self._reach_m = 2.0 * model.problem_scale(np.zeros(1))
+        self._start = self._at_rest(theta["p_init"], changes.get("p_init", 0.0))
         self._known: dict[int, _Slopes] = {}  # by identity of the state, which they keep alive
         self._phase: list[_Slopes] = [self._start]  # ends of this phase's stages
         self._travel: Array | None = None
         self._duals: dict[int, tuple[Array, Array]] = {}  # by identity of the place, which they keep alive
-        self.force_n: list[Array] = [np.zeros(len(DIFFERENTIATED))]
+        self._zero_n = np.zeros(len(self._solved))  # of the force when the test starts
+        self.force_n: list[Array] = [np.zeros(len(changes))]
         self.corrections, self.seconds = 0, 0.0
 
+    def _at_rest(self, p_init: float, change: float) -> _Slopes:
+        model, r, n = self._model, len(self._solved), 3 * self._model.problem.space.n_nodes
+        rest = model.initial_state(p_init)
+        by_p_init = change * np.array([float(name == "p_init") for name in self._solved])
+        x = np.zeros((len(rest.x), r + self._in_series))
+        x[n:, :r] = by_p_init
+        shape = (*rest.volume.shape, r)
+        memory = tuple(np.zeros((*before.shape, r)) for before in rest.memory)
+        lost = tuple(np.zeros((*before.shape, r)) for before in rest.lost)
+        return _Slopes(rest, x, np.zeros(shape), np.zeros(shape) + by_p_init, memory, lost)
+
     def follow(self, step: Step) -> None:
-        """Differentiates an accepted step; appends dF/dlog(theta) [N], (4,), to `force_n`."""
+        """Differentiates an accepted step; appends the force's derivatives [N], (r,), to `force_n`."""
         started = time.perf_counter()
         for stage in step.stages:
             slopes, force = self._differentiate(stage)
             self._known[id(stage.state)] = slopes
             self._phase.append(slopes)
-        self.force_n.append(force if self._model.laws else _with_scaled(force, step.force_n))
+        if abs(step.state.time_s - self._model.starts_s) < 1e-6:
+            self._zero_n = force
+        self.force_n.append(self._follows(force, step.force_n) if self._follows else force)
         self._known = dict(list(self._known.items())[-2 * GUESS_POINTS :])
         if step.corner:
             self._turn()
@@ -121,13 +170,43 @@ class ForceGradients:
         return last.x + sum(share * (old.x - last.x) for share, old in zip(shares, before, strict=True))
 
     def _differentiate(self, stage: Stage) -> tuple[_Slopes, Array]:
+        before = self._before(stage)
+        equations = self._model.equations(stage.length_s, stage.history, stage.elapsed_s)
+        x = self._guess(stage.state, equations)
+        x[self._model.problem.pattern.fixed] = 0.0
+        x[3 * self._model.problem.pads] = self._of_pads(stage.state.time_s, before)
+        x, found, force = self._solve(stage, equations, self._action(stage, before), x)
+        if self._in_series:
+            return self._less_lost(stage, before, x, found, force)
+        return _Slopes(stage.state, x, found.volume, found.pressure, found.memory, before.lost), force
+
+    def _before(self, stage: Stage) -> _Slopes:
+        """Derivatives of the stage's history."""
+        sources = [(weight, self._of(state)) for weight, state in stage.sources]
+        volume = np.asarray(sum(weight * slopes.volume for weight, slopes in sources))
+        pressure = np.asarray(sum(weight * slopes.pressure for weight, slopes in sources))
+        return replace(sources[-1][1], volume=volume, pressure=pressure)
+
+    def _of_pads(self, time_s: float, before: _Slopes) -> Array:
+        """Derivatives of the pads' displacement [m], with what was lost before; and their travel."""
+        here = self._model.motion.at(time_s)
+        moved = np.array([(float(one.motion.at(time_s)) - here) / EPSILON for one in self._varied])
+        moved = moved - sum(lost[0] for lost in before.lost)
+        return 0.5 * np.append(moved, [self._reach_m] * self._in_series)
+
+    def _solve(
+        self,
+        stage: Stage,
+        equations: Equations,
+        action: Callable[[Array], _Evaluated],
+        x: Array,
+    ) -> tuple[Array, _Evaluated, Array]:
+        """From a guess x (dofs, r) whose fixed rows are right: x, what is `Evaluated` there, the force."""
         model, solver, free = self._model, self._model.solver, self._model.problem.pattern.free
-        action = self._action(stage)
-        equations = model.equations(stage.length_s, stage.history, stage.elapsed_s)
+        if model.laws:
+            solver.renew(equations, stage.state.x)
         dual = self._dual(solver.toward(equations.place))
         weight, allowed_n = equations.weight[:, None], TOLERANCE * model.nominal_force()
-        x = self._guess(stage.state, equations)
-        x[model.problem.pattern.fixed] = 0.0
         tried: list[tuple[Array, Array]] = []  # unknowns and the corrections that they asked for
         for _ in range(MOST_CORRECTIONS):
             found = action(x)
@@ -138,8 +217,7 @@ class ForceGradients:
             tried = [*tried, (x[free] * weight, correction * weight)][-ANDERSON_DEPTH:]
             x[free] += _accelerated(tried) / weight
             self.corrections += 1
-        force = 2.0 * found.residual[model.problem.pad_x].sum(axis=0) + missing_n
-        return _Slopes(stage.state, x, found.volume, found.pressure, found.memory), force
+        return x, found, 2.0 * found.residual[model.problem.pad_x].sum(axis=0) + missing_n
 
     def _dual(self, place: Array) -> Array:
         """M^-1 g (free,) with the factorisation M that was made at `place`, solved for once."""
@@ -149,32 +227,75 @@ class ForceGradients:
             self._duals = dict([*self._duals.items(), (id(place), known)][-DUALS:])
         return known[1]
 
-    def _action(self, stage: Stage) -> Callable[[Array], Evaluated]:
+    def _action(self, stage: Stage, before: _Slopes) -> Callable[[Array], _Evaluated]:
         """Derivatives of all that is `Evaluated` at the stage's end, from those of the unknowns there."""
-        sources = [(weight, self._of(state)) for weight, state in stage.sources]
-        volume_old = np.asarray(sum(weight * slopes.volume for weight, slopes in sources))
-        pressure_old = np.asarray(sum(weight * slopes.pressure for weight, slopes in sources))
         if not self._model.laws:
-            return TangentAction(self._model, stage, self._rates, volume_old, pressure_old)
-        last = sources[-1][1]
-        before = _Slopes(last.state, last.x, volume_old, pressure_old, last.memory)
-        return lambda x: _differences(self._model, self._changed, stage, before, x)
+            return TangentAction(self._model, stage, self._rates, before.volume, before.pressure)
+        return lambda x: _Differences(self._model, self._varied, stage, before, x)
+
+    def _less_lost(
+        self, stage: Stage, before: _Slopes, x: Array, found: _Evaluated, force: Array
+    ) -> tuple[_Slopes, Array]:
+        """All derivatives once what lies in series with the skin has answered to the force's."""
+        model, r = self._model, len(self._varied)
+        travel, stiffness = x[:, r] / self._reach_m, float(force[r]) / self._reach_m
+        own, lost, more = force[:r], before.lost, np.zeros(r)
+        if stage.state.time_s > model.starts_s + 1e-9:
+            force_n = model.problem.reaction(stage.residual) - model.zero_n
+            held = sum(one[0] for one in before.lost)
+            yielding = _yielding(model, stage, force_n)
+            asked = sum(one[0] for one in self._lost(stage, before, force_n, own - self._zero_n))
+            more = (asked - held) / (1.0 + yielding * stiffness)
+            own = own - stiffness * more
+            lost = self._lost(stage, before, force_n, own - self._zero_n)
+        columns = x.copy()
+        columns[:, :r] -= np.outer(travel, more)
+
+        def less(values: Array) -> Array:
+            return np.asarray(values[..., :r] - values[..., r:] / self._reach_m * more)
+
+        memory = tuple(less(one) for one in found.memory)
+        return _Slopes(stage.state, columns, less(found.volume), less(found.pressure), memory, lost), own
+
+    def _lost(self, stage: Stage, before: _Slopes, force_n: float, slopes_n: Array) -> tuple[Array, ...]:
+        """Derivatives (k, r) of each series element's memory, from the force's (r,)."""
+        found: list[list[Array]] = []
+        for r, one in enumerate(self._varied):
+            varied = [law.series for law in one.laws if law.series is not None]
+            found.append([
+                (element.follow(force_n + EPSILON * float(slopes_n[r]), stage.elapsed_s,
+                                old + EPSILON * slope[:, r]) - now) / EPSILON
+                for element, old, slope, now in zip(
+                    varied, stage.history.lost, before.lost, stage.state.lost, strict=True)
+            ])  # fmt: skip
+        return tuple(np.stack(columns, axis=1) for columns in zip(*found, strict=True))
 
 
-_Changed = tuple[Material, tuple[TissueLaw, ...]]
+def _yielding(model: LagrangianModel, stage: Stage, force_n: float) -> float:
+    """How much more is lost in series for a newton more [m/N]."""
+    by_n = EPSILON * model.nominal_force()
+    elements = [law.series for law in model.laws if law.series is not None]
+    return sum(
+        float((element.follow(force_n + by_n, stage.elapsed_s, old)[0]
+               - element.follow(force_n, stage.elapsed_s, old)[0]) / by_n)
+        for element, old in zip(elements, stage.history.lost, strict=True)
+    )  # fmt: skip
 
 
-def _changed(
+def _varied(
     model: LagrangianModel, theta: Mapping[str, float], name: str, by: float, laws: Sequence[Bind]
-) -> _Changed:
-    """The model's material and laws with one parameter's logarithm changed."""
-    values = {**theta, name: theta[name] * np.exp(by)}
-    bound = sorted((bind(values, model.problem) for bind in laws), key=lambda law: law.rank)
-    return material(values, model.problem.mesh.cutis), tuple(bound)
+) -> _Varied:
+    """Raises InputError for a change that makes of a run another one."""
+    values = {**theta, name: theta[name] + by}
+    bound = tuple(sorted((bind(values, model.problem) for bind in laws), key=lambda law: law.rank))
+    motion, starts_s = model.on_the_way(bound)
+    if starts_s != model.starts_s:
+        raise InputError(f"gradients: {name}", theta[name], "pads that were opened before the test")
+    return _Varied(material(values, model.problem.mesh.cutis), bound, motion)
 
 
 def _rates(up: Sequence[Material], down: Sequence[Material]) -> tuple[Array, Array, Array]:
-    """Derivatives of mu, lam and mobility by r logarithms, (e, r) each, from materials at both sides."""
+    """Derivatives of mu, lam and mobility by r parameters, (e, r) each, from materials at both sides."""
 
     def rate(of: Callable[[Material], Array]) -> Array:
         pairs = zip(up, down, strict=True)
@@ -183,41 +304,66 @@ def _rates(up: Sequence[Material], down: Sequence[Material]) -> tuple[Array, Arr
     return rate(lambda m: m.mu), rate(lambda m: m.lam), rate(lambda m: m.mobility)
 
 
-def _with_scaled(force: Array, force_n: float) -> Array:
-    """All four of the base model's derivatives [N], from the last three and the force."""
-    return np.concatenate([[(force_n - SCALING[1:] @ force) / SCALING[0]], force])
+def _follows(
+    model: LagrangianModel, theta: Mapping[str, float], changes: Mapping[str, float]
+) -> Callable[[Array, float], Array] | None:
+    """All derivatives (r,) from the force and those without E_c's; of a base model asked for its four."""
+    if model.laws or not set(SCALING) <= set(changes):
+        return None
+    names = [name for name in changes if name != "E_c"]
+    share = np.array([SCALING.get(name, 0.0) * theta[name] / changes[name] for name in names])
+    place, scale = tuple(changes).index("E_c"), changes["E_c"] / theta["E_c"]
+    return lambda force, force_n: np.insert(force, place, scale * (force_n - share @ force))
 
 
-def _differences(
-    model: LagrangianModel, changed: Sequence[_Changed], stage: Stage, before: _Slopes, x: Array
-) -> Evaluated:
-    """Derivatives by r logarithms at the stage's end, by differences of the residual.
+class _Differences:
+    """Derivatives by r parameters at a stage's end, by differences of the residual; `Evaluated`'s fields.
 
-    `before` has those of the stage's history, x (dofs, r) are those of its unknowns.
+    `before` has those of the stage's history, x (dofs, r) those of its unknowns; a last column beyond r is
+    of the pads' travel, of which no history knows.
     """
-    base, history, columns = stage.state, stage.history, []
-    for r, to in enumerate(changed):
-        old = State(
-            history.time_s,
-            history.x,
-            history.volume + EPSILON * before.volume[..., r],
-            history.pressure + EPSILON * before.pressure[..., r],
-            tuple(m + EPSILON * d[..., r] for m, d in zip(history.memory, before.memory, strict=True)),
-        )
-        found = model.residual(base.x + EPSILON * x[:, r], stage.length_s, old, stage.elapsed_s, to)
-        if found is None:  # the cells were upright a moment ago, at the same unknowns to a millionth
-            raise FloatingPointError(f"no derivative at t = {base.time_s:.3f} s: a cell is all but flat")
-        columns.append(found)
 
-    def slope(of: Callable[[Evaluated], Array], at: Array) -> Array:
-        return np.stack([(of(found) - at) / EPSILON for found in columns], axis=-1)
+    def __init__(
+        self, model: LagrangianModel, varied: Sequence[_Varied], stage: Stage, before: _Slopes, x: Array
+    ) -> None:
+        self._base, self._columns = stage.state, []
+        for r, column in enumerate(x.T):
+            old, to = stage.history, (model.material, model.laws)
+            if r < len(varied):
+                to, old = (varied[r].material, varied[r].laws), _moved(old, before, r)
+            moved = self._base.x + EPSILON * column
+            found = model.residual(moved, stage.length_s, old, stage.elapsed_s, to)
+            if found is None:  # the cells were upright a moment ago, at the same unknowns to a millionth
+                at_s = self._base.time_s
+                raise FloatingPointError(f"no derivative at t = {at_s:.3f} s: a cell is all but flat")
+            self._columns.append(found)
+        self.residual = self._slope(lambda f: f.residual, stage.residual)
 
-    memory = tuple(slope(lambda f, k=k: f.memory[k], m) for k, m in enumerate(base.memory))  # type: ignore[misc]
-    return Evaluated(
-        slope(lambda f: f.residual, stage.residual),
-        slope(lambda f: f.volume, base.volume),
-        slope(lambda f: f.pressure, base.pressure),
-        memory,
+    @property
+    def volume(self) -> Array:
+        return self._slope(lambda f: f.volume, self._base.volume)
+
+    @property
+    def pressure(self) -> Array:
+        return self._slope(lambda f: f.pressure, self._base.pressure)
+
+    @property
+    def memory(self) -> tuple[Array, ...]:
+        return tuple(self._slope(lambda f, k=k: f.memory[k], m) for k, m in enumerate(self._base.memory))  # type: ignore[misc]
+
+    def _slope(self, of: Callable[[Evaluated], Array], at: Array) -> Array:
+        return np.stack([(of(found) - at) / EPSILON for found in self._columns], axis=-1)
+
+
+def _moved(history: State, before: _Slopes, r: int) -> State:
+    """A stage's history, EPSILON of parameter r's change further."""
+    memory = zip(history.memory, before.memory, strict=True)
+    return State(
+        history.time_s,
+        history.x,
+        history.volume + EPSILON * before.volume[..., r],
+        history.pressure + EPSILON * before.pressure[..., r],
+        tuple(m + EPSILON * slope[..., r] for m, slope in memory),
     )
 
 
@@ -229,6 +375,7 @@ def _accelerated(tried: list[tuple[Array, Array]]) -> Array:
     moves = np.stack([after[0] - before[0] for before, after in pairwise(tried)], axis=2)
     turns = np.stack([after[1] - before[1] for before, after in pairwise(tried)], axis=2)
     gram = np.einsum("nrk,nrl->rkl", turns, turns)
-    ridge = 1e-12 * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(gram.shape[1])
+    size = np.trace(gram, axis1=1, axis2=2) + np.finfo(float).tiny  # 0 of what nothing depends on
+    ridge = 1e-12 * size[:, None, None] * np.eye(gram.shape[1])
     gain = np.linalg.solve(gram + ridge, np.einsum("nrk,nr->rk", turns, correction)[:, :, None])[:, :, 0]
     return np.asarray(correction - np.einsum("nrk,rk->nr", moves + turns, gain))

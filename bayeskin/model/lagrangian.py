@@ -14,7 +14,7 @@ smallest length is taken as such a fall (`NewtonSolver.relax`), and the phase st
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -34,6 +34,7 @@ from bayeskin.model.problem import Material, Problem
 from bayeskin.model.tissue import Passage, TissueLaw
 from bayeskin.types import Array, PadMotion
 
+OPENED_S, REST_S = 1e3, 1e6  # pads that were opened before the test: by then, and when it starts
 SMALLEST_MOTION_M = 1e-4  # so that a protocol without motion has a scale too
 GAMMA = 1.0 - np.sqrt(0.5)
 FIRST_STEP_S = 1.0
@@ -43,7 +44,7 @@ STEPS_PER_PHASE = 5  # fewer, longer ones cost as much: their guesses are worse,
 CUTIS_THICKNESS_M, SUBCUTIS_THICKNESS_M = 2e-3, 8e-3
 PAD_WIDTH_M, PAD_EDGE_M = 8e-3, 18e-3  # both halves of the pad; distance of its inner edge from x = 0
 SERIES_TOLERANCE = 1e-5  # of the largest displacement, in what is lost before the skin
-MOST_SECANTS = 8
+MOST_TRIALS = 8  # of what is lost
 SOLVER_TOLERANCE = 1e-4  # of the largest displacement and pressure, before the last correction
 
 
@@ -103,6 +104,7 @@ class Step:
 class LagrangianModel:
     """The equations of one run: a problem, a material and a motion; knows nothing of step control.
 
+    motion : the protocol; then that of the pads, with what `laws` make of it
     starts_s, zero_n : when the test starts and the force then; what lies in series with the skin acts from
     then on, on the force beyond that
     """
@@ -112,15 +114,15 @@ class LagrangianModel:
     motion: PadMotion
     laws: tuple[TissueLaw, ...] = ()
     solver: NewtonSolver = field(default_factory=NewtonSolver)
-    starts_s: float = 0.0
     zero_n: float = 0.0
+    starts_s: float = field(init=False)
     full_residual: Array = field(init=False)
 
     def __post_init__(self) -> None:
         self.laws = tuple(sorted(self.laws, key=lambda law: law.rank))
         self._series = [law.series for law in self.laws if law.series is not None]
-        for element in self._series:
-            self.motion = element.moved(self.motion)
+        self._protocol = self.motion
+        self.motion, self.starts_s = self.on_the_way(self.laws)
         self.full_residual = np.zeros(self.problem.space.dofs)
         shape = self.problem.space.weight.shape
         self._chunks = assembly.chunks(shape)
@@ -131,7 +133,21 @@ class LagrangianModel:
         self._surfaces = [
             (term, *self.problem.pattern.places(term.matrix)) for law in self.laws for term in law.surfaces
         ]
+        self._answer: tuple[float, Array] | None = None  # of force and unknowns to a metre that is lost
         self._travel: Array | None = None  # change of the unknowns a metre of the pads' travel
+
+    def on_the_way(self, laws: Sequence[TissueLaw]) -> tuple[PadMotion, float]:
+        """What laws leave of the protocol on its way to the pads, whatever the force; and when it starts.
+
+        Pads that were opened before are slowly moved apart and left to rest.
+        """
+        motion, opening_m = self._protocol, sum(law.opening_m for law in laws)
+        if opening_m != 0.0:
+            time_s = np.concatenate([[0.0, OPENED_S], REST_S + motion.time_s])
+            motion = PadMotion(time_s, np.concatenate([[0.0, opening_m], opening_m + motion.displacement_m]))
+        for law in laws:
+            motion = law.series.moved(motion) if law.series else motion
+        return motion, REST_S if opening_m != 0.0 else 0.0
 
     def remember_travel(self, past: list[State]) -> None:
         """Keeps how the unknowns went with the pads, to guess how they set out again."""
@@ -189,7 +205,7 @@ class LagrangianModel:
                 s.n_nodes, s.nodes_u[c], s.nodes_p[c], s.grad_u[c], s.grad_p[c], s.value_p, s.weight[c],
                 found.stress, found.content, found.flux, out,
             )  # fmt: skip
-        for term, _, _ in self._surfaces:
+        for term in [term for law in laws for term in law.surfaces]:
             out += (h if term.per_second else 1.0) * (term.matrix @ x)
         memory = tuple(passage.after for passage in passages)
         return Evaluated(out, volume, pressure, memory) if np.isfinite(out).all() else None
@@ -301,14 +317,17 @@ class LagrangianModel:
             last.lost,
         )
         equations = self.equations(length_s, old, time_s - old.time_s)
-        lost_m = sum(float(memory[0]) for memory in old.lost)
+        yields = bool(self._series) and time_s > self.starts_s + 1e-9
+        lost_m = _total(old.lost)
+        if yields and not (jump or fall):
+            lost_m = float(self.motion.at(time_s)) - 2.0 * float(guess[3 * self.problem.pads[0]])
         pad_m = self.pad_displacement(time_s, lost_m)
         if fall:
             x = self.solver.relax(equations, self.problem.prescribe(guess, pad_m), self._drag)
         else:
             x = self._solve(equations, old, guess, pad_m, jump)
         lost = old.lost
-        if self._series and time_s > self.starts_s + 1e-9:
+        if yields:
             x, lost = self._solve_in_series(equations, old, x, time_s, lost_m)
         if x is None:
             return None
@@ -334,25 +353,39 @@ class LagrangianModel:
     def _solve_in_series(
         self, equations: Equations, old: State, x: Array | None, time_s: float, lost_m: float
     ) -> tuple[Array | None, tuple[Array, ...]]:
-        """From the unknowns with `lost_m` lost: those where what is lost fits the force, by secants."""
+        """From the unknowns with `lost_m` lost: those where what is lost fits the force.
+
+        How unknowns and force answer to what is lost is remembered from the last two that were solved for.
+        """
         allowed_m = SERIES_TOLERANCE * self.problem_scale(np.zeros(1))
-        tried: list[tuple[float, float]] = []  # lost displacement and how much more the force asks for
-        for _ in range(MOST_SECANTS):
+        before: tuple[float, float, Array] | None = None  # lost, force, unknowns
+        for _ in range(MOST_TRIALS):
             if x is None:
                 break
             force_n = self.problem.reaction(self.full_residual) - self.zero_n
-            lost = tuple(
-                element.follow(force_n, time_s - old.time_s, before)
-                for element, before in zip(self._series, old.lost, strict=True)
-            )
-            missing = sum(float(memory[0]) for memory in lost) - lost_m
+            lost = self._lost(force_n, time_s, old)
+            missing = _total(lost) - lost_m
             if abs(missing) < allowed_m:
                 return x, lost
-            tried = [*tried, (lost_m, missing)][-2:]
-            slope = (tried[1][1] - tried[0][1]) / (tried[1][0] - tried[0][0]) if len(tried) > 1 else -1.0
-            lost_m -= missing / min(slope, -0.5)  # -1 where the force does not mind
-            x = self._solve(equations, old, x, self.pad_displacement(time_s, lost_m), False)
+            if before is not None and abs(lost_m - before[0]) > allowed_m:
+                more_m = lost_m - before[0]
+                self._answer = (force_n - before[1]) / more_m, (x - before[2]) / more_m
+            before = lost_m, force_n, x
+            stiffness, ride = self._answer or (0.0, np.zeros_like(x))
+            by_n = 1e-3 * abs(force_n) + 1e-9
+            yielding = (_total(self._lost(force_n + by_n, time_s, old)) - _total(lost)) / by_n
+            step_m = missing / max(1.0 - yielding * stiffness, 0.5)
+            lost_m += step_m
+            pad_m = self.pad_displacement(time_s, lost_m)
+            x = self._solve(equations, old, x + step_m * ride, pad_m, False)
         return None, old.lost
+
+    def _lost(self, force_n: float, time_s: float, old: State) -> tuple[Array, ...]:
+        """The memory of each element in series under a force, of what it was."""
+        return tuple(
+            element.follow(force_n, time_s - old.time_s, before)
+            for element, before in zip(self._series, old.lost, strict=True)
+        )
 
     def finish(self, stages: tuple[Stage, ...], mass: Array) -> Step:
         """The step made of `stages`, with the local error `mass` (e, q) of the fluid mass."""
@@ -373,6 +406,11 @@ class LagrangianModel:
             return np.inf
         before = self.problem.reaction(self.full_residual)
         return abs(self.problem.reaction(found.residual) - before)
+
+
+def _total(lost: tuple[Array, ...]) -> float:
+    """Displacement [m] that all elements in series lose."""
+    return sum(float(memory[0]) for memory in lost)
 
 
 def _part(passage: Passage, cells: slice) -> Passage:

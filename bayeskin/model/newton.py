@@ -129,7 +129,11 @@ class NewtonSolver:
 
     def solve(self, equations: Equations, guess: Array) -> Array | None:
         """The solution from a guess whose fixed dofs are already right; None if none was found."""
-        x, nearest = guess.copy(), self._nearest(equations.place)
+        with np.errstate(over="ignore", invalid="ignore"):  # of steps that are then refused
+            return self._solved(equations, guess.copy())
+
+    def _solved(self, equations: Equations, x: Array) -> Array | None:
+        nearest = self._nearest(equations.place)
         fresh = nearest is None
         if nearest is None:
             self.renew(equations, x)

@@ -14,7 +14,7 @@ import numpy as np
 
 from bayeskin.errors import InputError
 from bayeskin.model import article, lagrangian
-from bayeskin.model.gradients import DIFFERENTIATED, ForceGradients
+from bayeskin.model.gradients import ForceGradients
 from bayeskin.model.linear import SOLVER_NAME
 from bayeskin.model.mesh import SkinMesh, brick_mesh, read_gmsh
 from bayeskin.model.newton import NewtonSolver
@@ -24,7 +24,6 @@ from bayeskin.model.tissue import Bind
 from bayeskin.types import Array, Observation, PadMotion, Simulation, frozen_array
 
 PHYSICS_VERSION = 2  # raised when a change of the code changes a force by more than its tolerance
-OPENED_S, REST_S = 1e3, 1e6  # pads that were opened before the test: by then, and when it starts
 ARTICLE_STEP_S = 0.5  # every 50th sample of a 100 Hz recording
 
 OnState = Callable[[float, Array, float], None]  # time_s, x (dofs,), force_n
@@ -89,7 +88,7 @@ def simulate(
     theta: Mapping[str, float],
     on_progress: Callable[[float], None] | None = None,
     on_state: OnState | None = None,
-    gradients: bool = False,
+    gradients: Mapping[str, float] | None = None,
     laws: Sequence[Bind] = (),
 ) -> Simulation:
     """Runs the full model over the whole motion.
@@ -97,10 +96,10 @@ def simulate(
     theta : E_c, E_s [Pa], k_c, k_s [m^2], p_init [Pa], and the parameters of `laws`
     on_progress : called with the fraction of the motion that is done
     on_state : called with time [s], all unknowns (dofs,) and force [N] of each accepted step
-    gradients : also the force's derivatives by the logarithms of `gradients.DIFFERENTIATED`, `reaction` only
+    gradients : also the force's derivatives by these parameters, each for the change that stands with it,
+        `reaction` only (`gradients.logarithms`: by the logarithms of the base's four)
     laws : physics beyond the base model, `reaction` only; with pads that were opened before the test the
-        force is relative to that at its start, where all is at rest. No gradients with laws in series with
-        the skin.
+        force is relative to that at its start, where all is at rest
 
     A run that does not converge is a Simulation with status "failed", its steps so far, and a
     message with the step, the time and a remedy. Raises InputError for a parameter that is
@@ -141,7 +140,7 @@ def simulate_on(
     _check(theta, bool(laws))
     started = time.perf_counter()
     history = _History(motion, None, None)
-    outcome = _run_reaction(problem, solid, tolerance, laws, motion, theta, history, False)
+    outcome = _run_reaction(problem, solid, tolerance, laws, motion, theta, history, None)
     seconds = time.perf_counter() - started
     return _simulation(problem, motion, theta, history, outcome, seconds, problem.mesh.hash)
 
@@ -181,7 +180,7 @@ def _simulation(
         message=message,
         stats=stats,
         model_hash=model_hash,
-        gradient_names=DIFFERENTIATED if slopes else (),
+        gradient_names=slopes.names if slopes else (),
         gradient_n=_beyond_start(slopes.force_n[-len(force) :]) if slopes else np.zeros((0, 0)),
     )
 
@@ -219,23 +218,18 @@ def _run_reaction(
     motion: PadMotion,
     theta: Mapping[str, float],
     history: _History,
-    gradients: bool,
+    gradients: Mapping[str, float] | None,
 ) -> _Outcome:
     """Fills the history; returns a message, empty for a run that finished."""
     bound = tuple(bind(theta, problem) for bind in laws)
-    if gradients and any(law.series for law in bound):
-        raise InputError(
-            "gradients", "a mechanism in series with the skin", "mechanisms of the tissue itself"
-        )
-    motion, before_s = _with_opening(motion, sum(law.opening_m for law in bound))
-    model = lagrangian.LagrangianModel(problem, solid, motion, bound, starts_s=before_s)
-    slopes = ForceGradients(model, theta, laws) if gradients else None
+    model = lagrangian.LagrangianModel(problem, solid, motion, bound)
+    slopes = ForceGradients(model, theta, gradients, laws) if gradients else None
     at_start: list[float] = []
 
     def on_step(step: lagrangian.Step) -> None:
         if slopes is not None and step.stages:
             slopes.follow(step)
-        time_s = step.state.time_s - before_s
+        time_s = step.state.time_s - model.starts_s
         if time_s > -1e-6:
             at_start.append(step.force_n)
             model.zero_n = at_start[0]
@@ -247,14 +241,6 @@ def _run_reaction(
     except FloatingPointError as error:
         message = str(error)
     return message, model.solver, slopes
-
-
-def _with_opening(motion: PadMotion, opening_m: float) -> tuple[PadMotion, float]:
-    """The motion of pads that were slowly moved apart before and left to rest; and when the test starts."""
-    if opening_m == 0.0:
-        return motion, 0.0
-    time_s = np.concatenate([[0.0, OPENED_S], REST_S + motion.time_s])
-    return PadMotion(time_s, np.concatenate([[0.0, opening_m], opening_m + motion.displacement_m])), REST_S
 
 
 def _run_article(

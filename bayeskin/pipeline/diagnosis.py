@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import re
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,32 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 import bayeskin
-from bayeskin import inference, storage
-from bayeskin.config import Config, RecordingConfig, SurrogateConfig
-from bayeskin.errors import InputError
-from bayeskin.inference import LogPosterior
+from bayeskin import inference
 from bayeskin.inference.noise_model import bins_in_windows
-from bayeskin.inference.straighten import find_shear
-from bayeskin.mechanisms import Mechanism, catalogue
-from bayeskin.mechanisms.mechanism import Instrument
-from bayeskin.mismatch.contributions import contributions
-from bayeskin.mismatch.discrepancy import discrepancy
-from bayeskin.mismatch.discretised import Discretised
-from bayeskin.mismatch.fit import Fit, instrument_noise, restored, stored, surrogate_limit
-from bayeskin.mismatch.form import propose_form
-from bayeskin.mismatch.full_fit import FullFit, fit_full
-from bayeskin.mismatch.locate import MODEL_ERROR, Located, locate
-from bayeskin.mismatch.observed import ObservedSurrogate
-from bayeskin.mismatch.resample import Resampled, resample
+from bayeskin.mismatch.fit import Fit, restored, stored
+from bayeskin.mismatch.full_fit import FullFit
+from bayeskin.mismatch.locate import Located
 from bayeskin.mismatch.search import Build, Search, search
 from bayeskin.mismatch.verdict import Diagnosis, judge
-from bayeskin.model.accuracy import mesh_error
-from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline import design, recording, training
 from bayeskin.pipeline.diagnosis_outputs import (
     Found,
-    FullResult,
-    Remainder,
     candidates,
     draw,
     in_words,
@@ -49,56 +31,14 @@ from bayeskin.pipeline.diagnosis_outputs import (
     unexplained,
     window,
 )
-from bayeskin.pipeline.effects import effect_files, effects_of
-from bayeskin.pipeline.engine import Reporter, Run, Silent, Stage, open_run, run_stages
+from bayeskin.pipeline.effects import effect_files
+from bayeskin.pipeline.engine import Reporter, Run, Silent, Stage, run_stages
 from bayeskin.pipeline.folder import plain, read_lines, sha256_of, write_json
-from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
-from bayeskin.pipeline.reported import FullForce
-from bayeskin.pipeline.shipping import shipped_for
-from bayeskin.pipeline.training import base_surrogate
-from bayeskin.recordings import read_recording, segment
-from bayeskin.surrogates import Effect, with_effects
-from bayeskin.types import Array, BinnedForce, PadMotion, Surrogate
-from bayeskin.workers import Lost, run_parallel
-
-PREDICTIVE_DRAWS = 300
-BEND = 2.0 * MODEL_ERROR  # of which half is left after one factor on the force
-FULL_RUNS = 5  # of the full model, at most, to take up a fit of the surrogate
-
-
-@dataclass(frozen=True)
-class Workbench:
-    """All that a search needs of a run: its bins and protocol, the base's surrogate, what is known."""
-
-    run: Run
-    binned: BinnedForce
-    motion: PadMotion
-    base: Surrogate
-    effects: tuple[Effect, ...]
-    known: Mapping[str, Mechanism]
-
-    @cached_property
-    def spec(self) -> ModelSpec:
-        """The full model."""
-        return model_spec(self.run)
-
-    def posterior(self, until_s: float | None, names: Sequence[str]) -> LogPosterior:
-        """The posterior with a set of mechanisms, fitted up to a time (None: to the end)."""
-        asked = {name: bounds for name, bounds in self.run.config.noise if bounds is not None}
-        parts = [effect for effect in self.effects if effect.mechanism in names]
-        skin: Surrogate = with_effects(self.base, parts)  # type: ignore[arg-type]
-        error = mesh_error(self.spec.mesh_hash) if self.spec.observation == "reaction" else None
-        if error is not None:
-            skin = Discretised(
-                skin, self.motion, error.rms, 2.0 * MODEL_ERROR
-            )  # half is left after one factor
-        instrument = tuple(self.known[n] for n in names if isinstance(self.known[n].act, Instrument))
-        seen = ObservedSurrogate(skin, instrument, self.motion) if instrument else skin
-        return LogPosterior(
-            seen, self.binned, None if until_s is None else ((0.0, until_s),),
-            replace(instrument_noise(self.binned), **asked), sure_within_n=surrogate_limit(self.binned),
-        )  # fmt: skip
+from bayeskin.pipeline.taking_up import FullResult, TakenUp, fit_beginnings, take_up
+from bayeskin.pipeline.workbench import Workbench, opened, workbench
+from bayeskin.types import Array, BinnedForce
+from bayeskin.workers import run_parallel
 
 
 def diagnose(source: Path, reporter: Reporter) -> dict[str, Any]:
@@ -115,24 +55,6 @@ def diagnose(source: Path, reporter: Reporter) -> dict[str, Any]:
     return plain({**answer, "text": text})
 
 
-def opened(source: Path, reporter: Reporter) -> Run:
-    """A configuration's run, or that of a recording by itself beside it. Raises InputError as `diagnose`."""
-    if source.suffix == ".toml":
-        return open_run(source, reporter)
-    found = read_recording(source)
-    surrogate = shipped_for(recording.pad_motion("reaction", found, segment(found), "idealised"))
-    if surrogate is None:
-        raise InputError(
-            source, "a protocol that no shipped surrogate was trained on",
-            "a configuration with a design of its own: bayeskin diagnose CONFIG.toml",
-        )  # fmt: skip
-    config = Config(
-        name=re.sub(r"[^A-Za-z0-9._-]", "-", f"run-{source.stem}"),
-        recording=RecordingConfig(file=source.name), surrogate=SurrogateConfig(file=surrogate.name),
-    )  # fmt: skip
-    return Run(config, source, source.resolve().with_name(f"{source.stem}-diagnosis"), reporter)
-
-
 def _work(run: Run) -> Mapping[str, Any]:
     started = time.monotonic()
     bench = workbench(run)
@@ -143,25 +65,32 @@ def _work(run: Run) -> Mapping[str, Any]:
         run.reporter.log("waiting for the search on the recording's beginning")
         beside.join()
     begun = None if split_s is None else _searched(bench, split_s)
-    before, after = (locate(one, whole.best.theta, run.config.seed) for one in (whole.base, whole.best))
-    found = judge(whole, bench.known, before, after)
-    parts = contributions(whole.best, partial(bench.posterior, None))
-    remainder = _remainder(bench, found, whole.best, after)
-    taken = _taken_up(bench, [whole.base, whole.best])
+    run.reporter.log("the full model takes up what was found")
+    pairs = [whole.base, whole.best] if whole.best.names else [whole.base]
+    taken = take_up(run, pairs, whole.best.theta)
+    before, after = taken[0], taken[-1]
+    held_out: list[FullResult] = [None, None]
+    if begun is not None and split_s is not None:
+        run.reporter.log("and what was found on the recording's beginning")
+        held_out = fit_beginnings(run, [begun.base, begun.best], split_s)
+    found = judge(whole, bench.known, before.located, after.located)
+    remainder = after.remainder if leaves_something(found, after.located) else None
+    best = after.full.theta if isinstance(after.full, FullFit) else whole.best.theta
     answer: dict[str, Any] = {
         "verdict": found.verdict,
-        "located": [window(one) for one in before.windows],
-        "remaining": [window(one) for one in after.windows],
+        "located": [window(one) for one in before.located.windows],
+        "remaining": [window(one) for one in after.located.windows],
         "explained": found.explained,
         "mechanisms": [
-            mechanism(one, bench.known[one.name], parts, taken[1].draws.summary) for one in found.named
+            mechanism(one, bench.known[one.name], after.parts, after.draws.summary, best)
+            for one in found.named
         ],
         "unexplained": None if remainder is None else unexplained(remainder),
         "candidates": candidates(whole, bench.known),
         "unsure": sorted({name for names in whole.unsure for name in names if len(names) == 1}),
         "fit": {
-            "before": _fit(bench, whole.base, taken[0], begun.base if begun else None, split_s),
-            "after": _fit(bench, whole.best, taken[1], begun.best if begun else None, split_s),
+            "before": _fit(bench, whole.base, before, begun.base if begun else None, held_out[0], split_s),
+            "after": _fit(bench, whole.best, after, begun.best if begun else None, held_out[1], split_s),
         },
         "best_set": list(whole.best.names),
         "held_out_set": list(begun.best.names) if begun else [],
@@ -170,65 +99,15 @@ def _work(run: Run) -> Mapping[str, Any]:
     write_json(run.at(STAGE.name, "diagnosis.json"), answer)
     figures = draw(
         run.folder / STAGE.name, caption(run), bench.binned, bench.motion,
-        Found(whole, [one.full for one in taken], before, after, parts, remainder), answer["candidates"],
+        Found(whole, [before.full, after.full], before.located, after.located, after.parts, remainder),
+        answer["candidates"],
     )  # fmt: skip
     return {**answer, "figures": [figure.name for figure in figures]}
 
 
-def _remainder(bench: Workbench, found: Diagnosis, best: Fit, after: Located) -> Remainder | None:
-    """What is left, where the mismatch is unknown or windows remain beside what is named."""
-    if found.verdict == "nothing-missing" or (found.verdict == "named" and not after.windows):
-        return None
-    motion, seed = bench.motion, bench.run.config.seed
-    return Remainder(discrepancy(best, motion), propose_form(best, motion, seed))
-
-
-@dataclass(frozen=True)
-class TakenUp:
-    """What follows a search's fit: draws of its posterior, and the full model's own fit from there."""
-
-    draws: Resampled
-    full: FullResult
-
-
-def _taken_up(bench: Workbench, fits: Sequence[Fit]) -> list[TakenUp]:
-    """Each fit sampled, and taken up by the full model itself (by the article's, not), in two processes."""
-    run = bench.run
-    run.reporter.log("posterior, and the full model, without and with what was found")
-    apart: list[partial[Any]] = [partial(_fit_full_apart, run.config_path, stored(one)) for one in fits]
-    apart += [partial(_resample_apart, run.config_path, stored(one)) for one in fits]
-    if run.config.model.observation != "reaction":
-        apart = apart[len(fits) :]
-    done = dict(run_parallel(_call, apart, 2))
-    found = [done[i] for i in range(len(apart))]
-    full = found[: -len(fits)] or [None] * len(fits)
-    draws = [_resample_apart(run.config_path, stored(fits[i])) if isinstance(one, Lost) else one
-             for i, one in enumerate(found[-len(fits) :])]  # fmt: skip
-    return [TakenUp(d, f.reason if isinstance(f, Lost) else f) for d, f in zip(draws, full, strict=True)]
-
-
-def _call(task: partial[Any]) -> Any:
-    return task()
-
-
-def _fit_full_apart(source: Path, plain: Mapping[str, Any]) -> FullFit | str:
-    """In a process of its own: mechanisms have no copies."""
-    bench, names = workbench(opened(source, Silent())), plain["names"]
-    run_it = FullForce(bench.spec, bench.motion, bench.binned.edges_s)
-    beyond = [bench.known[name] for name in names if bench.known[name].act.bind is None]
-    exact = [p.name for mechanism in beyond for p in mechanism.parameters]
-    return fit_full(
-        bench.posterior(None, names), plain["theta"], lambda point: run_it((names, point)), exact, FULL_RUNS,
-        bench.run.config.seed,
-    )  # fmt: skip
-
-
-def _resample_apart(source: Path, plain: Mapping[str, Any]) -> Resampled:
-    bench = workbench(opened(source, Silent()))
-    alone, wide = bench.posterior(None, ()), bench.posterior(None, plain["names"])
-    shear = find_shear(alone)
-    among = shear.among(alone.names, wide.names) if shear else None
-    return resample(restored(plain, wide), among, alone.surrogate.space.dim, bench.run.config.seed)
+def leaves_something(found: Diagnosis, after: Located) -> bool:
+    """Whether there is something to describe: the mismatch is unknown, or windows remain beside names."""
+    return found.verdict == "unknown" or (found.verdict == "named" and bool(after.windows))
 
 
 def _search_beside(run: Run, split_s: float) -> threading.Thread:
@@ -241,16 +120,6 @@ def _search_beside(run: Run, split_s: float) -> threading.Thread:
 
 def _search_apart(source: Path, split_s: float) -> None:
     _searched(workbench(opened(source, Silent())), split_s)
-
-
-def workbench(run: Run) -> Workbench:
-    """Of a run whose stages up to `train` are done."""
-    binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
-    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
-    effects = effects_of(run) if run.config.model.observation == "reaction" else []
-    learnt = {effect.mechanism for effect in effects}
-    known = {n: m for n, m in catalogue().items() if isinstance(m.act, Instrument) or n in learnt}
-    return Workbench(run, binned, motion, base_surrogate(run), tuple(effects), known)
 
 
 def fits_of(bench: Workbench) -> list[Fit]:
@@ -300,25 +169,21 @@ def _end_of_second_hold(binned: BinnedForce) -> float | None:
 
 
 def _fit(
-    bench: Workbench, found: Fit, taken: TakenUp, begun: Fit | None, split_s: float | None
-) -> dict[str, Any]:
+    bench: Workbench, found: Fit, taken: TakenUp, begun: Fit | None, held_out: FullResult,
+    split_s: float | None,
+) -> dict[str, Any]:  # fmt: skip
     """RMSE [N] of a fit to the whole recording, by phase, of one to its beginning on the rest; coverage."""
     binned = bench.binned
-    by_phase = inference.rmse(binned, found.force_n)
-    held_out = None
-    if begun is not None and split_s is not None:
-        rest = bins_in_windows(binned, ((split_s, float(binned.edges_s[-1])),)) >= 0
-        held_out = float(np.sqrt(np.mean((binned.force_n[rest] - begun.force_n[rest]) ** 2)))
-    draws = taken.draws.draws
-    some = inference.evenly(draws, PREDICTIVE_DRAWS)
-    bands = inference.bands(found.log_posterior, some, np.random.default_rng(bench.run.config.seed))
     usable = bins_in_windows(binned, None) >= 0
+    rest = usable
+    if split_s is not None:
+        rest = bins_in_windows(binned, ((split_s, float(binned.edges_s[-1])),)) >= 0
     return {
-        "rmse": float(np.sqrt(np.mean((binned.force_n[usable] - found.force_n[usable]) ** 2))),
-        "rmse_by_phase": dict(by_phase.by_kind_n),
-        "rmse_held_out": held_out,
-        "full_model": _full(taken.full, found.force_n, binned, usable),
-        "coverage90": inference.coverage(binned, *bands.interval(0.9)),
+        "rmse": _rms(binned.force_n - found.force_n, usable),
+        "rmse_by_phase": dict(inference.rmse(binned, found.force_n).by_kind_n),
+        "rmse_held_out": None if begun is None else _rms(binned.force_n - begun.force_n, rest),
+        "full_model": _full(taken.full, held_out, found.force_n, binned, usable, rest),
+        "coverage90": taken.coverage90,
         "log_evidence": found.log_evidence,
         "theta": taken.draws.summary,
         "sampled": {
@@ -330,23 +195,26 @@ def _fit(
 
 
 def _full(
-    full: FullResult, force_n: Array, binned: BinnedForce, usable: NDArray[np.bool_]
-) -> dict[str, Any] | None:
-    """RMSE [N] of the full model where its own fit ended, and how far the surrogate's is off from it."""
+    full: FullResult, held_out: FullResult, force_n: Array, binned: BinnedForce, usable: NDArray[np.bool_],
+    rest: NDArray[np.bool_],
+) -> dict[str, Any] | None:  # fmt: skip
+    """RMSE [N] of the full model where its own fits ended, and how far the surrogate's is off from it."""
     if not isinstance(full, FullFit):
         return None if full is None else {"message": full}
-
-    def rms(values: Array) -> float:
-        return float(np.sqrt(np.mean(values[usable] ** 2)))
-
+    begun = held_out if isinstance(held_out, FullFit) else None
     return {
-        "rmse": rms(binned.force_n - full.force_n),
+        "rmse": _rms(binned.force_n - full.force_n, usable),
         "rmse_by_phase": dict(inference.rmse(binned, full.force_n).by_kind_n),
-        "fit_off_by": rms(force_n - full.force_n),
+        "rmse_held_out": None if begun is None else _rms(binned.force_n - begun.force_n, rest),
+        "fit_off_by": _rms(force_n - full.force_n, usable),
         "runs": full.runs,
         "gained": full.gained,
         "theta": dict(full.theta),
     }
+
+
+def _rms(values: Array, among: NDArray[np.bool_]) -> float:
+    return float(np.sqrt(np.mean(values[among] ** 2)))
 
 
 def _files(run: Run) -> list[Path]:

@@ -12,25 +12,13 @@ import numpy as np
 from bayeskin import report
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.contributions import Contribution
-from bayeskin.mismatch.discrepancy import Discrepancy
 from bayeskin.mismatch.fit import Fit
-from bayeskin.mismatch.form import Form
 from bayeskin.mismatch.full_fit import FullFit
 from bayeskin.mismatch.locate import Located, Window
 from bayeskin.mismatch.search import Search
 from bayeskin.mismatch.verdict import Named
+from bayeskin.pipeline.taking_up import FullResult, Remainder
 from bayeskin.types import Array, BinnedForce, PadMotion
-
-
-@dataclass(frozen=True)
-class Remainder:
-    """What the best set leaves over: a discrepancy, and the form that is proposed for it."""
-
-    discrepancy: Discrepancy
-    form: Form
-
-
-FullResult = FullFit | str | None  # of the full model, or why its first run failed; None where none is made
 
 
 @dataclass(frozen=True)
@@ -57,15 +45,17 @@ def window(one: Window) -> dict[str, Any]:
 
 
 def mechanism(
-    one: Named, known: Mechanism, parts: Sequence[Contribution], values: Mapping[str, Mapping[str, Any]]
-) -> dict[str, Any]:
-    """An entry of a named mechanism, `known`; `parts` are those of the best set, `values` its parameters'."""
+    one: Named, known: Mechanism, parts: Sequence[Contribution], values: Mapping[str, Mapping[str, Any]],
+    best: Mapping[str, float],
+) -> dict[str, Any]:  # fmt: skip
+    """An entry of a named mechanism, `known`; `parts` are those of the best set, `values` summaries of its
+    parameters, `best` the most probable ones."""
     parameters = {p.name: {**values[p.name], "unit": p.unit} for p in known.parameters if p.name in values}
     return {
         "name": one.name, "probability": one.probability, "group": list(one.group),
         "group_probability": one.group_probability, "explains_n": one.explains_n,
-        "contribution_n": next(part.size_n for part in parts if part.name == one.name),
-        "parameters": parameters, "statement": one.statement,
+        "contribution_n": next((part.size_n for part in parts if part.name == one.name), None),
+        "parameters": parameters, "statement": known.statement({**known.neutral, **best}),
     }  # fmt: skip
 
 
@@ -173,8 +163,9 @@ def _full_in_words(full: Mapping[str, Any] | None) -> list[str]:
     if "message" in full:
         return [f"  full model: failed: {full['message']}"]
     rmse, off = (1e3 * full[name] for name in ("rmse", "fit_off_by"))
-    runs = f"{full['runs']} run{'s' * (full['runs'] != 1)}"
-    return [f"  full model, {runs}: RMSE {rmse:.1f} mN, the surrogate's fit is off by {off:.1f} mN"]
+    held = full["rmse_held_out"]
+    rest = "" if held is None else f", {1e3 * held:.1f} mN on what follows the second hold, not fitted"
+    return [f"  full model: RMSE {rmse:.1f} mN{rest}; the surrogate's fit is off by {off:.1f} mN"]
 
 
 def _left_in_words(left: Mapping[str, Any]) -> list[str]:

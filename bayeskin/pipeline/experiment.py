@@ -25,6 +25,7 @@ from bayeskin.pipeline import diagnosis
 from bayeskin.pipeline.engine import Reporter, Silent
 from bayeskin.pipeline.folder import plain, read_lines, sha256_of, write_json
 from bayeskin.pipeline.provenance import caption
+from bayeskin.pipeline.workbench import opened, workbench
 from bayeskin.types import PadMotion, Simulation
 from bayeskin.workers import Lost, run_parallel
 
@@ -37,11 +38,11 @@ def choose(source: Path, reporter: Reporter) -> dict[str, Any]:
     Diagnoses first, where that is not done. Outputs go to the run's folder `experiment`. Raises InputError
     for bad input, among it the article's observation, which no other protocol has.
     """
-    run = diagnosis.opened(source, reporter)
+    run = opened(source, reporter)
     if run.config.model.observation != "reaction":
         raise InputError(source, "the article's observation", "model.observation = 'reaction'")
     diagnosis.diagnose(source, reporter)
-    bench = diagnosis.workbench(run)
+    bench = workbench(run)
     fits = compete(diagnosis.fits_of(bench), bench.known)
     answer: dict[str, Any] = {"sets": [list(one.names) for one in fits], "experiments": [], "ok": True}
     if len(fits) > 1:
@@ -83,7 +84,7 @@ def _row(one: Experiment) -> dict[str, Any]:
 
 def _weigh_apart(source: Path, fits: Sequence[Mapping[str, Any]], name: str) -> Experiment:
     """In a process of its own: mechanisms have no copies."""
-    bench = diagnosis.workbench(diagnosis.opened(source, Silent()))
+    bench = workbench(opened(source, Silent()))
     found = [restored(one, bench.posterior(None, one["names"])) for one in fits]
     protocol = next(one for one in protocols(bench.motion) if one.name == name)
     return weigh(protocol, found, bench.known, _coarse, bench.run.config.seed)

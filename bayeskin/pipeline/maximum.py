@@ -9,6 +9,7 @@ import numpy as np
 
 from bayeskin import inference, report, storage
 from bayeskin.inference import MapCheck, RefinedMap
+from bayeskin.model.gradients import logarithms
 from bayeskin.model.simulate import simulate
 from bayeskin.pipeline.calibration import log_posterior_of, rmse_table
 from bayeskin.pipeline.engine import Run, Stage
@@ -37,8 +38,9 @@ class _FullModel:
         label = f"full run {self.count}"
         tell = self.run.reporter.progress
         simulation = simulate(
-            self.spec, self.motion, theta, lambda share: tell(label, share), gradients=self.gradients
-        )
+            self.spec, self.motion, theta, lambda share: tell(label, share),
+            gradients=logarithms(theta) if self.gradients else None,
+        )  # fmt: skip
         storage.save(kept, simulation)
         return simulation
 

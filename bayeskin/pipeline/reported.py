@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from bayeskin.mechanisms.mechanism import ForceOfTime
 from bayeskin.model.problem import PARAMETERS
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.types import Array, PadMotion, Simulation
+
+STEP = 1e-4  # of a change, for differences of what the instrument makes of a force
 
 
 def reported(
@@ -39,11 +41,32 @@ class FullForce:
     edges_s: Array
 
     def __call__(self, case: tuple[Sequence[str], Mapping[str, float]]) -> Array | str:
+        found = self.with_slopes(case, {})
+        return found if isinstance(found, str) else found[0]
+
+    def with_slopes(
+        self, case: tuple[Sequence[str], Mapping[str, float]], changes: Mapping[str, float]
+    ) -> tuple[Array, Array] | str:
+        """Bin means (m,), and their derivatives (m, r) by these parameters, each for its change."""
         names, values = case
         mechanisms = [catalogue()[name] for name in names]
         along = {p.name for mechanism in solved(mechanisms) for p in mechanism.parameters}
         theta = {name: value for name, value in values.items() if name in along or name in PARAMETERS}
-        simulation = simulate(self.spec, self.motion, theta, laws=laws(mechanisms))
+        by = {name: change for name, change in changes.items() if name in theta}
+        simulation = simulate(self.spec, self.motion, theta, laws=laws(mechanisms), gradients=by)
         if simulation.status != "ok":
             return simulation.message
-        return bin_means(reported(simulation, mechanisms, values, self.motion), self.motion, self.edges_s)[0]
+        slopes = dict(zip(simulation.gradient_names, simulation.gradient_n.T, strict=True))
+        runs = [replace(simulation, force_n=simulation.force_n + STEP * slopes.get(name, 0.0))
+                for name in changes]  # fmt: skip
+        columns = {name: np.full(1 + len(changes), value) for name, value in values.items()}
+        for row, (name, change) in enumerate(changes.items(), start=1):
+            columns[name][row] += STEP * change
+
+        def force(time_s: Array) -> Array:
+            times_s = np.broadcast_to(time_s, (1 + len(runs), np.shape(time_s)[-1]))
+            return np.stack([run.at(row) for run, row in zip([simulation, *runs], times_s, strict=True)])
+
+        beyond = [mechanism for mechanism in mechanisms if mechanism.act.bind is None]
+        seen = bin_means(observed(beyond, columns, self.motion, force), self.motion, self.edges_s)
+        return seen[0], (seen[1:] - seen[0]).T / STEP

@@ -1,0 +1,149 @@
+"""The full model takes up what a search on its surrogate has found: a fit of its own, the posterior there.
+
+First on the coarsest bricks, whose runs are quick and carry their derivatives, then on the model's own mesh
+with these derivatives. Sampled, located and taken apart is the posterior about that fit, in which nothing of
+the surrogate's error is left. The article's formulation and models of one's own keep the surrogate's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayeskin import inference
+from bayeskin.inference import LogPosterior
+from bayeskin.inference.straighten import find_shear
+from bayeskin.mismatch.contributions import Contribution, Force, contributions
+from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
+from bayeskin.mismatch.fit import Fit, fit_near, restored, stored
+from bayeskin.mismatch.form import Form, propose_form
+from bayeskin.mismatch.full_fit import FullFit, fit_full
+from bayeskin.mismatch.locate import Located, locate
+from bayeskin.mismatch.resample import Resampled, resample
+from bayeskin.pipeline.engine import Run, Silent
+from bayeskin.pipeline.reported import FullForce
+from bayeskin.pipeline.workbench import Workbench, opened, workbench
+from bayeskin.types import Array
+from bayeskin.workers import Lost, run_parallel
+
+COARSE_RUNS, FULL_RUNS = 10, 3  # at most
+PREDICTIVE_DRAWS = 300
+
+FullResult = FullFit | str | None  # of the full model, or why its first run failed; None where none is made
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What a set leaves over: a discrepancy, and the form that is proposed for it."""
+
+    discrepancy: Discrepancy
+    form: Form
+
+
+@dataclass(frozen=True)
+class TakenUp:
+    """What follows a search's fit on the whole recording.
+
+    full : the full model's fit; draws : of the posterior; coverage90 : share of bins in its predictive band;
+    located : windows that it leaves; parts : what each mechanism contributes; remainder : what is left
+    """
+
+    full: FullResult
+    draws: Resampled
+    coverage90: float
+    located: Located
+    parts: tuple[Contribution, ...]
+    remainder: Remainder
+
+
+def take_up(run: Run, whole: Sequence[Fit], noise: Mapping[str, float]) -> list[TakenUp]:
+    """Fits to the whole recording; `noise` among its values has the noise that is no mismatch."""
+    return _in_two_processes([partial(_whole_apart, run.config_path, stored(one), noise) for one in whole])
+
+
+def fit_beginnings(run: Run, begun: Sequence[Fit], until_s: float) -> list[FullResult]:
+    """Fits to the recording up to a time."""
+    return _in_two_processes([partial(_begun_apart, run.config_path, stored(one), until_s) for one in begun])
+
+
+def _in_two_processes(apart: Sequence[partial[Any]]) -> list[Any]:
+    """What each gives, the last first, which are the longest; one whose process is lost is done here."""
+    order = list(reversed(range(len(apart))))
+    done = {order[i]: found for i, found in run_parallel(_call, [apart[i] for i in order], 2)}
+    return [apart[i]() if isinstance(done[i], Lost) else done[i] for i in range(len(apart))]
+
+
+def _call(task: partial[Any]) -> Any:
+    return task()
+
+
+def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, float]) -> TakenUp:
+    """In a process of its own: mechanisms have no copies."""
+    bench = workbench(opened(source, Silent()))
+    seed, build = bench.run.config.seed, partial(bench.posterior, None)
+    alone, found = build(()), restored(plain, build(plain["names"]))
+    straight = find_shear(alone)
+    shear = straight.among(alone.names, found.log_posterior.names) if straight else None
+    full, about = _full(bench, found)
+    force: Force = partial(_surrogate_force, bench)
+    if about is not None and isinstance(full, FullFit):
+        found = fit_near(found.names, about, full.theta, shear)
+        force = _coarse(bench)
+    draws = resample(found, shear, alone.surrogate.space.dim, seed)
+    some = inference.evenly(draws.draws, PREDICTIVE_DRAWS)
+    bands = inference.bands(found.log_posterior, some, np.random.default_rng(seed))
+    return TakenUp(
+        full, draws, inference.coverage(bench.binned, *bands.interval(0.9)), locate(found, noise, seed),
+        tuple(contributions(found.names, found.theta, force)),
+        Remainder(discrepancy(found, bench.motion), propose_form(found, bench.motion, seed)),
+    )  # fmt: skip
+
+
+def _begun_apart(source: Path, plain: Mapping[str, Any], until_s: float) -> FullResult:
+    bench = workbench(opened(source, Silent()))
+    return _full(bench, restored(plain, bench.posterior(until_s, plain["names"])))[0]
+
+
+def _full(bench: Workbench, found: Fit) -> tuple[FullResult, LogPosterior | None]:
+    """The full model's own fit from a search's, and the posterior about it."""
+    if bench.spec.observation != "reaction":
+        return None, None
+    beyond = [bench.known[name] for name in found.names if bench.known[name].act.bind is None]
+    exact = [p.name for mechanism in beyond for p in mechanism.parameters]
+    coarse, fine = _coarse(bench), FullForce(bench.spec, bench.motion, bench.binned.edges_s)
+    known: dict[tuple[float, ...], tuple[Array, Array] | str] = {}
+
+    def quick(theta: Mapping[str, float], changes: Mapping[str, float]) -> tuple[Array, Array] | str:
+        key = tuple(theta[name] for name in changes)
+        if key not in known:
+            known[key] = coarse.with_slopes((found.names, theta), changes)
+        return known[key]
+
+    def whole(theta: Mapping[str, float], changes: Mapping[str, float]) -> tuple[Array, Array] | str:
+        slopes, force = quick(theta, changes), fine((found.names, theta))
+        if isinstance(slopes, str) or isinstance(force, str):
+            return slopes if isinstance(slopes, str) else str(force)
+        return force, slopes[1]
+
+    fitted = partial(fit_full, found.log_posterior, exact=exact, seed=bench.run.config.seed)
+    first = fitted(found.theta, quick, rounds=COARSE_RUNS, allow=bench.with_mesh_error)
+    start = found.theta if isinstance(first, str) else first[0].theta
+    last = fitted(start, whole, rounds=FULL_RUNS, allow=bench.with_mesh_error)
+    return (last, None) if isinstance(last, str) else last
+
+
+def _coarse(bench: Workbench) -> FullForce:
+    spec = replace(bench.spec, mesh="bricks", refinement=0)
+    return FullForce(spec, bench.motion, bench.binned.edges_s)
+
+
+def _surrogate_force(bench: Workbench, case: tuple[Sequence[str], Mapping[str, float]]) -> Array:
+    """Mean force (m,) of the surrogate with a set, at the values that its posterior knows."""
+    log_posterior = bench.posterior(None, case[0])
+    values = log_posterior.from_sampling(log_posterior.vector(case[1]))
+    return np.asarray(log_posterior.predict(values).mean[0])

@@ -1,0 +1,96 @@
+"""What a diagnosis works on: a recording, surrogate and mechanisms, and the posteriors of sets of these."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from bayeskin import storage
+from bayeskin.config import Config, RecordingConfig, SurrogateConfig
+from bayeskin.errors import InputError
+from bayeskin.inference import LogPosterior
+from bayeskin.mechanisms import Mechanism, catalogue
+from bayeskin.mechanisms.mechanism import Instrument
+from bayeskin.mismatch.discretised import Discretised
+from bayeskin.mismatch.fit import instrument_noise, surrogate_limit
+from bayeskin.mismatch.locate import MODEL_ERROR
+from bayeskin.mismatch.observed import ObservedSurrogate
+from bayeskin.model.accuracy import mesh_error
+from bayeskin.model.simulate import ModelSpec
+from bayeskin.pipeline import recording
+from bayeskin.pipeline.effects import effects_of
+from bayeskin.pipeline.engine import Reporter, Run, open_run
+from bayeskin.pipeline.model import model_spec
+from bayeskin.pipeline.shipping import shipped_for
+from bayeskin.pipeline.training import base_surrogate
+from bayeskin.recordings import read_recording, segment
+from bayeskin.surrogates import Effect, with_effects
+from bayeskin.types import BinnedForce, PadMotion, Surrogate
+
+BEND = 2.0 * MODEL_ERROR  # of which half is left after one factor on the force
+
+
+@dataclass(frozen=True)
+class Workbench:
+    """All that a search needs of a run: its bins and protocol, the base's surrogate, what is known."""
+
+    run: Run
+    binned: BinnedForce
+    motion: PadMotion
+    base: Surrogate
+    effects: tuple[Effect, ...]
+    known: Mapping[str, Mechanism]
+
+    @cached_property
+    def spec(self) -> ModelSpec:
+        """The full model."""
+        return model_spec(self.run)
+
+    def with_mesh_error(self, skin: Surrogate) -> Surrogate:
+        """A surrogate that allows for what a finer mesh would change, where that is known."""
+        error = mesh_error(self.spec.mesh_hash) if self.spec.observation == "reaction" else None
+        return skin if error is None else Discretised(skin, self.motion, error.rms, BEND)
+
+    def posterior(self, until_s: float | None, names: Sequence[str]) -> LogPosterior:
+        """The posterior with a set of mechanisms, fitted up to a time (None: to the end)."""
+        asked = {name: bounds for name, bounds in self.run.config.noise if bounds is not None}
+        parts = [effect for effect in self.effects if effect.mechanism in names]
+        skin: Surrogate = with_effects(self.base, parts)  # type: ignore[arg-type]
+        skin = self.with_mesh_error(skin)
+        instrument = tuple(self.known[n] for n in names if isinstance(self.known[n].act, Instrument))
+        seen = ObservedSurrogate(skin, instrument, self.motion) if instrument else skin
+        return LogPosterior(
+            seen, self.binned, None if until_s is None else ((0.0, until_s),),
+            replace(instrument_noise(self.binned), **asked), sure_within_n=surrogate_limit(self.binned),
+        )  # fmt: skip
+
+
+def opened(source: Path, reporter: Reporter) -> Run:
+    """A configuration's run, or that of a recording by itself beside it. Raises InputError as `diagnose`."""
+    if source.suffix == ".toml":
+        return open_run(source, reporter)
+    found = read_recording(source)
+    surrogate = shipped_for(recording.pad_motion("reaction", found, segment(found), "idealised"))
+    if surrogate is None:
+        raise InputError(
+            source, "a protocol that no shipped surrogate was trained on",
+            "a configuration with a design of its own: bayeskin diagnose CONFIG.toml",
+        )  # fmt: skip
+    config = Config(
+        name=re.sub(r"[^A-Za-z0-9._-]", "-", f"run-{source.stem}"),
+        recording=RecordingConfig(file=source.name), surrogate=SurrogateConfig(file=surrogate.name),
+    )  # fmt: skip
+    return Run(config, source, source.resolve().with_name(f"{source.stem}-diagnosis"), reporter)
+
+
+def workbench(run: Run) -> Workbench:
+    """Of a run whose stages up to `train` are done."""
+    binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
+    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    effects = effects_of(run) if run.config.model.observation == "reaction" else []
+    learnt = {effect.mechanism for effect in effects}
+    known = {n: m for n, m in catalogue().items() if isinstance(m.act, Instrument) or n in learnt}
+    return Workbench(run, binned, motion, base_surrogate(run), tuple(effects), known)
