@@ -30,7 +30,7 @@ from bayeskin.types import Array
 PRIOR = 0.05  # of a mechanism to be at work, before the recording is seen
 MOST = 8  # steps
 SHORTLIST = 5  # mechanisms of a step that are tried thoroughly
-PATHS = 4  # at most
+PATHS = 2  # at most
 AT_BOUND = 0.999  # of the noise's range
 UNSURE = 0.5  # of what a mechanism adds, RMS: sd of the surrogate's error in it
 ONLY_WITH = {"friction-creep": "device-friction"}
