@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from bayeskin.pipeline.effects import effect_files
 from bayeskin.pipeline.engine import Reporter, Run, Silent, Stage, run_stages
 from bayeskin.pipeline.folder import plain, read_lines, sha256_of, write_json
 from bayeskin.pipeline.provenance import caption
-from bayeskin.pipeline.taking_up import FullResult, TakenUp, fit_beginnings, take_up
+from bayeskin.pipeline.taking_up import FullResult, TakenUp, take_up
 from bayeskin.pipeline.workbench import Workbench, opened, workbench
 from bayeskin.types import Array, BinnedForce
 from bayeskin.workers import run_parallel
@@ -67,12 +67,10 @@ def _work(run: Run) -> Mapping[str, Any]:
     begun = None if split_s is None else _searched(bench, split_s)
     run.reporter.log("the full model takes up what was found")
     pairs = [whole.base, whole.best] if whole.best.names else [whole.base]
-    taken = take_up(run, pairs, whole.best.theta)
+    taken, held_out = take_up(
+        run, pairs, whole.best.theta, [begun.base, begun.best] if begun else [], split_s
+    )
     before, after = taken[0], taken[-1]
-    held_out: list[FullResult] = [None, None]
-    if begun is not None and split_s is not None:
-        run.reporter.log("and what was found on the recording's beginning")
-        held_out = fit_beginnings(run, [begun.base, begun.best], split_s)
     found = judge(whole, bench.known, before.located, after.located)
     remainder = after.remainder if leaves_something(found, after.located) else None
     best = after.full.theta if isinstance(after.full, FullFit) else whole.best.theta
@@ -89,8 +87,8 @@ def _work(run: Run) -> Mapping[str, Any]:
         "candidates": candidates(whole, bench.known),
         "unsure": sorted({name for names in whole.unsure for name in names if len(names) == 1}),
         "fit": {
-            "before": _fit(bench, whole.base, before, begun.base if begun else None, held_out[0], split_s),
-            "after": _fit(bench, whole.best, after, begun.best if begun else None, held_out[1], split_s),
+            "before": _fit(bench, whole.base, before, begun.base if begun else None, held_out[:1], split_s),
+            "after": _fit(bench, whole.best, after, begun.best if begun else None, held_out[1:], split_s),
         },
         "best_set": list(whole.best.names),
         "held_out_set": list(begun.best.names) if begun else [],
@@ -169,7 +167,7 @@ def _end_of_second_hold(binned: BinnedForce) -> float | None:
 
 
 def _fit(
-    bench: Workbench, found: Fit, taken: TakenUp, begun: Fit | None, held_out: FullResult,
+    bench: Workbench, found: Fit, taken: TakenUp, begun: Fit | None, held_out: Sequence[FullResult],
     split_s: float | None,
 ) -> dict[str, Any]:  # fmt: skip
     """RMSE [N] of a fit to the whole recording, by phase, of one to its beginning on the rest; coverage."""
@@ -195,13 +193,13 @@ def _fit(
 
 
 def _full(
-    full: FullResult, held_out: FullResult, force_n: Array, binned: BinnedForce, usable: NDArray[np.bool_],
-    rest: NDArray[np.bool_],
+    full: FullResult, held_out: Sequence[FullResult], force_n: Array, binned: BinnedForce,
+    usable: NDArray[np.bool_], rest: NDArray[np.bool_],
 ) -> dict[str, Any] | None:  # fmt: skip
     """RMSE [N] of the full model where its own fits ended, and how far the surrogate's is off from it."""
     if not isinstance(full, FullFit):
         return None if full is None else {"message": full}
-    begun = held_out if isinstance(held_out, FullFit) else None
+    begun = next((one for one in held_out if isinstance(one, FullFit)), None)
     return {
         "rmse": _rms(binned.force_n - full.force_n, usable),
         "rmse_by_phase": dict(inference.rmse(binned, full.force_n).by_kind_n),

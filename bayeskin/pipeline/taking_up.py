@@ -31,7 +31,7 @@ from bayeskin.pipeline.workbench import Workbench, opened, workbench
 from bayeskin.types import Array
 from bayeskin.workers import Lost, run_parallel
 
-COARSE_RUNS, FULL_RUNS = 10, 3  # at most
+COARSE_RUNS, FULL_RUNS = 10, 2  # at most
 PREDICTIVE_DRAWS = 300
 
 FullResult = FullFit | str | None  # of the full model, or why its first run failed; None where none is made
@@ -61,21 +61,19 @@ class TakenUp:
     remainder: Remainder
 
 
-def take_up(run: Run, whole: Sequence[Fit], noise: Mapping[str, float]) -> list[TakenUp]:
-    """Fits to the whole recording; `noise` among its values has the noise that is no mismatch."""
-    return _in_two_processes([partial(_whole_apart, run.config_path, stored(one), noise) for one in whole])
+def take_up(
+    run: Run, whole: Sequence[Fit], noise: Mapping[str, float], begun: Sequence[Fit], until_s: float | None
+) -> tuple[list[TakenUp], list[FullResult]]:
+    """Fits to the whole recording, and those of fits to its beginning up to a time; in two processes.
 
-
-def fit_beginnings(run: Run, begun: Sequence[Fit], until_s: float) -> list[FullResult]:
-    """Fits to the recording up to a time."""
-    return _in_two_processes([partial(_begun_apart, run.config_path, stored(one), until_s) for one in begun])
-
-
-def _in_two_processes(apart: Sequence[partial[Any]]) -> list[Any]:
-    """What each gives, the last first, which are the longest; one whose process is lost is done here."""
-    order = list(reversed(range(len(apart))))
+    `noise` among its values has the noise that is no mismatch.
+    """
+    apart: list[partial[Any]] = [partial(_whole_apart, run.config_path, stored(one), noise) for one in whole]
+    apart += [partial(_begun_apart, run.config_path, stored(one), until_s) for one in begun]
+    order = sorted(range(len(apart)), key=lambda i: -len([*whole, *begun][i].names))  # the longest first
     done = {order[i]: found for i, found in run_parallel(_call, [apart[i] for i in order], 2)}
-    return [apart[i]() if isinstance(done[i], Lost) else done[i] for i in range(len(apart))]
+    found = [apart[i]() if isinstance(done[i], Lost) else done[i] for i in range(len(apart))]
+    return found[: len(whole)], found[len(whole) :]
 
 
 def _call(task: partial[Any]) -> Any:
@@ -104,7 +102,7 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
     )  # fmt: skip
 
 
-def _begun_apart(source: Path, plain: Mapping[str, Any], until_s: float) -> FullResult:
+def _begun_apart(source: Path, plain: Mapping[str, Any], until_s: float | None) -> FullResult:
     bench = workbench(opened(source, Silent()))
     return _full(bench, restored(plain, bench.posterior(until_s, plain["names"])))[0]
 
