@@ -61,8 +61,9 @@ from bayeskin.errors import InputError
 from bayeskin.model import accuracy, lagrangian, simulate
 from bayeskin.model.problem import Problem, material
 from bayeskin.model.simulate import ModelSpec, problem_of
+from bayeskin.recordings import idealised_motion, segment
 from bayeskin.report import save_figure
-from bayeskin.types import Array, PadMotion, Simulation
+from bayeskin.types import Array, PadMotion, Recording, Simulation
 
 TOLERANCES = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)
 TIME_REFERENCE, TIME_CHECK = 1e-6, 1e-5
@@ -92,8 +93,14 @@ ROWS = rows.Rows(
 )
 
 
+def demo_motion() -> PadMotion:
+    """The idealised protocol of the shipped demo, as `bayeskin run` takes it."""
+    recording = storage.load(Path(__file__).parents[1] / "data" / "demo.h5", Recording)
+    return idealised_motion(recording, segment(recording))
+
+
 def motions() -> dict[str, PadMotion]:
-    whole = {"healthy": healthy_skin.HEALTHY_SKIN, "demo": healthy_skin.demo_motion()}
+    whole = {"healthy": healthy_skin.HEALTHY_SKIN, "demo": demo_motion()}
     cycles = {f"{name}, first cycle": healthy_skin.first_cycle(motion) for name, motion in whole.items()}
     loading = PadMotion(np.array([0.0, 9.4]), np.array([0.0, 9.45e-3]))
     return whole | cycles | {LOADING: loading}

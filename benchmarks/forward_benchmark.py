@@ -42,20 +42,16 @@ import healthy_skin
 import numpy as np
 import rows
 import scipy.sparse as sp
-from matplotlib.figure import Figure
 
 from bayeskin.model import assembly, linear, newton, poroelastic, simulate
 from bayeskin.model.gradients import ForceGradients, logarithms
 from bayeskin.model.linear import SOLVER_NAME, Factorisations
 from bayeskin.model.simulate import ModelSpec, problem_of
-from bayeskin.report import save_figure
-from bayeskin.report.style import INK, PAGE_IN, new_figure, state_finding, styled
 from bayeskin.types import Array, PadMotion
 from bayeskin.workers import Lost, run_parallel
 
 ARTICLE_CPU_S = 3600.0  # stated, for 694 steps; see above
 STAGES = ("evaluation", "law", "residual", "tangent", "analysis", "factorisation", "solve", "rest")
-COLOURS = ("#56B4E9", "#0072B2", "#009E73", "#E69F00", "#882255", "#D55E00", "#CC79A7", "#B0B0B0")
 FACTORISATIONS_ALONE, SOLVES_ALONE = 5, 30
 MESHES = ("bricks-1", "Mesh_SKIN.msh")
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
@@ -240,41 +236,6 @@ def table(found: dict[str, dict[str, float]], whole: bool) -> str:
     return rows.markdown(["", *found], lines)
 
 
-@styled
-def figure_forward(found: dict[str, dict[str, float]]) -> Figure:
-    """Stages as shares of the run on each mesh, with the floor."""
-    figure = new_figure(PAGE_IN, 0.75 + 0.55 * len(found) + 0.6)
-    ax = figure.subplots()
-    for y, m in enumerate(found.values()):
-        left = 0.0
-        for stage, colour in zip(STAGES, COLOURS, strict=True):
-            share = 100 * m[f"{stage}_s"] / m["cpu_s"]
-            ax.barh(y, share, 0.55, left, color=colour, label=stage if y == 0 else None)
-            left += share
-        floor = 100 * m["floor_s"] / m["cpu_s"]
-        ax.plot([floor, floor], [y - 0.38, y + 0.38], color=INK, lw=1.4, label="floor" if y == 0 else None)
-    names = [f"{mesh.removesuffix('.msh')}\n{m['cpu_s']:.1f} s" for mesh, m in found.items()]
-    ax.set(
-        yticks=range(len(found)), yticklabels=names, xlabel="share of the run's CPU time [%]", xlim=(0, 100)
-    )
-    ax.invert_yaxis()
-    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.05))
-    state_finding(
-        figure, _finding(found),
-        "One run at point C over the healthy-skin protocol, one thread; analysis: the first factorisation. "
-        "Floor: the time of the factorisations and solves alone.",
-    )  # fmt: skip
-    return figure
-
-
-def _finding(found: dict[str, dict[str, float]]) -> str:
-    mesh, m = list(found.items())[-1]
-    return (
-        f"On {mesh.removesuffix('.msh')} ({m['dofs']:,.0f} unknowns) a run takes {m['cpu_s']:.0f} CPU s, "
-        f"{m['cpu_s'] / m['floor_s']:.1f} times its factorisations and solves alone"
-    )
-
-
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -290,6 +251,10 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> None:
+    from forward_figure import figure_forward  # drawing is not for the processes whose memory is measured
+
+    from bayeskin.report import save_figure
+
     asked = arguments()
     results = replace(ROWS, path=asked.results / ROWS.path.name)
     protocol = "first cycle" if asked.first_cycle else "whole"
@@ -309,7 +274,7 @@ def main() -> None:
             found.append(row)
     by_mesh = medians(found)
     print(table(by_mesh, whole=not asked.first_cycle))
-    save_figure(figure_forward(by_mesh), asked.figures / "forward", "benchmarks/forward_benchmark.py")
+    save_figure(figure_forward(by_mesh, STAGES), asked.figures / "forward", "benchmarks/forward_benchmark.py")
 
 
 if __name__ == "__main__":

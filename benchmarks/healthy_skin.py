@@ -15,12 +15,10 @@ from unittest import mock
 
 import numpy as np
 
-from bayeskin import storage
 from bayeskin.model import mesh as mesh_module
 from bayeskin.model.mesh import brick_lines
 from bayeskin.model.simulate import ModelSpec, _mesh, problem_of
-from bayeskin.recordings import idealised_motion, segment
-from bayeskin.types import Array, PadMotion, Recording
+from bayeskin.types import Array, PadMotion
 
 HEALTHY_SKIN = PadMotion(
     np.array([0, 9.6, 19, 79, 88.5, 97.9, 147.9, 157.4, 166.8, 206.8, 214.5, 222.2, 258, 267.4, 347.4]),
@@ -41,12 +39,6 @@ GMSH_MESHES = ("Mesh_SKIN.msh", "Symmetric_skin_XY_RF.msh")
 def first_cycle(motion: PadMotion) -> PadMotion:
     """Rest, first loading, hold and unloading: the first five corners."""
     return PadMotion(motion.time_s[:5], motion.displacement_m[:5])
-
-
-def demo_motion() -> PadMotion:
-    """The idealised protocol of the shipped demo, as `bayeskin run` takes it."""
-    recording = storage.load(Path(__file__).parents[1] / "data" / "demo.h5", Recording)
-    return idealised_motion(recording, segment(recording))
 
 
 def supplement_mesh(name: str) -> Path | None:

@@ -1,0 +1,46 @@
+"""The figure of benchmarks/forward_benchmark.py."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from matplotlib.figure import Figure
+
+from bayeskin.report.style import INK, PAGE_IN, new_figure, state_finding, styled
+
+COLOURS = ("#56B4E9", "#0072B2", "#009E73", "#E69F00", "#882255", "#D55E00", "#CC79A7", "#B0B0B0")
+
+
+@styled
+def figure_forward(found: Mapping[str, Mapping[str, float]], stages: Sequence[str]) -> Figure:
+    """Stages as shares of the run on each mesh, with the floor."""
+    figure = new_figure(PAGE_IN, 0.75 + 0.55 * len(found) + 0.6)
+    ax = figure.subplots()
+    for y, m in enumerate(found.values()):
+        left = 0.0
+        for stage, colour in zip(stages, COLOURS, strict=True):
+            share = 100 * m[f"{stage}_s"] / m["cpu_s"]
+            ax.barh(y, share, 0.55, left, color=colour, label=stage if y == 0 else None)
+            left += share
+        floor = 100 * m["floor_s"] / m["cpu_s"]
+        ax.plot([floor, floor], [y - 0.38, y + 0.38], color=INK, lw=1.4, label="floor" if y == 0 else None)
+    names = [f"{mesh.removesuffix('.msh')}\n{m['cpu_s']:.1f} s" for mesh, m in found.items()]
+    ax.set(
+        yticks=range(len(found)), yticklabels=names, xlabel="share of the run's CPU time [%]", xlim=(0, 100)
+    )
+    ax.invert_yaxis()
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.05))
+    state_finding(
+        figure, _finding(found),
+        "One run at point C over the healthy-skin protocol, one thread; analysis: the first factorisation. "
+        "Floor: the time of the factorisations and solves alone.",
+    )  # fmt: skip
+    return figure
+
+
+def _finding(found: Mapping[str, Mapping[str, float]]) -> str:
+    mesh, m = list(found.items())[-1]
+    return (
+        f"On {mesh.removesuffix('.msh')} ({m['dofs']:,.0f} unknowns) a run takes {m['cpu_s']:.0f} CPU s, "
+        f"{m['cpu_s'] / m['floor_s']:.1f} times its factorisations and solves alone"
+    )
