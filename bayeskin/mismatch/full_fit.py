@@ -179,6 +179,8 @@ def _maximum(
     starts = [np.clip(vector, low, high)]
     starts += [np.clip(starts[0] + 0.3 * rng.uniform(-1, 1, len(low)) * (high - low), low, high)
                for _ in range(STARTS - 1)]  # fmt: skip
-    top = max((gauss_newton(near, start, None, CLIMB) for start in starts), key=lambda one: one.value)
+    top, *others = (gauss_newton(near, start, None, CLIMB) for start in starts)
+    for one in others:  # what the recording does not inform stays as it is
+        top = one if one.value > top.value + ENOUGH else top
     inside = np.clip(top.vector, *local.bounds)
     return local.named(local.from_sampling(inside)), float(local.log_prob(inside[None])[0])
