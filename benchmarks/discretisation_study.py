@@ -58,7 +58,7 @@ from discretisation_tables import (
 
 from bayeskin import storage
 from bayeskin.errors import InputError
-from bayeskin.model import accuracy, lagrangian, simulate
+from bayeskin.model import accuracy, lagrangian, simulate, stepping
 from bayeskin.model.problem import Problem, material
 from bayeskin.model.simulate import ModelSpec, problem_of
 from bayeskin.recordings import idealised_motion, segment
@@ -69,7 +69,11 @@ TOLERANCES = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)
 TIME_REFERENCE, TIME_CHECK = 1e-6, 1e-5
 SETTINGS = {
     "as run": {},
-    "reference": {"SOLVER_TOLERANCE": 1e-7, "SHORTEST_STEP": 1e-6, "STEPS_PER_PHASE": 40},
+    "reference": {
+        (lagrangian, "SOLVER_TOLERANCE"): 1e-7,
+        (stepping, "SHORTEST_STEP"): 1e-6,
+        (stepping, "STEPS_PER_PHASE"): 40,
+    },
 }
 WHOLE_MESHES = ("bricks-1", "bricks-2", "Mesh_SKIN.msh")
 CYCLE_MESHES = ("bricks-1-halved", "Symmetric_skin_XY_RF.msh")
@@ -129,8 +133,8 @@ def _simulate(run: Run, spec: ModelSpec, table: rows.Rows, stem: Path) -> rows.R
     face = FaceStress(problem, theta)
     stress: list[float] = []
     with ExitStack() as patches:
-        for name, value in SETTINGS[run.settings].items():
-            patches.enter_context(mock.patch.object(lagrangian, name, value))
+        for (module, name), value in SETTINGS[run.settings].items():
+            patches.enter_context(mock.patch.object(module, name, value))
         started = time.process_time()
         found = simulate(
             spec, motions()[run.protocol], theta, rows.progress(run.mesh),

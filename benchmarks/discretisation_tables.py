@@ -9,7 +9,7 @@ import numpy as np
 import rows
 
 from bayeskin.model import ModelSpec
-from bayeskin.model.lagrangian import STEPS_PER_PHASE
+from bayeskin.model.stepping import STEPS_PER_PHASE
 from bayeskin.types import Simulation
 
 SPACE_TOLERANCE = 3e-4

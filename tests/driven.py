@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import skfem
 
-from bayeskin.model.lagrangian import LagrangianModel, State, advance
+from bayeskin.model.lagrangian import LagrangianModel, State
 from bayeskin.model.mesh import SkinMesh, roll
 from bayeskin.model.problem import Material, Problem
 from bayeskin.model.space import TaylorHood, sparsity, taylor_hood
+from bayeskin.model.stepping import advance
 from bayeskin.types import Array, PadMotion
 
 STILL = PadMotion(np.array([0.0, 1.0]), np.zeros(2))

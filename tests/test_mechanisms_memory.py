@@ -25,10 +25,11 @@ from bayeskin.mechanisms.slow_recovery import KelvinVoigt, SlowRecovery
 from bayeskin.mechanisms.solid_viscoelasticity import Relaxation
 from bayeskin.mechanisms.strain_dependent_permeability import StrainDependentPermeability
 from bayeskin.model import ModelSpec, simulate
-from bayeskin.model.lagrangian import LagrangianModel, State, advance
+from bayeskin.model.lagrangian import LagrangianModel, State
 from bayeskin.model.mesh import brick_mesh
 from bayeskin.model.problem import build_problem
 from bayeskin.model.space import taylor_hood
+from bayeskin.model.stepping import advance
 from bayeskin.types import PadMotion
 
 SHORT = PadMotion(np.array([0.0, 6.0, 12.0, 18.0]), 1e-3 * np.array([0.0, 6.0, 6.0, 0.0]))

@@ -13,9 +13,10 @@ from bayeskin.mechanisms.fibres import Fibres, add_stress
 from bayeskin.mechanisms.fluid_leakage import open_surface
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.model import ModelSpec, simulate
-from bayeskin.model.lagrangian import LagrangianModel, advance
+from bayeskin.model.lagrangian import LagrangianModel
 from bayeskin.model.mesh import brick_mesh
 from bayeskin.model.problem import build_problem, material
+from bayeskin.model.stepping import advance
 from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import PadMotion
 

@@ -13,10 +13,11 @@ from bayeskin.mechanisms import catalogue, laws
 from bayeskin.model import ModelSpec, lagrangian, simulate
 from bayeskin.model.directional import TangentAction
 from bayeskin.model.gradients import ForceGradients, logarithms
-from bayeskin.model.lagrangian import Evaluated, LagrangianModel, Stage, State, Step, advance, integrate
+from bayeskin.model.lagrangian import Evaluated, LagrangianModel, Stage, State, Step
 from bayeskin.model.newton import EXTRAPOLATION_POINTS
 from bayeskin.model.problem import Material, material
 from bayeskin.model.simulate import problem_of
+from bayeskin.model.stepping import advance, integrate
 from bayeskin.model.tissue import Bind
 from bayeskin.types import PadMotion
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from bayeskin.model.lagrangian import LagrangianModel, integrate
+from bayeskin.model.lagrangian import LagrangianModel
 from bayeskin.model.mesh import layered_mesh
 from bayeskin.model.newton import Equations, NewtonSolver
 from bayeskin.model.problem import build_problem, material
+from bayeskin.model.stepping import integrate
 from bayeskin.types import PadMotion
 
 

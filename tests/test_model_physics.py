@@ -8,11 +8,12 @@ import skfem
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from bayeskin.model.lagrangian import GAMMA, LagrangianModel, State, advance
+from bayeskin.model.lagrangian import LagrangianModel, State
 from bayeskin.model.mesh import SkinMesh
 from bayeskin.model.problem import Material, Problem
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.model.space import sparsity, taylor_hood
+from bayeskin.model.stepping import GAMMA, advance
 from bayeskin.types import PadMotion
 
 STILL = PadMotion(np.array([0.0, 1.0]), np.zeros(2))

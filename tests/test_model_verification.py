@@ -14,10 +14,11 @@ from driven import DrivenModel, Point, TightModel, block, by_layer, corner_point
 from manufactured import Manufactured, errors, exact_state, strong_load, weak_load
 from scipy.spatial.transform import Rotation
 
-from bayeskin.model.lagrangian import SOLVER_TOLERANCE, LagrangianModel, integrate
+from bayeskin.model.lagrangian import SOLVER_TOLERANCE, LagrangianModel
 from bayeskin.model.mesh import brick_mesh
 from bayeskin.model.problem import build_problem, material
 from bayeskin.model.space import taylor_hood
+from bayeskin.model.stepping import integrate
 from bayeskin.types import PadMotion
 
 EDGE_M = 10e-3

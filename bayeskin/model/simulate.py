@@ -13,13 +13,15 @@ from pathlib import Path
 import numpy as np
 
 from bayeskin.errors import InputError
-from bayeskin.model import article, lagrangian
+from bayeskin.model import article
 from bayeskin.model.gradients import ForceGradients
+from bayeskin.model.lagrangian import LagrangianModel, Step
 from bayeskin.model.linear import SOLVER_NAME
 from bayeskin.model.mesh import SkinMesh, brick_mesh, read_gmsh
 from bayeskin.model.newton import NewtonSolver
 from bayeskin.model.own import identity, simulate_own
 from bayeskin.model.problem import PARAMETERS, Constants, Material, Problem, build_problem, material
+from bayeskin.model.stepping import integrate
 from bayeskin.model.tissue import Bind
 from bayeskin.types import Array, Observation, PadMotion, Simulation, frozen_array
 
@@ -222,11 +224,11 @@ def _run_reaction(
 ) -> _Outcome:
     """Fills the history; returns a message, empty for a run that finished."""
     bound = tuple(bind(theta, problem) for bind in laws)
-    model = lagrangian.LagrangianModel(problem, solid, motion, bound)
+    model = LagrangianModel(problem, solid, motion, bound)
     slopes = ForceGradients(model, theta, gradients, laws) if gradients else None
     at_start: list[float] = []
 
-    def on_step(step: lagrangian.Step) -> None:
+    def on_step(step: Step) -> None:
         if slopes is not None and step.stages:
             slopes.follow(step)
         time_s = step.state.time_s - model.starts_s
@@ -237,7 +239,7 @@ def _run_reaction(
             history.add(max(time_s, 0.0), step.state.x, force_n, step.corner, step.error_n)
 
     try:
-        message = lagrangian.integrate(model, theta["p_init"], tolerance, on_step)
+        message = integrate(model, theta["p_init"], tolerance, on_step)
     except FloatingPointError as error:
         message = str(error)
     return message, model.solver, slopes
