@@ -108,6 +108,12 @@ def _sure(facts: RunFacts) -> Verdict:
     return Verdict("trusted" if trusted else "not trusted", "good" if trusted else "doubt", lines)
 
 
+def fits_of(fit: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """By model the fits without or with mechanisms, the last the best there is: the full model's, if any."""
+    full = fit.get("full_model")
+    return {"surrogate": fit, **({"full model": full} if full and "rmse" in full else {})}
+
+
 def _missing(facts: RunFacts) -> Verdict:
     said = facts.said("diagnose")
     if not said:
@@ -115,7 +121,7 @@ def _missing(facts: RunFacts) -> Verdict:
         why = [f"Nobody has looked yet: the stage diagnose is {standing}."]
         return Verdict("not known yet", "none", why, f"bayeskin diagnose {facts.config_path}")
     fit = said["fit"]
-    both = [quantity(fit[when]["rmse"], "N") for when in ("before", "after")]
+    both = [quantity([*fits_of(fit[when]).values()][-1]["rmse"], "N") for when in ("before", "after")]
     if said["verdict"] == "nothing-missing":
         return Verdict(
             "nothing", "good", [f"The recording stays within what the model allows ({both[0]} RMSE)."]

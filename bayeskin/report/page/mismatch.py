@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from bayeskin.report.page.answer import fits_of
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
 from bayeskin.report.page.numbers import number, percent, quantity
@@ -70,14 +71,15 @@ def _fits(fit: Mapping[str, Mapping[str, Any]]) -> Table:
     rows = [
         row(
             (
-                when,
-                cell(fit[when]["rmse"], "N"),
-                cell(fit[when]["rmse_held_out"], "N"),
-                *(cell(fit[when]["rmse_by_phase"].get(kind), "N") for kind in kinds),
+                f"{when}, {name}",
+                cell(one["rmse"], "N"),
+                cell(one["rmse_held_out"], "N"),
+                *(cell(one["rmse_by_phase"].get(kind), "N") for kind in kinds),
                 Cell(percent(fit[when]["coverage90"]), fit[when]["coverage90"]),
             )
         )
         for when in ("before", "after")
+        for name, one in fits_of(fit[when]).items()
     ]
     head = ("fit", "whole recording", "held out", *kinds, "90 % band holds")
     return Table(
