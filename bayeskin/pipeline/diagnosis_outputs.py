@@ -109,10 +109,11 @@ def draw(
     candidates: Sequence[Mapping[str, Any]],
 ) -> list[Path]:  # fmt: skip
     """Writes the figures into a folder, the run in their metadata; returns their paths."""
+    before_n, after_n = _full_or_fit(found)
     figures = {
-        "located": report.figure_located(binned, motion, found.before, found.search.base.force_n),
+        "located": report.figure_located(binned, motion, found.before, before_n),
         "candidates": report.figure_candidates(candidates),
-        "before_after": report.figure_before_after(binned, motion, *_full_or_fit(found)),
+        "before_after": report.figure_before_after(binned, motion, before_n, after_n),
         "residual_by_phase": report.figure_residual_by_phase(binned, motion, found.before, found.after),
     }
     if found.parts:

@@ -105,7 +105,7 @@ def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, fo
         f"The recording leaves what the model allows in {count} window{'s' * (count != 1)}"
         if count
         else "The recording stays within what the model allows",
-        "Orange: recorded force above the model's; blue: below. Allowed: measured noise, the surrogate's "
+        "Orange: recorded force above the model's; blue: below. Allowed: measured noise, the model's own "
         "error, the parameters' uncertainty. One search in twenty finds a window where nothing is missing.",
     )
     return figure
@@ -193,7 +193,7 @@ def figure_residual_by_phase(
         figure,
         "Most is left {}: {:.1f} mN RMS before, {:.1f} mN after".format(WORDS[most], *sizes[most]),
         "Before: the base model's best fit. After: that with the best set of mechanisms. Later cycles are "
-        "fainter. Allowed: measured noise, the surrogate's error, the parameters' uncertainty, after.",
+        "fainter. Allowed: measured noise, the model's own error, the parameters' uncertainty, after.",
     )
     return figure
 
