@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -66,10 +66,10 @@ def _work(run: Run) -> Mapping[str, Any]:
         beside.join()
     begun = None if split_s is None else _searched(bench, split_s)
     run.reporter.log("the full model takes up what was found")
-    pairs = [whole.base, whole.best] if whole.best.names else [whole.base]
-    taken, held_out = take_up(
-        run, pairs, whole.best.theta, [begun.base, begun.best] if begun else [], split_s
+    taken, begins = take_up(
+        run, _base_and_best(whole), whole.best.theta, _base_and_best(begun) if begun else [], split_s
     )
+    held_out = begins or [None]
     before, after = taken[0], taken[-1]
     found = judge(whole, bench.known, before.located, after.located)
     remainder = after.remainder if leaves_something(found, after.located) else None
@@ -87,8 +87,8 @@ def _work(run: Run) -> Mapping[str, Any]:
         "candidates": candidates(whole, bench.known),
         "unsure": sorted({name for names in whole.unsure for name in names if len(names) == 1}),
         "fit": {
-            "before": _fit(bench, whole.base, before, begun.base if begun else None, held_out[:1], split_s),
-            "after": _fit(bench, whole.best, after, begun.best if begun else None, held_out[1:], split_s),
+            "before": _fit(bench, whole.base, before, begun.base if begun else None, held_out[0], split_s),
+            "after": _fit(bench, whole.best, after, begun.best if begun else None, held_out[-1], split_s),
         },
         "best_set": list(whole.best.names),
         "held_out_set": list(begun.best.names) if begun else [],
@@ -101,6 +101,11 @@ def _work(run: Run) -> Mapping[str, Any]:
         answer["candidates"],
     )  # fmt: skip
     return {**answer, "figures": [figure.name for figure in figures]}
+
+
+def _base_and_best(found: Search) -> list[Fit]:
+    """One fit where nothing beats the base."""
+    return [found.base, found.best] if found.best.names else [found.base]
 
 
 def leaves_something(found: Diagnosis, after: Located) -> bool:
@@ -167,7 +172,7 @@ def _end_of_second_hold(binned: BinnedForce) -> float | None:
 
 
 def _fit(
-    bench: Workbench, found: Fit, taken: TakenUp, begun: Fit | None, held_out: Sequence[FullResult],
+    bench: Workbench, found: Fit, taken: TakenUp, begun: Fit | None, held_out: FullResult,
     split_s: float | None,
 ) -> dict[str, Any]:  # fmt: skip
     """RMSE [N] of a fit to the whole recording, by phase, of one to its beginning on the rest; coverage."""
@@ -193,13 +198,13 @@ def _fit(
 
 
 def _full(
-    full: FullResult, held_out: Sequence[FullResult], force_n: Array, binned: BinnedForce,
+    full: FullResult, held_out: FullResult, force_n: Array, binned: BinnedForce,
     usable: NDArray[np.bool_], rest: NDArray[np.bool_],
 ) -> dict[str, Any] | None:  # fmt: skip
     """RMSE [N] of the full model where its own fits ended, and how far the surrogate's is off from it."""
     if not isinstance(full, FullFit):
         return None if full is None else {"message": full}
-    begun = next((one for one in held_out if isinstance(one, FullFit)), None)
+    begun = held_out if isinstance(held_out, FullFit) else None
     return {
         "rmse": _rms(binned.force_n - full.force_n, usable),
         "rmse_by_phase": dict(inference.rmse(binned, full.force_n).by_kind_n),
