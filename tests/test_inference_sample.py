@@ -19,7 +19,7 @@ from bayeskin.errors import InputError
 from bayeskin.inference import Limits, LogPosterior, SampleSettings, identifiability, load_chains, sample
 from bayeskin.inference.convergence import assess, autocorrelation_steps, split_rhat
 from bayeskin.inference.coordinates import MoveCoordinates
-from bayeskin.inference.moves import SnookerMove, SubspaceMove, mixed_moves
+from bayeskin.inference.moves import SnookerMove, SubspaceMove, TriesMove, mixed_moves
 from bayeskin.inference.straighten import Shear, find_shear
 from bayeskin.types import Array
 
@@ -51,13 +51,43 @@ def walled(shear: Shear | None) -> MoveCoordinates:
 
 @pytest.mark.parametrize(
     "moves",
-    [SnookerMove(), SubspaceMove(), mixed_moves(walled(curved_shear(5))), mixed_moves(walled(None))],
-    ids=["snooker", "subspace", "all, straightened", "all, normal scores"],
+    [
+        SnookerMove(),
+        SubspaceMove(),
+        TriesMove(walled(curved_shear(5))),
+        TriesMove(walled(None)),
+        mixed_moves(walled(curved_shear(5))),
+        mixed_moves(walled(None)),
+    ],
+    ids=[
+        "snooker",
+        "subspace",
+        "tries, straightened",
+        "tries, normal scores",
+        "all, straightened",
+        "all, normal scores",
+    ],
 )
 def test_a_move_keeps_a_unit_normal(moves: object) -> None:
     mean, error = unit_normal_variance(moves, 5, 2000)
     assert abs(mean - 1.0) < 4 * error + 0.005
     assert error < 0.02
+
+
+def test_tries_keep_the_shares_of_two_modes_between_walls() -> None:
+    def log_prob(x: np.ndarray) -> np.ndarray:
+        low, high = (-0.5 * np.sum(((x - centre) / 0.3) ** 2, axis=1) for centre in (1.0, 3.0))
+        inside = np.all((x > 0.0) & (x < 4.0), axis=1)
+        return np.where(inside, np.logaddexp(np.log(0.8) + low, np.log(0.2) + high), -np.inf)
+
+    move = TriesMove(MoveCoordinates(None, np.zeros(3), np.full(3, 4.0)))
+    random = np.random.RandomState(2)
+    sampler = emcee.EnsembleSampler(30, 3, log_prob, moves=move, vectorize=True)
+    sampler.run_mcmc(emcee.State(random.uniform(0.0, 4.0, (30, 3)), random_state=random.get_state()), 6000)
+    means = [batch.mean() for batch in np.array_split(sampler.get_chain()[600:], 20)]
+    error = np.std(means, ddof=1) / np.sqrt(20)
+    assert abs(np.mean(means) - 1.4) < 4 * error
+    assert error < 0.01
 
 
 def test_a_walker_on_top_of_its_anchor_stays_where_it_is() -> None:

@@ -1,17 +1,21 @@
-"""The moves of an ensemble, in coordinates made for them: differential evolution, stretch, snooker."""
+"""The moves of an ensemble, in coordinates made for them: tries, differential evolution, stretch, snooker."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import emcee
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.types import Array
 
 _CROSSOVER = (0.15, 0.3, 1.0)  # shares of the coordinates that a step moves
 _JUMP, _JITTER = 0.1, 1e-5  # share of steps of full length, from mode to mode; noise that fills space
+_TRIES, _FREEDOM = 5, 5.0  # points that a walker chooses from; of the t-distribution that they are from
 _GAMMA = 1.7  # of about 2.38 / sqrt(2), optimal for the difference of two projected points
 
 
@@ -66,11 +70,77 @@ class SubspaceMove(emcee.moves.red_blue.RedBlueMove):
         return walkers + moved * step, np.zeros(count)
 
 
+class TriesMove(emcee.moves.Move):
+    """Moves each walker to one of several points of a t-distribution, fitted to the other half's walkers.
+
+    A step that does not depend on where the walker is forgets that at once; of several tries one is more
+    often worth it, and their densities cost little more together than one. Independent multiple-try
+    Metropolis: Martino (2018), Digital Signal Processing 75:134, section 4.2.
+    """
+
+    def __init__(self, coordinates: MoveCoordinates) -> None:
+        self.coordinates = coordinates
+
+    def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, NDArray[np.bool_]]:
+        """One step of all walkers, half after half, and which of them moved, (walkers,)."""
+        count = len(state.coords)
+        accepted, half = np.zeros(count, dtype=bool), np.arange(count) % 2
+        model.random.shuffle(half)
+        for part in (0, 1):
+            own = np.flatnonzero(half == part)
+            y = self.coordinates.forward(state.coords)
+            around = _Around.of(y[half != part])
+            tried = around.draw(len(own) * _TRIES, model.random)
+            points = self.coordinates.back(tried)
+            log_prob, _ = model.compute_log_prob_fn(points)
+            weight = log_prob + self.coordinates.log_volume(tried) - around.log_density(tried)
+            weight = weight.reshape(len(own), _TRIES)
+            stay = state.log_prob[own] + self.coordinates.log_volume(y[own]) - around.log_density(y[own])
+            top = np.maximum(weight.max(axis=1), stay)
+            weight, stay = np.exp(weight - top[:, None]), np.exp(stay - top)
+            total = weight.sum(axis=1)
+            row, level = np.arange(len(own)), model.random.random_sample(len(own)) * total
+            chosen = np.minimum((np.cumsum(weight, axis=1) < level[:, None]).sum(axis=1), _TRIES - 1)
+            moves = model.random.random_sample(len(own)) * (total - weight[row, chosen] + stay) < total
+            to, picks = own[moves], (row * _TRIES + chosen)[moves]
+            state.coords[to], state.log_prob[to], accepted[to] = points[picks], log_prob[picks], True
+        return state, accepted
+
+
+@dataclass(frozen=True)
+class _Around:
+    """A t-distribution: its centre (d,) and the Cholesky factor (d, d) of its spread."""
+
+    centre: Array
+    root: Array
+
+    @classmethod
+    def of(cls, points: Array) -> _Around:
+        """With the mean and covariance of points (n, d), correlations shrunk where these are few."""
+        count, dim = points.shape
+        spread = np.cov(points.T)
+        own = np.diag(spread.diagonal())
+        spread = (count * spread + dim * own) / (count + dim) + 1e-10 * np.eye(dim)
+        return cls(points.mean(axis=0), np.linalg.cholesky(spread))
+
+    def draw(self, count: int, random: Any) -> Array:
+        """Points (count, d)."""
+        size = np.sqrt(random.chisquare(_FREEDOM, (count, 1)) / _FREEDOM)
+        return self.centre + random.standard_normal((count, len(self.centre))) / size @ self.root.T
+
+    def log_density(self, points: Array) -> Array:
+        """At points (n, d), up to a constant, (n,)."""
+        apart = solve_triangular(self.root, (points - self.centre).T, lower=True)
+        squared = np.sum(apart**2, axis=0)
+        return np.asarray(-0.5 * (_FREEDOM + len(self.centre)) * np.log1p(squared / _FREEDOM))
+
+
 def mixed_moves(coordinates: MoveCoordinates) -> list[tuple[emcee.moves.Move, float]]:
     """The moves with their shares, all made in `coordinates`."""
-    # Mostly differential evolution, which mixes fastest; the others keep it from any one scale.
-    kinds = ((SubspaceMove, 0.8), (emcee.moves.StretchMove, 0.1), (SnookerMove, 0.1))
-    return [(_local(kind)(coordinates), share) for kind, share in kinds]
+    # Tries forget fastest where they are accepted; differential evolution goes on where they are not, and the
+    # others keep it from any one scale.
+    kinds = ((SubspaceMove, 0.32), (emcee.moves.StretchMove, 0.04), (SnookerMove, 0.04))
+    return [(TriesMove(coordinates), 0.6), *((_local(kind)(coordinates), share) for kind, share in kinds)]
 
 
 def _local(kind: type) -> type:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import emcee
 import numpy as np
+from numpy.typing import NDArray
 
 from bayeskin.errors import InputError
 from bayeskin.inference import chains as store
@@ -19,7 +20,7 @@ from bayeskin.inference.straighten import find_shear
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
 _FIRST_CHECK = 500
-# Steps at which walkers that lag behind are brought back; all that came before is burn-in.
+# Steps at which walkers that lag behind are brought back; all before the last that did is burn-in.
 _RESCUES = (200, 400, 800, 1600)
 _REFRESH = 100  # steps between two words of progress
 Progress = Callable[[float, str], None]
@@ -90,7 +91,7 @@ def sample(
                 run.changed = False
         chains = np.stack([r.backend.chain[:goal] for r in runs])
         log_prob = np.stack([r.backend.log_prob[:goal] for r in runs])
-        settled = max((at for at in _RESCUES if at < goal), default=0)
+        settled = max((run.last_rescue(goal) for run in runs), default=0)
         convergence = assess(chains, log_prob, log_posterior.names, settings.limits, settled)
         _tell(progress, convergence, settings, convergence.verdict.reasons[0])
         if convergence.verdict.trusted or goal >= settings.max_steps:
@@ -150,15 +151,12 @@ class _Ensemble:
                     yield self.backend.iteration
 
     def _rescue(self) -> None:
-        """Puts walkers whose density lags behind their ensemble's where one of the others has been.
+        """Puts walkers that lag behind where one of the others has been.
 
-        A walker lags if its mean log density over the last half of the run lies two interquartile ranges
-        below the lower quartile (Vrugt et al. 2009, section 3.3). What is drawn depends on the step alone.
+        What is drawn depends on the step alone (Vrugt et al. 2009, section 3.3).
         """
         at = self.backend.iteration
-        level = self.backend.log_prob[at // 2 : at].mean(axis=0)
-        low, high = np.quantile(level, [0.25, 0.75])
-        lagging = level < low - 2.0 * (high - low)
+        lagging = self._lagging(at)
         good = np.flatnonzero(~lagging)
         rng = np.random.default_rng([*self._seed.generate_state(4), at])
         steps = rng.integers(at // 2, at, lagging.sum())
@@ -167,6 +165,17 @@ class _Ensemble:
         coords[lagging] = self.backend.chain[steps, picks]
         log_prob[lagging] = self.backend.log_prob[steps, picks]
         self.state = emcee.State(coords, log_prob=log_prob, random_state=self.state.random_state)
+
+    def _lagging(self, at: int) -> NDArray[np.bool_]:
+        """Walkers (W,) whose mean log density over the last half of the run to step `at` lies two
+        interquartile ranges below the lower quartile."""
+        level = self.backend.log_prob[at // 2 : at].mean(axis=0)
+        low, high = np.quantile(level, [0.25, 0.75])
+        return np.asarray(level < low - 2.0 * (high - low))
+
+    def last_rescue(self, goal: int) -> int:
+        """The last step before `goal` at which walkers were brought back, or 0."""
+        return max((at for at in _RESCUES if at < goal and self._lagging(at).any()), default=0)
 
 
 def _ensembles(

@@ -1,0 +1,256 @@
+"""Whether a surrogate should learn from derivatives: error against what its runs cost, with and without.
+
+Runs of the `reaction` on 80 bricks over the healthy-skin protocol at the first points of a design of the
+default prior box, each with its derivatives by the four inputs of the surrogate (benchmarks/healthy_skin.py,
+bayeskin/surrogates/similarity.py); a run's CPU seconds count with those of its derivatives only where these
+are used. Four surrogates of the same latents, for 24, 48, ... runs, at the same held-out runs:
+
+    chaos, GP                        from forces, as `bayeskin train` makes them
+    chaos with derivatives           matching pursuit over rows of values and of slopes
+    GP with derivatives              rows at small steps from each run, as its derivatives predict them
+
+    python benchmarks/gradient_surrogates.py
+
+Finished runs lie in benchmarks/results/gradient_surrogates, which a later start does not repeat. Prints the
+table and draws docs/figures/gradient_surrogates.{png,svg}.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from unittest import mock
+
+import healthy_skin
+import numpy as np
+import rows
+from matplotlib.figure import Figure
+
+from bayeskin.design import default_space, first_wave
+from bayeskin.model import ModelSpec, simulate
+from bayeskin.report import save_figure
+from bayeskin.report.style import PAGE_IN, new_figure, state_finding, styled
+from bayeskin.surrogates import hyperparameters
+from bayeskin.surrogates.chaos import (
+    FOLDS,
+    MOST_TERMS,
+    LatentChaos,
+    _pursue,
+    fit_sparse,
+    legendre_basis,
+    multi_indices,
+)
+from bayeskin.surrogates.gp import LatentGPs
+from bayeskin.surrogates.hyperparameters import fit_latent
+from bayeskin.surrogates.shapes import ShapeTransform, split
+from bayeskin.surrogates.similarity import Similarity
+from bayeskin.surrogates.train import fit_latents
+from bayeskin.types import Array
+from bayeskin.workers import Lost, run_parallel
+
+FOLDER = rows.RESULTS / "gradient_surrogates"
+FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "gradient_surrogates"
+SEED = 31
+SIZES = (24, 48, 96)
+HELD_OUT = 32
+SPEC = ModelSpec(refinement=0)
+EDGES_S = np.arange(9.5, 347.0, 0.5)
+STEERED = ("E_s", "k_c", "k_s", "p_init")  # one of them for each input
+P_INIT_CHANGE_PA = 100.0
+SLOPE_WEIGHTS = (0.03, 0.1, 0.3)  # of a derivative over the box's width beside a value
+STEP = 0.003  # of the box's width, to a row that derivatives predict; of 0.001 ... 0.06 the best
+KINDS = ("chaos", "GP", "chaos with derivatives", "GP with derivatives")
+COLOURS = ("#E69F00", "#0072B2", "#D55E00", "#009E73")
+
+
+def _run(task: tuple[int, dict[str, float]]) -> str:
+    """One run and its derivatives, into its file; what went wrong, or nothing."""
+    index, theta = task
+    changes = {name: theta[name] for name in STEERED} | {"p_init": P_INIT_CHANGE_PA}
+    simulate(SPEC, healthy_skin.first_cycle(healthy_skin.HEALTHY_SKIN), theta)  # compiles
+    started = time.process_time()
+    plain = simulate(SPEC, healthy_skin.HEALTHY_SKIN, theta)
+    between = time.process_time()
+    found = simulate(SPEC, healthy_skin.HEALTHY_SKIN, theta, gradients=changes)
+    ended = time.process_time()
+    for one in (plain, found):
+        if one.status != "ok":
+            return f"{theta}: {one.message}"
+    partial = FOLDER / f"{index}.part.npz"
+    np.savez(
+        partial, force_n=found.bin_means(EDGES_S), slopes_n=found.gradient_bin_means(EDGES_S),
+        run_s=between - started, both_s=ended - between,
+    )  # fmt: skip
+    partial.rename(FOLDER / f"{index}.npz")
+    return ""
+
+
+def _jacobian(similarity: Similarity, theta: Array) -> Array:
+    """Derivatives (n, inputs, steered) of the inputs by the changes that the slopes are for."""
+    names = similarity.space.names
+    columns = []
+    for name in STEERED:
+        j = names.index(name)
+        change = np.full(len(theta), P_INIT_CHANGE_PA) if name == "p_init" else theta[:, j]
+        up, down = theta.copy(), theta.copy()
+        up[:, j] += 1e-5 * change
+        down[:, j] -= 1e-5 * change
+        columns.append((similarity.inputs(up) - similarity.inputs(down)) / 2e-5)
+    return np.stack(columns, axis=2)
+
+
+def _latent_slopes(transform: ShapeTransform, force_n: Array, slopes_n: Array) -> Array:
+    """Derivatives (n, q, inputs) of the latents from those of the force (n, m, inputs)."""
+    shapes = split(force_n)[1]
+    rms = np.sqrt(np.mean(force_n**2, axis=1))
+    relative = slopes_n / rms[:, None, None]
+    amplitude = np.mean(shapes[:, :, None] * relative, axis=1)
+    turned = relative - shapes[:, :, None] * amplitude[:, None, :]
+    scores = np.einsum("nmi,km->nki", turned, transform.components)
+    return np.concatenate([amplitude[:, None, :], scores], axis=1)
+
+
+def _slope_basis(unit: Array, indices: np.ndarray) -> Array:
+    """Derivatives of the basis by each input, (inputs, n, P)."""
+    step = 1e-5
+    columns = []
+    for j in range(unit.shape[1]):
+        up, down = unit.copy(), unit.copy()
+        up[:, j] += step
+        down[:, j] -= step
+        columns.append((legendre_basis(up, indices) - legendre_basis(down, indices)) / (2 * step))
+    return np.stack(columns)
+
+
+def _pursued(unit: Array, target: Array, slopes: Array) -> Callable[[Array], Array]:
+    """A sparse expansion of one latent, (n,) with slopes (n, inputs); terms and weight by folds."""
+    n, dim = unit.shape
+    fold = np.arange(n) % FOLDS
+    best = (np.inf, 0.0, np.zeros((0, dim), dtype=np.int64), [0])
+    for degree in range(1, 13):
+        indices = multi_indices(dim, degree)
+        if len(indices) > n * (1 + dim):
+            break
+        basis, steep = legendre_basis(unit, indices), _slope_basis(unit, indices)
+        most = min(n * (1 + dim) // 3, MOST_TERMS, len(indices))
+        for weight in SLOPE_WEIGHTS:
+            stacked = np.concatenate([basis, *(weight * steep)])
+            aims = np.concatenate([target, *(weight * slopes.T)])
+            missed = np.empty((n, most))
+            for k in range(FOLDS):
+                learn = np.tile(fold != k, 1 + dim)
+                missed[fold == k] = _pursue(stacked, aims, learn, most)[1][: int(np.sum(fold == k))]
+            errors = np.mean(missed**2, axis=0)
+            if errors.min() < best[0]:
+                chosen = _pursue(stacked, aims, np.ones(len(aims), dtype=bool), int(np.argmin(errors)) + 1)[0]
+                best = (float(errors.min()), weight, indices, chosen)
+    _, weight, indices, chosen = best
+    terms = indices[chosen]
+    stacked = np.concatenate([legendre_basis(unit, terms), *(weight * _slope_basis(unit, terms))])
+    coefficients = np.linalg.lstsq(stacked, np.concatenate([target, *(weight * slopes.T)]), rcond=None)[0]
+    return lambda at: legendre_basis(at, terms) @ coefficients
+
+
+def _predictions(kind: str, inputs: Array, targets: Array, slopes: Array, at: Array) -> Array:
+    """Latents (k, q) at inputs `at` from targets (n, q) and slopes (n, q, inputs)."""
+    ones = np.ones(len(inputs))
+    if kind == "chaos":
+        fits = [fit_sparse(inputs, column, ones) for column in targets.T]
+        return LatentChaos.assemble(inputs, targets, fits).predict(at)[0]
+    if kind == "chaos with derivatives":
+        found = [_pursued(inputs, targets[:, q], slopes[:, q])(at) for q in range(targets.shape[1])]
+        return np.stack(found, axis=1)
+    if kind == "GP with derivatives":
+        steps = STEP * np.eye(inputs.shape[1])
+        near = [(inputs + step, targets + slopes @ step) for step in steps]
+        inputs = np.concatenate([inputs, *(where for where, _ in near)])
+        targets = np.concatenate([targets, *(what for _, what in near)])
+        ones = np.ones(len(inputs))
+    with mock.patch.object(
+        hyperparameters, "ROWS_TO_FIT", len(inputs)
+    ):  # else it would part the rows of a run
+        gps = [fit_latent(inputs, column, ones) for column in targets.T]
+    return LatentGPs.assemble(inputs, targets, gps).predict(at)[0]
+
+
+def _rows(theta: Array) -> list[tuple[str, int, float, float, float]]:
+    """Kind, runs, CPU seconds of its runs, error [%] at held-out runs, seconds of training."""
+    stored = [np.load(FOLDER / f"{index}.npz") for index in range(len(theta))]
+    force_n, slopes_n, run_s, both_s = (
+        np.stack([one[name] for one in stored]) for name in ("force_n", "slopes_n", "run_s", "both_s")
+    )
+    similarity = Similarity(default_space())
+    inputs, log_scale = similarity.inputs(theta), similarity.log_scale(theta)
+    slopes_n = np.einsum("nms,nsi->nmi", slopes_n, np.linalg.inv(_jacobian(similarity, theta)))
+    test = np.arange(len(theta)) >= max(SIZES)
+    truth = force_n[test] / np.sqrt(np.mean(force_n[test] ** 2, axis=1))[:, None]
+    found = []
+    for size in SIZES:
+        train = np.arange(len(theta)) < size
+        transform, targets, _ = fit_latents(
+            fit_latent, inputs[train], log_scale[train], force_n[train], np.ones(size)
+        )
+        slopes = _latent_slopes(transform, force_n[train], slopes_n[train])
+        for kind in KINDS:
+            started = time.process_time()
+            latents = _predictions(kind, inputs[train], targets, slopes, inputs[test])
+            took = time.process_time() - started
+            times = np.exp(log_scale[test])
+            force = transform.decode(latents, np.zeros_like(latents), times).mean
+            miss = force / np.sqrt(np.mean(force_n[test] ** 2, axis=1))[:, None] - truth
+            cost = (both_s if "derivatives" in kind else run_s)[train].sum()
+            found.append((kind, size, float(cost), 100.0 * float(np.sqrt(np.mean(miss**2))), took))
+            rows.say(f"{kind}, {size} runs: {found[-1][3]:.3f} %")
+    return found
+
+
+@styled
+def _draw(found: Sequence[tuple[str, int, float, float, float]]) -> Figure:
+    figure = new_figure(0.7 * PAGE_IN, 3.4)
+    axes = figure.subplots()
+    for kind, colour in zip(KINDS, COLOURS, strict=True):
+        mine = [row for row in found if row[0] == kind]
+        axes.loglog([row[2] / 60 for row in mine], [row[3] for row in mine], "o-", color=colour, label=kind)
+    axes.set_xlabel("CPU time of the runs, with derivatives where used [min]")
+    axes.set_ylabel("held-out error [% of RMS force]")
+    axes.legend()
+    state_finding(
+        figure, "For its CPU time a GP gains nothing from derivatives",
+        "Base model, 80 bricks, healthy-skin protocol; 24, 48 and 96 runs, the same 32 held out.",
+    )  # fmt: skip
+    return figure
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs what is missing, prints the table, draws."""
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
+    parser.add_argument("--workers", type=int, default=2)
+    workers = parser.parse_args(arguments).workers
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    space = default_space()
+    wave = first_wave(space, max(SIZES), HELD_OUT, SEED)
+    theta = np.concatenate([wave.theta[~wave.held_out], wave.theta[wave.held_out]])
+    missing = [
+        (index, dict(zip(space.names, map(float, point), strict=True)))
+        for index, point in enumerate(theta)
+        if not (FOLDER / f"{index}.npz").is_file()
+    ]
+    for done, (index, outcome) in enumerate(run_parallel(_run, missing, workers)):
+        if isinstance(outcome, Lost) or outcome:
+            raise SystemExit(f"run {missing[index][0]}: {outcome}")
+        rows.say(f"{done + 1} of {len(missing)} runs")
+    found = _rows(theta)
+    header = ("surrogate", "runs", "CPU s of runs", "held-out error [%]", "training [CPU s]")
+    cells = [
+        (kind, str(size), f"{cost:.0f}", f"{error:.3f}", f"{took:.1f}")
+        for kind, size, cost, error, took in found
+    ]
+    print(rows.markdown(header, cells))
+    save_figure(_draw(found), FIGURE, "benchmarks/gradient_surrogates.py")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
