@@ -46,7 +46,7 @@ from bayeskin.types import Array, PadMotion
 
 SCALING = {"E_c": 1.0, "E_s": 1.0, "k_c": -1.0, "k_s": -1.0}  # F = sum of these times dF/dlog, base model
 EPSILON = 1e-5  # of a parameter's change: truncation 1e-5, rounding 1e-9
-TOLERANCE = 2e-4  # of what a correction would add to the force, relative to the nominal force
+TOLERANCE = 1e-4  # of what a correction would add to the force, relative to the nominal force
 UNCORRECTED = 0.05  # times that for a bare guess, whose error adds up from stage to stage
 MOST_CORRECTIONS = 12
 ANDERSON_DEPTH = 4
