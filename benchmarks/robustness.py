@@ -5,10 +5,11 @@ both layers, log-uniform, as in its text; p_init as default) and the default pri
 `reaction` on the default mesh over the whole healthy-skin protocol (benchmarks/healthy_skin.py). Counts
 finished and failed runs, lists every failure with its parameters, and checks that all forces are finite.
 
-    python benchmarks/robustness.py
+    python benchmarks/robustness.py                  # on the default mesh, some hours
+    python benchmarks/robustness.py --refinement 0   # on 80 bricks
 
 Finished runs are rows of benchmarks/results/robustness.csv, which a later start does not repeat; more points
-keep those already run. Draws docs/figures/robustness.{png,svg}.
+keep those already run. Draws docs/figures/robustness-80-bricks.{png,svg} or -448-bricks.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -85,15 +86,15 @@ def points(space: ParameterSpace, n: int, seed: int) -> list[dict[str, float]]:
     return [dict(zip(space.names, map(float, row), strict=True)) for row in space.from_unit(unit)]
 
 
-def perform(item: Item) -> Item:
+def perform(spec: ModelSpec, item: Item) -> Item:
     """One run as a row; what it raises, which it never should, is a failure too."""
     motion = healthy_skin.HEALTHY_SKIN
     motion = healthy_skin.first_cycle(motion) if item["protocol"] == "first cycle" else motion
     theta = {name: item[name] for name in NAMES}
-    _compile()
+    _compile(spec)
     started = time.process_time()
     try:
-        found = simulate(ModelSpec(), motion, theta)
+        found = simulate(spec, motion, theta)
     except Exception as error:  # one run must not end the count
         return item | _no_run("raised", f"{type(error).__name__}: {error}", time.process_time() - started)
     return item | {
@@ -111,10 +112,10 @@ def perform(item: Item) -> Item:
 
 
 @cache
-def _compile() -> None:
+def _compile(spec: ModelSpec) -> None:
     """A short run, once a process, so that no time is that of compiling and of building the mesh's space."""
     compiling = PadMotion(np.array([0.0, 1.0]), np.array([0.0, 1e-4]))
-    simulate(ModelSpec(tolerance=1.0), compiling, healthy_skin.POINTS["C"])
+    simulate(replace(spec, tolerance=1.0), compiling, healthy_skin.POINTS["C"])
 
 
 def _no_run(status: str, message: str, cpu_s: float) -> Item:
@@ -124,12 +125,12 @@ def _no_run(status: str, message: str, cpu_s: float) -> Item:
     }  # fmt: skip
 
 
-def run_all(items: Sequence[Item], table: rows.Rows, workers: int) -> list[rows.Row]:
+def run_all(spec: ModelSpec, items: Sequence[Item], table: rows.Rows, workers: int) -> list[rows.Row]:
     """Rows of all items, those that are there already among them."""
     there = {table.key_of(row): row for row in table.read()}
     todo = [item for item in items if table.key_of(item) not in there]
     rows.say(f"{len(items) - len(todo)} of {len(items)} runs are there already")
-    for done, (i, result) in enumerate(run_parallel(perform, todo, workers), start=1):
+    for done, (i, result) in enumerate(run_parallel(partial(perform, spec), todo, workers), start=1):
         row = todo[i] | _no_run("lost", result.reason, np.nan) if isinstance(result, Lost) else result
         there[table.key_of(row)] = table.append(**row)
         if row["status"] != "ok" or done % 20 == 0 or done == len(todo):
@@ -165,7 +166,7 @@ def failures(found: dict[str, list[rows.Row]]) -> str:
 
 
 @styled
-def figure_robustness(found: dict[str, list[rows.Row]]) -> Figure:
+def figure_robustness(found: dict[str, list[rows.Row]], mesh: str) -> Figure:
     """Where runs failed, by the two ratios that govern them, and the CPU time of all."""
     figure = new_figure(PAGE_IN, 2.9)
     axes = figure.subplots(1, len(found) + 1)
@@ -187,7 +188,7 @@ def figure_robustness(found: dict[str, list[rows.Row]]) -> Figure:
     total = sum(map(len, found.values()))
     state_finding(
         figure, f"{total - failed} of {total} runs at random parameters finish",
-        "Each point is a full run over the healthy-skin protocol on the default bricks; crosses failed. "
+        f"Each point is a full run over the healthy-skin protocol on {mesh}; crosses failed. "
         "Slow drainage is on the left.",
     )  # fmt: skip
     return figure
@@ -209,6 +210,7 @@ def arguments() -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--n", type=int, default=500, help="points of each box (default 500)")
+    parser.add_argument("--refinement", type=int, choices=(0, 1), default=1, help="of the bricks")
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--first-cycle", action="store_true", help="the first cycle of the protocol only")
@@ -219,11 +221,12 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     asked = arguments()
+    spec, mesh = ModelSpec(refinement=asked.refinement), ("80 bricks", "448 bricks")[asked.refinement]
     table = replace(ROWS, path=asked.results / ROWS.path.name)
     same = {
         "protocol": "first cycle" if asked.first_cycle else "whole",
         "seed": asked.seed,
-        "model_hash": ModelSpec().hash,
+        "model_hash": spec.hash,
     }
     drawn = {box: points(space, asked.n, asked.seed) for box, space in boxes().items()}
     items = [
@@ -231,11 +234,12 @@ def main() -> None:
         for index, both in enumerate(zip(*drawn.values(), strict=True))  # a partial count has some of each
         for box, theta in zip(drawn, both, strict=True)
     ]
-    done = run_all(items, table, asked.workers)
+    done = run_all(spec, items, table, asked.workers)
     rows.warn_of_mixed_code(done)
     found = {box: [r for r in done if r["box"] == box] for box in boxes()}
     print(f"seed {asked.seed}\n\n{summary(found)}\n\n{failures(found)}")
-    save_figure(figure_robustness(found), asked.figures / "robustness", "benchmarks/robustness.py")
+    stem = f"robustness-{mesh.replace(' ', '-')}"
+    save_figure(figure_robustness(found, mesh), asked.figures / stem, "benchmarks/robustness.py")
 
 
 if __name__ == "__main__":
