@@ -22,6 +22,7 @@ from bayeskin.errors import InputError
 from bayeskin.types import Parameter, ParameterSpace
 
 Positive = Annotated[int, Field(gt=0)]
+NotNegative = Annotated[int, Field(ge=0)]
 
 
 WHO_RUNS: Any = {"design": {"workers", "scheduler"}, "slurm": True}  # no result depends on it
@@ -47,7 +48,7 @@ class ModelConfig(_Section):
 
     observation: Literal["reaction", "article", "own"] = "reaction"
     mesh: str = "bricks"
-    refinement: Positive = 1  # of the bricks, toward the pads' edges
+    refinement: NotNegative = 1  # of the bricks, toward the pads' edges; 0: 80 of them
     forward: str | None = None
 
     @model_validator(mode="before")
@@ -119,7 +120,7 @@ class DesignConfig(_Section):
 
     points: Annotated[list[Positive], Field(min_length=1)] = [128, 96, 64]
     held_out: Positive = 16
-    coarse: Positive | None = None
+    coarse: NotNegative | None = None
     fine_points: Positive = 16
     fine_held_out: Positive = 6
     workers: Positive = 2

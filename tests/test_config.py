@@ -55,6 +55,11 @@ def test_the_hash_follows_the_content_and_ignores_the_workers(tmp_path: Path) ->
         (SMALLEST + "[parameters.E_c]\nlower = 2e6\nupper = 1e4\n", "parameters.E_c", "lower below upper"),
         (SMALLEST + "[parameters.k_c]\nlower = 0.0\n", "parameters.k_c.lower", "above zero"),
         (SMALLEST + "[parameters.k_c]\nupper = inf\n", "parameters.k_c.upper", "finite"),
+        (
+            SMALLEST + "[model]\nrefinement = -1\n",
+            "model.refinement",
+            "found -1; expected greater than or equal to 0",
+        ),
         (SMALLEST + "[fit]\nbin_width_s = 0.0\n", "fit.bin_width_s", "found 0.0; expected greater than 0"),
         (SMALLEST + "[fit]\nwindows_s = [[75.0, 18.8]]\n", "fit.windows_s", "start below end"),
         (SMALLEST + "[fit]\nwindows_s = [[75.0]]\n", "fit.windows_s.0.1", "found nothing"),

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
 
+from bayeskin.model import stepping
 from bayeskin.model.lagrangian import LagrangianModel
 from bayeskin.model.mesh import layered_mesh
 from bayeskin.model.newton import Equations, NewtonSolver
@@ -56,20 +59,34 @@ def test_past_a_fold_a_fall_ends_in_the_next_equilibrium(side: float) -> None:
     assert solver.counts["falls"] == 1
 
 
-def test_a_soft_cutis_on_a_stiff_subcutis_folds_and_the_run_goes_on() -> None:
-    """Beyond the guard it snaps; before and after the skin's reactions along x are in equilibrium."""
+def foldable() -> LagrangianModel:
+    """Skin whose cutis, a thousand times softer than the subcutis, snaps beyond the guard."""
     beyond_guard = (36.5, 38.0, 41.0, 46.0, 60.0, 105.0)  # finer than the project's bricks, so that it folds
     x = (0.0, 9.0, 18.0, 26.0, 27.0, 33.0, 35.0, *beyond_guard)
     lines = [1e-3 * np.array(axis) for axis in (x, (0.0, 4.0, 5.0, 12.0, 18.0, 84.0), (0.0, 8.0, 10.0))]
     problem = build_problem(layered_mesh(lines, "coarse bricks"))
     theta = {"E_c": 2.3e5, "E_s": 2.24e8, "k_c": 1.4e-16, "k_s": 2.5e-13}
     motion = PadMotion(np.array([0.0, 9.4]), np.array([0.0, 6.7e-3]))
-    model, steps = LagrangianModel(problem, material(theta, problem.mesh.cutis), motion), []
+    return LagrangianModel(problem, material(theta, problem.mesh.cutis), motion)
+
+
+def test_a_soft_cutis_on_a_stiff_subcutis_folds_and_the_run_goes_on() -> None:
+    """Before and after it snaps the skin's reactions along x are in equilibrium."""
+    model, steps = foldable(), []
     assert integrate(model, 700.0, 1e-3, steps.append) == ""
     assert steps[-1].state.time_s == pytest.approx(9.4)
     assert model.solver.counts["falls"] >= 1
+    problem = model.problem
     supports = 3 * np.union1d(problem.pads, problem.space.facet_nodes("symmetry_x"))
     for step in steps[1:]:
         assert step.state.volume.min() > 0.5
         assert abs(step.stages[-1].residual[supports].sum()) < 1e-4 * step.force_n
+    model.solver.release()
+
+
+def test_a_run_that_folds_too_often_is_given_up_and_says_where(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stepping, "MOST_CRAWLS", 2)
+    model = foldable()
+    message = integrate(model, 700.0, 1e-3, lambda step: None)
+    assert re.fullmatch(r"step \d+ at t = \S+ s: the skin has folded and snapped 1 times; try .*", message)
     model.solver.release()

@@ -28,7 +28,7 @@ DEAR = 8.0  # iterations left from which a factorisation, worth some twenty-five
 SMALLEST_DAMPING = 1 / 64
 SAME_PLACE = 0.2  # a factorisation this near to a new one is replaced by it
 EXTRAPOLATION_POINTS = 3
-COUNTED = ("iterations", "residuals", "factorisations", "solves", "falls")
+COUNTED = ("iterations", "residuals", "factorisations", "solves", "falls", "crawls")
 MOST_RELAXING, RELAXED = 400, 1e5  # steps of `relax`, and the length at which its drag is all but nothing
 ALLOWED_CONTRACTION, WANTED_CONTRACTION, MOST_GROWTH = 0.8, 0.25, 10.0
 
@@ -181,6 +181,7 @@ class NewtonSolver:
         """One step against drag: where to, the residual there, its size in units of the tolerance, and that
         of a second iteration relative to it, 0 of a step within the tolerance, which may be mere rounding.
         """
+        self.counts["crawls"] += 1
         self.renew(equations, x, drag)
         step = -self.back_substitute(right)
         trial = x.copy()

@@ -9,7 +9,8 @@ and length h*. The local error of the fluid mass, filtered through the tangent (
 an error of the force in newtons, which steers the step.
 
 A soft cutis on a stiff subcutis folds, and snaps from one equilibrium to another. A step that fails at the
-smallest length is taken as such a fall (`NewtonSolver.relax`), and the phase starts anew after it.
+smallest length is taken as such a fall (`NewtonSolver.relax`), and the phase starts anew after it. On fine
+meshes wrinkles may follow each other without end; a run whose falls become too dear is given up.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ GAMMA = 1.0 - np.sqrt(0.5)
 FIRST_STEP_S = 1.0
 SHORTEST_STEP = 1e-3  # of the phase; what asks for less is a fall, or has failed
 GROWTH, SHRINK = 2.0, 0.25  # zero-stable while steps grow less than 2.41-fold
+MOST_CRAWLS = 3000  # of a run: steps of its falls, some 150 each
 STEPS_PER_PHASE = 5  # fewer, longer ones cost as much: their guesses are worse, their tangents further apart
 
 
@@ -104,6 +106,12 @@ def integrate(
         past, h = [state], min(FIRST_STEP_S, 0.5 * (end - start))
         longest, shortest = (end - start) / STEPS_PER_PHASE, SHORTEST_STEP * (end - start)
         while state.time_s < end - 1e-9:
+            spent = model.solver.counts
+            if spent["crawls"] > MOST_CRAWLS:
+                return (
+                    f"step {count + 1} at t = {state.time_s:.3f} s: the skin has folded and snapped "
+                    f"{spent['falls']} times; try a subcutis less stiff beside the cutis, or a coarser mesh"
+                )
             h = _landing(max(h, shortest), end - state.time_s, longest)
             step = advance(model, past, h)
             falls = step is None and h <= shortest
