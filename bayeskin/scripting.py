@@ -91,7 +91,9 @@ def calibrate(
         log_posterior, config = work.log_posterior, run.config
         best = inference.find_map(log_posterior, config.seed, config.map.starts, config.map.evaluations).theta
         chains = chains_folder(run, log_posterior)
-        posterior = inference.sample(log_posterior, chains, config.seed, best, settings_of(config))
+        posterior = inference.sample(
+            log_posterior, chains, config.seed, best, settings_of(config), threads=config.design.workers
+        )
         origin = provenance_of(run, log_posterior, recording.sha256)
         rng = np.random.default_rng([config.seed, 1])
         idata = inference.to_inference_data(log_posterior, posterior, origin, rng, PREDICTIVE_DRAWS)

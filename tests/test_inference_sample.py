@@ -174,13 +174,30 @@ def test_a_run_in_two_parts_is_the_run_in_one(tmp_path: Path) -> None:
     assert not np.array_equal(*load_chains(tmp_path / "one", problem))  # ensembles are independent
 
 
+def test_threads_change_nothing(tmp_path: Path) -> None:
+    problem = line_problem()
+    settings = SampleSettings(3, 16, 600, Limits(effective_samples=1e9))
+    alone = sample(problem, tmp_path / "one", 7, LINE_START, settings)
+    together = sample(problem, tmp_path / "two", 7, LINE_START, settings, threads=2)
+    assert np.array_equal(alone.draws, together.draws)
+
+
+def test_an_error_in_a_thread_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(sys.modules["bayeskin.inference.sample"]._Ensemble, "_rescue", fail)
+    with pytest.raises(ZeroDivisionError):
+        sample(line_problem(), tmp_path, 7, LINE_START, SampleSettings(2, 16, 600), threads=2)
+
+
 def test_an_interrupted_run_goes_on_bit_for_bit(tmp_path: Path) -> None:
     problem = line_problem()
-    settings = SampleSettings(2, 16, 600, Limits(effective_samples=1e9))
+    settings = SampleSettings(2, 16, 750, Limits(effective_samples=1e9))
     whole = sample(problem, tmp_path / "one", 7, LINE_START, settings)
 
     def interrupt(_: float, text: str) -> None:
-        if "ensemble 2" in text and "step 600" in text:
+        if "ensemble 2" in text and "step 700" in text:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -189,7 +206,7 @@ def test_an_interrupted_run_goes_on_bit_for_bit(tmp_path: Path) -> None:
         emcee.backends.HDFBackend(str(tmp_path / "two" / f"ensemble_{e}.h5"), read_only=True).iteration
         for e in (0, 1)
     ]
-    assert steps == [600, 500]
+    assert steps == [750, 500]
     assert np.array_equal(whole.draws, sample(problem, tmp_path / "two", 7, LINE_START, settings).draws)
 
 

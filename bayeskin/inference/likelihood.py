@@ -54,7 +54,7 @@ def log_likelihood(chain: NoiseChain, prediction: Prediction, noise: Array) -> A
     )
 
 
-@nb.njit(cache=True, error_model="numpy", fastmath=_FAST)
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def _kernel(
     mean: Array, factor: Array, diagonal: Array, noise: Array,
     bins: NDArray[np.int64], force: Array, variance: Array, covariance: Array,

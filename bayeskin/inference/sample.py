@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Event
 
 import emcee
 import numpy as np
@@ -63,12 +67,14 @@ def sample(
     start: Mapping[str, float],
     settings: SampleSettings | None = None,
     progress: Progress | None = None,
+    threads: int = 1,
 ) -> Posterior:
     """Runs ensembles from around `start` (the MAP, SI by name) until the verdict is trust, or to max_steps.
 
     `folder` keeps one file an ensemble, ``ensemble_0.h5`` ..., in emcee's own HDF5 form with its random
     state, each replaced as a whole after every stretch. An interrupted run goes on from there and gives
-    the draws that an uninterrupted one gives. Raises InputError when the files there belong to another
+    the draws that an uninterrupted one gives, and so does any number of `threads`, over which the ensembles
+    are spread. Raises InputError when the files there belong to another
     posterior, seed or number of walkers; they stay as they are.
     """
     settings = settings or SampleSettings()
@@ -81,14 +87,14 @@ def sample(
     goal = 0
     while True:
         goal = _next_check(goal, settings.max_steps)
-        for e, run in enumerate(runs):
-            for at in run.advance(goal):
-                _tell(
-                    progress, convergence, settings, f"ensemble {e + 1} of {len(runs)}, step {at} of {goal}"
-                )
-            if run.changed:
-                store.save(files[e], run.backend, log_posterior.names, identity)
-                run.changed = False
+        with closing(_advanced(runs, goal, threads)) as advanced:
+            for e, at in advanced:
+                if at < goal:
+                    text = f"ensemble {e + 1} of {len(runs)}, step {at} of {goal}"
+                    _tell(progress, convergence, settings, text)
+                elif runs[e].changed:
+                    store.save(files[e], runs[e].backend, log_posterior.names, identity)
+                    runs[e].changed = False
         chains = np.stack([r.backend.chain[:goal] for r in runs])
         log_prob = np.stack([r.backend.log_prob[:goal] for r in runs])
         settled = max((run.last_rescue(goal) for run in runs), default=0)
@@ -111,6 +117,32 @@ def load_chains(folder: Path | str, log_posterior: LogPosterior) -> Array:
 def evenly(draws: Array, count: int) -> Array:
     """At most `count` of draws (n, D), evenly over all of them."""
     return draws[np.linspace(0, len(draws) - 1, min(count, len(draws))).astype(int)]
+
+
+def _advanced(runs: Sequence[_Ensemble], goal: int, threads: int) -> Generator[tuple[int, int], None, None]:
+    """Brings all ensembles to step `goal`; yields which is at which step now and then, and at the goal."""
+    told: SimpleQueue[tuple[int, int]] = SimpleQueue()
+    stop = Event()
+
+    def advance(e: int) -> None:
+        try:
+            for at in runs[e].advance(goal):
+                if stop.is_set():
+                    return
+                told.put((e, at))
+        finally:
+            told.put((e, goal))
+
+    with ThreadPoolExecutor(threads) as pool:
+        futures = [pool.submit(advance, e) for e in range(len(runs))]
+        try:
+            for _ in runs:
+                while (step := told.get())[1] < goal:
+                    yield step
+                futures[step[0]].result()
+                yield step
+        finally:  # an interruption, or an error of one: the others end at their next word
+            stop.set()
 
 
 class _Ensemble:
@@ -147,7 +179,7 @@ class _Ensemble:
             missing = stop - self.backend.iteration
             for state in self.sampler.sample(self.state, iterations=missing, skip_initial_state_check=True):
                 self.state = state
-                if self.backend.iteration % _REFRESH == 0:
+                if self.backend.iteration % _REFRESH == 0 and self.backend.iteration < goal:
                     yield self.backend.iteration
 
     def _rescue(self) -> None:

@@ -100,7 +100,7 @@ class Shear(_FreezesArrays):
         return _monomials(np.ascontiguousarray(unit.T), self.powers)
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _monomials(unit: Array, powers: NDArray[np.int64]) -> Array:
     """Products over columns of unit (D, n) raised to powers (t, D): (t, n)."""
     terms = np.ones((len(powers), unit.shape[1]))

@@ -68,7 +68,8 @@ def _draws_of(run: Run, best: Mapping[str, float], log_posterior: LogPosterior) 
     """Draws of a posterior, from about its most probable point."""
     folder = chains_folder(run, log_posterior)
     settings, tell = settings_of(run.config), partial(_tell_sampling, run)
-    return inference.sample(log_posterior, folder, run.config.seed, best, settings, tell)
+    threads = run.config.design.workers
+    return inference.sample(log_posterior, folder, run.config.seed, best, settings, tell, threads)
 
 
 def _history(log_posterior: LogPosterior, bands: inference.Bands) -> dict[str, Any]:

@@ -73,7 +73,7 @@ class _Stack(NamedTuple):
         return mean.T, (self.spread * variance).T
 
 
-@nb.njit(cache=True, fastmath={"reassoc", "contract"})
+@nb.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _collect(white: Array, linear: Array, trend: Array, mean: Array, variance: Array) -> None:
     """Fills mean and variance (q, k), without nugget, from what `predict` has multiplied."""
     half, p = white.shape[2], trend.shape[2] - 1

@@ -52,7 +52,7 @@ class ShapeTransform(_FreezesArrays):
         return Prediction(mean, columns.transpose(0, 2, 1), scale**2 * self.truncation)
 
 
-@nb.njit(cache=True)
+@nb.njit(cache=True, nogil=True)
 def _fill(mean: Array, components: Array, sd: Array, scaled_sd: Array, columns: Array) -> None:
     """Fills columns (n, 1 + K, m): the mean times its sd, then each component times its own."""
     for i in range(len(columns)):
