@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from bayeskin.design import default_space
 from bayeskin.errors import InputError
-from bayeskin.types import Parameter, ParameterSpace
+from bayeskin.types import Correlation, Parameter, ParameterSpace
 
 Positive = Annotated[int, Field(gt=0)]
 NotNegative = Annotated[int, Field(ge=0)]
@@ -226,6 +226,7 @@ class Config(_Section):
     seed: Annotated[int, Field(ge=0)] = 1
     model: ModelConfig = ModelConfig()
     parameters: dict[str, PriorConfig] = {}
+    correlations: dict[str, float] = {}  # of two normal priors, as "E_c-E_s"
     design: DesignConfig = DesignConfig()
     slurm: SlurmConfig | None = None
     surrogate: SurrogateConfig = SurrogateConfig()
@@ -300,10 +301,24 @@ def _table(plain: Mapping[str, Any], name: str = "") -> list[str]:
 def parameter_space(config: Config, where: object = "configuration") -> ParameterSpace:
     """The prior box: the defaults with the configuration's changes, or that of a forward model of one's own.
 
-    Raises InputError for an unknown parameter, bounds upside down, or a log prior that reaches zero.
+    Raises InputError for an unknown parameter, bounds upside down, a log prior that reaches zero, or
+    correlations that cannot be.
     """
-    if config.model.forward is not None:
-        return _own_space(config, where)
+    space = _own_space(config, where) if config.model.forward is not None else _changed_space(config, where)
+    pairs = {f"{one}-{other}": (one, other) for one in space.names for other in space.names}
+    correlations = []
+    for key, value in config.correlations.items():
+        if key not in pairs:
+            raise InputError(f"{where}: correlations.{key}", "an unknown pair", "two parameters, as E_c-E_s")
+        correlations.append(Correlation(*pairs[key], value))
+    try:
+        return replace(space, correlations=tuple(correlations))
+    except InputError as error:
+        raise InputError(f"{where}: {error.where}", error.found, error.expected) from None
+
+
+def _changed_space(config: Config, where: object) -> ParameterSpace:
+    """The default one with the configuration's changes."""
     default = default_space()
     unknown = sorted(set(config.parameters) - set(default.names))
     if unknown:

@@ -227,7 +227,8 @@ def sentence(result: SobolResult) -> str:
 
 def describe(space: ParameterSpace) -> str:
     """The input distribution in words."""
-    return "independent: " + "; ".join(map(_described, space.parameters))
+    how = "independent, correlations of their priors left out: " if space.correlations else "independent: "
+    return how + "; ".join(map(_described, space.parameters))
 
 
 def _described(p: Parameter) -> str:

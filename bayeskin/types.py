@@ -10,11 +10,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr, ndtri
+
+from bayeskin.errors import InputError
 
 Array = NDArray[np.float64]
 PhaseKind = Literal["rest", "load", "hold", "unload"]
@@ -70,14 +72,39 @@ class Parameter:
         return self.prior.endswith("normal")
 
 
+class Correlation(NamedTuple):
+    """Of the normal priors of two parameters, by their names, on their lines."""
+
+    one: str
+    other: str
+    value: float
+
+
 @dataclass(frozen=True)
 class ParameterSpace:
-    """An ordered box of independent priors; the only place where theta meets the unit cube.
+    """An ordered box of priors; the only place where theta meets the unit cube.
 
-    `theta` is always in SI units, shape ``(..., d)``, columns in the order of `names`.
+    `theta` is always in SI units, shape ``(..., d)``, columns in the order of `names`. Priors are independent
+    but for normal and log-normal ones with `correlations`: a multivariate normal, cut to the bounds.
+    Raises InputError for correlations that no multivariate normal has.
     """
 
     parameters: tuple[Parameter, ...]
+    correlations: tuple[Correlation, ...] = ()
+
+    def __post_init__(self) -> None:
+        peaked = [p.name for p in self.parameters if p.peaked]
+        for one, other, value in self.correlations:
+            for name in (one, other):
+                if name not in peaked:
+                    found = f"{name}, whose prior is not normal" if name in self.names else repr(name)
+                    raise InputError("correlations", found, "two parameters with normal or log-normal priors")
+            if one == other or not abs(value) < 1.0:
+                where = f"correlations: {one} and {other}"
+                raise InputError(where, f"{value:g}", "two different parameters and a value between -1 and 1")
+        if self.correlations and not np.linalg.eigvalsh(self._correlation).min() > 1e-9:
+            stated = ", ".join(f"{one} and {other} {value:g}" for one, other, value in self.correlations)
+            raise InputError("correlations", stated, "correlations that can hold together")
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -107,8 +134,28 @@ class ParameterSpace:
             tuple(replace(p, prior=flat[p.in_log]) if p.peaked else p for p in self.parameters)
         )
 
+    def draw(self, rng: np.random.Generator, count: int) -> Array:
+        """Draws of the prior, (count, d); correlated ones by rejection of what lies beyond the bounds."""
+        theta = self.from_unit(rng.uniform(size=(count, self.dim)))
+        if not self.correlations:
+            return np.clip(theta, self.lower, self.upper)
+        line, (low, high) = self.to_line(theta), self._line
+        columns = list(self._normals)
+        centre, spread = np.array([self._normals[j][:2] for j in columns]).T
+        root = np.linalg.cholesky(self._correlation)
+        missing = np.arange(count)
+        while len(missing):
+            trial = centre + spread * (rng.standard_normal((len(missing), len(columns))) @ root.T)
+            inside = np.all((trial >= low[columns]) & (trial <= high[columns]), axis=1)
+            line[missing[inside][:, None], columns] = trial[inside]
+            missing = missing[~inside]
+        return np.clip(self.from_line(line), self.lower, self.upper)
+
     def to_unit(self, theta: ArrayLike) -> Array:
-        """Prior cumulative probability of each coordinate, shape (..., d); outside [0, 1] beyond the box."""
+        """Prior cumulative probability of each coordinate, shape (..., d); outside [0, 1] beyond the box.
+
+        Each coordinate by itself, correlated or not, as in `from_unit`.
+        """
         low, high = self._line
         line = self.to_line(theta)
         unit = np.asarray((line - low) / (high - low))
@@ -127,7 +174,10 @@ class ParameterSpace:
         return self.from_line(line)
 
     def log_density(self, line: ArrayLike) -> Array:
-        """Log prior density (...,) on the line, at points (..., d) within the bounds."""
+        """Log prior density (...,) on the line, at points (..., d) within the bounds.
+
+        With correlations up to the constant by which the bounds cut their normal law.
+        """
         line = np.asarray(line, dtype=float)
         low, high = self._line
         flat = [j for j in range(self.dim) if j not in self._normals]
@@ -135,6 +185,12 @@ class ParameterSpace:
         for j, (centre, spread, _, share) in self._normals.items():
             z = (line[..., j] - centre) / spread
             out += -0.5 * z**2 - np.log(spread * share * np.sqrt(2.0 * np.pi))
+        if self.correlations:
+            centre, spread = np.array([own[:2] for own in self._normals.values()]).T
+            z = (line[..., list(self._normals)] - centre) / spread
+            precision = np.linalg.inv(self._correlation)
+            out += -0.5 * np.einsum("...i,ij,...j->...", z, precision - np.eye(len(precision)), z)
+            out -= 0.5 * np.linalg.slogdet(self._correlation)[1]
         return out
 
     def to_line(self, theta: ArrayLike) -> Array:
@@ -167,6 +223,15 @@ class ParameterSpace:
                 left, right = (float(ndtr((bound - centre) / p.spread)) for bound in (low[j], high[j]))
                 out[j] = (centre, p.spread, left, right - left)
         return out
+
+    @cached_property
+    def _correlation(self) -> Array:
+        """Of the normal priors, in the order of `_normals`."""
+        place = {self.names[j]: k for k, j in enumerate(self._normals)}
+        matrix = np.eye(len(place))
+        for one, other, value in self.correlations:
+            matrix[place[one], place[other]] = matrix[place[other], place[one]] = value
+        return matrix
 
     @cached_property
     def _offset(self) -> Array:

@@ -13,7 +13,7 @@ BASE = {"errors", "types", "storage", "shipped", "workers", "umbridge", "probe",
 SIBLINGS = {"recordings", "model", "design", "surrogates"}
 BELOW = {
     "errors": set(),
-    "types": set(),
+    "types": {"errors"},
     "storage": {"types", "errors"},
     "shipped": {"errors"},
     "workers": {"errors"},

@@ -8,11 +8,11 @@ import pytest
 from scipy import stats
 from toy_inference import line_problem
 
-from bayeskin.config import load_config, parameter_space
+from bayeskin.config import load_config, parameter_space, to_toml
 from bayeskin.errors import InputError
 from bayeskin.inference import identifiability
 from bayeskin.sensitivity import describe
-from bayeskin.types import Parameter, ParameterSpace
+from bayeskin.types import Correlation, Parameter, ParameterSpace
 
 SPACE = ParameterSpace(
     (
@@ -73,6 +73,44 @@ def test_draws_of_a_normal_prior_taught_nothing():
         assert one.contraction == pytest.approx(0.0, abs=0.05)
 
 
+JOINT = dataclasses.replace(SPACE, correlations=(Correlation("E", "p", -0.7),))
+
+
+def test_a_joint_prior_is_a_normal_law_of_both_cut_to_the_bounds():
+    sd = np.array([np.log(3.0), 2.0])
+    law = stats.multivariate_normal([np.log(2e4), 0.5], np.outer(sd, sd) * [[1.0, -0.7], [-0.7, 1.0]])
+    line = SPACE.to_line(SPACE.from_unit(np.random.default_rng(3).uniform(size=(50, 3))))
+    difference = JOINT.log_density(line) - law.logpdf(line[:, :2])
+    np.testing.assert_allclose(difference, difference[0], atol=1e-9)
+    draws = JOINT.to_line(JOINT.draw(np.random.default_rng(4), 20_000))
+    many = law.rvs(400_000, random_state=5)
+    low, high = JOINT.to_line(JOINT.lower)[:2], JOINT.to_line(JOINT.upper)[:2]
+    kept = many[np.all((many >= low) & (many <= high), axis=1)]
+    np.testing.assert_allclose(draws[:, :2].mean(axis=0), kept.mean(axis=0), atol=0.03)
+    np.testing.assert_allclose(np.cov(draws[:, :2].T), np.cov(kept.T), atol=0.04)
+    assert np.corrcoef(draws.T)[0, 2] == pytest.approx(0.0, abs=0.03)
+    assert JOINT.contains(JOINT.draw(np.random.default_rng(6), 1000)).all()
+
+
+def test_a_joint_prior_pulls_the_posterior_of_a_line():
+    problem = line_problem()
+    x = problem.surrogate.columns
+    priors = [dataclasses.replace(p, prior="normal", centre=0.0, spread=0.1)
+              for p in problem.surrogate.space.parameters]  # fmt: skip
+    names = [p.name for p in priors]
+    material = ParameterSpace(tuple(priors), (Correlation(*names, 0.8),))
+    informed = dataclasses.replace(problem, material=material)
+    covariance = (2.5e-3 + 1e-6) * np.eye(40) + 1e-4 * np.outer(x[1], x[1])
+    information = x @ np.linalg.solve(covariance, x.T)
+    information = information + np.linalg.inv(0.1**2 * np.array([[1.0, 0.8], [0.8, 1.0]]))
+    mean = np.linalg.solve(information, x @ np.linalg.solve(covariance, problem.binned.force_n))
+    offsets = 0.01 * np.random.default_rng(1).standard_normal((50, 2))
+    rest = np.tile(informed.bounds[0][2:], (50, 1))
+    found = informed.log_prob(np.column_stack([mean + offsets, rest]))
+    exact = -0.5 * np.einsum("ni,ij,nj->n", offsets, information, offsets)
+    np.testing.assert_allclose(found - found[0], exact - exact[0], atol=0.02)
+
+
 def test_the_distribution_stands_in_words():
     assert "E log-normal about 20000 (1.09861) 1000 to 1e+06 Pa" in describe(SPACE)
 
@@ -80,6 +118,51 @@ def test_the_distribution_stands_in_words():
 def written(where: Path, text: str) -> Path:
     (where / "case.toml").write_text(f'[recording]\nfile = "r.h5"\n[parameters.E_c]\n{text}\n')
     return where / "case.toml"
+
+
+TWO = """prior = "log-normal"
+median = 60e3
+factor = 2.0
+[parameters.E_s]
+prior = "log-normal"
+median = 15e3
+factor = 2.0
+[correlations]
+"""
+
+
+def test_a_configuration_states_a_joint_prior(tmp_path: Path):
+    config = load_config(written(tmp_path, TWO + "E_c-E_s = -0.6"))
+    assert parameter_space(config).correlations == (Correlation("E_c", "E_s", -0.6),)
+    (tmp_path / "again.toml").write_text(to_toml(config))
+    assert load_config(tmp_path / "again.toml") == config
+    assert parameter_space(config).box.correlations == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("E_c-E_x = 0.5", "correlations.E_c-E_x: found an unknown pair; expected two parameters, as E_c-E_s"),
+        ("E_c-k_c = 0.5", "found k_c, whose prior is not normal; expected two parameters with normal"),
+        (
+            "E_c-E_s = 1.0",
+            "correlations: E_c and E_s: found 1; expected two different parameters",
+        ),
+        ("E_c-E_c = 0.5", "found 0.5; expected two different parameters"),
+        ('E_c-E_s = "much"', 'correlations.E_c-E_s: found "much"; expected a valid number'),
+    ],
+)
+def test_a_joint_prior_that_cannot_be_is_refused(tmp_path: Path, text: str, says: str):
+    with pytest.raises(InputError) as caught:
+        load_config(written(tmp_path, TWO + text))
+    assert says in str(caught.value)
+
+
+def test_correlations_that_cannot_hold_together_are_refused():
+    normal = [Parameter(name, "Pa", -9.0, 9.0, "normal") for name in "abc"]
+    pairs = (Correlation("a", "b", 0.9), Correlation("b", "c", 0.9), Correlation("a", "c", -0.9))
+    with pytest.raises(InputError, match="correlations that can hold together"):
+        ParameterSpace(tuple(normal), pairs)
 
 
 def test_a_configuration_states_a_prior_and_its_source(tmp_path: Path):

@@ -41,7 +41,7 @@ def to_inference_data(
     import arviz as az  # takes seconds, which only those who ask for it should wait
 
     space, (ensembles, n, _) = posterior.space, posterior.draws.shape
-    prior = space.from_unit(rng.uniform(size=(_PRIOR_DRAWS, space.dim)))
+    prior = space.draw(rng, _PRIOR_DRAWS)
     constant = _constant(log_posterior)
     idata = az.from_dict(
         posterior={name: posterior.draws[..., j] for j, name in enumerate(space.names)},

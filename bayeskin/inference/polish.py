@@ -132,7 +132,7 @@ def _maximum(
         else:
             low, high = middle - reach * (p.upper - p.lower), middle + reach * (p.upper - p.lower)
         narrowed.append(replace(p, lower=max(low, p.lower), upper=min(high, p.upper)))
-    found = climb(replace(about, material=ParameterSpace(tuple(narrowed))), centre)
+    found = climb(replace(about, material=replace(linear.space, parameters=tuple(narrowed))), centre)
     return dict(found.theta), _density(about, found.theta)
 
 

@@ -67,7 +67,8 @@ class LogPosterior:
         """Priors of all sampled parameters: the material's, then the noise's."""
         material = self.material or self.surrogate.space
         return ParameterSpace(
-            material.parameters + noise_space(self.chain.kinds, self.noise_priors).parameters
+            material.parameters + noise_space(self.chain.kinds, self.noise_priors).parameters,
+            material.correlations,
         )
 
     @property

@@ -164,7 +164,7 @@ def _within(local: LogPosterior, vector: Array, reach: Array) -> LogPosterior:
         replace(p, lower=float(max(a, p.lower)), upper=float(min(b, p.upper)))
         for p, a, b in zip(space.parameters, lower, upper, strict=True)
     )
-    return replace(local, material=ParameterSpace(narrowed))
+    return replace(local, material=replace(space, parameters=narrowed))
 
 
 def _maximum(

@@ -85,8 +85,8 @@ def _draw(
     )
     report.save_figure(figure, run.at("train", "validation"), caption(run))
     space = parameter_space(run.config, run.config_path)
-    unit = np.random.default_rng([run.config.seed, 3]).uniform(size=(PRIOR_DRAWS, space.dim))
-    drawn = surrogate.predict(np.clip(space.from_unit(unit), space.lower, space.upper)).mean
+    theta = space.draw(np.random.default_rng([run.config.seed, 3]), PRIOR_DRAWS)
+    drawn = surrogate.predict(theta).mean
     figure = report.figure_prior_predictive(binned, drawn)
     report.save_figure(figure, run.at("train", "prior_predictive"), caption(run))
 
