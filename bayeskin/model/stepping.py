@@ -110,7 +110,7 @@ def integrate(
             if spent["crawls"] > MOST_CRAWLS:
                 return (
                     f"step {count + 1} at t = {state.time_s:.3f} s: the skin has folded and snapped "
-                    f"{spent['falls']} times; try a subcutis less stiff beside the cutis, or a coarser mesh"
+                    f"{spent['falls']} times; try layers less unlike in stiffness, or a coarser mesh"
                 )
             h = _landing(max(h, shortest), end - state.time_s, longest)
             step = advance(model, past, h)
