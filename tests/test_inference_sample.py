@@ -56,8 +56,9 @@ def walled(shear: Shear | None) -> MoveCoordinates:
         SubspaceMove(),
         TriesMove(walled(curved_shear(5))),
         TriesMove(walled(None)),
-        mixed_moves(walled(curved_shear(5))),
-        mixed_moves(walled(None)),
+        mixed_moves(walled(curved_shear(5)), 30),
+        mixed_moves(walled(None), 30),
+        mixed_moves(walled(None), 14),
     ],
     ids=[
         "snooker",
@@ -66,6 +67,7 @@ def walled(shear: Shear | None) -> MoveCoordinates:
         "tries, normal scores",
         "all, straightened",
         "all, normal scores",
+        "without tries",
     ],
 )
 def test_a_move_keeps_a_unit_normal(moves: object) -> None:

@@ -16,6 +16,7 @@ from bayeskin.types import Array
 _CROSSOVER = (0.15, 0.3, 1.0)  # shares of the coordinates that a step moves
 _JUMP, _JITTER = 0.1, 1e-5  # share of steps of full length, from mode to mode; noise that fills space
 _TRIES, _FREEDOM = 5, 5.0  # points that a walker chooses from; of the t-distribution that they are from
+WALKERS_A_COORDINATE = 3  # or no tries
 _GAMMA = 1.7  # of about 2.38 / sqrt(2), optimal for the difference of two projected points
 
 
@@ -135,12 +136,17 @@ class _Around:
         return np.asarray(-0.5 * (_FREEDOM + len(self.centre)) * np.log1p(squared / _FREEDOM))
 
 
-def mixed_moves(coordinates: MoveCoordinates) -> list[tuple[emcee.moves.Move, float]]:
-    """The moves with their shares, all made in `coordinates`."""
+def mixed_moves(coordinates: MoveCoordinates, walkers: int) -> list[tuple[emcee.moves.Move, float]]:
+    """The moves with their shares, all made in `coordinates`.
+
+    Tries only where half of the walkers tell a distribution in so many coordinates; elsewhere they miss.
+    """
     # Tries forget fastest where they are accepted; differential evolution goes on where they are not, and the
     # others keep it from any one scale.
-    kinds = ((SubspaceMove, 0.32), (emcee.moves.StretchMove, 0.04), (SnookerMove, 0.04))
-    return [(TriesMove(coordinates), 0.6), *((_local(kind)(coordinates), share) for kind, share in kinds)]
+    tries = 0.6 if walkers >= WALKERS_A_COORDINATE * len(coordinates.low) else 0.0
+    kinds = ((SubspaceMove, 0.8), (emcee.moves.StretchMove, 0.1), (SnookerMove, 0.1))
+    moves = [(_local(kind)(coordinates), (1.0 - tries) * share) for kind, share in kinds]
+    return [(TriesMove(coordinates), tries), *moves] if tries else moves
 
 
 def _local(kind: type) -> type:

@@ -164,7 +164,7 @@ class _Ensemble:
             backend.nwalkers,
             log_posterior.dim,
             log_posterior.log_prob,
-            moves=mixed_moves(coordinates),
+            moves=mixed_moves(coordinates, backend.nwalkers),
             backend=backend,
             vectorize=True,
         )

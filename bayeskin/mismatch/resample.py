@@ -70,7 +70,11 @@ def resample(
     chains, densities = [], []
     for ensemble in range(ENSEMBLES):
         sampler = emcee.EnsembleSampler(
-            walkers, log_posterior.dim, log_posterior.log_prob, moves=mixed_moves(coordinates), vectorize=True
+            walkers,
+            log_posterior.dim,
+            log_posterior.log_prob,
+            moves=mixed_moves(coordinates, walkers),
+            vectorize=True,
         )
         random = np.random.RandomState(int(rng.integers(2**32)))
         first = emcee.State(starts(walkers), random_state=random.get_state())
