@@ -24,7 +24,7 @@ def on_scheduler(address: str) -> Iterator[Map]:
 
     Raises InputError where nobody answers.
     """
-    distributed = _extra("distributed")
+    distributed = extra("distributed")
     try:
         client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
@@ -40,7 +40,7 @@ def on_slurm(jobs: int, settings: Mapping[str, Any]) -> Iterator[Map]:
 
     Raises InputError for settings that it does not take.
     """
-    distributed, queue = _extra("distributed"), _extra("dask_jobqueue")
+    distributed, queue = extra("distributed"), extra("dask_jobqueue")
     try:
         cluster = queue.SLURMCluster(cores=1, processes=1, scheduler_options=HIDDEN, **settings)
     except (TypeError, ValueError) as error:
@@ -51,7 +51,7 @@ def on_slurm(jobs: int, settings: Mapping[str, Any]) -> Iterator[Map]:
 
 
 def _over(client: Any) -> Map:
-    distributed = _extra("distributed")
+    distributed = extra("distributed")
 
     def over(function: Callable[[Any], Any], items: Sequence[Any]) -> Generator[tuple[int, Any], None, None]:
         futures = {client.submit(function, item, pure=False): index for index, item in enumerate(items)}
@@ -71,7 +71,7 @@ def _result(future: Any, distributed: Any) -> Any:
         return Lost(f"the worker process ended each time; last: {killed.last_worker}")
 
 
-def _extra(name: str) -> Any:
+def extra(name: str) -> Any:
     import importlib
 
     try:

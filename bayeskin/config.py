@@ -75,7 +75,7 @@ class PriorConfig(_Section):
     """What replaces the default prior of one parameter; what is not given stays as it was.
 
     `mean` and `sd` belong to a normal prior, `median` and `factor` (of one sd) to a log-normal one; both are
-    cut to the bounds.
+    cut to the bounds. `correlations` are with normal priors of other parameters, by their names, stated once.
 
     With `model.forward` these are all the parameters there are: each has bounds, and may have a unit.
     """
@@ -87,6 +87,7 @@ class PriorConfig(_Section):
     sd: Annotated[float, Field(gt=0)] | None = None
     median: Annotated[float, Field(gt=0)] | None = None
     factor: Annotated[float, Field(gt=1)] | None = None
+    correlations: dict[str, float] = {}
     source: str = "configuration"
     unit: str | None = None
 
@@ -226,7 +227,6 @@ class Config(_Section):
     seed: Annotated[int, Field(ge=0)] = 1
     model: ModelConfig = ModelConfig()
     parameters: dict[str, PriorConfig] = {}
-    correlations: dict[str, float] = {}  # of two normal priors, as "E_c-E_s"
     design: DesignConfig = DesignConfig()
     slurm: SlurmConfig | None = None
     surrogate: SurrogateConfig = SurrogateConfig()
@@ -305,14 +305,13 @@ def parameter_space(config: Config, where: object = "configuration") -> Paramete
     correlations that cannot be.
     """
     space = _own_space(config, where) if config.model.forward is not None else _changed_space(config, where)
-    pairs = {f"{one}-{other}": (one, other) for one in space.names for other in space.names}
-    correlations = []
-    for key, value in config.correlations.items():
-        if key not in pairs:
-            raise InputError(f"{where}: correlations.{key}", "an unknown pair", "two parameters, as E_c-E_s")
-        correlations.append(Correlation(*pairs[key], value))
+    stated = tuple(
+        Correlation(one, other, value)
+        for one, given in config.parameters.items()
+        for other, value in given.correlations.items()
+    )
     try:
-        return replace(space, correlations=tuple(correlations))
+        return replace(space, correlations=stated)
     except InputError as error:
         raise InputError(f"{where}: {error.where}", error.found, error.expected) from None
 

@@ -93,7 +93,7 @@ class ParameterSpace:
     correlations: tuple[Correlation, ...] = ()
 
     def __post_init__(self) -> None:
-        peaked = [p.name for p in self.parameters if p.peaked]
+        peaked, pairs = [p.name for p in self.parameters if p.peaked], set[frozenset[str]]()
         for one, other, value in self.correlations:
             for name in (one, other):
                 if name not in peaked:
@@ -102,6 +102,9 @@ class ParameterSpace:
             if one == other or not abs(value) < 1.0:
                 where = f"correlations: {one} and {other}"
                 raise InputError(where, f"{value:g}", "two different parameters and a value between -1 and 1")
+            if {one, other} in pairs:
+                raise InputError(f"correlations: {one} and {other}", "two values", "one")
+            pairs.add(frozenset((one, other)))
         if self.correlations and not np.linalg.eigvalsh(self._correlation).min() > 1e-9:
             stated = ", ".join(f"{one} and {other} {value:g}" for one, other, value in self.correlations)
             raise InputError("correlations", stated, "correlations that can hold together")
@@ -176,7 +179,7 @@ class ParameterSpace:
     def log_density(self, line: ArrayLike) -> Array:
         """Log prior density (...,) on the line, at points (..., d) within the bounds.
 
-        With correlations up to the constant by which the bounds cut their normal law.
+        With correlations up to a constant.
         """
         line = np.asarray(line, dtype=float)
         low, high = self._line
@@ -188,9 +191,7 @@ class ParameterSpace:
         if self.correlations:
             centre, spread = np.array([own[:2] for own in self._normals.values()]).T
             z = (line[..., list(self._normals)] - centre) / spread
-            precision = np.linalg.inv(self._correlation)
-            out += -0.5 * np.einsum("...i,ij,...j->...", z, precision - np.eye(len(precision)), z)
-            out -= 0.5 * np.linalg.slogdet(self._correlation)[1]
+            out -= 0.5 * np.einsum("...i,ij,...j->...", z, self._shared_precision, z)
         return out
 
     def to_line(self, theta: ArrayLike) -> Array:
@@ -232,6 +233,11 @@ class ParameterSpace:
         for one, other, value in self.correlations:
             matrix[place[one], place[other]] = matrix[place[other], place[one]] = value
         return matrix
+
+    @cached_property
+    def _shared_precision(self) -> Array:
+        """What correlations add to the precision of normal priors that have none."""
+        return np.asarray(np.linalg.inv(self._correlation) - np.eye(len(self._correlation)))
 
     @cached_property
     def _offset(self) -> Array:

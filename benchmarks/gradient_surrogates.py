@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from unittest import mock
 
@@ -65,11 +66,17 @@ KINDS = ("chaos", "GP", "chaos with derivatives", "GP with derivatives")
 COLOURS = ("#E69F00", "#0072B2", "#D55E00", "#009E73")
 
 
+@cache
+def _compile() -> None:
+    """Once a process, so that no run is timed with it."""
+    simulate(SPEC, healthy_skin.first_cycle(healthy_skin.HEALTHY_SKIN), healthy_skin.POINTS["C"])
+
+
 def _run(task: tuple[int, dict[str, float]]) -> str:
     """One run and its derivatives, into its file; what went wrong, or nothing."""
     index, theta = task
     changes = {name: theta[name] for name in STEERED} | {"p_init": P_INIT_CHANGE_PA}
-    simulate(SPEC, healthy_skin.first_cycle(healthy_skin.HEALTHY_SKIN), theta)  # compiles
+    _compile()
     started = time.process_time()
     plain = simulate(SPEC, healthy_skin.HEALTHY_SKIN, theta)
     between = time.process_time()
@@ -168,9 +175,8 @@ def _predictions(kind: str, inputs: Array, targets: Array, slopes: Array, at: Ar
         inputs = np.concatenate([inputs, *(where for where, _ in near)])
         targets = np.concatenate([targets, *(what for _, what in near)])
         ones = np.ones(len(inputs))
-    with mock.patch.object(
-        hyperparameters, "ROWS_TO_FIT", len(inputs)
-    ):  # else it would part the rows of a run
+    # All rows at once: a subset would part the rows of a run.
+    with mock.patch.object(hyperparameters, "ROWS_TO_FIT", len(inputs)):
         gps = [fit_latent(inputs, column, ones) for column in targets.T]
     return LatentGPs.assemble(inputs, targets, gps).predict(at)[0]
 

@@ -28,7 +28,7 @@ import healthy_skin
 import numpy as np
 import rows
 
-from bayeskin.cluster import on_scheduler
+from bayeskin import cluster
 from bayeskin.design import Wave, default_space, first_wave
 from bayeskin.errors import InputError
 from bayeskin.model import ModelSpec, simulate
@@ -45,15 +45,12 @@ RUN = partial(simulate, SPEC, MOTION)
 @contextmanager
 def dask(workers: int) -> Iterator[Map]:
     """Over a cluster on this machine. Raises InputError without Dask."""
-    try:
-        import distributed
-    except ImportError:
-        raise InputError("Dask", "no distributed installed", "pip install 'bayeskin[cluster]'") from None
+    distributed = cluster.extra("distributed")
     with (
         distributed.LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"
-        ) as cluster,
-        on_scheduler(cluster.scheduler_address) as over,
+        ) as here,
+        cluster.on_scheduler(here.scheduler_address) as over,
     ):
         yield over
 

@@ -13,6 +13,7 @@ docs/figures/two_fidelities.{png,svg}; the runs lie in benchmarks/results/two_fi
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -58,7 +59,7 @@ class Teller:
 
 
 def sampled(case: str) -> tuple[dict[str, Array], str]:
-    """Draws of every quantity, and the run's verdict."""
+    """Draws of every quantity, and in words what they cost and whether they are trusted."""
     FOLDER.mkdir(parents=True, exist_ok=True)
     path = FOLDER / f"{case}.toml"
     path.write_text(CASES[case])
@@ -67,7 +68,13 @@ def sampled(case: str) -> tuple[dict[str, Array], str]:
     posterior = load_inference_data(FOLDER / case / "sample" / "posterior.nc").posterior
     draws = {name: np.ravel(posterior[name].to_numpy()) for name in QUANTITIES[1:]}
     draws["stiffness"] = PEAK_N_PER_PA[0] * draws["E_c"] + PEAK_N_PER_PA[1] * draws["E_s"]
-    return draws, answer["verdict"]
+    design = json.loads((FOLDER / case / "design" / "stage.json").read_text())["summary"]
+    check = answer["full_model"][-1]
+    said = (
+        f"{case}: {design['seconds_of_runs']:.0f} s of {design['runs']} runs; of {check['draws']} draws "
+        f"{check['effective']:.1f} effective in the full model; {answer['verdict']}"
+    )
+    return draws, said
 
 
 def table(draws: dict[str, dict[str, Array]]) -> str:
@@ -124,8 +131,8 @@ def main() -> None:
     found = {case: sampled(case) for case in CASES}
     draws = {case: of for case, (of, _) in found.items()}
     print(table(draws))
-    for case, (_, verdict) in found.items():
-        print(f"{case}: {verdict}")
+    for _, said in found.values():
+        print(said)
     save_figure(figure(draws), FIGURE, "benchmarks/two_fidelities.py")
 
 

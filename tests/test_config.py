@@ -49,7 +49,7 @@ def test_the_hash_follows_the_content_and_ignores_the_workers(tmp_path: Path) ->
         (
             SMALLEST + "[parameters.E_c]\nlow = 1\n",
             "parameters.E_c.low",
-            "one of lower, upper, prior, mean, sd, median, factor, source, unit",
+            "one of lower, upper, prior, mean, sd, median, factor, correlations, source, unit",
         ),
         (SMALLEST + "[parameters.E_x]\nlower = 1\n", "parameters.E_x", "one of E_c, E_s, k_c, k_s, p_init"),
         (SMALLEST + "[parameters.E_c]\nlower = 2e6\nupper = 1e4\n", "parameters.E_c", "lower below upper"),

@@ -76,6 +76,13 @@ def test_a_move_keeps_a_unit_normal(moves: object) -> None:
     assert error < 0.02
 
 
+def test_tries_are_made_where_the_walkers_tell_a_distribution() -> None:
+    for walkers, tries in ((15, True), (14, False)):
+        moves = mixed_moves(walled(None), walkers)
+        assert any(isinstance(move, TriesMove) for move, _ in moves) == tries
+        assert sum(share for _, share in moves) == pytest.approx(1.0)
+
+
 def test_tries_keep_the_shares_of_two_modes_between_walls() -> None:
     def log_prob(x: np.ndarray) -> np.ndarray:
         low, high = (-0.5 * np.sum(((x - centre) / 0.3) ** 2, axis=1) for centre in (1.0, 3.0))

@@ -12,7 +12,7 @@ from bayeskin.config import load_config, parameter_space, to_toml
 from bayeskin.errors import InputError
 from bayeskin.inference import identifiability
 from bayeskin.sensitivity import describe
-from bayeskin.types import Correlation, Parameter, ParameterSpace
+from bayeskin.types import Array, Correlation, Parameter, ParameterSpace
 
 SPACE = ParameterSpace(
     (
@@ -50,20 +50,28 @@ def test_the_box_of_a_normal_prior_is_flat_and_a_flat_one_is_its_own():
     np.testing.assert_array_equal(SPACE.box.lower, SPACE.lower)
 
 
-def test_a_normal_prior_gives_the_conjugate_posterior_of_a_line():
+def normal(parameter: Parameter, spread: float) -> Parameter:
+    return dataclasses.replace(parameter, prior="normal", centre=0.0, spread=spread)
+
+
+def assert_conjugate(parameters: tuple[Parameter, ...], precision: Array, *correlations: Correlation) -> None:
+    """The posterior of a line whose prior adds `precision` is the closed form's."""
     problem = line_problem()
     x = problem.surrogate.columns
-    a, b = problem.surrogate.space.parameters
-    prior = dataclasses.replace(a, prior="normal", centre=0.0, spread=0.02)
-    informed = dataclasses.replace(problem, material=ParameterSpace((prior, b)))
+    informed = dataclasses.replace(problem, material=ParameterSpace(parameters, correlations))
     covariance = (2.5e-3 + 1e-6) * np.eye(40) + 1e-4 * np.outer(x[1], x[1])
-    information = x @ np.linalg.solve(covariance, x.T) + np.diag([1 / 0.02**2, 0.0])
+    information = x @ np.linalg.solve(covariance, x.T) + precision
     mean = np.linalg.solve(information, x @ np.linalg.solve(covariance, problem.binned.force_n))
     offsets = 0.01 * np.random.default_rng(1).standard_normal((50, 2))
     rest = np.tile(informed.bounds[0][2:], (50, 1))
     found = informed.log_prob(np.column_stack([mean + offsets, rest]))
     exact = -0.5 * np.einsum("ni,ij,nj->n", offsets, information, offsets)
     np.testing.assert_allclose(found - found[0], exact - exact[0], atol=0.02)
+
+
+def test_a_normal_prior_gives_the_conjugate_posterior_of_a_line():
+    a, b = line_problem().surrogate.space.parameters
+    assert_conjugate((normal(a, 0.02), b), np.diag([1 / 0.02**2, 0.0]))
 
 
 def test_draws_of_a_normal_prior_taught_nothing():
@@ -93,22 +101,9 @@ def test_a_joint_prior_is_a_normal_law_of_both_cut_to_the_bounds():
 
 
 def test_a_joint_prior_pulls_the_posterior_of_a_line():
-    problem = line_problem()
-    x = problem.surrogate.columns
-    priors = [dataclasses.replace(p, prior="normal", centre=0.0, spread=0.1)
-              for p in problem.surrogate.space.parameters]  # fmt: skip
-    names = [p.name for p in priors]
-    material = ParameterSpace(tuple(priors), (Correlation(*names, 0.8),))
-    informed = dataclasses.replace(problem, material=material)
-    covariance = (2.5e-3 + 1e-6) * np.eye(40) + 1e-4 * np.outer(x[1], x[1])
-    information = x @ np.linalg.solve(covariance, x.T)
-    information = information + np.linalg.inv(0.1**2 * np.array([[1.0, 0.8], [0.8, 1.0]]))
-    mean = np.linalg.solve(information, x @ np.linalg.solve(covariance, problem.binned.force_n))
-    offsets = 0.01 * np.random.default_rng(1).standard_normal((50, 2))
-    rest = np.tile(informed.bounds[0][2:], (50, 1))
-    found = informed.log_prob(np.column_stack([mean + offsets, rest]))
-    exact = -0.5 * np.einsum("ni,ij,nj->n", offsets, information, offsets)
-    np.testing.assert_allclose(found - found[0], exact - exact[0], atol=0.02)
+    a, b = (normal(p, 0.1) for p in line_problem().surrogate.space.parameters)
+    covariance = 0.1**2 * np.array([[1.0, 0.8], [0.8, 1.0]])
+    assert_conjugate((a, b), np.linalg.inv(covariance), Correlation(a.name, b.name, 0.8))
 
 
 def test_the_distribution_stands_in_words():
@@ -127,12 +122,12 @@ factor = 2.0
 prior = "log-normal"
 median = 15e3
 factor = 2.0
-[correlations]
+[parameters.E_c.correlations]
 """
 
 
 def test_a_configuration_states_a_joint_prior(tmp_path: Path):
-    config = load_config(written(tmp_path, TWO + "E_c-E_s = -0.6"))
+    config = load_config(written(tmp_path, TWO + "E_s = -0.6"))
     assert parameter_space(config).correlations == (Correlation("E_c", "E_s", -0.6),)
     (tmp_path / "again.toml").write_text(to_toml(config))
     assert load_config(tmp_path / "again.toml") == config
@@ -142,14 +137,15 @@ def test_a_configuration_states_a_joint_prior(tmp_path: Path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("E_c-E_x = 0.5", "correlations.E_c-E_x: found an unknown pair; expected two parameters, as E_c-E_s"),
-        ("E_c-k_c = 0.5", "found k_c, whose prior is not normal; expected two parameters with normal"),
+        ("E_x = 0.5", "correlations: found 'E_x'; expected two parameters with normal or log-normal priors"),
+        ("k_c = 0.5", "found k_c, whose prior is not normal; expected two parameters with normal"),
+        ("E_s = 1.0", "correlations: E_c and E_s: found 1; expected two different parameters"),
+        ("E_c = 0.5", "found 0.5; expected two different parameters"),
+        ('E_s = "much"', 'E_c.correlations.E_s: found "much"; expected a valid number'),
         (
-            "E_c-E_s = 1.0",
-            "correlations: E_c and E_s: found 1; expected two different parameters",
+            "E_s = 0.5\n[parameters.E_s.correlations]\nE_c = 0.5",
+            "E_s and E_c: found two values; expected one",
         ),
-        ("E_c-E_c = 0.5", "found 0.5; expected two different parameters"),
-        ('E_c-E_s = "much"', 'correlations.E_c-E_s: found "much"; expected a valid number'),
     ],
 )
 def test_a_joint_prior_that_cannot_be_is_refused(tmp_path: Path, text: str, says: str):
@@ -159,10 +155,10 @@ def test_a_joint_prior_that_cannot_be_is_refused(tmp_path: Path, text: str, says
 
 
 def test_correlations_that_cannot_hold_together_are_refused():
-    normal = [Parameter(name, "Pa", -9.0, 9.0, "normal") for name in "abc"]
+    three = [Parameter(name, "Pa", -9.0, 9.0, "normal") for name in "abc"]
     pairs = (Correlation("a", "b", 0.9), Correlation("b", "c", 0.9), Correlation("a", "c", -0.9))
     with pytest.raises(InputError, match="correlations that can hold together"):
-        ParameterSpace(tuple(normal), pairs)
+        ParameterSpace(tuple(three), pairs)
 
 
 def test_a_configuration_states_a_prior_and_its_source(tmp_path: Path):

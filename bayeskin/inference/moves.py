@@ -16,7 +16,7 @@ from bayeskin.types import Array
 _CROSSOVER = (0.15, 0.3, 1.0)  # shares of the coordinates that a step moves
 _JUMP, _JITTER = 0.1, 1e-5  # share of steps of full length, from mode to mode; noise that fills space
 _TRIES, _FREEDOM = 5, 5.0  # points that a walker chooses from; of the t-distribution that they are from
-WALKERS_A_COORDINATE = 3  # or no tries
+_WALKERS_A_COORDINATE = 3  # or no tries
 _GAMMA = 1.7  # of about 2.38 / sqrt(2), optimal for the difference of two projected points
 
 
@@ -143,7 +143,7 @@ def mixed_moves(coordinates: MoveCoordinates, walkers: int) -> list[tuple[emcee.
     """
     # Tries forget fastest where they are accepted; differential evolution goes on where they are not, and the
     # others keep it from any one scale.
-    tries = 0.6 if walkers >= WALKERS_A_COORDINATE * len(coordinates.low) else 0.0
+    tries = 0.6 if walkers >= _WALKERS_A_COORDINATE * len(coordinates.low) else 0.0
     kinds = ((SubspaceMove, 0.8), (emcee.moves.StretchMove, 0.1), (SnookerMove, 0.1))
     moves = [(_local(kind)(coordinates), (1.0 - tries) * share) for kind, share in kinds]
     return [(TriesMove(coordinates), tries), *moves] if tries else moves
