@@ -16,13 +16,14 @@ from bayeskin.inference.gauss_newton import gauss_newton, promise
 from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import catalogue
 from bayeskin.mismatch.discretised import Discretised
-from bayeskin.mismatch.fit import Fit, fit, fit_base, restored, stored
+from bayeskin.mismatch.fit import Fit, fit, fit_base, restored, soft_on_stiff, stored
 from bayeskin.mismatch.full_fit import fit_full
 from bayeskin.mismatch.locate import locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.resample import resample
 from bayeskin.mismatch.search import search
 from bayeskin.mismatch.verdict import judge
+from bayeskin.types import ParameterSpace
 
 KNOWN = {
     name: catalogue()[name] for name in ("force-offset", "sensor-drift", "viscous-drag", "sensor-events")
@@ -279,3 +280,23 @@ def test_a_full_fit_whose_runs_fail_keeps_what_it_has() -> None:
     found, _ = fit_full(alone, start, once, (), 5, 1)
     assert found.gained == 0.0
     assert found.theta["E_c"] == pytest.approx(start["E_c"])
+
+
+def test_a_subcutis_much_stiffer_than_the_cutis_is_not_believed() -> None:
+    problem = dataclasses.replace(toy_problem(), excludes=soft_on_stiff)
+    for ratio, possible in ((1.9, True), (2.1, False)):
+        theta = {**TRUTH, **NOISE, "E_c": TRUTH["E_s"] / ratio}
+        assert np.isfinite(problem.log_prob(problem.vector(theta)[None])[0]) == possible
+    line = line_problem()
+    assert np.isfinite(dataclasses.replace(line, excludes=soft_on_stiff).log_prob(sum(line.bounds)[None] / 2))
+
+
+def test_an_error_that_the_surrogate_denies_is_held_by_its_spring() -> None:
+    problem = line_problem()
+    slope = 0.01 * problem.surrogate.columns[1]
+    binned = dataclasses.replace(problem.binned, force_n=40.0 * slope)
+    near = tuple(dataclasses.replace(p, lower=-1e-9, upper=1e-9) for p in problem.surrogate.space.parameters)
+    held = dataclasses.replace(problem, binned=binned, material=ParameterSpace(near))
+    found = gauss_newton(held, np.mean(held.bounds, axis=0), None).latent
+    information = np.sum(slope**2) / (0.05**2 + 1e-6)
+    np.testing.assert_allclose(found, [(40.0 * information + 300.0) / (information + 101.0)], rtol=1e-3)

@@ -208,10 +208,12 @@ class _Linear:
             weighted = (design * weight[:, None]).T
             normal = weighted @ design
             penalty = np.full(design.shape[1], 1e-6)
-            penalty[self.inner :] = _stiffness(change[self.inner :])
             penalty[: self.inner] += damping * np.maximum(np.diag(normal)[: self.inner], 1e-6)
+            target = weighted @ residual
+            penalty[self.inner :], rest = _spring(change[self.inner :])
+            target[self.inner :] += rest
             normal[np.diag_indices(len(normal))] += penalty
-            change = _bounded(normal, weighted @ residual, room_down, room_up, self.inner)
+            change = _bounded(normal, target, room_down, room_up, self.inner)
         step = np.zeros(len(x))
         step[: self.inner] = change[: self.inner] * width
         return step
@@ -226,8 +228,10 @@ class _Linear:
         latent: Array = np.zeros(factor.shape[1])
         for _ in range(REWEIGHTED):
             pull = (self.nu + 1.0) / (self.nu + (residual - factor @ latent) ** 2)
-            curved = (factor * pull[:, None]).T @ factor + np.diag(_stiffness(latent))
-            latent = np.asarray(np.linalg.solve(curved, (factor * pull[:, None]).T @ residual), dtype=float)
+            weighted = (factor * pull[:, None]).T
+            stiffness, rest = _spring(latent)
+            curved = weighted @ factor + np.diag(stiffness)
+            latent = np.asarray(np.linalg.solve(curved, weighted @ residual + rest), dtype=float)
         left = residual - factor @ latent
         steep = slopes.T @ ((self.nu + 1.0) / (self.nu + left**2) * left)
         low, high = self.low[self.inner :], self.high[self.inner :]
@@ -237,10 +241,10 @@ class _Linear:
         return information, np.concatenate([steep, noise_gradient]), latent
 
 
-def _stiffness(latent: Array) -> Array:
-    """Of the prior of the surrogate's error, as a spring to zero (r,)."""
-    size = np.abs(latent)
-    return 1.0 + STIFF * np.maximum(size - FARTHEST, 0.0) / np.maximum(size, FARTHEST)
+def _spring(latent: Array) -> tuple[Array, Array]:
+    """Of the prior of the surrogate's error (r,): its stiffness, and its pull where the error is zero."""
+    beyond = np.abs(latent) > FARTHEST
+    return np.where(beyond, 1.0 + STIFF, 1.0), np.where(beyond, STIFF * FARTHEST * np.sign(latent), 0.0)
 
 
 def _bounded(normal: Array, target: Array, low: Array, high: Array, count: int) -> Array:

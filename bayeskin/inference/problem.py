@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -30,7 +30,8 @@ class LogPosterior:
     """Posterior of material and noise parameters given one recording's bins.
 
     `fit_windows` [s] says which bins are fitted (those wholly inside one), None means all.
-    `material` replaces the surrogate's own prior; its box must lie in the surrogate's. Where the
+    `material` replaces the surrogate's own prior; its box must lie in the surrogate's. Where `excludes`
+    says so of rows (n, d) of the surrogate's parameters, the prior is zero. Where the
     surrogate's sd, RMS over all bins, exceeds `sure_within_n` [N], the density is zero: a surrogate that
     knows next to nothing there would otherwise explain anything.
     Raises InputError when surrogate, bins, windows or priors do not belong together.
@@ -42,6 +43,7 @@ class LogPosterior:
     noise_priors: NoisePriors = field(default_factory=NoisePriors)
     material: ParameterSpace | None = None
     sure_within_n: float | None = None
+    excludes: Callable[[ParameterSpace, Array], NDArray[np.bool_]] | None = None
 
     def __post_init__(self) -> None:
         ours, theirs = self.binned.edges_s, self.surrogate.edges_s
@@ -122,6 +124,8 @@ class LogPosterior:
         """Log-likelihood (n,) at SI values (n, D) in the box."""
         prediction = self.predict(theta)
         found = log_likelihood(self.chain, prediction, self.split(theta)[1])
+        if self.excludes is not None:
+            found = np.where(self.excludes(self.surrogate.space, self.split(theta)[0]), -np.inf, found)
         if self.sure_within_n is None:
             return found
         unsure = np.mean(prediction.sd() ** 2, axis=1) > self.sure_within_n**2

@@ -24,18 +24,21 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayeskin.inference import LogPosterior, NoisePriors
 from bayeskin.inference.gauss_newton import Top, gauss_newton, promise
 from bayeskin.inference.straighten import Shear
-from bayeskin.types import Array, BinnedForce
+from bayeskin.types import Array, BinnedForce, ParameterSpace
 
 NOISE_SHARE = 1.5  # sd of the noise beyond that, at most, of the median sd of a bin's own mean
 LONGEST_S = 2.0  # of the noise's memory
 FEWEST_TAILS = 50.0  # of the tail index: nearly normal, since spikes are gone from robust means of bins
+STIFFEST_BELOW = 2.0  # the subcutis over the cutis: on a stiffer one a cutis folds, and fat is the softer
 SURE = 0.03  # sd of the surrogate, RMS, at most, of the recorded force's range
 DRAWS = 96  # of the prior for each new parameter, from which climbs start
 BASE_STARTS, STARTS = 10, 2
+NEAREST = 8  # trials that are weighed for each that is climbed from
 REDRAWN = 1  # times that the parameters of a part are drawn anew, about the best so far
 FIRST_ROUNDS, ROUNDS = 6, 25  # of every climb, and of the one that is then ahead
 EDGE = 1e-6  # of the unit cube: on a bound
@@ -50,6 +53,14 @@ def instrument_noise(binned: BinnedForce) -> NoisePriors:
         tau_s=(NoisePriors().tau_s[0], LONGEST_S),
         nu=(FEWEST_TAILS, NoisePriors().nu[1]),
     )
+
+
+def soft_on_stiff(space: ParameterSpace, theta: Array) -> NDArray[np.bool_]:
+    """Whether the subcutis is more than `STIFFEST_BELOW` times as stiff as the cutis, at rows (n, d)."""
+    names = space.names
+    if not {"E_c", "E_s"} <= set(names):
+        return np.zeros(len(theta), dtype=bool)
+    return np.asarray(theta[:, names.index("E_s")] > STIFFEST_BELOW * theta[:, names.index("E_c")])
 
 
 def surrogate_limit(binned: BinnedForce) -> float:
@@ -239,8 +250,14 @@ def _about(
 
 
 def likely(log_posterior: LogPosterior, trials: Array, count: int) -> list[Array]:
-    """The most probable of trials (n, D)."""
-    values = log_posterior.log_prob(trials) if len(trials) else np.zeros(0)
+    """The most probable of trials (n, D), among those whose force is nearest to the recorded one."""
+    if not len(trials):
+        return []
+    chain = log_posterior.chain
+    mean = log_posterior.predict(log_posterior.from_sampling(trials)).mean[:, chain.bins]
+    away = np.sum((chain.force_n - mean) ** 2, axis=1)
+    trials = trials[np.argsort(away)[: NEAREST * count]]
+    values = log_posterior.log_prob(trials)
     return [trials[i] for i in np.argsort(-values)[:count] if np.isfinite(values[i])]
 
 

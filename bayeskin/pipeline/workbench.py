@@ -15,7 +15,7 @@ from bayeskin.inference import LogPosterior
 from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.discretised import Discretised
-from bayeskin.mismatch.fit import instrument_noise, surrogate_limit
+from bayeskin.mismatch.fit import instrument_noise, soft_on_stiff, surrogate_limit
 from bayeskin.mismatch.locate import MODEL_ERROR
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.model.accuracy import mesh_error
@@ -65,6 +65,7 @@ class Workbench:
         return LogPosterior(
             seen, self.binned, None if until_s is None else ((0.0, until_s),),
             replace(instrument_noise(self.binned), **asked), sure_within_n=surrogate_limit(self.binned),
+            excludes=soft_on_stiff,
         )  # fmt: skip
 
 
