@@ -36,6 +36,7 @@ def train(
     focus: Array | None = None,
     region: tuple[Array, Array] | None = None,
     active: NDArray[np.int64] | None = None,
+    whole_shape: bool = False,
 ) -> tuple[ShapeSurrogate, Validation]:
     """Trains on the design's training rows; the held-out rows only measure the error.
 
@@ -43,7 +44,8 @@ def train(
     error over four folds drawn with `seed`. focus: weights (n,) of the design's rows in the principal
     components and in the error that decides. region: lower and upper corner (d,) in the design's unit
     cube; the surrogate then answers only inside, and learns from rows in and slightly around it. active:
-    which inputs of `Similarity` matter (None: all).
+    which inputs of `Similarity` matter (None: all). whole_shape: keeps components whose scores nothing
+    predicts too, since what is left out counts as noise of each bin by itself, which it is not.
     Raises InputError for too few rows or force that is not finite.
     """
     space = design.space if region is None else narrowed(design.space, *region)
@@ -57,7 +59,7 @@ def train(
     _refuse_unusable(design, space, training)
     kinds: tuple[Kind, ...] = ("gp", "chaos") if kind == "auto" else (kind,)
     if kind == "auto" and not testing.any():
-        kinds = (_best_of_folds(kinds, space, design, training, focus, seed, active),)
+        kinds = (_best_of_folds(kinds, space, design, training, focus, seed, active, whole_shape),)
     provenance = {
         "version": __version__,
         "design_seed": design.seed,
@@ -67,7 +69,7 @@ def train(
     }
     results = []
     for name in kinds:
-        surrogate = _fit(name, space, design, training, focus, provenance, active)
+        surrogate = _fit(name, space, design, training, focus, provenance, active, whole_shape)
         results.append((surrogate, _measure(surrogate, design, training, testing, focus)))
     return min(results, key=lambda result: result[1].relative_error)
 
@@ -99,7 +101,7 @@ def _within(inputs: Array, margin: float) -> NDArray[np.bool_]:
 
 def _fit(
     kind: Kind, space: ParameterSpace, design: Design, rows: NDArray[np.bool_], focus: Array,
-    provenance: dict[str, Any], active: NDArray[np.int64],
+    provenance: dict[str, Any], active: NDArray[np.int64], whole_shape: bool,
 ) -> ShapeSurrogate:  # fmt: skip
     """One surrogate of one kind on the rows given."""
     similarity = Similarity(space)
@@ -113,10 +115,14 @@ def _fit(
     )
     latents: Latents
     if kind == "gp":
-        transform, targets, gp_fits = fit_latents(fit_latent, inputs, log_scale, force_n, focus[rows])
+        transform, targets, gp_fits = fit_latents(
+            fit_latent, inputs, log_scale, force_n, focus[rows], whole_shape
+        )
         latents = LatentGPs.assemble(inputs, targets, gp_fits)
     else:
-        transform, targets, chaos_fits = fit_latents(fit_sparse, inputs, log_scale, force_n, focus[rows])
+        transform, targets, chaos_fits = fit_latents(
+            fit_sparse, inputs, log_scale, force_n, focus[rows], whole_shape
+        )
         latents = LatentChaos.assemble(inputs, targets, chaos_fits)
     return ShapeSurrogate(space, design.edges_s, transform, latents, {**provenance, "kind": kind}, active)
 
@@ -127,24 +133,29 @@ def fit_latents(
     log_scale: Array,
     force_n: Array,
     weights: Array,
+    whole_shape: bool = False,
 ) -> tuple[ShapeTransform, Array, list[F]]:
-    """Fits the amplitude, then components until what is left is negligible beside the error made."""
+    """Fits the amplitude, then components until what is left is negligible beside the error made.
+
+    whole_shape: as in `train`; beside the error of the shape only.
+    """
     amplitude, shapes = split(force_n)
     full, variances = all_components(shapes, weights)
     scores = (shapes - full.mean) @ full.components.T
     fits = [fit_one(inputs, amplitude - log_scale, weights)]
-    error = fits[0].error * shapes.shape[1]  # a shape's squares sum to the number of bins
+    # a shape's squares sum to the number of bins
+    error = 0.0 if whole_shape else fits[0].error * shapes.shape[1]
     left = float(variances.sum())
     for k in range(min(MOST_COMPONENTS, len(inputs) // 3, int(np.sum(variances > 1e-14 * left)))):
         if left <= max(TRUNCATION_SHARE * error, 1e-14 * shapes.shape[1]):
             break
         fit = fit_one(inputs, scores[:, k], weights)
-        if fit.error > UNLEARNABLE * variances[k]:
+        if fit.error > UNLEARNABLE * variances[k] and not whole_shape:
             break
         fits.append(fit)
         error += fit.error
         left -= float(variances[k])
-    transform = full.keep(len(fits) - 1, shapes)
+    transform = full.keep(len(fits) - 1, shapes, np.ones(len(shapes)))
     targets = transform.encode(force_n)
     targets[:, 0] -= log_scale
     return transform, targets, fits
@@ -167,7 +178,7 @@ def _measure(
 
 def _best_of_folds(
     kinds: tuple[Kind, ...], space: ParameterSpace, design: Design, training: NDArray[np.bool_],
-    focus: Array, seed: int, active: NDArray[np.int64],
+    focus: Array, seed: int, active: NDArray[np.int64], whole_shape: bool,
 ) -> Kind:  # fmt: skip
     """The kind with the smaller squared error over folds that neither its fit nor its choices have seen."""
     rows = np.flatnonzero(training & space.contains(design.theta))
@@ -177,7 +188,7 @@ def _best_of_folds(
         out = np.zeros_like(training)
         out[order[k::FOLDS]] = True
         for kind in kinds:
-            surrogate = _fit(kind, space, design, training & ~out, focus, {}, active)
+            surrogate = _fit(kind, space, design, training & ~out, focus, {}, active, whole_shape)
             miss = surrogate.predict(design.theta[out]).mean - design.force_n[out]
             errors[kind] += float(focus[out] @ np.sum(miss**2, axis=1))
     return min(kinds, key=lambda kind: errors[kind])
