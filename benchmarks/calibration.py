@@ -82,7 +82,8 @@ def made_by_model(about: LogPosterior, theta: Array) -> Array:
     recording = read_recording(shipped("data/demo.h5"))
     motion = pad_motion("reaction", recording, segment(recording), "idealised")
     names = about.surrogate.space.names
-    run = simulate(ModelSpec(), motion, dict(zip(names, map(float, theta), strict=True)))
+    material = map(float, about.split(theta)[0][0])
+    run = simulate(ModelSpec(), motion, dict(zip(names, material, strict=True)))
     if run.status != "ok":
         raise RuntimeError(run.message)
     return run.bin_means(about.surrogate.edges_s)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from bayeskin.model import ModelSpec
 from bayeskin.model.problem import build_problem
 from bayeskin.types import Simulation
 
@@ -133,3 +135,12 @@ def test_a_recording_is_made_inferred_and_ranked_in_one_row(benchmark):
     assert not rows[0]["trusted"]  # 40 steps, and it says so
     assert "needed" in rows[0]["reason"]
     assert 0.0 <= rows[0]["band50"] <= rows[0]["band90"] <= 1.0
+
+
+def test_a_recording_of_the_full_model_is_near_the_surrogate_s(benchmark, monkeypatch):
+    calibration = benchmark("calibration")
+    monkeypatch.setattr(calibration, "ModelSpec", partial(ModelSpec, refinement=0))
+    about = calibration.problem()
+    middle = about.space.from_unit(np.full(about.dim, 0.5))
+    force, expected = calibration.made_by_model(about, middle), about.predict(middle).mean[0]
+    assert np.sqrt(np.mean((force - expected) ** 2)) < 0.05 * np.ptp(expected)
