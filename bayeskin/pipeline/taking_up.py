@@ -31,7 +31,8 @@ from bayeskin.pipeline.workbench import Workbench, opened, workbench
 from bayeskin.types import Array
 from bayeskin.workers import Lost, run_parallel
 
-RUNS = {"best": (8, 2), "base": (4, 1), "held out": (8, 1)}  # at most, on the coarsest bricks and in full
+FULL_RUNS = 2  # at most: the first shows what the coarse mesh has missed
+COARSE_RUNS, BASE_RUNS = 8, 4  # at most, with mechanisms and without
 PREDICTIVE_DRAWS = 300
 
 FullResult = FullFit | str | None  # of the full model, or why its first run failed; None where none is made
@@ -129,11 +130,10 @@ def _full(bench: Workbench, found: Fit) -> tuple[FullResult, LogPosterior | None
         return force, slopes[1]
 
     fitted = partial(fit_full, found.log_posterior, exact=exact, seed=bench.run.config.seed)
-    held_out = found.log_posterior.fit_windows is not None
-    coarse_runs, full_runs = RUNS["base" if not found.names else "held out" if held_out else "best"]
+    coarse_runs = COARSE_RUNS if found.names else BASE_RUNS
     first = fitted(found.theta, quick, rounds=coarse_runs, allow=bench.with_mesh_error)
     start = found.theta if isinstance(first, str) else first[0].theta
-    last = fitted(start, whole, rounds=full_runs, allow=bench.with_mesh_error)
+    last = fitted(start, whole, rounds=FULL_RUNS, allow=bench.with_mesh_error)
     return (last, None) if isinstance(last, str) else last
 
 
