@@ -16,7 +16,7 @@ from bayeskin.inference.gauss_newton import gauss_newton, promise
 from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import catalogue
 from bayeskin.mismatch.discretised import Discretised
-from bayeskin.mismatch.fit import Fit, fit, fit_base, restored, soft_on_stiff, stored
+from bayeskin.mismatch.fit import Fit, fit, fit_base, likely, restored, soft_on_stiff, stored
 from bayeskin.mismatch.full_fit import fit_full
 from bayeskin.mismatch.locate import locate
 from bayeskin.mismatch.observed import ObservedSurrogate
@@ -295,8 +295,37 @@ def test_an_error_that_the_surrogate_denies_is_held_by_its_spring() -> None:
     problem = line_problem()
     slope = 0.01 * problem.surrogate.columns[1]
     binned = dataclasses.replace(problem.binned, force_n=40.0 * slope)
-    near = tuple(dataclasses.replace(p, lower=-1e-9, upper=1e-9) for p in problem.surrogate.space.parameters)
+    near = tuple(dataclasses.replace(p, lower=-1e-4, upper=1e-4) for p in problem.surrogate.space.parameters)
     held = dataclasses.replace(problem, binned=binned, material=ParameterSpace(near))
-    found = gauss_newton(held, np.mean(held.bounds, axis=0), None).latent
+    found = gauss_newton(held, np.mean(held.bounds, axis=0), None)
     information = np.sum(slope**2) / (0.05**2 + 1e-6)
-    np.testing.assert_allclose(found, [(40.0 * information + 300.0) / (information + 101.0)], rtol=1e-3)
+    expected = (40.0 * information + 300.0) / (information + 101.0)
+    np.testing.assert_allclose(found.latent, [expected], rtol=1e-3)
+    # what is known of the line is what the density's curvature says, by differences along each parameter
+    low, high = held.bounds
+    step = np.diag(0.1 * (high - low))[:2]
+    middle = np.mean(held.bounds, axis=0)
+    middle[2:] = found.vector[2:]
+    up, here, down = (held.log_prob(middle + sign * step) for sign in (1, 0, -1))
+    at = gauss_newton(held, middle, None, 0)
+    np.testing.assert_allclose(np.diag(at.information)[:2], (2 * here - up - down) / 0.01, rtol=0.02)
+
+
+def test_starts_are_among_those_that_can_be() -> None:
+    problem = dataclasses.replace(toy_problem(), excludes=soft_on_stiff)
+    low, high = problem.bounds
+    trials = np.random.default_rng(3).uniform(low, high, (400, problem.dim))
+    ratio = problem.from_sampling(trials)[:, 1] / problem.from_sampling(trials)[:, 0]
+    assert (ratio > 2.0).sum() > 50
+    possible = trials[ratio <= 2.0]
+    for one, other in zip(likely(problem, trials, 6), likely(problem, possible, 6), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_what_a_posterior_rules_out_is_part_of_what_it_is() -> None:
+    plain = toy_problem()
+    others = [
+        dataclasses.replace(plain, excludes=soft_on_stiff),
+        dataclasses.replace(plain, sure_within_n=1.0),
+    ]
+    assert len({one.identity["parameters"] for one in (plain, *others)}) == 3

@@ -49,7 +49,7 @@ def gauss_newton(log_posterior: LogPosterior, start: Array, shear: Shear | None,
     x = np.clip(np.asarray(start, dtype=float), low, high)
     value = float(log_posterior.log_prob(x[None])[0])
     small = made = 0
-    while made < rounds and small < 2:
+    while np.isfinite(value) and made < rounds and small < 2:
         made += 1
         before = value
         linear = _Linear(log_posterior, x)
@@ -221,10 +221,6 @@ class _Linear:
     def curvature(self) -> tuple[Array, Array, Array]:
         """Information (D, D) and gradient (D,) over the unit cube; the surrogate's error (r,)."""
         residual, slopes, factor = self.columns()
-        weight = (self.nu + 1.0) / (self.nu + 3.0)
-        inside = weight * factor.T @ factor + np.eye(factor.shape[1])
-        cross = weight * factor.T @ slopes
-        material = weight * slopes.T @ slopes - cross.T @ np.linalg.solve(inside, cross)
         latent: Array = np.zeros(factor.shape[1])
         for _ in range(REWEIGHTED):
             pull = (self.nu + 1.0) / (self.nu + (residual - factor @ latent) ** 2)
@@ -232,6 +228,10 @@ class _Linear:
             stiffness, rest = _spring(latent)
             curved = weighted @ factor + np.diag(stiffness)
             latent = np.asarray(np.linalg.solve(curved, weighted @ residual + rest), dtype=float)
+        weight = (self.nu + 1.0) / (self.nu + 3.0)
+        inside = weight * factor.T @ factor + np.diag(_spring(latent)[0])
+        cross = weight * factor.T @ slopes
+        material = weight * slopes.T @ slopes - cross.T @ np.linalg.solve(inside, cross)
         left = residual - factor @ latent
         steep = slopes.T @ ((self.nu + 1.0) / (self.nu + left**2) * left)
         low, high = self.low[self.inner :], self.high[self.inner :]

@@ -122,14 +122,19 @@ class LogPosterior:
 
     def log_likelihood(self, theta: ArrayLike) -> Array:
         """Log-likelihood (n,) at SI values (n, D) in the box."""
+        theta = np.atleast_2d(np.asarray(theta, dtype=float))
         prediction = self.predict(theta)
         found = log_likelihood(self.chain, prediction, self.split(theta)[1])
+        return np.where(self.impossible(theta, prediction), -np.inf, found)
+
+    def impossible(self, theta: Array, prediction: Prediction) -> NDArray[np.bool_]:
+        """Which rows (n, D) in SI `excludes` or `sure_within_n` rule out, the prediction at them given."""
+        out = np.zeros(len(prediction.mean), dtype=bool)
         if self.excludes is not None:
-            found = np.where(self.excludes(self.surrogate.space, self.split(theta)[0]), -np.inf, found)
-        if self.sure_within_n is None:
-            return found
-        unsure = np.mean(prediction.sd() ** 2, axis=1) > self.sure_within_n**2
-        return np.where(unsure, -np.inf, found)
+            out |= self.excludes(self.surrogate.space, self.split(theta)[0])
+        if self.sure_within_n is not None:
+            out |= np.mean(prediction.sd() ** 2, axis=1) > self.sure_within_n**2
+        return out
 
     @cached_property
     def blocks(self) -> tuple[int, ...]:
@@ -175,7 +180,7 @@ class LogPosterior:
         b = self.binned
         arrays = (b.edges_s, b.force_n, b.variance_n2, b.correlation, b.phase)
         return {
-            "parameters": _sha256(repr(self.space)),
+            "parameters": _sha256(repr(self.space), *self._limits()),
             "surrogate": _sha256(
                 json.dumps(dict(self.surrogate.provenance), sort_keys=True, default=str),
                 *self._probe(),
@@ -183,6 +188,10 @@ class LogPosterior:
             "recording": _sha256(repr(b.phases), *(np.ascontiguousarray(a).tobytes() for a in arrays)),
             "fit windows": _sha256(repr(self.fit_windows)),
         }
+
+    def _limits(self) -> tuple[str, ...]:
+        excludes = [] if self.excludes is None else [getattr(self.excludes, "__qualname__", "")]
+        return (*excludes, *([] if self.sure_within_n is None else [f"{self.sure_within_n:.5g}"]))
 
     def _probe(self) -> tuple[str, ...]:
         # Provenance may miss what changed (a patched file): the prediction itself does not. Five digits,

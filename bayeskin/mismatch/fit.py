@@ -253,9 +253,10 @@ def likely(log_posterior: LogPosterior, trials: Array, count: int) -> list[Array
     """The most probable of trials (n, D), among those whose force is nearest to the recorded one."""
     if not len(trials):
         return []
-    chain = log_posterior.chain
-    mean = log_posterior.predict(log_posterior.from_sampling(trials)).mean[:, chain.bins]
-    away = np.sum((chain.force_n - mean) ** 2, axis=1)
+    chain, theta = log_posterior.chain, log_posterior.from_sampling(trials)
+    prediction = log_posterior.predict(theta)
+    away = np.sum((chain.force_n - prediction.mean[:, chain.bins]) ** 2, axis=1)
+    away[log_posterior.impossible(theta, prediction)] = np.inf
     trials = trials[np.argsort(away)[: NEAREST * count]]
     values = log_posterior.log_prob(trials)
     return [trials[i] for i in np.argsort(-values)[:count] if np.isfinite(values[i])]

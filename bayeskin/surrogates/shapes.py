@@ -29,8 +29,8 @@ class ShapeTransform(_FreezesArrays):
     def keep(self, count: int, shapes: Array, weights: Array) -> ShapeTransform:
         """The first `count` components; what they leave of `shapes` (n, m) becomes the truncation.
 
-        Rows of weight w (n,) have noise of variance 1 / w, and the square of what is left of them the
-        variance 1 / w^2, by which they are averaged.
+        What is left of each row counts by the square of its weight (n,): of a row that is noise for the most
+        part it says nothing.
         """
         components = self.components[:count]
         centred = shapes - self.mean
