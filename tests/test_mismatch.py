@@ -11,6 +11,7 @@ import pytest
 import toy
 from toy_inference import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
 
+from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior, NoisePriors, find_map
 from bayeskin.inference.gauss_newton import gauss_newton, promise
 from bayeskin.inference.straighten import find_shear
@@ -329,3 +330,9 @@ def test_what_a_posterior_rules_out_is_part_of_what_it_is() -> None:
         dataclasses.replace(plain, sure_within_n=1.0),
     ]
     assert len({one.identity["parameters"] for one in (plain, *others)}) == 3
+
+
+def test_a_prior_without_a_skin_that_can_be_is_refused() -> None:
+    alone = dataclasses.replace(toy_problem(), excludes=lambda space, theta: np.ones(len(theta), dtype=bool))
+    with pytest.raises(InputError, match="none but skins that a diagnosis rules out"):
+        fit_base(alone, 1, None)

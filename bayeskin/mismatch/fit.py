@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior, NoisePriors
 from bayeskin.inference.gauss_newton import Top, gauss_newton, promise
 from bayeskin.inference.straighten import Shear
@@ -145,10 +146,16 @@ def _drawn(vector: Array, columns: list[int], low: Array, high: Array, rng: np.r
 
 
 def fit_base(log_posterior: LogPosterior, seed: int, shear: Shear | None) -> Fit:
-    """Without any mechanism: the best of climbs from the most probable of many draws of the prior."""
+    """Without any mechanism: the best of climbs from the most probable of many draws of the prior.
+
+    Raises InputError where the prior holds no skin that can be.
+    """
     low, high = log_posterior.bounds
     trials = np.random.default_rng(seed).uniform(low, high, (8 * DRAWS, log_posterior.dim))
     starts = likely(log_posterior, trials, BASE_STARTS)
+    if not starts:
+        expected = f"skins whose E_s can be at most {STIFFEST_BELOW:g} E_c, and which the surrogate knows"
+        raise InputError("priors", "none but skins that a diagnosis rules out", expected)
     return _best((), log_posterior, starts, shear, log_posterior.surrogate.space.dim, seed)
 
 

@@ -30,7 +30,6 @@ from numpy.typing import ArrayLike
 
 from bayeskin.errors import InputError
 from bayeskin.surrogates.screening import active_inputs
-from bayeskin.surrogates.shapes import split
 from bayeskin.surrogates.similarity import Similarity
 from bayeskin.surrogates.surrogate import ShapeSurrogate, refuse_outside
 from bayeskin.surrogates.train import Kind, train
@@ -117,9 +116,6 @@ def train_effect(
     (seen, weights), (corrects, its) = (_learnt(one, neutral, own, estimate) for one in (coarse, fine))
     active = active_inputs(seen, weights)
     surrogate, _ = train(seen, kind, seed, weights, active=active, whole_shape=True)  # type: ignore[arg-type]
-    rows = seen.training & (weights > 0.0)
-    shapes, kept = split(seen.force_n[rows])[1], len(surrogate.transform.components)
-    surrogate = replace(surrogate, transform=surrogate.transform.keep(kept, shapes, weights[rows]))
     surrogate, validation = correct(surrogate, corrects, its)
     return Effect(part, mechanism, neutral, tuple(own), surrogate, estimate), validation
 

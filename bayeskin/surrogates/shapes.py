@@ -26,19 +26,13 @@ class ShapeTransform(_FreezesArrays):
     components: Array
     truncation: Array
 
-    def keep(self, count: int, shapes: Array, weights: Array) -> ShapeTransform:
-        """The first `count` components; what they leave of `shapes` (n, m) becomes the truncation.
-
-        What is left of each row counts by the square of its weight (n,): of a row that is noise for the most
-        part it says nothing.
-        """
+    def keep(self, count: int, shapes: Array) -> ShapeTransform:
+        """The first `count` components; what they leave of `shapes` (n, m) becomes the truncation."""
         components = self.components[:count]
         centred = shapes - self.mean
         rest = centred - (centred @ components.T) @ components
-        share = weights**2 / np.sum(weights**2)
-        rows = 1.0 / np.sum(share**2)
-        freedom = max(rows - 1.0 - count, 1.0) / rows
-        return ShapeTransform(self.mean, components, share @ rest**2 / freedom)
+        freedom = max(len(shapes) - 1 - count, 1)
+        return ShapeTransform(self.mean, components, np.sum(rest**2, axis=0) / freedom)
 
     def encode(self, force_n: Array) -> Array:
         """Latent vectors (n, 1 + K) of histories (n, m)."""

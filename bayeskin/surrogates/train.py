@@ -155,7 +155,7 @@ def fit_latents(
         fits.append(fit)
         error += fit.error
         left -= float(variances[k])
-    transform = full.keep(len(fits) - 1, shapes, np.ones(len(shapes)))
+    transform = full.keep(len(fits) - 1, shapes)
     targets = transform.encode(force_n)
     targets[:, 0] -= log_scale
     return transform, targets, fits

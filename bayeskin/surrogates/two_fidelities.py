@@ -71,7 +71,7 @@ def correct(
     if training.sum() < fewest:
         raise InputError("fine design", f"{training.sum()} finished training rows", f"at least {fewest}")
     theta, force_n = fine.theta[training], fine.force_n[training]
-    own = surrogate.transform.keep(len(surrogate.transform.components), split(force_n)[1], focus[training])
+    own = surrogate.transform.keep(len(surrogate.transform.components), split(force_n)[1])
     transform = replace(own, truncation=np.maximum(own.truncation, surrogate.transform.truncation))
     inputs = surrogate.inputs(theta)
     change = transform.encode(force_n) - coarse.predict(inputs)[0]
