@@ -22,7 +22,7 @@ from bayeskin.mismatch.full_fit import fit_full
 from bayeskin.mismatch.locate import locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.resample import resample
-from bayeskin.mismatch.search import search
+from bayeskin.mismatch.search import Made, search
 from bayeskin.mismatch.verdict import judge
 from bayeskin.types import ParameterSpace
 
@@ -94,15 +94,35 @@ def test_nothing_is_missing_where_nothing_is() -> None:
 
 def test_a_search_that_was_stopped_goes_on_without_repeating_a_fit() -> None:
     alone = concealing(3, ("force-offset",), F0=-0.04)
-    made: list[Fit] = []
+    made: list[Made] = []
     first = search(lambda these: building(alone, these), KNOWN, 1, on_fit=made.append)
-    kept = [json.loads(json.dumps(stored(one))) for one in made]
-    done = {tuple(one["names"]): restored(one, building(alone, one["names"])) for one in kept}
-    again: list[Fit] = []
+    kept = [(json.loads(json.dumps(stored(one.fit))), one.counts) for one in made]
+    done = [Made(restored(one, building(alone, one["names"])), counts) for one, counts in kept]
+    again: list[Made] = []
     second = search(lambda these: building(alone, these), KNOWN, 1, done=done, on_fit=again.append)
     assert not again
     assert second.best.names == first.best.names
     np.testing.assert_array_equal(second.best.force_n, first.best.force_n)
+
+
+def test_where_much_is_left_a_search_goes_on_from_the_best_of_another() -> None:
+    """What the toy's mechanisms cannot explain leaves much; one climb from the other's values is enough."""
+    values = {"F0": -0.04, "drag": 20.0}
+    alone = concealing(2, ("force-offset", "viscous-drag"), **values)
+    wild = 0.01 * np.sin(np.arange(len(alone.binned.force_n)) / 3.0)
+    binned = dataclasses.replace(alone.binned, force_n=alone.binned.force_n + wild)
+    alone = dataclasses.replace(alone, binned=binned, noise_priors=QUIET)
+    first = search(lambda these: building(alone, these), KNOWN, 1)
+    asked: list[str] = []
+
+    def another() -> Fit:
+        asked.append("")
+        return first.best
+
+    second = search(lambda these: building(alone, these), {}, 1, another=another)
+    assert asked
+    assert set(second.fits) >= {(), first.best.names}
+    assert second.best.value >= first.best.value - 1e-6
 
 
 def test_evidence_is_that_of_a_line_in_closed_form() -> None:

@@ -25,6 +25,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from bayeskin.mechanisms.elastic import elastic_stress, scale_elastic
+from bayeskin.mechanisms.lines import stretch_of, strict
 from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Tissue, Values
 from bayeskin.model.assembly import Chunk, compiled, inverse_and_determinant
 from bayeskin.model.lagrangian import PAD_EDGE_M
@@ -131,17 +132,14 @@ def estimate(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTi
     strength = np.stack([values["g_1"], values["g_2"]], axis=1)
     tau_s = np.stack([values["tau_1"], values["tau_2"]], axis=1)
     stress = np.broadcast_to(force(grid_s) / _stretch(motion, grid_s), (len(strength), len(grid_s)))
-    rate = np.diff(stress, axis=1) / elapsed
+    rate = np.ascontiguousarray(np.diff(stress, axis=1) / elapsed)
     left = np.zeros((len(strength), len(grid_s), 2))
-    remember(np.ascontiguousarray(rate), elapsed, strength, tau_s, left)
+    remember(rate, elapsed, strength, tau_s, left)
 
     def reported(time_s: Array) -> Array:
-        place = np.clip(np.searchsorted(grid_s, time_s, side="right") - 1, 0, len(elapsed) - 1)
-        rows = np.arange(len(strength))[:, None]
-        place = np.broadcast_to(place, (len(rows), np.shape(time_s)[-1]))
-        keep = np.exp(-(time_s - grid_s[place])[..., None] / tau_s[:, None])
-        grown = (strength * tau_s)[:, None] * rate[rows, place][..., None] * (1.0 - keep)
-        more = np.sum(keep * left[rows, place] + grown, axis=2)
+        times = np.ascontiguousarray(np.atleast_2d(time_s))
+        more = np.empty((len(strength), times.shape[1]))
+        recall(grid_s, rate, strength, tau_s, left, times, more)
         return np.asarray(force(time_s) + _stretch(motion, time_s) * more)
 
     return reported
@@ -156,6 +154,20 @@ def remember(rate, elapsed, strength, tau_s, left):
                 keep = np.exp(-elapsed[k] / tau_s[i, b])
                 grown = strength[i, b] * tau_s[i, b] * rate[i, k] * (1.0 - keep)
                 left[i, k + 1, b] = keep * left[i, k, b] + grown
+
+
+@strict
+def recall(grid, rate, strength, tau_s, left, times, more):
+    """Fills more (n, t), the branches' sum at times (1 or n, t), from their shares `left` on a grid (k,)."""
+    for i in range(more.shape[0]):
+        row, k = times[i if len(times) > 1 else 0], 0
+        for j in range(more.shape[1]):
+            k = stretch_of(grid, k, row[j])
+            total = 0.0
+            for b in range(strength.shape[1]):
+                keep = np.exp(-(row[j] - grid[k]) / tau_s[i, b])
+                total += keep * left[i, k, b] + strength[i, b] * tau_s[i, b] * rate[i, k] * (1.0 - keep)
+            more[i, j] = total
 
 
 def _stretch(motion: PadMotion, time_s: Array) -> Array:

@@ -38,6 +38,8 @@ FEWEST_TAILS = 50.0  # of the tail index: nearly normal, since spikes are gone f
 STIFFEST_BELOW = 2.0  # the subcutis over the cutis: on a stiffer one a cutis folds, and fat is the softer
 SURE = 0.03  # sd of the surrogate, RMS, at most, of the recorded force's range
 DRAWS = 96  # of the prior for each new parameter, from which climbs start
+RANKED = 32  # of these, for the order in which mechanisms are tried
+SKINS = 256  # draws of the base's parameters, from which climbs on other skins start
 BASE_STARTS, STARTS = 10, 2
 NEAREST = 8  # trials that are weighed for each that is climbed from
 REDRAWN = 1  # times that the parameters of a part are drawn anew, about the best so far
@@ -133,14 +135,16 @@ def promised(
     new = np.array([name not in start for name in log_posterior.names])
     for part in parts:
         columns = [log_posterior.names.index(name) for name in part]
-        trials = _drawn(vector, columns, low, high, rng)
+        trials = _drawn(vector, columns, RANKED, low, high, rng)
         best = max(best, promise(log_posterior, vector, trials, ~new, 1)[0][1])
     return best
 
 
-def _drawn(vector: Array, columns: list[int], low: Array, high: Array, rng: np.random.Generator) -> Array:
-    """Points (n, D) with some coordinates drawn from the prior."""
-    trials = np.tile(vector, (DRAWS * len(columns), 1))
+def _drawn(
+    vector: Array, columns: list[int], each: int, low: Array, high: Array, rng: np.random.Generator
+) -> Array:
+    """Points (n, D) with some coordinates drawn from the prior, so many for each of them."""
+    trials = np.tile(vector, (each * len(columns), 1))
     trials[:, columns] = rng.uniform(low[columns], high[columns], (len(trials), len(columns)))
     return trials
 
@@ -208,7 +212,7 @@ def _searched(
     without = log_posterior.named(log_posterior.from_sampling(vector))
     without |= {name: neutral[name] for name in (*part, *later)}
     alone = np.clip(log_posterior.vector(without), low, high)
-    trials = _drawn(alone, columns, low, high, rng)
+    trials = _drawn(alone, columns, DRAWS, low, high, rng)
     top = _climbed(
         log_posterior, [vector, *_promising(log_posterior, alone, trials, part, later, neutral)], shear
     )
@@ -295,7 +299,7 @@ def other_skins(
 ) -> Array:
     """Points (n, D) with the base's parameters drawn anew, and stiffness such that the force fits best."""
     low, high = log_posterior.bounds
-    trials = np.tile(vector, (8 * DRAWS, 1))
+    trials = np.tile(vector, (SKINS, 1))
     trials[:, :skin] = np.random.default_rng(seed).uniform(low[:skin], high[:skin], (len(trials), skin))
     if shear is None:
         return trials
@@ -339,7 +343,7 @@ def _evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
 def _room(log_posterior: LogPosterior, top: Top, unit: Array, i: int) -> float:
     """Integral over one coordinate of the unit cube of the density relative to the top's, the others held."""
     low, high = log_posterior.bounds
-    away = np.logspace(-5.0, 0.0, 26)
+    away = np.logspace(-5.0, 0.0, 16)
     places = np.unique(np.clip(np.concatenate([unit[i] - away, unit[i : i + 1], unit[i] + away]), 0.0, 1.0))
     points = np.repeat(unit[None], len(places), axis=0)
     points[:, i] = places

@@ -4,10 +4,10 @@ About a run F at theta_0 with derivatives J the force is taken as
 
     F + S(theta) - S(theta_0) + (J - dS/du) (u - u_0) ,
 
-S the surrogate's mean, u coordinates of the box: right to first order, with the surrogate's curvature. Each
-round maximises the posterior of that force, which has no surrogate's error in it, within a trust region of
-the parameters that the full model solves, makes a run there, and goes on from it if the posterior of the
-full model itself has risen.
+S the surrogate's mean, u coordinates of the box: right to first order, with the surrogate's curvature;
+without J its slopes are the surrogate's, where that knows them well. Each round maximises the posterior of
+that force, which has no surrogate's error in it, within a trust region of the parameters that the full model
+solves, makes a run there, and goes on from it if the posterior of the full model itself has risen.
 
 First-order model management: Alexandrov, Lewis, Gumbert, Green & Newman, J. Aircraft 38 (2001), 1093-1101.
 """
@@ -31,7 +31,7 @@ STARTS = 3  # climbs of a round: from the best point, and from others in the tru
 CLIMB = 20  # rounds of each
 STEP = 1e-4  # of the box, for the surrogate's differences
 
-Full = Callable[[Mapping[str, float], Mapping[str, float]], tuple[Array, Array] | str]
+Full = Callable[[Mapping[str, float], Mapping[str, float]], tuple[Array, Array | None] | str]
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def fit_full(
     With the fit comes the posterior of the force about it.
 
     full : of all parameters, and of changes of those of the force that count as one: bins' means (m,) and
-        their derivatives (m, d) for these changes, or why a run failed
+        their derivatives (m, d) for these changes (None: the surrogate's), or why a run failed
     exact : parameters whose effect the surrogate has exactly, which no trust region holds
     allow : puts the full model's own error into a surrogate that has none
     """
@@ -107,7 +107,10 @@ def fit_full(
             trust *= 0.25
         else:
             force, slopes = found
-            anchored = Anchored(surrogate, theta, force, slopes - _slopes(surrogate, theta))
+            own = _slopes(surrogate, theta)
+            anchored = Anchored(
+                surrogate, theta, force, np.zeros_like(own) if slopes is None else slopes - own
+            )
             there = replace(log_posterior, surrogate=allow(anchored), sure_within_n=None)
             vector = _with_noise(there, trial)
             value = float(there.log_prob(vector[None])[0])

@@ -8,7 +8,7 @@ In each step the others are ordered by what they promise beside those taken (a s
 promising are tried; then each taken one is left out again, so that what a later one has made needless goes.
 The first step tries all, those that promise less by one climb each. Where the noise of the best set is still
 as large as it may be, much is left: then other paths are followed, from single mechanisms that it does not
-have.
+have, and from the best set of another search, where there is one.
 
 Probabilities are shares of weight over all sets that were tried and count: those of sets never tried count
 as nothing.
@@ -39,12 +39,25 @@ Build = Callable[[Sequence[str]], LogPosterior]  # the posterior with a set of m
 Progress = Callable[[float, str], None]
 
 
+@dataclass(frozen=True)
+class Made:
+    """A fit, and whether it counts."""
+
+    fit: Fit
+    counts: bool
+
+
 @dataclass
 class Search:
     """All sets tried, by their names sorted, and the best of them; those that do not count are `unsure`."""
 
     fits: dict[tuple[str, ...], Fit] = field(default_factory=dict)
     unsure: dict[tuple[str, ...], Fit] = field(default_factory=dict)
+
+    def add(self, made: Made) -> None:
+        """Keeps a fit, of two of the same set the likelier."""
+        kept = self.fits if made.counts else self.unsure
+        kept[made.fit.names] = max(made.fit, kept.get(made.fit.names, made.fit), key=weight)
 
     @property
     def base(self) -> Fit:
@@ -72,28 +85,35 @@ def search(
     known: Mapping[str, Mechanism],
     seed: int,
     progress: Progress | None = None,
-    done: Mapping[tuple[str, ...], Fit] | None = None,
-    on_fit: Callable[[Fit], None] | None = None,
+    done: Sequence[Made] = (),
+    on_fit: Callable[[Made], None] | None = None,
+    another: Callable[[], Fit | None] = lambda: None,
 ) -> Search:
     """Forward from the fit without any mechanism, then backward.
 
-    done : fits of an earlier search that was stopped, which are not made again; on_fit is told each new one
+    done : what a search that was stopped had made, in order, which is not made again
+    on_fit : is told each new fit
+    another : the best of another search, on a part of the recording say; asked for where much is left
     """
-    done = done or {}
+    before = {made.fit.names: [m for m in done if m.fit.names == made.fit.names] for made in done}
     alone = build(())
     straight, skin = find_shear(alone), alone.surrogate.space.dim
     neutral = {name: value for m in known.values() for name, value in m.neutral.items()}
 
-    def kept(key: tuple[str, ...], make: Callable[[], Fit]) -> Fit | None:
+    def kept(key: tuple[str, ...], make: Callable[[], Fit], anew: bool = False) -> Fit | None:
         """The fit of a set, None where it does not count."""
-        if key not in found.fits and key not in found.unsure:
-            one = done[key] if key in done else make()
-            if key not in done and on_fit:
-                on_fit(one)
-            (found.fits if sure(one, build) else found.unsure)[key] = one
+        if anew or (key not in found.fits and key not in found.unsure):
+            if before.get(key):
+                made = before[key].pop(0)
+            else:
+                one = make()
+                made = Made(one, sure(one, build))
+                if on_fit:
+                    on_fit(made)
+            found.add(made)
         return found.fits.get(key)
 
-    def tried(names: Sequence[str], start: Fit, thorough: bool = True) -> Fit | None:
+    def tried(names: Sequence[str], start: Fit, thorough: bool = True, anew: bool = False) -> Fit | None:
         key = tuple(sorted(names))
 
         def make() -> Fit:
@@ -102,7 +122,7 @@ def search(
             new = _new(known, key, start.names) if thorough else []
             return fit(key, wide, start.theta, neutral, seed, skin, shear, new)
 
-        return kept(key, make)
+        return kept(key, make, anew)
 
     def step(current: Fit, label: str) -> Fit:
         """The best of the sets with one mechanism more, or `current` where none has more weight."""
@@ -122,14 +142,16 @@ def search(
                 progress((count + 1) / len(tries), f"{label}: {name}: {nats}")
         return max(fits, key=weight)
 
-    def path(current: Fit, label: str) -> None:
-        for size in range(len(current.names) + 1, MOST + 1):
-            ahead = step(current, f"{label}, mechanism {size}")
-            if ahead is current:
-                return
+    def path(ahead: Fit, label: str) -> None:
+        current = None
+        while ahead is not current:
             current = ahead
             while len(current.names) > 1 and (leaner := _leaner(current, tried)) is not None:
                 current = leaner
+            if len(current.names) < MOST:
+                ahead = step(current, f"{label}, mechanism {len(current.names) + 1}")
+            else:
+                ahead = current
 
     found = Search()
     base = kept((), lambda: fit_base(alone, seed, straight))
@@ -142,6 +164,10 @@ def search(
             break
         singles.remove(starts[0])
         path(starts[0], f"path {count}")
+    if _much_left(found.best) and (other := another()) is not None:
+        start = tried(other.names, other, anew=True)
+        if start is not None:
+            path(start, "path from another search")
     return found
 
 

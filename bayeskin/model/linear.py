@@ -9,6 +9,9 @@ first, because displacements [m] and pressures [Pa] lie many decades apart.
 from __future__ import annotations
 
 import ctypes
+import os
+import sys
+from pathlib import Path
 from typing import Protocol
 
 import numba
@@ -17,6 +20,10 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 from bayeskin.types import Array
+
+# MKL's wheel puts its library here; unless told, pypardiso looks through the whole environment in each run.
+for _library in Path(sys.prefix, "lib").glob("libmkl_rt*"):
+    os.environ.setdefault("PYPARDISO_MKL_RT", str(_library))
 
 try:
     import pypardiso

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.mismatch.fit import Fit, restored, stored
 from bayeskin.mismatch.full_fit import FullFit
 from bayeskin.mismatch.locate import Located
-from bayeskin.mismatch.search import Build, Search, search
+from bayeskin.mismatch.search import Build, Made, Search, search
 from bayeskin.mismatch.verdict import Diagnosis, judge
 from bayeskin.pipeline import design, recording, training
 from bayeskin.pipeline.diagnosis_outputs import (
@@ -38,7 +38,7 @@ from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.taking_up import FullResult, TakenUp, take_up
 from bayeskin.pipeline.workbench import Workbench, opened, workbench
 from bayeskin.types import Array, BinnedForce
-from bayeskin.workers import run_parallel
+from bayeskin.workers import Lost, run_parallel
 
 
 def diagnose(source: Path, reporter: Reporter) -> dict[str, Any]:
@@ -59,12 +59,9 @@ def _work(run: Run) -> Mapping[str, Any]:
     started = time.monotonic()
     bench = workbench(run)
     split_s = _end_of_second_hold(bench.binned)
-    beside = None if split_s is None else _search_beside(run, split_s)
-    whole = _searched(bench, None)
-    if beside is not None:
-        run.reporter.log("waiting for the search on the recording's beginning")
-        beside.join()
-    begun = None if split_s is None else _searched(bench, split_s)
+    beginning = (lambda: None) if split_s is None else _search_beside(run, bench, split_s)
+    whole = _searched(bench, None, lambda: found.best if (found := beginning()) else None)
+    begun = beginning()
     run.reporter.log("the full model takes up what was found")
     taken, begins = take_up(
         run, _base_and_best(whole), whole.best.theta, _base_and_best(begun) if begun else [], split_s
@@ -113,12 +110,23 @@ def leaves_something(found: Diagnosis, after: Located) -> bool:
     return found.verdict == "unknown" or (found.verdict == "named" and bool(after.windows))
 
 
-def _search_beside(run: Run, split_s: float) -> threading.Thread:
-    """The search on the beginning in a process of its own that ends with this one; its fits go to a file."""
+def _search_beside(run: Run, bench: Workbench, split_s: float) -> Callable[[], Search]:
+    """The search on the beginning in a process of its own that ends with this one; what is returned waits."""
+    ended: list[Any] = []
     search_it = partial(_search_apart, run.config_path)
-    thread = threading.Thread(target=lambda: list(run_parallel(search_it, [split_s], 1)), daemon=True)
+    thread = threading.Thread(target=lambda: ended.extend(run_parallel(search_it, [split_s], 1)), daemon=True)
     thread.start()
-    return thread
+
+    @cache
+    def beginning() -> Search:
+        if thread.is_alive():
+            run.reporter.log("waiting for the search on the recording's beginning")
+        thread.join()
+        if not ended or isinstance(ended[0][1], Lost):
+            return _searched(bench, split_s)
+        return _as_search(_made_in(bench, partial(bench.posterior, split_s)))
+
+    return beginning
 
 
 def _search_apart(source: Path, split_s: float) -> None:
@@ -127,8 +135,15 @@ def _search_apart(source: Path, split_s: float) -> None:
 
 def fits_of(bench: Workbench) -> list[Fit]:
     """All sets that the search on the whole recording has tried so far."""
-    build = partial(bench.posterior, None)
-    return _fits_in(_search_file(bench, build), build)
+    found = _as_search(_made_in(bench, partial(bench.posterior, None)))
+    return [*found.fits.values(), *found.unsure.values()]
+
+
+def _as_search(made: Sequence[Made]) -> Search:
+    found = Search()
+    for one in made:
+        found.add(one)
+    return found
 
 
 def _search_file(bench: Workbench, build: Build) -> Path:
@@ -138,31 +153,34 @@ def _search_file(bench: Workbench, build: Build) -> Path:
          [repr(mechanism.parameters) for mechanism in bench.known.values()],
          [[effect.part, dict(effect.surrogate.provenance)] for effect in bench.effects]]
     )  # fmt: skip
-    return bench.run.folder / "searches" / f"{identity[:16]}.jsonl"
+    return bench.run.folder / "searches" / f"{identity[:16]}-made.jsonl"
 
 
-def _searched(bench: Workbench, until_s: float | None) -> Search:
+def _searched(
+    bench: Workbench, until_s: float | None, another: Callable[[], Fit | None] = lambda: None
+) -> Search:
     """The search up to a time, going on from the fits that one stopped before has left."""
     run, build = bench.run, partial(bench.posterior, until_s)
     label = "whole recording" if until_s is None else f"up to {until_s:.1f} s"
     file = _search_file(bench, build)
-    done = {one.names: one for one in _fits_in(file, build)}
+    done = _made_in(bench, build)
     file.parent.mkdir(parents=True, exist_ok=True)
     with open(file, "a", encoding="utf-8") as handle:
 
-        def on_fit(found: Fit) -> None:
-            handle.write(json.dumps(stored(found)) + "\n")
+        def on_fit(made: Made) -> None:
+            handle.write(json.dumps({**stored(made.fit), "counts": made.counts}) + "\n")
             handle.flush()
 
         return search(
             build, bench.known, run.config.seed,
-            lambda share, note: run.reporter.progress(label, share, note), done, on_fit,
+            lambda share, note: run.reporter.progress(label, share, note), done, on_fit, another,
         )  # fmt: skip
 
 
-def _fits_in(file: Path, build: Build) -> list[Fit]:
-    """Fits of a search that was stopped."""
-    return [restored(said, build(said["names"])) for said in read_lines(file)]
+def _made_in(bench: Workbench, build: Build) -> list[Made]:
+    """What a search has made so far, in order."""
+    rows = read_lines(_search_file(bench, build))
+    return [Made(restored(said, build(said["names"])), said["counts"]) for said in rows]
 
 
 def _end_of_second_hold(binned: BinnedForce) -> float | None:

@@ -1,8 +1,9 @@
 """The full model takes up what a search on its surrogate has found: a fit of its own, the posterior there.
 
 First on the coarsest bricks, whose runs are quick and carry their derivatives, then on the model's own mesh
-with these derivatives. Sampled, located and taken apart is the posterior about that fit, in which nothing of
-the surrogate's error is left. The article's formulation and models of one's own keep the surrogate's.
+with these derivatives; without mechanisms on that at once, with the slopes of the base's surrogate. Sampled,
+located and taken apart is the posterior about that fit, in which nothing of the surrogate's error is left.
+The article's formulation and models of one's own keep the surrogate's.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ from bayeskin.pipeline.workbench import Workbench, opened, workbench
 from bayeskin.types import Array
 from bayeskin.workers import Lost, run_parallel
 
+COARSE_RUNS = 8  # at most
 FULL_RUNS = 2  # at most: the first shows what the coarse mesh has missed
-COARSE_RUNS, BASE_RUNS = 8, 4  # at most, with mechanisms and without
+BASE_RUNS = 4  # at most, of the model's own mesh, where there are no mechanisms
 PREDICTIVE_DRAWS = 300
 
 FullResult = FullFit | str | None  # of the full model, or why its first run failed; None where none is made
@@ -129,11 +131,19 @@ def _full(bench: Workbench, found: Fit) -> tuple[FullResult, LogPosterior | None
             return slopes if isinstance(slopes, str) else str(force)
         return force, slopes[1]
 
-    fitted = partial(fit_full, found.log_posterior, exact=exact, seed=bench.run.config.seed)
-    coarse_runs = COARSE_RUNS if found.names else BASE_RUNS
-    first = fitted(found.theta, quick, rounds=coarse_runs, allow=bench.with_mesh_error)
-    start = found.theta if isinstance(first, str) else first[0].theta
-    last = fitted(start, whole, rounds=FULL_RUNS, allow=bench.with_mesh_error)
+    def alone(theta: Mapping[str, float], _: Mapping[str, float]) -> tuple[Array, None] | str:
+        force = fine((found.names, theta))
+        return force if isinstance(force, str) else (force, None)
+
+    fitted = partial(
+        fit_full, found.log_posterior, exact=exact, seed=bench.run.config.seed, allow=bench.with_mesh_error
+    )
+    if not found.names:
+        last = fitted(found.theta, alone, rounds=BASE_RUNS)
+    else:
+        first = fitted(found.theta, quick, rounds=COARSE_RUNS)
+        start = found.theta if isinstance(first, str) else first[0].theta
+        last = fitted(start, whole, rounds=FULL_RUNS)
     return (last, None) if isinstance(last, str) else last
 
 
