@@ -16,6 +16,7 @@ from bayeskin.inference import LogPosterior, NoisePriors, find_map
 from bayeskin.inference.gauss_newton import gauss_newton, promise
 from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import catalogue
+from bayeskin.mismatch.blocked import errors_left_out, without
 from bayeskin.mismatch.discretised import Discretised
 from bayeskin.mismatch.fit import Fit, fit, fit_base, likely, restored, soft_on_stiff, stored
 from bayeskin.mismatch.full_fit import fit_full
@@ -356,3 +357,34 @@ def test_a_prior_without_a_skin_that_can_be_is_refused() -> None:
     alone = dataclasses.replace(toy_problem(), excludes=lambda space, theta: np.ones(len(theta), dtype=bool))
     with pytest.raises(InputError, match="none but skins that a diagnosis rules out"):
         fit_base(alone, 1, None)
+
+
+def test_a_phase_is_predicted_by_a_fit_without_it() -> None:
+    """A jump in the second half: seen by the fit, hence not by the fit without that half."""
+    alone = dataclasses.replace(concealing(0), noise_priors=QUIET)
+    base = fit_base(alone, 1, None)
+    errors = errors_left_out(base, None)
+    plain = (alone.binned.force_n - base.force_n)[alone.chain.bins]
+    assert np.all(np.isfinite(errors))
+    assert np.sqrt(np.mean(errors**2)) < 1.5 * np.sqrt(np.mean(plain**2))
+    last = alone.binned.phase[alone.chain.bins] == alone.binned.phase[alone.chain.bins][-1]
+    force = alone.binned.force_n.copy()
+    force[alone.chain.bins[last]] += 0.05
+    jumped = dataclasses.replace(alone, binned=dataclasses.replace(alone.binned, force_n=force))
+    wild = errors_left_out(dataclasses.replace(base, log_posterior=jumped), None)
+    np.testing.assert_allclose(wild[last] - errors[last], 0.05, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("spans", "left"),
+    [
+        (((0.0, 10.0),), ((0.0, 3.0), (5.0, 10.0))),
+        (((3.0, 5.0),), ()),
+        (((0.0, 4.0), (6.0, 9.0)), ((0.0, 3.0), (6.0, 9.0))),
+        (((6.0, 9.0),), ((6.0, 9.0),)),
+    ],
+)
+def test_windows_lose_what_is_left_out(
+    spans: tuple[tuple[float, float], ...], left: tuple[tuple[float, float], ...]
+) -> None:
+    assert without(spans, 3.0, 5.0) == left

@@ -193,7 +193,7 @@ def _fit(
     bench: Workbench, found: Fit, taken: TakenUp, begun: Fit | None, held_out: FullResult,
     split_s: float | None,
 ) -> dict[str, Any]:  # fmt: skip
-    """RMSE [N] of a fit to the whole recording, by phase, of one to its beginning on the rest; coverage."""
+    """RMSE [N] of a fit: whole, by phase, of phases left out; of one to the beginning, of what follows."""
     binned = bench.binned
     usable = bins_in_windows(binned, None) >= 0
     rest = usable
@@ -204,6 +204,7 @@ def _fit(
         "rmse_by_phase": dict(inference.rmse(binned, found.force_n).by_kind_n),
         "rmse_held_out": None if begun is None else _rms(binned.force_n - begun.force_n, rest),
         "full_model": _full(taken.full, held_out, found.force_n, binned, usable, rest),
+        "rmse_left_out": taken.left_out_n,
         "coverage90": taken.coverage90,
         "log_evidence": found.log_evidence,
         "theta": taken.draws.summary,

@@ -19,6 +19,7 @@ import numpy as np
 from bayeskin import inference
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.straighten import find_shear
+from bayeskin.mismatch.blocked import errors_left_out
 from bayeskin.mismatch.contributions import Contribution, Force, contributions
 from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
 from bayeskin.mismatch.fit import Fit, fit_near, restored, stored
@@ -53,12 +54,14 @@ class TakenUp:
     """What follows a search's fit on the whole recording.
 
     full : the full model's fit; draws : of the posterior; coverage90 : share of bins in its predictive band;
+    left_out_n : RMS error of phases that the fit is made without;
     located : windows that it leaves; parts : what each mechanism contributes; remainder : what is left
     """
 
     full: FullResult
     draws: Resampled
     coverage90: float
+    left_out_n: float
     located: Located
     parts: tuple[Contribution, ...]
     remainder: Remainder
@@ -99,7 +102,8 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
     some = inference.evenly(draws.draws, PREDICTIVE_DRAWS)
     bands = inference.bands(found.log_posterior, some, np.random.default_rng(seed))
     return TakenUp(
-        full, draws, inference.coverage(bench.binned, *bands.interval(0.9)), locate(found, noise, seed),
+        full, draws, inference.coverage(bench.binned, *bands.interval(0.9)),
+        float(np.sqrt(np.mean(errors_left_out(found, shear) ** 2))), locate(found, noise, seed),
         tuple(contributions(found.names, found.theta, force)),
         Remainder(discrepancy(found, bench.motion), propose_form(found, bench.motion, seed)),
     )  # fmt: skip

@@ -75,15 +75,19 @@ def _fits(fit: Mapping[str, Mapping[str, Any]]) -> Table:
                 cell(one["rmse"], "N"),
                 cell(one["rmse_held_out"], "N"),
                 *(cell(one["rmse_by_phase"].get(kind), "N") for kind in kinds),
+                cell(fit[when]["rmse_left_out"], "N"),
                 Cell(percent(fit[when]["coverage90"]), fit[when]["coverage90"]),
             )
         )
         for when in ("before", "after")
         for name, one in fits_of(fit[when]).items()
     ]
-    head = ("fit", "whole recording", "held out", *kinds, "90 % band holds")
+    head = ("fit", "whole recording", "held out", *kinds, "phases left out", "90 % band holds")
     return Table(
-        "RMSE without and with the mechanisms; held out: after the second hold, not fitted", head, rows
+        "RMSE without and with the mechanisms; held out: after the second hold, not fitted; "
+        "left out: each phase by a fit without it",
+        head,
+        rows,
     )
 
 
