@@ -13,9 +13,10 @@ from toy import EDGES_S, SPACE, toy_bin_means
 from bayeskin.design import sobol_points
 from bayeskin.mechanisms.strain_stiffening import first_modulus
 from bayeskin.surrogates import Pair, load_surrogate, save_surrogate, train, train_effect
+from bayeskin.surrogates.distinct import at_distinct
 from bayeskin.surrogates.files import contents_hash
 from bayeskin.surrogates.screening import active_inputs
-from bayeskin.types import Array, Design, Parameter, ParameterSpace
+from bayeskin.types import Array, Design, Parameter, ParameterSpace, Prediction
 
 WIDE = ParameterSpace(
     (*SPACE.parameters, Parameter("a", "1", 0.0, 2.0, "uniform"), Parameter("idle", "1", 0.0, 1.0, "uniform"))
@@ -101,3 +102,21 @@ def test_fibre_stress_is_what_the_fibres_pull_with_in_skin_a_quarter_longer(kapp
     h = 1e-5
     stress = 2.0 * (energy(1.25**2 + h) - energy(1.25**2 - h)) / (2.0 * h)
     assert stress == pytest.approx(asked, rel=1e-6)
+
+
+def test_rows_that_agree_are_predicted_once_and_all_get_their_own() -> None:
+    rng = np.random.default_rng(0)
+    theta = np.array([[1.0, 2.0], [3.0, 4.0], [1.0, 2.0], [0.0, 9.0], [3.0, 4.0]])
+    factor = rng.standard_normal((10, 7, 3))
+    asked: list[Array] = []
+
+    def predict(these: Array, also: Array) -> Prediction:
+        asked.append(these)
+        place = these[:, 0].astype(int)
+        return Prediction(also[:, None] + np.zeros((1, 7)), factor[place], factor[place][:, :, 0] ** 2)
+
+    plain = predict(theta, theta[:, 1])
+    once = at_distinct(predict, theta, theta[:, 1])
+    assert len(asked[-1]) == 3
+    for name in ("mean", "factor", "diagonal"):
+        np.testing.assert_array_equal(getattr(once, name), getattr(plain, name))

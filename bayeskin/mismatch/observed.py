@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from bayeskin.mechanisms import Mechanism, observed
 from bayeskin.mechanisms.binned import BinnedForces
 from bayeskin.mechanisms.mechanism import Instrument
+from bayeskin.surrogates.distinct import at_distinct
 from bayeskin.types import Array, PadMotion, ParameterSpace, Prediction, Surrogate
 
 
@@ -47,7 +48,8 @@ class ObservedSurrogate:
         """Force at theta (n, d) or (d,). Raises InputError outside the box."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         inner = self.skin.space.dim
-        found = self.skin.predict(theta[:, :inner])
+        skin = theta[:, :inner]
+        found = at_distinct(lambda these, _: self.skin.predict(these), skin, skin)
         values = dict(zip(self.space.names[inner:], theta[:, inner:].T, strict=True))
         return Prediction(found.mean + self._added(values, found.mean), found.factor, found.diagonal)
 

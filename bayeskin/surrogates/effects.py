@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayeskin.errors import InputError
+from bayeskin.surrogates.distinct import at_distinct
 from bayeskin.surrogates.screening import active_inputs
 from bayeskin.surrogates.similarity import Similarity
 from bayeskin.surrogates.surrogate import ShapeSurrogate, refuse_outside
@@ -174,9 +175,10 @@ class WithEffects:
         """Force at theta (n, d) or (d,), with its uncertainty; errors of the parts taken as independent."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
-        found = [self.base.predict(theta[:, : self.base.space.dim])]
+        base = theta[:, : self.base.space.dim]
+        found = [at_distinct(lambda these, _: self.base.predict(these), base, base)]
         for effect, columns in zip(self.effects, self._columns, strict=True):
-            found.append(effect.predict(theta[:, columns], found[0].mean))
+            found.append(at_distinct(effect.predict, theta[:, columns], found[0].mean))
         rows = [one.factor.transpose(0, 2, 1) for one in found]  # as they lie in memory
         return Prediction(
             mean=sum((one.mean for one in found[1:]), found[0].mean),
