@@ -11,9 +11,9 @@ import pytest
 from toy import EDGES_S, SPACE, toy_bin_means
 
 from bayeskin.design import sobol_points
+from bayeskin.distinct import at_distinct
 from bayeskin.mechanisms.strain_stiffening import first_modulus
 from bayeskin.surrogates import Pair, load_surrogate, save_surrogate, train, train_effect
-from bayeskin.surrogates.distinct import at_distinct
 from bayeskin.surrogates.files import contents_hash
 from bayeskin.surrogates.screening import active_inputs
 from bayeskin.types import Array, Design, Parameter, ParameterSpace, Prediction

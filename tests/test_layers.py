@@ -9,7 +9,7 @@ import pytest
 import bayeskin
 
 PACKAGE = Path(bayeskin.__file__).parent
-BASE = {"errors", "types", "storage", "shipped", "workers", "umbridge", "probe", "words"}
+BASE = {"errors", "types", "storage", "shipped", "workers", "umbridge", "probe", "words", "distinct"}
 SIBLINGS = {"recordings", "model", "design", "surrogates"}
 BELOW = {
     "errors": set(),
@@ -20,6 +20,7 @@ BELOW = {
     "umbridge": {"errors"},
     "probe": {"errors"},
     "words": set(),
+    "distinct": {"types"},
     "cluster": {"errors", "workers"},
     **dict.fromkeys(SIBLINGS, BASE),
     "journal": BASE,

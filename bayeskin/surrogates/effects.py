@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from bayeskin.distinct import at_distinct
 from bayeskin.errors import InputError
-from bayeskin.surrogates.distinct import at_distinct
 from bayeskin.surrogates.screening import active_inputs
 from bayeskin.surrogates.similarity import Similarity
 from bayeskin.surrogates.surrogate import ShapeSurrogate, refuse_outside
