@@ -489,6 +489,16 @@ def test_a_scoreboard_of_made_up_verdicts_counts_as_it_should() -> None:
     assert json.loads(json.dumps(board, allow_nan=False)) == board
 
 
+@pytest.mark.parametrize(
+    ("full", "ratio"),
+    [(None, 1.5), ({"message": "failed"}, 1.5), ({"rmse_held_out": None}, 1.5), ({"rmse_held_out": 2e-3}, 1.0)],
+)
+def test_held_out_is_the_full_model_s_where_it_has_a_fit(full: dict | None, ratio: float) -> None:
+    answer = said("force-offset", fit={"after": {"rmse_held_out": 3e-3, "full_model": full}})
+    found = judge("001", key("force-offset"), answer)
+    assert found.held_out == pytest.approx(ratio * 2e-3 / key("force-offset")["floor_n"])
+
+
 def made_up() -> tuple[dict, dict]:
     fit = {
         "after": {

@@ -2,7 +2,8 @@
 
 A verdict names right when it names what is concealed and nothing else; it is right up to look-alikes when
 each name it gives stands for one that is concealed and lies in one of its groups (`LOOK_ALIKES`). A verdict
-whose own group is larger than those is wrong. Shares have 90 % Wilson intervals.
+whose own group is larger than those is wrong. What is held out is the full model's, where that has made a
+fit. Shares have 90 % Wilson intervals.
 """
 
 from __future__ import annotations
@@ -99,7 +100,8 @@ def judge(number: str, key: Mapping[str, Any], answer: Mapping[str, Any]) -> Jud
     allowed = all(set(one.get("group", ())) <= group_of(one["name"]) for one in said)
     fit = answer.get("fit", {}).get("after", {})
     parameters = {name: one for mechanism in said for name, one in mechanism.get("parameters", {}).items()}
-    held_out = fit.get("rmse_held_out")
+    best = fit if (fit.get("full_model") or {}).get("rmse_held_out") is None else fit["full_model"]
+    held_out = best.get("rmse_held_out")
     return Judged(
         number=number,
         label=key["label"],
