@@ -491,7 +491,12 @@ def test_a_scoreboard_of_made_up_verdicts_counts_as_it_should() -> None:
 
 @pytest.mark.parametrize(
     ("full", "ratio"),
-    [(None, 1.5), ({"message": "failed"}, 1.5), ({"rmse_held_out": None}, 1.5), ({"rmse_held_out": 2e-3}, 1.0)],
+    [
+        (None, 1.5),
+        ({"message": "failed"}, 1.5),
+        ({"rmse_held_out": None}, 1.5),
+        ({"rmse_held_out": 2e-3}, 1.0),
+    ],
 )
 def test_held_out_is_the_full_model_s_where_it_has_a_fit(full: dict | None, ratio: float) -> None:
     answer = said("force-offset", fit={"after": {"rmse_held_out": 3e-3, "full_model": full}})
