@@ -343,7 +343,7 @@ def _evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
 def _room(log_posterior: LogPosterior, top: Top, unit: Array, i: int) -> float:
     """Integral over one coordinate of the unit cube of the density relative to the top's, the others held."""
     low, high = log_posterior.bounds
-    away = np.logspace(-5.0, 0.0, 16)
+    away = np.logspace(-5.0, 0.0, 26)
     places = np.unique(np.clip(np.concatenate([unit[i] - away, unit[i : i + 1], unit[i] + away]), 0.0, 1.0))
     points = np.repeat(unit[None], len(places), axis=0)
     points[:, i] = places

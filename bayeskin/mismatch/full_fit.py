@@ -107,10 +107,8 @@ def fit_full(
             trust *= 0.25
         else:
             force, slopes = found
-            own = _slopes(surrogate, theta)
-            anchored = Anchored(
-                surrogate, theta, force, np.zeros_like(own) if slopes is None else slopes - own
-            )
+            own = np.zeros((len(force), space.dim)) if slopes is None else slopes - _slopes(surrogate, theta)
+            anchored = Anchored(surrogate, theta, force, own)
             there = replace(log_posterior, surrogate=allow(anchored), sure_within_n=None)
             vector = _with_noise(there, trial)
             value = float(there.log_prob(vector[None])[0])

@@ -17,7 +17,7 @@ as nothing.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from bayeskin.mismatch.fit import Fit, fit, fit_base, promised
 from bayeskin.types import Array
 
 PRIOR = 0.05  # of a mechanism to be at work, before the recording is seen
-MOST = 8  # steps
+MOST = 8  # mechanisms of a set, from which on no further one is tried
 SHORTLIST = 5  # mechanisms of a step that are tried thoroughly
 PATHS = 2  # at most
 AT_BOUND = 0.999  # of the noise's range
@@ -55,9 +55,13 @@ class Search:
     unsure: dict[tuple[str, ...], Fit] = field(default_factory=dict)
 
     def add(self, made: Made) -> None:
-        """Keeps a fit, of two of the same set the likelier."""
-        kept = self.fits if made.counts else self.unsure
-        kept[made.fit.names] = max(made.fit, kept.get(made.fit.names, made.fit), key=weight)
+        """Keeps a fit: of two of the same set the one that counts, else the likelier."""
+        names = made.fit.names
+        if made.counts:
+            self.unsure.pop(names, None)
+            self.fits[names] = max(made.fit, self.fits.get(names, made.fit), key=weight)
+        elif names not in self.fits:
+            self.unsure[names] = max(made.fit, self.unsure.get(names, made.fit), key=weight)
 
     @property
     def base(self) -> Fit:
@@ -165,7 +169,8 @@ def search(
         singles.remove(starts[0])
         path(starts[0], f"path {count}")
     if _much_left(found.best) and (other := another()) is not None:
-        start = tried(other.names, other, anew=True)
+        here = replace(other, theta={**found.best.theta, **other.theta})  # noise that the other knows not
+        start = tried(other.names, here, anew=True)
         if start is not None:
             path(start, "path from another search")
     return found

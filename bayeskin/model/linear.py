@@ -21,14 +21,16 @@ import scipy.sparse.linalg as spla
 
 from bayeskin.types import Array
 
-# MKL's wheel puts its library here; unless told, pypardiso looks through the whole environment in each run.
-for _library in Path(sys.prefix, "lib").glob("libmkl_rt*"):
-    os.environ.setdefault("PYPARDISO_MKL_RT", str(_library))
-
+_library = next(iter(sorted(p for p in Path(sys.prefix, "lib").glob("libmkl_rt*") if p.is_file())), None)
+_unset = "PYPARDISO_MKL_RT" not in os.environ and _library is not None
+if _unset:  # where MKL's wheel puts it; else pypardiso looks through the whole environment
+    os.environ["PYPARDISO_MKL_RT"] = str(_library)
 try:
     import pypardiso
 except (ImportError, OSError):  # no wheel for this processor, or no MKL beside it
     pypardiso = None
+if _unset:  # a child may have another environment
+    del os.environ["PYPARDISO_MKL_RT"]
 
 SOLVER_NAME = "MKL PARDISO" if pypardiso is not None else "SuperLU"
 _STRUCTURALLY_SYMMETRIC, _SYMMETRIC_INDEFINITE = 1, -2
@@ -64,7 +66,7 @@ class _Pardiso:
     def __init__(self, symmetric: bool) -> None:
         self._symmetric = symmetric
         self._type = _SYMMETRIC_INDEFINITE if symmetric else _STRUCTURALLY_SYMMETRIC
-        self._pardiso = pypardiso.PyPardisoSolver().libmkl["pardiso"]  # with argument types of our own
+        self._pardiso = pypardiso.ps.libmkl["pardiso"]  # with argument types of our own
         self._handle = np.zeros(64, np.int64)
         self._settings = np.zeros(64, np.int32)
         for number, value in _SETTINGS.items():

@@ -122,9 +122,9 @@ def _search_beside(run: Run, bench: Workbench, split_s: float) -> Callable[[], S
         if thread.is_alive():
             run.reporter.log("waiting for the search on the recording's beginning")
         thread.join()
-        if not ended or isinstance(ended[0][1], Lost):
-            return _searched(bench, split_s)
-        return _as_search(_made_in(bench, partial(bench.posterior, split_s)))
+        made = _made_in(bench, partial(bench.posterior, split_s))
+        whole = ended and not isinstance(ended[0][1], Lost) and any(not one.fit.names for one in made)
+        return _as_search(made) if whole else _searched(bench, split_s)
 
     return beginning
 

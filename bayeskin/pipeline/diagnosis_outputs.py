@@ -147,7 +147,8 @@ def in_words(answer: Mapping[str, Any]) -> str:
         rest = "" if held is None else f", {1e3 * held:.1f} mN on what follows the second hold, not fitted"
         lines.append(f"{when}: RMSE {1e3 * fits[when]['rmse']:.1f} mN{rest}")
         lines += _full_in_words(fits[when]["full_model"])
-        lines.append(f"  each phase by a fit without it: RMSE {1e3 * fits[when]['rmse_left_out']:.1f} mN")
+        if (left := fits[when].get("rmse_left_out")) is not None:
+            lines.append(f"  each phase by a fit without it: RMSE {1e3 * left:.1f} mN")
         if not fits[when]["sampled"]["settled"]:
             lines.append(f"  intervals are rough: R-hat of the draws {fits[when]['sampled']['rhat']:.2f}")
     lines += _left_in_words(answer["unexplained"]) if answer["unexplained"] else []

@@ -1,9 +1,9 @@
 """The full model takes up what a search on its surrogate has found: a fit of its own, the posterior there.
 
 First on the coarsest bricks, whose runs are quick and carry their derivatives, then on the model's own mesh
-with these derivatives; without mechanisms on that at once, with the slopes of the base's surrogate. Sampled,
-located and taken apart is the posterior about that fit, in which nothing of the surrogate's error is left.
-The article's formulation and models of one's own keep the surrogate's.
+with these derivatives; without mechanisms on that at once, with the slopes of the base's surrogate, if it
+runs there. Sampled, located and taken apart is the posterior about that fit, in which nothing of the
+surrogate's error is left. The article's formulation and models of one's own keep the surrogate's.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from bayeskin import inference
 from bayeskin.inference import LogPosterior
-from bayeskin.inference.straighten import find_shear
+from bayeskin.inference.straighten import Shear, find_shear
 from bayeskin.mismatch.blocked import errors_left_out
 from bayeskin.mismatch.contributions import Contribution, Force, contributions
 from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
@@ -54,14 +54,14 @@ class TakenUp:
     """What follows a search's fit on the whole recording.
 
     full : the full model's fit; draws : of the posterior; coverage90 : share of bins in its predictive band;
-    left_out_n : RMS error of phases that the fit is made without;
+    left_out_n : RMS error of phases that the fit is made without, None where there is but one;
     located : windows that it leaves; parts : what each mechanism contributes; remainder : what is left
     """
 
     full: FullResult
     draws: Resampled
     coverage90: float
-    left_out_n: float
+    left_out_n: float | None
     located: Located
     parts: tuple[Contribution, ...]
     remainder: Remainder
@@ -103,10 +103,17 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
     bands = inference.bands(found.log_posterior, some, np.random.default_rng(seed))
     return TakenUp(
         full, draws, inference.coverage(bench.binned, *bands.interval(0.9)),
-        float(np.sqrt(np.mean(errors_left_out(found, shear) ** 2))), locate(found, noise, seed),
+        _left_out(found, shear), locate(found, noise, seed),
         tuple(contributions(found.names, found.theta, force)),
         Remainder(discrepancy(found, bench.motion), propose_form(found, bench.motion, seed)),
     )  # fmt: skip
+
+
+def _left_out(found: Fit, shear: Shear | None) -> float | None:
+    fitted = found.log_posterior.chain.bins
+    if len(np.unique(found.log_posterior.binned.phase[fitted])) < 2:
+        return None
+    return float(np.sqrt(np.mean(errors_left_out(found, shear) ** 2)))
 
 
 def _begun_apart(source: Path, plain: Mapping[str, Any], until_s: float | None) -> FullResult:
@@ -142,9 +149,10 @@ def _full(bench: Workbench, found: Fit) -> tuple[FullResult, LogPosterior | None
     fitted = partial(
         fit_full, found.log_posterior, exact=exact, seed=bench.run.config.seed, allow=bench.with_mesh_error
     )
+    last: tuple[FullFit, LogPosterior] | str = ""
     if not found.names:
         last = fitted(found.theta, alone, rounds=BASE_RUNS)
-    else:
+    if isinstance(last, str):
         first = fitted(found.theta, quick, rounds=COARSE_RUNS)
         start = found.theta if isinstance(first, str) else first[0].theta
         last = fitted(start, whole, rounds=FULL_RUNS)

@@ -68,6 +68,9 @@ def _parameters(found: Sequence[Mapping[str, Any]]) -> Table:
 
 def _fits(fit: Mapping[str, Mapping[str, Any]]) -> Table:
     kinds = list(fit["before"]["rmse_by_phase"])
+    last = {
+        when: [*fits_of(fit[when]).values()][-1] for when in fit
+    }  # of whose posterior phases are left out
     rows = [
         row(
             (
@@ -75,7 +78,7 @@ def _fits(fit: Mapping[str, Mapping[str, Any]]) -> Table:
                 cell(one["rmse"], "N"),
                 cell(one["rmse_held_out"], "N"),
                 *(cell(one["rmse_by_phase"].get(kind), "N") for kind in kinds),
-                cell(fit[when]["rmse_left_out"], "N"),
+                cell(fit[when].get("rmse_left_out") if one is last[when] else None, "N"),
                 Cell(percent(fit[when]["coverage90"]), fit[when]["coverage90"]),
             )
         )
