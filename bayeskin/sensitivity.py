@@ -105,9 +105,7 @@ def sobol(
         raise InputError("sobol: space", describe(space), f"a box within {describe(surrogate.space)}")
     draws = error_draws(surrogate, ERROR_DRAWS, rng)
     estimate = pick_freeze if method == "pick-freeze" else projection
-    return estimate(
-        lambda theta: surrogate.predict(theta).mean, space, surrogate.edges_s, rng, samples, draws
-    )
+    return estimate(surrogate.predict_mean, space, surrogate.edges_s, rng, samples, draws)
 
 
 def error_draws(surrogate: Surrogate, count: int, rng: np.random.Generator) -> list[Function]:

@@ -418,6 +418,10 @@ class Surrogate(Protocol):
         """Force at theta (n, d), vectorised. Raises InputError outside the box."""
         ...
 
+    def predict_mean(self, theta: ArrayLike) -> Array:
+        """The mean (n, m) of `predict` alone, which may be had for less."""
+        ...
+
 
 @dataclass(frozen=True)
 class Provenance:

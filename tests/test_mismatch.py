@@ -377,6 +377,9 @@ class Scaled:
             found, mean=self.factor * found.mean, factor=0.0 * found.factor, diagonal=0.0 * found.diagonal
         )
 
+    def predict_mean(self, theta):
+        return self.predict(theta).mean
+
 
 def test_a_subcutis_much_stiffer_than_the_cutis_is_not_believed() -> None:
     problem = dataclasses.replace(toy_problem(), excludes=soft_on_stiff)

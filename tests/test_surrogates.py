@@ -502,3 +502,11 @@ def test_a_surrogate_obeys_the_law_exactly():
     once, twice = surrogate.predict(theta), surrogate.predict(scaled(theta, 2.0))
     np.testing.assert_allclose(twice.mean, 2.0 * once.mean, rtol=1e-10)
     np.testing.assert_allclose(twice.sd(), 2.0 * once.sd(), rtol=1e-10)
+
+
+def test_the_mean_alone_is_that_of_the_whole_prediction(trained):
+    theta = SPACE.box.from_unit(np.random.default_rng(3).uniform(size=(40, SPACE.dim)))
+    whole, times = trained[0], np.linspace(0.5, 2.0, 40)
+    for surrogate in (whole, WithEffects(whole, ())):
+        np.testing.assert_allclose(surrogate.predict_mean(theta), surrogate.predict(theta).mean, rtol=1e-9)
+    np.testing.assert_allclose(whole.predict_mean(theta, times), whole.predict(theta, times).mean, rtol=1e-9)

@@ -72,6 +72,9 @@ class ToySurrogate:
         factor = np.repeat(self.sd_n * self.modes[None], len(theta), axis=0)
         return Prediction(mean, factor, np.full(mean.shape, (0.1 * self.sd_n) ** 2))
 
+    def predict_mean(self, theta: ArrayLike) -> Array:
+        return self.predict(theta).mean
+
 
 class LineSurrogate:
     """force = a + b t: a linear model, whose posterior is Gaussian when the noise is known."""
@@ -88,6 +91,9 @@ class LineSurrogate:
         mean = np.atleast_2d(theta) @ self.columns
         factor = np.repeat(0.01 * self.columns[1][None, :, None], len(mean), axis=0)
         return Prediction(mean, factor, np.full(mean.shape, 1e-6))
+
+    def predict_mean(self, theta: ArrayLike) -> Array:
+        return self.predict(theta).mean
 
 
 def line_problem(seed: int = 0) -> LogPosterior:

@@ -75,7 +75,7 @@ def promise(
     inner = linear.inner
     others = free[:inner]
     bins = linear.chain.bins
-    mean = log_posterior.predict(log_posterior.from_sampling(trials)).mean[:, bins]
+    mean = log_posterior.predict_mean(log_posterior.from_sampling(trials))[:, bins]
     change = linear.white((mean - linear.here.mean[:, bins]).T)
     residual, slopes, factor = linear.columns()
     room = np.concatenate([slopes[:, others], factor], axis=1)

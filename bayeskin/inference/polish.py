@@ -48,11 +48,15 @@ class LinearForce:
 
     def predict(self, theta: ArrayLike) -> Prediction:
         """Force at theta (n, d)."""
+        mean = self.predict_mean(theta)
+        return Prediction(mean, np.zeros((*mean.shape, 1)), np.zeros(mean.shape))
+
+    def predict_mean(self, theta: ArrayLike) -> Array:
+        """Force (n, m) at theta (n, d)."""
         ratio = np.atleast_2d(np.asarray(theta, dtype=float)) / self.theta
         moduli = np.array([p.stress_power == 1 for p in self.space.parameters])
         change = np.where(moduli, ratio - 1.0, np.log(np.where(self.moves & ~moduli, ratio, 1.0)))
-        mean = self.force_n + np.where(self.moves, change, 0.0) @ self.gradient_n.T
-        return Prediction(mean, np.zeros((*mean.shape, 1)), np.zeros(mean.shape))
+        return np.asarray(self.force_n + np.where(self.moves, change, 0.0) @ self.gradient_n.T)
 
 
 @dataclass(frozen=True)

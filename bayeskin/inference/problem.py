@@ -105,6 +105,11 @@ class LogPosterior:
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         return self.surrogate.predict(theta[:, : self.surrogate.space.dim])
 
+    def predict_mean(self, theta: ArrayLike) -> Array:
+        """The mean (n, m) of `predict` alone."""
+        theta = np.atleast_2d(np.asarray(theta, dtype=float))
+        return self.surrogate.predict_mean(theta[:, : self.surrogate.space.dim])
+
     def log_prob(self, vectors: ArrayLike) -> Array:
         """Log posterior density (n,) at vectors (n, D) in sampling coordinates, up to the evidence.
 

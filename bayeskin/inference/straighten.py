@@ -150,7 +150,7 @@ def _amplitude(log_posterior: LogPosterior, x: Array) -> Array:
     theta = log_posterior.from_sampling(x)
     return np.concatenate(
         [
-            log_posterior.predict(theta[a : a + _CHUNK]).mean[:, chain.bins] @ share
+            log_posterior.predict_mean(theta[a : a + _CHUNK])[:, chain.bins] @ share
             for a in range(0, len(theta), _CHUNK)
         ]
     )

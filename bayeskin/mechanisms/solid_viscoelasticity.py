@@ -149,7 +149,7 @@ def estimate(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTi
 def remember(rate, elapsed, strength, tau_s, left):
     """Fills left (n, k, b), the branches' share at each time, of stresses that change by rate (n, k - 1)."""
     for i in range(rate.shape[0]):
-        for b in range(strength.shape[1]):
+        for b in np.flatnonzero(strength[i]):
             for k in range(rate.shape[1]):
                 keep = np.exp(-elapsed[k] / tau_s[i, b])
                 grown = strength[i, b] * tau_s[i, b] * rate[i, k] * (1.0 - keep)
@@ -160,11 +160,11 @@ def remember(rate, elapsed, strength, tau_s, left):
 def recall(grid, rate, strength, tau_s, left, times, more):
     """Fills more (n, t), the branches' sum at times (1 or n, t), from their shares `left` on a grid (k,)."""
     for i in range(more.shape[0]):
-        row, k = times[i if len(times) > 1 else 0], 0
+        row, k, acting = times[i if len(times) > 1 else 0], 0, np.flatnonzero(strength[i])
         for j in range(more.shape[1]):
             k = stretch_of(grid, k, row[j])
             total = 0.0
-            for b in range(strength.shape[1]):
+            for b in acting:
                 keep = np.exp(-(row[j] - grid[k]) / tau_s[i, b])
                 total += keep * left[i, k, b] + strength[i, b] * tau_s[i, b] * rate[i, k] * (1.0 - keep)
             more[i, j] = total

@@ -52,6 +52,10 @@ class Discretised:
         factor = np.concatenate([rows, more], axis=1).transpose(0, 2, 1)
         return Prediction(found.mean, factor, found.diagonal)
 
+    def predict_mean(self, theta: ArrayLike) -> Array:
+        """That of `skin`."""
+        return self.skin.predict_mean(theta)
+
     @cached_property
     def _shapes(self) -> Array:
         """Of both errors relative to the force, (2, m)."""

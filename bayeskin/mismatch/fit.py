@@ -305,7 +305,7 @@ def other_skins(
         return trials
     bins, recorded = log_posterior.chain.bins, log_posterior.chain.force_n
     for _ in range(3):  # the force is nearly of degree one in the moduli together
-        force = log_posterior.predict(log_posterior.from_sampling(trials)).mean[:, bins]
+        force = log_posterior.predict_mean(log_posterior.from_sampling(trials))[:, bins]
         factor = (force @ recorded) / np.maximum(np.sum(force**2, axis=1), np.finfo(float).tiny)
         trials[:, shear.group] += np.log(np.clip(factor, 1e-3, 1e3))[:, None]
         trials = trials[np.all((trials >= low) & (trials <= high), axis=1)]

@@ -60,11 +60,15 @@ class Anchored:
 
     def predict(self, theta: ArrayLike) -> Prediction:
         """Force at theta (n, d) or (d,). Raises InputError outside the box."""
-        theta = np.atleast_2d(np.asarray(theta, dtype=float))
-        mean = self.surrogate.predict(np.vstack([self.theta, theta])).mean
-        away = self.space.box.to_unit(theta) - self.space.box.to_unit(self.theta)
-        force = self.force_n + mean[1:] - mean[0] + away @ self.slopes_n.T
+        force = self.predict_mean(theta)
         return Prediction(force, np.zeros((*force.shape, 1)), np.zeros(force.shape))
+
+    def predict_mean(self, theta: ArrayLike) -> Array:
+        """Force (n, m) at theta (n, d) or (d,). Raises InputError outside the box."""
+        theta = np.atleast_2d(np.asarray(theta, dtype=float))
+        mean = self.surrogate.predict_mean(np.vstack([self.theta, theta]))
+        away = self.space.box.to_unit(theta) - self.space.box.to_unit(self.theta)
+        return np.asarray(self.force_n + mean[1:] - mean[0] + away @ self.slopes_n.T)
 
 
 @dataclass(frozen=True)
@@ -141,7 +145,7 @@ def _slopes(surrogate: Surrogate, theta: Array) -> Array:
     unit = box.to_unit(theta)
     steps = np.diag(np.where(unit > 0.5, -STEP, STEP))
     rows = np.vstack([theta, np.clip(box.from_unit(unit + steps), box.lower, box.upper)])
-    mean = surrogate.predict(rows).mean
+    mean = surrogate.predict_mean(rows)
     return np.asarray((mean[1:] - mean[0]).T / np.diag(steps))
 
 

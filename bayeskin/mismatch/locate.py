@@ -121,7 +121,7 @@ def _slopes(found: Fit) -> Array:
     step = 1e-4 * np.eye(len(low))[free]
     ahead = np.clip(found.unit + step, 0.0, 1.0)
     points = low + np.concatenate([found.unit[None], ahead]) * (high - low)
-    mean = log_posterior.predict(log_posterior.from_sampling(points)).mean[:, log_posterior.chain.bins]
+    mean = log_posterior.predict_mean(log_posterior.from_sampling(points))[:, log_posterior.chain.bins]
     return np.asarray((mean[1:] - mean[0]).T / 1e-4)
 
 

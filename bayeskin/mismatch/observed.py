@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayeskin.distinct import at_distinct
+from bayeskin.distinct import at_distinct, mean_at_distinct
 from bayeskin.mechanisms import Mechanism, observed
 from bayeskin.mechanisms.binned import BinnedForces
 from bayeskin.mechanisms.mechanism import Instrument
@@ -52,6 +52,15 @@ class ObservedSurrogate:
         found = at_distinct(lambda these, _: self.skin.predict(these), skin, skin)
         values = dict(zip(self.space.names[inner:], theta[:, inner:].T, strict=True))
         return Prediction(found.mean + self._added(values, found.mean), found.factor, found.diagonal)
+
+    def predict_mean(self, theta: ArrayLike) -> Array:
+        """The mean (n, m) of `predict` alone."""
+        theta = np.atleast_2d(np.asarray(theta, dtype=float))
+        inner = self.skin.space.dim
+        skin = theta[:, :inner]
+        mean = mean_at_distinct(lambda these, _: self.skin.predict_mean(these), skin, skin)
+        values = dict(zip(self.space.names[inner:], theta[:, inner:].T, strict=True))
+        return mean + self._added(values, mean)
 
     def _added(self, values: Mapping[str, Array], mean_n: Array) -> Array:
         """What the mechanisms add to the bins' means (n, m)."""

@@ -132,7 +132,7 @@ def derivatives(log_posterior: LogPosterior, unit: Array) -> Array:
     points = np.tile(centre, (2 * d, 1))
     points[:d, :d] += STEP * np.eye(d)
     points[d:, :d] -= STEP * np.eye(d)
-    mean = log_posterior.predict(log_posterior.from_sampling(low + points * (high - low))).mean
+    mean = log_posterior.predict_mean(log_posterior.from_sampling(low + points * (high - low)))
     return np.asarray((mean[:d] - mean[d:]).T / (2 * STEP))
 
 

@@ -52,7 +52,7 @@ def _over_posterior(run: Run, rng: np.random.Generator) -> dict[str, Any]:
     surrogate = load_surrogate(refined if refined.is_file() else run.at("map", "surrogate.h5"))
     material = ParameterSpace(space.parameters[: surrogate.space.dim])
     few = inference.evenly(draws, MOST_DRAWS)[:, : material.dim]
-    force = np.concatenate([surrogate.predict(few[i : i + CHUNK]).mean for i in range(0, len(few), CHUNK)])
+    force = np.concatenate([surrogate.predict_mean(few[i : i + CHUNK]) for i in range(0, len(few), CHUNK)])
     found = shapley(material, few, force, surrogate.edges_s, rng, "the posterior, its correlations included")
     order = np.argsort(-np.nan_to_num(found.effects))
     shares = [f"{found.names[j]} {100 * found.effects[j]:.0f} %" for j in order[:3]]

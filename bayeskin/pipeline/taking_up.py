@@ -168,4 +168,4 @@ def _surrogate_force(bench: Workbench, case: tuple[Sequence[str], Mapping[str, f
     """Mean force (m,) of the surrogate with a set, at the values that its posterior knows."""
     log_posterior = bench.posterior(None, case[0])
     values = log_posterior.from_sampling(log_posterior.vector(case[1]))
-    return np.asarray(log_posterior.predict(values).mean[0])
+    return log_posterior.predict_mean(values)[0]

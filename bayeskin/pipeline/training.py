@@ -86,7 +86,7 @@ def _draw(
     report.save_figure(figure, run.at("train", "validation"), caption(run))
     space = parameter_space(run.config, run.config_path)
     theta = space.draw(np.random.default_rng([run.config.seed, 3]), PRIOR_DRAWS)
-    drawn = surrogate.predict(theta).mean
+    drawn = surrogate.predict_mean(theta)
     figure = report.figure_prior_predictive(binned, drawn)
     report.save_figure(figure, run.at("train", "prior_predictive"), caption(run))
 
@@ -103,7 +103,7 @@ def _errors_by_wave(run: Run, design: Design, binned: BinnedForce, held_out: Des
     for wave in waves[:-1] if held_out is design else waves:
         early = design.wave <= wave
         part = dataclasses.replace(design, ok=design.ok & early)
-        rows.append(trained(run, part, binned)[0].predict(theta).mean)
+        rows.append(trained(run, part, binned)[0].predict_mean(theta))
     scale = np.sqrt(np.mean(truth**2, axis=1))
     return np.array([np.sqrt(np.mean((mean - truth) ** 2, axis=1)) / scale for mean in [*rows, last_n]])
 

@@ -176,6 +176,11 @@ class LatentChaos(_FreezesArrays):
             variance[:, j] = self._variance(j, np.sum((rows @ fit.root) ** 2, axis=1))
         return mean, variance
 
+    def predict_mean(self, unit: Array) -> Array:
+        """The mean (k, q) of `predict` alone."""
+        basis = legendre_basis(unit, self.indices)
+        return np.stack([basis[:, fit.terms] @ fit.coefficients for fit in self._solved], axis=1)
+
     def leave_one_out(self) -> tuple[Array, Array]:
         """Mean and variance of each row given all others, (n, q) each; terms kept."""
         residual = np.stack([fit.residual for fit in self._solved], axis=1)

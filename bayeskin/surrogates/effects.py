@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayeskin.distinct import at_distinct
+from bayeskin.distinct import at_distinct, mean_at_distinct
 from bayeskin.errors import InputError
 from bayeskin.surrogates.screening import active_inputs
 from bayeskin.surrogates.similarity import Similarity
@@ -70,6 +70,17 @@ class Effect:
         size = _rms(change)
         found = self.surrogate.predict(theta, size * np.exp(-similarity.log_scale(theta)))
         return replace(found, mean=found.mean + change - size[:, None])
+
+    def predict_mean(self, theta: Array, base: Array) -> Array:
+        """The mean (n, m) of `predict` alone."""
+        similarity = self.surrogate.similarity
+        if self.estimate is None:
+            return self.surrogate.predict_mean(theta, strength(similarity, self.own[0], self.neutral, theta))
+        change = self.estimate(theta[:, -len(self.own) :], base)
+        size = _rms(change)
+        return self.surrogate.predict_mean(theta, size * np.exp(-similarity.log_scale(theta))) + (
+            change - size[:, None]
+        )
 
 
 def _rms(values: Array) -> Array:
@@ -185,6 +196,16 @@ class WithEffects:
             factor=np.concatenate(rows, axis=1).transpose(0, 2, 1),
             diagonal=sum((one.diagonal for one in found[1:]), found[0].diagonal),
         )
+
+    def predict_mean(self, theta: ArrayLike) -> Array:
+        """The mean (n, m) of `predict` alone."""
+        theta = np.atleast_2d(np.asarray(theta, dtype=float))
+        refuse_outside(self.space, theta)
+        base = theta[:, : self.base.space.dim]
+        mean = alone = mean_at_distinct(lambda these, _: self.base.predict_mean(these), base, base)
+        for effect, columns in zip(self.effects, self._columns, strict=True):
+            mean = mean + mean_at_distinct(effect.predict_mean, theta[:, columns], alone)
+        return mean
 
     @cached_property
     def _columns(self) -> list[list[int]]:

@@ -60,17 +60,28 @@ class _Stack(NamedTuple):
 
     def predict(self, centred: Array, basis: Array) -> tuple[Array, Array]:
         """Mean and variance (k, q) at k centred inputs (k, d) with trend basis (k, p)."""
-        k, d = centred.shape
-        mapped = np.ones((len(self.latents), k, d + 2))
-        np.matmul(centred, self.maps, out=mapped[:, :, :d])
-        mapped[:, :, d] = -0.5 * np.einsum("qki,qki->qk", mapped[:, :, :d], mapped[:, :, :d])
-        rows = correlations(self.name, mapped @ self.inputs)
+        rows = self._correlations(centred)
+        k = len(centred)
         white = rows[:, :, : self.half] @ self.top
         mean, variance = np.empty((2, len(self.latents), k))
         _collect(white, rows @ self.bottom, basis @ self.trend, mean, variance)
         mean = self.centre + self.deviation * mean
         variance = np.maximum(variance + self.nugget, np.maximum(self.nugget, SMALLEST_NUGGET))
         return mean.T, (self.spread * variance).T
+
+    def predict_mean(self, centred: Array, basis: Array) -> Array:
+        """The mean (k, q) of `predict` alone: a product with a vector where the variance takes a matrix."""
+        mean = self._correlations(centred) @ self.bottom[:, :, -1:]
+        mean += basis @ self.trend[:, :, -1:]
+        return np.asarray((self.centre + self.deviation * mean[:, :, 0]).T)
+
+    def _correlations(self, centred: Array) -> Array:
+        """With the training rows, (q, k, n)."""
+        k, d = centred.shape
+        mapped = np.ones((len(self.latents), k, d + 2))
+        np.matmul(centred, self.maps, out=mapped[:, :, :d])
+        mapped[:, :, d] = -0.5 * np.einsum("qki,qki->qk", mapped[:, :, :d], mapped[:, :, :d])
+        return correlations(self.name, mapped @ self.inputs)
 
 
 @nb.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
@@ -172,6 +183,16 @@ class LatentGPs(_FreezesArrays):
                 found = stack.predict(unit[part] - 0.5, basis)
                 mean[part, stack.latents], variance[part, stack.latents] = found
         return mean, variance
+
+    def predict_mean(self, unit: Array) -> Array:
+        """The mean (k, q) of `predict` alone."""
+        mean = np.empty((len(unit), len(self.kernels)))
+        for start in range(0, len(unit), CHUNK):
+            part = slice(start, start + CHUNK)
+            basis = trend_basis(unit[part], self.degree)
+            for stack in self._stacks:
+                mean[part, stack.latents] = stack.predict_mean(unit[part] - 0.5, basis)
+        return mean
 
     @cached_property
     def _stacks(self) -> list[_Stack]:

@@ -45,11 +45,17 @@ class ShapeTransform(_FreezesArrays):
         Delta method: d force = force da + exp(a) components dz.
         """
         scale = (times * np.exp(latent[:, 0]))[:, None]
-        mean = (scale * latent[:, 1:]) @ self.components
-        mean += scale * self.mean
+        mean = self.decode_mean(latent, times)
         columns = np.empty((*latent.shape, len(self.mean)))
         _fill(mean, self.components, sd, scale * sd, columns)
         return Prediction(mean, columns.transpose(0, 2, 1), scale**2 * self.truncation)
+
+    def decode_mean(self, latent: Array, times: Array | float = 1.0) -> Array:
+        """The mean (n, m) of `decode` alone."""
+        scale = (times * np.exp(latent[:, 0]))[:, None]
+        mean = np.asarray((scale * latent[:, 1:]) @ self.components)
+        mean += scale * self.mean
+        return mean
 
 
 @nb.njit(cache=True, nogil=True)

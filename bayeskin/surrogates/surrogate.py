@@ -28,6 +28,10 @@ class Latents(Protocol):
         """Mean and variance (n, q) at inputs (n, k), those of `Similarity` that matter."""
         ...
 
+    def predict_mean(self, unit: Array) -> Array:
+        """The mean (n, q) of `predict` alone."""
+        ...
+
     def leave_one_out(self) -> tuple[Array, Array]:
         """Mean and variance (n, q) of each training row given the others."""
         ...
@@ -65,6 +69,14 @@ class ShapeSurrogate(_FreezesArrays):
         refuse_outside(self.space, theta)
         mean, variance = self.latents.predict(self.inputs(theta))
         return self._decode(theta, mean, variance, times)
+
+    def predict_mean(self, theta: ArrayLike, times: Array | float = 1.0) -> Array:
+        """The mean (n, m) of `predict` alone."""
+        theta = np.atleast_2d(np.asarray(theta, dtype=float))
+        refuse_outside(self.space, theta)
+        latent = self.latents.predict_mean(self.inputs(theta))
+        latent[:, 0] += self.similarity.log_scale(theta)
+        return self.transform.decode_mean(latent, times)
 
     def leave_one_out(self, theta: Array) -> Prediction:
         """Force at the training rows, theta (n, d), as the others predict it; hyperparameters kept."""

@@ -189,6 +189,6 @@ def _best_of_folds(
         out[order[k::FOLDS]] = True
         for kind in kinds:
             surrogate = _fit(kind, space, design, training & ~out, focus, {}, active, whole_shape)
-            miss = surrogate.predict(design.theta[out]).mean - design.force_n[out]
+            miss = surrogate.predict_mean(design.theta[out]) - design.force_n[out]
             errors[kind] += float(focus[out] @ np.sum(miss**2, axis=1))
     return min(kinds, key=lambda kind: errors[kind])

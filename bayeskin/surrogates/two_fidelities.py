@@ -44,6 +44,10 @@ class CorrectedLatents:
         change, its_variance = self.correction.predict(unit)
         return mean + change, variance + its_variance
 
+    def predict_mean(self, unit: Array) -> Array:
+        """The mean (n, q) of `predict` alone."""
+        return self.coarse.predict_mean(unit) + self.correction.predict_mean(unit)
+
     def leave_one_out(self) -> tuple[Array, Array]:
         """Mean and variance (n, q) at each fine run, its correction as the other fine runs predict it."""
         mean, variance = self.coarse.predict(self.inputs)
