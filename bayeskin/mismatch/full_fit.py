@@ -75,7 +75,7 @@ class Anchored:
 class FullFit:
     """theta: all parameters by name (SI) of the best run; value: its log posterior; force_n (m,).
 
-    runs : made; gained : nats on the first of them
+    runs : made; gained : nats on the first of them; settled : whether next to nothing is still to be gained
     """
 
     theta: Mapping[str, float]
@@ -83,6 +83,7 @@ class FullFit:
     force_n: Array
     runs: int
     gained: float
+    settled: bool = False
 
 
 def fit_full(
@@ -128,6 +129,7 @@ def fit_full(
             break
         trial, promised = _maximum(local, best.theta, trust, exact, rng)
         if promised - best.value < ENOUGH:
+            best = replace(best, settled=True)
             break
     assert best is not None
     return best, local

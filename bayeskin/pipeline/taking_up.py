@@ -1,9 +1,9 @@
 """The full model takes up what a search on its surrogate has found: a fit of its own, the posterior there.
 
 First on the coarsest bricks, whose runs are quick and carry their derivatives, then on the model's own mesh
-with these derivatives; without mechanisms on that at once, with the slopes of the base's surrogate, if it
-runs there. Sampled, located and taken apart is the posterior about that fit, in which nothing of the
-surrogate's error is left. The article's formulation and models of one's own keep the surrogate's.
+with these derivatives; without mechanisms on that at once, with the slopes of the base's surrogate, where
+these are good enough. Sampled, located and taken apart is the posterior about that fit, in which nothing of
+the surrogate's error is left. The article's formulation and models of one's own keep the surrogate's.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from bayeskin.pipeline.workbench import Workbench, opened, workbench
 from bayeskin.types import Array
 from bayeskin.workers import Lost, run_parallel
 
-COARSE_RUNS = 8  # at most
-FULL_RUNS = 2  # at most: the first shows what the coarse mesh has missed
-BASE_RUNS = 4  # at most, of the model's own mesh, where there are no mechanisms
+COARSE_RUNS, BASE_RUNS = 8, 4  # at most, with mechanisms and without
+FULL_RUNS = 4  # at most, of the model's own mesh: the first shows what the coarse one has missed
+DIRECT_RUNS = 2  # at most, with the slopes of the base's surrogate
 PREDICTIVE_DRAWS = 300
 
 FullResult = FullFit | str | None  # of the full model, or why its first run failed; None where none is made
@@ -149,13 +149,13 @@ def _full(bench: Workbench, found: Fit) -> tuple[FullResult, LogPosterior | None
     fitted = partial(
         fit_full, found.log_posterior, exact=exact, seed=bench.run.config.seed, allow=bench.with_mesh_error
     )
-    last: tuple[FullFit, LogPosterior] | str = ""
     if not found.names:
-        last = fitted(found.theta, alone, rounds=BASE_RUNS)
-    if isinstance(last, str):
-        first = fitted(found.theta, quick, rounds=COARSE_RUNS)
-        start = found.theta if isinstance(first, str) else first[0].theta
-        last = fitted(start, whole, rounds=FULL_RUNS)
+        direct = fitted(found.theta, alone, rounds=DIRECT_RUNS)
+        if not isinstance(direct, str) and direct[0].settled:
+            return direct
+    first = fitted(found.theta, quick, rounds=COARSE_RUNS if found.names else BASE_RUNS)
+    start = found.theta if isinstance(first, str) else first[0].theta
+    last = fitted(start, whole, rounds=FULL_RUNS)
     return (last, None) if isinstance(last, str) else last
 
 
