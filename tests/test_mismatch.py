@@ -16,6 +16,7 @@ from bayeskin.inference import LogPosterior, NoisePriors, find_map
 from bayeskin.inference.gauss_newton import gauss_newton, promise
 from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import catalogue
+from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.blocked import errors_left_out, without
 from bayeskin.mismatch.discretised import Discretised
 from bayeskin.mismatch.fit import fit, fit_base, fit_near, likely, restored, soft_on_stiff, stored
@@ -25,6 +26,9 @@ from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.resample import resample
 from bayeskin.mismatch.search import Made, Search, search, weight
 from bayeskin.mismatch.verdict import judge
+from bayeskin.proof.cases import shipped_screen
+from bayeskin.proof.protocol import MOTION
+from bayeskin.surrogates.effects import WithEffects
 from bayeskin.types import ParameterSpace
 
 KNOWN = {
@@ -146,6 +150,20 @@ def test_a_set_tried_again_from_another_search_is_kept_where_it_is_better_and_no
         second = run(made[:stopped], again.append)
         assert [one.fit.names for one in again] == names[stopped:]
         assert second.best.value == first.best.value
+
+
+def test_means_alone_are_those_of_whole_predictions_of_all_that_is_shipped() -> None:
+    """Every effect, with estimates too, behind every mechanism of the instrument and the mesh's error."""
+    screen = shipped_screen()
+    instrument = tuple(m for m in catalogue().values() if isinstance(m.act, Instrument))
+    skin = Discretised(WithEffects(screen.refit.surrogate, screen.effects), MOTION, 2e-3, 2e-3)
+    seen = ObservedSurrogate(skin, instrument, MOTION)
+    theta = seen.space.box.from_unit(np.random.default_rng(4).uniform(size=(3, seen.space.dim)))
+    theta = theta[[0, 1, 1, 2]]
+    theta[2, -1] = theta[0, -1]  # one skin, seen through two instruments
+    whole = seen.predict(theta).mean
+    assert np.ptp(whole[1] - whole[2]) > 0.0
+    np.testing.assert_allclose(seen.predict_mean(theta), whole, rtol=1e-7, atol=1e-9)
 
 
 def test_a_set_that_counts_is_not_unsure_too() -> None:

@@ -46,21 +46,21 @@ class ObservedSurrogate:
 
     def predict(self, theta: ArrayLike) -> Prediction:
         """Force at theta (n, d) or (d,). Raises InputError outside the box."""
-        theta = np.atleast_2d(np.asarray(theta, dtype=float))
-        inner = self.skin.space.dim
-        skin = theta[:, :inner]
+        skin, values = self._split(theta)
         found = at_distinct(lambda these, _: self.skin.predict(these), skin, skin)
-        values = dict(zip(self.space.names[inner:], theta[:, inner:].T, strict=True))
         return Prediction(found.mean + self._added(values, found.mean), found.factor, found.diagonal)
 
     def predict_mean(self, theta: ArrayLike) -> Array:
         """The mean (n, m) of `predict` alone."""
+        skin, values = self._split(theta)
+        mean = mean_at_distinct(lambda these, _: self.skin.predict_mean(these), skin, skin)
+        return mean + self._added(values, mean)
+
+    def _split(self, theta: ArrayLike) -> tuple[Array, dict[str, Array]]:
+        """The skin's parameters (n, k), and the instrument's by name, (n,) each."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         inner = self.skin.space.dim
-        skin = theta[:, :inner]
-        mean = mean_at_distinct(lambda these, _: self.skin.predict_mean(these), skin, skin)
-        values = dict(zip(self.space.names[inner:], theta[:, inner:].T, strict=True))
-        return mean + self._added(values, mean)
+        return theta[:, :inner], dict(zip(self.space.names[inner:], theta[:, inner:].T, strict=True))
 
     def _added(self, values: Mapping[str, Array], mean_n: Array) -> Array:
         """What the mechanisms add to the bins' means (n, m)."""

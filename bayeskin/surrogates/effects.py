@@ -63,24 +63,23 @@ class Effect:
 
     def predict(self, theta: Array, base: Array) -> Prediction:
         """What the effect adds to the base's force (n, m), at theta (n, d) in the order of its space."""
-        similarity = self.surrogate.similarity
-        if self.estimate is None:
-            return self.surrogate.predict(theta, strength(similarity, self.own[0], self.neutral, theta))
-        change = self.estimate(theta[:, -len(self.own) :], base)
-        size = _rms(change)
-        found = self.surrogate.predict(theta, size * np.exp(-similarity.log_scale(theta)))
-        return replace(found, mean=found.mean + change - size[:, None])
+        times, beside = self._scaled(theta, base)
+        found = self.surrogate.predict(theta, times)
+        return replace(found, mean=found.mean + beside)
 
     def predict_mean(self, theta: Array, base: Array) -> Array:
         """The mean (n, m) of `predict` alone."""
+        times, beside = self._scaled(theta, base)
+        return self.surrogate.predict_mean(theta, times) + beside
+
+    def _scaled(self, theta: Array, base: Array) -> tuple[Array, Array | float]:
+        """How many times (n,) what is learnt adds to the force, and what comes to it, (n, m)."""
         similarity = self.surrogate.similarity
         if self.estimate is None:
-            return self.surrogate.predict_mean(theta, strength(similarity, self.own[0], self.neutral, theta))
+            return strength(similarity, self.own[0], self.neutral, theta), 0.0
         change = self.estimate(theta[:, -len(self.own) :], base)
         size = _rms(change)
-        return self.surrogate.predict_mean(theta, size * np.exp(-similarity.log_scale(theta))) + (
-            change - size[:, None]
-        )
+        return size * np.exp(-similarity.log_scale(theta)), change - size[:, None]
 
 
 def _rms(values: Array) -> Array:
