@@ -119,7 +119,7 @@ def summaries() -> dict[str, dict[str, Any]]:
             "verdict": "named",
             "located": [{"t0": 0.0, "t1": 9.5, "phase": "rest", "cycle": 0, "mean_residual": -0.0586,
                          "significance": 0.001}],
-            "remaining": [],
+            "remaining": [], "unknown_probability": 0.07,
             "mechanisms": [
                 {"name": "device-friction", "probability": 0.98, "group": ["device-friction", "viscous-drag"],
                  "group_probability": 1.0, "explains_n": 0.03, "statement": "The slide rubs: 60 mN.",

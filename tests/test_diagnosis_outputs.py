@@ -63,7 +63,7 @@ def parts_of(*names: str) -> list[Contribution]:
 
 
 def located(residual_n: np.ndarray, *windows: Window) -> Located:
-    return Located(windows, np.arange(len(residual_n)), residual_n, np.full(len(residual_n), 1e-3))
+    return Located(windows, np.arange(len(residual_n)), residual_n, np.full(len(residual_n), 1e-3), 1.0)
 
 
 WINDOW = Window(15.0, 45.0, "hold", 1, 5e-3, 1e-3)
@@ -123,7 +123,7 @@ def test_what_is_left_is_described_where_something_is(
     verdict: Any, windows: tuple[Window, ...], described: bool
 ) -> None:
     after = located(np.zeros(len(BINNED.force_n)), *windows)
-    assert diagnosis.leaves_something(Diagnosis(verdict, (), 0.0), after) == described
+    assert diagnosis.leaves_something(Diagnosis(verdict, (), 0.0, 0.05), after) == described
 
 
 def drifting() -> Fit:
@@ -163,7 +163,9 @@ def test_words_say_what_is_left_only_where_something_is(remainder: Remainder) ->
     answer = {
         "verdict": "unknown", "mechanisms": [], "located": [], "remaining": [], "candidates": [],
         "fit": {"before": fits, "after": fits}, "folder": "x", "unexplained": None, "unsure": [],
+        "unknown_probability": 0.974,
     }  # fmt: skip
+    assert "outside this catalogue: probability at most 0.97" in in_words(answer)
     assert "unexplained" not in in_words(answer)
     assert "R-hat" not in in_words(answer)
     rough = {**fits, "sampled": {**fits["sampled"], "settled": False}}
@@ -230,7 +232,7 @@ def test_residuals_by_phase_have_a_line_a_cycle_and_the_rms_of_their_kind() -> N
 
 def test_residuals_of_a_part_of_the_recording_leave_the_other_phases_out() -> None:
     inside = np.flatnonzero(BINNED.time_s < 50.0)
-    part = Located((), inside, np.full(len(inside), 1e-3), np.full(len(inside), 1e-3))
+    part = Located((), inside, np.full(len(inside), 1e-3), np.full(len(inside), 1e-3), 1.0)
     figure = report.figure_residual_by_phase(BINNED, toy.MOTION, part, part)
     assert [len(ax.get_lines()) for ax in figure.axes] == [2, 2, 2, 2]
     moving = dataclasses.replace(

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 import toy
+from scipy.stats import kstest
 from toy_inference import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
 
 from bayeskin.errors import InputError
@@ -24,8 +25,8 @@ from bayeskin.mismatch.full_fit import fit_full
 from bayeskin.mismatch.locate import locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.resample import resample
-from bayeskin.mismatch.search import Made, Search, search, weight
-from bayeskin.mismatch.verdict import judge
+from bayeskin.mismatch.search import PRIOR, Made, Search, search, weight
+from bayeskin.mismatch.verdict import judge, unknown_probability
 from bayeskin.proof.cases import shipped_screen
 from bayeskin.proof.protocol import MOTION
 from bayeskin.surrogates.effects import WithEffects
@@ -78,6 +79,7 @@ def test_a_concealed_mechanism_is_named_and_its_parameters_are_right(
     assert [one.name for one in verdict.named] == list(names)
     assert before.windows
     assert verdict.explained > 0.8
+    assert verdict.unknown_probability < 0.5
     for name in (name for name in values if not name.startswith("event")):
         draws = found.best.draws(1000, 0)[:, found.best.log_posterior.names.index(name)]
         assert abs(values[name] - draws.mean()) < 4.0 * draws.std(), name
@@ -95,6 +97,24 @@ def test_nothing_is_missing_where_nothing_is() -> None:
         before, after = (locate(one, found.best.theta, 1) for one in (found.base, found.best))
         verdicts.append(judge(found, KNOWN, before, after).verdict)
     assert verdicts.count("nothing-missing") >= 3
+
+
+def test_the_chance_of_the_farthest_window_is_uniform_where_nothing_is_missing() -> None:
+    fits = [fit_base(alone, 1, find_shear(alone)) for alone in map(concealing, range(12))]
+    chances = [locate(one, one.theta, 1).chance for one in fits]
+    assert kstest(chances, "uniform").pvalue > 0.01
+    off = concealing(0, ("viscous-drag",), drag=30.0)
+    assert locate(fit_base(off, 1, find_shear(off)), fits[0].theta, 1).chance < 1e-6
+
+
+def test_the_probability_of_unknown_is_the_bound_of_sellke_bayarri_and_berger() -> None:
+    """Their table 1: at even odds, by p, what the null keeps at least."""
+    even = {0.05: 0.289, 0.01: 0.111, 0.001: 0.0184}
+    for chance, null in even.items():
+        odds = PRIOR / (1.0 - PRIOR) * (1.0 - null) / null
+        assert unknown_probability(chance) == pytest.approx(odds / (1.0 + odds), rel=5e-3)
+    assert unknown_probability(0.0) == 1.0
+    assert unknown_probability(1.0) == unknown_probability(0.4) == pytest.approx(PRIOR)
 
 
 def test_a_search_that_was_stopped_goes_on_without_repeating_a_fit() -> None:

@@ -17,6 +17,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from bayeskin.inference.noise_model import draw_noise
 from bayeskin.mismatch.fit import Fit
@@ -43,12 +44,16 @@ class Window:
 
 @dataclass(frozen=True)
 class Located:
-    """Windows in time order; residual (k,) [N] and what is allowed of it, sd (k,) [N], at bins (k,)."""
+    """Windows in time order; residual (k,) [N] and what is allowed of it, sd (k,) [N], at bins (k,).
+
+    chance : that some window goes by itself as far as the farthest does
+    """
 
     windows: tuple[Window, ...]
     bins: NDArray[np.int64]
     residual_n: Array
     allowed_n: Array
+    chance: float
 
 
 def model_error(binned: BinnedForce) -> float:
@@ -74,7 +79,8 @@ def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
         tall = np.maximum(tall, np.abs(centred - centred.mean()) / sd)
     z = np.array([_means(residual[None], *span)[0] for span in spans]) / scale
     windows = []
-    for a, b in _chosen(spans, z, float(np.quantile(tall, 1.0 - LEVEL))):
+    limit = float(np.quantile(tall, 1.0 - LEVEL))
+    for a, b in _chosen(spans, z, limit):
         mean = float(residual[a:b].mean())
         sd = float(np.hypot(_means(spread, a, b).std(), error_n))
         chance = (1 + np.sum(tall >= abs(mean) / sd)) / (1 + len(tall))
@@ -86,7 +92,15 @@ def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
                 phase.kind, phase.cycle, mean, float(chance),
             )
         )  # fmt: skip
-    return Located(tuple(windows), chain.bins, residual, spread.std(axis=0))
+    farthest = _chance(tall, limit, float(np.abs(z).max()))
+    return Located(tuple(windows), chain.bins, residual, spread.std(axis=0), farthest)
+
+
+def _chance(tall: Array, limit: float, farthest: float) -> float:
+    """Share of draws whose farthest window goes as far; beyond `limit` a normal tail, for want of draws."""
+    if farthest <= limit:
+        return float((1 + np.sum(tall >= farthest)) / (1 + len(tall)))
+    return float(LEVEL * np.exp(norm.logsf(farthest) - norm.logsf(limit)))
 
 
 def _allowed(found: Fit, noise: Mapping[str, float], seed: int, rng: np.random.Generator) -> Array:

@@ -4,20 +4,27 @@ A mechanism is named where it, or its group of look-alikes together, has nine ch
 out of its set costs more than the full model's own error, if no window is left or what is named explains nine
 tenths of the squared residual beyond what is allowed. Nothing is missing where none is named and no window is
 found, or what goes beyond the allowed is within the model's own error. Otherwise the mismatch is unknown.
+
+The probability that something acts which no set has is at most that of Sellke, Bayarri & Berger (2001,
+The American Statistician 55:62): where the farthest window left is met by chance with probability p < 1/e,
+no alternative of a broad class makes it likelier by more than 1 / (-e p ln p). Before the recording is seen
+it is taken to be as probable as any mechanism.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.special import xlogy
 
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.locate import Located, model_error
-from bayeskin.mismatch.search import Search, weight
+from bayeskin.mismatch.search import PRIOR, Search, weight
 
 PROBABLE = 0.9
 EXPLAINED = 0.9
@@ -40,11 +47,15 @@ class Named:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The verdict, what is named, and the share of the squared residual that it explains."""
+    """The verdict, what is named, and the share of the squared residual that it explains.
+
+    unknown_probability : at most, that something acts which is in no set tried
+    """
 
     verdict: Literal["nothing-missing", "named", "unknown"]
     named: tuple[Named, ...]
     explained: float
+    unknown_probability: float
 
 
 def judge(found: Search, known: Mapping[str, Mechanism], before: Located, after: Located) -> Diagnosis:
@@ -57,10 +68,16 @@ def judge(found: Search, known: Mapping[str, Mechanism], before: Located, after:
         if (one := _named(found, known[name])).group_probability > PROBABLE and one.explains_n > least
     )
     if not named and (not before.windows or beyond_allowed(before) < least):
-        return Diagnosis("nothing-missing", (), 0.0)
+        return Diagnosis("nothing-missing", (), 0.0, unknown_probability(before.chance))
     if named and (explained > EXPLAINED or not after.windows):
-        return Diagnosis("named", named, explained)
-    return Diagnosis("unknown", (), explained)
+        return Diagnosis("named", named, explained, unknown_probability(after.chance))
+    return Diagnosis("unknown", (), explained, unknown_probability(after.chance))
+
+
+def unknown_probability(chance: float) -> float:
+    """At most, that a fit lacks something whose farthest window goes so far by chance (0 to 1)."""
+    factor = 1.0 if chance > 1.0 / math.e else -float(xlogy(math.e * chance, chance))
+    return PRIOR / (PRIOR + (1.0 - PRIOR) * factor)
 
 
 def _rms(found: Fit) -> float:

@@ -76,6 +76,7 @@ def _work(run: Run) -> Mapping[str, Any]:
         "located": [window(one) for one in before.located.windows],
         "remaining": [window(one) for one in after.located.windows],
         "explained": found.explained,
+        "unknown_probability": found.unknown_probability,
         "mechanisms": [
             mechanism(one, bench.known[one.name], after.parts, after.draws.summary, best)
             for one in found.named

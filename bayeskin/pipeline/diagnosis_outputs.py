@@ -141,6 +141,8 @@ def in_words(answer: Mapping[str, Any]) -> str:
         f"  {one['name']} (probability {one['probability']:.2f}): {one['statement']}"
         for one in answer["mechanisms"]
     ]
+    if (lacking := answer.get("unknown_probability")) is not None:
+        lines.append(f"  something else, outside this catalogue: probability at most {lacking:.2f}")
     lines.append(f"{len(answer['located'])} windows before, {len(answer['remaining'])} after")
     for when in ("before", "after"):
         held = fits[when]["rmse_held_out"]

@@ -114,6 +114,14 @@ def fits_of(fit: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     return {"surrogate": fit, **({"full model": full} if full and "rmse" in full else {})}
 
 
+def _beyond_the_catalogue(said: Mapping[str, Any]) -> list[str]:
+    """Nothing of a diagnosis that did not ask."""
+    chance = said.get("unknown_probability")
+    if chance is None:
+        return []
+    return [f"Something outside the catalogue: probability {number(chance)} at most."]
+
+
 def _missing(facts: RunFacts) -> Verdict:
     said = facts.said("diagnose")
     if not said:
@@ -123,13 +131,13 @@ def _missing(facts: RunFacts) -> Verdict:
     fit = said["fit"]
     both = [quantity([*fits_of(fit[when]).values()][-1]["rmse"], "N") for when in ("before", "after")]
     if said["verdict"] == "nothing-missing":
-        return Verdict(
-            "nothing", "good", [f"The recording stays within what the model allows ({both[0]} RMSE)."]
-        )
+        within = f"The recording stays within what the model allows ({both[0]} RMSE)."
+        return Verdict("nothing", "good", [within, *_beyond_the_catalogue(said)])
     lines = [f"{one['statement']} (probability {number(one['probability'])})" for one in said["mechanisms"]]
     lines.append(f"RMSE {both[0]} without, {both[1]} with what was found.")
     left = len(said["remaining"])
     if left:
         lines.append(f"{left} window{'s' * (left != 1)} of the recording remain unexplained.")
+    lines += _beyond_the_catalogue(said)
     word = "named" if said["verdict"] == "named" else "something that has no name here"
     return Verdict(word, "doubt", lines)
