@@ -393,6 +393,27 @@ def test_without_slopes_of_its_own_the_full_model_is_fitted_with_the_surrogate_s
     assert found.value > float(truth.log_prob(truth.vector(at_truth)[None])[0]) - 0.5
 
 
+def test_a_full_fit_that_leaves_much_settles_for_what_much_is() -> None:
+    """Nats of a residual of twenty times the noise are four hundred times as many."""
+    alone = dataclasses.replace(concealing(0), noise_priors=QUIET)
+    noise = {f"sd_{kind}": 6e-3 for kind in ("rest", "load", "hold", "unload")}
+    start = {**TRUTH, **noise, "tau_noise": 0.5, "nu_noise": 50.0, "E_c": 1.02 * TRUTH["E_c"]}
+    waves = 0.1 * np.sin(np.arange(len(alone.binned.force_n)))
+
+    def full(theta, changes):
+        return alone.surrogate.predict([theta[n] for n in alone.surrogate.space.names]).mean[0], None
+
+    runs = []
+    for left_n in (0.0 * waves, waves):
+        force = np.array(alone.binned.force_n) + left_n
+        recorded = dataclasses.replace(alone, binned=dataclasses.replace(alone.binned, force_n=force))
+        answer = fit_full(recorded, start, full, (), 6, 1)
+        assert not isinstance(answer, str)
+        assert answer[0].settled
+        runs.append(answer[0].runs)
+    assert runs[0] > runs[1] == 1
+
+
 @dataclasses.dataclass(frozen=True)
 class Scaled:
     """A surrogate without error whose force is so many times another's."""

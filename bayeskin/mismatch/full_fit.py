@@ -26,7 +26,7 @@ from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.types import Array, ParameterSpace, Prediction, Surrogate
 
 TRUST, SMALLEST, LARGEST = 0.1, 0.005, 0.4  # of the prior's width, either side
-ENOUGH = 0.5  # nats still to be gained
+ENOUGH = 0.5  # nats still to be gained, where the residual is noise
 STARTS = 3  # climbs of a round: from the best point, and from others in the trust region
 CLIMB = 20  # rounds of each
 STEP = 1e-4  # of the box, for the surrogate's differences
@@ -128,11 +128,18 @@ def fit_full(
         if trust < SMALLEST:
             break
         trial, promised = _maximum(local, best.theta, trust, exact, rng)
-        if promised - best.value < ENOUGH:
+        if promised - best.value < ENOUGH * _excess(local, best):
             best = replace(best, settled=True)
             break
     assert best is not None
     return best, local
+
+
+def _excess(local: LogPosterior, best: FullFit) -> float:
+    """How many times the noise's mean square the residual's is, 1 at least: by so much nats are inflated."""
+    noise_n = max(best.theta[name] for name in local.names if name.startswith("sd_"))
+    residual = local.chain.force_n - best.force_n[local.chain.bins]
+    return max(float(np.mean(residual**2)) / noise_n**2, 1.0)
 
 
 def _change(space: ParameterSpace, theta: Array) -> Array:
