@@ -76,6 +76,8 @@ def test_a_concealed_mechanism_is_named_and_its_parameters_are_right(
     before, after = (locate(one, found.best.theta, 1) for one in (found.base, found.best))
     verdict = judge(found, KNOWN, before, after)
     assert verdict.verdict == "named"
+    assert judge(found, KNOWN, before, after, (0.0, 1.0)) == verdict
+    assert judge(found, KNOWN, before, after, (1.0, 0.0)).verdict == "unknown"
     assert [one.name for one in verdict.named] == list(names)
     assert before.windows
     assert verdict.explained > 0.8

@@ -23,10 +23,11 @@ from numpy.typing import ArrayLike
 
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import gauss_newton
+from bayeskin.inference.noise_model import scales
 from bayeskin.types import Array, ParameterSpace, Prediction, Surrogate
 
 TRUST, SMALLEST, LARGEST = 0.1, 0.005, 0.4  # of the prior's width, either side
-ENOUGH = 0.5  # nats still to be gained, where the residual is noise
+ENOUGH = 2.0  # nats still to be gained, where the residual is noise: the posterior is about the run
 STARTS = 3  # climbs of a round: from the best point, and from others in the trust region
 CLIMB = 20  # rounds of each
 STEP = 1e-4  # of the box, for the surrogate's differences
@@ -137,9 +138,9 @@ def fit_full(
 
 def _excess(local: LogPosterior, best: FullFit) -> float:
     """How many times the noise's mean square the residual's is, 1 at least: by so much nats are inflated."""
-    noise_n = max(best.theta[name] for name in local.names if name.startswith("sd_"))
-    residual = local.chain.force_n - best.force_n[local.chain.bins]
-    return max(float(np.mean(residual**2)) / noise_n**2, 1.0)
+    chain, values = local.chain, local.from_sampling(local.vector(best.theta))[None]
+    noise_n, _ = scales(chain, local.split(values)[1], np.zeros((1, len(chain.bins))))
+    return max(float(np.mean(((chain.force_n - best.force_n[chain.bins]) / noise_n[0]) ** 2)), 1.0)
 
 
 def _change(space: ParameterSpace, theta: Array) -> Array:

@@ -2,8 +2,9 @@
 
 A mechanism is named where it, or its group of look-alikes together, has nine chances in ten, and leaving it
 out of its set costs more than the full model's own error, if no window is left or what is named explains nine
-tenths of the squared residual beyond what is allowed. Nothing is missing where none is named and no window is
-found, or what goes beyond the allowed is within the model's own error. Otherwise the mismatch is unknown.
+tenths of the squared residual beyond what is allowed. Where the full model was fitted, its evidence has to be
+for the set, too. Nothing is missing where none is named and no window is found, or what goes beyond the
+allowed is within the model's own error. Otherwise the mismatch is unknown.
 
 The probability that something acts which no set has is at most that of Sellke, Bayarri & Berger (2001,
 The American Statistician 55:62): where the farthest window left is met by chance with probability p < 1/e,
@@ -58,13 +59,20 @@ class Diagnosis:
     unknown_probability: float
 
 
-def judge(found: Search, known: Mapping[str, Mechanism], before: Located, after: Located) -> Diagnosis:
-    """The verdict on a search; `before` and `after` are located at its base and at its best set."""
+def judge(
+    found: Search, known: Mapping[str, Mechanism], before: Located, after: Located,
+    full_weights: tuple[float, float] | None = None,
+) -> Diagnosis:  # fmt: skip
+    """The verdict on a search; `before` and `after` are located at its base and at its best set.
+
+    full_weights : of these two by the full model, where that was fitted
+    """
     best, explained = found.best, explained_share(before, after)
     least = NOTICEABLE * model_error(best.log_posterior.binned)
+    confirmed = full_weights is None or full_weights[1] > full_weights[0]
     named = tuple(
         one
-        for name in best.names
+        for name in (best.names if confirmed else ())
         if (one := _named(found, known[name])).group_probability > PROBABLE and one.explains_n > least
     )
     if not named and (not before.windows or beyond_allowed(before) < least):

@@ -68,7 +68,11 @@ def _work(run: Run) -> Mapping[str, Any]:
     )
     held_out = begins or [None]
     before, after = taken[0], taken[-1]
-    found = judge(whole, bench.known, before.located, after.located)
+    full = (before.full_weight, after.full_weight)
+    found = judge(
+        whole, bench.known, before.located, after.located,
+        None if full[0] is None or full[1] is None else (full[0], full[1]),
+    )  # fmt: skip
     remainder = after.remainder if leaves_something(found, after.located) else None
     best = after.full.theta if isinstance(after.full, FullFit) else whole.best.theta
     answer: dict[str, Any] = {

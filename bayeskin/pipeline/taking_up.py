@@ -1,8 +1,9 @@
 """The full model takes up what a search on its surrogate has found: a fit of its own, the posterior there.
 
-First on the coarsest bricks, whose runs are quick and carry their derivatives, then on the model's own mesh
-with these derivatives; without mechanisms on that at once, with the slopes of the base's surrogate, where
-these are good enough. Sampled, located and taken apart is the posterior about that fit, in which nothing of
+A first run of the model's own mesh shows by how much the coarsest bricks are off. These, whose runs are quick
+and carry their derivatives, are fitted with that difference added, then the model's own mesh with their
+derivatives. Without mechanisms the slopes of the base's surrogate come first, and last where they are good
+enough. Sampled, located and taken apart is the posterior about that fit, in which nothing of
 the surrogate's error is left. The article's formulation and models of one's own keep the surrogate's.
 """
 
@@ -27,6 +28,7 @@ from bayeskin.mismatch.form import Form, propose_form
 from bayeskin.mismatch.full_fit import FullFit, fit_full
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
+from bayeskin.mismatch.search import weight
 from bayeskin.pipeline.engine import Run, Silent
 from bayeskin.pipeline.reported import FullForce
 from bayeskin.pipeline.workbench import Workbench, opened, workbench
@@ -34,8 +36,8 @@ from bayeskin.types import Array
 from bayeskin.workers import Lost, run_parallel
 
 COARSE_RUNS, BASE_RUNS = 8, 4  # at most, with mechanisms and without
-FULL_RUNS = 4  # at most, of the model's own mesh: the first shows what the coarse one has missed
-DIRECT_RUNS = 2  # at most, with the slopes of the base's surrogate
+FULL_RUNS = 4  # at most, of the model's own mesh with the coarse one's slopes
+DIRECT_RUNS = 2  # at most, of the model's own mesh with the slopes of the base's surrogate
 PREDICTIVE_DRAWS = 300
 
 FullResult = FullFit | str | None  # of the full model, or why its first run failed; None where none is made
@@ -53,12 +55,14 @@ class Remainder:
 class TakenUp:
     """What follows a search's fit on the whole recording.
 
-    full : the full model's fit; draws : of the posterior; coverage90 : share of bins in its predictive band;
+    full : the full model's fit; full_weight : logarithm of the set's weight by it, None without it;
+    draws : of the posterior; coverage90 : share of bins in its predictive band;
     left_out_n : RMS error of phases that the fit is made without, None where there is but one;
     located : windows that it leaves; parts : what each mechanism contributes; remainder : what is left
     """
 
     full: FullResult
+    full_weight: float | None
     draws: Resampled
     coverage90: float
     left_out_n: float | None
@@ -95,14 +99,16 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
     shear = straight.among(alone.names, found.log_posterior.names) if straight else None
     full, about = _full(bench, found)
     force: Force = partial(_surrogate_force, bench)
+    full_weight = None
     if about is not None and isinstance(full, FullFit):
         found = fit_near(found.names, about, full.theta, shear)
+        full_weight = weight(found) + full.value - found.value  # as high as a run has shown it to be
         force = _coarse(bench)
     draws = resample(found, shear, alone.surrogate.space.dim, seed)
     some = inference.evenly(draws.draws, PREDICTIVE_DRAWS)
     bands = inference.bands(found.log_posterior, some, np.random.default_rng(seed))
     return TakenUp(
-        full, draws, inference.coverage(bench.binned, *bands.interval(0.9)),
+        full, full_weight, draws, inference.coverage(bench.binned, *bands.interval(0.9)),
         _left_out(found, shear), locate(found, noise, seed),
         tuple(contributions(found.names, found.theta, force)),
         Remainder(discrepancy(found, bench.motion), propose_form(found, bench.motion, seed)),
@@ -128,34 +134,47 @@ def _full(bench: Workbench, found: Fit) -> tuple[FullResult, LogPosterior | None
     beyond = [bench.known[name] for name in found.names if bench.known[name].act.bind is None]
     exact = [p.name for mechanism in beyond for p in mechanism.parameters]
     coarse, fine = _coarse(bench), FullForce(bench.spec, bench.motion, bench.binned.edges_s)
-    known: dict[tuple[float, ...], tuple[Array, Array] | str] = {}
+    coarse_runs: dict[tuple[float, ...], tuple[Array, Array] | str] = {}
+    fine_runs: dict[tuple[float, ...], Array | str] = {}
 
     def quick(theta: Mapping[str, float], changes: Mapping[str, float]) -> tuple[Array, Array] | str:
         key = tuple(theta[name] for name in changes)
-        if key not in known:
-            known[key] = coarse.with_slopes((found.names, theta), changes)
-        return known[key]
+        if key not in coarse_runs:
+            coarse_runs[key] = coarse.with_slopes((found.names, theta), changes)
+        return coarse_runs[key]
+
+    def alone(theta: Mapping[str, float], changes: Mapping[str, float]) -> tuple[Array, None] | str:
+        key = tuple(theta[name] for name in changes)
+        if key not in fine_runs:
+            fine_runs[key] = fine((found.names, theta))
+        force = fine_runs[key]
+        return force if isinstance(force, str) else (force, None)
+
+    def lifted(theta: Mapping[str, float], changes: Mapping[str, float]) -> tuple[Array, Array] | str:
+        """The coarse mesh with what the model's own added where that was run first."""
+        here, there, own = quick(theta, changes), quick(start, changes), alone(start, changes)
+        if isinstance(here, str) or isinstance(there, str) or isinstance(own, str):
+            return next(one for one in (here, there, own) if isinstance(one, str))
+        return here[0] + own[0] - there[0], here[1]
 
     def whole(theta: Mapping[str, float], changes: Mapping[str, float]) -> tuple[Array, Array] | str:
-        slopes, force = quick(theta, changes), fine((found.names, theta))
-        if isinstance(slopes, str) or isinstance(force, str):
-            return slopes if isinstance(slopes, str) else str(force)
-        return force, slopes[1]
-
-    def alone(theta: Mapping[str, float], _: Mapping[str, float]) -> tuple[Array, None] | str:
-        force = fine((found.names, theta))
-        return force if isinstance(force, str) else (force, None)
+        slopes, own = quick(theta, changes), alone(theta, changes)
+        if isinstance(slopes, str) or isinstance(own, str):
+            return slopes if isinstance(slopes, str) else str(own)
+        return own[0], slopes[1]
 
     fitted = partial(
         fit_full, found.log_posterior, exact=exact, seed=bench.run.config.seed, allow=bench.with_mesh_error
     )
+    start = found.theta
     if not found.names:
-        direct = fitted(found.theta, alone, rounds=DIRECT_RUNS)
-        if not isinstance(direct, str) and direct[0].settled:
-            return direct
-    first = fitted(found.theta, quick, rounds=COARSE_RUNS if found.names else BASE_RUNS)
-    start = found.theta if isinstance(first, str) else first[0].theta
-    last = fitted(start, whole, rounds=FULL_RUNS)
+        direct = fitted(start, alone, rounds=DIRECT_RUNS)
+        if not isinstance(direct, str):
+            if direct[0].settled:
+                return direct
+            start = direct[0].theta
+    first = fitted(start, lifted, rounds=COARSE_RUNS if found.names else BASE_RUNS)
+    last = fitted(start if isinstance(first, str) else first[0].theta, whole, rounds=FULL_RUNS)
     return (last, None) if isinstance(last, str) else last
 
 
