@@ -354,6 +354,21 @@ def test_the_full_model_s_own_maximum_is_found_with_a_surrogate_s_wrong_slopes()
     assert found.gained > 1.0
     assert found.value == pytest.approx(best.value, abs=0.5)
     np.testing.assert_allclose(found.force_n, force(found.theta), atol=1e-6)
+    assert found.mesh_n == 0.0
+
+
+def test_a_full_fit_has_in_its_force_what_its_mesh_is_wrong_by() -> None:
+    """The full model pulls two hundredths too hard, its parameters held: the recording shows that."""
+    alone = dataclasses.replace(concealing(0), noise_priors=QUIET)
+    noise = {f"sd_{kind}": 2e-3 for kind in ("rest", "load", "hold", "unload")}
+    start = {**TRUTH, **noise, "tau_noise": 0.5, "nu_noise": 50.0}
+    right = alone.surrogate.predict([TRUTH[n] for n in alone.surrogate.space.names]).mean[0]
+    found, _ = fit_full(
+        alone, start, lambda theta, changes: (1.02 * right, None), (), 1, 1,
+        lambda surrogate: Discretised(surrogate, toy.MOTION, 0.02, 1e-9),
+    )  # fmt: skip
+    np.testing.assert_allclose(found.force_n, right, atol=2e-3)
+    assert found.mesh_n == pytest.approx(0.02 * np.sqrt(np.mean(right**2)), rel=0.2)
 
 
 def test_a_full_fit_whose_runs_fail_keeps_what_it_has() -> None:

@@ -74,14 +74,17 @@ class Anchored:
 
 @dataclass(frozen=True)
 class FullFit:
-    """theta: all parameters by name (SI) of the best run; value: its log posterior; force_n (m,).
+    """theta: all parameters by name (SI) of the best run; value: its log posterior; force_n (m,): the run's,
+    with what its own mesh is wrong by as the recording shows it.
 
-    runs : made; gained : nats on the first of them; settled : whether next to nothing is still to be gained
+    mesh_n : that error, RMS [N]; runs : made; gained : nats on the first of them;
+    settled : whether next to nothing is still to be gained
     """
 
     theta: Mapping[str, float]
     value: float
     force_n: Array
+    mesh_n: float
     runs: int
     gained: float
     settled: bool = False
@@ -116,13 +119,16 @@ def fit_full(
             own = np.zeros((len(force), space.dim)) if slopes is None else slopes - _slopes(surrogate, theta)
             anchored = Anchored(surrogate, theta, force, own)
             there = replace(log_posterior, surrogate=allow(anchored), sure_within_n=None)
-            vector = _with_noise(there, trial)
+            vector, latent = _with_noise(there, trial)
+            values = there.from_sampling(vector)
             value = float(there.log_prob(vector[None])[0])
             if best is None or value > best.value:
                 first = value if best is None else best.value - best.gained
                 trust = TRUST if best is None else min(2.0 * trust, LARGEST)
-                named = there.named(there.from_sampling(vector))
-                best, local = FullFit(named, value, force, count, value - first), there
+                error_n = there.predict(values).factor[0] @ latent
+                mesh_n = float(np.sqrt(np.mean(error_n**2)))
+                best = FullFit(there.named(values), value, force + error_n, mesh_n, count, value - first)
+                local = there
             else:
                 trust *= 0.25
         best = replace(best, runs=count)
@@ -159,12 +165,13 @@ def _slopes(surrogate: Surrogate, theta: Array) -> Array:
     return np.asarray((mean[1:] - mean[0]).T / np.diag(steps))
 
 
-def _with_noise(there: LogPosterior, trial: Mapping[str, float]) -> Array:
-    """The point (D,) with the noise that suits its force best: a climb with all else held."""
+def _with_noise(there: LogPosterior, trial: Mapping[str, float]) -> tuple[Array, Array]:
+    """The point (D,) with the noise that suits its force best, a climb with all else held; latent (r,)."""
     low, high = there.bounds
     vector = np.clip(there.vector(trial), low, high)
     held = _within(there, vector, np.zeros(there.surrogate.space.dim))
-    return np.clip(gauss_newton(held, np.clip(vector, *held.bounds), None, 3).vector, low, high)
+    top = gauss_newton(held, np.clip(vector, *held.bounds), None, 3)
+    return np.clip(top.vector, low, high), top.latent
 
 
 def _within(local: LogPosterior, vector: Array, reach: Array) -> LogPosterior:

@@ -225,7 +225,8 @@ def _full(
     full: FullResult, held_out: FullResult, force_n: Array, binned: BinnedForce,
     usable: NDArray[np.bool_], rest: NDArray[np.bool_],
 ) -> dict[str, Any] | None:  # fmt: skip
-    """RMSE [N] of the full model where its own fits ended, and how far the surrogate's is off from it."""
+    """RMSE [N] of the full model where its own fits ended, its mesh's error in it as the recording shows that
+    (`mesh_n`, RMS), and how far the surrogate's fit is off from it."""
     if not isinstance(full, FullFit):
         return None if full is None else {"message": full}
     begun = held_out if isinstance(held_out, FullFit) else None
@@ -233,6 +234,7 @@ def _full(
         "rmse": _rms(binned.force_n - full.force_n, usable),
         "rmse_by_phase": dict(inference.rmse(binned, full.force_n).by_kind_n),
         "rmse_held_out": None if begun is None else _rms(binned.force_n - begun.force_n, rest),
+        "mesh_n": full.mesh_n,
         "fit_off_by": _rms(force_n - full.force_n, usable),
         "runs": full.runs,
         "gained": full.gained,
