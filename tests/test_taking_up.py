@@ -3,41 +3,57 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import toy
-from test_mismatch import KNOWN, QUIET, Scaled, building, concealing
+from test_mismatch import KNOWN, QUIET, Scaled, Wrong, building, concealing
 from toy_inference import TRUTH
 
-from bayeskin.mismatch.fit import fit_near
+from bayeskin.inference import LogPosterior
+from bayeskin.mismatch.fit import Fit, fit_near
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline import taking_up
 
-OFF = 0.97  # of the force: what the coarse mesh makes of it
+COARSE, FINE = 0.97, 1.02  # of the toy's force: what either mesh makes of it
+Values = Mapping[str, float]
+
+
+@dataclasses.dataclass
+class Runs:
+    """All runs made, of the coarse mesh and of the model's own; `fails` says of which these fail."""
+
+    coarse: list[Values] = dataclasses.field(default_factory=list)
+    fine: list[Values] = dataclasses.field(default_factory=list)
+    fails: Callable[[Values], bool] = lambda values: False
 
 
 @pytest.fixture
-def runs(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
-    """Counts runs of a full model that is the toy's, a little stiffer, and of a coarse one that is softer."""
-    made = {"coarse": 0, "fine": 0}
+def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
+    """Of a full model that is the toy."""
+    made = Runs()
 
     class Full:
-        def __init__(self, spec, motion, edges_s):
+        def __init__(self, spec: ModelSpec, motion: object, edges_s: object) -> None:
             self.coarse = spec.refinement == 0
 
-        def __call__(self, case):
-            return self.with_slopes(case, {})[0]
+        def __call__(self, case: Any) -> Any:
+            found = self.with_slopes(case, {})
+            return found if isinstance(found, str) else found[0]
 
-        def with_slopes(self, case, changes):
-            made["coarse" if self.coarse else "fine"] += 1
+        def with_slopes(self, case: Any, changes: Values) -> Any:
             names, values = case
+            (made.coarse if self.coarse else made.fine).append(dict(values))
+            if not self.coarse and made.fails(values):
+                return "did not converge"
             surrogate = building(concealing(0), names).surrogate
 
-            def force(theta):
+            def force(theta: Values) -> np.ndarray:
                 row = [theta[name] for name in surrogate.space.names]
-                return (OFF if self.coarse else 1.02) * surrogate.predict_mean([row])[0]
+                return (COARSE if self.coarse else FINE) * surrogate.predict_mean([row])[0]
 
             moved = [(force({**values, name: values[name] + 1e-4 * by}) - force(values)) / 1e-4
                      for name, by in changes.items()]  # fmt: skip
@@ -47,23 +63,51 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> dict[str, int]:
     return made
 
 
-@pytest.mark.parametrize("names", [(), ("force-offset",)])
-def test_the_coarse_mesh_leads_the_full_model_to_its_own_maximum(
-    names: tuple[str, ...], runs: dict[str, int]
-) -> None:
+def taken_up(names: tuple[str, ...]) -> tuple[Any, Any, Fit, LogPosterior]:
+    """What `_full` makes of a fit to a surrogate that is off, that fit, and the exact posterior."""
     right = building(dataclasses.replace(concealing(0, names, F0=-0.04), noise_priors=QUIET), names)
+    skin = Wrong() if not names else dataclasses.replace(right.surrogate, skin=Wrong())
+    wrong = dataclasses.replace(right, surrogate=skin)
     truth = {**TRUTH, **({"F0": -0.04} if names else {})}
     noise = {name: 2e-3 if name.startswith("sd_") else 0.5 for name in right.names if name not in truth}
-    start = fit_near(names, right, {**truth, **noise, "nu_noise": 60.0}, None)
+    start = fit_near(names, wrong, {**truth, **noise, "nu_noise": 60.0}, None)
     bench = SimpleNamespace(
         spec=ModelSpec(), motion=toy.MOTION, binned=right.binned, with_mesh_error=lambda surrogate: surrogate,
-        known={name: KNOWN[name] for name in names},
-        run=SimpleNamespace(config=SimpleNamespace(seed=1)),
+        known={name: KNOWN[name] for name in names}, run=SimpleNamespace(config=SimpleNamespace(seed=1)),
     )  # fmt: skip
-    full, about = taking_up._full(bench, start)
+    full, about = taking_up._full(bench, start)  # type: ignore[arg-type]
+    return full, about, start, dataclasses.replace(right, surrogate=Scaled(right.surrogate, FINE))
+
+
+def unlike(made: list[Values]) -> bool:
+    """Whether no two runs are of the same point."""
+    points = np.array([[values[name] for name in TRUTH if name != "p_init"] for values in made])
+    apart = [np.abs(a / b - 1.0).max() for i, a in enumerate(points) for b in points[:i]]
+    return min(apart, default=1.0) > 1e-6
+
+
+@pytest.mark.parametrize("names", [(), ("force-offset",)])
+def test_the_coarse_mesh_leads_the_full_model_to_its_own_maximum(names: tuple[str, ...], runs: Runs) -> None:
+    full, about, start, exact = taken_up(names)
+    best = fit_near(names, exact, start.theta, None)
     assert full.settled
-    exact = dataclasses.replace(right, surrogate=Scaled(right.surrogate, 1.02))
-    best = fit_near(names, exact, full.theta, None)
     assert full.value > best.value - 2.5
-    assert runs["fine"] <= 3
+    assert full.runs == len(runs.fine)
+    assert runs.coarse
+    assert unlike(runs.coarse)
+    assert unlike(runs.fine)
+    assert len(runs.fine) <= 3 + (0 if names else taking_up.DIRECT_RUNS)
     assert about is not None
+
+
+def test_a_full_run_that_fails_where_the_surrogate_s_fit_is_does_not_end_the_fit(runs: Runs) -> None:
+    failed: list[Values] = []
+    runs.fails = lambda values: not failed and not failed.append(values)  # type: ignore[func-returns-value]
+    full, _, start, exact = taken_up(("force-offset",))
+    assert failed
+    assert full.value > fit_near(("force-offset",), exact, start.theta, None).value - 2.5
+
+
+def test_a_full_model_of_which_no_run_converges_says_so(runs: Runs) -> None:
+    runs.fails = lambda values: True
+    assert taken_up(("force-offset",))[:2] == ("did not converge", None)

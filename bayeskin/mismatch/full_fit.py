@@ -28,6 +28,7 @@ from bayeskin.types import Array, ParameterSpace, Prediction, Surrogate
 
 TRUST, SMALLEST, LARGEST = 0.1, 0.005, 0.4  # of the prior's width, either side
 ENOUGH = 2.0  # nats still to be gained, where the residual is noise: the posterior is about the run
+AHEAD = 0.5  # nats by which another climb has to be better: what is not informed stays as it is
 STARTS = 3  # climbs of a round: from the best point, and from others in the trust region
 CLIMB = 20  # rounds of each
 STEP = 1e-4  # of the box, for the surrogate's differences
@@ -77,14 +78,14 @@ class FullFit:
     """theta: all parameters by name (SI) of the best run; value: its log posterior; force_n (m,): the run's,
     with what its own mesh is wrong by as the recording shows it.
 
-    mesh_n : that error, RMS [N]; runs : made; gained : nats on the first of them;
+    mesh_n (m,) : that error, 0 where none is allowed for; runs : made; gained : nats on the first of them;
     settled : whether next to nothing is still to be gained
     """
 
     theta: Mapping[str, float]
     value: float
     force_n: Array
-    mesh_n: float
+    mesh_n: Array
     runs: int
     gained: float
     settled: bool = False
@@ -125,9 +126,9 @@ def fit_full(
             if best is None or value > best.value:
                 first = value if best is None else best.value - best.gained
                 trust = TRUST if best is None else min(2.0 * trust, LARGEST)
-                error_n = there.predict(values).factor[0] @ latent
-                mesh_n = float(np.sqrt(np.mean(error_n**2)))
-                best = FullFit(there.named(values), value, force + error_n, mesh_n, count, value - first)
+                mesh_n = there.predict(values).factor[0] @ latent
+                named = {**there.named(values), **{name: trial[name] for name in space.names}}
+                best = FullFit(named, value, force + mesh_n, mesh_n, count, value - first)
                 local = there
             else:
                 trust *= 0.25
@@ -136,17 +137,24 @@ def fit_full(
             break
         trial, promised = _maximum(local, best.theta, trust, exact, rng)
         if promised - best.value < ENOUGH * _excess(local, best):
-            best = replace(best, settled=True)
+            best = replace(best, settled=trust >= TRUST)
             break
     assert best is not None
     return best, local
 
 
 def _excess(local: LogPosterior, best: FullFit) -> float:
-    """How many times the noise's mean square the residual's is, 1 at least: by so much nats are inflated."""
+    """By how much nats are inflated where more than noise is left, 1 at least.
+
+    The mean squared score of the innovations, which is what a sandwich of informations has in its middle
+    (Godambe 1960, Ann. Math. Stat. 31:1208).
+    """
     chain, values = local.chain, local.from_sampling(local.vector(best.theta))[None]
-    noise_n, _ = scales(chain, local.split(values)[1], np.zeros((1, len(chain.bins))))
-    return max(float(np.mean(((chain.force_n - best.force_n[chain.bins]) / noise_n[0]) ** 2)), 1.0)
+    noise = local.split(values)[1]
+    scale_n, rho = (one[0] for one in scales(chain, noise, np.zeros((1, len(chain.bins)))))
+    unit, nu = (chain.force_n - best.force_n[chain.bins]) / scale_n, float(noise[0, -1])
+    eps = (unit - rho * np.concatenate([[0.0], unit[:-1]])) / np.sqrt(1.0 - rho**2)
+    return max(float(np.mean(((nu + 1.0) * eps / (nu + eps**2)) ** 2)), 1.0)
 
 
 def _change(space: ParameterSpace, theta: Array) -> Array:
@@ -202,7 +210,7 @@ def _maximum(
     starts += [np.clip(starts[0] + 0.3 * rng.uniform(-1, 1, len(low)) * (high - low), low, high)
                for _ in range(STARTS - 1)]  # fmt: skip
     top, *others = (gauss_newton(near, start, None, CLIMB) for start in starts)
-    for one in others:  # what the recording does not inform stays as it is
-        top = one if one.value > top.value + ENOUGH else top
+    for one in others:
+        top = one if one.value > top.value + AHEAD else top
     inside = np.clip(top.vector, *local.bounds)
     return local.named(local.from_sampling(inside)), float(local.log_prob(inside[None])[0])

@@ -17,7 +17,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from bayeskin.inference.noise_model import draw_noise
 from bayeskin.mismatch.fit import Fit
@@ -25,6 +24,7 @@ from bayeskin.types import Array, BinnedForce
 
 DRAWS = 1000
 LEVEL = 0.05
+TAIL = 0.1  # of the draws, from whose farthest windows the chance of going farther is read
 SHORTEST = 2  # bins
 MODEL_ERROR = 1e-3  # of the force's range
 PRIOR_PRECISION = 12.0  # of a uniform prior over the unit cube
@@ -79,28 +79,32 @@ def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
         tall = np.maximum(tall, np.abs(centred - centred.mean()) / sd)
     z = np.array([_means(residual[None], *span)[0] for span in spans]) / scale
     windows = []
-    limit = float(np.quantile(tall, 1.0 - LEVEL))
-    for a, b in _chosen(spans, z, limit):
+    for a, b in _chosen(spans, z, float(np.quantile(tall, 1.0 - LEVEL))):
         mean = float(residual[a:b].mean())
         sd = float(np.hypot(_means(spread, a, b).std(), error_n))
-        chance = (1 + np.sum(tall >= abs(mean) / sd)) / (1 + len(tall))
         phase = log_posterior.binned.phases[log_posterior.binned.phase[chain.bins[a]]]
         edges = log_posterior.binned.edges_s
         windows.append(
             Window(
                 float(edges[chain.bins[a]]), float(edges[chain.bins[b - 1] + 1]),
-                phase.kind, phase.cycle, mean, float(chance),
+                phase.kind, phase.cycle, mean, _chance(tall, abs(mean) / sd),
             )
         )  # fmt: skip
-    farthest = _chance(tall, limit, float(np.abs(z).max()))
-    return Located(tuple(windows), chain.bins, residual, spread.std(axis=0), farthest)
+    chance = _chance(tall, float(np.abs(z).max(initial=0.0)))
+    return Located(tuple(windows), chain.bins, residual, spread.std(axis=0), chance)
 
 
-def _chance(tall: Array, limit: float, farthest: float) -> float:
-    """Share of draws whose farthest window goes as far; beyond `limit` a normal tail, for want of draws."""
-    if farthest <= limit:
-        return float((1 + np.sum(tall >= farthest)) / (1 + len(tall)))
-    return float(LEVEL * np.exp(norm.logsf(farthest) - norm.logsf(limit)))
+def _chance(tall: Array, height: float) -> float:
+    """Of some window of a draw going so high, in sd.
+
+    From draws; beyond the highest tenth of them by its own tail, in which squares are exponential as a
+    Gaussian's are (their scale is the draws': no model's error is in these).
+    """
+    edge = float(np.quantile(tall, 1.0 - TAIL))
+    if height <= edge:
+        return float((1 + np.sum(tall >= height)) / (1 + len(tall)))
+    scale = float(np.mean(tall[tall > edge] ** 2 - edge**2))
+    return float(TAIL * np.exp(-(height**2 - edge**2) / scale))
 
 
 def _allowed(found: Fit, noise: Mapping[str, float], seed: int, rng: np.random.Generator) -> Array:

@@ -7,9 +7,9 @@ for the set, too. Nothing is missing where none is named and no window is found,
 allowed is within the model's own error. Otherwise the mismatch is unknown.
 
 The probability that something acts which no set has is at most that of Sellke, Bayarri & Berger (2001,
-The American Statistician 55:62): where the farthest window left is met by chance with probability p < 1/e,
-no alternative of a broad class makes it likelier by more than 1 / (-e p ln p). Before the recording is seen
-it is taken to be as probable as any mechanism.
+The American Statistician 55:62): where the farthest window that the believed fit leaves (of the best set, or
+of none) is met by chance with probability p < 1/e, no alternative of a broad class makes it likelier by more
+than 1 / (-e p ln p). Before the recording is seen it is taken to be as probable as any one mechanism.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Named:
 class Diagnosis:
     """The verdict, what is named, and the share of the squared residual that it explains.
 
-    unknown_probability : at most, that something acts which is in no set tried
+    unknown_probability : at most, that something acts which is outside the catalogue
     """
 
     verdict: Literal["nothing-missing", "named", "unknown"]
@@ -76,10 +76,12 @@ def judge(
         if (one := _named(found, known[name])).group_probability > PROBABLE and one.explains_n > least
     )
     if not named and (not before.windows or beyond_allowed(before) < least):
-        return Diagnosis("nothing-missing", (), 0.0, unknown_probability(before.chance))
+        chance = 1.0 if before.windows else before.chance  # the model's own error may be all of it
+        return Diagnosis("nothing-missing", (), 0.0, unknown_probability(chance))
+    something_else = unknown_probability((after if confirmed else before).chance)
     if named and (explained > EXPLAINED or not after.windows):
-        return Diagnosis("named", named, explained, unknown_probability(after.chance))
-    return Diagnosis("unknown", (), explained, unknown_probability(after.chance))
+        return Diagnosis("named", named, explained, something_else)
+    return Diagnosis("unknown", (), explained, something_else)
 
 
 def unknown_probability(chance: float) -> float:

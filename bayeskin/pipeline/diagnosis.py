@@ -208,7 +208,7 @@ def _fit(
         "rmse": _rms(binned.force_n - found.force_n, usable),
         "rmse_by_phase": dict(inference.rmse(binned, found.force_n).by_kind_n),
         "rmse_held_out": None if begun is None else _rms(binned.force_n - begun.force_n, rest),
-        "full_model": _full(taken.full, held_out, found.force_n, binned, usable, rest),
+        "full_model": _full(taken, held_out, found.force_n, binned, usable, rest),
         "rmse_left_out": taken.left_out_n,
         "coverage90": taken.coverage90,
         "log_evidence": found.log_evidence,
@@ -222,11 +222,12 @@ def _fit(
 
 
 def _full(
-    full: FullResult, held_out: FullResult, force_n: Array, binned: BinnedForce,
+    taken: TakenUp, held_out: FullResult, force_n: Array, binned: BinnedForce,
     usable: NDArray[np.bool_], rest: NDArray[np.bool_],
 ) -> dict[str, Any] | None:  # fmt: skip
-    """RMSE [N] of the full model where its own fits ended, its mesh's error in it as the recording shows that
-    (`mesh_n`, RMS), and how far the surrogate's fit is off from it."""
+    """RMSE [N] of the full model where its own fits ended, with its mesh's error as the recording shows that
+    (`mesh_n`, RMS) and of the run as it is; how far the surrogate's fit is off from it."""
+    full = taken.full
     if not isinstance(full, FullFit):
         return None if full is None else {"message": full}
     begun = held_out if isinstance(held_out, FullFit) else None
@@ -234,10 +235,13 @@ def _full(
         "rmse": _rms(binned.force_n - full.force_n, usable),
         "rmse_by_phase": dict(inference.rmse(binned, full.force_n).by_kind_n),
         "rmse_held_out": None if begun is None else _rms(binned.force_n - begun.force_n, rest),
-        "mesh_n": full.mesh_n,
+        "rmse_of_run": _rms(binned.force_n - full.force_n + full.mesh_n, usable),
+        "mesh_n": _rms(full.mesh_n, usable),
         "fit_off_by": _rms(force_n - full.force_n, usable),
         "runs": full.runs,
         "gained": full.gained,
+        "settled": full.settled,
+        "log_weight": taken.full_weight,
         "theta": dict(full.theta),
     }
 
