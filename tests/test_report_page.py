@@ -129,6 +129,23 @@ def test_the_answer_comes_first_and_says_what_how_sure_and_what_is_missing(whole
     assert text.index("What is missing?") < text.index("Phases of the recording")
 
 
+@pytest.mark.parametrize(
+    ("changed", "word"),
+    [
+        ({"verdict": "unknown", "unknown_probability": 0.97}, "something that has no name here"),
+        ({"verdict": "unknown", "unknown_probability": 0.05}, "something that several causes would explain"),
+        ({"verdict": "nothing-missing", "unknown_probability": 0.05}, "nothing"),
+    ],
+)
+def test_what_is_missing_is_said_in_a_word(changed: dict[str, object], word: str) -> None:
+    stages = facts().stages
+    diagnosed = {**summaries()["diagnose"], **changed}
+    stages = {**stages, "diagnose": dataclasses.replace(stages["diagnose"], summary=diagnosed)}
+    text = Walk(render_page(dataclasses.replace(facts(), stages=stages))).text()
+    assert f"What is missing? {word}" in text
+    assert f"Something outside the catalogue: probability {changed['unknown_probability']} at most." in text
+
+
 def test_the_table_of_parameters_has_prior_interval_unit_and_sentence(whole: str) -> None:
     text = Walk(whole).text()
     row = "p init initial interstitial pressure uniform, −0.261 to 4.04 kPa 0.842 −0.522 2.02 kPa 1.6"

@@ -139,5 +139,8 @@ def _missing(facts: RunFacts) -> Verdict:
     if left:
         lines.append(f"{left} window{'s' * (left != 1)} of the recording remain unexplained.")
     lines += _beyond_the_catalogue(said)
-    word = "named" if said["verdict"] == "named" else "something that has no name here"
+    if said["verdict"] == "named":
+        return Verdict("named", "doubt", lines)
+    outside = said.get("unknown_probability", 1.0) > 0.5
+    word = "something that has no name here" if outside else "something that several causes would explain"
     return Verdict(word, "doubt", lines)
