@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 import toy
+from scipy.signal import lfilter
 from scipy.stats import kstest, norm
 from toy_inference import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
 
@@ -19,9 +20,9 @@ from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.blocked import errors_left_out, without
-from bayeskin.mismatch.discretised import Discretised
+from bayeskin.mismatch.discretised import BEND, RELAXATION_S, RELAXING, Discretised, relaxing
 from bayeskin.mismatch.fit import fit, fit_base, fit_near, likely, restored, soft_on_stiff, stored
-from bayeskin.mismatch.full_fit import fit_full
+from bayeskin.mismatch.full_fit import ENOUGH, fit_full
 from bayeskin.mismatch.locate import _chance, locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.resample import resample
@@ -194,7 +195,7 @@ def test_means_alone_are_those_of_whole_predictions_of_all_that_is_shipped() -> 
     """Every effect, with estimates too, behind every mechanism of the instrument and the mesh's error."""
     screen = shipped_screen()
     instrument = tuple(m for m in catalogue().values() if isinstance(m.act, Instrument))
-    skin = Discretised(WithEffects(screen.refit.surrogate, screen.effects), MOTION, 2e-3, 2e-3)
+    skin = Discretised(WithEffects(screen.refit.surrogate, screen.effects), MOTION, 2e-3)
     seen = ObservedSurrogate(skin, instrument, MOTION)
     theta = seen.space.box.from_unit(np.random.default_rng(4).uniform(size=(3, seen.space.dim)))
     theta = theta[[0, 1, 1, 2]]
@@ -275,16 +276,28 @@ def test_a_mechanism_that_does_nothing_gains_nothing() -> None:
     assert more.log_evidence < base.log_evidence + 2.0
 
 
-def test_the_mesh_s_error_is_a_factor_and_a_bend_of_the_force() -> None:
+def test_the_mesh_s_error_is_a_factor_and_a_bend_of_the_force_and_what_relaxes() -> None:
     skin = ToySurrogate()
     theta = np.array([list(TRUTH.values())] * 2)
-    plain, allowed = skin.predict(theta), Discretised(skin, toy.MOTION, 0.004, 0.001).predict(theta)
+    plain, allowed = skin.predict(theta), Discretised(skin, toy.MOTION, 0.004).predict(theta)
     np.testing.assert_array_equal(allowed.mean, plain.mean)
     new = allowed.factor[0, :, plain.factor.shape[2] :]
     np.testing.assert_allclose(new[:, 0], 0.004 * plain.mean[0])
     middle = 0.5 * (skin.edges_s[1:] + skin.edges_s[:-1])
     top, bottom = np.argmax(toy.MOTION.at(middle)), np.argmin(toy.MOTION.at(middle))
-    np.testing.assert_allclose(new[[top, bottom], 1], 0.001 * plain.mean[0, [top, bottom]] * [1, -1])
+    np.testing.assert_allclose(new[[top, bottom], 1], BEND * plain.mean[0, [top, bottom]] * [1, -1])
+    np.testing.assert_allclose(new[:, 2:].T, RELAXING * plain.mean[0].max() * relaxing(toy.MOTION, middle))
+
+
+def test_what_relaxes_is_the_answer_of_a_spring_and_a_dashpot() -> None:
+    """dr/dt = d(d / max d)/dt - r / tau, integrated in short steps."""
+    step_s = 1e-3
+    time_s = np.arange(0.0, toy.MOTION.time_s[-1], step_s)
+    share = toy.MOTION.at(time_s) / toy.MOTION.displacement_m.max()
+    for found, tau in zip(relaxing(toy.MOTION, time_s), RELAXATION_S, strict=True):
+        decay, slow = np.exp(-step_s / tau), np.exp(-0.5 * step_s / tau)
+        by_steps = lfilter([slow], [1.0, -decay], np.diff(share, prepend=share[0]))
+        np.testing.assert_allclose(found, by_steps, atol=2e-4)
 
 
 def test_a_mesh_that_is_off_by_a_factor_stays_inside_the_intervals() -> None:
@@ -293,7 +306,7 @@ def test_a_mesh_that_is_off_by_a_factor_stays_inside_the_intervals() -> None:
     truth = right.surrogate.predict([list(TRUTH.values())]).mean[0].max()
     for allows, inside in ((False, False), (True, True)):
         skin = ToySurrogate(sd_n=1e-9)
-        allowing = Discretised(skin, toy.MOTION, 0.004, 0.001) if allows else skin
+        allowing = Discretised(skin, toy.MOTION, 0.004) if allows else skin
         alone = dataclasses.replace(right, binned=off, surrogate=allowing)
         found = resample(fit_base(alone, 1, None), find_shear(alone), len(TRUTH), 1)
         force = skin.predict(found.draws[:, : len(TRUTH)]).mean.max(axis=1)
@@ -368,7 +381,7 @@ def test_the_full_model_s_own_maximum_is_found_with_a_surrogate_s_wrong_slopes()
     assert any(about.surrogate is one for one in allowed)
     assert found.runs == len(made)
     assert found.gained > 1.0
-    assert found.value == pytest.approx(best.value, abs=0.5)
+    assert best.value - ENOUGH < found.value < best.value + 0.1
     np.testing.assert_allclose(found.force_n, force(found.theta), atol=1e-6)
     assert not found.mesh_n.any()
 
@@ -381,7 +394,7 @@ def test_a_full_fit_has_in_its_force_what_its_mesh_is_wrong_by() -> None:
     right = alone.surrogate.predict([TRUTH[n] for n in alone.surrogate.space.names]).mean[0]
     found, _ = fit_full(
         alone, start, lambda theta, changes: (1.02 * right, None), (), 1, 1,
-        lambda surrogate: Discretised(surrogate, toy.MOTION, 0.02, 1e-9),
+        lambda surrogate: Discretised(surrogate, toy.MOTION, 0.02),
     )  # fmt: skip
     np.testing.assert_allclose(found.force_n, right, atol=2e-3)
     np.testing.assert_allclose(found.force_n - found.mesh_n, 1.02 * right)

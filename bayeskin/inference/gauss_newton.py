@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
-from bayeskin.inference.noise_model import NoiseChain, scales
+from bayeskin.inference.noise_model import NoiseChain, innovations
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.straighten import Shear
 from bayeskin.types import Array, NDArray, Prediction
@@ -170,11 +170,8 @@ class _Linear:
         _, noise = self.log_posterior.split(
             self.log_posterior.from_sampling(np.concatenate([self.x[: self.inner], self.noise]))
         )
-        scale, rho = scales(self.chain, noise, self.here.diagonal[:, self.chain.bins])
-        unit = columns / scale[0][:, None]
-        before = np.concatenate([np.zeros((1, columns.shape[1])), unit[:-1]])
         self.nu = float(noise[0, -1])
-        return np.asarray((unit - rho[0][:, None] * before) / np.sqrt(1.0 - rho[0] ** 2)[:, None])
+        return innovations(self.chain, noise[0], self.here.diagonal[0, self.chain.bins], columns)
 
     def columns(self) -> tuple[Array, Array, Array]:
         """Residual (k,), slopes (k, d) and the surrogate's factor (k, r), whitened by the noise at hand."""

@@ -156,6 +156,14 @@ def scales(chain: NoiseChain, noise: Array, diagonal: Array) -> tuple[Array, Arr
     return scale, rho
 
 
+def innovations(chain: NoiseChain, noise: Array, diagonal: Array, columns: Array) -> Array:
+    """eps (k, n) of the module's equations, of each of `columns` (k, n) [N]; noise (q,), diagonal (k,)."""
+    scale, rho = (one[0, :, None] for one in scales(chain, noise[None], diagonal[None]))
+    unit = columns / scale
+    before = np.concatenate([np.zeros((1, columns.shape[1])), unit[:-1]])
+    return np.asarray((unit - rho * before) / np.sqrt(1.0 - rho**2))
+
+
 def draw_noise(chain: NoiseChain, noise: Array, diagonal: Array, rng: np.random.Generator) -> Array:
     """Noise [N] (n, k) drawn from the chain at n noise parameter vectors (n, q)."""
     scale, rho = scales(chain, noise, diagonal)

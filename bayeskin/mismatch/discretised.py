@@ -1,13 +1,15 @@
-"""A surrogate that allows for its model's mesh.
+"""A surrogate that allows for its model's mesh, and for the calibration of the load cell.
 
-What a finer mesh would change is, within a tenth, a factor on the force; what that leaves goes with
-displacement (docs/discretisation.md). Both are errors of the force at every point of the parameter space, so
-they belong to the surrogate's factor: two columns of one sd each,
+What a finer mesh would change is, within a tenth, a factor on the force; a cell's calibration is one, too.
+What that leaves goes with displacement, and relaxes after each movement, because a mesh resolves the flow of
+the fluid to its own size only (`benchmarks/mesh_shapes.py`). All are errors of the force at every point of
+the parameter space, so they belong to the surrogate's factor: columns of one sd each,
 
-    a F(t)  and  b F(t) (2 d(t) / max d - 1) ,
+    a F(t) ,  b F(t) (2 d(t) / max d - 1)  and  c max |F| r_i(t) ,
 
-F the predicted force and d the pads' displacement. Without them a fit takes the mesh for skin: intervals of
-moduli come out as narrow as the noise alone lets them be.
+F the predicted force, d the pads' displacement and r_i the answer of a spring and dashpot of relaxation time
+tau_i to d / max d. Without them a fit takes the mesh for skin: intervals of moduli come out as narrow as the
+noise alone lets them be.
 """
 
 from __future__ import annotations
@@ -22,15 +24,23 @@ from numpy.typing import ArrayLike
 
 from bayeskin.types import Array, PadMotion, ParameterSpace, Prediction, Surrogate
 
+CALIBRATION = 0.01  # sd of a factor on the force: what a load cell of class 1 is off by (ISO 7500-1:2018)
+BEND = 3e-3  # b, of the force
+RELAXING = 1.5e-3  # c, of the largest force
+RELAXATION_S = (
+    3.0,
+    12.0,
+    50.0,
+)  # tau_i: an answer is told from one three times slower, hardly from one twice
+
 
 @dataclass(frozen=True)
 class Discretised:
-    """Satisfies `types.Surrogate`: `skin` with its model's error, sd `amplitude` and `bend` of the force."""
+    """Satisfies `types.Surrogate`: `skin` with its model's error, whose factor has the sd `amplitude`."""
 
     skin: Surrogate
     motion: PadMotion
     amplitude: float
-    bend: float
 
     @property
     def space(self) -> ParameterSpace:
@@ -42,13 +52,13 @@ class Discretised:
 
     @property
     def provenance(self) -> Mapping[str, Any]:
-        return {**self.skin.provenance, "mesh_error": [self.amplitude, self.bend]}
+        return {**self.skin.provenance, "mesh_error": [self.amplitude, BEND, RELAXING]}
 
     def predict(self, theta: ArrayLike) -> Prediction:
         """Force at theta (n, d) or (d,). Raises InputError outside the box."""
         found = self.skin.predict(theta)
         rows = found.factor.transpose(0, 2, 1)  # as they lie in memory
-        more = found.mean[:, None, :] * self._shapes
+        more = errors(found.mean, *self._shapes) * self._sd[:, None]
         factor = np.concatenate([rows, more], axis=1).transpose(0, 2, 1)
         return Prediction(found.mean, factor, found.diagonal)
 
@@ -57,8 +67,35 @@ class Discretised:
         return self.skin.predict_mean(theta)
 
     @cached_property
-    def _shapes(self) -> Array:
-        """Of both errors relative to the force, (2, m)."""
-        middle = 0.5 * (self.edges_s[1:] + self.edges_s[:-1])
-        share = self.motion.at(middle) / float(np.max(np.abs(self.motion.displacement_m)))
-        return np.stack([np.full(len(middle), self.amplitude), self.bend * (2.0 * share - 1.0)])
+    def _sd(self) -> Array:
+        return np.array([self.amplitude, BEND, *[RELAXING] * len(RELAXATION_S)])
+
+    @cached_property
+    def _shapes(self) -> tuple[Array, Array]:
+        return shapes(self.motion, self.edges_s)
+
+
+def shapes(motion: PadMotion, edges_s: Array) -> tuple[Array, Array]:
+    """In bins: what multiplies the force (2, m), and the relaxing answers (k, m)."""
+    middle = 0.5 * (edges_s[1:] + edges_s[:-1])
+    share = motion.at(middle) / float(np.max(np.abs(motion.displacement_m)))
+    return np.stack([np.ones(len(middle)), 2.0 * share - 1.0]), relaxing(motion, middle)
+
+
+def relaxing(motion: PadMotion, time_s: Array) -> Array:
+    """Force of a spring and a dashpot in series at given times, (k, m), stretched by d / max d; exact."""
+    largest = float(np.max(np.abs(motion.displacement_m)))
+    rate = np.diff(motion.displacement_m) / largest / np.diff(motion.time_s)
+    out = np.zeros((len(RELAXATION_S), len(time_s)))
+    for row, tau in zip(out, RELAXATION_S, strict=True):
+        for start, end, speed in zip(motion.time_s[:-1], motion.time_s[1:], rate, strict=True):
+            since = np.maximum(time_s - start, 0.0)
+            after = np.maximum(time_s - end, 0.0)
+            row += speed * tau * (np.exp(-after / tau) - np.exp(-since / tau))
+    return out
+
+
+def errors(mean_n: Array, multiplying: Array, added: Array) -> Array:
+    """All shapes (n, 2 + k, m) of the error of forces (n, m), of the size of the force."""
+    largest = np.max(np.abs(mean_n), axis=1)[:, None, None]
+    return np.concatenate([mean_n[:, None, :] * multiplying, largest * added], axis=1)

@@ -1,13 +1,9 @@
-"""A set of mechanisms fitted by the full model itself, with its own slopes.
+"""A set of mechanisms fitted by the full model itself, with its own slopes where it has them.
 
-About a run F at theta_0 with derivatives J the force is taken as
-
-    F + S(theta) - S(theta_0) + (J - dS/du) (u - u_0) ,
-
-S the surrogate's mean, u coordinates of the box: right to first order, with the surrogate's curvature;
-without J its slopes are the surrogate's, where that knows them well. Each round maximises the posterior of
-that force, which has no surrogate's error in it, within a trust region of the parameters that the full model
-solves, makes a run there, and goes on from it if the posterior of the full model itself has risen.
+The force is the surrogate's, corrected by all runs made (`corrected`): at a run it is the run's, to first
+order where that has slopes, and far from all runs the surrogate's error is what it was. Each round maximises
+the posterior of that force within a trust region of the parameters that the full model solves, makes a run
+there, and goes on from it if the posterior of the full model itself has risen.
 
 First-order model management: Alexandrov, Lewis, Gumbert, Green & Newman, J. Aircraft 38 (2001), 1093-1101.
 """
@@ -16,61 +12,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import gauss_newton
-from bayeskin.inference.noise_model import scales
-from bayeskin.types import Array, ParameterSpace, Prediction, Surrogate
+from bayeskin.inference.noise_model import innovations
+from bayeskin.mismatch.corrected import Corrected, FullRun
+from bayeskin.types import Array, ParameterSpace, Surrogate
 
 TRUST, SMALLEST, LARGEST = 0.1, 0.005, 0.4  # of the prior's width, either side
+COMMON = 10.0  # variance of the mean of errors of added effects, over that of the rest
 ENOUGH = 2.0  # nats still to be gained, where the residual is noise: the posterior is about the run
 AHEAD = 0.5  # nats by which another climb has to be better: what is not informed stays as it is
 STARTS = 3  # climbs of a round: from the best point, and from others in the trust region
 CLIMB = 20  # rounds of each
-STEP = 1e-4  # of the box, for the surrogate's differences
 
 Full = Callable[[Mapping[str, float], Mapping[str, float]], tuple[Array, Array | None] | str]
-
-
-@dataclass(frozen=True)
-class Anchored:
-    """Satisfies `types.Surrogate`, without error: force_n (m,) at theta (d,), where a run was made.
-
-    slopes_n (m, d) are added to those of `surrogate`, by coordinates of its box.
-    """
-
-    surrogate: Surrogate
-    theta: Array
-    force_n: Array
-    slopes_n: Array
-
-    @property
-    def space(self) -> ParameterSpace:
-        return self.surrogate.space
-
-    @property
-    def edges_s(self) -> Array:
-        return self.surrogate.edges_s
-
-    @property
-    def provenance(self) -> Mapping[str, Any]:
-        return self.surrogate.provenance
-
-    def predict(self, theta: ArrayLike) -> Prediction:
-        """Force at theta (n, d) or (d,). Raises InputError outside the box."""
-        force = self.predict_mean(theta)
-        return Prediction(force, np.zeros((*force.shape, 1)), np.zeros(force.shape))
-
-    def predict_mean(self, theta: ArrayLike) -> Array:
-        """Force (n, m) at theta (n, d) or (d,). Raises InputError outside the box."""
-        theta = np.atleast_2d(np.asarray(theta, dtype=float))
-        mean = self.surrogate.predict_mean(np.vstack([self.theta, theta]))
-        away = self.space.box.to_unit(theta) - self.space.box.to_unit(self.theta)
-        return np.asarray(self.force_n + mean[1:] - mean[0] + away @ self.slopes_n.T)
 
 
 @dataclass(frozen=True)
@@ -94,18 +52,24 @@ class FullFit:
 def fit_full(
     log_posterior: LogPosterior, start: Mapping[str, float], full: Full, exact: Sequence[str], rounds: int,
     seed: int, allow: Callable[[Surrogate], Surrogate] = lambda surrogate: surrogate,
+    given: Sequence[FullRun] = (), several: bool = True,
 ) -> tuple[FullFit, LogPosterior] | str:  # fmt: skip
     """From `start` (all parameters), at most so many runs; the message of the first, where that fails.
 
-    With the fit comes the posterior of the force about it.
+    With the fit comes the posterior of the force about it. The surrogate has no error of the full model's own
+    in its factor.
 
     full : of all parameters, and of changes of those of the force that count as one: bins' means (m,) and
         their derivatives (m, d) for these changes (None: the surrogate's), or why a run failed
     exact : parameters whose effect the surrogate has exactly, which no trust region holds
     allow : puts the full model's own error into a surrogate that has none
+    given : runs of the same model made before
+    several : whether the surrogate adds up several effects, so that its errors go far; climbs take them to
     """
     surrogate, rng = log_posterior.surrogate, np.random.default_rng(seed)
     space, trial, trust = surrogate.space, dict(start), TRUST
+    inexact = np.array([name not in exact for name in space.names])
+    runs = tuple(given)
     best: FullFit | None = None
     local = log_posterior
     for count in range(1, rounds + 1):
@@ -116,20 +80,18 @@ def fit_full(
                 return found
             trust *= 0.25
         else:
-            force, slopes = found
-            own = np.zeros((len(force), space.dim)) if slopes is None else slopes - _slopes(surrogate, theta)
-            anchored = Anchored(surrogate, theta, force, own)
-            there = replace(log_posterior, surrogate=allow(anchored), sure_within_n=None)
-            vector, latent = _with_noise(there, trial)
-            values = there.from_sampling(vector)
-            value = float(there.log_prob(vector[None])[0])
+            others = (run for run in runs if not np.array_equal(run.theta, theta))
+            runs = (*others, FullRun(theta, *found))
+            local = replace(log_posterior, surrogate=allow(Corrected(surrogate, runs, inexact, COMMON)))
+            vector, latent = _with_noise(local, trial)
+            values = local.from_sampling(vector)
+            value = float(local.log_prob(vector[None])[0])
             if best is None or value > best.value:
                 first = value if best is None else best.value - best.gained
                 trust = TRUST if best is None else min(2.0 * trust, LARGEST)
-                mesh_n = there.predict(values).factor[0] @ latent
-                named = {**there.named(values), **{name: trial[name] for name in space.names}}
-                best = FullFit(named, value, force + mesh_n, mesh_n, count, value - first)
-                local = there
+                allowed_n = local.predict(values).factor[0] @ latent
+                named = {**local.named(values), **{name: trial[name] for name in space.names}}
+                best = FullFit(named, value, found[0] + allowed_n, allowed_n, count, value - first)
             else:
                 trust *= 0.25
         best = replace(best, runs=count)
@@ -140,6 +102,8 @@ def fit_full(
             best = replace(best, settled=trust >= TRUST)
             break
     assert best is not None
+    if not several:
+        local = replace(local, surrogate=allow(Corrected(surrogate, runs, inexact)))
     return best, local
 
 
@@ -150,10 +114,9 @@ def _excess(local: LogPosterior, best: FullFit) -> float:
     (Godambe 1960, Ann. Math. Stat. 31:1208).
     """
     chain, values = local.chain, local.from_sampling(local.vector(best.theta))[None]
-    noise = local.split(values)[1]
-    scale_n, rho = (one[0] for one in scales(chain, noise, np.zeros((1, len(chain.bins)))))
-    unit, nu = (chain.force_n - best.force_n[chain.bins]) / scale_n, float(noise[0, -1])
-    eps = (unit - rho * np.concatenate([[0.0], unit[:-1]])) / np.sqrt(1.0 - rho**2)
+    noise = local.split(values)[1][0]
+    left = (chain.force_n - best.force_n[chain.bins])[:, None]
+    eps, nu = innovations(chain, noise, np.zeros(len(left)), left), float(noise[-1])
     return max(float(np.mean(((nu + 1.0) * eps / (nu + eps**2)) ** 2)), 1.0)
 
 
@@ -161,16 +124,6 @@ def _change(space: ParameterSpace, theta: Array) -> Array:
     """Of each parameter (d,), by one coordinate of the box."""
     unit, h = space.box.to_unit(theta), 1e-6
     return np.asarray((space.box.from_unit(unit + h) - space.box.from_unit(unit - h)) / (2.0 * h))
-
-
-def _slopes(surrogate: Surrogate, theta: Array) -> Array:
-    """Of the surrogate's mean (m, d) by coordinates of the box, by differences toward its middle."""
-    box = surrogate.space.box
-    unit = box.to_unit(theta)
-    steps = np.diag(np.where(unit > 0.5, -STEP, STEP))
-    rows = np.vstack([theta, np.clip(box.from_unit(unit + steps), box.lower, box.upper)])
-    mean = surrogate.predict_mean(rows)
-    return np.asarray((mean[1:] - mean[0]).T / np.diag(steps))
 
 
 def _with_noise(there: LogPosterior, trial: Mapping[str, float]) -> tuple[Array, Array]:

@@ -99,81 +99,102 @@ def search(
     on_fit : is told each new fit
     another : the best of another search, on a part of the recording say; asked for where much is left
     """
-    before = {made.fit.names: [m for m in done if m.fit.names == made.fit.names] for made in done}
-    alone = build(())
-    straight, skin = find_shear(alone), alone.surrogate.space.dim
-    neutral = {name: value for m in known.values() for name, value in m.neutral.items()}
-
-    def kept(key: tuple[str, ...], make: Callable[[], Fit], anew: bool = False) -> Fit | None:
-        """The fit of a set, None where it does not count."""
-        if anew or (key not in found.fits and key not in found.unsure):
-            if before.get(key):
-                made = before[key].pop(0)
-            else:
-                one = make()
-                made = Made(one, sure(one, build))
-                if on_fit:
-                    on_fit(made)
-            found.add(made)
-        return found.fits.get(key)
-
-    def tried(names: Sequence[str], start: Fit, thorough: bool = True, anew: bool = False) -> Fit | None:
-        key = tuple(sorted(names))
-
-        def make() -> Fit:
-            wide = build(key)
-            shear = straight.among(alone.names, wide.names) if straight else None
-            new = _new(known, key, start.names) if thorough else []
-            return fit(key, wide, start.theta, neutral, seed, skin, shear, new)
-
-        return kept(key, make, anew)
-
-    def step(current: Fit, label: str) -> Fit:
-        """The best of the sets with one mechanism more, or `current` where none has more weight."""
-        sets = {name: _with(current.names, name) for name in known if name not in current.names}
-        promises = {
-            name: promised(build(names), current.theta, neutral, _new(known, names, current.names), seed)
-            for name, names in sets.items()
-        }
-        order = sorted(sets, key=lambda name: -promises[name])
-        tries = order if not current.names else order[:SHORTLIST]
-        fits = [current]
-        for count, name in enumerate(tries):
-            one = tried(sets[name], current, count < SHORTLIST)
-            fits += [] if one is None else [one]
-            if progress:
-                nats = "unsure" if one is None else f"{one.log_evidence - current.log_evidence:+.1f} nats"
-                progress((count + 1) / len(tries), f"{label}: {name}: {nats}")
-        return max(fits, key=weight)
-
-    def path(ahead: Fit, label: str) -> None:
-        current = None
-        while ahead is not current:
-            current = ahead
-            while len(current.names) > 1 and (leaner := _leaner(current, tried)) is not None:
-                current = leaner
-            if len(current.names) < MOST:
-                ahead = step(current, f"{label}, mechanism {len(current.names) + 1}")
-            else:
-                ahead = current
-
-    found = Search()
-    base = kept((), lambda: fit_base(alone, seed, straight))
-    assert base is not None
-    path(base, "path 1")
+    forward = _Forward(build, known, seed, progress or (lambda share, note: None), done, on_fit)
+    found = forward.found
+    forward.path(forward.base(), "path 1")
     singles = sorted((one for one in found.fits.values() if len(one.names) == 1), key=weight, reverse=True)
     for count in range(2, PATHS + 1):
         starts = [one for one in singles[1:] if not set(one.names) <= set(found.best.names)]
         if not _much_left(found.best) or not starts:
             break
         singles.remove(starts[0])
-        path(starts[0], f"path {count}")
+        forward.path(starts[0], f"path {count}")
     if _much_left(found.best) and (other := another()) is not None:
         here = replace(other, theta={**found.best.theta, **other.theta})  # noise that the other knows not
-        start = tried(other.names, here, anew=True)
+        start = forward.tried(other.names, here, anew=True)
         if start is not None:
-            path(start, "path from another search")
+            forward.path(start, "path from another search")
     return found
+
+
+class _Forward:
+    """The sets `found` so far, and steps from one to the next; fits that an earlier search made are taken."""
+
+    def __init__(
+        self, build: Build, known: Mapping[str, Mechanism], seed: int, progress: Progress,
+        done: Sequence[Made], on_fit: Callable[[Made], None] | None,
+    ) -> None:  # fmt: skip
+        self.found = Search()
+        self._build, self._known, self._seed = build, known, seed
+        self._progress, self._on_fit = progress, on_fit
+        self._made = {made.fit.names: [m for m in done if m.fit.names == made.fit.names] for made in done}
+        self._alone = build(())
+        self._straight = find_shear(self._alone)
+        self._neutral = {name: value for m in known.values() for name, value in m.neutral.items()}
+
+    def base(self) -> Fit:
+        """The fit without any mechanism."""
+        found = self._kept((), lambda: fit_base(self._alone, self._seed, self._straight))
+        assert found is not None
+        return found
+
+    def path(self, ahead: Fit, label: str) -> None:
+        """From a set forward and back, as long as that gains weight."""
+        current = None
+        while ahead is not current:
+            current = ahead
+            while len(current.names) > 1 and (leaner := _leaner(current, self.tried)) is not None:
+                current = leaner
+            if len(current.names) < MOST:
+                ahead = self._step(current, f"{label}, mechanism {len(current.names) + 1}")
+            else:
+                ahead = current
+
+    def tried(
+        self, names: Sequence[str], start: Fit, thorough: bool = True, anew: bool = False
+    ) -> Fit | None:
+        """The fit of a set from that of another, None where it does not count."""
+        key = tuple(sorted(names))
+
+        def make() -> Fit:
+            wide = self._build(key)
+            shear = self._straight.among(self._alone.names, wide.names) if self._straight else None
+            new = _new(self._known, key, start.names) if thorough else []
+            skin = self._alone.surrogate.space.dim
+            return fit(key, wide, start.theta, self._neutral, self._seed, skin, shear, new)
+
+        return self._kept(key, make, anew)
+
+    def _kept(self, key: tuple[str, ...], make: Callable[[], Fit], anew: bool = False) -> Fit | None:
+        """The fit of a set, made where it was not yet, None where it does not count."""
+        if anew or (key not in self.found.fits and key not in self.found.unsure):
+            if self._made.get(key):
+                made = self._made[key].pop(0)
+            else:
+                one = make()
+                made = Made(one, sure(one, self._build))
+                if self._on_fit:
+                    self._on_fit(made)
+            self.found.add(made)
+        return self.found.fits.get(key)
+
+    def _step(self, current: Fit, label: str) -> Fit:
+        """The best of the sets with one mechanism more, or `current` where none has more weight."""
+        sets = {name: _with(current.names, name) for name in self._known if name not in current.names}
+        promises = {name: self._promised(names, current) for name, names in sets.items()}
+        order = sorted(sets, key=lambda name: -promises[name])
+        tries = order if not current.names else order[:SHORTLIST]
+        fits = [current]
+        for count, name in enumerate(tries):
+            one = self.tried(sets[name], current, count < SHORTLIST)
+            fits += [] if one is None else [one]
+            nats = "unsure" if one is None else f"{one.log_evidence - current.log_evidence:+.1f} nats"
+            self._progress((count + 1) / len(tries), f"{label}: {name}: {nats}")
+        return max(fits, key=weight)
+
+    def _promised(self, names: Sequence[str], current: Fit) -> float:
+        new = _new(self._known, names, current.names)
+        return promised(self._build(names), current.theta, self._neutral, new, self._seed)
 
 
 def _much_left(best: Fit) -> bool:

@@ -22,6 +22,7 @@ from bayeskin.inference import LogPosterior
 from bayeskin.inference.straighten import Shear, find_shear
 from bayeskin.mismatch.blocked import errors_left_out
 from bayeskin.mismatch.contributions import Contribution, Force, contributions
+from bayeskin.mismatch.corrected import FullRun
 from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
 from bayeskin.mismatch.fit import Fit, fit_near, restored, stored
 from bayeskin.mismatch.form import Form, propose_form
@@ -166,9 +167,15 @@ def _full(bench: Workbench, found: Fit) -> tuple[FullResult, LogPosterior | None
             return slopes if isinstance(slopes, str) else str(own)
         return own[0], slopes[1]
 
+    def made() -> list[FullRun]:
+        return [FullRun(np.array(key), force, None) for key, force in fine_runs.items()
+                if not isinstance(force, str)]  # fmt: skip
+
+    plain = replace(found.log_posterior, surrogate=bench.surrogate(found.names))
     fitted = partial(
-        fit_full, found.log_posterior, exact=exact, seed=bench.run.config.seed, allow=bench.with_mesh_error
-    )
+        fit_full, plain, exact=exact, seed=bench.run.config.seed, allow=bench.with_mesh_error,
+        several=len(found.names) - len(beyond) > 1,
+    )  # fmt: skip
     start = found.theta
     if not found.names:
         direct = fitted(start, alone, rounds=DIRECT_RUNS)
@@ -177,10 +184,10 @@ def _full(bench: Workbench, found: Fit) -> tuple[FullResult, LogPosterior | None
                 return direct
             start = direct[0].theta
     first = fitted(start, partial(lifted, start), rounds=COARSE_RUNS if found.names else BASE_RUNS)
-    last = fitted(start if isinstance(first, str) else first[0].theta, whole, rounds=FULL_RUNS)
+    last = fitted(start if isinstance(first, str) else first[0].theta, whole, rounds=FULL_RUNS, given=made())
     again = fitted(start, whole, rounds=1)  # no new run
     if not isinstance(again, str) and (isinstance(last, str) or again[0].value > last[0].value):
-        last = fitted(start, whole, rounds=FULL_RUNS)
+        last = fitted(start, whole, rounds=FULL_RUNS, given=made())
     if isinstance(last, str):
         return last, None
     return replace(last[0], runs=len(fine_runs)), last[1]

@@ -8,15 +8,16 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from bayeskin import storage
 from bayeskin.config import Config, RecordingConfig, SurrogateConfig
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior
 from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import Instrument
-from bayeskin.mismatch.discretised import Discretised
+from bayeskin.mismatch.discretised import CALIBRATION, Discretised
 from bayeskin.mismatch.fit import instrument_noise, soft_on_stiff, surrogate_limit
-from bayeskin.mismatch.locate import MODEL_ERROR
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec
@@ -29,8 +30,6 @@ from bayeskin.pipeline.training import base_surrogate
 from bayeskin.recordings import read_recording, segment
 from bayeskin.surrogates import Effect, with_effects
 from bayeskin.types import BinnedForce, PadMotion, Surrogate
-
-BEND = 2.0 * MODEL_ERROR  # of which half is left after one factor on the force
 
 
 @dataclass(frozen=True)
@@ -50,20 +49,26 @@ class Workbench:
         return model_spec(self.run)
 
     def with_mesh_error(self, skin: Surrogate) -> Surrogate:
-        """A surrogate that allows for what a finer mesh would change, where that is known."""
+        """A surrogate that allows for what a finer mesh would change, where that is known, and for the load
+        cell's calibration."""
         error = mesh_error(self.spec.mesh_hash) if self.spec.observation == "reaction" else None
-        return skin if error is None else Discretised(skin, self.motion, error.rms, BEND)
+        if error is None:
+            return skin
+        return Discretised(skin, self.motion, float(np.hypot(error.rms, CALIBRATION)))
+
+    def surrogate(self, names: Sequence[str]) -> Surrogate:
+        """Of the full model on its mesh, with a set of mechanisms."""
+        parts = [effect for effect in self.effects if effect.mechanism in names]
+        skin: Surrogate = with_effects(self.base, parts)  # type: ignore[arg-type]
+        instrument = tuple(self.known[n] for n in names if isinstance(self.known[n].act, Instrument))
+        return ObservedSurrogate(skin, instrument, self.motion) if instrument else skin
 
     def posterior(self, until_s: float | None, names: Sequence[str]) -> LogPosterior:
         """The posterior with a set of mechanisms, fitted up to a time (None: to the end)."""
         asked = {name: bounds for name, bounds in self.run.config.noise if bounds is not None}
-        parts = [effect for effect in self.effects if effect.mechanism in names]
-        skin: Surrogate = with_effects(self.base, parts)  # type: ignore[arg-type]
-        skin = self.with_mesh_error(skin)
-        instrument = tuple(self.known[n] for n in names if isinstance(self.known[n].act, Instrument))
-        seen = ObservedSurrogate(skin, instrument, self.motion) if instrument else skin
+        seen, windows = self.with_mesh_error(self.surrogate(names)), ((0.0, until_s),) if until_s else None
         return LogPosterior(
-            seen, self.binned, None if until_s is None else ((0.0, until_s),),
+            seen, self.binned, windows,
             replace(instrument_noise(self.binned), **asked), sure_within_n=surrogate_limit(self.binned),
             excludes=soft_on_stiff,
         )  # fmt: skip
