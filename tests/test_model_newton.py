@@ -90,3 +90,12 @@ def test_a_run_that_folds_too_often_is_given_up_and_says_where(monkeypatch: pyte
     message = integrate(model, 700.0, 1e-3, lambda step: None)
     assert re.fullmatch(r"step \d+ at t = \S+ s: the skin has folded and snapped 1 times; try .*", message)
     model.solver.release()
+
+
+def test_a_skin_that_folds_has_failed_where_falls_are_not_followed() -> None:
+    model, steps = foldable(), []
+    message = integrate(model, 700.0, 1e-3, steps.append, falls_too=False)
+    assert re.fullmatch(r"step \d+ at t = \S+ s: the skin folds; try .*", message)
+    assert model.solver.counts["falls"] == 0
+    assert 0.0 < steps[-1].state.time_s < 9.4
+    model.solver.release()

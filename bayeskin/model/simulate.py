@@ -92,6 +92,7 @@ def simulate(
     on_state: OnState | None = None,
     gradients: Mapping[str, float] | None = None,
     laws: Sequence[Bind] = (),
+    falls_too: bool = True,
 ) -> Simulation:
     """Runs the full model over the whole motion.
 
@@ -100,6 +101,7 @@ def simulate(
     on_state : called with time [s], all unknowns (dofs,) and force [N] of each accepted step
     gradients : also the force's derivatives by these parameters, each for the change that stands with it,
         `reaction` only (`gradients.logarithms`: by the logarithms of the base's four)
+    falls_too : whether a skin that folds is followed across the fold, which takes minutes; else it has failed
     laws : physics beyond the base model, `reaction` only; with pads that were opened before the test the
         force is relative to that at its start, where all is at rest
 
@@ -120,7 +122,9 @@ def simulate(
     history = _History(motion, on_progress, on_state)
     if spec.observation == "reaction":
         solid = material(theta, problem.mesh.cutis)
-        outcome = _run_reaction(problem, solid, spec.tolerance, laws, motion, theta, history, gradients)
+        outcome = _run_reaction(
+            problem, solid, spec.tolerance, laws, motion, theta, history, gradients, falls_too
+        )
     else:
         outcome = (*_run_article(problem, motion, theta, history), None)
     return _simulation(problem, motion, theta, history, outcome, time.perf_counter() - started, spec.hash)
@@ -221,6 +225,7 @@ def _run_reaction(
     theta: Mapping[str, float],
     history: _History,
     gradients: Mapping[str, float] | None,
+    falls_too: bool = True,
 ) -> _Outcome:
     """Fills the history; returns a message, empty for a run that finished."""
     bound = tuple(bind(theta, problem) for bind in laws)
@@ -239,7 +244,7 @@ def _run_reaction(
             history.add(max(time_s, 0.0), step.state.x, force_n, step.corner, step.error_n)
 
     try:
-        message = integrate(model, theta["p_init"], tolerance, on_step)
+        message = integrate(model, theta["p_init"], tolerance, on_step, falls_too)
     except FloatingPointError as error:
         message = str(error)
     return message, model.solver, slopes

@@ -93,10 +93,12 @@ def integrate(
     p_init: float,
     tolerance: float,
     on_step: Callable[[Step], None],
+    falls_too: bool = True,
 ) -> str:
     """Runs the whole motion; calls `on_step` for the start and for each accepted step.
 
     tolerance : estimated local error of the force a step, relative to the nominal force.
+    falls_too : whether a skin that folds is followed to where it comes to rest; else the run has failed.
     Returns "" or, for a run that failed, one line with the step, the time and a remedy.
     """
     state = model.initial_state(p_init)
@@ -115,6 +117,11 @@ def integrate(
             h = _landing(max(h, shortest), end - state.time_s, longest)
             step = advance(model, past, h)
             falls = step is None and h <= shortest
+            if falls and not falls_too:
+                return (
+                    f"step {count + 1} at t = {state.time_s:.3f} s: the skin folds; "
+                    "try layers less unlike in stiffness, or a coarser mesh"
+                )
             if falls:
                 step = _fall(model, state, h)
                 if step is None:

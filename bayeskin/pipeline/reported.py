@@ -33,7 +33,7 @@ def reported(
 class FullForce:
     """A function of (names of mechanisms, values by name): bin means (m,) of a full run with them.
 
-    Of a run that fails its message. Picklable, for `run_parallel`.
+    Of a run that fails its message, of a skin that folds, too. Picklable, for `run_parallel`.
     """
 
     spec: ModelSpec
@@ -53,7 +53,9 @@ class FullForce:
         along = {p.name for mechanism in solved(mechanisms) for p in mechanism.parameters}
         theta = {name: value for name, value in values.items() if name in along or name in PARAMETERS}
         by = {name: change for name, change in changes.items() if name in theta}
-        simulation = simulate(self.spec, self.motion, theta, laws=laws(mechanisms), gradients=by)
+        simulation = simulate(
+            self.spec, self.motion, theta, laws=laws(mechanisms), gradients=by, falls_too=False
+        )
         if simulation.status != "ok":
             return simulation.message
         slopes = dict(zip(simulation.gradient_names, simulation.gradient_n.T, strict=True))
