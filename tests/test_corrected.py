@@ -8,26 +8,16 @@ import numpy as np
 import pytest
 from toy_inference import TRUTH, ToySurrogate
 
-from bayeskin.mismatch.corrected import LENGTH, Corrected, FullRun, slopes
+from bayeskin.mismatch.corrected import LENGTH, Corrected, FullRun, Sure, slopes
 
-SURE, OFF = ToySurrogate(), ToySurrogate(bias_n=0.01)
+SURE, OFF = ToySurrogate(sd_n=0.1), ToySurrogate(bias_n=0.01, sd_n=0.1)
 THETA = np.array([TRUTH[name] for name in SURE.space.names])
 ALL = np.ones(5, dtype=bool)
 
 
-def away(unit: object) -> np.ndarray:
-    """THETA moved by so much in coordinates of the box."""
-    box = SURE.space.box
-    return box.from_unit(box.to_unit(THETA) + np.asarray(unit))
-
-
-def run_at(theta: np.ndarray, sloped: bool = False, wave: float = 0.0) -> FullRun:
-    """Of a model that pulls a fiftieth harder than the toy, with a wave [N] that goes with log E_c."""
-    here = Harder(wave)
-    return FullRun(theta, here.predict_mean(theta)[0], slopes(here, theta) if sloped else None)
-
-
 class Harder(ToySurrogate):
+    """Pulls a fiftieth harder than the toy, with a wave [N] that goes with log E_c."""
+
     def __init__(self, wave: float) -> None:
         super().__init__()
         self.wave = wave
@@ -38,8 +28,29 @@ class Harder(ToySurrogate):
         return dataclasses.replace(found, mean=1.02 * found.mean + self.wave * np.sin(turns))
 
 
+def away(unit: object) -> np.ndarray:
+    """THETA moved by so much in coordinates of the box."""
+    box = SURE.space.box
+    return box.from_unit(box.to_unit(THETA) + np.asarray(unit))
+
+
+def run_at(theta: np.ndarray, sloped: bool = False, wave: float = 0.0) -> FullRun:
+    here = Harder(wave)
+    return FullRun(theta, here.predict_mean(theta)[0], slopes(here, theta) if sloped else None)
+
+
+def error_of(run: FullRun, surrogate: ToySurrogate) -> np.ndarray:
+    """Over the size of the surrogate's force."""
+    mean = surrogate.predict_mean(run.theta)[0]
+    return (run.force_n - mean) / rms(mean)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def test_at_a_run_the_force_is_the_run_s_and_nothing_is_unsure() -> None:
-    runs = (run_at(THETA), run_at(away([0.1, -0.1, 0.2, 0.0, 0.1])))
+    runs = (run_at(THETA), run_at(away([0.1, -0.1, 0.2, 0.0, 0.1]), sloped=True))
     found = Corrected(OFF, runs, ALL).predict(np.array([run.theta for run in runs]))
     np.testing.assert_allclose(found.mean, [run.force_n for run in runs], atol=1e-6)
     assert found.sd().max() < 3e-3 * OFF.predict(THETA).sd().max()
@@ -47,52 +58,115 @@ def test_at_a_run_the_force_is_the_run_s_and_nothing_is_unsure() -> None:
 
 @pytest.mark.parametrize("common", [0.0, 1e3])
 def test_one_run_s_error_fades_unless_errors_have_a_mean_of_their_own(common: float) -> None:
-    found = Corrected(OFF, (run_at(THETA),), ALL, common)
-    error = run_at(THETA).force_n - OFF.predict_mean(THETA)[0]
+    run = run_at(THETA)
+    found = Corrected(OFF, (run,), ALL, common)
     for far in (0.05, 0.15, 0.4):
         theta = away([0.6 * far, 0.0, -0.8 * far, 0.0, 0.0])
-        k = (1.0 + (far / LENGTH) ** 2) ** -0.5
+        k = np.exp(-0.5 * (far / LENGTH) ** 2)
         weight = (common + k) / (common + 1.0)
         there, plain = found.predict(theta), OFF.predict(theta)
-        np.testing.assert_allclose(there.mean - plain.mean, weight * error[None], rtol=1e-4, atol=1e-9)
+        expected = weight * error_of(run, OFF) * rms(plain.mean)
+        np.testing.assert_allclose((there.mean - plain.mean)[0], expected, rtol=1e-3, atol=1e-7)
         left = common + 1.0 - weight * (common + k)  # 1 - k^2 without a mean, 2 (1 - k) with a large one
         np.testing.assert_allclose(there.sd(), np.sqrt(left) * plain.sd(), rtol=1e-3)
         np.testing.assert_allclose(there.mean, found.predict_mean(theta))
+        np.testing.assert_array_equal(Sure(found).predict(theta).mean, found.predict_mean(theta))
+        assert not Sure(found).predict(theta).sd().any()
 
 
 def test_of_two_runs_the_nearer_one_s_error_counts_for_more() -> None:
     """Closed form of ordinary kriging: (1 + (k_1 - k_2) / (1 - k_12)) / 2 is the first one's weight."""
-    first, second = away([0.3, 0, 0, 0, 0]), away([-0.3, 0, 0, 0, 0])
+    first, second = away([0.1, 0, 0, 0, 0]), away([-0.1, 0, 0, 0, 0])
     harder, plain = run_at(first), SURE.predict_mean(second)[0]
     found = Corrected(SURE, (harder, FullRun(second, plain, None)), ALL, 1e6)
-    theta = away([0.2, 0.1, 0, 0, 0])
-    k_1, k_2, k_12 = ((1.0 + square / LENGTH**2) ** -0.5 for square in (0.02, 0.26, 0.36))
+    theta = away([0.05, 0.1, 0, 0, 0])
+    k_1, k_2, k_12 = (np.exp(-0.5 * square / LENGTH**2) for square in (0.0125, 0.0325, 0.04))
     weight = 0.5 * (1.0 + (k_1 - k_2) / (1.0 - k_12))
-    error = harder.force_n - SURE.predict_mean(first)[0]
-    change = found.predict(theta).mean - SURE.predict_mean(theta)
-    np.testing.assert_allclose(change, weight * error[None], rtol=1e-3, atol=1e-8)
+    change = (found.predict(theta).mean - SURE.predict_mean(theta))[0]
+    expected = weight * error_of(harder, SURE) * rms(SURE.predict_mean(theta))
+    np.testing.assert_allclose(change, expected, rtol=1e-3, atol=1e-7)
 
 
-def test_slopes_tell_what_a_second_run_next_to_the_first_would() -> None:
-    sloped = Corrected(SURE, (run_at(THETA, sloped=True, wave=0.01),), ALL)
-    near = np.concatenate([np.zeros((1, 5)), 2e-2 * LENGTH * np.eye(5)])
-    beside = Corrected(SURE, tuple(run_at(away(step), wave=0.01) for step in near), ALL)
-    for step in ([0.05, 0.0, 0.0, 0.0, 0.0], [0.03, -0.04, 0.02, 0.0, 0.0], [0.2, 0.1, 0.0, 0.1, 0.0]):
-        one, other = sloped.predict(away(step)), beside.predict(away(step))
-        change = other.mean - SURE.predict_mean(away(step))
-        assert np.abs(one.mean - other.mean).max() < 0.06 * np.abs(change).max()
-        np.testing.assert_allclose(one.sd(), other.sd(), rtol=0.06, atol=1e-5)
+def test_what_is_known_correlates_as_derivatives_of_the_law_do() -> None:
+    """By finite differences, in lengths; runs with slopes and without, one exact parameter."""
+    inexact = np.array([True, True, False, True, True])
+    places = [[0.0] * 5, [0.1, 0.05, 0.3, -0.1, 0.0], [-0.05, 0.1, 0.0, 0.15, 0.1]]
+    runs = tuple(
+        run_at(away(place), sloped=sloped) for place, sloped in zip(places, (True, False, True), strict=True)
+    )
+    found = Corrected(SURE, runs, inexact, common=2.5)
+    box, h = SURE.space.box, 1e-4
+    at = np.array([box.to_unit(run.theta)[inexact] for run in runs]) / LENGTH
+
+    def law(a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.exp(-0.5 * np.sum((a - b) ** 2)) + 2.5)
+
+    steps = h * np.eye(4)
+    sides = [
+        (law(at[i], at[j] + e) - law(at[i], at[j] - e)) / (2 * h)
+        for i in range(3)
+        for j in (0, 2)
+        for e in steps
+    ]
+    np.testing.assert_allclose(found._known[:3, 3:].ravel(), sides, atol=1e-6)
+    mixed = [
+        (law(a + e, b + f) - law(a + e, b - f) - law(a - e, b + f) + law(a - e, b - f)) / (4 * h * h)
+        for a in at[[0, 2]] for e in steps for b in at[[0, 2]] for f in steps
+    ]  # fmt: skip
+    inner = found._known[3:, 3:]
+    without = inner - np.diag(np.diag(inner)) + np.eye(8)  # what slopes are wrong by stands on the diagonal
+    np.testing.assert_allclose(without.ravel(), mixed, atol=1e-5)
+    assert np.all(np.diag(inner) >= 1.0)
+    forces = [law(a, b) for a in at for b in at]
+    np.testing.assert_allclose(found._known[:3, :3].ravel(), forces, atol=1e-5)
+    theta = away([0.02, 0.03, 0.1, 0.04, -0.05])
+    here = box.to_unit(theta)[inexact] / LENGTH
+    expected = [law(here, one) for one in at]
+    expected += [(law(here, at[j] + e) - law(here, at[j] - e)) / (2 * h) for j in (0, 2) for e in steps]
+    np.testing.assert_allclose(found._correlation(theta[None])[0], expected, atol=1e-6)
+
+
+def test_slopes_tell_what_the_surrogate_s_are_wrong_by() -> None:
+    run = run_at(THETA, sloped=True, wave=0.01)
+    unsure = ToySurrogate(sd_n=1.0)  # so that what slopes are wrong by is little
     right = slopes(Harder(0.01), THETA)
-    before, after = (np.abs(slopes(one, THETA) - right).max() for one in (SURE, sloped))
-    assert after < 0.02 * before
+    wrong = np.abs(slopes(unsure, THETA) - right).max()
+    assert np.abs(slopes(Corrected(unsure, (run,), ALL), THETA) - right).max() < 0.05 * wrong
+    assert (
+        np.abs(
+            slopes(Corrected(unsure, (dataclasses.replace(run, slopes_n=None),), ALL), THETA) - right
+        ).max()
+        > 0.2 * wrong
+    )
+
+
+def test_slopes_that_a_surrogate_knows_better_are_not_followed() -> None:
+    """A coarse mesh's are wrong by a fiftieth, which is many sd of a good surrogate."""
+    good = ToySurrogate(sd_n=1e-5)
+    right = slopes(good, THETA)
+    run = FullRun(THETA, good.predict_mean(THETA)[0], 1.02 * right)
+    found = slopes(Corrected(good, (run,), ALL), THETA)
+    assert np.abs(found - right).max() < 0.05 * np.abs(0.02 * right).max()
+
+
+def test_errors_that_the_surrogate_denies_leave_it_less_sure() -> None:
+    theta = away([0.3, 0.0, 0.0, 0.0, 0.0])
+    denying, run = ToySurrogate(sd_n=1e-4), run_at(THETA)
+    error = rms(run.force_n - denying.predict_mean(THETA)[0])
+    times = error / rms(denying.predict(THETA).sd())
+    assert times > 5.0
+    sd = Corrected(denying, (run,), ALL).predict(theta).sd()
+    k = np.exp(-0.5 * (0.3 / LENGTH) ** 2)
+    np.testing.assert_allclose(sd, times * np.sqrt(1 - k**2) * denying.predict(theta).sd(), rtol=1e-3)
 
 
 def test_what_the_surrogate_has_exactly_moves_nothing_away() -> None:
-    exact = np.array([True, True, True, True, False])
+    inexact = np.array([True, True, True, True, False])
     theta = away([0.0, 0.0, 0.0, 0.0, 0.5])
-    found = Corrected(OFF, (run_at(THETA, sloped=True),), exact).predict(theta)
-    error = run_at(THETA).force_n - OFF.predict_mean(THETA)[0]
-    np.testing.assert_allclose(found.mean - OFF.predict_mean(theta), error[None], rtol=1e-4, atol=1e-8)
+    run = run_at(THETA, sloped=True)
+    found = Corrected(OFF, (run,), inexact).predict(theta)
+    expected = error_of(run, OFF) * rms(OFF.predict_mean(theta))
+    np.testing.assert_allclose((found.mean - OFF.predict_mean(theta))[0], expected, rtol=1e-3, atol=1e-6)
     assert found.sd().max() < 3e-3 * OFF.predict(theta).sd().max()
 
 

@@ -1,15 +1,16 @@
 """A surrogate corrected by runs of the full model near by.
 
-The surrogate's error, in units of its own sd, is a Gaussian process of the box's coordinates u with the
-rational quadratic correlation of half a power,
+The surrogate's error over the size of its force is a Gaussian process of the box's coordinates u with the
+correlation
 
-    k(u, u') = (1 + |u - u'|^2 / l^2)^(-1/2) ,
+    k(u, u') = exp(-|u - u'|^2 / (2 l^2)) ,
 
 since a trained surrogate errs anew from one training point to the next. What several effects do to each
 other, which it does not know, goes far: their error has a mean of its own, of the variance `common`. The
 forces of runs, and where a run has them its slopes, give the errors between by kriging, and with them how
-much of the surrogate's variance is left: none at a run, all of it far away, and as much again for the mean
-where there is one.
+much of the surrogate's variance is left: none at a run, all of it far away, and with a single run as much
+again for the mean where there is one. Where errors at the runs are larger than the surrogate says, what is
+left is larger by as much.
 
 Rasmussen & Williams (2006), ch. 2.7, 4.2 and 9.4.
 """
@@ -26,9 +27,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayeskin.types import Array, ParameterSpace, Prediction, Surrogate
 
-LENGTH = 0.15  # l, of the box: how far apart a surrogate's training points are
-OWN_SLOPES = 1e-2  # variance of a run's slopes, which may be those of a coarser mesh; per l, of the error's
-ROUNDING = 1e-6  # variance of its force
+LENGTH = 0.15  # l, of the box: less than training points are apart, beyond which errors do not correlate
+SLOPES = 0.02  # of a run's slopes: what they are wrong by, being those of a coarser mesh
+ROUNDING = 1e-6  # variance of a run's force, over that of the surrogate's error
 STEP = 1e-4  # of the box, for the surrogate's differences
 
 
@@ -70,15 +71,16 @@ class Corrected:
         shared = self._correlation(theta)
         weights = shared @ self._inverse
         left = 1.0 + self.common - np.einsum("na,na->n", weights, shared)
-        left = np.maximum(left, 0.0)[:, None]
+        left = self._excess * np.maximum(left, 0.0)[:, None]
         rows = found.factor.transpose(0, 2, 1) * np.sqrt(left)[:, None]
-        return Prediction(found.mean + weights @ self._errors, rows.transpose(0, 2, 1), found.diagonal * left)
+        mean = found.mean + _size(found.mean) * (weights @ self._errors)
+        return Prediction(mean, rows.transpose(0, 2, 1), found.diagonal * left)
 
     def predict_mean(self, theta: ArrayLike) -> Array:
         """The mean (n, m) of `predict` alone."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
-        weights = self._correlation(theta) @ self._inverse
-        return np.asarray(self.surrogate.predict_mean(theta) + weights @ self._errors)
+        mean = self.surrogate.predict_mean(theta)
+        return np.asarray(mean + _size(mean) * (self._correlation(theta) @ self._inverse @ self._errors))
 
     def _scaled(self, theta: Array) -> Array:
         """Coordinates (n, e) of those in which the surrogate errs, in lengths."""
@@ -89,45 +91,118 @@ class Corrected:
         return self._scaled(np.array([run.theta for run in self.runs]))
 
     @cached_property
+    def _here(self) -> Prediction:
+        """The surrogate at the runs."""
+        return self.surrogate.predict(np.array([run.theta for run in self.runs]))
+
+    @cached_property
+    def _sd(self) -> Array:
+        """Of the surrogate at the runs, RMS over bins, (k,) [N]; next to nothing where it says none."""
+        sd = np.sqrt(np.mean(self._here.sd() ** 2, axis=1))
+        return np.maximum(sd, 1e-6 * _size(self._here.mean)[:, 0])
+
+    @cached_property
     def _sloped(self) -> list[int]:
         return [i for i, run in enumerate(self.runs) if run.slopes_n is not None]
+
+    @cached_property
+    def _slopes(self) -> Array:
+        """Of the runs that have them, by lengths, (s, e, m) [N]."""
+        found = [run.slopes_n[:, self.inexact].T for run in self.runs if run.slopes_n is not None]
+        shape = (len(found), self._places.shape[1], self._here.mean.shape[1])
+        return LENGTH * np.array(found).reshape(shape)
 
     def _correlation(self, theta: Array) -> Array:
         """Of the error at theta (n, d) with what is known: that at each run, then its slopes (n, a)."""
         away = self._scaled(theta)[:, None, :] - self._places
-        near = 1.0 + np.sum(away**2, axis=2)
-        slopes = away[:, self._sloped] * near[:, self._sloped, None] ** -1.5
+        near = np.exp(-0.5 * np.sum(away**2, axis=2))
+        slopes = away[:, self._sloped] * near[:, self._sloped, None]
         slopes = slopes.reshape(len(theta), len(self._sloped) * away.shape[2])
-        return np.concatenate([near**-0.5 + self.common, slopes], axis=1)
+        return np.concatenate([near + self.common, slopes], axis=1)
+
+    @cached_property
+    def _between(self) -> Array:
+        """Correlations (k, k) of the errors at the runs."""
+        away = self._places[:, None, :] - self._places
+        near = np.exp(-0.5 * np.sum(away**2, axis=2))
+        return np.asarray(near + self.common + ROUNDING * np.eye(len(self.runs)))
+
+    @cached_property
+    def _known(self) -> Array:
+        """Correlations (a, a) of all that is known."""
+        away = self._places[:, None, :] - self._places
+        near = np.exp(-0.5 * np.sum(away**2, axis=2))
+        s = self._sloped
+        count = len(s) * self._places.shape[1]
+        sides = (away[:, s] * near[:, s, None]).reshape(len(self.runs), count)
+        apart = away[np.ix_(s, s)]
+        both = np.eye(self._places.shape[1]) - apart[:, :, :, None] * apart[:, :, None, :]
+        both = both * near[np.ix_(s, s)][:, :, None, None]
+        inner = both.transpose(0, 2, 1, 3).reshape(count, count)
+        sd = np.sqrt(self._excess) * self._sd[s, None]
+        wrong = SLOPES * np.sqrt(np.mean(self._slopes**2, axis=2)) / sd
+        return np.block([[self._between, sides], [sides.T, inner + np.diag(wrong.ravel() ** 2)]])
 
     @cached_property
     def _inverse(self) -> Array:
-        """Of the correlations (a, a) of all that is known."""
-        away = self._places[:, None, :] - self._places
-        near = 1.0 + np.sum(away**2, axis=2)
-        s = self._sloped
-        count = len(s) * self._places.shape[1]
-        mixed = away[:, s] * near[:, s, None] ** -1.5
-        apart, close = away[np.ix_(s, s)], near[np.ix_(s, s)][:, :, None, None]
-        both = np.eye(self._places.shape[1]) * close**-1.5
-        both = both - 3.0 * apart[:, :, :, None] * apart[:, :, None, :] * close**-2.5
-        sides = mixed.reshape(len(self.runs), count)
-        inner = both.transpose(0, 2, 1, 3).reshape(count, count) + OWN_SLOPES * np.eye(count)
-        forces = near**-0.5 + self.common + ROUNDING * np.eye(len(self.runs))
-        return np.asarray(np.linalg.inv(np.block([[forces, sides], [sides.T, inner]])))
+        return np.asarray(np.linalg.inv(self._known))
+
+    @cached_property
+    def _excess(self) -> float:
+        """Mean square of the errors at the runs, in what the surrogate says of them; 1 at least."""
+        own = (self._runs_n - self._here.mean) / self._sd[:, None]
+        square = np.sum(own * np.linalg.solve(self._between, own), axis=0) / len(self.runs)
+        return max(float(np.mean(square)), 1.0)
+
+    @cached_property
+    def _runs_n(self) -> Array:
+        """Forces of the runs (k, m) [N]."""
+        return np.array([run.force_n for run in self.runs])
 
     @cached_property
     def _errors(self) -> Array:
-        """Of the surrogate at each run, then of its slopes by lengths, (a, m)."""
-        theta = np.array([run.theta for run in self.runs])
-        forces = np.array([run.force_n for run in self.runs]) - self.surrogate.predict_mean(theta)
-        rows = [forces]
-        for i in self._sloped:
-            run = self.runs[i]
-            assert run.slopes_n is not None
-            wrong = run.slopes_n - slopes(self.surrogate, run.theta)
-            rows.append(LENGTH * wrong[:, self.inexact].T)
+        """Of the surrogate at each run, then of its slopes by lengths, (a, m), over the size of its force."""
+        mean, size = self._here.mean, _size(self._here.mean)
+        errors = (self._runs_n - mean) / size
+        rows = [errors]
+        for i, own in zip(self._sloped, self._slopes, strict=True):
+            theirs = LENGTH * slopes(self.surrogate, self.runs[i].theta)[:, self.inexact].T
+            growth = (theirs @ mean[i]) / (mean[i] @ mean[i])  # of the size of the force
+            rows.append((own - theirs) / size[i] - growth[:, None] * errors[i])
         return np.concatenate(rows)
+
+
+@dataclass(frozen=True)
+class Sure:
+    """Satisfies `types.Surrogate`: the mean of another, as if that had no error."""
+
+    other: Surrogate
+
+    @property
+    def space(self) -> ParameterSpace:
+        return self.other.space
+
+    @property
+    def edges_s(self) -> Array:
+        return self.other.edges_s
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        return self.other.provenance
+
+    def predict(self, theta: ArrayLike) -> Prediction:
+        """Force at theta (n, d) or (d,). Raises InputError outside the box."""
+        force = self.predict_mean(theta)
+        return Prediction(force, np.zeros((*force.shape, 1)), np.zeros(force.shape))
+
+    def predict_mean(self, theta: ArrayLike) -> Array:
+        """Force (n, m) at theta (n, d) or (d,). Raises InputError outside the box."""
+        return self.other.predict_mean(theta)
+
+
+def _size(mean_n: Array) -> Array:
+    """RMS of forces (n, m) over bins, (n, 1)."""
+    return np.asarray(np.sqrt(np.mean(mean_n**2, axis=1, keepdims=True)))
 
 
 def slopes(surrogate: Surrogate, theta: Array) -> Array:

@@ -1,9 +1,9 @@
 """A set of mechanisms fitted by the full model itself, with its own slopes where it has them.
 
 The force is the surrogate's, corrected by all runs made (`corrected`): at a run it is the run's, to first
-order where that has slopes, and far from all runs the surrogate's error is what it was. Each round maximises
-the posterior of that force within a trust region of the parameters that the full model solves, makes a run
-there, and goes on from it if the posterior of the full model itself has risen.
+order where that has slopes. Each round maximises the posterior of that force, as if it had no error, within
+a trust region of the parameters that the full model solves, makes a run there, and goes on from it if the
+posterior of the full model itself has risen. What is returned has the error again.
 
 First-order model management: Alexandrov, Lewis, Gumbert, Green & Newman, J. Aircraft 38 (2001), 1093-1101.
 """
@@ -18,11 +18,11 @@ import numpy as np
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.noise_model import innovations
-from bayeskin.mismatch.corrected import Corrected, FullRun
+from bayeskin.mismatch.corrected import Corrected, FullRun, Sure
 from bayeskin.types import Array, ParameterSpace, Surrogate
 
 TRUST, SMALLEST, LARGEST = 0.1, 0.005, 0.4  # of the prior's width, either side
-COMMON = 10.0  # variance of the mean of errors of added effects, over that of the rest
+COMMON = 100.0  # variance of the mean of errors of added effects, over that of the rest
 ENOUGH = 2.0  # nats still to be gained, where the residual is noise: the posterior is about the run
 AHEAD = 0.5  # nats by which another climb has to be better: what is not informed stays as it is
 STARTS = 3  # climbs of a round: from the best point, and from others in the trust region
@@ -34,9 +34,9 @@ Full = Callable[[Mapping[str, float], Mapping[str, float]], tuple[Array, Array |
 @dataclass(frozen=True)
 class FullFit:
     """theta: all parameters by name (SI) of the best run; value: its log posterior; force_n (m,): the run's,
-    with what its own mesh is wrong by as the recording shows it.
+    with what is allowed for its mesh and the load cell as the recording shows it.
 
-    mesh_n (m,) : that error, 0 where none is allowed for; runs : made; gained : nats on the first of them;
+    mesh_n (m,) : that, 0 where none is allowed for; runs : made; gained : nats on the first of them;
     settled : whether next to nothing is still to be gained
     """
 
@@ -82,7 +82,8 @@ def fit_full(
         else:
             others = (run for run in runs if not np.array_equal(run.theta, theta))
             runs = (*others, FullRun(theta, *found))
-            local = replace(log_posterior, surrogate=allow(Corrected(surrogate, runs, inexact, COMMON)))
+            ahead = Sure(Corrected(surrogate, runs, inexact, COMMON))
+            local = replace(log_posterior, surrogate=allow(ahead), sure_within_n=None)
             vector, latent = _with_noise(local, trial)
             values = local.from_sampling(vector)
             value = float(local.log_prob(vector[None])[0])
@@ -102,9 +103,8 @@ def fit_full(
             best = replace(best, settled=trust >= TRUST)
             break
     assert best is not None
-    if not several:
-        local = replace(local, surrogate=allow(Corrected(surrogate, runs, inexact)))
-    return best, local
+    about = allow(Corrected(surrogate, runs, inexact, COMMON if several else 0.0))
+    return best, replace(local, surrogate=about)
 
 
 def _excess(local: LogPosterior, best: FullFit) -> float:

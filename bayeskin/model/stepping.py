@@ -119,7 +119,7 @@ def integrate(
             falls = step is None and h <= shortest
             if falls and not falls_too:
                 return (
-                    f"step {count + 1} at t = {state.time_s:.3f} s: the skin folds; "
+                    f"step {count + 1} at t = {state.time_s:.3f} s: the skin folds, or does not converge; "
                     "try layers less unlike in stiffness, or a coarser mesh"
                 )
             if falls:

@@ -225,8 +225,8 @@ def _full(
     taken: TakenUp, held_out: FullResult, force_n: Array, binned: BinnedForce,
     usable: NDArray[np.bool_], rest: NDArray[np.bool_],
 ) -> dict[str, Any] | None:  # fmt: skip
-    """RMSE [N] of the full model where its own fits ended, with its mesh's error as the recording shows that
-    (`mesh_n`, RMS) and of the run as it is; how far the surrogate's fit is off from it."""
+    """RMSE [N] of the full model where its own fits ended, with what is allowed for its mesh and the load
+    cell (`mesh_n`, RMS) and of the run as it is; how far the surrogate's fit is off from it."""
     full = taken.full
     if not isinstance(full, FullFit):
         return None if full is None else {"message": full}

@@ -3,8 +3,8 @@
 A first run of the model's own mesh shows by how much the coarsest bricks are off. These, whose runs are quick
 and carry their derivatives, are fitted with that difference added, then the model's own mesh with their
 derivatives. Without mechanisms the slopes of the base's surrogate come first, and last where they are good
-enough. Sampled, located and taken apart is the posterior about that fit, in which nothing of
-the surrogate's error is left. The article's formulation and models of one's own keep the surrogate's.
+enough. Sampled, located and taken apart is the posterior of the surrogate corrected by the runs of the
+model's own mesh. The article's formulation and models of one's own keep the surrogate's.
 """
 
 from __future__ import annotations
@@ -159,13 +159,13 @@ def _full(bench: Workbench, found: Fit) -> tuple[FullResult, LogPosterior | None
         here, there, own = quick(theta, changes), quick(start, changes), alone(start, changes)
         if isinstance(here, str) or isinstance(there, str) or isinstance(own, str):
             return here
-        return here[0] + own[0] - there[0], here[1]
+        return here[0] + own[0] - there[0], here[1] * _factor(there[0], own[0])
 
     def whole(theta: Mapping[str, float], changes: Mapping[str, float]) -> tuple[Array, Array] | str:
         slopes, own = quick(theta, changes), alone(theta, changes)
         if isinstance(slopes, str) or isinstance(own, str):
             return slopes if isinstance(slopes, str) else str(own)
-        return own[0], slopes[1]
+        return own[0], slopes[1] * _factor(slopes[0], own[0])
 
     def made() -> list[FullRun]:
         return [FullRun(np.array(key), force, None) for key, force in fine_runs.items()
@@ -174,7 +174,7 @@ def _full(bench: Workbench, found: Fit) -> tuple[FullResult, LogPosterior | None
     plain = replace(found.log_posterior, surrogate=bench.surrogate(found.names))
     fitted = partial(
         fit_full, plain, exact=exact, seed=bench.run.config.seed, allow=bench.with_mesh_error,
-        several=len(found.names) - len(beyond) > 1,
+        several=sum(effect.mechanism in found.names for effect in bench.effects) > 1,
     )  # fmt: skip
     start = found.theta
     if not found.names:
@@ -191,6 +191,11 @@ def _full(bench: Workbench, found: Fit) -> tuple[FullResult, LogPosterior | None
     if isinstance(last, str):
         return last, None
     return replace(last[0], runs=len(fine_runs)), last[1]
+
+
+def _factor(coarse_n: Array, own_n: Array) -> float:
+    """On a coarse force that brings it nearest to the model's own."""
+    return float(coarse_n @ own_n / (coarse_n @ coarse_n))
 
 
 def _coarse(bench: Workbench) -> FullForce:

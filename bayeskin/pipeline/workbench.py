@@ -50,7 +50,7 @@ class Workbench:
 
     def with_mesh_error(self, skin: Surrogate) -> Surrogate:
         """A surrogate that allows for what a finer mesh would change, where that is known, and for the load
-        cell's calibration."""
+        cell's calibration; `reaction` only."""
         error = mesh_error(self.spec.mesh_hash) if self.spec.observation == "reaction" else None
         if error is None:
             return skin
@@ -66,9 +66,9 @@ class Workbench:
     def posterior(self, until_s: float | None, names: Sequence[str]) -> LogPosterior:
         """The posterior with a set of mechanisms, fitted up to a time (None: to the end)."""
         asked = {name: bounds for name, bounds in self.run.config.noise if bounds is not None}
-        seen, windows = self.with_mesh_error(self.surrogate(names)), ((0.0, until_s),) if until_s else None
+        windows = None if until_s is None else ((0.0, until_s),)
         return LogPosterior(
-            seen, self.binned, windows,
+            self.with_mesh_error(self.surrogate(names)), self.binned, windows,
             replace(instrument_noise(self.binned), **asked), sure_within_n=surrogate_limit(self.binned),
             excludes=soft_on_stiff,
         )  # fmt: skip
