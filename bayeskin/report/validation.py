@@ -137,9 +137,9 @@ def coverage(true_n: Array, prediction: Prediction, nominal: Array) -> tuple[Arr
     z = np.abs(prediction.mean - true_n) / np.where(known, sd, 1.0)
     weight = known.sum(axis=1)
     inside = np.array([np.sum((z <= ndtri(0.5 + p / 2)) & known, axis=1) for p in nominal])  # (k, n)
-    share = inside.sum(axis=1) / max(weight.sum(), 1)
-    n = len(true_n)
-    spread = ((inside - share[:, None] * weight) ** 2).sum(axis=1) / max(weight.sum(), 1) ** 2
+    total, n = max(int(weight.sum()), 1), len(true_n)
+    share = inside.sum(axis=1) / total
+    spread = ((inside - share[:, None] * weight) ** 2).sum(axis=1) / total**2
     return share, np.sqrt(spread * n / max(n - 1, 1))
 
 
