@@ -108,7 +108,8 @@ def test_the_summary_answers_what_a_reader_asks(folder: Path) -> None:
     assert sum(one["share"] for one in shares.values()) == pytest.approx(1.0)
     for table in summary["sobol"].values():
         assert "uniform" in table["distribution"]
-        assert table["aggregated"]["E_c"]["total"] > 0.1
+        stiff = [table["aggregated"][name]["total"] for name in ("E_c", "E_s")]
+        assert max(stiff) > 0.1  # near the maximum either, wherever on their ridge that lies
         assert len(table["pairs"]) == 10
 
 
