@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from toy_inference import TRUTH, ToySurrogate
 
-from bayeskin.mismatch.corrected import LENGTH, Corrected, FullRun, Sure, slopes
+from bayeskin.mismatch.corrected import LENGTH, CorrectedSurrogate, FullRun, Sure, slopes
 
 SURE, OFF = ToySurrogate(sd_n=0.1), ToySurrogate(bias_n=0.01, sd_n=0.1)
 THETA = np.array([TRUTH[name] for name in SURE.space.names])
@@ -51,7 +51,7 @@ def rms(values: np.ndarray) -> float:
 
 def test_at_a_run_the_force_is_the_run_s_and_nothing_is_unsure() -> None:
     runs = (run_at(THETA), run_at(away([0.1, -0.1, 0.2, 0.0, 0.1]), sloped=True))
-    found = Corrected(OFF, runs, ALL).predict(np.array([run.theta for run in runs]))
+    found = CorrectedSurrogate(OFF, runs, ALL).predict(np.array([run.theta for run in runs]))
     np.testing.assert_allclose(found.mean, [run.force_n for run in runs], atol=1e-6)
     assert found.sd().max() < 3e-3 * OFF.predict(THETA).sd().max()
 
@@ -59,7 +59,7 @@ def test_at_a_run_the_force_is_the_run_s_and_nothing_is_unsure() -> None:
 @pytest.mark.parametrize("common", [0.0, 1e3])
 def test_one_run_s_error_fades_unless_errors_have_a_mean_of_their_own(common: float) -> None:
     run = run_at(THETA)
-    found = Corrected(OFF, (run,), ALL, common)
+    found = CorrectedSurrogate(OFF, (run,), ALL, common)
     for far in (0.05, 0.15, 0.4):
         theta = away([0.6 * far, 0.0, -0.8 * far, 0.0, 0.0])
         k = np.exp(-0.5 * (far / LENGTH) ** 2)
@@ -78,7 +78,7 @@ def test_of_two_runs_the_nearer_one_s_error_counts_for_more() -> None:
     """Closed form of ordinary kriging: (1 + (k_1 - k_2) / (1 - k_12)) / 2 is the first one's weight."""
     first, second = away([0.1, 0, 0, 0, 0]), away([-0.1, 0, 0, 0, 0])
     harder, plain = run_at(first), SURE.predict_mean(second)[0]
-    found = Corrected(SURE, (harder, FullRun(second, plain, None)), ALL, 1e6)
+    found = CorrectedSurrogate(SURE, (harder, FullRun(second, plain, None)), ALL, 1e6)
     theta = away([0.05, 0.1, 0, 0, 0])
     k_1, k_2, k_12 = (np.exp(-0.5 * square / LENGTH**2) for square in (0.0125, 0.0325, 0.04))
     weight = 0.5 * (1.0 + (k_1 - k_2) / (1.0 - k_12))
@@ -94,7 +94,7 @@ def test_what_is_known_correlates_as_derivatives_of_the_law_do() -> None:
     runs = tuple(
         run_at(away(place), sloped=sloped) for place, sloped in zip(places, (True, False, True), strict=True)
     )
-    found = Corrected(SURE, runs, inexact, common=2.5)
+    found = CorrectedSurrogate(SURE, runs, inexact, common=2.5)
     box, h = SURE.space.box, 1e-4
     at = np.array([box.to_unit(run.theta)[inexact] for run in runs]) / LENGTH
 
@@ -131,10 +131,10 @@ def test_slopes_tell_what_the_surrogate_s_are_wrong_by() -> None:
     unsure = ToySurrogate(sd_n=1.0)  # so that what slopes are wrong by is little
     right = slopes(Harder(0.01), THETA)
     wrong = np.abs(slopes(unsure, THETA) - right).max()
-    assert np.abs(slopes(Corrected(unsure, (run,), ALL), THETA) - right).max() < 0.05 * wrong
+    assert np.abs(slopes(CorrectedSurrogate(unsure, (run,), ALL), THETA) - right).max() < 0.05 * wrong
     assert (
         np.abs(
-            slopes(Corrected(unsure, (dataclasses.replace(run, slopes_n=None),), ALL), THETA) - right
+            slopes(CorrectedSurrogate(unsure, (dataclasses.replace(run, slopes_n=None),), ALL), THETA) - right
         ).max()
         > 0.2 * wrong
     )
@@ -145,7 +145,7 @@ def test_slopes_that_a_surrogate_knows_better_are_not_followed() -> None:
     good = ToySurrogate(sd_n=1e-5)
     right = slopes(good, THETA)
     run = FullRun(THETA, good.predict_mean(THETA)[0], 1.02 * right)
-    found = slopes(Corrected(good, (run,), ALL), THETA)
+    found = slopes(CorrectedSurrogate(good, (run,), ALL), THETA)
     assert np.abs(found - right).max() < 0.05 * np.abs(0.02 * right).max()
 
 
@@ -155,7 +155,7 @@ def test_errors_that_the_surrogate_denies_leave_it_less_sure() -> None:
     error = rms(run.force_n - denying.predict_mean(THETA)[0])
     times = error / rms(denying.predict(THETA).sd())
     assert times > 5.0
-    sd = Corrected(denying, (run,), ALL).predict(theta).sd()
+    sd = CorrectedSurrogate(denying, (run,), ALL).predict(theta).sd()
     k = np.exp(-0.5 * (0.3 / LENGTH) ** 2)
     np.testing.assert_allclose(sd, times * np.sqrt(1 - k**2) * denying.predict(theta).sd(), rtol=1e-3)
 
@@ -164,7 +164,7 @@ def test_what_the_surrogate_has_exactly_moves_nothing_away() -> None:
     inexact = np.array([True, True, True, True, False])
     theta = away([0.0, 0.0, 0.0, 0.0, 0.5])
     run = run_at(THETA, sloped=True)
-    found = Corrected(OFF, (run,), inexact).predict(theta)
+    found = CorrectedSurrogate(OFF, (run,), inexact).predict(theta)
     expected = error_of(run, OFF) * rms(OFF.predict_mean(theta))
     np.testing.assert_allclose((found.mean - OFF.predict_mean(theta))[0], expected, rtol=1e-3, atol=1e-6)
     assert found.sd().max() < 3e-3 * OFF.predict(theta).sd().max()
@@ -173,11 +173,13 @@ def test_what_the_surrogate_has_exactly_moves_nothing_away() -> None:
 def test_more_runs_leave_less_unsure() -> None:
     theta = away([0.05, 0.05, 0.0, 0.0, 0.0])
     runs = tuple(run_at(away([0.1 * i, 0.0, 0.1 * j, 0.0, 0.0])) for i in range(2) for j in range(2))
-    left = [Corrected(SURE, runs[: n + 1], ALL).predict(theta).sd().max() for n in range(4)]
+    left = [CorrectedSurrogate(SURE, runs[: n + 1], ALL).predict(theta).sd().max() for n in range(4)]
     assert left == sorted(left, reverse=True)
     assert left[-1] < 0.9 * left[0]
 
 
 def test_it_is_known_by_its_runs() -> None:
-    one, other = (Corrected(SURE, (run_at(away([u, 0, 0, 0, 0])),), ALL).provenance for u in (0.0, 0.1))
+    one, other = (
+        CorrectedSurrogate(SURE, (run_at(away([u, 0, 0, 0, 0])),), ALL).provenance for u in (0.0, 0.1)
+    )
     assert one != other

@@ -110,6 +110,12 @@ class LogPosterior:
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         return self.surrogate.predict_mean(theta[:, : self.surrogate.space.dim])
 
+    def force_n(self, vector: Array, latent: Array) -> Array:
+        """Force on all bins (m,) at sampling coordinates (D,), with the surrogate's error `latent` (r,) in
+        sd of each column of its factor."""
+        found = self.predict(self.from_sampling(vector))
+        return np.asarray(found.mean[0] + found.factor[0] @ latent)
+
     def log_prob(self, vectors: ArrayLike) -> Array:
         """Log posterior density (n,) at vectors (n, D) in sampling coordinates, up to the evidence.
 

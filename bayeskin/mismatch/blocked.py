@@ -58,5 +58,4 @@ def _refitted(found: Fit, part: LogPosterior, shear: Shear | None) -> Array:
         part, np.clip(part.vector(found.theta), low, high),
         shear.among(wide, part.names) if shear else None, ROUNDS,
     )  # fmt: skip
-    prediction = part.predict(part.from_sampling(top.vector))
-    return np.asarray(prediction.mean[0] + prediction.factor[0] @ top.latent)
+    return part.force_n(top.vector, top.latent)

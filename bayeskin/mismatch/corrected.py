@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayeskin.types import Array, ParameterSpace, Prediction, Surrogate
+from bayeskin.mismatch.wrapper import Wrapper
+from bayeskin.types import Array, Prediction, Surrogate
 
 LENGTH = 0.15  # l, of the box: less than training points are apart, beyond which errors do not correlate
 SLOPES = 0.02  # of a run's slopes: what they are wrong by, being those of a coarser mesh
@@ -43,31 +44,22 @@ class FullRun:
 
 
 @dataclass(frozen=True)
-class Corrected:
-    """Satisfies `types.Surrogate`: `surrogate` given `runs`; `inexact` (d,) says in which it errs, `common`
-    is the variance of its error's mean over that of the rest."""
+class CorrectedSurrogate(Wrapper):
+    """`inner` given `runs`; `inexact` (d,) says in which parameters it errs, `common` is the variance of its
+    error's mean over that of the rest."""
 
-    surrogate: Surrogate
     runs: tuple[FullRun, ...]
     inexact: NDArray[np.bool_]
     common: float = 0.0
 
     @property
-    def space(self) -> ParameterSpace:
-        return self.surrogate.space
-
-    @property
-    def edges_s(self) -> Array:
-        return self.surrogate.edges_s
-
-    @property
     def provenance(self) -> Mapping[str, Any]:
-        return {**self.surrogate.provenance, "corrected_by": [list(run.theta) for run in self.runs]}
+        return {**self.inner.provenance, "corrected_by": [list(run.theta) for run in self.runs]}
 
     def predict(self, theta: ArrayLike) -> Prediction:
         """Force at theta (n, d) or (d,). Raises InputError outside the box."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
-        found = self.surrogate.predict(theta)
+        found = self.inner.predict(theta)
         shared = self._correlation(theta)
         weights = shared @ self._inverse
         left = 1.0 + self.common - np.einsum("na,na->n", weights, shared)
@@ -79,7 +71,7 @@ class Corrected:
     def predict_mean(self, theta: ArrayLike) -> Array:
         """The mean (n, m) of `predict` alone."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
-        mean = self.surrogate.predict_mean(theta)
+        mean = self.inner.predict_mean(theta)
         return np.asarray(mean + _size(mean) * (self._correlation(theta) @ self._inverse @ self._errors))
 
     def _scaled(self, theta: Array) -> Array:
@@ -93,7 +85,7 @@ class Corrected:
     @cached_property
     def _here(self) -> Prediction:
         """The surrogate at the runs."""
-        return self.surrogate.predict(np.array([run.theta for run in self.runs]))
+        return self.inner.predict(np.array([run.theta for run in self.runs]))
 
     @cached_property
     def _sd(self) -> Array:
@@ -121,13 +113,6 @@ class Corrected:
         return np.concatenate([near + self.common, slopes], axis=1)
 
     @cached_property
-    def _between(self) -> Array:
-        """Correlations (k, k) of the errors at the runs."""
-        away = self._places[:, None, :] - self._places
-        near = np.exp(-0.5 * np.sum(away**2, axis=2))
-        return np.asarray(near + self.common + ROUNDING * np.eye(len(self.runs)))
-
-    @cached_property
     def _known(self) -> Array:
         """Correlations (a, a) of all that is known."""
         away = self._places[:, None, :] - self._places
@@ -141,7 +126,8 @@ class Corrected:
         inner = both.transpose(0, 2, 1, 3).reshape(count, count)
         sd = np.sqrt(self._excess) * self._sd[s, None]
         wrong = SLOPES * np.sqrt(np.mean(self._slopes**2, axis=2)) / sd
-        return np.block([[self._between, sides], [sides.T, inner + np.diag(wrong.ravel() ** 2)]])
+        forces = near + self.common + ROUNDING * np.eye(len(self.runs))
+        return np.block([[forces, sides], [sides.T, inner + np.diag(wrong.ravel() ** 2)]])
 
     @cached_property
     def _inverse(self) -> Array:
@@ -165,38 +151,19 @@ class Corrected:
         errors = (self._runs_n - mean) / size
         rows = [errors]
         for i, own in zip(self._sloped, self._slopes, strict=True):
-            theirs = LENGTH * slopes(self.surrogate, self.runs[i].theta)[:, self.inexact].T
+            theirs = LENGTH * slopes(self.inner, self.runs[i].theta)[:, self.inexact].T
             growth = (theirs @ mean[i]) / (mean[i] @ mean[i])  # of the size of the force
             rows.append((own - theirs) / size[i] - growth[:, None] * errors[i])
         return np.concatenate(rows)
 
 
-@dataclass(frozen=True)
-class Sure:
-    """Satisfies `types.Surrogate`: the mean of another, as if that had no error."""
-
-    other: Surrogate
-
-    @property
-    def space(self) -> ParameterSpace:
-        return self.other.space
-
-    @property
-    def edges_s(self) -> Array:
-        return self.other.edges_s
-
-    @property
-    def provenance(self) -> Mapping[str, Any]:
-        return self.other.provenance
+class Sure(Wrapper):
+    """The mean of another, as if that had no error."""
 
     def predict(self, theta: ArrayLike) -> Prediction:
         """Force at theta (n, d) or (d,). Raises InputError outside the box."""
         force = self.predict_mean(theta)
         return Prediction(force, np.zeros((*force.shape, 1)), np.zeros(force.shape))
-
-    def predict_mean(self, theta: ArrayLike) -> Array:
-        """Force (n, m) at theta (n, d) or (d,). Raises InputError outside the box."""
-        return self.other.predict_mean(theta)
 
 
 def _size(mean_n: Array) -> Array:

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayeskin.types import Array, PadMotion, ParameterSpace, Prediction, Surrogate
+from bayeskin.mismatch.wrapper import Wrapper
+from bayeskin.types import Array, PadMotion, Prediction
 
 CALIBRATION = 0.01  # sd of a factor on the force: what a load cell of class 1 is off by (ISO 7500-1:2018)
 BEND = 3e-3  # b, of the force
@@ -35,36 +36,23 @@ RELAXATION_S = (
 
 
 @dataclass(frozen=True)
-class Discretised:
-    """Satisfies `types.Surrogate`: `skin` with its model's error, whose factor has the sd `amplitude`."""
+class Discretised(Wrapper):
+    """`inner` with its model's error, whose factor has the sd `amplitude`."""
 
-    skin: Surrogate
     motion: PadMotion
     amplitude: float
 
     @property
-    def space(self) -> ParameterSpace:
-        return self.skin.space
-
-    @property
-    def edges_s(self) -> Array:
-        return self.skin.edges_s
-
-    @property
     def provenance(self) -> Mapping[str, Any]:
-        return {**self.skin.provenance, "mesh_error": [self.amplitude, BEND, RELAXING]}
+        return {**self.inner.provenance, "mesh_error": [self.amplitude, BEND, RELAXING]}
 
     def predict(self, theta: ArrayLike) -> Prediction:
         """Force at theta (n, d) or (d,). Raises InputError outside the box."""
-        found = self.skin.predict(theta)
+        found = self.inner.predict(theta)
         rows = found.factor.transpose(0, 2, 1)  # as they lie in memory
         more = errors(found.mean, *self._shapes) * self._sd[:, None]
         factor = np.concatenate([rows, more], axis=1).transpose(0, 2, 1)
         return Prediction(found.mean, factor, found.diagonal)
-
-    def predict_mean(self, theta: ArrayLike) -> Array:
-        """That of `skin`."""
-        return self.skin.predict_mean(theta)
 
     @cached_property
     def _sd(self) -> Array:

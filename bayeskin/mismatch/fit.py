@@ -90,9 +90,7 @@ class Fit:
     @cached_property
     def force_n(self) -> Array:
         """The force on all bins (m,), with the surrogate's error as the recording shows it."""
-        point = self.log_posterior.from_sampling(self.log_posterior.vector(self.theta))
-        found = self.log_posterior.predict(point)
-        return np.asarray(found.mean[0] + found.factor[0] @ self.latent)
+        return self.log_posterior.force_n(self.log_posterior.vector(self.theta), self.latent)
 
     @cached_property
     def unit(self) -> Array:

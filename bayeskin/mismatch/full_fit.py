@@ -3,7 +3,7 @@
 The force is the surrogate's, corrected by all runs made (`corrected`): at a run it is the run's, to first
 order where that has slopes. Each round maximises the posterior of that force, as if it had no error, within
 a trust region of the parameters that the full model solves, makes a run there, and goes on from it if the
-posterior of the full model itself has risen. What is returned has the error again.
+posterior of the full model itself has risen. The surrogate that is returned has the error again.
 
 First-order model management: Alexandrov, Lewis, Gumbert, Green & Newman, J. Aircraft 38 (2001), 1093-1101.
 """
@@ -18,7 +18,7 @@ import numpy as np
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.noise_model import innovations
-from bayeskin.mismatch.corrected import Corrected, FullRun, Sure
+from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun, Sure
 from bayeskin.types import Array, ParameterSpace, Surrogate
 
 TRUST, SMALLEST, LARGEST = 0.1, 0.005, 0.4  # of the prior's width, either side
@@ -53,11 +53,11 @@ def fit_full(
     log_posterior: LogPosterior, start: Mapping[str, float], full: Full, exact: Sequence[str], rounds: int,
     seed: int, allow: Callable[[Surrogate], Surrogate] = lambda surrogate: surrogate,
     given: Sequence[FullRun] = (), several: bool = True,
-) -> tuple[FullFit, LogPosterior] | str:  # fmt: skip
+) -> tuple[FullFit, CorrectedSurrogate] | str:  # fmt: skip
     """From `start` (all parameters), at most so many runs; the message of the first, where that fails.
 
-    With the fit comes the posterior of the force about it. The surrogate has no error of the full model's own
-    in its factor.
+    With the fit comes the surrogate of the force about it. That of `log_posterior` has no error of the full
+    model's own in its factor, nor has what is returned.
 
     full : of all parameters, and of changes of those of the force that count as one: bins' means (m,) and
         their derivatives (m, d) for these changes (None: the surrogate's), or why a run failed
@@ -82,7 +82,7 @@ def fit_full(
         else:
             others = (run for run in runs if not np.array_equal(run.theta, theta))
             runs = (*others, FullRun(theta, *found))
-            ahead = Sure(Corrected(surrogate, runs, inexact, COMMON))
+            ahead = Sure(CorrectedSurrogate(surrogate, runs, inexact, COMMON))
             local = replace(log_posterior, surrogate=allow(ahead), sure_within_n=None)
             vector, latent = _with_noise(local, trial)
             values = local.from_sampling(vector)
@@ -98,24 +98,23 @@ def fit_full(
         best = replace(best, runs=count)
         if trust < SMALLEST:
             break
-        trial, promised = _maximum(local, best.theta, trust, exact, rng)
-        if promised - best.value < ENOUGH * _excess(local, best):
+        trial, promised, force_n = _maximum(local, best.theta, trust, exact, rng)
+        if promised - best.value < ENOUGH * _excess(local, trial, force_n):
             best = replace(best, settled=trust >= TRUST)
             break
     assert best is not None
-    about = allow(Corrected(surrogate, runs, inexact, COMMON if several else 0.0))
-    return best, replace(local, surrogate=about)
+    return best, CorrectedSurrogate(surrogate, runs, inexact, COMMON if several else 0.0)
 
 
-def _excess(local: LogPosterior, best: FullFit) -> float:
-    """By how much nats are inflated where more than noise is left, 1 at least.
+def _excess(local: LogPosterior, theta: Mapping[str, float], force_n: Array) -> float:
+    """By how much nats are inflated where more than noise is left of the force (m,) at a point, 1 at least.
 
     The mean squared score of the innovations, which is what a sandwich of informations has in its middle
     (Godambe 1960, Ann. Math. Stat. 31:1208).
     """
-    chain, values = local.chain, local.from_sampling(local.vector(best.theta))[None]
+    chain, values = local.chain, local.from_sampling(local.vector(theta))[None]
     noise = local.split(values)[1][0]
-    left = (chain.force_n - best.force_n[chain.bins])[:, None]
+    left = (chain.force_n - force_n[chain.bins])[:, None]
     eps, nu = innovations(chain, noise, np.zeros(len(left)), left), float(noise[-1])
     return max(float(np.mean(((nu + 1.0) * eps / (nu + eps**2)) ** 2)), 1.0)
 
@@ -153,8 +152,8 @@ def _within(local: LogPosterior, vector: Array, reach: Array) -> LogPosterior:
 def _maximum(
     local: LogPosterior, centre: Mapping[str, float], trust: float, exact: Sequence[str],
     rng: np.random.Generator,
-) -> tuple[dict[str, float], float]:  # fmt: skip
-    """The most probable point in the trust region, and its log posterior."""
+) -> tuple[dict[str, float], float, Array]:  # fmt: skip
+    """The most probable point in the trust region, its log posterior and the force (m,) that it promises."""
     names = local.surrogate.space.names
     vector = local.vector(centre)
     near = _within(local, vector, np.array([1.0 if name in exact else trust for name in names]))
@@ -166,4 +165,5 @@ def _maximum(
     for one in others:
         top = one if one.value > top.value + AHEAD else top
     inside = np.clip(top.vector, *local.bounds)
-    return local.named(local.from_sampling(inside)), float(local.log_prob(inside[None])[0])
+    value = float(local.log_prob(inside[None])[0])
+    return local.named(local.from_sampling(inside)), value, local.force_n(inside, top.latent)

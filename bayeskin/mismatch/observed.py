@@ -19,47 +19,43 @@ from bayeskin.distinct import at_distinct, mean_at_distinct
 from bayeskin.mechanisms import Mechanism, observed
 from bayeskin.mechanisms.binned import BinnedForces
 from bayeskin.mechanisms.mechanism import Instrument
-from bayeskin.types import Array, PadMotion, ParameterSpace, Prediction, Surrogate
+from bayeskin.mismatch.wrapper import Wrapper
+from bayeskin.types import Array, PadMotion, ParameterSpace, Prediction
 
 
 @dataclass(frozen=True)
-class ObservedSurrogate:
-    """Satisfies `types.Surrogate`: `skin`'s parameters, then those of the instrument's `mechanisms`."""
+class ObservedSurrogate(Wrapper):
+    """The parameters of `inner`, then those of the instrument's `mechanisms`."""
 
-    skin: Surrogate
     mechanisms: tuple[Mechanism, ...]
     motion: PadMotion
-
-    @property
-    def edges_s(self) -> Array:
-        return self.skin.edges_s
 
     @cached_property
     def space(self) -> ParameterSpace:
         """Of the skin, then of each mechanism."""
         more = tuple(p for mechanism in self.mechanisms for p in mechanism.parameters)
-        return ParameterSpace((*self.skin.space.parameters, *more))
+        return ParameterSpace((*self.inner.space.parameters, *more))
 
     @property
     def provenance(self) -> Mapping[str, Any]:
-        return {**self.skin.provenance, "instrument": [m.name for m in self.mechanisms]}
+        return {**self.inner.provenance, "instrument": [m.name for m in self.mechanisms]}
 
     def predict(self, theta: ArrayLike) -> Prediction:
         """Force at theta (n, d) or (d,). Raises InputError outside the box."""
         skin, values = self._split(theta)
-        found = at_distinct(lambda these, _: self.skin.predict(these), skin, skin)
+        found = at_distinct(lambda these, _: self.inner.predict(these), skin, skin)
         return Prediction(found.mean + self._added(values, found.mean), found.factor, found.diagonal)
 
     def predict_mean(self, theta: ArrayLike) -> Array:
         """The mean (n, m) of `predict` alone."""
         skin, values = self._split(theta)
-        mean = mean_at_distinct(lambda these, _: self.skin.predict_mean(these), skin, skin)
+        mean = mean_at_distinct(lambda these, _: self.inner.predict_mean(these), skin, skin)
         return mean + self._added(values, mean)
 
     def _split(self, theta: ArrayLike) -> tuple[Array, dict[str, Array]]:
         """The skin's parameters (n, k), and the instrument's by name, (n,) each."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
-        inner = self.skin.space.dim
+        inner = self.inner.space.dim
         return theta[:, :inner], dict(zip(self.space.names[inner:], theta[:, inner:].T, strict=True))
 
     def _added(self, values: Mapping[str, Array], mean_n: Array) -> Array:

@@ -22,7 +22,7 @@ from bayeskin.inference import LogPosterior
 from bayeskin.inference.straighten import Shear, find_shear
 from bayeskin.mismatch.blocked import errors_left_out
 from bayeskin.mismatch.contributions import Contribution, Force, contributions
-from bayeskin.mismatch.corrected import FullRun
+from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun, Sure
 from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
 from bayeskin.mismatch.fit import Fit, fit_near, restored, stored
 from bayeskin.mismatch.form import Form, propose_form
@@ -33,7 +33,7 @@ from bayeskin.mismatch.search import weight
 from bayeskin.pipeline.engine import Run, Silent
 from bayeskin.pipeline.reported import FullForce
 from bayeskin.pipeline.workbench import Workbench, opened, workbench
-from bayeskin.types import Array
+from bayeskin.types import Array, Surrogate
 from bayeskin.workers import Lost, run_parallel
 
 COARSE_RUNS, BASE_RUNS = 8, 4  # at most, with mechanisms and without
@@ -98,11 +98,13 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
     alone, found = build(()), restored(plain, build(plain["names"]))
     straight = find_shear(alone)
     shear = straight.among(alone.names, found.log_posterior.names) if straight else None
-    full, about = _full(bench, found)
+    full, corrected = _full(bench, found)
     force: Force = partial(_surrogate_force, bench)
-    full_weight = None
-    if about is not None and isinstance(full, FullFit):
-        found = fit_near(found.names, about, full.theta, shear)
+    full_weight, sure = None, found
+    if corrected is not None and isinstance(full, FullFit):
+        found = fit_near(found.names, _about(bench, found, corrected), full.theta, shear)
+        # An error that is let go takes up what is missing, which no phase left out would show.
+        sure = replace(found, log_posterior=_about(bench, found, Sure(corrected)))
         # Mechanisms have to be worth what a run has shown, the model without them what is promised.
         full_weight = weight(found) + (full.value - found.value if found.names else 0.0)
         force = _coarse(bench)
@@ -111,10 +113,15 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
     bands = inference.bands(found.log_posterior, some, np.random.default_rng(seed))
     return TakenUp(
         full, full_weight, draws, inference.coverage(bench.binned, *bands.interval(0.9)),
-        _left_out(found, shear), locate(found, noise, seed),
+        _left_out(sure, shear), locate(found, noise, seed),
         tuple(contributions(found.names, found.theta, force)),
         Remainder(discrepancy(found, bench.motion), propose_form(found, bench.motion, seed)),
     )  # fmt: skip
+
+
+def _about(bench: Workbench, found: Fit, surrogate: Surrogate) -> LogPosterior:
+    """The posterior by a surrogate of the full model on its mesh, however unsure."""
+    return replace(found.log_posterior, surrogate=bench.with_mesh_error(surrogate), sure_within_n=None)
 
 
 def _left_out(found: Fit, shear: Shear | None) -> float | None:
@@ -129,8 +136,8 @@ def _begun_apart(source: Path, plain: Mapping[str, Any], until_s: float | None) 
     return _full(bench, restored(plain, bench.posterior(until_s, plain["names"])))[0]
 
 
-def _full(bench: Workbench, found: Fit) -> tuple[FullResult, LogPosterior | None]:
-    """The full model's own fit from a search's, and the posterior about it."""
+def _full(bench: Workbench, found: Fit) -> tuple[FullResult, CorrectedSurrogate | None]:
+    """The full model's own fit from a search's, and the surrogate about it."""
     if bench.spec.observation != "reaction":
         return None, None
     beyond = [bench.known[name] for name in found.names if bench.known[name].act.bind is None]
