@@ -194,6 +194,17 @@ class ParameterSpace:
             out -= 0.5 * np.einsum("...i,ij,...j->...", z, self._shared_precision, z)
         return out
 
+    def log_density_slopes(self, line: Array) -> tuple[Array, Array]:
+        """Gradient (d,) of `log_density` at a point (d,) on the line, and its curvature (d, d), downward."""
+        gradient, curvature = np.zeros(self.dim), np.zeros((self.dim, self.dim))
+        if self._normals:
+            columns = list(self._normals)
+            centre, spread = np.array([own[:2] for own in self._normals.values()]).T
+            precision = np.linalg.inv(self._correlation) / np.outer(spread, spread)
+            curvature[np.ix_(columns, columns)] = precision
+            gradient[columns] = precision @ (centre - np.asarray(line)[columns])
+        return gradient, curvature
+
     def to_line(self, theta: ArrayLike) -> Array:
         """Coordinates (..., d) in which each prior is uniform or normal: the value, or its logarithm."""
         theta = np.asarray(theta, dtype=float)

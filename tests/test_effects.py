@@ -10,10 +10,14 @@ import numpy as np
 import pytest
 from toy import EDGES_S, SPACE, toy_bin_means
 
-from bayeskin.design import sobol_points
+from bayeskin.design import default_space, sobol_points
 from bayeskin.distinct import at_distinct
+from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.strain_stiffening import first_modulus
+from bayeskin.pipeline.effects import coarse_wave, parts_of, with_own
+from bayeskin.proof.cases import shipped_screen
 from bayeskin.surrogates import Pair, load_surrogate, save_surrogate, train, train_effect
+from bayeskin.surrogates.effects import WithEffects
 from bayeskin.surrogates.files import contents_hash
 from bayeskin.surrogates.screening import active_inputs
 from bayeskin.types import Array, Design, Parameter, ParameterSpace, Prediction
@@ -120,3 +124,41 @@ def test_rows_that_agree_are_predicted_once_and_all_get_their_own() -> None:
     assert len(asked[-1]) == 3
     for name in ("mean", "factor", "diagonal"):
         np.testing.assert_array_equal(getattr(once, name), getattr(plain, name))
+
+
+def test_values_of_a_mechanism_fill_the_box_beside_the_base_s() -> None:
+    """Sequences scrambled apart go in step: seven of eight cells of a plane stay empty."""
+    part = parts_of(catalogue()["strain-stiffening"])[0]
+    wave = with_own(part, coarse_wave(default_space(), 512, 1))
+    shorter = with_own(part, coarse_wave(default_space(), 100, 1))
+    np.testing.assert_array_equal(wave.theta[:100], shorter.theta)
+    unit = wave.space.to_unit(wave.theta)
+    for i in range(5):
+        for j in range(5, wave.space.dim):
+            cells = np.histogram2d(unit[:, i], unit[:, j], bins=8, range=[[0, 1], [0, 1]])[0]
+            assert np.sum(cells == 0) < 8, (i, j)
+
+
+def test_an_estimate_is_of_the_force_that_the_other_effects_make() -> None:
+    """Two branches beside fibres: each as Effect has it, of the force with fibres, whatever the order."""
+    screen = shipped_screen()
+    by_part = {effect.part: effect for effect in screen.effects}
+    branches = [by_part[f"solid-viscoelasticity-g_{i}"] for i in (1, 2)]
+    fibres, base = by_part["strain-stiffening"], screen.refit.surrogate
+    rng = np.random.default_rng(3)
+    found = []
+    for effects in ((fibres, *branches), (*branches, fibres)):
+        whole = WithEffects(base, effects)
+        theta = whole.space.from_unit(rng.uniform(0.2, 0.8, (4, whole.space.dim)))
+        theta[2, 5:] = theta[1, 5:]
+        theta[2, :5] = theta[1, :5]  # a row twice
+        values = {name: theta[:, i] for i, name in enumerate(whole.space.names)}
+        own = {e.part: np.stack([values[n] for n in e.space.names], axis=1) for e in effects}
+        force = base.predict_mean(theta[:, :5])
+        stiff = force + fibres.predict_mean(own[fibres.part], force)
+        expected = stiff + sum(e.predict_mean(own[e.part], stiff) for e in branches)
+        np.testing.assert_allclose(whole.predict_mean(theta), expected, rtol=1e-6)
+        np.testing.assert_allclose(whole.predict(theta).mean, expected, rtol=1e-6)
+        apart = stiff + sum(e.predict_mean(own[e.part], force) for e in branches)
+        found.append(np.abs(apart - expected).max())
+    assert min(found) > 1e-3

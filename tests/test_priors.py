@@ -11,6 +11,7 @@ from toy_inference import line_problem
 from bayeskin.config import load_config, parameter_space, to_toml
 from bayeskin.errors import InputError
 from bayeskin.inference import identifiability
+from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.sensitivity import describe
 from bayeskin.types import Array, Correlation, Parameter, ParameterSpace
 
@@ -72,6 +73,35 @@ def assert_conjugate(parameters: tuple[Parameter, ...], precision: Array, *corre
 def test_a_normal_prior_gives_the_conjugate_posterior_of_a_line():
     a, b = line_problem().surrogate.space.parameters
     assert_conjugate((normal(a, 0.02), b), np.diag([1 / 0.02**2, 0.0]))
+
+
+@pytest.mark.parametrize("correlation", [0.0, -0.7])
+def test_slopes_of_a_normal_prior_are_its_density_s(correlation: float):
+    space = dataclasses.replace(SPACE, correlations=(Correlation("E", "p", correlation),))
+    line = space.to_line(np.array([4e4, 1.3, 1e-14]))
+    gradient, curvature = space.log_density_slopes(line)
+    steps = 1e-3 * np.eye(3)
+    ahead = (space.log_density(line + steps) - space.log_density(line - steps)) / 2e-3
+    np.testing.assert_allclose(gradient, ahead, atol=1e-8)
+    moved = np.array([space.log_density_slopes(line + step)[0] for step in steps])
+    np.testing.assert_allclose(-curvature, (moved - gradient) / 1e-3, atol=1e-8)
+
+
+def test_a_climb_sees_a_normal_prior():
+    """One that says more than the data do: the climb ends where both agree, and knows how sharp that is."""
+    problem = line_problem()
+    parameters = tuple(normal(p, 0.02) for p in problem.surrogate.space.parameters)
+    space = ParameterSpace(parameters, (Correlation(*(p.name for p in parameters), 0.8),))
+    informed = dataclasses.replace(problem, material=space)
+    low, high = informed.bounds
+    top = gauss_newton(informed, 0.1 * low + 0.9 * high, None, 4)
+    width, steps = (high - low)[:2], 1e-3 * np.eye(informed.dim)[:2]
+    ahead, behind = (informed.log_prob(top.vector + sign * steps) for sign in (1, -1))
+    np.testing.assert_allclose(width * (ahead - behind) / 2e-3, 0.0, atol=0.5)
+    curved = -(width**2) * (ahead + behind - 2 * top.value) / 1e-6
+    np.testing.assert_allclose(np.diag(top.information)[:2], curved, rtol=0.02)
+    alone = gauss_newton(problem, 0.1 * low + 0.9 * high, None, 4)
+    assert np.abs(top.vector[:2]).max() < 0.5 * np.abs(alone.vector[:2]).max()
 
 
 def test_draws_of_a_normal_prior_taught_nothing():

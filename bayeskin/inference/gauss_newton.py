@@ -183,6 +183,14 @@ class _Linear:
             self._columns = white[:, 0], white[:, 1 : self.inner + 1], white[:, self.inner + 1 :]
         return self._columns
 
+    def prior(self, x: Array) -> tuple[Array, Array]:
+        """Gradient (d,) of the log prior of the material at x (D,) and its curvature (d, d), downward, by the
+        box's width."""
+        width = (self.high - self.low)[: self.inner]
+        gradient, curvature = self.log_posterior.space.log_density_slopes(x)
+        inner = curvature[: self.inner, : self.inner]
+        return width * gradient[: self.inner], np.outer(width, width) * inner
+
     def step(
         self, x: Array, damping: float, explained: Array | float = 0.0, free: NDArray[np.bool_] | None = None
     ) -> Array:
@@ -198,6 +206,9 @@ class _Linear:
         width = (self.high - self.low)[: self.inner]
         room_up = (self.high[: self.inner] - x[: self.inner]) / width
         room_down = (self.low[: self.inner] - x[: self.inner]) / width
+        pull, bend = self.prior(x)
+        if free is not None:
+            pull, bend = pull * free, bend * np.outer(free, free)
         change: Array = np.zeros(design.shape[1])
         for _ in range(REWEIGHTED):
             left = residual - design @ change
@@ -209,6 +220,8 @@ class _Linear:
             target = weighted @ residual
             penalty[self.inner :], rest = _spring(change[self.inner :])
             target[self.inner :] += rest
+            target[: self.inner] += pull
+            normal[: self.inner, : self.inner] += bend
             normal[np.diag_indices(len(normal))] += penalty
             change = _bounded(normal, target, room_down, room_up, self.inner)
         step = np.zeros(len(x))
@@ -234,8 +247,9 @@ class _Linear:
         low, high = self.low[self.inner :], self.high[self.inner :]
         _, noise_gradient, second = self._differences((self.noise - low) / (high - low))
         information = np.diag(np.concatenate([np.zeros(self.inner), np.maximum(-second, 0.0)]))
-        information[: self.inner, : self.inner] = material
-        return information, np.concatenate([steep, noise_gradient]), latent
+        pull, bend = self.prior(self.x)
+        information[: self.inner, : self.inner] = material + bend
+        return information, np.concatenate([steep + pull, noise_gradient]), latent
 
 
 def _spring(latent: Array) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +94,7 @@ def simulate_with(
 def effect_wave(part: Part, design: Design, points: int, held_out: int, seed: int) -> Wave:
     """Points of the base's design, each with values of the part's parameters from its prior."""
     inputs = Similarity(design.space).inputs(design.theta)
-    return _with_own(part, fine_wave(design, inputs, points, held_out, seed))
+    return with_own(part, fine_wave(design, inputs, points, held_out, seed))
 
 
 def coarse_wave(space: ParameterSpace, points: int, seed: int) -> Wave:
@@ -111,20 +112,20 @@ def nested(wave: Wave, few: Wave) -> Wave:
     return replace(wave, theta=theta, held_out=np.zeros(len(theta), bool), record={"rule": rule})
 
 
-def _with_own(part: Part, base: Wave) -> Wave:
-    """A wave of base parameters with values of the part's own beside them."""
-    own = ParameterSpace(part.own)
-    number = int(sha256_of(part.name)[:8], 16)
-    unit = np.empty((len(base.theta), own.dim))
-    for out in (False, True):
-        rows = base.held_out == out
-        theta = sobol_points(own, int(rows.sum()), [base.seed, number, int(out)])
-        unit[rows] = own.to_unit(theta)
+def with_own(part: Part, base: Wave) -> Wave:
+    """A wave of base parameters with values of the part's own beside them.
+
+    These are drawn anew for each point, from its own seed: a sequence that fills their box by itself goes in
+    step with the base's, and leaves most of a plane of one parameter of each empty.
+    """
+    own, number = ParameterSpace(part.own), int(sha256_of(part.name)[:8], 16)
+    points = [[base.seed, number, int(sha256(row.tobytes()).hexdigest()[:16], 16)] for row in base.theta]
+    unit = np.array([np.random.default_rng(point).uniform(size=own.dim) for point in points])
     if own.parameters[0].lower == part.neutral:
         unit[:, 0] = WEAKEST + (1.0 - WEAKEST) * unit[:, 0]
     theta = np.concatenate([base.theta, own.from_unit(unit)], axis=1)
     space = ParameterSpace((*base.space.parameters, *part.own))
-    rule = f"{base.record['rule']}, with Sobol' points of {', '.join(own.names)}"
+    rule = f"{base.record['rule']}, with draws of {', '.join(own.names)}"
     return Wave(space, np.clip(theta, space.lower, space.upper), base.held_out, 0, base.seed, {"rule": rule})
 
 
@@ -148,7 +149,7 @@ def _learn(run: Run, part: Part) -> dict[str, Any]:
     coarse_spec = replace(spec, mesh="bricks", refinement=0)
     wave = coarse_wave(base.space, config.effects.coarse, config.seed)
     few = effect_wave(part, base, config.effects.points, config.effects.held_out, config.seed)
-    many = nested(_with_own(part, wave), few)
+    many = nested(with_own(part, wave), few)
     with crew(run) as run_all:
         make = partial(_runs, run, run_all, base.edges_s)
         without = make("coarse", coarse_spec, nested(wave, few), None)

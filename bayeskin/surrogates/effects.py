@@ -15,15 +15,16 @@ the estimate's RMS over time, |D|:
 
 so that H / c is near one everywhere and has a logarithm, whatever the sign of what is left.
 
-Effects of several parts add up: what they do to each other is left to full runs.
+Effects of several parts add up, and an estimate is of the force F_0 that all without an estimate make: what
+they do to each other beyond that is left to full runs (`benchmarks/pairs.py` says how much it is).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,6 +39,7 @@ from bayeskin.surrogates.two_fidelities import correct
 from bayeskin.surrogates.validate import Validation
 from bayeskin.types import Array, Design, ParameterSpace, Prediction, Surrogate
 
+T = TypeVar("T")
 Estimate = Callable[[Array, Array], Array]  # own parameters (n, k), force without (n, m) to its change (n, m)
 SMALLEST = 5e-4  # of the base force, RMS: below it an effect is the solver's noise
 SMALL = 5e-3  # from here on an effect's own relative error decides
@@ -187,11 +189,15 @@ class WithEffects:
         refuse_outside(self.space, theta)
         base = theta[:, : self.base.space.dim]
         found = [at_distinct(lambda these, _: self.base.predict(these), base, base)]
-        for effect, columns in zip(self.effects, self._columns, strict=True):
-            found.append(at_distinct(effect.predict, theta[:, columns], found[0].mean))
+        alone = others = found[0].mean
+        for effect, known, own in self._ordered:
+            without = alone if effect.estimate is None else others
+            predict = partial(_of_columns, effect.predict, own)
+            found.append(at_distinct(predict, theta[:, known], without))
+            others = others + found[-1].mean if effect.estimate is None else others
         rows = [one.factor.transpose(0, 2, 1) for one in found]  # as they lie in memory
         return Prediction(
-            mean=sum((one.mean for one in found[1:]), found[0].mean),
+            mean=sum((one.mean for one in found[1:]), alone),
             factor=np.concatenate(rows, axis=1).transpose(0, 2, 1),
             diagonal=sum((one.diagonal for one in found[1:]), found[0].diagonal),
         )
@@ -201,15 +207,31 @@ class WithEffects:
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
         base = theta[:, : self.base.space.dim]
-        mean = alone = mean_at_distinct(lambda these, _: self.base.predict_mean(these), base, base)
-        for effect, columns in zip(self.effects, self._columns, strict=True):
-            mean = mean + mean_at_distinct(effect.predict_mean, theta[:, columns], alone)
+        mean = alone = others = mean_at_distinct(lambda these, _: self.base.predict_mean(these), base, base)
+        for effect, known, own in self._ordered:
+            without = alone if effect.estimate is None else others
+            predict = partial(_of_columns, effect.predict_mean, own)
+            mean = mean + mean_at_distinct(predict, theta[:, known], without)
+            others = mean if effect.estimate is None else others
         return mean
 
     @cached_property
-    def _columns(self) -> list[list[int]]:
-        """Of each effect, where in `space` its parameters are."""
-        return [[self.space.names.index(name) for name in effect.space.names] for effect in self.effects]
+    def _ordered(self) -> list[tuple[Effect, list[int], list[int]]]:
+        """Effects with an estimate last; of each, which columns of theta it depends on, and which of these
+        are its own space's."""
+        place = {name: column for column, name in enumerate(self.space.names)}
+        ordered = sorted(self.effects, key=lambda effect: effect.estimate is not None)
+        found, before = [], set(range(self.base.space.dim))
+        for effect in ordered:
+            columns = [place[name] for name in effect.space.names]
+            known = columns if effect.estimate is None else sorted(before.union(columns))
+            found.append((effect, known, [known.index(column) for column in columns]))
+            before.update(columns if effect.estimate is None else ())
+        return found
+
+
+def _of_columns(predict: Callable[[Array, Array], T], columns: list[int], theta: Array, without: Array) -> T:
+    return predict(theta[:, columns], without)
 
 
 def with_effects(base: ShapeSurrogate, effects: Sequence[Effect]) -> Surrogate:
