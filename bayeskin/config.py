@@ -146,13 +146,14 @@ class SurrogateConfig(_Section):
 
 
 class EffectsConfig(_Section):
-    """Tissue mechanisms (all of them by default) to learn, and runs a part of each to do so.
+    """Tissue mechanisms (all of them by default) to learn, and pairs of their parts; runs for each to do so.
 
     `coarse` of them on the coarsest bricks, with and without the mechanism; `points` and `held_out` of the
     model itself, which correct those and test the correction.
     """
 
     mechanisms: list[str] = []
+    pairs: list[tuple[str, str]] = []
     coarse: Positive = 400
     points: Positive = 72
     held_out: Positive = 20

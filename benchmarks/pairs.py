@@ -38,7 +38,7 @@ from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline.reported import FullForce
 from bayeskin.proof.cases import shipped_screen
 from bayeskin.shipped import shipped
-from bayeskin.surrogates import Effect, with_effects
+from bayeskin.surrogates import Effect, composed, with_effects
 from bayeskin.types import Array, Design, ParameterSpace
 from bayeskin.workers import Lost, run_parallel
 
@@ -87,21 +87,16 @@ def together(
     """Of one skin and pair, in mN at a peak of 1 N; runs: neither, each alone, both."""
     neither, *alone, both = runs
     to_skin = 1e3 / float(np.abs(neither).max())
-    change = [one - neither for one in alone]
-    composed = neither + change[0] + change[1]
-    for i, effect in enumerate(effects):
-        if effect.estimate is not None:
-            others = alone[1 - i]
-            here, there = (effect.estimate(own[i][None], f[None])[0] for f in (neither, others))
-            learnt = (change[i] - here) / _rms(here)
-            composed = others + there + _rms(there) * learnt
+    estimates = [effect.estimate for effect in effects]
+    sides = [one[None] for one in alone]
+    made = composed(neither[None], sides, [values[None] for values in own], estimates)[0]
     surrogate = with_effects(shipped_screen().refit.surrogate, effects)
     unit = surrogate.space.to_unit(np.concatenate([theta, *own])[None])[0]
-    miss = both - composed
+    miss = both - made
     by = slopes(surrogate, np.concatenate([theta, *own]))
     found = lsq_linear(by, miss, bounds=(np.minimum(-unit, -1e-9), np.maximum(1.0 - unit, 1e-9)))
     values = {
-        "together": _rms(both - neither), "added": _rms(both - neither - sum(change)),
+        "together": _rms(both - neither), "added": _rms(both + neither - sum(alone)),
         "composed": _rms(miss), "left": _rms(miss - by @ found.x),
     }  # fmt: skip
     return {name: to_skin * float(value) for name, value in values.items()}
@@ -128,8 +123,8 @@ def main() -> None:
     parser.add_argument("--docs", type=Path, default=DOCS, help="folder of surrogate.md")
     asked = parser.parse_args()
     screen = shipped_screen()
-    parts = {effect.part: effect for effect in screen.effects}
-    pairs = [(a, b) for a, b in combinations(parts, 2) if parts[a].mechanism != parts[b].mechanism]
+    parts = {effect.part: effect for effect in screen.effects if len(effect.mechanisms) == 1}
+    pairs = [(a, b) for a, b in combinations(parts, 2) if parts[a].mechanisms != parts[b].mechanisms]
     theta = skins(asked.skins)
     base_n = screen.refit.force(theta)
     own = {(i, name): strong(effect, theta[i], base_n[i], i)
@@ -144,7 +139,7 @@ def main() -> None:
             values |= dict(zip(parts[name].own, map(float, own[skin, name]), strict=True))
         text = " ".join(f"{name}={value:.8g}" for name, value in values.items())
         found = (skin, *(*names, "", "")[:2], text)
-        mechanisms = [parts[name].mechanism for name in names]
+        mechanisms = [parts[name].mechanisms[0] for name in names]
         needed[found] = (mechanisms, {**neutral, **values})
         return found
 

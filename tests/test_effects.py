@@ -51,7 +51,7 @@ def test_fine_runs_take_the_coarse_mesh_s_error_out_of_an_effect() -> None:
     theta, base, truth = FINE.design.theta[rows], FINE.without_n[rows], FINE.change()[rows]
     left = []
     for fine in (COARSE, FINE):  # corrected by itself, and by the fine model
-        effect, validation = train_effect("a", "toy", 0.0, ("a", "idle"), COARSE, fine, "gp")
+        effect, validation = train_effect("a", ["toy"], {"a": 0.0}, ("a", "idle"), COARSE, fine, "gp")
         left.append(error(effect.predict(theta, base).mean, truth))
     assert left[0] > 0.05
     assert left[1] < 0.012
@@ -129,8 +129,8 @@ def test_rows_that_agree_are_predicted_once_and_all_get_their_own() -> None:
 def test_values_of_a_mechanism_fill_the_box_beside_the_base_s() -> None:
     """Sequences scrambled apart go in step: seven of eight cells of a plane stay empty."""
     part = parts_of(catalogue()["strain-stiffening"])[0]
-    wave = with_own(part, coarse_wave(default_space(), 512, 1))
-    shorter = with_own(part, coarse_wave(default_space(), 100, 1))
+    wave = with_own([part], coarse_wave(default_space(), 512, 1))
+    shorter = with_own([part], coarse_wave(default_space(), 100, 1))
     np.testing.assert_array_equal(wave.theta[:100], shorter.theta)
     unit = wave.space.to_unit(wave.theta)
     for i in range(5):

@@ -309,7 +309,7 @@ def test_effects_add_their_strength_times_what_they_have_learnt(gp):
     more = replace(
         DESIGN, space=space, theta=np.column_stack([DESIGN.theta, np.linspace(0.0, 1.0, len(DESIGN.theta))])
     )
-    effect = Effect("g", "toy", 0.2, ("g",), train(more, "gp", seed=0)[0])
+    effect = Effect("g", ("toy",), {"g": 0.2}, ("g",), train(more, "gp", seed=0)[0])
     both = WithEffects(gp[0], (effect,))
     base, learnt = gp[0].predict(DESIGN.theta[:9]), effect.surrogate.predict(more.theta[:9])
     s = (more.theta[:9, 5] - 0.2)[:, None]

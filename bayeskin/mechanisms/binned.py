@@ -77,9 +77,10 @@ class BinnedEstimate:
 
 
 def estimate_of(
-    mechanism: Mechanism, own: Sequence[str], motion: PadMotion, edges_s: Array
+    mechanisms: Sequence[Mechanism], own: Sequence[str], motion: PadMotion, edges_s: Array
 ) -> BinnedEstimate | None:
-    """None for a mechanism without an estimate."""
-    if not isinstance(mechanism.act, Tissue) or mechanism.act.estimate is None:
+    """None for a mechanism without an estimate, and for what two do beyond both."""
+    mechanism = mechanisms[0]
+    if len(mechanisms) > 1 or not isinstance(mechanism.act, Tissue) or mechanism.act.estimate is None:
         return None
     return BinnedEstimate(mechanism, tuple(own), motion, edges_s)

@@ -2,12 +2,13 @@
 
 Each part of a mechanism is run with and without at the same base parameters, the other parts neutral: at
 many points on the coarsest bricks, and at some of the base's design in the full model itself, which correct
-what the coarse runs have taught.
+what the coarse runs have taught. Of a pair of parts, run together and each alone, what they do beyond what
+their surrogates make of both is learnt.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
@@ -36,12 +37,16 @@ from bayeskin.surrogates import (
     Pair,
     Similarity,
     Validation,
+    composed,
+    effect_of,
     load_manifest,
     load_surrogate,
     manifest_of,
     save_surrogate,
     train_effect,
+    with_effects,
 )
+from bayeskin.surrogates.effects import Estimate
 from bayeskin.types import Array, Design, PadMotion, Parameter, ParameterSpace, Simulation
 from bayeskin.workers import Map
 
@@ -81,20 +86,21 @@ def parts_of(mechanism: Mechanism) -> list[Part]:
 
 
 def simulate_with(
-    mechanism: str,
-    neutral: Mapping[str, float],
+    mechanisms: Sequence[str],
     spec: ModelSpec,
     motion: PadMotion,
     theta: Mapping[str, float],
 ) -> Simulation:
-    """A full run with one mechanism; its parameters that are not in theta are neutral."""
-    return simulate(spec, motion, {**neutral, **theta}, laws=laws([catalogue()[mechanism]]))
+    """A full run with mechanisms; their parameters that are not in theta are neutral."""
+    known = [catalogue()[name] for name in mechanisms]
+    neutral = {name: value for one in known for name, value in one.neutral.items()}
+    return simulate(spec, motion, {**neutral, **theta}, laws=laws(known))
 
 
-def effect_wave(part: Part, design: Design, points: int, held_out: int, seed: int) -> Wave:
-    """Points of the base's design, each with values of the part's parameters from its prior."""
+def effect_wave(parts: Sequence[Part], design: Design, points: int, held_out: int, seed: int) -> Wave:
+    """Points of the base's design, each with values of the parts' parameters from their priors."""
     inputs = Similarity(design.space).inputs(design.theta)
-    return with_own(part, fine_wave(design, inputs, points, held_out, seed))
+    return with_own(parts, fine_wave(design, inputs, points, held_out, seed))
 
 
 def coarse_wave(space: ParameterSpace, points: int, seed: int) -> Wave:
@@ -112,25 +118,42 @@ def nested(wave: Wave, few: Wave) -> Wave:
     return replace(wave, theta=theta, held_out=np.zeros(len(theta), bool), record={"rule": rule})
 
 
-def with_own(part: Part, base: Wave) -> Wave:
-    """A wave of base parameters with values of the part's own beside them.
+def with_own(parts: Sequence[Part], base: Wave) -> Wave:
+    """A wave of base parameters with values of the parts' own beside them.
 
     These are drawn anew for each point, from its own seed: a sequence that fills their box by itself goes in
     step with the base's, and leaves most of a plane of one parameter of each empty.
     """
-    own, number = ParameterSpace(part.own), int(sha256_of(part.name)[:8], 16)
-    points = [[base.seed, number, int(sha256(row.tobytes()).hexdigest()[:16], 16)] for row in base.theta]
-    unit = np.array([np.random.default_rng(point).uniform(size=own.dim) for point in points])
-    if own.parameters[0].lower == part.neutral:
-        unit[:, 0] = WEAKEST + (1.0 - WEAKEST) * unit[:, 0]
-    theta = np.concatenate([base.theta, own.from_unit(unit)], axis=1)
-    space = ParameterSpace((*base.space.parameters, *part.own))
-    rule = f"{base.record['rule']}, with draws of {', '.join(own.names)}"
-    return Wave(space, np.clip(theta, space.lower, space.upper), base.held_out, 0, base.seed, {"rule": rule})
+    theta, space = base.theta, base.space
+    for part in parts:
+        own = ParameterSpace(part.own)
+        unit = np.array([_draw(part, base.seed, row) for row in base.theta])
+        if own.parameters[0].lower == part.neutral:
+            unit[:, 0] = WEAKEST + (1.0 - WEAKEST) * unit[:, 0]
+        theta = np.concatenate([theta, np.clip(own.from_unit(unit), own.lower, own.upper)], axis=1)
+        space = ParameterSpace((*space.parameters, *part.own))
+    rule = base.record["rule"]
+    if parts:
+        rule = f"{rule}, with draws of {', '.join(space.names[base.space.dim :])}"
+    return Wave(space, theta, base.held_out, 0, base.seed, {"rule": rule})
+
+
+def _draw(part: Part, seed: int, row: Array) -> Array:
+    """Uniform (k,), of a part at a point."""
+    number, place = int(sha256_of(part.name)[:8], 16), int(sha256(row.tobytes()).hexdigest()[:16], 16)
+    return np.random.default_rng([seed, number, place]).uniform(size=len(part.own))
 
 
 def _work(run: Run) -> Mapping[str, Any]:
-    return {part.name: _learn(run, part) for mechanism in _chosen(run) for part in parts_of(mechanism)}
+    pairs = _pairs(run)
+    alone = [part for mechanism in _chosen(run) for part in parts_of(mechanism)]
+    each = {part.name: (part,) for part in [*alone, *(part for pair in pairs for part in pair)]}
+    return {name_of(parts): _learn(run, parts) for parts in [*each.values(), *pairs]}
+
+
+def name_of(parts: Sequence[Part]) -> str:
+    """One word for what parts do together."""
+    return "-with-".join(part.name for part in parts)
 
 
 def _chosen(run: Run) -> list[Mechanism]:
@@ -143,35 +166,71 @@ def _chosen(run: Run) -> list[Mechanism]:
     return [tissue[name] for name in names]
 
 
-def _learn(run: Run, part: Part) -> dict[str, Any]:
+def _pairs(run: Run) -> list[tuple[Part, ...]]:
+    known = {part.name: part for mechanism in catalogue().values() if isinstance(mechanism.act, Tissue)
+             for part in parts_of(mechanism)}  # fmt: skip
+    for names in run.config.effects.pairs:
+        where, found = f"{run.config_path}: effects.pairs", " and ".join(names)
+        if not set(names) <= set(known):
+            raise InputError(where, found, f"two of {', '.join(known)}")
+        if len({known[name].mechanism.name for name in names}) < 2:
+            raise InputError(where, found, "parts of two mechanisms")
+    return [tuple(known[name] for name in names) for names in run.config.effects.pairs]
+
+
+def _learn(run: Run, parts: Sequence[Part]) -> dict[str, Any]:
     config, spec = run.config, model_spec(run)
     base = storage.load(run.at("design", "design.h5"), Design)
     coarse_spec = replace(spec, mesh="bricks", refinement=0)
     wave = coarse_wave(base.space, config.effects.coarse, config.seed)
-    few = effect_wave(part, base, config.effects.points, config.effects.held_out, config.seed)
-    many = nested(with_own(part, wave), few)
+    some = [[], *([part] for part in parts)] if len(parts) > 1 else [[]]
+    few = {
+        name_of(these): effect_wave(
+            these, base, config.effects.points, config.effects.held_out, config.seed
+        ) for these in [*some, parts]
+    }  # fmt: skip
     with crew(run) as run_all:
         make = partial(_runs, run, run_all, base.edges_s)
-        without = make("coarse", coarse_spec, nested(wave, few), None)
-        coarse = make(f"{part.name}, coarse", coarse_spec, many, part)
-        fine = make(part.name, spec, few, part)
-    storage.save(run.at("effects", f"{part.name}-design.h5"), fine)
-    return _train(run, part, Pair(coarse, base_force(without, coarse)), Pair(fine, base_force(base, fine)))
+        *many, coarse = [
+            make("coarse", coarse_spec, nested(with_own(these, wave), few[name_of(these)]), these)
+            for these in [*some, parts]
+        ]
+        *others, fine = [make("fine", spec, few[name_of(these)], these) for these in [*some[1:], parts]]
+    storage.save(run.at("effects", f"{name_of(parts)}-design.h5"), fine)
+    estimates = [_estimate(run, [part], base.edges_s) for part in parts]
+    pairs = [Pair(design, _without(parts, estimates, known, design))
+             for known, design in ((many, coarse), ([base, *others], fine))]  # fmt: skip
+    return _train(run, parts, *pairs)
+
+
+def _estimate(run: Run, parts: Sequence[Part], edges_s: Array) -> Estimate | None:
+    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    own = [p.name for part in parts for p in part.own]
+    return estimate_of([part.mechanism for part in parts], own, motion, edges_s)
+
+
+def _without(
+    parts: Sequence[Part], estimates: Sequence[Estimate | None], known: Sequence[Design], design: Design
+) -> Array:
+    """The force (n, m) at the points of a design without what it is to teach; known: without any part, and
+    with each alone where there are two."""
+    neither, *alone = [force_at(one, design) for one in known]
+    if not alone:
+        return neither
+    columns = [[design.space.names.index(p.name) for p in part.own] for part in parts]
+    return composed(neither, alone, [design.theta[:, these] for these in columns], estimates)
 
 
 def _runs(
-    run: Run, run_all: Map, edges_s: Array, label: str, spec: ModelSpec, wave: Wave, part: Part | None
+    run: Run, run_all: Map, edges_s: Array, label: str, spec: ModelSpec, wave: Wave, parts: Sequence[Part]
 ) -> Design:
-    """The runs of a wave with a part of a mechanism, or (None) without; none is made twice."""
+    """The runs of a wave with parts of mechanisms, or without any; none is made twice."""
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     known = [vars(p) for p in wave.space.parameters]
-    name = "base" if part is None else part.name
+    name = name_of(parts) or "base"
     identity = sha256_of([spec.hash, vars(motion), edges_s, name, known])
-    task: Simulate = (
-        partial(simulate, spec, motion)
-        if part is None
-        else partial(simulate_with, part.mechanism.name, dict(part.mechanism.neutral), spec, motion)
-    )
+    task: Simulate = partial(simulate_with, [part.mechanism.name for part in parts], spec, motion)
+    label = f"{name}, {label}"
     run.reporter.log(f"{label}: {len(wave.theta)} full runs")
     file = run.folder / "runs" / f"{name}-{identity[:12]}.h5"
     return run_design(file, wave, edges_s, task, spec.hash, run_all, partial(tell, run, label))
@@ -194,31 +253,28 @@ def effects_of(run: Run) -> list[Effect]:
         said, surrogate = load_manifest(path), load_surrogate(path)
         if said["model_hash"] != model_spec(run).hash:
             raise InputError(path, "an effect of another model", "one of this configuration's model")
-        about = said["effect"]
-        own, mechanism = tuple(about["own"]), catalogue()[about["mechanism"]]
-        estimate = estimate_of(mechanism, own, motion, surrogate.edges_s)
-        found.append(Effect(about["part"], mechanism.name, about["neutral"], own, surrogate, estimate))
+        mechanisms = [catalogue()[name] for name in said["effect"]["mechanisms"]]
+        estimate = estimate_of(mechanisms, said["effect"]["own"], motion, surrogate.edges_s)
+        found.append(effect_of(said["effect"], surrogate, estimate))
     return found
 
 
-def _train(run: Run, part: Part, coarse: Pair, fine: Pair) -> dict[str, Any]:
+def _train(run: Run, parts: Sequence[Part], coarse: Pair, fine: Pair) -> dict[str, Any]:
     """The effect's surrogate, into the stage's folder, and what is known of its error."""
-    own = list(part.own_names)
-    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    name, own = name_of(parts), [p.name for part in parts for p in part.own]
+    neutral = {part.own[0].name: part.neutral for part in parts}
     try:
         effect, validation = train_effect(
-            part.name, part.mechanism.name, part.neutral, own, coarse, fine, run.config.surrogate.kind,
-            run.config.seed, estimate_of(part.mechanism, own, motion, fine.design.edges_s),
+            name, [part.mechanism.name for part in parts], neutral, own, coarse, fine,
+            run.config.surrogate.kind, run.config.seed, _estimate(run, parts, fine.design.edges_s),
         )  # fmt: skip
     except InputError as few:
-        run.reporter.log(f"{part.name}: no surrogate: {few}")
+        run.reporter.log(f"{name}: no surrogate: {few}")
         return {"learnt": False, "message": str(few)}
     said = {"learnt": True, **_errors(run, effect, validation, fine.without_n, fine.design)}
-    manifest = {**manifest_of(effect.surrogate, validation), "effect": {
-        "part": effect.part, "mechanism": effect.mechanism, "neutral": effect.neutral, "own": own,
-    }, **said}  # fmt: skip
-    save_surrogate(run.at("effects", f"{part.name}.h5"), effect.surrogate, manifest)
-    run.reporter.log(in_words(part.name, said))
+    manifest = {**manifest_of(effect.surrogate, validation), "effect": effect.about, **said}
+    save_surrogate(run.at("effects", f"{name}.h5"), effect.surrogate, manifest)
+    run.reporter.log(in_words(name, said))
     return said
 
 
@@ -232,23 +288,24 @@ def in_words(name: str, said: Mapping[str, Any]) -> str:
     )
 
 
-def base_force(base: Design, design: Design) -> Array:
-    """The base design's force (n, m) at the base parameters of each row of an effect's design."""
-    row_of = {theta.tobytes(): row for row, theta in enumerate(base.theta)}
-    theta = np.ascontiguousarray(design.theta[:, : base.space.dim])
-    return base.force_n[[row_of[one.tobytes()] for one in theta]]
+def force_at(known: Design, design: Design) -> Array:
+    """The force (n, m) of a design in some of the parameters of another, at each of the other's points."""
+    row_of = {theta.tobytes(): row for row, theta in enumerate(known.theta)}
+    theta = design.theta[:, [design.space.names.index(name) for name in known.space.names]]
+    return known.force_n[[row_of[one.tobytes()] for one in np.ascontiguousarray(theta)]]
 
 
 def _errors(
     run: Run, effect: Effect, validation: Validation, without: Array, design: Design
 ) -> dict[str, Any]:
     """Of the force with the effect, on held-out rows at forces of a skin test [mN]: of the effect's surrogate
-    beside the base's own runs, and of both surrogates together."""
-    rows = design.testing
+    beside runs without it, and of all surrogates together."""
+    rows = design.testing & np.isfinite(without).all(axis=1)
     theta, truth = design.theta[rows], design.force_n[rows]
-    alone = without[rows] + effect.predict(theta, without[rows]).mean
-    base = base_surrogate(run).predict(theta[:, : -len(effect.own)]).mean
-    both = base + effect.predict(theta, base).mean
+    alone = without[rows] + effect.predict_mean(theta, without[rows])
+    others = [one for one in effects_of(run) if len(one.mechanisms) == 1 and set(one.own) < set(effect.own)]
+    whole = with_effects(base_surrogate(run), [*others, effect])
+    both = whole.predict_mean(theta[:, [design.space.names.index(name) for name in whole.space.names]])
     peak = np.abs(truth).max(axis=1)
     to_skin = 1e3 / np.maximum(peak, 1e-12)  # mN of a force whose peak is 1 N
 

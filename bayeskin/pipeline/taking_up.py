@@ -181,7 +181,7 @@ def _full(bench: Workbench, found: Fit) -> tuple[FullResult, CorrectedSurrogate 
     plain = replace(found.log_posterior, surrogate=bench.surrogate(found.names))
     fitted = partial(
         fit_full, plain, exact=exact, seed=bench.run.config.seed, allow=bench.with_mesh_error,
-        several=sum(effect.mechanism in found.names for effect in bench.effects) > 1,
+        several=len(bench.effects_among(found.names)) > 1,
     )  # fmt: skip
     start = found.theta
     if not found.names:

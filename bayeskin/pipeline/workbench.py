@@ -56,9 +56,13 @@ class Workbench:
             return skin
         return Discretised(skin, self.motion, float(np.hypot(error.rms, CALIBRATION)))
 
+    def effects_among(self, names: Sequence[str]) -> list[Effect]:
+        """Effects of the mechanisms of a set, and of its pairs."""
+        return [effect for effect in self.effects if set(effect.mechanisms) <= set(names)]
+
     def surrogate(self, names: Sequence[str]) -> Surrogate:
         """Of the full model on its mesh, with a set of mechanisms."""
-        parts = [effect for effect in self.effects if effect.mechanism in names]
+        parts = self.effects_among(names)
         skin: Surrogate = with_effects(self.base, parts)  # type: ignore[arg-type]
         instrument = tuple(self.known[n] for n in names if isinstance(self.known[n].act, Instrument))
         return ObservedSurrogate(skin, instrument, self.motion) if instrument else skin
@@ -97,6 +101,6 @@ def workbench(run: Run) -> Workbench:
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     effects = effects_of(run) if run.config.model.observation == "reaction" else []
-    learnt = {effect.mechanism for effect in effects}
+    learnt = {effect.mechanisms[0] for effect in effects if len(effect.mechanisms) == 1}
     known = {n: m for n, m in catalogue().items() if isinstance(m.act, Instrument) or n in learnt}
     return Workbench(run, binned, motion, base_surrogate(run), tuple(effects), known)

@@ -23,7 +23,7 @@ from bayeskin.proof.outside import OUTSIDE
 from bayeskin.proof.protocol import EDGES_S, MOTION, SURROGATE
 from bayeskin.proof.remains import ALONE, Refit, rms
 from bayeskin.shipped import shipped
-from bayeskin.surrogates import Effect, load_manifest, load_surrogate
+from bayeskin.surrogates import Effect, effect_of, load_manifest, load_surrogate
 from bayeskin.types import Array, ParameterSpace
 
 Kind = Literal["nothing", "alone", "pair", "outside"]
@@ -133,7 +133,7 @@ class Screen:
         """Bin means (n, m) at theta (n, 5) with mechanisms at values (n,) each."""
         force_n = base_n = self.refit.force(theta)
         for effect in self.effects:
-            if effect.mechanism in names:
+            if set(effect.mechanisms) <= set(names):
                 own = np.stack([values[name] for name in effect.own], axis=1)
                 point = np.concatenate([theta, own], axis=1)
                 force_n = force_n + effect.predict(point, base_n).mean
@@ -167,11 +167,9 @@ def shipped_screen() -> Screen:
     for file in sorted(path.with_name(f"{path.stem}-effects").glob("*.h5")):
         if not file.stem.endswith("-design"):
             about = load_manifest(file)["effect"]
-            own, mechanism = tuple(about["own"]), catalogue()[about["mechanism"]]
-            estimate = estimate_of(mechanism, own, MOTION, EDGES_S)
-            effects.append(
-                Effect(about["part"], mechanism.name, about["neutral"], own, load_surrogate(file), estimate)
-            )
+            mechanisms = [catalogue()[name] for name in about["mechanisms"]]
+            estimate = estimate_of(mechanisms, about["own"], MOTION, EDGES_S)
+            effects.append(effect_of(about, load_surrogate(file), estimate))
     return Screen(Refit(load_surrogate(path)), tuple(effects), catalogue())
 
 

@@ -16,7 +16,8 @@ the estimate's RMS over time, |D|:
 so that H / c is near one everywhere and has a logarithm, whatever the sign of what is left.
 
 Effects of several parts add up, and an estimate is of the force F_0 that all without an estimate make: what
-they do to each other beyond that is left to full runs (`benchmarks/pairs.py` says how much it is).
+two do to each other beyond that (`benchmarks/pairs.py`) is an effect of its own, s the product of their
+strengths, where that is worth it, and else left to full runs.
 """
 
 from __future__ import annotations
@@ -47,17 +48,24 @@ SMALL = 5e-3  # from here on an effect's own relative error decides
 
 @dataclass(frozen=True)
 class Effect:
-    """One part of a mechanism: `surrogate` of G, or of H, over the base's and the part's own parameters.
+    """One part of a mechanism, or what the parts of two do beyond both: `surrogate` of G, or of H, over the
+    base's parameters and their `own`.
 
-    The first own parameter is the strength, 0 effect at `neutral`. estimate: D, where the mechanism has one.
+    neutral: of each strength its value without effect, one a mechanism. estimate: D, where a part has one.
     """
 
     part: str
-    mechanism: str
-    neutral: float
+    mechanisms: tuple[str, ...]
+    neutral: Mapping[str, float]
     own: tuple[str, ...]
     surrogate: ShapeSurrogate
     estimate: Estimate | None = None
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What a manifest says of it, for `effect_of`."""
+        return {"part": self.part, "mechanisms": list(self.mechanisms), "neutral": dict(self.neutral),
+                "own": list(self.own)}  # fmt: skip
 
     @property
     def space(self) -> ParameterSpace:
@@ -78,7 +86,7 @@ class Effect:
         """How many times (n,) what is learnt adds to the force, and what comes to it, (n, m)."""
         similarity = self.surrogate.similarity
         if self.estimate is None:
-            return strength(similarity, self.own[0], self.neutral, theta), 0.0
+            return strength(similarity, self.neutral, theta), 0.0
         change = self.estimate(theta[:, -len(self.own) :], base)
         size = _rms(change)
         return size * np.exp(-similarity.log_scale(theta)), change - size[:, None]
@@ -89,18 +97,43 @@ def _rms(values: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(values**2, axis=1)))
 
 
-def strength(similarity: Similarity, name: str, neutral: float, theta: Array) -> Array:
-    """s (n,) at theta (n, d): the parameter's distance from neutral, over the modulus to its power."""
-    space = similarity.space
-    column = space.names.index(name)
+def effect_of(about: Mapping[str, Any], surrogate: ShapeSurrogate, estimate: Estimate | None) -> Effect:
+    """The effect that `Effect.about` tells of."""
+    return Effect(
+        about["part"], tuple(about["mechanisms"]), about["neutral"], tuple(about["own"]), surrogate, estimate
+    )
+
+
+def strength(similarity: Similarity, neutral: Mapping[str, float], theta: Array) -> Array:
+    """s (n,) at theta (n, d): each strength's distance from neutral, over the modulus to its power; of two
+    their product."""
+    space, found = similarity.space, np.ones(len(theta))
     scale = similarity.log_scale(theta)
-    return np.asarray((theta[:, column] - neutral) * np.exp(-space.parameters[column].stress_power * scale))
+    for name, value in neutral.items():
+        column = space.names.index(name)
+        found *= (theta[:, column] - value) * np.exp(-space.parameters[column].stress_power * scale)
+    return found
+
+
+def composed(
+    neither_n: Array, alone_n: Sequence[Array], own: Sequence[Array], estimates: Sequence[Estimate | None]
+) -> Array:
+    """Force (n, m) that exact surrogates of several effects make together, from runs without and with each.
+
+    neither_n, alone_n (n, m) each; own (n, k): each effect's parameters, for its estimate where it has one
+    """
+    effects = list(zip(alone_n, own, estimates, strict=True))
+    found = others = neither_n + sum(one - neither_n for one, _, estimate in effects if estimate is None)
+    for one, values, estimate in effects:
+        if estimate is not None:
+            here, there = estimate(values, neither_n), estimate(values, others)
+            found = found + there + (_rms(there) / _rms(here))[:, None] * (one - neither_n - here)
+    return found
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Runs with a mechanism, `design`, and the force (n, m) of the same model at the same base parameters
-    without it."""
+    """Runs with an effect, `design`, and the force (n, m) of the same model at the same points without it."""
 
     design: Design
     without_n: Array
@@ -112,8 +145,8 @@ class Pair:
 
 def train_effect(
     part: str,
-    mechanism: str,
-    neutral: float,
+    mechanisms: Sequence[str],
+    neutral: Mapping[str, float],
     own: Sequence[str],
     coarse: Pair,
     fine: Pair,
@@ -130,16 +163,16 @@ def train_effect(
     active = active_inputs(seen, weights)
     surrogate, _ = train(seen, kind, seed, weights, active=active, whole_shape=True)  # type: ignore[arg-type]
     surrogate, validation = correct(surrogate, corrects, its)
-    return Effect(part, mechanism, neutral, tuple(own), surrogate, estimate), validation
+    return Effect(part, tuple(mechanisms), neutral, tuple(own), surrogate, estimate), validation
 
 
 def _learnt(
-    pair: Pair, neutral: float, own: Sequence[str], estimate: Estimate | None
+    pair: Pair, neutral: Mapping[str, float], own: Sequence[str], estimate: Estimate | None
 ) -> tuple[Design, Array]:
     """The design whose force is G, or H, and weights (n,) of its rows, 0 where no effect shows."""
     design, change = pair.design, pair.change()
     similarity = Similarity(design.space)
-    s = strength(similarity, own[0], neutral, design.theta)
+    s = strength(similarity, neutral, design.theta)
     with np.errstate(invalid="ignore"):
         size = _rms(change) / _rms(pair.without_n)
         shows = design.ok & (size > SMALLEST) & (np.abs(s) > 0.0)
@@ -174,9 +207,9 @@ class WithEffects:
 
     @cached_property
     def space(self) -> ParameterSpace:
-        """The base's parameters, then each effect's own."""
-        own = [effect.space.parameters[-len(effect.own) :] for effect in self.effects]
-        return ParameterSpace((*self.base.space.parameters, *(p for part in own for p in part)))
+        """The base's parameters, then each effect's own, those of two parts once."""
+        own = {p.name: p for effect in self.effects for p in effect.space.parameters[-len(effect.own) :]}
+        return ParameterSpace((*self.base.space.parameters, *own.values()))
 
     @property
     def provenance(self) -> Mapping[str, Any]:
