@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -12,11 +13,12 @@ from toy import EDGES_S, SPACE, toy_bin_means
 
 from bayeskin.design import default_space, sobol_points
 from bayeskin.distinct import at_distinct
+from bayeskin.errors import InputError
 from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.strain_stiffening import first_modulus
-from bayeskin.pipeline.effects import coarse_wave, parts_of, with_own
+from bayeskin.pipeline.effects import _pairs, coarse_wave, force_at, name_of, parts_of, with_own
 from bayeskin.proof.cases import shipped_screen
-from bayeskin.surrogates import Pair, load_surrogate, save_surrogate, train, train_effect
+from bayeskin.surrogates import Pair, composed, effect_of, load_surrogate, save_surrogate, train, train_effect
 from bayeskin.surrogates.effects import WithEffects
 from bayeskin.surrogates.files import contents_hash
 from bayeskin.surrogates.screening import active_inputs
@@ -162,3 +164,63 @@ def test_an_estimate_is_of_the_force_that_the_other_effects_make() -> None:
         apart = stiff + sum(e.predict_mean(own[e.part], force) for e in branches)
         found.append(np.abs(apart - expected).max())
     assert min(found) > 1e-3
+
+
+BOTH = ParameterSpace((*SPACE.parameters, *(Parameter(name, "1", 0.0, 2.0, "uniform") for name in "ab")))
+LATE = np.clip(np.linspace(-1.0, 1.0, len(EDGES_S) - 1), 0.0, 1.0)
+
+
+def runs_with(names: str, rows: int, seed: int, held_out: int) -> Design:
+    """The toy with an effect a of its force, one b that comes late, and what both do beyond."""
+    theta = sobol_points(BOTH, rows, seed)
+    a, b = (theta[:, 5 + i : 6 + i] * (name in names) for i, name in enumerate("ab"))
+    force = toy_bin_means(theta[:, : SPACE.dim])
+    size = np.abs(force).max(axis=1, keepdims=True)
+    force = force * (1.0 + 0.3 * a) + 0.2 * b * size * LATE + 0.4 * a * b * force * LATE
+    space = ParameterSpace(tuple(p for p in BOTH.parameters if p.name not in "ab" or p.name in names))
+    columns = [BOTH.names.index(name) for name in space.names]
+    return Design(
+        space, EDGES_S, theta[:, columns], force, np.zeros(rows, int), np.arange(rows) >= rows - held_out,
+        np.ones(rows, bool), ("",) * rows, np.zeros(rows), seed, "toy",
+    )  # fmt: skip
+
+
+def test_what_two_do_beyond_both_is_an_effect_of_its_own() -> None:
+    effects, missed = [], []
+    base, _ = train(runs_with("", 160, 1, 0), "gp")
+    test = runs_with("ab", 40, 5, 0)
+    for names in ("a", "b", "ab"):
+        pairs = []
+        for rows, seed, held_out in ((160, 1, 0), (40, 2, 8)):
+            neither, *alone = (
+                runs_with(n, rows, seed, held_out) for n in ("", *(names if names == "ab" else ""))
+            )
+            with_it = runs_with(names, rows, seed, held_out)
+            without = force_at(neither, with_it)
+            if alone:
+                without = composed(
+                    without, [force_at(one, with_it) for one in alone], [without] * 2, [None] * 2
+                )
+            pairs.append(Pair(with_it, without))
+        effect, _ = train_effect(names, names, dict.fromkeys(names, 0.0), tuple(names), *pairs, "gp")
+        effects.append(effect)
+        if len(effects) > 1:
+            missed.append(error(WithEffects(base, tuple(effects)).predict_mean(test.theta), test.force_n))
+        assert effect_of(effect.about, effect.surrogate, None) == effect
+    assert missed[0] > 0.1
+    assert missed[1] < 0.02
+
+
+def test_a_pair_is_of_two_mechanisms_that_there_are() -> None:
+    def run(*pairs: tuple[str, str]) -> SimpleNamespace:
+        config = SimpleNamespace(effects=SimpleNamespace(pairs=pairs))
+        return SimpleNamespace(config=config, config_path="x.toml")
+
+    (found,) = _pairs(run(("pre-stretch", "solid-viscoelasticity-g_2")))
+    assert name_of(found) == "pre-stretch-with-solid-viscoelasticity-g_2"
+    for pair, says in (
+        (("pre-stretch", "lotion"), "x.toml: effects.pairs: found pre-stretch and lotion"),
+        (("solid-viscoelasticity-g_1", "solid-viscoelasticity-g_2"), "parts of two mechanisms"),
+    ):
+        with pytest.raises(InputError, match=says):
+            _pairs(run(pair))

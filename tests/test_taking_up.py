@@ -63,17 +63,17 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
     return made
 
 
-def taken_up(names: tuple[str, ...]) -> tuple[Any, Any, Fit, LogPosterior]:
+def taken_up(names: tuple[str, ...], effects: int = 0) -> tuple[Any, Any, Fit, LogPosterior]:
     """What `_full` makes of a fit to a surrogate that is off, that fit, and the exact posterior."""
     right = building(dataclasses.replace(concealing(0, names, F0=-0.04), noise_priors=QUIET), names)
-    skin = Wrong() if not names else dataclasses.replace(right.surrogate, skin=Wrong())
+    skin = Wrong() if not names else dataclasses.replace(right.surrogate, inner=Wrong())
     wrong = dataclasses.replace(right, surrogate=skin)
     truth = {**TRUTH, **({"F0": -0.04} if names else {})}
     noise = {name: 2e-3 if name.startswith("sd_") else 0.5 for name in right.names if name not in truth}
     start = fit_near(names, wrong, {**truth, **noise, "nu_noise": 60.0}, None)
     bench = SimpleNamespace(
         spec=ModelSpec(), motion=toy.MOTION, binned=right.binned, with_mesh_error=lambda surrogate: surrogate,
-        surrogate=lambda names: skin, effects=(),
+        surrogate=lambda names: skin, effects_among=lambda names: [None] * effects,
         known={name: KNOWN[name] for name in names}, run=SimpleNamespace(config=SimpleNamespace(seed=1)),
     )  # fmt: skip
     full, about = taking_up._full(bench, start)  # type: ignore[arg-type]
@@ -99,6 +99,14 @@ def test_the_coarse_mesh_leads_the_full_model_to_its_own_maximum(names: tuple[st
     assert unlike(runs.fine)
     assert len(runs.fine) <= taking_up.FULL_RUNS + (0 if names else taking_up.DIRECT_RUNS)
     assert about is not None
+
+
+def test_only_several_effects_err_together(runs: Runs) -> None:
+    assert [taken_up(("force-offset",), effects)[1].common > 0.0 for effects in (0, 1, 2)] == [
+        False,
+        False,
+        True,
+    ]
 
 
 def test_a_full_run_that_fails_where_the_surrogate_s_fit_is_does_not_end_the_fit(runs: Runs) -> None:
