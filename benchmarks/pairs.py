@@ -15,7 +15,7 @@ forces brought to a peak of 1 N, as RMS over the recording:
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/pairs.py
 
 Finished runs are rows of benchmarks/results/pairs.csv, which a later start does not repeat. Writes the table
-between the markers of docs/surrogate.md.
+between the markers of docs/mechanisms.md.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--skins", type=int, default=6)
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of surrogate.md")
+    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of mechanisms.md")
     asked = parser.parse_args()
     screen = shipped_screen()
     parts = {effect.part: effect for effect in screen.effects if len(effect.mechanisms) == 1}
@@ -158,7 +158,7 @@ def main() -> None:
             )
     block = table({pair: many for pair, many in found.items() if many})
     print(block)
-    path = asked.docs / "surrogate.md"
+    path = asked.docs / "mechanisms.md"
     pattern = re.compile(r"(<!-- pairs -->\n).*(<!-- /pairs -->)", re.DOTALL)
     path.write_text(pattern.sub(lambda m: f"{m[1]}\n{block}\n\n{m[2]}", path.read_text()))
 
