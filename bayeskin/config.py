@@ -149,7 +149,8 @@ class EffectsConfig(_Section):
     """Tissue mechanisms (all of them by default) to learn, and pairs of their parts; runs for each to do so.
 
     `coarse` of them on the coarsest bricks, with and without the mechanism; `points` and `held_out` of the
-    model itself, which correct those and test the correction.
+    model itself, which correct those and test the correction; `plausible` more of it, and a third as many
+    held out, where the recording leaves the mechanism plausible.
     """
 
     mechanisms: list[str] = []
@@ -157,6 +158,7 @@ class EffectsConfig(_Section):
     coarse: Positive = 400
     points: Positive = 72
     held_out: Positive = 20
+    plausible: NotNegative = 0
 
 
 class FitConfig(_Section):

@@ -10,11 +10,13 @@ import h5py
 import numpy as np
 import pytest
 from toy import EDGES_S, SPACE, toy_bin_means
+from toy import MOTION as PULL
 
 from bayeskin.design import default_space, sobol_points
 from bayeskin.distinct import at_distinct
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import catalogue
+from bayeskin.mechanisms.fibre_anisotropy import AT_ANY_ANGLE
 from bayeskin.mechanisms.strain_stiffening import first_modulus
 from bayeskin.pipeline.effects import _pairs, coarse_wave, force_at, name_of, parts_of, with_own
 from bayeskin.proof.cases import shipped_screen
@@ -196,10 +198,10 @@ def test_what_two_do_beyond_both_is_an_effect_of_its_own() -> None:
                 runs_with(n, rows, seed, held_out) for n in ("", *(names if names == "ab" else ""))
             )
             with_it = runs_with(names, rows, seed, held_out)
-            without = force_at(neither, with_it)
+            without = force_at([neither], with_it)
             if alone:
                 without = composed(
-                    without, [force_at(one, with_it) for one in alone], [without] * 2, [None] * 2
+                    without, [force_at([one], with_it) for one in alone], [without] * 2, [None] * 2
                 )
             pairs.append(Pair(with_it, without))
         effect, _ = train_effect(names, names, dict.fromkeys(names, 0.0), tuple(names), *pairs, "gp")
@@ -224,3 +226,16 @@ def test_a_pair_is_of_two_mechanisms_that_there_are() -> None:
     ):
         with pytest.raises(InputError, match=says):
             _pairs(run(pair))
+
+
+def test_lines_along_the_pull_make_a_skin_as_many_times_as_stiff_and_others_less() -> None:
+    act, angles = catalogue()["fibre-anisotropy"].act, np.linspace(0.0, np.pi / 2, 91)
+    for ratio in (1.0, 1.5, 4.0):
+        values = {"langer_ratio": np.full(91, ratio), "langer_angle": angles}
+        (factor,) = act.estimate(values, PULL, lambda t: np.ones((91, len(t))))(np.zeros(1)).T
+        gain = factor - AT_ANY_ANGLE * (ratio - 1.0)
+        assert gain[0] == pytest.approx(ratio)
+        assert np.all(gain > 1.0 - 1e-12)
+        assert gain[55] == pytest.approx(1.0, abs=0.01 * ratio)
+    # across, by hand: narrowing is held back, y = 2 / (4 + 3 r)
+    assert gain[-1] == pytest.approx(2 * ((1 + (2 / 13) ** 2 + (11 / 13) ** 2) / 3 + 1.5 * (2 / 13) ** 2))

@@ -19,7 +19,7 @@ from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
 from bayeskin.inference.noise_model import NoiseChain, innovations
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.straighten import Shear
-from bayeskin.types import Array, NDArray, Prediction
+from bayeskin.types import Array, NDArray
 
 STEP = 1e-4  # of the box, for differences
 DAMPED = (0.0, 1e-2, 1.0, 1e2, 1e4)  # shares of the information added to its diagonal
@@ -124,10 +124,10 @@ class _Linear:
         side = np.where(x + STEP * width <= self.high, 1.0, -1.0)[: self.inner]
         points = np.repeat(x[None], self.inner + 1, axis=0)
         points[1:, : self.inner] += np.diag(side * STEP * width[: self.inner])
-        found = log_posterior.predict(log_posterior.from_sampling(points))
-        self.here = Prediction(found.mean[:1], found.factor[:1], found.diagonal[:1])
-        bins = self.chain.bins
-        slope = (found.mean[1:] - found.mean[0])[:, bins] / (side * STEP)[:, None]
+        theta = log_posterior.from_sampling(points)
+        self.here = log_posterior.predict(theta[:1])
+        mean, bins = log_posterior.predict_mean(theta), self.chain.bins
+        slope = (mean[1:] - mean[0])[:, bins] / (side * STEP)[:, None]
         self.slope = slope.T  # (k, inner), a box width
         self.noise = x[self.inner :]
         self._columns: tuple[Array, Array, Array] | None = None

@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 
 from bayeskin import storage
-from bayeskin.design import Wave, fine_wave, sobol_points
+from bayeskin.design import Wave, fine_wave, next_wave, sobol_points
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, catalogue, laws
 from bayeskin.mechanisms.binned import estimate_of
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline.crew import crew
-from bayeskin.pipeline.design import tell
+from bayeskin.pipeline.design import fitted_bins, noise_floor_n, tell
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.model import model_spec
@@ -47,7 +47,16 @@ from bayeskin.surrogates import (
     with_effects,
 )
 from bayeskin.surrogates.effects import Estimate
-from bayeskin.types import Array, Design, PadMotion, Parameter, ParameterSpace, Simulation
+from bayeskin.types import (
+    Array,
+    BinnedForce,
+    Design,
+    PadMotion,
+    Parameter,
+    ParameterSpace,
+    Simulation,
+    Surrogate,
+)
 from bayeskin.workers import Map
 
 WEAKEST = 0.1  # of a strength's prior: effects below are straight lines to nothing, and lost in noise
@@ -179,7 +188,7 @@ def _pairs(run: Run) -> list[tuple[Part, ...]]:
 
 
 def _learn(run: Run, parts: Sequence[Part]) -> dict[str, Any]:
-    config, spec = run.config, model_spec(run)
+    config, spec, name = run.config, model_spec(run), name_of(parts)
     base = storage.load(run.at("design", "design.h5"), Design)
     coarse_spec = replace(spec, mesh="bricks", refinement=0)
     wave = coarse_wave(base.space, config.effects.coarse, config.seed)
@@ -196,11 +205,53 @@ def _learn(run: Run, parts: Sequence[Part]) -> dict[str, Any]:
             for these in [*some, parts]
         ]
         *others, fine = [make("fine", spec, few[name_of(these)], these) for these in [*some[1:], parts]]
-    storage.save(run.at("effects", f"{name_of(parts)}-design.h5"), fine)
-    estimates = [_estimate(run, [part], base.edges_s) for part in parts]
-    pairs = [Pair(design, _without(parts, estimates, known, design))
-             for known, design in ((many, coarse), ([base, *others], fine))]  # fmt: skip
-    return _train(run, parts, *pairs)
+        teaching = _without(run, parts, [[one] for one in many], coarse)
+        known = [[base], *([one] for one in others)]
+        try:
+            effect, validation = _train(run, parts, teaching, _without(run, parts, known, fine))
+            if config.effects.plausible:
+                wave = plausible_wave(run, effect)
+                *more, fine = [make("plausible", spec, in_some(wave, these), these)
+                               for these in [*some, parts]]  # fmt: skip
+                known = [[*one, new] for one, new in zip(known, more, strict=True)]
+                effect, validation = _train(run, parts, teaching, _without(run, parts, known, fine))
+        except InputError as too_few:
+            run.reporter.log(f"{name}: no surrogate: {too_few}")
+            return {"learnt": False, "message": str(too_few)}
+    storage.save(run.at("effects", f"{name}-design.h5"), fine)
+    without_n = _without(run, parts, known, fine).without_n
+    said = {"learnt": True, **_errors(run, effect, validation, without_n, fine)}
+    manifest = {**manifest_of(effect.surrogate, validation), "effect": effect.about, **said}
+    save_surrogate(run.at("effects", f"{name}.h5"), effect.surrogate, manifest)
+    run.reporter.log(in_words(name, said))
+    return said
+
+
+def plausible_wave(run: Run, effect: Effect) -> Wave:
+    """Points of the part of the prior that the recording leaves plausible with an effect, and a third as many
+    held out."""
+    binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
+    fitted, count = fitted_bins(run, binned), run.config.effects.plausible
+    whole = _beside(run, effect)
+    return next_wave(
+        whole.space, whole.predict, binned.force_n, fitted, noise_floor_n(binned, fitted), count,
+        -(-count // 3), 1, run.config.seed,
+    )  # fmt: skip
+
+
+def in_some(wave: Wave, parts: Sequence[Part]) -> Wave:
+    """A wave in the base's parameters and those of some parts."""
+    own = {p.name for part in parts for p in part.own}
+    known = {p.name for mechanism in catalogue().values() for p in mechanism.parameters}
+    columns = [i for i, name in enumerate(wave.space.names) if name not in known or name in own]
+    space = ParameterSpace(tuple(wave.space.parameters[i] for i in columns))
+    return replace(wave, space=space, theta=wave.theta[:, columns])
+
+
+def _beside(run: Run, effect: Effect) -> Surrogate:
+    """The surrogate of the force with an effect, and of a pair with that of each part."""
+    others = [one for one in effects_of(run) if len(one.mechanisms) == 1 and set(one.own) < set(effect.own)]
+    return with_effects(base_surrogate(run), [*others, effect])
 
 
 def _estimate(run: Run, parts: Sequence[Part], edges_s: Array) -> Estimate | None:
@@ -209,16 +260,15 @@ def _estimate(run: Run, parts: Sequence[Part], edges_s: Array) -> Estimate | Non
     return estimate_of([part.mechanism for part in parts], own, motion, edges_s)
 
 
-def _without(
-    parts: Sequence[Part], estimates: Sequence[Estimate | None], known: Sequence[Design], design: Design
-) -> Array:
-    """The force (n, m) at the points of a design without what it is to teach; known: without any part, and
-    with each alone where there are two."""
-    neither, *alone = [force_at(one, design) for one in known]
+def _without(run: Run, parts: Sequence[Part], known: Sequence[Sequence[Design]], design: Design) -> Pair:
+    """A design beside the force without what it is to teach, from designs without any part, and with each
+    alone where there are two."""
+    neither, *alone = [force_at(some, design) for some in known]
     if not alone:
-        return neither
-    columns = [[design.space.names.index(p.name) for p in part.own] for part in parts]
-    return composed(neither, alone, [design.theta[:, these] for these in columns], estimates)
+        return Pair(design, neither)
+    own = [design.theta[:, [design.space.names.index(p.name) for p in part.own]] for part in parts]
+    estimates = [_estimate(run, [part], design.edges_s) for part in parts]
+    return Pair(design, composed(neither, alone, own, estimates))
 
 
 def _runs(
@@ -259,66 +309,68 @@ def effects_of(run: Run) -> list[Effect]:
     return found
 
 
-def _train(run: Run, parts: Sequence[Part], coarse: Pair, fine: Pair) -> dict[str, Any]:
-    """The effect's surrogate, into the stage's folder, and what is known of its error."""
-    name, own = name_of(parts), [p.name for part in parts for p in part.own]
-    neutral = {part.own[0].name: part.neutral for part in parts}
-    try:
-        effect, validation = train_effect(
-            name, [part.mechanism.name for part in parts], neutral, own, coarse, fine,
-            run.config.surrogate.kind, run.config.seed, _estimate(run, parts, fine.design.edges_s),
-        )  # fmt: skip
-    except InputError as few:
-        run.reporter.log(f"{name}: no surrogate: {few}")
-        return {"learnt": False, "message": str(few)}
-    said = {"learnt": True, **_errors(run, effect, validation, fine.without_n, fine.design)}
-    manifest = {**manifest_of(effect.surrogate, validation), "effect": effect.about, **said}
-    save_surrogate(run.at("effects", f"{name}.h5"), effect.surrogate, manifest)
-    run.reporter.log(in_words(name, said))
-    return said
+def _train(run: Run, parts: Sequence[Part], coarse: Pair, fine: Pair) -> tuple[Effect, Validation]:
+    return train_effect(
+        name_of(parts), [part.mechanism.name for part in parts],
+        {part.own[0].name: part.neutral for part in parts}, [p.name for part in parts for p in part.own],
+        coarse, fine, run.config.surrogate.kind, run.config.seed, _estimate(run, parts, fine.design.edges_s),
+    )  # fmt: skip
 
 
 def in_words(name: str, said: Mapping[str, Any]) -> str:
     """One line on a part's surrogate."""
     if not said["learnt"]:
         return f"{name}: no surrogate: {said['message']}"
-    return (
+    text = (
         f"{name}: held-out error {said['median_error_mn']:.2g} mN where the effect is "
         f"{said['median_effect_mn']:.3g} mN and the peak 1 N (medians)"
     )
+    near = said["plausible"]
+    return (
+        f"{text}; {near['median_error_mn']:.2g} mN where the recording leaves it plausible" if near else text
+    )
 
 
-def force_at(known: Design, design: Design) -> Array:
-    """The force (n, m) of a design in some of the parameters of another, at each of the other's points."""
-    row_of = {theta.tobytes(): row for row, theta in enumerate(known.theta)}
-    theta = design.theta[:, [design.space.names.index(name) for name in known.space.names]]
-    return known.force_n[[row_of[one.tobytes()] for one in np.ascontiguousarray(theta)]]
+def force_at(known: Sequence[Design], design: Design) -> Array:
+    """The force (n, m) of designs in some of the parameters of another, at each of the other's points."""
+    force_of = {theta.tobytes(): force for one in known for theta, force in zip(one.theta, one.force_n,
+                strict=True)}  # fmt: skip
+    theta = design.theta[:, [design.space.names.index(name) for name in known[0].space.names]]
+    return np.array([force_of[one.tobytes()] for one in np.ascontiguousarray(theta)])
 
 
 def _errors(
     run: Run, effect: Effect, validation: Validation, without: Array, design: Design
 ) -> dict[str, Any]:
     """Of the force with the effect, on held-out rows at forces of a skin test [mN]: of the effect's surrogate
-    beside runs without it, and of all surrogates together."""
-    rows = design.testing & np.isfinite(without).all(axis=1)
-    theta, truth = design.theta[rows], design.force_n[rows]
-    alone = without[rows] + effect.predict_mean(theta, without[rows])
-    others = [one for one in effects_of(run) if len(one.mechanisms) == 1 and set(one.own) < set(effect.own)]
-    whole = with_effects(base_surrogate(run), [*others, effect])
-    both = whole.predict_mean(theta[:, [design.space.names.index(name) for name in whole.space.names]])
-    peak = np.abs(truth).max(axis=1)
-    to_skin = 1e3 / np.maximum(peak, 1e-12)  # mN of a force whose peak is 1 N
+    beside runs without it, and of all surrogates together; over the prior, and over what is plausible."""
+    whole = _beside(run, effect)
+    columns = [design.space.names.index(name) for name in whole.space.names]
 
-    def rms(values: Array) -> Array:
-        return np.asarray(np.sqrt(np.mean(values**2, axis=1)) * to_skin)
+    def measured(wave: int) -> dict[str, Any] | None:
+        rows = design.testing & np.isfinite(without).all(axis=1) & (design.wave == wave)
+        if not rows.any():
+            return None
+        theta, truth, base = design.theta[rows], design.force_n[rows], without[rows]
+        alone = base + effect.predict_mean(theta, base)
+        both = whole.predict_mean(theta[:, columns])
+        to_skin = 1e3 / np.maximum(np.abs(truth).max(axis=1), 1e-12)  # mN of a force whose peak is 1 N
+        change, error, of_both = (
+            np.sqrt(np.mean(values**2, axis=1)) * to_skin
+            for values in (truth - base, truth - alone, truth - both)
+        )
+        return {
+            "median_effect_mn": float(np.median(change)),
+            "median_error_mn": float(np.median(error)),
+            "p90_error_mn": float(np.quantile(error, 0.9)),
+            "median_error_of_both_mn": float(np.median(of_both)),
+            "rows": int(rows.sum()),
+        }
 
     return {
-        "median_effect_mn": float(np.median(rms(truth - without[rows]))),
-        "median_error_mn": float(np.median(rms(truth - alone))),
-        "p90_error_mn": float(np.quantile(rms(truth - alone), 0.9)),
-        "median_error_of_both_mn": float(np.median(rms(truth - both))),
+        **(measured(0) or {}),
+        "plausible": measured(1),
         "coverage_90": validation.coverage_90,
-        "rows": int(rows.sum()),
         "failed": int((~design.ok).sum()),
         "seconds_of_runs": float(np.nansum(design.seconds)),
     }
