@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import h5py
 import numpy as np
@@ -12,19 +15,30 @@ import pytest
 from toy import EDGES_S, SPACE, toy_bin_means
 from toy import MOTION as PULL
 
-from bayeskin.design import default_space, sobol_points
+from bayeskin import storage
+from bayeskin.design import Wave, default_space, first_wave, sobol_points
 from bayeskin.distinct import at_distinct
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.fibre_anisotropy import AT_ANY_ANGLE
 from bayeskin.mechanisms.strain_stiffening import first_modulus
-from bayeskin.pipeline.effects import _pairs, coarse_wave, force_at, name_of, parts_of, with_own
+from bayeskin.pipeline import effects as effects_stage
+from bayeskin.pipeline.effects import Part, _pairs, coarse_wave, force_at, name_of, parts_of, with_own
 from bayeskin.proof.cases import shipped_screen
-from bayeskin.surrogates import Pair, composed, effect_of, load_surrogate, save_surrogate, train, train_effect
+from bayeskin.surrogates import (
+    Pair,
+    composed,
+    effect_of,
+    load_surrogate,
+    manifest_of,
+    save_surrogate,
+    train,
+    train_effect,
+)
 from bayeskin.surrogates.effects import WithEffects
 from bayeskin.surrogates.files import contents_hash
 from bayeskin.surrogates.screening import active_inputs
-from bayeskin.types import Array, Design, Parameter, ParameterSpace, Prediction
+from bayeskin.types import Array, BinnedForce, Design, Parameter, ParameterSpace, Phase, Prediction
 
 WIDE = ParameterSpace(
     (*SPACE.parameters, Parameter("a", "1", 0.0, 2.0, "uniform"), Parameter("idle", "1", 0.0, 1.0, "uniform"))
@@ -239,3 +253,94 @@ def test_lines_along_the_pull_make_a_skin_as_many_times_as_stiff_and_others_less
         assert gain[55] == pytest.approx(1.0, abs=0.01 * ratio)
     # across, by hand: narrowing is held back, y = 2 / (4 + 3 r)
     assert gain[-1] == pytest.approx(2 * ((1 + (2 / 13) ** 2 + (11 / 13) ** 2) / 3 + 1.5 * (2 / 13) ** 2))
+
+
+@dataclass(frozen=True)
+class Spec:
+    """Stands in for a model's; `mesh` and `refinement` are what the stage changes."""
+
+    mesh: str = "own"
+    refinement: int = 1
+    hash: str = "toy"
+
+
+def toy_runs(wave: Wave, parts: Sequence[Part]) -> Design:
+    """The toy with two mechanisms by their own names, and what both do beyond each."""
+    values = dict(zip(wave.space.names, wave.theta.T[:, :, None], strict=True))
+    force = toy_bin_means(wave.theta[:, :5])
+    size = np.abs(force).max(axis=1, keepdims=True)
+    strengths = [5.0 * values.get("opening", 0.0), 0.1 * (values.get("langer_ratio", 1.0) - 1.0)]
+    force = force * (1.0 + strengths[0]) - 0.3 * strengths[1] * size * LATE * (1.0 + 8.0 * strengths[0])
+    n = len(wave.theta)
+    return Design(
+        wave.space, EDGES_S, wave.theta, force, np.full(n, wave.number), wave.held_out, np.ones(n, bool),
+        ("",) * n, np.zeros(n), wave.seed, "toy",
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_the_stage_learns_parts_then_pairs_and_refines_where_they_are_plausible(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: dict[str, list[int]] = {}
+
+    def runs(run: Any, run_all: Any, edges_s: Array, label: str, spec: Any, wave: Wave, parts: Any) -> Design:
+        made.setdefault(f"{name_of(parts)}, {label}", []).append(len(wave.theta))
+        found = toy_runs(wave, parts)
+        if label == "plausible":  # in one file with the first ones
+            wave = effects_stage.effect_wave(parts, base, 32, 8, 1)
+            first = toy_runs(wave, parts)
+            rows = ("theta", "force_n", "wave", "held_out", "ok", "seconds")
+            joined = {name: np.concatenate([getattr(first, name), getattr(found, name)]) for name in rows}
+            found = replace(found, **joined, messages=first.messages + found.messages)
+        return found
+
+    monkeypatch.setattr(effects_stage, "_runs", runs)
+    monkeypatch.setattr(effects_stage, "crew", nullcontext)
+    monkeypatch.setattr(effects_stage, "model_spec", lambda run: Spec())
+    base = toy_runs(first_wave(SPACE, 96, 24, 1), ())
+    surrogate, validation = train(base, "gp")
+    settings = SimpleNamespace(
+        mechanisms=["pre-stretch"], pairs=[("pre-stretch", "fibre-anisotropy")], coarse=128, points=32,
+        held_out=8, plausible=6,
+    )  # fmt: skip
+    config = SimpleNamespace(
+        effects=settings, seed=1, surrogate=SimpleNamespace(kind="gp", file=None),
+        fit=SimpleNamespace(windows_s=None),
+    )  # fmt: skip
+    run = SimpleNamespace(
+        config=config, folder=tmp_path, config_path="x.toml", reporter=SimpleNamespace(log=lambda text: None),
+        at=lambda *parts: tmp_path.joinpath(*parts),
+    )  # fmt: skip
+    for stage in ("recording", "design", "train", "effects"):
+        (tmp_path / stage).mkdir()
+    truth = toy_runs(Wave(SPACE, SPACE.from_unit(np.full((1, 5), 0.5)), np.zeros(1, bool), 0, 1), ()).force_n[
+        0
+    ]
+    bins = len(truth)
+    recorded = BinnedForce(
+        EDGES_S, truth, np.full(bins, (0.01 * np.abs(truth).max()) ** 2), np.zeros(bins - 1),
+        np.zeros(bins, int), (Phase("hold", 1, 0.0, float(EDGES_S[-1])),),
+    )  # fmt: skip
+    storage.save(tmp_path / "recording" / "binned.h5", recorded)
+    storage.save(tmp_path / "recording" / "motion.h5", PULL)
+    storage.save(tmp_path / "design" / "design.h5", base)
+    save_surrogate(tmp_path / "train" / "surrogate.h5", surrogate, manifest_of(surrogate, validation))
+    found = effects_stage._work(run)
+    assert list(found) == ["pre-stretch", "fibre-anisotropy", "fibre-anisotropy-with-pre-stretch"]
+    for said in found.values():
+        assert said["plausible"]["rows"] == 2
+        assert said["median_error_mn"] < 0.1 * said["median_effect_mn"]
+    assert made["pre-stretch, coarse"] == [160, 160]  # the pair's own are those of its parts
+    assert made["fibre-anisotropy-with-pre-stretch, coarse"] == [160]
+    assert made["fibre-anisotropy-with-pre-stretch, plausible"] == [8]
+    loaded = effects_stage.effects_of(run)
+    assert sorted(len(effect.mechanisms) for effect in loaded) == [1, 1, 2]
+    test = toy_runs(with_own([parts_of(catalogue()[n])[0] for n in ("pre-stretch", "fibre-anisotropy")],
+                             coarse_wave(SPACE, 64, 9)),
+                    [])  # fmt: skip
+    whole = WithEffects(surrogate, tuple(loaded))
+    columns = [test.space.names.index(name) for name in whole.space.names]
+    apart = WithEffects(surrogate, tuple(effect for effect in loaded if len(effect.mechanisms) == 1))
+    missed = [error(one.predict_mean(test.theta[:, columns]), test.force_n) for one in (whole, apart)]
+    assert missed[0] < 0.5 * missed[1]

@@ -184,7 +184,8 @@ def _pairs(run: Run) -> list[tuple[Part, ...]]:
             raise InputError(where, found, f"two of {', '.join(known)}")
         if len({known[name].mechanism.name for name in names}) < 2:
             raise InputError(where, found, "parts of two mechanisms")
-    return [tuple(known[name] for name in names) for names in run.config.effects.pairs]
+    pairs = (sorted(names, key=lambda name: known[name].mechanism.name) for names in run.config.effects.pairs)
+    return [tuple(known[name] for name in names) for names in pairs]
 
 
 def _learn(run: Run, parts: Sequence[Part]) -> dict[str, Any]:
@@ -232,10 +233,11 @@ def plausible_wave(run: Run, effect: Effect) -> Wave:
     held out."""
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
     fitted, count = fitted_bins(run, binned), run.config.effects.plausible
-    whole = _beside(run, effect)
+    whole, space = _beside(run, effect), effect.space
+    columns = [space.names.index(name) for name in whole.space.names]
     return next_wave(
-        whole.space, whole.predict, binned.force_n, fitted, noise_floor_n(binned, fitted), count,
-        -(-count // 3), 1, run.config.seed,
+        space, lambda theta: whole.predict(theta[:, columns]), binned.force_n, fitted,
+        noise_floor_n(binned, fitted), count, -(-count // 3), 1, run.config.seed,
     )  # fmt: skip
 
 

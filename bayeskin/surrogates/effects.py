@@ -15,9 +15,9 @@ the estimate's RMS over time, |D|:
 
 so that H / c is near one everywhere and has a logarithm, whatever the sign of what is left.
 
-Effects of several parts add up, and an estimate is of the force F_0 that all without an estimate make: what
-two do to each other beyond that (`benchmarks/pairs.py`) is an effect of its own, s the product of their
-strengths, where that is worth it, and else left to full runs.
+Effects of several parts add up, and an estimate is of the force F_0 that the mechanisms before it make, those
+without an estimate first (`composed`). What two do to each other beyond that (`benchmarks/pairs.py`) is an
+effect of its own, s the product of their strengths, where that is worth it, and else left to full runs.
 """
 
 from __future__ import annotations
@@ -118,15 +118,17 @@ def strength(similarity: Similarity, neutral: Mapping[str, float], theta: Array)
 def composed(
     neither_n: Array, alone_n: Sequence[Array], own: Sequence[Array], estimates: Sequence[Estimate | None]
 ) -> Array:
-    """Force (n, m) that exact surrogates of several effects make together, from runs without and with each.
+    """Force (n, m) that exact surrogates of effects of several mechanisms, in the order of these names, make
+    together, from runs without and with each.
 
+    Those without an estimate add up. Each with one is then taken of the force so far.
     neither_n, alone_n (n, m) each; own (n, k): each effect's parameters, for its estimate where it has one
     """
     effects = list(zip(alone_n, own, estimates, strict=True))
-    found = others = neither_n + sum(one - neither_n for one, _, estimate in effects if estimate is None)
+    found = neither_n + sum(one - neither_n for one, _, estimate in effects if estimate is None)
     for one, values, estimate in effects:
         if estimate is not None:
-            here, there = estimate(values, neither_n), estimate(values, others)
+            here, there = estimate(values, neither_n), estimate(values, found)
             found = found + there + (_rms(there) / _rms(here))[:, None] * (one - neither_n - here)
     return found
 
@@ -222,15 +224,13 @@ class WithEffects:
         refuse_outside(self.space, theta)
         base = theta[:, : self.base.space.dim]
         found = [at_distinct(lambda these, _: self.base.predict(these), base, base)]
-        alone = others = found[0].mean
-        for effect, known, own in self._ordered:
-            without = alone if effect.estimate is None else others
+        for effect, known, own, before in self._ordered:
+            without = sum((found[i].mean for i in before), found[0].mean)
             predict = partial(_of_columns, effect.predict, own)
             found.append(at_distinct(predict, theta[:, known], without))
-            others = others + found[-1].mean if effect.estimate is None else others
         rows = [one.factor.transpose(0, 2, 1) for one in found]  # as they lie in memory
         return Prediction(
-            mean=sum((one.mean for one in found[1:]), alone),
+            mean=sum((one.mean for one in found[1:]), found[0].mean),
             factor=np.concatenate(rows, axis=1).transpose(0, 2, 1),
             diagonal=sum((one.diagonal for one in found[1:]), found[0].diagonal),
         )
@@ -240,26 +240,29 @@ class WithEffects:
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
         base = theta[:, : self.base.space.dim]
-        mean = alone = others = mean_at_distinct(lambda these, _: self.base.predict_mean(these), base, base)
-        for effect, known, own in self._ordered:
-            without = alone if effect.estimate is None else others
+        found = [mean_at_distinct(lambda these, _: self.base.predict_mean(these), base, base)]
+        for effect, known, own, before in self._ordered:
+            without = sum((found[i] for i in before), found[0])
             predict = partial(_of_columns, effect.predict_mean, own)
-            mean = mean + mean_at_distinct(predict, theta[:, known], without)
-            others = mean if effect.estimate is None else others
-        return mean
+            found.append(mean_at_distinct(predict, theta[:, known], without))
+        return np.asarray(sum(found[1:], found[0]))
 
     @cached_property
-    def _ordered(self) -> list[tuple[Effect, list[int], list[int]]]:
-        """Effects with an estimate last; of each, which columns of theta it depends on, and which of these
-        are its own space's."""
+    def _ordered(self) -> list[tuple[Effect, list[int], list[int], list[int]]]:
+        """Effects in the order of `composed`; of each, which columns of theta it depends on, which of these
+        are its own space's, and which ones (the base is 0) make the force that it is an estimate of."""
         place = {name: column for column, name in enumerate(self.space.names)}
-        ordered = sorted(self.effects, key=lambda effect: effect.estimate is not None)
-        found, before = [], set(range(self.base.space.dim))
-        for effect in ordered:
+        found: list[tuple[Effect, list[int], list[int], list[int]]] = []
+        for effect in sorted(self.effects, key=lambda one: (one.estimate is not None, one.mechanisms)):
             columns = [place[name] for name in effect.space.names]
-            known = columns if effect.estimate is None else sorted(before.union(columns))
-            found.append((effect, known, [known.index(column) for column in columns]))
-            before.update(columns if effect.estimate is None else ())
+            before = [
+                i
+                for i, (one, *_) in enumerate(found, start=1)
+                if effect.estimate and len(one.mechanisms) == 1 and one.mechanisms != effect.mechanisms
+            ]
+            seen = {column for i in before for column in found[i - 1][1]}  # fmt: skip
+            known = sorted(seen.union(columns))
+            found.append((effect, known, [known.index(column) for column in columns], before))
         return found
 
 
