@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,23 +13,25 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from toy import EDGES_S, SPACE, toy_bin_means
+from toy import EDGES_S, SPACE, toy_bin_means, toy_simulate
 from toy import MOTION as PULL
 
 from bayeskin import storage
-from bayeskin.design import Wave, default_space, first_wave, sobol_points
+from bayeskin.design import default_space, first_wave, sobol_points
 from bayeskin.distinct import at_distinct
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.fibre_anisotropy import AT_ANY_ANGLE
 from bayeskin.mechanisms.strain_stiffening import first_modulus
 from bayeskin.pipeline import effects as effects_stage
-from bayeskin.pipeline.effects import Part, _pairs, coarse_wave, force_at, name_of, parts_of, with_own
+from bayeskin.pipeline.effects import _pairs, coarse_wave, force_at, name_of, parts_of, with_own
 from bayeskin.proof.cases import shipped_screen
+from bayeskin.runner import run_design
 from bayeskin.surrogates import (
     Pair,
     composed,
     effect_of,
+    effects_among,
     load_surrogate,
     manifest_of,
     save_surrogate,
@@ -142,6 +145,48 @@ def test_rows_that_agree_are_predicted_once_and_all_get_their_own() -> None:
     assert len(asked[-1]) == 3
     for name in ("mean", "factor", "diagonal"):
         np.testing.assert_array_equal(getattr(once, name), getattr(plain, name))
+
+
+def test_an_error_of_the_force_grows_with_what_is_estimated_of_it() -> None:
+    """One sd of the base's first error, taken through fibres along the pull and branches."""
+    screen = shipped_screen()
+    by_part = {effect.part: effect for effect in screen.effects}
+    lines, branch = by_part["fibre-anisotropy"], by_part["solid-viscoelasticity-g_2"]
+    base, whole = screen.refit.surrogate, WithEffects(screen.refit.surrogate, (branch, lines))
+    theta = whole.space.from_unit(np.full((1, whole.space.dim), 0.5))
+    theta[0, whole.space.names.index("langer_angle")] = 0.1
+    values = dict(zip(whole.space.names, theta.T, strict=True))
+    own = [np.stack([values[name] for name in one.space.names], axis=1) for one in (lines, branch)]
+
+    def through(force: Array) -> Array:
+        force = force + lines.predict_mean(own[0], force)
+        return force + branch.predict_mean(own[1], force)
+
+    alone = base.predict(theta[:, :5])
+    found = whole.predict(theta)
+    error = alone.factor[..., 0]
+    grown = through(alone.mean + error) - through(alone.mean)
+    assert np.linalg.norm(found.factor[..., 0]) == pytest.approx(np.linalg.norm(grown), rel=0.1)
+    assert np.linalg.norm(grown) > 2.0 * np.linalg.norm(error)
+
+
+def test_an_effect_learnt_beside_another_estimate_is_refused() -> None:
+    effects = {effect.part: effect for effect in shipped_screen().effects}
+    lines, stiff = effects["fibre-anisotropy"], effects["strain-stiffening"]
+    other = [None, lambda own, force: 2.0 * lines.estimate(own, force)]
+    for effect, estimate in ((lines, other[0]), (lines, other[1]), (stiff, lambda own, force: force)):
+        with pytest.raises(InputError, match=f"effect {effect.part}: found learnt beside another estimate"):
+            effect_of(effect.about, effect.surrogate, estimate)
+
+
+def test_a_pair_counts_where_both_parts_are_there() -> None:
+    def one(*mechanisms: str) -> Any:
+        return SimpleNamespace(mechanisms=mechanisms, own=mechanisms)
+
+    effects = [one("a"), one("b"), one("a", "b"), one("b", "c")]
+    assert [e.own for e in effects_among(effects, ("a", "b"))] == [("a",), ("b",), ("a", "b")]
+    assert [e.own for e in effects_among(effects, ("b", "c"))] == [("b",)]
+    assert [e.own for e in effects_among(effects, ("a",))] == [("a",)]
 
 
 def test_values_of_a_mechanism_fill_the_box_beside_the_base_s() -> None:
@@ -264,81 +309,82 @@ class Spec:
     hash: str = "toy"
 
 
-def toy_runs(wave: Wave, parts: Sequence[Part]) -> Design:
+def toy_simulate_with(mechanisms: Sequence[str], spec: Any, motion: Any, theta: Mapping[str, float]) -> Any:
     """The toy with two mechanisms by their own names, and what both do beyond each."""
-    values = dict(zip(wave.space.names, wave.theta.T[:, :, None], strict=True))
-    force = toy_bin_means(wave.theta[:, :5])
-    size = np.abs(force).max(axis=1, keepdims=True)
-    strengths = [5.0 * values.get("opening", 0.0), 0.1 * (values.get("langer_ratio", 1.0) - 1.0)]
-    force = force * (1.0 + strengths[0]) - 0.3 * strengths[1] * size * LATE * (1.0 + 8.0 * strengths[0])
-    n = len(wave.theta)
-    return Design(
-        wave.space, EDGES_S, wave.theta, force, np.full(n, wave.number), wave.held_out, np.ones(n, bool),
-        ("",) * n, np.zeros(n), wave.seed, "toy",
-    )  # fmt: skip
+    found = toy_simulate(theta)
+    force, late = found.force_n, np.clip(2.0 * found.time_s / found.time_s[-1] - 1.0, 0.0, 1.0)
+    a, b = 5.0 * theta.get("opening", 0.0), 0.1 * (theta.get("langer_ratio", 1.0) - 1.0)
+    force = force * (1.0 + a) - 0.3 * b * np.abs(force).max() * late * (1.0 + 8.0 * a)
+    assert len(mechanisms) == ("opening" in theta) + ("langer_ratio" in theta)
+    MADE.append((len(mechanisms), tuple(theta.values())))
+    return replace(found, theta=theta, force_n=force)
+
+
+MADE: list[tuple[int, tuple[float, ...]]] = []
+
+
+def serial(task: Any, points: Sequence[Any]) -> Any:
+    yield from ((i, task(point)) for i, point in enumerate(points))
 
 
 @pytest.mark.slow
 def test_the_stage_learns_parts_then_pairs_and_refines_where_they_are_plausible(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made: dict[str, list[int]] = {}
-
-    def runs(run: Any, run_all: Any, edges_s: Array, label: str, spec: Any, wave: Wave, parts: Any) -> Design:
-        made.setdefault(f"{name_of(parts)}, {label}", []).append(len(wave.theta))
-        found = toy_runs(wave, parts)
-        if label == "plausible":  # in one file with the first ones
-            wave = effects_stage.effect_wave(parts, base, 32, 8, 1)
-            first = toy_runs(wave, parts)
-            rows = ("theta", "force_n", "wave", "held_out", "ok", "seconds")
-            joined = {name: np.concatenate([getattr(first, name), getattr(found, name)]) for name in rows}
-            found = replace(found, **joined, messages=first.messages + found.messages)
-        return found
-
-    monkeypatch.setattr(effects_stage, "_runs", runs)
-    monkeypatch.setattr(effects_stage, "crew", nullcontext)
+    monkeypatch.setattr(effects_stage, "simulate_with", toy_simulate_with)
+    monkeypatch.setattr(effects_stage, "crew", lambda run: nullcontext(serial))
     monkeypatch.setattr(effects_stage, "model_spec", lambda run: Spec())
-    base = toy_runs(first_wave(SPACE, 96, 24, 1), ())
-    surrogate, validation = train(base, "gp")
-    settings = SimpleNamespace(
-        mechanisms=["pre-stretch"], pairs=[("pre-stretch", "fibre-anisotropy")], coarse=128, points=32,
-        held_out=8, plausible=6,
-    )  # fmt: skip
-    config = SimpleNamespace(
-        effects=settings, seed=1, surrogate=SimpleNamespace(kind="gp", file=None),
-        fit=SimpleNamespace(windows_s=None),
-    )  # fmt: skip
-    run = SimpleNamespace(
-        config=config, folder=tmp_path, config_path="x.toml", reporter=SimpleNamespace(log=lambda text: None),
-        at=lambda *parts: tmp_path.joinpath(*parts),
-    )  # fmt: skip
     for stage in ("recording", "design", "train", "effects"):
         (tmp_path / stage).mkdir()
-    truth = toy_runs(Wave(SPACE, SPACE.from_unit(np.full((1, 5), 0.5)), np.zeros(1, bool), 0, 1), ()).force_n[
-        0
-    ]
-    bins = len(truth)
+    base_task = partial(toy_simulate_with, [], None, None)
+    base_file = tmp_path / "design" / "base.h5"
+    base = run_design(base_file, first_wave(SPACE, 96, 24, 1), EDGES_S, base_task, "toy", serial)
+    MADE.clear()
+    surrogate, validation = train(base, "gp")
+    middle = toy_bin_means(SPACE.from_unit(np.full((1, 5), 0.5)))[0]
+    bins = len(middle)
     recorded = BinnedForce(
-        EDGES_S, truth, np.full(bins, (0.01 * np.abs(truth).max()) ** 2), np.zeros(bins - 1),
+        EDGES_S, middle, np.full(bins, (0.01 * np.abs(middle).max()) ** 2), np.zeros(bins - 1),
         np.zeros(bins, int), (Phase("hold", 1, 0.0, float(EDGES_S[-1])),),
     )  # fmt: skip
     storage.save(tmp_path / "recording" / "binned.h5", recorded)
     storage.save(tmp_path / "recording" / "motion.h5", PULL)
     storage.save(tmp_path / "design" / "design.h5", base)
     save_surrogate(tmp_path / "train" / "surrogate.h5", surrogate, manifest_of(surrogate, validation))
-    found = effects_stage._work(run)
-    assert list(found) == ["pre-stretch", "fibre-anisotropy", "fibre-anisotropy-with-pre-stretch"]
+
+    def learnt(plausible: int, *pairs: tuple[str, str]) -> tuple[Any, dict[str, Any]]:
+        settings = SimpleNamespace(
+            mechanisms=["pre-stretch"], pairs=pairs, coarse=128, points=32, held_out=8, plausible=plausible
+        )
+        config = SimpleNamespace(
+            effects=settings, seed=1, surrogate=SimpleNamespace(kind="gp", file=None),
+            fit=SimpleNamespace(windows_s=None),
+        )  # fmt: skip
+        reporter = SimpleNamespace(log=lambda text: None, progress=lambda *what: None)
+        run = SimpleNamespace(
+            config=config, folder=tmp_path, config_path="x.toml", reporter=reporter,
+            at=lambda *parts: tmp_path.joinpath(*parts),
+        )  # fmt: skip
+        return run, dict(effects_stage._work(run))
+
+    names = ["pre-stretch", "fibre-anisotropy", "fibre-anisotropy-with-pre-stretch"]
+    _, first = learnt(6)
+    run, found = learnt(6, ("pre-stretch", "fibre-anisotropy"))
+    assert first == {"pre-stretch": found["pre-stretch"]}  # whatever its file has of the pair's
+    assert list(found) == names
+    assert len(set(MADE)) == len(MADE)  # none twice
     for said in found.values():
         assert said["plausible"]["rows"] == 2
-        assert said["median_error_mn"] < 0.1 * said["median_effect_mn"]
-    assert made["pre-stretch, coarse"] == [160, 160]  # the pair's own are those of its parts
-    assert made["fibre-anisotropy-with-pre-stretch, coarse"] == [160]
-    assert made["fibre-anisotropy-with-pre-stretch, plausible"] == [8]
+        assert said["prior"]["median_error_mn"] < 0.1 * said["prior"]["median_effect_mn"]
+    count = len(MADE)
+    assert learnt(6, ("pre-stretch", "fibre-anisotropy"))[1] == found
+    assert len(MADE) == count
     loaded = effects_stage.effects_of(run)
     assert sorted(len(effect.mechanisms) for effect in loaded) == [1, 1, 2]
-    test = toy_runs(with_own([parts_of(catalogue()[n])[0] for n in ("pre-stretch", "fibre-anisotropy")],
-                             coarse_wave(SPACE, 64, 9)),
-                    [])  # fmt: skip
+    both = with_own([parts_of(catalogue()[n])[0] for n in names[:2]], coarse_wave(SPACE, 64, 9))
+    test_file = tmp_path / "test.h5"
+    task = partial(toy_simulate_with, names[:2], None, None)
+    test = run_design(test_file, both, EDGES_S, task, "toy", serial)
     whole = WithEffects(surrogate, tuple(loaded))
     columns = [test.space.names.index(name) for name in whole.space.names]
     apart = WithEffects(surrogate, tuple(effect for effect in loaded if len(effect.mechanisms) == 1))

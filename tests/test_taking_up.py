@@ -71,9 +71,10 @@ def taken_up(names: tuple[str, ...], effects: int = 0) -> tuple[Any, Any, Fit, L
     truth = {**TRUTH, **({"F0": -0.04} if names else {})}
     noise = {name: 2e-3 if name.startswith("sd_") else 0.5 for name in right.names if name not in truth}
     start = fit_near(names, wrong, {**truth, **noise, "nu_noise": 60.0}, None)
+    learnt = [SimpleNamespace(mechanisms=names, own=(f"p{i}",)) for i in range(effects)]
     bench = SimpleNamespace(
         spec=ModelSpec(), motion=toy.MOTION, binned=right.binned, with_mesh_error=lambda surrogate: surrogate,
-        surrogate=lambda names: skin, effects_among=lambda names: [None] * effects,
+        surrogate=lambda names: skin, effects=learnt,
         known={name: KNOWN[name] for name in names}, run=SimpleNamespace(config=SimpleNamespace(seed=1)),
     )  # fmt: skip
     full, about = taking_up._full(bench, start)  # type: ignore[arg-type]

@@ -79,9 +79,14 @@ def promise(
     change = linear.white((mean - linear.here.mean[:, bins]).T)
     residual, slopes, factor = linear.columns()
     room = np.concatenate([slopes[:, others], factor], axis=1)
-    prior = np.concatenate([np.full(int(others.sum()), 12.0), np.ones(factor.shape[1])])
+    moved = int(others.sum())
+    pull, bend = linear.prior(vector)
+    normal = room.T @ room + np.diag(np.r_[np.full(moved, 12.0), np.ones(factor.shape[1])])
+    normal[:moved, :moved] += bend[np.ix_(others, others)]
     target = np.column_stack([residual, change])
-    solved = np.linalg.solve(room.T @ room + np.diag(prior), room.T @ target)
+    right = room.T @ target
+    right[:moved, 0] += pull[others]
+    solved = np.linalg.solve(normal, right)
     left = target - room @ solved
     length = np.maximum(np.sum(change * left[:, 1:], axis=0), 1e-12)
     multiple = (change.T @ left[:, 0]) / length

@@ -25,7 +25,7 @@ from bayeskin.mechanisms.binned import estimate_of
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline.crew import crew
-from bayeskin.pipeline.design import fitted_bins, noise_floor_n, tell
+from bayeskin.pipeline.design import fitted_bins, noise_floor_n, rows_of, tell
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.model import model_spec
@@ -156,8 +156,19 @@ def _draw(part: Part, seed: int, row: Array) -> Array:
 def _work(run: Run) -> Mapping[str, Any]:
     pairs = _pairs(run)
     alone = [part for mechanism in _chosen(run) for part in parts_of(mechanism)]
-    each = {part.name: (part,) for part in [*alone, *(part for pair in pairs for part in pair)]}
-    return {name_of(parts): _learn(run, parts) for parts in [*each.values(), *pairs]}
+    each = {part.name: part for part in [*alone, *(part for pair in pairs for part in pair)]}
+    said = {name: _learn(run, [part]) for name, part in each.items()}
+    for pair in pairs:
+        missing = [part.name for part in pair if not said[part.name]["learnt"]]
+        said[name_of(pair)] = (
+            _not_learnt(run, name_of(pair), f"none of {missing[0]}") if missing else _learn(run, pair)
+        )
+    return said
+
+
+def _not_learnt(run: Run, name: str, message: str) -> dict[str, Any]:
+    run.reporter.log(f"{name}: no surrogate: {message}")
+    return {"learnt": False, "message": message}
 
 
 def name_of(parts: Sequence[Part]) -> str:
@@ -202,23 +213,25 @@ def _learn(run: Run, parts: Sequence[Part]) -> dict[str, Any]:
     with crew(run) as run_all:
         make = partial(_runs, run, run_all, base.edges_s)
         *many, coarse = [
-            make("coarse", coarse_spec, nested(with_own(these, wave), few[name_of(these)]), these)
+            make("coarse", coarse_spec, [nested(with_own(these, wave), few[name_of(these)])], these)
             for these in [*some, parts]
         ]
-        *others, fine = [make("fine", spec, few[name_of(these)], these) for these in [*some[1:], parts]]
-        teaching = _without(run, parts, [[one] for one in many], coarse)
-        known = [[base], *([one] for one in others)]
+        *others, fine = [make("fine", spec, [few[name_of(these)]], these) for these in [*some[1:], parts]]
+        known, teaching = (
+            [[base], *([one] for one in others)],
+            _without(run, parts, [[one] for one in many], coarse),
+        )
         try:
             effect, validation = _train(run, parts, teaching, _without(run, parts, known, fine))
-            if config.effects.plausible:
-                wave = plausible_wave(run, effect)
-                *more, fine = [make("plausible", spec, in_some(wave, these), these)
-                               for these in [*some, parts]]  # fmt: skip
-                known = [[*one, new] for one, new in zip(known, more, strict=True)]
-                effect, validation = _train(run, parts, teaching, _without(run, parts, known, fine))
         except InputError as too_few:
-            run.reporter.log(f"{name}: no surrogate: {too_few}")
-            return {"learnt": False, "message": str(too_few)}
+            return _not_learnt(run, name, str(too_few))
+        if config.effects.plausible:
+            near = plausible_wave(run, effect)
+            known[0].append(make("plausible", spec, [in_some(near, [])], []))
+            *others, fine = [make("plausible", spec, [few[name_of(these)], in_some(near, these)], these)
+                             for these in [*some[1:], parts]]  # fmt: skip
+            known[1:] = [[one] for one in others]
+            effect, validation = _train(run, parts, teaching, _without(run, parts, known, fine))
     storage.save(run.at("effects", f"{name}-design.h5"), fine)
     without_n = _without(run, parts, known, fine).without_n
     said = {"learnt": True, **_errors(run, effect, validation, without_n, fine)}
@@ -243,7 +256,7 @@ def plausible_wave(run: Run, effect: Effect) -> Wave:
 
 def in_some(wave: Wave, parts: Sequence[Part]) -> Wave:
     """A wave in the base's parameters and those of some parts."""
-    own = {p.name for part in parts for p in part.own}
+    own = {name for part in parts for name in part.own_names}
     known = {p.name for mechanism in catalogue().values() for p in mechanism.parameters}
     columns = [i for i, name in enumerate(wave.space.names) if name not in known or name in own]
     space = ParameterSpace(tuple(wave.space.parameters[i] for i in columns))
@@ -258,7 +271,7 @@ def _beside(run: Run, effect: Effect) -> Surrogate:
 
 def _estimate(run: Run, parts: Sequence[Part], edges_s: Array) -> Estimate | None:
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
-    own = [p.name for part in parts for p in part.own]
+    own = [name for part in parts for name in part.own_names]
     return estimate_of([part.mechanism for part in parts], own, motion, edges_s)
 
 
@@ -274,10 +287,12 @@ def _without(run: Run, parts: Sequence[Part], known: Sequence[Sequence[Design]],
 
 
 def _runs(
-    run: Run, run_all: Map, edges_s: Array, label: str, spec: ModelSpec, wave: Wave, parts: Sequence[Part]
-) -> Design:
-    """The runs of a wave with parts of mechanisms, or without any; none is made twice."""
+    run: Run, run_all: Map, edges_s: Array, label: str, spec: ModelSpec, waves: Sequence[Wave],
+    parts: Sequence[Part],
+) -> Design:  # fmt: skip
+    """The runs of waves with parts of mechanisms, or without any, those of the last made now; none twice."""
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    wave = waves[-1]
     known = [vars(p) for p in wave.space.parameters]
     name = name_of(parts) or "base"
     identity = sha256_of([spec.hash, vars(motion), edges_s, name, known])
@@ -285,7 +300,8 @@ def _runs(
     label = f"{name}, {label}"
     run.reporter.log(f"{label}: {len(wave.theta)} full runs")
     file = run.folder / "runs" / f"{name}-{identity[:12]}.h5"
-    return run_design(file, wave, edges_s, task, spec.hash, run_all, partial(tell, run, label))
+    made = run_design(file, wave, edges_s, task, spec.hash, run_all, partial(tell, run, label))
+    return rows_of(made, waves)
 
 
 def effect_files(run: Run) -> list[Path]:
@@ -314,7 +330,8 @@ def effects_of(run: Run) -> list[Effect]:
 def _train(run: Run, parts: Sequence[Part], coarse: Pair, fine: Pair) -> tuple[Effect, Validation]:
     return train_effect(
         name_of(parts), [part.mechanism.name for part in parts],
-        {part.own[0].name: part.neutral for part in parts}, [p.name for part in parts for p in part.own],
+        {part.own[0].name: part.neutral for part in parts},
+        [name for part in parts for name in part.own_names],
         coarse, fine, run.config.surrogate.kind, run.config.seed, _estimate(run, parts, fine.design.edges_s),
     )  # fmt: skip
 
@@ -323,14 +340,12 @@ def in_words(name: str, said: Mapping[str, Any]) -> str:
     """One line on a part's surrogate."""
     if not said["learnt"]:
         return f"{name}: no surrogate: {said['message']}"
-    text = (
-        f"{name}: held-out error {said['median_error_mn']:.2g} mN where the effect is "
-        f"{said['median_effect_mn']:.3g} mN and the peak 1 N (medians)"
-    )
-    near = said["plausible"]
-    return (
-        f"{text}; {near['median_error_mn']:.2g} mN where the recording leaves it plausible" if near else text
-    )
+    places = (("prior", ""), ("plausible", " where the recording leaves it plausible"))
+    errors = [
+        f"{found['median_error_mn']:.2g} mN where the effect is {found['median_effect_mn']:.3g} mN{where}"
+        for key, where in places if (found := said[key])
+    ]  # fmt: skip
+    return f"{name}: held-out error {', '.join(errors) or 'not known'} (medians, of a peak of 1 N)"
 
 
 def force_at(known: Sequence[Design], design: Design) -> Array:
@@ -370,7 +385,7 @@ def _errors(
         }
 
     return {
-        **(measured(0) or {}),
+        "prior": measured(0),
         "plausible": measured(1),
         "coverage_90": validation.coverage_90,
         "failed": int((~design.ok).sum()),

@@ -33,6 +33,7 @@ from bayeskin.mismatch.search import weight
 from bayeskin.pipeline.engine import Run, Silent
 from bayeskin.pipeline.reported import FullForce
 from bayeskin.pipeline.workbench import Workbench, opened, workbench
+from bayeskin.surrogates import effects_among
 from bayeskin.types import Array, Surrogate
 from bayeskin.workers import Lost, run_parallel
 
@@ -181,7 +182,7 @@ def _full(bench: Workbench, found: Fit) -> tuple[FullResult, CorrectedSurrogate 
     plain = replace(found.log_posterior, surrogate=bench.surrogate(found.names))
     fitted = partial(
         fit_full, plain, exact=exact, seed=bench.run.config.seed, allow=bench.with_mesh_error,
-        several=len(bench.effects_among(found.names)) > 1,
+        several=len(effects_among(bench.effects, found.names)) > 1,
     )  # fmt: skip
     start = found.theta
     if not found.names:

@@ -28,7 +28,7 @@ from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.shipping import shipped_for
 from bayeskin.pipeline.training import base_surrogate
 from bayeskin.recordings import read_recording, segment
-from bayeskin.surrogates import Effect, with_effects
+from bayeskin.surrogates import Effect, effects_among, with_effects
 from bayeskin.types import BinnedForce, PadMotion, Surrogate
 
 
@@ -56,13 +56,9 @@ class Workbench:
             return skin
         return Discretised(skin, self.motion, float(np.hypot(error.rms, CALIBRATION)))
 
-    def effects_among(self, names: Sequence[str]) -> list[Effect]:
-        """Effects of the mechanisms of a set, and of its pairs."""
-        return [effect for effect in self.effects if set(effect.mechanisms) <= set(names)]
-
     def surrogate(self, names: Sequence[str]) -> Surrogate:
         """Of the full model on its mesh, with a set of mechanisms."""
-        parts = self.effects_among(names)
+        parts = effects_among(self.effects, names)
         skin: Surrogate = with_effects(self.base, parts)  # type: ignore[arg-type]
         instrument = tuple(self.known[n] for n in names if isinstance(self.known[n].act, Instrument))
         return ObservedSurrogate(skin, instrument, self.motion) if instrument else skin

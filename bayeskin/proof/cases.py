@@ -23,7 +23,14 @@ from bayeskin.proof.outside import OUTSIDE
 from bayeskin.proof.protocol import EDGES_S, MOTION, SURROGATE
 from bayeskin.proof.remains import ALONE, Refit, rms
 from bayeskin.shipped import shipped
-from bayeskin.surrogates import Effect, effect_of, load_manifest, load_surrogate
+from bayeskin.surrogates import (
+    Effect,
+    effect_of,
+    effects_among,
+    load_manifest,
+    load_surrogate,
+    with_effects,
+)
 from bayeskin.types import Array, ParameterSpace
 
 Kind = Literal["nothing", "alone", "pair", "outside"]
@@ -131,12 +138,9 @@ class Screen:
 
     def force(self, names: Sequence[str], theta: Array, values: Mapping[str, Array]) -> Array:
         """Bin means (n, m) at theta (n, 5) with mechanisms at values (n,) each."""
-        force_n = base_n = self.refit.force(theta)
-        for effect in self.effects:
-            if set(effect.mechanisms) <= set(names):
-                own = np.stack([values[name] for name in effect.own], axis=1)
-                point = np.concatenate([theta, own], axis=1)
-                force_n = force_n + effect.predict(point, base_n).mean
+        whole = with_effects(self.refit.surrogate, effects_among(self.effects, names))  # type: ignore[arg-type]
+        columns = [*theta.T, *(values[name] for name in whole.space.names[theta.shape[1] :])]
+        force_n = Refit(whole).force(np.stack(columns, axis=1))
         reported = [self.known[n] for n in names if isinstance(self.known[n].act, Instrument)]
         if not reported:
             return force_n

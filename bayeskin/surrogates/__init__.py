@@ -6,6 +6,7 @@ from bayeskin.surrogates.effects import (
     WithEffects,
     composed,
     effect_of,
+    effects_among,
     train_effect,
     with_effects,
 )
@@ -18,6 +19,6 @@ from bayeskin.surrogates.validate import Validation, validate
 
 __all__ = [
     "Effect", "Pair", "ShapeSurrogate", "Similarity", "Validation", "WithEffects", "composed", "correct",
-    "effect_of", "load_manifest", "load_surrogate", "manifest_of", "save_surrogate", "train", "train_effect",
-    "validate", "with_effects",
+    "effect_of", "effects_among", "load_manifest", "load_surrogate", "manifest_of", "save_surrogate", "train",
+    "train_effect", "validate", "with_effects",
 ]  # fmt: skip

@@ -22,7 +22,7 @@ effect of its own, s the product of their strengths, where that is worth it, and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, TypeVar
@@ -64,15 +64,17 @@ class Effect:
     @property
     def about(self) -> dict[str, Any]:
         """What a manifest says of it, for `effect_of`."""
-        return {"part": self.part, "mechanisms": list(self.mechanisms), "neutral": dict(self.neutral),
-                "own": list(self.own)}  # fmt: skip
+        return {
+            "part": self.part, "mechanisms": list(self.mechanisms), "neutral": dict(self.neutral),
+            "own": list(self.own), "estimate": _told(self.surrogate, self.own, self.estimate),
+        }  # fmt: skip
 
     @property
     def space(self) -> ParameterSpace:
         return self.surrogate.space
 
     def predict(self, theta: Array, base: Array) -> Prediction:
-        """What the effect adds to the base's force (n, m), at theta (n, d) in the order of its space."""
+        """What the effect adds to a force (n, m), at theta (n, d) in the order of its space."""
         times, beside = self._scaled(theta, base)
         found = self.surrogate.predict(theta, times)
         return replace(found, mean=found.mean + beside)
@@ -98,10 +100,23 @@ def _rms(values: Array) -> Array:
 
 
 def effect_of(about: Mapping[str, Any], surrogate: ShapeSurrogate, estimate: Estimate | None) -> Effect:
-    """The effect that `Effect.about` tells of."""
-    return Effect(
-        about["part"], tuple(about["mechanisms"]), about["neutral"], tuple(about["own"]), surrogate, estimate
-    )
+    """The effect that `Effect.about` tells of. Raises InputError if it was learnt beside another estimate."""
+    own = tuple(about["own"])
+    learnt, now = about["estimate"], _told(surrogate, own, estimate)
+    if (learnt is None) != (now is None) or (now is not None and not np.isclose(learnt, now, rtol=1e-6)):
+        raise InputError(
+            f"effect {about['part']}", "learnt beside another estimate", "bayeskin effects, run anew"
+        )
+    return Effect(about["part"], tuple(about["mechanisms"]), about["neutral"], own, surrogate, estimate)
+
+
+def _told(surrogate: ShapeSurrogate, own: Sequence[str], estimate: Estimate | None) -> float | None:
+    """A number by which an estimate is told from another: what it makes of a force that grows."""
+    if estimate is None:
+        return None
+    space = surrogate.space
+    middle = space.from_unit(np.full((1, space.dim), 0.5))[:, -len(own) :]
+    return float(_rms(estimate(middle, np.linspace(0.0, 1.0, len(surrogate.edges_s) - 1)[None]))[0])
 
 
 def strength(similarity: Similarity, neutral: Mapping[str, float], theta: Array) -> Array:
@@ -219,20 +234,29 @@ class WithEffects:
         return {**self.base.provenance, "effects": parts}
 
     def predict(self, theta: ArrayLike) -> Prediction:
-        """Force at theta (n, d) or (d,), with its uncertainty; errors of the parts taken as independent."""
+        """Force at theta (n, d) or (d,), with its uncertainty; errors of the parts taken as independent.
+
+        An estimate is of a force with errors, which grow as the force does.
+        """
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
         base = theta[:, : self.base.space.dim]
         found = [at_distinct(lambda these, _: self.base.predict(these), base, base)]
+        grown = np.ones((len(self.effects) + 1, len(theta)))  # of each one's error, by estimates of its force
         for effect, known, own, before in self._ordered:
             without = sum((found[i].mean for i in before), found[0].mean)
             predict = partial(_of_columns, effect.predict, own)
             found.append(at_distinct(predict, theta[:, known], without))
-        rows = [one.factor.transpose(0, 2, 1) for one in found]  # as they lie in memory
+            if effect.estimate is not None:
+                grown[[0, *before]] *= _rms(without + found[-1].mean) / _rms(without)
+        rows = [times[:, None, None] * one.factor.transpose(0, 2, 1)  # as they lie in memory
+                for times, one in zip(grown, found, strict=True)]  # fmt: skip
         return Prediction(
             mean=sum((one.mean for one in found[1:]), found[0].mean),
             factor=np.concatenate(rows, axis=1).transpose(0, 2, 1),
-            diagonal=sum((one.diagonal for one in found[1:]), found[0].diagonal),
+            diagonal=np.sum(
+                [times[:, None] ** 2 * one.diagonal for times, one in zip(grown, found, strict=True)], axis=0
+            ),
         )
 
     def predict_mean(self, theta: ArrayLike) -> Array:
@@ -268,6 +292,13 @@ class WithEffects:
 
 def _of_columns(predict: Callable[[Array, Array], T], columns: list[int], theta: Array, without: Array) -> T:
     return predict(theta[:, columns], without)
+
+
+def effects_among(effects: Sequence[Effect], mechanisms: Collection[str]) -> list[Effect]:
+    """Those of a set of mechanisms, and of its pairs where each part is there."""
+    found = [effect for effect in effects if set(effect.mechanisms) <= set(mechanisms)]
+    alone = {name for effect in found if len(effect.mechanisms) == 1 for name in effect.own}
+    return [effect for effect in found if alone.issuperset(effect.own)]
 
 
 def with_effects(base: ShapeSurrogate, effects: Sequence[Effect]) -> Surrogate:
