@@ -179,6 +179,13 @@ def test_an_effect_learnt_beside_another_estimate_is_refused() -> None:
             effect_of(effect.about, effect.surrogate, estimate)
 
 
+def test_a_file_of_a_former_version_is_refused() -> None:
+    (lines,) = (effect for effect in shipped_screen().effects if effect.part == "fibre-anisotropy")
+    former = {name: value for name, value in lines.about.items() if name != "estimate"}
+    with pytest.raises(InputError, match="found a file of a former version"):
+        effect_of(former, lines.surrogate, lines.estimate)
+
+
 def test_a_pair_counts_where_both_parts_are_there() -> None:
     def one(*mechanisms: str) -> Any:
         return SimpleNamespace(mechanisms=mechanisms, own=mechanisms)

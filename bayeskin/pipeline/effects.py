@@ -265,7 +265,8 @@ def in_some(wave: Wave, parts: Sequence[Part]) -> Wave:
 
 def _beside(run: Run, effect: Effect) -> Surrogate:
     """The surrogate of the force with an effect, and of a pair with that of each part."""
-    others = [one for one in effects_of(run) if len(one.mechanisms) == 1 and set(one.own) < set(effect.own)]
+    learnt = effects_of(run) if len(effect.mechanisms) > 1 else []
+    others = [one for one in learnt if set(one.own) < set(effect.own)]
     return with_effects(base_surrogate(run), [*others, effect])
 
 

@@ -101,6 +101,10 @@ def _rms(values: Array) -> Array:
 
 def effect_of(about: Mapping[str, Any], surrogate: ShapeSurrogate, estimate: Estimate | None) -> Effect:
     """The effect that `Effect.about` tells of. Raises InputError if it was learnt beside another estimate."""
+    if "estimate" not in about:
+        raise InputError(
+            f"effect {about['part']}", "a file of a former version", "bayeskin effects, run anew"
+        )
     own = tuple(about["own"])
     learnt, now = about["estimate"], _told(surrogate, own, estimate)
     if (learnt is None) != (now is None) or (now is not None and not np.isclose(learnt, now, rtol=1e-6)):
