@@ -1,10 +1,10 @@
 """What two tissue mechanisms do together, beside what each does alone.
 
 Surrogates of effects add up (`bayeskin/surrogates/effects.py`), and an effect that has an estimate is taken
-of the force that those before it make. On the skins of the shipped design that the healthy-skin recording leaves
-plausible, with each mechanism as strong as makes its effect a fifth of the force (or as it can be), every
-pair is run together, each alone, and neither, on the coarsest bricks. Printed are medians over the skins, of
-forces brought to a peak of 1 N, as RMS over the recording:
+of the force that those before it make. On the skins of the shipped design that the healthy-skin recording
+leaves plausible, with each mechanism as strong as makes its effect a fifth of the force (or as it can be),
+every pair is run together, each alone, and neither, on the coarsest bricks. Printed are medians over the
+skins, of forces brought to a peak of 1 N, as RMS over the recording:
 
 - together: what the pair does to the force;
 - added: by how much the sum of what each does is off;
