@@ -15,7 +15,6 @@ table between the markers of docs/discretisation.md.
 from __future__ import annotations
 
 import argparse
-import re
 from functools import partial
 from pathlib import Path
 
@@ -96,9 +95,7 @@ def main() -> None:
         rows.say(f"skin {i}: {100 * found[LEFT[0]]:.2f} % of the peak, {100 * found[LEFT[-1]]:.3f} % left")
     block = table([row for key in inputs if (row := ROWS.find(**key))])
     print(block)
-    path = asked.docs / "discretisation.md"
-    pattern = re.compile(r"(<!-- shapes -->\n).*(<!-- /shapes -->)", re.DOTALL)
-    path.write_text(pattern.sub(lambda m: f"{m[1]}\n{block}\n\n{m[2]}", path.read_text()))
+    rows.into_docs(asked.docs / "discretisation.md", "shapes", block)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,6 @@ between the markers of docs/mechanisms.md.
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -158,9 +157,7 @@ def main() -> None:
             )
     block = table({pair: many for pair, many in found.items() if many})
     print(block)
-    path = asked.docs / "mechanisms.md"
-    pattern = re.compile(r"(<!-- pairs -->\n).*(<!-- /pairs -->)", re.DOTALL)
-    path.write_text(pattern.sub(lambda m: f"{m[1]}\n{block}\n\n{m[2]}", path.read_text()))
+    rows.into_docs(asked.docs / "mechanisms.md", "pairs", block)
 
 
 def table(found: Mapping[tuple[str, str], Sequence[Mapping[str, float]]]) -> str:

@@ -7,6 +7,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -122,3 +123,14 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table; numbers as they were formatted."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def into_docs(path: Path, name: str, block: str) -> None:
+    """Puts a block between the page's markers of this name. Ends the program where there are none."""
+    start, end = f"<!-- {name} -->", f"<!-- /{name} -->"
+    whole = path.read_text()
+    if not re.search(f"{start}\n.*{end}", whole, re.DOTALL):
+        raise SystemExit(f"{path}: no markers {start} and {end}")
+    path.write_text(
+        re.sub(f"{start}\n.*{end}", lambda _: f"{start}\n\n{block}\n\n{end}", whole, flags=re.DOTALL)
+    )
