@@ -1,8 +1,10 @@
 """The same map as `bayeskin.workers`, on other machines: a Dask cluster by address, or one of SLURM's.
 
-Needs the extra `bayeskin[cluster]`. A worker that dies costs its own item, which is run again elsewhere; an
-item that has cost as many workers as the scheduler allows (its `allowed-failures`) is given up. Workers
-should have one thread each (``dask worker --nthreads 1``): the full model uses a core.
+Needs the extra `bayeskin[cluster]`. A worker that dies costs its own item, which is run again elsewhere. The
+scheduler gives up whatever stood in a worker's queue as often as it allows workers to die (its
+`allowed-failures`), be it the cause or not: what it has given up is run once more, one by one after all
+others, and then only the cause is lost. Workers should have one thread each (``dask worker --nthreads 1``):
+the full model uses a core.
 """
 
 from __future__ import annotations
@@ -55,11 +57,22 @@ def _over(client: Any) -> Map:
 
     def over(function: Callable[[Any], Any], items: Sequence[Any]) -> Generator[tuple[int, Any], None, None]:
         futures = {client.submit(function, item, pure=False): index for index, item in enumerate(items)}
+        given_up: list[int] = []
         try:
             for future in distributed.as_completed(list(futures), loop=client.loop):
-                yield futures[future], _result(future, distributed)
+                result = _result(future, distributed)
+                if isinstance(result, Lost):
+                    given_up.append(futures[future])
+                else:
+                    yield futures[future], result
         finally:
             client.cancel(list(futures))
+        for index in given_up:
+            alone = client.submit(function, items[index], pure=False)
+            try:
+                yield index, _result(alone, distributed)
+            finally:
+                client.cancel([alone])
 
     return over
 

@@ -20,9 +20,10 @@ from bayeskin.cluster import on_scheduler, on_slurm
 from bayeskin.errors import InputError
 from bayeskin.runner import load_design, run_design
 from bayeskin.types import Design
-from bayeskin.workers import local
+from bayeskin.workers import Lost, local
 
 distributed = pytest.importorskip("distributed")
+dask = pytest.importorskip("dask")
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +75,21 @@ def test_a_point_that_kills_every_worker_is_a_failed_row(cluster, tmp_path: Path
     stiff = SHORT.theta[:, 0] > 3e5
     np.testing.assert_array_equal(found.ok, ~stiff)
     assert all("ended" in found.messages[row] for row in np.flatnonzero(stiff))
+
+
+def test_what_stands_in_the_queue_of_a_worker_that_dies_is_not_lost_with_it() -> None:
+    """One worker that is handed all items at once: the scheduler gives the innocent up with the deadly."""
+    hasty = {"worker-saturation": float("inf"), "allowed-failures": 0}
+    with (
+        dask.config.set({f"distributed.scheduler.{name}": value for name, value in hasty.items()}),
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+        ) as cluster,
+        on_scheduler(cluster.scheduler_address) as over,
+    ):
+        found = dict(over(toy_runs.deadly_first, range(3)))
+    assert isinstance(found[0], Lost)
+    assert (found[1], found[2]) == (1, 2)
 
 
 def test_a_run_that_comes_back_twice_is_one_row(tmp_path: Path, expected: Design) -> None:

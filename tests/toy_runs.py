@@ -63,6 +63,13 @@ def deadly(theta: Mapping[str, float], folder: str, deaths: int) -> Simulation:
     return toy_simulate(theta)
 
 
+def deadly_first(item: int) -> int:
+    """Kills its own process on item 0."""
+    if item == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item
+
+
 def stuck(theta: Mapping[str, float], folder: str) -> Simulation:
     """Says which process it is in, then takes for ever."""
     (Path(folder) / f"{os.getpid()}.pid").touch()
