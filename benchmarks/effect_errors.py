@@ -1,4 +1,4 @@
-"""By how much shipped surrogates miss held-out runs of the full model with a tissue mechanism, by size of the effect.
+"""By how much shipped surrogates miss held-out full runs with a tissue mechanism, by size of its effect.
 
 The surrogates of the base and of the effect together (of a pair also those of its parts) against runs that
 neither was learnt from, as RMS over the recording, of forces brought to a peak of 1 N. The size of an effect

@@ -539,7 +539,7 @@ def test_a_phase_is_predicted_by_a_fit_without_it() -> None:
     """A hold in which all pulls harder: the whole fit leans toward it, one without that hold does not."""
     alone = dataclasses.replace(concealing(0), noise_priors=QUIET)
     holds = [i for i, phase in enumerate(alone.binned.phases) if phase.kind == "hold"]
-    other = np.where(alone.binned.phase == holds[-1], 1.2, 1.0) * alone.binned.force_n
+    other = np.where(alone.binned.phase == holds[-1], 1.1, 1.0) * alone.binned.force_n
     alone = dataclasses.replace(alone, binned=dataclasses.replace(alone.binned, force_n=other))
     base = fit_base(alone, 1, None)
     errors, bins = errors_left_out(base, None), alone.chain.bins

@@ -1,11 +1,11 @@
 """A local maximum of the posterior in few predictions: Gauss-Newton on the force, the noise in between.
 
-Each round makes the noise parameters the most probable ones for the present force, then takes the force as
-linear in the material parameters, by one-sided differences, and solves the robust regression of the residual
-on them and on the surrogate's own error, within the prior box. Steps of several damped lengths are tried,
-straight and along the ridge of the moduli (`straighten`); the best of them is taken if the posterior itself
-rises. The information matrix that the last round used is the posterior's curvature by Fisher scoring, with
-the t's (nu + 1) / (nu + 3) for each innovation (Lange, Little & Taylor 1989, JASA 84:881).
+Each round makes a Newton step of the noise parameters for the present force, then takes the force as linear
+in the material parameters, by one-sided differences, and solves the robust regression of the residual on them
+and on the surrogate's own error, within the prior box. Steps of several damped lengths are tried, straight
+and along the ridge of the moduli (`straighten`); the best of them is taken if the posterior itself rises. The
+information matrix that the last round used is the posterior's curvature by Fisher scoring, with the t's
+(nu + 1) / (nu + 3) for each innovation (Lange, Little & Taylor 1989, JASA 84:881).
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize
 
 from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
 from bayeskin.inference.noise_model import NoiseChain, innovations
@@ -25,6 +24,8 @@ STEP = 1e-4  # of the box, for differences
 DAMPED = (0.0, 1e-2, 1.0, 1e2, 1e4)  # shares of the information added to its diagonal
 ENOUGH = 0.02  # nats a round
 REWEIGHTED = 4  # steps of the regression with t weights
+NOISE_STEPS = (0.03, 0.1, 0.3, 1.0)  # of Newton's, for the noise
+FARTHEST_NOISE = 0.5  # of the box, a step of the noise
 
 
 @dataclass(frozen=True)
@@ -138,16 +139,17 @@ class _Linear:
         self._columns: tuple[Array, Array, Array] | None = None
 
     def with_noise(self) -> Array:
-        """The point with the most probable noise for its force."""
+        """The point with more probable noise for its force: Newton's step, the best of several lengths."""
         low, high = self.low[self.inner :], self.high[self.inner :]
-        found = minimize(
-            self._minus, (self.noise - low) / (high - low), jac=True, method="L-BFGS-B",
-            bounds=[(0.0, 1.0)] * len(low), options={"maxiter": 6, "ftol": 1e-9},
-        )  # fmt: skip
-        unit = np.clip(found.x, 0.0, 1.0)
-        if self._values(unit[None])[0] >= self._values(((self.noise - low) / (high - low))[None])[0]:
-            self.noise = low + unit * (high - low)
-            self._columns = None
+        unit = (self.noise - low) / (high - low)
+        value, gradient, second = self._differences(unit)
+        far = np.maximum(np.abs(second), np.abs(gradient) / FARTHEST_NOISE)
+        step = np.divide(gradient, far, out=np.zeros_like(gradient), where=far > 0.0)
+        tried = np.clip(unit + np.outer(NOISE_STEPS, step), 0.0, 1.0)
+        values = self._values(tried)
+        best = int(np.argmax(values))
+        if values[best] > value:
+            self.noise, self._columns = low + tried[best] * (high - low), None
         return np.concatenate([self.x[: self.inner], self.noise])
 
     def _values(self, unit: Array) -> Array:
@@ -165,10 +167,6 @@ class _Linear:
         values = self._values(np.concatenate([unit[None], centre[None], centre + eye, centre - eye]))
         up, down = values[2:].reshape(2, -1)
         return float(values[0]), (up - down) / (2 * STEP), (up + down - 2 * values[1]) / STEP**2
-
-    def _minus(self, unit: Array) -> tuple[float, Array]:
-        value, gradient, _ = self._differences(unit)
-        return -value, -gradient
 
     def white(self, columns: Array) -> Array:
         """Columns (k, n) in innovations of the noise at hand."""

@@ -7,7 +7,7 @@ taken by its density, and move as those of a run do (`inference.moves`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 import emcee
 import numpy as np
 
+from bayeskin.inference import LogPosterior
 from bayeskin.inference.convergence import Limits, assess
 from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.inference.gauss_newton import gauss_newton
@@ -24,7 +25,7 @@ from bayeskin.mismatch.fit import FIRST_ROUNDS, Fit, likely, other_skins
 from bayeskin.types import Array
 
 ENSEMBLES, FEWEST_WALKERS = 2, 40
-BURN_IN, STEPS, EVERY = 300, 900, 10  # steps forgotten, made in all, and between two that are kept
+LEGS, FORGOTTEN, EVERY = (300, 600, 900), 1 / 3, 5  # steps after which draws may do; their share forgotten
 MODES = 6  # climbs from other skins
 NEAR = 0.5  # of Laplace's sd, about a mode
 LIMITS = Limits(effective_samples=200.0, lengths=5.0, rhat=1.1)  # for intervals, not for tails
@@ -55,38 +56,50 @@ class Resampled:
         }
 
 
-def resample(
-    found: Fit, shear: Shear | None, skin: int, seed: int, progress: Callable[[float], None] | None = None
-) -> Resampled:
+def resample(found: Fit, shear: Shear | None, skin: int, seed: int) -> Resampled:
     """Draws of the posterior about `found`; `shear` as for `fit`, the base's parameters are the first `skin`.
 
-    `progress` is told the share that is done.
+    They end after the first of `LEGS` by which they have settled.
     """
     log_posterior = found.log_posterior
     rng = np.random.default_rng([seed, 7])
     starts = _starts(found, shear, skin, seed, rng)
     walkers = max(FEWEST_WALKERS, 2 * log_posterior.dim + 2)
     coordinates = MoveCoordinates(shear, *log_posterior.bounds)
-    chains, densities = [], []
-    for ensemble in range(ENSEMBLES):
-        sampler = emcee.EnsembleSampler(
-            walkers,
-            log_posterior.dim,
-            log_posterior.log_prob,
-            moves=mixed_moves(coordinates, walkers),
+    samplers = [
+        emcee.EnsembleSampler(
+            walkers, log_posterior.dim, log_posterior.log_prob, moves=mixed_moves(coordinates, walkers),
             vectorize=True,
         )
-        random = np.random.RandomState(int(rng.integers(2**32)))
-        first = emcee.State(starts(walkers), random_state=random.get_state())
-        for step, _ in enumerate(sampler.sample(first, iterations=STEPS, skip_initial_state_check=True)):
-            if progress and step % 50 == 0:
-                progress((ensemble + step / STEPS) / ENSEMBLES)
-        chains.append(sampler.get_chain())
-        densities.append(sampler.get_log_prob())
-    whole = np.stack(chains)
-    state = assess(whole, np.stack(densities), log_posterior.names, LIMITS, BURN_IN)
-    kept = log_posterior.from_sampling(whole[:, BURN_IN::EVERY].reshape(-1, log_posterior.dim))
-    return Resampled(log_posterior.names, kept, float(np.nanmax(state.rhat)), float(np.nanmin(state.ess)))
+        for _ in range(ENSEMBLES)
+    ]  # fmt: skip
+    states = [
+        emcee.State(starts(walkers), random_state=np.random.RandomState(int(rng.integers(2**32))).get_state())
+        for _ in samplers
+    ]
+    made = 0
+    for steps in LEGS:
+        states = [
+            sampler.run_mcmc(state, steps - made, skip_initial_state_check=True)
+            for sampler, state in zip(samplers, states, strict=True)
+        ]
+        made = steps
+        drawn, enough = _assessed(samplers, log_posterior, int(FORGOTTEN * steps))
+        if enough:
+            break
+    return drawn
+
+
+def _assessed(
+    samplers: Sequence[emcee.EnsembleSampler], log_posterior: LogPosterior, burn_in: int
+) -> tuple[Resampled, bool]:
+    """What ensembles have drawn after their first steps, and whether that is enough."""
+    chains = np.stack([sampler.get_chain() for sampler in samplers])
+    densities = np.stack([sampler.get_log_prob() for sampler in samplers])
+    state = assess(chains, densities, log_posterior.names, LIMITS, burn_in)
+    kept = log_posterior.from_sampling(chains[:, burn_in::EVERY].reshape(-1, log_posterior.dim))
+    drawn = Resampled(log_posterior.names, kept, float(np.nanmax(state.rhat)), float(np.nanmin(state.ess)))
+    return drawn, state.verdict.trusted
 
 
 def _starts(
