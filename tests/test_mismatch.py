@@ -15,6 +15,7 @@ from toy_inference import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
 
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior, NoisePriors, find_map
+from bayeskin.inference.convergence import Limits
 from bayeskin.inference.gauss_newton import gauss_newton, promise
 from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import catalogue
@@ -313,6 +314,20 @@ def test_a_mesh_that_is_off_by_a_factor_stays_inside_the_intervals() -> None:
         force = skin.predict(found.draws[:, : len(TRUTH)]).mean.max(axis=1)
         low, high = np.quantile(force, [0.05, 0.95])
         assert (low < truth < high) == inside, (low, truth, high)
+
+
+def test_draws_are_the_same_however_often_it_is_asked_whether_they_do(monkeypatch) -> None:
+    alone = concealing(0)
+    base, shear = fit_base(alone, 1, None), find_shear(alone)
+
+    def drawn(legs: tuple[int, ...], effective: float) -> np.ndarray:
+        monkeypatch.setattr("bayeskin.mismatch.resample.LEGS", legs)
+        monkeypatch.setattr("bayeskin.mismatch.resample.LIMITS", Limits(effective, 5.0, 1.1))
+        return resample(base, shear, len(TRUTH), 1).draws
+
+    whole = drawn((400,), np.inf)
+    np.testing.assert_array_equal(drawn((200, 400), np.inf), whole)
+    assert 0 < len(drawn((200, 400), 50.0)) < len(whole)
 
 
 class Unsure(ToySurrogate):
