@@ -240,7 +240,7 @@ def prove(folder: Path | None, at_most: int | None, rediagnose: int, as_json: bo
     FOLDER is a set that `bayeskin conceal` made; by default the one that is shipped. A recording that has a
     verdict is not diagnosed again, so the command can be interrupted; keys are opened when the verdicts are
     written. With --at-most, what is judged by then is scored. With --rediagnose, N of the recordings are
-    diagnosed afresh, elsewhere, and the exit code is 1 if one has another verdict than the stored one.
+    diagnosed afresh, elsewhere; the exit code is 1 if one has another verdict than the same sources gave.
 
     \b
     Example:

@@ -122,9 +122,9 @@ def diagnose(
 ) -> dict[str, Any]:
     """What the model leaves out of a recording: the answer of ``bayeskin diagnose``.
 
-    Surrogate, seed, windows and noise are those that `posterior` was made with. Minutes, on two processes: a
-    script that calls it needs the guard ``if __name__ == "__main__":``. `folder` keeps figures and what is
-    needed to go on.
+    Surrogate, seed and noise are those that `posterior` was made with; the whole recording is fitted.
+    Minutes, on two processes: a script that calls it needs the guard ``if __name__ == "__main__":``.
+    `folder` keeps figures and what is needed to go on.
     """
     settings = {} if posterior is None else _settings_of(recording, posterior)
     with _opened(recording, _with_surrogate(recording, settings, None), folder) as run:

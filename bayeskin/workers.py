@@ -14,6 +14,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from bayeskin.errors import InputError
+from bayeskin.off_limits import keep_out
 
 ATTEMPTS = 3  # an item that has cost so many workers is given up
 ONE_THREAD = {
@@ -161,6 +162,7 @@ def _work(pipe: Connection, function: Callable[[Any], Any]) -> None:
     """The life of a worker: ready, then one item after another until the parent closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    keep_out()
     pipe.send(None)
     with suppress(EOFError, OSError):  # the parent is gone
         while True:

@@ -9,14 +9,26 @@ import pytest
 import bayeskin
 
 PACKAGE = Path(bayeskin.__file__).parent
-BASE = {"errors", "types", "storage", "shipped", "workers", "umbridge", "probe", "words", "distinct"}
+BASE = {
+    "errors",
+    "types",
+    "storage",
+    "shipped",
+    "workers",
+    "umbridge",
+    "probe",
+    "words",
+    "distinct",
+    "off_limits",
+}
 SIBLINGS = {"recordings", "model", "design", "surrogates"}
 BELOW = {
     "errors": set(),
     "types": {"errors"},
     "storage": {"types", "errors"},
     "shipped": {"errors"},
-    "workers": {"errors"},
+    "off_limits": set(),
+    "workers": {"errors", "off_limits"},
     "umbridge": {"errors"},
     "probe": {"errors"},
     "words": set(),

@@ -30,15 +30,25 @@ from bayeskin.pipeline.shipping import motion_sha256
 from bayeskin.proof import closed, conceal, score, seals
 from bayeskin.proof.cases import Case, Plan, Screen, draw, plans, shipped_screen
 from bayeskin.proof.conceal import concealed, full_run
-from bayeskin.proof.noise import noise
+from bayeskin.proof.noise import floor_after, noise
 from bayeskin.proof.outside import OUTSIDE, Change
-from bayeskin.proof.protocol import EDGES_S, KINDS, MOTION, SURROGATE, kind_at, samples_s
+from bayeskin.proof.protocol import EDGES_S, HELD_OUT_FROM_S, KINDS, MOTION, SURROGATE, kind_at, samples_s
 from bayeskin.proof.remains import Refit, rms, windows
-from bayeskin.proof.score import CLEAR, group_of, judge, overlap, share, stands_for
+from bayeskin.proof.score import (
+    CLEAR,
+    group_of,
+    is_listed,
+    judge,
+    overlap,
+    share,
+    share_of_parts,
+    stands_for,
+)  # fmt: skip
 from bayeskin.recordings import bin_recording, read_recording, segment, uniform_edges
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_manifest, load_surrogate
 from bayeskin.types import PadMotion, Prediction, Recording, Simulation
+from bayeskin.workers import run_parallel
 
 SEED, COUNT = 5, 4
 PACKAGE = Path(bayeskin.__file__).parent
@@ -311,6 +321,56 @@ def test_while_it_is_diagnosed_no_key_can_be_opened(made: Path, tmp_path: Path) 
     assert (made / "seals" / "001.json").read_text()
 
 
+def opens(path: str) -> bool:
+    try:
+        return bool(Path(path).read_text())
+    except PermissionError:
+        return False
+
+
+def test_nor_by_a_worker_that_is_started_meanwhile(made: Path) -> None:
+    key_path = str(made / "seals" / "001.json")
+    with closed(made):
+        assert dict(run_parallel(opens, [key_path, str(made / "index.json")], 1)) == {0: False, 1: True}
+    assert dict(run_parallel(opens, [key_path], 1)) == {0: True}
+
+
+def test_a_diagnosis_that_fails_ends_no_set(made: Path, tmp_path: Path) -> None:
+    def fails(path: Path, reporter) -> dict:
+        failing = len(seen)
+        seen.append(path)
+        if failing == 0:
+            raise InputError("priors", "none but impossible skins", "others")
+        return (
+            {"ok": False, "message": "design: all runs failed"}
+            if failing == 1
+            else nothing_found(path, reporter)
+        )
+
+    seen: list[Path] = []
+    copy = Path(shutil.copytree(made, tmp_path / "copy"))
+    pipeline.prove(copy, Silent(), diagnose=fails)
+    board = pipeline.prove(copy, Silent(), diagnose=fails)["scoreboard"]
+    assert (len(seen), board["judged"]) == (COUNT, COUNT)
+    assert [one["answer"] for one in board["each"]][:2] == ["failed", "failed"]
+
+
+def test_a_set_that_is_no_set_is_told(tmp_path: Path) -> None:
+    for text in ("[]", '{"recordings": []}', '{"recordings": {"001": {}}}'):
+        (tmp_path / "index.json").write_text(text)
+        with pytest.raises(InputError, match="index"):
+            pipeline.prove(tmp_path, Silent(), diagnose=nothing_found)
+
+
+def test_a_set_without_its_seals_is_not_made_again(made: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(made, tmp_path / "copy"))
+    shutil.rmtree(copy / "seals")
+    before = (copy / "index.json").read_text()
+    with pytest.raises(InputError, match="without its seals"):
+        pipeline.conceal(copy, SEED, COUNT, Silent())
+    assert (copy / "index.json").read_text() == before
+
+
 def test_another_verdict_is_a_failure_of_the_same_sources_only(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -321,6 +381,8 @@ def test_another_verdict_is_a_failure_of_the_same_sources_only(
     pipeline.prove(copy, Silent(), diagnose=nothing_found)
     again = pipeline.prove(copy, Silent(), rediagnose=1, diagnose=other)
     assert (again["ok"], list(again["rediagnosed_the_same"].values())) == (False, [False])
+    assert "ANOTHER VERDICT" in again["text"]
+    assert pipeline.prove(copy, Silent(), rediagnose=2, diagnose=nothing_found)["ok"]
     monkeypatch.setattr(pipeline, "diagnosing_sources", lambda: "others")
     assert pipeline.prove(copy, Silent(), rediagnose=1, diagnose=other)["ok"]
 
@@ -381,17 +443,6 @@ def test_prove_goes_on_where_it_was_interrupted_and_records_one_scoring(made: Pa
     assert len(seen) == COUNT + 1
 
 
-def test_a_verdict_that_comes_out_otherwise_is_told(made: Path, tmp_path: Path) -> None:
-    copy = Path(shutil.copytree(made, tmp_path / "copy"))
-    pipeline.prove(copy, Silent(), diagnose=nothing_found)
-    assert pipeline.prove(copy, Silent(), 2, diagnose=nothing_found)["ok"]
-    told = pipeline.prove(
-        copy, Silent(), 2, diagnose=lambda path, _: {**nothing_found(path, _), "verdict": "unknown"}
-    )
-    assert not told["ok"]
-    assert "ANOTHER VERDICT" in told["text"]
-
-
 # Scores
 
 
@@ -420,6 +471,9 @@ def said(*names: str, **more) -> dict:
         ("pad-slip", ["pad-slip", "slow-recovery"], False, False),
         ("pad-slip", [], False, False),
         ("pre-stretch", ["force-offset", "strain-stiffening"], False, True),
+        ("pre-stretch", ["force-offset"], False, False),
+        ("strain-stiffening", ["pre-stretch"], False, False),
+        ("force-offset", ["device-friction"], False, True),
         ("force-offset", ["strain-stiffening"], False, False),
         ("pad-slip + sensor-drift", ["sensor-drift", "pad-slip"], True, True),
         ("pad-slip + sensor-drift", ["sensor-drift", "preconditioning"], False, True),
@@ -437,11 +491,38 @@ def test_a_group_larger_than_what_is_known_to_look_alike_is_wrong() -> None:
     answer["mechanisms"][0]["group"] = ["pad-slip", "slow-recovery", "backlash"]
     found = judge("001", key("pad-slip"), answer)
     assert (found.right, found.right_group) == (False, False)
+    answer = said("device-friction")
+    answer["mechanisms"][0]["group"] = ["viscous-drag", "force-offset"]  # each in one of its groups
+    found = judge("001", key("device-friction"), answer)
+    assert (found.right, found.right_group) == (False, False)
+
+
+def test_the_probability_of_a_pair_is_that_of_its_less_probable_part() -> None:
+    both = key("pad-slip + sensor-drift", "pair")
+    assert judge("001", both, said("pad-slip")).probability == 0.0
+    assert judge("001", both, said("pad-slip", "sensor-drift")).probability == 0.9
+
+
+def test_an_interval_of_parameters_counts_recordings() -> None:
+    one, many = share([True, False]), share_of_parts([{"a": True, "b": True}, {"a": False, "b": False}, {}])
+    assert (many["hits"], many["of"]) == (2, 4)
+    assert (many["share"], many["low"], many["high"]) == (one["share"], one["low"], one["high"])
+
+
+def test_what_is_held_out_has_a_floor_of_its_own() -> None:
+    time_s = samples_s()
+    made_n = noise(np.random.default_rng(1), time_s, 2e-3)
+    quiet = np.abs(made_n - np.median(made_n)) < 10e-3  # no spikes
+    bins = np.digitize(time_s, EDGES_S) - 1
+    means = np.array([made_n[quiet & (bins == i)].mean() for i in range(len(EDGES_S) - 1)])
+    late = EDGES_S[:-1] > HELD_OUT_FROM_S
+    ratio = np.sqrt(np.mean(means[late] ** 2) / np.mean(means**2))
+    assert floor_after(1.0, HELD_OUT_FROM_S) == pytest.approx(ratio, rel=0.05)
 
 
 def test_the_catalogue_s_own_groups_are_allowed_and_mutual() -> None:
     for name, mechanism in catalogue().items():
-        assert set(mechanism.group) <= group_of(name), name
+        assert is_listed(set(mechanism.group)), name
     assert stands_for({"viscous-drag"}, {"device-friction"})
     assert stands_for({"device-friction"}, {"viscous-drag"})
 
@@ -484,7 +565,8 @@ def test_a_scoreboard_of_made_up_verdicts_counts_as_it_should() -> None:
         2,
     )
     assert (board["base_in_interval"]["clear"]["hits"], board["base_in_interval"]["clear"]["of"]) == (1, 2)
-    assert board["held_out_over_floor"]["clear"]["median"] == pytest.approx(1.25)
+    floor_n = floor_after(2e-3, HELD_OUT_FROM_S)
+    assert board["held_out_over_floor"]["clear"]["median"] == pytest.approx(2.5e-3 / floor_n)
     assert board["location_overlap"]["clear"]["median"] == 0.0
     assert board["confusion"]["nothing"] == {"nothing-missing": 2, "sensor-drift": 1}
     assert board["confusion"]["outside"] == {"unknown": 1, "strain-stiffening": 1}
@@ -493,18 +575,18 @@ def test_a_scoreboard_of_made_up_verdicts_counts_as_it_should() -> None:
 
 
 @pytest.mark.parametrize(
-    ("full", "ratio"),
+    ("full", "rmse_n"),
     [
-        (None, 1.5),
-        ({"message": "failed"}, 1.5),
-        ({"rmse_held_out": None}, 1.5),
-        ({"rmse_held_out": 2e-3}, 1.0),
+        (None, 3e-3),
+        ({"message": "failed"}, 3e-3),
+        ({"rmse_held_out": None}, 3e-3),
+        ({"rmse_held_out": 2e-3}, 2e-3),
     ],
 )
-def test_held_out_is_the_full_model_s_where_it_has_a_fit(full: dict | None, ratio: float) -> None:
+def test_held_out_is_the_full_model_s_where_it_has_a_fit(full: dict | None, rmse_n: float) -> None:
     answer = said("force-offset", fit={"after": {"rmse_held_out": 3e-3, "full_model": full}})
     found = judge("001", key("force-offset"), answer)
-    assert found.held_out == pytest.approx(ratio * 2e-3 / key("force-offset")["floor_n"])
+    assert found.held_out == pytest.approx(rmse_n / floor_after(2e-3, HELD_OUT_FROM_S))
 
 
 def made_up() -> tuple[dict, dict]:

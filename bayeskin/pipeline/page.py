@@ -46,7 +46,7 @@ def facts_of(run: Run, stages: Mapping[str, Stage]) -> RunFacts:
         version=bayeskin.__version__,
         seed=config.seed,
         observation=config.model.observation,
-        mesh=Path(config.model.mesh).name,
+        mesh=config.model.forward or Path(config.model.mesh).name,
         parameters={p.name: p.description for p in space.parameters},
         stages=found,
         history=_history(run) if "sample" in found and found["sample"].done else None,

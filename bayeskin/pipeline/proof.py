@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,8 @@ from bayeskin.proof import seals
 from bayeskin.shipped import shipped
 
 Diagnose = Callable[[Path, Reporter], Mapping[str, Any]]
-NOT_DIAGNOSING = ("proof", "report")  # parts of the package on which no verdict depends
+NOT_DIAGNOSING = ("proof", "report", "_shipped")  # parts of the package on which no verdict depends
+FAILED = "failed"  # in a verdict's place, where the diagnosis has ended without one
 SET = "data/proof/index.json"
 
 
@@ -35,6 +36,7 @@ def prove(
 
     rediagnose : so many, spread over the set, are diagnosed afresh in a temporary place and compared with
         their stored verdicts; another verdict is a failure where the sources are those of the stored one
+    A diagnosis that fails has the verdict "failed", and the set goes on. Each scoring is recorded.
     at_most : of those without a verdict so many are diagnosed now; what is judged by then is scored
 
     While anything is diagnosed, the seals cannot be opened.
@@ -60,20 +62,21 @@ def prove(
     verdicts = {number: one for number, one in stored.items() if one is not None}
     board = proof.score(seals.read_keys(folder), {number: one["answer"] for number, one in verdicts.items()})
     current = sum(one["sources_sha256"] == sources for one in verdicts.values())
-    if current == len(index):
-        _record(folder, sources, board)
     compared = {number: _same(one, verdicts[number]["answer"]) for number, one in again.items()}
-    figure = report.figure_proof(board)
-    made = report.save_figure(
-        figure, folder / "scoreboard", f"bayeskin {bayeskin.__version__}, {folder.name}"
-    )
+    figures: Sequence[Path] = ()
+    try:
+        _record(folder, sources, current, board)
+        stamp = f"bayeskin {bayeskin.__version__}, {folder.name}"
+        figures = report.save_figure(report.figure_proof(board), folder / "scoreboard", stamp)
+    except OSError as error:  # a set that came with an installation
+        reporter.log(f"{folder}: {error.strerror}: neither figure nor scoring is kept")
     document = {
         "ok": all(same or verdicts[n]["sources_sha256"] != sources for n, same in compared.items()),
         "folder": folder,
         "scoreboard": board,
         "verdicts_of_these_sources": current,
         "rediagnosed_the_same": compared,
-        "figures": list(made),
+        "figures": list(figures),
     }
     return plain({**document, "text": _in_words(document)})
 
@@ -100,28 +103,33 @@ def diagnosing_sources() -> str:
     package = Path(bayeskin.__file__).parent
     files = [
         path
-        for path in sorted(package.rglob("*.py"))
+        for path in sorted([*package.rglob("*.py"), *package.glob("model/*.json")])
         if path.relative_to(package).parts[0] not in NOT_DIAGNOSING
         and path.name != "cli.py"
         and path != Path(__file__)
     ]
+    named = [[path.relative_to(package).as_posix(), sha256_of_file(path)] for path in files]
     surrogate = shipped("surrogates/healthy-skin-reaction.h5")
-    files += sorted(surrogate.parent.glob("healthy-skin-reaction*.json"))
-    files += sorted(surrogate.with_name(f"{surrogate.stem}-effects").glob("*.json"))
-    return sha256_of([[path.name, sha256_of_file(path)] for path in files])
+    learnt = sorted(surrogate.parent.glob("healthy-skin-reaction*.json"))
+    learnt += sorted(surrogate.with_name(f"{surrogate.stem}-effects").glob("*.json"))
+    return sha256_of([*named, *([path.name, sha256_of_file(path)] for path in learnt)])
 
 
 def _diagnosed(
     folder: Path, number: str, expected: str, reporter: Reporter, diagnose: Diagnose
 ) -> dict[str, Any]:
-    """The answer on a copy of the recording, far from the set."""
+    """The answer on a copy of the recording, far from the set; `FAILED` and why where there is none."""
     source = seals.recording_path(folder, number)
     if sha256_of_file(source) != expected:
         raise InputError(source, "other contents than the index says", f"sha256 {expected[:12]}...")
     with tempfile.TemporaryDirectory(prefix="bayeskin-prove-") as place:
         copy = Path(shutil.copyfile(source, Path(place) / "recording.h5"))
-        answer = dict(diagnose(copy, reporter))
-    return {name: value for name, value in plain(answer).items() if name not in ("figures", "text")}
+        try:
+            answer = dict(diagnose(copy, reporter))
+        except InputError as error:
+            answer = {"message": str(error)}
+    said = {name: value for name, value in plain(answer).items() if name not in ("figures", "text")}
+    return {"verdict": FAILED, **said}
 
 
 def _verdict_path(folder: Path, number: str) -> Path:
@@ -132,7 +140,11 @@ def _stored(folder: Path, number: str, recording_sha256: str) -> dict[str, Any] 
     """The verdict on this very recording, if there is one."""
     path = _verdict_path(folder, number)
     found: dict[str, Any] | None = seals.read_json(path) if path.is_file() else None
-    return found if found and found["recording_sha256"] == recording_sha256 else None
+    if found is None:
+        return None
+    if not isinstance(found, dict) or not {"recording_sha256", "sources_sha256", "answer"} <= set(found):
+        raise InputError(path, "no verdict of a proof", "one that `bayeskin prove` wrote")
+    return found if found["recording_sha256"] == recording_sha256 else None
 
 
 def _store(folder: Path, number: str, recording_sha256: str, sources: str, answer: Mapping[str, Any]) -> None:
@@ -149,7 +161,7 @@ def _store(folder: Path, number: str, recording_sha256: str, sources: str, answe
     )
 
 
-def _record(folder: Path, sources: str, board: Mapping[str, Any]) -> None:
+def _record(folder: Path, sources: str, current: int, board: Mapping[str, Any]) -> None:
     """Adds this scoring to those before it; one for each state of the sources and each set of verdicts."""
     path = folder / seals.SCORINGS
     before = seals.read_json(path) if path.is_file() else []
@@ -162,6 +174,7 @@ def _record(folder: Path, sources: str, board: Mapping[str, Any]) -> None:
         "version": bayeskin.__version__,
         "sources_sha256": sources,
         "verdicts_sha256": verdicts,
+        "verdicts_of_these_sources": current,
         "scoreboard": kept,
     }
     write_json(path, [*before, new])
@@ -183,6 +196,8 @@ def _same(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 
 def _in_a_word(answer: Mapping[str, Any]) -> str:
+    if answer["verdict"] == FAILED:
+        return f"{FAILED}: {answer.get('message', '')}"
     names = ", ".join(one["name"] for one in answer.get("mechanisms", []))
     return f"{answer['verdict']}{': ' + names if names else ''}"
 

@@ -17,6 +17,12 @@ BEFORE_REPORT = (
 )  # fmt: skip
 
 
+def _whose(run: Run) -> dict[str, str]:
+    """The mesh, or the model of one's own."""
+    own = run.config.model.forward
+    return {"mesh": run.config.model.mesh} if own is None else {"forward": own}
+
+
 def _summarise(run: Run) -> Mapping[str, Any]:
     """The answer of a run, for people and programs, from what its stages said."""
     said = {stage.name: run.summary(stage.name) for stage in BEFORE_REPORT}
@@ -32,7 +38,7 @@ def _summarise(run: Run) -> Mapping[str, Any]:
         "remarks": list(sampled["remarks"]),
         "name": run.config.name,
         "recording": {key: said["recording"][key] for key in ("name", "sha256", "samples", "duration_s")},
-        "model": {"observation": run.config.model.observation, "mesh": run.config.model.mesh},
+        "model": {"observation": run.config.model.observation, **_whose(run)},
         "posterior": sampled["parameters"],
         "identifiability": [*sampled["identifiability"], *sampled["ridges"]],
         "learned": sampled["learned"],

@@ -69,9 +69,6 @@ class Case:
     target: float = 0.0  # size aimed at, of the floor
 
 
-_Chosen = tuple[str, Kind, tuple[str, ...], str]
-
-
 def plans(seed: int, count: int) -> tuple[Plan, ...]:
     """What each of `count` recordings conceals, in the order of their numbers. Same seed, same plans."""
     rng = np.random.default_rng([seed, 0])

@@ -204,14 +204,15 @@ def _key(case: Case, runs: _Runs, screen: Screen, attempt: int, peak_n: float) -
 def _agree(folder: Path, seed: int, count: int) -> None:
     """Raises InputError where the folder holds another set."""
     path, ours = folder / seals.SEALS / seals.SET, {"seed": seed, "count": count}
-    if path.is_file():
-        found = seals.read_json(path)
-        if found != ours:
-            expected = f"--seed {found['seed']} --count {found['count']}, or another folder"
-            raise InputError(folder, f"a set of another making than --seed {seed} --count {count}", expected)
-    else:
-        seals.write_json(path, ours)
+    if not path.is_file():
+        if (folder / seals.INDEX).is_file() and seals.read_index(folder):
+            raise InputError(folder, "a set without its seals", "a folder of its own for a new set")
         seals.write_json(folder / seals.INDEX, {"recordings": {}})
+        seals.write_json(path, ours)
+    elif (found := seals.read_json(path)) != ours:
+        raise InputError(
+            folder, f"a set of another making than --seed {seed} --count {count}: {found}", "another folder"
+        )
 
 
 def _finished(folder: Path, number: str) -> bool:

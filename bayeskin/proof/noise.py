@@ -20,9 +20,16 @@ SPIKE_LEAST, SPIKE_MORE = 6.0, 8.0  # of the floor: the smallest, and the mean o
 FLOORS_N = (1.5e-3, 2.5e-3)  # between which a recording's floor is drawn
 
 
-def floor_unit() -> float:
-    """RMS over the 0.5 s bins of the sd of their means, of noise with the sds of `WHITE` and `SLOW`."""
+def floor_after(floor_n: float, from_s: float) -> float:
+    """RMS of the noise of 0.5 s means [N] from a time on, where it is floor_n over the whole recording."""
+    return floor_n * floor_unit(from_s) / floor_unit()
+
+
+def floor_unit(from_s: float = 0.0) -> float:
+    """RMS over the 0.5 s bins from a time on of the sd of their means, of noise with the sds of `WHITE` and
+    `SLOW`."""
     middle = 0.5 * (EDGES_S[1:] + EDGES_S[:-1])
+    middle = middle[middle > from_s]
     count = round((EDGES_S[1] - EDGES_S[0]) * RATE_HZ)
     lags = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) / RATE_HZ
     shared = float(np.mean(np.exp(-lags / SLOW_S)))

@@ -23,6 +23,7 @@ KINDS: tuple[PhaseKind, ...] = (
 )  # fmt: skip
 MOTION = PadMotion(np.array(_CORNERS_S), np.round(1e-3 * np.array(_HEIGHTS_MM), 12))
 RATE_HZ = 20.0
+HELD_OUT_FROM_S = _CORNERS_S[6]  # the end of the second hold
 EDGES_S = uniform_edges(_CORNERS_S[-1])
 
 

@@ -2,8 +2,9 @@
 
 A verdict names right when it names what is concealed and nothing else; it is right up to look-alikes when
 each name it gives stands for one that is concealed and lies in one of its groups (`LOOK_ALIKES`). A verdict
-whose own group is larger than those is wrong. What is held out is the full model's, where that has made a
-fit. Shares have 90 % Wilson intervals.
+whose own group is larger than one of those is wrong, and so is a diagnosis that failed. What is held out is
+the full model's, where that has made a fit, over the floor of what is held out. Shares have 90 % Wilson
+intervals; those of parameters count recordings, since the parameters of one go together.
 """
 
 from __future__ import annotations
@@ -18,18 +19,17 @@ import numpy as np
 from scipy.stats import norm
 
 from bayeskin.mechanisms import catalogue
-from bayeskin.proof.protocol import EDGES_S
+from bayeskin.proof.noise import floor_after
+from bayeskin.proof.protocol import EDGES_S, HELD_OUT_FROM_S
 
 # What one force channel at one speed cannot tell apart; no other group is allowed.
 LOOK_ALIKES = (
     {"solid-viscoelasticity", "strain-dependent-permeability", "friction-creep"},
     {"device-friction", "viscous-drag"},
     {"preconditioning", "pad-slip", "slow-recovery"},
-    {"pre-stretch", "force-offset"},
-    {"pre-stretch", "strain-stiffening"},
     {"force-offset", "device-friction"},
 )
-TAKEN_FOR_EACH_OTHER = ({"pre-stretch"}, {"force-offset", "strain-stiffening"})
+TAKEN_FOR_EACH_OTHER = ({"pre-stretch"}, {"force-offset", "strain-stiffening"})  # only both together
 CLEAR = 3.0  # of the floor: sizes from here on are to be named
 SIZE_EDGES = (0.0, 1.0, 1.5, 2.2, 3.0, 5.0, 8.0, 15.0, np.inf)  # eight sizes, of the floor
 WITHIN_SD = float(norm.ppf(0.95))
@@ -67,6 +67,7 @@ def score(keys: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Mapping[s
     nothing = [one for one in found if one.kind == "nothing"]
     outside = [one for one in found if one.kind == "outside"]
     inside = [one for one in found if one.kind in ("alone", "pair")]
+    right = [one for one in inside if one.right]
     return {
         "recordings": len(keys),
         "judged": len(found),
@@ -75,12 +76,12 @@ def score(keys: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Mapping[s
         "named_up_to_look_alikes": _by_class(inside, lambda some: share(one.right_group for one in some)),
         "unknown_outside": _by_class(outside, lambda some: share(one.answer == "unknown" for one in some)),
         "location_overlap": _by_class([*inside, *outside], lambda some: median(o.overlap for o in some)),
-        "effect_in_interval": _by_class(_right(inside), lambda some: share(_flat(o.inside for o in some))),
-        "base_in_interval": _by_class(_right(inside), lambda some: share(_flat(o.inside_base for o in some))),
-        "base_in_interval_nothing": share(_flat(one.inside_base for one in nothing)),
+        "effect_in_interval": _by_class(right, lambda some: share_of_parts(o.inside for o in some)),
+        "base_in_interval": _by_class(right, lambda some: share_of_parts(o.inside_base for o in some)),
+        "base_in_interval_nothing": share_of_parts(one.inside_base for one in nothing),
         "held_out_over_floor": {
             "nothing": median(one.held_out for one in nothing),
-            **_by_class(_right(inside), lambda some: median(one.held_out for one in some)),
+            **_by_class(right, lambda some: median(one.held_out for one in some)),
         },
         "confusion": confusion(found),
         "detectability": detectability(inside),
@@ -97,7 +98,8 @@ def judge(number: str, key: Mapping[str, Any], answer: Mapping[str, Any]) -> Jud
     truth, said = set(key["mechanisms"]), answer.get("mechanisms", [])
     named = tuple(one["name"] for one in said) if answer["verdict"] == "named" else ()
     right = bool(truth) and set(named) == truth
-    allowed = all(set(one.get("group", ())) <= group_of(one["name"]) for one in said)
+    allowed = all(is_listed({one["name"], *one.get("group", ())}) for one in said)
+    probable = {one["name"]: float(one["probability"]) for one in said}
     fit = answer.get("fit", {}).get("after", {})
     parameters = {name: one for mechanism in said for name, one in mechanism.get("parameters", {}).items()}
     best = fit if (fit.get("full_model") or {}).get("rmse_held_out") is None else fit["full_model"]
@@ -111,12 +113,18 @@ def judge(number: str, key: Mapping[str, Any], answer: Mapping[str, Any]) -> Jud
         named=named,
         right=right and allowed,
         right_group=bool(truth) and allowed and (right or stands_for(set(named), truth)),
-        probability=max((float(one["probability"]) for one in said if one["name"] in truth), default=0.0),
+        probability=min((probable.get(name, 0.0) for name in truth), default=0.0),
         overlap=overlap(key["windows"], [(one["t0"], one["t1"]) for one in answer.get("located", [])]),
-        inside=_better(_inside(parameters, key["values"]), _inside(parameters, _exchanged(key["values"]))),
+        inside=_inside(parameters, _in_order(key["values"], parameters)),
         inside_base=_inside(fit.get("theta", {}), {name: key["theta"][name] for name in BASE}),
-        held_out=None if held_out is None else held_out / key["floor_n"],
+        held_out=None if held_out is None else held_out / floor_after(key["floor_n"], HELD_OUT_FROM_S),
     )
+
+
+def is_listed(group: set[str]) -> bool:
+    """Whether all of these are known to look alike; one by itself always."""
+    listed = (*LOOK_ALIKES, set.union(*TAKEN_FOR_EACH_OTHER))
+    return len(group) == 1 or any(group <= known for known in listed)
 
 
 def group_of(name: str) -> set[str]:
@@ -175,27 +183,39 @@ def _inside(said: Mapping[str, Any], truth: Mapping[str, float]) -> dict[str, bo
     return found
 
 
-def _exchanged(values: Mapping[str, float]) -> dict[str, float]:
-    """The same truth, its two steps of the load cell's zero in the other order."""
+def _in_order(values: Mapping[str, float], said: Mapping[str, Any]) -> Mapping[str, float]:
+    """The truth, its two steps of the load cell's zero in the order in time of those that are said."""
+    times = ("event_1_at", "event_2_at")
+    if not all(name in values and isinstance(said.get(name), Mapping) for name in times):
+        return values
+    first, second = (said[name]["mean"] for name in times)
+    if (values[times[0]] < values[times[1]]) == (first < second):
+        return values
     other = {"event_1_at": "event_2_at", "event_1_step": "event_2_step"}
     other |= {second: first for first, second in other.items()}
     return {name: values[other.get(name, name)] for name in values}
 
 
-def _better(one: dict[str, bool], other: dict[str, bool]) -> dict[str, bool]:
-    return one if sum(one.values()) >= sum(other.values()) else other
+def share(hits: Iterable[bool], among: int | None = None) -> dict[str, Any]:
+    """How many of how many, their share, its 90 % interval after Wilson (J. Am. Stat. Assoc. 22, 1927).
 
-
-def share(hits: Iterable[bool]) -> dict[str, Any]:
-    """How many of how many, their share, its 90 % interval after Wilson (J. Am. Stat. Assoc. 22, 1927)."""
+    among : the number of trials, where several hits are of one
+    """
     said = list(hits)
-    n, k = len(said), sum(said)
-    if n == 0:
+    k, n = sum(said), len(said) if among is None else among
+    if not said:
         return {"hits": 0, "of": 0, "share": None, "low": None, "high": None}
-    z2, p = WITHIN_SD**2, k / n
+    z2, p = WITHIN_SD**2, k / len(said)
     middle = (p + z2 / (2 * n)) / (1 + z2 / n)
     half = WITHIN_SD * float(np.sqrt(p * (1 - p) / n + z2 / (4 * n * n))) / (1 + z2 / n)
-    return {"hits": k, "of": n, "share": p, "low": max(middle - half, 0.0), "high": min(middle + half, 1.0)}
+    low, high = max(middle - half, 0.0), min(middle + half, 1.0)
+    return {"hits": k, "of": len(said), "share": p, "low": low, "high": high}
+
+
+def share_of_parts(parts: Iterable[Mapping[str, bool]]) -> dict[str, Any]:
+    """`share` of all values of several recordings, whose interval counts the recordings."""
+    known = [part for part in parts if part]
+    return share((value for part in known for value in part.values()), len(known))
 
 
 def median(values: Iterable[float | None]) -> dict[str, Any]:
@@ -209,14 +229,6 @@ def median(values: Iterable[float | None]) -> dict[str, Any]:
 
 def _by_class(found: Sequence[Judged], of: Callable[[list[Judged]], dict[str, Any]]) -> dict[str, Any]:
     return {"clear": of([o for o in found if o.clear]), "below": of([o for o in found if not o.clear])}
-
-
-def _right(found: Iterable[Judged]) -> list[Judged]:
-    return [one for one in found if one.right]
-
-
-def _flat(parts: Iterable[Mapping[str, bool]]) -> list[bool]:
-    return [value for part in parts for value in part.values()]
 
 
 def confusion(found: Iterable[Judged]) -> dict[str, dict[str, int]]:

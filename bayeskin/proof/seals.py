@@ -9,21 +9,19 @@ FOLDER/scorings.json        each scoring of the whole set
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
-import sys
-from collections.abc import Iterator, Mapping
-from functools import cache
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 from bayeskin.errors import InputError
+from bayeskin.off_limits import off_limits
 
 RECORDINGS, SEALS, VERDICTS = "recordings", "seals", "verdicts"
 INDEX, SCORINGS, SET = "index.json", "scorings.json", "set.json"
-_CLOSED: list[str] = []  # folders under seal at the moment; the hook stays once it is set
 
 
 def sha256(path: Path) -> str:
@@ -54,7 +52,12 @@ def read_json(path: Path) -> Any:
 
 def read_index(folder: Path) -> dict[str, dict[str, str]]:
     """sha256 of recording and key by number ("001"); raises InputError where there is no set."""
-    found: dict[str, dict[str, str]] = read_json(folder / INDEX)["recordings"]
+    said = read_json(folder / INDEX)
+    found = said.get("recordings") if isinstance(said, dict) else None
+    if not isinstance(found, dict) or not all(
+        isinstance(one, dict) and set(one) == {"recording_sha256", "key_sha256"} for one in found.values()
+    ):
+        raise InputError(folder / INDEX, "no index of a set", "hashes of recordings and keys, by number")
     return dict(sorted(found.items()))
 
 
@@ -76,30 +79,6 @@ def read_keys(folder: Path) -> dict[str, Mapping[str, Any]]:
     return keys
 
 
-@contextlib.contextmanager
-def closed(folder: Path) -> Iterator[None]:
-    """While it lasts, this process and those that it forks can open no file under the set's seals.
-
-    An attempt raises PermissionError.
-    """
-    _set_hook()
-    sealed = os.path.realpath(folder / SEALS)
-    _CLOSED.append(sealed)
-    try:
-        yield
-    finally:
-        _CLOSED.remove(sealed)
-
-
-@cache
-def _set_hook() -> None:
-    sys.addaudithook(_refuse)  # for good: Python takes none back
-
-
-def _refuse(event: str, arguments: tuple[Any, ...]) -> None:
-    if _CLOSED and event in ("open", "os.listdir", "os.scandir"):
-        name = arguments[0]
-        if isinstance(name, str | bytes | os.PathLike):
-            path = os.path.realpath(os.fsdecode(name))
-            if any(path == one or path.startswith(one + os.sep) for one in _CLOSED):
-                raise PermissionError(f"{path} is under seal")
+def closed(folder: Path) -> AbstractContextManager[None]:
+    """While it lasts, no process of this program can open a file under the set's seals (`off_limits`)."""
+    return off_limits(folder / SEALS)
