@@ -144,3 +144,8 @@ def test_a_recording_of_the_full_model_is_near_the_surrogate_s(benchmark, monkey
     middle = about.space.from_unit(np.full(about.dim, 0.5))
     force, expected = calibration.made_by_model(about, middle), about.predict(middle).mean[0]
     assert np.sqrt(np.mean((force - expected) ** 2)) < 0.05 * np.ptp(expected)
+
+
+def test_the_page_of_mechanisms_has_the_catalogue_as_it_is(benchmark):
+    page = Path(__file__).parents[1] / "docs" / "mechanisms.md"
+    assert benchmark("catalogue_table").table() in page.read_text()
