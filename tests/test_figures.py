@@ -525,6 +525,16 @@ def test_profiles_name_what_the_fit_does_not_exclude(draws: np.ndarray) -> None:
     assert "bounds every parameter" in headline(drawn(report.figure_profiles(SPACE, draws, some[:1])))
 
 
+def test_profiles_of_many_parameters_take_several_rows(draws: np.ndarray) -> None:
+    names = [f"x{i}" for i in range(10)]
+    space = ParameterSpace(tuple(Parameter(name, "Pa", 1.0, 2.0, "uniform") for name in names))
+    values = np.linspace(1.0, 2.0, 5)
+    some = [Profile(name, values, -values, (1.0, 2.0), False, False) for name in names]
+    figure = drawn(report.figure_profiles(space, np.linspace(1.0, 2.0, 40).reshape(4, 10), some))
+    assert len([ax for ax in figure.axes if ax.lines]) == 10
+    assert len({round(ax.get_position().y0, 3) for ax in figure.axes}) == 2
+
+
 def test_the_model_check_says_what_moves_most(draws: np.ndarray) -> None:
     weights = np.array([0.4, 0.3, 0.2, 0.1])
     found = Weighed(SPACE, draws[:4], np.log(weights), weights, 10 / 3, float("nan"), Verdict(True, ("",)))

@@ -129,20 +129,42 @@ def test_the_answer_comes_first_and_says_what_how_sure_and_what_is_missing(whole
     assert text.index("What is missing?") < text.index("Phases of the recording")
 
 
+def diagnosed_as(changed: dict[str, object]) -> str:
+    """The page's text where the diagnosis said otherwise."""
+    stages = facts().stages
+    said = {**summaries()["diagnose"], **changed}
+    stages = {**stages, "diagnose": dataclasses.replace(stages["diagnose"], summary=said)}
+    return Walk(render_page(dataclasses.replace(facts(), stages=stages))).text()
+
+
+def test_errors_of_one_model_are_compared() -> None:
+    fit = summaries()["diagnose"]["fit"]
+    failed = {**fit, "after": {**fit["after"], "full_model": {"message": "the skin folds"}}}
+    assert "RMSE 80 mN without, 24.7 mN with" in diagnosed_as({"fit": failed})
+
+
 @pytest.mark.parametrize(
-    ("changed", "word"),
+    ("changed", "word", "sentence"),
     [
-        ({"verdict": "unknown", "unknown_probability": 0.97}, "something that has no name here"),
-        ({"verdict": "unknown", "unknown_probability": 0.05}, "something that several causes would explain"),
-        ({"verdict": "nothing-missing", "unknown_probability": 0.05}, "nothing"),
+        (
+            {"verdict": "unknown", "unknown_probability": 0.97},
+            "something that has no name here",
+            "that no mechanism of the catalogue explains",
+        ),
+        (
+            {"verdict": "unknown", "unknown_probability": 0.05},
+            "something that several causes would explain",
+            "that several mechanisms of the catalogue would explain",
+        ),
+        ({"verdict": "nothing-missing", "unknown_probability": 0.05}, "nothing", "leaves nothing out"),
     ],
 )
-def test_what_is_missing_is_said_in_a_word(changed: dict[str, object], word: str) -> None:
-    stages = facts().stages
-    diagnosed = {**summaries()["diagnose"], **changed}
-    stages = {**stages, "diagnose": dataclasses.replace(stages["diagnose"], summary=diagnosed)}
-    text = Walk(render_page(dataclasses.replace(facts(), stages=stages))).text()
+def test_what_is_missing_is_said_alike_in_a_word_and_a_sentence(
+    changed: dict[str, object], word: str, sentence: str
+) -> None:
+    text = diagnosed_as(changed)
     assert f"What is missing? {word}" in text
+    assert sentence in text
     assert f"Something outside the catalogue: probability {changed['unknown_probability']} at most." in text
 
 

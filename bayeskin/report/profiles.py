@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from string import ascii_lowercase
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,19 +27,25 @@ from bayeskin.report.style import (
 from bayeskin.types import Array, Parameter, ParameterSpace
 
 _DEEPEST = 8.0  # nats shown
+ACROSS = 6  # panels side by side, at most
 
 
 @styled
 def figure_profiles(space: ParameterSpace, draws: ArrayLike, profiles: Sequence[Profile]) -> Figure:
     """Each profile over its prior, with the posterior's 90 % interval, draws (n, D) in SI, under it."""
     draws = np.atleast_2d(np.asarray(draws, dtype=float))
-    figure = new_figure(PAGE_IN, 2.5)
-    axes = np.atleast_1d(figure.subplots(1, len(profiles), sharey=True))
-    for letter, ax, profile in zip("abcdefgh", axes, profiles, strict=False):
+    rows = -(-len(profiles) // ACROSS)
+    figure = new_figure(PAGE_IN, 2.5 * rows)
+    across = -(-len(profiles) // rows)
+    axes = np.ravel(figure.subplots(rows, across, sharey=True, squeeze=False))
+    for ax in axes[len(profiles) :]:
+        ax.remove()
+    for letter, ax, profile in zip(ascii_lowercase, axes, profiles, strict=False):
         column = space.names.index(profile.name)
         _draw(ax, space.parameters[column], profile, draws[:, column])
         panel_title(ax, letter)
-    axes[0].set(ylim=(-_DEEPEST, 0.6), ylabel="below the best fit [nats]")
+    for ax in axes[: len(profiles) : across]:
+        ax.set(ylim=(-_DEEPEST, 0.6), ylabel="below the best fit [nats]")
     flat = [one.name for one in profiles if one.flat]
     finding = (
         f"The fit excludes no value of {list_symbols(flat)}" if flat else "The fit bounds every parameter"

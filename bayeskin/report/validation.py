@@ -59,7 +59,7 @@ def figure_validation(
     for ax, letter, title in zip((amplitude, cover, waves, over_time), "abcd", titles, strict=True):
         panel_title(ax, letter, title)
     below = np.mean(np.sqrt(np.mean(error**2, axis=0)) <= noise)
-    inside = np.mean(error <= ndtri(0.95) * prediction.sd())
+    inside = coverage(true, prediction, np.array([0.9]))[0][0]
     finding = (
         f"RMS error below the recording's noise in {100 * below:.0f} % of bins; "
         f"90 % intervals hold {100 * inside:.0f} % of the held-out forces"

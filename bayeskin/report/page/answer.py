@@ -129,7 +129,9 @@ def _missing(facts: RunFacts) -> Verdict:
         why = [f"Nobody has looked yet: the stage diagnose is {standing}."]
         return Verdict("not known yet", "none", why, f"bayeskin diagnose {facts.config_path}")
     fit = said["fit"]
-    both = [quantity([*fits_of(fit[when]).values()][-1]["rmse"], "N") for when in ("before", "after")]
+    fits = [fits_of(fit[when]) for when in ("before", "after")]
+    model = "full model" if all("full model" in one for one in fits) else "surrogate"
+    both = [quantity(one[model]["rmse"], "N") for one in fits]
     if said["verdict"] == "nothing-missing":
         within = f"The recording stays within what the model allows ({both[0]} RMSE)."
         return Verdict("nothing", "good", [within, *_beyond_the_catalogue(said)])
@@ -141,6 +143,14 @@ def _missing(facts: RunFacts) -> Verdict:
     lines += _beyond_the_catalogue(said)
     if said["verdict"] == "named":
         return Verdict("named", "doubt", lines)
-    outside = said.get("unknown_probability", 1.0) > 0.5
-    word = "something that has no name here" if outside else "something that several causes would explain"
+    word = (
+        "something that has no name here"
+        if is_outside(said)
+        else "something that several causes would explain"
+    )
     return Verdict(word, "doubt", lines)
+
+
+def is_outside(said: Mapping[str, Any]) -> bool:
+    """Whether a mismatch of unknown cause is rather outside the catalogue than one of several in it."""
+    return bool(said.get("unknown_probability", 1.0) > 0.5)

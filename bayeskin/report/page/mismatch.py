@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bayeskin.report.page.answer import fits_of
+from bayeskin.report.page.answer import fits_of, is_outside
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
 from bayeskin.report.page.numbers import number, percent, quantity
@@ -15,15 +15,18 @@ from bayeskin.report.page.sections import absent, cell
 _VERDICTS = {
     "nothing-missing": "The model leaves nothing out that the recording shows.",
     "named": "The recording shows physics that the model leaves out, and it has been named.",
-    "unknown": "The model leaves something out that no mechanism of the catalogue explains.",
 }
+_OUTSIDE = "The model leaves something out that no mechanism of the catalogue explains."
+_SEVERAL = (
+    "The model leaves something out that several mechanisms of the catalogue would explain, none surely."
+)
 
 
 def mismatch(facts: RunFacts) -> Section:
     said = facts.said("diagnose")
     blocks: list[Block] = list(absent(facts, "diagnose"))
     if said:
-        blocks.append(Text([_VERDICTS.get(said["verdict"], said["verdict"])]))
+        blocks.append(Text([_VERDICTS.get(said["verdict"], _OUTSIDE if is_outside(said) else _SEVERAL)]))
         if said["mechanisms"]:
             blocks.append(_mechanisms(said["mechanisms"]))
         blocks.append(_fits(said["fit"]))
