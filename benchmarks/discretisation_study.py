@@ -26,7 +26,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import time
 from contextlib import ExitStack
 from dataclasses import replace
@@ -223,17 +222,6 @@ def space_study(asked: argparse.Namespace, table: rows.Rows) -> list[Result]:
     return [perform(run, table) for run in kept]
 
 
-def write_block(path: Path, text: str) -> None:
-    """Puts `text` between the markers of the document, whole or not at all."""
-    whole = path.read_text()
-    pattern = re.compile(r"(<!-- study -->\n).*(<!-- /study -->)", re.DOTALL)
-    if not pattern.search(whole):
-        raise SystemExit(f"{path}: no markers <!-- study --> and <!-- /study -->")
-    staged = path.with_name(f".{path.name}.partial")
-    staged.write_text(pattern.sub(lambda m: f"{m[1]}\n{text}\n\n{m[2]}", whole))
-    staged.replace(path)
-
-
 def write_mesh_errors(errors: dict[str, dict[str, float]]) -> None:
     """Into the package, by the mesh's hash, where `bayeskin simulate` finds them."""
     by_hash = {}
@@ -283,7 +271,7 @@ def main() -> None:
         write_mesh_errors(mesh_errors(results))
     block = "\n\n".join(parts)
     print(block)
-    write_block(asked.docs / "discretisation.md", block)
+    rows.into_docs(asked.docs / "discretisation.md", "study", block)
     cells = {r.run.mesh: int(r.row["cells"]) for r in results if r.force}
     at_c = [r for r in results if r.run.point == "C" and r.force and r.run.protocol != LOADING]
     figure = figure_discretisation(

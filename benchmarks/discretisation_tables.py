@@ -151,20 +151,27 @@ def peak_table(results: Sequence[Result]) -> str:
 
 
 def choose(errors: TimeErrors, target: float) -> float | None:
-    """The loosest tolerance whose RMS error is below the target at every point, as are all tighter ones."""
-    chosen = None
+    """The loosest tolerance whose RMS error is below the target at every point, as are all tighter ones. A
+    point without a run is not below."""
+    chosen, points = None, {point for _, point in errors}
     for tolerance in sorted({t for t, _ in errors}):
-        if max(e.rms for (t, _), e in errors.items() if t == tolerance) >= target:
+        found = {point: e.rms for (t, point), e in errors.items() if t == tolerance}
+        if set(found) != points or max(found.values()) >= target:
             break
         chosen = tolerance
     return chosen
 
 
 def choose_mesh(results: Sequence[Result], target: float) -> str | None:
-    """The bricks of fewest cells whose RMS error is below the target at every point."""
+    """The bricks of fewest cells whose RMS error is below the target at every point; all must have run."""
     errors = space_errors(results)
+    points = {point for _, point in errors}
     cells = {r.run.mesh: int(r.row["cells"]) for r in results if r.force and r.run.mesh.startswith("bricks")}
-    worst = {m: max(e.rms for (mesh, _), e in errors.items() if mesh == m) for m, _ in errors if m in cells}
+    worst = {
+        m: max(e.rms for (mesh, _), e in errors.items() if mesh == m)
+        for m in cells
+        if {point for mesh, point in errors if mesh == m} == points
+    }
     good = [m for m, rms in worst.items() if rms < target and m != SPACE_REFERENCE]
     return min(good, key=lambda mesh: cells[mesh], default=None)
 
@@ -177,7 +184,7 @@ def verdict(
     (chosen_on, chosen_from), (tested_on, tested) = list(times.items()) or [("", {})] * 2
     tolerance = choose(chosen_from, time_target)
     if tolerance is not None:
-        worst = max(e.rms for (t, _), e in tested.items() if t == tolerance)
+        worst = max((e.rms for (t, _), e in tested.items() if t == tolerance), default=np.nan)
         lines.append(
             f"Tolerance: {tolerance:g} is the loosest whose RMS error on the protocol `{chosen_on}` is below "
             f"{100 * time_target:g} % of the peak at all points; on `{tested_on}` it gives at most "

@@ -12,13 +12,13 @@ Writes docs/figures/mechanisms.{png,svg} and the table between the markers of do
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import healthy_skin
 import numpy as np
+import rows
 
 from bayeskin.mechanisms import Mechanism, catalogue, laws, observed, solved
 from bayeskin.mechanisms.mechanism import Instrument
@@ -29,7 +29,6 @@ from bayeskin.types import Array, PadMotion
 
 ROOT = Path(__file__).parents[1]
 DOCUMENT, FIGURE = ROOT / "docs" / "mechanisms.md", ROOT / "docs" / "figures" / "mechanisms"
-START, END = "<!-- gallery -->", "<!-- /gallery -->"
 MOTION = PadMotion(healthy_skin.HEALTHY_SKIN.time_s[:8], healthy_skin.HEALTHY_SKIN.displacement_m[:8])
 BASE = healthy_skin.POINTS["A"]
 TIMES_S = np.arange(0.0, MOTION.time_s[-1], 0.25)
@@ -111,9 +110,9 @@ def run(values: Mapping[str, float], mechanisms: list[Mechanism]) -> tuple[Array
 def figure_mechanisms(found: Mapping[str, Shown]):
     """What each mechanism adds to the force, a panel each, over the force without it."""
     columns = 4
-    rows = -(-(len(found) + 1) // columns)
-    figure = new_figure(PAGE_IN, 1.2 * rows + 0.5)
-    axes = figure.subplots(rows, columns).ravel()
+    high = -(-(len(found) + 1) // columns)
+    figure = new_figure(PAGE_IN, 1.2 * high + 0.5)
+    axes = figure.subplots(high, columns).ravel()
     for ax, (name, one) in zip(axes, found.items(), strict=False):
         behind = ax.twinx()
         behind.fill_between(TIMES_S, one.without, color=FAINT, alpha=0.6)
@@ -169,11 +168,7 @@ def main() -> None:
     save_figure(figure_mechanisms(found), FIGURE, "benchmarks/mechanism_gallery.py")
     text = table(found, known)
     print(text)
-    if DOCUMENT.is_file():
-        written = re.sub(
-            f"{START}.*{END}", lambda _: f"{START}\n{text}\n{END}", DOCUMENT.read_text(), flags=re.S
-        )
-        DOCUMENT.write_text(written)
+    rows.into_docs(DOCUMENT, "gallery", text)
 
 
 if __name__ == "__main__":

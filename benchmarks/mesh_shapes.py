@@ -48,11 +48,15 @@ def skins(count: int) -> Array:
     return theta[theta[:, 1] <= STIFFEST_BELOW * theta[:, 0]][:count]
 
 
-def refined(theta: dict[str, float]) -> dict[str, float]:
-    """Of one skin: the parts of the difference and what they leave, relative to the peak."""
+def refined(theta: dict[str, float]) -> dict[str, float] | str:
+    """Of one skin: the parts of the difference and what they leave, relative to the peak; or why a run failed."""
     motion = healthy_skin.HEALTHY_SKIN
     edges_s = np.arange(0.0, motion.time_s[-1], BIN_S)
-    here, finer = (simulate(ModelSpec(refinement=r), motion, theta).bin_means(edges_s) for r in (1, 2))
+    runs = [simulate(ModelSpec(refinement=r), motion, theta) for r in (1, 2)]
+    for run in runs:
+        if run.status != "ok":
+            return run.message
+    here, finer = (run.bin_means(edges_s) for run in runs)
     peak = float(np.abs(finer).max())
     columns = errors(here[None], *shapes(motion, edges_s))[0]
     left = [_rms(finer - here) / peak]
@@ -88,8 +92,8 @@ def main() -> None:
     missing = [i for i, key in enumerate(inputs) if ROWS.find(**key) is None]
     for place, found in run_parallel(partial(refined), [cases[i] for i in missing], 2):
         i = missing[place]
-        if isinstance(found, Lost):
-            rows.say(f"skin {i}: lost")
+        if isinstance(found, Lost | str):
+            rows.say(f"skin {i}: {found if isinstance(found, str) else found.reason}")
             continue
         ROWS.append(**inputs[i], **cases[i], **found, code=rows.CODE)
         rows.say(f"skin {i}: {100 * found[LEFT[0]]:.2f} % of the peak, {100 * found[LEFT[-1]]:.3f} % left")

@@ -131,6 +131,7 @@ def into_docs(path: Path, name: str, block: str) -> None:
     whole = path.read_text()
     if not re.search(f"{start}\n.*{end}", whole, re.DOTALL):
         raise SystemExit(f"{path}: no markers {start} and {end}")
-    path.write_text(
-        re.sub(f"{start}\n.*{end}", lambda _: f"{start}\n\n{block}\n\n{end}", whole, flags=re.DOTALL)
-    )
+    written = re.sub(f"{start}\n.*{end}", lambda _: f"{start}\n\n{block}\n\n{end}", whole, flags=re.DOTALL)
+    staged = path.with_name(f".{path.name}.partial")
+    staged.write_text(written)
+    staged.replace(path)

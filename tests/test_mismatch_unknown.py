@@ -187,6 +187,7 @@ def test_features_say_where_and_how_it_grows() -> None:
 def test_a_form_of_the_library_is_found_with_its_coefficient(
     extra: Extra, name: str, coefficient: float, unit: str
 ) -> None:
+    named = 0
     for seed in range(3):
         form = propose_form(known_fit(seed, extra), toy.MOTION, 0)
         first = form.terms[0]
@@ -194,9 +195,11 @@ def test_a_form_of_the_library_is_found_with_its_coefficient(
         assert form.r2_left_out > 0.4
         assert "in phases left out" in form.sentence
         if first.name == name:
+            named += 1
             assert first.unit == unit
             assert abs(first.coefficient - coefficient) < 0.35 * abs(coefficient)
             assert 0.0 < first.standard_error < 0.4 * abs(coefficient)
+    assert named > 0
 
 
 def test_noise_has_no_form_and_neither_has_what_one_phase_does_alone() -> None:

@@ -93,11 +93,11 @@ def phase_legend(ax: Axes, phases: Sequence[Phase]) -> None:
         ax.legend_ = None  # leaves room for a second key inside the axes
 
 
-def draw_bands(ax: Axes, x: ArrayLike, low: Array, high: Array, color: str = MODEL, label: str = "") -> None:
+def draw_bands(ax: Axes, x: ArrayLike, low: Array, high: Array) -> None:
     """Fills the 50 % and 90 % bands; low and high (2, m) for LEVELS, in the axes' unit."""
     for level, lower, upper in reversed(list(zip(LEVELS, low, high, strict=True))):
-        name = f"{label}{100 * level:.0f} % band"
-        ax.fill_between(np.asarray(x), lower, upper, color=color, alpha=_OPACITY[level], lw=0, label=name)
+        name = f"{100 * level:.0f} % band"
+        ax.fill_between(np.asarray(x), lower, upper, color=MODEL, alpha=_OPACITY[level], lw=0, label=name)
 
 
 def runs_of(mask: ArrayLike) -> list[tuple[int, int]]:
