@@ -49,7 +49,7 @@ def skins(count: int) -> Array:
 
 
 def refined(theta: dict[str, float]) -> dict[str, float] | str:
-    """Of one skin: the parts of the difference and what they leave, relative to the peak; or why a run failed."""
+    """Of one skin: the parts of the difference and what they leave, over the peak; or why a run failed."""
     motion = healthy_skin.HEALTHY_SKIN
     edges_s = np.arange(0.0, motion.time_s[-1], BIN_S)
     runs = [simulate(ModelSpec(refinement=r), motion, theta) for r in (1, 2)]
