@@ -18,12 +18,10 @@ import numpy as np
 from bayeskin.model import mesh as mesh_module
 from bayeskin.model.mesh import brick_lines
 from bayeskin.model.simulate import ModelSpec, _mesh, problem_of
+from bayeskin.proof.protocol import MOTION
 from bayeskin.types import Array, PadMotion
 
-HEALTHY_SKIN = PadMotion(
-    np.array([0, 9.6, 19, 79, 88.5, 97.9, 147.9, 157.4, 166.8, 206.8, 214.5, 222.2, 258, 267.4, 347.4]),
-    1e-3 * np.array([0, 0, 9.45, 9.45, 0.02, 9.45, 9.45, 0.02, 9.45, 9.45, 1.76, 9.45, 9.45, 0, 0]),
-)
+HEALTHY_SKIN = MOTION
 P_INIT_PA = 700.0
 POINTS = {
     name: dict(zip(("E_c", "E_s", "k_c", "k_s", "p_init"), (*values, P_INIT_PA), strict=True))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import skfem
+from driven import corner_points
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
@@ -157,7 +158,7 @@ def test_consolidation_follows_terzaghis_series(kind):
     n = space.n_nodes
     closed = np.flatnonzero(np.isclose(space.points_u[0], 0.0))
     across = 3 * np.arange(n)
-    corners = _corner_points(space)
+    corners = corner_points(space)
     drained = 3 * n + np.flatnonzero(np.isclose(corners[0], length))
     fixed = np.unique(np.concatenate([3 * closed, across + 1, across + 2, drained]))
     skin = model(mesh, fixed, np.array([], int), permeability)
@@ -180,12 +181,6 @@ def test_consolidation_follows_terzaghis_series(kind):
     np.testing.assert_allclose(past[-1].x[3 * n :] / -load, series, atol=2e-3)
 
 
-def _corner_points(space):
-    points = np.zeros((3, space.n_corners))
-    points[:, space.nodes_p] = space.points_u[:, space.nodes_u[:, : space.nodes_p.shape[1]]]
-    return points
-
-
 def test_time_integration_is_of_second_order():
     """Consolidation rebound as above: halving the step divides the error by four."""
     mesh = bar("bricks", cells=4)
@@ -193,7 +188,7 @@ def test_time_integration_is_of_second_order():
     n = space.n_nodes
     closed = np.flatnonzero(np.isclose(space.points_u[0], 0.0))
     end = np.flatnonzero(np.isclose(space.points_u[0], 1.0))
-    drained = 3 * n + np.flatnonzero(np.isclose(_corner_points(space)[0], 1.0))
+    drained = 3 * n + np.flatnonzero(np.isclose(corner_points(space)[0], 1.0))
     fixed = np.unique(
         np.concatenate([3 * closed, 3 * np.arange(n) + 1, 3 * np.arange(n) + 2, 3 * end, drained])
     )
