@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import tomllib
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from bayeskin.pipeline import stages
 from bayeskin.pipeline.engine import Silent, open_run
 from bayeskin.pipeline.new import new_config, new_demo
 from bayeskin.pipeline.shipping import shipped_files
+from bayeskin.pipeline.workbench import opened
 from bayeskin.shipped import shipped
 from bayeskin.types import Recording
 
@@ -131,3 +133,11 @@ def test_without_a_recording_it_is_the_demo(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there already"):
         new_demo(tmp_path / "other.toml")
     assert not (tmp_path / "other.toml").exists()
+
+
+def test_a_recording_with_the_name_of_a_shipped_surrogate_is_not_taken_for_it(tmp_path: Path) -> None:
+    recording = tmp_path / "demo.h5"
+    shutil.copy(shipped("data/demo.h5"), recording)
+    run = opened(recording, Silent())
+    assert run.config.surrogate.file == recording.name
+    assert shipped_files(run).surrogate == shipped("surrogates/demo.h5")

@@ -1,7 +1,7 @@
 """A local maximum of the posterior in few predictions: Gauss-Newton on the force, the noise in between.
 
-Each round makes a Newton step of the noise parameters for the present force, then takes the force as linear
-in the material parameters, by one-sided differences, and solves the robust regression of the residual on them
+Each round makes the noise parameters the most probable ones for the present force, then takes the force
+as linear in the material parameters, by one-sided differences, and solves the robust regression on them
 and on the surrogate's own error, within the prior box. Steps of several damped lengths are tried, straight
 and along the ridge of the moduli (`straighten`); the best of them is taken if the posterior itself rises. The
 information matrix that the last round used is the posterior's curvature by Fisher scoring, with the t's
@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize
 
 from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
 from bayeskin.inference.noise_model import NoiseChain, innovations
@@ -44,8 +45,14 @@ class Top:
     rounds: int
 
 
-def gauss_newton(log_posterior: LogPosterior, start: Array, shear: Shear | None, rounds: int = 40) -> Top:
-    """From `start` (D,) in sampling coordinates; `shear` straightens this posterior, where it is known."""
+def gauss_newton(
+    log_posterior: LogPosterior, start: Array, shear: Shear | None, rounds: int = 40, quick: bool = False
+) -> Top:
+    """From `start` (D,) in sampling coordinates; `shear` straightens this posterior, where it is known.
+
+    quick : for the first rounds of many climbs, of which the best goes on without: the noise makes a Newton
+        step a round only, at half the cost, and a climb across a ridge may end on its side
+    """
     low, high = log_posterior.bounds
     x = np.clip(np.asarray(start, dtype=float), low, high)
     value = float(log_posterior.log_prob(x[None])[0])
@@ -54,7 +61,7 @@ def gauss_newton(log_posterior: LogPosterior, start: Array, shear: Shear | None,
         made += 1
         before = value
         linear = _Linear(log_posterior, x)
-        x = linear.with_noise()
+        x = linear.with_noise(quick)
         trials = _trials(linear, x, shear)
         values = log_posterior.log_prob(trials)
         best = int(np.argmax(values))
@@ -138,19 +145,39 @@ class _Linear:
         self.noise = x[self.inner :]
         self._columns: tuple[Array, Array, Array] | None = None
 
-    def with_noise(self) -> Array:
-        """The point with more probable noise for its force: Newton's step, the best of several lengths."""
+    def with_noise(self, quick: bool) -> Array:
+        """The point with the most probable noise for its force, or where a Newton step of the noise ends."""
         low, high = self.low[self.inner :], self.high[self.inner :]
         unit = (self.noise - low) / (high - low)
+        better = self._stepped(unit) if quick else self._most_probable(unit)
+        if better is not None:
+            self.noise, self._columns = low + better * (high - low), None
+        return np.concatenate([self.x[: self.inner], self.noise])
+
+    def _most_probable(self, unit: Array) -> Array | None:
+        found = minimize(
+            self._minus, unit, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(unit),
+            options={"maxiter": 6, "ftol": 1e-9},
+        )  # fmt: skip
+        better = np.clip(found.x, 0.0, 1.0)
+        values = self._values(np.array([unit, better]))
+        return better if values[1] > values[0] else None
+
+    def _stepped(self, unit: Array) -> Array | None:
+        """The best of several lengths of Newton's step, each coordinate by its own second derivative."""
         value, gradient, second = self._differences(unit)
         far = np.maximum(np.abs(second), np.abs(gradient) / FARTHEST_NOISE)
         step = np.divide(gradient, far, out=np.zeros_like(gradient), where=far > 0.0)
         tried = np.clip(unit + np.outer(NOISE_STEPS, step), 0.0, 1.0)
         values = self._values(tried)
         best = int(np.argmax(values))
-        if values[best] > value:
-            self.noise, self._columns = low + tried[best] * (high - low), None
-        return np.concatenate([self.x[: self.inner], self.noise])
+        return tried[best] if values[best] > value else None
+
+    def _minus(self, unit: Array) -> tuple[float, Array]:
+        """Minus the value, and its gradient (q,) by one-sided differences."""
+        side = np.where(unit + STEP <= 1.0, 1.0, -1.0)
+        values = self._values(np.concatenate([unit[None], unit + STEP * np.diag(side)]))
+        return -float(values[0]), (values[0] - values[1:]) * side / STEP
 
     def _values(self, unit: Array) -> Array:
         """Log-likelihoods (n,) at noise parameters (n, q) of the unit cube."""

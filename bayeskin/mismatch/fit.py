@@ -273,7 +273,7 @@ def likely(log_posterior: LogPosterior, trials: Array, count: int) -> list[Array
 
 def _climbed(log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None) -> Top:
     """The one ahead after a few rounds."""
-    tops = [gauss_newton(log_posterior, start, shear, FIRST_ROUNDS) for start in starts]
+    tops = [gauss_newton(log_posterior, start, shear, FIRST_ROUNDS, quick=True) for start in starts]
     return max(tops, key=lambda one: one.value)
 
 

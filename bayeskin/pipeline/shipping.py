@@ -34,17 +34,20 @@ class ShippedFiles(NamedTuple):
 
 
 def shipped_files(run: Run) -> ShippedFiles:
-    """The files that ``surrogate.file`` names: beside the configuration, or among those shipped."""
-    name = run.config.surrogate.file
+    """The files that ``surrogate.file`` names: beside the configuration, or among those shipped.
+
+    A recording of that name beside it is none of them.
+    """
+    name, folder = run.config.surrogate.file, run.config_path.resolve().parent
     assert name is not None
-    own = run.config_path.resolve().parent / name
-    path = own if own.is_file() else shipped(f"surrogates/{name}")
+    own = folder / name
+    path = own if own.is_file() and name != run.config.recording.file else shipped(f"surrogates/{name}")
     fine = None if run.config.design.coarse is None else path.with_name(f"{path.stem}-fine.h5")
     files = ShippedFiles(path, path.with_name(f"{path.stem}-design.h5"), fine)
     for file in files.present[1:]:
         if not file.is_file():
             raise InputError(f"{run.config_path}: surrogate.file", f"no {file}", "its design beside it")
-    for file in files.present if own.is_file() else ():
+    for file in files.present if path == own else ():
         refuse_damaged(file, "a surrogate that bayeskin wrote, and its design")
     return files
 
