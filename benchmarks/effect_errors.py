@@ -22,10 +22,10 @@ import rows
 
 from bayeskin import storage
 from bayeskin.mechanisms import catalogue
-from bayeskin.mechanisms.binned import estimate_of
+from bayeskin.mechanisms.binned import estimates_by_name
 from bayeskin.recordings import idealised_motion, read_recording, segment
 from bayeskin.shipped import shipped
-from bayeskin.surrogates import Effect, effect_of, load_manifest, load_surrogate, with_effects
+from bayeskin.surrogates import effects_in, load_effect, load_surrogate, with_effects
 from bayeskin.types import Array, Design, PadMotion
 
 SURROGATES = Path(__file__).parents[1] / "surrogates"
@@ -44,18 +44,11 @@ def motions() -> dict[str, PadMotion]:
     }
 
 
-def effect_in(path: Path, motion: PadMotion) -> Effect:
-    """A shipped effect, its estimate made for the protocol."""
-    about, surrogate = load_manifest(path)["effect"], load_surrogate(path)
-    mechanisms = [catalogue()[name] for name in about["mechanisms"]]
-    return effect_of(about, surrogate, estimate_of(mechanisms, about["own"], motion, surrogate.edges_s))
-
-
 def errors(base: Path, motion: PadMotion) -> dict[str, tuple[Array, Array]]:
     """Of each part, sizes and errors (n,) of its held-out runs, in mN at a peak of 1 N."""
-    folder = base.with_name(f"{base.stem}-effects")
-    files = [path for path in sorted(folder.glob("*.h5")) if not path.stem.endswith("-design")]
-    effects, alone = [effect_in(path, motion) for path in files], load_surrogate(base)
+    files = effects_in(base.with_name(f"{base.stem}-effects"))
+    estimates = estimates_by_name(catalogue(), motion)
+    effects, alone = [load_effect(path, estimates) for path in files], load_surrogate(base)
     found = {}
     for path, effect in zip(files, effects, strict=True):
         design = storage.load(path.with_name(f"{path.stem}-design.h5"), Design)

@@ -560,7 +560,7 @@ def test_a_phase_is_predicted_by_a_fit_without_it() -> None:
     errors, bins = errors_left_out(base, None), alone.chain.bins
     of_hold = alone.binned.phase[bins] == holds[-1]
     left_in = (alone.binned.force_n - base.force_n)[bins][of_hold]
-    assert np.mean(errors[of_hold]) > np.mean(left_in) + 2e-3
+    assert np.mean(errors[of_hold]) > np.mean(left_in) + 10e-3
     hold = alone.binned.phases[holds[-1]]
     spans = ((float(alone.binned.edges_s[0]), float(alone.binned.edges_s[-1])),)
     part = dataclasses.replace(alone, fit_windows=without(spans, hold.start_s, hold.end_s))

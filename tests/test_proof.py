@@ -349,10 +349,12 @@ def test_a_diagnosis_that_fails_ends_no_set(made: Path, tmp_path: Path) -> None:
 
     seen: list[Path] = []
     copy = Path(shutil.copytree(made, tmp_path / "copy"))
-    pipeline.prove(copy, Silent(), diagnose=fails)
     board = pipeline.prove(copy, Silent(), diagnose=fails)["scoreboard"]
     assert (len(seen), board["judged"]) == (COUNT, COUNT)
     assert [one["answer"] for one in board["each"]][:2] == ["failed", "failed"]
+    again = pipeline.prove(copy, Silent(), diagnose=fails)["scoreboard"]  # those two once more, and no other
+    assert len(seen) == COUNT + 2
+    assert "failed" not in [one["answer"] for one in again["each"]]
 
 
 def test_a_set_that_is_no_set_is_told(tmp_path: Path) -> None:

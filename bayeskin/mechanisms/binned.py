@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -84,3 +84,10 @@ def estimate_of(
     if len(mechanisms) > 1 or not isinstance(mechanism.act, Tissue) or mechanism.act.estimate is None:
         return None
     return BinnedEstimate(mechanism, tuple(own), motion, edges_s)
+
+
+def estimates_by_name(
+    known: Mapping[str, Mechanism], motion: PadMotion
+) -> Callable[[Sequence[str], Sequence[str], Array], BinnedEstimate | None]:
+    """`estimate_of` by names of mechanisms, names of their own parameters, and edges of bins."""
+    return lambda names, own, edges_s: estimate_of([known[name] for name in names], own, motion, edges_s)

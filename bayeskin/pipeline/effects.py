@@ -21,7 +21,7 @@ from bayeskin import storage
 from bayeskin.design import Wave, fine_wave, next_wave, sobol_points
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, catalogue, laws
-from bayeskin.mechanisms.binned import estimate_of
+from bayeskin.mechanisms.binned import estimate_of, estimates_by_name
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline.crew import crew
@@ -38,9 +38,9 @@ from bayeskin.surrogates import (
     Similarity,
     Validation,
     composed,
-    effect_of,
+    effects_in,
+    load_effect,
     load_manifest,
-    load_surrogate,
     manifest_of,
     save_surrogate,
     train_effect,
@@ -311,21 +311,18 @@ def effect_files(run: Run) -> list[Path]:
     folder = run.folder / "effects"
     if not list(folder.glob("*.json")) and file is not None:
         folder = shipped_files(run).surrogate.with_name(f"{Path(file).stem}-effects")
-    return sorted(path for path in folder.glob("*.h5") if not path.stem.endswith("-design"))
+    return effects_in(folder)
 
 
 def effects_of(run: Run) -> list[Effect]:
     """The effects in `effect_files`. Raises InputError for files of another model."""
-    found = []
-    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
-    for path in effect_files(run):
-        said, surrogate = load_manifest(path), load_surrogate(path)
-        if said["model_hash"] != model_spec(run).hash:
+    files = effect_files(run)
+    for path in files:
+        if load_manifest(path)["model_hash"] != model_spec(run).hash:
             raise InputError(path, "an effect of another model", "one of this configuration's model")
-        mechanisms = [catalogue()[name] for name in said["effect"]["mechanisms"]]
-        estimate = estimate_of(mechanisms, said["effect"]["own"], motion, surrogate.edges_s)
-        found.append(effect_of(said["effect"], surrogate, estimate))
-    return found
+    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    estimates = estimates_by_name(catalogue(), motion)
+    return [load_effect(path, estimates) for path in files]
 
 
 def _train(run: Run, parts: Sequence[Part], coarse: Pair, fine: Pair) -> tuple[Effect, Validation]:

@@ -36,10 +36,10 @@ def prove(
 
     rediagnose : so many, spread over the set, are diagnosed afresh in a temporary place and compared with
         their stored verdicts; another verdict is a failure where the sources are those of the stored one
-    A diagnosis that fails has the verdict "failed", and the set goes on. Each scoring is recorded.
     at_most : of those without a verdict so many are diagnosed now; what is judged by then is scored
 
-    While anything is diagnosed, the seals cannot be opened.
+    A diagnosis that fails has the verdict "failed" until a later call tries it again, and the set goes on.
+    Each scoring is recorded. While anything is diagnosed, the seals cannot be opened.
     Raises InputError for a folder without a set, or whose contents are not what its index says.
     """
     folder = shipped(SET).parent if folder is None else folder
@@ -48,7 +48,7 @@ def prove(
         raise InputError(folder, "a set without recordings", "one that `bayeskin conceal` made")
     with proof.closed(folder):
         hashes = {number: said["recording_sha256"] for number, said in index.items()}
-        new = [number for number, expected in hashes.items() if _stored(folder, number, expected) is None]
+        new = [number for number, expected in hashes.items() if not _answered(folder, number, expected)]
         for place, number in enumerate(new[:at_most]):
             reporter.progress("recordings", place / len(new), f"{number} of {len(index)}")
             answer = _diagnosed(folder, number, hashes[number], reporter, diagnose)
@@ -145,6 +145,12 @@ def _stored(folder: Path, number: str, recording_sha256: str) -> dict[str, Any] 
     if not isinstance(found, dict) or not {"recording_sha256", "sources_sha256", "answer"} <= set(found):
         raise InputError(path, "no verdict of a proof", "one that `bayeskin prove` wrote")
     return found if found["recording_sha256"] == recording_sha256 else None
+
+
+def _answered(folder: Path, number: str, recording_sha256: str) -> bool:
+    """Whether there is a verdict, and not that the diagnosis failed."""
+    found = _stored(folder, number, recording_sha256)
+    return found is not None and found["answer"]["verdict"] != FAILED
 
 
 def _store(folder: Path, number: str, recording_sha256: str, sources: str, answer: Mapping[str, Any]) -> None:

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed
-from bayeskin.mechanisms.binned import estimate_of
+from bayeskin.mechanisms.binned import estimates_by_name
 from bayeskin.mechanisms.mechanism import Instrument, Tissue
 from bayeskin.proof.noise import FLOORS_N
 from bayeskin.proof.outside import OUTSIDE
@@ -25,9 +25,9 @@ from bayeskin.proof.remains import ALONE, Refit, rms
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import (
     Effect,
-    effect_of,
     effects_among,
-    load_manifest,
+    effects_in,
+    load_effect,
     load_surrogate,
     with_effects,
 )
@@ -164,14 +164,10 @@ class _Straight:
 def shipped_screen() -> Screen:
     """With the surrogates that come with bayeskin."""
     path = shipped(SURROGATE)
-    effects = []
-    for file in sorted(path.with_name(f"{path.stem}-effects").glob("*.h5")):
-        if not file.stem.endswith("-design"):
-            about = load_manifest(file)["effect"]
-            mechanisms = [catalogue()[name] for name in about["mechanisms"]]
-            estimate = estimate_of(mechanisms, about["own"], MOTION, EDGES_S)
-            effects.append(effect_of(about, load_surrogate(file), estimate))
-    return Screen(Refit(load_surrogate(path)), tuple(effects), catalogue())
+    known = catalogue()
+    estimates = estimates_by_name(known, MOTION)
+    files = effects_in(path.with_name(f"{path.stem}-effects"))
+    return Screen(Refit(load_surrogate(path)), tuple(load_effect(one, estimates) for one in files), known)
 
 
 def draw(plan: Plan, attempt: int, screen: Screen) -> Case:

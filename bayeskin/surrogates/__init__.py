@@ -10,7 +10,14 @@ from bayeskin.surrogates.effects import (
     train_effect,
     with_effects,
 )
-from bayeskin.surrogates.files import load_manifest, load_surrogate, manifest_of, save_surrogate
+from bayeskin.surrogates.files import (
+    effects_in,
+    load_effect,
+    load_manifest,
+    load_surrogate,
+    manifest_of,
+    save_surrogate,
+)
 from bayeskin.surrogates.similarity import Similarity
 from bayeskin.surrogates.surrogate import ShapeSurrogate
 from bayeskin.surrogates.train import train
@@ -19,6 +26,7 @@ from bayeskin.surrogates.validate import Validation, validate
 
 __all__ = [
     "Effect", "Pair", "ShapeSurrogate", "Similarity", "Validation", "WithEffects", "composed", "correct",
-    "effect_of", "effects_among", "load_manifest", "load_surrogate", "manifest_of", "save_surrogate", "train",
+    "effect_of", "effects_among", "effects_in", "load_effect",
+    "load_manifest", "load_surrogate", "manifest_of", "save_surrogate", "train",
     "train_effect", "validate", "with_effects",
 ]  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +15,13 @@ import numpy as np
 from bayeskin import __version__, storage
 from bayeskin.errors import InputError
 from bayeskin.surrogates.chaos import LatentChaos
+from bayeskin.surrogates.effects import Effect, Estimate, effect_of
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.shapes import ShapeTransform
 from bayeskin.surrogates.surrogate import Latents, ShapeSurrogate
 from bayeskin.surrogates.two_fidelities import CorrectedLatents
 from bayeskin.surrogates.validate import Validation
-from bayeskin.types import ParameterSpace, frozen_array
+from bayeskin.types import Array, ParameterSpace, frozen_array
 
 FORMAT = "bayeskin surrogate"
 FORMAT_VERSION = 4  # 2: inputs are those of `Similarity`; 3: latents may have a correction; 4: active inputs
@@ -111,6 +112,22 @@ def load_manifest(path: Path | str) -> dict[str, Any]:
     with h5py.File(path, "r") as handle:
         manifest: dict[str, Any] = json.loads(handle.attrs["manifest"])
     return manifest
+
+
+def effects_in(folder: Path) -> list[Path]:
+    """Files of effects in a folder, without their designs; [] where there is none."""
+    return sorted(path for path in folder.glob("*.h5") if not path.stem.endswith("-design"))
+
+
+def load_effect(
+    path: Path, estimates: Callable[[Sequence[str], Sequence[str], Array], Estimate | None]
+) -> Effect:
+    """An effect from its file; `estimates` by names of mechanisms, names of their own parameters, and bins.
+
+    Raises InputError as `load_surrogate` does, and where the effect was learnt beside another estimate.
+    """
+    about, surrogate = load_manifest(path)["effect"], load_surrogate(path)
+    return effect_of(about, surrogate, estimates(about["mechanisms"], about["own"], surrogate.edges_s))
 
 
 def _refuse_unfit(path: Path, handle: h5py.File) -> None:
