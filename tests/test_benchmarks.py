@@ -84,6 +84,7 @@ def test_the_tolerance_chosen_is_the_loosest_below_which_all_are_good(benchmark)
     rms = {1e-1: 1e-4, 1e-2: 9e-4, 1e-3: 2e-4, 1e-4: 1e-5}  # the loosest is good by chance
     errors = {(t, "A"): study.Error(e, e, 1.0, 1.0, e) for t, e in rms.items()}
     assert study.choose(errors, 5e-4) == 1e-3
+    assert study.choose(errors | {(1e-4, "B"): errors[1e-4, "A"]}, 5e-4) == 1e-4  # of B only the tightest ran
 
 
 def test_the_peers_likelihood_is_the_normal_with_their_covariance(benchmark):
