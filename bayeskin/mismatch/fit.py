@@ -98,6 +98,12 @@ class Fit:
         low, high = self.log_posterior.bounds
         return np.asarray((self.log_posterior.vector(self.theta) - low) / (high - low))
 
+    @property
+    def log_likelihood(self) -> float:
+        """At the point: the density without that of the uniform priors."""
+        low, high = self.log_posterior.bounds
+        return self.value + float(np.sum(np.log(high - low)))
+
     def draws(self, count: int, seed: int) -> Array:
         """SI values (count, D) from the Gaussian about the point, folded back at the priors' bounds."""
         rng = np.random.default_rng(seed)

@@ -6,9 +6,13 @@ the noise: far from the noise an uncertain surrogate explains much by its own er
 
 In each step the others are ordered by what they promise beside those taken (a score test), and the most
 promising are tried; then each taken one is left out again, so that what a later one has made needless goes.
-The first step tries all, those that promise less by one climb each. Where the noise of the best set is still
-as large as it may be, much is left: then other paths are followed, from single mechanisms that it does not
-have, and from the best set of another search, where there is one.
+The first step tries all, those that promise less by one climb each. A set that was tried before is climbed
+once more from a larger one's top, and from a smaller one's that is ahead of it: one path stops where another
+goes on.
+
+Where the noise of the best set is still as large as it may be, much is left. Then each taken one is searched
+for again beside the others as they have become, and other paths are followed: from single mechanisms that the
+best set does not have, and from the best set of another search, where there is one.
 
 Probabilities are shares of weight over all sets that were tried and count: those of sets never tried count
 as nothing.
@@ -31,6 +35,7 @@ PRIOR = 0.05  # of a mechanism to be at work, before the recording is seen
 MOST = 8  # mechanisms of a set, from which on no further one is tried
 SHORTLIST = 5  # mechanisms of a step that are tried thoroughly
 PATHS = 2  # at most
+GAIN = 1.0  # nats: less is no reason to go on from the same set
 AT_BOUND = 0.999  # of the noise's range
 UNSURE = 0.5  # of what a mechanism adds, RMS: sd of the surrogate's error in it
 ONLY_WITH = {"friction-creep": "device-friction"}
@@ -111,7 +116,7 @@ def search(
         forward.path(starts[0], f"path {count}")
     if _much_left(found.best) and (other := another()) is not None:
         here = replace(other, theta={**found.best.theta, **other.theta})  # noise that the other knows not
-        start = forward.tried(other.names, here, anew=True)
+        start = forward.tried(other.names, here)
         if start is not None:
             forward.path(start, "path from another search")
     return found
@@ -130,6 +135,7 @@ class _Forward:
         self._made = {made.fit.names: [m for m in done if m.fit.names == made.fit.names] for made in done}
         self._alone = build(())
         self._straight = find_shear(self._alone)
+        self._climbed: set[tuple[tuple[str, ...], tuple[str, ...], float]] = set()  # what, and from where
         self._neutral = {name: value for m in known.values() for name, value in m.neutral.items()}
 
     def base(self) -> Fit:
@@ -145,16 +151,23 @@ class _Forward:
             current = ahead
             while len(current.names) > 1 and (leaner := _leaner(current, self.tried)) is not None:
                 current = leaner
+            ahead = current
             if len(current.names) < MOST:
                 ahead = self._step(current, f"{label}, mechanism {len(current.names) + 1}")
-            else:
-                ahead = current
+            if ahead is current and _much_left(current):
+                ahead = self._again(current, label)
 
     def tried(
-        self, names: Sequence[str], start: Fit, thorough: bool = True, anew: bool = False
+        self, names: Sequence[str], start: Fit, thorough: bool = True, again: bool = False
     ) -> Fit | None:
-        """The fit of a set from that of another, None where it does not count."""
+        """The fit of a set from that of another, None where it does not count.
+
+        One made before is made `again` where that is asked for or may gain, but not twice from one start.
+        """
         key = tuple(sorted(names))
+        climb = (key, start.names, start.value)
+        anew = climb not in self._climbed and (again or _may_gain(self.found.fits.get(key), key, start))
+        self._climbed.add(climb)
 
         def make() -> Fit:
             wide = self._build(key)
@@ -192,9 +205,26 @@ class _Forward:
             self._progress((count + 1) / len(tries), f"{label}: {name}: {nats}")
         return max(fits, key=weight)
 
+    def _again(self, current: Fit, label: str) -> Fit:
+        """The best fit of the same set, each mechanism searched for anew where the others are without it."""
+        best = current
+        for count, name in enumerate(current.names):
+            rest = self.tried(_without(current.names, name), current)
+            if rest is not None and (one := self.tried(current.names, rest, again=True)) is not None:
+                best = max(best, one, key=weight)
+            gain = weight(best) - weight(current)
+            self._progress((count + 1) / len(current.names), f"{label}, {name} again: {gain:+.1f} nats")
+        return best if weight(best) > weight(current) + GAIN else current
+
     def _promised(self, names: Sequence[str], current: Fit) -> float:
         new = _new(self._known, names, current.names)
         return promised(self._build(names), current.theta, self._neutral, new, self._seed)
+
+
+def _may_gain(before: Fit | None, names: Sequence[str], start: Fit) -> bool:
+    """Whether another climb of a set is worth it: from no smaller set, or from one that is ahead."""
+    smaller = set(start.names) < set(names)
+    return not smaller or (before is not None and before.log_likelihood < start.log_likelihood)
 
 
 def _much_left(best: Fit) -> bool:
@@ -221,7 +251,7 @@ def sure(found: Fit, build: Build) -> bool:
     noise_n = max(found.theta[name] for name in whole.names if name.startswith("sd_"))
     mean, variance = _predicted(whole, found)
     for name in found.names:
-        without = build([other for other in found.names if name not in (other, ONLY_WITH.get(other))])
+        without = build(_without(found.names, name))
         its_mean, its_variance = _predicted(without, found)
         added = float(np.sqrt(np.mean((mean - its_mean) ** 2)))
         unsure = float(np.sqrt(max(float(np.mean(variance - its_variance)), 0.0)))
@@ -237,10 +267,14 @@ def _predicted(log_posterior: LogPosterior, found: Fit) -> tuple[Array, Array]:
     return prediction.mean[0], prediction.sd()[0] ** 2
 
 
+def _without(names: Sequence[str], name: str) -> list[str]:
+    """A set with one mechanism fewer, and without those that do nothing without it."""
+    return [other for other in names if name not in (other, ONLY_WITH.get(other))]
+
+
 def _leaner(best: Fit, tried: Callable[[Sequence[str], Fit], Fit | None]) -> Fit | None:
     """The best of the sets with one mechanism fewer, where that has more weight."""
-    sets = [[other for other in best.names if other != name] for name in best.names]
-    sets = [[n for n in names if n not in ONLY_WITH or ONLY_WITH[n] in names] for names in sets]
+    sets = [_without(best.names, name) for name in best.names]
     fewer = [one for names in sets if (one := tried(names, best)) is not None]
     leanest = max(fewer, key=weight, default=best)
     return leanest if weight(leanest) > weight(best) else None
