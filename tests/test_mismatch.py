@@ -30,7 +30,7 @@ from bayeskin.mismatch.full_fit import ENOUGH, fit_full
 from bayeskin.mismatch.locate import _chance, locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.resample import resample
-from bayeskin.mismatch.search import PRIOR, Made, Search, search, weight
+from bayeskin.mismatch.search import PRIOR, Made, Search, search, sure, weight
 from bayeskin.mismatch.verdict import judge, unknown_probability
 from bayeskin.mismatch.wrapper import Wrapper
 from bayeskin.proof.cases import shipped_screen
@@ -220,7 +220,7 @@ class Landscape:
         """A posterior of one coordinate, the noise of rests."""
         return SimpleNamespace(
             names=("sd_rest",), bounds=(np.zeros(1), np.ones(1)), vector=lambda theta: np.array([self.left]),
-            surrogate=SimpleNamespace(space=SimpleNamespace(dim=4)),
+            surrogate=SimpleNamespace(space=SimpleNamespace(dim=4)), of="".join(names),
         )  # fmt: skip
 
     def best(self, known: str, another: Callable[[], Fit | None] = lambda: None) -> tuple[str, float]:
@@ -249,6 +249,36 @@ def test_where_much_is_left_each_mechanism_is_searched_for_again_beside_the_othe
     tops = {"": {"": [0.0], "a": [2.0]}, "a": {"": [20.0, 35.0, 35.5, 36.0]}}
     assert Landscape(tops, 0.5, monkeypatch).best("a") == ("a", 20.0)
     assert Landscape(tops, 1.0, monkeypatch).best("a") == ("a", 35.0)
+
+
+def test_where_much_is_left_another_mechanism_is_tried_in_the_place_of_each(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    single = {"": [10.0], "ab": [10.0], "bc": [10.0], "abc": [10.0]}
+    tops = {
+        "": {name: [0.0] for name in ("", "a", "b", "c", "ab", "bc")},
+        "a": single, "b": single, "c": {"": [5.0], "ac": [5.0], "bc": [5.0]},
+        "ab": {"a": [30.0], "b": [30.0], "abc": [30.0]}, "ac": {"a": [11.0], "c": [11.0]},
+        "bc": {"b": [60.0], "c": [60.0], "abc": [60.0]},
+        "abc": {"ab": [31.0], "bc": [61.0]},
+    }  # fmt: skip
+    promises = {"ab": 3.0, "ac": 2.0, "bc": 1.0}
+    landscape = Landscape(tops, 0.5, monkeypatch)
+    known = lambda posterior, *rest: promises.get(posterior.of, 0.0)  # noqa: E731
+    monkeypatch.setattr("bayeskin.mismatch.search.promised", known)
+    monkeypatch.setattr("bayeskin.mismatch.search.SHORTLIST", 1)
+    assert landscape.best("abc") == ("ab", 30.0)
+    landscape.left = 1.0
+    assert landscape.best("abc") == ("bc", 60.0)
+
+
+def test_a_fit_where_nothing_is_possible_has_no_weight_and_does_not_count() -> None:
+    alone = dataclasses.replace(concealing(0), excludes=lambda space, theta: np.ones(len(theta), bool))
+    middle = alone.named(alone.from_sampling(np.mean(alone.bounds, axis=0)))
+    found = fit_near((), alone, middle, None)
+    assert weight(found) == found.value == -np.inf
+    assert np.all(np.isfinite(found.covariance))
+    assert not sure(found, lambda names: alone)
 
 
 def test_another_search_shows_where_no_path_of_its_own_leads(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -317,7 +317,9 @@ def other_skins(
 
 
 def _evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
-    """Log evidence, and the covariance (D, D) over the unit cube."""
+    """Log evidence, and the covariance (D, D) over the unit cube; the prior's where nothing is possible."""
+    if not np.isfinite(top.value):
+        return -np.inf, np.eye(log_posterior.dim) / 12.0
     low, high = log_posterior.bounds
     unit = (top.vector - low) / (high - low)
     uphill = np.where(unit < EDGE, -top.gradient, np.where(unit > 1.0 - EDGE, top.gradient, 0.0))

@@ -11,8 +11,9 @@ once more from a larger one's top, and from a smaller one's that is ahead of it:
 goes on.
 
 Where the noise of the best set is still as large as it may be, much is left. Then each taken one is searched
-for again beside the others as they have become, and other paths are followed: from single mechanisms that the
-best set does not have, and from the best set of another search, where there is one.
+for anew beside the others as they have become, and the most promising other one in its place; and other paths
+are followed: from single mechanisms that the best set does not have, and from the best set of another search,
+where there is one.
 
 Probabilities are shares of weight over all sets that were tried and count: those of sets never tried count
 as nothing.
@@ -35,6 +36,7 @@ PRIOR = 0.05  # of a mechanism to be at work, before the recording is seen
 MOST = 8  # mechanisms of a set, from which on no further one is tried
 SHORTLIST = 5  # mechanisms of a step that are tried thoroughly
 PATHS = 2  # at most
+EXCHANGES = 1  # mechanisms that are tried in another's place
 GAIN = 1.0  # nats: less is no reason to go on from the same set
 AT_BOUND = 0.999  # of the noise's range
 UNSURE = 0.5  # of what a mechanism adds, RMS: sd of the surrogate's error in it
@@ -155,7 +157,7 @@ class _Forward:
             if len(current.names) < MOST:
                 ahead = self._step(current, f"{label}, mechanism {len(current.names) + 1}")
             if ahead is current and _much_left(current):
-                ahead = self._again(current, label)
+                ahead = self._renewed(current, label)
 
     def tried(
         self, names: Sequence[str], start: Fit, thorough: bool = True, again: bool = False
@@ -205,15 +207,18 @@ class _Forward:
             self._progress((count + 1) / len(tries), f"{label}: {name}: {nats}")
         return max(fits, key=weight)
 
-    def _again(self, current: Fit, label: str) -> Fit:
-        """The best fit of the same set, each mechanism searched for anew where the others are without it."""
+    def _renewed(self, current: Fit, label: str) -> Fit:
+        """The best set that is reached by searching for each mechanism anew, and for another in its place."""
         best = current
         for count, name in enumerate(current.names):
-            rest = self.tried(_without(current.names, name), current)
-            if rest is not None and (one := self.tried(current.names, rest, again=True)) is not None:
-                best = max(best, one, key=weight)
+            if name in best.names and (rest := self.tried(_without(best.names, name), best)) is not None:
+                sets = [_with(rest.names, other) for other in self._known if other not in best.names]
+                sets.sort(key=lambda names, rest=rest: -self._promised(names, rest))  # type: ignore[misc]
+                fits = [self.tried(best.names, rest, again=True)]
+                fits += [self.tried(names, rest) for names in sets[:EXCHANGES]]
+                best = max([best, *(one for one in fits if one is not None)], key=weight)
             gain = weight(best) - weight(current)
-            self._progress((count + 1) / len(current.names), f"{label}, {name} again: {gain:+.1f} nats")
+            self._progress((count + 1) / len(current.names), f"{label}, {name} anew: {gain:+.1f} nats")
         return best if weight(best) > weight(current) + GAIN else current
 
     def _promised(self, names: Sequence[str], current: Fit) -> float:
@@ -246,7 +251,12 @@ def _with(names: Sequence[str], name: str) -> tuple[str, ...]:
 
 
 def sure(found: Fit, build: Build) -> bool:
-    """Whether the surrogate knows of each mechanism at least half of what it adds, or all but the noise."""
+    """Whether the surrogate knows of each mechanism at least half of what it adds, or all but the noise.
+
+    Not where all that was tried is impossible, as skins may be that were well with a mechanism more.
+    """
+    if not np.isfinite(found.value):
+        return False
     whole = found.log_posterior
     noise_n = max(found.theta[name] for name in whole.names if name.startswith("sd_"))
     mean, variance = _predicted(whole, found)
