@@ -23,12 +23,12 @@ from math import isqrt
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import qmc
 
 from bayeskin.errors import InputError
+from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.types import Array, Parameter, ParameterSpace, Surrogate, _FreezesArrays
 
 Function = Callable[[Array], Array]
@@ -41,7 +41,6 @@ ERROR_SAMPLES = 256  # rows on which a draw's effect on the indices is measured
 ERROR_LENGTH = 0.3  # of the box: about the spacing of a hundred runs in five dimensions
 ERROR_FEATURES = 128
 MOST_TERMS = 600
-HYPERBOLIC_NORM = 0.75
 CHUNK = 512
 
 
@@ -183,7 +182,7 @@ def projection(
     """
     unit, fresh = (_sobol_points(space.dim, samples, rng) for _ in range(2))
     indices = _expansion_terms(space.dim, len(unit) // 4)
-    basis = _legendre(unit, indices)
+    basis = legendre_basis(unit, indices)
     gram = cho_factor(basis.T @ basis)
 
     def coefficients(values: Array) -> Array:
@@ -192,7 +191,7 @@ def projection(
     found = coefficients(_in_chunks(function, space.from_unit(unit)))
     truth = _in_chunks(function, space.from_unit(fresh))
     widths = np.diff(edges_s)
-    missed = float(np.mean((truth - _legendre(fresh, indices) @ found) ** 2, axis=0) @ widths)
+    missed = float(np.mean((truth - legendre_basis(fresh, indices) @ found) ** 2, axis=0) @ widths)
     scatter = float(np.var(truth, axis=0) @ widths)
     moved = [_expansion_parts(coefficients(_in_chunks(f, space.from_unit(unit))), indices) for f in draws]
     spread = _Parts(*(np.concatenate(part) for part in zip(*moved, strict=True))) if moved else None
@@ -278,26 +277,10 @@ def _pair_columns(dim: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 def _expansion_terms(dim: int, most: int) -> NDArray[np.int64]:
     """Degrees (P, dim) of the largest hyperbolic set of at most `most` (and `MOST_TERMS`) terms."""
-    degree, terms = 0, np.zeros((1, dim), dtype=np.int64)
-    while True:
-        degree += 1
-        cost = np.arange(degree + 1.0) ** HYPERBOLIC_NORM
-        larger, spent = np.zeros((1, 0), dtype=np.int64), np.zeros(1)
-        for _ in range(dim):
-            sums = spent[:, None] + cost
-            row, power = np.nonzero(sums <= cost[-1] * (1.0 + 1e-12))
-            larger, spent = np.column_stack([larger[row], power]), sums[row, power]
-        if len(larger) > min(most, MOST_TERMS):
-            return terms
-        terms = larger
-
-
-def _legendre(unit: Array, indices: NDArray[np.int64]) -> Array:
-    """Legendre products orthonormal over the unit cube, (n, P)."""
-    degree = int(indices.max())
-    powers = legvander(2.0 * unit - 1.0, degree) * np.sqrt(2.0 * np.arange(degree + 1) + 1.0)
-    values = [powers[:, j, column] for j, column in enumerate(indices.T)]
-    return np.asarray(np.prod(values, axis=0))
+    degree, terms = 1, multi_indices(dim, 0)
+    while len(larger := multi_indices(dim, degree)) <= min(most, MOST_TERMS):
+        degree, terms = degree + 1, larger
+    return terms
 
 
 def _expansion_parts(coefficients: Array, indices: NDArray[np.int64]) -> _Parts:

@@ -162,8 +162,8 @@ class ParameterSpace:
         low, high = self._line
         line = self.to_line(theta)
         unit = np.asarray((line - low) / (high - low))
-        for j, (centre, spread, left, share) in self._normals.items():
-            unit[..., j] = (ndtr((line[..., j] - centre) / spread) - left) / share
+        for j, (centre, spread, side, below, share) in self._normals.items():
+            unit[..., j] = (ndtr(side * (line[..., j] - centre) / spread) - below) / share
         return unit
 
     def from_unit(self, unit: ArrayLike) -> Array:
@@ -171,8 +171,8 @@ class ParameterSpace:
         low, high = self._line
         unit = np.asarray(unit, dtype=float)
         line = np.asarray(low + unit * (high - low))
-        for j, (centre, spread, left, share) in self._normals.items():
-            line[..., j] = centre + spread * ndtri(np.clip(left + unit[..., j] * share, 0.0, 1.0))
+        for j, (centre, spread, side, below, share) in self._normals.items():
+            line[..., j] = centre + side * spread * ndtri(np.clip(below + unit[..., j] * share, 0.0, 1.0))
             line[..., j] = np.clip(line[..., j], low[j], high[j])
         return self.from_line(line)
 
@@ -185,9 +185,9 @@ class ParameterSpace:
         low, high = self._line
         flat = [j for j in range(self.dim) if j not in self._normals]
         out = np.full(line.shape[:-1], -float(np.sum(np.log((high - low)[flat]))))
-        for j, (centre, spread, _, share) in self._normals.items():
+        for j, (centre, spread, _, _, share) in self._normals.items():
             z = (line[..., j] - centre) / spread
-            out += -0.5 * z**2 - np.log(spread * share * np.sqrt(2.0 * np.pi))
+            out += -0.5 * z**2 - np.log(spread * abs(share) * np.sqrt(2.0 * np.pi))
         if self.correlations:
             centre, spread = np.array([own[:2] for own in self._normals.values()]).T
             z = (line[..., list(self._normals)] - centre) / spread
@@ -225,15 +225,20 @@ class ParameterSpace:
         return self.to_line(self.lower), self.to_line(self.upper)
 
     @cached_property
-    def _normals(self) -> dict[int, tuple[float, float, float, float]]:
-        """By column of a normal prior: centre and spread on the line, mass below the bounds, mass within."""
+    def _normals(self) -> dict[int, tuple[float, float, float, float, float]]:
+        """By column of a normal prior: centre and spread on the line, side, mass below the bounds, within.
+
+        Where the lower bound is above the centre, side is -1, the mass is that above it, and that within is
+        negative: far out, what is below cannot be told from one.
+        """
         low, high = self._line
         out = {}
         for j, p in enumerate(self.parameters):
             if p.peaked:
                 centre = float(np.log(p.centre + p.offset)) if p.in_log else p.centre
-                left, right = (float(ndtr((bound - centre) / p.spread)) for bound in (low[j], high[j]))
-                out[j] = (centre, p.spread, left, right - left)
+                side = -1.0 if low[j] > centre else 1.0
+                left, right = (float(ndtr(side * (end - centre) / p.spread)) for end in (low[j], high[j]))
+                out[j] = (centre, p.spread, side, left, right - left)
         return out
 
     @cached_property

@@ -31,6 +31,7 @@ from matplotlib.figure import Figure
 
 from bayeskin.design import default_space, first_wave
 from bayeskin.model import ModelSpec, simulate
+from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.report import save_figure
 from bayeskin.report.style import PAGE_IN, new_figure, state_finding, styled
 from bayeskin.surrogates import hyperparameters
@@ -40,8 +41,6 @@ from bayeskin.surrogates.chaos import (
     LatentChaos,
     _pursue,
     fit_sparse,
-    legendre_basis,
-    multi_indices,
 )
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.hyperparameters import fit_latent

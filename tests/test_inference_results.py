@@ -35,7 +35,8 @@ from bayeskin.inference import (
     to_inference_data,
 )
 from bayeskin.inference.identify import information_gain_nats, parts
-from bayeskin.types import Array, Parameter, ParameterSpace, Provenance, Simulation
+from bayeskin.inference.inference_data import _attributes
+from bayeskin.types import Array, Correlation, Parameter, ParameterSpace, Provenance, Simulation
 
 mpl.use("Agg")
 HOLDS = ((15.0, 45.0), (75.0, 105.0))
@@ -294,6 +295,15 @@ def test_a_ridge_is_named() -> None:
     assert "E and F form a ridge" in found[0].statement
 
 
+def test_a_curved_ridge_is_named() -> None:
+    """Two moduli whose weighted sum is what the force hangs on: in logarithms that is a bend, no line."""
+    rng = np.random.default_rng(4)
+    share = rng.uniform(0.004, 0.996, 4000) ** rng.choice([0.2, 1.0, 5.0], 4000)
+    draws = np.column_stack([np.exp(9.0) * share, np.exp(9.0) * (1.0 - share), rng.uniform(-10, 10, 4000)])
+    assert abs(np.corrcoef(np.log(draws[:, :2]), rowvar=False)[0, 1]) < 0.8
+    assert [(r.first, r.second) for r in identifiability(SPACE, draws).ridges] == [("E", "F")]
+
+
 def test_a_posterior_on_a_bound_is_said_to_lean_on_it() -> None:
     draws = ridge_draws()
     draws[:, 0] = np.exp(np.random.default_rng(1).exponential(0.3, len(draws)))
@@ -336,6 +346,14 @@ def test_inference_data_survives_its_file(stored: tuple[Posterior, az.InferenceD
     posterior, idata = stored
     space, draws = draws_of(idata)
     assert space == posterior.space
+    tied = ParameterSpace(
+        tuple(dataclasses.replace(p, prior="normal", centre=p.lower) for p in space.parameters[:2]),
+        (Correlation(*space.names[:2], 0.5),),
+    )
+    c = posterior.convergence
+    c = dataclasses.replace(c, ess=c.ess[:2], rhat=c.rhat[:2], tau_steps=c.tau_steps[:, :2])
+    attributes = _attributes(dataclasses.replace(posterior, space=tied, convergence=c), Provenance("1"))
+    assert draws_of(az.InferenceData(posterior=idata.posterior, attrs=attributes))[0] == tied
     assert np.array_equal(draws, posterior.flat)
     assert {"sample_stats", "log_likelihood", "posterior_predictive", "prior", "observed_data",
             "constant_data"} <= set(idata.groups())  # fmt: skip

@@ -177,10 +177,17 @@ def test_a_run_in_two_parts_is_the_run_in_one(tmp_path: Path) -> None:
     sample(problem, tmp_path / "two", 7, LINE_START, dataclasses.replace(SHORT, max_steps=23))
     parts = sample(problem, tmp_path / "two", 7, LINE_START, SHORT)
     assert np.array_equal(whole.draws, parts.draws)
-    assert np.array_equal(load_chains(tmp_path / "one", problem), load_chains(tmp_path / "two", problem))
+    assert np.array_equal(*(load_chains(tmp_path / part, problem, 2) for part in ("one", "two")))
     other = sample(problem, tmp_path / "three", 8, LINE_START, SHORT)
     assert not np.array_equal(whole.log_prob, other.log_prob)
-    assert not np.array_equal(*load_chains(tmp_path / "one", problem))  # ensembles are independent
+    assert not np.array_equal(*load_chains(tmp_path / "one", problem, 2))  # ensembles are independent
+
+
+def test_chains_of_more_ensembles_than_are_asked_for_are_left_alone(tmp_path: Path) -> None:
+    problem = line_problem()
+    sample(problem, tmp_path, 7, LINE_START, dataclasses.replace(SHORT, ensembles=3, max_steps=10))
+    sample(problem, tmp_path, 7, LINE_START, dataclasses.replace(SHORT, ensembles=2, max_steps=30))
+    assert load_chains(tmp_path, problem, 2).shape[:2] == (2, 30)
 
 
 def test_threads_change_nothing(tmp_path: Path) -> None:
@@ -306,6 +313,13 @@ def autoregressive(shape: tuple[int, ...], phi: float, rng: np.random.Generator)
 def test_the_autocorrelation_time_is_that_of_the_process() -> None:
     chains = autoregressive((2, 3000, 20, 2), 0.8, np.random.default_rng(0))
     assert autocorrelation_steps(chains) == pytest.approx(9.0, rel=0.15)
+
+
+def test_a_walker_that_moves_in_some_coordinates_counts_in_these() -> None:
+    """A move in a subspace leaves the other coordinates as they are."""
+    chains = autoregressive((1, 3000, 20, 2), 0.8, np.random.default_rng(3))
+    chains[0, :, 0, 1] = 0.3
+    assert autocorrelation_steps(chains) == pytest.approx(9.0, rel=0.2)
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.5])

@@ -20,11 +20,13 @@ BASE = {
     "words",
     "distinct",
     "off_limits",
+    "polynomials",
 }
 SIBLINGS = {"recordings", "model", "design", "surrogates"}
 BELOW = {
     "errors": set(),
     "types": {"errors"},
+    "polynomials": {"types"},
     "storage": {"types", "errors"},
     "shipped": {"errors"},
     "off_limits": set(),

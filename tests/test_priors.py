@@ -45,6 +45,18 @@ def test_probabilities_and_densities_are_those_of_scipy():
     assert SPACE.from_unit([[1.0, 1.0, 1.0]]) == pytest.approx(SPACE.upper[None])
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_normal_prior_far_from_its_centre_keeps_its_law(side: float):
+    """Twelve spreads out, where what is on the other side of the bounds cannot be told from one."""
+    low, high = sorted((12.0 * side, 12.5 * side))
+    space = ParameterSpace((Parameter("x", "1", low, high, "normal", centre=0.0, spread=1.0),))
+    unit = np.array([[0.1], [0.5], [0.9]])
+    found, law = space.from_unit(unit), stats.truncnorm(low, high)
+    np.testing.assert_allclose(found[:, 0], law.ppf(unit[:, 0]), rtol=1e-9)
+    np.testing.assert_allclose(space.to_unit(found), unit, rtol=1e-9)
+    np.testing.assert_allclose(space.log_density(found), law.logpdf(found[:, 0]), rtol=1e-9)
+
+
 def test_the_box_of_a_normal_prior_is_flat_and_a_flat_one_is_its_own():
     assert [p.prior for p in SPACE.box.parameters] == ["log-uniform", "uniform", "log-uniform"]
     assert SPACE.box.box == SPACE.box

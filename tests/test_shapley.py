@@ -21,6 +21,17 @@ def test_a_linear_force_of_correlated_inputs(rho):
     assert np.all((found.interval[0] <= found.effects) & (found.effects <= found.interval[1]))
 
 
+@pytest.mark.parametrize("rho", [-0.95, -0.9996])
+def test_parameters_without_effect_have_no_share_beside_a_ridge(rho):
+    """Two whose sum is what the force hangs on share it evenly, however narrow their ridge is."""
+    rng, narrow = np.random.default_rng(6), np.sqrt(0.5 * (1.0 + rho))
+    along, across = rng.normal(size=(2, 2000, 1)) * [[[np.sqrt(0.5 * (1.0 - rho))]], [[narrow]]]
+    theta = 0.5 + 0.05 * np.hstack([across + along, across - along, rng.normal(size=(2000, 3))])
+    force = np.tanh(10.0 * theta[:, :2].sum(axis=1, keepdims=True) - 9.0)
+    found = shapley(box(5, 0.0, 1.0), theta, force, ONE_BIN, rng, "a ridge")
+    np.testing.assert_allclose(found.effects, [0.5, 0.5, 0.0, 0.0, 0.0], atol=0.02)
+
+
 def test_independent_inputs_share_their_interactions_evenly():
     rng = np.random.default_rng(2)
     theta = rng.uniform(-np.pi, np.pi, (6000, 3))

@@ -18,6 +18,7 @@ from toy import EDGES_S, SPACE, toy_bin_means
 
 from bayeskin.design import default_space
 from bayeskin.errors import InputError
+from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.surrogates import (
     Effect,
     WithEffects,
@@ -28,7 +29,7 @@ from bayeskin.surrogates import (
     train,
     validate,
 )
-from bayeskin.surrogates.chaos import LatentChaos, fit_sparse, legendre_basis, multi_indices
+from bayeskin.surrogates.chaos import LatentChaos, fit_sparse
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.hyperparameters import LatentFit, _Data, _likelihood, fit_latent
 from bayeskin.surrogates.kernels import KERNELS, kernel, squared_distances, trend_basis, trend_degree

@@ -98,15 +98,16 @@ def assess(
 def autocorrelation_steps(chains: Array) -> Array:
     """Integrated autocorrelation time (E, D) [steps] of chains (E, n, W, D); NaN where nothing moves.
 
-    Walkers that never move have no autocorrelation and are left out; `_stuck` is what reports them.
+    Walkers that never move in a coordinate have no autocorrelation there and are left out; `_stuck` is what
+    reports those that move in none.
     """
     every = max(1, chains.shape[1] // _RESOLVED)
     times = np.full((len(chains), chains.shape[3]), np.nan)
     for e, chain in enumerate(chains[:, ::every]):
-        moving = np.any(chain != chain[0], axis=(0, 2))
-        if moving.any():
+        moving = np.any(chain != chain[0], axis=0)
+        for j in np.flatnonzero(moving.any(axis=0)):
             with np.errstate(invalid="ignore", divide="ignore"):
-                times[e] = every * emcee.autocorr.integrated_time(chain[:, moving], tol=0)
+                times[e, j] = every * emcee.autocorr.integrated_time(chain[:, moving[:, j], j], tol=0)[0]
     return np.maximum(times, 1.0)
 
 

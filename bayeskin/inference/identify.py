@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
+from scipy.stats import rankdata
 
 from bayeskin.types import Array, Parameter, ParameterSpace
 
@@ -22,9 +23,9 @@ _CELLS = 200
 
 @dataclass(frozen=True)
 class Learned:
-    """One parameter: 1 - posterior over prior variance and Kullback-Leibler gain [nats], both in sampling
-    coordinates (log for log-uniform); 5, 50 and 95 % quantiles in SI; all that in a statement, and in a
-    sentence without statistics."""
+    """One parameter: 1 - posterior over prior variance and Kullback-Leibler gain [nats], both in the
+    coordinate in which its prior is uniform; 5, 50 and 95 % quantiles in SI; all that in a statement, and in
+    a sentence without statistics."""
 
     name: str
     contraction: float
@@ -36,7 +37,7 @@ class Learned:
 
 @dataclass(frozen=True)
 class Ridge:
-    """Two parameters that the data ties together: their correlation in sampling coordinates."""
+    """Two parameters that the data ties together, be it along a curve: the correlation of their ranks."""
 
     first: str
     second: str
@@ -57,7 +58,7 @@ def identifiability(space: ParameterSpace, draws: ArrayLike) -> Identifiability:
     unit = space.to_unit(np.asarray(draws, dtype=float))
     learned = tuple(_learn(p, unit[:, j], space, j) for j, p in enumerate(space.parameters))
     with np.errstate(invalid="ignore"):
-        correlation: Array = np.nan_to_num(np.atleast_2d(np.corrcoef(unit, rowvar=False)))
+        correlation: Array = np.nan_to_num(np.atleast_2d(np.corrcoef(rankdata(unit, axis=0), rowvar=False)))
     pairs = [(i, j) for j in range(space.dim) for i in range(j) if abs(correlation[i, j]) > _RIDGE]
     pairs.sort(key=lambda pair: -abs(correlation[pair]))
     return Identifiability(learned, tuple(_ridge(space, i, j, float(correlation[i, j])) for i, j in pairs))
@@ -186,5 +187,5 @@ def _sentence(p: Parameter, contraction: float, gain: float, quantiles: tuple[fl
 def _ridge(space: ParameterSpace, i: int, j: int, correlation: float) -> Ridge:
     first, second = space.names[i], space.names[j]
     how = "they rise and fall together" if correlation > 0 else "one makes up for the other"
-    statement = f"{first} and {second} form a ridge (correlation {correlation:+.2f}): {how}"
+    statement = f"{first} and {second} form a ridge (rank correlation {correlation:+.2f}): {how}"
     return Ridge(first, second, correlation, statement)

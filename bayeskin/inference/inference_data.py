@@ -15,7 +15,7 @@ from bayeskin.errors import InputError
 from bayeskin.inference.bands import predictive_draws
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.sample import Posterior
-from bayeskin.types import Array, Parameter, ParameterSpace, Provenance
+from bayeskin.types import Array, Correlation, Parameter, ParameterSpace, Provenance
 
 if TYPE_CHECKING:
     import arviz
@@ -98,7 +98,8 @@ def draws_of(idata: arviz.InferenceData) -> tuple[ParameterSpace, Array]:
     stored = idata.attrs.get("parameters")
     if stored is None:
         raise InputError("InferenceData", "no attribute 'parameters'", "one made by bayeskin")
-    space = ParameterSpace(tuple(Parameter(**entry) for entry in json.loads(stored)))
+    tied = tuple(Correlation(*entry) for entry in json.loads(idata.attrs.get("correlations", "[]")))
+    space = ParameterSpace(tuple(Parameter(**entry) for entry in json.loads(stored)), tied)
     return space, np.stack([idata["posterior"][name].values.ravel() for name in space.names], axis=-1)
 
 
@@ -149,6 +150,7 @@ def _attributes(posterior: Posterior, provenance: Provenance) -> dict[str, Any]:
         "seed": posterior.seed,
         "provenance": json.dumps(dict(provenance.extra), sort_keys=True, default=str),
         "parameters": json.dumps([dataclasses.asdict(p) for p in posterior.space.parameters]),
+        "correlations": json.dumps(posterior.space.correlations),
         "trusted": int(c.verdict.trusted),
         "verdict": json.dumps(c.verdict.reasons),
         "steps": c.steps,

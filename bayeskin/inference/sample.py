@@ -79,7 +79,7 @@ def sample(
     """
     settings = settings or SampleSettings()
     _check(settings, log_posterior.dim)
-    files = [Path(folder) / f"ensemble_{e}.h5" for e in range(settings.ensembles)]
+    files = _files(folder, settings.ensembles)
     identity = {**log_posterior.identity, "seed": str(seed), "walkers": str(settings.walkers)}
     backends = [store.load(f, log_posterior.names, identity) if f.exists() else None for f in files]
     runs = _ensembles(log_posterior, log_posterior.vector(start), seed, settings.walkers, backends)
@@ -104,14 +104,17 @@ def sample(
             return _posterior(log_posterior, chains, log_prob, convergence, seed)
 
 
-def load_chains(folder: Path | str, log_posterior: LogPosterior) -> Array:
-    """Whole chains (E, n, W, D) in SI that `sample` left in `folder`, to their common length."""
-    files = sorted(Path(folder).glob("ensemble_*.h5"), key=lambda f: int(f.stem.split("_")[1]))
-    if not files:
-        raise InputError(folder, "no chains", "files ensemble_0.h5, ...")
+def load_chains(folder: Path | str, log_posterior: LogPosterior, ensembles: int) -> Array:
+    """Whole chains (E, n, W, D) in SI of the first ensembles that `sample` left in `folder`, to their common
+    length. Raises InputError where one is not there or is another posterior's."""
+    files = _files(folder, ensembles)
     parts = [store.load(f, log_posterior.names, log_posterior.identity).chain for f in files]
     steps = min(len(p) for p in parts)
     return log_posterior.from_sampling(np.stack([p[:steps] for p in parts]))
+
+
+def _files(folder: Path | str, ensembles: int) -> list[Path]:
+    return [Path(folder) / f"ensemble_{e}.h5" for e in range(ensembles)]
 
 
 def evenly(draws: Array, count: int) -> Array:

@@ -61,7 +61,7 @@ def _over_posterior(run: Run, rng: np.random.Generator) -> dict[str, Any]:
             f"What the posterior leaves open of the force, {1e3 * np.sqrt(found.variance_n2):.2g} mN sd over "
             f"time, is shared by {', '.join(shares)}."
         ),
-        "method": "Shapley effects by nearest neighbours",
+        "method": "Shapley effects by polynomial regression",
         "distribution": found.distribution,
         "samples": found.draws,
         "shares": {

@@ -177,8 +177,8 @@ def _draw_posterior(
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     fitted = np.isin(np.arange(len(binned.force_n)), log_posterior.chain.bins)
     convergence = posterior.convergence
-    whole = inference.load_chains(chains_folder(run, log_posterior), log_posterior)
-    kept = whole[: run.config.sample.ensembles, convergence.burn_in : convergence.steps]
+    folder, ensembles = chains_folder(run, log_posterior), run.config.sample.ensembles
+    kept = inference.load_chains(folder, log_posterior, ensembles)[:, convergence.burn_in : convergence.steps]
     figures = {
         "posterior": report.figure_posterior(posterior.space, posterior.flat, best),
         "fit": report.figure_fit(
