@@ -22,6 +22,7 @@ from bayeskin.errors import InputError
 from bayeskin.types import Correlation, Parameter, ParameterSpace
 
 Positive = Annotated[int, Field(gt=0)]
+FEWEST_CHECKED = 8  # draws: of fewer, weights say next to nothing
 NotNegative = Annotated[int, Field(ge=0)]
 
 
@@ -205,8 +206,14 @@ class SampleConfig(_Section):
 class CheckConfig(_Section):
     """Posterior draws that the full model runs again, and how often they may join the design."""
 
-    draws: Annotated[int, Field(ge=0)] = 24
-    rounds: Annotated[int, Field(ge=0)] = 2
+    draws: NotNegative = 24
+    rounds: NotNegative = 2
+
+    @model_validator(mode="after")
+    def _one_or_two_say_nothing(self) -> CheckConfig:
+        if 0 < self.draws < FEWEST_CHECKED:
+            raise ValueError(f"draws: found {self.draws}; expected 0 for none, or at least {FEWEST_CHECKED}")
+        return self
 
 
 class MapConfig(_Section):

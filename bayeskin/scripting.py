@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bayeskin import inference, storage
-from bayeskin.config import config_of, parameter_space, to_toml
+from bayeskin.config import FEWEST_CHECKED, config_of, parameter_space, to_toml
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior, Weighed
 from bayeskin.model import simulate as run_model
@@ -102,7 +102,12 @@ def calibrate(
 
 
 def check(recording: Recording, posterior: arviz.InferenceData, draws: int = 24) -> Weighed:
-    """Runs the full model at evenly taken draws of a posterior of `calibrate`, and weighs them by it."""
+    """Runs the full model at evenly taken draws of a posterior of `calibrate`, and weighs them by it.
+
+    Raises InputError for fewer than 8 draws, of which weights say next to nothing.
+    """
+    if draws < FEWEST_CHECKED:
+        raise InputError("draws", draws, f"at least {FEWEST_CHECKED}")
     settings = _settings_of(recording, posterior)
     with _opened(recording, settings) as run:
         work = _workpiece(run, recording)

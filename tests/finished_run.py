@@ -96,8 +96,9 @@ def summaries() -> dict[str, dict[str, Any]]:
                  "sd_of_log_ratio": 0.4, "trusted": True, "message": "full model at 24 posterior draws"},
             ],
             "corrected": {
-                name: {"mean": mean, "sd": 1.0, "shift_sd": 0.11, "shift_error_sd": 0.08}
-                for name, mean in (("E_c", 51e3), ("p_init", 840.0), ("sd_rest", 0.0029))
+                name: {"median": median, "low_90": 0.5 * median, "high_90": 2.0 * median, "shift_sd": 0.11,
+                       "shift_error_sd": 0.08}
+                for name, median in (("E_c", 51e3), ("p_init", 840.0), ("sd_rest", 0.0029))
             },
             "rmse": _RMSE, "coverage_90": 0.9462, "coverage_90_fitted": 0.9512,
             "rms_sd_n": {"parameter": 0.0013, "surrogate": 0.0009, "noise": 0.0042},

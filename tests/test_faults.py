@@ -25,7 +25,8 @@ from own_models import PARAMETERS, SPRING, TRUE, spring
 from toy import MOTION
 
 from bayeskin import storage
-from bayeskin.pipeline.folder import read_record
+from bayeskin.errors import InputError
+from bayeskin.pipeline.folder import read_lines, read_record
 from bayeskin.runner import load_design
 from bayeskin.types import Recording
 
@@ -132,17 +133,56 @@ def test_a_read_only_folder_is_told(case: Path) -> None:
         case.parent.chmod(0o755)
 
 
+def test_a_folder_that_is_not_the_runs_own_is_left_as_it_is(case: Path) -> None:
+    """A run is named after its configuration: somebody may keep recordings in a folder of that name."""
+    lab_book = case.parent / "case" / "recording" / "lab-book.txt"
+    lab_book.parent.mkdir(parents=True)
+    lab_book.write_text("measured on Monday")
+    refused(bayeskin("design", case), "case/recording: found other files, among them lab-book.txt")
+    assert lab_book.read_text() == "measured on Monday"
+
+
+def test_a_link_to_another_place_is_not_written_through(case: Path) -> None:
+    other = case.parent / "other"
+    other.mkdir()
+    (case.parent / "case").mkdir()
+    (case.parent / "case" / "recording").symlink_to(other, target_is_directory=True)
+    refused(bayeskin("design", case), "case/recording: found a link to another place")
+    assert not list(other.iterdir())
+
+
+@pytest.mark.parametrize(
+    "record", ["[]", '{"inputs_sha256": 1, "done": "yes", "seconds": []}',
+               '{"inputs_sha256": "", "done": true, "seconds": 1, "outputs": [], "summary": 3}'],
+)  # fmt: skip
+def test_a_record_of_other_contents_is_none(tmp_path: Path, record: str) -> None:
+    (tmp_path / "stage.json").write_text(record)
+    assert read_record(tmp_path) is None
+
+
+def test_a_torn_last_line_is_cut_off_and_another_one_is_told(tmp_path: Path) -> None:
+    file = tmp_path / "made.jsonl"
+    file.write_bytes('{"a": 1}\n{"b": "caf\u00e9'.encode()[:-1])
+    assert read_lines(file) == [{"a": 1}]
+    assert file.read_bytes() == b'{"a": 1}\n'
+    for line in (b"[1]\n", b"{nonsense\n", b"\xff\n"):
+        file.write_bytes(b'{"a": 1}\n' + line)
+        with pytest.raises(InputError, match="line 2: found no JSON mapping"):
+            read_lines(file)
+
+
 def test_a_second_run_on_a_folder_is_refused_and_the_first_goes_on(case: Path) -> None:
-    (case.parent / "spring.py").write_text(
-        "import time\n" + SPRING.replace("    pull =", "    time.sleep(0.3)\n    pull =")
-    )
+    go = case.parent / "go"
+    waiting = f"    while not os.path.exists({str(go)!r}):\n        time.sleep(0.05)\n    pull ="
+    (case.parent / "spring.py").write_text("import os\nimport time\n" + SPRING.replace("    pull =", waiting))
     first = subprocess.Popen([sys.executable, "-c", MAIN, "design", str(case)], stderr=subprocess.DEVNULL)
-    while not list(case.parent.glob("case/runs/*.journal")):
+    while not list(case.parent.glob("case/runs/*")):
         assert first.poll() is None
         time.sleep(0.05)
     refused(
         bayeskin("train", case), f"in use by another bayeskin (process {first.pid}); expected one process"
     )
+    go.touch()
     assert first.wait() == 0
     assert len(load_design(case.parent / "case/design/design.h5").theta) == 30
 

@@ -538,8 +538,9 @@ def test_profiles_of_many_parameters_take_several_rows(draws: np.ndarray) -> Non
 def test_the_model_check_says_what_moves_most(draws: np.ndarray) -> None:
     weights = np.array([0.4, 0.3, 0.2, 0.1])
     found = Weighed(SPACE, draws[:4], np.log(weights), weights, 10 / 3, float("nan"), Verdict(True, ("",)))
-    moved = [Corrected(n, 1.0, 1.0, -0.8 if n == "k_s" else 0.1, 0.05) for n in SPACE.names]
-    figure = drawn(report.figure_model_check(SPACE, draws, found, moved))
+    quantiles = (0.5, 1.0, 2.0)
+    moved = [Corrected(n, quantiles, -0.8 if n == "k_s" else 0.1, 0.05, 1.0) for n in SPACE.names]
+    figure = drawn(report.figure_model_check(found, moved))
     assert "By 4 full runs 3 draws remain effective" in headline(figure)
     assert "k_" in headline(figure)
     assert "0.80 of its sd" in headline(figure)

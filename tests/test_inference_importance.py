@@ -5,10 +5,12 @@ import dataclasses
 import arviz as az
 import numpy as np
 import pytest
+from scipy.special import ndtri
 from toy_inference import LineSurrogate, line_problem
 
-from bayeskin.inference import LogPosterior, corrected, weigh
-from bayeskin.types import Array
+from bayeskin.inference import LogPosterior, Weighed, corrected, weigh
+from bayeskin.inference.convergence import Verdict
+from bayeskin.types import Array, Parameter, ParameterSpace
 
 NOISE = [0.05, 0.001, 1e6]
 
@@ -43,8 +45,9 @@ def test_weighed_draws_give_the_full_models_posterior() -> None:
     exact = mean - [0.0, slope]  # b takes the slope away
     for j, one in enumerate(corrected(found, theta)[:2]):
         sd = np.sqrt(covariance[j, j])
-        assert one.mean == pytest.approx(exact[j], abs=0.06 * sd)
-        assert one.sd == pytest.approx(sd, rel=0.06)
+        expected = exact[j] + sd * ndtri([0.05, 0.5, 0.95])
+        np.testing.assert_allclose(one.quantiles, expected, atol=0.12 * sd)
+        assert one.sd_ratio * theta[:, j].std() == pytest.approx(sd, rel=0.06)
     b = corrected(found, theta)[1]
     raw = theta[:, 1]
     assert b.shift_sd == pytest.approx((exact[1] - raw.mean()) / raw.std(), abs=4 * b.shift_error_sd)
@@ -57,11 +60,25 @@ def test_few_draws_move_the_mean_of_many_by_what_the_weights_say() -> None:
     mean = gaussian(problem, np.zeros((40, 40)))[0]
     few = [draws(problem, 24, seed=seed) for seed in range(1, 101)]
     moved = [corrected(weigh(problem, one, full_force(one)), many)[1] for one in few]
-    off = np.array([one.mean for one in moved]) - mean[1]
+    off = np.array([one.quantiles[1] for one in moved]) - mean[1]
     alone = np.array([one[:, 1].mean() for one in few]) - mean[1]
     assert np.sqrt(np.mean(off**2)) < 0.7 * np.sqrt(np.mean(alone**2))
     said = np.array([one.shift_error_sd for one in moved]) * many[:, 1].std()
     assert 0.6 < np.sqrt(np.mean((off / said) ** 2)) < 1.6
+
+
+def test_a_permeability_stays_one_when_the_weights_move_it_far() -> None:
+    """Over decades, a shift of the mean in SI would make it negative: it is the logarithm's that moves."""
+    rng = np.random.default_rng(1)
+    space = ParameterSpace((Parameter("k", "m^2", 1e-16, 1e-11, "log-uniform"),))
+    many = 1e-13 * np.exp(1.5 * rng.standard_normal((4000, 1)))
+    weights = np.where(np.arange(24) < 4, 0.24, 0.002)
+    few = np.sort(many[:24], axis=0)
+    found = Weighed(space, few, np.log(weights), weights, 4.0, float("nan"), Verdict(False, ("",)))
+    (one,) = corrected(found, many)
+    assert 1e-16 <= one.quantiles[0] < one.quantiles[1] < min(one.quantiles[2], np.median(many))
+    expected = np.median(np.log(many)) + weights @ np.log(few[:, 0]) - np.log(few[:, 0]).mean()
+    assert np.log(one.quantiles[1]) == pytest.approx(expected, abs=0.05)
 
 
 def test_few_draws_are_judged_by_their_effective_number() -> None:

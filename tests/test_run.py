@@ -41,7 +41,7 @@ walkers = 24
 max_steps = {steps}
 effective_samples = 100
 [check]
-draws = 6
+draws = 8
 [map]
 starts = 2
 evaluations = 1000

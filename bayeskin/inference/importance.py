@@ -44,14 +44,15 @@ class Weighed(_FreezesArrays):
 
 @dataclass(frozen=True)
 class Corrected:
-    """One parameter under the full model: mean and sd in SI; shift of the mean in sd of the surrogate's
-    posterior, and its standard error."""
+    """One parameter under the full model: 5, 50 and 95 % quantiles in SI. On its line (logarithms where the
+    prior is in them) the shift of the mean in sd of the surrogate's posterior, its standard error, and the sd
+    over that one."""
 
     name: str
-    mean: float
-    sd: float
+    quantiles: tuple[float, float, float]
     shift_sd: float
     shift_error_sd: float
+    sd_ratio: float
 
 
 def weigh(log_posterior: LogPosterior, theta: ArrayLike, force_n: ArrayLike) -> Weighed:
@@ -75,23 +76,23 @@ def weigh(log_posterior: LogPosterior, theta: ArrayLike, force_n: ArrayLike) -> 
 def corrected(weighed: Weighed, draws: ArrayLike) -> tuple[Corrected, ...]:
     """The full model's posterior beside the surrogate's, whose draws (n, D) in SI are many more.
 
-    The mean is that of all draws moved by what the weights move that of the weighed ones; the sd is scaled
-    likewise. So an error of sampling few draws cancels where the weights are nearly alike.
+    All draws are moved, on the line, by what the weights move the mean of the weighed ones, and stretched by
+    what they stretch their sd. So an error of sampling few draws cancels where the weights are nearly alike.
     """
-    draws, theta, w = np.asarray(draws, dtype=float), weighed.theta, weighed.weights
-    plain, moved = theta.mean(axis=0), w @ theta
-    shift = moved - plain
-    error = np.sqrt(((w - 1.0 / len(w)) ** 2) @ (theta - moved) ** 2)
-    tiny = np.finfo(float).tiny
-    wide = np.maximum(draws.std(axis=0), tiny)
-    scale = np.sqrt(w @ (theta - moved) ** 2 / np.maximum(theta.var(axis=0), tiny))
+    space, w, tiny = weighed.space, weighed.weights, np.finfo(float).tiny
+    line, few = space.to_line(draws), space.to_line(weighed.theta)
+    mean, moved = line.mean(axis=0), w @ few
+    shift = moved - few.mean(axis=0)
+    error = np.sqrt(((w - 1.0 / len(w)) ** 2) @ (few - moved) ** 2)
+    wide = np.maximum(line.std(axis=0), tiny)
+    ratio = np.sqrt(w @ (few - moved) ** 2 / np.maximum(few.var(axis=0), tiny))
+    quantiles = np.quantile(mean + shift + ratio * (line - mean), [0.05, 0.5, 0.95], axis=0)
+    inside = np.clip(space.from_line(quantiles), space.lower, space.upper)
+    columns = zip(space.names, inside.T, shift / wide, error / wide, ratio, strict=True)
     return tuple(
-        Corrected(name, *(float(v) for v in values))
-        for name, *values in zip(
-            weighed.space.names, draws.mean(axis=0) + shift, wide * scale, shift / wide, error / wide,
-            strict=True,
-        )
-    )  # fmt: skip
+        Corrected(name, (float(low), float(middle), float(high)), float(by), float(unsure), float(times))
+        for name, (low, middle, high), by, unsure, times in columns
+    )
 
 
 def _weights(log_ratio: Array) -> tuple[Array, float]:

@@ -87,13 +87,15 @@ def said_of(weighed: Weighed) -> dict[str, Any]:
 
 
 def corrected_table(checked: Checked) -> dict[str, dict[str, Any]] | None:
-    """By parameter the full model's mean and sd by the last weights, and how far the mean moved."""
+    """By parameter the full model's quantiles by the last weights, and how far the mean moved."""
     if not checked.rounds or checked.rounds[-1].effective <= 1.0:
         return None
     found = inference.corrected(checked.rounds[-1], checked.posterior.flat)
-    return {
-        one.name: {
-            "mean": one.mean, "sd": one.sd, "shift_sd": one.shift_sd, "shift_error_sd": one.shift_error_sd,
-        }
-        for one in found
-    }  # fmt: skip
+    table = {}
+    for one in found:
+        low, median, high = one.quantiles
+        table[one.name] = {
+            "median": median, "low_90": low, "high_90": high,
+            "shift_sd": one.shift_sd, "shift_error_sd": one.shift_error_sd,
+        }  # fmt: skip
+    return table

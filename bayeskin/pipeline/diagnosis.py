@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 import bayeskin
 from bayeskin import inference
+from bayeskin.errors import InputError
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.mismatch.fit import Fit, restored, stored
 from bayeskin.mismatch.full_fit import FullFit
@@ -184,8 +185,12 @@ def _searched(
 
 def _made_in(bench: Workbench, build: Build) -> list[Made]:
     """What a search has made so far, in order."""
-    rows = read_lines(_search_file(bench, build))
-    return [Made(restored(said, build(said["names"])), said["counts"]) for said in rows]
+    file = _search_file(bench, build)
+    rows = read_lines(file)
+    try:
+        return [Made(restored(said, build(said["names"])), said["counts"]) for said in rows]
+    except (KeyError, TypeError):
+        raise InputError(file, "no fits of a search", "those that `diagnose` wrote, or no file") from None
 
 
 def _end_of_second_hold(binned: BinnedForce) -> float | None:

@@ -44,20 +44,36 @@ class Record:
 def read_record(stage_folder: Path) -> Record | None:
     """The stage's record; None when there is none, or none that can be read."""
     try:
-        return Record(**json.loads((stage_folder / RECORD).read_text()))
+        found = Record(**json.loads((stage_folder / RECORD).read_text()))
     except (OSError, ValueError, TypeError):
         return None
+    plain_ones = isinstance(found.inputs_sha256, str) and isinstance(found.done, bool)
+    mappings = all(isinstance(one, dict) for one in (found.outputs, found.summary, found.provenance))
+    return found if plain_ones and mappings and isinstance(found.seconds, int | float) else None
 
 
 def read_lines(file: Path) -> list[dict[str, Any]]:
-    """JSON lines of a file, [] without one; a torn last line is cut off, so that more can follow."""
+    """JSON lines of a file, [] without one; a torn last line is cut off, so that more can follow.
+
+    Raises InputError for a line that is no mapping in JSON.
+    """
     if not file.is_file():
         return []
-    text = file.read_text(encoding="utf-8")
-    whole = text[: text.rfind("\n") + 1]
-    if whole != text:
-        file.write_text(whole, encoding="utf-8")
-    return [json.loads(line) for line in whole.splitlines()]
+    contents = file.read_bytes()
+    end = contents.rfind(b"\n") + 1
+    if end != len(contents):
+        os.truncate(file, end)
+    rows = []
+    for number, line in enumerate(contents[:end].splitlines(), start=1):
+        try:
+            rows.append(json.loads(line))
+        except ValueError:
+            rows.append(None)
+        if not isinstance(rows[-1], dict):
+            raise InputError(
+                f"{file}, line {number}", "no JSON mapping", "one; without the file all begins anew"
+            )
+    return rows
 
 
 def write_record(stage_folder: Path, record: Record) -> None:
@@ -86,8 +102,10 @@ def output_hashes(stage_folder: Path) -> dict[str, str]:
 def begin(stage_folder: Path, inputs_sha256: str) -> float:
     """Readies a stage's folder; returns the seconds that an interrupted attempt already spent.
 
-    What an attempt on other inputs left is removed: nothing of it may be mistaken for this one's.
+    What an attempt on other inputs left is removed: nothing of it may be mistaken for this one's. Raises
+    InputError for a folder that is no stage's: what others have put there stays.
     """
+    _refuse_foreign(stage_folder)
     record = read_record(stage_folder)
     if record is None or record.inputs_sha256 != inputs_sha256:
         shutil.rmtree(stage_folder, ignore_errors=True)
@@ -96,6 +114,17 @@ def begin(stage_folder: Path, inputs_sha256: str) -> float:
     seconds = 0.0 if record is None or record.done else record.seconds
     write_record(stage_folder, Record(inputs_sha256, done=False, seconds=seconds))
     return seconds
+
+
+def _refuse_foreign(stage_folder: Path) -> None:
+    """A stage's folder has a record, or nothing yet but what an attempt that was killed has left hidden."""
+    if stage_folder.is_symlink():
+        raise InputError(stage_folder, "a link to another place", "a folder of the run's own")
+    if stage_folder.is_dir() and not (stage_folder / RECORD).is_file():
+        others = sorted(p.name for p in stage_folder.iterdir() if not p.name.startswith("."))
+        if others:
+            expected = "a folder that a run may fill and empty: move it, or give the run another name"
+            raise InputError(stage_folder, f"other files, among them {others[0]}", expected)
 
 
 @contextlib.contextmanager

@@ -198,7 +198,7 @@ def _draw_posterior(
     if checked.rounds:
         weighed = checked.rounds[-1]
         moved = inference.corrected(weighed, posterior.flat)
-        figures["model_check"] = report.figure_model_check(posterior.space, posterior.flat, weighed, moved)
+        figures["model_check"] = report.figure_model_check(weighed, moved)
     for name, figure in figures.items():
         report.save_figure(figure, run.at("sample", name), caption(run))
 

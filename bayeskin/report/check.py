@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike
 
 from bayeskin.inference import Corrected, Weighed
 from bayeskin.report.style import (
@@ -20,14 +19,11 @@ from bayeskin.report.style import (
     styled,
     symbol,
 )
-from bayeskin.types import ParameterSpace
 
 
 @styled
-def figure_model_check(
-    space: ParameterSpace, draws: ArrayLike, weighed: Weighed, corrected: Sequence[Corrected]
-) -> Figure:
-    """Weights of the draws run again, and each parameter's posterior (draws (n, D) in SI) by them."""
+def figure_model_check(weighed: Weighed, corrected: Sequence[Corrected]) -> Figure:
+    """Weights of the draws run again, and each parameter's posterior by them."""
     figure = new_figure(PAGE_IN, 2.9)
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.7))
     count = len(weighed.weights)
@@ -40,8 +36,7 @@ def figure_model_check(
     left.set(xlabel="draw, heaviest first", ylabel="weight")
     panel_title(left, "a", "weights by the full model")
     place = np.arange(len(corrected))
-    spread = np.asarray(draws, dtype=float).std(axis=0)
-    ratio = [one.sd / max(sd, np.finfo(float).tiny) for one, sd in zip(corrected, spread, strict=True)]
+    ratio = [one.sd_ratio for one in corrected]
     shift = [one.shift_sd for one in corrected]
     right.errorbar(place - 0.12, np.zeros(len(place)), yerr=1.0, fmt="o", color=MODEL, label="surrogate")
     right.errorbar(place + 0.12, shift, yerr=ratio, fmt="o", color=ACCENT, label="full model")
@@ -60,7 +55,7 @@ def figure_model_check(
     )
     caption = (
         "Thin bars: sd of the posterior; thick: standard error of the full model's mean, from so few draws. "
-        "Each in units of the sd of the surrogate's posterior, about its mean."
+        "Each in units of the sd of the surrogate's posterior, in logarithms where the prior is."
     )
     state_finding(figure, finding, caption)
     return figure

@@ -7,7 +7,7 @@ from typing import Any
 
 from bayeskin.report.page.facts import RunFacts, StageFacts
 from bayeskin.report.page.figures import pictures
-from bayeskin.report.page.numbers import number, percent, quantity
+from bayeskin.report.page.numbers import interval, number, percent, quantity
 from bayeskin.report.page.parts import Block, Cell, Facts, Folded, Heading, Section, Source, Table, Text, row
 from bayeskin.report.page.sections import absent, cell
 
@@ -81,17 +81,24 @@ def _at_draws(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
             row(
                 (
                     name,
-                    cell(said["parameters"][name]["mean"], said["parameters"][name]["unit"]),
-                    cell(one["mean"], said["parameters"][name]["unit"]),
-                    cell(one["sd"], said["parameters"][name]["unit"]),
+                    *_median(said["parameters"][name], said["parameters"][name]["unit"]),
+                    *_median(one, said["parameters"][name]["unit"]),
                     Cell(f"{number(one['shift_sd'])} ± {number(one['shift_error_sd'])}", one["shift_sd"]),
                 )
             )
             for name, one in said["corrected"].items()
         ]
-        head = ("parameter", "mean, surrogate", "mean, full model", "sd, full model", "shift in sd")
+        head = (
+            "parameter", "median, surrogate", "90 % interval", "median, full model", "90 % interval",
+            "shift in sd",
+        )  # fmt: skip
         blocks.append(Table("The posterior by the full model's weights", head, rows, symbols=True))
     return [*blocks, *pictures(facts, "sample", ["model_check"])]
+
+
+def _median(one: Mapping[str, Any], unit: str) -> tuple[Cell, Cell]:
+    low, high = one["low_90"], one["high_90"]
+    return cell(one["median"], unit), Cell(interval(low, high, unit), low)
 
 
 def _held_out(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
