@@ -83,6 +83,15 @@ def summaries() -> dict[str, dict[str, Any]]:
                 "sd_rest: the data informs it weakly: median 0.0028, 90 % interval 0.0019 to 0.0045 N",
             ],
             "ridges": ["E_c and E_s form a ridge (correlation -0.87): one makes up for the other"],
+            "residuals": {
+                "passes": True,
+                "sentence": "what the fit leaves looks like the assumed noise: in its law and all else",
+                "p_law": 0.43, "p_correlation": 0.3, "autocorrelation": [0.1, -0.05],
+                "by_kind": {
+                    "rest": {"bins": 40, "sd": 0.97, "p_sd": 0.8, "correlation": 0.06, "p_correlation": 0.7},
+                    "load": {"bins": 4, "sd": None, "p_sd": None, "correlation": None, "p_correlation": None},
+                },
+            },
             "learned": {
                 name: {"contraction": 0.6, "gain_nats": 0.9, "sentence": f"This test taught of {name}."}
                 for name in ("E_c", "p_init", "sd_rest")

@@ -7,12 +7,18 @@ import sys
 from functools import partial
 from pathlib import Path
 
+import arviz as az
 import numpy as np
 import pytest
+import toy_inference
+from scipy.integrate import cumulative_trapezoid
 from scipy.stats import multivariate_normal
 
+from bayeskin.inference import NoisePriors
 from bayeskin.model import ModelSpec
 from bayeskin.model.problem import build_problem
+from bayeskin.recordings import read_recording
+from bayeskin.shipped import shipped
 from bayeskin.types import Simulation
 
 
@@ -150,3 +156,57 @@ def test_a_recording_of_the_full_model_is_near_the_surrogate_s(benchmark, monkey
 def test_the_page_of_mechanisms_has_the_catalogue_as_it_is(benchmark):
     page = Path(__file__).parents[1] / "docs" / "mechanisms.md"
     assert benchmark("catalogue_table").table() in page.read_text()
+
+
+def some_draws(problem, count=200):
+    """Around the truth of the toy, in SI."""
+    rng = np.random.default_rng(3)
+    centre = problem.vector({**toy_inference.TRUTH, **toy_inference.NOISE})
+    low, high = problem.bounds
+    return problem.from_sampling(np.clip(centre + 0.02 * rng.standard_normal((count, len(low))), low, high))
+
+
+def test_phases_are_scored_as_arviz_scores_them(benchmark):
+    noise, problem = benchmark("noise_models"), toy_inference.toy_problem()
+    theta = some_draws(problem)
+    phases, pareto_k = noise.predicted(problem, theta, problem.binned.force_n)
+    idata = az.from_dict(
+        posterior={"x": theta[None, :, 0]}, log_likelihood={"y": problem.block_log_likelihood(theta)[None]}
+    )
+    exact = az.loo(idata, pointwise=True, reff=1.0)
+    assert phases == pytest.approx(exact.loo_i.values, abs=1e-6)
+    assert pareto_k == pytest.approx(exact.pareto_k.values, abs=1e-6)
+
+
+def test_only_the_phase_left_out_is_scored_on_the_other_force(benchmark):
+    noise, problem = benchmark("noise_models"), toy_inference.toy_problem()
+    theta, force = some_draws(problem), np.array(problem.binned.force_n)
+    own, _ = noise.predicted(problem, theta, force)
+    force[problem.binned.phase == problem.blocks[2]] += 0.05
+    other, _ = noise.predicted(problem, theta, force)
+    assert other[2] < own[2] - 10.0
+    assert np.delete(other, 2) == pytest.approx(np.delete(own, 2), abs=1e-6)
+
+
+def test_each_model_of_the_noise_lacks_one_part(benchmark):
+    noise = benchmark("noise_models")
+    found = noise.models(shipped("data/demo.h5"), shipped("surrogates/demo.h5"))
+    reference = found[noise.SHIPPED]
+    assert reference.noise_priors == NoisePriors()
+    assert found["Gaussian"].space.lower[-1] >= 1e5
+    assert found["white"].noise_priors.tau_s[1] < 0.01 * np.diff(reference.binned.edges_s).min()
+    one_sd = found["one sd for all phases"]
+    assert [name for name in one_sd.names if name.startswith("sd_")] == ["sd_hold"]
+    assert len(one_sd.blocks) == len(reference.blocks)
+    spiked = found["spikes left in the bins"].binned
+    recording = read_recording(shipped("data/demo.h5"))
+    integral = cumulative_trapezoid(recording.force_n, recording.time_s, initial=0)
+    plain = np.interp(spiked.edges_s, recording.time_s, integral)
+    assert np.diff(plain) / np.diff(spiked.edges_s) == pytest.approx(spiked.force_n, abs=1e-4)
+    assert np.abs(spiked.force_n - reference.binned.force_n).max() > 1e-3
+
+
+def test_differences_of_scores_have_the_error_of_their_sum(benchmark):
+    noise, rng = benchmark("noise_models"), np.random.default_rng(0)
+    phases = rng.normal(-3.0, 2.0, 400)
+    assert noise.difference(phases, np.zeros(400)) == f"{phases.sum():+.1f} ± {20 * phases.std(ddof=1):.1f}"

@@ -15,7 +15,7 @@ from toy import EDGES_S, MOTION, SPACE, toy_bin_means, toy_force
 
 from bayeskin import report
 from bayeskin.errors import InputError
-from bayeskin.inference import Corrected, Profile, Weighed
+from bayeskin.inference import Corrected, Profile, ResidualCheck, Weighed
 from bayeskin.inference.convergence import Limits, Verdict
 from bayeskin.report import posterior, style, timeline, traces, triangle, validation
 from bayeskin.types import BinnedForce, Design, Parameter, ParameterSpace, Phase, Prediction, Recording
@@ -544,6 +544,26 @@ def test_the_model_check_says_what_moves_most(draws: np.ndarray) -> None:
     assert "By 4 full runs 3 draws remain effective" in headline(figure)
     assert "k_" in headline(figure)
     assert "0.80 of its sd" in headline(figure)
+
+
+def left(scores: np.ndarray, p_correlation: float) -> ResidualCheck:
+    return ResidualCheck(scores, np.linspace(0.3, -0.1, 10), 0.5, p_correlation, ())
+
+
+def test_what_is_left_is_drawn_against_the_assumed_noise() -> None:
+    scores = np.random.default_rng(5).normal(size=200)
+    figure = drawn(report.figure_residuals(left(scores, 0.2)))
+    assert headline(figure) == "What the fit leaves looks like the assumed noise"
+    points = figure.axes[0].lines[-1]
+    assert np.array_equal(points.get_ydata(), np.sort(scores))
+    assert np.all(np.diff(points.get_xdata()) > 0)
+    assert figure.axes[1].patches[0].get_y() == pytest.approx(-1.96 / np.sqrt(200), rel=1e-3)
+    outside = [line.get_ydata() for line in figure.axes[1].lines if line.get_color() == style.ACCENT]
+    assert np.concatenate(outside) == pytest.approx(np.linspace(0.3, -0.1, 10)[:4])
+    figure = drawn(report.figure_residuals(left(scores, 1e-9)))
+    assert headline(figure) == "What the fit leaves is not the assumed noise"
+    assert "correlated otherwise" in figure.get_supxlabel().replace("\n", " ")
+    assert drawn(report.figure_residuals(ResidualCheck(scores[:1], np.empty(0), 0.5, np.nan, ())))
 
 
 def test_prior_predictive_places_the_recorded_peak(binned: BinnedForce) -> None:

@@ -129,6 +129,13 @@ def test_the_answer_comes_first_and_says_what_how_sure_and_what_is_missing(whole
     assert text.index("What is missing?") < text.index("Phases of the recording")
 
 
+def test_what_the_fit_leaves_stands_among_the_checks(whole: str) -> None:
+    text = Walk(whole).text()
+    said = "What the fit leaves looks like the assumed noise: in its law and all else."
+    assert text.index("Sampling: trusted") < text.index(said) < text.index("The surrogate on runs held out")
+    assert "rest400.970.80.060.7load4––––" in text.replace(" ", "")
+
+
 def diagnosed_as(changed: dict[str, object]) -> str:
     """The page's text where the diagnosis said otherwise."""
     stages = facts().stages

@@ -113,6 +113,15 @@ def test_the_summary_answers_what_a_reader_asks(folder: Path) -> None:
         assert len(table["pairs"]) == 10
 
 
+def test_what_the_fit_leaves_is_tested_and_said(folder: Path) -> None:
+    said = json.loads((folder / "case" / "sample" / "stage.json").read_text())["summary"]
+    found = said["residuals"]
+    assert sum(one["bins"] for one in found["by_kind"].values()) == 75  # those fitted
+    assert found["passes"] == (found["sentence"] not in said["remarks"])
+    assert found["sentence"] in unescape((folder / "case" / "report.html").read_text()).replace("W", "w")
+    assert len(found["autocorrelation"]) == 10
+
+
 def test_the_design_holds_each_wave_with_its_labels(folder: Path) -> None:
     stored = load_design(folder / "case" / "design" / "design.h5")
     training, testing = stored.training, stored.testing
@@ -128,7 +137,7 @@ def test_each_stage_draws_its_figures_and_says_where_they_come_from(folder: Path
         "design": ["waves"],
         "train": ["validation", "prior_predictive"],
         "map": ["map_check"],
-        "sample": ["posterior", "fit", "traces", "profiles", "model_check"],
+        "sample": ["posterior", "fit", "traces", "profiles", "residuals", "model_check"],
         "sobol": ["sobol_prior_gp", "sobol_prior_chaos", "sobol_near_map"],
     }
     for stage, names in expected.items():
@@ -139,7 +148,7 @@ def test_each_stage_draws_its_figures_and_says_where_they_come_from(folder: Path
 def test_the_page_shows_the_whole_run(folder: Path) -> None:
     shown = (folder / "case" / "report.html").read_text()
     drawn = [path.stem for path in (folder / "case").rglob("*.svg")]
-    assert len(drawn) == 13
+    assert len(drawn) == 14
     for name in drawn:
         assert f'-{name}"'.replace("_", "-") in shown, name
     for parameter in SPACE.parameters:

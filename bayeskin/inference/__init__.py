@@ -25,6 +25,7 @@ from bayeskin.inference.optimise import MapResult, StartResult, find_map
 from bayeskin.inference.polish import Polished, polish_map
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.profile import Profile, profiles
+from bayeskin.inference.residuals import KindCheck, ResidualCheck, check_residuals
 from bayeskin.inference.sample import Posterior, SampleSettings, evenly, load_chains, sample
 
 __all__ = [
@@ -33,6 +34,7 @@ __all__ = [
     "Corrected",
     "ForceDraws",
     "Identifiability",
+    "KindCheck",
     "Learned",
     "Limits",
     "LogPosterior",
@@ -43,6 +45,7 @@ __all__ = [
     "Posterior",
     "Profile",
     "RefinedMap",
+    "ResidualCheck",
     "Ridge",
     "Rmse",
     "SampleSettings",
@@ -52,6 +55,7 @@ __all__ = [
     "bands",
     "bands_of",
     "check_map",
+    "check_residuals",
     "corrected",
     "coverage",
     "draws_of",

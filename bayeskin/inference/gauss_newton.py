@@ -261,13 +261,7 @@ class _Linear:
     def curvature(self) -> tuple[Array, Array, Array]:
         """Information (D, D) and gradient (D,) over the unit cube; the surrogate's error (r,)."""
         residual, slopes, factor = self.columns()
-        latent: Array = np.zeros(factor.shape[1])
-        for _ in range(REWEIGHTED):
-            pull = (self.nu + 1.0) / (self.nu + (residual - factor @ latent) ** 2)
-            weighted = (factor * pull[:, None]).T
-            stiffness, rest = _spring(latent)
-            curved = weighted @ factor + np.diag(stiffness)
-            latent = np.asarray(np.linalg.solve(curved, weighted @ residual + rest), dtype=float)
+        latent = surrogate_error(residual, factor, self.nu)
         weight = (self.nu + 1.0) / (self.nu + 3.0)
         inside = weight * factor.T @ factor + np.diag(_spring(latent)[0])
         cross = weight * factor.T @ slopes
@@ -280,6 +274,21 @@ class _Linear:
         pull, bend = self.prior(self.x)
         information[: self.inner, : self.inner] = material + bend
         return information, np.concatenate([steep + pull, noise_gradient]), latent
+
+
+def surrogate_error(residual: Array, factor: Array, nu: float) -> Array:
+    """The most probable error of the surrogate (r,), in sd of each column of its factor.
+
+    residual (k,) and factor (k, r) whitened to innovations, of t noise with `nu` degrees of freedom.
+    """
+    latent: Array = np.zeros(factor.shape[1])
+    for _ in range(REWEIGHTED):
+        weight = (nu + 1.0) / (nu + (residual - factor @ latent) ** 2)
+        weighted = (factor * weight[:, None]).T
+        stiffness, rest = _spring(latent)
+        curved = weighted @ factor + np.diag(stiffness)
+        latent = np.asarray(np.linalg.solve(curved, weighted @ residual + rest), dtype=float)
+    return latent
 
 
 def _spring(latent: Array) -> tuple[Array, Array]:

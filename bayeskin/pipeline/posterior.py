@@ -37,10 +37,36 @@ def _sample(run: Run) -> Mapping[str, Any]:
     inference.save_inference_data(run.at("sample", "posterior.nc"), idata)
     drawn = inference.predictive_draws(log_posterior, inference.evenly(posterior.flat, PREDICTIVE_DRAWS), rng)
     profiles = inference.profiles(log_posterior, best)
-    _draw_posterior(run, checked, best, drawn, profiles)
+    residuals = _residuals(checked)
+    _draw_posterior(run, checked, best, drawn, profiles, residuals)
     bands = inference.bands_of(log_posterior.binned.time_s, drawn)
     write_json(run.at("sample", "bands.json"), _history(log_posterior, bands))
-    return {**_sampled(checked, bands), "profiles": {one.name: _profiled(one) for one in profiles}}
+    return {**_sampled(checked, bands, residuals), "profiles": {one.name: _profiled(one) for one in profiles}}
+
+
+def _residuals(checked: Checked) -> inference.ResidualCheck:
+    """What the most probable of the draws leaves."""
+    log_posterior, posterior = checked.log_posterior, checked.posterior
+    best = posterior.flat[int(np.argmax(posterior.log_prob))]
+    return inference.check_residuals(log_posterior, log_posterior.to_sampling(best))
+
+
+def _left(residuals: inference.ResidualCheck) -> dict[str, Any]:
+    """A check of residuals in a summary."""
+    return {
+        "passes": residuals.passes,
+        "sentence": residuals.sentence,
+        "p_law": residuals.p_law,
+        "p_correlation": residuals.p_correlation,
+        "autocorrelation": residuals.autocorrelation,
+        "by_kind": {
+            one.kind: {
+                "bins": one.bins, "sd": one.sd, "p_sd": one.p_sd,
+                "correlation": one.correlation, "p_correlation": one.p_correlation,
+            }
+            for one in residuals.kinds
+        },
+    }  # fmt: skip
 
 
 def _profiled(profile: inference.Profile) -> dict[str, Any]:
@@ -100,7 +126,7 @@ def _tell_sampling(run: Run, share: float, text: str) -> None:
     run.reporter.progress("sampling", share, text)
 
 
-def _sampled(checked: Checked, bands: inference.Bands) -> dict[str, Any]:
+def _sampled(checked: Checked, bands: inference.Bands, residuals: inference.ResidualCheck) -> dict[str, Any]:
     log_posterior, posterior, c = checked.log_posterior, checked.posterior, checked.posterior.convergence
     low, high = bands.interval(0.9)
     learned = inference.identifiability(posterior.space, posterior.flat)
@@ -109,7 +135,8 @@ def _sampled(checked: Checked, bands: inference.Bands) -> dict[str, Any]:
         "ok": verdict.trusted,
         "verdict": "trusted" if verdict.trusted else "not trusted",
         "reasons": list(verdict.reasons),
-        "remarks": list(inference.noise_remarks(learned)),
+        "remarks": [*inference.noise_remarks(learned), *([] if residuals.passes else [residuals.sentence])],
+        "residuals": _left(residuals),
         "steps": c.steps,
         "draws": len(posterior.flat),
         "parameters": _table(posterior),
@@ -171,6 +198,7 @@ def _draw_posterior(
     best: Mapping[str, float],
     drawn: inference.ForceDraws,
     profiles: Sequence[inference.Profile],
+    residuals: inference.ResidualCheck,
 ) -> None:
     log_posterior, posterior = checked.log_posterior, checked.posterior
     binned = log_posterior.binned
@@ -191,6 +219,7 @@ def _draw_posterior(
             force_n=drawn.force_n,
         ),
         "profiles": report.figure_profiles(posterior.space, posterior.flat, profiles),
+        "residuals": report.figure_residuals(residuals),
         "traces": report.figure_traces(
             posterior.space, kept, convergence.verdict, settings_of(run.config).limits
         ),

@@ -16,6 +16,7 @@ from bayeskin.report.prior import figure_prior_predictive
 from bayeskin.report.profiles import figure_profiles
 from bayeskin.report.proof import figure_proof
 from bayeskin.report.recording import figure_recording
+from bayeskin.report.residuals import figure_residuals
 from bayeskin.report.save import save_figure
 from bayeskin.report.sobol import figure_sobol
 from bayeskin.report.traces import figure_traces
@@ -40,6 +41,7 @@ __all__ = [
     "figure_proof",
     "figure_recording",
     "figure_residual_by_phase",
+    "figure_residuals",
     "figure_sobol",
     "figure_traces",
     "figure_validation",

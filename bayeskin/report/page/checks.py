@@ -16,6 +16,7 @@ def checks(facts: RunFacts) -> Section:
     """Convergence, the full model at the most probable point, held-out runs, the design."""
     parts = (
         ("Sampling", _convergence(facts, facts.said("sample"))),
+        ("What the fit leaves", _left(facts, facts.said("sample"))),
         ("The full model where the posterior is highest", _full_model(facts, facts.said("map"))),
         ("The full model at draws of the posterior", _at_draws(facts, facts.said("sample"))),
         ("The surrogate on runs held out", _held_out(facts, facts.said("train"))),
@@ -41,6 +42,31 @@ def _convergence(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
         Text(said["reasons"], listed=True),
         Folded("Convergence of each parameter", [Table("Convergence", head, rows, symbols=True)]),
         *pictures(facts, "sample", ["traces"]),
+    ]
+
+
+def _left(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
+    if not said:
+        return absent(facts, "sample")
+    found = said["residuals"]
+    rows = [
+        row(
+            (
+                kind,
+                Cell(str(one["bins"]), one["bins"]),
+                Cell(number(one["sd"]), one["sd"]),
+                Cell(number(one["p_sd"]), one["p_sd"]),
+                Cell(number(one["correlation"]), one["correlation"]),
+                Cell(number(one["p_correlation"]), one["p_correlation"]),
+            )
+        )
+        for kind, one in found["by_kind"].items()
+    ]
+    head = ("phase", "bins", "sd, 1 as assumed", "p", "correlation of neighbours, 0 as assumed", "p")
+    return [
+        Text([f"{found['sentence'][0].upper()}{found['sentence'][1:]}."]),
+        Folded("By kind of phase", [Table("What the fit leaves, by kind of phase", head, rows)]),
+        *pictures(facts, "sample", ["residuals"]),
     ]
 
 

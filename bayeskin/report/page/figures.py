@@ -48,6 +48,11 @@ _KNOWN = {
         "How well the recording can be fitted with one parameter held, over its prior, beside the posterior.",
     ),
     ("sample", "traces"): ("The chains", "Traces of each parameter over the sampling's steps, by ensemble."),
+    ("sample", "residuals"): (
+        "What the fit leaves, against the assumed noise",
+        "Quantiles of what the fit leaves against those of the assumed noise, and its autocorrelation with "
+        "the limits that the assumed noise keeps.",
+    ),
     ("sample", "model_check"): (
         "The posterior by the full model",
         "Weights that the full model gives draws of the posterior, and what they do to each parameter's mean "

@@ -1,0 +1,142 @@
+"""Whether what a fit leaves is the noise that the likelihood takes it for.
+
+With the surrogate's error at its mode taken out, the innovations of `noise_model` at a good point are
+independent draws of the noise's own t law. They are brought to a standard normal by that law (z with
+Phi(z) = T_nu(eps)), so that tails of any weight leave the same scores, which are tested for
+- their law: Kolmogorov & Smirnov,
+- correlation over `LAGS` bins: Ljung & Box (1978), Biometrika 65:297, about the law's mean of zero,
+- in each kind of phase their sd, which is 1, and the correlation of neighbours, which is 0.
+The parameters were fitted to the same bins, which makes the tests lenient, never strict.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from bayeskin.inference.gauss_newton import surrogate_error
+from bayeskin.inference.noise_model import innovations
+from bayeskin.inference.problem import LogPosterior
+from bayeskin.types import Array, PhaseKind, _FreezesArrays
+
+LAGS = 10
+FAMILY_WISE = 0.01  # probability that noise as assumed fails any of the tests
+_FEWEST = 8  # bins of a kind of phase that are tested by themselves
+_SMALLEST = 1e-300  # tail probability whose score is still a number: 37 sd
+
+
+@dataclass(frozen=True)
+class KindCheck:
+    """Scores of one kind of phase: number of bins, sd, correlation of neighbours, and a p-value of each.
+
+    NaN where there are too few bins.
+    """
+
+    kind: PhaseKind
+    bins: int
+    sd: float
+    p_sd: float
+    correlation: float
+    p_correlation: float
+
+
+@dataclass(frozen=True)
+class ResidualCheck(_FreezesArrays):
+    """What a fit leaves, in scores (k,) of the fitted bins: standard normal if the noise is as assumed.
+
+    autocorrelation (l,) over 1 to l bins; p_law of Kolmogorov & Smirnov, p_correlation of Ljung & Box.
+    """
+
+    scores: Array
+    autocorrelation: Array
+    p_law: float
+    p_correlation: float
+    kinds: tuple[KindCheck, ...]
+
+    @property
+    def limit(self) -> float:
+        """The p-value below which a single test fails, so that all together hold `FAMILY_WISE`."""
+        return FAMILY_WISE / (2 + 2 * len(self.kinds))
+
+    @property
+    def passes(self) -> bool:
+        return not self._failures()
+
+    @property
+    def sentence(self) -> str:
+        """The outcome in plain words."""
+        if not self.passes:
+            return f"what the fit leaves is not the assumed noise: {'; '.join(self._failures())}"
+        return (
+            "what the fit leaves looks like the assumed noise: in its law (Kolmogorov-Smirnov "
+            f"p = {self.p_law:.2g}), in its correlation (Ljung-Box over {len(self.autocorrelation)} lags "
+            f"p = {self.p_correlation:.2g}) and in each kind of phase"
+        )
+
+    def _failures(self) -> list[str]:
+        out = []
+        if self.p_law < self.limit:
+            out.append(f"it has another law (Kolmogorov-Smirnov p = {self.p_law:.2g})")
+        if self.p_correlation < self.limit:
+            lags, p = len(self.autocorrelation), self.p_correlation
+            out.append(f"it is correlated otherwise (Ljung-Box over {lags} lags p = {p:.2g})")
+        for one in self.kinds:
+            when = f"while pads {one.kind}"
+            if one.p_sd < self.limit:
+                out.append(f"{when} its sd is {one.sd:.2g} of the assumed (p = {one.p_sd:.2g})")
+            if one.p_correlation < self.limit:
+                r, p = one.correlation, one.p_correlation
+                out.append(f"{when} neighbours correlate by {r:+.2f} beyond the assumed (p = {p:.2g})")
+        return out
+
+
+def check_residuals(log_posterior: LogPosterior, vector: Array) -> ResidualCheck:
+    """What is left of the fitted bins at sampling coordinates (D,), against the noise assumed there."""
+    chain, theta = log_posterior.chain, log_posterior.from_sampling(vector)[None]
+    prediction, noise = log_posterior.predict(theta), log_posterior.split(theta)[1][0]
+    residual = chain.force_n - prediction.mean[0, chain.bins]
+    columns = np.column_stack([residual, prediction.factor[0, chain.bins]])
+    white = innovations(chain, noise, prediction.diagonal[0, chain.bins], columns)
+    left, factor, nu = white[:, 0], white[:, 1:], float(noise[-1])
+    scores = normal_scores(left - factor @ surrogate_error(left, factor, nu), nu)
+    follows = ~chain.starts[1:] & (chain.kind[1:] == chain.kind[:-1])
+    kinds = []
+    for i, kind in enumerate(chain.kinds):
+        later = 1 + np.flatnonzero(follows & (chain.kind[1:] == i))
+        kinds.append(_checked(kind, scores[chain.kind == i], scores[later - 1], scores[later]))
+    found = autocorrelation(scores, min(LAGS, len(scores) - 1))
+    p_law = float(stats.kstest(scores, "norm").pvalue)
+    return ResidualCheck(scores, found, p_law, _ljung_box(found, len(scores)), tuple(kinds))
+
+
+def normal_scores(innovation: Array, nu: float) -> Array:
+    """Standard normal scores (k,) of draws (k,) of Student's t with `nu` degrees of freedom, inf allowed."""
+    tail = np.maximum(stats.t.sf(np.abs(innovation), nu), _SMALLEST)
+    return np.asarray(np.sign(innovation) * stats.norm.isf(tail))
+
+
+def autocorrelation(scores: Array, lags: int) -> Array:
+    """(lags,) of scores (k,) about zero."""
+    k = len(scores)
+    return np.array([scores[lag:] @ scores[: k - lag] for lag in range(1, lags + 1)]) / (scores @ scores)
+
+
+def _ljung_box(correlation: Array, count: int) -> float:
+    lag = np.arange(1, len(correlation) + 1)
+    return float(stats.chi2.sf(count * (count + 2) * np.sum(correlation**2 / (count - lag)), len(lag)))
+
+
+def _checked(kind: PhaseKind, scores: Array, before: Array, after: Array) -> KindCheck:
+    """`before` and `after` (p,): the pairs of neighbours among the kind's scores (k,)."""
+    if len(after) < _FEWEST:
+        return KindCheck(kind, len(scores), math.nan, math.nan, math.nan, math.nan)
+    square = float(scores @ scores)
+    p_sd = 2.0 * min(stats.chi2.cdf(square, len(scores)), stats.chi2.sf(square, len(scores)))
+    correlation = float(before @ after / np.sqrt((before @ before) * (after @ after)))
+    p_correlation = 2.0 * stats.norm.sf(abs(correlation) * math.sqrt(len(after)))
+    return KindCheck(
+        kind, len(scores), math.sqrt(square / len(scores)), float(p_sd), correlation, float(p_correlation)
+    )

@@ -1,0 +1,70 @@
+"""What a fit leaves, against the noise that the likelihood takes it for."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.stats import beta, norm
+
+from bayeskin.inference import ResidualCheck
+from bayeskin.report.style import (
+    ACCENT,
+    FAINT,
+    GREY,
+    MODEL,
+    PAGE_IN,
+    new_figure,
+    panel_title,
+    state_finding,
+    styled,
+)
+
+_LEVEL = 0.95
+
+
+@styled
+def figure_residuals(found: ResidualCheck) -> Figure:
+    """Quantiles of the scores against the assumed law's, and their autocorrelation with its limits."""
+    figure = new_figure(PAGE_IN, 2.9)
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1.4))
+    _quantiles(left, found)
+    panel_title(left, "a", f"its law: Kolmogorov-Smirnov p = {found.p_law:.2g}")
+    _correlation(right, found)
+    panel_title(right, "b", f"its correlation: Ljung-Box p = {found.p_correlation:.2g}")
+    short, _, why = found.sentence.partition(": ")
+    finding = f"{short[0].upper()}{short[1:]}"
+    caption = (
+        "What the fit leaves, freed of the assumed correlation and brought by the assumed law to a standard "
+        "normal, of each fitted bin. Grey: where the assumed noise keeps 95 % of the points. "
+        f"{'' if found.passes else why[0].upper() + why[1:] + '.'}"
+    )
+    state_finding(figure, finding, caption)
+    return figure
+
+
+def _quantiles(ax: Axes, found: ResidualCheck) -> None:
+    count = len(found.scores)
+    rank = np.arange(1, count + 1)
+    expected = norm.ppf((rank - 0.5) / count)
+    tails = ((1.0 - _LEVEL) / 2, (1.0 + _LEVEL) / 2)
+    low, high = (norm.ppf(beta.ppf(tail, rank, count + 1 - rank)) for tail in tails)
+    ax.fill_between(expected, low, high, color=FAINT, alpha=0.6, lw=0)
+    ax.plot(expected, expected, color=GREY, lw=0.8)
+    ax.plot(expected, np.sort(found.scores), ".", color=MODEL, ms=3)
+    ax.set(xlabel="assumed noise [sd]", ylabel="what the fit leaves [sd]")
+
+
+def _correlation(ax: Axes, found: ResidualCheck) -> None:
+    limit = norm.ppf(0.5 * (1.0 + _LEVEL)) / np.sqrt(len(found.scores))
+    lags = np.arange(1, len(found.autocorrelation) + 1)
+    ax.axhspan(-limit, limit, color=FAINT, alpha=0.6, lw=0)
+    ax.axhline(0.0, color=GREY, lw=0.8)
+    outside = np.abs(found.autocorrelation) > limit
+    for chosen, color in ((~outside, MODEL), (outside, ACCENT)):
+        ax.vlines(lags[chosen], 0.0, found.autocorrelation[chosen], color=color, lw=1.5)
+        ax.plot(lags[chosen], found.autocorrelation[chosen], "o", color=color)
+    reach = 1.15 * max(2.0 * limit, np.abs(found.autocorrelation).max(initial=0.0))
+    ax.set(xlabel="bins apart", ylabel="autocorrelation", ylim=(-reach, reach))
+    ax.set_xlim(0.5, max(len(lags), 1) + 0.5)
+    ax.set_xticks(lags)
