@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import click
 
@@ -24,21 +24,46 @@ as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON d
 a_config = click.argument("config", type=click.Path(path_type=Path))
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+class _Workflow(click.Group):
+    """Lists its commands in the order in which one comes to need them."""
+
+    ORDER: ClassVar[dict[str, tuple[str, ...]]] = {
+        "From a recording to an answer": ("doctor", "new", "import", "run", "diagnose", "report"),
+        "Single stages": ("design", "train", "map", "sample", "sobol", "effects"),
+        "Further": ("experiment", "simulate", "serve", "prove", "conceal"),
+    }
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return [name for names in self.ORDER.values() for name in names]
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        for title, names in self.ORDER.items():
+            with formatter.section(title):
+                shown = [(name, self.commands[name].get_short_help_str(formatter.width)) for name in names]
+                formatter.write_dl(shown)
+
+
+@click.group(
+    cls=_Workflow, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+)
 @click.version_option(bayeskin.__version__, prog_name="bayeskin")
 def cli() -> None:
     """What living skin is made of, from an extensometer test, and how sure one can be.
 
     \b
     Start here:
-      bayeskin doctor                               does it work here
-      bayeskin run runs/demo.toml                   everything, on the recording that is shipped
-      bayeskin new test.xlsx -o runs/test.toml      a configuration for a recording of your own
-      bayeskin run runs/test.toml
+      bayeskin doctor                       does it work here
+      bayeskin run runs/demo.toml           everything, on the shipped recording
+      bayeskin new test.xlsx -o test.toml   a configuration for your own
+      bayeskin run test.toml
+
+    \b
+    Your shell completes commands and options after (zsh: zsh_source)
+      eval "$(_BAYESKIN_COMPLETE=bash_source bayeskin)"
     """
 
 
-@cli.command("import")
+@cli.command("import", short_help="Read a recording (xlsx, csv, tsv, h5), write it as HDF5.")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("-o", "out", required=True, type=click.Path(path_type=Path), help="HDF5 file to write.")
 @click.option("--sheet", help="Sheet of a workbook, where several hold the columns.")
@@ -59,7 +84,7 @@ def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
     _answer(single.import_recording(file, out, sheet), as_json)
 
 
-@cli.command()
+@cli.command(short_help="Write a configuration for a recording of your own.")
 @click.argument("recording", required=False, type=click.Path(path_type=Path))
 @click.option(
     "-o", "out", type=click.Path(path_type=Path), help="TOML file to write; default: beside RECORDING."
@@ -82,7 +107,7 @@ def new(recording: Path | None, out: Path | None, as_json: bool) -> None:
     _answer(new_demo(out) if recording is None else new_config(recording, out), as_json)
 
 
-@cli.command()
+@cli.command(short_help="One run of the full model on a recording's displacement.")
 @click.argument("config", required=False, type=click.Path(path_type=Path))
 @click.option(
     "--recording", type=click.Path(path_type=Path), help="Recording whose displacement drives the run."
@@ -136,11 +161,11 @@ def _stage_command(name: str, text: str) -> None:
 
 
 _stage_command("design", "Run the full model at the design's points, wave by wave.")
-_stage_command("train", "Train the surrogate on the design and validate it on held-out points.")
-_stage_command("effects", "Learn what each tissue mechanism does to the force, from full runs.")
+_stage_command("train", "Train the surrogate on the design, validate it on held-out points.")
+_stage_command("effects", "Learn what each tissue mechanism does to the force, by full runs.")
 _stage_command("map", "Find the most probable point and check it by the full model.")
-_stage_command("sample", "Sample the posterior until it can be trusted; bands on the predicted force.")
-_stage_command("sobol", "Sobol indices of the force over time.")
+_stage_command("sample", "Sample the posterior until it can be trusted; bands on the force.")
+_stage_command("sobol", "Sobol' indices of the force over time.")
 
 
 @cli.command()
@@ -164,7 +189,7 @@ def report(config: Path, as_json: bool) -> None:
     _answer(document, as_json)
 
 
-@cli.command()
+@cli.command(short_help="All stages of a configuration, skipping what is done.")
 @a_config
 @a_scheduler
 @as_json
@@ -182,7 +207,7 @@ def run(config: Path, scheduler: str | None, as_json: bool) -> None:
     _run(config, None, scheduler, as_json)
 
 
-@cli.command()
+@cli.command(short_help="What the model leaves out: where, which physics.")
 @click.argument("source", type=click.Path(path_type=Path))
 @as_json
 def diagnose(source: Path, as_json: bool) -> None:
@@ -229,7 +254,7 @@ def experiment(source: Path, as_json: bool) -> None:
     _answer(document, as_json)
 
 
-@cli.command()
+@cli.command(short_help="What a diagnosis is worth, on concealed effects.")
 @click.argument("folder", required=False, type=click.Path(path_type=Path))
 @click.option("--at-most", type=click.IntRange(min=0), metavar="N", help="Diagnose N more, then score.")
 @click.option("--rediagnose", default=0, type=click.IntRange(min=0), metavar="N", help="Diagnose N again.")
@@ -254,7 +279,7 @@ def prove(folder: Path | None, at_most: int | None, rediagnose: int, as_json: bo
     _answer(document, as_json)
 
 
-@cli.command()
+@cli.command(short_help="Make a set of recordings for prove.")
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--seed", required=True, type=int, help="What the set is drawn from.")
 @click.option("--count", required=True, type=int, help="Recordings in the set.")
@@ -275,7 +300,7 @@ def conceal(folder: Path, seed: int, count: int, as_json: bool) -> None:
     _answer(document, as_json)
 
 
-@cli.command()
+@cli.command(short_help="The full model as a UM-Bridge server for other tools.")
 @click.argument("config", required=False, type=click.Path(path_type=Path))
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen at.")
 @click.option("--port", default=4242, show_default=True, type=click.IntRange(0, 65535), help="0: a free one.")
@@ -303,7 +328,7 @@ def serve(config: Path | None, host: str, port: int, as_json: bool) -> None:
         server.serve_forever()
 
 
-@cli.command()
+@cli.command(short_help="Whether this installation works.")
 @as_json
 def doctor(as_json: bool) -> None:
     """Whether this installation works, in the folder that you are in.

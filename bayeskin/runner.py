@@ -31,7 +31,7 @@ from bayeskin.types import Array, Design, ParameterSpace, Simulation
 from bayeskin.workers import Lost, Map, local
 
 Simulate = Callable[[Mapping[str, float]], Simulation]
-Progress = Callable[[int, int, int, float], None]
+Progress = Callable[[int, int, int], None]
 
 
 class _Outcome(NamedTuple):
@@ -63,9 +63,8 @@ def run_design(
     results carry `model_hash`. edges_s (m+1,): the bins whose mean force is kept. A point is known by its
     bytes, so a repeated one is not run again. A run that fails, raises, or kills its worker `ATTEMPTS`
     times becomes a row with ``ok`` False and a message. Called again after an interruption of any
-    kind, it goes on. progress(done, total, failed, eta_s) counts this wave's points; eta_s is NaN
-    until there is something to estimate from. Ctrl-C ends the workers, keeps what is finished and
-    raises KeyboardInterrupt.
+    kind, it goes on. progress(done, total, failed) counts this wave's points. Ctrl-C ends the workers,
+    keeps what is finished and raises KeyboardInterrupt.
 
     Raises InputError, with nothing written, when the file holds another parameter space, model or
     bins, when a point lies outside the box, when another process runs the same file, or when
@@ -177,15 +176,13 @@ def _as_run(path: Path, theta: Array, outcome: _Outcome | Lost, bins: int, model
 
 def _reporter(progress: Progress | None, total: int, known: list[bool]) -> Callable[[Run | None], None]:
     """Turns finished runs into calls of `progress`; `known` says of earlier ones whether they are ok."""
-    start, states = time.monotonic(), list(known)
+    states = list(known)
 
     def report(run: Run | None) -> None:
         if run is not None:
             states.append(run.ok)
-        done_now = len(states) - len(known)
-        each_s = (time.monotonic() - start) / done_now if done_now else math.nan
         if progress is not None:
-            progress(len(states), total, states.count(False), each_s * (total - len(states)))
+            progress(len(states), total, states.count(False))
 
     return report
 

@@ -4,33 +4,49 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from collections.abc import Callable
+from datetime import timedelta
 from typing import Any
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 from bayeskin.errors import InputError
 
 DONE, NOT_TRUSTED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 
+class _Left(ProgressColumn):
+    """The time until the end, at the pace since the beginning; nothing until there is a pace."""
+
+    def render(self, task: Task) -> Text:
+        gained, told_s = task.completed - task.fields["first"], task.fields["told_s"]
+        if gained <= 0 or task.elapsed is None:
+            return Text()
+        left_s = told_s * (1.0 - task.completed) / gained - (task.elapsed - told_s)
+        return Text(f"{timedelta(seconds=max(round(left_s), 0))} left")
+
+
 class Terminal:
     """Tells a person on stderr how a run goes on; bars only where somebody can see them move."""
 
-    def __init__(self) -> None:
-        self.console = Console(stderr=True, highlight=False)
+    def __init__(self, console: Console | None = None, clock: Callable[[], float] = time.monotonic) -> None:
+        self.console = console or Console(stderr=True, highlight=False)
         columns = (
             TextColumn("{task.description}"),
-            BarColumn(),
+            BarColumn(16),
             TimeElapsedColumn(),
+            _Left(),
             TextColumn("{task.fields[note]}"),
         )
         self.bars = Progress(
-            *columns, console=self.console, transient=True, disable=not self.console.is_terminal
-        )
-        self.tasks: dict[str, Any] = {}
+            *columns, console=self.console, transient=True, disable=not self.console.is_terminal,
+            get_time=clock,
+        )  # fmt: skip
+        self.tasks: dict[str, Task] = {}
 
     def __enter__(self) -> Terminal:
         self.bars.start()
@@ -43,9 +59,15 @@ class Terminal:
         self.console.print(message, markup=False, soft_wrap=True)
 
     def progress(self, label: str, share: float, note: str = "") -> None:
-        if label not in self.tasks:
-            self.tasks[label] = self.bars.add_task(label, total=1.0, note=note)
-        self.bars.update(self.tasks[label], completed=share, note=note, visible=share < 1.0)
+        """The share of something that is done; one that falls begins another round of it."""
+        task = self.tasks.get(label)
+        if task is None or share < task.completed:
+            if task is not None:
+                self.bars.remove_task(task.id)
+            name = self.bars.add_task(label, total=1.0, first=share, told_s=0.0, note=note)
+            task = self.tasks[label] = next(one for one in self.bars.tasks if one.id == name)
+        told_s = task.elapsed or 0.0
+        self.bars.update(task.id, completed=share, told_s=told_s, note=note, visible=share < 1.0)
 
 
 def exit_code(call: Callable[[], Any]) -> int:

@@ -38,7 +38,8 @@ class Commands(Directive):
 
     def run(self) -> list[nodes.Node]:
         found: list[nodes.Node] = []
-        for name, command in sorted(cli.commands.items()):
+        for name in cli.list_commands(click.Context(cli)):
+            command = cli.commands[name]
             context = click.Context(command, info_name=f"bayeskin {name}", max_content_width=100)
             section = nodes.section(ids=[f"bayeskin-{name}"], names=[f"bayeskin {name}"])
             section += nodes.title(text=f"bayeskin {name}")

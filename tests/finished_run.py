@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from bayeskin.report.page import RunFacts, StageFacts
 from bayeskin.report.page.figures import _KNOWN
 from bayeskin.report.save import _render
+from bayeskin.sensitivity import SobolResult
 
 PARAMETERS = {"E_c": "Young's modulus of the cutis", "p_init": "initial interstitial pressure"}
 HISTORY = {
@@ -21,6 +23,16 @@ HISTORY = {
     "low_90_n": [-0.02, 0.09, 0.18, 0.27],
     "high_90_n": [0.02, 0.13, 0.22, 0.31],
 }
+_NONE = np.full((2, 2, 4), np.nan)
+INDICES = SobolResult(
+    names=("E_c", "p_init"), edges_s=np.arange(0.0, 2.5, 0.5),
+    first=np.array([[np.nan, 0.8, 0.7, 0.6], [np.nan, 0.1, 0.2, -0.001]]),
+    total=np.array([[np.nan, 0.85, 0.75, 0.65], [np.nan, 0.15, 0.25, 0.05]]),
+    first_interval=_NONE, total_interval=_NONE, first_aggregated=np.ones(2), total_aggregated=np.ones(2),
+    first_aggregated_interval=np.ones((2, 2)), total_aggregated_interval=np.ones((2, 2)),
+    second=np.ones((1, 4)), second_aggregated=np.ones(1), second_aggregated_interval=np.ones((2, 1)),
+    variance_n2=np.ones(4), unexplained=0.0, samples=2048, method="pick-freeze", distribution="independent",
+)  # fmt: skip
 _RMSE = {
     "whole_n": 0.00365, "by_kind_n": {"rest": 0.0035, "load": 0.0039}, "fitted_n": 0.0036,
     "not_fitted_n": None, "article_holds_n": None,
@@ -167,6 +179,6 @@ def facts(**changed: Any) -> RunFacts:
         "name": "forearm", "config_path": "runs/forearm.toml", "config_text": 'name = "forearm"\n',
         "config_sha256": "c" * 64, "version": "0.1.0", "seed": 7, "observation": "reaction", "mesh": "bricks",
         "parameters": PARAMETERS, "stages": {**stages, "effects": StageFacts("effects", "not run")},
-        "history": HISTORY,
+        "history": HISTORY, "indices": {"prior_gp": INDICES},
     }  # fmt: skip
     return RunFacts(**{**given, **changed})

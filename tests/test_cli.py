@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -463,6 +464,20 @@ def test_help_teaches_each_command_by_an_example(bayeskin: Command) -> None:
         assert code == 0
         assert "--json" in out
         assert f"bayeskin {name} " in out.split("Example:")[1]
+
+
+def test_the_list_of_commands_follows_the_work_and_fits_a_terminal(
+    bayeskin: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    _, out, _ = bayeskin("--help")
+    listed = re.findall(r"^  ([a-z]+)  ", out[out.index("From a recording") :], re.MULTILINE)
+    assert sorted(listed) == sorted(cli.cli.commands)
+    work = ["new", "import", "run", "diagnose", "report", "design", "train", "map", "sample", "sobol"]
+    assert [name for name in listed if name in work] == work
+    assert max(map(len, out.splitlines())) <= 80
+    assert all(re.search(rf"^  {name} .*\.$", out, re.MULTILINE) for name in listed)  # each in one line
+    assert "_BAYESKIN_COMPLETE" in out
 
 
 def test_a_shell_completes_commands_and_options() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -654,3 +655,15 @@ def test_fields_that_are_zero_and_shapes_that_do_not_fit() -> None:
         report.figure_fields(ROWS, points, quads + 40, part, [], columns, "")
     with pytest.raises(InputError, match="parts"):
         report.figure_fields(ROWS, points, quads, part[:3], [], columns, "")
+
+
+def test_names_along_a_large_triangle_do_not_run_into_each_other() -> None:
+    names = ("sd_rest", "sd_load", "sd_hold", "sd_unload", *(f"E_{letter}" for letter in "abdefgh"))
+    one = dataclasses.replace(SPACE.parameters[0], unit="N", prior="log-uniform", lower=1e-4, upper=0.3)
+    space = ParameterSpace(tuple(dataclasses.replace(one, name=name) for name in names))
+    draws = 10.0 ** np.random.default_rng(1).uniform(-3.5, -1.0, (400, len(names)))
+    figure = drawn(report.figure_posterior(space, draws, {}))
+    boxes = [ax.yaxis.label.get_window_extent() for ax in figure.axes if ax.get_ylabel()]
+    boxes.sort(key=lambda box: -box.y1)
+    assert len(boxes) == 10
+    assert all(lower.y1 <= upper.y0 for upper, lower in itertools.pairwise(boxes))

@@ -142,10 +142,9 @@ def _run_wave(
         )  # fmt: skip
 
 
-def tell(run: Run, label: str, done: int, total: int, failed: int, eta_s: float) -> None:
+def tell(run: Run, label: str, done: int, total: int, failed: int) -> None:
     """Progress of a design, in words."""
-    left = f", {eta_s / 60:.0f} min left" if np.isfinite(eta_s) else ""
-    run.reporter.progress(label, done / max(total, 1), f"{done} of {total} runs, {failed} failed{left}")
+    run.reporter.progress(label, done / max(total, 1), f"{done} of {total} runs, {failed} failed")
 
 
 def _draw_wave(

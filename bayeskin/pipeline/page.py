@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import bayeskin
+from bayeskin import storage
 from bayeskin.config import parameter_space
 from bayeskin.pipeline.engine import Run, Stage, standing
 from bayeskin.pipeline.folder import Record
 from bayeskin.report.page import RunFacts, StageFacts, render_page
+from bayeskin.sensitivity import SobolResult
 
 FILE = "report.html"
 
@@ -50,6 +52,7 @@ def facts_of(run: Run, stages: Mapping[str, Stage]) -> RunFacts:
         parameters={p.name: p.description for p in space.parameters},
         stages=found,
         history=_history(run) if "sample" in found and found["sample"].done else None,
+        indices=_indices(run, found["sobol"]) if "sobol" in found else {},
     )
 
 
@@ -71,3 +74,9 @@ def _history(run: Run) -> dict[str, Any] | None:
     """The stage `sample`'s bands; None of a run that was sampled before the stage wrote any."""
     file = run.at("sample", "bands.json")
     return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+
+
+def _indices(run: Run, stage: StageFacts) -> dict[str, SobolResult]:
+    """Sobol' indices over time, of those sets that the stage `sobol` has a file of."""
+    files = {name: run.at("sobol", f"{name}.h5") for name in stage.summary if stage.done}
+    return {name: storage.load(file, SobolResult) for name, file in files.items() if file.is_file()}

@@ -91,8 +91,9 @@ def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, fo
         loops.plot(displacement_mm[inside], 1e3 * binned.force_n[inside], ".", ms=2.5, color=color)
     for ax in (force, residual):
         shade_phases(ax, binned.phases, cycles=ax is force)
-    force.legend(loc="upper right")
-    residual.legend(loc="upper right")
+    force.margins(y=0.14)  # room for the cycles' names
+    _key_above(force)
+    _key_above(residual)
     force.tick_params(labelbottom=False)
     force.set_ylabel("force [mN]")
     residual.set(xlabel="time [s]", ylabel="recorded − model [mN]")
@@ -109,6 +110,11 @@ def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, fo
         "error, the parameters' uncertainty. One search in twenty finds a window where nothing is missing.",
     )
     return figure
+
+
+def _key_above(ax: Axes) -> None:
+    """The key over the axes at the right, where it hides nothing."""
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.2)
 
 
 @styled
@@ -156,7 +162,8 @@ def figure_before_after(binned: BinnedForce, motion: PadMotion, before_n: Array,
         loops.plot(displacement_mm, 1e3 * values, color=color, lw=0.8)
     for ax in (force, residual):
         shade_phases(ax, binned.phases, cycles=ax is force)
-    force.legend(loc="upper right")
+    force.margins(y=0.14)  # room for the cycles' names
+    _key_above(force)
     force.tick_params(labelbottom=False)
     force.set_ylabel("force [mN]")
     residual.set(xlabel="time [s]", ylabel="recorded − model [mN]")

@@ -128,6 +128,7 @@ def symbol(name: str) -> str:
     """A parameter's name as it is printed: ``E_c`` set as a symbol, ``gap_width`` as words."""
     name = re.sub(rf"^([A-Z](?=[a-z\d]$)|[a-z](?=\d$)|(?:{'|'.join(_GREEK)})(?=\d$))", r"\1_", name)
     head, _, tail = name.partition("_")
+    head = "sigma" if head == "sd" and tail else head
     if re.fullmatch(r"[A-Za-z]", head) or head in _GREEK:
         base = rf"\{head}" if head in _GREEK else head
         if not re.fullmatch(r"\w*", tail):

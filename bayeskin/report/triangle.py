@@ -51,18 +51,19 @@ def label_edges(
 ) -> None:
     """Names and numbers along the outer edges only; `across` and `down` are the parameters of both."""
     most = 4 if len(axes) <= 4 else 3
+    size = 7.5 if len(axes) <= 8 else 6.0  # a name is to be no longer than its panel is high
     for i, row in enumerate(axes):
         last = i == len(axes) - 1
         for j, ax in enumerate(row):
             ax.set_xticks(inner_ticks(*ax.get_xlim(), most))
             ax.tick_params(axis="x", labelbottom=last, rotation=0 if len(axes) <= 3 else 45)
             if last:
-                ax.set_xlabel(parameter_label(across[j]))
+                ax.set_xlabel(parameter_label(across[j]), size=size)
             if across[j] is not down[i]:  # the diagonal of a corner plot has no second parameter
                 ax.set_yticks(inner_ticks(*ax.get_ylim(), most))
                 ax.tick_params(axis="y", labelleft=j == 0)
                 if j == 0:
-                    ax.set_ylabel(parameter_label(down[i]))
+                    ax.set_ylabel(parameter_label(down[i]), size=size)
     figure.align_labels()
 
 

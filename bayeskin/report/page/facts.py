@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from bayeskin.sensitivity import SobolResult
+
 
 @dataclass(frozen=True)
 class StageFacts:
@@ -33,6 +35,7 @@ class RunFacts:
     config_path : as a person would type it; config_text : the file's own
     parameters : those of the model, by name in their order, and what each means
     history : the recorded bins and what is predicted for them, as the stage `sample` writes them
+    indices : Sobol' indices over time by what they are taken over, as the stage `sobol` writes them
     """
 
     name: str
@@ -46,6 +49,7 @@ class RunFacts:
     parameters: Mapping[str, str]
     stages: Mapping[str, StageFacts]
     history: Mapping[str, Any] | None = None
+    indices: Mapping[str, SobolResult] = field(default_factory=dict)
 
     def stage(self, name: str) -> StageFacts:
         """A stage's facts; of one that nothing is known of, that it has not been run."""

@@ -33,51 +33,45 @@
   const dialog = document.getElementById("large");
   const room = dialog.querySelector(".room");
   let home = null;
-  each("button.enlarge", (button) => {
-    const frame = button.closest("figure").querySelector(".wide");
-    if (!frame.firstElementChild) return;
+  each("figure", (figure) => {
+    const drawing = figure.firstElementChild;
+    if (!drawing.querySelector("svg")) return;
+    const button = figure.querySelector(".enlarge");
     button.hidden = false;
     button.addEventListener("click", () => {
-      home = frame;
-      room.setAttribute("role", "img");
-      room.setAttribute("aria-label", frame.getAttribute("aria-label"));
-      room.append(frame.firstElementChild);
+      home = figure;
+      room.append(drawing);
       dialog.showModal();
     });
   });
   dialog.addEventListener("close", () => {
-    if (home) home.append(room.firstElementChild);
+    if (home) home.prepend(room.firstElementChild);
     home = null;
   });
   dialog.querySelector(".close").addEventListener("click", () => dialog.close());
 
-  // The force's history: the bin under the pointer, or under the cross-hair that the arrow keys move.
-  const source = document.getElementById("history-data");
-  if (source) {
-    const data = JSON.parse(source.textContent);
-    const chart = document.getElementById("history");
+  // Charts: what is said of the time under the pointer, or under the cross-hair that the arrow keys move.
+  each(".chart", (frame) => {
+    const data = JSON.parse(frame.querySelector("script").textContent);
+    const chart = frame.querySelector("svg");
     const cross = chart.querySelector(".cross");
     const hair = cross.querySelector("line");
-    const dot = cross.querySelector("circle");
-    const out = document.getElementById("read-out");
+    const dots = [...cross.querySelectorAll("circle")];
+    const out = frame.querySelector(".read-out");
     let at = 0;
-    const millinewton = (force) => `${(1000 * force).toFixed(1)} mN`.replace("-", "−");
     const show = (bin) => {
       at = Math.min(Math.max(bin, 0), data.x.length - 1);
-      const t = data.time_s[at];
-      const phase = data.phases.find((one) => t >= one.from && t < one.to);
-      const recorded = data.recorded_n[at];
       for (const end of ["x1", "x2"]) hair.setAttribute(end, data.x[at]);
       hair.setAttribute("y1", data.top);
       hair.setAttribute("y2", data.bottom);
-      dot.setAttribute("cx", data.x[at]);
-      dot.setAttribute("cy", data.y[at]);
+      dots.forEach((dot, series) => {
+        const y = data.dots[series][at];
+        dot.setAttribute("visibility", y === null ? "hidden" : "inherit");
+        dot.setAttribute("cx", data.x[at]);
+        dot.setAttribute("cy", y ?? 0);
+      });
       cross.classList.add("on");
-      out.textContent = `${t.toFixed(2)} s${phase ? `, ${phase.name}` : ""}: `
-        + (recorded === null ? "nothing recorded" : `recorded ${millinewton(recorded)}`)
-        + (data.fitted[at] ? "" : " (not fitted)")
-        + `; predicted ${millinewton(data.median_n[at])}, 90 % band `
-        + `${millinewton(data.low_90_n[at])} to ${millinewton(data.high_90_n[at])}`;
+      out.textContent = data.says[at];
     };
     const nearest = (x) => {
       let best = 0;
@@ -99,7 +93,7 @@
       event.preventDefault();
       show(at + steps[event.key]);
     });
-  }
+  });
 
   // Paper shows what is folded away.
   let opened = [];

@@ -82,12 +82,24 @@ class Source:
 
 
 @dataclass(frozen=True)
-class Chart:
-    """The force's history: a drawing, and the numbers under a cross-hair."""
+class Key:
+    """What a mark of a chart stands for: "dots", "line", "dashed" or "band", in its own colour or none."""
 
+    text: str
+    mark: str
+    color: str = ""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A plot over time that can be enlarged: a drawing, and what a cross-hair reads from it."""
+
+    key: str
+    title: str
     svg: str
     data: Mapping[str, Any]
     alt: str
+    keys: Sequence[Key]
 
 
 Block = Heading | Table | Picture | Facts | Text | Missing | Folded | Source | Chart

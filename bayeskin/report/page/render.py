@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
 from bayeskin.report.page import checks, mismatch, sections
 from bayeskin.report.page.answer import answer
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.parts import Block, Section
+from bayeskin.report.page.prose import prose
 
 _HERE = Path(__file__).parent
 
@@ -25,7 +25,7 @@ def render_page(facts: RunFacts) -> str:
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters |= {"kind": _kind, "symbol": _symbol}
+    environment.filters |= {"kind": _kind, "prose": prose}
     return environment.get_template("page.html").render(
         facts=facts,
         answer=answer(facts),
@@ -43,11 +43,3 @@ def _sections(facts: RunFacts) -> list[Section]:
 
 def _kind(block: Block) -> str:
     return type(block).__name__
-
-
-def _symbol(name: str) -> Markup:
-    """A parameter's name as it is printed: ``E_c`` with a subscript, longer names as they are."""
-    found = re.fullmatch(r"([A-Za-z])_(\w+)", name)
-    if found is None:
-        return escape(name)
-    return Markup("<i>{}</i><sub>{}</sub>").format(*found.groups())

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayeskin.report.page.answer import prior_range, sentences, without_numbers
+from bayeskin.report.page.charts import history_chart, indices_chart, residual_chart
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
-from bayeskin.report.page.history import history_chart
 from bayeskin.report.page.numbers import interval, number, percent, quantity, scale
 from bayeskin.report.page.parts import Block, Cell, Facts, Folded, Missing, Section, Table, Text, row
 
@@ -101,11 +101,16 @@ def fit(facts: RunFacts) -> Section:
     blocks: list[Block] = list(absent(facts, "sample"))
     if said:
         if facts.history is not None:
-            blocks.append(history_chart(facts.history, facts.said("recording").get("phases", ())))
+            blocks += [chart(facts.history, _phases_of(facts)) for chart in (history_chart, residual_chart)]
         tables = {"posterior mean": said["rmse"], "full model, most probable point": None}
         tables["full model, most probable point"] = facts.said("map").get("rmse_of_full_model")
         blocks += [_rmse(tables), _bands(said), *pictures(facts, "sample", ["fit"])]
     return Section("fit", "Fit", blocks)
+
+
+def _phases_of(facts: RunFacts) -> Sequence[Mapping[str, Any]]:
+    phases: Sequence[Mapping[str, Any]] = facts.said("recording").get("phases", ())
+    return phases
 
 
 def _rmse(tables: Mapping[str, Mapping[str, Any] | None]) -> Table:
@@ -197,12 +202,15 @@ def sobol(facts: RunFacts) -> Section:
     for name, one in said.items():
         title = _INDICES.get(name, name)
         tables = [_shares(one)] if "shares" in one else _indices(one, title)
+        key, found = f"indices-{name}".replace("_", "-"), facts.indices.get(name)
         blocks += [
             *tables,
             Text([one["sentence"]]),
+            *([indices_chart(key, title, found, _phases_of(facts))] if found is not None else []),
             *pictures(facts, "sobol", [f"sobol_{name}"]),
             Folded(
-                f"How: {title}", [Text([f"{one['method']}, {one['samples']} samples", one["distribution"]])]
+                f"How: {title}",
+                [Text([f"{one['method']}, {one['samples']} samples", f"inputs: {one['distribution']}"])],
             ),
         ]
     return Section("sobol", "Sobol' indices", blocks)
@@ -216,14 +224,14 @@ def _indices(one: Mapping[str, Any], title: str) -> list[Block]:
     ]
     return [
         Table(
-            f"Sobol' indices aggregated over time, {title}; inputs {one['distribution']}",
+            f"Sobol' indices aggregated over time, {title}",
             ("parameter", "first order", "90 % interval", "total", "90 % interval"),
             [_index(parameter, index) for parameter, index in one["aggregated"].items()],
             symbols=True,
         ),
         Folded(
             f"Pairs: {title}",
-            [Table(f"Second order, {title}", ("pair", "second order", "90 % interval"), pairs)],
+            [Table(f"Second order, {title}", ("pair", "second order", "90 % interval"), pairs, symbols=True)],
         ),
     ]
 
@@ -234,7 +242,7 @@ def _shares(one: Mapping[str, Any]) -> Table:
         for name, share in one["shares"].items()
     ]
     return Table(
-        f"Shapley effects aggregated over time; inputs {one['distribution']}",
+        "Shapley effects aggregated over time, over the posterior",
         ("parameter", "share of the variance", "90 % interval"),
         rows,
         symbols=True,

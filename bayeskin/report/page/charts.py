@@ -1,0 +1,140 @@
+"""The charts whose values can be read: force, what the fit leaves of it, Sobol' indices, over time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayeskin.report.page.parts import Chart, Key
+from bayeskin.report.page.plot import Phases, Plot, moments
+from bayeskin.report.style import parameter_colors
+from bayeskin.sensitivity import SobolResult
+from bayeskin.types import Array
+from bayeskin.words import number
+
+_BANDS = Key("50 and 90 % bands", "band")
+
+
+def history_chart(history: Mapping[str, Any], phases: Phases) -> Chart:
+    """Recorded bins, predicted median, 50 and 90 % bands of the stage `sample`'s bands.json.
+
+    phases : kind, cycle, start_s and end_s of each, as the stage `recording` says.
+    """
+    series, fitted = _series(history)
+    plot = Plot(series["time_s"], [values for name, values in series.items() if name != "time_s"])
+    parts = [
+        *(plot.band(series[f"low_{level}_n"], series[f"high_{level}_n"], "") for level in (90, 50)),
+        plot.line(series["median_n"], "median"),
+        plot.dots(series["recorded_n"], fitted, "recorded"),
+        plot.dots(series["recorded_n"], ~fitted, "recorded unfitted"),
+    ]
+    return Chart(
+        "history",
+        "Force over time",
+        plot.svg("history", "force [N]", phases, parts, 1),
+        plot.numbers([series["median_n"]], list(_forces(series, fitted, phases))),
+        _alt(series, fitted),
+        (Key("recorded", "dots"), Key("predicted median", "line"), _BANDS),
+    )
+
+
+def residual_chart(history: Mapping[str, Any], phases: Phases) -> Chart:
+    """What the predicted median leaves of each recorded bin, in mN, and the bands about it."""
+    series, fitted = _series(history)
+    median_n, left_mn = series["median_n"], 1e3 * (series["recorded_n"] - series["median_n"])
+    names = ("low_90", "high_90", "low_50", "high_50")
+    ends = {name: 1e3 * (series[f"{name}_n"] - median_n) for name in names}
+    plot = Plot(series["time_s"], [left_mn, *ends.values()])
+    parts = [
+        *(plot.band(ends[f"low_{level}"], ends[f"high_{level}"], "") for level in (90, 50)),
+        plot.line(np.zeros_like(median_n), "median"),
+        plot.dots(left_mn, fitted, "recorded"),
+        plot.dots(left_mn, ~fitted, "recorded unfitted"),
+    ]
+    low, high = (number(end, 3) for end in (np.nanmin(left_mn), np.nanmax(left_mn)))
+    alt = f"Recorded less predicted force over time, from {low} to {high} mN, with the 50 and 90 % bands."
+    return Chart(
+        "residual",
+        "What the fit leaves, over time",
+        plot.svg("residual", "recorded − predicted [mN]", phases, parts, 1),
+        plot.numbers([left_mn], list(_residuals(series, fitted, phases))),
+        alt,
+        (Key("recorded − predicted median", "dots"), _BANDS),
+    )
+
+
+def indices_chart(key: str, title: str, result: SobolResult, phases: Phases) -> Chart:
+    """Sobol' indices over time: first order as lines, totals dashed, a colour for each parameter."""
+    time_s = 0.5 * (result.edges_s[1:] + result.edges_s[:-1])
+    plot = Plot(time_s, [*result.first, *result.total, np.array([0.0, 1.0])])
+    colors = parameter_colors(result.names)
+    parts = [
+        plot.line(values, name, color)
+        for series, name in ((result.total, "index total"), (result.first, "index"))
+        for values, color in zip(series, colors, strict=True)
+    ]
+    keys = [Key(name, "line", color) for name, color in zip(result.names, colors, strict=True)]
+    return Chart(
+        key,
+        f"Sobol' indices over time, {title}",
+        plot.svg(key, "share of the force's variance", phases, parts, len(result.names)),
+        plot.numbers(list(result.first), list(_shares(time_s, result, phases))),
+        f"Sobol' indices of {', '.join(result.names)} over time, first order and total, {title}.",
+        (*keys, Key("total, with all interactions", "dashed")),
+    )
+
+
+def _series(history: Mapping[str, Any]) -> tuple[dict[str, Array], NDArray[np.bool_]]:
+    """Arrays (m,) by name, NaN where there is no value, and which bins were fitted."""
+    series = {name: np.array(values, dtype=float) for name, values in history.items() if name != "fitted"}
+    return series, np.array(history["fitted"], dtype=bool)
+
+
+def _forces(series: Mapping[str, Array], fitted: NDArray[np.bool_], phases: Phases) -> Iterator[str]:
+    for i, moment in enumerate(moments(series["time_s"], phases)):
+        median, low, high = (_millinewton(series[name][i]) for name in ("median_n", "low_90_n", "high_90_n"))
+        recorded = series["recorded_n"][i]
+        said = "nothing recorded" if np.isnan(recorded) else f"recorded {_millinewton(recorded)}"
+        said += "" if fitted[i] else " (not fitted)"
+        yield f"{moment}: {said}; predicted {median}, 90 % band {low} to {high}"
+
+
+def _residuals(series: Mapping[str, Array], fitted: NDArray[np.bool_], phases: Phases) -> Iterator[str]:
+    median_n = series["median_n"]
+    for i, moment in enumerate(moments(series["time_s"], phases)):
+        left = series["recorded_n"][i] - median_n[i]
+        low, high = (_millinewton(series[name][i] - median_n[i]) for name in ("low_90_n", "high_90_n"))
+        said = "nothing recorded" if np.isnan(left) else f"{_millinewton(left)} left"
+        yield f"{moment}: {said}{'' if fitted[i] else ' (not fitted)'}; 90 % band {low} to {high}"
+
+
+def _shares(time_s: Array, result: SobolResult, phases: Phases) -> Iterator[str]:
+    for i, moment in enumerate(moments(time_s, phases)):
+        both = zip(result.names, result.first[:, i], result.total[:, i], strict=True)
+        said = [
+            f"{name} {_share(alone)} ({_share(whole)})" for name, alone, whole in both if not np.isnan(alone)
+        ]
+        yield f"{moment}: " + (
+            f"first order (total): {', '.join(said)}" if said else "the force does not vary"
+        )
+
+
+def _millinewton(force_n: float) -> str:
+    return f"{1e3 * force_n + 0.0:.1f} mN".replace("-", "−")
+
+
+def _share(index: float) -> str:
+    return f"{round(index, 2) + 0.0:.2f}".replace("-", "−")
+
+
+def _alt(series: Mapping[str, Array], fitted: NDArray[np.bool_]) -> str:
+    recorded = series["recorded_n"]
+    part = "" if fitted.all() else f", {int(fitted.sum())} of them fitted"
+    return (
+        f"Force over {series['time_s'][-1]:.0f} s: {len(recorded)} recorded means{part}, from "
+        f"{number(np.nanmin(recorded), 3)} to {number(np.nanmax(recorded), 3)} N, with the predicted median "
+        "and the 50 and 90 % bands around it."
+    )

@@ -1,0 +1,118 @@
+"""A plot over time drawn in the page itself: axes, phases, lines, bands, dots, and a cross-hair over them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+from bayeskin.report.timeline import runs_of
+from bayeskin.types import Array
+
+WIDTH, HEIGHT = 760, 320
+LEFT, RIGHT, TOP, BOTTOM = 54, 10, 24, 40
+Phases = Sequence[Mapping[str, Any]]
+
+
+class Plot:
+    """From seconds and values to the drawing's own units; each method gives a piece of SVG."""
+
+    def __init__(self, time_s: Array, values: Sequence[Array]) -> None:
+        """`values`, each (m,), are all to be seen; NaN is not drawn."""
+        self.time_s = time_s
+        self.t0, self.t1 = float(time_s[0]), float(time_s[-1])
+        everything = np.concatenate(values)
+        low, high = float(np.nanmin(everything)), float(np.nanmax(everything))
+        margin = 0.04 * ((high - low) or 1.0)
+        self.low, self.high = low - margin, high + margin
+
+    def x(self, time_s: Any) -> Any:
+        return LEFT + (np.asarray(time_s) - self.t0) / ((self.t1 - self.t0) or 1.0) * (WIDTH - LEFT - RIGHT)
+
+    def y(self, values: Any) -> Any:
+        share = (np.asarray(values) - self.low) / (self.high - self.low)
+        return HEIGHT - BOTTOM - share * (HEIGHT - TOP - BOTTOM)
+
+    def svg(self, key: str, label: str, phases: Phases, parts: Sequence[str], dots: int) -> str:
+        """The whole drawing, `parts` between its axes and a cross-hair with so many dots."""
+        circles = '<circle r="4"/>' * dots
+        cross = f'<g class="cross"><line class="hair"/>{circles}</g>'
+        inner = "".join((self._phases(phases), self._axes(label), *parts, cross))
+        return (
+            f'<svg id="{key}" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" '
+            f'role="img" aria-labelledby="{key}-alt">{inner}</svg>'
+        )
+
+    def numbers(self, marked: Sequence[Array], says: Sequence[str]) -> dict[str, Any]:
+        """What the cross-hair needs: where it stands at each time, its dots, and what is read there."""
+        dots = [[None if np.isnan(v) else round(float(v), 1) for v in self.y(values)] for values in marked]
+        return {
+            "x": np.round(self.x(self.time_s), 1).tolist(), "dots": dots, "says": list(says),
+            "top": TOP, "bottom": HEIGHT - BOTTOM, "width": WIDTH,
+        }  # fmt: skip
+
+    def line(self, values: Array, name: str, color: str = "") -> str:
+        """Interrupted where there is no value."""
+        colored = f' style="--own: {color}"' if color else ""
+        return f'<path class="{name}" d="{self._path(self.time_s, values)}"{colored}/>'
+
+    def band(self, low: Array, high: Array, name: str) -> str:
+        around = np.concatenate([self.time_s, self.time_s[::-1]]), np.concatenate([high, low[::-1]])
+        return f'<path class="band {name}" d="{self._path(*around)}Z"/>'
+
+    def dots(self, values: Array, chosen: NDArray[np.bool_], name: str) -> str:
+        """Points as a path of lines without length, which round caps make visible."""
+        kept = chosen & np.isfinite(values)
+        points = zip(self.x(self.time_s[kept]), self.y(values[kept]), strict=True)
+        path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
+        return f'<path class="{name}" d="{path}"/>' if path else ""
+
+    def _path(self, time_s: Array, values: Array) -> str:
+        pieces = []
+        for start, end in runs_of(np.isfinite(values)):
+            points = zip(self.x(time_s[start:end]), self.y(values[start:end]), strict=True)
+            pieces.append("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points))
+        return "".join(pieces)
+
+    def _phases(self, phases: Phases) -> str:
+        tinted = [
+            f'<rect class="phase {escape(p["kind"])}" x="{a:.1f}" y="{TOP}" width="{max(b - a, 0.0):.1f}" '
+            f'height="{HEIGHT - TOP - BOTTOM}"/>'
+            for p in phases
+            if p["kind"] != "rest"
+            for a, b in [np.clip(self.x([p["start_s"], p["end_s"]]), LEFT, WIDTH - RIGHT)]
+        ]
+        return "".join(tinted)
+
+    def _axes(self, label: str) -> str:
+        bottom = HEIGHT - BOTTOM
+        parts = [f'<line class="axis" x1="{LEFT}" y1="{bottom}" x2="{WIDTH - RIGHT}" y2="{bottom}"/>']
+        for tick in _ticks(self.t0, self.t1, 8):
+            x = self.x(tick)
+            parts.append(f'<line class="axis" x1="{x:.1f}" y1="{bottom}" x2="{x:.1f}" y2="{bottom + 4}"/>')
+            parts.append(f'<text x="{x:.1f}" y="{bottom + 17}" text-anchor="middle">{tick:g}</text>')
+        for tick in _ticks(self.low, self.high, 6):
+            y = self.y(tick)
+            parts.append(f'<line class="grid" x1="{LEFT}" y1="{y:.1f}" x2="{WIDTH - RIGHT}" y2="{y:.1f}"/>')
+            said = f"{tick:g}".replace("-", "−")
+            parts.append(f'<text x="{LEFT - 7}" y="{y + 4:.1f}" text-anchor="end">{said}</text>')
+        middle = 0.5 * (LEFT + WIDTH - RIGHT)
+        parts.append(f'<text x="{middle}" y="{HEIGHT - 4}" text-anchor="middle">time [s]</text>')
+        parts.append(f'<text x="4" y="{TOP - 9}">{label}</text>')
+        return "".join(parts)
+
+
+def moments(time_s: Array, phases: Phases) -> Iterator[str]:
+    """Each time and the phase that it lies in, such as "1.25 s, load of cycle 1"."""
+    for t in time_s:
+        inside = [p for p in phases if p["start_s"] <= t < p["end_s"]]
+        yield f"{t:.2f} s" + "".join(f", {p['kind']} of cycle {p['cycle']}" for p in inside[:1])
+
+
+def _ticks(low: float, high: float, most: int) -> list[float]:
+    found = MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
+    return [float(f"{tick:.9g}") for tick in found if low <= tick <= high]
