@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import h5py
 import numpy as np
@@ -73,16 +74,28 @@ def load(path: Path | str, cls: type[T]) -> T:
 
     Raises InputError if the file is absent, is not HDF5, is not bayeskin's, or holds another type.
     """
-    path = Path(path)
+    path, expected = Path(path), f"a bayeskin {cls.__name__} file"
+    with reading(path, expected) as handle:
+        if handle.attrs.get("format") != FORMAT:
+            raise InputError(path, "an HDF5 file of another origin", expected)
+        return read(handle, cls, path)
+
+
+@contextmanager
+def reading(path: Path, expected: str) -> Iterator[h5py.File]:
+    """An HDF5 file, open. Whatever goes wrong meanwhile is its fault: raises InputError that names it."""
     if not path.is_file():
-        raise InputError(path, "no such file", f"a bayeskin {cls.__name__} file")
+        raise InputError(path, "no such file", expected)
     try:
         with h5py.File(path, "r") as handle:
-            if handle.attrs.get("format") != FORMAT:
-                raise InputError(path, "an HDF5 file of another origin", f"a bayeskin {cls.__name__} file")
-            return read(handle, cls, path)
-    except OSError as error:
-        raise InputError(path, f"not readable as HDF5 ({error})", f"a bayeskin {cls.__name__} file") from None
+            yield handle
+    except InputError as error:
+        if error.where.startswith(str(path)):
+            raise
+        raise InputError(f"{path}: {error.where}", error.found, error.expected) from None
+    except Exception as error:  # libhdf5, json and numpy raise of every kind on a damaged file
+        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise InputError(path, f"not readable as HDF5 ({said})", expected) from None
 
 
 def write(group: h5py.Group, value: Any) -> None:
@@ -95,19 +108,40 @@ def write(group: h5py.Group, value: Any) -> None:
 def read(group: h5py.Group, cls: type[T], where: object = "") -> T:
     """Reads a dataclass from an open HDF5 group; a field that came later has its default.
 
-    Raises InputError when the group holds another type.
+    Raises InputError when the group holds another type, or a field of another kind than the type says.
     """
     found = group.attrs.get("type")
     if found != cls.__name__:
         raise InputError(where or group.name, f"type {found!r}", f"type {cls.__name__!r}")
-    values = {}
+    values, kinds = {}, get_type_hints(cls)
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         if field.name not in group and field.name not in group.attrs:
             if field.default is not dataclasses.MISSING:
                 continue
             raise InputError(where or group.name, f"no field {field.name!r}", f"all fields of {cls.__name__}")
-        values[field.name] = _read_field(group, field.name)
+        value = values[field.name] = _read_field(group, field.name)
+        if not _is(value, kinds[field.name]):
+            at, found = f"{where or group.name}: {field.name}", " ".join(repr(value).split())[:60]
+            raise InputError(at, found, f"{field.type}, as in a {cls.__name__}")
     return cls(**values)
+
+
+def _is(value: Any, kind: Any) -> bool:
+    """Whether a value read is what an annotation says; of arrays their kind of numbers, no shape."""
+    origin, parts = get_origin(kind) or kind, get_args(kind)
+    if origin is Literal:
+        return isinstance(value, str) and value in parts
+    if origin is np.ndarray:
+        wanted = get_args(parts[1])[0]
+        return isinstance(value, np.ndarray) and np.can_cast(value.dtype, wanted, "same_kind")
+    if origin is tuple:
+        return isinstance(value, tuple) and all(_is(part, parts[0]) for part in value)
+    if hasattr(origin, "_fields"):  # a named tuple, which JSON makes a list
+        wanted = get_type_hints(origin).values()
+        return isinstance(value, list) and len(value) == len(wanted) and all(map(_is, value, wanted))
+    if origin in (int, float):
+        return isinstance(value, int | origin) and not isinstance(value, bool)
+    return isinstance(value, origin)
 
 
 def _write_field(group: h5py.Group, name: str, value: Any) -> None:

@@ -78,6 +78,9 @@ def check_fits(run: Run, files: ShippedFiles, design: Design, binned: BinnedForc
     """Raises InputError unless model, protocol and bins are this run's, and its priors lie in the box."""
     said = load_manifest(files.surrogate)
     where = f"{run.config_path}: surrogate.file {files.surrogate.name}"
+    waves = said.get("waves")
+    if not isinstance(waves, list) or not all(isinstance(w, dict) and "kept_fraction" in w for w in waves):
+        raise InputError(f"{where}: manifest: waves", f"{waves!r:.60}", "how the points of each were chosen")
     if (design.model_hash, said.get("model_hash")) != (waves_spec(run).hash, model_spec(run).hash):
         raise InputError(where, "a surrogate of another model", "one of this configuration's model")
     if said.get("motion_sha256") != motion_sha256(motion):
@@ -87,7 +90,9 @@ def check_fits(run: Run, files: ShippedFiles, design: Design, binned: BinnedForc
         expected = f"the recording's {len(binned.edges_s) - 1} bins to {binned.edges_s[-1]:g} s"
         raise InputError(where, found, expected)
     for ours in parameter_space(run.config, run.config_path).parameters:
-        box = said["parameters"][ours.name]
+        box = said["parameters"].get(ours.name)
+        if box is None:
+            raise InputError(where, f"none of {ours.name}", "a surrogate of this configuration's parameters")
         if ours.lower < box["lower"] or ours.upper > box["upper"]:
             raise InputError(
                 f"{run.config_path}: parameters.{ours.name}",
