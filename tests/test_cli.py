@@ -118,8 +118,8 @@ def backwards(path: Path) -> None:
         (backwards, "increase"),
         (lambda path: path.write_text(""), "empty"),
         (lambda path: path.write_text("time (s),displacement (mm),force (N)\n0,0,abc\n"), "abc"),
-        (lambda path: None, "unreadable"),
-        (lambda path: path.mkdir(), "unreadable"),
+        (lambda path: None, "no such file"),
+        (lambda path: path.mkdir(), "a folder"),
     ],
     ids=["no force", "two forces", "one phase", "time backwards", "empty", "text", "absent", "a folder"],
 )

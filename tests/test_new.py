@@ -103,7 +103,7 @@ def test_what_cannot_be_done_is_refused_in_one_line_and_nothing_written(
     own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert "ending .toml" in refused(capsys, "new", own, "-o", tmp_path / "own.yaml")
-    assert "unreadable" in refused(capsys, "new", tmp_path / "absent.csv")
+    assert "no such file" in refused(capsys, "new", tmp_path / "absent.csv")
     assert "absent" in refused(capsys, "new", own, "-o", tmp_path / "absent" / "own.toml")
     assert [path.name for path in tmp_path.iterdir()] == ["own.h5"]
 
