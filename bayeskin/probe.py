@@ -1,8 +1,8 @@
 """Whether a file that somebody brought can be read to its end, and whether libhdf5 survives it.
 
-A pipe may never end, a device never does. Damaged bytes can make libhdf5 loop for ever, ask for all memory or end the process. A foreign file is
-therefore read once, whole, in a process of its own with a limit on time and memory; only then here. Files of
-a run's folder are not: they are written whole or not at all.
+A pipe may never end, a device never does. Damaged bytes can make libhdf5 loop for ever, ask for all memory
+or end the process. A foreign file is therefore read once, whole, in a process of its own with a limit on time
+and memory; only then here. Files of a run's folder are not: they are written whole or not at all.
 """
 
 from __future__ import annotations

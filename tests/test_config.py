@@ -112,6 +112,7 @@ def test_what_is_not_toml_is_refused_with_its_line(tmp_path: Path) -> None:
         load_config(tmp_path)
 
 
+FILE = "recording.file = 'a'\n"
 DEEP, MANY_DIGITS = "[" * 20_000, "9" * 5_000
 
 
@@ -123,15 +124,15 @@ DEEP, MANY_DIGITS = "[" * 20_000, "9" * 5_000
         (f"seed = {MANY_DIGITS}", "digits"),
         (f"seed = 0x{'f' * 5_000}", "digits"),
         (
-            "recording.file = 'a'\nseed = 9223372036854775808",
+            FILE + "seed = 9223372036854775808",
             "seed: found 9223372036854775808; expected less than",
         ),
         (
-            "recording.file = 'a'\n[design]\npoints = [10000000000]",
-            "design.points.0: found 10000000000; expected less than",
+            FILE + "[design]\npoints = [10000000000]",
+            "points.0: found 10000000000; expected less",
         ),
-        ("recording.file = 'a'\n[model]\nrefinement = 40", "model.refinement: found 40; expected less than"),
-        ("recording.file = 'a'\n[sobol]\nsamples = 1000000000", "sobol.samples: found"),
+        (FILE + "[model]\nrefinement = 40", "model.refinement: found 40; expected less than"),
+        (FILE + "[sobol]\nsamples = 1000000000", "sobol.samples: found"),
         ("#" * 1_000_001, "found 1000001 bytes; expected a TOML"),
         ("time,force\n0,1\n", r"line 1.*; expected a TOML configuration, as `bayeskin new RECORDING`"),
     ],

@@ -258,7 +258,7 @@ def test_a_file_beyond_memory_is_refused_before_it_is_read(tmp_path: Path) -> No
 
 def test_bins_beyond_memory_are_refused() -> None:
     for width_s, end_s in ((1e-9, 130.0), (1e-320, 130.0), (0.5, 1e300), (0.5, np.nan)):
-        with pytest.raises(InputError, match="bin_width_s: found .*; expected bins so wide"):
+        with pytest.raises(InputError, match=r"bin_width_s: found .*; expected bins so wide"):
             uniform_edges(end_s, width_s)
 
 
