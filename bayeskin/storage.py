@@ -95,7 +95,8 @@ def reading(path: Path, expected: str) -> Iterator[h5py.File]:
         raise InputError(f"{path}: {error.where}", error.found, error.expected) from None
     except Exception as error:  # libhdf5, json and numpy raise of every kind on a damaged file
         said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise InputError(path, f"not readable as HDF5 ({said})", expected) from None
+        what = "not readable as HDF5" if isinstance(error, OSError) else "contents that cannot be read"
+        raise InputError(path, f"{what} ({said})", expected) from None
 
 
 def write(group: h5py.Group, value: Any) -> None:
@@ -113,17 +114,31 @@ def read(group: h5py.Group, cls: type[T], where: object = "") -> T:
     found = group.attrs.get("type")
     if found != cls.__name__:
         raise InputError(where or group.name, f"type {found!r}", f"type {cls.__name__!r}")
-    values, kinds = {}, get_type_hints(cls)
+    values = {}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         if field.name not in group and field.name not in group.attrs:
             if field.default is not dataclasses.MISSING:
                 continue
             raise InputError(where or group.name, f"no field {field.name!r}", f"all fields of {cls.__name__}")
-        value = values[field.name] = _read_field(group, field.name)
-        if not _is(value, kinds[field.name]):
-            at, found = f"{where or group.name}: {field.name}", " ".join(repr(value).split())[:60]
-            raise InputError(at, found, f"{field.type}, as in a {cls.__name__}")
-    return cls(**values)
+        values[field.name] = _read_field(group, field.name)
+    return checked(cls(**values), where or group.name)
+
+
+def checked(value: T, where: object) -> T:
+    """A dataclass made of what somebody's file says.
+
+    Raises InputError unless each field is what its annotation says, but for the shapes of arrays.
+    """
+    kinds = get_type_hints(type(value))
+    for field in dataclasses.fields(value):  # type: ignore[arg-type]
+        given = getattr(value, field.name)
+        if not _is(given, kinds[field.name]):
+            found, expected = (
+                " ".join(repr(given).split())[:60],
+                f"{field.type}, as in a {type(value).__name__}",
+            )
+            raise InputError(f"{where}: {field.name}", found, expected)
+    return value
 
 
 def _is(value: Any, kind: Any) -> bool:
@@ -138,7 +153,7 @@ def _is(value: Any, kind: Any) -> bool:
         return isinstance(value, tuple) and all(_is(part, parts[0]) for part in value)
     if hasattr(origin, "_fields"):  # a named tuple, which JSON makes a list
         wanted = get_type_hints(origin).values()
-        return isinstance(value, list) and len(value) == len(wanted) and all(map(_is, value, wanted))
+        return isinstance(value, list | tuple) and len(value) == len(wanted) and all(map(_is, value, wanted))
     if origin in (int, float):
         return isinstance(value, int | origin) and not isinstance(value, bool)
     return isinstance(value, origin)
