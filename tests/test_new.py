@@ -141,3 +141,24 @@ def test_a_recording_with_the_name_of_a_shipped_surrogate_is_not_taken_for_it(tm
     run = opened(recording, Silent())
     assert run.config.surrogate.file == recording.name
     assert shipped_files(run).surrogate == shipped("surrogates/demo.h5")
+
+
+def test_a_surrogate_that_is_nowhere_is_told_apart_from_a_broken_installation(tmp_path: Path) -> None:
+    shutil.copy(shipped("data/demo.h5"), tmp_path / "a.h5")
+    case = tmp_path / "case.toml"
+    case.write_text('[recording]\nfile = "a.h5"\n[surrogate]\nfile = "mine.h5"\n')
+    with pytest.raises(InputError, match=r"surrogate.file: found no file .*mine.h5; expected .*: demo.h5, "):
+        shipped_files(open_run(case, Silent()))
+
+
+def test_effects_that_come_with_a_surrogate_of_ones_own_are_tried_before_they_are_read(
+    tmp_path: Path,
+) -> None:
+    for name in ("a.h5", "mine.h5", "mine-design.h5"):
+        shutil.copy(shipped("data/demo.h5"), tmp_path / name)
+    (tmp_path / "mine-effects").mkdir()
+    (tmp_path / "mine-effects" / "bottom-adherence.h5").write_bytes(b"\x89HDF")
+    case = tmp_path / "case.toml"
+    case.write_text('[recording]\nfile = "a.h5"\n[surrogate]\nfile = "mine.h5"\n')
+    with pytest.raises(InputError, match=r"bottom-adherence.h5: found not readable as HDF5"):
+        shipped_files(open_run(case, Silent()))
