@@ -19,11 +19,17 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from bayeskin.design import default_space
 from bayeskin.errors import InputError
+from bayeskin.probe import bytes_of
 from bayeskin.types import Correlation, Parameter, ParameterSpace
 
-Positive = Annotated[int, Field(gt=0)]
+MOST_BYTES = 1_000_000  # of a configuration
+EXPECTED = "a TOML configuration, as `bayeskin new RECORDING` writes one"
+TOO_DEEP = "tables or lists nested too deeply"
 FEWEST_CHECKED = 8  # draws: of fewer, weights say next to nothing
-NotNegative = Annotated[int, Field(ge=0)]
+# Upper bounds refuse slips of the pen, which would take all memory; no computation comes near them.
+Positive = Annotated[int, Field(gt=0, le=10**9)]
+Runs = Annotated[int, Field(gt=0, le=100_000)]  # of the full model
+Refinement = Annotated[int, Field(ge=0, le=6)]
 
 
 WHO_RUNS: Any = {"design": {"workers", "scheduler"}, "slurm": True}  # no result depends on it
@@ -49,7 +55,7 @@ class ModelConfig(_Section):
 
     observation: Literal["reaction", "article", "own"] = "reaction"
     mesh: str = "bricks"
-    refinement: NotNegative = 1  # of the bricks, toward the pads' edges; 0: 80 of them
+    refinement: Refinement = 1  # of the bricks, toward the pads' edges; 0: 80 of them
     forward: str | None = None
 
     @model_validator(mode="before")
@@ -120,19 +126,19 @@ class DesignConfig(_Section):
     the address of a Dask scheduler, has the runs made there.
     """
 
-    points: Annotated[list[Positive], Field(min_length=1)] = [128, 96, 64]
-    held_out: Positive = 16
-    coarse: NotNegative | None = None
-    fine_points: Positive = 16
-    fine_held_out: Positive = 6
-    workers: Positive = 2
+    points: Annotated[list[Runs], Field(min_length=1, max_length=100)] = [128, 96, 64]
+    held_out: Runs = 16
+    coarse: Refinement | None = None
+    fine_points: Runs = 16
+    fine_held_out: Runs = 6
+    workers: Annotated[int, Field(gt=0, le=4096)] = 2
     scheduler: str | None = None
 
 
 class SlurmConfig(_Section):
     """Full runs as jobs of SLURM through dask-jobqueue: how many, and what it is told of each."""
 
-    jobs: Positive
+    jobs: Annotated[int, Field(gt=0, le=100_000)]
     queue: str | None = None
     account: str | None = None
     memory: str = "2GB"
@@ -156,10 +162,10 @@ class EffectsConfig(_Section):
 
     mechanisms: list[str] = []
     pairs: list[tuple[str, str]] = []
-    coarse: Positive = 400
-    points: Positive = 72
-    held_out: Positive = 20
-    plausible: NotNegative = 0
+    coarse: Runs = 400
+    points: Runs = 72
+    held_out: Runs = 20
+    plausible: Annotated[int, Field(ge=0, le=100_000)] = 0
 
 
 class FitConfig(_Section):
@@ -197,8 +203,8 @@ class NoiseConfig(_Section):
 class SampleConfig(_Section):
     """Independent ensembles of walkers, and when to stop."""
 
-    ensembles: Annotated[int, Field(ge=2)] = 4
-    walkers: Annotated[int, Field(ge=4)] = 40
+    ensembles: Annotated[int, Field(ge=2, le=1000)] = 4
+    walkers: Annotated[int, Field(ge=4, le=100_000)] = 40
     effective_samples: Positive = 5000
     max_steps: Positive = 20000
 
@@ -206,8 +212,8 @@ class SampleConfig(_Section):
 class CheckConfig(_Section):
     """Posterior draws that the full model runs again, and how often they may join the design."""
 
-    draws: NotNegative = 24
-    rounds: NotNegative = 2
+    draws: Annotated[int, Field(ge=0, le=100_000)] = 24
+    rounds: Annotated[int, Field(ge=0, le=1000)] = 2
 
     @model_validator(mode="after")
     def _one_or_two_say_nothing(self) -> CheckConfig:
@@ -219,14 +225,14 @@ class CheckConfig(_Section):
 class MapConfig(_Section):
     """Starts of the search for the most probable point, and evaluations that each may spend."""
 
-    starts: Positive = 8
+    starts: Annotated[int, Field(gt=0, le=100_000)] = 8
     evaluations: Positive = 20000
 
 
 class SobolConfig(_Section):
     """Samples a matrix of the pick-freeze estimate on the Gaussian process."""
 
-    samples: Positive = 2048
+    samples: Annotated[int, Field(gt=0, le=2**20)] = 2048
 
 
 class Config(_Section):
@@ -234,7 +240,7 @@ class Config(_Section):
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
     recording: RecordingConfig
-    seed: Annotated[int, Field(ge=0)] = 1
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
     model: ModelConfig = ModelConfig()
     parameters: dict[str, PriorConfig] = {}
     design: DesignConfig = DesignConfig()
@@ -273,12 +279,15 @@ def load_config(path: Path | str) -> Config:
     or range, bounds upside down.
     """
     path = Path(path)
+    data = bytes_of(path, EXPECTED, MOST_BYTES)
     try:
-        plain = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(path, "no such file", "a TOML configuration") from None
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(path, f"{error}", "a TOML configuration") from None
+        plain = tomllib.loads(data.decode("utf-8-sig"))
+    except UnicodeDecodeError:
+        raise InputError(path, "bytes that are not text in UTF-8", EXPECTED) from None
+    except RecursionError:
+        raise InputError(path, TOO_DEEP, EXPECTED) from None
+    except ValueError as error:  # of TOML, or of a number with thousands of digits
+        raise InputError(path, str(error), EXPECTED) from None
     plain.setdefault("name", path.stem)
     return config_of(plain, path)
 
@@ -289,6 +298,10 @@ def config_of(plain: Mapping[str, Any], where: Path | str) -> Config:
         config = Config.model_validate_json(json.dumps(plain, default=str))
     except ValidationError as error:
         raise _input_error(where, error) from None
+    except RecursionError:
+        raise InputError(where, TOO_DEEP, EXPECTED) from None
+    except ValueError as error:  # of a number with thousands of digits
+        raise InputError(where, str(error), EXPECTED) from None
     parameter_space(config, where)
     return config
 

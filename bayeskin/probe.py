@@ -1,13 +1,14 @@
-"""Whether libhdf5 survives a file that somebody brought.
+"""Whether a file that somebody brought can be read to its end, and whether libhdf5 survives it.
 
-Damaged bytes can make libhdf5 loop for ever, ask for all memory or end the process. A foreign file is
-therefore read once, whole, in a process of its own with a limit on time and memory; only then here. Files of
-a run's folder are not: they are written whole or not at all.
+A pipe may never end, a device never does. Damaged bytes can make libhdf5 loop for ever, ask for all memory
+or end the process. A foreign file is therefore read once, whole, in a process of its own with a limit on time
+and memory; only then here. Files of a run's folder are not: they are written whole or not at all.
 """
 
 from __future__ import annotations
 
 import os
+import stat
 import subprocess
 import sys
 from functools import lru_cache
@@ -20,6 +21,7 @@ STARTS_S, BYTES_A_S = (
     2e6,
 )  # a busy machine takes seconds to start Python, and reads 100 times as quickly
 MEMORY_BYTES = 4 * 2**30
+MOST_BYTES = 2 * 2**30  # of a file that is read as a whole
 
 _READ_ALL = """
 import resource, sys
@@ -39,8 +41,33 @@ except BaseException as error:
 """
 
 
+def refuse_endless(path: Path, expected: str, most_bytes: int = MOST_BYTES) -> None:
+    """Raises InputError unless `path` is a regular file of at most `most_bytes`."""
+    try:
+        found = os.stat(path)
+    except FileNotFoundError:
+        raise InputError(path, "no such file", expected) from None
+    except (OSError, ValueError) as error:
+        raise InputError(path, f"an unreadable file ({error})", expected) from None
+    if not stat.S_ISREG(found.st_mode):
+        what = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe or a device, no file"
+        raise InputError(path, what, expected)
+    if found.st_size > most_bytes:
+        raise InputError(path, f"{found.st_size} bytes", f"{expected}, of at most {most_bytes} bytes")
+
+
+def bytes_of(path: Path, expected: str, most_bytes: int = MOST_BYTES) -> bytes:
+    """A file's bytes. Raises InputError as `refuse_endless`, and for one that cannot be read."""
+    refuse_endless(path, expected, most_bytes)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(path, f"an unreadable file ({error.strerror})", expected) from None
+
+
 def refuse_damaged(path: Path, expected: str) -> None:
     """Raises InputError unless all of an HDF5 file can be read, in reasonable time and memory."""
+    refuse_endless(path, expected)
     found = os.stat(path)
     fault = _fault_of(str(path), found.st_size, found.st_mtime_ns, found.st_ino)
     if fault is not None:

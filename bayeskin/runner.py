@@ -19,7 +19,6 @@ from glob import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -122,15 +121,31 @@ def add_points(
 
 
 def load_design(path: Path | str) -> Design:
-    """The finished waves in a design file. Raises InputError when there is no such file."""
-    return storage.load(path, Design)
+    """The finished waves in a design file.
+
+    Raises InputError when there is no such file, or its arrays do not belong together.
+    """
+    design = storage.load(path, Design)
+    rows, bins = len(np.atleast_1d(design.ok)), design.edges_s.size - 1
+    shapes = {
+        "edges_s": (bins + 1,), "theta": (rows, design.space.dim), "force_n": (rows, bins), "wave": (rows,),
+        "held_out": (rows,), "ok": (rows,), "seconds": (rows,),
+    }  # fmt: skip
+    for name, shape in shapes.items():
+        if getattr(design, name).shape != shape:
+            raise InputError(f"{path}: {name}", f"shape {getattr(design, name).shape}", f"shape {shape}")
+    if len(design.messages) != rows:
+        raise InputError(f"{path}: messages", f"{len(design.messages)} of them", f"{rows}, one a row")
+    if not (np.isfinite(design.theta).all() and np.isfinite(design.force_n[design.ok]).all()):
+        raise InputError(path, "values that are not finite", "finite ones, but for runs that failed")
+    return design
 
 
 def load_waves(path: Path | str) -> tuple[dict[str, Any], ...]:
     """How the points of each wave were chosen, oldest first. Raises InputError as `load_design`."""
     load_design(path)
-    with h5py.File(path, "r") as handle:
-        return tuple(json.loads(handle.attrs.get("waves", "[]")))
+    with storage.reading(Path(path), "a bayeskin Design file") as handle:
+        return tuple(map(dict, json.loads(handle.attrs.get("waves", "[]"))))
 
 
 def _bin_means_of(simulate: Simulate, names: tuple[str, ...], edges: Array, theta: Array) -> _Outcome:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import h5py
 import numpy as np
@@ -73,16 +74,29 @@ def load(path: Path | str, cls: type[T]) -> T:
 
     Raises InputError if the file is absent, is not HDF5, is not bayeskin's, or holds another type.
     """
-    path = Path(path)
+    path, expected = Path(path), f"a bayeskin {cls.__name__} file"
+    with reading(path, expected) as handle:
+        if handle.attrs.get("format") != FORMAT:
+            raise InputError(path, "an HDF5 file of another origin", expected)
+        return read(handle, cls, path)
+
+
+@contextmanager
+def reading(path: Path, expected: str) -> Iterator[h5py.File]:
+    """An HDF5 file, open. Whatever goes wrong meanwhile is its fault: raises InputError that names it."""
     if not path.is_file():
-        raise InputError(path, "no such file", f"a bayeskin {cls.__name__} file")
+        raise InputError(path, "no such file", expected)
     try:
         with h5py.File(path, "r") as handle:
-            if handle.attrs.get("format") != FORMAT:
-                raise InputError(path, "an HDF5 file of another origin", f"a bayeskin {cls.__name__} file")
-            return read(handle, cls, path)
-    except OSError as error:
-        raise InputError(path, f"not readable as HDF5 ({error})", f"a bayeskin {cls.__name__} file") from None
+            yield handle
+    except InputError as error:
+        if error.where.startswith(str(path)):
+            raise
+        raise InputError(f"{path}: {error.where}", error.found, error.expected) from None
+    except Exception as error:  # libhdf5, json and numpy raise of every kind on a damaged file
+        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        what = "not readable as HDF5" if isinstance(error, OSError) else "contents that cannot be read"
+        raise InputError(path, f"{what} ({said})", expected) from None
 
 
 def write(group: h5py.Group, value: Any) -> None:
@@ -95,7 +109,7 @@ def write(group: h5py.Group, value: Any) -> None:
 def read(group: h5py.Group, cls: type[T], where: object = "") -> T:
     """Reads a dataclass from an open HDF5 group; a field that came later has its default.
 
-    Raises InputError when the group holds another type.
+    Raises InputError when the group holds another type, or a field of another kind than the type says.
     """
     found = group.attrs.get("type")
     if found != cls.__name__:
@@ -107,7 +121,42 @@ def read(group: h5py.Group, cls: type[T], where: object = "") -> T:
                 continue
             raise InputError(where or group.name, f"no field {field.name!r}", f"all fields of {cls.__name__}")
         values[field.name] = _read_field(group, field.name)
-    return cls(**values)
+    return checked(cls(**values), where or group.name)
+
+
+def checked(value: T, where: object) -> T:
+    """A dataclass made of what somebody's file says.
+
+    Raises InputError unless each field is what its annotation says, but for the shapes of arrays.
+    """
+    kinds = get_type_hints(type(value))
+    for field in dataclasses.fields(value):  # type: ignore[arg-type]
+        given = getattr(value, field.name)
+        if not _is(given, kinds[field.name]):
+            found, expected = (
+                " ".join(repr(given).split())[:60],
+                f"{field.type}, as in a {type(value).__name__}",
+            )
+            raise InputError(f"{where}: {field.name}", found, expected)
+    return value
+
+
+def _is(value: Any, kind: Any) -> bool:
+    """Whether a value read is what an annotation says; of arrays their kind of numbers, no shape."""
+    origin, parts = get_origin(kind) or kind, get_args(kind)
+    if origin is Literal:
+        return isinstance(value, str) and value in parts
+    if origin is np.ndarray:
+        wanted = get_args(parts[1])[0]
+        return isinstance(value, np.ndarray) and np.can_cast(value.dtype, wanted, "same_kind")
+    if origin is tuple:
+        return isinstance(value, tuple) and all(_is(part, parts[0]) for part in value)
+    if hasattr(origin, "_fields"):  # a named tuple, which JSON makes a list
+        wanted = get_type_hints(origin).values()
+        return isinstance(value, list | tuple) and len(value) == len(wanted) and all(map(_is, value, wanted))
+    if origin in (int, float):
+        return isinstance(value, int | origin) and not isinstance(value, bool)
+    return isinstance(value, origin)
 
 
 def _write_field(group: h5py.Group, name: str, value: Any) -> None:

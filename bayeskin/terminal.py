@@ -87,7 +87,7 @@ def exit_code(call: Callable[[], Any]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except OSError as error:
-        return complain(str(error), WRONG_INPUT)
+        return complain(f"{error.filename}: {error.strerror}" if error.filename else str(error), WRONG_INPUT)
 
 
 def complain(message: str, code: int) -> int:

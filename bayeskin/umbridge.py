@@ -12,6 +12,7 @@ from __future__ import annotations
 import http.client
 import json
 import math
+import sys
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -120,7 +121,7 @@ def _checked_url(url: str) -> Any:
 def _understood(url: str, text: bytes) -> dict[str, Any]:
     try:
         said = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         said = None
     if not isinstance(said, dict):
         raise InputError(url, f"the answer {text[:40]!r}", EXPECTED)
@@ -148,6 +149,11 @@ class _Server(ThreadingHTTPServer):
         TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Nothing where a client has left before its answer: that is no fault of the server's."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(request, client_address)
+
 
 class _Handler(BaseHTTPRequestHandler):
     """The requests of the protocol that a model without derivatives answers."""
@@ -163,26 +169,30 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(404, "UnsupportedFeature", f"no {self.path}")
 
     def do_POST(self) -> None:
+        length = self.headers.get("Content-Length", "")
+        if not (length.isdecimal() and len(length) < 20 and int(length) <= MOST_BYTES):
+            self.close_connection = True  # what follows cannot be told from the next request
+            self._refuse(400, "InvalidInput", f"Content-Length {length!r:.40}; expected at most {MOST_BYTES}")
+            return
+        body = self.rfile.read(int(length))
         try:
-            asked = self._content()
-            self._say(200, self._answer(self.path, asked))
+            answer = self._answer(self.path, self._understood(body))
         except (InputError, Refused) as error:
             self._refuse(400, "InvalidInput", str(error))
         except Exception as error:  # of the model: the client is told, and the server stays
             self._refuse(500, "ModelError", f"{type(error).__name__}: {error}")
+        else:
+            self._say(200, answer)
 
-    def _content(self) -> dict[str, Any]:
-        length = self.headers.get("Content-Length", "")
-        if not length.isdecimal() or int(length) > MOST_BYTES:
-            raise Refused(f"Content-Length {length!r}; expected at most {MOST_BYTES}")
+    def _understood(self, body: bytes) -> dict[str, Any]:
         try:
-            asked = json.loads(self.rfile.read(int(length)))
+            asked = json.loads(body)
         except (ValueError, RecursionError):
             asked = None
         if not isinstance(asked, dict) or not isinstance(asked.get("config", {}), dict):
             raise Refused("the request is no JSON object with a config that is one")
         if asked.get("name") != self.model.name:
-            raise Refused(f"no model {asked.get('name')!r}; there is {self.model.name!r}")
+            raise Refused(f"no model {asked.get('name')!r:.60}; there is {self.model.name!r}")
         return asked
 
     def _answer(self, path: str, asked: Mapping[str, Any]) -> dict[str, Any]:

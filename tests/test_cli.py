@@ -119,8 +119,8 @@ def backwards(path: Path) -> None:
         (backwards, "increase"),
         (lambda path: path.write_text(""), "empty"),
         (lambda path: path.write_text("time (s),displacement (mm),force (N)\n0,0,abc\n"), "abc"),
-        (lambda path: None, "unreadable"),
-        (lambda path: path.mkdir(), "unreadable"),
+        (lambda path: None, "no such file"),
+        (lambda path: path.mkdir(), "a folder"),
     ],
     ids=["no force", "two forces", "one phase", "time backwards", "empty", "text", "absent", "a folder"],
 )
@@ -386,7 +386,7 @@ def ready(measured: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("[parameters.E_c]\nupper = 4e6\n", "a part of 10000 to 2e+06"),
         ("[fit]\nbin_width_s = 1.0\n", "130 bins"),
         ("[model]\nrefinement = 2\n", "another model"),
-        ("[surrogate]\nfile = 'absent.h5'\n", "surrogates/absent.h5"),
+        ("[surrogate]\nfile = 'absent.h5'\n", "one that is shipped: demo.h5"),
     ],
     ids=["parameters outside its box", "other bins", "other model", "absent"],
 )

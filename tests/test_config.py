@@ -1,5 +1,6 @@
 """A configuration is either complete and in range, or refused in one line that names the key."""
 
+import os
 import re
 from pathlib import Path
 
@@ -109,3 +110,59 @@ def test_what_is_not_toml_is_refused_with_its_line(tmp_path: Path) -> None:
         load_config(tmp_path / "binary.toml")
     with pytest.raises(InputError):
         load_config(tmp_path)
+
+
+FILE = "recording.file = 'a'\n"
+DEEP, MANY_DIGITS = "[" * 20_000, "9" * 5_000
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (f"a = {DEEP}", "nested too deeply"),
+        (".".join("a" * 3_000) + " = 1", "nested too deeply"),
+        (f"seed = {MANY_DIGITS}", "digits"),
+        (f"seed = 0x{'f' * 5_000}", "digits"),
+        (
+            FILE + "seed = 9223372036854775808",
+            "seed: found 9223372036854775808; expected less than",
+        ),
+        (
+            FILE + "[design]\npoints = [10000000000]",
+            "points.0: found 10000000000; expected less",
+        ),
+        (FILE + "[model]\nrefinement = 40", "model.refinement: found 40; expected less than"),
+        (FILE + "[sobol]\nsamples = 1000000000", "sobol.samples: found"),
+        ("#" * 1_000_001, "found 1000001 bytes; expected a TOML"),
+        ("time,force\n0,1\n", r"line 1.*; expected a TOML configuration, as `bayeskin new RECORDING`"),
+    ],
+    ids=lambda value: value[-12:],
+)
+def test_what_would_take_all_memory_or_the_stack_is_refused(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(InputError, match=says) as caught:
+        load_config(written(tmp_path, text))
+    assert len(str(caught.value)) < 600
+    assert "\n" not in str(caught.value)
+
+
+def test_the_mark_that_notepad_puts_before_a_text_is_no_part_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.toml"
+    path.write_bytes(b"\xef\xbb\xbf[recording]\r\nfile = 'a.csv'\r\n")
+    assert load_config(path).recording.file == "a.csv"
+
+
+def test_a_recording_is_told_from_a_configuration(tmp_path: Path) -> None:
+    (tmp_path / "good.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(InputError, match=r"not text in UTF-8; expected .*`bayeskin new RECORDING`"):
+        load_config(tmp_path / "good.h5")
+
+
+def test_what_is_no_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    for path, found in (
+        (tmp_path, "a folder"),
+        (tmp_path / "pipe.toml", "a pipe or a device, no file"),
+        (Path(os.devnull), "a pipe or a device, no file"),
+    ):
+        with pytest.raises(InputError, match=f": found {found}; expected a TOML"):
+            load_config(path)

@@ -6,13 +6,17 @@ those of another format, or all random. The slow runs together take more than a 
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import arviz as az
+import emcee
 import h5py
 import meshio
 import numpy as np
@@ -20,19 +24,22 @@ import openpyxl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from toy import MOTION, SPACE, toy_force
+from toy import EDGES_S, MOTION, SPACE, toy_bin_means, toy_force
 
 from bayeskin import probe, storage
 from bayeskin.config import load_config
 from bayeskin.errors import InputError
-from bayeskin.inference import load_inference_data
+from bayeskin.inference import chains, draws_of, inference_data, load_inference_data, save_inference_data
 from bayeskin.journal import Journal, Run
 from bayeskin.model.mesh import GMSH_LAYERS, GMSH_NAMES, read_gmsh
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline import folder
 from bayeskin.pipeline.serve import Asked, ServedModel
 from bayeskin.recordings import phase_noise, read_recording, segment
-from bayeskin.types import Recording
+from bayeskin.runner import load_waves
+from bayeskin.surrogates import load_manifest, manifest_of, save_surrogate, train
+from bayeskin.surrogates.files import contents_hash
+from bayeskin.types import Design, Recording
 from bayeskin.umbridge import Refused, _understood
 
 ROOT = Path(__file__).parents[1]
@@ -163,6 +170,7 @@ READERS: dict[str, tuple[Callable[[Path], object], Callable[[Path], bytes], int]
 EACH = 10
 MOST_HDF5 = 400  # each takes a process
 MANY = 170  # times the examples, in a slow run
+HERE = {"name": "toy", "contents": "1"}  # what a chain is of
 TIMES = pytest.mark.parametrize("times", [1, pytest.param(MANY, marks=pytest.mark.slow)])
 
 
@@ -257,6 +265,96 @@ def test_damaged_hdf5_neither_hangs_nor_ends_us(name: str, times: int, tmp_path:
         path.write_bytes(damaged(sound, rng, [sound]))
         count += refused(read, path)
     assert count
+
+
+def a_design() -> Design:
+    theta = SPACE.from_unit(np.random.default_rng(3).random((40, SPACE.dim)))
+    force_n, held_out = toy_bin_means(theta), np.arange(40) % 5 == 0
+    wave, ok = np.zeros(40, dtype=np.int64), np.ones(40, dtype=bool)
+    return Design(SPACE, EDGES_S, theta, force_n, wave, held_out, ok, ("",) * 40, np.ones(40), 1, "toy")
+
+
+def as_surrogate(path: Path) -> None:
+    surrogate, validation = train(a_design(), "gp", seed=0)
+    save_surrogate(path, surrogate, manifest_of(surrogate, validation))
+
+
+def as_posterior(path: Path) -> None:
+    draws = SPACE.from_unit(np.random.default_rng(4).random((2, 30, SPACE.dim)))
+    columns = {name: draws[..., j] for j, name in enumerate(SPACE.names)}
+    said = json.dumps([dataclasses.asdict(p) for p in SPACE.parameters])
+    save_inference_data(path, az.from_dict(columns, attrs={"parameters": said, "correlations": "[]"}))
+
+
+def as_chain(path: Path) -> None:
+    backend = emcee.backends.Backend()
+    sampler = emcee.EnsembleSampler(8, 2, lambda x: -0.5 * float(x @ x), backend=backend)
+    sampler.run_mcmc(np.random.default_rng(5).standard_normal((8, 2)), 5)
+    chains.save(path, backend, ("a", "b"), HERE)
+
+
+# name of the file, how a sound one is made, how it is read, examples a run: of altered contents, of bytes
+HDF5: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], int, int]] = {
+    "surrogate.h5": (as_surrogate, load_manifest, 40, 2),
+    "design.h5": (lambda path: storage.save(path, a_design(), {"waves": "[{}]"}), load_waves, 40, 2),
+    "posterior.nc": (as_posterior, lambda path: draws_of(load_inference_data(path)), 10, 2),
+    "chain.h5": (as_chain, lambda path: chains.load(path, ("a", "b"), HERE), 40, 0),  # a run's own
+}
+NONSENSE = [
+    np.ones((2, 2)), np.zeros(0), np.arange(3), np.nan, -1, 2**62, True, "[" * 9999, "[]", "[1]", "{}",
+    '{"a": [null]}', "text", b"\xff\xfe", "", h5py.Empty("f8"),
+]  # fmt: skip
+
+
+def alter(path: Path, rng: np.random.Generator) -> None:
+    """Takes one part out of a sound HDF5 file, or puts nonsense in its place; hashes are mended."""
+    with h5py.File(path, "r+") as handle:
+        names: list[str] = ["/"]
+        handle.visit(names.append)
+        node = handle[names[int(rng.integers(len(names)))]]
+        value = NONSENSE[int(rng.integers(len(NONSENSE)))]
+        keys = [*node.attrs] if rng.integers(2) or node.name == "/" else []
+        at = keys[int(rng.integers(len(keys)))] if keys else None
+        parent, own = (node.attrs, at) if at else (node.parent, node.name)
+        if node.name != "/" or at:
+            del parent[own]
+            if rng.integers(4):
+                parent[own] = value
+        with suppress(UnicodeEncodeError):  # of a text that is none
+            handle.attrs["arrays_sha256"] = contents_hash(handle)
+
+
+@pytest.mark.filterwarnings("ignore")
+@TIMES
+@pytest.mark.parametrize("name", HDF5)
+def test_altered_contents_are_read_or_refused_in_one_line(
+    name: str, times: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make, read, examples, _ = HDF5[name]
+    make(tmp_path / name)
+    read(tmp_path / name)
+    sound, path, count = (tmp_path / name).read_bytes(), tmp_path / "in" / name, 0
+    path.parent.mkdir()
+    monkeypatch.setattr(inference_data, "refuse_damaged", lambda *_: None)  # written by a sound libhdf5
+    for seed in range(times * examples):
+        path.write_bytes(sound)
+        alter(path, np.random.default_rng(seed))
+        count += refused(read, path)
+    assert count
+
+
+@pytest.mark.filterwarnings("ignore")
+@TIMES
+@pytest.mark.parametrize("name", [name for name, (*_, examples) in HDF5.items() if examples])
+def test_damaged_bytes_of_what_a_user_brings_do_not_end_us(name: str, times: int, tmp_path: Path) -> None:
+    make, read, _, examples = HDF5[name]
+    make(tmp_path / name)
+    sound, path, rng = (tmp_path / name).read_bytes(), tmp_path / "in" / name, np.random.default_rng(8)
+    path.parent.mkdir()
+    for _ in range(min(times * examples, MOST_HDF5)):
+        path.write_bytes(damaged(sound, rng, [sound]))
+        if not refused(lambda path: probe.refuse_damaged(path, name), path):
+            refused(read, path)
 
 
 def test_the_file_that_libhdf5_reads_for_ever_is_refused(

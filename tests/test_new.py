@@ -8,6 +8,7 @@ import shutil
 import tomllib
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -103,7 +104,8 @@ def test_what_cannot_be_done_is_refused_in_one_line_and_nothing_written(
     own: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert "ending .toml" in refused(capsys, "new", own, "-o", tmp_path / "own.yaml")
-    assert "unreadable" in refused(capsys, "new", tmp_path / "absent.csv")
+    assert "no such file" in refused(capsys, "new", tmp_path / "absent.csv")
+    assert ".: found a folder; expected a recording" in refused(capsys, "new", Path())
     assert "absent" in refused(capsys, "new", own, "-o", tmp_path / "absent" / "own.toml")
     assert [path.name for path in tmp_path.iterdir()] == ["own.h5"]
 
@@ -141,3 +143,43 @@ def test_a_recording_with_the_name_of_a_shipped_surrogate_is_not_taken_for_it(tm
     run = opened(recording, Silent())
     assert run.config.surrogate.file == recording.name
     assert shipped_files(run).surrogate == shipped("surrogates/demo.h5")
+
+
+def test_a_surrogate_that_is_nowhere_is_told_apart_from_a_broken_installation(tmp_path: Path) -> None:
+    shutil.copy(shipped("data/demo.h5"), tmp_path / "a.h5")
+    case = tmp_path / "case.toml"
+    case.write_text('[recording]\nfile = "a.h5"\n[surrogate]\nfile = "mine.h5"\n')
+    with pytest.raises(InputError, match=r"surrogate.file: found no file .*mine.h5; expected .*: demo.h5, "):
+        shipped_files(open_run(case, Silent()))
+
+
+def test_effects_that_come_with_a_surrogate_of_ones_own_are_tried_before_they_are_read(
+    tmp_path: Path,
+) -> None:
+    for name in ("a.h5", "mine.h5", "mine-design.h5"):
+        shutil.copy(shipped("data/demo.h5"), tmp_path / name)
+    (tmp_path / "mine-effects").mkdir()
+    (tmp_path / "mine-effects" / "bottom-adherence.h5").write_bytes(b"\x89HDF")
+    case = tmp_path / "case.toml"
+    case.write_text('[recording]\nfile = "a.h5"\n[surrogate]\nfile = "mine.h5"\n')
+    with pytest.raises(InputError, match=r"bottom-adherence.h5: found not readable as HDF5"):
+        shipped_files(open_run(case, Silent()))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"waves": None}, "manifest: waves: found None"),
+        ({"parameters": {}}, "manifest: parameters: found others"),
+    ],
+    ids=["no waves", "no box"],
+)
+def test_a_manifest_without_what_a_run_reads_is_refused(demo: Path, change: dict, says: str) -> None:
+    for name in ("demo", "demo-design"):
+        shutil.copy(shipped(f"surrogates/{name}.h5"), demo.with_name(f"{name.replace('demo', 'mine')}.h5"))
+    with h5py.File(demo.with_name("mine.h5"), "r+") as handle:
+        handle.attrs["manifest"] = json.dumps({**json.loads(handle.attrs["manifest"]), **change})
+    case = demo.with_name("case.toml")
+    case.write_text(f'[recording]\nfile = "{demo.name}"\n[surrogate]\nfile = "mine.h5"\n')
+    with pytest.raises(InputError, match=says):
+        stages.run(case, "design", Silent())

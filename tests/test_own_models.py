@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -330,6 +331,63 @@ def test_the_full_model_is_served(served: str) -> None:
         assert model([list(THETA.values())], config)[0][0] == pytest.approx(FULL_MODEL_N, rel=1e-3)
         with pytest.raises(Exception, match=r"InvalidInput.*E_c: found -1"):
             model([[-1.0, *list(THETA.values())[1:]]], config)
+
+
+class Waiting:
+    """A model that answers when it is let."""
+
+    name = "waiting"
+
+    def __init__(self) -> None:
+        self.begun, self.let = threading.Event(), threading.Event()
+
+    def input_sizes(self, config):
+        return [1]
+
+    def output_sizes(self, config):
+        return [1]
+
+    def evaluate(self, inputs, config):
+        self.begun.set()
+        assert self.let.wait(20.0)
+        return inputs
+
+
+def asked_raw(address, sent: bytes, reset: bool) -> socket.socket:
+    """A connection that has sent bytes; `reset`: one that its client will tear down as it closes it."""
+    client = socket.create_connection(address, timeout=20.0)
+    if reset:
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    client.sendall(sent)
+    return client
+
+
+def test_clients_that_misbehave_or_leave_print_nothing_at_the_server(capfd: pytest.CaptureFixture) -> None:
+    model, before = Waiting(), set(threading.enumerate())
+    listening = server(model, "127.0.0.1", 0)
+    serving = threading.Thread(target=listening.serve_forever, daemon=True)
+    serving.start()
+    body = b'{"name": "waiting", "input": [[1.0]]}'
+    whole = b"POST /Evaluate HTTP/1.1\r\nContent-Length: %d\r\n\r\n" % len(body) + body
+    leaving = asked_raw(listening.server_address, whole, reset=True)
+    assert model.begun.wait(20.0)
+    leaving.close()
+    for sent in (b"", b"\x00\xff garbage\r\n\r\n", b"GET /Info", whole[:-5], b"POST / HTTP/1.1\r\n"):
+        asked_raw(listening.server_address, sent, reset=True).close()
+    for length in (b"-1", b"9" * 5000, b"64000001", b"x"):
+        sent = b"POST /Evaluate HTTP/1.1\r\nContent-Length: %s\r\n\r\n" % length
+        with asked_raw(listening.server_address, sent, reset=False) as client:
+            assert client.recv(100).startswith(b"HTTP/1.0 400")
+    with asked_raw(listening.server_address, whole[:-5], reset=False) as client:
+        client.shutdown(socket.SHUT_WR)
+        assert client.recv(100).startswith(b"HTTP/1.0 400")
+    model.let.set()
+    for thread in set(threading.enumerate()) - before - {serving}:
+        thread.join(20.0)
+    assert Client(f"http://127.0.0.1:{listening.server_address[1]}").name() == "waiting"
+    listening.shutdown()
+    listening.server_close()
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_server_that_goes_away_costs_no_finished_run_and_fails_none(tmp_path: Path) -> None:

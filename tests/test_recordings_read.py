@@ -1,6 +1,7 @@
 """A file becomes a recording in SI, or one line that says which row is wrong, and how."""
 
 import hashlib
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from skin_test import article_recording
 
 from bayeskin import storage
 from bayeskin.errors import InputError
-from bayeskin.recordings import read_recording
+from bayeskin.recordings import read_recording, uniform_edges
 from bayeskin.recordings.headers import parse_header
 from bayeskin.types import Recording
 
@@ -236,9 +237,29 @@ def test_files_that_are_nothing_are_refused(tmp_path: Path, name: str, data: byt
 
 
 def test_a_file_that_is_absent_or_a_folder_is_refused(tmp_path: Path) -> None:
-    for path in (tmp_path / "absent.csv", tmp_path):
-        with pytest.raises(InputError, match="unreadable"):
+    for path, found in ((tmp_path / "absent.csv", "no such file"), (tmp_path, "a folder")):
+        with pytest.raises(InputError, match=f": found {found}; expected a recording"):
             read_recording(path)
+
+
+@pytest.mark.parametrize("ending", [".csv", ".xlsx", ".h5", ""])
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path, ending: str) -> None:
+    os.mkfifo(tmp_path / f"pipe{ending}")
+    with pytest.raises(InputError, match="found a pipe or a device, no file; expected a recording"):
+        read_recording(tmp_path / f"pipe{ending}")
+
+
+def test_a_file_beyond_memory_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    with open(tmp_path / "a.csv", "wb") as handle:
+        handle.truncate(2**31 + 1)  # a hole: takes no room
+    with pytest.raises(InputError, match="found 2147483649 bytes; expected a recording, of at most"):
+        read_recording(tmp_path / "a.csv")
+
+
+def test_bins_beyond_memory_are_refused() -> None:
+    for width_s, end_s in ((1e-9, 130.0), (1e-320, 130.0), (0.5, 1e300), (0.5, np.nan)):
+        with pytest.raises(InputError, match=r"bin_width_s: found .*; expected bins so wide"):
+            uniform_edges(end_s, width_s)
 
 
 @pytest.mark.parametrize("ending", [".xlsx", ".h5"])

@@ -441,3 +441,21 @@ def test_a_design_file_is_an_ordinary_file_of_the_project(tmp_path: Path, whole:
     assert load_waves(tmp_path / "copy.h5") == ()
     with pytest.raises(InputError, match="no such file"):
         load_design(tmp_path / "absent.h5")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("theta", np.zeros((3, 2)), r"theta: found shape \(3, 2\); expected shape"),
+        ("messages", ("",), "messages: found 1 of them"),
+        ("edges_s", np.zeros((2, 2)), "edges_s: found shape"),
+        ("theta", np.full(WAVE.theta.shape, np.nan), "values that are not finite"),
+    ],
+)
+def test_a_design_whose_arrays_do_not_belong_together_is_refused(
+    serial: None, tmp_path: Path, name: str, value: object, says: str
+) -> None:
+    made = run(tmp_path / "design.h5")
+    storage.save(tmp_path / "other.h5", replace(made, **{name: value}))
+    with pytest.raises(InputError, match=says):
+        load_design(tmp_path / "other.h5")

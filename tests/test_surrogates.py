@@ -30,6 +30,7 @@ from bayeskin.surrogates import (
     validate,
 )
 from bayeskin.surrogates.chaos import LatentChaos, fit_sparse
+from bayeskin.surrogates.files import contents_hash
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.hyperparameters import LatentFit, _Data, _likelihood, fit_latent
 from bayeskin.surrogates.kernels import KERNELS, kernel, squared_distances, trend_basis, trend_degree
@@ -459,6 +460,53 @@ def test_damaged_files_are_refused(gp, tmp_path, damage, match):
     damage(path)
     with pytest.raises(InputError, match=match):
         load_surrogate(path)
+
+
+def of_shape(name, values):
+    """Another array in the place of one, and the hash that belongs to it: made by hand, not damaged."""
+
+    def change(handle):
+        del handle[name]
+        handle[name] = values
+        handle.attrs["arrays_sha256"] = contents_hash(handle)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (lambda handle: handle.attrs.update(format_version="abc"), "found format version abc; expected"),
+        (lambda handle: handle.attrs.update(format_version=np.arange(3)), "found format version"),
+        (lambda handle: handle.attrs.update(kind="other"), "contents that cannot be read"),
+        (lambda handle: handle.attrs.update(manifest="[]"), "manifest or provenance: found JSON of another"),
+        (lambda handle: handle.attrs.update(manifest="[" * 20000), "contents that cannot be read"),
+        (lambda handle: handle.attrs.pop("manifest"), "contents that cannot be read"),
+        (lambda handle: handle.attrs.update(manifest="{}"), "manifest: model_hash: found None"),
+        (lambda handle: handle.attrs.update(manifest='{"model_hash": "0"}'), "manifest: parameters"),
+        (lambda handle: handle.attrs.update(provenance="[1]"), "manifest or provenance"),
+        (of_shape("transform/mean", np.ones((2, 2))), r"transform: mean: found shape \(2, 2\)"),
+        (of_shape("transform/components", np.ones(3)), "transform: components: found shape"),
+        (of_shape("transform/truncation", np.ones(1)), "transform: truncation: found shape"),
+        (of_shape("transform/mean", b"text"), "mean: found"),
+        (of_shape("edges_s", np.ones((2, 2))), r"edges_s: found shape \(2, 2\)"),
+        (of_shape("edges_s", np.zeros(len(EDGES_S))), "edges_s: found edges that do not increase"),
+        (of_shape("edges_s", np.full(len(EDGES_S), np.nan)), "edges_s: found values that are not finite"),
+        (of_shape("active", np.array([0, 1, 2, 3, 9])), r"active: found inputs \[0, 1, 2, 3, 9\]"),
+        (of_shape("latents/nuggets", np.ones(99)), r"latents: nuggets: found shape \(99,\)"),
+        (of_shape("latents/inputs", np.ones((3, 2, 2))), "latents: inputs: found shape"),
+        (of_shape("space/parameters", 1.0), "contents that cannot be read"),
+    ],
+)
+def test_files_with_other_contents_are_refused_in_one_line(gp, tmp_path, change, match):
+    path = tmp_path / "s.h5"
+    save_surrogate(path, gp[0], manifest_of(*gp))
+    with h5py.File(path, "a") as handle:
+        change(handle)
+    with pytest.raises(InputError, match=match) as refused:
+        load_manifest(path)
+    assert str(refused.value).startswith(str(path))
+    assert "\n" not in str(refused.value)
 
 
 def test_the_same_design_gives_the_same_surrogate():

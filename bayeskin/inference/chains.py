@@ -11,6 +11,7 @@ import emcee
 import h5py
 import numpy as np
 
+from bayeskin import storage
 from bayeskin.errors import InputError
 
 
@@ -49,23 +50,22 @@ def load(path: Path, names: tuple[str, ...], identity: Mapping[str, str]) -> emc
     Raises InputError when the file is not readable, has other parameters, or differs in any entry of
     `identity` (entries that `identity` lacks are not compared).
     """
-    try:
-        with h5py.File(path, "r") as handle:
-            found = json.loads(handle["mcmc"].attrs["bayeskin"])
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(path, f"not a chain of bayeskin ({error})", "ensemble_N.h5 of `sample`") from None
-    if tuple(found["names"]) != names:
-        raise InputError(path, f"a chain of {', '.join(found['names'])}", f"one of {', '.join(names)}")
-    for entry, value in identity.items():
-        if found["identity"].get(entry) != value:
-            raise InputError(
-                path, f"a chain with another {entry} ({found['identity'].get(entry, 'none')[:12]})",
-                f"the same {entry} ({value[:12]}); sample into another folder",
-            )  # fmt: skip
-    return _in_memory(emcee.backends.HDFBackend(str(path), read_only=True))
+    with storage.reading(path, "ensemble_N.h5 of `sample`") as handle:
+        found = json.loads(handle["mcmc"].attrs["bayeskin"])
+        its_names, its_identity = tuple(map(str, found["names"])), dict(found["identity"])
+        if its_names != names:
+            raise InputError(path, f"a chain of {', '.join(its_names)}", f"one of {', '.join(names)}")
+        for entry, value in identity.items():
+            if its_identity.get(entry) != value:
+                raise InputError(
+                    path, f"a chain with another {entry} ({its_identity.get(entry, 'none')!s:.12})",
+                    f"the same {entry} ({value[:12]}); sample into another folder",
+                )  # fmt: skip
+        return _in_memory(emcee.backends.HDFBackend(str(path), read_only=True), len(names))
 
 
-def _in_memory(disk: emcee.backends.HDFBackend) -> emcee.backends.Backend:
+def _in_memory(disk: emcee.backends.HDFBackend, count: int) -> emcee.backends.Backend:
+    """Raises InputError unless it holds steps of walkers in `count` parameters."""
     walkers, dim = (int(v) for v in disk.shape)
     memory = emcee.backends.Backend()
     memory.reset(walkers, dim)
@@ -73,6 +73,11 @@ def _in_memory(disk: emcee.backends.HDFBackend) -> emcee.backends.Backend:
     memory.log_prob = np.array(disk.get_log_prob())
     memory.accepted = np.array(disk.accepted)
     memory.iteration = int(disk.iteration)
+    steps = (memory.iteration, walkers, count)
+    if dim != count or (memory.chain.shape, memory.log_prob.shape) != (steps, steps[:2]):
+        raise InputError(
+            "chain", f"shape {memory.chain.shape}", f"shape {steps}, and of log_prob {steps[:2]}"
+        )
     memory.random_state = tuple(
         part.item() if isinstance(part, np.generic) else part for part in disk.random_state
     )

@@ -15,6 +15,8 @@ from bayeskin.errors import InputError
 from bayeskin.inference.bands import predictive_draws
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.sample import Posterior
+from bayeskin.probe import refuse_damaged
+from bayeskin.storage import checked
 from bayeskin.types import Array, Correlation, Parameter, ParameterSpace, Provenance
 
 if TYPE_CHECKING:
@@ -81,26 +83,42 @@ def load_inference_data(path: Path | str) -> arviz.InferenceData:
     """Reads what `save_inference_data` wrote. Raises InputError when absent or not NetCDF of ArviZ."""
     import arviz as az
 
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(path, "no such file", "a posterior in NetCDF")
+    path, expected = Path(path), "a posterior in NetCDF"
+    refuse_damaged(path, expected)
     try:
         idata = az.from_netcdf(str(path), engine=_ENGINE)
-    except (OSError, ValueError) as error:
-        raise InputError(path, f"not readable ({error})", "a posterior in NetCDF") from None
+    except Exception as error:  # h5netcdf and xarray raise of every kind on a damaged file
+        raise InputError(path, f"not readable ({_in_a_line(error)})", expected) from None
     if "posterior" not in idata.groups():
         raise InputError(path, f"groups {', '.join(idata.groups()) or 'none'}", "a group 'posterior'")
     return idata
 
 
 def draws_of(idata: arviz.InferenceData) -> tuple[ParameterSpace, Array]:
-    """The priors and the draws (s, D) in SI that an InferenceData of `to_inference_data` holds."""
+    """The priors and the draws (s, D) in SI that an InferenceData of `to_inference_data` holds.
+
+    Raises InputError for one of another origin, or whose parts do not belong together.
+    """
+    where, expected = "InferenceData", "one made by bayeskin"
     stored = idata.attrs.get("parameters")
     if stored is None:
-        raise InputError("InferenceData", "no attribute 'parameters'", "one made by bayeskin")
-    tied = tuple(Correlation(*entry) for entry in json.loads(idata.attrs.get("correlations", "[]")))
-    space = ParameterSpace(tuple(Parameter(**entry) for entry in json.loads(stored)), tied)
-    return space, np.stack([idata["posterior"][name].values.ravel() for name in space.names], axis=-1)
+        raise InputError(where, "no attribute 'parameters'", expected)
+    try:
+        tied = tuple(Correlation(*entry) for entry in json.loads(idata.attrs.get("correlations", "[]")))
+        given = tuple(checked(Parameter(**entry), where) for entry in json.loads(stored))
+        space = checked(ParameterSpace(given, tied), where)
+        draws = np.stack([idata["posterior"][name].values.ravel() for name in space.names], axis=-1)
+    except InputError:
+        raise
+    except Exception as error:  # json, xarray and numpy raise of every kind on what somebody altered
+        raise InputError(where, f"contents that cannot be read ({_in_a_line(error)})", expected) from None
+    if draws.dtype.kind != "f" or not np.isfinite(draws).all():
+        raise InputError(f"{where}: posterior", "draws that are not finite numbers", expected)
+    return space, draws
+
+
+def _in_a_line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
 
 
 def _predictive(

@@ -68,8 +68,9 @@ def _work(run: Run) -> Mapping[str, Any]:
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     if run.config.surrogate.file is not None:
         files = shipped_files(run)
-        design, records = load_design(files.design), load_manifest(files.surrogate)["waves"]
+        design = load_design(files.design)
         check_fits(run, files, design, binned, motion)
+        records = load_manifest(files.surrogate)["waves"]
         fine = load_design(files.fine) if files.fine is not None else None
     else:
         design, records = _run_waves(run, binned, motion)

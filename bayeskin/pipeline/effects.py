@@ -29,7 +29,7 @@ from bayeskin.pipeline.design import fitted_bins, noise_floor_n, rows_of, tell
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.model import model_spec
-from bayeskin.pipeline.shipping import shipped_files
+from bayeskin.pipeline.shipping import effects_beside, shipped_files
 from bayeskin.pipeline.training import base_surrogate
 from bayeskin.runner import Simulate, run_design
 from bayeskin.surrogates import (
@@ -307,10 +307,9 @@ def _runs(
 
 def effect_files(run: Run) -> list[Path]:
     """Of the effects that this run has learnt, else of those shipped with its surrogate; [] without any."""
-    file = run.config.surrogate.file
     folder = run.folder / "effects"
-    if not list(folder.glob("*.json")) and file is not None:
-        folder = shipped_files(run).surrogate.with_name(f"{Path(file).stem}-effects")
+    if not list(folder.glob("*.json")) and run.config.surrogate.file is not None:
+        folder = effects_beside(shipped_files(run).surrogate)
     return effects_in(folder)
 
 

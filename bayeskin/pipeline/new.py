@@ -28,12 +28,12 @@ def new_config(file: Path, out: Path | None = None) -> dict[str, Any]:
     It takes a shipped surrogate where one knows the recording's protocol, else a design of its own.
     Raises InputError, with nothing written, for no recording of a test, or an `out` that is there already.
     """
+    recording = read_recording(file)
     out = out or file.with_suffix(".toml")
     if out.suffix != ".toml":
         raise InputError(f"-o {out}", f"ending {out.suffix!r}", "ending .toml")
     if out.exists():
         raise InputError(f"-o {out}", "a file that is there already", "a name that is free")
-    recording = read_recording(file)
     phases = segment(recording)
     noise = phase_noise(recording, phases)
     found = describe(recording, phases, noise)

@@ -43,7 +43,7 @@ def facts_of(run: Run, stages: Mapping[str, Stage]) -> RunFacts:
     return RunFacts(
         name=config.name,
         config_path=str(run.config_path),
-        config_text=run.config_path.read_text(encoding="utf-8"),
+        config_text=run.config_path.read_text(encoding="utf-8-sig"),
         config_sha256=config.sha256,
         version=bayeskin.__version__,
         seed=config.seed,

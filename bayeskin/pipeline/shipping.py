@@ -17,7 +17,7 @@ from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.model import model_spec, waves_spec
 from bayeskin.probe import refuse_damaged
 from bayeskin.shipped import shipped
-from bayeskin.surrogates import load_manifest
+from bayeskin.surrogates import effects_in, load_manifest
 from bayeskin.types import BinnedForce, Design, PadMotion
 
 
@@ -41,21 +41,34 @@ def shipped_files(run: Run) -> ShippedFiles:
     name, folder = run.config.surrogate.file, run.config_path.resolve().parent
     assert name is not None
     own = folder / name
-    path = own if own.is_file() and name != run.config.recording.file else shipped(f"surrogates/{name}")
+    brought = own.is_file() and name != run.config.recording.file
+    path = own if brought else _shipped_folder() / name
+    if not path.is_file():
+        ready = ", ".join(f"{file.stem}.h5" for file in sorted(_shipped_folder().glob("*.json")))
+        expected = f"a file beside the configuration, or one that is shipped: {ready}"
+        raise InputError(f"{run.config_path}: surrogate.file", f"no file {own}", expected)
     fine = None if run.config.design.coarse is None else path.with_name(f"{path.stem}-fine.h5")
     files = ShippedFiles(path, path.with_name(f"{path.stem}-design.h5"), fine)
     for file in files.present[1:]:
         if not file.is_file():
             raise InputError(f"{run.config_path}: surrogate.file", f"no {file}", "its design beside it")
-    for file in files.present if path == own else ():
-        refuse_damaged(file, "a surrogate that bayeskin wrote, and its design")
+    for file in (*files.present, *effects_in(effects_beside(path))) if brought else ():
+        refuse_damaged(file, "a surrogate that bayeskin wrote, and its design and effects")
     return files
+
+
+def effects_beside(surrogate: Path) -> Path:
+    """The folder of effects that belongs to a surrogate's file."""
+    return surrogate.with_name(f"{surrogate.stem}-effects")
+
+
+def _shipped_folder() -> Path:
+    return shipped("surrogates/README.md").parent
 
 
 def shipped_for(motion: PadMotion) -> Path | None:
     """The shipped surrogate of the reaction on the generator's bricks for a protocol, if there is one."""
-    folder = shipped("surrogates/README.md").parent
-    for path in sorted(folder.glob("*.json")):
+    for path in sorted(_shipped_folder().glob("*.json")):
         said = json.loads(path.read_text(encoding="utf-8"))
         ours = (said.get("observation"), said.get("mesh")) == ("reaction", "bricks")
         if ours and said.get("motion_sha256") == motion_sha256(motion):
@@ -78,6 +91,9 @@ def check_fits(run: Run, files: ShippedFiles, design: Design, binned: BinnedForc
     """Raises InputError unless model, protocol and bins are this run's, and its priors lie in the box."""
     said = load_manifest(files.surrogate)
     where = f"{run.config_path}: surrogate.file {files.surrogate.name}"
+    waves = said.get("waves")
+    if not isinstance(waves, list) or not all(isinstance(w, dict) and "kept_fraction" in w for w in waves):
+        raise InputError(f"{where}: manifest: waves", f"{waves!r:.60}", "how the points of each were chosen")
     if (design.model_hash, said.get("model_hash")) != (waves_spec(run).hash, model_spec(run).hash):
         raise InputError(where, "a surrogate of another model", "one of this configuration's model")
     if said.get("motion_sha256") != motion_sha256(motion):
@@ -87,7 +103,9 @@ def check_fits(run: Run, files: ShippedFiles, design: Design, binned: BinnedForc
         expected = f"the recording's {len(binned.edges_s) - 1} bins to {binned.edges_s[-1]:g} s"
         raise InputError(where, found, expected)
     for ours in parameter_space(run.config, run.config_path).parameters:
-        box = said["parameters"][ours.name]
+        box = said["parameters"].get(ours.name)
+        if box is None:
+            raise InputError(where, f"none of {ours.name}", "a surrogate of this configuration's parameters")
         if ours.lower < box["lower"] or ours.upper > box["upper"]:
             raise InputError(
                 f"{run.config_path}: parameters.{ours.name}",

@@ -19,11 +19,19 @@ from bayeskin.recordings.correlation import NoiseShape, weighted_covariance
 from bayeskin.recordings.noise import NoiseAnalysis, analyse
 from bayeskin.types import Array, BinnedForce, Phase, Recording
 
+MOST_BINS = 1_000_000
+
 
 def uniform_edges(recording_or_end_s: Recording | float, width_s: float = 0.5) -> Array:
-    """Edges [s] (m+1,) of the whole bins of `width_s` from 0 to the recording's end, or to the time given."""
+    """Edges [s] (m+1,) of the whole bins of `width_s` from 0 to the recording's end, or to the time given.
+
+    Raises InputError where there would be more than `MOST_BINS`.
+    """
     last = recording_or_end_s
     end_s = float(last.time_s[-1]) if isinstance(last, Recording) else float(last)
+    if not end_s < MOST_BINS * width_s:
+        found = f"{width_s:g} s for {end_s:g} s"
+        raise InputError("bin_width_s", found, f"bins so wide that they are fewer than {MOST_BINS}")
     return width_s * np.arange(int(end_s / width_s + 1e-6) + 1, dtype=float)
 
 

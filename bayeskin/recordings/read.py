@@ -10,7 +10,7 @@ import numpy as np
 
 from bayeskin import storage
 from bayeskin.errors import InputError
-from bayeskin.probe import refuse_damaged
+from bayeskin.probe import bytes_of, refuse_damaged, refuse_endless
 from bayeskin.recordings.headers import UNITS, Column
 from bayeskin.recordings.tables import Table, read_text, read_workbook
 from bayeskin.types import Array, Recording
@@ -46,36 +46,23 @@ def read_recording(path: Path | str, *, sheet: str | None = None) -> Recording:
     InputError : the file cannot be read, or is no recording of a skin test; says where, what and why.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, f"an unreadable file ({error.strerror})", "a recording") from None
-    kind = path.suffix.lower()
+    refuse_endless(path, "a recording")
+    kind, known = path.suffix.lower(), _WORKBOOKS | _TEXTS | _STORED
+    if kind not in known:
+        raise InputError(path, f"ending {kind!r}", f"one of {', '.join(sorted(known))}")
     if kind in _STORED:
         return _read_stored(path)
-    if kind in _WORKBOOKS:
-        table = read_workbook(path, data, sheet)
-    elif kind in _TEXTS:
-        table = read_text(path, data)
-    else:
-        endings = ", ".join(sorted(_WORKBOOKS | _TEXTS | _STORED))
-        raise InputError(path, f"ending {kind!r}", f"one of {endings}")
+    data = bytes_of(path, "a recording")
+    table = read_workbook(path, data, sheet) if kind in _WORKBOOKS else read_text(path, data)
     with np.errstate(over="ignore"):  # absurd numbers become infinite, and are refused as such
         return _to_recording(path.stem, table, hashlib.sha256(data).hexdigest())
 
 
 def _read_stored(path: Path) -> Recording:
     refuse_damaged(path, "a bayeskin Recording file")
-    try:
-        recording = storage.load(path, Recording)
-        arrays = [np.asarray(a) for a in (recording.time_s, recording.displacement_m, recording.force_n)]
-        sound = len({a.shape for a in arrays}) == 1 and all(
-            a.ndim == 1 and a.dtype.kind == "f" for a in arrays
-        )
-    except InputError:
-        raise
-    except Exception as error:  # HDF5 raises of every kind on a damaged file
-        raise InputError(path, f"a damaged file ({type(error).__name__})", "a bayeskin Recording") from None
+    recording = storage.load(path, Recording)
+    arrays = [recording.time_s, recording.displacement_m, recording.force_n]
+    sound = len({a.shape for a in arrays}) == 1 and all(a.ndim == 1 and a.dtype.kind == "f" for a in arrays)
     if not sound:
         raise InputError(path, "arrays of other shapes or kinds", "three arrays of numbers of one length")
     _refuse_unsound(str(path), 0, *arrays)

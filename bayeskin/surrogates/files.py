@@ -18,6 +18,7 @@ from bayeskin.surrogates.chaos import LatentChaos
 from bayeskin.surrogates.effects import Effect, Estimate, effect_of
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.shapes import ShapeTransform
+from bayeskin.surrogates.sound import refuse_unsound
 from bayeskin.surrogates.surrogate import Latents, ShapeSurrogate
 from bayeskin.surrogates.two_fidelities import CorrectedLatents
 from bayeskin.surrogates.validate import Validation
@@ -26,6 +27,7 @@ from bayeskin.types import Array, ParameterSpace, frozen_array
 FORMAT = "bayeskin surrogate"
 FORMAT_VERSION = 4  # 2: inputs are those of `Similarity`; 3: latents may have a correction; 4: active inputs
 READABLE = (3, 4)  # in 3 all inputs are active
+EXPECTED = "a surrogate that bayeskin wrote"
 LATENTS: dict[str, type[LatentGPs] | type[LatentChaos]] = {"gp": LatentGPs, "chaos": LatentChaos}
 
 
@@ -41,10 +43,14 @@ def manifest_of(surrogate: ShapeSurrogate, validation: Validation) -> dict[str, 
         "coverage_90": validation.coverage_90,
         "median_point_relative_error": float(np.median(validation.point_relative)),
         "worst_point_relative_error": float(np.max(validation.point_relative)),
-        "parameters": {
-            p.name: {"unit": p.unit, "lower": p.lower, "upper": p.upper, "prior": p.prior}
-            for p in surrogate.space.parameters
-        },
+        "parameters": _described(surrogate.space),
+    }
+
+
+def _described(space: ParameterSpace) -> dict[str, dict[str, Any]]:
+    return {
+        p.name: {"unit": p.unit, "lower": p.lower, "upper": p.upper, "prior": p.prior}
+        for p in space.parameters
     }
 
 
@@ -82,36 +88,43 @@ def save_surrogate(path: Path | str, surrogate: ShapeSurrogate, manifest: Mappin
 def load_surrogate(path: Path | str) -> ShapeSurrogate:
     """Reads what `save_surrogate` wrote; predictions are the same bit for bit on the same machine.
 
-    Raises InputError if the file is absent, truncated, foreign, of another format version, or if its
-    contents do not match the hash stored with them.
+    Raises InputError if the file is absent, truncated, foreign, of another format version, if its arrays
+    do not match the hash stored with them (which covers no attribute of the root: not the manifest), or if
+    they do not belong together.
     """
-    path = Path(path)
-    expected = "a surrogate that bayeskin wrote"
-    if not path.is_file():
-        raise InputError(path, "no such file", expected)
-    try:
-        with h5py.File(path, "r") as handle:
-            _refuse_unfit(path, handle)
-            latents: Latents = storage.read(handle["latents"], LATENTS[handle.attrs["kind"]], path)
-            if "correction" in handle:
-                correction = storage.read(handle["correction"], LatentGPs, path)
-                latents = CorrectedLatents(latents, correction)
-            active = handle["active"][()] if "active" in handle else np.arange(latents.inputs.shape[1])
-            return ShapeSurrogate(
-                storage.read(handle["space"], ParameterSpace, path), frozen_array(handle["edges_s"][()]),
-                storage.read(handle["transform"], ShapeTransform, path), latents,
-                json.loads(handle.attrs["provenance"]), frozen_array(active, np.int64),
-            )  # fmt: skip
-    except (OSError, KeyError, RuntimeError, json.JSONDecodeError) as error:
-        raise InputError(path, f"not readable as one ({error})".replace("\n", " "), expected) from None
+    return _loaded(Path(path))[0]
 
 
 def load_manifest(path: Path | str) -> dict[str, Any]:
-    """The manifest inside a surrogate's file. Raises InputError as `load_surrogate` does."""
-    load_surrogate(path)
-    with h5py.File(path, "r") as handle:
-        manifest: dict[str, Any] = json.loads(handle.attrs["manifest"])
+    """The manifest inside a surrogate's file, which knows the model, and the same box as the arrays.
+
+    Raises InputError as `load_surrogate` does, and where it does not.
+    """
+    surrogate, manifest = _loaded(Path(path))
+    if not isinstance(manifest.get("model_hash"), str):
+        raise InputError(f"{path}: manifest: model_hash", repr(manifest.get("model_hash")), "a hash")
+    if manifest.get("parameters") != _described(surrogate.space):
+        raise InputError(f"{path}: manifest: parameters", "others than those of the arrays", "the same box")
     return manifest
+
+
+def _loaded(path: Path) -> tuple[ShapeSurrogate, dict[str, Any]]:
+    with storage.reading(path, EXPECTED) as handle:
+        _refuse_unfit(path, handle)
+        latents: Latents = storage.read(handle["latents"], LATENTS[handle.attrs["kind"]], path)
+        if "correction" in handle:
+            latents = CorrectedLatents(latents, storage.read(handle["correction"], LatentGPs, path))
+        active = handle["active"][()] if "active" in handle else np.arange(latents.inputs.shape[1])
+        surrogate = ShapeSurrogate(
+            storage.read(handle["space"], ParameterSpace, path), frozen_array(handle["edges_s"][()]),
+            storage.read(handle["transform"], ShapeTransform, path), latents,
+            json.loads(handle.attrs["provenance"]), frozen_array(active, np.int64),
+        )  # fmt: skip
+        refuse_unsound(surrogate)
+        manifest = json.loads(handle.attrs["manifest"])
+        if not isinstance(manifest, dict) or not isinstance(surrogate.provenance, dict):
+            raise InputError("manifest or provenance", "JSON of another kind", "a table of names and values")
+        return surrogate, manifest
 
 
 def effects_in(folder: Path) -> list[Path]:
@@ -126,16 +139,19 @@ def load_effect(
 
     Raises InputError as `load_surrogate` does, and where the effect was learnt beside another estimate.
     """
-    about, surrogate = load_manifest(path)["effect"], load_surrogate(path)
+    surrogate, manifest = _loaded(path)
+    about = manifest.get("effect")
+    if not isinstance(about, dict) or not {"part", "mechanisms", "neutral", "own"} <= set(about):
+        raise InputError(f"{path}: manifest: effect", f"{about!r:.60}", "what `bayeskin effects` writes")
     return effect_of(about, surrogate, estimates(about["mechanisms"], about["own"], surrogate.edges_s))
 
 
 def _refuse_unfit(path: Path, handle: h5py.File) -> None:
     if handle.attrs.get("format") != FORMAT:
-        raise InputError(path, "an HDF5 file of another origin", "a surrogate that bayeskin wrote")
-    version = int(handle.attrs["format_version"])
-    if version not in READABLE:
-        raise InputError(path, f"format version {version}", f"format version {FORMAT_VERSION}")
+        raise InputError(path, "an HDF5 file of another origin", EXPECTED)
+    version = str(handle.attrs["format_version"])
+    if version not in map(str, READABLE):
+        raise InputError(path, f"format version {version:.40}", f"format version {FORMAT_VERSION}")
     if contents_hash(handle) != handle.attrs["arrays_sha256"]:
         raise InputError(path, "contents that differ from their stored hash", "an unaltered file")
 
