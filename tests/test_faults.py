@@ -176,7 +176,8 @@ def test_a_second_run_on_a_folder_is_refused_and_the_first_goes_on(case: Path) -
     waiting = f"    while not os.path.exists({str(go)!r}):\n        time.sleep(0.05)\n    pull ="
     (case.parent / "spring.py").write_text("import os\nimport time\n" + SPRING.replace("    pull =", waiting))
     first = subprocess.Popen([sys.executable, "-c", MAIN, "design", str(case)], stderr=subprocess.DEVNULL)
-    while not list(case.parent.glob("case/runs/*")):
+    lock = case.parent / "case" / ".lock"
+    while not lock.is_file() or lock.read_text() != str(first.pid):
         assert first.poll() is None
         time.sleep(0.05)
     refused(

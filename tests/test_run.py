@@ -21,6 +21,7 @@ from bayeskin.pipeline.calibration import refined_posterior
 from bayeskin.pipeline.checking import checked_posterior, with_full_model
 from bayeskin.pipeline.engine import Silent, open_run
 from bayeskin.pipeline.indices import nearby
+from bayeskin.report.page.prose import prose
 from bayeskin.runner import load_design
 from bayeskin.types import Design, Recording, Simulation
 
@@ -118,7 +119,8 @@ def test_what_the_fit_leaves_is_tested_and_said(folder: Path) -> None:
     found = said["residuals"]
     assert sum(one["bins"] for one in found["by_kind"].values()) == 75  # those fitted
     assert found["passes"] == (found["sentence"] not in said["remarks"])
-    assert found["sentence"] in unescape((folder / "case" / "report.html").read_text()).replace("W", "w")
+    shown = (folder / "case" / "report.html").read_text()
+    assert str(prose(found["sentence"]))[1:] in shown  # there its first letter is a capital
     assert len(found["autocorrelation"]) == 10
 
 
@@ -155,11 +157,11 @@ def test_the_page_shows_the_whole_run(folder: Path) -> None:
         assert parameter.description in unescape(shown)
     assert "not trusted" in shown
     assert "The stage diagnose has not been run." in shown
-    history = json.loads(shown.split('id="history-data">')[1].split("</script>")[0])
-    bands = json.loads((folder / "case" / "sample" / "bands.json").read_text())
-    assert len(history["time_s"]) == len(bands["time_s"]) == 130
-    assert sum(history["fitted"]) == 75
-    assert all(low < high for low, high in zip(history["low_90_n"], history["high_90_n"], strict=True))
+    charts = [json.loads(part.split("</script>")[0]) for part in shown.split('type="application/json">')[1:]]
+    said = charts[0]["says"]
+    assert len(charts) == 5  # force, residual, Sobol' indices
+    assert len(said) == 130
+    assert sum("not fitted" not in one for one in said) == 75
 
 
 def test_the_posterior_is_an_inference_data_with_its_origin(folder: Path) -> None:
@@ -173,7 +175,7 @@ def test_the_full_model_weighs_draws_of_the_posterior(folder: Path) -> None:
     said = json.loads((folder / "case" / "sample" / "stage.json").read_text())["summary"]
     assert len(said["full_model"]) == 1  # chains that have not converged add nothing to the design
     found = said["full_model"][0]
-    assert (found["draws"], found["failed"]) == (6, 0)
+    assert (found["draws"], found["failed"]) == (8, 0)
     assert found["message"] in said["reasons"]
     assert found["effective"] >= 1.0
     assert said["corrected"] is None or set(said["corrected"]) == set(said["parameters"])
@@ -216,7 +218,7 @@ def test_draws_join_the_design_where_the_full_model_is_elsewhere(
     assert run.at("sample", "surrogate.h5").is_file() == (rounds > 1)
     if rounds > 1:
         after = storage.load(run.at("sample", "design.h5"), Design)
-        assert len(after.theta) == len(before.theta) + 6 * (rounds - 1)
+        assert len(after.theta) == len(before.theta) + 8 * (rounds - 1)
         assert not with_full_model(Verdict(True, ()), found).trusted
 
 

@@ -75,7 +75,7 @@ def test_settings_reach_the_posterior_and_its_provenance(said: dict[str, Any]) -
 def test_the_full_model_weighs_the_documented_draws(said: dict[str, Any]) -> None:
     assert said["run"].status == "ok"
     weighed = said["weighed"]
-    assert len(weighed.theta) == 2
+    assert len(weighed.theta) == 8
     assert weighed.weights.sum() == pytest.approx(1.0)
     assert np.isfinite(weighed.log_ratio).all()
 

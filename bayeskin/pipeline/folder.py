@@ -108,12 +108,21 @@ def begin(stage_folder: Path, inputs_sha256: str) -> float:
     _refuse_foreign(stage_folder)
     record = read_record(stage_folder)
     if record is None or record.inputs_sha256 != inputs_sha256:
-        shutil.rmtree(stage_folder, ignore_errors=True)
+        _remove(stage_folder)
         record = None
     stage_folder.mkdir(parents=True, exist_ok=True)
     seconds = 0.0 if record is None or record.done else record.seconds
     write_record(stage_folder, Record(inputs_sha256, done=False, seconds=seconds))
     return seconds
+
+
+def _remove(stage_folder: Path) -> None:
+    """As a whole, by another name first: what a kill in between leaves has no stage's name."""
+    removed = stage_folder.with_name(f".{stage_folder.name}.removed")
+    shutil.rmtree(removed, ignore_errors=True)
+    if stage_folder.is_dir():
+        stage_folder.rename(removed)
+        shutil.rmtree(removed, ignore_errors=True)
 
 
 def _refuse_foreign(stage_folder: Path) -> None:
