@@ -94,9 +94,13 @@ def reading(path: Path, expected: str) -> Iterator[h5py.File]:
             raise
         raise InputError(f"{path}: {error.where}", error.found, error.expected) from None
     except Exception as error:  # libhdf5, json and numpy raise of every kind on a damaged file
-        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         what = "not readable as HDF5" if isinstance(error, OSError) else "contents that cannot be read"
-        raise InputError(path, f"{what} ({said})", expected) from None
+        raise InputError(path, f"{what} ({in_a_line(error)})", expected) from None
+
+
+def in_a_line(error: Exception) -> str:
+    """What a library has to say of a file, in one line that is not too long."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
 
 
 def write(group: h5py.Group, value: Any) -> None:

@@ -25,7 +25,7 @@ from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.binned import estimates_by_name
 from bayeskin.recordings import idealised_motion, read_recording, segment
 from bayeskin.shipped import shipped
-from bayeskin.surrogates import effects_in, load_effect, load_surrogate, with_effects
+from bayeskin.surrogates import effects_beside, effects_in, load_effect, load_surrogate, with_effects
 from bayeskin.types import Array, Design, PadMotion
 
 SURROGATES = Path(__file__).parents[1] / "surrogates"
@@ -46,7 +46,7 @@ def motions() -> dict[str, PadMotion]:
 
 def errors(base: Path, motion: PadMotion) -> dict[str, tuple[Array, Array]]:
     """Of each part, sizes and errors (n,) of its held-out runs, in mN at a peak of 1 N."""
-    files = effects_in(base.with_name(f"{base.stem}-effects"))
+    files = effects_in(effects_beside(base))
     estimates = estimates_by_name(catalogue(), motion)
     effects, alone = [load_effect(path, estimates) for path in files], load_surrogate(base)
     found = {}

@@ -24,6 +24,7 @@ from bayeskin.model.lagrangian import LagrangianModel
 from bayeskin.model.mesh import brick_mesh
 from bayeskin.model.problem import build_problem, material
 from bayeskin.pipeline import proof as pipeline
+from bayeskin.pipeline.diagnosing_sources import imported
 from bayeskin.pipeline.engine import Silent
 from bayeskin.pipeline.recording import pad_motion
 from bayeskin.pipeline.shipping import motion_sha256
@@ -387,6 +388,20 @@ def test_another_verdict_is_a_failure_of_the_same_sources_only(
     assert pipeline.prove(copy, Silent(), rediagnose=2, diagnose=nothing_found)["ok"]
     monkeypatch.setattr(pipeline, "diagnosing_sources", lambda: "others")
     assert pipeline.prove(copy, Silent(), rediagnose=1, diagnose=other)["ok"]
+
+
+def test_a_verdict_is_of_all_modules_that_a_diagnosis_loads_and_of_no_others() -> None:
+    package = Path(bayeskin.__file__).parent
+    script = (
+        "import sys\nfrom bayeskin.pipeline import diagnosis\n"
+        "print(*(m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'bayeskin'), sep='\\n')"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    loaded = {Path(line).relative_to(package).as_posix() for line in ended.stdout.split()}
+    counted = {file.relative_to(package).as_posix() for file in imported(package / "pipeline/diagnosis.py")}
+    assert {file for file in loaded if not file.startswith(("report/", "proof/"))} <= counted
+    assert {"mismatch/search.py", "model/lagrangian.py", "surrogates/files.py"} <= counted
+    assert not counted & {"cli.py", "pipeline/proof.py", "pipeline/serve.py", "report/proof.py", "shapley.py"}
 
 
 def test_a_diagnosis_in_a_process_that_refuses_the_seals_goes_through(made: Path) -> None:

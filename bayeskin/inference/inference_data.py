@@ -16,7 +16,7 @@ from bayeskin.inference.bands import predictive_draws
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.sample import Posterior
 from bayeskin.probe import refuse_damaged
-from bayeskin.storage import checked
+from bayeskin.storage import checked, in_a_line
 from bayeskin.types import Array, Correlation, Parameter, ParameterSpace, Provenance
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def load_inference_data(path: Path | str) -> arviz.InferenceData:
     try:
         idata = az.from_netcdf(str(path), engine=_ENGINE)
     except Exception as error:  # h5netcdf and xarray raise of every kind on a damaged file
-        raise InputError(path, f"not readable ({_in_a_line(error)})", expected) from None
+        raise InputError(path, f"not readable ({in_a_line(error)})", expected) from None
     if "posterior" not in idata.groups():
         raise InputError(path, f"groups {', '.join(idata.groups()) or 'none'}", "a group 'posterior'")
     return idata
@@ -111,14 +111,10 @@ def draws_of(idata: arviz.InferenceData) -> tuple[ParameterSpace, Array]:
     except InputError:
         raise
     except Exception as error:  # json, xarray and numpy raise of every kind on what somebody altered
-        raise InputError(where, f"contents that cannot be read ({_in_a_line(error)})", expected) from None
+        raise InputError(where, f"contents that cannot be read ({in_a_line(error)})", expected) from None
     if draws.dtype.kind != "f" or not np.isfinite(draws).all():
         raise InputError(f"{where}: posterior", "draws that are not finite numbers", expected)
     return space, draws
-
-
-def _in_a_line(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
 
 
 def _predictive(

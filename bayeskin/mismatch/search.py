@@ -195,13 +195,11 @@ class _Forward:
 
     def _step(self, current: Fit, label: str) -> Fit:
         """The best of the sets with one mechanism more, or `current` where none has more weight."""
-        sets = {name: _with(current.names, name) for name in self._known if name not in current.names}
-        promises = {name: self._promised(names, current) for name, names in sets.items()}
-        order = sorted(sets, key=lambda name: -promises[name])
+        order = self._by_promise(current, current.names)
         tries = order if not current.names else order[:SHORTLIST]
         fits = [current]
-        for count, name in enumerate(tries):
-            one = self.tried(sets[name], current, count < SHORTLIST)
+        for count, (name, names) in enumerate(tries):
+            one = self.tried(names, current, count < SHORTLIST)
             fits += [] if one is None else [one]
             nats = "unsure" if one is None else f"{one.log_evidence - current.log_evidence:+.1f} nats"
             self._progress((count + 1) / len(tries), f"{label}: {name}: {nats}")
@@ -212,14 +210,19 @@ class _Forward:
         best = current
         for count, name in enumerate(current.names):
             if name in best.names and (rest := self.tried(_without(best.names, name), best)) is not None:
-                sets = [_with(rest.names, other) for other in self._known if other not in best.names]
-                sets.sort(key=lambda names, rest=rest: -self._promised(names, rest))  # type: ignore[misc]
                 fits = [self.tried(best.names, rest, again=True)]
-                fits += [self.tried(names, rest) for names in sets[:EXCHANGES]]
+                others = self._by_promise(rest, best.names)[:EXCHANGES]
+                fits += [self.tried(names, rest) for _, names in others]
                 best = max([best, *(one for one in fits if one is not None)], key=weight)
             gain = weight(best) - weight(current)
             self._progress((count + 1) / len(current.names), f"{label}, {name} anew: {gain:+.1f} nats")
         return best if weight(best) > weight(current) + GAIN else current
+
+    def _by_promise(self, current: Fit, but: Sequence[str]) -> list[tuple[str, tuple[str, ...]]]:
+        """All mechanisms but some, and the set with each, the most promising beside `current` first."""
+        sets = [(name, _with(current.names, name)) for name in self._known if name not in but]
+        promises = {name: self._promised(names, current) for name, names in sets}
+        return sorted(sets, key=lambda one: -promises[one[0]])
 
     def _promised(self, names: Sequence[str], current: Fit) -> float:
         new = _new(self._known, names, current.names)

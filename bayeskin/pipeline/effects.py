@@ -29,7 +29,7 @@ from bayeskin.pipeline.design import fitted_bins, noise_floor_n, rows_of, tell
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.model import model_spec
-from bayeskin.pipeline.shipping import effects_beside, shipped_files
+from bayeskin.pipeline.shipping import shipped_files
 from bayeskin.pipeline.training import base_surrogate
 from bayeskin.runner import Simulate, run_design
 from bayeskin.surrogates import (
@@ -38,9 +38,9 @@ from bayeskin.surrogates import (
     Similarity,
     Validation,
     composed,
+    effects_beside,
     effects_in,
     load_effect,
-    load_manifest,
     manifest_of,
     save_surrogate,
     train_effect,
@@ -315,13 +315,9 @@ def effect_files(run: Run) -> list[Path]:
 
 def effects_of(run: Run) -> list[Effect]:
     """The effects in `effect_files`. Raises InputError for files of another model."""
-    files = effect_files(run)
-    for path in files:
-        if load_manifest(path)["model_hash"] != model_spec(run).hash:
-            raise InputError(path, "an effect of another model", "one of this configuration's model")
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     estimates = estimates_by_name(catalogue(), motion)
-    return [load_effect(path, estimates) for path in files]
+    return [load_effect(path, estimates, model_spec(run).hash) for path in effect_files(run)]
 
 
 def _train(run: Run, parts: Sequence[Part], coarse: Pair, fine: Pair) -> tuple[Effect, Validation]:

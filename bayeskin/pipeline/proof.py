@@ -14,13 +14,13 @@ import bayeskin
 from bayeskin import proof, report
 from bayeskin.errors import InputError
 from bayeskin.pipeline import diagnosis
+from bayeskin.pipeline.diagnosing_sources import diagnosing_sources
 from bayeskin.pipeline.engine import Reporter
 from bayeskin.pipeline.folder import plain, sha256_of, sha256_of_file, write_json
 from bayeskin.proof import seals
 from bayeskin.shipped import shipped
 
 Diagnose = Callable[[Path, Reporter], Mapping[str, Any]]
-NOT_DIAGNOSING = ("proof", "report", "_shipped")  # parts of the package on which no verdict depends
 FAILED = "failed"  # in a verdict's place, where the diagnosis has ended without one
 SET = "data/proof/index.json"
 
@@ -96,23 +96,6 @@ def conceal(folder: Path, seed: int, count: int, reporter: Reporter) -> dict[str
     return plain(
         {"ok": True, "folder": folder, "made": made, "count": count, "seconds": seconds, "text": text}
     )
-
-
-def diagnosing_sources() -> str:
-    """sha256 over all that a verdict depends on: the package but for proof and figures; surrogates."""
-    package = Path(bayeskin.__file__).parent
-    files = [
-        path
-        for path in sorted([*package.rglob("*.py"), *package.glob("model/*.json")])
-        if path.relative_to(package).parts[0] not in NOT_DIAGNOSING
-        and path.name != "cli.py"
-        and path != Path(__file__)
-    ]
-    named = [[path.relative_to(package).as_posix(), sha256_of_file(path)] for path in files]
-    surrogate = shipped("surrogates/healthy-skin-reaction.h5")
-    learnt = sorted(surrogate.parent.glob("healthy-skin-reaction*.json"))
-    learnt += sorted(surrogate.with_name(f"{surrogate.stem}-effects").glob("*.json"))
-    return sha256_of([*named, *([path.name, sha256_of_file(path)] for path in learnt)])
 
 
 def _diagnosed(

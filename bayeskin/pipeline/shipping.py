@@ -17,7 +17,7 @@ from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.model import model_spec, waves_spec
 from bayeskin.probe import refuse_damaged
 from bayeskin.shipped import shipped
-from bayeskin.surrogates import effects_in, load_manifest
+from bayeskin.surrogates import effects_beside, effects_in, load_manifest
 from bayeskin.types import BinnedForce, Design, PadMotion
 
 
@@ -55,11 +55,6 @@ def shipped_files(run: Run) -> ShippedFiles:
     for file in (*files.present, *effects_in(effects_beside(path))) if brought else ():
         refuse_damaged(file, "a surrogate that bayeskin wrote, and its design and effects")
     return files
-
-
-def effects_beside(surrogate: Path) -> Path:
-    """The folder of effects that belongs to a surrogate's file."""
-    return surrogate.with_name(f"{surrogate.stem}-effects")
 
 
 def _shipped_folder() -> Path:

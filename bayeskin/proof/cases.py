@@ -26,6 +26,7 @@ from bayeskin.shipped import shipped
 from bayeskin.surrogates import (
     Effect,
     effects_among,
+    effects_beside,
     effects_in,
     load_effect,
     load_surrogate,
@@ -166,7 +167,7 @@ def shipped_screen() -> Screen:
     path = shipped(SURROGATE)
     known = catalogue()
     estimates = estimates_by_name(known, MOTION)
-    files = effects_in(path.with_name(f"{path.stem}-effects"))
+    files = effects_in(effects_beside(path))
     return Screen(Refit(load_surrogate(path)), tuple(load_effect(one, estimates) for one in files), known)
 
 

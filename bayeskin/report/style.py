@@ -33,7 +33,10 @@ RECORDED, MODEL, ACCENT = INK, "#0072B2", "#D55E00"
 PARTS = {"parameters": "#0072B2", "surrogate": "#D55E00", "noise": "#8C8C8C", "all": INK}
 _NAMED = {"E_c": "#0072B2", "E_s": "#D55E00", "k_c": "#56B4E9", "k_s": "#E69F00", "p_init": "#009E73"}
 _FURTHER = ("#CC79A7", "#332288", "#882255", "#999933", "#44AA99", "#AA4499", "#661100", "#888888")
-_GREEK = ("alpha", "beta", "gamma", "delta", "eta", "lambda", "mu", "nu", "rho", "sigma", "tau", "phi")
+GREEK = {
+    "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "eta": "η", "lambda": "λ", "mu": "μ", "nu": "ν",
+    "rho": "ρ", "sigma": "σ", "tau": "τ", "phi": "φ",
+}  # fmt: skip
 
 STYLE: dict[str, Any] = {
     "figure.facecolor": "white", "savefig.facecolor": "white", "figure.dpi": 100,
@@ -126,11 +129,11 @@ def plain_log(axis: Axis) -> None:
 
 def symbol(name: str) -> str:
     """A parameter's name as it is printed: ``E_c`` set as a symbol, ``gap_width`` as words."""
-    name = re.sub(rf"^([A-Z](?=[a-z\d]$)|[a-z](?=\d$)|(?:{'|'.join(_GREEK)})(?=\d$))", r"\1_", name)
+    name = re.sub(rf"^([A-Z](?=[a-z\d]$)|[a-z](?=\d$)|(?:{'|'.join(GREEK)})(?=\d$))", r"\1_", name)
     head, _, tail = name.partition("_")
     head = "sigma" if head == "sd" and tail else head
-    if re.fullmatch(r"[A-Za-z]", head) or head in _GREEK:
-        base = rf"\{head}" if head in _GREEK else head
+    if re.fullmatch(r"[A-Za-z]", head) or head in GREEK:
+        base = rf"\{head}" if head in GREEK else head
         if not re.fullmatch(r"\w*", tail):
             return name.replace("_", " ")
         sub = tail.replace("_", ",") if len(tail) <= 1 else rf"\mathrm{{{tail.replace('_', ',')}}}"

@@ -11,6 +11,7 @@ from bayeskin.surrogates.effects import (
     with_effects,
 )
 from bayeskin.surrogates.files import (
+    effects_beside,
     effects_in,
     load_effect,
     load_manifest,
@@ -26,7 +27,7 @@ from bayeskin.surrogates.validate import Validation, validate
 
 __all__ = [
     "Effect", "Pair", "ShapeSurrogate", "Similarity", "Validation", "WithEffects", "composed", "correct",
-    "effect_of", "effects_among", "effects_in", "load_effect",
+    "effect_of", "effects_among", "effects_beside", "effects_in", "load_effect",
     "load_manifest", "load_surrogate", "manifest_of", "save_surrogate", "train",
     "train_effect", "validate", "with_effects",
 ]  # fmt: skip

@@ -127,19 +127,29 @@ def _loaded(path: Path) -> tuple[ShapeSurrogate, dict[str, Any]]:
         return surrogate, manifest
 
 
+def effects_beside(surrogate: Path) -> Path:
+    """The folder of effects that belongs to a surrogate's file."""
+    return surrogate.with_name(f"{surrogate.stem}-effects")
+
+
 def effects_in(folder: Path) -> list[Path]:
     """Files of effects in a folder, without their designs; [] where there is none."""
     return sorted(path for path in folder.glob("*.h5") if not path.stem.endswith("-design"))
 
 
 def load_effect(
-    path: Path, estimates: Callable[[Sequence[str], Sequence[str], Array], Estimate | None]
+    path: Path,
+    estimates: Callable[[Sequence[str], Sequence[str], Array], Estimate | None],
+    model_hash: str | None = None,
 ) -> Effect:
     """An effect from its file; `estimates` by names of mechanisms, names of their own parameters, and bins.
 
-    Raises InputError as `load_surrogate` does, and where the effect was learnt beside another estimate.
+    Raises InputError as `load_surrogate` does, where the effect was learnt beside another estimate, and where
+    it is of another model than the one asked for.
     """
     surrogate, manifest = _loaded(path)
+    if model_hash is not None and manifest.get("model_hash") != model_hash:
+        raise InputError(path, "an effect of another model", "one of this configuration's model")
     about = manifest.get("effect")
     if not isinstance(about, dict) or not {"part", "mechanisms", "neutral", "own"} <= set(about):
         raise InputError(f"{path}: manifest: effect", f"{about!r:.60}", "what `bayeskin effects` writes")

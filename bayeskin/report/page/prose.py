@@ -7,12 +7,9 @@ import re
 from markupsafe import Markup, escape
 
 from bayeskin.report.page.numbers import interval, number, quantity
-from bayeskin.report.style import unit_text
+from bayeskin.report.style import GREEK, unit_text
 
-_GREEK = {
-    "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "eta": "η", "lambda": "λ", "mu": "μ", "nu": "ν",
-    "rho": "ρ", "sd": "σ", "sigma": "σ", "tau": "τ", "phi": "φ",
-}  # fmt: skip
+_GREEK = {**GREEK, "sd": GREEK["sigma"]}
 _NAME = re.compile(rf"(?<![\w./-])([A-Za-z]|{'|'.join(_GREEK)})_([a-z]\w*)(?![\w/(]|\.\w)")
 _NUMBER = r"(?<![\w.-])(-?\d+(?:\.\d+)?(?:e[+-]\d+)?)"
 _UNIT = r"(Pa|N|m\^2)(?![\w^])"

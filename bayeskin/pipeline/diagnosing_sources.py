@@ -1,0 +1,60 @@
+"""A hash of all that the verdict of a diagnosis depends on: whether a stored one still holds."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import bayeskin
+from bayeskin import mechanisms
+from bayeskin.pipeline import diagnosis
+from bayeskin.pipeline.folder import sha256_of, sha256_of_file
+from bayeskin.shipped import shipped
+from bayeskin.surrogates import effects_beside
+
+WITHOUT_EFFECT = (
+    "proof",
+    "report",
+)  # imported by a diagnosis: what hides seals from it, and draws its figures
+PACKAGE = Path(bayeskin.__file__).parent
+
+
+def diagnosing_sources() -> str:
+    """sha256 over the modules that a diagnosis imports, all mechanisms, the model's tables, surrogates."""
+    files = sorted({*imported(Path(diagnosis.__file__)), *Path(mechanisms.__file__).parent.glob("*.py")})
+    files += sorted(PACKAGE.glob("model/*.json"))
+    surrogate = shipped("surrogates/healthy-skin-reaction.h5")
+    files += sorted(surrogate.parent.glob("healthy-skin-reaction*.json"))
+    files += sorted(effects_beside(surrogate).glob("*.json"))
+    return sha256_of([[path.name, sha256_of_file(path)] for path in files])
+
+
+def imported(module: Path) -> set[Path]:
+    """The files of the package that `module` imports, itself among them, directly or by way of others."""
+    found: set[Path] = set()
+    waiting = {module}
+    while waiting:
+        file = waiting.pop()
+        found.add(file)
+        waiting |= set(_imports(file)) - found
+    return found
+
+
+def _imports(file: Path) -> Iterator[Path]:
+    """What one file imports of the package, with the packages that these modules lie in."""
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        for name in names:
+            top, *parts = name.split(".")
+            if top != PACKAGE.name or (parts and parts[0] in WITHOUT_EFFECT):
+                continue
+            place = PACKAGE
+            yield place / "__init__.py"
+            for part in parts:
+                place /= part
+                yield from (p for p in (place / "__init__.py", place.with_suffix(".py")) if p.is_file())
