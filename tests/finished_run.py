@@ -155,6 +155,25 @@ def summaries() -> dict[str, dict[str, Any]]:
                        "full_model": {"rmse": full, "rmse_by_phase": {"rest": full}, "rmse_held_out": None}}
                 for when, rmse, full in (("before", 0.08, 0.078), ("after", 0.0247, 0.0213))
             },
+            "unexplained": {
+                "size_n": 0.0123, "share": {"displacement": 0.75, "phase": 0.25}, "gain_nats": 41.0,
+                "noticeable": True, "features": ["it grows while loading"],
+                "form": {
+                    "terms": [{"name": "u^3 while loading", "coefficient": -0.011, "standard_error": 0.002,
+                               "unit": "N", "alike": ["u^2 while loading"]}],
+                    "r2_left_out": 0.7, "sentence": "0.7 of it follows u^3 while loading",
+                },
+            },
+        },
+        "experiment": {
+            "sets": [["device-friction"], ["viscous-drag"]],
+            "experiments": [
+                {"protocol": "quarter speed", "sentence": "The same at a quarter of the speed.",
+                 "gain_nats": 0.66, "standard_error": 0.01, "named": 0.97, "possible_nats": 0.693,
+                 "failed": 0},
+                {"protocol": "no holds", "sentence": "Cycles without holds.", "gain_nats": None,
+                 "standard_error": None, "named": None, "possible_nats": 0.693, "failed": 12},
+            ],
         },
     }  # fmt: skip
 

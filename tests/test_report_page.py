@@ -183,6 +183,27 @@ def test_the_table_of_parameters_has_prior_interval_unit_and_sentence(whole: str
     assert "median 5.08e+04" not in text  # its numbers stand beside it, in a unit that reads well
 
 
+def test_what_is_left_and_which_test_would_tell_stand_in_the_mismatch(whole: str) -> None:
+    text = Walk(whole).text()
+    for said in (
+        "12.3 mN RMS beyond what parameters take up; it varies 75 % with displacement, 25 % with phase.",
+        "it grows while loading",
+        "0.7 of it follows u^3 while loading",
+        "u^2 while loading",
+        "Taken as equally probable: device-friction; or viscous-drag.",
+        "quarter speed The same at a quarter of the speed. 95.2 % 1.44 % 97 %",
+    ):
+        assert re.sub(r"\s", "", said) in re.sub(r"\s", "", text), said
+    assert "Nothing beyond noise" in diagnosed_as(
+        {"unexplained": {**summaries()["diagnose"]["unexplained"], "noticeable": False}}
+    )
+    nothing = diagnosed_as({"unexplained": None})
+    assert "beyond what parameters take up; it varies" not in nothing
+    stages = {name: one for name, one in facts().stages.items() if name != "experiment"}
+    unasked = Walk(render_page(dataclasses.replace(facts(), stages=stages))).text()
+    assert "Which further test" not in unasked
+
+
 HOSTILE = '<script>alert("1")</script>&\'"<img src=x onerror=alert(2)>'
 
 

@@ -114,6 +114,18 @@ def test_the_summary_answers_what_a_reader_asks(folder: Path) -> None:
         assert len(table["pairs"]) == 10
 
 
+def test_priors_with_their_sources_and_what_the_data_says_are_printed(folder: Path) -> None:
+    summary = json.loads((folder / "case" / "summary.json").read_text())
+    for stage in (None, "sample"):
+        text = stages.run(folder / "case.toml", stage, Silent())["text"]
+        for name, one in summary["posterior"].items():
+            prior = one["prior"]
+            low, high = (f"{prior[end]:.4g}" for end in ("lower", "upper"))
+            assert f"  {name}: {prior['kind']}, {low} to {high} {one['unit']}; {prior['source']}" in text
+        assert [line for line in summary["identifiability"] if f"  {line}" not in text] == []
+    assert set(summary["profiles"]) == set(SPACE.names)
+
+
 def test_what_the_fit_leaves_is_tested_and_said(folder: Path) -> None:
     said = json.loads((folder / "case" / "sample" / "stage.json").read_text())["summary"]
     found = said["residuals"]

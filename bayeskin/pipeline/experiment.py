@@ -7,6 +7,7 @@ mesh changes them nearly alike.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
@@ -22,8 +23,18 @@ from bayeskin.mismatch.fit import restored, stored
 from bayeskin.mismatch.protocols import protocols
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline import diagnosis
-from bayeskin.pipeline.engine import Reporter, Silent
-from bayeskin.pipeline.folder import plain, read_lines, sha256_of, write_json
+from bayeskin.pipeline.engine import Reporter, Run, Silent
+from bayeskin.pipeline.folder import (
+    Record,
+    current_record,
+    output_hashes,
+    plain,
+    read_lines,
+    read_record,
+    sha256_of,
+    write_json,
+    write_record,
+)
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.workbench import opened, workbench
 from bayeskin.types import PadMotion, Simulation
@@ -42,6 +53,7 @@ def choose(source: Path, reporter: Reporter) -> dict[str, Any]:
     if run.config.model.observation != "reaction":
         raise InputError(source, "the article's observation", "model.observation = 'reaction'")
     diagnosis.diagnose(source, reporter)
+    started = time.monotonic()
     bench = workbench(run)
     fits = compete(diagnosis.fits_of(bench), bench.known)
     answer: dict[str, Any] = {"sets": [list(one.names) for one in fits], "experiments": [], "ok": True}
@@ -51,8 +63,21 @@ def choose(source: Path, reporter: Reporter) -> dict[str, Any]:
         figure = report.figure_experiments(ranked(found))
         made = report.save_figure(figure, run.folder / FOLDER / "experiments", caption(run))
         answer["figures"] = [path.name for path in made]
-    write_json(run.folder / FOLDER / "experiment.json", plain(answer))
-    return plain({**answer, "folder": run.folder / FOLDER, "text": _in_words(answer)})
+    where = run.folder / FOLDER
+    write_json(where / "experiment.json", answer)
+    seconds = time.monotonic() - started
+    write_record(where, Record(_diagnosis(run), True, seconds, output_hashes(where), plain(answer)))
+    return plain({**answer, "folder": where, "text": _in_words(answer)})
+
+
+def answered(run: Run) -> Record | None:
+    """What was answered about the diagnosis that stands in the run's folder, if anything was asked of it."""
+    return current_record(run.folder / FOLDER, _diagnosis(run))
+
+
+def _diagnosis(run: Run) -> str:
+    record = read_record(run.folder / diagnosis.STAGE.name)
+    return "" if record is None else record.sha256
 
 
 def _weighed(

@@ -11,6 +11,7 @@ from typing import Any
 import bayeskin
 from bayeskin import storage
 from bayeskin.config import parameter_space
+from bayeskin.pipeline import experiment
 from bayeskin.pipeline.engine import Run, Stage, standing
 from bayeskin.pipeline.folder import Record
 from bayeskin.report.page import RunFacts, StageFacts, render_page
@@ -39,7 +40,10 @@ def facts_of(run: Run, stages: Mapping[str, Stage]) -> RunFacts:
     """All that the page says, from the stages' records."""
     config = run.config
     space = parameter_space(config, run.config_path)
-    found = {name: _facts(run, name, *one) for name, one in standing(run, stages).items() if name != "report"}
+    stands = standing(run, stages)
+    if stands.get("diagnose", ("", None))[0] == "done" and (asked := experiment.answered(run)) is not None:
+        stands[experiment.FOLDER] = "done", asked
+    found = {name: _facts(run, name, *one) for name, one in stands.items() if name != "report"}
     return RunFacts(
         name=config.name,
         config_path=str(run.config_path),

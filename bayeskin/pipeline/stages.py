@@ -42,6 +42,7 @@ def _summarise(run: Run) -> Mapping[str, Any]:
         "posterior": sampled["parameters"],
         "identifiability": [*sampled["identifiability"], *sampled["ridges"]],
         "learned": sampled["learned"],
+        "profiles": sampled["profiles"],
         "full_model_at_draws": sampled["full_model"],
         "corrected": sampled["corrected"],
         "map": {
@@ -144,7 +145,12 @@ def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str
             [said["message"], said["checks"][-1]["message"], *_polish(said["polished"])]
         ),
         "sample": lambda: "\n".join(
-            [said["verdict"], *said["reasons"], *said["remarks"], *_table(said["parameters"])]
+            [
+                *(said["verdict"], *said["reasons"], *said["remarks"]),
+                *_table(said["parameters"]),
+                *_identified([*said["identifiability"], *said["ridges"]]),
+                *_priors(said["parameters"]),
+            ]
         ),
         "sobol": lambda: "\n".join(one["sentence"] for one in said.values()),
         "effects": lambda: "\n".join(effects.in_words(name, one) for name, one in said.items()),
@@ -170,13 +176,28 @@ def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
         [
             f"{said['name']}: {said['verdict']}: {'; '.join(said['because'])}",
             *_table(said["posterior"]),
-            *said["identifiability"],
+            *_identified(said["identifiability"]),
+            *_priors(said["posterior"]),
             *said["remarks"],
             f"model at the most probable point: RMSE {', '.join(off)}",
             error["message"],
             f"outputs in {folder}, {sum(said['seconds'].values()):.0f} s in all",
         ]
     )
+
+
+def _identified(sentences: Sequence[str]) -> list[str]:
+    return ["what the data says of each:", *(f"  {sentence}" for sentence in sentences)]
+
+
+def _priors(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Each prior with its bounds and where it comes from."""
+    return ["priors:", *(f"  {name}: {_prior(p['prior'], p['unit'])}" for name, p in parameters.items())]
+
+
+def _prior(prior: Mapping[str, Any], unit: str) -> str:
+    about = f" about {prior['centre']:.4g} {unit}" if prior["kind"].endswith("normal") else ""
+    return f"{prior['kind']}{about}, {prior['lower']:.4g} to {prior['upper']:.4g} {unit}; {prior['source']}"
 
 
 def _table(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:

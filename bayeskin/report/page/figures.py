@@ -76,6 +76,23 @@ _KNOWN = {
         "The fit before and after",
         "Force and residual over time and force over displacement, without and with the mechanisms found.",
     ),
+    ("diagnose", "residual_by_phase"): (
+        "The residual by phase",
+        "Recorded minus modelled force in each kind of phase, without and with the mechanisms found.",
+    ),
+    ("diagnose", "contributions"): (
+        "What each mechanism adds to the force",
+        "Force of each mechanism over time and over displacement, at the best fit less that without it.",
+    ),
+    ("diagnose", "discrepancy"): (
+        "What is left, described",
+        "The residual beyond what parameters take up, and the smooth process that describes it, over time "
+        "and displacement.",
+    ),
+    ("experiment", "experiments"): (
+        "What further tests would tell",
+        "Expected information of each protocol about which explanation is true, with standard errors.",
+    ),
 }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from bayeskin.report.page.answer import fits_of, is_outside
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
 from bayeskin.report.page.numbers import number, percent, quantity
-from bayeskin.report.page.parts import Block, Cell, Folded, Section, Table, Text, row
+from bayeskin.report.page.parts import Block, Cell, Folded, Heading, Section, Table, Text, row
 from bayeskin.report.page.sections import absent, cell
 
 _VERDICTS = {
@@ -39,6 +39,8 @@ def mismatch(facts: RunFacts) -> Section:
                 f"Windows: {len(said['located'])} before, {len(said['remaining'])} after",
                 [_windows("Before", said["located"]), _windows("After", said["remaining"])],
             ),
+            *_unexplained(said["unexplained"]),
+            *_experiments(facts),
         ]
     return Section("mismatch", "Mismatch", blocks)
 
@@ -110,6 +112,73 @@ def _candidates(candidates: Sequence[Mapping[str, Any]]) -> Table:
     ]
     head = ("mechanism", "log evidence gained [nats]", "standard error")
     return Table("Each mechanism added to the model alone", head, rows)
+
+
+def _unexplained(left: Mapping[str, Any] | None) -> list[Block]:
+    """What a process without a name describes of the residual: how much, in what, and in what form."""
+    if left is None:
+        return []
+    if not left["noticeable"]:
+        return [Heading("What is left"), Text(["Nothing beyond noise and the surrogate's error."])]
+    form = left["form"]
+    rows = [
+        row(
+            (
+                term["name"],
+                Cell(number(term["coefficient"]), term["coefficient"]),
+                Cell(number(term["standard_error"]), term["standard_error"]),
+                term["unit"],
+                ", ".join(term["alike"]) or "none",
+            )
+        )
+        for term in form["terms"]
+    ]
+    head = ("term", "coefficient", "standard error", "unit", "not told from")
+    shares = ", ".join(f"{percent(share)} with {name}" for name, share in left["share"].items())
+    lines = [
+        f"{quantity(left['size_n'], 'N')} RMS beyond what parameters take up; it varies {shares}.",
+        *left["features"],
+        form["sentence"],
+    ]
+    return [
+        Heading("What is left"),
+        Text(lines, listed=True),
+        *([Table("The form that predicts it in phases left out", head, rows)] if rows else []),
+    ]
+
+
+def _experiments(facts: RunFacts) -> list[Block]:
+    """Further tests by what they are expected to tell; nothing where nobody has asked."""
+    asked = facts.said("experiment")
+    if not asked:
+        return []
+    title = Heading("Which further test would tell the explanations apart")
+    if not asked["experiments"]:
+        return [title, Text(["Nothing competes with what explains the recording best."])]
+    rows = [
+        row(
+            (
+                one["protocol"],
+                one["sentence"],
+                Cell(percent(_share(one["gain_nats"], one)), one["gain_nats"]),
+                Cell(percent(_share(one["standard_error"], one)), one["standard_error"]),
+                Cell(percent(one["named"]), one["named"]),
+            )
+        )
+        for one in asked["experiments"]
+    ]
+    head = ("protocol", "what is done", "tells, of all there is to know", "±", "the true one is then named")
+    sets = "; or ".join(", ".join(names) for names in asked["sets"])
+    return [
+        title,
+        Text([f"Taken as equally probable: {sets}."]),
+        Table("Further tests, the most informative first", head, rows),
+        *pictures(facts, "experiment"),
+    ]
+
+
+def _share(nats: float | None, one: Mapping[str, Any]) -> float | None:
+    return None if nats is None else nats / one["possible_nats"]
 
 
 def _windows(when: str, windows: Sequence[Mapping[str, Any]]) -> Table:
