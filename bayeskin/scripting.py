@@ -24,6 +24,7 @@ from bayeskin.model import simulate as run_model
 from bayeskin.pipeline import diagnosis
 from bayeskin.pipeline.calibration import log_posterior_of
 from bayeskin.pipeline.engine import Run, Silent
+from bayeskin.pipeline.folder import plain
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.posterior import PREDICTIVE_DRAWS, chains_folder, provenance_of, settings_of
 from bayeskin.pipeline.recording import pad_motion, prepared
@@ -156,6 +157,7 @@ def _with_surrogate(
     recording: Recording, settings: Mapping[str, Any], surrogate: str | Path | None
 ) -> dict[str, Any]:
     """The settings with a surrogate that knows the recording's protocol."""
+    recording = _recording(recording)
     if surrogate is None and "surrogate" in settings:
         return dict(settings)
     if surrogate is None:
@@ -172,6 +174,7 @@ def _with_surrogate(
 
 def _settings_of(recording: Recording, posterior: arviz.InferenceData) -> dict[str, Any]:
     """The configuration that a posterior was made with; refused for another recording than its own."""
+    recording = _recording(recording)
     if "recording_sha256" not in posterior.attrs:
         raise InputError("posterior", "an InferenceData without provenance", "one made by bayeskin")
     if posterior.attrs["recording_sha256"] != recording.sha256:
@@ -181,16 +184,23 @@ def _settings_of(recording: Recording, posterior: arviz.InferenceData) -> dict[s
     return dict(json.loads(posterior.attrs["provenance"])["config"])
 
 
+def _recording(given: object) -> Recording:
+    if not isinstance(given, Recording):
+        raise InputError("recording", f"{type(given).__name__} {given!r:.60}", "one of bk.load_recording")
+    return given
+
+
 @contextmanager
 def _opened(
     recording: Recording, settings: Mapping[str, Any], folder: str | Path | None = None
 ) -> Iterator[Run]:
     """A run on a recording, its files in `folder` or in one that is gone afterwards."""
     with tempfile.TemporaryDirectory() as passing:
+        recording = _recording(recording)
         where = Path(folder or passing)
         where.mkdir(parents=True, exist_ok=True)
         storage.save(where / FILE, recording)
         own = {**settings.get("recording", {}), "file": FILE}
-        config = config_of({"name": "calibration", **settings, "recording": own}, "settings")
+        config = config_of(plain({"name": "calibration", **settings, "recording": own}), "settings")
         (where / CONFIG).write_text(to_toml(config), encoding="utf-8")
         yield Run(config, where / CONFIG, where / config.name, Silent())

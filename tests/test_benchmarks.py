@@ -19,7 +19,7 @@ from bayeskin.model import ModelSpec
 from bayeskin.model.problem import build_problem
 from bayeskin.recordings import read_recording
 from bayeskin.shipped import shipped
-from bayeskin.types import Simulation
+from bayeskin.types import Recording, Simulation
 
 
 @pytest.fixture
@@ -210,3 +210,65 @@ def test_differences_of_scores_have_the_error_of_their_sum(benchmark):
     noise, rng = benchmark("noise_models"), np.random.default_rng(0)
     phases = rng.normal(-3.0, 2.0, 400)
     assert noise.difference(phases, np.zeros(400)) == f"{phases.sum():+.1f} ± {20 * phases.std(ddof=1):.1f}"
+
+
+def test_the_default_move_is_judged_on_the_same_density_and_repeats(benchmark):
+    speed, problem = benchmark("sampling_speed"), toy_inference.toy_problem()
+    start = {**toy_inference.TRUTH, **toy_inference.NOISE}
+    timed = [speed.default_move(problem, start, seed, 200) for seed in (1, 1, 2)]
+    assert timed[0].found.steps == 200
+    assert 0.0 < timed[0].fewest == timed[1].fewest != timed[2].fewest
+    assert timed[0].highest > 1.01  # 200 steps are too few, and the measure sees it
+    assert not timed[0].found.verdict.trusted
+
+
+def ramp(until_s=180.0):
+    """The article's sampling, every 10 ms, of a force [N] that grows by 1 mN a second."""
+    time_s = np.round(np.arange(0.0, until_s, 0.01), 10)
+    return Recording(time_s, np.zeros_like(time_s), 1e-3 * time_s, "ramp", "0" * 64)
+
+
+def test_the_articles_smoothing_delays_looks_around_and_looks_ahead_by_segment(benchmark):
+    article = benchmark("article_calibration")
+    time_s, force_n = article.smoothed(ramp())
+    assert (time_s[1] - time_s[0], time_s[-1]) == pytest.approx((0.5, 144.5))
+    late = dict(zip(np.round(time_s, 3).tolist(), (1e3 * force_n - time_s).tolist(), strict=True))
+    # means over the 50 samples before and the sample itself lag by 0.25 s, those after lead by as much
+    assert [late[t] for t in (10.0, 50.0, 80.0, 95.0, 120.0)] == pytest.approx(
+        [-0.25, 0.0, 0.25, -0.25, 0.0], abs=1e-9
+    )
+    assert late[0.0] == 0.0  # among the first 19, which are zero
+    assert late[30.0] == pytest.approx(2.505)  # the mean of the 500 samples after it: none before 30 s
+    assert late[74.5] == pytest.approx((0.49 - 5.0) / 2, abs=0.01)  # none after 75 s
+
+
+def test_the_articles_cost_is_the_rmse_in_its_windows_alone(benchmark):
+    article = benchmark("article_calibration")
+    time_s = np.arange(0.0, 145.0, 0.5)
+    outside = (time_s < 18.8) | ((time_s > 75.0) & (time_s < 97.8))
+    target = np.where(outside, 1.0, 0.0)
+    cost = article.cost_of(article.PRESETS["script"], time_s, target, lambda theta: np.full(290, 3e-3))
+    assert cost(article.FOUND) == pytest.approx(3e-3)
+    failed = article.cost_of(article.PRESETS["script"], time_s, target, lambda theta: np.full(290, np.nan))
+    assert failed(article.FOUND) == article.UNSTABLE_N
+
+
+def test_the_articles_search_keeps_to_its_bounds_and_its_evaluations(benchmark):
+    article = benchmark("article_calibration")
+    low, high = (
+        np.array(ends) for ends in (article.PRESETS["script"].lower, article.PRESETS["script"].upper)
+    )
+    asked = []
+
+    def cost(theta):
+        asked.append(theta)
+        return float(np.sum(np.log(theta / article.FOUND) ** 2))
+
+    ended = article.search(cost, low, high, seed=1)
+    assert len(asked) == article.EVALUATIONS
+    assert np.all((np.array(asked) >= low * (1 - 1e-9)) & (np.array(asked) <= high * (1 + 1e-9)))
+    assert cost(ended) == min(map(cost, asked[: article.EVALUATIONS])) < cost(article.START)
+    assert article.least(cost, low, high) == pytest.approx(article.FOUND, rel=1e-2)
+    cut = article.PRESETS["text"].within(dict.fromkeys(article.NAMES, (20e3, 30e3)))
+    assert cut[0].tolist() == [20e3] * 4
+    assert cut[1][2] == article.PRESETS["text"].upper[2]

@@ -106,7 +106,20 @@ def test_a_diagnosis_takes_the_posteriors_settings(
     assert (asked[0].parent / config.recording.file).is_file()
 
 
+def test_numbers_of_numpy_are_settings_too(tmp_path: Path) -> None:
+    recording = bk.load_recording(ROOT / "data" / "demo.h5")
+    small = {"sample": {"ensembles": np.int64(2), "walkers": 24, "max_steps": 40}, "map": {"starts": 1}}
+    made = bk.calibrate(
+        recording, seed=np.int64(3), fit={"windows_s": np.array([[0.0, 75.0]])}, folder=tmp_path, **small
+    )
+    config = json.loads(made.attrs["provenance"])["config"]
+    assert (config["seed"], config["fit"]["windows_s"]) == (3, [[0.0, 75.0]])
+
+
 def test_wrong_input_is_one_line() -> None:
+    for call in (bk.calibrate, bk.simulate, bk.diagnose):
+        with pytest.raises(InputError, match=r"found str 'data/demo.h5'; expected one of bk.load_recording"):
+            call("data/demo.h5")
     recording = bk.load_recording(ROOT / "data" / "demo.h5")
     with pytest.raises(InputError, match=r"settings: sample.walker: found an unknown key"):
         bk.calibrate(recording, "demo.h5", sample={"walker": 3})
