@@ -197,10 +197,25 @@ def _result(folder: Path, stage: str) -> Any:
     if stage == "design":
         with h5py.File(folder / "case" / "design" / "design.h5") as handle:
             numbers |= {name: handle[name][()].tobytes() for name in ("theta", "force_n", "ok", "wave")}
+    if stage == "train":
+        numbers |= _arrays(folder / "case" / "train" / "surrogate.h5")
     for chain in sorted((folder / "case").glob("chains/*/*.h5")):
         with h5py.File(chain) as handle:
             numbers[chain.name] = handle["mcmc/chain"][()].tobytes()
     return numbers
+
+
+def _arrays(file: Path) -> dict[str, bytes]:
+    """Every array of numbers in an HDF5 file, by its path; texts hold times."""
+    found: dict[str, bytes] = {}
+
+    def visit(name: str, node: Any) -> None:
+        if isinstance(node, h5py.Dataset) and node.dtype.kind in "fiub" and "seconds" not in name:
+            found[name] = np.asarray(node[()]).tobytes()
+
+    with h5py.File(file) as handle:
+        handle.visititems(visit)
+    return found
 
 
 def _timeless(value: Any) -> Any:

@@ -1,0 +1,45 @@
+"""The figures of docs/gallery.md that the demo leaves: those of its run, and the fields inside the skin.
+
+    python benchmarks/demo_gallery.py
+
+Runs `bayeskin run runs/demo.toml`, where what is done is skipped, and `bayeskin simulate --figures`, and
+copies what they draw to docs/figures/demo-*.png.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+FIGURES = ROOT / "docs" / "figures"
+OF_THE_RUN = (
+    "recording/recording", "train/prior_predictive", "train/validation", "map/map_check", "sample/fit",
+    "sample/posterior", "sample/profiles", "sample/traces", "sample/residuals", "sobol/sobol_prior_gp",
+)  # fmt: skip
+
+
+def called(*arguments: str) -> None:
+    """A command of bayeskin in the checkout; ends the program where the input is wrong."""
+    command = [sys.executable, "-c", "from bayeskin.cli import main; main()", *arguments]
+    if subprocess.run(command, cwd=ROOT, check=False).returncode > 1:
+        raise SystemExit(f"bayeskin {' '.join(arguments)} failed")
+
+
+def main() -> None:
+    called("run", "runs/demo.toml")
+    with tempfile.TemporaryDirectory() as folder:
+        called("simulate", "-o", f"{folder}/force.csv", "--figures", folder)
+        made = [Path(folder) / "fields.png"]
+        made += [ROOT / "runs" / "demo" / f"{name}.png" for name in OF_THE_RUN]
+        for path in made:
+            target = FIGURES / f"demo-{path.stem.replace('_', '-')}.png"
+            shutil.copyfile(path, target)
+            print(target.relative_to(ROOT))
+
+
+if __name__ == "__main__":
+    main()
