@@ -10,6 +10,8 @@ import dataclasses
 import io
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -170,6 +172,7 @@ READERS: dict[str, tuple[Callable[[Path], object], Callable[[Path], bytes], int]
 EACH = 10
 MOST_HDF5 = 400  # each takes a process
 MANY = 170  # times the examples, in a slow run
+GUIDED = 10_000  # inputs of each reader that coverage leads to, in a slow run
 HERE = {"name": "toy", "contents": "1"}  # what a chain is of
 TIMES = pytest.mark.parametrize("times", [1, pytest.param(MANY, marks=pytest.mark.slow)])
 
@@ -236,6 +239,15 @@ def test_damaged_files_are_read_or_refused_in_one_line(name: str, times: int, tm
 
     run()
     assert count[0] or name in ("stage.json", "a.journal")  # these pass over what is torn
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", READERS)
+def test_inputs_that_reach_new_code_are_read_or_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("atheris", reason="atheris is not installed (extra `fuzz`)")
+    command = [sys.executable, str(ROOT / "tests" / "coverage_fuzz.py"), name, str(GUIDED)]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (ended.returncode, f"Done {GUIDED}" in ended.stderr) == (0, True), ended.stdout[-3000:]
 
 
 KEYS = st.sampled_from([*REQUEST, "time_s", "displacement_m"])
