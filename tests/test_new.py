@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import shutil
@@ -16,6 +17,7 @@ from bayeskin import cli, storage
 from bayeskin.config import Config, RecordingConfig, load_config, parameter_space
 from bayeskin.design import default_space
 from bayeskin.errors import InputError
+from bayeskin.inference import NoisePriors
 from bayeskin.pipeline import stages
 from bayeskin.pipeline.engine import Silent, open_run
 from bayeskin.pipeline.new import new_config, new_demo
@@ -75,11 +77,13 @@ def test_every_key_that_is_commented_out_is_a_default(own: Path) -> None:
     new_config(own)
     text = own.with_suffix(".toml").read_text()
     with_keys = re.sub(r"^# (?=\[|\w+ = )", "", text, flags=re.MULTILINE)
+    assert re.findall(r"^# \w+ = .*[^#]# *$", text, re.MULTILINE) == []  # each says what it is
     own.with_suffix(".toml").write_text(with_keys.replace("windows_s = [[0.0, 60.0]]", ""))
     config = load_config(own.with_suffix(".toml"))
-    assert set(tomllib.loads(with_keys)) >= {"model", "fit", "sample", "parameters", "design"}
+    assert set(tomllib.loads(with_keys)) == {*Config.model_fields} - {"slurm", "surrogate"}
     default = Config(name="own", recording=RecordingConfig(file="own.h5"))
-    assert config.model_copy(update={"parameters": {}}) == default
+    assert config.model_copy(update={"parameters": {}, "noise": default.noise}) == default
+    assert dict(config.noise) == dataclasses.asdict(NoisePriors())
     space = parameter_space(config)
     for ours, known in zip(space.parameters, default_space().parameters, strict=True):
         assert (ours.lower, ours.upper, ours.prior) == (known.lower, known.upper, known.prior)

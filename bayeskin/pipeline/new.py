@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from bayeskin.config import Config, DesignConfig, RecordingConfig
 from bayeskin.design import default_space
 from bayeskin.errors import InputError
+from bayeskin.inference import NoisePriors
 from bayeskin.pipeline.folder import plain
 from bayeskin.pipeline.recording import pad_motion
 from bayeskin.pipeline.shipping import shipped_for
@@ -20,6 +21,48 @@ from bayeskin.shipped import shipped
 from bayeskin.types import Parameter
 
 _SECONDS_A_RUN = (4, 15)  # of one core, on the default mesh
+
+_NOISE = NoisePriors()
+_UNSTATED = {"windows_s": [[0.0, 60.0]], "sd_n": _NOISE.sd_n, "tau_s": _NOISE.tau_s, "nu": _NOISE.nu}
+# section, what it is about, its keys and what they are
+_SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
+    ("model", "the force that the model reports, and its mesh", {
+        "observation": '"reaction" on the pad, or "article": what the article\'s code integrates',
+        "mesh": "or a gmsh file",
+        "refinement": "of the bricks: 0 coarse and quick, 2 fine and slow",
+    }),
+    ("fit", "what is fitted", {
+        "windows_s": "for example; without it the whole recording",
+        "bin_width_s": "of the force's means",
+    }),
+    ("noise", "bounds of its log-uniform priors", {
+        "sd_n": "N, of each kind of phase",
+        "tau_s": "s, correlation time",
+        "nu": "tail index: small is heavy",
+    }),
+    ("map", "the search for the most probable point", {
+        "starts": "by three kinds of search in turn",
+        "evaluations": "of each start, at most",
+    }),
+    ("sample", "when the posterior has been sampled enough", {
+        "ensembles": "that share nothing but the posterior",
+        "walkers": "in each",
+        "effective_samples": "of the parameter that has fewest",
+        "max_steps": "by which it has to be trusted",
+    }),
+    ("check", "the full model at draws of the posterior", {
+        "draws": "0 for none; each is a full run",
+        "rounds": "in which they may join the design, where the surrogate is off",
+    }),
+    ("effects", "what `bayeskin effects` learns of tissue mechanisms: hours of full runs", {
+        "mechanisms": "all of the tissue where none is named",
+        "coarse": "runs on 80 bricks for each part of one",
+        "points": "full runs for each",
+        "held_out": "full runs that test it",
+        "plausible": "more of them where the recording leaves the mechanism plausible",
+    }),
+    ("sobol", "indices over the prior", {"samples": "a matrix of the estimate"}),
+)  # fmt: skip
 
 
 def new_config(file: Path, out: Path | None = None) -> dict[str, Any]:
@@ -76,7 +119,11 @@ def _configuration(name: str, reference: str, found: str, surrogate: str | None)
     parts = [
         [f"name = {_quoted(name)}", f"seed = {config.seed}"],
         _commented(found),
-        ["[recording]", f"file = {_quoted(reference)}  # relative to this file"],
+        [
+            "[recording]",
+            f"file = {_quoted(reference)}  # relative to this file",
+            f'# protocol = {_quoted(config.recording.protocol)}  # or "recorded": as it was, dearer',
+        ],
         _surrogate(surrogate) if surrogate else _design(config.design),
         ["# What can be set besides, with its default: take the # away to change it.", *_optional(config)],
     ]
@@ -117,32 +164,19 @@ def _design(design: DesignConfig) -> list[str]:
 
 
 def _optional(config: Config) -> list[str]:
-    sections: Sequence[tuple[str, str, Sequence[str]]] = (
-        (
-            "[model]",
-            "the force that the model reports, and its mesh",
-            (f'observation = "{config.model.observation}"',),
-        ),
-        (
-            "[fit]",
-            "without windows the whole recording is fitted",
-            ("windows_s = [[0.0, 60.0]]  # for example", f"bin_width_s = {config.fit.bin_width_s}"),
-        ),
-        (
-            "[sample]",
-            "when the posterior has been sampled enough",
-            (
-                f"effective_samples = {config.sample.effective_samples}",
-                f"max_steps = {config.sample.max_steps}",
-            ),
-        ),
-    )
     lines = []
-    for head, what, keys in sections:
-        lines += ["", f"# {head}  # {what}", *(f"# {key}" for key in keys)]
+    for section, what, keys in _SECTIONS:
+        stated = {key: getattr(getattr(config, section), key) for key in keys}
+        lines += ["", f"# [{section}]  # {what}"]
+        lines += [f"# {key} = {_toml(value, key)}  # {keys[key]}" for key, value in stated.items()]
     for parameter in default_space().parameters:
         lines += ["", *_prior(parameter)]
     return lines
+
+
+def _toml(value: object, key: str) -> str:
+    """A default as TOML has it; where none is stated, an example or what stands for it."""
+    return json.dumps(_UNSTATED[key] if value is None else value)
 
 
 def _prior(parameter: Parameter) -> list[str]:
