@@ -164,7 +164,7 @@ _stage_command("design", "Run the full model at the design's points, wave by wav
 _stage_command("train", "Train the surrogate on the design, validate it on held-out points.")
 _stage_command("effects", "Learn what each tissue mechanism does to the force, by full runs.")
 _stage_command("map", "Find the most probable point and check it by the full model.")
-_stage_command("sample", "Sample the posterior until it can be trusted; bands on the force.")
+_stage_command("sample", "Sample the posterior, run the full model at draws; bands on the force.")
 _stage_command("sobol", "Sobol' indices of the force over time.")
 
 
@@ -217,8 +217,9 @@ def diagnose(source: Path, as_json: bool) -> None:
 
     Tries each mechanism of the catalogue that acts on the instrument, and each of the tissue's that
     `bayeskin effects` has learnt or that is shipped with the surrogate, with all other parameters free
-    again; then sets of them. Selection and fit are repeated on the recording up to the end of its second
-    hold and tested on what follows.
+    again; then sets of them. Where there are three holds or more, selection and fit are repeated on the
+    recording up to the end of the second and tested on what follows. It takes minutes, with many mechanisms
+    most of an hour. The exit code is 0 whatever the verdict.
 
     \b
     Example:
@@ -238,7 +239,8 @@ def diagnose(source: Path, as_json: bool) -> None:
 def experiment(source: Path, as_json: bool) -> None:
     """Which further test would tell look-alikes apart.
 
-    SOURCE as for `bayeskin diagnose`, which is run first where that is not done. The set that explains the
+    SOURCE as for `bayeskin diagnose`, which is run first where that is not done; the reaction only, since no
+    other protocol has the article's observation. The set that explains the
     recording best and those with look-alikes in its place are taken as equally probable; draws of their
     posteriors are run on nine protocols, variations of the recording's own, and the expected information
     about which is true is computed from the forces.

@@ -158,7 +158,7 @@ def _with_surrogate(
 ) -> dict[str, Any]:
     """The settings with a surrogate that knows the recording's protocol."""
     recording = _recording(recording)
-    if surrogate is None and "surrogate" in settings:
+    if surrogate is None and settings.get("surrogate", {}).get("file") is not None:
         return dict(settings)
     if surrogate is None:
         found = shipped_for(pad_motion("reaction", recording, segment(recording), "idealised"))
@@ -181,7 +181,11 @@ def _settings_of(recording: Recording, posterior: arviz.InferenceData) -> dict[s
         raise InputError(
             "posterior", f"that of another recording than {recording.name}", "the recording it was made of"
         )
-    return dict(json.loads(posterior.attrs["provenance"])["config"])
+    settings = dict(json.loads(posterior.attrs["provenance"])["config"])
+    if settings["surrogate"].get("file") is None:
+        expected = "one of a surrogate's file; `bayeskin run` and `diagnose` do this for a design of its own"
+        raise InputError("posterior", "one of a run with a design of its own", expected)
+    return settings
 
 
 def _recording(given: object) -> Recording:

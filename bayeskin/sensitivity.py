@@ -40,6 +40,7 @@ ERROR_DRAWS = 16
 ERROR_SAMPLES = 256  # rows on which a draw's effect on the indices is measured
 ERROR_LENGTH = 0.3  # of the box: about the spacing of a hundred runs in five dimensions
 ERROR_FEATURES = 128
+HIGHEST_DEGREE = 40
 MOST_TERMS = 600
 CHUNK = 512
 
@@ -182,6 +183,9 @@ def projection(
     """
     unit, fresh = (_sobol_points(space.dim, samples, rng) for _ in range(2))
     indices = _expansion_terms(space.dim, len(unit) // 4)
+    if len(indices) == 1:
+        expected = f"at least {4 * (space.dim + 1)} with {space.dim} parameters"
+        raise InputError("sobol.samples", samples, expected)
     basis = legendre_basis(unit, indices)
     gram = cho_factor(basis.T @ basis)
 
@@ -276,9 +280,12 @@ def _pair_columns(dim: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _expansion_terms(dim: int, most: int) -> NDArray[np.int64]:
-    """Degrees (P, dim) of the largest hyperbolic set of at most `most` (and `MOST_TERMS`) terms."""
+    """Degrees (P, dim) of the largest hyperbolic set of at most `most` (and `MOST_TERMS`) terms.
+
+    Raises InputError where a constant is all that so few samples can carry.
+    """
     degree, terms = 1, multi_indices(dim, 0)
-    while len(larger := multi_indices(dim, degree)) <= min(most, MOST_TERMS):
+    while degree <= HIGHEST_DEGREE and len(larger := multi_indices(dim, degree)) <= min(most, MOST_TERMS):
         degree, terms = degree + 1, larger
     return terms
 

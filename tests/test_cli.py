@@ -177,6 +177,20 @@ def test_simulate_adds_the_mechanisms_that_are_named(
     np.testing.assert_allclose(np.median(beyond), 0.02, atol=1e-6)
 
 
+def test_the_peak_that_is_told_is_that_of_the_force_that_is_written(
+    bayeskin: Command, measured: Path, tmp_path: Path, runs: list[str]
+) -> None:
+    peaks = []
+    for offset in ("0", "-0.1"):
+        out = tmp_path / f"{offset}.csv"
+        more = ("--mechanism", "force-offset", "--set", f"F0={offset}")
+        code, said, _ = bayeskin("simulate", "--recording", measured, "-o", out, *more, "--json")
+        written = np.loadtxt(out, delimiter=",", skiprows=1)[:, 2]
+        peaks.append(json.loads(said)["stats"]["peak_force_n"])
+        assert (code, peaks[-1]) == (0, pytest.approx(np.abs(written).max()))
+    assert peaks[0] - peaks[1] == pytest.approx(0.1)
+
+
 @pytest.fixture
 def runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """A stand-in for the full model that stretches all uniformly; lists the names of the runs it made."""
@@ -238,7 +252,7 @@ def test_the_figure_of_fields_shows_four_moments_or_those_asked_for(
     assert bayeskin(*common)[0] == 0
     first = [label.splitlines() for label in given["labels"]]
     assert [(what, pads) for _, what, pads in first] == [
-        ("end of loading 1", "pads at 4.50 mm"), ("middle of hold 1", "pads at 4.50 mm"),
+        ("end of loading 1", "pads at 1.98 mm"), ("middle of hold 1", "pads at 1.98 mm"),
         ("end of unloading 1", "pads at 0.00 mm"), ("middle of rest 2", "pads at 0.00 mm"),
     ]  # fmt: skip
     assert given["columns"][1].values[:, 0] == pytest.approx([-0.9, -0.9, 0.0, 0.0])
@@ -261,6 +275,14 @@ def test_the_figure_of_fields_shows_four_moments_or_those_asked_for(
         (["--at", "3"], ("--at 3", "--figures DIR")),
         (["--figures", "file/figures"], ("--figures file/figures", "file is a file")),
         (["--fields", "file"], ("--fields file", "file is a file")),
+        (
+            ["--figures", "figures", "--mechanism", "strain-stiffening"],
+            ("--mechanism strain-stiffening", "fields are of the base law"),
+        ),
+        (
+            ["--fields", "fields", "--mechanism", "pad-slip", "--mechanism", "preconditioning"],
+            ("--mechanism preconditioning", "fields are of the base law"),
+        ),
     ],
 )
 def test_wrong_options_of_the_outputs_are_refused_before_the_run(

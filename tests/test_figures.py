@@ -159,6 +159,14 @@ def test_recording_shows_phases_cycles_and_loops(recording: Recording, binned: B
     assert headline(figure).startswith("arm: 2 cycles to 9 mm")
 
 
+@pytest.mark.parametrize("name", ["arm_$1_left_$2_.csv", "P$03_$S1.xlsx", "$", "a$b_c", r"c:\\$x_{1}$.csv"])
+def test_a_files_name_is_no_markup(
+    recording: Recording, binned: BinnedForce, name: str, tmp_path: Path
+) -> None:
+    figure = report.figure_recording(dataclasses.replace(recording, name=name), binned)
+    report.save_figure(figure, tmp_path / "recording", "x")
+
+
 def test_recording_of_nothing_but_rest(recording: Recording, binned: BinnedForce) -> None:
     still = dataclasses.replace(recording, displacement_m=np.zeros_like(recording.time_s))
     rest = dataclasses.replace(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,10 +24,12 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.information import expected_gain
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.protocols import own, phases_of, protocols
-from bayeskin.pipeline import experiment
+from bayeskin.pipeline import diagnosis, experiment
 from bayeskin.pipeline.engine import Silent
+from bayeskin.pipeline.folder import Record, write_record
 from bayeskin.report import figure_experiments
 from bayeskin.types import PadMotion, Parameter, Simulation
+from bayeskin.workers import Lost
 
 OWN_SPEED = 9e-4  # m/s, the toy's
 DRAG = 4e-3 / OWN_SPEED
@@ -194,7 +197,13 @@ def test_sets_with_look_alikes_in_the_place_of_the_likeliest_compete() -> None:
     alike = fitted("drag", dragging=DRAG)
     both = dataclasses.replace(alike, names=("drag", "rub"), log_evidence=1.0)
     none = dataclasses.replace(alike, names=(), log_evidence=3.0)
-    assert [one.names for one in compete([none, alike, both, likely], KNOWN)] == [("rub",), ("drag",)]
+    found = [none, alike, both, likely]
+    assert [one.names for one in compete(found, ["rub"], KNOWN)] == [("rub",), ("drag",)]
+    # A set that the search refused, since the surrogate is unsure of it, is no reference however likely.
+    unsure = dataclasses.replace(alike, log_evidence=99.0)
+    assert [one.names for one in compete([*found, unsure], ["rub"], KNOWN)] == [("rub",), ("drag",)]
+    impossible = dataclasses.replace(alike, log_evidence=-np.inf)
+    assert [one.names for one in compete([none, impossible, likely], ["rub"], KNOWN)] == [("rub",)]
 
 
 def test_noise_of_a_test_to_come_is_that_of_the_fit() -> None:
@@ -226,13 +235,8 @@ def test_protocols_judged_before_an_interruption_are_not_judged_again(
             yield place, weigh(listed[name], fits, KNOWN, toy_run, 0)
 
     monkeypatch.setattr(experiment, "run_parallel", serially)
-    asked = (
-        tmp_path / "x.toml",
-        [{"names": list(one.names)} for one in fits],
-        toy.MOTION,
-        tmp_path,
-        Silent(),
-    )
+    bench = SimpleNamespace(motion=toy.MOTION, run=SimpleNamespace(config=SimpleNamespace(seed=0)))
+    asked = (tmp_path / "x.toml", [{"names": list(one.names)} for one in fits], bench, tmp_path, Silent())
     with pytest.raises(KeyboardInterrupt):
         experiment._weighed(*asked)
     file = next(tmp_path.glob("*.jsonl"))
@@ -248,3 +252,66 @@ def test_protocols_judged_before_an_interruption_are_not_judged_again(
     assert words.splitlines()[0] == "taken as equally probable: rub; or drag"
     assert found[0].sentence in words.splitlines()[1]
     assert "nothing competes" in experiment._in_words({"sets": [["rub"]], "experiments": []})
+
+
+@dataclasses.dataclass(frozen=True)
+class Asked:
+    """What `choose` sees of a run that has been diagnosed."""
+
+    source: Path
+    folder: Path
+
+
+@pytest.fixture
+def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
+    """A run whose diagnosis has been made, and found that something rubs."""
+    (tmp_path / "x.toml").write_text('[recording]\nfile = "x.h5"\n')
+    record = Record("inputs", True, 1.0, {"diagnosis.json": "00"})
+    (tmp_path / "x" / "diagnose").mkdir(parents=True)
+    write_record(tmp_path / "x" / "diagnose", record)
+    config = SimpleNamespace(model=SimpleNamespace(observation="reaction"), seed=0)
+    run = SimpleNamespace(
+        config=config, folder=tmp_path / "x", at=lambda *parts: tmp_path.joinpath("x", *parts)
+    )
+    bench = SimpleNamespace(motion=toy.MOTION, run=run, known=KNOWN)
+    monkeypatch.setattr(experiment, "opened", lambda *_: run)
+    monkeypatch.setattr(experiment, "workbench", lambda _: bench)
+    monkeypatch.setattr(experiment, "stored", lambda one: {"names": list(one.names)})
+    monkeypatch.setattr(experiment, "caption", lambda _: "x")
+    monkeypatch.setattr(diagnosis, "diagnose", lambda *_: {"best_set": ["rub"]})
+    return Asked(tmp_path / "x.toml", tmp_path / "x" / "experiment")
+
+
+def test_nothing_competes_with_the_only_set_that_was_tried(
+    diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(diagnosis, "fits_of", lambda _: [fitted("rub", rubbing=4e-3)])
+    answer = experiment.choose(diagnosed.source, Silent())
+    assert (answer["ok"], answer["sets"]) == (True, [["rub"]])
+    assert "nothing competes" in answer["text"]
+    assert (diagnosed.folder / "experiment.json").is_file()
+
+
+def test_protocols_whose_processes_are_lost_are_said_to_be_unjudged(
+    diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
+    monkeypatch.setattr(diagnosis, "fits_of", lambda _: fits)
+    monkeypatch.setattr(
+        experiment, "run_parallel", lambda judge, names, _: ((i, Lost("killed")) for i in range(len(names)))
+    )
+    answer = experiment.choose(diagnosed.source, Silent())
+    assert (answer["ok"], len(answer["experiments"])) == (False, 9)
+    assert "nothing competes" not in answer["text"]
+    assert answer["text"].count("could not be judged") == 9
+    asked: list[str] = []
+
+    def now(judge: Any, names: Sequence[str], workers: int) -> Iterator[tuple[int, Any]]:
+        asked.extend(names)
+        listed = {one.name: one for one in protocols(toy.MOTION)}
+        for place, name in enumerate(names):
+            yield place, weigh(listed[name], fits, KNOWN, toy_run, 0)
+
+    monkeypatch.setattr(experiment, "run_parallel", now)
+    assert experiment.choose(diagnosed.source, Silent())["ok"]
+    assert len(asked) == 9  # what was lost is judged anew

@@ -133,6 +133,13 @@ def test_states_at_chosen_times_are_linear_between_steps(problem):
         np.testing.assert_allclose(state, expected)
 
 
+def test_the_last_moment_is_kept_though_the_last_time_misses_it_by_rounding(problem):
+    states = StatesAt((130.1,), problem, 0.0)
+    end = np.ones(problem.space.dofs)
+    states.on_state((1e6 + 130.1) - 1e6, end, 0.0)
+    np.testing.assert_allclose(states.states, [end])
+
+
 # --- the surface near the pads ---------------------------------------------------------------------
 
 

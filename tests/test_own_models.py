@@ -26,11 +26,12 @@ from bayeskin import cli, report, storage
 from bayeskin.design import Wave
 from bayeskin.errors import InputError, Unavailable
 from bayeskin.mechanisms import bin_means, catalogue, observed
+from bayeskin.model import ModelSpec
 from bayeskin.model.own import identity, simulate_own, simulate_server, simulate_with
 from bayeskin.pipeline import stages
 from bayeskin.pipeline.doctor import FULL_MODEL_N, THETA
 from bayeskin.pipeline.engine import Silent
-from bayeskin.pipeline.serve import open_server
+from bayeskin.pipeline.serve import Asked, ServedModel, open_server
 from bayeskin.runner import load_design, run_design
 from bayeskin.types import Parameter, ParameterSpace, Recording
 from bayeskin.umbridge import Client, server
@@ -258,6 +259,13 @@ def test_ours_answers_the_client_of_the_package_umbridge(served: str) -> None:
     other = {"protocol": {"time_s": [0.0, 4.0], "displacement_m": [0.0, 4e-3]}, "edges_s": [0.0, 2.0, 4.0]}
     (two,) = model([[100.0, 0.0, 8.0]], other)
     np.testing.assert_allclose(two, [0.1, 0.3], rtol=1e-9)
+
+
+def test_a_mechanism_whose_parameter_has_the_models_name_is_refused() -> None:
+    own = (Parameter("F0", "N", 0.0, 1.0, "uniform"),)
+    model = ServedModel(ModelSpec(), own, Asked(MOTION, np.arange(0.0, 131.0), None, ()))
+    with pytest.raises(InputError, match="found F0 twice"):
+        model.input_sizes({"mechanisms": ["force-offset"]})
 
 
 def test_instrument_mechanisms_bring_their_parameters(served: str) -> None:

@@ -57,11 +57,15 @@ def test_the_page_fits_its_width_and_a_browser_has_nothing_to_complain_of(
 
 def test_what_a_browser_complains_of_is_heard(shown: Browser, page: Path) -> None:
     wrong = page.with_name("wrong.html")
-    extra = '<script>console.error("said"); absent();</script><img src="https://a.b/c.png" alt="">'
+    extra = '<script>document.title = "run";</script><img src="https://a.b/c.png" alt="">'
     wrong.write_text(page.read_text().replace("</body>", f"{extra}</body>"))
     shown.open(wrong, 1280)
+    assert shown.ask("document.title") != "run"  # no script but the page's own is run
+    shown.ask("console.error('said'); setTimeout(() => absent())")
+    shown.ask("new Promise((done) => setTimeout(done, 50))")
     told = " ".join(shown.complaints)
-    assert [part for part in ("absent is not defined", "'said'", "img-src") if part not in told] == []
+    parts = ("absent is not defined", "'said'", "img-src", "script-src")
+    assert [part for part in parts if part not in told] == []
 
 
 def test_tables_sort(shown: Browser, page: Path) -> None:

@@ -387,7 +387,27 @@ def test_another_verdict_is_a_failure_of_the_same_sources_only(
     assert "ANOTHER VERDICT" in again["text"]
     assert pipeline.prove(copy, Silent(), rediagnose=2, diagnose=nothing_found)["ok"]
     monkeypatch.setattr(pipeline, "diagnosing_sources", lambda: "others")
-    assert pipeline.prove(copy, Silent(), rediagnose=1, diagnose=other)["ok"]
+    compared = pipeline.prove(copy, Silent(), rediagnose=1, diagnose=other)
+    assert (compared["ok"], list(compared["rediagnosed_of_these_sources"].values())) == (True, [False])
+    assert "another verdict than that stored, which other sources gave" in compared["text"]
+
+
+def test_a_scoring_by_another_scorer_is_recorded(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = Path(shutil.copytree(made, tmp_path / "copy"))
+
+    def recorded() -> int:
+        pipeline.prove(copy, Silent(), diagnose=nothing_found)
+        return len(json.loads((copy / "scorings.json").read_text()))
+
+    once = recorded()
+    assert recorded() == once
+    hashed = pipeline.sha256_of_file
+    monkeypatch.setattr(
+        pipeline, "sha256_of_file", lambda path: "other" if path.name == "score.py" else hashed(path)
+    )
+    assert recorded() == once + 1
 
 
 def test_a_verdict_is_of_all_modules_that_a_diagnosis_loads_and_of_no_others() -> None:
@@ -401,7 +421,7 @@ def test_a_verdict_is_of_all_modules_that_a_diagnosis_loads_and_of_no_others() -
     counted = {file.relative_to(package).as_posix() for file in imported(package / "pipeline/diagnosis.py")}
     assert {file for file in loaded if not file.startswith(("report/", "proof/"))} <= counted
     assert {"mismatch/search.py", "model/lagrangian.py", "surrogates/files.py"} <= counted
-    assert not counted & {"cli.py", "pipeline/proof.py", "pipeline/serve.py", "report/proof.py", "shapley.py"}
+    assert not counted & {"cli.py", "pipeline/proof.py", "pipeline/serve.py", "scripting.py", "shapley.py"}
 
 
 def test_a_diagnosis_in_a_process_that_refuses_the_seals_goes_through(made: Path) -> None:
@@ -604,6 +624,14 @@ def test_held_out_is_the_full_model_s_where_it_has_a_fit(full: dict | None, rmse
     answer = said("force-offset", fit={"after": {"rmse_held_out": 3e-3, "full_model": full}})
     found = judge("001", key("force-offset"), answer)
     assert found.held_out == pytest.approx(rmse_n / floor_after(2e-3, HELD_OUT_FROM_S))
+
+
+def test_a_group_larger_than_one_listed_is_no_answer_of_the_confusion_matrix() -> None:
+    answer = said("device-friction")
+    assert judge("001", key("device-friction"), answer).answer == "device-friction"
+    answer["mechanisms"][0]["group"] = ["device-friction", "pad-slip", "backlash"]
+    found = judge("001", key("device-friction"), answer)
+    assert (found.right, found.answer) == (False, "group too large")
 
 
 def made_up() -> tuple[dict, dict]:

@@ -252,6 +252,38 @@ def test_a_figure_that_would_run_or_fetch_something_does_not() -> None:
     assert "</tspan> c" in safe
 
 
+SVG = 'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink"'
+
+
+@pytest.mark.parametrize(
+    "inside",
+    [
+        '<script xmlns="">run()</script>',
+        "<SCRIPT>run()</SCRIPT>",
+        '<foreignObject><iframe xmlns="http://www.w3.org/1999/xhtml" srcdoc="run()"/></foreignObject>',
+        '<a><set attributeName="href" to="javascript:run()"/></a>',
+        '<animate attributeName="href" values="javascript:run()"/>',
+        '<h:script xmlns:h="http://www.w3.org/1999/xhtml">run()</h:script>',
+    ],
+)
+def test_only_what_figures_are_drawn_with_stays(inside: str) -> None:
+    safe = inline_svg(f'<svg {SVG}><g>{inside}<path d="M0 0"/></g></svg>', "p")
+    assert "run()" not in safe
+    assert "<path" in safe
+    assert "sha256-" in render_page(facts())
+    assert "script-src 'unsafe-inline'" not in render_page(facts())
+
+
+def test_what_is_no_svg_is_a_damaged_figure() -> None:
+    run = facts()
+    bare = dataclasses.replace(
+        run.stages["recording"], figures={"recording": "<svg><script>run()</script></svg>"}
+    )
+    text = render_page(dataclasses.replace(run, stages={**run.stages, "recording": bare}))
+    assert "Its file is damaged" in text
+    assert "run()" not in text
+
+
 def test_a_damaged_figure_is_named_and_the_rest_of_the_page_stands() -> None:
     run = facts()
     cut = dataclasses.replace(run.stages["recording"], figures={"recording": "<svg><g>"})

@@ -259,3 +259,12 @@ def test_nearby_is_a_tenth_either_way_inside_the_prior() -> None:
     np.testing.assert_allclose(near.upper[:4], [2e6, 1.1e4, 1.1e-16, 1.1e-13])
     assert np.all(near.lower < near.upper)
     assert SPACE.contains([near.lower, near.upper]).all()
+    narrow = dataclasses.replace(SPACE.parameters[0], lower=600e3, upper=650e3)
+    space = dataclasses.replace(SPACE, parameters=(narrow, *SPACE.parameters[1:]))
+    at = {"E_c": 620e3, "E_s": 1e4, "k_c": 1e-16, "k_s": 1e-13, "p_init": 0.0}
+    inside = nearby(space, at)
+    assert (inside.lower[0], inside.upper[0]) == (600e3, 650e3)
+    for bound in (600e3, 650e3):
+        at_bound = nearby(space, {**at, "E_c": bound})
+        assert space.contains([at_bound.lower, at_bound.upper]).all()
+        assert at_bound.lower[0] < at_bound.upper[0]

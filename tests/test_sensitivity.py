@@ -147,6 +147,18 @@ def test_indices_of_the_shipped_surrogate_agree_with_salib(method):
 
 
 @pytest.mark.parametrize("estimate", METHODS)
+def test_one_parameter_has_all_the_variance(estimate):
+    result = estimate(lambda x: np.sin(3 * x), box(1, 0.0, 1.0), ONE_BIN, np.random.default_rng(2), 2048)
+    assert result.first[:, 0] == pytest.approx([1.0], abs=0.01)
+    assert result.total[:, 0] == pytest.approx([1.0], abs=0.01)
+
+
+def test_samples_that_carry_nothing_but_a_constant_are_refused():
+    with pytest.raises(InputError, match=r"sobol\.samples: found 8; expected at least 20 with 4 parameters"):
+        projection(sobol_g, box(4, 0.0, 1.0), ONE_BIN, np.random.default_rng(2), 8)
+
+
+@pytest.mark.parametrize("estimate", METHODS)
 def test_sobol_g(estimate):
     """Kinked, so that a polynomial converges slowly: it says so in `unexplained`."""
     result = estimate(sobol_g, box(5, 0.0, 1.0), ONE_BIN, np.random.default_rng(2), 4096)

@@ -54,15 +54,15 @@ class Experiment:
     failed: int
 
 
-def compete(found: Sequence[Fit], known: Mapping[str, Mechanism]) -> list[Fit]:
-    """The likeliest set of a search, and the likeliest of those tried that have, in the place of some of its
+def compete(found: Sequence[Fit], names: Sequence[str], known: Mapping[str, Mechanism]) -> list[Fit]:
+    """The set of these names, and the likeliest of those tried that have, in the place of some of its
     mechanisms, look-alikes: one for each choice of mechanisms that differs from it."""
-    best = max(found, key=weight)
+    best = max((one for one in found if one.names == tuple(names)), key=weight)
 
     def alike(other: Fit) -> bool:
         gone, new = set(best.names) - set(other.names), set(other.names) - set(best.names)
         groups = {name for one in gone for name in known[one].group}
-        return bool(gone) and len(gone) == len(new) and new <= groups
+        return bool(gone) and len(gone) == len(new) and new <= groups and bool(np.isfinite(weight(other)))
 
     by_names = {other.names: other for other in found if alike(other)}
     return [best, *sorted(by_names.values(), key=weight, reverse=True)[: MOST_SETS - 1]]

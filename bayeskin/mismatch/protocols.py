@@ -44,7 +44,7 @@ def protocols(motion: PadMotion) -> tuple[Protocol, ...]:
     steps = {
         "same again": (
             [ordinary, ordinary],
-            f"Two cycles to {mm:.3g} mm at {mm_s:.2g} mm/s with holds of {hold:.0f} s, as recorded.",
+            f"Two cycles to {mm:.3g} mm at {mm_s:.2g} mm/s with holds of {hold:.0f} s.",
         ),
         "quarter speed": (
             [cycle(pace=0.25)] * 2,
@@ -68,7 +68,7 @@ def protocols(motion: PadMotion) -> tuple[Protocol, ...]:
         ),
         "long pause": (
             [cycle(rest_s=LONG_S), ordinary],
-            f"Two cycles as recorded with a pause of {LONG_S:.0f} s at zero displacement between them.",
+            f"The same two cycles with a pause of {LONG_S:.0f} s at zero displacement between them.",
         ),
         "rests at zero": (
             [cycle(held_s=0.0, rest_s=2 * STILL_S[1])] * 3,

@@ -25,6 +25,8 @@ import skfem
 from bayeskin.model.problem import Constants, Problem, material
 from bayeskin.types import Array
 
+SLACK_S = 1e-6  # by which a run's last time, found as a difference, may miss the protocol's end
+
 
 @dataclass(frozen=True)
 class Fields:
@@ -91,10 +93,10 @@ class StatesAt:
     def on_state(self, time_s: float, x: Array, force_n: float) -> None:
         """Takes the next state of the run."""
         before_s, before = self._before
-        while len(self.states) < len(self.times_s) and self.times_s[len(self.states)] <= time_s:
+        while len(self.states) < len(self.times_s) and self.times_s[len(self.states)] <= time_s + SLACK_S:
             span = time_s - before_s
             share = (self.times_s[len(self.states)] - before_s) / span if span > 0.0 else 1.0
-            self.states.append((1.0 - share) * before + share * x)
+            self.states.append((1.0 - min(share, 1.0)) * before + min(share, 1.0) * x)
         self._before = time_s, x.copy()
 
 

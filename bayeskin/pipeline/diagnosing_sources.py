@@ -13,10 +13,7 @@ from bayeskin.pipeline.folder import sha256_of, sha256_of_file
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import effects_beside
 
-WITHOUT_EFFECT = (
-    "proof",
-    "report",
-)  # imported by a diagnosis: what hides seals from it, and draws its figures
+WITHOUT_EFFECT = ("report", "scripting")  # figures; what the package offers to scripts that ask for it
 PACKAGE = Path(bayeskin.__file__).parent
 
 

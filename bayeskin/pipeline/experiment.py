@@ -1,7 +1,7 @@
 """Which further test would tell the explanations of a mismatch apart, after it has been diagnosed.
 
-Runs are those of the coarsest bricks, which are quick: what matters is by how much explanations differ, and a
-mesh changes them nearly alike.
+Runs are those of the coarsest bricks, which are quick (a mesh of one's own stays): what matters is by how
+much explanations differ, and a mesh changes them nearly alike.
 """
 
 from __future__ import annotations
@@ -9,16 +9,17 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import bayeskin
 from bayeskin import report
 from bayeskin.errors import InputError
-from bayeskin.mismatch.experiments import Experiment, compete, ranked, weigh
+from bayeskin.mismatch.experiments import DRAWS, Experiment, compete, ranked, weigh
 from bayeskin.mismatch.fit import restored, stored
 from bayeskin.mismatch.protocols import protocols
 from bayeskin.model.simulate import ModelSpec, simulate
@@ -27,6 +28,7 @@ from bayeskin.pipeline.engine import Reporter, Run, Silent
 from bayeskin.pipeline.folder import (
     Record,
     current_record,
+    locked,
     output_hashes,
     plain,
     read_lines,
@@ -36,7 +38,7 @@ from bayeskin.pipeline.folder import (
     write_record,
 )
 from bayeskin.pipeline.provenance import caption
-from bayeskin.pipeline.workbench import opened, workbench
+from bayeskin.pipeline.workbench import Workbench, opened, workbench
 from bayeskin.types import PadMotion, Simulation
 from bayeskin.workers import Lost, run_parallel
 
@@ -50,23 +52,27 @@ def choose(source: Path, reporter: Reporter) -> dict[str, Any]:
     for bad input, among it the article's observation, which no other protocol has.
     """
     run = opened(source, reporter)
-    if run.config.model.observation != "reaction":
-        raise InputError(source, "the article's observation", "model.observation = 'reaction'")
-    diagnosis.diagnose(source, reporter)
-    started = time.monotonic()
-    bench = workbench(run)
-    fits = compete(diagnosis.fits_of(bench), bench.known)
-    answer: dict[str, Any] = {"sets": [list(one.names) for one in fits], "experiments": [], "ok": True}
-    if len(fits) > 1:
-        found = _weighed(source, [stored(one) for one in fits], bench.motion, run.folder / FOLDER, reporter)
-        answer["experiments"] = [_row(one) for one in ranked(found)]
-        figure = report.figure_experiments(ranked(found))
-        made = report.save_figure(figure, run.folder / FOLDER / "experiments", caption(run))
-        answer["figures"] = [path.name for path in made]
+    observation = run.config.model.observation
+    if observation != "reaction":
+        raise InputError(source, f"model.observation {observation!r}", "'reaction'")
+    diagnosed = diagnosis.diagnose(source, reporter)
     where = run.folder / FOLDER
-    write_json(where / "experiment.json", answer)
-    seconds = time.monotonic() - started
-    write_record(where, Record(_diagnosis(run), True, seconds, output_hashes(where), plain(answer)))
+    with locked(run.folder):
+        started, of = time.monotonic(), _diagnosis(run)
+        where.mkdir(parents=True, exist_ok=True)
+        bench = workbench(run)
+        fits = compete(diagnosis.fits_of(bench), diagnosed["best_set"], bench.known)
+        answer: dict[str, Any] = {"sets": [list(one.names) for one in fits], "experiments": [], "ok": True}
+        if len(fits) > 1:
+            found = ranked(_weighed(source, [stored(one) for one in fits], bench, where, reporter))
+            answer["ok"] = any(np.isfinite(one.gain_nats) for one in found)
+            answer["experiments"] = [_row(one) for one in found]
+            figure = report.figure_experiments(found)
+            made = report.save_figure(figure, where / "experiments", caption(run))
+            answer["figures"] = [path.name for path in made]
+        write_json(where / "experiment.json", answer)
+        seconds = time.monotonic() - started
+        write_record(where, Record(of, True, seconds, output_hashes(where), plain(answer)))
     return plain({**answer, "folder": where, "text": _in_words(answer)})
 
 
@@ -81,19 +87,26 @@ def _diagnosis(run: Run) -> str:
 
 
 def _weighed(
-    source: Path, fits: Sequence[Mapping[str, Any]], motion: PadMotion, folder: Path, reporter: Reporter
+    source: Path, fits: Sequence[Mapping[str, Any]], bench: Workbench, folder: Path, reporter: Reporter
 ) -> list[Experiment]:
-    """Each protocol judged in one of two processes; those judged before an interruption are not again."""
-    listed = {one.name: one for one in protocols(motion)}
-    folder.mkdir(parents=True, exist_ok=True)
-    file = folder / f"weighed-{sha256_of([list(map(dict, fits))])[:12]}.jsonl"
+    """Each protocol judged in one of two processes; those judged before an interruption are not again.
+
+    One whose process was lost has no gain, and is judged anew the next time.
+    """
+    listed = {one.name: one for one in protocols(bench.motion)}
+    of = [bayeskin.__version__, bench.run.config.seed, list(map(dict, fits))]
+    file = folder / f"weighed-{sha256_of(of)[:12]}.jsonl"
     done = {
         row["protocol"]: Experiment(**row, motion=listed[row["protocol"]].motion) for row in read_lines(file)
     }
     todo = [name for name in listed if name not in done]
     for place, one in run_parallel(partial(_weigh_apart, source, fits), todo, 2):
         if isinstance(one, Lost):
-            reporter.log(f"{todo[place]}: {one.reason}")
+            lost = listed[todo[place]]
+            reporter.log(f"{lost.name}: {one.reason}")
+            done[lost.name] = Experiment(
+                lost.name, lost.sentence, lost.motion, *3 * (np.nan,), np.log(len(fits)), DRAWS * len(fits)
+            )
             continue
         done[one.protocol] = one
         with open(file, "a", encoding="utf-8") as handle:
@@ -112,15 +125,17 @@ def _weigh_apart(source: Path, fits: Sequence[Mapping[str, Any]], name: str) -> 
     bench = workbench(opened(source, Silent()))
     found = [restored(one, bench.posterior(None, one["names"])) for one in fits]
     protocol = next(one for one in protocols(bench.motion) if one.name == name)
-    return weigh(protocol, found, bench.known, _coarse, bench.run.config.seed)
+    return weigh(protocol, found, bench.known, partial(_coarse, bench.spec), bench.run.config.seed)
 
 
-def _coarse(motion: PadMotion, theta: Mapping[str, float], laws: Sequence[Any]) -> Simulation:
-    return simulate(ModelSpec(refinement=0), motion, theta, laws=laws)
+def _coarse(
+    spec: ModelSpec, motion: PadMotion, theta: Mapping[str, float], laws: Sequence[Any]
+) -> Simulation:
+    return simulate(replace(spec, refinement=0), motion, theta, laws=laws)
 
 
 def _in_words(answer: Mapping[str, Any]) -> str:
-    if not answer["experiments"]:
+    if len(answer["sets"]) < 2:
         return "nothing competes: no look-alike was tried in the place of what explains the recording best"
     lines = ["taken as equally probable: " + "; or ".join(", ".join(one) for one in answer["sets"])]
     for one in answer["experiments"]:

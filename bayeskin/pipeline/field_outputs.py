@@ -117,9 +117,10 @@ def field_figure(
             directions=velocity,
         ),
     ]
+    pad = surface.part == PARTS.index("pad")  # with what lies in series, not where the drive is
     labels = [
-        f"{number(time_s, 4)} s\n{what}\npads at {0.5e3 * motion.at(time_s):.2f} mm"
-        for time_s, what in moments.items()
+        f"{number(time_s, 4)} s\n{what}\npads at {1e3 * state.displacement_m[pad].mean():.2f} mm"
+        for (time_s, what), state in zip(moments.items(), seen, strict=True)
     ]
     return report.figure_fields(
         labels,

@@ -76,8 +76,7 @@ def nearby(space: ParameterSpace, theta: Mapping[str, float]) -> ParameterSpace:
 
     def around(p: Parameter) -> Parameter:
         reach = max(NEARBY * abs(theta[p.name]), 1e-6 * (p.upper - p.lower))
-        lower = min(max(theta[p.name] - reach, p.lower), p.upper - reach)
-        upper = max(min(theta[p.name] + reach, p.upper), p.lower + reach)
+        lower, upper = max(theta[p.name] - reach, p.lower), min(theta[p.name] + reach, p.upper)
         return replace(p, lower=lower, upper=upper, prior="uniform")
 
     return ParameterSpace(tuple(around(p) for p in space.parameters))

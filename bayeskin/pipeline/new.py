@@ -21,6 +21,9 @@ from bayeskin.shipped import shipped
 from bayeskin.types import Parameter
 
 _SECONDS_A_RUN = (4, 15)  # of one core, on the default mesh
+_SHIPPED_KNOWS = (
+    "# Another model, bin width or wider bounds need another surrogate: take [surrogate] above out.",
+)
 
 _NOISE = NoisePriors()
 _UNSTATED = {"windows_s": [[0.0, 60.0]], "sd_n": _NOISE.sd_n, "tau_s": _NOISE.tau_s, "nu": _NOISE.nu}
@@ -48,7 +51,7 @@ _SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
         "ensembles": "that share nothing but the posterior",
         "walkers": "in each",
         "effective_samples": "of the parameter that has fewest",
-        "max_steps": "by which it has to be trusted",
+        "max_steps": "it stops there, trusted or not",
     }),
     ("check", "the full model at draws of the posterior", {
         "draws": "0 for none; each is a full run",
@@ -61,7 +64,7 @@ _SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
         "held_out": "full runs that test it",
         "plausible": "more of them where the recording leaves the mechanism plausible",
     }),
-    ("sobol", "indices over the prior", {"samples": "a matrix of the estimate"}),
+    ("sobol", "indices over the prior", {"samples": "more make their intervals narrower"}),
 )  # fmt: skip
 
 
@@ -125,7 +128,12 @@ def _configuration(name: str, reference: str, found: str, surrogate: str | None)
             f'# protocol = {_quoted(config.recording.protocol)}  # or "recorded": as it was, dearer',
         ],
         _surrogate(surrogate) if surrogate else _design(config.design),
-        ["# What can be set besides, with its default: take the # away to change it.", *_optional(config)],
+        [
+            "# What can be set besides, with its default. To change one, take the # from its line and from",
+            "# that of the section above it.",
+            *(_SHIPPED_KNOWS if surrogate else ()),
+            *_optional(config),
+        ],
     ]
     return "\n\n".join("\n".join(part) for part in parts) + "\n"
 

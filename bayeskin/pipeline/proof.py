@@ -76,6 +76,7 @@ def prove(
         "scoreboard": board,
         "verdicts_of_these_sources": current,
         "rediagnosed_the_same": compared,
+        "rediagnosed_of_these_sources": {n: verdicts[n]["sources_sha256"] == sources for n in compared},
         "figures": list(figures),
     }
     return plain({**document, "text": _in_words(document)})
@@ -151,18 +152,20 @@ def _store(folder: Path, number: str, recording_sha256: str, sources: str, answe
 
 
 def _record(folder: Path, sources: str, current: int, board: Mapping[str, Any]) -> None:
-    """Adds this scoring to those before it; one for each state of the sources and each set of verdicts."""
+    """Adds this scoring to those before it; one for each state of the sources and of the scorer, and each set
+    of verdicts."""
     path = folder / seals.SCORINGS
     before = seals.read_json(path) if path.is_file() else []
     verdicts = sha256_of([sha256_of_file(p) for p in sorted((folder / seals.VERDICTS).glob("*.json"))])
-    if any((one["sources_sha256"], one["verdicts_sha256"]) == (sources, verdicts) for one in before):
+    scorer = sha256_of_file(Path(proof.__file__).with_name("score.py"))
+    of = {"sources_sha256": sources, "verdicts_sha256": verdicts, "scorer_sha256": scorer}
+    if any(of.items() <= one.items() for one in before):
         return
     kept = {name: value for name, value in board.items() if name not in ("each", "by_mechanism", "confusion")}
     new = {
         "date": datetime.now(UTC).date().isoformat(),
         "version": bayeskin.__version__,
-        "sources_sha256": sources,
-        "verdicts_sha256": verdicts,
+        **of,
         "verdicts_of_these_sources": current,
         "scoreboard": kept,
     }
@@ -215,7 +218,9 @@ def _in_words(document: Mapping[str, Any]) -> str:
         middle = "none" if found["median"] is None else f"{found['median']:.2f}"
         lines.append(f"{text}, 3 x floor and more: median {middle} of {found['of']}")
     for number, same in document["rediagnosed_the_same"].items():
-        lines.append(f"{number} diagnosed again: {'the same' if same else 'ANOTHER VERDICT'}")
+        current = document["rediagnosed_of_these_sources"][number]
+        other = "ANOTHER VERDICT" if current else "another verdict than that stored, which other sources gave"
+        lines.append(f"{number} diagnosed again: {'the same' if same else other}")
     return "\n".join(lines)
 
 

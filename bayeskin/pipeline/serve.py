@@ -83,7 +83,11 @@ class ServedModel:
 
     def _names(self, asked: Asked) -> list[str]:
         more = [p.name for mechanism in asked.mechanisms for p in mechanism.parameters]
-        return [*(p.name for p in self.parameters), *more]
+        names = [*(p.name for p in self.parameters), *more]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise InputError("config: mechanisms", f"{twice[0]} twice", "parameters of other names")
+        return names
 
     def _asked(self, config: Mapping[str, Any]) -> Asked:
         for key in config:

@@ -16,7 +16,9 @@ from bayeskin.config import load_config, parameter_space
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, catalogue, laws, solved
 from bayeskin.model.accuracy import mesh_error
+from bayeskin.model.problem import Problem
 from bayeskin.model.simulate import ModelSpec, problem_of, simulate
+from bayeskin.model.tissue import TissueLaw
 from bayeskin.pipeline.engine import Reporter, Run
 from bayeskin.pipeline.field_outputs import FieldOutputs, moments_of
 from bayeskin.pipeline.folder import plain
@@ -90,6 +92,7 @@ def simulate_once(
     outputs = None
     if fields or figures:
         problem = problem_of(spec.mesh, spec.refinement)
+        _refuse_other_stresses(added, theta | along, problem)
         outputs = FieldOutputs(problem, theta, motion, moments, fields, figures)
     simulation = simulate(
         spec, motion, theta | along, lambda share: reporter.progress("simulation", share),
@@ -98,9 +101,8 @@ def simulate_once(
     files: list[Path] = []
     if simulation.status == "ok":
         simulation = _reported(simulation, added, values, motion)
-        shown = outputs.write(caption(run)) if outputs else []
         write_simulation(out, simulation)
-        files = [out, *shown]
+        files = [out, *(outputs.write(caption(run)) if outputs else ())]
     return _answer(simulation, spec, files)
 
 
@@ -136,6 +138,17 @@ def _mechanisms(names: Sequence[str]) -> list[Mechanism]:
     return [known[name] for name in dict.fromkeys(names)]
 
 
+def _refuse_other_stresses(
+    mechanisms: Sequence[Mechanism], values: Mapping[str, float], problem: Problem
+) -> None:
+    """Fields are those of the base law: a mechanism that changes it at a point has others."""
+    for mechanism in mechanisms:
+        bind = mechanism.act.bind
+        if bind is not None and type(bind(values, problem)).respond is not TissueLaw.respond:
+            expected = "none that changes the tissue's stress or flow: fields are of the base law"
+            raise InputError("--fields, --figures", f"--mechanism {mechanism.name}", expected)
+
+
 def _refuse_senseless(parameter: Parameter, value: float) -> None:
     positive = parameter.in_log and parameter.offset == 0.0
     if not np.isfinite(value) or (positive and value <= 0.0):
@@ -151,13 +164,14 @@ def _reported(
         return simulation
     every = np.arange(0.0, simulation.time_s[-1], REPORTED_EVERY_S)
     time_s = np.union1d(simulation.time_s, every)
-    force = reported(simulation, mechanisms, values, motion)
+    force_n = reported(simulation, mechanisms, values, motion)(time_s)[0]
     return replace(
         simulation,
         theta=dict(values),
         time_s=time_s,
         displacement_m=motion.at(time_s),
-        force_n=force(time_s)[0],
+        force_n=force_n,
+        stats={**simulation.stats, "peak_force_n": float(np.abs(force_n).max())},
         corner=np.isin(time_s, simulation.time_s[simulation.corner]),
     )
 

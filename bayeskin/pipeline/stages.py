@@ -166,7 +166,12 @@ def _polish(polished: Mapping[str, Any] | None) -> list[str]:
 
 def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
     error = said["map"]["surrogate_error"]
-    rmse = said["rmse"]["full_model_at_map"] or said["rmse"]["posterior_mean"]
+    full = said["rmse"]["full_model_at_map"]
+    model, rmse = (
+        ("surrogate at the posterior mean", said["rmse"]["posterior_mean"])
+        if full is None
+        else ("full model at the most probable point", full)
+    )
     off = [f"{1e3 * rmse['whole_n']:.2f} mN over the whole recording"]
     if rmse["not_fitted_n"] is not None:
         off.append(
@@ -179,7 +184,7 @@ def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
             *_identified(said["identifiability"]),
             *_priors(said["posterior"]),
             *said["remarks"],
-            f"model at the most probable point: RMSE {', '.join(off)}",
+            f"{model}: RMSE {', '.join(off)}",
             error["message"],
             f"outputs in {folder}, {sum(said['seconds'].values()):.0f} s in all",
         ]

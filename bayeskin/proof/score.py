@@ -35,6 +35,7 @@ SIZE_EDGES = (0.0, 1.0, 1.5, 2.2, 3.0, 5.0, 8.0, 15.0, np.inf)  # eight sizes, o
 WITHIN_SD = float(norm.ppf(0.95))
 BASE = ("E_c", "E_s", "k_c", "k_s")
 SEVERAL = "several names"
+TOO_LARGE = "group too large"  # of look-alikes, larger than any that is listed
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def judge(number: str, key: Mapping[str, Any], answer: Mapping[str, Any]) -> Jud
         label=key["label"],
         kind=key["kind"],
         size=float(key["size"]),
-        answer=_label(answer["verdict"], named, truth, key["label"]),
+        answer=_label(answer["verdict"], named, truth, key["label"]) if allowed else TOO_LARGE,
         named=named,
         right=right and allowed,
         right_group=bool(truth) and allowed and (right or stands_for(set(named), truth)),

@@ -108,15 +108,14 @@ def draw_parts(ax: Axes, binned: BinnedForce, bands: ForceBands) -> None:
 
 def draw_residual_loop(ax: Axes, binned: BinnedForce, predicted_n: Array, displacement_mm: Array) -> None:
     """Residual [mN] over displacement, each bin in the colour of its phase."""
-    kinds = np.array([p.kind for p in binned.phases])[binned.phase] if binned.phases else None
+    kinds = np.array([p.kind for p in binned.phases])[binned.phase]
     residual_mn = 1e3 * (binned.force_n - predicted_n)
     ax.axhline(0, color=GREY, lw=0.6)
     for kind, color in PHASE_COLORS.items():
-        inside = kinds == kind if kinds is not None else np.full(len(residual_mn), kind == "rest")
+        inside = kinds == kind
         if np.any(inside):
             ax.plot(displacement_mm[inside], residual_mn[inside], ".", ms=3, color=color, label=kind)
-    if kinds is not None:
-        ax.legend(loc="best", handletextpad=0.1, markerscale=2)
+    ax.legend(loc="best", handletextpad=0.1, markerscale=2)
     ax.set(xlabel="displacement [mm]", ylabel="residual [mN]")
 
 

@@ -23,7 +23,7 @@ from bayeskin.report.style import (
     styled,
 )
 
-_LAST = ("both", "several names", "unknown")
+_LAST = ("both", "several names", "group too large", "unknown")
 _SHADES = LinearSegmentedColormap.from_list("shades", ["white", MODEL])
 _OPEN_END = 1.6  # the last class of sizes has no upper end: so many times its lower one
 

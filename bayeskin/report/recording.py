@@ -7,7 +7,16 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bayeskin.report.style import INK, PAGE_IN, RECORDED, new_figure, panel_title, state_finding, styled
+from bayeskin.report.style import (
+    INK,
+    PAGE_IN,
+    RECORDED,
+    literal,
+    new_figure,
+    panel_title,
+    state_finding,
+    styled,
+)
 from bayeskin.report.timeline import phase_legend, shade_phases
 from bayeskin.types import Array, BinnedForce, Recording
 from bayeskin.words import number
@@ -30,8 +39,6 @@ def figure_recording(recording: Recording, binned: BinnedForce) -> Figure:
     force.plot(recording.time_s, recording.force_n, color=RECORDED, lw=0.4, rasterized=many)
     for ax in (motion, force):
         shade_phases(ax, phases, cycles=ax is motion)
-    if not phases:
-        motion.set_xlim(recording.time_s[0], recording.time_s[-1])
     low, high = displacement_mm.min(), displacement_mm.max()
     reach = (high - low) or 1.0
     motion.set_ylim(low - 0.06 * reach, high + 0.28 * reach)
@@ -45,7 +52,7 @@ def figure_recording(recording: Recording, binned: BinnedForce) -> Figure:
     panel_title(loops, "c", "loops, bin means")
     cycles = len({p.cycle for p in phases if p.kind in ("load", "unload")})
     finding = (
-        f"{recording.name}: {cycles} cycle{'s' * (cycles != 1)} to {number(high, 3)} mm, "
+        f"{literal(recording.name)}: {cycles} cycle{'s' * (cycles != 1)} to {number(high, 3)} mm, "
         f"forces from {number(recording.force_n.min(), 3)} to {number(recording.force_n.max(), 3)} N"
     )
     rate_hz = 1.0 / np.median(np.diff(recording.time_s))

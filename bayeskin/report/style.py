@@ -85,7 +85,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 def state_finding(figure: Figure, finding: str, caption: str = "") -> tuple[Text, Text]:
     """Heads the figure with what it shows, and foots it with how to read it; both wrapped to its width."""
     width = figure.get_figwidth()
-    bold = re.sub(r"\$(.+?)\$", r"$\\boldsymbol{\1}$", finding)
+    bold = re.sub(r"(?<!\\)\$(.+?)(?<!\\)\$", r"$\\boldsymbol{\1}$", finding)
     bold = re.sub(r"(?<![\w{])-(?=\d)", "−", bold)
     head = figure.suptitle("\n".join(_wrap(bold, int(13 * width))), x=0.01, ha="left", linespacing=1.25)
     foot = figure.supxlabel(
@@ -97,6 +97,11 @@ def state_finding(figure: Figure, finding: str, caption: str = "") -> tuple[Text
         linespacing=1.3,
     )
     return head, foot
+
+
+def literal(text: str) -> str:
+    """Somebody's own words, such as a file's name, as text of a figure: no markup."""
+    return text.replace("$", r"\$")
 
 
 def _wrap(text: str, columns: int) -> list[str]:

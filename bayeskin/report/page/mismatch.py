@@ -153,7 +153,7 @@ def _experiments(facts: RunFacts) -> list[Block]:
     if not asked:
         return []
     title = Heading("Which further test would tell the explanations apart")
-    if not asked["experiments"]:
+    if len(asked["sets"]) < 2:
         return [title, Text(["Nothing competes with what explains the recording best."])]
     rows = [
         row(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -19,19 +21,22 @@ _HERE = Path(__file__).parent
 def render_page(facts: RunFacts) -> str:
     """One HTML document that loads nothing: text, figures, style and script are all in it.
 
-    All that comes from a configuration or a recording is escaped. The same facts give the same bytes.
+    All that comes from a configuration or a recording is escaped, and no script but the page's own, known by
+    its hash, would be run. The same facts give the same bytes.
     """
     environment = Environment(
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.filters |= {"kind": _kind, "prose": prose}
+    script = (_HERE / "page.js").read_text(encoding="utf-8")
     return environment.get_template("page.html").render(
         facts=facts,
         answer=answer(facts),
         sections=_sections(facts),
         style=Markup((_HERE / "page.css").read_text(encoding="utf-8")),
-        script=Markup((_HERE / "page.js").read_text(encoding="utf-8")),
+        script=Markup(script),
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     )
 
 

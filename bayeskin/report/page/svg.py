@@ -7,7 +7,12 @@ import xml.etree.ElementTree as ElementTree
 
 _SVG, _XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 _HREF = f"{{{_XLINK}}}href"
-_LEFT_OUT = {f"{{{_SVG}}}metadata", f"{{{_SVG}}}script"}
+# What matplotlib draws with; metadata, scripts and all that could run or fetch something are not among them.
+_KNOWN = {f"{{{_SVG}}}{name}" for name in (
+    "svg", "g", "defs", "style", "clipPath", "path", "rect", "circle", "ellipse", "line", "polyline",
+    "polygon", "use", "image", "text", "tspan", "title", "desc", "linearGradient", "radialGradient", "stop",
+    "pattern", "marker", "mask",
+)}  # fmt: skip
 _URL = re.compile(r"""url\(\s*['"]?#([^)'"]+)['"]?\s*\)""")
 _OUTSIDE = re.compile(r"""url\(\s*(?!['"]?#)[^)]*\)|@import[^;]*;?""")
 
@@ -19,15 +24,18 @@ def inline_svg(text: str, prefix: str) -> str:
     """The `<svg>` element of an SVG file, as wide as it is given room.
 
     Identifiers, and what refers to them, get `prefix`, so that figures of one page do not take each other's
-    parts. Style rules hold inside this figure only. Metadata, scripts, event handlers and references to
-    anything outside of the file are left out. Raises ElementTree.ParseError for text that is no XML.
+    parts. Style rules hold inside this figure only. Elements that matplotlib does not draw with (metadata,
+    scripts, foreign objects), event handlers and references to anything outside of the file are left out.
+    Raises ElementTree.ParseError for text that is no SVG.
     """
     root = ElementTree.fromstring(text)
+    if root.tag != f"{{{_SVG}}}svg":
+        raise ElementTree.ParseError(f"{root.tag} is no SVG")
     for parent in list(root.iter()):
         for child in list(parent):
             if child.tail is not None and child.tail.isspace():
                 child.tail = None  # the file's indentation
-            if child.tag in _LEFT_OUT:
+            if child.tag not in _KNOWN:
                 parent.remove(child)
     for element in root.iter():
         element.attrib = dict(
