@@ -164,7 +164,7 @@ _stage_command("design", "Run the full model at the design's points, wave by wav
 _stage_command("train", "Train the surrogate on the design, validate it on held-out points.")
 _stage_command("effects", "Learn what each tissue mechanism does to the force, by full runs.")
 _stage_command("map", "Find the most probable point and check it by the full model.")
-_stage_command("sample", "Sample the posterior, run the full model at draws; bands on the force.")
+_stage_command("sample", "Sample the posterior, check it at draws; bands on the force.")
 _stage_command("sobol", "Sobol' indices of the force over time.")
 
 
