@@ -3,16 +3,18 @@
     python benchmarks/demo_gallery.py
 
 Runs `bayeskin run runs/demo.toml`, where what is done is skipped, and `bayeskin simulate --figures`, and
-copies what they draw to docs/figures/demo-*.png.
+copies what they draw to docs/figures/demo-*.png, in 256 colours.
 """
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "docs" / "figures"
@@ -29,6 +31,16 @@ def called(*arguments: str) -> None:
         raise SystemExit(f"bayeskin {' '.join(arguments)} failed")
 
 
+def smaller(path: Path, target: Path) -> None:
+    """A PNG in 256 colours, its texts kept: what a repository is to hold."""
+    with Image.open(path) as image:
+        texts = PngInfo()
+        for key, text in image.info.items():
+            if isinstance(text, str):
+                texts.add_text(key, text)
+        image.convert("RGB").quantize(256).save(target, optimize=True, pnginfo=texts, dpi=image.info["dpi"])
+
+
 def main() -> None:
     called("run", "runs/demo.toml")
     with tempfile.TemporaryDirectory() as folder:
@@ -37,7 +49,7 @@ def main() -> None:
         made += [ROOT / "runs" / "demo" / f"{name}.png" for name in OF_THE_RUN]
         for path in made:
             target = FIGURES / f"demo-{path.stem.replace('_', '-')}.png"
-            shutil.copyfile(path, target)
+            smaller(path, target)
             print(target.relative_to(ROOT))
 
 
