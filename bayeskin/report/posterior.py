@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
 from bayeskin.errors import InputError
+from bayeskin.inference.identify import identifiability
 from bayeskin.report.style import (
     ACCENT,
     GREY,
@@ -26,7 +27,6 @@ from bayeskin.types import Array, Parameter, ParameterSpace
 
 _BINS = 80
 _TINTS = ["#C6DDEC", "#7FB3D5"]  # of the 90 % and the 50 % region
-_AS_PRIOR = 0.9  # a 90 % interval at least this wide, relative to the prior's, counts as not informed
 
 
 @styled
@@ -53,11 +53,11 @@ def figure_posterior(
     caption = (
         f"{len(draws)} posterior draws. Regions hold 50 % and 90 % of them (smoothed histogram); "
         "a pair without structure beyond the draws' own scatter is tinted evenly. "
-        "Above each marginal: median and 90 % interval. Dashed: prior. "
-        f"As the prior had it: a 90 % interval at least {_AS_PRIOR:g} times the prior's."
+        "Above each marginal: median and 90 % interval. Dashed: prior."
     )
     d = len(parameters)
-    figure, axes = triangle(parameters, 0.34, _finding(parameters, columns), caption)
+    places = [space.names.index(name) for name in chosen]
+    figure, axes = triangle(parameters, 0.34, _finding(parameters, draws[:, places]), caption)
     for i in range(d):
         _draw_marginal(axes[i][i], parameters[i], columns[i], float(best[i]), ranges[i])
         for j in range(i):
@@ -167,16 +167,15 @@ def _draw_key(axes: list[list[Axes]], has_map: bool) -> None:
     axes[0][0].legend(handles=handles, loc="upper left", bbox_to_anchor=(1.05, 1.0))
 
 
-def _finding(parameters: Sequence[Parameter], columns: Sequence[Array]) -> str:
-    as_prior: list[str] = []
-    informed: list[str] = []
-    for p, values in zip(parameters, columns, strict=True):
-        low, high = axis_values(p, ParameterSpace((p,)).from_unit([[0.05], [0.95]])[:, 0])
-        width = np.subtract(*np.quantile(values, [0.95, 0.05])) / (high - low)
-        (as_prior if width > _AS_PRIOR else informed).append(p.name)
-    if not as_prior:
-        return f"The recording narrows {list_symbols(informed)} against the prior"
-    if not informed:
-        return f"The recording leaves {list_symbols(as_prior)} as wide as the prior"
-    narrowed, left = list_symbols(informed), list_symbols(as_prior)
-    return f"The recording narrows {narrowed}; it leaves {left} as the prior had it"
+def _finding(parameters: Sequence[Parameter], draws: Array) -> str:
+    """What the recording says of each parameter, draws (s, d) in their order, as `identifiability` has it."""
+    said = identifiability(ParameterSpace(tuple(parameters)), draws).parameters
+    kinds: dict[str, list[str]] = {"does not inform it": [], "informs it weakly": [], "informs it": []}
+    for one in said:
+        kinds[next(kind for kind in kinds if kind in one.statement)].append(one.name)
+    as_prior, little, much = kinds.values()
+    parts = [f"informs {list_symbols(much)}"] if much else []
+    parts += [f"informs {list_symbols(little)} weakly"] if little else []
+    had = "it" if len(as_prior) == 1 else "them"
+    parts += [f"leaves {list_symbols(as_prior)} as the prior had {had}"] if as_prior else []
+    return f"The recording {'; it '.join(parts)}"
