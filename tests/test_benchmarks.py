@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import toy_inference
 from scipy.integrate import cumulative_trapezoid
-from scipy.stats import multivariate_normal
+from scipy.stats import binom, multivariate_normal
 
 from bayeskin.inference import NoisePriors
 from bayeskin.model import ModelSpec
@@ -272,3 +272,27 @@ def test_the_articles_search_keeps_to_its_bounds_and_its_evaluations(benchmark):
     cut = article.PRESETS["text"].within(dict.fromkeys(article.NAMES, (20e3, 30e3)))
     assert cut[0].tolist() == [20e3] * 4
     assert cut[1][2] == article.PRESETS["text"].upper[2]
+
+
+@pytest.mark.parametrize("data", ["surrogate", "full"])
+def test_stored_ranks_are_uniform_and_stand_in_the_documentation(benchmark, data):
+    """What `benchmarks/calibration.py` has found so far: no parameter's intervals are wrong for certain."""
+    calibration = benchmark("calibration")
+    found = [row for row in calibration.ROWS.read() if (row["data"], row["seed"]) == (data, "1")]
+    found.sort(key=lambda row: int(row["index"]))
+    counts = [n for n in range(len(found), 49, -1) if shown(calibration.table(found[:n]))]
+    assert len(counts) == 1  # the page has the table of so many
+    n = counts[0]
+    for name in calibration.NAMES:
+        ranks = np.array([int(row[f"rank_{name}"]) for row in found[:n]])
+        assert calibration.uniformity(ranks) > 0.01 / len(calibration.NAMES), name
+        for level in (50, 90):
+            held = sum(row[f"in{level}_{name}"] == "True" for row in found[:n])
+            low, high = binom.ppf([0.0005, 0.9995], n, level / 100)
+            assert low <= held <= high, (name, level)
+
+
+def shown(table: str) -> bool:
+    """Whether a page of the documentation has the rows of a table."""
+    page = (Path(__file__).parents[1] / "docs" / "inference.md").read_text()
+    return all(line in page for line in table.splitlines()[2:])
