@@ -53,11 +53,19 @@ def write_hdf5(path: Path, fill: Callable[[h5py.File], None]) -> None:
         fill(handle)
         handle.flush()
         image = handle.id.get_file_image()
+    write_bytes(path, image)
+
+
+def write_bytes(path: Path, contents: bytes) -> None:
+    """Writes a file whole or not at all; an earlier one stays until then.
+
+    Raises InputError where it cannot be written.
+    """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(partial, "wb") as out:
-            out.write(image)
+            out.write(contents)
             out.flush()
             os.fsync(out.fileno())
         os.replace(partial, path)

@@ -86,13 +86,18 @@ class ParameterSpace:
 
     `theta` is always in SI units, shape ``(..., d)``, columns in the order of `names`. Priors are independent
     but for normal and log-normal ones with `correlations`: a multivariate normal, cut to the bounds.
-    Raises InputError for correlations that no multivariate normal has.
+    Raises InputError for a name that stands twice, and for correlations that no multivariate normal has.
     """
 
     parameters: tuple[Parameter, ...]
     correlations: tuple[Correlation, ...] = ()
 
     def __post_init__(self) -> None:
+        twice = next((name for name in self.names if self.names.count(name) > 1), None)
+        if twice is not None:
+            raise InputError(
+                "parameters", f"{twice} twice", "names that differ, also from those of mechanisms"
+            )
         peaked, pairs = [p.name for p in self.parameters if p.peaked], set[frozenset[str]]()
         for one, other, value in self.correlations:
             for name in (one, other):

@@ -113,6 +113,55 @@ def test_a_real_disk_that_is_full_is_told(case: Path) -> None:
         subprocess.run(["umount", str(disk)], check=True)
 
 
+FILLED = """
+import resource, sys, tempfile
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+import test_fuzz
+kind, path, size = sys.argv[1], Path(sys.argv[2]), sys.argv[3]
+make = test_fuzz.HDF5[kind][0]
+with tempfile.TemporaryDirectory() as elsewhere:
+    make(Path(elsewhere) / kind)  # what is compiled on the way has files of its own
+if size:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(size), int(size)))
+try:
+    make(path)
+except test_fuzz.InputError as error:
+    print(error)
+"""
+
+
+def told_of_a_full_disk(kind: str, folder: Path, size: str) -> None:
+    """Writes a kind of file where there is no room for it."""
+    path = folder / kind
+    path.write_bytes(b"what was there before")
+    code = FILLED.format(tests=str(Path(__file__).parent))
+    command = [sys.executable, "-c", code, kind, str(path), size]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert f"{kind}: found that it cannot be written" in ended.stdout
+    assert path.read_bytes() == b"what was there before"
+    assert [file.name for file in folder.iterdir()] == [kind]
+
+
+@pytest.mark.parametrize("size", ["0", "1000"])
+@pytest.mark.parametrize("kind", ["surrogate.h5", "chain.h5"])
+def test_a_full_disk_under_surrogates_and_chains_is_told(kind: str, size: str, tmp_path: Path) -> None:
+    told_of_a_full_disk(kind, tmp_path, size)
+
+
+@pytest.mark.parametrize("kind", ["surrogate.h5", "chain.h5", "posterior.nc"])
+def test_a_real_disk_that_is_full_under_what_a_run_writes_is_told(kind: str, tmp_path: Path) -> None:
+    if subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=8k", "tmpfs", str(tmp_path)], capture_output=True, check=False
+    ).returncode:
+        pytest.skip("no right to mount a small disk")
+    try:
+        told_of_a_full_disk(kind, tmp_path, "")
+    finally:
+        subprocess.run(["umount", str(tmp_path)], check=True)
+
+
 def without_a_superusers_rights() -> None:
     """Nobody's rights go beyond a file's mode: PR_CAPBSET_DROP of CAP_DAC_OVERRIDE, which exec then lacks."""
     ctypes.CDLL(None).prctl(24, 1, 0, 0, 0)

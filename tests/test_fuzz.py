@@ -12,6 +12,7 @@ import json
 import os
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -393,3 +394,16 @@ def test_an_hdf5_bomb_is_refused_before_it_takes_the_memory(tmp_path: Path) -> N
         handle.create_dataset("time_s", shape=(2**32,), dtype="f8", compression="gzip", chunks=(2**20,))
     with pytest.raises(InputError, match=r"not readable as HDF5 \(.*Memory"):
         read_recording(tmp_path / "a.h5")
+
+
+def test_a_workbook_that_unpacks_to_more_than_any_recording_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.xlsx").write_bytes(as_workbook())
+    with (
+        zipfile.ZipFile(tmp_path / "a.xlsx", "a", zipfile.ZIP_DEFLATED) as book,
+        book.open("xl/sharedStrings2.xml", "w", force_zip64=True) as part,
+    ):
+        for _ in range(1100):
+            part.write(b" " * 2**20)
+    assert (tmp_path / "a.xlsx").stat().st_size < 5e6
+    with pytest.raises(InputError, match=r"1\.2e\+09 bytes when unpacked; expected at most 1\.1e\+09"):
+        read_recording(tmp_path / "a.xlsx")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -21,27 +20,25 @@ def save(
     """Writes a chain so that `emcee.backends.HDFBackend(path)` reads it.
 
     emcee itself appends in place at every step; a process killed while it does so leaves a file that
-    nothing opens. Here the earlier file stays until the new one is complete and on disk.
+    nothing opens. Here the earlier file stays until the new one is complete and on disk. Raises InputError
+    where it cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        emcee.backends.HDFBackend(str(partial)).reset(backend.nwalkers, backend.ndim)
-        with h5py.File(partial, "r+") as handle:
-            group = handle["mcmc"]
-            for name in ("chain", "log_prob"):
-                group[name].resize(backend.iteration, axis=0)
-                group[name][...] = getattr(backend, name)
-            group["accepted"][...] = backend.accepted
-            group.attrs["iteration"] = backend.iteration
-            for index, part in enumerate(backend.random_state):
-                group.attrs[f"random_state_{index}"] = part
-            group.attrs["bayeskin"] = json.dumps({"names": list(names), "identity": dict(identity)})
-        with open(partial, "rb") as written:
-            os.fsync(written.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+
+    def fill(handle: h5py.File) -> None:
+        group = handle.create_group("mcmc")
+        for name in ("chain", "log_prob"):
+            steps = np.asarray(getattr(backend, name))
+            group.create_dataset(name, data=steps, maxshape=(None, *steps.shape[1:]))
+        group.create_dataset("accepted", data=np.asarray(backend.accepted, dtype=float))
+        group.attrs.update(
+            version=emcee.__version__, nwalkers=backend.nwalkers, ndim=backend.ndim, has_blobs=False,
+            iteration=backend.iteration,
+        )  # fmt: skip
+        for index, part in enumerate(backend.random_state):
+            group.attrs[f"random_state_{index}"] = part
+        group.attrs["bayeskin"] = json.dumps({"names": list(names), "identity": dict(identity)})
+
+    storage.write_hdf5(path, fill)
 
 
 def load(path: Path, names: tuple[str, ...], identity: Mapping[str, str]) -> emcee.backends.Backend:

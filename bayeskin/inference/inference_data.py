@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +18,7 @@ from bayeskin.inference.bands import predictive_draws
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.sample import Posterior
 from bayeskin.probe import refuse_damaged
-from bayeskin.storage import checked, in_a_line
+from bayeskin.storage import checked, in_a_line, write_bytes
 from bayeskin.types import Array, Correlation, Parameter, ParameterSpace, Provenance
 
 if TYPE_CHECKING:
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 
 _PRIOR_DRAWS = 2000
 _ENGINE = "h5netcdf"
+_MEMORY = "/dev/shm"  # Linux's folder in memory
 
 
 def to_inference_data(
@@ -66,17 +69,17 @@ def to_inference_data(
 
 
 def save_inference_data(path: Path | str, idata: arviz.InferenceData) -> None:
-    """Writes NetCDF (h5netcdf), whole or not at all; an earlier file stays until then."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        idata.to_netcdf(str(partial), engine=_ENGINE)
-        with open(partial, "rb") as written:
-            os.fsync(written.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    """Writes NetCDF (h5netcdf), whole or not at all; an earlier file stays until then.
+
+    Made elsewhere first, in memory where the system has a place for that: libhdf5 ends the process on a disk
+    that is full. Raises InputError where it cannot be written.
+    """
+    needed = 2 * sum(idata[group].nbytes for group in idata.groups())
+    roomy = os.path.isdir(_MEMORY) and shutil.disk_usage(_MEMORY).free > needed
+    with tempfile.TemporaryDirectory(dir=_MEMORY if roomy else None) as elsewhere:
+        made = Path(elsewhere) / "posterior.nc"
+        idata.to_netcdf(str(made), engine=_ENGINE)
+        write_bytes(Path(path), made.read_bytes())
 
 
 def load_inference_data(path: Path | str) -> arviz.InferenceData:

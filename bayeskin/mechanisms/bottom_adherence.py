@@ -55,7 +55,7 @@ MECHANISM = Mechanism(
             0.0,
             1e9,
             "log-uniform",
-            "springs between subcutis and fascia",
+            "tangential stiffness of the bond to the fascia, by area",
             stress_power=1,
             offset=1e5,
         ),

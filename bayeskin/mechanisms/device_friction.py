@@ -64,8 +64,8 @@ MECHANISM = Mechanism(
     name="device-friction",
     parameters=(
         Parameter("Fc", "N", 0.0, 0.1, "uniform", "sliding friction of the drive"),
-        Parameter("presliding", "m", 5e-6, 3e-4, "log-uniform", "displacement over which friction turns"),
-        Parameter("friction_start", "-", -1.0, 1.0, "uniform", "friction at t = 0, of the sliding one"),
+        Parameter("presliding", "m", 5e-6, 3e-4, "log-uniform", "travel over which it turns"),
+        Parameter("friction_start", "-", -1.0, 1.0, "uniform", "friction at t = 0, over Fc"),
     ),
     neutral={"Fc": 0.0, "presliding": 5e-5, "friction_start": 0.0},
     statement=lambda v: (

@@ -45,7 +45,7 @@ MECHANISM = Mechanism(
             0.0,
             1e-8,
             "log-uniform",
-            "conductance of the surface",
+            "conductance of the surface: outflow by its area and pressure",
             stress_power=-1,
             offset=1e-12,
         ),

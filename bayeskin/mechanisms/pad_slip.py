@@ -56,7 +56,7 @@ MECHANISM = Mechanism(
             0.0,
             1e-3,
             "log-uniform",
-            "creep of the adhesive",
+            "speed of the slip, by the force beyond what the adhesive bears",
             stress_power=-1,
             offset=1e-6,
         ),

@@ -32,7 +32,9 @@ def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
 
 MECHANISM = Mechanism(
     name="pre-stretch",
-    parameters=(Parameter("opening", "-", 0.0, 0.15, "uniform", "of the pads, of the half gauge length"),),
+    parameters=(
+        Parameter("opening", "-", 0.0, 0.15, "uniform", "of each pad before, of the half gauge length"),
+    ),
     neutral={"opening": 0.0},
     statement=lambda v: f"The skin was stretched by {100 * v['opening']:.1f} % when the test began.",
     group=("pre-stretch", "force-offset", "strain-stiffening"),

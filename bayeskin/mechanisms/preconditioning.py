@@ -105,14 +105,14 @@ def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
 MECHANISM = Mechanism(
     name="preconditioning",
     parameters=(
-        Parameter("damage", "-", 0.0, 0.6, "uniform", "largest loss of stiffness"),
+        Parameter("damage", "-", 0.0, 0.6, "uniform", "largest loss of stiffness, as a share"),
         Parameter(
             "damage_energy",
             "Pa",
             1e2,
             1e5,
             "log-uniform",
-            "stored energy at which it is lost",
+            "stored energy at which 63 % of that is lost",
             stress_power=1,
         ),
     ),

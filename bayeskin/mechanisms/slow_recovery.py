@@ -67,7 +67,7 @@ MECHANISM = Mechanism(
             0.0,
             2e-3,
             "log-uniform",
-            "of the surrounding tissue",
+            "displacement that the surrounding tissue yields, by the force",
             stress_power=-1,
             offset=2e-5,
         ),

@@ -178,9 +178,9 @@ def _stretch(motion: PadMotion, time_s: Array) -> Array:
 MECHANISM = Mechanism(
     name="solid-viscoelasticity",
     parameters=(
-        Parameter("g_1", "-", 0.0, 2.0, "uniform", "first branch, of the equilibrium stress"),
+        Parameter("g_1", "-", 0.0, 2.0, "uniform", "stress of the first branch, over that at rest"),
         Parameter("tau_1", "s", 0.2, 15.0, "log-uniform", "relaxation time of the first branch"),
-        Parameter("g_2", "-", 0.0, 2.0, "uniform", "second branch, of the equilibrium stress"),
+        Parameter("g_2", "-", 0.0, 2.0, "uniform", "stress of the second branch, over that at rest"),
         Parameter("tau_2", "s", 15.0, 300.0, "log-uniform", "relaxation time of the second branch"),
     ),
     neutral={"g_1": 0.0, "tau_1": 2.0, "g_2": 0.0, "tau_2": 60.0},

@@ -70,7 +70,9 @@ def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
 
 MECHANISM = Mechanism(
     name="strain-dependent-permeability",
-    parameters=(Parameter("M_k", "-", -100.0, 100.0, "uniform", "exponent of the permeability by J - 1"),),
+    parameters=(
+        Parameter("M_k", "-", -100.0, 100.0, "uniform", "k = k0 exp(M_k (J - 1)), J the relative volume"),
+    ),
     neutral={"M_k": 0.0},
     statement=lambda v: (
         f"Permeability changes by {100 * np.expm1(0.01 * v['M_k']):+.0f} % where the volume grows by 1 %."

@@ -202,7 +202,7 @@ def _pairs(run: Run) -> list[tuple[Part, ...]]:
 def _learn(run: Run, parts: Sequence[Part]) -> dict[str, Any]:
     config, spec, name = run.config, model_spec(run), name_of(parts)
     base = storage.load(run.at("design", "design.h5"), Design)
-    coarse_spec = replace(spec, mesh="bricks", refinement=0)
+    coarse_spec = spec.coarsest
     wave = coarse_wave(base.space, config.effects.coarse, config.seed)
     some = [[], *([part] for part in parts)] if len(parts) > 1 else [[]]
     few = {

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -131,7 +131,7 @@ def _weigh_apart(source: Path, fits: Sequence[Mapping[str, Any]], name: str) -> 
 def _coarse(
     spec: ModelSpec, motion: PadMotion, theta: Mapping[str, float], laws: Sequence[Any]
 ) -> Simulation:
-    return simulate(replace(spec, refinement=0), motion, theta, laws=laws)
+    return simulate(spec.coarsest, motion, theta, laws=laws)
 
 
 def _in_words(answer: Mapping[str, Any]) -> str:

@@ -14,6 +14,7 @@ from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.types import Array, PadMotion, Simulation
 
 STEP = 1e-4  # of a change, for differences of what the instrument makes of a force
+BESIDE = 1e-4  # of a change, by which derivatives are taken beside a neutral value
 
 
 def reported(
@@ -53,6 +54,9 @@ class FullForce:
         along = {p.name for mechanism in solved(mechanisms) for p in mechanism.parameters}
         theta = {name: value for name, value in values.items() if name in along or name in PARAMETERS}
         by = {name: change for name, change in changes.items() if name in theta}
+        # At its neutral value a law may not be there at all, and has no derivative (pads never opened).
+        neutral = {name: value for mechanism in mechanisms for name, value in mechanism.neutral.items()}
+        theta |= {name: theta[name] + BESIDE * by[name] for name in by if theta[name] == neutral.get(name)}
         simulation = simulate(
             self.spec, self.motion, theta, laws=laws(mechanisms), gradients=by, falls_too=False
         )

@@ -207,8 +207,7 @@ def _factor(coarse_n: Array, own_n: Array) -> float:
 
 
 def _coarse(bench: Workbench) -> FullForce:
-    spec = replace(bench.spec, mesh="bricks", refinement=0)
-    return FullForce(spec, bench.motion, bench.binned.edges_s)
+    return FullForce(bench.spec.coarsest, bench.motion, bench.binned.edges_s)
 
 
 def _surrogate_force(bench: Workbench, case: tuple[Sequence[str], Mapping[str, float]]) -> Array:

@@ -20,6 +20,7 @@ from bayeskin.types import Array
 
 _HEADER_WITHIN = 50  # rows searched for the header; laboratory exports put a preamble before it
 _CHUNK = 50_000  # rows held as text at a time
+MOST_UNPACKED = 2**30  # bytes of a workbook's parts; a sheet of a million rows with three columns has 10^8
 Row = Sequence[Any]
 Split = Callable[[Iterable[str]], Iterator[Row]]
 
@@ -67,6 +68,10 @@ def read_workbook(path: Path, data: bytes, sheet: str | None) -> Table:
     import openpyxl
 
     try:
+        with zipfile.ZipFile(io.BytesIO(data)) as parts:
+            unpacked = sum(part.file_size for part in parts.infolist())
+        if unpacked > MOST_UNPACKED:
+            raise InputError(path, f"{unpacked:.2g} bytes when unpacked", f"at most {MOST_UNPACKED:.2g}")
         book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
         names = list(book.sheetnames)
         if sheet is not None and sheet not in names:

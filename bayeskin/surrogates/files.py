@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -55,34 +54,33 @@ def _described(space: ParameterSpace) -> dict[str, dict[str, Any]]:
 
 
 def save_surrogate(path: Path | str, surrogate: ShapeSurrogate, manifest: Mapping[str, Any]) -> None:
-    """Writes the surrogate and, beside it as ``.json``, its manifest; whole or not at all."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with h5py.File(partial, "w") as handle:
-            storage.write(handle.create_group("space"), surrogate.space)
-            storage.write(handle.create_group("transform"), surrogate.transform)
-            latents = surrogate.latents
-            if isinstance(latents, CorrectedLatents):
-                storage.write(handle.create_group("correction"), latents.correction)
-                latents = latents.coarse
-            storage.write(handle.create_group("latents"), latents)
-            handle.create_dataset("edges_s", data=surrogate.edges_s)
-            handle.create_dataset("active", data=surrogate.active)
-            digest = contents_hash(handle)
-            text = json.dumps({**manifest, "arrays_sha256": digest}, indent=2, sort_keys=True)
-            handle.attrs.update(
-                format=FORMAT, format_version=FORMAT_VERSION, version=__version__, arrays_sha256=digest,
-                kind=surrogate.provenance["kind"], manifest=text,
-                provenance=json.dumps(dict(surrogate.provenance)),
-            )  # fmt: skip
-        with open(partial, "rb") as written:
-            os.fsync(written.fileno())
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-    path.with_suffix(".json").write_text(text + "\n")
+    """Writes the surrogate and, beside it as ``.json``, its manifest; each whole or not at all.
+
+    Raises InputError where it cannot be written.
+    """
+    path, latents = Path(path), surrogate.latents
+    text = ""
+
+    def fill(handle: h5py.File) -> None:
+        nonlocal latents, text
+        storage.write(handle.create_group("space"), surrogate.space)
+        storage.write(handle.create_group("transform"), surrogate.transform)
+        if isinstance(latents, CorrectedLatents):
+            storage.write(handle.create_group("correction"), latents.correction)
+            latents = latents.coarse
+        storage.write(handle.create_group("latents"), latents)
+        handle.create_dataset("edges_s", data=surrogate.edges_s)
+        handle.create_dataset("active", data=surrogate.active)
+        digest = contents_hash(handle)
+        text = json.dumps({**manifest, "arrays_sha256": digest}, indent=2, sort_keys=True)
+        handle.attrs.update(
+            format=FORMAT, format_version=FORMAT_VERSION, version=__version__, arrays_sha256=digest,
+            kind=surrogate.provenance["kind"], manifest=text,
+            provenance=json.dumps(dict(surrogate.provenance)),
+        )  # fmt: skip
+
+    storage.write_hdf5(path, fill)
+    storage.write_bytes(path.with_suffix(".json"), f"{text}\n".encode())
 
 
 def load_surrogate(path: Path | str) -> ShapeSurrogate:
