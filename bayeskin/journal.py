@@ -11,6 +11,7 @@ import fcntl
 import json
 import os
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -82,23 +83,31 @@ class Journal:
         if text and not text.endswith(b"\n"):
             self._file.write(b"\n")  # closes a torn line, so that the next one starts afresh
         runs = {}
-        for line in text.splitlines():
-            plain = _parsed(line)
-            if plain is None:
+        for number, line in enumerate(text.splitlines(), start=1):
+            whole = _whole(line)
+            if whole is None:
                 continue
-            if plain["design"] != self.identity:
+            try:
+                design, run = self._run(json.loads(whole))
+            except (KeyError, TypeError, ValueError, RecursionError):
+                expected = "one that bayeskin wrote; without the file all runs are made anew"
+                raise InputError(f"{self.path}, line {number}", "what is no run", expected) from None
+            if design != self.identity:
                 raise InputError(
                     self.path,
                     "unfinished runs of another model, parameter space or time bins",
                     "runs of this design; finish or remove those first",
                 )
-            force_n = [np.nan] * self.bins if plain["force_n"] is None else plain["force_n"]
-            run = Run(
-                np.array(plain["theta"], dtype=float), np.array(force_n, dtype=float), plain["ok"],
-                plain["message"], plain["seconds"],
-            )  # fmt: skip
             runs[run.theta.tobytes()] = run
         return runs
+
+    def _run(self, plain: Mapping[str, Any]) -> tuple[Any, Run]:
+        """What a line is of, and its run."""
+        force_n = [np.nan] * self.bins if plain["force_n"] is None else plain["force_n"]
+        return plain["design"], Run(
+            np.array(plain["theta"], dtype=float), np.array(force_n, dtype=float), plain["ok"],
+            plain["message"], plain["seconds"],
+        )  # fmt: skip
 
 
 def _line(run: Run, identity: str) -> bytes:
@@ -114,14 +123,13 @@ def _line(run: Run, identity: str) -> bytes:
     return b"%08x %d %s\n" % (zlib.crc32(text), len(text), text)
 
 
-def _parsed(line: bytes) -> dict[str, Any] | None:
+def _whole(line: bytes) -> bytes | None:
     """The content of a whole line, None for a torn or damaged one."""
     head, _, rest = line.partition(b" ")
     length, _, text = rest.partition(b" ")
     if length != b"%d" % len(text) or head != b"%08x" % zlib.crc32(text):
         return None
-    plain: dict[str, Any] = json.loads(text)
-    return plain
+    return text
 
 
 def _open_locked(path: Path) -> IO[bytes]:

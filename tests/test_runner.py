@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import zlib
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -459,3 +460,16 @@ def test_a_design_whose_arrays_do_not_belong_together_is_refused(
     storage.save(tmp_path / "other.h5", replace(made, **{name: value}))
     with pytest.raises(InputError, match=says):
         load_design(tmp_path / "other.h5")
+
+
+@pytest.mark.parametrize(
+    "contents",
+    [b'{"design": "a"}', b"{", b"[]", b"3", b'{"design": "a", "theta": "x", "force_n": null}', b"[" * 9999],
+)
+def test_a_line_with_the_right_checksum_that_is_no_run_is_refused(tmp_path: Path, contents: bytes) -> None:
+    path = tmp_path / "j"
+    path.write_bytes(b"%08x %d %s\n" % (zlib.crc32(contents), len(contents), contents))
+    with pytest.raises(
+        InputError, match=r"j, line 1: found what is no run; expected one that bayeskin wrote"
+    ):
+        Journal(path, "a", bins=3)
