@@ -240,10 +240,10 @@ def experiment(source: Path, as_json: bool) -> None:
     """Which further test would tell look-alikes apart.
 
     SOURCE as for `bayeskin diagnose`, which is run first where that is not done; the reaction only, since no
-    other protocol has the article's observation. The set that explains the
-    recording best and those with look-alikes in its place are taken as equally probable; draws of their
-    posteriors are run on nine protocols, variations of the recording's own, and the expected information
-    about which is true is computed from the forces.
+    other protocol has the article's observation. The set that explains the recording best and those with
+    look-alikes in its place are taken as equally probable; draws of their posteriors are run on nine
+    protocols, variations of the recording's own, and the expected information about which is true is
+    computed from the forces.
 
     \b
     Example:

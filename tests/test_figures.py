@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import re
 from pathlib import Path
 
 import numpy as np
@@ -164,7 +165,9 @@ def test_a_files_name_is_no_markup(
     recording: Recording, binned: BinnedForce, name: str, tmp_path: Path
 ) -> None:
     figure = report.figure_recording(dataclasses.replace(recording, name=name), binned)
-    report.save_figure(figure, tmp_path / "recording", "x")
+    _, svg = report.save_figure(figure, tmp_path / "recording", "x")
+    shown = re.sub(r"\s", "", "".join(re.findall(r"<!-- (.*?) -->", svg.read_text())))
+    assert name in shown  # as it stands, each sign of it
 
 
 def test_recording_of_nothing_but_rest(recording: Recording, binned: BinnedForce) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,13 +25,7 @@ def write_page(run: Run, stages: Mapping[str, Stage]) -> Path:
     A stage that is not done, or was made from something else than now, is named and left out.
     """
     path = run.folder / FILE
-    run.folder.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        partial.write_text(render_page(facts_of(run, stages)), encoding="utf-8")
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+    storage.write_bytes(path, render_page(facts_of(run, stages)).encode())
     return path
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-import os
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -116,18 +116,11 @@ def write_simulation(out: Path, simulation: Simulation) -> None:
     if out.suffix == ".h5":
         storage.save(out, simulation)
         return
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
-    columns = ("time_s", "displacement_m", "force_n")
-    try:
-        with open(partial, "w", newline="") as handle:
-            writer = csv.writer(handle, lineterminator="\n")
-            writer.writerow(columns)
-            rows = zip(*(getattr(simulation, name).tolist() for name in columns), strict=True)
-            writer.writerows(rows)
-        os.replace(partial, out)
-    finally:
-        partial.unlink(missing_ok=True)
+    columns, text = ("time_s", "displacement_m", "force_n"), io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(getattr(simulation, name).tolist() for name in columns), strict=True))
+    storage.write_bytes(out, text.getvalue().encode())
 
 
 def _mechanisms(names: Sequence[str]) -> list[Mechanism]:
