@@ -182,7 +182,7 @@ def train_effect(
     """
     (seen, weights), (corrects, its) = (_learnt(one, neutral, own, estimate) for one in (coarse, fine))
     active = active_inputs(seen, weights)
-    surrogate, _ = train(seen, kind, seed, weights, active=active, whole_shape=True)  # type: ignore[arg-type]
+    surrogate, _ = train(seen, kind, seed, weights, active=active)  # type: ignore[arg-type]
     surrogate, validation = correct(surrogate, corrects, its)
     return Effect(part, tuple(mechanisms), neutral, tuple(own), surrogate, estimate), validation
 

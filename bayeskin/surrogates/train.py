@@ -23,8 +23,9 @@ from bayeskin.types import Array, Design, ParameterSpace
 Kind = Literal["gp", "chaos"]
 F = TypeVar("F", LatentFit, SparseFit)
 MOST_COMPONENTS = 12
-TRUNCATION_SHARE = 0.1  # of the latents' squared error: 5 % more error, for fewer latents to predict
-UNLEARNABLE = 0.9  # of a component's variance left as error: it predicts nothing, so it is truncation
+TRUNCATION_SHARE = (
+    0.01  # of the latents' squared error: what is left out counts as noise of each bin by itself
+)
 MARGIN = 0.15  # of the region's width: rows just outside it support the surrogate at its faces
 FOLDS = 4
 
@@ -36,7 +37,6 @@ def train(
     focus: Array | None = None,
     region: tuple[Array, Array] | None = None,
     active: NDArray[np.int64] | None = None,
-    whole_shape: bool = False,
 ) -> tuple[ShapeSurrogate, Validation]:
     """Trains on the design's training rows; the held-out rows only measure the error.
 
@@ -44,8 +44,7 @@ def train(
     error over four folds drawn with `seed`. focus: weights (n,) of the design's rows in the principal
     components and in the error that decides. region: lower and upper corner (d,) in the design's unit
     cube; the surrogate then answers only inside, and learns from rows in and slightly around it. active:
-    which inputs of `Similarity` matter (None: all). whole_shape: keeps components whose scores nothing
-    predicts too, since what is left out counts as noise of each bin by itself, which it is not.
+    which inputs of `Similarity` matter (None: all).
     Raises InputError for too few rows or force that is not finite.
     """
     space = design.space if region is None else narrowed(design.space, *region)
@@ -59,7 +58,7 @@ def train(
     _refuse_unusable(design, space, training)
     kinds: tuple[Kind, ...] = ("gp", "chaos") if kind == "auto" else (kind,)
     if kind == "auto" and not testing.any():
-        kinds = (_best_of_folds(kinds, space, design, training, focus, seed, active, whole_shape),)
+        kinds = (_best_of_folds(kinds, space, design, training, focus, seed, active),)
     provenance = {
         "version": __version__,
         "design_seed": design.seed,
@@ -69,7 +68,7 @@ def train(
     }
     results = []
     for name in kinds:
-        surrogate = _fit(name, space, design, training, focus, provenance, active, whole_shape)
+        surrogate = _fit(name, space, design, training, focus, provenance, active)
         results.append((surrogate, _measure(surrogate, design, training, testing, focus)))
     return min(results, key=lambda result: result[1].relative_error)
 
@@ -101,7 +100,7 @@ def _within(inputs: Array, margin: float) -> NDArray[np.bool_]:
 
 def _fit(
     kind: Kind, space: ParameterSpace, design: Design, rows: NDArray[np.bool_], focus: Array,
-    provenance: dict[str, Any], active: NDArray[np.int64], whole_shape: bool,
+    provenance: dict[str, Any], active: NDArray[np.int64],
 ) -> ShapeSurrogate:  # fmt: skip
     """One surrogate of one kind on the rows given."""
     similarity = Similarity(space)
@@ -115,14 +114,10 @@ def _fit(
     )
     latents: Latents
     if kind == "gp":
-        transform, targets, gp_fits = fit_latents(
-            fit_latent, inputs, log_scale, force_n, focus[rows], whole_shape
-        )
+        transform, targets, gp_fits = fit_latents(fit_latent, inputs, log_scale, force_n, focus[rows])
         latents = LatentGPs.assemble(inputs, targets, gp_fits)
     else:
-        transform, targets, chaos_fits = fit_latents(
-            fit_sparse, inputs, log_scale, force_n, focus[rows], whole_shape
-        )
+        transform, targets, chaos_fits = fit_latents(fit_sparse, inputs, log_scale, force_n, focus[rows])
         latents = LatentChaos.assemble(inputs, targets, chaos_fits)
     return ShapeSurrogate(space, design.edges_s, transform, latents, {**provenance, "kind": kind}, active)
 
@@ -133,25 +128,21 @@ def fit_latents(
     log_scale: Array,
     force_n: Array,
     weights: Array,
-    whole_shape: bool = False,
 ) -> tuple[ShapeTransform, Array, list[F]]:
-    """Fits the amplitude, then components until what is left is negligible beside the error made.
+    """Fits the amplitude, then components until what is left is negligible beside the error of those.
 
-    whole_shape: as in `train`; beside the error of the shape only.
+    One that no input predicts is kept too: its error is one of all bins together. Left out it would count as
+    noise of each bin by itself, which it is not, and bend a posterior by many of its sd.
     """
     amplitude, shapes = split(force_n)
     full, variances = all_components(shapes, weights)
     scores = (shapes - full.mean) @ full.components.T
     fits = [fit_one(inputs, amplitude - log_scale, weights)]
-    # a shape's squares sum to the number of bins
-    error = 0.0 if whole_shape else fits[0].error * shapes.shape[1]
-    left = float(variances.sum())
+    error, left = 0.0, float(variances.sum())  # of shapes, whose squares sum to the number of bins
     for k in range(min(MOST_COMPONENTS, len(inputs) // 3, int(np.sum(variances > 1e-14 * left)))):
         if left <= max(TRUNCATION_SHARE * error, 1e-14 * shapes.shape[1]):
             break
         fit = fit_one(inputs, scores[:, k], weights)
-        if fit.error > UNLEARNABLE * variances[k] and not whole_shape:
-            break
         fits.append(fit)
         error += fit.error
         left -= float(variances[k])
@@ -178,7 +169,7 @@ def _measure(
 
 def _best_of_folds(
     kinds: tuple[Kind, ...], space: ParameterSpace, design: Design, training: NDArray[np.bool_],
-    focus: Array, seed: int, active: NDArray[np.int64], whole_shape: bool,
+    focus: Array, seed: int, active: NDArray[np.int64],
 ) -> Kind:  # fmt: skip
     """The kind with the smaller squared error over folds that neither its fit nor its choices have seen."""
     rows = np.flatnonzero(training & space.contains(design.theta))
@@ -188,7 +179,7 @@ def _best_of_folds(
         out = np.zeros_like(training)
         out[order[k::FOLDS]] = True
         for kind in kinds:
-            surrogate = _fit(kind, space, design, training & ~out, focus, {}, active, whole_shape)
+            surrogate = _fit(kind, space, design, training & ~out, focus, {}, active)
             miss = surrogate.predict_mean(design.theta[out]) - design.force_n[out]
             errors[kind] += float(focus[out] @ np.sum(miss**2, axis=1))
     return min(kinds, key=lambda kind: errors[kind])
