@@ -14,12 +14,15 @@ import toy_inference
 from scipy.integrate import cumulative_trapezoid
 from scipy.stats import binom, multivariate_normal
 
+from bayeskin import storage
 from bayeskin.inference import NoisePriors
 from bayeskin.model import ModelSpec
 from bayeskin.model.problem import build_problem
 from bayeskin.recordings import read_recording
 from bayeskin.shipped import shipped
-from bayeskin.types import Recording, Simulation
+from bayeskin.surrogates import load_surrogate
+from bayeskin.surrogates.shapes import split
+from bayeskin.types import Design, Recording, Simulation
 
 
 @pytest.fixture
@@ -103,6 +106,26 @@ def test_the_peers_likelihood_is_the_normal_with_their_covariance(benchmark):
         assert found[i] == pytest.approx(exact, rel=1e-10)
     plain = multivariate_normal(np.zeros(8), peers.NOISE_N**2 * np.eye(8)).logpdf(residual)
     np.testing.assert_allclose(peers.log_likelihood(residual, None), plain, rtol=1e-10)
+
+
+def test_nats_left_by_a_factor_are_those_of_its_covariance(benchmark):
+    components, rng = benchmark("components"), np.random.default_rng(5)
+    error = 2e-3 * rng.standard_normal(20)
+    factor, diagonal = 1e-3 * rng.standard_normal((20, 3)), 1e-6 * rng.uniform(size=20)
+    covariance = factor @ factor.T + np.diag(diagonal + components.NOISE_N**2)
+    expected = 0.5 * error @ np.linalg.solve(covariance, error)
+    assert components.unexplained(error, factor, diagonal) == pytest.approx(expected, rel=1e-10)
+
+
+def test_a_surrogate_cut_to_fewer_components_calls_the_rest_noise_of_bins(benchmark):
+    components, whole = benchmark("components"), load_surrogate(shipped("surrogates/demo.h5"))
+    design = storage.load(shipped("surrogates/demo-design.h5"), Design)
+    shapes, theta = split(design.force_n[design.training])[1], design.theta[:5]
+    count = len(whole.transform.components)
+    same, fewer = (components.cut(whole, k, shapes).predict(theta) for k in (count, count - 3))
+    np.testing.assert_allclose(same.mean, whole.predict(theta).mean, rtol=1e-9)
+    assert fewer.factor.shape[2] == same.factor.shape[2] - 3
+    assert np.all(fewer.diagonal.mean(axis=1) > same.diagonal.mean(axis=1))
 
 
 def test_a_package_that_is_absent_costs_one_line(benchmark, capsys):
