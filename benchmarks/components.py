@@ -2,8 +2,8 @@
 
 What the components leave out of a shape counts as noise of each bin by itself. It is none: it is the same
 over many bins, and a millinewton of it, kept up over a recording, moves a posterior by many of its sd. The
-shipped surrogate of the healthy-skin protocol, cut to fewer components than it has, against held-out runs, both
-brought to a peak of 1 N: the error, what of it counts as noise of bins, and by how many nats a run's own
+shipped surrogate of the healthy-skin protocol, cut to fewer components than it has, against held-out runs,
+both brought to a peak of 1 N: the error, what of it counts as noise of bins, and by how many nats a run's own
 parameters are the less likely, beside a noise of 2 mN, for what the surrogate's factor does not explain.
 
     python benchmarks/components.py
