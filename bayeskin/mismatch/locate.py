@@ -2,9 +2,9 @@
 
 What is allowed is the residual that noise alone leaves after a fit: draws of the noise, with its parameters
 of a fit that takes no mismatch for noise, less what parameters and the surrogate's error take up of each;
-and, of any window's mean, `MODEL_ERROR` of the force's range, which the mesh leaves (docs/discretisation.md:
-up to 0.10 % after one factor). Mean residuals over
-windows of every length inside each phase are counted in standard deviations of the same means of draws; the
+and, of any window's mean, `MODEL_ERROR` of the force's range, which mesh and time steps leave of it beyond
+what is allowed for (`discretised`; docs/discretisation.md: 0.02 and 0.04 %, RMS). Mean residuals over windows
+of every length inside each phase are counted in standard deviations of the same means of draws; the
 largest over all windows has its distribution from the draws themselves, so that one chance in `LEVEL` finds
 any window where nothing is missing (a scan statistic: Glaz, Naus & Wallenstein 2001).
 """
@@ -26,7 +26,7 @@ DRAWS = 1000
 LEVEL = 0.05
 TAIL = 0.1  # of the draws, from whose farthest windows the chance of going farther is read
 SHORTEST = 2  # bins
-MODEL_ERROR = 1e-3  # of the force's range
+MODEL_ERROR = 4e-4  # of the force's range
 PRIOR_PRECISION = 12.0  # of a uniform prior over the unit cube
 
 
@@ -57,7 +57,7 @@ class Located:
 
 
 def model_error(binned: BinnedForce) -> float:
-    """What the full model itself is wrong by [N], after the best factor."""
+    """What the full model itself is wrong by [N], beyond the shapes that are allowed for."""
     return MODEL_ERROR * float(np.nanmax(binned.force_n) - np.nanmin(binned.force_n))
 
 
