@@ -23,9 +23,7 @@ from bayeskin.types import Array, Design, ParameterSpace
 Kind = Literal["gp", "chaos"]
 F = TypeVar("F", LatentFit, SparseFit)
 MOST_COMPONENTS = 12
-TRUNCATION_SHARE = (
-    0.01  # of the latents' squared error: what is left out counts as noise of each bin by itself
-)
+TRUNCATION_SHARE = 0.01  # of the shape's squared error: what is left out counts as noise of single bins
 MARGIN = 0.15  # of the region's width: rows just outside it support the surrogate at its faces
 FOLDS = 4
 
