@@ -24,6 +24,7 @@ from bayeskin.pipeline.new import new_config, new_demo
 from bayeskin.pipeline.shipping import shipped_files
 from bayeskin.pipeline.workbench import opened
 from bayeskin.shipped import shipped
+from bayeskin.surrogates import load_manifest
 from bayeskin.types import Recording
 
 
@@ -60,7 +61,8 @@ def test_a_known_protocol_takes_the_shipped_surrogate_and_the_design_stage_accep
     )
     assert open_run(out, Silent()).beside("data/forearm.h5").samefile(demo)
     assert "#   demo: 6501 samples at 50 Hz" in out.read_text()
-    assert stages.run(out, "design", Silent())["training"] == 96
+    manifest = load_manifest(shipped("surrogates/demo.h5"))
+    assert stages.run(out, "design", Silent())["training"] == manifest["training_rows"]
 
 
 def test_an_unknown_protocol_gets_a_design_of_its_own(own: Path) -> None:
