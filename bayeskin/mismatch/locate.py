@@ -3,10 +3,11 @@
 What is allowed is the residual that noise alone leaves after a fit: draws of the noise, with its parameters
 of a fit that takes no mismatch for noise, less what parameters and the surrogate's error take up of each;
 and, of any window's mean, `MODEL_ERROR` of the force's range, which mesh and time steps leave of it beyond
-what is allowed for (`discretised`; docs/discretisation.md: 0.02 and 0.04 %, RMS). Mean residuals over windows
-of every length inside each phase are counted in standard deviations of the same means of draws; the
-largest over all windows has its distribution from the draws themselves, so that one chance in `LEVEL` finds
-any window where nothing is missing (a scan statistic: Glaz, Naus & Wallenstein 2001).
+what is allowed for (`discretised`; docs/discretisation.md: 0.02 and 0.04 %, RMS), or `MESH_ERROR`, which
+they leave beside a factor alone (0.10 %, there), where no shape of a mesh's error is allowed for. Mean
+residuals over windows of every length inside each phase are counted in standard deviations of the same means
+of draws; the largest over all windows has its distribution from the draws themselves, so that one chance in
+`LEVEL` finds any window where nothing is missing (a scan statistic: Glaz, Naus & Wallenstein 2001).
 """
 
 from __future__ import annotations
@@ -18,15 +19,18 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from bayeskin.inference import LogPosterior
 from bayeskin.inference.noise_model import draw_noise
+from bayeskin.mismatch.discretised import Discretised
 from bayeskin.mismatch.fit import Fit
-from bayeskin.types import Array, BinnedForce
+from bayeskin.types import Array
 
 DRAWS = 1000
 LEVEL = 0.05
 TAIL = 0.1  # of the draws, from whose farthest windows the chance of going farther is read
 SHORTEST = 2  # bins
 MODEL_ERROR = 4e-4  # of the force's range
+MESH_ERROR = 1e-3  # the same
 PRIOR_PRECISION = 12.0  # of a uniform prior over the unit cube
 
 
@@ -56,9 +60,11 @@ class Located:
     chance: float
 
 
-def model_error(binned: BinnedForce) -> float:
+def model_error(log_posterior: LogPosterior) -> float:
     """What the full model itself is wrong by [N], beyond the shapes that are allowed for."""
-    return MODEL_ERROR * float(np.nanmax(binned.force_n) - np.nanmin(binned.force_n))
+    force_n = log_posterior.binned.force_n
+    share = MODEL_ERROR if isinstance(log_posterior.surrogate, Discretised) else MESH_ERROR
+    return share * float(np.nanmax(force_n) - np.nanmin(force_n))
 
 
 def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
@@ -71,7 +77,7 @@ def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
     residual = chain.force_n - found.force_n[chain.bins]
     spread = _allowed(found, noise, seed, rng)
     spans = _spans(log_posterior.binned.phase[chain.bins])
-    error_n = model_error(log_posterior.binned)
+    error_n = model_error(log_posterior)
     scale = np.array([np.hypot(_means(spread, *span).std(), error_n) for span in spans])
     tall = np.zeros(len(spread))
     for span, sd in zip(spans, scale, strict=True):

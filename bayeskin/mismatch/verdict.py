@@ -68,7 +68,7 @@ def judge(
     full_weights : of these two by the full model, where that was fitted
     """
     best, explained = found.best, explained_share(before, after)
-    least = NOTICEABLE * model_error(best.log_posterior.binned)
+    least = NOTICEABLE * model_error(best.log_posterior)
     confirmed = full_weights is None or full_weights[1] > full_weights[0]
     named = tuple(
         one
