@@ -7,11 +7,13 @@ they are wrong.
 from __future__ import annotations
 
 import json
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -129,12 +131,23 @@ def diagnose(
     """What the model leaves out of a recording: the answer of ``bayeskin diagnose``.
 
     Surrogate, seed and noise are those that `posterior` was made with; the whole recording is fitted.
-    Minutes, on two processes: a script that calls it needs the guard ``if __name__ == "__main__":``.
-    `folder` keeps figures and what is needed to go on.
+    Minutes, on two processes. `folder` keeps figures and what is needed to go on.
     """
     settings = {} if posterior is None else _settings_of(recording, posterior)
-    with _opened(recording, _with_surrogate(recording, settings, None), folder) as run:
+    with _opened(recording, _with_surrogate(recording, settings, None), folder) as run, _apart_from_script():
         return diagnosis.diagnose(run.config_path, Silent())
+
+
+@contextmanager
+def _apart_from_script() -> Iterator[None]:
+    """Processes started inside do not run the caller's script again, so that it needs no guard: they need
+    nothing of it."""
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = script
 
 
 @dataclass(frozen=True)

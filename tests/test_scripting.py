@@ -106,6 +106,23 @@ def test_a_diagnosis_takes_the_posteriors_settings(
     assert (asked[0].parent / config.recording.file).is_file()
 
 
+def test_a_script_that_diagnoses_needs_no_guard(tmp_path: Path) -> None:
+    (tmp_path / "unguarded.py").write_text(
+        "import math, sys\n"
+        "import bayeskin as bk\n"
+        "from bayeskin.pipeline import diagnosis\n"
+        "from bayeskin.workers import run_parallel\n"
+        "print('once')\n"
+        "diagnosis.diagnose = lambda source, reporter: dict(run_parallel(math.sqrt, [4.0], 1))\n"
+        f"print(bk.diagnose(bk.load_recording({str(ROOT / 'data' / 'demo.h5')!r})))\n"
+        "print(sys.modules['__main__'].bk is bk)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, tmp_path / "unguarded.py"], capture_output=True, text=True, cwd=ROOT
+    )
+    assert (done.returncode, done.stdout.split()) == (0, ["once", "{0:", "2.0}", "True"]), done.stderr
+
+
 def test_numbers_of_numpy_are_settings_too(tmp_path: Path) -> None:
     recording = bk.load_recording(ROOT / "data" / "demo.h5")
     small = {"sample": {"ensembles": np.int64(2), "walkers": 24, "max_steps": 40}, "map": {"starts": 1}}
