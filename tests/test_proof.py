@@ -26,6 +26,7 @@ from bayeskin.model.problem import build_problem, material
 from bayeskin.pipeline import proof as pipeline
 from bayeskin.pipeline.diagnosing_sources import imported
 from bayeskin.pipeline.engine import Silent
+from bayeskin.pipeline.folder import locked
 from bayeskin.pipeline.recording import pad_motion
 from bayeskin.pipeline.shipping import motion_sha256
 from bayeskin.proof import closed, conceal, score, seals
@@ -356,6 +357,18 @@ def test_a_diagnosis_that_fails_ends_no_set(made: Path, tmp_path: Path) -> None:
     again = pipeline.prove(copy, Silent(), diagnose=fails)["scoreboard"]  # those two once more, and no other
     assert len(seen) == COUNT + 2
     assert "failed" not in [one["answer"] for one in again["each"]]
+
+
+def test_a_set_is_worked_on_by_one_process(made: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(made, tmp_path / "set"))
+    with locked(copy):
+        with pytest.raises(InputError, match=r"in use by another bayeskin \(process \d+\)"):
+            pipeline.prove(copy, Silent(), diagnose=nothing_found)
+        with pytest.raises(InputError, match="in use by another bayeskin"):
+            pipeline.conceal(copy, SEED, COUNT, Silent())
+    assert pipeline.prove(copy, Silent(), diagnose=nothing_found)["scoreboard"]["judged"] == COUNT
+    with locked(copy):  # nothing is left to be diagnosed, and a score takes no turns
+        assert pipeline.prove(copy, Silent(), diagnose=nothing_found)["scoreboard"]["judged"] == COUNT
 
 
 def test_a_set_that_is_no_set_is_told(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from bayeskin.errors import InputError
 from bayeskin.pipeline import diagnosis
 from bayeskin.pipeline.diagnosing_sources import diagnosing_sources
 from bayeskin.pipeline.engine import Reporter
-from bayeskin.pipeline.folder import plain, sha256_of, sha256_of_file, write_json
+from bayeskin.pipeline.folder import locked, plain, sha256_of, sha256_of_file, write_json
 from bayeskin.proof import seals
 from bayeskin.shipped import shipped
 
@@ -40,15 +41,21 @@ def prove(
 
     A diagnosis that fails has the verdict "failed" until a later call tries it again, and the set goes on.
     Each scoring is recorded. While anything is diagnosed, the seals cannot be opened.
-    Raises InputError for a folder without a set, or whose contents are not what its index says.
+    Raises InputError for a folder without a set, whose contents are not what its index says, or on
+    which another process is at work.
     """
     folder = shipped(SET).parent if folder is None else folder
     index, sources = seals.read_index(folder), diagnosing_sources()
     if not index:
         raise InputError(folder, "a set without recordings", "one that `bayeskin conceal` made")
-    with proof.closed(folder):
-        hashes = {number: said["recording_sha256"] for number, said in index.items()}
-        new = [number for number, expected in hashes.items() if not _answered(folder, number, expected)]
+    hashes = {number: said["recording_sha256"] for number, said in index.items()}
+
+    def unanswered() -> list[str]:
+        return [number for number, expected in hashes.items() if not _answered(folder, number, expected)]
+
+    diagnosing = bool(unanswered()) and at_most != 0
+    with proof.closed(folder), locked(folder) if diagnosing else nullcontext():
+        new = unanswered()
         for place, number in enumerate(new[:at_most]):
             reporter.progress("recordings", place / len(new), f"{number} of {len(index)}")
             answer = _diagnosed(folder, number, hashes[number], reporter, diagnose)
@@ -83,7 +90,10 @@ def prove(
 
 
 def conceal(folder: Path, seed: int, count: int, reporter: Reporter) -> dict[str, Any]:
-    """Makes a set of concealed recordings, or what is missing of it. Raises InputError as `proof.conceal`."""
+    """Makes a set of concealed recordings, or what is missing of it.
+
+    Raises InputError as `proof.conceal`, and where another process is at work on the set.
+    """
     if count < 1 or seed < 0:
         raise InputError("--seed, --count", f"{seed}, {count}", "a seed from 0 on and at least one recording")
     started = time.monotonic()
@@ -91,7 +101,8 @@ def conceal(folder: Path, seed: int, count: int, reporter: Reporter) -> dict[str
     def tell(share: float, note: str) -> None:
         reporter.progress("recordings", share, note)
 
-    made = proof.conceal(folder, seed, count, tell)
+    with locked(folder):
+        made = proof.conceal(folder, seed, count, tell)
     seconds = time.monotonic() - started
     text = f"{made} of {count} recordings made in {seconds:.0f} s; keys in {folder / seals.SEALS}"
     return plain(
