@@ -37,7 +37,8 @@ def _told(parameter: Parameter, neutral: float | None) -> str:
     unit = "" if parameter.unit in ("1", "-") else f" {parameter.unit}"
     off = "" if neutral is None else f" ({neutral:g})"
     span = f"{parameter.lower:.3g} to {parameter.upper:.3g}{unit}"
-    return f"`{parameter.name}` {span}, {parameter.prior}{off}: {parameter.description}"
+    law = f"{parameter.prior}, offset {parameter.offset:.0e}" if parameter.offset else parameter.prior
+    return f"`{parameter.name}` {span}, {law}{off}: {parameter.description}"
 
 
 def main() -> None:

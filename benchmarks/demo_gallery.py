@@ -38,7 +38,8 @@ def smaller(path: Path, target: Path) -> None:
         for key, text in image.info.items():
             if isinstance(text, str):
                 texts.add_text(key, text)
-        image.convert("RGB").quantize(256).save(target, optimize=True, pnginfo=texts, dpi=image.info["dpi"])
+        colours = image.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE)
+        colours.save(target, optimize=True, pnginfo=texts, dpi=image.info["dpi"])
 
 
 def main() -> None:

@@ -268,5 +268,8 @@ def test_candidates_of_a_few_nats_are_read_off_beside_one_of_hundreds() -> None:
     figure.draw_without_rendering()
     (numbers,) = figure.axes[0].child_axes
     assert [label.get_text() for label in numbers.get_yticklabels()] == [
-        "+0.0 ± 0.0", "−1.3 ± 0.4", "+812.3 ± 100.0"
+        "+0.0 ± 0.0", "−1.3 ± 0.4", "+812 ± 100"
     ]  # fmt: skip
+    assert headline(figure).endswith("viscous-drag alone gains most")
+    rows[1] |= {"delta_score": 750.0}
+    assert headline(report.figure_candidates(rows)).endswith("most, 1 other as much within the error")

@@ -79,7 +79,7 @@ def figure_fields(
             _outline(ax, flat[i], nodes, parts, strong)
             if field.directions is not None:
                 _arrows(ax, flat[i][nodes].mean(axis=1), field, i, scale)
-            _frame(ax, low, high, field.values[i])
+            _frame(ax, low, high, field.values[i], field.unit)
         axes[0, j].set_title(field.label, loc="center")
         extend = "min" if field.directions is not None else "neither"
         bar = figure.colorbar(
@@ -184,12 +184,12 @@ def _arrows(ax: Axes, centres_mm: Array, field: SurfaceField, row: int, scale: S
     )  # fmt: skip
 
 
-def _frame(ax: Axes, low: Array, high: Array, values: Array) -> None:
+def _frame(ax: Axes, low: Array, high: Array, values: Array, unit: str) -> None:
     margin = 0.01 * float(high[0] - low[0])
     ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
     ax.set(xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
-    reach = f"{number(values.min(), 3)} to {number(values.max(), 3)}".replace("-", "−")
+    reach = f"{number(values.min(), 3)} to {number(values.max(), 3)} {unit}".replace("-", "−")
     ax.text(1.0, 0.0, reach, transform=ax.transAxes, ha="right", va="bottom", fontsize=6.5, color=GREY)
 
 

@@ -131,16 +131,23 @@ def figure_candidates(candidates: Sequence[Mapping[str, Any]]) -> Figure:
     ax.axvline(0.0, color=GREY, lw=0.6)
     ax.set_yticks(place, [row["name"] for row in rows])
     numbers = ax.secondary_yaxis("right")  # bars of a few nats do not show beside one of hundreds
-    said = [f"{round(a, 1) + 0.0:+.1f} ± {b:.1f}" for a, b in zip(gain, error, strict=True)]
+    digits = [0 if abs(a) >= 100.0 else 1 for a in gain]
+    said = [f"{round(a, d) + 0.0:+.{d}f} ± {b:.{d}f}" for a, b, d in zip(gain, error, digits, strict=True)]
     numbers.set_yticks(place, [one.replace("-", "−") for one in said])
     numbers.tick_params(length=0.0)
     numbers.spines["right"].set_visible(False)
     ax.set_xlabel("log evidence gained over the base model [nats]")
-    finding = (
-        f"{rows[-1]['name']} alone gains most" if len(rows) and gain[-1] > 0 else "No mechanism alone gains"
-    )
+    finding = "No mechanism alone gains"
+    if len(rows) and gain[-1] > 0:
+        near = int(np.sum(gain[:-1] > gain[-1] - np.hypot(error[:-1], error[-1])))
+        finding = f"{rows[-1]['name']} alone gains most" + (
+            f", {near} {'other' if near == 1 else 'others'} as much within the error" if near else ""
+        )
     state_finding(
-        figure, finding, "All other parameters free again for each. Lines: standard error over phases."
+        figure,
+        finding,
+        "All other parameters free again for each. Lines: standard error over phases. Not shown: mechanisms "
+        "of whose best fit the surrogate is unsure.",
     )
     return figure
 
