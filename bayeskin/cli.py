@@ -359,10 +359,11 @@ def _run(config: Path, last: str | None, scheduler: str | None, as_json: bool) -
 
 def _answer(document: Mapping[str, Any], as_json: bool) -> None:
     """Prints a command's answer; exits with 1 when it says of itself that it failed."""
-    if as_json:
-        click.echo(json.dumps(document, indent=2, allow_nan=False))
-    else:
-        click.echo(document["text"])
+    try:
+        click.echo(json.dumps(document, indent=2, allow_nan=False) if as_json else document["text"])
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader left, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     if not document["ok"]:
         raise click.exceptions.Exit(NOT_TRUSTED)
 

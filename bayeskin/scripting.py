@@ -47,11 +47,15 @@ def load_recording(path: Path | str, sheet: str | None = None) -> Recording:
     return read_recording(path, sheet=sheet)
 
 
-def simulate(recording: Recording, theta: Mapping[str, float] | None = None, **settings: Any) -> Simulation:
+def simulate(
+    recording: Recording, /, theta: Mapping[str, float] | None = None, **settings: Any
+) -> Simulation:
     """One run of the full model on a recording's displacement: some seconds.
 
     theta : SI values by name; what is left out stands at the median of its prior
     settings : sections of a configuration, such as ``model={"refinement": 2}``
+
+    Raises InputError for wrong settings or values.
     """
     with _opened(recording, settings) as run:
         space = parameter_space(run.config)
@@ -67,6 +71,7 @@ def simulate(recording: Recording, theta: Mapping[str, float] | None = None, **s
 
 def calibrate(
     recording: Recording,
+    /,
     surrogate: str | Path | None = None,
     folder: str | Path | None = None,
     **settings: Any,
@@ -107,7 +112,8 @@ def calibrate(
 def check(recording: Recording, posterior: arviz.InferenceData, draws: int = 24) -> Weighed:
     """Runs the full model at evenly taken draws of a posterior of `calibrate`, and weighs them by it.
 
-    Raises InputError for fewer than 8 draws, of which weights say next to nothing.
+    Raises InputError for fewer than 8 draws, of which weights say next to nothing, and for a posterior by
+    another surrogate than the file's that it names, as `bayeskin run` makes where it trains on.
     """
     if draws < FEWEST_CHECKED:
         raise InputError("draws", draws, f"at least {FEWEST_CHECKED}")
@@ -115,6 +121,9 @@ def check(recording: Recording, posterior: arviz.InferenceData, draws: int = 24)
     with _opened(recording, settings) as run:
         work = _workpiece(run, recording)
         log_posterior, flat = work.log_posterior, inference.draws_of(posterior)[1]
+        if json.loads(posterior.attrs["provenance"]).get("identity") != log_posterior.identity:
+            other = f"one by another surrogate than that of {run.config.surrogate.file}"
+            raise InputError("posterior", other, "one of bk.calibrate; `bayeskin run` has checked its own")
         few = inference.evenly(flat, draws)
         spec, names, edges = model_spec(run), log_posterior.surrogate.space.names, work.binned.edges_s
         force = np.full((len(few), len(edges) - 1), np.nan)

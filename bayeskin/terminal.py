@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import time
 from collections.abc import Callable
 from datetime import timedelta
@@ -83,9 +81,6 @@ def exit_code(call: Callable[[], Any]) -> int:
         return complain(str(error), WRONG_INPUT)
     except (KeyboardInterrupt, click.Abort):
         return complain("interrupted; the same command goes on from here", INTERRUPTED)
-    except BrokenPipeError:  # the reader of our stdout left, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return DONE
     except OSError as error:
         return complain(f"{error.filename}: {error.strerror}" if error.filename else str(error), WRONG_INPUT)
 

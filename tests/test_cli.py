@@ -191,6 +191,30 @@ def test_the_peak_that_is_told_is_that_of_the_force_that_is_written(
     assert peaks[0] - peaks[1] == pytest.approx(0.1)
 
 
+def test_with_mechanisms_no_two_times_are_the_same(
+    bayeskin: Command, measured: Path, tmp_path: Path, runs: list[str]
+) -> None:
+    out = tmp_path / "f.csv"
+    assert bayeskin("simulate", "--recording", measured, "-o", out, "--mechanism", "force-offset")[0] == 0
+    steps = np.diff(np.loadtxt(out, delimiter=",", skiprows=1)[:, 0])
+    assert steps.min() > 1e-3
+    assert steps.max() <= 0.1 + 1e-9
+
+
+def test_a_reader_that_leaves_early_does_not_hide_what_was_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    code = (
+        "import sys; from bayeskin import cli\n"
+        "import bayeskin.pipeline.new as new\n"
+        "new.new_demo = lambda out: {'ok': False, 'text': 'x' * 10 ** 6}\n"
+        "cli.main(['new'])\n"
+    )
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run([sys.executable, "-c", code], stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
 @pytest.fixture
 def runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """A stand-in for the full model that stretches all uniformly; lists the names of the runs it made."""
@@ -275,6 +299,10 @@ def test_the_figure_of_fields_shows_four_moments_or_those_asked_for(
         (["--at", "3"], ("--at 3", "--figures DIR")),
         (["--figures", "file/figures"], ("--figures file/figures", "file is a file")),
         (["--fields", "file"], ("--fields file", "file is a file")),
+        (
+            ["--fields", "fields", "--observation", "article", "--mesh", "SKIN.msh"],
+            ("--fields, --figures", "'article', whose stresses are not those of the fields"),
+        ),
         (
             ["--figures", "figures", "--mechanism", "strain-stiffening"],
             ("--mechanism strain-stiffening", "fields are of the base law"),

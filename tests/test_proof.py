@@ -343,6 +343,8 @@ def test_a_diagnosis_that_fails_ends_no_set(made: Path, tmp_path: Path) -> None:
         seen.append(path)
         if failing == 0:
             raise InputError("priors", "none but impossible skins", "others")
+        if failing == 2:
+            raise np.linalg.LinAlgError("singular")
         return (
             {"ok": False, "message": "design: all runs failed"}
             if failing == 1
@@ -353,9 +355,11 @@ def test_a_diagnosis_that_fails_ends_no_set(made: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(made, tmp_path / "copy"))
     board = pipeline.prove(copy, Silent(), diagnose=fails)["scoreboard"]
     assert (len(seen), board["judged"]) == (COUNT, COUNT)
-    assert [one["answer"] for one in board["each"]][:2] == ["failed", "failed"]
-    again = pipeline.prove(copy, Silent(), diagnose=fails)["scoreboard"]  # those two once more, and no other
-    assert len(seen) == COUNT + 2
+    assert [one["answer"] for one in board["each"]][:3] == ["failed", "failed", "failed"]
+    again = pipeline.prove(copy, Silent(), diagnose=fails)[
+        "scoreboard"
+    ]  # those three once more, and no other
+    assert len(seen) == COUNT + 3
     assert "failed" not in [one["answer"] for one in again["each"]]
 
 

@@ -259,6 +259,10 @@ def test_nearby_is_a_tenth_either_way_inside_the_prior() -> None:
     np.testing.assert_allclose(near.upper[:4], [2e6, 1.1e4, 1.1e-16, 1.1e-13])
     assert np.all(near.lower < near.upper)
     assert SPACE.contains([near.lower, near.upper]).all()
+    wide = dataclasses.replace(SPACE.parameters[2], upper=1e-8)
+    wider = dataclasses.replace(SPACE, parameters=(*SPACE.parameters[:2], wide, *SPACE.parameters[3:]))
+    there = nearby(wider, {"E_c": 2e6, "E_s": 1e4, "k_c": 2e-16, "k_s": 1e-13, "p_init": 0.0})
+    np.testing.assert_allclose([there.lower[2], there.upper[2]], [1.8e-16, 2.2e-16])
     narrow = dataclasses.replace(SPACE.parameters[0], lower=600e3, upper=650e3)
     space = dataclasses.replace(SPACE, parameters=(narrow, *SPACE.parameters[1:]))
     at = {"E_c": 620e3, "E_s": 1e4, "k_c": 1e-16, "k_s": 1e-13, "p_init": 0.0}

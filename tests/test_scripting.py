@@ -106,6 +106,20 @@ def test_a_diagnosis_takes_the_posteriors_settings(
     assert (asked[0].parent / config.recording.file).is_file()
 
 
+def test_draws_by_another_surrogate_are_not_weighed(said: dict[str, Any]) -> None:
+    posterior = said["posterior"].copy()
+    made_of = json.loads(posterior.attrs["provenance"])
+    made_of["identity"]["surrogate"] = "of a run that has trained on"
+    posterior.attrs["provenance"] = json.dumps(made_of)
+    with pytest.raises(InputError, match="posterior: found one by another surrogate"):
+        bk.check(said["recording"], posterior, 8)
+
+
+def test_the_recording_s_section_is_a_setting_too(said: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=r"recording\.protocol"):
+        bk.simulate(said["recording"], recording={"protocol": "straight"})
+
+
 def test_a_script_that_diagnoses_needs_no_guard(tmp_path: Path) -> None:
     (tmp_path / "unguarded.py").write_text(
         "import math, sys\n"

@@ -56,8 +56,15 @@ class Experiment:
 
 def compete(found: Sequence[Fit], names: Sequence[str], known: Mapping[str, Mechanism]) -> list[Fit]:
     """The set of these names, and the likeliest of those tried that have, in the place of some of its
-    mechanisms, look-alikes: one for each choice of mechanisms that differs from it."""
-    best = max((one for one in found if one.names == tuple(names)), key=weight)
+    mechanisms, look-alikes: one for each choice of mechanisms that differs from it.
+
+    Raises InputError where no fit is of the set.
+    """
+    own = [one for one in found if one.names == tuple(names)]
+    if not own:
+        expected = "those that `bayeskin diagnose` left: remove the run's folder `diagnose` to make them anew"
+        raise InputError("searches", f"no fit of {', '.join(names) or 'the base model'}", expected)
+    best = max(own, key=weight)
 
     def alike(other: Fit) -> bool:
         gone, new = set(best.names) - set(other.names), set(other.names) - set(best.names)

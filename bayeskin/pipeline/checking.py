@@ -71,6 +71,11 @@ def with_full_model(verdict: Verdict, checked: Checked) -> Verdict:
     return Verdict(False, (*found.reasons, *verdict.reasons))
 
 
+def says_something(weighed: Weighed) -> bool:
+    """Whether the weights of a round describe a posterior: not where one draw, or none, has them all."""
+    return weighed.effective > 1.0
+
+
 def said_of(weighed: Weighed) -> dict[str, Any]:
     """One round for summary and report."""
     finite: Array = weighed.log_ratio[np.isfinite(weighed.log_ratio)]
@@ -88,7 +93,7 @@ def said_of(weighed: Weighed) -> dict[str, Any]:
 
 def corrected_table(checked: Checked) -> dict[str, dict[str, Any]] | None:
     """By parameter the full model's quantiles by the last weights, and how far the mean moved."""
-    if not checked.rounds or checked.rounds[-1].effective <= 1.0:
+    if not checked.rounds or not says_something(checked.rounds[-1]):
         return None
     found = inference.corrected(checked.rounds[-1], checked.posterior.flat)
     table = {}

@@ -48,14 +48,17 @@ FOLDER = "experiment"
 def choose(source: Path, reporter: Reporter) -> dict[str, Any]:
     """The answer of `bayeskin experiment` on a configuration's run, or on a recording by itself.
 
-    Diagnoses first, where that is not done. Outputs go to the run's folder `experiment`. Raises InputError
-    for bad input, among it the article's observation, which no other protocol has.
+    Diagnoses first, where that is not done, and answers as `diagnose` where that fails. Outputs go to the
+    run's folder `experiment`. Raises InputError for bad input, among it the article's observation, which no
+    other protocol has.
     """
     run = opened(source, reporter)
     observation = run.config.model.observation
     if observation != "reaction":
         raise InputError(source, f"model.observation {observation!r}", "'reaction'")
     diagnosed = diagnosis.diagnose(source, reporter)
+    if "best_set" not in diagnosed:
+        return diagnosed
     where = run.folder / FOLDER
     with locked(run.folder):
         started, of = time.monotonic(), _diagnosis(run)

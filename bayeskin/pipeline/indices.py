@@ -75,7 +75,7 @@ def nearby(space: ParameterSpace, theta: Mapping[str, float]) -> ParameterSpace:
     """Uniform within 10 % of `theta`'s values (SI by name), cut to the prior's box."""
 
     def around(p: Parameter) -> Parameter:
-        reach = max(NEARBY * abs(theta[p.name]), 1e-6 * (p.upper - p.lower))
+        reach = NEARBY * abs(theta[p.name]) or 1e-6 * (p.upper - p.lower)
         lower, upper = max(theta[p.name] - reach, p.lower), min(theta[p.name] + reach, p.upper)
         return replace(p, lower=lower, upper=upper, prior="uniform")
 

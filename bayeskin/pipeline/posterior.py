@@ -15,11 +15,19 @@ from bayeskin import inference, report, storage
 from bayeskin.config import Config
 from bayeskin.inference import LogPosterior, Posterior, Verdict
 from bayeskin.pipeline.calibration import refined_posterior, rmse_table
-from bayeskin.pipeline.checking import Checked, checked_posterior, corrected_table, said_of, with_full_model
+from bayeskin.pipeline.checking import (
+    Checked,
+    checked_posterior,
+    corrected_table,
+    said_of,
+    says_something,
+    with_full_model,
+)
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import sha256_of, write_json
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
+from bayeskin.pipeline.shipping import shipped_files
 from bayeskin.types import PadMotion, Provenance, Recording
 
 PREDICTIVE_DRAWS = 1000
@@ -81,9 +89,15 @@ def _profiled(profile: inference.Profile) -> dict[str, Any]:
 def provenance_of(run: Run, log_posterior: LogPosterior, recording_sha256: str) -> Provenance:
     """What a posterior was made from, its configuration included."""
     config = run.config
+    told = config.model_dump(mode="json", exclude_none=True)
+    if config.surrogate.file is not None:
+        ready = shipped_files(run).surrogate
+        if ready == run.config_path.resolve().parent / config.surrogate.file:  # the configuration may move
+            told["surrogate"]["file"] = str(ready)
     extra = {
         "surrogate": dict(log_posterior.surrogate.provenance),
-        "config": config.model_dump(mode="json", exclude_none=True),
+        "config": told,
+        "identity": log_posterior.identity,
     }
     return Provenance(
         bayeskin.__version__, config.sha256, recording_sha256, model_spec(run).hash, config.seed, extra
@@ -224,7 +238,7 @@ def _draw_posterior(
             posterior.space, kept, convergence.verdict, settings_of(run.config).limits
         ),
     }
-    if checked.rounds:
+    if checked.rounds and says_something(checked.rounds[-1]):
         weighed = checked.rounds[-1]
         moved = inference.corrected(weighed, posterior.flat)
         figures["model_check"] = report.figure_model_check(weighed, moved)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -49,34 +51,14 @@ def prove(
     if not index:
         raise InputError(folder, "a set without recordings", "one that `bayeskin conceal` made")
     hashes = {number: said["recording_sha256"] for number, said in index.items()}
-
-    def unanswered() -> list[str]:
-        return [number for number, expected in hashes.items() if not _answered(folder, number, expected)]
-
-    diagnosing = bool(unanswered()) and at_most != 0
-    with proof.closed(folder), locked(folder) if diagnosing else nullcontext():
-        new = unanswered()
-        for place, number in enumerate(new[:at_most]):
-            reporter.progress("recordings", place / len(new), f"{number} of {len(index)}")
-            answer = _diagnosed(folder, number, hashes[number], reporter, diagnose)
-            _store(folder, number, hashes[number], sources, answer)
-            reporter.log(f"{number}: {_in_a_word(answer)}")
-        again = {
-            number: _diagnosed(folder, number, hashes[number], reporter, diagnose)
-            for number in _spread([n for n, e in hashes.items() if _stored(folder, n, e)], rediagnose)
-        }
-    stored = {number: _stored(folder, number, expected) for number, expected in hashes.items()}
-    verdicts = {number: one for number, one in stored.items() if one is not None}
+    judge = _Judge(folder, hashes, reporter, diagnose)
+    again = judge.work(sources, at_most, rediagnose)
+    verdicts = {
+        number: one for number, expected in hashes.items() if (one := _stored(folder, number, expected))
+    }
     board = proof.score(seals.read_keys(folder), {number: one["answer"] for number, one in verdicts.items()})
     current = sum(one["sources_sha256"] == sources for one in verdicts.values())
     compared = {number: _same(one, verdicts[number]["answer"]) for number, one in again.items()}
-    figures: Sequence[Path] = ()
-    try:
-        _record(folder, sources, current, board)
-        stamp = f"bayeskin {bayeskin.__version__}, {folder.name}"
-        figures = report.save_figure(report.figure_proof(board), folder / "scoreboard", stamp)
-    except OSError as error:  # a set that came with an installation
-        reporter.log(f"{folder}: {error.strerror}: neither figure nor scoring is kept")
     document = {
         "ok": all(same or verdicts[n]["sources_sha256"] != sources for n, same in compared.items()),
         "folder": folder,
@@ -84,9 +66,72 @@ def prove(
         "verdicts_of_these_sources": current,
         "rediagnosed_the_same": compared,
         "rediagnosed_of_these_sources": {n: verdicts[n]["sources_sha256"] == sources for n in compared},
-        "figures": list(figures),
+        "figures": list(_kept(folder, sources, current, board, reporter)),
     }
     return plain({**document, "text": _in_words(document)})
+
+
+@dataclass(frozen=True)
+class _Judge:
+    """Diagnoses recordings of a set, of which `hashes` are known by number, while its seals are closed."""
+
+    folder: Path
+    hashes: Mapping[str, str]
+    reporter: Reporter
+    diagnose: Diagnose
+
+    def work(self, sources: str, at_most: int | None, rediagnose: int) -> dict[str, Mapping[str, Any]]:
+        """Stores verdicts where there are none, at most so many; returns those of `rediagnose` others."""
+        diagnosing = bool(self._new()) and at_most != 0
+        with proof.closed(self.folder), locked(self.folder) if diagnosing else nullcontext():
+            new = self._new()
+            for place, number in enumerate(new[:at_most]):
+                self.reporter.progress("recordings", place / len(new), f"{number} of {len(self.hashes)}")
+                answer = self._diagnosed(number)
+                _store(self.folder, number, self.hashes[number], sources, answer)
+                self.reporter.log(f"{number}: {_in_a_word(answer)}")
+            judged = [
+                number for number, expected in self.hashes.items() if _stored(self.folder, number, expected)
+            ]
+            return {number: self._diagnosed(number) for number in _spread(judged, rediagnose)}
+
+    def _new(self) -> list[str]:
+        return [
+            number for number, expected in self.hashes.items() if not _answered(self.folder, number, expected)
+        ]
+
+    def _diagnosed(self, number: str) -> dict[str, Any]:
+        """The answer on a copy of the recording, far from the set; `FAILED` and why where there is none."""
+        source, expected = seals.recording_path(self.folder, number), self.hashes[number]
+        if sha256_of_file(source) != expected:
+            raise InputError(source, "other contents than the index says", f"sha256 {expected[:12]}...")
+        with tempfile.TemporaryDirectory(prefix="bayeskin-prove-", ignore_cleanup_errors=True) as place:
+            copy = Path(shutil.copyfile(source, Path(place) / "recording.h5"))
+            try:
+                answer = dict(self.diagnose(copy, self.reporter))
+            except Exception as error:  # whatever it is, it is one recording's
+                known = isinstance(error, InputError)
+                answer = {"message": str(error) if known else f"{type(error).__name__}: {error}"}
+                if not known:
+                    self.reporter.log("".join(traceback.format_exception(error)))
+        said = {name: value for name, value in plain(answer).items() if name not in ("figures", "text")}
+        return {"verdict": FAILED, **said}
+
+
+def _kept(
+    folder: Path, sources: str, current: int, board: Mapping[str, Any], reporter: Reporter
+) -> Sequence[Path]:
+    """Records the scoring and draws the scoreboard, where the folder can be written and is nobody else's."""
+    try:
+        with locked(folder):
+            _record(folder, sources, current, board)
+            stamp = f"bayeskin {bayeskin.__version__}, {folder.name}"
+            return report.save_figure(report.figure_proof(board), folder / "scoreboard", stamp)
+    except InputError as error:
+        reporter.log(f"{error}: neither figure nor scoring is kept")
+    except OSError as error:  # a set that came with an installation
+        reporter.log(f"{folder}: {error.strerror}: neither figure nor scoring is kept")
+    return ()
 
 
 def conceal(folder: Path, seed: int, count: int, reporter: Reporter) -> dict[str, Any]:
@@ -108,23 +153,6 @@ def conceal(folder: Path, seed: int, count: int, reporter: Reporter) -> dict[str
     return plain(
         {"ok": True, "folder": folder, "made": made, "count": count, "seconds": seconds, "text": text}
     )
-
-
-def _diagnosed(
-    folder: Path, number: str, expected: str, reporter: Reporter, diagnose: Diagnose
-) -> dict[str, Any]:
-    """The answer on a copy of the recording, far from the set; `FAILED` and why where there is none."""
-    source = seals.recording_path(folder, number)
-    if sha256_of_file(source) != expected:
-        raise InputError(source, "other contents than the index says", f"sha256 {expected[:12]}...")
-    with tempfile.TemporaryDirectory(prefix="bayeskin-prove-") as place:
-        copy = Path(shutil.copyfile(source, Path(place) / "recording.h5"))
-        try:
-            answer = dict(diagnose(copy, reporter))
-        except InputError as error:
-            answer = {"message": str(error)}
-    said = {name: value for name, value in plain(answer).items() if name not in ("figures", "text")}
-    return {"verdict": FAILED, **said}
 
 
 def _verdict_path(folder: Path, number: str) -> Path:

@@ -31,6 +31,7 @@ from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, Parameter, ParameterSpace, Simulation
 from bayeskin.words import number
 
+SAME_S = 1e-6  # times so near each other are one
 REPORTED_EVERY_S = 0.1  # with mechanisms, whose force changes within a step of the model
 
 
@@ -91,6 +92,9 @@ def simulate_once(
     reporter.log(f"simulating {motion.time_s[-1]:.1f} s, {spec.forward or _on_mesh(spec)}")
     outputs = None
     if fields or figures:
+        if spec.observation == "article":
+            found = "model.observation 'article', whose stresses are not those of the fields"
+            raise InputError("--fields, --figures", found, "'reaction'")
         problem = problem_of(spec.mesh, spec.refinement)
         _refuse_other_stresses(added, theta | along, problem)
         outputs = FieldOutputs(problem, theta, motion, moments, fields, figures)
@@ -156,7 +160,8 @@ def _reported(
     if not mechanisms:
         return simulation
     every = np.arange(0.0, simulation.time_s[-1], REPORTED_EVERY_S)
-    time_s = np.union1d(simulation.time_s, every)
+    apart = np.abs(every[:, None] - simulation.time_s).min(axis=1) > SAME_S
+    time_s = np.union1d(simulation.time_s, every[apart])
     force_n = reported(simulation, mechanisms, values, motion)(time_s)[0]
     return replace(
         simulation,

@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed
 from bayeskin.mechanisms.binned import estimates_by_name
 from bayeskin.mechanisms.mechanism import Instrument, Tissue
@@ -204,11 +205,13 @@ def _sized(plan: Plan, rng: np.random.Generator, screen: Screen, floor_n: float,
         for row in np.argsort(_far(size, target) + short)[:FITTED]:
             fitted = rms(screen.refit.residual(all_n[row], theta[row], ALONE)) / floor_n
             far = _far(fitted, target) + short[row]
-            if found is None or far < best:
+            if far < best:
                 best, found = far, (theta[row], {name: float(v[row]) for name, v in values.items()})
         if best < NEAR:
             break
-    assert found is not None
+    if found is None:
+        found_n = f"no draw of {', '.join(plan.mechanisms)} with a peak of {PEAK_N[0]:g} to {PEAK_N[1]:g} N"
+        raise InputError("proof", found_n, f"one among {BATCHES * BATCH}")
     return Case(plan, _named(screen, found[0]), found[1], 0.0, floor_n, target)
 
 

@@ -184,7 +184,7 @@ def figure_experiments(table: Sequence[_Experiment]) -> Figure:
     finding = (
         f"“{rows[-1].protocol[0].upper()}{rows[-1].protocol[1:]}” tells most about what is missing"
         if len(rows) and gain[-1] > 0.0
-        else "None of these tests would tell what is missing"
+        else "None of these tests is shown to tell what is missing"
     )
     state_finding(
         figure, finding,
