@@ -280,10 +280,7 @@ def _pair_columns(dim: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _expansion_terms(dim: int, most: int) -> NDArray[np.int64]:
-    """Degrees (P, dim) of the largest hyperbolic set of at most `most` (and `MOST_TERMS`) terms.
-
-    Raises InputError where a constant is all that so few samples can carry.
-    """
+    """Degrees (P, dim) of the largest hyperbolic set of at most `most` (and `MOST_TERMS`) terms."""
     degree, terms = 1, multi_indices(dim, 0)
     while degree <= HIGHEST_DEGREE and len(larger := multi_indices(dim, degree)) <= min(most, MOST_TERMS):
         degree, terms = degree + 1, larger

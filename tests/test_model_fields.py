@@ -11,8 +11,8 @@ import pytest
 from skin_test import supplement
 
 from bayeskin.model.fields import FieldWriter, StatesAt, fields_of
-from bayeskin.model.mesh import read_gmsh
-from bayeskin.model.problem import material
+from bayeskin.model.mesh import layered_mesh, read_gmsh
+from bayeskin.model.problem import build_problem, material
 from bayeskin.model.simulate import ModelSpec, problem_of, simulate
 from bayeskin.model.surface import PARTS, _divided_triangle, seen_surface, surface_state
 from bayeskin.types import PadMotion
@@ -67,6 +67,27 @@ def test_fluid_runs_down_the_pressure_gradient_relative_to_the_solid(problem):
     for layer, k, porosity in ((problem.mesh.cutis, 1e-14, 0.2), (~problem.mesh.cutis, 5e-13, 0.4)):
         expected = 2e-3 - k / (5e-3 * porosity) * 1e5
         np.testing.assert_allclose(fields.fluid_velocity[layer][:, 0], expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("tetrahedra", [False, True])
+def test_the_solid_s_velocity_is_its_mean_over_a_cell(tetrahedra):
+    """Quadratic over the depth, on straight cells, whose means are known from their corners."""
+    lines = [np.array(axis) for axis in ([0.0, 0.01, 0.03], [0.0, 0.02], [0.0, 0.004, 0.01])]
+    radius_m = 1e4
+    mesh = layered_mesh(lines, "straight", tetrahedra, 4e-3, radius_m)
+    problem = build_problem(mesh)
+    space = problem.space
+    z = space.points_u[2] - radius_m
+    x, rate = np.zeros(space.dofs), np.zeros(space.dofs)
+    rate[2 : 3 * space.n_nodes : 3] = z**2
+    corners = z[space.nodes_u[:, : 4 if tetrahedra else 8]]
+    found = fields_of(problem, THETA, x, rate).fluid_velocity[:, 2]
+    if tetrahedra:  # the mean of a product of linear functions over a simplex
+        expected = (corners.sum(axis=1) ** 2 + (corners**2).sum(axis=1)) / 20
+    else:
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        expected = (low**2 + low * high + high**2) / 3
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 def corners_of(problem):

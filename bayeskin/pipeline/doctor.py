@@ -1,6 +1,7 @@
 """Whether an installation works: what is installed, what solves, a folder to write in, a test of both models.
 
-Nothing of the package is imported before it is tested, so that one broken part is a finding and no crash.
+Nothing of the models is imported before it is tested, so that one broken part is a finding and no crash; the
+command line itself needs click and rich.
 """
 
 from __future__ import annotations

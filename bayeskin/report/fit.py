@@ -62,10 +62,10 @@ def figure_fit(
     loop = figure.add_subplot(grid[0, 1])
     residual_loop = figure.add_subplot(grid[1:, 1], sharex=loop)
     _draw_force(force, binned, bands, chosen)
-    draw_residual(residual, binned, bands, chosen)
-    draw_parts(parts, binned, bands)
+    _draw_residual(residual, binned, bands, chosen)
+    _draw_parts(parts, binned, bands)
     _draw_loop(loop, binned, bands, displacement_mm)
-    draw_residual_loop(residual_loop, binned, bands.median_n, displacement_mm)
+    _draw_residual_loop(residual_loop, binned, bands.median_n, displacement_mm)
     for ax in (force, residual, loop):
         ax.tick_params(labelbottom=False)
     titles = ("", "residual in the predictive bands", "90 % half-width", "force", "residual by phase")
@@ -80,7 +80,7 @@ def figure_fit(
     return figure
 
 
-def draw_residual(ax: Axes, binned: BinnedForce, bands: ForceBands, chosen: Mask) -> None:
+def _draw_residual(ax: Axes, binned: BinnedForce, bands: ForceBands, chosen: Mask) -> None:
     """Recorded minus predicted median [mN] over time, against the predictive bands around it."""
     shade_phases(ax, binned.phases)
     draw_bands(ax, binned.time_s, 1e3 * (bands.low_n - bands.median_n), 1e3 * (bands.high_n - bands.median_n))
@@ -89,7 +89,7 @@ def draw_residual(ax: Axes, binned: BinnedForce, bands: ForceBands, chosen: Mask
     ax.set_ylabel("residual [mN]")
 
 
-def draw_parts(ax: Axes, binned: BinnedForce, bands: ForceBands) -> None:
+def _draw_parts(ax: Axes, binned: BinnedForce, bands: ForceBands) -> None:
     """Half-width [mN] of the 90 % interval by its parts over time, on a log axis."""
     shade_phases(ax, binned.phases)
     for name, width_n in bands.parts_n.items():
@@ -106,7 +106,7 @@ def draw_parts(ax: Axes, binned: BinnedForce, bands: ForceBands) -> None:
     ax.set(xlabel="time [s]", ylabel="half-width [mN]")
 
 
-def draw_residual_loop(ax: Axes, binned: BinnedForce, predicted_n: Array, displacement_mm: Array) -> None:
+def _draw_residual_loop(ax: Axes, binned: BinnedForce, predicted_n: Array, displacement_mm: Array) -> None:
     """Residual [mN] over displacement, each bin in the colour of its phase."""
     kinds = np.array([p.kind for p in binned.phases])[binned.phase]
     residual_mn = 1e3 * (binned.force_n - predicted_n)
@@ -155,9 +155,6 @@ def _finding(binned: BinnedForce, bands: ForceBands, chosen: Mask) -> str:
     def part(mask: Mask) -> str:
         return f"{number(1e3 * np.sqrt(np.nanmean(residual[mask] ** 2)), 3)} mN RMS"
 
-    if not chosen.any():
-        held = f"{100 * inside.mean():.0f} % of bins in the 90 % band"
-        return f"Predicted without fitting: {part(~chosen)} apart, {held}"
     elsewhere = "" if chosen.all() else f", {part(~chosen)} elsewhere"
     return (
         f"The fit leaves {part(chosen)} where it was fitted{elsewhere}; "
