@@ -145,13 +145,19 @@ def test_the_design_holds_each_wave_with_its_labels(folder: Path) -> None:
     assert records[1]["kept_fraction"] < records[0]["kept_fraction"] == 1.0
 
 
+def model_check(folder: Path) -> list[str]:
+    """The figure of the full model at draws, where more than one of them carries weight."""
+    said = json.loads((folder / "case" / "sample" / "stage.json").read_text())["summary"]
+    return [] if said["corrected"] is None else ["model_check"]
+
+
 def test_each_stage_draws_its_figures_and_says_where_they_come_from(folder: Path) -> None:
     expected = {
         "recording": ["recording"],
         "design": ["waves"],
         "train": ["validation", "prior_predictive"],
         "map": ["map_check"],
-        "sample": ["posterior", "fit", "traces", "profiles", "residuals", "model_check"],
+        "sample": ["posterior", "fit", "traces", "profiles", "residuals", *model_check(folder)],
         "sobol": ["sobol_prior_gp", "sobol_prior_chaos", "sobol_near_map"],
     }
     for stage, names in expected.items():
@@ -162,7 +168,7 @@ def test_each_stage_draws_its_figures_and_says_where_they_come_from(folder: Path
 def test_the_page_shows_the_whole_run(folder: Path) -> None:
     shown = (folder / "case" / "report.html").read_text()
     drawn = [path.stem for path in (folder / "case").rglob("*.svg")]
-    assert len(drawn) == 14
+    assert len(drawn) == 13 + len(model_check(folder))
     for name in drawn:
         assert f'-{name}"'.replace("_", "-") in shown, name
     for parameter in SPACE.parameters:

@@ -155,6 +155,9 @@ def _finding(binned: BinnedForce, bands: ForceBands, chosen: Mask) -> str:
     def part(mask: Mask) -> str:
         return f"{number(1e3 * np.sqrt(np.nanmean(residual[mask] ** 2)), 3)} mN RMS"
 
+    if not chosen.any():
+        held = f"{100 * inside.mean():.0f} % of bins in the 90 % band"
+        return f"Predicted without fitting: {part(~chosen)} apart, {held}"
     elsewhere = "" if chosen.all() else f", {part(~chosen)} elsewhere"
     return (
         f"The fit leaves {part(chosen)} where it was fitted{elsewhere}; "
