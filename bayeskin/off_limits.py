@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections.abc import Iterator
@@ -24,7 +25,7 @@ def off_limits(folder: Path) -> Iterator[None]:
     closed = os.path.realpath(folder)
     _FOLDERS.append(closed)
     before = os.environ.get(_VARIABLE)
-    os.environ[_VARIABLE] = os.pathsep.join(_FOLDERS)
+    os.environ[_VARIABLE] = json.dumps(_FOLDERS)
     try:
         yield
     finally:
@@ -39,7 +40,7 @@ def keep_out() -> None:
     """Makes a process that was started meanwhile open none either, for the rest of its life."""
     if folders := os.environ.get(_VARIABLE):
         _set_hook()
-        _FOLDERS.extend(folders.split(os.pathsep))
+        _FOLDERS.extend(json.loads(folders))
 
 
 @cache

@@ -290,6 +290,17 @@ class PadMotion(_FreezesArrays):
         """LVDT displacement [m] at the times given, same shape."""
         return np.interp(np.asarray(time_s, dtype=float), self.time_s, self.displacement_m)
 
+    def times(self, step_s: float, beside_s: ArrayLike | None = None) -> Array:
+        """Times (n,) [s] every `step_s` and at the corners, or `beside_s`; a microsecond apart at least."""
+        kept = self.time_s if beside_s is None else np.asarray(beside_s, dtype=float)
+        every = np.arange(0.0, self.time_s[-1], step_s)
+        after = np.searchsorted(kept, every)
+        nearest = np.minimum(
+            np.abs(every - kept[np.maximum(after - 1, 0)]),
+            np.abs(every - kept[np.minimum(after, len(kept) - 1)]),
+        )
+        return np.union1d(kept, every[nearest > 1e-6])  # rounding makes two of one
+
 
 @dataclass(frozen=True)
 class Recording(_FreezesArrays):
@@ -323,6 +334,32 @@ class BinnedForce(_FreezesArrays):
     def time_s(self) -> Array:
         """Bin centres, (m,)."""
         return 0.5 * (self.edges_s[1:] + self.edges_s[:-1])
+
+
+@dataclass(frozen=True)
+class Jumps(_FreezesArrays):
+    """What a recording's samples allow its force to jump by.
+
+    lowest_n, highest_n (n,) : from where to where, at time_s (n,); infinite where the samples do not say
+    """
+
+    time_s: Array
+    lowest_n: Array
+    highest_n: Array
+
+    def refute(self, time_s: Array, size_n: Array) -> NDArray[np.bool_]:
+        """Whether the samples speak against jumps of size_n (k,) [N] at time_s (k,)."""
+        at = np.clip(np.searchsorted(self.time_s, time_s), 0, len(self.time_s) - 1)
+        return np.asarray((size_n < self.lowest_n[at]) | (size_n > self.highest_n[at]))
+
+    def until(self, end_s: float) -> Jumps:
+        """What the samples up to a time allow."""
+        known = self.time_s <= end_s
+        return replace(
+            self,
+            lowest_n=np.where(known, self.lowest_n, -np.inf),
+            highest_n=np.where(known, self.highest_n, np.inf),
+        )
 
 
 @dataclass(frozen=True)

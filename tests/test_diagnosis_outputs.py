@@ -26,7 +26,15 @@ from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.search import Search
 from bayeskin.mismatch.verdict import Diagnosis, Named
 from bayeskin.pipeline import diagnosis
-from bayeskin.pipeline.diagnosis_outputs import Found, Remainder, draw, in_words, mechanism, unexplained
+from bayeskin.pipeline.diagnosis_outputs import (
+    Found,
+    Remainder,
+    candidates,
+    draw,
+    in_words,
+    mechanism,
+    unexplained,
+)
 from bayeskin.pipeline.folder import plain
 
 CREEP_S = 20.0
@@ -59,7 +67,7 @@ def parts_of(*names: str) -> list[Contribution]:
         values = log_posterior.from_sampling(log_posterior.vector(case[1]))
         return np.asarray(log_posterior.predict(values).mean[0])
 
-    return contributions(names, fitted(*names).theta, force)
+    return contributions(names, fitted(*names).theta, force, catalogue())
 
 
 def located(residual_n: np.ndarray, *windows: Window) -> Located:
@@ -163,6 +171,7 @@ def test_words_say_what_is_left_only_where_something_is(remainder: Remainder) ->
     answer = {
         "verdict": "unknown", "mechanisms": [], "located": [], "remaining": [], "candidates": [],
         "fit": {"before": fits, "after": fits}, "folder": "x", "unexplained": None, "unsure": [],
+        "refuted": [],
         "unknown_probability": 0.974,
     }  # fmt: skip
     assert "outside this catalogue: probability at most 0.97" in in_words(answer)
@@ -256,6 +265,16 @@ def test_contributions_have_a_row_each_and_rounding_does_not_fill_one() -> None:
     np.testing.assert_allclose(drawn, 1e3 * parts[0].force_n)
     low, high = figure.axes[-2].get_ylim()
     assert high - low > 0.02  # mN
+
+
+def test_what_a_pair_gains_is_no_candidate_s_alone() -> None:
+    known = catalogue()
+    sets: list[tuple[str, ...]] = [(), ("device-friction",), ("device-friction", "force-offset")]
+    search = Search({names: fitted(*names) for names in sets}, {("force-offset",): fitted("force-offset")})
+    assert [row["name"] for row in candidates(search, known)] == ["device-friction"]
+    needed = ("device-friction", "friction-creep")
+    search.fits[needed] = fitted(*needed)
+    assert {row["name"] for row in candidates(search, known)} == set(needed)
 
 
 def test_candidates_of_a_few_nats_are_read_off_beside_one_of_hundreds() -> None:

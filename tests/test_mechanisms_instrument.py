@@ -16,7 +16,7 @@ from bayeskin.errors import InputError
 from bayeskin.mechanisms import bin_means, catalogue, observed
 from bayeskin.mechanisms.lines import interpolated
 from bayeskin.mechanisms.mechanism import Instrument
-from bayeskin.types import PadMotion, ParameterSpace
+from bayeskin.types import Jumps, PadMotion, ParameterSpace
 
 MOTION = PadMotion(
     np.array([0.0, 5.0, 14.4, 45.0, 54.4, 65.0, 74.4, 105.0, 114.4, 130.0]),
@@ -57,7 +57,7 @@ OFF_NEUTRAL = {"F0": 0.03, "drift": 1e-4, "delay": 0.3, "event_1_step": 0.02, "f
 
 @pytest.mark.parametrize("name", ALL)
 def test_a_mechanism_off_its_neutral_value_shows_and_can_be_told(name):
-    base = ("device-friction",) if name == "friction-creep" else ()
+    base = ALL[name].needs
     values = values_of(*base, name)
     chosen = {key: value for key, value in OFF_NEUTRAL.items() if key in values}
     without = reported(*base, friction_start=0.5) if base else 0.0
@@ -148,6 +148,18 @@ def test_a_delayed_force_is_that_of_before():
     np.testing.assert_allclose(both[kept], (late + drag)[kept], atol=1e-12)  # the clock comes last
 
 
+def test_events_are_refuted_where_samples_show_no_step():
+    act = ALL["sensor-events"].act
+    assert isinstance(act, Instrument)
+    assert act.refuted is not None
+    end_s = MOTION.time_s[-1]
+    jumps = Jumps(np.array([0.5, 1.0]) * end_s, np.array([-0.01, -np.inf]), np.array([0.02, np.inf]))
+    steps = {f"event_{i}_at": np.full(4, 0.4 * i) for i in (1, 2)}
+    steps |= {"event_1_step": np.array([0.01, 0.03, -0.02, 0.03])}
+    steps |= {"event_2_step": np.array([0.005, 0.005, 0.01, 0.04])}  # of which samples say nothing
+    assert act.refuted(steps, MOTION, jumps).tolist() == [False, True, True, False]
+
+
 def test_events_and_drift_add_what_they_say():
     found = reported("sensor-events", event_1_at=0.25, event_1_step=0.03, event_2_at=0.5, event_2_step=-0.01)
     np.testing.assert_allclose(found[[324, 326, 649, 651]], [0.0, 0.03, 0.03, 0.02], atol=1e-15)
@@ -186,6 +198,7 @@ MECHANISM = Mechanism(
         Place.CELL,
         lambda values, motion, force: added(force, lambda t: values["{parameter}"][:, None] + 0 * t),
     ),
+    {more}
 )
 """
 
@@ -194,8 +207,8 @@ MECHANISM = Mechanism(
 def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Installs a package beside bayeskin that brings a mechanism of its own."""
 
-    def install(name: str, parameter: str) -> None:
-        (tmp_path / "magnet.py").write_text(PLUGIN.format(name=name, parameter=parameter))
+    def install(name: str, parameter: str, more: str = "") -> None:
+        (tmp_path / "magnet.py").write_text(PLUGIN.format(name=name, parameter=parameter, more=more))
         info = tmp_path / "magnet-1.0.dist-info"
         info.mkdir()
         (info / "METADATA").write_text("Metadata-Version: 2.1\nName: magnet\nVersion: 1.0\n")
@@ -211,6 +224,12 @@ def test_another_package_adds_a_mechanism(plugin):
     assert "magnet" in catalogue()
     force = observed([catalogue()["magnet"]], {"pull": np.array([0.2])}, MOTION, skin)
     np.testing.assert_allclose(force(TIMES_S), skin(TIMES_S) + 0.2)
+
+
+def test_a_need_of_what_there_is_not_is_refused(plugin):
+    plugin("magnet", "pull", "needs=('iron',),")
+    with pytest.raises(InputError, match="magnet: found a need of iron"):
+        catalogue()
 
 
 @pytest.mark.parametrize(("name", "parameter"), [("force-offset", "pull"), ("magnet", "F0")])

@@ -19,14 +19,15 @@ from toy_inference import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior, NoisePriors, find_map
 from bayeskin.inference.convergence import Limits
-from bayeskin.inference.gauss_newton import gauss_newton, promise
+from bayeskin.inference.gauss_newton import gauss_newton, promise, surrogate_error
 from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.blocked import errors_left_out, without
+from bayeskin.mismatch.corrected import Sure
 from bayeskin.mismatch.discretised import BEND, RELAXATION_S, RELAXING, Discretised, relaxing
 from bayeskin.mismatch.fit import Fit, fit, fit_base, fit_near, likely, restored, soft_on_stiff, stored
-from bayeskin.mismatch.full_fit import ENOUGH, fit_full
+from bayeskin.mismatch.full_fit import ENOUGH, at_run, fit_full
 from bayeskin.mismatch.locate import _chance, locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.resample import resample
@@ -205,7 +206,7 @@ class Landscape:
         for name, stand_in in (
             ("fit_base", lambda posterior, seed, straight: self.fit((), posterior, "")),
             ("fit", lambda names, posterior, theta, *rest: self.fit(names, posterior, theta["from"])),
-            ("find_shear", lambda posterior: None), ("sure", lambda found, build: True),
+            ("find_shear", lambda posterior: None), ("sure", lambda *rest: True),
             ("promised", lambda posterior, *rest: 1.0), ("_new", lambda *rest: []),
         ):  # fmt: skip
             monkeypatch.setattr(f"bayeskin.mismatch.search.{name}", stand_in)
@@ -278,7 +279,7 @@ def test_a_fit_where_nothing_is_possible_has_no_weight_and_does_not_count() -> N
     found = fit_near((), alone, middle, None)
     assert weight(found) == found.value == -np.inf
     assert np.all(np.isfinite(found.covariance))
-    assert not sure(found, lambda names: alone)
+    assert not sure(found, lambda names: alone, KNOWN)
 
 
 def test_another_search_shows_where_no_path_of_its_own_leads(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -462,6 +463,20 @@ def test_a_set_of_which_the_surrogate_is_unsure_does_not_count() -> None:
     assert found.probability(["sensor-drift"]) == 0.0
 
 
+def test_a_set_that_something_else_refutes_does_not_count() -> None:
+    steps = {"event_1_at": 0.3, "event_1_step": 0.03, "event_2_at": 0.7, "event_2_step": -0.04}
+    alone = concealing(0, ("sensor-events",), **steps)
+    known = {name: KNOWN[name] for name in ("sensor-events", "viscous-drag")}
+
+    def build(names: Sequence[str]) -> LogPosterior:
+        return building(alone, names)
+
+    assert search(build, known, 1).best.names == ("sensor-events",)
+    found = search(build, known, 1, refuted=lambda one: "sensor-events" in one.names)
+    assert not any("sensor-events" in names for names in found.fits)
+    assert found.unsure["sensor-events",].log_evidence > found.base.log_evidence
+
+
 class Wrong(ToySurrogate):
     """Off by some percent of the force and of the slopes, and sure of itself."""
 
@@ -517,6 +532,25 @@ def test_a_full_fit_has_in_its_force_what_its_mesh_is_wrong_by() -> None:
     )  # fmt: skip
     np.testing.assert_allclose(found.force_n, right, atol=2e-3)
     np.testing.assert_allclose(found.force_n - found.mesh_n, 1.02 * right)
+
+
+def test_a_mismatch_is_located_beside_the_run_and_not_beside_what_the_surrogate_might_be() -> None:
+    """A surrogate so unsure that its error could take up all that the run leaves."""
+    alone = dataclasses.replace(concealing(0), noise_priors=QUIET)
+    noise = {f"sd_{kind}": 2e-3 for kind in ("rest", "load", "hold", "unload")}
+    start = {**TRUTH, **noise, "tau_noise": 0.5, "nu_noise": 50.0}
+    right = alone.surrogate.predict([TRUTH[n] for n in alone.surrogate.space.names]).mean[0]
+    full, corrected = fit_full(alone, start, lambda theta, changes: (0.8 * right, None), (), 1, 1)
+    unsure = fit_near((), dataclasses.replace(alone, surrogate=corrected), full.theta, None)
+    there = at_run(
+        dataclasses.replace(unsure, log_posterior=dataclasses.replace(alone, surrogate=Sure(corrected))), full
+    )
+    np.testing.assert_allclose(there.force_n, full.force_n, atol=1e-9)
+    assert {name: there.theta[name] for name in TRUTH} == pytest.approx(
+        {name: full.theta[name] for name in TRUTH}
+    )
+    found = locate(there, noise | {"tau_noise": 0.5, "nu_noise": 50.0}, 1)
+    np.testing.assert_allclose(found.residual_n, (alone.binned.force_n - full.force_n)[found.bins], atol=1e-9)
 
 
 def test_a_full_fit_whose_runs_fail_keeps_what_it_has() -> None:
@@ -682,3 +716,12 @@ def test_windows_lose_what_is_left_out(
     spans: tuple[tuple[float, float], ...], left: tuple[tuple[float, float], ...]
 ) -> None:
     assert without(spans, 3.0, 5.0) == left
+
+
+def test_the_most_probable_error_of_a_surrogate_that_knows_nothing_is_found() -> None:
+    """Beside columns that are alike and huge their prior is lost to rounding in a normal equation."""
+    rng = np.random.default_rng(0)
+    residual, column = rng.standard_normal((2, 400))
+    for size in (1.0, 1e12):
+        latent = surrogate_error(residual, size * np.repeat(column[:, None], 3, axis=1), 50.0)
+        assert size * latent.sum() == pytest.approx(column @ residual / (column @ column), rel=0.1)

@@ -33,7 +33,7 @@ from bayeskin.pipeline.doctor import FULL_MODEL_N, THETA
 from bayeskin.pipeline.engine import Silent
 from bayeskin.pipeline.serve import Asked, ServedModel, open_server
 from bayeskin.runner import load_design, run_design
-from bayeskin.types import Parameter, ParameterSpace, Recording
+from bayeskin.types import PadMotion, Parameter, ParameterSpace, Recording
 from bayeskin.umbridge import Client, server
 from bayeskin.workers import local
 
@@ -170,6 +170,26 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return lines[0]
 
 
+def test_a_function_that_raises_is_a_run_that_failed() -> None:
+    def raising(theta, time_s, displacement_m):
+        raise ValueError("too\nstiff")
+
+    found = simulate_with(raising, MOTION, TRUE)
+    assert found.status == "failed"
+    assert found.message.startswith("ValueError: too stiff (test_own_models.py, line ")
+
+
+def test_a_function_is_asked_for_no_time_twice() -> None:
+    asked: list[np.ndarray] = []
+    motion = PadMotion(
+        np.array([0.0, 3 * 0.1, 1.0, 9.600000000000001, 20.0]), np.array([0, 0, 1e-3, 1e-3, 0])
+    )
+    simulate_with(lambda theta, time_s, d: asked.append(time_s) or d, motion, TRUE)
+    assert np.diff(asked[0]).min() > 1e-3
+    assert set(motion.time_s) <= set(asked[0])
+    assert np.diff(asked[0]).max() < 0.1 + 1e-9
+
+
 @pytest.mark.parametrize(
     ("forward", "more", "says"),
     [
@@ -179,7 +199,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
         ("spring.py", PARAMETERS, "expected FILE.py:FUNCTION"),
         ("nowhere.at.all:force", PARAMETERS, "expected a Python file or module"),
         ("broken.py:force", PARAMETERS, "SyntaxError"),
-        ("spring.py:raising", PARAMETERS, "ZeroDivisionError: division by zero; expected a force at"),
+        ("spring.py:raising", PARAMETERS, "ZeroDivisionError: division by zero (spring.py, line "),
         ("spring.py:short", PARAMETERS, "a force of shape (3,); expected (1"),
         ("spring.py:endless", PARAMETERS, "not finite"),
         ("spring.py:force", "", "KeyError: 'stiffness'"),

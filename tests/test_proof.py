@@ -330,7 +330,8 @@ def opens(path: str) -> bool:
         return False
 
 
-def test_nor_by_a_worker_that_is_started_meanwhile(made: Path) -> None:
+def test_nor_by_a_worker_that_is_started_meanwhile(made: Path, tmp_path: Path) -> None:
+    made = Path(shutil.copytree(made, tmp_path / "set:1, odd"))
     key_path = str(made / "seals" / "001.json")
     with closed(made):
         assert dict(run_parallel(opens, [key_path, str(made / "index.json")], 1)) == {0: False, 1: True}

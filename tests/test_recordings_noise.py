@@ -19,12 +19,15 @@ from skin_test import (
 )
 
 from bayeskin.errors import InputError
+from bayeskin.mismatch.fit import QUICK_S, without_swings
 from bayeskin.recordings import (
     NoiseAnalysis,
     analyse,
     bin_recording,
+    covered_s,
     describe,
     describe_json,
+    jumps_of,
     phase_noise,
     segment,
     summarise,
@@ -212,6 +215,57 @@ def test_steps_are_found_with_their_times_and_sizes() -> None:
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.06)
 
 
+@pytest.mark.parametrize("interval_s", [0.01, 0.05])
+@pytest.mark.parametrize("slow_mn", [0.0, 1.0, 3.0])
+@pytest.mark.parametrize("lasts_s", [0.0, 0.03, 0.05])
+def test_jumps_that_are_there_are_allowed_and_others_are_refuted(
+    interval_s: float, slow_mn: float, lasts_s: float
+) -> None:
+    refuted, time_s = [], interval_s * np.arange(round(130.0 / interval_s) + 1)
+    for seed in range(3):
+        rng = np.random.default_rng([seed, 6])
+        times = np.array([25.0, 35.0, 85.0]) + rng.uniform(-0.4, 0.4, 3)
+        sizes = np.array([0.015, -0.015, 0.03])
+        force = true_force(time_s) + coloured(rng, len(time_s), 1e-3, 1e-3 * slow_mn, 0.3 * interval_s / 0.01)
+        for at_s, size_n in zip(times, sizes, strict=True):
+            force += size_n * np.clip((time_s - at_s) / max(lasts_s, 1e-9), 0.0, 1.0)
+        jumps = jumps_of(recording(force, MOTION, time_s), PHASES)
+        for off_s in (-0.3, 0.0, 0.3):  # a fit to bins knows a moment no better
+            assert not jumps.refute(times + off_s, sizes).any()
+        refuted += [
+            jumps.refute(np.array([28.0, 33.0, 88.0]), 2.0 * sizes),
+            jumps.refute(times, -2.0 * sizes),
+        ]
+        corners = np.array([phase.start_s for phase in PHASES[1:]])
+        assert not jumps.refute(corners, np.full(len(corners), 1.0)).any()
+        assert not jumps.until(30.0).refute(np.array([33.0]), np.array([1.0])).any()
+    assert np.mean(refuted) > (0.8 if slow_mn < 3.0 else 0.5)
+
+
+def test_a_slow_swing_is_no_quick_noise() -> None:
+    """It swings in holds only; loads are noisier, and stay so."""
+    rng = np.random.default_rng(3)
+    kinds = np.array([p.kind for p in PHASES])[
+        np.searchsorted([p.start_s for p in PHASES], TIME_S, side="right") - 1
+    ]
+    louder = np.where(kinds == "load", 4.0, 1.0)
+    plain = FORCE_N + louder * coloured(rng, len(TIME_S), 1e-3, 1e-3, 0.1)
+    swinging = plain + np.where(kinds == "hold", 0.1 * FORCE_N * np.sin(2.0 * np.pi * TIME_S / 4.1), 0.0)
+    of = {}
+    for name, force in (("plain", plain), ("swinging", swinging)):
+        made = recording(force)
+        whole = bin_recording(made, PHASES, EDGES_S)
+        quick = bin_recording(made, PHASES, EDGES_S, analyse(made, PHASES, QUICK_S))
+        holds = np.array([PHASES[i].kind == "hold" for i in whole.phase])
+        less = without_swings(whole, quick.variance_n2)
+        kept = less.variance_n2[~holds] / whole.variance_n2[~holds]
+        assert kept.min() > (0.99 if name == "plain" else 0.25)
+        of[name] = [np.median(one.variance_n2[holds]) for one in (whole, less)]
+    assert of["plain"][0] == of["plain"][1]
+    assert of["swinging"][0] > 16.0 * of["plain"][0]
+    assert of["swinging"][1] < min(15.0 * of["plain"][0], 0.5 * of["swinging"][0])
+
+
 def test_a_step_is_no_spike_and_stays_in_the_means() -> None:
     step = 0.05 * (TIME_S >= 30.2)
     rng = np.random.default_rng(2)
@@ -295,3 +349,15 @@ def test_the_articles_recording_has_one_sided_spikes_and_steps_of_its_zero() -> 
     assert np.median(np.abs(binned.force_n - raw.mean(axis=1))) < 1e-3
     assert (binned.variance_n2 > 0).all()
     assert (np.abs(binned.correlation) < 1).all()
+
+
+def test_the_last_sample_stands_for_an_interval() -> None:
+    """A recording at 20 Hz up to 129.95 s has as many bins as one to 130 s."""
+    time_s = 0.05 * np.arange(2600)
+    made = recording(true_force(time_s), MOTION, time_s)
+    assert uniform_edges(covered_s(made, MOTION))[-1] == EDGES_S[-1] == 130.0
+    means = bin_recording(made, segment(made), EDGES_S).force_n
+    np.testing.assert_allclose(means[-1], true_bin_means()[-1], atol=5e-4)
+    assert covered_s(recording(FORCE_N), MOTION) == 130.0
+    with pytest.raises(InputError, match=r"within 0 to 130 s"):
+        bin_recording(made, segment(made), np.append(EDGES_S, 130.5))

@@ -296,6 +296,30 @@ def test_gp_predicts_as_the_textbook_formulas(name):
     np.testing.assert_allclose(found[1][:, 0], target.var() * variance, rtol=1e-4)
 
 
+@pytest.mark.parametrize("nugget", [1e-2, 1.0])
+def test_a_variance_from_few_directions_is_hardly_larger_and_never_smaller(nugget, monkeypatch):
+    rng = np.random.default_rng(8)
+    unit, points = rng.random((300, 3)), rng.random((500, 3))
+    targets = np.sin(unit @ rng.normal(size=(3, 4)))
+    maps = np.tril(rng.normal(size=(4, 3, 3))) + 2 * np.eye(3)
+    names = ("gaussian", "matern52", "gaussian", "gaussian")
+    fits = [
+        LatentFit(name, map_, own, 0.0, 1.3)
+        for name, map_, own in zip(names, maps, (nugget, nugget, 1e-9, 10 * nugget), strict=True)
+    ]
+    gps = LatentGPs.assemble(unit, targets, fits)
+    assert [one.few is None for one in gps._conditioned] == [False, nugget < 1.0, True, False]
+    found = gps.predict(points)
+    monkeypatch.setattr("bayeskin.surrogates.gp.WORTH_IT", 1000)
+    exact = LatentGPs.assemble(unit, targets, fits).predict(points)
+    np.testing.assert_allclose(found[0], exact[0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(gps.predict_mean(points), exact[0], rtol=1e-9, atol=1e-9)
+    ratio = found[1] / exact[1]
+    assert ratio.min() > 1.0 - 1e-9
+    assert ratio.max() < 1.3
+    assert ratio.mean() < 1.03
+
+
 def test_latents_of_two_kernels_are_predicted_together_as_each_by_itself():
     rng = np.random.default_rng(7)
     unit, points = rng.random((41, 3)), rng.random((300, 3))

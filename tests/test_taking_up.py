@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -63,8 +64,8 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> Runs:
     return made
 
 
-def taken_up(names: tuple[str, ...], effects: int = 0) -> tuple[Any, Any, Fit, LogPosterior]:
-    """What `_full` makes of a fit to a surrogate that is off, that fit, and the exact posterior."""
+def bench_of(names: tuple[str, ...], effects: int = 0) -> tuple[Any, Fit, LogPosterior]:
+    """A workbench with a surrogate that is off, a fit to that, and the exact posterior."""
     right = building(dataclasses.replace(concealing(0, names, F0=-0.04), noise_priors=QUIET), names)
     skin = Wrong() if not names else dataclasses.replace(right.surrogate, inner=Wrong())
     wrong = dataclasses.replace(right, surrogate=skin)
@@ -74,11 +75,16 @@ def taken_up(names: tuple[str, ...], effects: int = 0) -> tuple[Any, Any, Fit, L
     learnt = [SimpleNamespace(mechanisms=names, own=(f"p{i}",)) for i in range(effects)]
     bench = SimpleNamespace(
         spec=ModelSpec(), motion=toy.MOTION, binned=right.binned, with_mesh_error=lambda surrogate: surrogate,
-        surrogate=lambda names: skin, effects=learnt,
+        surrogate=lambda names: skin, effects=learnt, posterior=lambda until_s, these: building(wrong, these),
         known={name: KNOWN[name] for name in names}, run=SimpleNamespace(config=SimpleNamespace(seed=1)),
     )  # fmt: skip
-    full, about = taking_up._full(bench, start)  # type: ignore[arg-type]
-    return full, about, start, dataclasses.replace(right, surrogate=Scaled(right.surrogate, FINE))
+    return bench, start, dataclasses.replace(right, surrogate=Scaled(right.surrogate, FINE))
+
+
+def taken_up(names: tuple[str, ...], effects: int = 0) -> tuple[Any, Any, Fit, LogPosterior]:
+    """What `_full` makes of a fit to a surrogate that is off, that fit, and the exact posterior."""
+    bench, start, exact = bench_of(names, effects)
+    return *taking_up._full(bench, start), start, exact
 
 
 def unlike(made: list[Values]) -> bool:
@@ -121,3 +127,26 @@ def test_a_full_run_that_fails_where_the_surrogate_s_fit_is_does_not_end_the_fit
 def test_a_full_model_of_which_no_run_converges_says_so(runs: Runs) -> None:
     runs.fails = lambda values: True
     assert taken_up(("force-offset",))[:2] == ("did not converge", None)
+
+
+def test_the_mismatch_is_located_beside_the_best_run(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not beside the surrogate about it, whose error would take up what is missing."""
+    bench, start, _ = bench_of(())
+    bench.known = {}
+    bumped = start.log_posterior.binned.force_n + 0.05 * (np.arange(len(start.force_n)) % 40 > 35)
+    bench.binned = dataclasses.replace(start.log_posterior.binned, force_n=bumped)
+    posterior = dataclasses.replace(start.log_posterior, binned=bench.binned)
+    bench.posterior = lambda until_s, names: posterior
+    for name, stand_in in (
+        ("opened", lambda *rest: None), ("workbench", lambda run: bench),
+        ("restored", lambda plain, posterior: dataclasses.replace(start, log_posterior=posterior)),
+        ("resample", lambda found, *rest: SimpleNamespace(draws=found.draws(20, 0))),
+        ("propose_form", lambda *rest: None), ("discrepancy", lambda *rest: None),
+    ):  # fmt: skip
+        monkeypatch.setattr(taking_up, name, stand_in)
+    taken = taking_up._whole_apart(Path("x"), {"names": []}, start.theta)
+    assert not isinstance(taken.full, str | None)
+    fitted = posterior.chain.bins
+    left = bumped[fitted] - taken.full.force_n[fitted]
+    assert taken.located.residual_n == pytest.approx(left, abs=1e-6)
+    assert taken.located.windows

@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 
 from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
@@ -263,9 +264,8 @@ class _Linear:
         residual, slopes, factor = self.columns()
         latent = surrogate_error(residual, factor, self.nu)
         weight = (self.nu + 1.0) / (self.nu + 3.0)
-        inside = weight * factor.T @ factor + np.diag(_spring(latent)[0])
-        cross = weight * factor.T @ slopes
-        material = weight * slopes.T @ slopes - cross.T @ np.linalg.solve(inside, cross)
+        taken = _orthonormal(np.sqrt(weight) * factor, _spring(latent)[0])[0].T @ slopes
+        material = weight * (slopes.T @ slopes - taken.T @ taken)
         left = residual - factor @ latent
         steep = slopes.T @ ((self.nu + 1.0) / (self.nu + left**2) * left)
         low, high = self.low[self.inner :], self.high[self.inner :]
@@ -283,12 +283,22 @@ def surrogate_error(residual: Array, factor: Array, nu: float) -> Array:
     """
     latent: Array = np.zeros(factor.shape[1])
     for _ in range(REWEIGHTED):
-        weight = (nu + 1.0) / (nu + (residual - factor @ latent) ** 2)
-        weighted = (factor * weight[:, None]).T
+        root = np.sqrt((nu + 1.0) / (nu + (residual - factor @ latent) ** 2))
         stiffness, rest = _spring(latent)
-        curved = weighted @ factor + np.diag(stiffness)
-        latent = np.asarray(np.linalg.solve(curved, weighted @ residual + rest), dtype=float)
+        columns, own, triangle = _orthonormal(root[:, None] * factor, stiffness)
+        target = columns.T @ (root * residual) + own.T @ (rest / np.sqrt(stiffness))
+        latent = np.asarray(solve_triangular(triangle, target), dtype=float)
     return latent
+
+
+def _orthonormal(factor: Array, stiffness: Array) -> tuple[Array, Array, Array]:
+    """Q (k, r) and (r, r), R (r, r) of the columns (k, r) over the roots of their prior's stiffness (r,).
+
+    Where a surrogate knows next to nothing, its columns are so large that beside their squares the prior is
+    lost to rounding.
+    """
+    q, triangle = np.linalg.qr(np.concatenate([factor, np.diag(np.sqrt(stiffness))]))
+    return q[: len(factor)], q[len(factor) :], triangle
 
 
 def _spring(latent: Array) -> tuple[Array, Array]:

@@ -11,7 +11,16 @@ import pkgutil
 from importlib.metadata import entry_points
 
 from bayeskin.errors import InputError
-from bayeskin.mechanisms.mechanism import Bins, Mechanism, bin_means, laws, observed, solved
+from bayeskin.mechanisms.mechanism import (
+    Bins,
+    Mechanism,
+    bin_means,
+    laws,
+    observed,
+    solved,
+    with_one,
+    without_one,
+)
 
 ENTRY_POINTS = "bayeskin.mechanisms"
 
@@ -19,7 +28,8 @@ ENTRY_POINTS = "bayeskin.mechanisms"
 def catalogue() -> dict[str, Mechanism]:
     """All mechanisms by name, in the order of their names.
 
-    Raises InputError if two have the same name, or share a parameter's.
+    Raises InputError if two have the same name, or share a parameter's, or one needs what there is not, or
+    what needs another itself.
     """
     modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
     found = [module.MECHANISM for module in modules if hasattr(module, "MECHANISM")]
@@ -28,7 +38,24 @@ def catalogue() -> dict[str, Mechanism]:
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise InputError("mechanisms", f"{twice[0]} twice", "different names")
-    return {m.name: m for m in sorted(found, key=lambda m: m.name)}
+    known = {m.name: m for m in sorted(found, key=lambda m: m.name)}
+    for mechanism in found:
+        for name in mechanism.needs:
+            if name not in known or known[name].needs:
+                expected = "a mechanism of the catalogue that needs none itself"
+                raise InputError(mechanism.name, f"a need of {name}", expected)
+    return known
 
 
-__all__ = ["ENTRY_POINTS", "Bins", "Mechanism", "bin_means", "catalogue", "laws", "observed", "solved"]
+__all__ = [
+    "ENTRY_POINTS",
+    "Bins",
+    "Mechanism",
+    "bin_means",
+    "catalogue",
+    "laws",
+    "observed",
+    "solved",
+    "with_one",
+    "without_one",
+]

@@ -1,8 +1,8 @@
 """The cutis is stiffer along the Langer lines, in pull and in push.
 
 The law of `fibres` with k2 = 0 and k1 = (ratio - 1) E_c / 4, so that Young's modulus along the lines is about
-`ratio` times E_c at small strain; the lines lie at an angle to x in the skin's plane. In one uniaxial test it
-cannot be told from E_c.
+`ratio` times E_c at small strain; the lines lie at an angle to x in the skin's plane. In one uniaxial test
+most of it looks like another E_c.
 
 Skin that is incompressible, pulled alike by a small strain, without shear, and narrows by the share y of it
 has, with r = ratio - 1 and the lines' angle a, the energy
@@ -66,7 +66,7 @@ MECHANISM = Mechanism(
     statement=lambda v: (
         f"The cutis is {v['langer_ratio']:.1f} times as stiff along lines at "
         f"{np.degrees(v['langer_angle']):.0f} degrees to the pull; "
-        "one uniaxial test cannot tell this from a stiffer cutis."
+        "in one uniaxial test most of this looks like a stiffer cutis, and a pull across would tell."
     ),
     group=("fibre-anisotropy",),
     act=Tissue(bind, estimate),

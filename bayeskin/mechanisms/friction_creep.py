@@ -1,6 +1,6 @@
 """The friction that a stop locks in relaxes: dF/dt = ... - F / tau in `device-friction`'s equation.
 
-Alone it has nothing to act on.
+Alone it has nothing to act on (`needs`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,10 @@ MECHANISM = Mechanism(
         Parameter("friction_tau", "s", 3.0, 1000.0, "log-uniform", "time in which friction relaxes"),
     ),
     neutral={"friction_tau": np.inf},
-    statement=lambda v: f"Friction that a stop locks in relaxes within {number(v['friction_tau'], 3)} s.",
+    statement=lambda v: (
+        f"Friction that a stop locks in relaxes with a time constant of {number(v['friction_tau'], 3)} s."
+    ),
     group=("friction-creep", "solid-viscoelasticity", "strain-dependent-permeability"),
     act=Instrument(Place.DRIVE, observe),
+    needs=("device-friction",),
 )

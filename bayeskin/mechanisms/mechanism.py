@@ -12,14 +12,16 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayeskin.mechanisms.lines import bin_integrals
 from bayeskin.model.tissue import Bind
-from bayeskin.types import Array, PadMotion, Parameter
+from bayeskin.types import Array, Jumps, PadMotion, Parameter
 
 Values = Mapping[str, Array]  # each parameter (n,), SI; those of all mechanisms that are on
 ForceOfTime = Callable[[Array], Array]  # times (t,) or (n, t) [s] to forces (n, t) [N]
 Observe = Callable[[Values, PadMotion, ForceOfTime], ForceOfTime]
+Refuted = Callable[[Values, PadMotion, Jumps], NDArray[np.bool_]]
 GAUSS_POINTS = 4  # between neighbouring edges and corners
 
 
@@ -39,12 +41,15 @@ class Instrument:
     bind : set where it changes the displacement that the skin sees: the full model solves it along, and
         `observe` is its shortcut for the force of a surrogate
     adds : whether what it adds to a force does not depend on that force
+    refuted : which values the samples of a recording speak against, by what they allow of jumps; None where
+        they cannot
     """
 
     place: Place
     observe: Observe
     bind: Bind | None = None
     adds: bool = True
+    refuted: Refuted | None = None
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,7 @@ class Mechanism:
     group : names of the look-alikes that one force channel cannot tell from it, its own among them
     parts : names of parameters that act by themselves, the first of each part the one that switches it on;
         () is one part of all
+    needs : names of mechanisms without which it does nothing
     """
 
     name: str
@@ -77,11 +83,22 @@ class Mechanism:
     group: tuple[str, ...]
     act: Instrument | Tissue
     parts: tuple[tuple[str, ...], ...] = ()
+    needs: tuple[str, ...] = ()
 
     @property
     def whole_or_parts(self) -> tuple[tuple[str, ...], ...]:
         """`parts`, or the one part of all parameters."""
         return self.parts or (tuple(p.name for p in self.parameters),)
+
+
+def with_one(names: Iterable[str], name: str, known: Mapping[str, Mechanism]) -> tuple[str, ...]:
+    """A set with one mechanism more, and those that it needs."""
+    return tuple(sorted({*names, name, *known[name].needs}))
+
+
+def without_one(names: Iterable[str], name: str, known: Mapping[str, Mechanism]) -> tuple[str, ...]:
+    """A set with one mechanism fewer, and without those that need it."""
+    return tuple(other for other in names if other != name and name not in known[other].needs)
 
 
 def observed(

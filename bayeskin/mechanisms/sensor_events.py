@@ -3,12 +3,16 @@
 Moments are counted as shares of the recording, so that one prior fits all.
 
 A step in the first or last fiftieth of a recording is not asked for: it would be an offset, or nothing.
+And a step is there from one sample to the next: where samples show none, something slower is at work.
 """
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
-from bayeskin.types import Array, PadMotion, Parameter
+from bayeskin.types import Array, Jumps, PadMotion, Parameter
 
 EVENTS = (1, 2)
 
@@ -23,6 +27,14 @@ def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTim
         )
 
     return added(force, steps)
+
+
+def refuted(values: Values, motion: PadMotion, jumps: Jumps) -> NDArray[np.bool_]:
+    """Of which values (n,) samples do not show the larger step; the smaller may stand for something slow."""
+    sizes = np.array([values[f"event_{i}_step"] for i in EVENTS])
+    moments = np.array([values[f"event_{i}_at"] for i in EVENTS]) * motion.time_s[-1]
+    larger = np.argmax(np.abs(sizes), axis=0), np.arange(sizes.shape[1])
+    return jumps.refute(moments[larger], sizes[larger])
 
 
 MECHANISM = Mechanism(
@@ -48,5 +60,5 @@ MECHANISM = Mechanism(
     ),
     group=("sensor-events",),
     parts=tuple((f"event_{i}_step", f"event_{i}_at") for i in EVENTS),
-    act=Instrument(Place.CELL, observe),
+    act=Instrument(Place.CELL, observe, refuted=refuted),
 )

@@ -76,7 +76,7 @@ MECHANISM = Mechanism(
     neutral={"recovery_compliance": 0.0, "recovery_time": 30.0},
     statement=lambda v: (
         f"Tissue around the test yields, {number(1e3 * v['recovery_compliance'], 2)} mm for each newton "
-        f"within {v['recovery_time']:.0f} s, and returns as slowly."
+        f"with a time constant of {v['recovery_time']:.0f} s, and returns as slowly."
     ),
     group=("slow-recovery", "preconditioning", "pad-slip"),
     act=Instrument(Place.PADS, observe, bind, adds=False),

@@ -178,16 +178,16 @@ def _stretch(motion: PadMotion, time_s: Array) -> Array:
 MECHANISM = Mechanism(
     name="solid-viscoelasticity",
     parameters=(
-        Parameter("g_1", "-", 0.0, 2.0, "uniform", "stress of the first branch, over that at rest"),
+        Parameter("g_1", "-", 0.0, 2.0, "uniform", "stress of the first branch, over that in the long run"),
         Parameter("tau_1", "s", 0.2, 15.0, "log-uniform", "relaxation time of the first branch"),
-        Parameter("g_2", "-", 0.0, 2.0, "uniform", "stress of the second branch, over that at rest"),
+        Parameter("g_2", "-", 0.0, 2.0, "uniform", "stress of the second branch, over that in the long run"),
         Parameter("tau_2", "s", 15.0, 300.0, "log-uniform", "relaxation time of the second branch"),
     ),
     neutral={"g_1": 0.0, "tau_1": 2.0, "g_2": 0.0, "tau_2": 60.0},
     statement=lambda v: (
         f"The solid itself relaxes: stretched at once it pulls {100 * (v['g_1'] + v['g_2']):.0f} % harder "
-        f"than at rest, of which {100 * v['g_1']:.0f} % fade within {number(v['tau_1'], 2)} s and "
-        f"{100 * v['g_2']:.0f} % within {number(v['tau_2'], 2)} s."
+        f"than in the long run; {100 * v['g_1']:.0f} % of the long-run force fade with a time constant of "
+        f"{number(v['tau_1'], 2)} s, {100 * v['g_2']:.0f} % with one of {number(v['tau_2'], 2)} s."
     ),
     group=("solid-viscoelasticity", "strain-dependent-permeability", "friction-creep"),
     act=Tissue(bind, estimate),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayeskin.mismatch.search import ONLY_WITH
+from bayeskin.mechanisms import Mechanism, without_one
 from bayeskin.types import Array
 
 
@@ -32,12 +32,15 @@ class Contribution:
 Force = Callable[[tuple[Sequence[str], Mapping[str, float]]], Array | str]  # of a set at values: (m,)
 
 
-def contributions(names: Sequence[str], theta: Mapping[str, float], force: Force) -> list[Contribution]:
+def contributions(
+    names: Sequence[str], theta: Mapping[str, float], force: Force, known: Mapping[str, Mechanism]
+) -> list[Contribution]:
     """Of each mechanism of a set at its values, the largest first; none where a force cannot be had."""
     whole, parts = force((names, theta)), []
     for name in names:
-        along = tuple(other for other in names if ONLY_WITH.get(other) == name)
-        without = force(([other for other in names if other not in (name, *along)], theta))
+        rest = without_one(names, name, known)
+        without = force((rest, theta))
         if not isinstance(whole, str) and not isinstance(without, str):
+            along = tuple(other for other in names if other not in (name, *rest))
             parts.append(Contribution(name, along, whole - without))
     return sorted(parts, key=lambda part: -part.size_n)

@@ -13,13 +13,14 @@ whose moment falls between two bins; a bound near by), both evidence and covaria
 
 The noise of a diagnosis is what an instrument does from moment to moment: its sd is bounded by what the
 recording shows within bins, and it forgets within seconds. What is larger or lasts longer is for physics to
-explain; noise that could take it up would leave nothing to find.
+explain; noise that could take it up would leave nothing to find. So swings of the force that are slower than
+a second, as a breath's, are not to pass for noise within bins.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -33,6 +34,7 @@ from bayeskin.inference.straighten import Shear
 from bayeskin.types import Array, BinnedForce, ParameterSpace
 
 NOISE_SHARE = 1.5  # sd of the noise beyond that, at most, of the median sd of a bin's own mean
+QUICK_S, QUICK_TIMES = 1.0, 2.5  # that sd is at most so many times what noise quicker than this makes it
 LONGEST_S = 2.0  # of the noise's memory
 FEWEST_TAILS = 50.0  # of the tail index: nearly normal, since spikes are gone from robust means of bins
 STIFFEST_BELOW = 2.0  # the subcutis over the cutis: on a stiffer one a cutis folds, and fat is the softer
@@ -45,6 +47,25 @@ NEAREST = 8  # trials that are weighed for each that is climbed from
 REDRAWN = 1  # times that the parameters of a part are drawn anew, about the best so far
 FIRST_ROUNDS, ROUNDS = 6, 25  # of every climb, and of the one that is then ahead
 EDGE = 1e-6  # of the unit cube: on a bound
+
+
+def without_swings(binned: BinnedForce, quick_n2: Array) -> BinnedForce:
+    """Bins whose means have no more noise, over each kind of phase, than is quick.
+
+    They stay as they are where most have little that is slower.
+
+    quick_n2 (m,) : variance of the means by noise that is quicker than `QUICK_S`
+    """
+    variance, kinds = binned.variance_n2.copy(), np.array([binned.phases[i].kind for i in binned.phase])
+
+    def share(own: NDArray[np.bool_]) -> float:
+        usual, quick = float(np.median(variance[own])), float(np.median(quick_n2[own]))
+        return min(1.0, QUICK_TIMES**2 * quick / usual) if usual > 0.0 else 1.0
+
+    if share(np.full(len(kinds), True)) < 1.0:
+        for own in (kinds == kind for kind in np.unique(kinds)):
+            variance[own] *= share(own)
+    return replace(binned, variance_n2=variance)
 
 
 def instrument_noise(binned: BinnedForce) -> NoisePriors:

@@ -19,6 +19,7 @@ from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.noise_model import innovations
 from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun, Sure
+from bayeskin.mismatch.fit import Fit
 from bayeskin.types import Array, ParameterSpace, Surrogate
 
 TRUST, SMALLEST, LARGEST = 0.1, 0.005, 0.4  # of the prior's width, either side
@@ -104,6 +105,13 @@ def fit_full(
             break
     assert best is not None
     return best, CorrectedSurrogate(surrogate, runs, inexact, COMMON if several else 0.0)
+
+
+def at_run(found: Fit, full: FullFit) -> Fit:
+    """A fit by a surrogate that is sure, moved to the best run, with the noise that suits it."""
+    local = found.log_posterior
+    vector, latent = _with_noise(local, full.theta)
+    return replace(found, theta=local.named(local.from_sampling(vector)), latent=latent)
 
 
 def _excess(local: LogPosterior, theta: Mapping[str, float], force_n: Array) -> float:

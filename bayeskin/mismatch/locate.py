@@ -1,7 +1,7 @@
 """Where a recording leaves what the calibrated model allows: windows, the error of the whole search held.
 
 What is allowed is the residual that noise alone leaves after a fit: draws of the noise, with its parameters
-of a fit that takes no mismatch for noise, less what parameters and the surrogate's error take up of each;
+of a fit that takes no mismatch for noise, less what parameters and the errors allowed for take up of each;
 and, of any window's mean, `MODEL_ERROR` of the force's range, which mesh and time steps leave of it beyond
 what is allowed for (`discretised`; docs/discretisation.md: 0.02 and 0.04 %, RMS), or `MESH_ERROR`, which
 they leave beside a factor alone (0.10 %, there), where no shape of a mesh's error is allowed for. Mean
@@ -12,7 +12,7 @@ of draws; the largest over all windows has its distribution from the draws thems
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -68,14 +68,16 @@ def model_error(log_posterior: LogPosterior) -> float:
 
 
 def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
-    """Windows in which the recording differs from the model at `found`.
+    """Windows in which the recording differs from the model at `found`, or at another point as near by.
 
-    `noise` holds the noise parameters among its values: those of a fit that takes no mismatch for noise.
+    A residual is tested as draws of noise are: less what small changes of the parameters take up of it, so
+    that `found` need not be the best there is. `noise` holds the noise parameters among its values: those of
+    a fit that takes no mismatch for noise.
     """
     log_posterior, rng = found.log_posterior, np.random.default_rng(seed)
     chain = log_posterior.chain
     residual = chain.force_n - found.force_n[chain.bins]
-    spread = _allowed(found, noise, seed, rng)
+    spread, refitted = _allowed(found, noise, seed, rng)
     spans = _spans(log_posterior.binned.phase[chain.bins])
     error_n = model_error(log_posterior)
     scale = np.array([np.hypot(_means(spread, *span).std(), error_n) for span in spans])
@@ -83,17 +85,18 @@ def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
     for span, sd in zip(spans, scale, strict=True):
         centred = _means(spread, *span)
         tall = np.maximum(tall, np.abs(centred - centred.mean()) / sd)
-    z = np.array([_means(residual[None], *span)[0] for span in spans]) / scale
+    tested = refitted(residual[None])
+    z = np.array([_means(tested, *span)[0] for span in spans]) / scale
     windows = []
     for a, b in _chosen(spans, z, float(np.quantile(tall, 1.0 - LEVEL))):
-        mean = float(residual[a:b].mean())
+        mean, left = float(residual[a:b].mean()), float(tested[0, a:b].mean())
         sd = float(np.hypot(_means(spread, a, b).std(), error_n))
         phase = log_posterior.binned.phases[log_posterior.binned.phase[chain.bins[a]]]
         edges = log_posterior.binned.edges_s
         windows.append(
             Window(
                 float(edges[chain.bins[a]]), float(edges[chain.bins[b - 1] + 1]),
-                phase.kind, phase.cycle, mean, _chance(tall, abs(mean) / sd),
+                phase.kind, phase.cycle, mean, _chance(tall, abs(left) / sd),
             )
         )  # fmt: skip
     chance = _chance(tall, float(np.abs(z).max(initial=0.0)))
@@ -113,8 +116,11 @@ def _chance(tall: Array, height: float) -> float:
     return float(TAIL * np.exp(-(height**2 - edge**2) / scale))
 
 
-def _allowed(found: Fit, noise: Mapping[str, float], seed: int, rng: np.random.Generator) -> Array:
-    """Draws (n, k) of the residual that noise, parameters and what the surrogate leaves open allow."""
+def _allowed(
+    found: Fit, noise: Mapping[str, float], seed: int, rng: np.random.Generator
+) -> tuple[Array, Callable[[Array], Array]]:
+    """Draws (n, k) of the residual that noise, parameters and what the surrogate leaves open allow; and what
+    is left of residuals (n, k) when parameters have taken up what they can, as of the draws."""
     log_posterior, chain = found.log_posterior, found.log_posterior.chain
     theta = found.draws(DRAWS, seed)
     columns = log_posterior.split(theta)[1].copy()
@@ -130,8 +136,12 @@ def _allowed(found: Fit, noise: Mapping[str, float], seed: int, rng: np.random.G
     prior = np.concatenate([np.full(design.shape[1] - best.factor.shape[2], PRIOR_PRECISION),
                             np.ones(best.factor.shape[2])])  # fmt: skip
     normal = (design * weight[:, None]).T @ design + np.diag(prior)
-    taken = (design @ np.linalg.solve(normal, (design * weight[:, None]).T @ drawn.T)).T
-    return np.asarray(drawn - taken)
+
+    def refitted(residual: Array) -> Array:
+        taken = design @ np.linalg.solve(normal, (design * weight[:, None]).T @ residual.T)
+        return np.asarray(residual - taken.T)
+
+    return refitted(drawn), refitted
 
 
 def _slopes(found: Fit) -> Array:

@@ -2,7 +2,8 @@
 
 A set's weight is its evidence times the prior of its size, every mechanism being there with the probability
 `PRIOR`. A set does not count in which the surrogate's error exceeds half of what some mechanism adds, and
-the noise: far from the noise an uncertain surrogate explains much by its own error.
+the noise: far from the noise an uncertain surrogate explains much by its own error. Nor does one that the
+samples between which bins take means refute.
 
 In each step the others are ordered by what they promise beside those taken (a score test), and the most
 promising are tried; then each taken one is left out again, so that what a later one has made needless goes.
@@ -28,7 +29,7 @@ import numpy as np
 
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.straighten import find_shear
-from bayeskin.mechanisms import Mechanism
+from bayeskin.mechanisms import Mechanism, with_one, without_one
 from bayeskin.mismatch.fit import Fit, fit, fit_base, promised
 from bayeskin.types import Array
 
@@ -40,7 +41,6 @@ EXCHANGES = 1  # mechanisms that are tried in another's place
 GAIN = 1.0  # nats: less is no reason to go on from the same set
 AT_BOUND = 0.999  # of the noise's range
 UNSURE = 0.5  # of what a mechanism adds, RMS: sd of the surrogate's error in it
-ONLY_WITH = {"friction-creep": "device-friction"}
 
 Build = Callable[[Sequence[str]], LogPosterior]  # the posterior with a set of mechanisms
 Progress = Callable[[float, str], None]
@@ -99,14 +99,16 @@ def search(
     done: Sequence[Made] = (),
     on_fit: Callable[[Made], None] | None = None,
     another: Callable[[], Fit | None] = lambda: None,
+    refuted: Callable[[Fit], bool] = lambda one: False,
 ) -> Search:
     """Forward from the fit without any mechanism, then backward.
 
     done : what a search that was stopped had made, in order, which is not made again
     on_fit : is told each new fit
     another : the best of another search, on a part of the recording say; asked for where much is left
+    refuted : whether something else that is known of the recording speaks against a fit
     """
-    forward = _Forward(build, known, seed, progress or (lambda share, note: None), done, on_fit)
+    forward = _Forward(build, known, seed, progress or (lambda share, note: None), done, on_fit, refuted)
     found = forward.found
     forward.path(forward.base(), "path 1")
     singles = sorted((one for one in found.fits.values() if len(one.names) == 1), key=weight, reverse=True)
@@ -129,11 +131,11 @@ class _Forward:
 
     def __init__(
         self, build: Build, known: Mapping[str, Mechanism], seed: int, progress: Progress,
-        done: Sequence[Made], on_fit: Callable[[Made], None] | None,
+        done: Sequence[Made], on_fit: Callable[[Made], None] | None, refuted: Callable[[Fit], bool],
     ) -> None:  # fmt: skip
         self.found = Search()
         self._build, self._known, self._seed = build, known, seed
-        self._progress, self._on_fit = progress, on_fit
+        self._progress, self._on_fit, self._refuted = progress, on_fit, refuted
         self._made = {made.fit.names: [m for m in done if m.fit.names == made.fit.names] for made in done}
         self._alone = build(())
         self._straight = find_shear(self._alone)
@@ -151,7 +153,7 @@ class _Forward:
         current = None
         while ahead is not current:
             current = ahead
-            while len(current.names) > 1 and (leaner := _leaner(current, self.tried)) is not None:
+            while len(current.names) > 1 and (leaner := self._leaner(current)) is not None:
                 current = leaner
             ahead = current
             if len(current.names) < MOST:
@@ -187,7 +189,7 @@ class _Forward:
                 made = self._made[key].pop(0)
             else:
                 one = make()
-                made = Made(one, sure(one, self._build))
+                made = Made(one, sure(one, self._build, self._known) and not self._refuted(one))
                 if self._on_fit:
                     self._on_fit(made)
             self.found.add(made)
@@ -201,7 +203,7 @@ class _Forward:
         for count, (name, names) in enumerate(tries):
             one = self.tried(names, current, count < SHORTLIST)
             fits += [] if one is None else [one]
-            nats = "unsure" if one is None else f"{one.log_evidence - current.log_evidence:+.1f} nats"
+            nats = "does not count" if one is None else f"{one.log_evidence - current.log_evidence:+.1f} nats"
             self._progress((count + 1) / len(tries), f"{label}: {name}: {nats}")
         return max(fits, key=weight)
 
@@ -209,7 +211,7 @@ class _Forward:
         """The best set that is reached by searching for each mechanism anew, and for another in its place."""
         best = current
         for count, name in enumerate(current.names):
-            if name in best.names and (rest := self.tried(_without(best.names, name), best)) is not None:
+            if name in best.names and (rest := self._leaving(best, name)) is not None:
                 fits = [self.tried(best.names, rest, again=True)]
                 others = self._by_promise(rest, best.names)[:EXCHANGES]
                 fits += [self.tried(names, rest) for _, names in others]
@@ -218,9 +220,19 @@ class _Forward:
             self._progress((count + 1) / len(current.names), f"{label}, {name} anew: {gain:+.1f} nats")
         return best if weight(best) > weight(current) + GAIN else current
 
+    def _leaving(self, best: Fit, name: str) -> Fit | None:
+        """The set with one mechanism fewer."""
+        return self.tried(without_one(best.names, name, self._known), best)
+
+    def _leaner(self, best: Fit) -> Fit | None:
+        """The best of the sets with one mechanism fewer, where that has more weight."""
+        fewer = [one for name in best.names if (one := self._leaving(best, name)) is not None]
+        leanest = max(fewer, key=weight, default=best)
+        return leanest if weight(leanest) > weight(best) else None
+
     def _by_promise(self, current: Fit, but: Sequence[str]) -> list[tuple[str, tuple[str, ...]]]:
         """All mechanisms but some, and the set with each, the most promising beside `current` first."""
-        sets = [(name, _with(current.names, name)) for name in self._known if name not in but]
+        sets = [(name, with_one(current.names, name, self._known)) for name in self._known if name not in but]
         promises = {name: self._promised(names, current) for name, names in sets}
         return sorted(sets, key=lambda one: -promises[one[0]])
 
@@ -248,12 +260,7 @@ def _new(
     return [part for name in names if name not in before for part in known[name].whole_or_parts]
 
 
-def _with(names: Sequence[str], name: str) -> tuple[str, ...]:
-    """A set with one mechanism more, and the one without which that does nothing."""
-    return tuple(sorted({*names, name, *([ONLY_WITH[name]] if name in ONLY_WITH else [])}))
-
-
-def sure(found: Fit, build: Build) -> bool:
+def sure(found: Fit, build: Build, known: Mapping[str, Mechanism]) -> bool:
     """Whether the surrogate knows of each mechanism at least half of what it adds, or all but the noise.
 
     Not where all that was tried is impossible, as skins may be that were well with a mechanism more.
@@ -264,7 +271,7 @@ def sure(found: Fit, build: Build) -> bool:
     noise_n = max(found.theta[name] for name in whole.names if name.startswith("sd_"))
     mean, variance = _predicted(whole, found)
     for name in found.names:
-        without = build(_without(found.names, name))
+        without = build(without_one(found.names, name, known))
         its_mean, its_variance = _predicted(without, found)
         added = float(np.sqrt(np.mean((mean - its_mean) ** 2)))
         unsure = float(np.sqrt(max(float(np.mean(variance - its_variance)), 0.0)))
@@ -278,16 +285,3 @@ def _predicted(log_posterior: LogPosterior, found: Fit) -> tuple[Array, Array]:
     values = log_posterior.from_sampling(log_posterior.vector(found.theta))
     prediction = log_posterior.predict(values)
     return prediction.mean[0], prediction.sd()[0] ** 2
-
-
-def _without(names: Sequence[str], name: str) -> list[str]:
-    """A set with one mechanism fewer, and without those that do nothing without it."""
-    return [other for other in names if name not in (other, ONLY_WITH.get(other))]
-
-
-def _leaner(best: Fit, tried: Callable[[Sequence[str], Fit], Fit | None]) -> Fit | None:
-    """The best of the sets with one mechanism fewer, where that has more weight."""
-    sets = [_without(best.names, name) for name in best.names]
-    fewer = [one for names in sets if (one := tried(names, best)) is not None]
-    leanest = max(fewer, key=weight, default=best)
-    return leanest if weight(leanest) > weight(best) else None

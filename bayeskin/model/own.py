@@ -13,6 +13,7 @@ import importlib.util
 import json
 import sys
 import time
+import traceback
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -43,8 +44,7 @@ def identity(forward: str) -> str:
 def simulate_own(forward: str, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
     """A run of the model that `forward` names.
 
-    Raises InputError where it cannot be found, Unavailable where the server does not answer, and whatever the
-    function raises.
+    Raises InputError where it cannot be found, Unavailable where the server does not answer.
     """
     if _is_url(forward):
         return simulate_server(forward, motion, theta)
@@ -56,17 +56,22 @@ def simulate_with(
 ) -> Simulation:
     """A run of any function ``force(theta, time_s, displacement_m)``, as the full model's runs look.
 
-    A force that is not finite is a Simulation that failed. Raises InputError for a result of another shape
-    than that of time_s (n,).
+    A force that is not finite, or a function that raises, is a Simulation that failed. Raises InputError for
+    a result of another shape than that of time_s (n,).
     """
-    started, time_s = time.perf_counter(), _times(motion)
-    found = np.asarray(force(dict(theta), time_s, motion.at(time_s)), dtype=float)
-    return _simulation(motion, theta, time_s, found, model_hash, time.perf_counter() - started)
+    started, time_s, message = time.perf_counter(), motion.times(STEP_S), ""
+    try:
+        found = np.asarray(force(dict(theta), time_s, motion.at(time_s)), dtype=float)
+    except InputError:
+        raise
+    except Exception as error:  # of somebody's function: it can be any
+        found, message = np.full(len(time_s), np.nan), _told(error)
+    return _simulation(motion, theta, time_s, found, model_hash, time.perf_counter() - started, message)
 
 
 def simulate_server(url: str, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
     """A run of the model of a UM-Bridge server; one that the server refuses is a Simulation that failed."""
-    started, time_s, client = time.perf_counter(), _times(motion), Client(url)
+    started, time_s, client = time.perf_counter(), motion.times(STEP_S), Client(url)
     config = {"protocol": {k: v.tolist() for k, v in vars(motion).items()}, "times_s": time_s.tolist()}
     try:
         name = client.name()
@@ -81,11 +86,6 @@ def simulate_server(url: str, motion: PadMotion, theta: Mapping[str, float]) -> 
         force_n, message = np.full(len(time_s), np.nan), f"the server: {refusal}"
     seconds = time.perf_counter() - started
     return _simulation(motion, theta, time_s, force_n, identity(url), seconds, message)
-
-
-def _times(motion: PadMotion) -> Array:
-    """Where the force is asked for: steps of `STEP_S`, and the protocol's corners."""
-    return np.union1d(np.arange(0.0, motion.time_s[-1], STEP_S), motion.time_s)
 
 
 def _simulation(
@@ -113,6 +113,13 @@ def _simulation(
         stats={"seconds": seconds, "peak_force_n": float(np.abs(force_n).max())},
         model_hash=model_hash,
     )
+
+
+def _told(error: Exception) -> str:
+    """What somebody's function raised and where, in one line."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    said, place = " ".join(str(error).split()), f"{Path(last.filename).name}, line {last.lineno}"
+    return f"{type(error).__name__}: {said} ({place})"
 
 
 def _is_url(forward: str) -> bool:

@@ -106,12 +106,7 @@ def _try_once(run: Run, spec: ModelSpec, motion: PadMotion, space: ParameterSpac
     """A model of one's own in the middle of the box. Raises InputError where it cannot be used at all."""
     run.reporter.log(f"one run of {spec.forward}")
     middle = dict(zip(space.names, space.from_unit([0.5] * space.dim).tolist(), strict=True))
-    try:
-        found = simulate(spec, motion, middle)
-    except InputError:
-        raise
-    except Exception as error:  # of somebody's function: it can be any
-        raise InputError(spec.forward, f"{type(error).__name__}: {error}", f"a force at {middle}") from None
+    found = simulate(spec, motion, middle)
     if found.status != "ok":
         raise InputError(spec.forward, found.message, f"a force at {middle}")
 

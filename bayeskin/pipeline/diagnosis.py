@@ -17,6 +17,7 @@ import bayeskin
 from bayeskin import inference
 from bayeskin.errors import InputError
 from bayeskin.inference.noise_model import bins_in_windows
+from bayeskin.mechanisms import with_one
 from bayeskin.mismatch.fit import Fit, restored, stored
 from bayeskin.mismatch.full_fit import FullFit
 from bayeskin.mismatch.locate import Located
@@ -88,7 +89,14 @@ def _work(run: Run) -> Mapping[str, Any]:
         ],
         "unexplained": None if remainder is None else unexplained(remainder),
         "candidates": candidates(whole, bench.known),
-        "unsure": sorted({name for names in whole.unsure for name in names if len(names) == 1}),
+        "unsure": [
+            name
+            for name in bench.known
+            if (one := whole.unsure.get(with_one((), name, bench.known))) and not bench.refuted(one)
+        ],
+        "refuted": sorted(
+            {name for one in whole.unsure.values() for name in bench.refuted(one)} - {*whole.best.names}
+        ),
         "fit": {
             "before": _fit(bench, whole.base, before, begun.base if begun else None, held_out[0], split_s),
             "after": _fit(bench, whole.best, after, begun.best if begun else None, held_out[-1], split_s),
@@ -157,7 +165,7 @@ def _search_file(bench: Workbench, build: Build) -> Path:
     identity = sha256_of(
         [bayeskin.__version__, bench.run.config.seed, build(()).identity, repr(build(()).noise_priors),
          [repr(mechanism.parameters) for mechanism in bench.known.values()],
-         [[effect.part, dict(effect.surrogate.provenance)] for effect in bench.effects]]
+         [[effect.part, dict(effect.surrogate.provenance)] for effect in bench.effects], vars(bench.jumps)]
     )  # fmt: skip
     return bench.run.folder / "searches" / f"{identity[:16]}-made.jsonl"
 
@@ -180,6 +188,7 @@ def _searched(
         return search(
             build, bench.known, run.config.seed,
             lambda share, note: run.reporter.progress(label, share, note), done, on_fit, another,
+            lambda one: bool(bench.refuted(one)),
         )  # fmt: skip
 
 

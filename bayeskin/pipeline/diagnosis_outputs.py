@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bayeskin import report
-from bayeskin.mechanisms import Mechanism
+from bayeskin.mechanisms import Mechanism, with_one
 from bayeskin.mismatch.contributions import Contribution
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.full_fit import FullFit
@@ -60,10 +60,11 @@ def mechanism(
 
 
 def candidates(found: Search, known: Mapping[str, Mechanism]) -> list[dict[str, Any]]:
-    """Each mechanism added to the base alone: gain of log evidence, and the standard error of that sum."""
+    """Each mechanism added to the base alone, or with those that it needs: gain of log evidence, and the
+    standard error of that sum. None of a mechanism of which the surrogate is unsure."""
     rows = []
     for name in known:
-        one = next((f for f in found.fits.values() if name in f.names and len(f.names) <= 2), None)
+        one = found.fits.get(with_one((), name, known))
         if one is None:
             continue
         rows.append(
@@ -158,6 +159,8 @@ def in_words(answer: Mapping[str, Any]) -> str:
     lines += [f"candidates alone, log evidence gained: {best}"]
     if answer["unsure"]:
         lines.append(f"the surrogate is too unsure here of: {', '.join(answer['unsure'])}")
+    if answer.get("refuted"):
+        lines.append(f"the recording's samples show nothing of: {', '.join(answer['refuted'])}")
     lines.append(f"outputs in {answer['folder']}")
     return "\n".join(lines)
 

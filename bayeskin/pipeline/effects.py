@@ -2,8 +2,9 @@
 
 Each part of a mechanism is run with and without at the same base parameters, the other parts neutral: at
 many points on the coarsest bricks, and at some of the base's design in the full model itself, which correct
-what the coarse runs have taught. Of a pair of parts, run together and each alone, what they do beyond what
-their surrogates make of both is learnt.
+what the coarse runs have taught. Of the base's design those points are left out whose subcutis a diagnosis
+takes for too stiff, or at which a coarse run's force is far from any that the recording may have. Of a pair,
+run together and each alone, what both do beyond what their surrogates make of them is learnt.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayeskin import storage
 from bayeskin.design import Wave, fine_wave, next_wave, sobol_points
@@ -23,6 +25,7 @@ from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, catalogue, laws
 from bayeskin.mechanisms.binned import estimate_of, estimates_by_name
 from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.mismatch.fit import soft_on_stiff
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline.crew import crew
 from bayeskin.pipeline.design import fitted_bins, noise_floor_n, rows_of, tell
@@ -59,6 +62,7 @@ from bayeskin.types import (
 )
 from bayeskin.workers import Map
 
+LARGEST = 3.0  # force of a coarse run, of the recording's; beyond, runs with fibres can take minutes
 WEAKEST = 0.1  # of a strength's prior: effects below are straight lines to nothing, and lost in noise
 
 
@@ -205,13 +209,20 @@ def _learn(run: Run, parts: Sequence[Part]) -> dict[str, Any]:
     coarse_spec = spec.coarsest
     wave = coarse_wave(base.space, config.effects.coarse, config.seed)
     some = [[], *([part] for part in parts)] if len(parts) > 1 else [[]]
+    likely = replace(base, ok=base.ok & ~soft_on_stiff(base.space, base.theta))
     few = {
         name_of(these): effect_wave(
-            these, base, config.effects.points, config.effects.held_out, config.seed
+            these, likely, config.effects.points, config.effects.held_out, config.seed
         ) for these in [*some, parts]
     }  # fmt: skip
     with crew(run) as run_all:
         make = partial(_runs, run, run_all, base.edges_s)
+        tried = make("coarse, at the full model's", coarse_spec, [few[name]], parts)
+        kept = _as_recorded(run, tried)
+        run.reporter.log(f"{name}: {kept.sum()} of these points have a force like the recording's")
+        if not kept.any():
+            return _not_learnt(run, name, "no coarse run has a force like the recording's")
+        few = {one: _rows(its, kept) for one, its in few.items()}
         *many, coarse = [
             make("coarse", coarse_spec, [nested(with_own(these, wave), few[name_of(these)])], these)
             for these in [*some, parts]
@@ -239,6 +250,17 @@ def _learn(run: Run, parts: Sequence[Part]) -> dict[str, Any]:
     save_surrogate(run.at("effects", f"{name}.h5"), effect.surrogate, manifest)
     run.reporter.log(in_words(name, said))
     return said
+
+
+def _as_recorded(run: Run, design: Design) -> NDArray[np.bool_]:
+    """Which runs (n,) have a force that the recording may have, up to `LARGEST` times its own."""
+    binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
+    largest_n = LARGEST * float(np.nanmax(np.abs(binned.force_n)))
+    return design.ok & (np.abs(np.nan_to_num(design.force_n)).max(axis=1) <= largest_n)
+
+
+def _rows(wave: Wave, kept: NDArray[np.bool_]) -> Wave:
+    return replace(wave, theta=wave.theta[kept], held_out=wave.held_out[kept])
 
 
 def plausible_wave(run: Run, effect: Effect) -> Wave:

@@ -41,7 +41,8 @@ class _FullModel:
             self.spec, self.motion, theta, lambda share: tell(label, share),
             gradients=logarithms(theta) if self.gradients else None,
         )  # fmt: skip
-        storage.save(kept, simulation)
+        if simulation.status == "ok":  # what failed may be mended meanwhile
+            storage.save(kept, simulation)
         return simulation
 
 

@@ -14,6 +14,7 @@ from bayeskin.recordings import (
     NoiseAnalysis,
     analyse,
     bin_recording,
+    covered_s,
     describe_json,
     idealised_motion,
     motion_of,
@@ -52,8 +53,7 @@ def prepared(run: Run, recording: Recording) -> Prepared:
     phases = segment(recording)
     analysis = analyse(recording, phases)
     motion = pad_motion(run.config.model.observation, recording, phases, run.config.recording.protocol)
-    covered_s = min(recording.time_s[-1], motion.time_s[-1])
-    edges_s = uniform_edges(float(covered_s), run.config.fit.bin_width_s)
+    edges_s = uniform_edges(covered_s(recording, motion), run.config.fit.bin_width_s)
     return Prepared(phases, analysis, motion, bin_recording(recording, phases, edges_s, analysis))
 
 

@@ -18,7 +18,7 @@ from bayeskin.pipeline.engine import Reporter, Run, open_run
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.recording import pad_motion
 from bayeskin.pipeline.reported import reported
-from bayeskin.recordings import read_recording, segment, uniform_edges
+from bayeskin.recordings import covered_s, read_recording, segment, uniform_edges
 from bayeskin.shipped import shipped
 from bayeskin.types import Array, PadMotion, Parameter
 from bayeskin.umbridge import Refused, Vectors, server
@@ -130,8 +130,7 @@ def _served(run: Run) -> ServedModel:
     spec, space = model_spec(run), parameter_space(run.config, run.config_path)
     recording = read_recording(run.beside(run.config.recording.file))
     motion = pad_motion(spec.observation, recording, segment(recording), run.config.recording.protocol)
-    covered_s = float(min(recording.time_s[-1], motion.time_s[-1]))
-    edges_s = uniform_edges(covered_s, run.config.fit.bin_width_s)
+    edges_s = uniform_edges(covered_s(recording, motion), run.config.fit.bin_width_s)
     return ServedModel(spec, space.parameters, Asked(motion, edges_s, None, ()))
 
 

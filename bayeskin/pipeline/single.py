@@ -31,7 +31,6 @@ from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, Parameter, ParameterSpace, Simulation
 from bayeskin.words import number
 
-SAME_S = 1e-6  # times so near each other are one
 REPORTED_EVERY_S = 0.1  # with mechanisms, whose force changes within a step of the model
 
 
@@ -159,9 +158,7 @@ def _reported(
     """The same run as an instrument with `mechanisms` reports it, at more times than the model's steps."""
     if not mechanisms:
         return simulation
-    every = np.arange(0.0, simulation.time_s[-1], REPORTED_EVERY_S)
-    apart = np.abs(every[:, None] - simulation.time_s).min(axis=1) > SAME_S
-    time_s = np.union1d(simulation.time_s, every[apart])
+    time_s = motion.times(REPORTED_EVERY_S, simulation.time_s)
     force_n = reported(simulation, mechanisms, values, motion)(time_s)[0]
     return replace(
         simulation,

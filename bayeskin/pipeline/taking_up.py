@@ -3,8 +3,9 @@
 A first run of the model's own mesh shows by how much the coarsest bricks are off. These, whose runs are quick
 and carry their derivatives, are fitted with that difference added, then the model's own mesh with their
 derivatives. Without mechanisms the slopes of the base's surrogate come first, and last where they are good
-enough. Sampled, located and taken apart is the posterior of the surrogate corrected by the runs of the
-model's own mesh. The article's formulation and models of one's own keep the surrogate's.
+enough. Sampled and taken apart is the posterior of the surrogate corrected by the runs of the model's own
+mesh; located is the mismatch beside the best of these runs. The article's formulation and models of one's own
+keep the surrogate's.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun, Sure
 from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
 from bayeskin.mismatch.fit import Fit, fit_near, restored, stored
 from bayeskin.mismatch.form import Form, propose_form
-from bayeskin.mismatch.full_fit import FullFit, fit_full
+from bayeskin.mismatch.full_fit import FullFit, at_run, fit_full
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import weight
@@ -101,11 +102,12 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
     shear = straight.among(alone.names, found.log_posterior.names) if straight else None
     full, corrected = _full(bench, found)
     force: Force = partial(_surrogate_force, bench)
-    full_weight, sure = None, found
+    full_weight, sure, there = None, found, found
     if corrected is not None and isinstance(full, FullFit):
         found = fit_near(found.names, _about(bench, found, corrected), full.theta, shear)
-        # An error that is let go takes up what is missing, which no phase left out would show.
+        # An error that is let go takes up what is missing, which no phase left out and no window would show.
         sure = replace(found, log_posterior=_about(bench, found, Sure(corrected)))
+        there = at_run(sure, full)
         # Mechanisms have to be worth what a run has shown, the model without them what is promised.
         full_weight = weight(found) + (full.value - found.value if found.names else 0.0)
         force = _coarse(bench)
@@ -114,8 +116,8 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
     bands = inference.bands(found.log_posterior, some, np.random.default_rng(seed))
     return TakenUp(
         full, full_weight, draws, inference.coverage(bench.binned, *bands.interval(0.9)),
-        _left_out(sure, shear), locate(found, noise, seed),
-        tuple(contributions(found.names, found.theta, force)),
+        _left_out(sure, shear), locate(there, noise, seed),
+        tuple(contributions(found.names, found.theta, force, bench.known)),
         Remainder(discrepancy(found, bench.motion), propose_form(found, bench.motion, seed)),
     )  # fmt: skip
 

@@ -79,7 +79,9 @@ def _draw(
     testing = held_out.testing
     truth, prediction = held_out.force_n[testing], surrogate.predict(held_out.theta[testing])
     noise_sd_n = np.sqrt(binned.variance_n2)
-    errors = _errors_by_wave(run, design, binned, held_out, prediction.mean)
+    scale = np.sqrt(np.mean(truth**2, axis=1))
+    means = [*_former(run, design, binned, held_out), prediction.mean]
+    errors = np.array([np.sqrt(np.mean((mean - truth) ** 2, axis=1)) / scale for mean in means])
     figure = report.figure_validation(
         design.edges_s, truth, prediction, noise_sd_n, errors, corrected=fine is not None
     )
@@ -91,21 +93,21 @@ def _draw(
     report.save_figure(figure, run.at("train", "prior_predictive"), caption(run))
 
 
-def _errors_by_wave(run: Run, design: Design, binned: BinnedForce, held_out: Design, last_n: Array) -> Array:
-    """Relative RMS error (waves, held-out points) of surrogates trained on the waves up to each.
+def _former(run: Run, design: Design, binned: BinnedForce, held_out: Design) -> list[Array]:
+    """What surrogates trained on the waves up to each but the last predict at held-out points, (n, m) each.
 
-    The last row is of `last_n`, the surrogate in use; held-out points of later waves count in all rows.
-    With a fine model's held-out points, the row before the last is of the uncorrected surrogate.
+    With a fine model's held-out points, the last is of the uncorrected surrogate, of all waves. NaN where
+    the surrogate was trained elsewhere.
     """
-    testing, waves = held_out.testing, np.unique(design.wave[design.ok])
-    truth, theta = held_out.force_n[testing], held_out.theta[held_out.testing]
-    rows = []
+    waves = np.unique(design.wave[design.ok])
+    theta, found = held_out.theta[held_out.testing], []
     for wave in waves[:-1] if held_out is design else waves:
-        early = design.wave <= wave
-        part = dataclasses.replace(design, ok=design.ok & early)
-        rows.append(trained(run, part, binned)[0].predict_mean(theta))
-    scale = np.sqrt(np.mean(truth**2, axis=1))
-    return np.array([np.sqrt(np.mean((mean - truth) ** 2, axis=1)) / scale for mean in [*rows, last_n]])
+        part = dataclasses.replace(design, ok=design.ok & (design.wave <= wave))
+        if run.config.surrogate.file is None:
+            found.append(trained(run, part, binned)[0].predict_mean(theta))
+        else:
+            found.append(np.full((len(theta), design.force_n.shape[1]), np.nan))
+    return found
 
 
 STAGE = Stage(

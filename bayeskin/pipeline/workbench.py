@@ -15,9 +15,16 @@ from bayeskin.config import Config, RecordingConfig, SurrogateConfig
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior
 from bayeskin.mechanisms import Mechanism, catalogue
-from bayeskin.mechanisms.mechanism import Instrument
+from bayeskin.mechanisms.mechanism import Instrument, Place
 from bayeskin.mismatch.discretised import CALIBRATION, Discretised
-from bayeskin.mismatch.fit import instrument_noise, soft_on_stiff, surrogate_limit
+from bayeskin.mismatch.fit import (
+    QUICK_S,
+    Fit,
+    instrument_noise,
+    soft_on_stiff,
+    surrogate_limit,
+    without_swings,
+)
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec
@@ -27,17 +34,21 @@ from bayeskin.pipeline.engine import Reporter, Run, open_run
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.shipping import shipped_for
 from bayeskin.pipeline.training import base_surrogate
-from bayeskin.recordings import read_recording, segment
+from bayeskin.recordings import analyse, bin_recording, jumps_of, read_recording, segment
 from bayeskin.surrogates import Effect, effects_among, with_effects
-from bayeskin.types import BinnedForce, PadMotion, Surrogate
+from bayeskin.types import BinnedForce, Jumps, PadMotion, Recording, Surrogate
 
 
 @dataclass(frozen=True)
 class Workbench:
-    """All that a search needs of a run: its bins and protocol, the base's surrogate, what is known."""
+    """All that a search needs of a run: its bins and protocol, the base's surrogate, what is known.
+
+    jumps : what the recording's samples allow its force to jump by
+    """
 
     run: Run
     binned: BinnedForce
+    jumps: Jumps
     motion: PadMotion
     base: Surrogate
     effects: tuple[Effect, ...]
@@ -47,6 +58,17 @@ class Workbench:
     def spec(self) -> ModelSpec:
         """The full model."""
         return model_spec(self.run)
+
+    def refuted(self, found: Fit) -> list[str]:
+        """Mechanisms of a fit that the samples it is of speak against; none beside a clock that is off."""
+        acts = {name: self.known[name].act for name in found.names}
+        instrument = {name: act for name, act in acts.items() if isinstance(act, Instrument)}
+        if any(act.place is Place.CLOCK for act in instrument.values()):
+            return []
+        values = {name: np.array([value]) for name, value in found.theta.items()}
+        jumps = self.jumps.until(self.binned.edges_s[found.log_posterior.chain.bins[-1] + 1])
+        return [name for name, act in instrument.items()
+                if act.refuted is not None and act.refuted(values, self.motion, jumps)[0]]  # fmt: skip
 
     def with_mesh_error(self, skin: Surrogate) -> Surrogate:
         """A surrogate that allows for what a finer mesh would change, where that is known, and for the load
@@ -94,9 +116,13 @@ def opened(source: Path, reporter: Reporter) -> Run:
 
 def workbench(run: Run) -> Workbench:
     """Of a run whose stages up to `train` are done."""
+    samples = storage.load(run.at("recording", "recording.h5"), Recording)
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
+    quick = bin_recording(samples, binned.phases, binned.edges_s, analyse(samples, binned.phases, QUICK_S))
+    binned, jumps = without_swings(binned, quick.variance_n2), jumps_of(samples, binned.phases)
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     effects = effects_of(run) if run.config.model.observation == "reaction" else []
     learnt = {effect.mechanisms[0] for effect in effects if len(effect.mechanisms) == 1}
     known = {n: m for n, m in catalogue().items() if isinstance(m.act, Instrument) or n in learnt}
-    return Workbench(run, binned, motion, base_surrogate(run), tuple(effects), known)
+    known = {name: m for name, m in known.items() if set(m.needs) <= set(known)}
+    return Workbench(run, binned, jumps, motion, base_surrogate(run), tuple(effects), known)

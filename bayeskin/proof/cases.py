@@ -44,7 +44,6 @@ SIZES = (1.0, 30.0)  # of the noise floor
 NEAR = 0.2  # of a logarithm: how near to its target a size is near enough
 LEAST_SHARE = 0.25  # of a pair's size, that each of the two should have
 BATCH, BATCHES, FITTED = 64, 8, 3  # draws at a time, how often, and how many of each are fitted
-NEEDS = {"friction-creep": "device-friction"}  # what a mechanism has nothing to act on without
 
 
 @dataclass(frozen=True)
@@ -82,8 +81,7 @@ def plans(seed: int, count: int) -> tuple[Plan, ...]:
         "nothing"
     ]
     for name in alone:
-        needed = (NEEDS[name],) if name in NEEDS else ()
-        chosen.append((name, "alone", (*needed, name), ""))
+        chosen.append((name, "alone", (*known[name].needs, name), ""))
     for pair in _pairs(rng, known, counts["pair"]):
         chosen.append((" + ".join(pair), "pair", pair, ""))
     for name in _cycled(rng, list(OUTSIDE), counts["outside"]):
@@ -119,7 +117,7 @@ def _cycled(rng: np.random.Generator, names: Sequence[str], count: int) -> list[
 def _pairs(rng: np.random.Generator, known: Mapping[str, Mechanism], count: int) -> list[tuple[str, str]]:
     """One that the full model solves and one that adds to its force, no look-alikes of each other."""
     solved = [n for n, m in known.items() if m.act.bind is not None]
-    adding = [n for n, m in known.items() if m.act.bind is None and n not in NEEDS]
+    adding = [n for n, m in known.items() if m.act.bind is None and not m.needs]
     found = []
     for first in _cycled(rng, solved, count):
         fitting = [n for n in adding if not set(known[n].group) & set(known[first].group)]

@@ -1,9 +1,16 @@
 """Recordings: read, cut into phases, their noise measured, binned, and turned into protocols."""
 
-from bayeskin.recordings.bins import bin_recording, uniform_edges
+from bayeskin.recordings.bins import bin_recording, covered_s, uniform_edges
 from bayeskin.recordings.describe import describe, describe_json
 from bayeskin.recordings.motion import idealised_motion, motion_of, recorded_motion
-from bayeskin.recordings.noise import NoiseAnalysis, PhaseNoise, analyse, phase_noise, summarise
+from bayeskin.recordings.noise import (
+    NoiseAnalysis,
+    PhaseNoise,
+    analyse,
+    jumps_of,
+    phase_noise,
+    summarise,
+)
 from bayeskin.recordings.read import read_recording
 from bayeskin.recordings.segment import resolution_m, segment
 
@@ -12,9 +19,11 @@ __all__ = [
     "PhaseNoise",
     "analyse",
     "bin_recording",
+    "covered_s",
     "describe",
     "describe_json",
     "idealised_motion",
+    "jumps_of",
     "motion_of",
     "phase_noise",
     "read_recording",

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bayeskin.errors import InputError
 from bayeskin.recordings.correlation import NoiseShape, weighted_covariance
 from bayeskin.recordings.noise import NoiseAnalysis, analyse
-from bayeskin.types import Array, BinnedForce, Phase, Recording
+from bayeskin.types import Array, BinnedForce, PadMotion, Phase, Recording
 
 MOST_BINS = 1_000_000
 
@@ -35,6 +35,15 @@ def uniform_edges(recording_or_end_s: Recording | float, width_s: float = 0.5) -
     return width_s * np.arange(int(end_s / width_s + 1e-6) + 1, dtype=float)
 
 
+def covered_s(recording: Recording, motion: PadMotion) -> float:
+    """Until when [s] samples stand for the force within a protocol: each for an interval, the last too."""
+    return float(min(recording.time_s[-1] + _interval_s(recording), motion.time_s[-1]))
+
+
+def _interval_s(recording: Recording) -> float:
+    return float(np.median(np.diff(recording.time_s)))
+
+
 def bin_recording(
     recording: Recording, phases: Sequence[Phase], edges_s: Array, analysis: NoiseAnalysis | None = None
 ) -> BinnedForce:
@@ -44,7 +53,8 @@ def bin_recording(
 
     Parameters
     ----------
-    edges_s : (m+1,) increasing, within the recording; every bin holds two samples at least
+    edges_s : (m+1,) increasing, within the recording or an interval after it, over which its last sample
+        stays; every bin holds two samples at least
     analysis : `analyse(recording, phases)`, where it is at hand already
 
     Raises
@@ -66,9 +76,10 @@ def _refuse_edges(recording: Recording, edges_s: Array) -> None:
     if edges_s.ndim != 1 or len(edges_s) < 2 or not np.all(np.diff(edges_s) > 0):
         raise InputError(where, "edges that do not increase", "at least two increasing times")
     slack = 1e-6 * (edges_s[1] - edges_s[0])
-    if edges_s[0] < time_s[0] - slack or edges_s[-1] > time_s[-1] + slack:
+    last_s = time_s[-1] + _interval_s(recording)
+    if edges_s[0] < time_s[0] - slack or edges_s[-1] > last_s + slack:
         found = f"{edges_s[0]:g} to {edges_s[-1]:g} s"
-        raise InputError(where, found, f"times within {time_s[0]:g} to {time_s[-1]:g} s")
+        raise InputError(where, found, f"times within {time_s[0]:g} to {last_s:g} s")
     counts = np.diff(np.searchsorted(time_s, edges_s - slack))
     if counts.min() < 2:
         thin = int(np.argmin(counts))
@@ -78,7 +89,7 @@ def _refuse_edges(recording: Recording, edges_s: Array) -> None:
 
 
 def _integral(time_s: Array, values: Array, edges_s: Array) -> Array:
-    """Mean over each bin, (m,), of the straight lines between samples (n,)."""
+    """Mean over each bin, (m,), of the straight lines between samples (n,), and of the last one after it."""
     origin = values.mean()  # keeps the running sum small, and its rounding with it
     y = values - origin
     sums = np.concatenate([[0.0], np.cumsum(0.5 * (y[1:] + y[:-1]) * np.diff(time_s))])
@@ -86,6 +97,8 @@ def _integral(time_s: Array, values: Array, edges_s: Array) -> Array:
     past = np.clip(edges_s - time_s[i], 0.0, None)
     slope = (y[i + 1] - y[i]) / (time_s[i + 1] - time_s[i])
     at_edges = sums[i] + y[i] * past + 0.5 * slope * past**2
+    after = edges_s > time_s[-1]
+    at_edges[after] = sums[-1] + y[-1] * (edges_s[after] - time_s[-1])
     return origin + np.diff(at_edges) / np.diff(edges_s)
 
 
@@ -109,7 +122,7 @@ def _noise_of_means(
     Where spikes were replaced, the white part is that of the samples that are left.
     """
     time_s = recording.time_s
-    interval_s = float(np.median(np.diff(time_s)))
+    interval_s = _interval_s(recording)
     middle = 0.5 * (edges_s[1:] + edges_s[:-1])
     sd = np.empty(len(middle))
     for i in np.unique(phase):

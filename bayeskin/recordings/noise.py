@@ -20,10 +20,10 @@ from bayeskin.recordings.correlation import (
     residual_windows,
 )
 from bayeskin.recordings.spikes import Despiked, despike
-from bayeskin.recordings.steps import Step, find_steps
-from bayeskin.types import Array, Phase, PhaseKind, Recording, _FreezesArrays
+from bayeskin.recordings.steps import Step, allowed_jumps, find_steps
+from bayeskin.types import Array, Jumps, Phase, PhaseKind, Recording, _FreezesArrays
 
-_WINDOW_S = 2.5  # over which the force under the noise is a parabola
+WINDOW_S = 2.5  # over which the force under the noise is a parabola
 _AFTER_BREAK_S = 1.0  # left out after a corner or step, where the force moves faster than that
 _LAG_S = 1.0
 _LEAST_WINDOW = 20  # samples
@@ -126,16 +126,31 @@ def summarise(analysis: NoiseAnalysis, phases: Sequence[Phase]) -> tuple[PhaseNo
     return tuple(out)
 
 
-def analyse(recording: Recording, phases: Sequence[Phase]) -> NoiseAnalysis:
-    """Spikes, correlation, local sd and steps; the second round knows the steps that the first one found."""
+def analyse(recording: Recording, phases: Sequence[Phase], window_s: float = WINDOW_S) -> NoiseAnalysis:
+    """Spikes, correlation, local sd and steps; the second round knows the steps that the first one found.
+
+    window_s : over which the force under the noise is a parabola, 20 samples at least; in a shorter one slow
+        swings of the force, which a long one takes for noise, are no noise either
+    """
     time_s = recording.time_s
     bounds = np.searchsorted(time_s, [*(p.start_s for p in phases), np.inf])
     bounds[0] = 0
-    first = _round(recording, phases, bounds, np.empty(0, dtype=np.int64))
+    first = _round(recording, phases, bounds, np.empty(0, dtype=np.int64), window_s)
     steps = _all_steps(time_s, first, phases)
     indices = np.searchsorted(time_s, [step.time_s for found in steps for step in found])
-    last = _round(recording, phases, bounds, indices) if len(indices) else first
+    last = _round(recording, phases, bounds, indices, window_s) if len(indices) else first
     return NoiseAnalysis(last.despiked, last.shapes, last.local, steps, bounds)
+
+
+def jumps_of(recording: Recording, phases: Sequence[Phase]) -> Jumps:
+    """What the samples of a recording allow its force to jump by within phases. Raises as `phase_noise`."""
+    analysis, found = analyse(recording, phases), []
+    for phase, local, (a, b) in zip(phases, analysis.local, pairwise(analysis.bounds), strict=True):
+        time_s, force_n = recording.time_s[a:b], analysis.despiked.force_n[a:b]
+        found.append(allowed_jumps(time_s, force_n, local.at(time_s), analysis.shapes[phase.kind]))
+    columns = [np.concatenate([getattr(one, name) for one in found])
+               for name in ("time_s", "lowest_n", "highest_n")]  # fmt: skip
+    return Jumps(*columns)
 
 
 def _all_steps(
@@ -165,16 +180,17 @@ def _all_steps(
 
 
 def _round(
-    recording: Recording, phases: Sequence[Phase], bounds: NDArray[np.int64], steps: NDArray[np.int64]
-) -> NoiseAnalysis:
+    recording: Recording, phases: Sequence[Phase], bounds: NDArray[np.int64], steps: NDArray[np.int64],
+    window_s: float,
+) -> NoiseAnalysis:  # fmt: skip
     time_s = recording.time_s
     interval_s = float(np.median(np.diff(time_s)))
     breaks = np.unique(np.concatenate([bounds, steps]))
     despiked = despike(time_s, recording.force_n, breaks.tolist())
     longest = int(np.max(np.diff(breaks)))
-    size = min(round(_WINDOW_S / interval_s), int(0.7 * longest))
-    if round(_WINDOW_S / interval_s) < _LEAST_WINDOW:
-        expected = f"at most {_WINDOW_S / _LEAST_WINDOW:.2g} s, to know their noise"
+    size = min(max(round(window_s / interval_s), _LEAST_WINDOW), int(0.7 * longest))
+    if round(WINDOW_S / interval_s) < _LEAST_WINDOW:
+        expected = f"at most {WINDOW_S / _LEAST_WINDOW:.2g} s, to know their noise"
         raise InputError(recording.name, f"samples {interval_s:.3g} s apart", expected)
     if size < _LEAST_WINDOW:
         found = f"{longest} samples in the longest phase"

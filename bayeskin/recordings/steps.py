@@ -11,15 +11,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_toeplitz
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.stats import norm
 
 from bayeskin.recordings.correlation import NoiseShape, weighted_covariance
-from bayeskin.types import Array
+from bayeskin.types import Array, Jumps
 
 FAMILY_WISE = 0.01  # probability that noise alone shows any step in a whole recording
 _WINDOW_S = 0.5
 _GAP_S = 0.05  # a step of the zero is not infinitely fast
 _MOST = 50  # in one phase
+_BESIDE_S = 1.0  # of a moment, in which a jump is looked for
+_BEYOND = 3.0  # sd by which a jump has to exceed what is seen, and
+_TIMES = 2.0  # how often that, to be refuted
 
 
 @dataclass(frozen=True)
@@ -72,6 +77,41 @@ def find_steps(time_s: Array, force_n: Array, sd_n: float, shape: NoiseShape, te
         free[max(0, at - window) : at + window + 1] = False
         steps.append(Step(float(time_s[first]), size, height / unit))
     return tuple(sorted(steps, key=lambda step: step.time_s))
+
+
+def allowed_jumps(time_s: Array, force_n: Array, sd_n: Array, shape: NoiseShape) -> Jumps:
+    """What one phase's force without spikes (n,) allows of jumps within it, under noise of local sd_n (n,).
+
+    A jump beside a parabola, by generalised least squares over a second to either side, with a gap for a jump
+    that takes some samples. Those seen half a second before and after count too, since a jump's time is not
+    known better. Near the phase's ends, where
+    the force itself bends, none is judged.
+    """
+    interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
+    half = max(5, round(_BESIDE_S / interval_s))
+    lowest, highest = np.full(len(time_s), -np.inf), np.full(len(time_s), np.inf)
+    if len(force_n) > 4 * half:
+        gap = max(1, round(_GAP_S / interval_s))
+        weights, share = _jump_filter(half, gap, shape.at(interval_s * np.arange(2 * half)))
+        jump = np.convolve(force_n, weights[::-1], mode="valid")  # [i]: at sample i + half
+        unit = _BEYOND * share * sd_n[half : len(sd_n) - half + 1]
+        low, high = np.minimum(jump - unit, _TIMES * jump), np.maximum(jump + unit, _TIMES * jump)
+        reach = half // 2
+        judged = slice(half + reach, len(time_s) - half - reach + 1)
+        lowest[judged] = minimum_filter1d(np.minimum(low, 0.0), 2 * reach + 1)[reach : len(low) - reach]
+        highest[judged] = maximum_filter1d(np.maximum(high, 0.0), 2 * reach + 1)[reach : len(high) - reach]
+    return Jumps(time_s, lowest, highest)
+
+
+def _jump_filter(half: int, gap: int, correlation: Array) -> tuple[Array, float]:
+    """Weights (2 half,) that give the jump at the first sample of the second half, and the sd of what they
+    give, over the noise's; none lies on `gap` samples before and from there."""
+    line = np.linspace(-1.0, 1.0, 2 * half)
+    between = np.eye(2 * half)[:, half - gap : half + gap]  # a value of its own each: it tells nothing
+    design = np.column_stack([line > 0.0, np.vander(line, 3), between])
+    white = solve_toeplitz(correlation, design)
+    covariance = np.linalg.inv(design.T @ white)
+    return np.asarray(covariance[0] @ white.T), float(np.sqrt(covariance[0, 0]))
 
 
 def _first_after(values: Array, near: int, window: int) -> int:

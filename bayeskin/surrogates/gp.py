@@ -1,6 +1,12 @@
 """Gaussian processes, one a latent: a polynomial trend, a kernel of a linear map of the inputs, a nugget.
 
 Universal kriging: Rasmussen & Williams (2006), ch. 2.7.
+
+A variance takes a product with an (n, n) matrix for each point. Where the nugget is not small, the kernel's
+rows hardly leave a subspace of few directions, found by pivoted Cholesky factors (Harbrecht, Peters &
+Schneider 2012, Appl. Numer. Math. 62:428): there an (r, n) matrix does. What lies outside counts as not
+explained, so that the variance comes out larger, never smaller, at the rows themselves by at most `SPARED` of
+the nugget.
 """
 
 from __future__ import annotations
@@ -12,11 +18,11 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dtrtri
+from scipy.linalg import qr, solve_triangular
+from scipy.linalg.lapack import dpstrf, dtrtri
 
 from bayeskin.surrogates.hyperparameters import SMALLEST_NUGGET, LatentFit
 from bayeskin.surrogates.kernels import (
-    KERNELS,
     correlations,
     kernel,
     squared_distances,
@@ -26,6 +32,9 @@ from bayeskin.surrogates.kernels import (
 from bayeskin.types import Array, _FreezesArrays
 
 CHUNK = 128  # points whose kernel rows stay in the cache
+WORTH_IT = 100  # rows: with fewer the products cost next to nothing
+SPARED = 0.1  # of the nugget, by which a variance may be larger at a row
+LEAST_NUGGET = 1e-6  # with smaller ones no row is near a subspace, or rounding hides it
 
 
 class _Conditioned(NamedTuple):
@@ -33,6 +42,7 @@ class _Conditioned(NamedTuple):
 
     mapped: Array  # (n, d)
     whitener: NDArray[np.float64]  # (n, n) L^-1, column-major
+    few: Array | None  # (r, n) in its place, where r is at most half of n
     weights: Array  # (n,) K^-1 (y - H b)
     trend: Array  # (p,) b
     trend_weights: Array  # (n, p) K^-1 H
@@ -43,7 +53,10 @@ class _Conditioned(NamedTuple):
 
 
 class _Stack(NamedTuple):
-    """All q latents of one kernel, so that one product does for all; the lower triangular in halves."""
+    """All q latents of one kernel, so that one product does for all; a lower triangular one in halves.
+
+    Those with few directions are a stack of their own, whose upper half has no rows.
+    """
 
     name: str
     latents: NDArray[np.intp]  # (q,) which
@@ -51,7 +64,7 @@ class _Stack(NamedTuple):
     maps: Array  # (q, d, d)
     inputs: Array  # (q, d + 2, n) mapped, 1, -1/2 their square
     top: Array  # (q, half, half) L^-1 transposed
-    bottom: Array  # (q, n, n - half + p + 1) L^-1, root H^T K^-1 and the weights, transposed
+    bottom: Array  # (q, n, n - half + p + 1) L^-1 or the few, root H^T K^-1 and the weights, transposed
     trend: Array  # (q, p, p + 1) the root and b, transposed
     nugget: Array  # (q, 1)
     centre: Array
@@ -105,6 +118,30 @@ def _collect(white: Array, linear: Array, trend: Array, mean: Array, variance: A
             variance[j, i] = 1.0 - explained
 
 
+def _few_directions(covariance: Array, nugget: float, whitener: Array) -> Array | None:
+    """What whitens (r, n) rows of a kernel, `covariance` (n, n) without its nugget, as `whitener` does.
+
+    None for few rows, for a small nugget, and where that takes more than half as many directions as there are
+    rows.
+    """
+    n = len(covariance)
+    if n < WORTH_IT or nugget < LEAST_NUGGET:
+        return None
+    explained = np.sum((whitener @ covariance) ** 2, axis=0)
+    for residual in (1.0, 0.3, 0.1, 0.03):
+        factor, pivots, rank, _ = dpstrf(covariance, tol=residual * min(nugget, 0.5), lower=1)
+        if rank > n // 2:
+            return None
+        columns = np.empty((n, rank))
+        columns[pivots - 1] = np.tril(factor)[:, :rank]
+        inside = qr(columns, mode="economic")[0]
+        lower = np.linalg.cholesky(inside.T @ covariance @ inside + nugget * np.eye(rank))
+        few = solve_triangular(lower, inside.T, lower=True)
+        if np.max(explained - np.sum((few @ covariance) ** 2, axis=0)) <= SPARED * nugget:
+            return np.asarray(few)
+    return None
+
+
 def _turned(stack: Array) -> Array:
     return np.ascontiguousarray(stack.transpose(0, 2, 1))
 
@@ -153,8 +190,8 @@ class LatentGPs(_FreezesArrays):
         target = (self.targets[:, j] - centre) / deviation
         mapped = (self.inputs - 0.5) @ self.linear_maps[j].T
         covariance = kernel(self.kernels[j], squared_distances(mapped, mapped))[0]
-        covariance.flat[:: n + 1] = 1.0 + self.nuggets[j]
-        lower = np.linalg.cholesky(covariance)
+        covariance.flat[:: n + 1] = 1.0
+        lower = np.linalg.cholesky(covariance + self.nuggets[j] * np.eye(n))
         whitener, _ = dtrtri(np.asfortranarray(lower), lower=1)
         white_basis, white_target = whitener @ basis, whitener @ target
         gram = np.linalg.cholesky(white_basis.T @ white_basis)
@@ -163,6 +200,7 @@ class LatentGPs(_FreezesArrays):
         return _Conditioned(
             mapped,
             np.asfortranarray(whitener),
+            _few_directions(covariance, float(self.nuggets[j]), whitener),
             whitener.T @ rest,
             trend,
             whitener.T @ white_basis,
@@ -196,18 +234,22 @@ class LatentGPs(_FreezesArrays):
 
     @cached_property
     def _stacks(self) -> list[_Stack]:
-        names = [name for name in KERNELS if name in self.kernels]
-        return [self._stack(name) for name in names]
+        alike: dict[tuple[str, bool], list[int]] = {}
+        for j, one in enumerate(self._conditioned):
+            alike.setdefault((self.kernels[j], one.few is None), []).append(j)
+        return [self._stack(name, np.array(latents)) for (name, _), latents in sorted(alike.items())]
 
-    def _stack(self, name: str) -> _Stack:
-        latents = np.array([j for j, kernel_name in enumerate(self.kernels) if kernel_name == name])
+    def _stack(self, name: str, latents: NDArray[np.intp]) -> _Stack:
         given = [self._conditioned[j] for j in latents]
-        half = len(self.inputs) // 2
+        whiteners = [one.whitener if one.few is None else one.few for one in given]
+        half = len(self.inputs) // 2 if given[0].few is None else 0
+        longest = max(len(whitener) for whitener in whiteners)
+        whiteners = [np.pad(whitener, ((0, longest - len(whitener)), (0, 0))) for whitener in whiteners]
         mapped = np.stack([one.mapped for one in given])
         square = -0.5 * np.sum(mapped**2, axis=2, keepdims=True)
         linear = [
-            np.vstack([one.whitener[half:], one.trend_root @ one.trend_weights.T, one.weights])
-            for one in given
+            np.vstack([whitener[half:], one.trend_root @ one.trend_weights.T, one.weights])
+            for one, whitener in zip(given, whiteners, strict=True)
         ]
         deviation = np.array([one.deviation for one in given])
         spread = (self.inflation[latents] * deviation) ** 2 * [one.variance for one in given]
@@ -217,7 +259,7 @@ class LatentGPs(_FreezesArrays):
             half=half,
             maps=_turned(self.linear_maps[latents]),
             inputs=_turned(np.concatenate([mapped, np.ones_like(square), square], axis=2)),
-            top=_turned(np.stack([one.whitener[:half, :half] for one in given])),
+            top=_turned(np.stack([whitener[:half, :half] for whitener in whiteners])),
             bottom=_turned(np.stack(linear)),
             trend=np.stack([np.column_stack([one.trend_root.T, one.trend]) for one in given]),
             nugget=self.nuggets[latents][:, None],
