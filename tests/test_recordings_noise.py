@@ -215,7 +215,7 @@ def test_steps_are_found_with_their_times_and_sizes() -> None:
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.06)
 
 
-@pytest.mark.parametrize("interval_s", [0.01, 0.05])
+@pytest.mark.parametrize("interval_s", [0.002, 0.01, 0.05])
 @pytest.mark.parametrize("slow_mn", [0.0, 1.0, 3.0])
 @pytest.mark.parametrize("lasts_s", [0.0, 0.03, 0.05])
 def test_jumps_that_are_there_are_allowed_and_others_are_refuted(

@@ -22,6 +22,7 @@ FAMILY_WISE = 0.01  # probability that noise alone shows any step in a whole rec
 _WINDOW_S = 0.5
 _GAP_S = 0.05  # a step of the zero is not infinitely fast
 _MOST = 50  # in one phase
+_FINEST_S = 0.01  # between samples that are looked at for jumps
 _BESIDE_S = 1.0  # of a moment, in which a jump is looked for
 _BEYOND = 3.0  # sd by which a jump has to exceed what is seen, and
 _TIMES = 2.0  # how often that, to be refuted
@@ -84,10 +85,12 @@ def allowed_jumps(time_s: Array, force_n: Array, sd_n: Array, shape: NoiseShape)
 
     A jump beside a parabola, by generalised least squares over a second to either side, with a gap for a jump
     that takes some samples. Those seen half a second before and after count too, since a jump's time is not
-    known better. Near the phase's ends, where
-    the force itself bends, none is judged.
+    known better. Near the phase's ends, where the force itself bends, none is judged. Of samples that lie
+    closer than `_FINEST_S` some are looked at.
     """
     interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
+    every = max(1, int(_FINEST_S / interval_s))
+    time_s, force_n, sd_n, interval_s = time_s[::every], force_n[::every], sd_n[::every], every * interval_s
     half = max(5, round(_BESIDE_S / interval_s))
     lowest, highest = np.full(len(time_s), -np.inf), np.full(len(time_s), np.inf)
     if len(force_n) > 4 * half:
@@ -107,7 +110,7 @@ def _jump_filter(half: int, gap: int, correlation: Array) -> tuple[Array, float]
     """Weights (2 half,) that give the jump at the first sample of the second half, and the sd of what they
     give, over the noise's; none lies on `gap` samples before and from there."""
     line = np.linspace(-1.0, 1.0, 2 * half)
-    between = np.eye(2 * half)[:, half - gap : half + gap]  # a value of its own each: it tells nothing
+    between = np.eye(2 * half, 2 * gap, gap - half)  # a value of its own each: it tells nothing
     design = np.column_stack([line > 0.0, np.vander(line, 3), between])
     white = solve_toeplitz(correlation, design)
     covariance = np.linalg.inv(design.T @ white)
