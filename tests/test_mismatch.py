@@ -26,7 +26,17 @@ from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.blocked import errors_left_out, without
 from bayeskin.mismatch.corrected import Sure
 from bayeskin.mismatch.discretised import BEND, RELAXATION_S, RELAXING, Discretised, relaxing
-from bayeskin.mismatch.fit import Fit, fit, fit_base, fit_near, likely, restored, soft_on_stiff, stored
+from bayeskin.mismatch.fit import (
+    Fit,
+    _times,
+    fit,
+    fit_base,
+    fit_near,
+    likely,
+    restored,
+    soft_on_stiff,
+    stored,
+)
 from bayeskin.mismatch.full_fit import ENOUGH, at_run, fit_full
 from bayeskin.mismatch.locate import _chance, locate
 from bayeskin.mismatch.observed import ObservedSurrogate
@@ -307,6 +317,31 @@ def test_means_alone_are_those_of_whole_predictions_of_all_that_is_shipped() -> 
     whole = seen.predict(theta).mean
     assert np.ptp(whole[1] - whole[2]) > 0.0
     np.testing.assert_allclose(seen.predict_mean(theta), whole, rtol=1e-7, atol=1e-9)
+
+
+def test_what_is_off_at_infinity_is_climbed_to_from_there() -> None:
+    """Creep of friction has an infinite time constant where there is none."""
+    both = tuple(catalogue()[name] for name in ("device-friction", "friction-creep"))
+    names = tuple(one.name for one in both)
+    truth = {"Fc": 0.04, "presliding": 5e-5, "friction_start": 0.0, "friction_tau": 15.0}
+    seen = ObservedSurrogate(ToySurrogate(), both, toy.MOTION)
+    plain = concealing(0)
+    gap = (
+        seen.predict([[*TRUTH.values(), *truth.values()]]).mean
+        - ToySurrogate().predict([[*TRUTH.values()]]).mean
+    )
+    binned = dataclasses.replace(plain.binned, force_n=plain.binned.force_n + gap[0])
+    wide = dataclasses.replace(plain, binned=binned, surrogate=seen)
+    base = fit_base(dataclasses.replace(plain, binned=binned), 1, None)
+    neutral = {name: value for one in both for name, value in one.neutral.items()}
+    parts = [part for one in both for part in one.whole_or_parts]
+    found = fit(names, wide, base.theta, neutral, 1, len(TRUTH), None, parts)
+    best = fit_near(names, wide, {**base.theta, **TRUTH, **truth}, None)
+    assert found.value > best.value - 0.5
+    assert found.theta["friction_tau"] == pytest.approx(15.0, rel=0.3)
+    assert _times(2.0, 30.0, np.inf) == 15.0
+    assert _times(-1.0, 30.0, np.inf) == np.inf
+    assert _times(2.0, 0.3, 0.1) == pytest.approx(0.5)
 
 
 def test_a_set_that_counts_is_not_unsure_too() -> None:

@@ -263,10 +263,17 @@ def _promising(
     for row, _, multiple, moved in promise(log_posterior, alone, trials, free, STARTS):
         for rest in (alone, moved):
             values = log_posterior.named(log_posterior.from_sampling(np.where(own, trials[row], rest)))
-            far = neutral[strength] + multiple * (values[strength] - neutral[strength])
+            far = _times(multiple, values[strength], neutral[strength])
             values[strength] = float(np.clip(far, parameter.lower, parameter.upper))
             starts.append(np.clip(log_posterior.vector(values), low, high))
     return starts
+
+
+def _times(multiple: float, value: float, neutral: float) -> float:
+    """A value that acts so many times as strongly; by its reciprocal where infinity is off."""
+    if np.isfinite(neutral):
+        return neutral + multiple * (value - neutral)
+    return value / multiple if multiple > 0.0 else neutral
 
 
 def _about(
