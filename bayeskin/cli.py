@@ -285,20 +285,26 @@ def prove(folder: Path | None, at_most: int | None, rediagnose: int, as_json: bo
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--seed", required=True, type=int, help="What the set is drawn from.")
 @click.option("--count", required=True, type=int, help="Recordings in the set.")
+@click.option("--only", multiple=True, metavar="NAME", help="`nothing`, a mechanism, an effect outside.")
 @as_json
-def conceal(folder: Path, seed: int, count: int, as_json: bool) -> None:
+def conceal(folder: Path, seed: int, count: int, only: tuple[str, ...], as_json: bool) -> None:
     """Make a set for `bayeskin prove`: recordings by the full model, with the effects' keys under seal.
 
-    A recording that is finished is not made again. One takes about half a minute.
+    A set has recordings without any effect, with each mechanism, with pairs, and with effects that no
+    mechanism is. With --only, which can be repeated, it has what is named, in equal numbers, and sizes from
+    one to thirty noise floors: how large must an effect be to be found? A recording that is finished is not
+    made again. One takes about half a minute, two are made at once.
 
     \b
     Example:
       bayeskin conceal sets/one --seed 7 --count 24
+      bayeskin conceal sets/none --seed 8 --count 80 --only nothing
+      bayeskin conceal sets/sizes --seed 9 --count 16 --only pad-slip --only force-offset
     """
     from bayeskin.pipeline import proof
 
     with Terminal() as terminal:
-        document = proof.conceal(folder, seed, count, terminal)
+        document = proof.conceal(folder, seed, count, terminal, only)
     _answer(document, as_json)
 
 

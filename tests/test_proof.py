@@ -31,7 +31,7 @@ from bayeskin.pipeline.recording import pad_motion
 from bayeskin.pipeline.shipping import motion_sha256
 from bayeskin.proof import closed, conceal, score, seals
 from bayeskin.proof.cases import Case, Plan, Screen, draw, plans, shipped_screen
-from bayeskin.proof.conceal import concealed, full_run
+from bayeskin.proof.conceal import Concealed, concealed, full_run
 from bayeskin.proof.noise import floor_after, noise
 from bayeskin.proof.outside import OUTSIDE, Change
 from bayeskin.proof.protocol import EDGES_S, HELD_OUT_FROM_S, KINDS, MOTION, SURROGATE, kind_at, samples_s
@@ -50,7 +50,7 @@ from bayeskin.recordings import bin_recording, read_recording, segment, uniform_
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_manifest, load_surrogate
 from bayeskin.types import PadMotion, Prediction, Recording, Simulation
-from bayeskin.workers import run_parallel
+from bayeskin.workers import local, run_parallel
 
 SEED, COUNT = 5, 4
 PACKAGE = Path(bayeskin.__file__).parent
@@ -89,10 +89,18 @@ def quick_run(case: Case, names, change: Change) -> Simulation:
     return Simulation(case.theta, time_s, MOTION.at(time_s), force_n, corner, "ok", "", {}, "")
 
 
+def quickly(plan: Plan) -> Concealed:
+    return concealed(plan, SKIN, quick_run)
+
+
+def one_by_one(function, items):
+    yield from ((index, function(item)) for index, item in enumerate(items))
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("set")
-    assert conceal(folder, SEED, COUNT, run=quick_run, screen=SKIN) == COUNT
+    assert conceal(folder, SEED, COUNT, make=quickly, run_all=one_by_one) == COUNT
     return folder
 
 
@@ -122,6 +130,23 @@ def test_a_set_of_64_has_every_mechanism_alone_and_at_least_15_effects_outside()
     assert len(OUTSIDE) >= 15
     assert not set(OUTSIDE) & set(catalogue())
     assert sum(p.tetrahedra for p in found) >= 64 / 3
+
+
+def test_a_set_of_what_was_asked_for_has_each_as_often_with_sizes_even_in_logarithm() -> None:
+    found = plans(3, 18, ["nothing", "friction-creep", "breathing"])
+    of = {name: [p for p in found if p.label == name] for name in ("nothing", "friction-creep", "breathing")}
+    assert [len(some) for some in of.values()] == [6, 6, 6]
+    assert {p.kind for p in of["nothing"]} == {"nothing"}
+    assert {p.mechanisms for p in of["friction-creep"]} == {("device-friction", "friction-creep")}
+    assert {p.outside for p in of["breathing"]} == {"breathing"}
+    targets = sorted(p.target for p in of["friction-creep"])
+    np.testing.assert_allclose(np.diff(np.log(targets)), np.log(30.0) / 6)
+    assert (targets[0] * targets[-1]) == pytest.approx(30.0)
+    assert len({p.numbers for p in found}) == 18
+    assert sum(p.tetrahedra for p in found) == 7
+    assert draw(of["friction-creep"][0], 0, SKIN).target == of["friction-creep"][0].target
+    with pytest.raises(InputError, match=r"--only: found pad-slop; expected nothing, or one of backlash"):
+        plans(3, 18, ["pad-slop"])
 
 
 def test_the_order_of_a_set_tells_nothing_of_its_kinds() -> None:
@@ -218,12 +243,35 @@ def test_a_set_is_the_same_when_it_is_made_again_and_what_is_there_is_not_made_a
     np.testing.assert_array_equal(again.recording.force_n, stored.force_n)
     assert json.loads(json.dumps(again.key)) == seals.read_keys(made)["003"]
 
-    def never(*_: object) -> Simulation:
+    def never(_: Plan) -> Concealed:
         raise AssertionError("a full run of what is there")
 
-    assert conceal(made, SEED, COUNT, run=never, screen=SKIN) == 0
-    with pytest.raises(InputError, match="another making"):
-        conceal(made, SEED + 1, COUNT, run=never, screen=SKIN)
+    assert conceal(made, SEED, COUNT, make=never, run_all=one_by_one) == 0
+    for seed, only in ((SEED + 1, ()), (SEED, ["nothing"])):
+        with pytest.raises(InputError, match="another making"):
+            conceal(made, seed, COUNT, only, make=never, run_all=one_by_one)
+
+
+def test_what_was_missing_of_a_set_is_made_in_any_order_by_processes(made: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(made, tmp_path / "copy"))
+    (copy / "recordings" / "002.h5").unlink()
+    (copy / "seals" / "004.json").write_text("{}")
+    told: list[tuple[float, str]] = []
+    assert conceal(copy, SEED, COUNT, tell=lambda *now: told.append(now), make=quickly, run_all=local(2)) == 2
+    assert told == [(0.75, "3 of 4"), (1.0, "4 of 4")]
+    assert seals.read_keys(copy) == seals.read_keys(made)
+    for number in ("002", "004"):
+        again, first = (seals.recording_path(one, number).read_bytes() for one in (copy, made))
+        assert again == first
+
+
+def test_a_case_that_cannot_be_made_is_told_and_those_before_it_are_kept(tmp_path: Path) -> None:
+    def fails_later(plan: Plan) -> Concealed | tuple[str, str, str]:
+        return quickly(plan) if plan.numbers[-1] < 2 else ("proof: x", "8 runs that failed", "one that ends")
+
+    with pytest.raises(InputError, match="proof: x: found 8 runs that failed; expected one that ends"):
+        conceal(tmp_path, SEED, COUNT, make=fails_later, run_all=one_by_one)
+    assert list(seals.read_index(tmp_path)) == ["001", "002"]
 
 
 def test_a_run_that_fails_is_drawn_anew() -> None:

@@ -134,8 +134,10 @@ def _kept(
     return ()
 
 
-def conceal(folder: Path, seed: int, count: int, reporter: Reporter) -> dict[str, Any]:
-    """Makes a set of concealed recordings, or what is missing of it.
+def conceal(
+    folder: Path, seed: int, count: int, reporter: Reporter, only: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Makes a set of concealed recordings, or what is missing of it; `only` as in `proof.cases.plans`.
 
     Raises InputError as `proof.conceal`, and where another process is at work on the set.
     """
@@ -147,7 +149,7 @@ def conceal(folder: Path, seed: int, count: int, reporter: Reporter) -> dict[str
         reporter.progress("recordings", share, note)
 
     with locked(folder):
-        made = proof.conceal(folder, seed, count, tell)
+        made = proof.conceal(folder, seed, count, only, tell)
     seconds = time.monotonic() - started
     text = f"{made} of {count} recordings made in {seconds:.0f} s; keys in {folder / seals.SEALS}"
     return plain(

@@ -1,15 +1,16 @@
 """Which cases are concealed in a set, drawn from its seed: what, how strongly, in which skin.
 
-Base parameters are drawn from the default box where the peak force is that of a skin test and the subcutis
-is not much stiffer than the cutis (on a stiff one a soft cutis folds), a mechanism's from their priors. Of
-many draws that one is taken whose size, by the shipped surrogates, is nearest to a target that is
-log-uniform over `SIZES`; where none comes near, the nearest.
+A set has all kinds in fixed shares, or `only` what is asked for, in equal numbers. Base parameters are drawn
+from the default box where the peak force is that of a skin test and the subcutis is not much stiffer than the
+cutis (on a stiff one a soft cutis folds), a mechanism's from their priors. Of many draws that one is taken
+whose size, by the shipped surrogates, is nearest to a target that is log-uniform over `SIZES`, or spread so
+evenly in a set of what was asked for; where none comes near, the nearest.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Literal
 
@@ -48,7 +49,10 @@ BATCH, BATCHES, FITTED = 64, 8, 3  # draws at a time, how often, and how many of
 
 @dataclass(frozen=True)
 class Plan:
-    """What one recording is to conceal; `label` is one word for it, `numbers` its own stream of chance."""
+    """What one recording is to conceal; `label` is one word for it, `numbers` its own stream of chance.
+
+    target : size to aim at, of the floor; 0 where chance decides
+    """
 
     label: str
     kind: Kind
@@ -56,6 +60,7 @@ class Plan:
     outside: str
     tetrahedra: bool
     numbers: tuple[int, ...]
+    target: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -70,29 +75,50 @@ class Case:
     target: float = 0.0  # size aimed at, of the floor
 
 
-def plans(seed: int, count: int) -> tuple[Plan, ...]:
-    """What each of `count` recordings conceals, in the order of their numbers. Same seed, same plans."""
+def plans(seed: int, count: int, only: Sequence[str] = ()) -> tuple[Plan, ...]:
+    """What each of `count` recordings conceals, in the order of their numbers. Same seed, same plans.
+
+    only : "nothing", mechanisms, effects outside the catalogue; () is all of them in the shares of `SHARES`.
+    Raises InputError for any other name.
+    """
     rng = np.random.default_rng([seed, 0])
     known = catalogue()
+    chosen = _asked_for(known, only, count) if only else _mixed(rng, known, count)
+    order = rng.permutation(count)
+    cut = set(rng.permutation(count)[: int(np.ceil(TETRAHEDRA * count))].tolist())
+    return tuple(
+        replace(chosen[i], tetrahedra=place in cut, numbers=(seed, 1, place))
+        for place, i in enumerate(order.tolist())
+    )
+
+
+def _mixed(rng: np.random.Generator, known: Mapping[str, Mechanism], count: int) -> list[Plan]:
     counts = _counts(count)
     tissue = [n for n, m in known.items() if isinstance(m.act, Tissue)]
     alone = [*_shuffled(rng, list(known)), *_cycled(rng, tissue, counts["alone"])][: counts["alone"]]
-    chosen: list[tuple[str, Kind, tuple[str, ...], str]] = [("nothing", "nothing", (), "")] * counts[
-        "nothing"
-    ]
-    for name in alone:
-        chosen.append((name, "alone", (*known[name].needs, name), ""))
+    chosen = [_plan("nothing", known)] * counts["nothing"] + [_plan(name, known) for name in alone]
     for pair in _pairs(rng, known, counts["pair"]):
-        chosen.append((" + ".join(pair), "pair", pair, ""))
-    for name in _cycled(rng, list(OUTSIDE), counts["outside"]):
-        chosen.append((name, "outside", (), name))
-    order = rng.permutation(count)
-    cut = set(rng.permutation(count)[: int(np.ceil(TETRAHEDRA * count))].tolist())
-    shuffled = enumerate(chosen[i] for i in order.tolist())
-    return tuple(
-        Plan(label, kind, mechanisms, outside, place in cut, (seed, 1, place))
-        for place, (label, kind, mechanisms, outside) in shuffled
-    )
+        chosen.append(Plan(" + ".join(pair), "pair", pair, "", False, ()))
+    return chosen + [_plan(name, known) for name in _cycled(rng, list(OUTSIDE), counts["outside"])]
+
+
+def _asked_for(known: Mapping[str, Mechanism], only: Sequence[str], count: int) -> list[Plan]:
+    """Each in turn; of one that is there n times the targets are the middles of n classes of size."""
+    for name in only:
+        if name not in ("nothing", *known, *OUTSIDE):
+            raise InputError("--only", name, f"nothing, or one of {', '.join((*known, *OUTSIDE))}")
+    times = [len(range(place, count, len(only))) for place in range(len(only))]
+    targets = [np.exp(np.interp((np.arange(n) + 0.5) / n, (0.0, 1.0), np.log(SIZES))) for n in times]
+    return [
+        replace(_plan(only[i % len(only)], known), target=float(targets[i % len(only)][i // len(only)]))
+        for i in range(count)
+    ]
+
+
+def _plan(name: str, known: Mapping[str, Mechanism]) -> Plan:
+    if name in known:
+        return Plan(name, "alone", (*known[name].needs, name), "", False, ())
+    return Plan(name, *(("nothing", (), "") if name == "nothing" else ("outside", (), name)), False, ())
 
 
 def _counts(count: int) -> dict[Kind, int]:
@@ -176,7 +202,7 @@ def draw(plan: Plan, attempt: int, screen: Screen) -> Case:
     floor_n = float(rng.uniform(*FLOORS_N))
     target = float(np.exp(rng.uniform(*np.log(SIZES))))
     if plan.mechanisms:
-        return _sized(plan, rng, screen, floor_n, target)
+        return _sized(plan, rng, screen, floor_n, plan.target or target)
     theta, _ = _skins(rng, screen, 1)
     strength = 0.0
     if plan.outside:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -29,6 +30,7 @@ from bayeskin.proof.outside import OUTSIDE, Change
 from bayeskin.proof.protocol import EDGES_S, MOTION, samples_s
 from bayeskin.proof.remains import rms, windows
 from bayeskin.types import Array, Recording, Simulation
+from bayeskin.workers import Lost, Map, local
 
 # Lines of the bricks [mm]: more of them, and graded otherwise, than those of the shipped surrogates' model.
 _X_MM = (0.0, 9.0, 16.0, 18.0, 19.0, 22.0, 25.0, 26.0, 27.0, 28.0, 31.0, 34.0, 35.0, 37.0, 43.0, 58.0, 105.0)
@@ -37,6 +39,8 @@ _HEIGHT_MM, _DEEP, _OUTER = 10.0, 0.5, 0.65  # subcutis divided in the middle, c
 TOLERANCE = 5e-4  # of a step; the surrogates' runs have twice that
 ATTEMPTS = 8
 LVDT_STEP_M, CELL_STEP_N = 1e-5, 2.0**-13
+
+TWO_AT_ONCE = local(2)  # processes, of which each needs some 1.5 GB
 
 Run = Callable[[Case, Sequence[str], Change], Simulation]  # with the mechanisms named, and the change
 
@@ -47,6 +51,9 @@ class Concealed:
 
     recording: Recording
     key: Mapping[str, Any]
+
+
+Made = Concealed | tuple[str, str, str]  # or where, what was found and expected instead
 
 
 @lru_cache(maxsize=3)
@@ -72,27 +79,44 @@ def full_run(case: Case, names: Sequence[str], change: Change) -> Simulation:
     return simulate_on(problem, solid, TOLERANCE, change.moved(MOTION), {**case.theta, **along}, binds)
 
 
+def made_of(plan: Plan) -> Made:
+    """`concealed` by the full model and the shipped surrogates, in a process of its own."""
+    try:
+        return concealed(plan, shipped_screen(), full_run)
+    except InputError as error:
+        return error.where, error.found, error.expected
+
+
 def conceal(
     folder: Path,
     seed: int,
     count: int,
+    only: Sequence[str] = (),
     tell: Callable[[float, str], None] = lambda share, note: None,
-    run: Run = full_run,
-    screen: Screen | None = None,
+    make: Callable[[Plan], Made] = made_of,
+    run_all: Map = TWO_AT_ONCE,
 ) -> int:
     """Makes what is missing of a set of `count` recordings; returns how many it made.
 
-    tell : called with the share that is done and a note. Raises InputError for a set of another seed or
-    count, or where the full model fails at every attempt.
+    only : see `plans`; tell : called with the share that is done and a note; run_all maps `make` over plans.
+    Raises InputError for a set of another making, for what `plans` does not know, or where the full model
+    fails at every attempt.
     """
-    _agree(folder, seed, count)
-    screen, made = screen or shipped_screen(), 0
-    for place, plan in enumerate(plans(seed, count)):
-        number = f"{place + 1:03d}"
-        if not _finished(folder, number):
-            _write(folder, number, concealed(plan, screen, run))
+    wanted = plans(seed, count, only)
+    _agree(folder, seed, count, only)
+    numbers = [f"{place + 1:03d}" for place in range(count)]
+    missing = [place for place, number in enumerate(numbers) if not _finished(folder, number)]
+    made = 0
+    with closing(run_all(make, [wanted[place] for place in missing])) as results:
+        for index, one in results:
+            if isinstance(one, Lost):
+                raise InputError("proof", one.reason, "a worker process that lives")
+            if not isinstance(one, Concealed):
+                raise InputError(*one)
+            _write(folder, numbers[missing[index]], one)
             made += 1
-        tell((place + 1) / count, f"{place + 1} of {count}")
+            done = count - len(missing) + made
+            tell(done / count, f"{done} of {count}")
     return made
 
 
@@ -201,18 +225,17 @@ def _key(case: Case, runs: _Runs, screen: Screen, attempt: int, peak_n: float) -
     }
 
 
-def _agree(folder: Path, seed: int, count: int) -> None:
+def _agree(folder: Path, seed: int, count: int, only: Sequence[str]) -> None:
     """Raises InputError where the folder holds another set."""
-    path, ours = folder / seals.SEALS / seals.SET, {"seed": seed, "count": count}
+    path = folder / seals.SEALS / seals.SET
+    ours: dict[str, Any] = {"seed": seed, "count": count, **({"only": list(only)} if only else {})}
     if not path.is_file():
         if (folder / seals.INDEX).is_file() and seals.read_index(folder):
             raise InputError(folder, "a set without its seals", "a folder of its own for a new set")
         seals.write_json(folder / seals.INDEX, {"recordings": {}})
         seals.write_json(path, ours)
     elif (found := seals.read_json(path)) != ours:
-        raise InputError(
-            folder, f"a set of another making than --seed {seed} --count {count}: {found}", "another folder"
-        )
+        raise InputError(folder, f"a set of another making than {ours}: {found}", "another folder")
 
 
 def _finished(folder: Path, number: str) -> bool:
