@@ -26,6 +26,8 @@ SHARES = (
     ("clear effects named right", ("named", "clear"), "90 %"),
     ("the same up to look-alikes", ("named_up_to_look_alikes", "clear"), "95 %"),
     ("smaller effects named right", ("named", "below"), ""),
+    ("mechanisms that add three floors and more, alone or in a pair, named", ("clear_mechanisms_named",), ""),
+    ("named mechanisms that are there, on all recordings", ("named_mechanisms_there",), ""),
     ("`unknown` for clear effects outside the catalogue", ("unknown_outside", "clear"), "80 %"),
     (
         "the effect's parameters in their 90 % intervals, where named right and clear",

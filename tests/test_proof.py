@@ -554,6 +554,7 @@ def key(label: str, kind: str = "alone", size: float = 5.0, **more) -> dict:
     base = {
         "label": label, "kind": kind, "mechanisms": mechanisms, "size": size, "floor_n": 2e-3,
         "windows": [(10.0, 20.0)], "theta": THETA, "values": {},
+        "sizes": dict.fromkeys(mechanisms, 2e-3 * size),
     }  # fmt: skip
     return base | more
 
@@ -604,6 +605,20 @@ def test_the_probability_of_a_pair_is_that_of_its_less_probable_part() -> None:
     both = key("pad-slip + sensor-drift", "pair")
     assert judge("001", both, said("pad-slip")).probability == 0.0
     assert judge("001", both, said("pad-slip", "sensor-drift")).probability == 0.9
+
+
+def test_of_a_pair_each_mechanism_that_adds_enough_counts_and_each_name() -> None:
+    both = key("pad-slip + sensor-drift", "pair", sizes={"pad-slip": 8e-3, "sensor-drift": 5e-3})
+    found = judge("001", both, said("pad-slip", "backlash"))
+    assert found.found == {"pad-slip": True}  # of the other 2.5 floors remain
+    assert found.there == {"pad-slip": True, "backlash": False}
+    other = judge("002", key("nothing", "nothing", 0.0), said("backlash"))
+    assert (other.found, other.there) == ({}, {"backlash": False})
+    keys = {"001": both, "002": key("nothing", "nothing", 0.0), "003": key("sensor-drift")}
+    answers = {"001": said("pad-slip", "backlash"), "002": said("backlash"), "003": said()}
+    board = score(keys, answers)
+    counts = [board[name] for name in ("clear_mechanisms_named", "named_mechanisms_there")]
+    assert [(one["hits"], one["of"]) for one in counts] == [(1, 2), (1, 3)]
 
 
 def test_an_interval_of_parameters_counts_recordings() -> None:

@@ -252,6 +252,11 @@ def _in_words(document: Mapping[str, Any]) -> str:
         for size, words in (("clear", "3 x floor and more"), ("below", "below")):
             lines.append(f"{text}, {words}: {_share(board[name][size])}")
     for name, text in (
+        ("clear_mechanisms_named", "mechanisms that add 3 x floor and more, named"),
+        ("named_mechanisms_there", "named mechanisms that are there"),
+    ):
+        lines.append(f"{text}: {_share(board[name])}")
+    for name, text in (
         ("location_overlap", "overlap of located windows"),
         ("held_out_over_floor", "held-out RMSE over the floor, where named right"),
     ):

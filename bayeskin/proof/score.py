@@ -3,8 +3,10 @@
 A verdict names right when it names what is concealed and nothing else; it is right up to look-alikes when
 each name it gives stands for one that is concealed and lies in one of its groups (`LOOK_ALIKES`). A verdict
 whose own group is larger than one of those is wrong, and so is a diagnosis that failed. What is held out is
-the full model's, where that has made a fit, over the floor of what is held out. Shares have 90 % Wilson
-intervals; those of parameters count recordings, since the parameters of one go together.
+the full model's, where that has made a fit, over the floor of what is held out. Beside recordings single
+mechanisms are counted: how many of those that add enough to be named are, whatever else is, and how many of
+the named are there. Shares have 90 % Wilson intervals; those of parameters and of single mechanisms count
+recordings, since those of one go together.
 """
 
 from __future__ import annotations
@@ -40,7 +42,11 @@ TOO_LARGE = "group too large"  # of look-alikes, larger than any that is listed
 
 @dataclass(frozen=True)
 class Judged:
-    """One verdict beside its key. Overlap and ratio are None where they have no meaning."""
+    """One verdict beside its key. Overlap and ratio are None where they have no meaning.
+
+    found : whether each concealed mechanism whose own part is clear is named; there : whether each named one
+    is concealed
+    """
 
     number: str
     label: str
@@ -50,6 +56,8 @@ class Judged:
     named: tuple[str, ...]
     right: bool
     right_group: bool
+    found: Mapping[str, bool]
+    there: Mapping[str, bool]
     probability: float
     overlap: float | None
     inside: Mapping[str, bool]
@@ -75,6 +83,8 @@ def score(keys: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Mapping[s
         "false_alarms": share(one.answer != "nothing-missing" for one in nothing),
         "named": _by_class(inside, lambda some: share(one.right for one in some)),
         "named_up_to_look_alikes": _by_class(inside, lambda some: share(one.right_group for one in some)),
+        "clear_mechanisms_named": share_of_parts(one.found for one in inside),
+        "named_mechanisms_there": share_of_parts(one.there for one in found),
         "unknown_outside": _by_class(outside, lambda some: share(one.answer == "unknown" for one in some)),
         "location_overlap": _by_class([*inside, *outside], lambda some: median(o.overlap for o in some)),
         "effect_in_interval": _by_class(right, lambda some: share_of_parts(o.inside for o in some)),
@@ -114,6 +124,10 @@ def judge(number: str, key: Mapping[str, Any], answer: Mapping[str, Any]) -> Jud
         named=named,
         right=right and allowed,
         right_group=bool(truth) and allowed and (right or stands_for(set(named), truth)),
+        found={
+            name: name in named for name, part_n in key["sizes"].items() if part_n >= CLEAR * key["floor_n"]
+        },
+        there={name: name in truth for name in named},
         probability=min((probable.get(name, 0.0) for name in truth), default=0.0),
         overlap=overlap(key["windows"], [(one["t0"], one["t1"]) for one in answer.get("located", [])]),
         inside=_inside(parameters, _in_order(key["values"], parameters)),
