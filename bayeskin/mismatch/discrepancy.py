@@ -22,12 +22,13 @@ from scipy.optimize import minimize
 
 from bayeskin.mismatch.features import describe
 from bayeskin.mismatch.fit import Fit
-from bayeskin.mismatch.unexplained import Place, Unexplained, unexplained
+from bayeskin.mismatch.unexplained import Place, Unexplained, occam, unexplained
 from bayeskin.types import Array, PadMotion
 
 PARTS = ("displacement", "phase", "cycle")
 SMALLEST, LARGEST = 0.01, 10.0  # size s: of the noise's sd, of the residual's RMS
 LENGTHS = ((0.05, 2.0), (0.2, 3.0), (0.2, 3.0))  # of the displacement's range; of log(1 + t / 1 s)
+STEP = 1e-3  # of a hyperparameter's range, for second derivatives
 NOTICEABLE = 5.0  # nats over no discrepancy; noise alone gains less in 99 of 100 recordings
 
 
@@ -39,7 +40,9 @@ class Discrepancy:
     beyond_n (k,) the residual beyond what parameters could still take up, and taken_n (k,) what they could;
     size_n the RMS of mean_n; share: of the squares of beyond_n those of mean_n, split by the parts' own;
     size_by_part, length_by_part: hyperparameters; gain_nats: log marginal likelihood over that of no
-    discrepancy; features: what it looks like, in words.
+    discrepancy; log_evidence: of the fit with it, and without_log_evidence: without (`Unexplained`), sizes
+    and lengths integrated over log-uniform priors between their bounds; features: what it looks like, in
+    words.
     """
 
     bins: NDArray[np.int64]
@@ -53,6 +56,8 @@ class Discrepancy:
     size_by_part: Mapping[str, float]
     length_by_part: Mapping[str, float]
     gain_nats: float
+    log_evidence: float
+    without_log_evidence: float
     features: tuple[str, ...]
 
     @property
@@ -66,7 +71,8 @@ def discrepancy(found: Fit, motion: PadMotion) -> Discrepancy:
     rest = unexplained(found, motion)
     squares = _squared_distances(rest.at)
     masks = _masks(rest.at)
-    line, value = _most_likely(rest, squares, masks)
+    bounds = _bounds(rest)
+    line, value = _most_likely(rest, squares, masks, bounds)
     kernels = _kernels(line, squares, masks)
     reduced = rest.reduce @ rest.residual_n
     root = np.linalg.cholesky(rest.reduce @ np.sum(kernels, axis=0) @ rest.reduce.T + np.eye(len(reduced)))
@@ -90,7 +96,8 @@ def discrepancy(found: Fit, motion: PadMotion) -> Discrepancy:
         {name: float(mean @ mean) * one / whole if whole > 0.0 else 0.0 for name, one in own.items()},
         dict(zip(PARTS, np.exp(line[:3]).tolist(), strict=True)),
         dict(zip(PARTS, np.exp(line[3:]).tolist(), strict=True)),
-        gain, features,
+        gain, rest.log_evidence + gain + _integrated(line, bounds, rest, squares, masks), rest.log_evidence,
+        features,
     )  # fmt: skip
 
 
@@ -114,14 +121,28 @@ def _kernels(line: Array, squares: Array, masks: Array) -> Array:
     return np.asarray(size**2 * masks * np.exp(-0.5 * squares / length**2))
 
 
-def _most_likely(rest: Unexplained, squares: Array, masks: Array) -> tuple[Array, float]:
-    """Logarithms of sizes and lengths (6,), and minus the log marginal likelihood there."""
+def _bounds(rest: Unexplained) -> Array:
+    """Of logarithms of sizes and lengths, (6, 2)."""
     noise = float(np.sqrt(np.median(np.diag(rest.noise_n2))))
     rms = max(float(np.sqrt(np.mean(rest.beyond(rest.residual_n) ** 2))), noise)
-    bounds = np.log([(SMALLEST * noise, LARGEST * rms)] * 3 + list(LENGTHS))
+    return np.log([(SMALLEST * noise, LARGEST * rms)] * 3 + list(LENGTHS))
+
+
+def _most_likely(rest: Unexplained, squares: Array, masks: Array, bounds: Array) -> tuple[Array, float]:
+    """Logarithms of sizes and lengths (6,), and minus the log marginal likelihood there."""
+    rms = np.exp(bounds[0, 1]) / LARGEST
     start = np.concatenate([np.full(3, np.log(rms / np.sqrt(3.0))), np.log([0.3, 0.8, 0.8])])
     found = minimize(_unlikely, start, (rest, squares, masks), jac=True, method="L-BFGS-B", bounds=bounds)
     return found.x, float(found.fun)
+
+
+def _integrated(line: Array, bounds: Array, rest: Unexplained, squares: Array, masks: Array) -> float:
+    """Laplace's logarithm of the share of the hyperparameters' box that the recording leaves, at the top."""
+    width = bounds[:, 1] - bounds[:, 0]
+    side = np.where(line + STEP * width < bounds[:, 1], STEP, -STEP)
+    there = [_unlikely(line + at, rest, squares, masks)[1] for at in (np.zeros(6), *np.diag(side * width))]
+    bend = np.array([(one - there[0]) * width / step for one, step in zip(there[1:], side, strict=True)])
+    return occam(np.linalg.eigvalsh(0.5 * (bend + bend.T)))
 
 
 def _unlikely(line: Array, rest: Unexplained, squares: Array, masks: Array) -> tuple[float, Array]:

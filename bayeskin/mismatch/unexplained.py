@@ -72,7 +72,8 @@ class Unexplained:
     """A fit's residual and what it takes to split it; k bins, r of them taken up by parameters.
 
     residual_n (k,) recorded minus model; force_n (k,) the model's; noise_n2 (k, k) covariance of measured
-    noise and surrogate's error; basis (k, k - r) is N; at: where the bins stand.
+    noise and surrogate's error; basis (k, k - r) is N; at: where the bins stand; information (d,) of what the
+    noise lets be known of the moving parameters over their priors' widths, the eigenvalues.
     """
 
     bins: NDArray[np.int64]
@@ -81,6 +82,15 @@ class Unexplained:
     noise_n2: Array
     basis: Array
     at: Place
+    information: Array
+
+    @property
+    def log_evidence(self) -> float:
+        """Without a discrepancy: of the fit, its force linear in the parameters, whose priors are uniform
+        (Laplace's, as in `fit`), up to a constant that is the same for all fits to the same bins."""
+        reduced = self.reduce @ self.residual_n
+        determinant = np.sum(np.log(np.diag(np.linalg.cholesky(self.noise_n2))))
+        return float(occam(self.information) - determinant - 0.5 * reduced @ reduced)
 
     @cached_property
     def _root(self) -> Array:
@@ -115,13 +125,22 @@ def unexplained(found: Fit, motion: PadMotion) -> Unexplained:
     factor = prediction.factor[0, chain.bins]
     material = found.unit[: log_posterior.surrogate.space.dim]
     moves = (material > AT_BOUND) & (material < 1.0 - AT_BOUND)
-    left, size, _ = np.linalg.svd(derivatives(log_posterior, found.unit)[chain.bins][:, moves])
+    slopes = derivatives(log_posterior, found.unit)[chain.bins][:, moves]
+    left, size, _ = np.linalg.svd(slopes)
     rank = int(np.sum(size > SMALLEST * size.max(initial=0.0)))
     at = place(binned.time_s[chain.bins], binned.phase[chain.bins], binned.phases, motion)
+    noise_n2 = chain_covariance(scale[0], rho[0]) + factor @ factor.T
+    white = solve_triangular(np.linalg.cholesky(noise_n2), slopes, lower=True)
     return Unexplained(
-        chain.bins, chain.force_n - force, force, chain_covariance(scale[0], rho[0]) + factor @ factor.T,
-        left[:, rank:], at,
+        chain.bins, chain.force_n - force, force, noise_n2, left[:, rank:], at,
+        np.linalg.eigvalsh(white.T @ white),
     )  # fmt: skip
+
+
+def occam(information: Array) -> float:
+    """Logarithm of what is left of uniform priors, from eigenvalues (d,) of the information over their
+    widths: nothing lost where there is none."""
+    return float(0.5 * np.sum(np.log(2.0 * np.pi / (np.maximum(information, 0.0) + 2.0 * np.pi))))
 
 
 def derivatives(log_posterior: LogPosterior, unit: Array) -> Array:

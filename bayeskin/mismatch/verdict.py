@@ -3,7 +3,9 @@
 A mechanism is named where it, or its group of look-alikes together, has nine chances in ten, and leaving it
 out of its set costs more than the full model's own error, if no window is left or what is named explains nine
 tenths of the squared residual beyond what is allowed. Where the full model was fitted, its evidence has to be
-for the set, too. Nothing is missing where none is named and no window is found, or what goes beyond the
+for the set, too. And the set has to be nine times as probable as something smooth without a name in its place
+(`discrepancy`), which bends as it likes and pays for that: what is of the catalogue is the shorter description.
+Nothing is missing where none is named and no window is found, or what goes beyond the
 allowed is within the model's own error. Otherwise the mismatch is unknown.
 
 The probability that something acts which no set has is at most that of Sellke, Bayarri & Berger (2001,
@@ -15,7 +17,7 @@ than 1 / (-e p ln p). Before the recording is seen it is taken to be as probable
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -51,37 +53,56 @@ class Diagnosis:
     """The verdict, what is named, and the share of the squared residual that it explains.
 
     unknown_probability : at most, that something acts which is outside the catalogue
+    believed : whether the evidence is for the best set
     """
 
     verdict: Literal["nothing-missing", "named", "unknown"]
     named: tuple[Named, ...]
     explained: float
     unknown_probability: float
+    believed: bool
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Logarithms of the evidence of a fit, and of it with something smooth without a name beside it."""
+
+    alone: float
+    with_more: float
+
+
+def set_probability(names: Sequence[str], without: Evidence, best: Evidence) -> float:
+    """Of the best set, alone or beside something without a name, against none of it, likewise."""
+    odds = float(np.log(PRIOR / (1.0 - PRIOR)))
+    logs = np.array([without.alone, without.with_more + odds, best.alone, best.with_more + odds])
+    logs[2:] += len(names) * odds
+    share = np.exp(logs - logs.max())
+    return float(share[2:].sum() / share.sum())
 
 
 def judge(
     found: Search, known: Mapping[str, Mechanism], before: Located, after: Located,
-    full_weights: tuple[float, float] | None = None,
+    full_weights: tuple[float, float] | None = None, probability: float = 1.0,
 ) -> Diagnosis:  # fmt: skip
     """The verdict on a search; `before` and `after` are located at its base and at its best set.
 
-    full_weights : of these two by the full model, where that was fitted
+    full_weights : of these two by the full model, where that was fitted; probability : `set_probability`
     """
     best, explained = found.best, explained_share(before, after)
     least = NOTICEABLE * model_error(best.log_posterior)
-    confirmed = full_weights is None or full_weights[1] > full_weights[0]
+    believed = (full_weights is None or full_weights[1] > full_weights[0]) and probability > PROBABLE
     named = tuple(
         one
-        for name in (best.names if confirmed else ())
+        for name in (best.names if believed else ())
         if (one := _named(found, known[name])).group_probability > PROBABLE and one.explains_n > least
     )
     if not named and (not before.windows or beyond_allowed(before) < least):
         chance = 1.0 if before.windows else before.chance  # the model's own error may be all of it
-        return Diagnosis("nothing-missing", (), 0.0, unknown_probability(chance))
-    something_else = unknown_probability((after if confirmed else before).chance)
+        return Diagnosis("nothing-missing", (), 0.0, unknown_probability(chance), believed)
+    something_else = unknown_probability((after if believed else before).chance)
     if named and (explained > EXPLAINED or not after.windows):
-        return Diagnosis("named", named, explained, something_else)
-    return Diagnosis("unknown", (), explained, something_else)
+        return Diagnosis("named", named, explained, something_else, believed)
+    return Diagnosis("unknown", (), explained, something_else, believed)
 
 
 def unknown_probability(chance: float) -> float:

@@ -22,7 +22,7 @@ from bayeskin.mismatch.fit import Fit, restored, stored
 from bayeskin.mismatch.full_fit import FullFit
 from bayeskin.mismatch.locate import Located
 from bayeskin.mismatch.search import Build, Made, Search, search
-from bayeskin.mismatch.verdict import Diagnosis, judge
+from bayeskin.mismatch.verdict import Diagnosis, judge, set_probability
 from bayeskin.pipeline import design, recording, training
 from bayeskin.pipeline.diagnosis_outputs import (
     Found,
@@ -71,11 +71,13 @@ def _work(run: Run) -> Mapping[str, Any]:
     held_out = begins or [None]
     before, after = taken[0], taken[-1]
     full = (before.full_weight, after.full_weight)
+    probability = set_probability(whole.best.names, before.evidence, after.evidence)
     found = judge(
         whole, bench.known, before.located, after.located,
-        None if full[0] is None or full[1] is None else (full[0], full[1]),
+        None if full[0] is None or full[1] is None else (full[0], full[1]), probability,
     )  # fmt: skip
-    remainder = after.remainder if leaves_something(found, after.located) else None
+    left = after if found.believed else before
+    remainder = left.remainder if leaves_something(found, after.located) else None
     best = after.full.theta if isinstance(after.full, FullFit) else whole.best.theta
     answer: dict[str, Any] = {
         "verdict": found.verdict,
@@ -83,6 +85,7 @@ def _work(run: Run) -> Mapping[str, Any]:
         "remaining": [window(one) for one in after.located.windows],
         "explained": found.explained,
         "unknown_probability": found.unknown_probability,
+        "set_probability": probability if whole.best.names else None,
         "mechanisms": [
             mechanism(one, bench.known[one.name], after.parts, after.draws.summary, best)
             for one in found.named

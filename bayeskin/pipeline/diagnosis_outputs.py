@@ -144,6 +144,9 @@ def in_words(answer: Mapping[str, Any]) -> str:
     ]
     if (lacking := answer.get("unknown_probability")) is not None:
         lines.append(f"  something else, outside this catalogue: probability at most {lacking:.2f}")
+    if (believed := answer.get("set_probability")) is not None:
+        text = "probability against something smooth without a name"
+        lines.append(f"  {', '.join(answer['best_set'])}: {text} {believed:.2f}")
     lines.append(f"{len(answer['located'])} windows before, {len(answer['remaining'])} after")
     for when in ("before", "after"):
         held = fits[when]["rmse_held_out"]

@@ -31,6 +31,7 @@ from bayeskin.mismatch.full_fit import FullFit, at_run, fit_full
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import weight
+from bayeskin.mismatch.verdict import Evidence
 from bayeskin.pipeline.engine import Run, Silent
 from bayeskin.pipeline.reported import FullForce
 from bayeskin.pipeline.workbench import Workbench, opened, workbench
@@ -61,7 +62,8 @@ class TakenUp:
     full : the full model's fit; full_weight : logarithm of the set's weight by it, None without that;
     draws : of the posterior; coverage90 : share of bins in its predictive band;
     left_out_n : RMS error of phases that the fit is made without, None where there is but one;
-    located : windows that it leaves; parts : what each mechanism contributes; remainder : what is left
+    evidence : of the best run, with the noise that is no mismatch; located : windows that it leaves;
+    parts : what each mechanism contributes; remainder : what is left
     """
 
     full: FullResult
@@ -69,6 +71,7 @@ class TakenUp:
     draws: Resampled
     coverage90: float
     left_out_n: float | None
+    evidence: Evidence
     located: Located
     parts: tuple[Contribution, ...]
     remainder: Remainder
@@ -111,14 +114,19 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
         # Mechanisms have to be worth what a run has shown, the model without them what is promised.
         full_weight = weight(found) + (full.value - found.value if found.names else 0.0)
         force = _coarse(bench)
+    force_names = there.log_posterior.surrogate.space.names
+    quiet = {name: noise[name] for name in there.log_posterior.names if name not in force_names}
+    there = replace(there, theta={**there.theta, **quiet})
+    left = discrepancy(there, bench.motion)
     draws = resample(found, shear, alone.surrogate.space.dim, seed)
     some = inference.evenly(draws.draws, PREDICTIVE_DRAWS)
     bands = inference.bands(found.log_posterior, some, np.random.default_rng(seed))
     return TakenUp(
         full, full_weight, draws, inference.coverage(bench.binned, *bands.interval(0.9)),
-        _left_out(sure, shear), locate(there, noise, seed),
+        _left_out(sure, shear), Evidence(left.without_log_evidence, left.log_evidence),
+        locate(there, noise, seed),
         tuple(contributions(found.names, found.theta, force, bench.known)),
-        Remainder(discrepancy(found, bench.motion), propose_form(found, bench.motion, seed)),
+        Remainder(left, propose_form(there, bench.motion, seed)),
     )  # fmt: skip
 
 
