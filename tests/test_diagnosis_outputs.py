@@ -131,7 +131,7 @@ def test_what_is_left_is_described_where_something_is(
     verdict: Any, windows: tuple[Window, ...], described: bool
 ) -> None:
     after = located(np.zeros(len(BINNED.force_n)), *windows)
-    assert diagnosis.leaves_something(Diagnosis(verdict, (), 0.0, 0.05), after) == described
+    assert diagnosis.leaves_something(Diagnosis(verdict, (), 0.0, 0.05, True), after) == described
 
 
 def drifting() -> Fit:
@@ -177,6 +177,8 @@ def test_words_say_what_is_left_only_where_something_is(remainder: Remainder) ->
     assert "outside this catalogue: probability at most 0.97" in in_words(answer)
     assert "unexplained" not in in_words(answer)
     assert "R-hat" not in in_words(answer)
+    believed = in_words({**answer, "best_set": ["pad-slip", "backlash"], "set_probability": 0.034})
+    assert "pad-slip, backlash: probability against something smooth without a name 0.03" in believed
     rough = {**fits, "sampled": {**fits["sampled"], "settled": False}}
     assert "R-hat of the draws 1.37" in in_words({**answer, "fit": {"before": rough, "after": fits}})
     assert "each phase by a fit without it: RMSE 4.0 mN" in in_words(answer)

@@ -42,7 +42,7 @@ from bayeskin.mismatch.locate import _chance, locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.resample import resample
 from bayeskin.mismatch.search import PRIOR, Made, Search, search, sure, weight
-from bayeskin.mismatch.verdict import judge, unknown_probability
+from bayeskin.mismatch.verdict import Evidence, judge, set_probability, unknown_probability
 from bayeskin.mismatch.wrapper import Wrapper
 from bayeskin.proof.cases import shipped_screen
 from bayeskin.proof.protocol import MOTION
@@ -97,6 +97,10 @@ def test_a_concealed_mechanism_is_named_and_its_parameters_are_right(
     refused = judge(found, KNOWN, before, after, (1.0, 0.0))
     assert (refused.verdict, refused.named) == ("unknown", ())
     assert refused.unknown_probability > 0.99
+    assert verdict.believed
+    assert not refused.believed
+    assert judge(found, KNOWN, before, after, (0.0, 1.0), 0.95) == verdict
+    assert judge(found, KNOWN, before, after, (0.0, 1.0), 0.85) == refused
     assert [one.name for one in verdict.named] == list(names)
     assert before.windows
     assert verdict.explained > 0.8
@@ -140,6 +144,18 @@ def test_the_chance_of_a_window_farther_than_all_draws_is_read_from_their_tail(s
     by_chance = np.reshape(found, (20, 3))
     assert np.all(np.abs(by_chance.mean(axis=0)) < np.log([1.05, 1.3, 2.0]))
     assert np.all(by_chance.std(axis=0) < np.log([1.1, 1.7, 3.0]))
+
+
+def test_a_set_pays_for_its_mechanisms_and_what_has_no_name_for_being_one_more() -> None:
+    odds = np.log(PRIOR / (1.0 - PRIOR))
+    nowhere = -np.inf
+    even = set_probability(["a"], Evidence(nowhere, 3.0), Evidence(3.0, nowhere))
+    assert even == pytest.approx(0.5)  # each is one thing more than nothing
+    two = set_probability(["a", "b"], Evidence(nowhere, 3.0), Evidence(3.0, nowhere))
+    assert two == pytest.approx(1.0 / (1.0 + np.exp(-odds)))
+    assert set_probability(["a"], Evidence(0.0, nowhere), Evidence(0.0, nowhere)) == pytest.approx(PRIOR)
+    beside = set_probability(["a"], Evidence(nowhere, 10.0), Evidence(0.0, 20.0))  # the set and more
+    assert beside == pytest.approx(1.0 / (1.0 + np.exp(-10.0 - odds)))
 
 
 def test_the_probability_of_unknown_is_the_bound_of_sellke_bayarri_and_berger() -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import toy
+from scipy.stats import multivariate_normal
 from toy_inference import NOISE, TRUTH, ToySurrogate, empty_recording
 
 from bayeskin.inference import LogPosterior
@@ -16,7 +17,7 @@ from bayeskin.mismatch.discrepancy import _masks, _squared_distances, _unlikely,
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.terms import library, memory
-from bayeskin.mismatch.unexplained import Place, derivatives, place, unexplained
+from bayeskin.mismatch.unexplained import Place, derivatives, occam, place, unexplained
 from bayeskin.report import figure_discrepancy
 from bayeskin.types import PadMotion, ParameterSpace
 
@@ -113,6 +114,31 @@ def test_mean_and_sd_are_those_of_a_dense_gaussian_process_with_a_flat_prior_of_
     np.testing.assert_allclose(found.sd_n, np.sqrt(variance), rtol=1e-3, atol=1e-8)
     covariance = free @ rest.noise_n2 @ free
     assert np.all(found.sd_n < np.sqrt(np.diag(covariance)))
+
+
+def test_the_evidence_without_a_discrepancy_is_the_integral_over_the_parameters() -> None:
+    """Of a force that is linear in them, with flat priors over their box."""
+    fit = known_fit(1, creeping)
+    rest = unexplained(fit, toy.MOTION)
+    d = fit.log_posterior.surrogate.space.dim
+    moves = (fit.unit[:d] > 1e-3) & (fit.unit[:d] < 1.0 - 1e-3)
+    slopes = derivatives(fit.log_posterior, fit.unit)[:, moves]
+    wide = multivariate_normal(None, rest.noise_n2 + slopes @ slopes.T)  # about the fit, as wide as the box
+    informed = rest.information[rest.information > 1.0]
+    flat = wide.logpdf(rest.residual_n) + 0.5 * np.sum(np.log(2.0 * np.pi * (1.0 + 1.0 / informed)))
+    constant = -0.5 * len(rest.residual_n) * np.log(2.0 * np.pi)
+    lost = occam(rest.information) - 0.5 * np.sum(np.log(2.0 * np.pi / informed))
+    assert len(informed) >= 3
+    assert rest.log_evidence == pytest.approx(flat - constant + lost, abs=0.2)
+
+
+def test_a_discrepancy_pays_for_its_sizes_and_lengths() -> None:
+    without, with_it = (discrepancy(known_fit(1, extra), toy.MOTION) for extra in (None, creeping))
+    for found in (without, with_it):
+        cost = found.log_evidence - found.without_log_evidence - found.gain_nats
+        assert -30.0 < cost < 0.0
+    assert without.log_evidence < without.without_log_evidence + 1.0  # nothing there
+    assert with_it.log_evidence > with_it.without_log_evidence + 20.0
 
 
 def test_slopes_of_the_likelihood_are_its_differences() -> None:

@@ -16,6 +16,7 @@ from toy_inference import TRUTH
 
 from bayeskin.inference import LogPosterior
 from bayeskin.mismatch.fit import Fit, fit_near
+from bayeskin.mismatch.verdict import Evidence
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline import taking_up
 
@@ -141,7 +142,8 @@ def test_the_mismatch_is_located_beside_the_best_run(runs: Runs, monkeypatch: py
         ("opened", lambda *rest: None), ("workbench", lambda run: bench),
         ("restored", lambda plain, posterior: dataclasses.replace(start, log_posterior=posterior)),
         ("resample", lambda found, *rest: SimpleNamespace(draws=found.draws(20, 0))),
-        ("propose_form", lambda *rest: None), ("discrepancy", lambda *rest: None),
+        ("propose_form", lambda *rest: None),
+        ("discrepancy", lambda *rest: SimpleNamespace(without_log_evidence=1.0, log_evidence=2.0)),
     ):  # fmt: skip
         monkeypatch.setattr(taking_up, name, stand_in)
     taken = taking_up._whole_apart(Path("x"), {"names": []}, start.theta)
@@ -150,3 +152,4 @@ def test_the_mismatch_is_located_beside_the_best_run(runs: Runs, monkeypatch: py
     left = bumped[fitted] - taken.full.force_n[fitted]
     assert taken.located.residual_n == pytest.approx(left, abs=1e-6)
     assert taken.located.windows
+    assert taken.evidence == Evidence(1.0, 2.0)

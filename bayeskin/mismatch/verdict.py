@@ -3,10 +3,10 @@
 A mechanism is named where it, or its group of look-alikes together, has nine chances in ten, and leaving it
 out of its set costs more than the full model's own error, if no window is left or what is named explains nine
 tenths of the squared residual beyond what is allowed. Where the full model was fitted, its evidence has to be
-for the set, too. And the set has to be nine times as probable as something smooth without a name in its place
-(`discrepancy`), which bends as it likes and pays for that: what is of the catalogue is the shorter description.
-Nothing is missing where none is named and no window is found, or what goes beyond the
-allowed is within the model's own error. Otherwise the mismatch is unknown.
+for the set, too. And the set has to be nine times as probable as something smooth without a name in its
+place (`discrepancy`), which bends as it likes and pays for that. Nothing is missing where none is named and
+no window is found, or what goes beyond the allowed is within the model's own error. Otherwise the mismatch is
+unknown.
 
 The probability that something acts which no set has is at most that of Sellke, Bayarri & Berger (2001,
 The American Statistician 55:62): where the farthest window that the believed fit leaves (of the best set, or
