@@ -168,8 +168,13 @@ def test_errors_of_one_model_are_compared() -> None:
 def test_what_is_missing_is_said_alike_in_a_word_and_a_sentence(
     changed: dict[str, object], word: str, sentence: str
 ) -> None:
+    changed |= {"set_probability": 0.023, "best_set": ["pad-slip", "backlash"]}
     text = diagnosed_as(changed)
     assert f"What is missing? {word}" in text
+    said = (
+        "Of the catalogue pad-slip, backlash fits best, with a probability of 0.023 against something smooth"
+    )
+    assert (said in text) == (changed["verdict"] == "unknown")
     assert sentence in text
     assert f"Something outside the catalogue: probability {changed['unknown_probability']} at most." in text
 

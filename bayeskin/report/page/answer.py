@@ -143,6 +143,10 @@ def _missing(facts: RunFacts) -> Verdict:
     lines += _beyond_the_catalogue(said)
     if said["verdict"] == "named":
         return Verdict("named", "doubt", lines)
+    if (share := said.get("set_probability")) is not None:
+        among = ", ".join(said["best_set"])
+        lines.append(f"Of the catalogue {among} fits best, with a probability of {number(share)} against "
+                     "something smooth without a name.")  # fmt: skip
     word = (
         "something that has no name here"
         if is_outside(said)
