@@ -516,6 +516,13 @@ def test_help_teaches_each_command_by_an_example(bayeskin: Command) -> None:
         assert f"bayeskin {name} " in out.split("Example:")[1]
 
 
+def test_a_set_of_what_nobody_knows_is_refused(tmp_path: Path, bayeskin: Command) -> None:
+    code, _, said = bayeskin("conceal", tmp_path / "set", "--seed", 1, "--count", 2, "--only", "pad-slop")
+    assert code == 2
+    assert "--only: found pad-slop; expected nothing, or one of backlash" in said
+    assert not (tmp_path / "set" / "index.json").exists()
+
+
 def test_the_list_of_commands_follows_the_work_and_fits_a_terminal(
     bayeskin: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,8 +21,8 @@ from scipy.linalg import cho_solve, solve_triangular
 from scipy.optimize import minimize
 
 from bayeskin.mismatch.features import describe
-from bayeskin.mismatch.fit import Fit
-from bayeskin.mismatch.unexplained import Place, Unexplained, occam, unexplained
+from bayeskin.mismatch.fit import Fit, occam
+from bayeskin.mismatch.unexplained import Place, Unexplained, unexplained
 from bayeskin.types import Array, PadMotion
 
 PARTS = ("displacement", "phase", "cycle")

@@ -344,6 +344,12 @@ def other_skins(
     return trials
 
 
+def occam(information: Array) -> float:
+    """Logarithm of what a recording leaves of uniform priors, from the eigenvalues (d,) of its information
+    over their widths; nothing is lost where there is none."""
+    return float(0.5 * np.sum(np.log(2.0 * np.pi / (np.maximum(information, 0.0) + 2.0 * np.pi))))
+
+
 def _evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
     """Log evidence, and the covariance (D, D) over the unit cube; the prior's where nothing is possible."""
     if not np.isfinite(top.value):
@@ -354,17 +360,15 @@ def _evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
     held = uphill > 0.0
     free = ~held
     values, vectors = np.linalg.eigh(top.information[np.ix_(free, free)])
-    values = np.maximum(values, 0.0) + 2.0 * np.pi
     t = np.linspace(0.0, 1.0, 2001) ** 3  # close together where the integrand is steep
     steep, curved = uphill[held], np.diag(top.information)[held]
     density = np.exp(-np.outer(steep, t) - 0.5 * np.outer(curved, t**2))
     mass = np.trapezoid(density, t, axis=1)
     log_likelihood = top.value + float(np.sum(np.log(high - low)))
-    log_evidence = (
-        log_likelihood + 0.5 * float(np.sum(np.log(2.0 * np.pi / values))) + float(np.sum(np.log(mass)))
-    )
+    log_evidence = log_likelihood + occam(values) + float(np.sum(np.log(mass)))
     covariance = np.zeros((len(unit), len(unit)))
-    covariance[np.ix_(free, free)] = (vectors / np.maximum(values, 12.0)) @ vectors.T
+    width = np.maximum(np.maximum(values, 0.0) + 2.0 * np.pi, 12.0)
+    covariance[np.ix_(free, free)] = (vectors / width) @ vectors.T
     away = np.trapezoid(density * t**2, t, axis=1) / mass  # mean square, from the bound
     covariance[held, held] = away
     share = np.ones(len(unit))

@@ -25,7 +25,7 @@ from scipy.linalg import solve_triangular
 
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.noise_model import scales
-from bayeskin.mismatch.fit import Fit
+from bayeskin.mismatch.fit import Fit, occam
 from bayeskin.types import Array, PadMotion, Phase
 
 STEP = 1e-3  # of the prior box in sampling coordinates, for derivatives
@@ -72,25 +72,26 @@ class Unexplained:
     """A fit's residual and what it takes to split it; k bins, r of them taken up by parameters.
 
     residual_n (k,) recorded minus model; force_n (k,) the model's; noise_n2 (k, k) covariance of measured
-    noise and surrogate's error; basis (k, k - r) is N; at: where the bins stand; information (d,) of what the
-    noise lets be known of the moving parameters over their priors' widths, the eigenvalues.
+    noise and surrogate's error; slopes (k, d) of the force over the priors' widths of the d parameters that
+    move; basis (k, k - r) is N; at: where the bins stand.
     """
 
     bins: NDArray[np.int64]
     residual_n: Array
     force_n: Array
     noise_n2: Array
+    slopes: Array
     basis: Array
     at: Place
-    information: Array
 
-    @property
+    @cached_property
     def log_evidence(self) -> float:
         """Without a discrepancy: of the fit, its force linear in the parameters, whose priors are uniform
         (Laplace's, as in `fit`), up to a constant that is the same for all fits to the same bins."""
-        reduced = self.reduce @ self.residual_n
-        determinant = np.sum(np.log(np.diag(np.linalg.cholesky(self.noise_n2))))
-        return float(occam(self.information) - determinant - 0.5 * reduced @ reduced)
+        reduced, root = self.reduce @ self.residual_n, np.linalg.cholesky(self.noise_n2)
+        white = solve_triangular(root, self.slopes, lower=True)
+        determinant = np.sum(np.log(np.diag(root)))
+        return float(occam(np.linalg.eigvalsh(white.T @ white)) - determinant - 0.5 * reduced @ reduced)
 
     @cached_property
     def _root(self) -> Array:
@@ -129,18 +130,10 @@ def unexplained(found: Fit, motion: PadMotion) -> Unexplained:
     left, size, _ = np.linalg.svd(slopes)
     rank = int(np.sum(size > SMALLEST * size.max(initial=0.0)))
     at = place(binned.time_s[chain.bins], binned.phase[chain.bins], binned.phases, motion)
-    noise_n2 = chain_covariance(scale[0], rho[0]) + factor @ factor.T
-    white = solve_triangular(np.linalg.cholesky(noise_n2), slopes, lower=True)
     return Unexplained(
-        chain.bins, chain.force_n - force, force, noise_n2, left[:, rank:], at,
-        np.linalg.eigvalsh(white.T @ white),
+        chain.bins, chain.force_n - force, force, chain_covariance(scale[0], rho[0]) + factor @ factor.T,
+        slopes, left[:, rank:], at,
     )  # fmt: skip
-
-
-def occam(information: Array) -> float:
-    """Logarithm of what is left of uniform priors, from eigenvalues (d,) of the information over their
-    widths: nothing lost where there is none."""
-    return float(0.5 * np.sum(np.log(2.0 * np.pi / (np.maximum(information, 0.0) + 2.0 * np.pi))))
 
 
 def derivatives(log_posterior: LogPosterior, unit: Array) -> Array:

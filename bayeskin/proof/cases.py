@@ -118,7 +118,9 @@ def _asked_for(known: Mapping[str, Mechanism], only: Sequence[str], count: int) 
 def _plan(name: str, known: Mapping[str, Mechanism]) -> Plan:
     if name in known:
         return Plan(name, "alone", (*known[name].needs, name), "", False, ())
-    return Plan(name, *(("nothing", (), "") if name == "nothing" else ("outside", (), name)), False, ())
+    if name == "nothing":
+        return Plan(name, "nothing", (), "", False, ())
+    return Plan(name, "outside", (), name, False, ())
 
 
 def _counts(count: int) -> dict[Kind, int]:
