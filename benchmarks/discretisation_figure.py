@@ -97,14 +97,16 @@ def _draw_times(ax: Axes, times: Mapping[str, Mapping[tuple[float, str], float]]
             ax.plot(*zip(*line, strict=True), dashes, marker="o", mfc=fill, color=colour, label=name)
     ax.axhline(100 * target, color=FAINT, lw=0.8, zorder=0)
     ax.annotate(
-        "target", (0.99, 100 * target), xycoords=ax.get_yaxis_transform(), ha="right", va="bottom", color=GREY
+        "target", (0.01, 100 * target), xycoords=ax.get_yaxis_transform(), ha="left", va="bottom", color=GREY
     )
     panel_title(ax, "b", "time, bricks-1")
     ax.set(xscale="log", yscale="log", xlabel="tolerance", ylabel="RMS error [% of peak]")
     if times:
         plain_log(ax.xaxis)
         plain_log(ax.yaxis)
-        ax.legend(loc="upper left", fontsize=6, ncols=2, handlelength=2.6)
+        smallest = min(error for errors in times.values() for error in errors.values())
+        ax.set_ylim(bottom=30 * smallest)  # room for the legend below the lines [%]
+        ax.legend(loc="lower right", fontsize=6, ncols=2, handlelength=2.6)
 
 
 def _draw_histories(ax: Axes, histories: Sequence[tuple[str, Simulation]], letter: str, label: str) -> None:

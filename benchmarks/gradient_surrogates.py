@@ -33,7 +33,7 @@ from bayeskin.design import default_space, first_wave
 from bayeskin.model import ModelSpec, simulate
 from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.report import save_figure
-from bayeskin.report.style import PAGE_IN, new_figure, state_finding, styled
+from bayeskin.report.style import PAGE_IN, new_figure, plain_log, state_finding, styled
 from bayeskin.surrogates import hyperparameters
 from bayeskin.surrogates.chaos import (
     FOLDS,
@@ -218,6 +218,8 @@ def _draw(found: Sequence[tuple[str, int, float, float, float]]) -> Figure:
     for kind, colour in zip(KINDS, COLOURS, strict=True):
         mine = [row for row in found if row[0] == kind]
         axes.loglog([row[2] / 60 for row in mine], [row[3] for row in mine], "o-", color=colour, label=kind)
+    plain_log(axes.xaxis)
+    plain_log(axes.yaxis)
     axes.set_xlabel("CPU time of the runs, with derivatives where used [min]")
     axes.set_ylabel("held-out error [% of RMS force]")
     axes.legend()

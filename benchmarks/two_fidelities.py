@@ -112,7 +112,7 @@ def figure(draws: dict[str, dict[str, Array]]) -> Figure:
             ax.stairs(density, edges, color=colour, label=case, lw=1.0)
         panel_title(ax, letter, name)
         ax.set(xlabel=f"{name} [{unit}]", yticks=[])
-    axes[0].legend(loc="upper left")
+    axes[0].legend(loc="upper right")
     shifts = {
         case: (np.median(draws[case]["stiffness"]) - np.median(draws["fine"]["stiffness"]))
         / spread(draws["fine"]["stiffness"])
