@@ -157,7 +157,10 @@ def test_each_stage_draws_its_figures_and_says_where_they_come_from(folder: Path
         "design": ["waves"],
         "train": ["validation", "prior_predictive"],
         "map": ["map_check"],
-        "sample": ["posterior", "fit", "traces", "profiles", "residuals", *model_check(folder)],
+        "sample": [
+            *("posterior", "posterior_noise", "fit", "traces", "profiles", "residuals"),
+            *model_check(folder),
+        ],
         "sobol": ["sobol_prior_gp", "sobol_prior_chaos", "sobol_near_map"],
     }
     for stage, names in expected.items():

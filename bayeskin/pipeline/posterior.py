@@ -221,8 +221,11 @@ def _draw_posterior(
     convergence = posterior.convergence
     folder, ensembles = chains_folder(run, log_posterior), run.config.sample.ensembles
     kept = inference.load_chains(folder, log_posterior, ensembles)[:, convergence.burn_in : convergence.steps]
+    material = posterior.space.names[: log_posterior.surrogate.space.dim]
+    noise = posterior.space.names[len(material) :]
     figures = {
-        "posterior": report.figure_posterior(posterior.space, posterior.flat, best),
+        "posterior": report.figure_posterior(posterior.space, posterior.flat, best, material),
+        "posterior_noise": report.figure_posterior(posterior.space, posterior.flat, best, noise),
         "fit": report.figure_fit(
             binned,
             motion.at(binned.time_s),

@@ -29,6 +29,7 @@ from bayeskin.report.timeline import PHASE_COLORS, phase_legend, shade_phases
 from bayeskin.types import Array, BinnedForce, PadMotion, Phase, PhaseKind
 
 Z90 = 1.645
+BELOW = "#882255"  # windows where the recorded force is below what the model allows; above: ACCENT
 WORDS: dict[PhaseKind, str] = {
     "load": "while loading", "unload": "while unloading", "hold": "in holds", "rest": "at rest",
 }  # fmt: skip
@@ -85,7 +86,7 @@ def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, fo
     loops.plot(displacement_mm, 1e3 * binned.force_n, ".", ms=1.5, color=GREY)
     loops.plot(displacement_mm, 1e3 * force_n, color=MODEL, lw=0.8)
     for window in located.windows:
-        color = ACCENT if window.mean_n > 0 else MODEL
+        color = ACCENT if window.mean_n > 0 else BELOW
         residual.axvspan(window.start_s, window.end_s, ymax=0.04, color=color, lw=0)
         inside = (time_s >= window.start_s) & (time_s <= window.end_s)
         loops.plot(displacement_mm[inside], 1e3 * binned.force_n[inside], ".", ms=2.5, color=color)
@@ -96,18 +97,20 @@ def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, fo
     _key_above(residual)
     force.tick_params(labelbottom=False)
     force.set_ylabel("force [mN]")
-    residual.set(xlabel="time [s]", ylabel="recorded − model [mN]")
+    residual.set(xlabel="time [s]", ylabel="force left [mN]")
     loops.set(xlabel="displacement [mm]", ylabel="force [mN]")
-    for ax, letter in zip((force, residual, loops), "abc", strict=True):
-        panel_title(ax, letter)
+    panel_title(force, "a", "best fit")
+    panel_title(residual, "b", "what no other values take up")
+    panel_title(loops, "c")
     count = len(located.windows)
     state_finding(
         figure,
         f"The recording leaves what the model allows in {count} window{'s' * (count != 1)}"
         if count
         else "The recording stays within what the model allows",
-        "Orange: recorded force above the model's; blue: below. Allowed: measured noise, the model's own "
-        "error, the parameters' uncertainty. One search in twenty finds a window where nothing is missing.",
+        "b: recorded less modelled force, without what other values of the parameters could take up. Orange: "
+        "windows where it is positive; purple: negative. Allowed: measured noise, the model's own error, the "
+        "parameters' uncertainty. One search in twenty finds a window where nothing is missing.",
     )
     return figure
 

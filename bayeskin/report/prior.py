@@ -51,7 +51,8 @@ def figure_prior_predictive(binned: BinnedForce, draws_n: ArrayLike) -> Figure:
     panel_title(fan, "a")
     panel_title(peaks, "b", "the prior's peak forces")
     finding = (
-        f"The recorded peak of {number(recorded_peak, 3)} N lies above {100 * share:.0f} % of the prior's"
+        f"The recorded peak of {number(recorded_peak, 3)} N (a bin's mean) lies above "
+        f"{100 * share:.0f} % of the prior's"
     )
     caption = (
         f"Black: recorded. Blue: median, 50 % and 90 % band of {len(draws)} draws from the prior; grey: "

@@ -84,14 +84,14 @@ def _draw_detectability(ax: Axes, classes: Sequence[Mapping[str, Any]]) -> None:
     for one in classes:
         low, high = one["from"] or lowest, one["to"] or one["from"] * _OPEN_END
         middle = np.sqrt(low * high)
-        for name, color, label, shift in (
-            ("named", INK, "right", 0.97),
-            ("up_to_look_alikes", MODEL, "up to look-alikes", 1.03),
+        for name, color, label, shift, width in (
+            ("named", INK, "right", 0.97, 3.0),
+            ("up_to_look_alikes", MODEL, "up to look-alikes", 1.03, 1.0),
         ):
             found = one[name]
             if not found["of"]:
                 continue
-            ax.hlines(found["share"], low, high, color=color, lw=1.3, label=label)
+            ax.hlines(found["share"], low, high, color=color, lw=width, label=label)
             ax.vlines(middle * shift, found["low"], found["high"], color=color, lw=0.7)
     handles, labels = ax.get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))

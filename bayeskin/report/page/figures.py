@@ -41,7 +41,11 @@ _KNOWN = {
     ),
     ("sample", "posterior"): (
         "The posterior",
-        "Marginal distributions of all parameters beside their priors, and pairs of them.",
+        "Marginal distributions of the material parameters beside their priors, and pairs of them.",
+    ),
+    ("sample", "posterior_noise"): (
+        "The noise",
+        "Marginal distributions of the noise's parameters beside their priors, and pairs of them.",
     ),
     ("sample", "profiles"): (
         "Profile likelihoods",

@@ -153,7 +153,7 @@ def posterior(facts: RunFacts) -> Section:
         blocks += [_parameters(facts, said["parameters"]), *pictures(facts, "sample", ["posterior"])]
         if said["ridges"]:
             blocks.insert(1, Text([f"{ridge}." for ridge in said["ridges"]], listed=True))
-        blocks += [*_taught(said), *pictures(facts, "sample", ["profiles"])]
+        blocks += [*_taught(said), *pictures(facts, "sample", ["profiles", "posterior_noise"])]
         sources = [f"{name}: {one['prior']['source']}." for name, one in said["parameters"].items()]
         blocks.append(Folded("Where the priors come from", [Text(sources, listed=True)]))
         blocks += pictures(facts, "train", ["prior_predictive"])
