@@ -1,11 +1,18 @@
 """Profile likelihoods: a parabola where the force is linear, flat where it does not know a parameter."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from toy_inference import NOISE, TRUTH, line_problem, toy_problem
 
-from bayeskin.inference import find_map, profiles
+from bayeskin.inference import LogPosterior, find_map, profile, profiles
 from bayeskin.inference.profile import DROP
+
+
+def nothing(problem: LogPosterior) -> np.ndarray:
+    """No draws."""
+    return np.empty((0, problem.dim))
 
 
 def test_a_linear_models_profile_is_a_parabola_of_its_standard_error() -> None:
@@ -14,7 +21,7 @@ def test_a_linear_models_profile_is_a_parabola_of_its_standard_error() -> None:
     x = problem.surrogate.columns
     covariance = (2.5e-3 + 1e-6) * np.eye(40) + 1e-4 * np.outer(x[1], x[1])
     spread = np.linalg.inv(x @ np.linalg.solve(covariance, x.T))
-    for j, found in enumerate(profiles(problem, best, points=201)):
+    for j, found in enumerate(profiles(problem, best, nothing(problem), points=201)):
         exact = -0.5 * (found.values - best[found.name]) ** 2 / spread[j, j]
         near = exact > -4.0  # further out the surrogate's error leaves its three sd
         assert near.sum() > 4
@@ -29,7 +36,7 @@ def test_a_linear_models_profile_is_a_parabola_of_its_standard_error() -> None:
 def test_a_parameter_without_effect_has_a_flat_profile_and_one_with_effect_has_not() -> None:
     problem = toy_problem()
     best = find_map(problem, seed=1, starts=3, evaluations=2000).theta
-    found = {one.name: one for one in profiles(problem, best, points=9)}
+    found = {one.name: one for one in profiles(problem, best, nothing(problem), points=9)}
     assert found["p_init"].flat
     assert np.ptp(found["p_init"].drop_nats) < 0.1
     assert found["p_init"].interval == pytest.approx((-670.0, 2144.0))
@@ -43,10 +50,31 @@ def test_a_profile_is_nowhere_above_the_maximum_and_tops_what_holds_the_rest() -
     problem = toy_problem()
     best = find_map(problem, seed=1, starts=3, evaluations=2000).theta
     top = problem.log_likelihood(np.array([list(best.values())]))[0]
-    found = profiles(problem, best, points=7)[0]
+    found = profiles(problem, best, nothing(problem), points=7)[0]
     rows = np.tile([best[name] for name in problem.names], (len(found.values), 1))
     rows[:, 0] = found.values
     alone = problem.log_likelihood(rows) - top
     assert np.all(found.drop_nats >= alone - 0.1)
     assert found.drop_nats.max() == 0.0
     assert set(NOISE) <= set(problem.names)
+
+
+def test_a_profile_begins_at_draws_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without any climb: as high as the likeliest and the nearest draw about each value, moved onto it."""
+    problem = toy_problem()
+    best = find_map(problem, seed=1, starts=3, evaluations=2000).theta
+    rng = np.random.default_rng(4)
+    about = problem.vector(best) + 0.02 * rng.standard_normal((40, problem.dim))
+    low, high = problem.bounds
+    about[:, 1] = rng.uniform(low[1], high[1], 40)
+    draws = problem.from_sampling(np.clip(about, low, high))
+
+    def stays(held: LogPosterior, at: np.ndarray, *_: object) -> SimpleNamespace:
+        return SimpleNamespace(vector=at)
+
+    monkeypatch.setattr(profile, "gauss_newton", stays)
+    without, found = (profiles(problem, best, some, points=9)[1] for some in (nothing(problem), draws))
+    assert np.all(found.drop_nats >= without.drop_nats - 1e-9)
+    values, top = problem.log_likelihood(draws), problem.log_likelihood(np.array([list(best.values())]))[0]
+    assert np.any(found.drop_nats > without.drop_nats + 1.0)
+    assert found.drop_nats.max() <= max(values.max() - top, 0.0) + 1e-9

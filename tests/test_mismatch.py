@@ -38,11 +38,11 @@ from bayeskin.mismatch.fit import (
     stored,
 )
 from bayeskin.mismatch.full_fit import ENOUGH, at_run, fit_full
-from bayeskin.mismatch.locate import _chance, locate
+from bayeskin.mismatch.locate import _chance, locate, model_error
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.resample import resample
 from bayeskin.mismatch.search import PRIOR, Made, Search, search, sure, weight
-from bayeskin.mismatch.verdict import Evidence, judge, set_probability, unknown_probability
+from bayeskin.mismatch.verdict import Evidence, _named, judge, set_probability, unknown_probability
 from bayeskin.mismatch.wrapper import Wrapper
 from bayeskin.proof.cases import shipped_screen
 from bayeskin.proof.protocol import MOTION
@@ -99,6 +99,10 @@ def test_a_concealed_mechanism_is_named_and_its_parameters_are_right(
     assert refused.unknown_probability > 0.99
     assert verdict.believed
     assert not refused.believed
+    assert judge(found, KNOWN, before, after, (None, 1.0)) == verdict
+    assert (
+        judge(found, KNOWN, before, after, (0.0, None)) == refused
+    )  # the full model fails with the set alone
     assert judge(found, KNOWN, before, after, (0.0, 1.0), 0.95) == verdict
     assert judge(found, KNOWN, before, after, (0.0, 1.0), 0.85) == refused
     assert [one.name for one in verdict.named] == list(names)
@@ -132,9 +136,44 @@ def test_the_chance_of_the_farthest_window_is_uniform_where_nothing_is_missing()
     assert locate(fit_base(off, 1, find_shear(off)), fits[0].theta, 1).chance < 1e-6
 
 
+@pytest.mark.parametrize("share", [1e-3, 1e-2])
+def test_what_the_model_is_wrong_by_is_no_mismatch(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In each phase by another amount, of a sd that is allowed for, below the noise's and above."""
+    monkeypatch.setattr("bayeskin.mismatch.locate.MESH_ERROR", share)
+    chances = []
+    for seed in range(30):
+        alone = concealing(seed)
+        binned = alone.binned
+        error_n = model_error(alone) * np.random.default_rng([seed, 1]).standard_normal(len(binned.phases))
+        binned = dataclasses.replace(binned, force_n=binned.force_n + error_n[binned.phase])
+        off = dataclasses.replace(alone, binned=binned)
+        at = Fit((), off, {**TRUTH, **NOISE}, 0.0, 0.0, 1e-6 * np.eye(off.dim), np.zeros(3))
+        chances.append(locate(at, at.theta, seed).chance)
+    assert np.sum(np.array(chances) < 0.05) <= 5
+
+
+def test_a_look_alike_that_is_named_too_lends_no_probability(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rubbing is sure, and an offset beside it is not, though each could stand for the other."""
+    known = catalogue()
+    alone = concealing(0)
+    found = Search()
+    names: tuple[str, ...]
+    for names, worth in (
+        ((), 0.0),
+        (("device-friction",), 20.0),
+        (("device-friction", "force-offset"), 23.0),
+    ):
+        found.add(Made(Fit(names, alone, {}, 0.0, worth, np.eye(1), np.zeros(1)), True))
+    monkeypatch.setattr("bayeskin.mismatch.verdict.explains", lambda *_: 1.0)
+    rubs, offset = (_named(found, known[name]) for name in ("device-friction", "force-offset"))
+    assert {"device-friction", "force-offset"} <= set(offset.group)
+    assert rubs.group_probability > 0.99
+    assert 0.4 < offset.group_probability < 0.6
+
+
 @pytest.mark.parametrize("scale", [1.0, 0.7])
 def test_the_chance_of_a_window_farther_than_all_draws_is_read_from_their_tail(scale: float) -> None:
-    """Of the largest of 200 Gaussians; a scale below one is what allowing for the model's error makes."""
+    """Of the largest of 200 Gaussians of one sd or another."""
     found = []
     for seed in range(20):
         tall = scale * np.abs(np.random.default_rng(seed).standard_normal((1000, 200))).max(axis=1)

@@ -3,12 +3,13 @@
 Where the profile is flat, no value of the parameter can be told from another by the fit, whatever the prior
 says (practical non-identifiability; Raue et al. 2009, Bioinformatics 25:1923). Noise parameters are free
 too. From the most probable point the held value moves to either end, each maximum from that of its
-neighbour by Gauss-Newton (`gauss_newton`).
+neighbour by Gauss-Newton (`gauss_newton`), and from the likeliest and the nearest of the posterior's draws
+about the value, which know ridges that bend and tops that lie apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,20 +44,26 @@ class Profile(_FreezesArrays):
         return self.open_below and self.open_above
 
 
-def profiles(log_posterior: LogPosterior, best: Mapping[str, float], points: int = 15) -> tuple[Profile, ...]:
+def profiles(
+    log_posterior: LogPosterior, best: Mapping[str, float], draws: Array, points: int = 15
+) -> tuple[Profile, ...]:
     """A profile for each material parameter, `points` values evenly over its prior and the best one.
 
-    best : all parameters (SI) of the most probable point
+    best : all parameters (SI) of the most probable point; draws : of the posterior (n, D), n from 0 on
     """
     material = log_posterior.material or log_posterior.surrogate.space
     log_posterior = replace(log_posterior, material=material.box)  # the fit's own word, no prior in it
     shear, names = find_shear(log_posterior), material.names
-    return tuple(_profile(log_posterior, best, shear, j, points) for j in range(len(names)))
+    known = log_posterior.to_sampling(draws)
+    values = log_posterior.log_prob(known)
+    known = known[np.argsort(-values)]
+    return tuple(_profile(log_posterior, best, known, shear, j, points) for j in range(len(names)))
 
 
 def _profile(
-    log_posterior: LogPosterior, best: Mapping[str, float], shear: Shear | None, column: int, points: int
-) -> Profile:
+    log_posterior: LogPosterior, best: Mapping[str, float], draws: Array, shear: Shear | None, column: int,
+    points: int,
+) -> Profile:  # fmt: skip
     low, high = (float(bound[column]) for bound in log_posterior.bounds)
     start = log_posterior.vector(best)
     line = np.sort(np.append(np.linspace(low, high, points), start[column]))
@@ -64,6 +71,10 @@ def _profile(
     last = len(line) - 1
     value, found = np.full(len(line), -np.inf), np.tile(start, (len(line), 1))
     value[middle], found[middle] = _held(log_posterior, start, shear, column)
+    for j, one in _likeliest_about(line, draws, column):
+        reached, point = _held(log_posterior, one, shear, column)
+        if reached > value[j]:
+            value[j], found[j] = reached, point
     # Out to both ends, then across and back: what one direction missed, the other may find.
     paths = ((middle, last), (middle, 0), (0, last), (last, 0))
     for first, end in paths:
@@ -82,6 +93,16 @@ def _profile(
     open_ends = (bool(drop[0] > -DROP), bool(drop[-1] > -DROP))
     name = log_posterior.names[column]
     return Profile(name, theta[:-2], drop, (float(theta[-2]), float(theta[-1])), *open_ends)
+
+
+def _likeliest_about(line: Array, draws: Array, column: int) -> Iterator[tuple[int, Array]]:
+    """Of each value (g,) the first and the nearest of the draws (n, D) about it, moved onto it."""
+    away = np.abs(draws[:, column, None] - line)
+    value = np.argmin(away, axis=1)
+    for j in np.unique(value):
+        about = np.flatnonzero(value == j)
+        for i in {int(about[0]), int(about[np.argmin(away[about, j])])}:
+            yield int(j), np.where(np.arange(draws.shape[1]) == column, line[j], draws[i])
 
 
 def _held(log_posterior: LogPosterior, at: Array, shear: Shear | None, column: int) -> tuple[float, Array]:

@@ -96,8 +96,9 @@ def discrepancy(found: Fit, motion: PadMotion) -> Discrepancy:
         {name: float(mean @ mean) * one / whole if whole > 0.0 else 0.0 for name, one in own.items()},
         dict(zip(PARTS, np.exp(line[:3]).tolist(), strict=True)),
         dict(zip(PARTS, np.exp(line[3:]).tolist(), strict=True)),
-        gain, rest.log_evidence + gain + _integrated(line, bounds, rest, squares, masks), rest.log_evidence,
-        features,
+        gain,
+        rest.log_evidence(np.sum(kernels, axis=0)) + _integrated(line, bounds, rest, squares, masks),
+        rest.log_evidence(), features,
     )  # fmt: skip
 
 

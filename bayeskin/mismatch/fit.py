@@ -323,7 +323,7 @@ def _best(
 
 def _fit_at(names: Sequence[str], log_posterior: LogPosterior, top: Top) -> Fit:
     theta = log_posterior.named(log_posterior.from_sampling(top.vector))
-    return Fit(tuple(names), log_posterior, theta, top.value, *_evidence(log_posterior, top), top.latent)
+    return Fit(tuple(names), log_posterior, theta, top.value, *evidence(log_posterior, top), top.latent)
 
 
 def other_skins(
@@ -350,7 +350,14 @@ def occam(information: Array) -> float:
     return float(0.5 * np.sum(np.log(2.0 * np.pi / (np.maximum(information, 0.0) + 2.0 * np.pi))))
 
 
-def _evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
+def held_density(steep: Array, curved: Array) -> tuple[Array, Array]:
+    """Distances (t,) from a bound into the unit cube, and the density (h, t) there over that on the bound, of
+    parameters that it holds; from minus its logarithm's first and second derivatives (h,) at the bound."""
+    t = np.linspace(0.0, 1.0, 2001) ** 3  # close together where the density is steep
+    return t, np.exp(-np.outer(steep, t) - 0.5 * np.outer(curved, t**2))
+
+
+def evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
     """Log evidence, and the covariance (D, D) over the unit cube; the prior's where nothing is possible."""
     if not np.isfinite(top.value):
         return -np.inf, np.eye(log_posterior.dim) / 12.0
@@ -360,9 +367,7 @@ def _evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
     held = uphill > 0.0
     free = ~held
     values, vectors = np.linalg.eigh(top.information[np.ix_(free, free)])
-    t = np.linspace(0.0, 1.0, 2001) ** 3  # close together where the integrand is steep
-    steep, curved = uphill[held], np.diag(top.information)[held]
-    density = np.exp(-np.outer(steep, t) - 0.5 * np.outer(curved, t**2))
+    t, density = held_density(uphill[held], np.diag(top.information)[held])
     mass = np.trapezoid(density, t, axis=1)
     log_likelihood = top.value + float(np.sum(np.log(high - low)))
     log_evidence = log_likelihood + occam(values) + float(np.sum(np.log(mass)))

@@ -2,7 +2,7 @@
 
 What is allowed is the residual that noise alone leaves after a fit: draws of the noise, with its parameters
 of a fit that takes no mismatch for noise, less what parameters and the errors allowed for take up of each;
-and, of any window's mean, `MODEL_ERROR` of the force's range, which mesh and time steps leave of it beyond
+and, in each phase, an error of `MODEL_ERROR` of the force's range, which mesh and time steps leave beyond
 what is allowed for (`discretised`; docs/discretisation.md: 0.02 and 0.04 %, RMS), or `MESH_ERROR`, which
 they leave beside a factor alone (0.10 %, there), where no shape of a mesh's error is allowed for. Mean
 residuals over windows of every length inside each phase are counted in standard deviations of the same means
@@ -32,6 +32,7 @@ SHORTEST = 2  # bins
 MODEL_ERROR = 4e-4  # of the force's range
 MESH_ERROR = 1e-3  # the same
 PRIOR_PRECISION = 12.0  # of a uniform prior over the unit cube
+STEP = 1e-4  # of the unit cube, inwards, for derivatives
 
 
 @dataclass(frozen=True)
@@ -77,10 +78,12 @@ def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
     log_posterior, rng = found.log_posterior, np.random.default_rng(seed)
     chain = log_posterior.chain
     residual = chain.force_n - found.force_n[chain.bins]
-    spread, refitted = _allowed(found, noise, seed, rng)
-    spans = _spans(log_posterior.binned.phase[chain.bins])
-    error_n = model_error(log_posterior)
-    scale = np.array([np.hypot(_means(spread, *span).std(), error_n) for span in spans])
+    phase = log_posterior.binned.phase[chain.bins]
+    spread, refitted = _allowed(found, noise, rng)
+    error_n = model_error(log_posterior) * rng.standard_normal((DRAWS, len(log_posterior.binned.phases)))
+    spread += error_n[:, phase]
+    spans = _spans(phase)
+    scale = np.array([_means(spread, *span).std() for span in spans])
     tall = np.zeros(len(spread))
     for span, sd in zip(spans, scale, strict=True):
         centred = _means(spread, *span)
@@ -90,13 +93,13 @@ def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
     windows = []
     for a, b in _chosen(spans, z, float(np.quantile(tall, 1.0 - LEVEL))):
         mean, left = float(residual[a:b].mean()), float(tested[0, a:b].mean())
-        sd = float(np.hypot(_means(spread, a, b).std(), error_n))
-        phase = log_posterior.binned.phases[log_posterior.binned.phase[chain.bins[a]]]
+        sd = float(_means(spread, a, b).std())
+        within = log_posterior.binned.phases[phase[a]]
         edges = log_posterior.binned.edges_s
         windows.append(
             Window(
                 float(edges[chain.bins[a]]), float(edges[chain.bins[b - 1] + 1]),
-                phase.kind, phase.cycle, mean, _chance(tall, abs(left) / sd),
+                within.kind, within.cycle, mean, _chance(tall, abs(left) / sd),
             )
         )  # fmt: skip
     chance = _chance(tall, float(np.abs(z).max(initial=0.0)))
@@ -107,7 +110,7 @@ def _chance(tall: Array, height: float) -> float:
     """Of some window of a draw going so high, in sd.
 
     From draws; beyond the highest tenth of them by its own tail, in which squares are exponential as a
-    Gaussian's are (their scale is the draws': no model's error is in these).
+    Gaussian's are.
     """
     edge = float(np.quantile(tall, 1.0 - TAIL))
     if height <= edge:
@@ -117,18 +120,16 @@ def _chance(tall: Array, height: float) -> float:
 
 
 def _allowed(
-    found: Fit, noise: Mapping[str, float], seed: int, rng: np.random.Generator
+    found: Fit, noise: Mapping[str, float], rng: np.random.Generator
 ) -> tuple[Array, Callable[[Array], Array]]:
     """Draws (n, k) of the residual that noise, parameters and what the surrogate leaves open allow; and what
     is left of residuals (n, k) when parameters have taken up what they can, as of the draws."""
     log_posterior, chain = found.log_posterior, found.log_posterior.chain
-    theta = found.draws(DRAWS, seed)
-    columns = log_posterior.split(theta)[1].copy()
-    columns[:] = [noise[name] for name in log_posterior.names[-columns.shape[1] :]]
+    own = [noise[name] for name in log_posterior.names[log_posterior.surrogate.space.dim :]]
     point = log_posterior.from_sampling(log_posterior.vector(found.theta))[None]
     best = log_posterior.predict(point)
     diagonal = np.repeat(best.diagonal[:, chain.bins], DRAWS, axis=0)
-    drawn = draw_noise(chain, columns, diagonal, rng)
+    drawn = draw_noise(chain, np.tile(own, (DRAWS, 1)), diagonal, rng)
     # What parameters and the surrogate's latent error leave open is what the recording does not fix: noise,
     # seen through the fit, moves both; a fit to each draw would take that part out of it again.
     weight = 1.0 / np.maximum(drawn.var(axis=0), 1e-18)
@@ -152,11 +153,11 @@ def _slopes(found: Fit) -> Array:
     free = [i for i in range(inner) if 1e-6 < found.unit[i] < 1.0 - 1e-6]
     if not free:
         return np.zeros((len(log_posterior.chain.bins), 0))
-    step = 1e-4 * np.eye(len(low))[free]
-    ahead = np.clip(found.unit + step, 0.0, 1.0)
-    points = low + np.concatenate([found.unit[None], ahead]) * (high - low)
+    step = np.where(found.unit[free] < 0.5, STEP, -STEP)
+    inwards = found.unit + step[:, None] * np.eye(len(low))[free]
+    points = low + np.concatenate([found.unit[None], inwards]) * (high - low)
     mean = log_posterior.predict_mean(log_posterior.from_sampling(points))[:, log_posterior.chain.bins]
-    return np.asarray((mean[1:] - mean[0]).T / 1e-4)
+    return np.asarray((mean[1:] - mean[0]).T / step)
 
 
 def _spans(phase: NDArray[np.int64]) -> list[tuple[int, int]]:

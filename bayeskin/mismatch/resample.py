@@ -2,7 +2,7 @@
 
 Laplace's Gaussian knows one mode: of permeabilities, which a force informs little, there are often several,
 and the moduli lie along a curved ridge. Two ensembles set out from the modes, each walker near one of them
-taken by its density, and move as those of a run do (`inference.moves`).
+taken by its share of the evidence, and move as those of a run do (`inference.moves`).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.moves import mixed_moves
 from bayeskin.inference.straighten import Shear
-from bayeskin.mismatch.fit import FIRST_ROUNDS, Fit, likely, other_skins
+from bayeskin.mismatch.fit import FIRST_ROUNDS, Fit, evidence, likely, other_skins
 from bayeskin.types import Array
 
 ENSEMBLES, FEWEST_WALKERS = 2, 40
@@ -33,17 +33,14 @@ LIMITS = Limits(effective_samples=200.0, lengths=5.0, rhat=1.1)  # for intervals
 
 @dataclass(frozen=True)
 class Resampled:
-    """Draws (n, D) in SI, columns `names`; rhat, the largest of all; effective, of the least known."""
+    """Draws (n, D) in SI, columns `names`; rhat, the largest of all; effective, of the least known; whether
+    these and the chains' times let intervals be taken from the draws (`LIMITS`)."""
 
     names: tuple[str, ...]
     draws: Array
     rhat: float
     effective: float
-
-    @property
-    def settled(self) -> bool:
-        """Whether intervals can be taken from these draws."""
-        return self.rhat <= LIMITS.rhat and self.effective >= LIMITS.effective_samples
+    settled: bool
 
     @cached_property
     def summary(self) -> dict[str, dict[str, Any]]:
@@ -84,22 +81,22 @@ def resample(found: Fit, shear: Shear | None, skin: int, seed: int) -> Resampled
             for sampler, state in zip(samplers, states, strict=True)
         ]
         made = steps
-        drawn, enough = _assessed(samplers, log_posterior, int(FORGOTTEN * steps))
-        if enough:
+        drawn = _assessed(samplers, log_posterior, int(FORGOTTEN * steps))
+        if drawn.settled:
             break
     return drawn
 
 
 def _assessed(
-    samplers: Sequence[emcee.EnsembleSampler], log_posterior: LogPosterior, burn_in: int
-) -> tuple[Resampled, bool]:
-    """What ensembles have drawn after their first steps, and whether that is enough."""
+    samplers: Sequence[emcee.EnsembleSampler], log_posterior: LogPosterior, forgotten: int
+) -> Resampled:
+    """What ensembles have drawn after their first steps, of which so many are forgotten at least."""
     chains = np.stack([sampler.get_chain() for sampler in samplers])
     densities = np.stack([sampler.get_log_prob() for sampler in samplers])
-    state = assess(chains, densities, log_posterior.names, LIMITS, burn_in)
-    kept = log_posterior.from_sampling(chains[:, burn_in::EVERY].reshape(-1, log_posterior.dim))
-    drawn = Resampled(log_posterior.names, kept, float(np.nanmax(state.rhat)), float(np.nanmin(state.ess)))
-    return drawn, state.verdict.trusted
+    state = assess(chains, densities, log_posterior.names, LIMITS, forgotten)
+    kept = log_posterior.from_sampling(chains[:, state.burn_in :: EVERY].reshape(-1, log_posterior.dim))
+    rhat, effective = float(np.nanmax(state.rhat)), float(np.nanmin(state.ess))
+    return Resampled(log_posterior.names, kept, rhat, effective, state.verdict.trusted)
 
 
 def _starts(
@@ -112,8 +109,8 @@ def _starts(
     others = likely(log_posterior, other_skins(best, log_posterior, shear, skin, seed), MODES)
     tops = [gauss_newton(log_posterior, start, shear, FIRST_ROUNDS) for start in others]
     centres = np.array([best, *(top.vector for top in tops)])
-    values = np.array([found.value, *(top.value for top in tops)])
-    share = np.exp(np.maximum(values - values.max(), -20.0) / log_posterior.dim)  # a mode's width counts too
+    masses = np.array([found.log_evidence, *(evidence(log_posterior, top)[0] for top in tops)])
+    share = np.exp(masses - masses.max())
     root = np.linalg.cholesky(found.covariance + 1e-12 * np.eye(len(low))) * (high - low)[:, None]
 
     def draw(count: int) -> Array:

@@ -6,12 +6,12 @@ and d the discrepancy,
 
     r = G b + d + e ,    G' d = 0 .
 
-b has no prior: whatever looks like a parameter is the parameter's, and is no discrepancy (Plumlee 2017, JASA
-112:1274; without this the two compete and the parameters lose their meaning: Brynjarsdottir & O'Hagan 2014,
-Inverse Problems 30:114007). A parameter at a bound of its prior does not move, and has no column in G. With N
-an orthonormal basis of what is orthogonal to G, and N' R N = M M', both the flat prior of b and the condition
-on d hold in the coordinates a = M^-1 N' r, in which the noise is the identity. The price: what parameters can
-imitate of a true discrepancy is not seen.
+In describing d, b has no prior: whatever looks like a parameter is the parameter's, and is no discrepancy
+(Plumlee 2017, JASA 112:1274; without this the two compete and the parameters lose their meaning:
+Brynjarsdottir & O'Hagan 2014, Inverse Problems 30:114007). A parameter at a bound of its prior has no column
+in G. With N an orthonormal basis of what is orthogonal to G, and N' R N = M M', both the flat prior of b and
+the condition on d hold in the coordinates a = M^-1 N' r, in which the noise is the identity. The price: what
+parameters can imitate of a true discrepancy is not seen. Evidence, which compares sets, gives b its prior.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from scipy.linalg import solve_triangular
 
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.noise_model import scales
-from bayeskin.mismatch.fit import Fit, occam
+from bayeskin.mismatch.fit import Fit, held_density
 from bayeskin.types import Array, PadMotion, Phase
 
 STEP = 1e-3  # of the prior box in sampling coordinates, for derivatives
@@ -73,7 +73,7 @@ class Unexplained:
 
     residual_n (k,) recorded minus model; force_n (k,) the model's; noise_n2 (k, k) covariance of measured
     noise and surrogate's error; slopes (k, d) of the force over the priors' widths of the d parameters that
-    move; basis (k, k - r) is N; at: where the bins stand.
+    move, and inwards (k, h) of those that a bound holds; basis (k, k - r) is N; at: where the bins stand.
     """
 
     bins: NDArray[np.int64]
@@ -81,17 +81,25 @@ class Unexplained:
     force_n: Array
     noise_n2: Array
     slopes: Array
+    inwards: Array
     basis: Array
     at: Place
 
-    @cached_property
-    def log_evidence(self) -> float:
-        """Without a discrepancy: of the fit, its force linear in the parameters, whose priors are uniform
-        (Laplace's, as in `fit`), up to a constant that is the same for all fits to the same bins."""
-        reduced, root = self.reduce @ self.residual_n, np.linalg.cholesky(self.noise_n2)
-        white = solve_triangular(root, self.slopes, lower=True)
-        determinant = np.sum(np.log(np.diag(root)))
-        return float(occam(np.linalg.eigvalsh(white.T @ white)) - determinant - 0.5 * reduced @ reduced)
+    def log_evidence(self, kernel_n2: Array | None = None) -> float:
+        """Of the fit, with a discrepancy of covariance (k, k) or without any, its force linear in the
+        parameters, up to a constant that is the same for all fits to the same bins.
+
+        b is normal, as dense at the fit as the uniform prior is; what a bound holds moves inwards only.
+        """
+        covariance = self.noise_n2 + self.slopes @ self.slopes.T / (2.0 * np.pi)
+        if kernel_n2 is not None:
+            covariance = covariance + self.beyond(self.beyond(kernel_n2).T)
+        root = np.linalg.cholesky(covariance)
+        white = solve_triangular(root, self.residual_n, lower=True)
+        moved = solve_triangular(root, self.inwards, lower=True)
+        t, density = held_density(np.maximum(-moved.T @ white, 0.0), np.sum(moved**2, axis=0))
+        mass = np.trapezoid(density, t, axis=1)
+        return float(np.sum(np.log(mass)) - np.sum(np.log(np.diag(root))) - 0.5 * white @ white)
 
     @cached_property
     def _root(self) -> Array:
@@ -126,13 +134,14 @@ def unexplained(found: Fit, motion: PadMotion) -> Unexplained:
     factor = prediction.factor[0, chain.bins]
     material = found.unit[: log_posterior.surrogate.space.dim]
     moves = (material > AT_BOUND) & (material < 1.0 - AT_BOUND)
-    slopes = derivatives(log_posterior, found.unit)[chain.bins][:, moves]
+    all_slopes = derivatives(log_posterior, found.unit)[chain.bins]
+    slopes, inwards = all_slopes[:, moves], (all_slopes * np.where(material < 0.5, 1.0, -1.0))[:, ~moves]
     left, size, _ = np.linalg.svd(slopes)
     rank = int(np.sum(size > SMALLEST * size.max(initial=0.0)))
     at = place(binned.time_s[chain.bins], binned.phase[chain.bins], binned.phases, motion)
     return Unexplained(
         chain.bins, chain.force_n - force, force, chain_covariance(scale[0], rho[0]) + factor @ factor.T,
-        slopes, left[:, rank:], at,
+        slopes, inwards, left[:, rank:], at,
     )  # fmt: skip
 
 

@@ -1,8 +1,8 @@
 """What a search says: nothing missing, named mechanisms, or unknown.
 
-A mechanism is named where it, or its group of look-alikes together, has nine chances in ten, and leaving it
-out of its set costs more than the full model's own error, if no window is left or what is named explains nine
-tenths of the squared residual beyond what is allowed. Where the full model was fitted, its evidence has to be
+A mechanism is named where it, or a look-alike in its place, has nine chances in ten, and leaving it out of
+its set costs more than the full model's own error, if no window is left or what is named explains nine tenths
+of the squared residual beyond what is allowed. Where the full model was fitted, its evidence has to be
 for the set, too. And the set has to be nine times as probable as something smooth without a name in its
 place (`discrepancy`), which bends as it likes and pays for that. Nothing is missing where none is named and
 no window is found, or what goes beyond the allowed is within the model's own error. Otherwise the mismatch is
@@ -36,7 +36,7 @@ NOTICEABLE = 2.0  # of the full model's own error
 
 @dataclass(frozen=True)
 class Named:
-    """One mechanism of the best set: probabilities of itself and of its group.
+    """One mechanism of the best set: probabilities of itself, and of it or a look-alike not in the set.
 
     explains_n : RMS of what the set explains and would not without it
     """
@@ -82,15 +82,17 @@ def set_probability(names: Sequence[str], without: Evidence, best: Evidence) -> 
 
 def judge(
     found: Search, known: Mapping[str, Mechanism], before: Located, after: Located,
-    full_weights: tuple[float, float] | None = None, probability: float = 1.0,
+    full_weights: tuple[float | None, float | None] = (None, None), probability: float = 1.0,
 ) -> Diagnosis:  # fmt: skip
     """The verdict on a search; `before` and `after` are located at its base and at its best set.
 
-    full_weights : of these two by the full model, where that was fitted; probability : `set_probability`
+    full_weights : of these two by the full model, where that could be fitted; a set that it could not be
+    fitted with, though without any, is not believed. probability : `set_probability`
     """
     best, explained = found.best, explained_share(before, after)
     least = NOTICEABLE * model_error(best.log_posterior)
-    believed = (full_weights is None or full_weights[1] > full_weights[0]) and probability > PROBABLE
+    without, with_set = full_weights
+    believed = probability > PROBABLE and (without is None or (with_set is not None and with_set > without))
     named = tuple(
         one
         for name in (best.names if believed else ())
@@ -139,7 +141,8 @@ def explained_share(before: Located, after: Located) -> float:
 
 
 def _named(found: Search, mechanism: Mechanism) -> Named:
+    beside = set(found.best.names) - {mechanism.name}
     return Named(
         mechanism.name, found.probability([mechanism.name]), mechanism.group,
-        found.probability(mechanism.group), explains(found, mechanism.name),
+        found.probability(sorted(set(mechanism.group) - beside)), explains(found, mechanism.name),
     )  # fmt: skip

@@ -70,11 +70,10 @@ def _work(run: Run) -> Mapping[str, Any]:
     )
     held_out = begins or [None]
     before, after = taken[0], taken[-1]
-    full = (before.full_weight, after.full_weight)
     probability = set_probability(whole.best.names, before.evidence, after.evidence)
     found = judge(
-        whole, bench.known, before.located, after.located,
-        None if full[0] is None or full[1] is None else (full[0], full[1]), probability,
+        whole, bench.known, before.located, after.located, (before.full_weight, after.full_weight),
+        probability,
     )  # fmt: skip
     left = after if found.believed else before
     remainder = left.remainder if leaves_something(found, after.located) else None

@@ -31,6 +31,7 @@ from bayeskin.pipeline.shipping import shipped_files
 from bayeskin.types import PadMotion, Provenance, Recording
 
 PREDICTIVE_DRAWS = 1000
+PROFILED_DRAWS = 2000  # among which a profile looks for where to begin
 
 
 def _sample(run: Run) -> Mapping[str, Any]:
@@ -44,7 +45,7 @@ def _sample(run: Run) -> Mapping[str, Any]:
     idata = inference.to_inference_data(log_posterior, posterior, provenance, rng, PREDICTIVE_DRAWS)
     inference.save_inference_data(run.at("sample", "posterior.nc"), idata)
     drawn = inference.predictive_draws(log_posterior, inference.evenly(posterior.flat, PREDICTIVE_DRAWS), rng)
-    profiles = inference.profiles(log_posterior, best)
+    profiles = inference.profiles(log_posterior, best, inference.evenly(posterior.flat, PROFILED_DRAWS))
     residuals = _residuals(checked)
     _draw_posterior(run, checked, best, drawn, profiles, residuals)
     bands = inference.bands_of(log_posterior.binned.time_s, drawn)

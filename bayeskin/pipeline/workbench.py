@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bayeskin import storage
-from bayeskin.config import Config, RecordingConfig, SurrogateConfig
+from bayeskin.config import Config, RecordingConfig, SurrogateConfig, parameter_space
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior
 from bayeskin.mechanisms import Mechanism, catalogue
@@ -36,7 +36,7 @@ from bayeskin.pipeline.shipping import shipped_for
 from bayeskin.pipeline.training import base_surrogate
 from bayeskin.recordings import analyse, bin_recording, jumps_of, read_recording, segment
 from bayeskin.surrogates import Effect, effects_among, with_effects
-from bayeskin.types import BinnedForce, Jumps, PadMotion, Recording, Surrogate
+from bayeskin.types import BinnedForce, Jumps, PadMotion, ParameterSpace, Recording, Surrogate
 
 
 @dataclass(frozen=True)
@@ -89,11 +89,26 @@ class Workbench:
         """The posterior with a set of mechanisms, fitted up to a time (None: to the end)."""
         asked = {name: bounds for name, bounds in self.run.config.noise if bounds is not None}
         windows = None if until_s is None else ((0.0, until_s),)
+        seen, surrogate = _up_to(self.binned, until_s), self.with_mesh_error(self.surrogate(names))
+        noise, material = replace(instrument_noise(seen), **asked), self._priors(surrogate.space)
         return LogPosterior(
-            self.with_mesh_error(self.surrogate(names)), self.binned, windows,
-            replace(instrument_noise(self.binned), **asked), sure_within_n=surrogate_limit(self.binned),
-            excludes=soft_on_stiff,
-        )  # fmt: skip
+            surrogate, self.binned, windows, noise, material, surrogate_limit(seen), soft_on_stiff
+        )
+
+    def _priors(self, space: ParameterSpace) -> ParameterSpace:
+        """A surrogate's parameters with the configuration's priors where it has them."""
+        asked = parameter_space(self.run.config)
+        own = {p.name: p for p in asked.parameters}
+        return ParameterSpace(tuple(own.get(p.name, p) for p in space.parameters), asked.correlations)
+
+
+def _up_to(binned: BinnedForce, until_s: float | None) -> BinnedForce:
+    """Bins with nothing in those that end after a time (None: as they are)."""
+    if until_s is None:
+        return binned
+    seen = binned.edges_s[1:] <= until_s
+    force_n, variance_n2 = (np.where(seen, x, np.nan) for x in (binned.force_n, binned.variance_n2))
+    return replace(binned, force_n=force_n, variance_n2=variance_n2)
 
 
 def opened(source: Path, reporter: Reporter) -> Run:

@@ -1,0 +1,73 @@
+"""What a diagnosis works on: the configuration's priors, and of a beginning nothing of what follows it."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import toy
+from toy_inference import ToySurrogate, empty_recording
+
+from bayeskin.config import config_of
+from bayeskin.inference import LogPosterior
+from bayeskin.mechanisms import catalogue
+from bayeskin.pipeline.workbench import Workbench
+from bayeskin.types import BinnedForce
+
+KNOWN = {"force-offset": catalogue()["force-offset"]}
+
+
+def bench(binned: BinnedForce, **parameters: Any) -> Workbench:
+    """Of the toy."""
+    told = {"name": "toy", "recording": {"file": "none.h5"}, "parameters": parameters}
+    run: Any = SimpleNamespace(config=config_of(told, "here"))
+    jumps: Any = None
+    made = Workbench(run, binned, jumps, toy.MOTION, ToySurrogate(), (), KNOWN)
+    vars(made)["spec"] = SimpleNamespace(observation="article")  # whose mesh is allowed nothing
+    return made
+
+
+def binned_force() -> BinnedForce:
+    """Rising, with noise of 1 mN in each bin."""
+    empty = empty_recording()
+    count = len(empty.force_n)
+    return dataclasses.replace(empty, force_n=np.linspace(0.0, 0.5, count), variance_n2=np.full(count, 1e-6))
+
+
+def test_the_configuration_s_priors_are_the_diagnosis_s() -> None:
+    soft = {"lower": 2e4, "upper": 8e4, "prior": "log-normal", "median": 4e4, "factor": 1.5}
+    found = bench(binned_force(), E_c=soft).posterior(None, ["force-offset"])
+    free = bench(binned_force()).posterior(None, ["force-offset"])
+    assert found.names == free.names
+    at = found.names.index("E_c")
+    np.testing.assert_allclose(np.exp([bound[at] for bound in found.bounds]), [2e4, 8e4])
+    middle = found.from_sampling(0.5 * (found.bounds[0] + found.bounds[1]))
+
+    def told_apart(problem: LogPosterior) -> float:
+        """Logarithm of the prior's density at 40 kPa over that at 60 kPa."""
+        theta = np.tile(middle, (2, 1))
+        theta[:, at] = 4e4, 6e4
+        prior = problem.log_prob(problem.to_sampling(theta)) - problem.log_likelihood(theta)
+        return float(prior[0] - prior[1])
+
+    assert told_apart(found) == pytest.approx(0.5)  # one factor away
+    assert told_apart(free) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_fit_to_the_beginning_knows_nothing_of_what_follows() -> None:
+    binned = binned_force()
+    split_s = float(binned.edges_s[60])
+    later = binned.edges_s[1:] > split_s
+    loud = dataclasses.replace(
+        binned, force_n=np.where(later, 9.0, binned.force_n), variance_n2=np.where(later, 1e-2, 1e-6)
+    )
+    first, second = (bench(one).posterior(split_s, []) for one in (binned, loud))
+    assert first.noise_priors == second.noise_priors
+    assert first.sure_within_n == second.sure_within_n
+    whole = bench(loud).posterior(None, [])
+    assert whole.sure_within_n is not None
+    assert second.sure_within_n is not None
+    assert whole.sure_within_n > 10.0 * second.sure_within_n
