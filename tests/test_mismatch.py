@@ -104,6 +104,8 @@ def test_a_concealed_mechanism_is_named_and_its_parameters_are_right(
         judge(found, KNOWN, before, after, (0.0, None)) == refused
     )  # the full model fails with the set alone
     assert judge(found, KNOWN, before, after, (0.0, 1.0), 0.95) == verdict
+    assert judge(found, KNOWN, before, after, left_out_n=(4e-3, 2e-3)) == verdict
+    assert judge(found, KNOWN, before, after, left_out_n=(2e-3, 4e-3)) == refused
     assert judge(found, KNOWN, before, after, (0.0, 1.0), 0.85) == refused
     assert [one.name for one in verdict.named] == list(names)
     assert before.windows

@@ -4,9 +4,9 @@ A mechanism is named where it, or a look-alike in its place, has nine chances in
 its set costs more than the full model's own error, if no window is left or what is named explains nine tenths
 of the squared residual beyond what is allowed. Where the full model was fitted, its evidence has to be
 for the set, too. And the set has to be nine times as probable as something smooth without a name in its
-place (`discrepancy`), which bends as it likes and pays for that. Nothing is missing where none is named and
-no window is found, or what goes beyond the allowed is within the model's own error. Otherwise the mismatch is
-unknown.
+place (`discrepancy`), which bends as it likes and pays for that, and to predict phases left out better than
+the model without it. Nothing is missing where none is named and no window is found, or what goes beyond the
+allowed is within the model's own error. Otherwise the mismatch is unknown.
 
 The probability that something acts which no set has is at most that of Sellke, Bayarri & Berger (2001,
 The American Statistician 55:62): where the farthest window that the believed fit leaves (of the best set, or
@@ -83,16 +83,19 @@ def set_probability(names: Sequence[str], without: Evidence, best: Evidence) -> 
 def judge(
     found: Search, known: Mapping[str, Mechanism], before: Located, after: Located,
     full_weights: tuple[float | None, float | None] = (None, None), probability: float = 1.0,
+    left_out_n: tuple[float | None, float | None] = (None, None),
 ) -> Diagnosis:  # fmt: skip
     """The verdict on a search; `before` and `after` are located at its base and at its best set.
 
     full_weights : of these two by the full model, where that could be fitted; a set that it could not be
-    fitted with, though without any, is not believed. probability : `set_probability`
+    fitted with, though without any, is not believed. probability : `set_probability`; left_out_n : RMS errors
+    of these two on phases that they were not fitted to, None where there is but one
     """
     best, explained = found.best, explained_share(before, after)
     least = NOTICEABLE * model_error(best.log_posterior)
     without, with_set = full_weights
     believed = probability > PROBABLE and (without is None or (with_set is not None and with_set > without))
+    believed = believed and (left_out_n[0] is None or left_out_n[1] is None or left_out_n[1] < left_out_n[0])
     named = tuple(
         one
         for name in (best.names if believed else ())

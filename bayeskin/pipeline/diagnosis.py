@@ -73,7 +73,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     probability = set_probability(whole.best.names, before.evidence, after.evidence)
     found = judge(
         whole, bench.known, before.located, after.located, (before.full_weight, after.full_weight),
-        probability,
+        probability, (before.left_out_n, after.left_out_n),
     )  # fmt: skip
     left = after if found.believed else before
     remainder = left.remainder if leaves_something(found, after.located) else None
