@@ -171,7 +171,7 @@ def test_each_stage_draws_its_figures_and_says_where_they_come_from(folder: Path
 def test_the_page_shows_the_whole_run(folder: Path) -> None:
     shown = (folder / "case" / "report.html").read_text()
     drawn = [path.stem for path in (folder / "case").rglob("*.svg")]
-    assert len(drawn) == 13 + len(model_check(folder))
+    assert len(drawn) == 14 + len(model_check(folder))
     for name in drawn:
         assert f'-{name}"'.replace("_", "-") in shown, name
     for parameter in SPACE.parameters:
