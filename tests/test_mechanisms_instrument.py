@@ -138,6 +138,19 @@ def test_ripple_repeats_with_the_position_and_only_while_moving():
     assert np.all(found[(TIMES_S > 14.5) & (TIMES_S < 44)] == 0.0)
 
 
+@pytest.mark.parametrize("period", [1e-4, 1.7e-4, 3.1e-4, 1e-3])
+def test_bins_mean_a_ripple_over_all_its_cycles(period):
+    """The integral of the sine over each second of even motion, from 1 to 10 cycles of it."""
+    chosen = {"ripple_period": period, "ripple_amplitude": 0.01, "ripple_phase": 0.3}
+    edges_s = np.arange(5.0, 15.0)
+    values = values_of("position-ripple", **chosen)
+    force = observed([ALL["position-ripple"]], values, MOTION, lambda t: np.zeros((1, np.shape(t)[-1])))
+    found = bin_means(force, MOTION, edges_s, [ALL["position-ripple"]])[0]
+    phase = 2 * np.pi * MOTION.at(edges_s) / period + 0.3
+    expected = -0.01 * np.diff(np.cos(phase)) / np.diff(phase)
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
 def test_a_delayed_force_is_that_of_before():
     before_s = TIMES_S - 0.45
     kept = before_s > 0.0  # and never on a corner, where the drag jumps

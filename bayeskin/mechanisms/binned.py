@@ -17,11 +17,11 @@ class BinnedForces:
     """Forces over time, straight between the middles of bins and the corners of the protocol.
 
     At a corner inside a bin the force follows from the straight lines on either side, and they meet halfway.
-    bins : takes means over the same bins
+    bins : takes means over the same bins, of what `mechanisms` make of a force
     """
 
-    def __init__(self, edges_s: Array, motion: PadMotion) -> None:
-        self.bins = Bins(motion, edges_s)
+    def __init__(self, edges_s: Array, motion: PadMotion, mechanisms: Sequence[Mechanism]) -> None:
+        self.bins = Bins(motion, edges_s, mechanisms)
         self._middle = middle = 0.5 * (edges_s[1:] + edges_s[:-1])
         self._corners = motion.time_s[(motion.time_s > middle[2]) & (motion.time_s < middle[-3])]
         self._right = np.searchsorted(middle, self._corners)
@@ -73,7 +73,7 @@ class BinnedEstimate:
 
     @cached_property
     def _forces(self) -> BinnedForces:
-        return BinnedForces(self.edges_s, self.motion)
+        return BinnedForces(self.edges_s, self.motion, [self.mechanism])
 
 
 def estimate_of(

@@ -22,7 +22,7 @@ Values = Mapping[str, Array]  # each parameter (n,), SI; those of all mechanisms
 ForceOfTime = Callable[[Array], Array]  # times (t,) or (n, t) [s] to forces (n, t) [N]
 Observe = Callable[[Values, PadMotion, ForceOfTime], ForceOfTime]
 Refuted = Callable[[Values, PadMotion, Jumps], NDArray[np.bool_]]
-GAUSS_POINTS = 4  # between neighbouring edges and corners
+GAUSS_POINTS = 4  # between neighbouring edges, corners and repeats
 
 
 class Place(IntEnum):
@@ -43,6 +43,7 @@ class Instrument:
     adds : whether what it adds to a force does not depend on that force
     refuted : which values the samples of a recording speak against, by what they allow of jumps; None where
         they cannot
+    repeats_m : the shortest travel [m] after which what it does comes again, infinite where nothing does
     """
 
     place: Place
@@ -50,6 +51,7 @@ class Instrument:
     bind: Bind | None = None
     adds: bool = True
     refuted: Refuted | None = None
+    repeats_m: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -127,11 +129,17 @@ def added(force: ForceOfTime, more: ForceOfTime) -> ForceOfTime:
 
 
 class Bins:
-    """Means of forces over the bins between edges_s (m+1,), exact to high order between corners."""
+    """Means of forces over the bins between edges_s (m+1,), exact to high order between corners.
 
-    def __init__(self, motion: PadMotion, edges_s: Array) -> None:
+    Of forces that `mechanisms` made, whatever repeats over the travel is followed too.
+    """
+
+    def __init__(self, motion: PadMotion, edges_s: Array, mechanisms: Iterable[Mechanism] = ()) -> None:
         inside = motion.time_s[(motion.time_s > edges_s[0]) & (motion.time_s < edges_s[-1])]
-        cuts = np.union1d(edges_s, inside)
+        repeats_m = min(
+            (m.act.repeats_m for m in mechanisms if isinstance(m.act, Instrument)), default=np.inf
+        )
+        cuts = _no_longer(np.union1d(edges_s, inside), motion, repeats_m)
         abscissa, weight = np.polynomial.legendre.leggauss(GAUSS_POINTS)
         self._width, self._weight, self._lasts_s = np.diff(cuts), 0.5 * weight, np.diff(edges_s)
         self._time_s = (cuts[:-1, None] + 0.5 * self._width[:, None] * (1.0 + abscissa)).ravel()
@@ -146,6 +154,15 @@ class Bins:
         return integral
 
 
-def bin_means(force: ForceOfTime, motion: PadMotion, edges_s: Array) -> Array:
-    """Means (n, m) of a force over the bins between edges_s (m+1,), of one force only."""
-    return Bins(motion, edges_s).means(force)
+def bin_means(
+    force: ForceOfTime, motion: PadMotion, edges_s: Array, mechanisms: Iterable[Mechanism] = ()
+) -> Array:
+    """Means (n, m), over the bins between edges_s (m+1,), of one force only, which `mechanisms` made."""
+    return Bins(motion, edges_s, mechanisms).means(force)
+
+
+def _no_longer(cuts: Array, motion: PadMotion, travel_m: float) -> Array:
+    """Times between which the pads move by `travel_m` or less, those of `cuts` among them."""
+    parts = np.ceil(np.abs(np.diff(motion.at(cuts))) / travel_m).astype(int).clip(1)
+    pieces = zip(cuts[:-1], cuts[1:], parts, strict=True)
+    return np.append(np.concatenate([np.linspace(a, b, n, endpoint=False) for a, b, n in pieces]), cuts[-1])

@@ -12,6 +12,7 @@ from bayeskin.mechanisms.viscous_drag import speed_of
 from bayeskin.types import Array, PadMotion, Parameter
 from bayeskin.words import number
 
+SHORTEST_M, LONGEST_M = 1e-4, 1e-3  # period
 AT_REST_M_S = 2e-5  # slower than this is no motion
 
 
@@ -31,7 +32,9 @@ def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTim
 MECHANISM = Mechanism(
     name="position-ripple",
     parameters=(
-        Parameter("ripple_period", "m", 1e-4, 1e-3, "log-uniform", "travel in which the ripple repeats"),
+        Parameter(
+            "ripple_period", "m", SHORTEST_M, LONGEST_M, "log-uniform", "travel in which the ripple repeats"
+        ),
         Parameter("ripple_amplitude", "N", 0.0, 0.015, "uniform", "half of the ripple from top to bottom"),
         Parameter(
             "ripple_phase", "rad", -np.pi, np.pi, "uniform", "phase of the ripple at zero displacement"
@@ -43,5 +46,5 @@ MECHANISM = Mechanism(
         f"{number(1e3 * v['ripple_period'], 2)} mm of its travel."
     ),
     group=("position-ripple",),
-    act=Instrument(Place.DRIVE, observe),
+    act=Instrument(Place.DRIVE, observe, repeats_m=SHORTEST_M),
 )

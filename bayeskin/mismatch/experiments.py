@@ -135,7 +135,8 @@ def _forces(
         run = simulate(motion, inside, laws(added))
         if run.status == "ok":
             values = {name: np.array([value]) for name, value in theta.items()}
-            rows.append(bin_means(observed(beyond, values, motion, _force_of(run)), motion, edges_s)[0])
+            force = observed(beyond, values, motion, _force_of(run))
+            rows.append(bin_means(force, motion, edges_s, beyond)[0])
     return np.array(rows).reshape(len(rows), len(edges_s) - 1)
 
 

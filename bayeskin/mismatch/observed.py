@@ -69,4 +69,4 @@ class ObservedSurrogate(Wrapper):
 
     @cached_property
     def _forces(self) -> BinnedForces:
-        return BinnedForces(self.edges_s, self.motion)
+        return BinnedForces(self.edges_s, self.motion, self.mechanisms)

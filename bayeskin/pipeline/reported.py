@@ -74,5 +74,5 @@ class FullForce:
             return np.stack([run.at(row) for run, row in zip([simulation, *runs], times_s, strict=True)])
 
         beyond = [mechanism for mechanism in mechanisms if mechanism.act.bind is None]
-        seen = bin_means(observed(beyond, columns, self.motion, force), self.motion, self.edges_s)
+        seen = bin_means(observed(beyond, columns, self.motion, force), self.motion, self.edges_s, beyond)
         return seen[0], (seen[1:] - seen[0]).T / STEP

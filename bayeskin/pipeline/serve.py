@@ -79,7 +79,7 @@ class ServedModel:
             return [np.atleast_2d(force(asked.times_s))[0].tolist()]
         if not asked.mechanisms:  # a design's own means
             return [run.bin_means(asked.edges_s).tolist()]
-        return [bin_means(force, asked.motion, asked.edges_s)[0].tolist()]
+        return [bin_means(force, asked.motion, asked.edges_s, asked.mechanisms)[0].tolist()]
 
     def _names(self, asked: Asked) -> list[str]:
         more = [p.name for mechanism in asked.mechanisms for p in mechanism.parameters]

@@ -170,7 +170,7 @@ class Screen:
         if not reported:
             return force_n
         straight = _Straight(force_n)
-        seen = bin_means(observed(reported, values, MOTION, straight), MOTION, EDGES_S)
+        seen = bin_means(observed(reported, values, MOTION, straight), MOTION, EDGES_S, reported)
         return np.asarray(force_n + seen - bin_means(straight, MOTION, EDGES_S))
 
 

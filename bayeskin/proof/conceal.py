@@ -187,7 +187,8 @@ def _key(case: Case, runs: _Runs, screen: Screen, attempt: int, peak_n: float) -
     theta = np.array([case.theta[name] for name in refit.surrogate.space.names])
 
     def means(names: Sequence[str], changed: bool) -> Array:
-        return bin_means(runs.force(names, changed), MOTION, EDGES_S)[0]
+        made_by = [screen.known[name] for name in names]
+        return bin_means(runs.force(names, changed), MOTION, EDGES_S, made_by)[0]
 
     whole, base = means(plan.mechanisms, bool(plan.outside)), means((), False)
     expected = refit.force(theta[None])[0]
