@@ -392,7 +392,7 @@ def test_what_is_off_at_infinity_is_climbed_to_from_there() -> None:
     base = fit_base(dataclasses.replace(plain, binned=binned), 1, None)
     neutral = {name: value for one in both for name, value in one.neutral.items()}
     parts = [part for one in both for part in one.whole_or_parts]
-    found = fit(names, wide, base.theta, neutral, 1, len(TRUTH), None, parts)
+    found = fit(names, wide, base.theta, neutral, 1, None, parts)
     best = fit_near(names, wide, {**base.theta, **TRUTH, **truth}, None)
     assert found.value > best.value - 0.5
     assert found.theta["friction_tau"] == pytest.approx(15.0, rel=0.3)
@@ -468,7 +468,7 @@ def test_a_mechanism_that_does_nothing_gains_nothing() -> None:
     alone = concealing(2)
     base = fit_base(alone, 1, None)
     wide = building(alone, ("sensor-drift",))
-    more = fit(("sensor-drift",), wide, base.theta, NEUTRAL, 1, 5, None, KNOWN["sensor-drift"].whole_or_parts)
+    more = fit(("sensor-drift",), wide, base.theta, NEUTRAL, 1, None, KNOWN["sensor-drift"].whole_or_parts)
     assert more.log_evidence < base.log_evidence + 2.0
 
 
@@ -504,7 +504,7 @@ def test_a_mesh_that_is_off_by_a_factor_stays_inside_the_intervals() -> None:
         skin = ToySurrogate(sd_n=1e-9)
         allowing = Discretised(skin, toy.MOTION, 0.004) if allows else skin
         alone = dataclasses.replace(right, binned=off, surrogate=allowing)
-        found = resample(fit_base(alone, 1, None), find_shear(alone), len(TRUTH), 1)
+        found = resample(fit_base(alone, 1, None), find_shear(alone), 1)
         force = skin.predict(found.draws[:, : len(TRUTH)]).mean.max(axis=1)
         low, high = np.quantile(force, [0.05, 0.95])
         assert (low < truth < high) == inside, (low, truth, high)
@@ -517,7 +517,7 @@ def test_draws_are_the_same_however_often_it_is_asked_whether_they_do(monkeypatc
     def drawn(legs: tuple[int, ...], effective: float) -> np.ndarray:
         monkeypatch.setattr("bayeskin.mismatch.resample.LEGS", legs)
         monkeypatch.setattr("bayeskin.mismatch.resample.LIMITS", Limits(effective, 5.0, 1.1))
-        return resample(base, shear, len(TRUTH), 1).draws
+        return resample(base, shear, 1).draws
 
     whole = drawn((400,), np.inf)
     np.testing.assert_array_equal(drawn((200, 400), np.inf), whole)

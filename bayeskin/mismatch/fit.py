@@ -31,6 +31,7 @@ from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior, NoisePriors
 from bayeskin.inference.gauss_newton import Top, gauss_newton, promise
 from bayeskin.inference.straighten import Shear
+from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array, BinnedForce, ParameterSpace
 
 NOISE_SHARE = 1.5  # sd of the noise beyond that, at most, of the median sd of a bin's own mean
@@ -41,7 +42,7 @@ STIFFEST_BELOW = 2.0  # the subcutis over the cutis: on a stiffer one a cutis fo
 SURE = 0.03  # sd of the surrogate, RMS, at most, of the recorded force's range
 DRAWS = 96  # of the prior for each new parameter, from which climbs start
 RANKED = 32  # of these, for the order in which mechanisms are tried
-SKINS = 256  # draws of the base's parameters, from which climbs on other skins start
+SKINS, SKIN_STARTS = 384, 4  # draws of all that the skin is made of, and climbs from the best of them
 BASE_STARTS, STARTS = 10, 2
 NEAREST = 8  # trials that are weighed for each that is climbed from
 REDRAWN = 1  # times that the parameters of a part are drawn anew, about the best so far
@@ -185,7 +186,7 @@ def fit_base(log_posterior: LogPosterior, seed: int, shear: Shear | None) -> Fit
     if not starts:
         expected = f"skins whose E_s can be at most {STIFFEST_BELOW:g} E_c, and which the surrogate knows"
         raise InputError("priors", "none but skins that a diagnosis rules out", expected)
-    return _best((), log_posterior, starts, shear, log_posterior.surrogate.space.dim, seed)
+    return _best((), log_posterior, starts, shear, seed)
 
 
 def fit(
@@ -194,15 +195,15 @@ def fit(
     start: Mapping[str, float],
     neutral: Mapping[str, float],
     seed: int,
-    skin: int,
     shear: Shear | None = None,
     parts: Sequence[Sequence[str]] = (),
 ) -> Fit:
     """The best of a few climbs from `start`, which has the values of a smaller set.
 
     What `start` does not have begins at its neutral value, and is searched for, one of `parts` (names of
-    parameters) after the other. `shear` straightens the ridges of this posterior, where it is known; the
-    base's parameters are the first `skin`.
+    parameters) after the other; at last, with all others as found, the whole skin is, with the mechanisms
+    that are in it: one that changes much has led the smaller set to another skin. `shear` straightens the
+    ridges of this posterior, where it is known.
     """
     low, high = log_posterior.bounds
     starts = [np.clip(log_posterior.vector({**neutral, **start}), low, high)]
@@ -212,7 +213,7 @@ def fit(
     rounds += [(part, []) for part in parts] if len(parts) > 1 else []  # again, with the others found
     for part, later in rounds:
         starts = [_searched(log_posterior, starts[0], part, later, neutral, rng, shear)]
-    return _best(names, log_posterior, starts, shear, skin, seed)
+    return _best(names, log_posterior, starts, shear, seed)
 
 
 def fit_near(
@@ -312,11 +313,10 @@ def _climbed(log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear 
 
 
 def _best(
-    names: Sequence[str], log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None,
-    skin: int, seed: int,
+    names: Sequence[str], log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None, seed: int
 ) -> Fit:  # fmt: skip
     ahead = _climbed(log_posterior, starts, shear)
-    others = likely(log_posterior, other_skins(ahead.vector, log_posterior, shear, skin, seed), STARTS)
+    others = likely(log_posterior, other_skins(ahead.vector, log_posterior, shear, seed), SKIN_STARTS)
     ahead = max(ahead, _climbed(log_posterior, [ahead.vector, *others], shear), key=lambda one: one.value)
     return _fit_at(names, log_posterior, gauss_newton(log_posterior, ahead.vector, shear, ROUNDS))
 
@@ -326,12 +326,12 @@ def _fit_at(names: Sequence[str], log_posterior: LogPosterior, top: Top) -> Fit:
     return Fit(tuple(names), log_posterior, theta, top.value, *evidence(log_posterior, top), top.latent)
 
 
-def other_skins(
-    vector: Array, log_posterior: LogPosterior, shear: Shear | None, skin: int, seed: int
-) -> Array:
-    """Points (n, D) with the base's parameters drawn anew, and stiffness such that the force fits best."""
+def other_skins(vector: Array, log_posterior: LogPosterior, shear: Shear | None, seed: int) -> Array:
+    """Points (n, D) with the base's parameters and those of tissue mechanisms drawn anew, and stiffness such
+    that the force fits best."""
     low, high = log_posterior.bounds
-    trials = np.tile(vector, (SKINS, 1))
+    skin = innermost(log_posterior.surrogate).space.dim
+    trials = np.tile(np.clip(vector, low, high), (SKINS, 1))
     trials[:, :skin] = np.random.default_rng(seed).uniform(low[:skin], high[:skin], (len(trials), skin))
     if shear is None:
         return trials

@@ -53,14 +53,14 @@ class Resampled:
         }
 
 
-def resample(found: Fit, shear: Shear | None, skin: int, seed: int) -> Resampled:
-    """Draws of the posterior about `found`; `shear` as for `fit`, the base's parameters are the first `skin`.
+def resample(found: Fit, shear: Shear | None, seed: int) -> Resampled:
+    """Draws of the posterior about `found`; `shear` as for `fit`.
 
     They end after the first of `LEGS` by which they have settled.
     """
     log_posterior = found.log_posterior
     rng = np.random.default_rng([seed, 7])
-    starts = _starts(found, shear, skin, seed, rng)
+    starts = _starts(found, shear, seed, rng)
     walkers = max(FEWEST_WALKERS, 2 * log_posterior.dim + 2)
     coordinates = MoveCoordinates(shear, *log_posterior.bounds)
     samplers = [
@@ -99,14 +99,12 @@ def _assessed(
     return Resampled(log_posterior.names, kept, rhat, effective, state.verdict.trusted)
 
 
-def _starts(
-    found: Fit, shear: Shear | None, skin: int, seed: int, rng: np.random.Generator
-) -> Callable[[int], Array]:
+def _starts(found: Fit, shear: Shear | None, seed: int, rng: np.random.Generator) -> Callable[[int], Array]:
     """A function that draws so many walkers (n, D) about the modes."""
     log_posterior = found.log_posterior
     low, high = log_posterior.bounds
     best = low + found.unit * (high - low)
-    others = likely(log_posterior, other_skins(best, log_posterior, shear, skin, seed), MODES)
+    others = likely(log_posterior, other_skins(best, log_posterior, shear, seed), MODES)
     tops = [gauss_newton(log_posterior, start, shear, FIRST_ROUNDS) for start in others]
     centres = np.array([best, *(top.vector for top in tops)])
     masses = np.array([found.log_evidence, *(evidence(log_posterior, top)[0] for top in tops)])

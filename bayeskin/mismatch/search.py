@@ -177,8 +177,7 @@ class _Forward:
             wide = self._build(key)
             shear = self._straight.among(self._alone.names, wide.names) if self._straight else None
             new = _new(self._known, key, start.names) if thorough else []
-            skin = self._alone.surrogate.space.dim
-            return fit(key, wide, start.theta, self._neutral, self._seed, skin, shear, new)
+            return fit(key, wide, start.theta, self._neutral, self._seed, shear, new)
 
         return self._kept(key, make, anew)
 

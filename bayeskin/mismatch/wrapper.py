@@ -36,3 +36,10 @@ class Wrapper:
     def predict_mean(self, theta: ArrayLike) -> Array:
         """The mean (n, m) of `predict` alone."""
         return self.inner.predict_mean(theta)
+
+
+def innermost(surrogate: Surrogate) -> Surrogate:
+    """That of the skin, and of what changes it: the one that is about no other."""
+    while isinstance(surrogate, Wrapper):
+        surrogate = surrogate.inner
+    return surrogate

@@ -118,7 +118,7 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
     quiet = {name: noise[name] for name in there.log_posterior.names if name not in force_names}
     there = replace(there, theta={**there.theta, **quiet})
     left = discrepancy(there, bench.motion)
-    draws = resample(found, shear, alone.surrogate.space.dim, seed)
+    draws = resample(found, shear, seed)
     some = inference.evenly(draws.draws, PREDICTIVE_DRAWS)
     bands = inference.bands(found.log_posterior, some, np.random.default_rng(seed))
     return TakenUp(
