@@ -33,6 +33,7 @@ from bayeskin.mismatch.fit import (
     fit_base,
     fit_near,
     likely,
+    other_skins,
     restored,
     soft_on_stiff,
     stored,
@@ -399,6 +400,26 @@ def test_what_is_off_at_infinity_is_climbed_to_from_there() -> None:
     assert _times(2.0, 30.0, np.inf) == 15.0
     assert _times(-1.0, 30.0, np.inf) == np.inf
     assert _times(2.0, 0.3, 0.1) == pytest.approx(0.5)
+
+
+def test_whole_skins_are_drawn_anew_and_no_instrument_also_from_a_bound() -> None:
+    """Within Observed and Discretised all that the innermost surrogate has is drawn; rounding loses none."""
+    plain = concealing(0)
+    inner = Discretised(
+        ObservedSurrogate(ToySurrogate(), (KNOWN["sensor-drift"],), toy.MOTION), toy.MOTION, 0.004
+    )
+    wide = dataclasses.replace(plain, surrogate=inner)
+    low, high = wide.bounds
+    for shear in (None, find_shear(plain)):
+        shear = shear and shear.among(plain.names, wide.names)
+        vector = 0.5 * (low + high)
+        vector[-1] = np.nextafter(high[-1], np.inf)
+        trials = other_skins(vector, wide, shear, 1)
+        assert len(trials) > 20
+        spread = np.ptp(trials, axis=0)
+        assert np.all(spread[: len(TRUTH)] > 0.5 * (high - low)[: len(TRUTH)])
+        assert np.all(spread[len(TRUTH) :] == 0.0)
+        assert np.all((trials >= low) & (trials <= high))
 
 
 def test_a_set_that_counts_is_not_unsure_too() -> None:
