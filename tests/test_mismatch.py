@@ -44,7 +44,7 @@ from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.resample import resample
 from bayeskin.mismatch.search import PRIOR, Made, Search, search, sure, weight
 from bayeskin.mismatch.verdict import Evidence, _named, judge, set_probability, unknown_probability
-from bayeskin.mismatch.wrapper import Wrapper
+from bayeskin.mismatch.wrapper import Wrapper, innermost
 from bayeskin.proof.cases import shipped_screen
 from bayeskin.proof.protocol import MOTION
 from bayeskin.surrogates.effects import WithEffects
@@ -367,8 +367,10 @@ def test_means_alone_are_those_of_whole_predictions_of_all_that_is_shipped() -> 
     """Every effect, with estimates too, behind every mechanism of the instrument and the mesh's error."""
     screen = shipped_screen()
     instrument = tuple(m for m in catalogue().values() if isinstance(m.act, Instrument))
-    skin = Discretised(WithEffects(screen.refit.surrogate, screen.effects), MOTION, 2e-3)
-    seen = ObservedSurrogate(skin, instrument, MOTION)
+    learnt = WithEffects(screen.refit.surrogate, screen.effects)
+    seen = ObservedSurrogate(Discretised(learnt, MOTION, 2e-3), instrument, MOTION)
+    assert innermost(seen) is learnt  # with parameters of tissue mechanisms
+    assert learnt.space.dim > screen.refit.surrogate.space.dim
     theta = seen.space.box.from_unit(np.random.default_rng(4).uniform(size=(3, seen.space.dim)))
     theta = theta[[0, 1, 1, 2]]
     theta[2, -1] = theta[0, -1]  # one skin, seen through two instruments
