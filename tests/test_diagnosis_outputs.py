@@ -6,12 +6,14 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 import toy
 from matplotlib.figure import Figure
+from test_mismatch import tried
 from toy_inference import NOISE, TRUTH, ToySurrogate, toy_problem
 
 from bayeskin import report
@@ -294,3 +296,23 @@ def test_candidates_of_a_few_nats_are_read_off_beside_one_of_hundreds() -> None:
     assert headline(figure).endswith("viscous-drag alone gains most")
     rows[1] |= {"delta_score": 750.0}
     assert headline(report.figure_candidates(rows)).endswith("most, 1 other as much within the error")
+
+
+def test_the_best_set_is_the_one_that_the_full_model_makes_it() -> None:
+    found = tried({(): 0.0, ("x",): 90.0, ("y",): 70.0})
+
+    def taken(weight: float | None) -> Any:
+        return SimpleNamespace(full_weight=weight)
+
+    before, after, rival = taken(5.0), taken(80.0), taken(95.0)
+    likeliest = diagnosis._likeliest(found, before, after, found.rivals(), [rival])
+    assert likeliest is rival
+    assert found.best.names == ("y",)
+    found.full = {}
+    assert diagnosis._likeliest(found, before, after, found.rivals(), [taken(None)]) is after
+    found.full = {}
+    assert diagnosis._likeliest(found, before, taken(1.0), found.rivals(), [taken(2.0)]) is before
+    found.full = {}
+    none = taken(None)
+    assert diagnosis._likeliest(found, none, none, found.rivals(), [none]) is none
+    assert found.best.names == ("x",)

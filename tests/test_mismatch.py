@@ -27,6 +27,7 @@ from bayeskin.mismatch.blocked import errors_left_out, without
 from bayeskin.mismatch.corrected import Sure
 from bayeskin.mismatch.discretised import BEND, RELAXATION_S, RELAXING, Discretised, relaxing
 from bayeskin.mismatch.fit import (
+    APART,
     Fit,
     _times,
     fit,
@@ -34,6 +35,7 @@ from bayeskin.mismatch.fit import (
     fit_near,
     likely,
     other_skins,
+    other_tops,
     restored,
     soft_on_stiff,
     stored,
@@ -44,7 +46,7 @@ from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.resample import resample
 from bayeskin.mismatch.search import PRIOR, Made, Search, search, sure, weight
 from bayeskin.mismatch.verdict import Evidence, _named, judge, set_probability, unknown_probability
-from bayeskin.mismatch.wrapper import Wrapper, innermost
+from bayeskin.mismatch.wrapper import Wrapper, innermost, skins
 from bayeskin.proof.cases import shipped_screen
 from bayeskin.proof.protocol import MOTION
 from bayeskin.surrogates.effects import WithEffects
@@ -370,7 +372,8 @@ def test_means_alone_are_those_of_whole_predictions_of_all_that_is_shipped() -> 
     learnt = WithEffects(screen.refit.surrogate, screen.effects)
     seen = ObservedSurrogate(Discretised(learnt, MOTION, 2e-3), instrument, MOTION)
     assert innermost(seen) is learnt  # with parameters of tissue mechanisms
-    assert learnt.space.dim > screen.refit.surrogate.space.dim
+    assert skins(seen) == (screen.refit.surrogate.space.dim, learnt.space.dim)
+    assert skins(learnt.base) == (screen.refit.surrogate.space.dim,)
     theta = seen.space.box.from_unit(np.random.default_rng(4).uniform(size=(3, seen.space.dim)))
     theta = theta[[0, 1, 1, 2]]
     theta[2, -1] = theta[0, -1]  # one skin, seen through two instruments
@@ -416,12 +419,95 @@ def test_whole_skins_are_drawn_anew_and_no_instrument_also_from_a_bound() -> Non
         shear = shear and shear.among(plain.names, wide.names)
         vector = 0.5 * (low + high)
         vector[-1] = np.nextafter(high[-1], np.inf)
-        trials = other_skins(vector, wide, shear, 1)
+        trials = other_skins(vector, wide, shear, 1, innermost(wide.surrogate).space.dim)
         assert len(trials) > 20
         spread = np.ptp(trials, axis=0)
         assert np.all(spread[: len(TRUTH)] > 0.5 * (high - low)[: len(TRUTH)])
         assert np.all(spread[len(TRUTH) :] == 0.0)
         assert np.all((trials >= low) & (trials <= high))
+
+
+def test_other_tops_are_apart_and_have_the_right_one_where_a_fit_is_of_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    alone = concealing(0)
+    shear, best = find_shear(alone), fit_base(alone, 1, None)
+    elsewhere = {**best.theta, "E_c": 4.0 * best.theta["E_c"], "E_s": 0.1 * best.theta["E_s"]}
+    wrong = dataclasses.replace(best, theta=elsewhere, value=float("-inf"))
+    tops = other_tops(wrong, shear, 1, 3)
+    assert 1 <= len(tops) <= 3
+    assert max(one.value for one in tops) > best.value - 0.5
+    for found, others in ((wrong, tops), (best, other_tops(best, shear, 1, 3))):
+        skin = [one.unit[: len(TRUTH)] for one in (found, *others)]
+        apart = [np.max(np.abs(a - b)) for i, a in enumerate(skin) for b in skin[:i]]
+        assert min(apart, default=1.0) > APART
+    hopes = [one.value + one.hope for one in tops]
+    assert hopes == sorted(hopes, reverse=True)
+    low, high = alone.bounds
+    same = low + best.unit * (high - low)
+    monkeypatch.setattr("bayeskin.mismatch.fit._other_starts", lambda *rest: [same, same])
+    assert other_tops(best, shear, 1, 3) == []
+    assert len(other_tops(wrong, shear, 1, 3)) == 1
+
+
+def test_what_a_surrogate_s_error_costs_is_what_it_would_gain_without_one() -> None:
+    """In closed form where nothing is left of the force and the noise is nearly Gaussian."""
+    alone = concealing(0)
+    names = alone.surrogate.space.names
+    mean = alone.surrogate.predict([[TRUTH[name] for name in names]]).mean[0]
+    normal = dataclasses.replace(QUIET, nu=(1e4, 1.001e4))
+    alone = dataclasses.replace(
+        alone, binned=dataclasses.replace(alone.binned, force_n=mean), noise_priors=normal
+    )
+
+    class Exact(Wrapper):
+        def predict(self, theta: Any) -> Any:
+            found = self.inner.predict(theta)
+            return dataclasses.replace(found, factor=np.zeros_like(found.factor))
+
+    exact = dataclasses.replace(alone, surrogate=Exact(alone.surrogate))
+    low, high = alone.bounds
+    noise = alone.named(alone.from_sampling(0.5 * (low + high)))
+    vector = alone.vector({**noise, **TRUTH})
+    theta = alone.named(alone.from_sampling(vector))
+    found = dataclasses.replace(fit_base(alone, 1, None), theta=theta)
+    gained = float(exact.log_prob(vector[None])[0] - alone.log_prob(vector[None])[0])
+    assert found.hope > 1.0
+    assert found.hope == pytest.approx(gained, rel=2e-3)
+
+
+def tried(weights: dict[tuple[str, ...], float]) -> Search:
+    """A search that has tried sets of these weights; x and y are of the tissue, drift is not."""
+    base = fit_base(concealing(0), 1, None)
+    odds = float(np.log(PRIOR / (1.0 - PRIOR)))
+    found = Search(tissue=frozenset("xyz"))
+    for names, nats in weights.items():
+        found.add(Made(dataclasses.replace(base, names=names, log_evidence=nats - len(names) * odds), True))
+    return found
+
+
+def test_the_full_model_s_word_on_some_sets_moves_all_with_their_tissue() -> None:
+    found = tried(
+        {(): 0.0, ("x",): 90.0, ("drift", "x"): 100.0, ("y",): 70.0, ("drift",): 95.0, ("y", "z"): 60.0}
+    )
+    assert found.best.names == ("drift", "x")
+    assert [one.names for one in found.rivals()] == [("y",)]  # not drift alone, which says nothing of tissue
+    assert found.probability(["y"]) < 1e-9
+    found.full = {(): 5.0, ("drift", "x"): 80.0, ("y",): 120.0}
+    assert found.best.names == ("y",)
+    assert found.weight(found.fits["x",]) == pytest.approx(70.0)
+    assert found.weight(found.fits["drift",]) == pytest.approx(100.0)  # as the model without any tissue's
+    assert found.weight(found.fits["y", "z"]) == pytest.approx(60.0)  # of which nothing was said
+    assert found.probability(["y"]) > 0.9999
+    found.full = {(): 5.0, ("drift", "x"): 80.0, ("y",): -np.inf}  # no run of it converges
+    assert found.best.names == ("drift", "x")
+    assert found.probability(["y"]) < 0.01
+
+
+def test_each_tissue_mechanism_of_the_best_has_a_rival_without_it() -> None:
+    found = tried({(): 0.0, ("x", "y"): 100.0, ("x",): 90.0, ("y", "z"): 80.0, ("z",): 70.0})
+    assert {one.names for one in found.rivals()} == {("y", "z"), ("x",)}
+    assert not tried({(): 0.0, ("drift",): 50.0, ("x",): 40.0}).rivals()
 
 
 def test_a_set_that_counts_is_not_unsure_too() -> None:

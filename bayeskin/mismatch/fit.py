@@ -30,8 +30,9 @@ from numpy.typing import NDArray
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior, NoisePriors
 from bayeskin.inference.gauss_newton import Top, gauss_newton, promise
+from bayeskin.inference.noise_model import innovations
 from bayeskin.inference.straighten import Shear
-from bayeskin.mismatch.wrapper import innermost
+from bayeskin.mismatch.wrapper import skins
 from bayeskin.types import Array, BinnedForce, ParameterSpace
 
 NOISE_SHARE = 1.5  # sd of the noise beyond that, at most, of the median sd of a bin's own mean
@@ -42,12 +43,14 @@ STIFFEST_BELOW = 2.0  # the subcutis over the cutis: on a stiffer one a cutis fo
 SURE = 0.03  # sd of the surrogate, RMS, at most, of the recorded force's range
 DRAWS = 96  # of the prior for each new parameter, from which climbs start
 RANKED = 32  # of these, for the order in which mechanisms are tried
-SKINS, SKIN_STARTS = 384, 4  # draws of all that the skin is made of, and climbs from the best of them
+SKINS, SKIN_STARTS = 384, 4  # draws of what the skin is made of, and climbs from the best of them
+APART = 0.1  # of the prior's width, in some parameter: tops that are nearer are the same
 BASE_STARTS, STARTS = 10, 2
 NEAREST = 8  # trials that are weighed for each that is climbed from
 REDRAWN = 1  # times that the parameters of a part are drawn anew, about the best so far
 FIRST_ROUNDS, ROUNDS = 6, 25  # of every climb, and of the one that is then ahead
 EDGE = 1e-6  # of the unit cube: on a bound
+AT_BOUND = 0.999  # of the noise's range
 
 
 def without_swings(binned: BinnedForce, quick_n2: Array) -> BinnedForce:
@@ -126,6 +129,15 @@ class Fit:
         low, high = self.log_posterior.bounds
         return self.value + float(np.sum(np.log(high - low)))
 
+    @cached_property
+    def hope(self) -> float:
+        """Nats that the surrogate's error costs by being free: a full model may give as many, at most."""
+        log_posterior, bins = self.log_posterior, self.log_posterior.chain.bins
+        values = log_posterior.from_sampling(log_posterior.vector(self.theta))[None]
+        there, noise = log_posterior.predict(values), log_posterior.split(values)[1][0]
+        factor = innovations(log_posterior.chain, noise, there.diagonal[0, bins], there.factor[0, bins])
+        return float(0.5 * np.linalg.slogdet(np.eye(factor.shape[1]) + factor.T @ factor)[1])
+
     def draws(self, count: int, seed: int) -> Array:
         """SI values (count, D) from the Gaussian about the point, folded back at the priors' bounds."""
         rng = np.random.default_rng(seed)
@@ -148,6 +160,13 @@ def restored(plain: Mapping[str, Any], log_posterior: LogPosterior) -> Fit:
     covariance, latent = (np.asarray(plain[name], dtype=float) for name in ("covariance", "latent"))
     value, log_evidence = plain["value"], plain["log_evidence"]
     return Fit(tuple(plain["names"]), log_posterior, plain["theta"], value, log_evidence, covariance, latent)
+
+
+def much_left(log_posterior: LogPosterior, theta: Mapping[str, float]) -> bool:
+    """Whether the noise of some kind of phase is as large as it may be."""
+    low, high = log_posterior.bounds
+    unit = (log_posterior.vector(theta) - low) / (high - low)
+    return any(unit[i] > AT_BOUND for i, name in enumerate(log_posterior.names) if name.startswith("sd_"))
 
 
 def promised(
@@ -201,9 +220,9 @@ def fit(
     """The best of a few climbs from `start`, which has the values of a smaller set.
 
     What `start` does not have begins at its neutral value, and is searched for, one of `parts` (names of
-    parameters) after the other; at last, with all others as found, the whole skin is, with the mechanisms
-    that are in it: one that changes much has led the smaller set to another skin. `shear` straightens the
-    ridges of this posterior, where it is known.
+    parameters) after the other; at last, with all others as found, the skin is, by itself and with the
+    mechanisms that are in it: one that changes much has led the smaller set to another skin. `shear`
+    straightens the ridges of this posterior, where it is known.
     """
     low, high = log_posterior.bounds
     starts = [np.clip(log_posterior.vector({**neutral, **start}), low, high)]
@@ -316,7 +335,7 @@ def _best(
     names: Sequence[str], log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None, seed: int
 ) -> Fit:  # fmt: skip
     ahead = _climbed(log_posterior, starts, shear)
-    others = likely(log_posterior, other_skins(ahead.vector, log_posterior, shear, seed), SKIN_STARTS)
+    others = _other_starts(ahead.vector, log_posterior, shear, seed, SKIN_STARTS)
     ahead = max(ahead, _climbed(log_posterior, [ahead.vector, *others], shear), key=lambda one: one.value)
     return _fit_at(names, log_posterior, gauss_newton(log_posterior, ahead.vector, shear, ROUNDS))
 
@@ -326,11 +345,40 @@ def _fit_at(names: Sequence[str], log_posterior: LogPosterior, top: Top) -> Fit:
     return Fit(tuple(names), log_posterior, theta, top.value, *evidence(log_posterior, top), top.latent)
 
 
-def other_skins(vector: Array, log_posterior: LogPosterior, shear: Shear | None, seed: int) -> Array:
-    """Points (n, D) with the base's parameters and those of tissue mechanisms drawn anew, and stiffness such
-    that the force fits best."""
+def other_tops(found: Fit, shear: Shear | None, seed: int, count: int) -> list[Fit]:
+    """Tops about other skins, the most hopeful first, each farther than `APART` from all before."""
+    log_posterior = found.log_posterior
     low, high = log_posterior.bounds
-    skin = innermost(log_posterior.surrogate).space.dim
+    skin = skins(log_posterior.surrogate)[-1]
+    starts = _other_starts(low + found.unit * (high - low), log_posterior, shear, seed, 2 * count)
+    tops = [gauss_newton(log_posterior, start, shear, FIRST_ROUNDS, quick=True) for start in starts]
+    chosen = [found]
+    for one in sorted((_fit_at(found.names, log_posterior, top) for top in tops), key=hopeful, reverse=True):
+        if all(np.max(np.abs(one.unit - other.unit)[:skin]) > APART for other in chosen):
+            chosen.append(one)
+    return chosen[1 : count + 1]
+
+
+def hopeful(found: Fit) -> float:
+    """Log density of a fit, were its surrogate's error free of cost."""
+    return found.value + found.hope
+
+
+def _other_starts(
+    vector: Array, log_posterior: LogPosterior, shear: Shear | None, seed: int, count: int
+) -> list[Array]:
+    """So many of the most probable `other_skins` of each kind."""
+    kinds = skins(log_posterior.surrogate)
+    drawn = [other_skins(vector, log_posterior, shear, seed, skin) for skin in kinds]
+    return [start for trials in drawn for start in likely(log_posterior, trials, count)]
+
+
+def other_skins(
+    vector: Array, log_posterior: LogPosterior, shear: Shear | None, seed: int, skin: int
+) -> Array:
+    """Points (n, D) with the first `skin` parameters drawn anew, those of the base and maybe of tissue
+    mechanisms, and stiffness such that the force fits best."""
+    low, high = log_posterior.bounds
     trials = np.tile(np.clip(vector, low, high), (SKINS, 1))
     trials[:, :skin] = np.random.default_rng(seed).uniform(low[:skin], high[:skin], (len(trials), skin))
     if shear is None:

@@ -22,6 +22,7 @@ from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.moves import mixed_moves
 from bayeskin.inference.straighten import Shear
 from bayeskin.mismatch.fit import FIRST_ROUNDS, Fit, evidence, likely, other_skins
+from bayeskin.mismatch.wrapper import skins
 from bayeskin.types import Array
 
 ENSEMBLES, FEWEST_WALKERS = 2, 40
@@ -104,7 +105,8 @@ def _starts(found: Fit, shear: Shear | None, seed: int, rng: np.random.Generator
     log_posterior = found.log_posterior
     low, high = log_posterior.bounds
     best = low + found.unit * (high - low)
-    others = likely(log_posterior, other_skins(best, log_posterior, shear, seed), MODES)
+    whole = skins(log_posterior.surrogate)[-1]
+    others = likely(log_posterior, other_skins(best, log_posterior, shear, seed, whole), MODES)
     tops = [gauss_newton(log_posterior, start, shear, FIRST_ROUNDS) for start in others]
     centres = np.array([best, *(top.vector for top in tops)])
     masses = np.array([found.log_evidence, *(evidence(log_posterior, top)[0] for top in tops)])

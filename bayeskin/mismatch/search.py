@@ -17,7 +17,8 @@ are followed: from single mechanisms that the best set does not have, and from t
 where there is one.
 
 Probabilities are shares of weight over all sets that were tried and count: those of sets never tried count
-as nothing.
+as nothing. What the full model, fitted with some of them, says of a choice of tissue mechanisms moves the
+weights of all sets with these; the best is then one that it has been fitted with.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ import numpy as np
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import Mechanism, with_one, without_one
-from bayeskin.mismatch.fit import Fit, fit, fit_base, promised
+from bayeskin.mismatch.fit import Fit, fit, fit_base, much_left, promised
 from bayeskin.types import Array
 
 PRIOR = 0.05  # of a mechanism to be at work, before the recording is seen
@@ -39,7 +40,6 @@ SHORTLIST = 5  # mechanisms of a step that are tried thoroughly
 PATHS = 2  # at most
 EXCHANGES = 1  # mechanisms that are tried in another's place
 GAIN = 1.0  # nats: less is no reason to go on from the same set
-AT_BOUND = 0.999  # of the noise's range
 UNSURE = 0.5  # of what a mechanism adds, RMS: sd of the surrogate's error in it
 
 Build = Callable[[Sequence[str]], LogPosterior]  # the posterior with a set of mechanisms
@@ -56,10 +56,16 @@ class Made:
 
 @dataclass
 class Search:
-    """All sets tried, by their names sorted, and the best of them; those that do not count are `unsure`."""
+    """All sets tried, by their names sorted, and the best of them; those that do not count are `unsure`.
+
+    tissue : mechanisms that the surrogate knows with an error; full : weights by the full model of the sets
+    that it was fitted with, where the best is one of them
+    """
 
     fits: dict[tuple[str, ...], Fit] = field(default_factory=dict)
     unsure: dict[tuple[str, ...], Fit] = field(default_factory=dict)
+    tissue: frozenset[str] = frozenset()
+    full: Mapping[tuple[str, ...], float] = field(default_factory=dict)
 
     def add(self, made: Made) -> None:
         """Keeps a fit: of two of the same set the one that counts, else the likelier."""
@@ -76,11 +82,34 @@ class Search:
 
     @property
     def best(self) -> Fit:
+        if self.full:
+            return self.fits[max(self.full, key=lambda names: self.full[names])]
         return max(self.fits.values(), key=weight)
+
+    def weight(self, one: Fit) -> float:
+        """Logarithm of a set's weight, moved as the full model has moved the likeliest with its tissue."""
+        same = [names for names in self.full if self._inner(self.fits[names]) == self._inner(one)]
+        if not same:
+            return weight(one)
+        likeliest = max(same, key=lambda names: self.full[names])
+        return weight(one) + self.full[likeliest] - weight(self.fits[likeliest])
+
+    def rivals(self) -> list[Fit]:
+        """For each of the best's tissue mechanisms the most hopeful set without it, if others are in that."""
+        found: dict[tuple[str, ...], Fit] = {}
+        for name in sorted(self._inner(self.best)):
+            others = [one for one in self.fits.values() if name not in one.names and self._inner(one)]
+            if others:
+                rival = max(others, key=lambda one: weight(one) + one.hope)
+                found[rival.names] = rival
+        return list(found.values())
+
+    def _inner(self, one: Fit) -> frozenset[str]:
+        return self.tissue & set(one.names)
 
     def probability(self, names: Sequence[str]) -> float:
         """Share of the weight of sets with any of these mechanisms."""
-        logs = np.array([weight(one) for one in self.fits.values()])
+        logs = np.array([self.weight(one) for one in self.fits.values()])
         share = np.exp(logs - logs.max())
         among = np.array([bool(set(names) & set(one.names)) for one in self.fits.values()])
         return float(share[among].sum() / share.sum())
@@ -114,11 +143,11 @@ def search(
     singles = sorted((one for one in found.fits.values() if len(one.names) == 1), key=weight, reverse=True)
     for count in range(2, PATHS + 1):
         starts = [one for one in singles[1:] if not set(one.names) <= set(found.best.names)]
-        if not _much_left(found.best) or not starts:
+        if not much_left(found.best.log_posterior, found.best.theta) or not starts:
             break
         singles.remove(starts[0])
         forward.path(starts[0], f"path {count}")
-    if _much_left(found.best) and (other := another()) is not None:
+    if much_left(found.best.log_posterior, found.best.theta) and (other := another()) is not None:
         here = replace(other, theta={**found.best.theta, **other.theta})  # noise that the other knows not
         start = forward.tried(other.names, here)
         if start is not None:
@@ -158,7 +187,7 @@ class _Forward:
             ahead = current
             if len(current.names) < MOST:
                 ahead = self._step(current, f"{label}, mechanism {len(current.names) + 1}")
-            if ahead is current and _much_left(current):
+            if ahead is current and much_left(current.log_posterior, current.theta):
                 ahead = self._renewed(current, label)
 
     def tried(
@@ -244,12 +273,6 @@ def _may_gain(before: Fit | None, names: Sequence[str], start: Fit) -> bool:
     """Whether another climb of a set is worth it: from no smaller set, or from one that is ahead."""
     smaller = set(start.names) < set(names)
     return not smaller or (before is not None and before.log_likelihood < start.log_likelihood)
-
-
-def _much_left(best: Fit) -> bool:
-    """Whether the noise of some kind of phase is as large as it may be."""
-    names = best.log_posterior.names
-    return any(best.unit[i] > AT_BOUND for i, name in enumerate(names) if name.startswith("sd_"))
 
 
 def _new(

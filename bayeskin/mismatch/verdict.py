@@ -27,7 +27,7 @@ from scipy.special import xlogy
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.locate import Located, model_error
-from bayeskin.mismatch.search import PRIOR, Search, weight
+from bayeskin.mismatch.search import PRIOR, Search
 
 PROBABLE = 0.9
 EXPLAINED = 0.9
@@ -127,7 +127,7 @@ def explains(found: Search, name: str) -> float:
     What another mechanism could explain in its place is for the probabilities to say.
     """
     rest = set(found.best.names) - {name}
-    without = max((one for one in found.fits.values() if set(one.names) <= rest), key=weight)
+    without = max((one for one in found.fits.values() if set(one.names) <= rest), key=found.weight)
     return float(np.sqrt(max(_rms(without) ** 2 - _rms(found.best) ** 2, 0.0)))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from bayeskin.mechanisms import catalogue
 from bayeskin.types import Array, ParameterSpace, Prediction, Surrogate
 
 
@@ -43,3 +44,10 @@ def innermost(surrogate: Surrogate) -> Surrogate:
     while isinstance(surrogate, Wrapper):
         surrogate = surrogate.inner
     return surrogate
+
+
+def skins(surrogate: Surrogate) -> tuple[int, ...]:
+    """How many of the first parameters are the skin's: its own, and those with mechanisms of the tissue."""
+    names = innermost(surrogate).space.names
+    of_mechanisms = {p.name for mechanism in catalogue().values() for p in mechanism.parameters}
+    return tuple(sorted({sum(name not in of_mechanisms for name in names), len(names)}))

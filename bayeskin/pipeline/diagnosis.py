@@ -63,6 +63,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     split_s = _end_of_second_hold(bench.binned)
     beginning = (lambda: None) if split_s is None else _search_beside(run, bench, split_s)
     whole = _searched(bench, None, lambda: found.best if (found := beginning()) else None)
+    whole.tissue = bench.tissue
     begun = beginning()
     run.reporter.log("the full model takes up what was found")
     taken, begins = take_up(
@@ -70,6 +71,9 @@ def _work(run: Run) -> Mapping[str, Any]:
     )
     held_out = begins or [None]
     before, after = taken[0], taken[-1]
+    if after.doubtful and (rivals := whole.rivals()):
+        run.reporter.log("the full model takes up what else it may be")
+        after = _likeliest(whole, before, after, rivals, take_up(run, rivals, whole.best.theta, [], None)[0])
     probability = set_probability(whole.best.names, before.evidence, after.evidence)
     found = judge(
         whole, bench.known, before.located, after.located, (before.full_weight, after.full_weight),
@@ -114,6 +118,18 @@ def _work(run: Run) -> Mapping[str, Any]:
         answer["candidates"],
     )  # fmt: skip
     return {**answer, "figures": [figure.name for figure in figures]}
+
+
+def _likeliest(
+    whole: Search, before: TakenUp, after: TakenUp, rivals: Sequence[Fit], taken: Sequence[TakenUp]
+) -> TakenUp:
+    """What follows the best set, which is the one of it and its rivals that the full model makes it."""
+    found = {whole.best.names: after, **{one.names: its for one, its in zip(rivals, taken, strict=True)}}
+    judged = {(): before, **found}
+    weights = {names: its.full_weight for names, its in judged.items() if its.full_weight is not None}
+    if weights:
+        whole.full = {**dict.fromkeys(judged, -np.inf), **weights}
+    return judged[whole.best.names]
 
 
 def _base_and_best(found: Search) -> list[Fit]:

@@ -2,10 +2,11 @@
 
 A first run of the model's own mesh shows by how much the coarsest bricks are off. These, whose runs are quick
 and carry their derivatives, are fitted with that difference added, then the model's own mesh with their
-derivatives. Without mechanisms the slopes of the base's surrogate come first, and last where they are good
-enough. Sampled and taken apart is the posterior of the surrogate corrected by the runs of the model's own
-mesh; located is the mismatch beside the best of these runs. The article's formulation and models of one's own
-keep the surrogate's.
+derivatives. Where the first of these fits is doubtful, others begin at other tops of the surrogate. Without
+mechanisms the slopes of the base's surrogate come first, and last where they are good enough. Sampled and
+taken apart is the posterior of the surrogate corrected by the runs of the model's own mesh; located is the
+mismatch beside the best of these runs. The article's formulation and models of one's own keep the
+surrogate's.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from bayeskin.mismatch.blocked import errors_left_out
 from bayeskin.mismatch.contributions import Contribution, Force, contributions
 from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun, Sure
 from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
-from bayeskin.mismatch.fit import Fit, fit_near, restored, stored
+from bayeskin.mismatch.fit import Fit, fit_near, much_left, other_tops, restored, stored
 from bayeskin.mismatch.form import Form, propose_form
 from bayeskin.mismatch.full_fit import FullFit, at_run, fit_full
 from bayeskin.mismatch.locate import Located, locate
@@ -41,6 +42,7 @@ from bayeskin.workers import Lost, run_parallel
 
 COARSE_RUNS, BASE_RUNS = 8, 4  # at most, with mechanisms and without
 FULL_RUNS = 4  # at most, of the model's own mesh with the coarse one's slopes
+OTHER_TOPS = 2  # at most, from which the coarse mesh is fitted where the first of its fits is doubtful
 DIRECT_RUNS = 2  # at most, of the model's own mesh with the slopes of the base's surrogate
 PREDICTIVE_DRAWS = 300
 
@@ -60,6 +62,7 @@ class TakenUp:
     """What follows a search's fit on the whole recording.
 
     full : the full model's fit; full_weight : logarithm of the set's weight by it, None without that;
+    doubtful : whether that may be of a lesser top, or of the wrong set;
     draws : of the posterior; coverage90 : share of bins in its predictive band;
     left_out_n : RMS error of phases that the fit is made without, None where there is but one;
     evidence : of the best run, with the noise that is no mismatch; located : windows that it leaves;
@@ -68,6 +71,7 @@ class TakenUp:
 
     full: FullResult
     full_weight: float | None
+    doubtful: bool
     draws: Resampled
     coverage90: float
     left_out_n: float | None
@@ -103,7 +107,7 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
     alone, found = build(()), restored(plain, build(plain["names"]))
     straight = find_shear(alone)
     shear = straight.among(alone.names, found.log_posterior.names) if straight else None
-    full, corrected = _full(bench, found)
+    full, corrected = _full(bench, found, shear)
     force: Force = partial(_surrogate_force, bench)
     full_weight, sure, there = None, found, found
     if corrected is not None and isinstance(full, FullFit):
@@ -122,7 +126,8 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
     some = inference.evenly(draws.draws, PREDICTIVE_DRAWS)
     bands = inference.bands(found.log_posterior, some, np.random.default_rng(seed))
     return TakenUp(
-        full, full_weight, draws, inference.coverage(bench.binned, *bands.interval(0.9)),
+        full, full_weight, full is not None and _doubtful(found.log_posterior, full),
+        draws, inference.coverage(bench.binned, *bands.interval(0.9)),
         _left_out(sure, shear), Evidence(left.without_log_evidence, left.log_evidence),
         locate(there, noise, seed),
         tuple(contributions(found.names, found.theta, force, bench.known)),
@@ -144,10 +149,20 @@ def _left_out(found: Fit, shear: Shear | None) -> float | None:
 
 def _begun_apart(source: Path, plain: Mapping[str, Any], until_s: float | None) -> FullResult:
     bench = workbench(opened(source, Silent()))
-    return _full(bench, restored(plain, bench.posterior(until_s, plain["names"])))[0]
+    found, straight = restored(plain, bench.posterior(until_s, plain["names"])), None
+    if found.names:
+        alone = bench.posterior(until_s, ())
+        straight = find_shear(alone)
+        straight = straight.among(alone.names, found.log_posterior.names) if straight else None
+    return _full(bench, found, straight)[0]
 
 
-def _full(bench: Workbench, found: Fit) -> tuple[FullResult, CorrectedSurrogate | None]:
+def _doubtful(log_posterior: LogPosterior, full: FullFit | str) -> bool:
+    """Whether the full model's fit failed, has not settled, or leaves all the noise that may be."""
+    return isinstance(full, str) or not full.settled or much_left(log_posterior, full.theta)
+
+
+def _full(bench: Workbench, found: Fit, shear: Shear | None) -> tuple[FullResult, CorrectedSurrogate | None]:
     """The full model's own fit from a search's, and the surrogate about it."""
     if bench.spec.observation != "reaction":
         return None, None
@@ -202,6 +217,11 @@ def _full(bench: Workbench, found: Fit) -> tuple[FullResult, CorrectedSurrogate 
                 return direct
             start = direct[0].theta
     first = fitted(start, partial(lifted, start), rounds=COARSE_RUNS if found.names else BASE_RUNS)
+    if found.names and (isinstance(first, str) or _doubtful(plain, first[0])):
+        for top in other_tops(found, shear, bench.run.config.seed, OTHER_TOPS):
+            other = fitted(top.theta, partial(lifted, top.theta), rounds=COARSE_RUNS)
+            if isinstance(first, str) or (not isinstance(other, str) and other[0].value > first[0].value):
+                first = other
     last = fitted(start if isinstance(first, str) else first[0].theta, whole, rounds=FULL_RUNS, given=made())
     again = fitted(start, whole, rounds=1)  # no new run
     if not isinstance(again, str) and (isinstance(last, str) or again[0].value > last[0].value):

@@ -59,6 +59,11 @@ class Workbench:
         """The full model."""
         return model_spec(self.run)
 
+    @property
+    def tissue(self) -> frozenset[str]:
+        """Mechanisms that the surrogate has learnt, with an error."""
+        return frozenset(name for effect in self.effects for name in effect.mechanisms)
+
     def refuted(self, found: Fit) -> list[str]:
         """Mechanisms of a fit that the samples it is of speak against; none beside a clock that is off."""
         acts = {name: self.known[name].act for name in found.names}
