@@ -476,7 +476,7 @@ def damage_origin(path):
     [
         (damage_array, "hash"),
         (damage_box, "hash"),
-        (damage_version, "format version 99; expected format version 4"),
+        (damage_version, "format version 99; expected format version 5"),
         (damage_origin, "another origin"),
         (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "not readable"),
         (lambda path: path.write_text("time,force\n"), "not readable"),

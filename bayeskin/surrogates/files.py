@@ -24,8 +24,10 @@ from bayeskin.surrogates.validate import Validation
 from bayeskin.types import Array, ParameterSpace, frozen_array
 
 FORMAT = "bayeskin surrogate"
-FORMAT_VERSION = 4  # 2: inputs are those of `Similarity`; 3: latents may have a correction; 4: active inputs
-READABLE = (3, 4)  # in 3 all inputs are active
+# 2: inputs are those of `Similarity`; 3: latents may have a correction; 4: active inputs; 5: a correction may
+# have latents of its own
+FORMAT_VERSION = 5
+READABLE = (3, 4, 5)  # in 3 all inputs are active
 EXPECTED = "a surrogate that bayeskin wrote"
 LATENTS: dict[str, type[LatentGPs] | type[LatentChaos]] = {"gp": LatentGPs, "chaos": LatentChaos}
 

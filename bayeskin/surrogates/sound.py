@@ -50,7 +50,7 @@ def _shaped(surrogate: ShapeSurrogate) -> Iterator[Shaped]:
 
 def _shaped_latents(latents: Latents, inputs: int, count: int) -> Iterator[Shaped]:
     if isinstance(latents, CorrectedLatents):
-        yield from _shaped_latents(latents.coarse, inputs, count)
+        yield from _shaped_latents(latents.coarse, inputs, min(count, _columns(latents.coarse)))
         yield from _shaped_latents(latents.correction, inputs, count)
     if not isinstance(latents, LatentGPs | LatentChaos):
         return
@@ -68,3 +68,9 @@ def _shaped_latents(latents: Latents, inputs: int, count: int) -> Iterator[Shape
     yield "latents: inflation", latents.inflation, (count,)
     known = [name for name in latents.kernels if name in KERNELS]
     yield "latents: kernels", np.zeros(len(known)), (count,)
+
+
+def _columns(latents: Latents) -> int:
+    """How many latents the coarse model has: those of further components are the fine one's alone."""
+    known = latents.targets if isinstance(latents, LatentGPs | LatentChaos) else np.zeros((1, 1))
+    return known.shape[-1] if known.ndim > 1 else 0
