@@ -2,7 +2,8 @@
 
 The surrogates of the base and of the effect together (of a pair also those of its parts) against runs that
 neither was learnt from, as RMS over the recording, of forces brought to a peak of 1 N. The size of an effect
-is what a run differs by from the base's surrogate.
+is what a run differs by from the base's surrogate. Beside them what the surrogates say of each bin by itself,
+which a likelihood takes for noise.
 
     python benchmarks/effect_errors.py
 
@@ -32,7 +33,7 @@ SURROGATES = Path(__file__).parents[1] / "surrogates"
 SIZES_MN = (0.0, 50.0, 150.0, 300.0, np.inf)
 RANGES = tuple(f"below {high:g} mN" if low == 0.0 else f"from {low:g} mN" if np.isinf(high)
                else f"{low:g} to {high:g} mN" for low, high in pairwise(SIZES_MN))  # fmt: skip
-HEADER = ("part", *RANGES, "all", "runs")
+HEADER = ("part", *RANGES, "all", "runs", "noise of bins")
 
 
 def motions() -> dict[str, PadMotion]:
@@ -44,8 +45,8 @@ def motions() -> dict[str, PadMotion]:
     }
 
 
-def errors(base: Path, motion: PadMotion) -> dict[str, tuple[Array, Array]]:
-    """Of each part, sizes and errors (n,) of its held-out runs, in mN at a peak of 1 N."""
+def errors(base: Path, motion: PadMotion) -> dict[str, tuple[Array, Array, Array]]:
+    """Of each part's held-out runs sizes, errors and what counts as noise of bins (n,), in mN at a peak of 1 N."""
     files = effects_in(effects_beside(base))
     estimates = estimates_by_name(catalogue(), motion)
     effects, alone = [load_effect(path, estimates) for path in files], load_surrogate(base)
@@ -65,17 +66,20 @@ def errors(base: Path, motion: PadMotion) -> dict[str, tuple[Array, Array]]:
             to_skin * np.sqrt(np.mean((truth - made.predict_mean(at(made.space.names))) ** 2, axis=1))
             for made in (alone, whole)
         )
-        found[effect.part] = size, error
+        bins = to_skin * np.sqrt(np.mean(whole.predict(at(whole.space.names)).diagonal, axis=1))
+        found[effect.part] = size, error, bins
     return found
 
 
-def table(found: dict[str, tuple[Array, Array]]) -> str:
+def table(found: dict[str, tuple[Array, Array, Array]]) -> str:
     """Medians by size, with the number of runs in brackets."""
     lines = []
-    for part, (size, error) in found.items():
+    for part, (size, error, bins) in found.items():
         among = [error[(size >= low) & (size < high)] for low, high in pairwise(SIZES_MN)]
         cells = [f"{np.median(some):.2g} ({len(some)})" if len(some) else "-" for some in among]
-        lines.append([f"`{part}`", *cells, f"{np.median(error):.2g}", str(len(error))])
+        lines.append(
+            [f"`{part}`", *cells, f"{np.median(error):.2g}", str(len(error)), f"{np.median(bins):.2g}"]
+        )
     return rows.markdown(HEADER, lines)
 
 

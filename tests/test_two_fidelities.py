@@ -62,6 +62,18 @@ def test_the_correction_removes_the_coarse_models_bias_on_runs_held_out_of_both(
     assert relative[0] >= relative[1]  # the correction's own uncertainty is added
 
 
+def test_a_shape_that_the_coarse_model_does_not_know_is_no_noise_of_single_bins(coarse):
+    fine = designed(3, coarse.theta, coarse.held_out)
+    bent = np.sin(7.0 * np.pi * np.linspace(0.0, 1.0, fine.force_n.shape[1]))
+    share = 0.05 * np.exp(-np.sum(SPACE.to_unit(fine.theta), axis=1))[:, None]
+    size = np.sqrt(np.mean(fine.force_n**2, axis=1))[:, None]
+    more = dataclasses.replace(fine, force_n=fine.force_n + share * size * bent)
+    found = correct(train(coarse, "gp")[0], more)[0].predict(fine.theta[fine.testing])
+    told = np.sqrt(found.diagonal.mean(axis=1) / np.mean(found.mean**2, axis=1))
+    added = np.sqrt(np.mean(share**2) * np.mean(bent**2))
+    assert np.all(told < 0.1 * added)
+
+
 def test_without_held_out_runs_each_fine_run_is_left_out_in_turn(coarse, fine):
     surrogate = train(coarse, "gp")[0]
     every = dataclasses.replace(fine, held_out=np.zeros(len(fine.theta), dtype=bool))
