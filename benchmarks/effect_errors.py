@@ -46,7 +46,7 @@ def motions() -> dict[str, PadMotion]:
 
 
 def errors(base: Path, motion: PadMotion) -> dict[str, tuple[Array, Array, Array]]:
-    """Of each part's held-out runs sizes, errors and what counts as noise of bins (n,), in mN at a peak of 1 N."""
+    """Of each part's held-out runs sizes, errors and noise of bins (n,), in mN at a peak of 1 N."""
     files = effects_in(effects_beside(base))
     estimates = estimates_by_name(catalogue(), motion)
     effects, alone = [load_effect(path, estimates) for path in files], load_surrogate(base)
