@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from toy_inference import TRUTH, ToySurrogate
 
-from bayeskin.mismatch.corrected import LENGTH, CorrectedSurrogate, FullRun, Sure, slopes
+from bayeskin.mismatch.corrected import LENGTH, CorrectedSurrogate, FullRun, slopes
+from bayeskin.mismatch.wrapper import Sure
 
 SURE, OFF = ToySurrogate(sd_n=0.1), ToySurrogate(bias_n=0.01, sd_n=0.1)
 THETA = np.array([TRUTH[name] for name in SURE.space.names])

@@ -157,15 +157,6 @@ class CorrectedSurrogate(Wrapper):
         return np.concatenate(rows)
 
 
-class Sure(Wrapper):
-    """The mean of another, as if that had no error."""
-
-    def predict(self, theta: ArrayLike) -> Prediction:
-        """Force at theta (n, d) or (d,). Raises InputError outside the box."""
-        force = self.predict_mean(theta)
-        return Prediction(force, np.zeros((*force.shape, 1)), np.zeros(force.shape))
-
-
 def _size(mean_n: Array) -> Array:
     """RMS of forces (n, m) over bins, (n, 1)."""
     return np.asarray(np.sqrt(np.mean(mean_n**2, axis=1, keepdims=True)))

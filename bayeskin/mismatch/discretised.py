@@ -15,15 +15,15 @@ noise alone lets them be.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayeskin.mismatch.wrapper import Wrapper
-from bayeskin.types import Array, PadMotion, Prediction
+from bayeskin.mismatch.wrapper import Sure, Wrapper
+from bayeskin.types import Array, PadMotion, Prediction, Surrogate
 
 CALIBRATION = 0.01  # sd of a factor on the force: what a load cell of class 1 is off by (ISO 7500-1:2018)
 BEND = 3e-3  # b, of the force
@@ -61,6 +61,13 @@ class Discretised(Wrapper):
     @cached_property
     def _shapes(self) -> tuple[Array, Array]:
         return shapes(self.motion, self.edges_s)
+
+
+def without_own_error(surrogate: Surrogate) -> Surrogate:
+    """The same as if it had no error but what is allowed for its model."""
+    if isinstance(surrogate, Discretised):
+        return replace(surrogate, inner=Sure(surrogate.inner))
+    return Sure(surrogate)
 
 
 def shapes(motion: PadMotion, edges_s: Array) -> tuple[Array, Array]:

@@ -30,8 +30,9 @@ from numpy.typing import NDArray
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior, NoisePriors
 from bayeskin.inference.gauss_newton import Top, gauss_newton, promise
-from bayeskin.inference.noise_model import innovations
+from bayeskin.inference.likelihood import log_likelihood
 from bayeskin.inference.straighten import Shear
+from bayeskin.mismatch.discretised import without_own_error
 from bayeskin.mismatch.wrapper import skins
 from bayeskin.types import Array, BinnedForce, ParameterSpace
 
@@ -131,12 +132,16 @@ class Fit:
 
     @cached_property
     def hope(self) -> float:
-        """Nats that the surrogate's error costs by being free: a full model may give as many, at most."""
-        log_posterior, bins = self.log_posterior, self.log_posterior.chain.bins
+        """Nats that the surrogate's own error costs by being free: a full model may give as many, at most."""
+        log_posterior = self.log_posterior
         values = log_posterior.from_sampling(log_posterior.vector(self.theta))[None]
-        there, noise = log_posterior.predict(values), log_posterior.split(values)[1][0]
-        factor = innovations(log_posterior.chain, noise, there.diagonal[0, bins], there.factor[0, bins])
-        return float(0.5 * np.linalg.slogdet(np.eye(factor.shape[1]) + factor.T @ factor)[1])
+        free, none = (
+            replace(log_posterior, surrogate=one).predict(values)
+            for one in (log_posterior.surrogate, without_own_error(log_posterior.surrogate))
+        )
+        chain, noise = log_posterior.chain, log_posterior.split(values)[1]
+        at_best = replace(chain, force_n=free.mean[0, chain.bins])
+        return float(log_likelihood(at_best, none, noise)[0] - log_likelihood(at_best, free, noise)[0])
 
     def draws(self, count: int, seed: int) -> Array:
         """SI values (count, D) from the Gaussian about the point, folded back at the priors' bounds."""

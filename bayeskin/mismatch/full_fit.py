@@ -18,8 +18,9 @@ import numpy as np
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.noise_model import innovations
-from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun, Sure
+from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun
 from bayeskin.mismatch.fit import Fit
+from bayeskin.mismatch.wrapper import Sure
 from bayeskin.types import Array, ParameterSpace, Surrogate
 
 TRUST, SMALLEST, LARGEST = 0.1, 0.005, 0.4  # of the prior's width, either side

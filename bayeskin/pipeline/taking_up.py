@@ -2,10 +2,10 @@
 
 A first run of the model's own mesh shows by how much the coarsest bricks are off. These, whose runs are quick
 and carry their derivatives, are fitted with that difference added, then the model's own mesh with their
-derivatives. Where the first of these fits is doubtful, others begin at other tops of the surrogate. Without
-mechanisms the slopes of the base's surrogate come first, and last where they are good enough. Sampled and
-taken apart is the posterior of the surrogate corrected by the runs of the model's own mesh; located is the
-mismatch beside the best of these runs. The article's formulation and models of one's own keep the
+derivatives. Others of these fits begin at other tops of the surrogate that promise more than was found.
+Without mechanisms the slopes of the base's surrogate come first, and last where they are good enough. Sampled
+and taken apart is the posterior of the surrogate corrected by the runs of the model's own mesh; located is
+the mismatch beside the best of these runs. The article's formulation and models of one's own keep the
 surrogate's.
 """
 
@@ -24,15 +24,16 @@ from bayeskin.inference import LogPosterior
 from bayeskin.inference.straighten import Shear, find_shear
 from bayeskin.mismatch.blocked import errors_left_out
 from bayeskin.mismatch.contributions import Contribution, Force, contributions
-from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun, Sure
+from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun
 from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
-from bayeskin.mismatch.fit import Fit, fit_near, much_left, other_tops, restored, stored
+from bayeskin.mismatch.fit import Fit, fit_near, hopeful, much_left, other_tops, restored, stored
 from bayeskin.mismatch.form import Form, propose_form
 from bayeskin.mismatch.full_fit import FullFit, at_run, fit_full
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import weight
 from bayeskin.mismatch.verdict import Evidence
+from bayeskin.mismatch.wrapper import Sure
 from bayeskin.pipeline.engine import Run, Silent
 from bayeskin.pipeline.reported import FullForce
 from bayeskin.pipeline.workbench import Workbench, opened, workbench
@@ -42,7 +43,7 @@ from bayeskin.workers import Lost, run_parallel
 
 COARSE_RUNS, BASE_RUNS = 8, 4  # at most, with mechanisms and without
 FULL_RUNS = 4  # at most, of the model's own mesh with the coarse one's slopes
-OTHER_TOPS = 2  # at most, from which the coarse mesh is fitted where the first of its fits is doubtful
+OTHER_TOPS = 2  # at most, from which the coarse mesh is fitted, too, where they promise more than it found
 DIRECT_RUNS = 2  # at most, of the model's own mesh with the slopes of the base's surrogate
 PREDICTIVE_DRAWS = 300
 
@@ -217,8 +218,10 @@ def _full(bench: Workbench, found: Fit, shear: Shear | None) -> tuple[FullResult
                 return direct
             start = direct[0].theta
     first = fitted(start, partial(lifted, start), rounds=COARSE_RUNS if found.names else BASE_RUNS)
-    if found.names and (isinstance(first, str) or _doubtful(plain, first[0])):
+    if found.names:
         for top in other_tops(found, shear, bench.run.config.seed, OTHER_TOPS):
+            if not isinstance(first, str) and hopeful(top) <= first[0].value:
+                break
             other = fitted(top.theta, partial(lifted, top.theta), rounds=COARSE_RUNS)
             if isinstance(first, str) or (not isinstance(other, str) and other[0].value > first[0].value):
                 first = other
