@@ -175,7 +175,7 @@ def _predictions(kind: str, inputs: Array, targets: Array, slopes: Array, at: Ar
         targets = np.concatenate([targets, *(what for _, what in near)])
         ones = np.ones(len(inputs))
     # All rows at once: a subset would part the rows of a run.
-    with mock.patch.object(hyperparameters, "ROWS_TO_FIT", len(inputs)):
+    with mock.patch.object(hyperparameters, "ROWS_TO_SEARCH", len(inputs)):
         gps = [fit_latent(inputs, column, ones) for column in targets.T]
     return LatentGPs.assemble(inputs, targets, gps).predict(at)[0]
 
