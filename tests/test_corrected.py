@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from toy_inference import TRUTH, ToySurrogate
 
-from bayeskin.mismatch.corrected import LENGTH, CorrectedSurrogate, FullRun, slopes
+from bayeskin.mismatch.corrected import LENGTH, LONGEST, CorrectedSurrogate, FullRun, error_lengths, slopes
 from bayeskin.mismatch.wrapper import Sure
 
 SURE, OFF = ToySurrogate(sd_n=0.1), ToySurrogate(bias_n=0.01, sd_n=0.1)
 THETA = np.array([TRUTH[name] for name in SURE.space.names])
-ALL = np.ones(5, dtype=bool)
+ALL = np.full(5, LENGTH)
 
 
 class Harder(ToySurrogate):
@@ -90,12 +90,13 @@ def test_of_two_runs_the_nearer_one_s_error_counts_for_more() -> None:
 
 def test_what_is_known_correlates_as_derivatives_of_the_law_do() -> None:
     """By finite differences, in lengths; runs with slopes and without, one exact parameter."""
-    inexact = np.array([True, True, False, True, True])
+    lengths = np.where([True, True, False, True, True], LENGTH, np.inf)
+    inexact = np.isfinite(lengths)
     places = [[0.0] * 5, [0.1, 0.05, 0.3, -0.1, 0.0], [-0.05, 0.1, 0.0, 0.15, 0.1]]
     runs = tuple(
         run_at(away(place), sloped=sloped) for place, sloped in zip(places, (True, False, True), strict=True)
     )
-    found = CorrectedSurrogate(SURE, runs, inexact, common=2.5)
+    found = CorrectedSurrogate(SURE, runs, lengths, common=2.5)
     box, h = SURE.space.box, 1e-4
     at = np.array([box.to_unit(run.theta)[inexact] for run in runs]) / LENGTH
 
@@ -162,10 +163,10 @@ def test_errors_that_the_surrogate_denies_leave_it_less_sure() -> None:
 
 
 def test_what_the_surrogate_has_exactly_moves_nothing_away() -> None:
-    inexact = np.array([True, True, True, True, False])
+    lengths = np.array([*ALL[:4], np.inf])
     theta = away([0.0, 0.0, 0.0, 0.0, 0.5])
     run = run_at(THETA, sloped=True)
-    found = CorrectedSurrogate(OFF, (run,), inexact).predict(theta)
+    found = CorrectedSurrogate(OFF, (run,), lengths).predict(theta)
     expected = error_of(run, OFF) * rms(OFF.predict_mean(theta))
     np.testing.assert_allclose((found.mean - OFF.predict_mean(theta))[0], expected, rtol=1e-3, atol=1e-6)
     assert found.sd().max() < 3e-3 * OFF.predict(theta).sd().max()
@@ -184,3 +185,30 @@ def test_it_is_known_by_its_runs() -> None:
         CorrectedSurrogate(SURE, (run_at(away([u, 0, 0, 0, 0])),), ALL).provenance for u in (0.0, 0.1)
     )
     assert one != other
+
+
+class Alike(ToySurrogate):
+    """Its error is alike over known lengths, all over the box of p_init; a fifth is noise of each point."""
+
+    lengths = np.array([0.3, 0.5, 0.2, 4.0, np.inf])
+
+    def correlation(self, theta, at):
+        apart = (self.space.box.to_unit(theta) - self.space.box.to_unit(at[None])) / self.lengths
+        alike = 0.8 * np.exp(-0.5 * np.sum(apart**2, axis=1))
+        return np.repeat(alike[:, None], self.modes.shape[1], axis=1)
+
+
+def test_errors_are_alike_as_far_as_the_surrogate_says() -> None:
+    exact = np.array([False, True, False, False, False])
+    found = error_lengths(Alike(), THETA, exact)
+    np.testing.assert_allclose(found, [0.3, np.inf, 0.2, 4.0, LONGEST], rtol=1e-6)
+    np.testing.assert_array_equal(error_lengths(SURE, THETA, exact), np.where(exact, np.inf, LENGTH))
+
+
+def test_a_run_leaves_what_the_force_does_not_know_as_it_was() -> None:
+    """Beside a run with another p_init the force is the run's, and hardly less sure."""
+    lengths = error_lengths(Alike(sd_n=0.1), THETA, np.zeros(5, dtype=bool))
+    found = CorrectedSurrogate(Alike(sd_n=0.1), (run_at(THETA),), lengths)
+    other = away([0.0, 0.0, 0.0, 0.0, 0.4])
+    np.testing.assert_allclose(found.predict(other).mean[0], run_at(THETA).force_n, rtol=2e-3)
+    assert found.predict(other).sd().max() < 0.05 * OFF.predict(other).sd().max()

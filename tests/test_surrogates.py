@@ -294,6 +294,9 @@ def test_gp_predicts_as_the_textbook_formulas(name):
     found = gp.predict(points)
     np.testing.assert_allclose(found[0][:, 0], target.mean() + target.std() * mean, rtol=1e-7)
     np.testing.assert_allclose(found[1][:, 0], target.var() * variance, rtol=1e-4)
+    apart = kernel(name, squared_distances(points @ map_.T, points[:1] @ map_.T))[0][:, 0]
+    covariance = process * (apart - both @ bordered @ both[0])
+    np.testing.assert_allclose(gp.covariance(points, points[0])[:, 0], target.var() * covariance, rtol=1e-4)
 
 
 @pytest.mark.parametrize("nugget", [1e-2, 1.0])
@@ -334,6 +337,19 @@ def test_latents_of_two_kernels_are_predicted_together_as_each_by_itself():
             np.testing.assert_allclose(found[:, j], expected[:, 0], rtol=1e-9)
 
 
+def test_errors_correlate_as_one_run_more_would_tell(trained):
+    """The more one row tells of another point, the nearer their errors' correlation is to one; at no distance
+    it is one but for what counts as noise."""
+    surrogate, at = trained[0], SPACE.from_unit(np.full(SPACE.dim, 0.5))
+    line = SPACE.from_unit(0.5 + np.linspace(0.0, 0.3, 4)[:, None] * np.eye(SPACE.dim)[0])
+    along = surrogate.correlation(line, at)
+    assert along.shape == (4, surrogate.predict(at).factor.shape[2])
+    assert np.all(np.abs(along) <= 1.0 + 1e-9)
+    assert np.all(along[0] > 0.0)
+    assert along[3, 0] < 0.7 * along[0, 0]
+    np.testing.assert_allclose(surrogate.correlation(at[None], line[2])[0], along[2], rtol=1e-6, atol=1e-9)
+
+
 def test_effects_add_their_strength_times_what_they_have_learnt(gp):
     own = Parameter("g", "1", 0.0, 1.0, "uniform")
     space = ParameterSpace((*SPACE.parameters, own))
@@ -349,6 +365,9 @@ def test_effects_add_their_strength_times_what_they_have_learnt(gp):
     np.testing.assert_allclose(found.mean, base.mean + s * learnt.mean, rtol=1e-12)
     covariance = base.sd() ** 2 + s**2 * learnt.sd() ** 2
     np.testing.assert_allclose(found.sd() ** 2, covariance, rtol=1e-9)
+    each = [gp[0].correlation(DESIGN.theta[:9], DESIGN.theta[0])]
+    each.append(effect.surrogate.correlation(more.theta[:9], more.theta[0]))
+    np.testing.assert_allclose(both.correlation(more.theta[:9], more.theta[0]), np.hstack(each), rtol=1e-12)
 
 
 def test_gp_leave_one_out_is_the_gp_without_the_row():

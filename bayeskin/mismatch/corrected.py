@@ -3,14 +3,15 @@
 The surrogate's error over the size of its force is a Gaussian process of the box's coordinates u with the
 correlation
 
-    k(u, u') = exp(-|u - u'|^2 / (2 l^2)) ,
+    k(u, u') = exp(-sum_i (u_i - u'_i)^2 / (2 l_i^2)) ,
 
-since a trained surrogate errs anew from one training point to the next. What several effects do to each
-other, which it does not know, goes far: their error has a mean of its own, of the variance `common`. The
-forces of runs, and where a run has them its slopes, give the errors between by kriging, and with them how
-much of the surrogate's variance is left: none at a run, all of it far away, and with a single run as much
-again for the mean where there is one. Where errors at the runs are larger than the surrogate says, what is
-left is larger by as much.
+l_i as far as the surrogate's own error is alike (`error_lengths`): errors are the same all along a parameter
+that the force does not know, and a length that were too short there would hold a posterior at the runs. What
+several effects do to each other, which it does not know, goes far: their error has a mean of its own, of the
+variance `common`. The forces of runs, and where a run has them its slopes, give the errors between by
+kriging, and with them how much of the surrogate's variance is left: none at a run, all of it far away, and
+with a single run as much again for the mean where there is one. Where errors at the runs are larger than the
+surrogate says, what is left is larger by as much.
 
 Rasmussen & Williams (2006), ch. 2.7, 4.2 and 9.4.
 """
@@ -26,9 +27,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayeskin.mismatch.wrapper import Wrapper
-from bayeskin.types import Array, Prediction, Surrogate
+from bayeskin.types import Array, Correlated, Prediction, Surrogate
 
-LENGTH = 0.15  # l, of the box: less than training points are apart, beyond which errors do not correlate
+LENGTH = 0.15  # l_i, of the box, where a surrogate does not say: less than training points are apart
+LONGEST = 10.0  # of the box: alike all over it
+APART = 0.1  # of the box, at which errors are compared
 SLOPES = 0.02  # of a run's slopes: what they are wrong by, being those of a coarser mesh
 ROUNDING = 1e-6  # variance of a run's force, over that of the surrogate's error
 STEP = 1e-4  # of the box, for the surrogate's differences
@@ -45,11 +48,14 @@ class FullRun:
 
 @dataclass(frozen=True)
 class CorrectedSurrogate(Wrapper):
-    """`inner` given `runs`; `inexact` (d,) says in which parameters it errs, `common` is the variance of its
-    error's mean over that of the rest."""
+    """`inner` given `runs`.
+
+    lengths (d,) : over which its error is alike, infinite where it makes none
+    common : variance of its error's mean over that of the rest
+    """
 
     runs: tuple[FullRun, ...]
-    inexact: NDArray[np.bool_]
+    lengths: Array
     common: float = 0.0
 
     @property
@@ -76,7 +82,17 @@ class CorrectedSurrogate(Wrapper):
 
     def _scaled(self, theta: Array) -> Array:
         """Coordinates (n, e) of those in which the surrogate errs, in lengths."""
-        return np.asarray(self.space.box.to_unit(theta)[:, self.inexact] / LENGTH)
+        return np.asarray((self.space.box.to_unit(theta) / self.lengths)[:, self._inexact])
+
+    @cached_property
+    def _inexact(self) -> NDArray[np.bool_]:
+        """In which coordinates it errs, (d,)."""
+        return np.isfinite(self.lengths)
+
+    @cached_property
+    def _far(self) -> Array:
+        """Their lengths (e, 1)."""
+        return self.lengths[self._inexact, None]
 
     @cached_property
     def _places(self) -> Array:
@@ -100,9 +116,11 @@ class CorrectedSurrogate(Wrapper):
     @cached_property
     def _slopes(self) -> Array:
         """Of the runs that have them, by lengths, (s, e, m) [N]."""
-        found = [run.slopes_n[:, self.inexact].T for run in self.runs if run.slopes_n is not None]
+        found = [
+            self._far * run.slopes_n[:, self._inexact].T for run in self.runs if run.slopes_n is not None
+        ]
         shape = (len(found), self._places.shape[1], self._here.mean.shape[1])
-        return LENGTH * np.array(found).reshape(shape)
+        return np.array(found).reshape(shape)
 
     def _correlation(self, theta: Array) -> Array:
         """Of the error at theta (n, d) with what is known: that at each run, then its slopes (n, a)."""
@@ -151,7 +169,7 @@ class CorrectedSurrogate(Wrapper):
         errors = (self._runs_n - mean) / size
         rows = [errors]
         for i, own in zip(self._sloped, self._slopes, strict=True):
-            theirs = LENGTH * slopes(self.inner, self.runs[i].theta)[:, self.inexact].T
+            theirs = self._far * slopes(self.inner, self.runs[i].theta)[:, self._inexact].T
             growth = (theirs @ mean[i]) / (mean[i] @ mean[i])  # of the size of the force
             rows.append((own - theirs) / size[i] - growth[:, None] * errors[i])
         return np.concatenate(rows)
@@ -170,3 +188,24 @@ def slopes(surrogate: Surrogate, theta: Array) -> Array:
     rows = np.vstack([theta, np.clip(box.from_unit(unit + steps), box.lower, box.upper)])
     mean = surrogate.predict_mean(rows)
     return np.asarray((mean[1:] - mean[0]).T / np.diag(steps))
+
+
+def error_lengths(surrogate: Surrogate, theta: Array, exact: NDArray[np.bool_]) -> Array:
+    """Over which the surrogate's error is alike about theta (d,), in coordinates of the box (d,); infinite in
+    those that it has exactly.
+
+    By what its processes say of the error's correlation, column by column of the factor, at points that are
+    `APART`. What they take for noise of each point counts as alike, as the rest is.
+    """
+    lengths = np.where(exact, np.inf, LENGTH)
+    if not isinstance(surrogate, Correlated):
+        return lengths
+    box = surrogate.space.box
+    unit = box.to_unit(theta)
+    steps = np.diag(np.where(unit > 0.5, -APART, APART))[~exact]
+    rows = np.vstack([theta, np.clip(box.from_unit(unit + steps), box.lower, box.upper)])
+    size = np.sqrt(np.mean(surrogate.predict(rows).factor ** 2, axis=1))
+    alike = np.sum(size * size[0] * surrogate.correlation(rows, theta), axis=1) / np.linalg.norm(size, axis=1)
+    share = np.clip(alike[1:] / alike[0], 1e-6, 1.0 - 1e-12)
+    lengths[~exact] = np.minimum(APART / np.sqrt(-2.0 * np.log(share)), LONGEST)
+    return lengths

@@ -18,7 +18,7 @@ import numpy as np
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.noise_model import innovations
-from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun
+from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun, error_lengths
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.wrapper import Sure
 from bayeskin.types import Array, ParameterSpace, Surrogate
@@ -70,7 +70,8 @@ def fit_full(
     """
     surrogate, rng = log_posterior.surrogate, np.random.default_rng(seed)
     space, trial, trust = surrogate.space, dict(start), TRUST
-    inexact = np.array([name not in exact for name in space.names])
+    held = np.array([name in exact for name in space.names])
+    lengths = error_lengths(surrogate, np.array([trial[name] for name in space.names]), held)
     runs = tuple(given)
     best: FullFit | None = None
     local = log_posterior
@@ -84,7 +85,7 @@ def fit_full(
         else:
             others = (run for run in runs if not np.array_equal(run.theta, theta))
             runs = (*others, FullRun(theta, *found))
-            ahead = Sure(CorrectedSurrogate(surrogate, runs, inexact, COMMON))
+            ahead = Sure(CorrectedSurrogate(surrogate, runs, lengths, COMMON))
             local = replace(log_posterior, surrogate=allow(ahead), sure_within_n=None)
             vector, latent = _with_noise(local, trial)
             values = local.from_sampling(vector)
@@ -105,7 +106,7 @@ def fit_full(
             best = replace(best, settled=trust >= TRUST)
             break
     assert best is not None
-    return best, CorrectedSurrogate(surrogate, runs, inexact, COMMON if several else 0.0)
+    return best, CorrectedSurrogate(surrogate, runs, lengths, COMMON if several else 0.0)
 
 
 def at_run(found: Fit, full: FullFit) -> Fit:

@@ -275,6 +275,15 @@ class WithEffects:
             found.append(mean_at_distinct(predict, theta[:, known], without))
         return np.asarray(sum(found[1:], found[0]))
 
+    def correlation(self, theta: Array, at: Array) -> Array:
+        """Of the error along each column of the factor, at theta (n, d) with that at a point (d,): (n, r)."""
+        base = self.base.space.dim
+        found = [self.base.correlation(theta[:, :base], at[:base])]
+        for effect, known, own, _ in self._ordered:
+            columns = [known[column] for column in own]
+            found.append(effect.surrogate.correlation(theta[:, columns], at[columns]))
+        return np.concatenate(found, axis=1)
+
     @cached_property
     def _ordered(self) -> list[tuple[Effect, list[int], list[int], list[int]]]:
         """Effects in the order of `composed`; of each, which columns of theta it depends on, which of these

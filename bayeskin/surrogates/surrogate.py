@@ -32,6 +32,10 @@ class Latents(Protocol):
         """The mean (n, q) of `predict` alone."""
         ...
 
+    def covariance(self, unit: Array, at: Array) -> Array:
+        """Of each latent's error at inputs (n, k) with that at one point (k,): (n, q)."""
+        ...
+
     def leave_one_out(self) -> tuple[Array, Array]:
         """Mean and variance (n, q) of each training row given the others."""
         ...
@@ -77,6 +81,12 @@ class ShapeSurrogate(_FreezesArrays):
         latent = self.latents.predict_mean(self.inputs(theta))
         latent[:, 0] += self.similarity.log_scale(theta)
         return self.transform.decode_mean(latent, times)
+
+    def correlation(self, theta: Array, at: Array) -> Array:
+        """Of the error along each column of the factor, at theta (n, d) with that at a point (d,): (n, r)."""
+        unit = self.inputs(np.vstack([theta, at[None]]))
+        variance = self.latents.predict(unit)[1]
+        return self.latents.covariance(unit[:-1], unit[-1]) / np.sqrt(variance[:-1] * variance[-1])
 
     def leave_one_out(self, theta: Array) -> Prediction:
         """Force at the training rows, theta (n, d), as the others predict it; hyperparameters kept."""
