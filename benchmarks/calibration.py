@@ -40,7 +40,7 @@ from bayeskin.recordings import bin_recording, read_recording, segment, uniform_
 from bayeskin.report import save_figure
 from bayeskin.report.style import GREY, MODEL, PAGE_IN, new_figure, state_finding, styled, symbol
 from bayeskin.shipped import shipped
-from bayeskin.surrogates import load_surrogate
+from bayeskin.surrogates import load_manifest, load_surrogate
 from bayeskin.types import Array
 from bayeskin.workers import Lost, run_parallel
 
@@ -52,7 +52,7 @@ NAMES = ("E_c", "E_s", "k_c", "k_s", "p_init", "sd_load", "sd_hold", "tau_noise"
 _EACH = ("true", "rank", "in50", "in90")
 ROWS = rows.Rows(
     rows.RESULTS / "calibration.csv",
-    ("data", "seed", "index"),
+    ("surrogate", "data", "seed", "index"),
     (
         *(f"{what}_{name}" for name in NAMES for what in _EACH),
         "band50", "band90", "trusted", "steps", "reason", "cpu_s", "code",
@@ -69,6 +69,11 @@ def problem() -> LogPosterior:
     surrogate = load_surrogate(shipped("surrogates/demo.h5"))
     edges_s = uniform_edges(float(surrogate.edges_s[-1]))
     return LogPosterior(surrogate, bin_recording(recording, phases, edges_s), WINDOW_S)
+
+
+def surrogate_hash() -> str:
+    """Short name of the shipped surrogate: ranks of one say nothing of another."""
+    return str(load_manifest(shipped("surrogates/demo.h5"))["arrays_sha256"])[:12]
 
 
 def made_by_surrogate(about: LogPosterior, theta: Array, rng: np.random.Generator) -> Array:
@@ -221,7 +226,8 @@ def main() -> None:
     parser.add_argument("--figures", type=Path, default=FIGURES)
     asked = parser.parse_args()
     store = replace(ROWS, path=asked.results / ROWS.path.name)
-    items = [{"data": asked.data, "seed": asked.seed, "index": index} for index in range(asked.n)]
+    known = {"surrogate": surrogate_hash(), "data": asked.data, "seed": asked.seed}
+    items = [{**known, "index": index} for index in range(asked.n)]
     there = {store.key_of(row): row for row in store.read()}
     todo = [item for item in items if store.key_of(item) not in there]
     rows.say(f"{len(items) - len(todo)} of {len(items)} are there already")
