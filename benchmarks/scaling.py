@@ -1,6 +1,6 @@
 """What running a design costs beside its runs: one and two local processes, Dask with one and two workers.
 
-The same full runs (80 bricks, first cycle of the healthy-skin protocol, first points of a design of the
+The same full runs (default bricks, first cycle of the healthy-skin protocol, first points of a design of the
 default box), timed by the clock:
 
     alone            one after the other in this process, no runner
@@ -36,7 +36,7 @@ from bayeskin.runner import run_design
 from bayeskin.workers import Map, local
 
 SEED = 5
-SPEC = ModelSpec(refinement=0)
+SPEC = ModelSpec()
 MOTION = healthy_skin.first_cycle(healthy_skin.HEALTHY_SKIN)
 EDGES_S = np.arange(9.5, 88.1, 0.5)
 RUN = partial(simulate, SPEC, MOTION)
