@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayeskin.mismatch.wrapper import Wrapper
+from bayeskin.mismatch.wrapper import Wrapper, innermost
 from bayeskin.types import Array, Correlated, Prediction, Surrogate
 
 LENGTH = 0.15  # l_i, of the box, where a surrogate does not say: less than training points are apart
@@ -198,14 +198,17 @@ def error_lengths(surrogate: Surrogate, theta: Array, exact: NDArray[np.bool_]) 
     `APART`. What they take for noise of each point counts as alike, as the rest is.
     """
     lengths = np.where(exact, np.inf, LENGTH)
-    if not isinstance(surrogate, Correlated):
+    if not isinstance(innermost(surrogate), Correlated):
         return lengths
+    assert isinstance(surrogate, Correlated)
     box = surrogate.space.box
     unit = box.to_unit(theta)
     steps = np.diag(np.where(unit > 0.5, -APART, APART))[~exact]
     rows = np.vstack([theta, np.clip(box.from_unit(unit + steps), box.lower, box.upper)])
     size = np.sqrt(np.mean(surrogate.predict(rows).factor ** 2, axis=1))
     alike = np.sum(size * size[0] * surrogate.correlation(rows, theta), axis=1) / np.linalg.norm(size, axis=1)
+    if not alike[0] > 0.0:  # at a run that it was trained on nothing but rounding is left
+        return lengths
     share = np.clip(alike[1:] / alike[0], 1e-6, 1.0 - 1e-12)
     lengths[~exact] = np.minimum(APART / np.sqrt(-2.0 * np.log(share)), LONGEST)
     return lengths
