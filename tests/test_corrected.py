@@ -6,9 +6,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from toy import MOTION
 from toy_inference import TRUTH, ToySurrogate
 
+from bayeskin.mechanisms import catalogue
 from bayeskin.mismatch.corrected import LENGTH, LONGEST, CorrectedSurrogate, FullRun, error_lengths, slopes
+from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.wrapper import Sure
 
 SURE, OFF = ToySurrogate(sd_n=0.1), ToySurrogate(bias_n=0.01, sd_n=0.1)
@@ -90,7 +93,7 @@ def test_of_two_runs_the_nearer_one_s_error_counts_for_more() -> None:
 
 def test_what_is_known_correlates_as_derivatives_of_the_law_do() -> None:
     """By finite differences, in lengths; runs with slopes and without, one exact parameter."""
-    lengths = np.where([True, True, False, True, True], LENGTH, np.inf)
+    lengths = np.array([0.15, 0.3, np.inf, 0.2, 2.0])
     inexact = np.isfinite(lengths)
     places = [[0.0] * 5, [0.1, 0.05, 0.3, -0.1, 0.0], [-0.05, 0.1, 0.0, 0.15, 0.1]]
     runs = tuple(
@@ -98,7 +101,7 @@ def test_what_is_known_correlates_as_derivatives_of_the_law_do() -> None:
     )
     found = CorrectedSurrogate(SURE, runs, lengths, common=2.5)
     box, h = SURE.space.box, 1e-4
-    at = np.array([box.to_unit(run.theta)[inexact] for run in runs]) / LENGTH
+    at = np.array([box.to_unit(run.theta)[inexact] for run in runs]) / lengths[inexact]
 
     def law(a: np.ndarray, b: np.ndarray) -> float:
         return float(np.exp(-0.5 * np.sum((a - b) ** 2)) + 2.5)
@@ -122,7 +125,7 @@ def test_what_is_known_correlates_as_derivatives_of_the_law_do() -> None:
     forces = [law(a, b) for a in at for b in at]
     np.testing.assert_allclose(found._known[:3, :3].ravel(), forces, atol=1e-5)
     theta = away([0.02, 0.03, 0.1, 0.04, -0.05])
-    here = box.to_unit(theta)[inexact] / LENGTH
+    here = box.to_unit(theta)[inexact] / lengths[inexact]
     expected = [law(here, one) for one in at]
     expected += [(law(here, at[j] + e) - law(here, at[j] - e)) / (2 * h) for j in (0, 2) for e in steps]
     np.testing.assert_allclose(found._correlation(theta[None])[0], expected, atol=1e-6)
@@ -133,7 +136,9 @@ def test_slopes_tell_what_the_surrogate_s_are_wrong_by() -> None:
     unsure = ToySurrogate(sd_n=1.0)  # so that what slopes are wrong by is little
     right = slopes(Harder(0.01), THETA)
     wrong = np.abs(slopes(unsure, THETA) - right).max()
-    assert np.abs(slopes(CorrectedSurrogate(unsure, (run,), ALL), THETA) - right).max() < 0.05 * wrong
+    uneven = np.array([0.15, 0.3, 0.1, 0.2, 2.0])
+    for lengths in (ALL, uneven):
+        assert np.abs(slopes(CorrectedSurrogate(unsure, (run,), lengths), THETA) - right).max() < 0.05 * wrong
     assert (
         np.abs(
             slopes(CorrectedSurrogate(unsure, (dataclasses.replace(run, slopes_n=None),), ALL), THETA) - right
@@ -212,3 +217,17 @@ def test_a_run_leaves_what_the_force_does_not_know_as_it_was() -> None:
     other = away([0.0, 0.0, 0.0, 0.0, 0.4])
     np.testing.assert_allclose(found.predict(other).mean[0], run_at(THETA).force_n, rtol=2e-3)
     assert found.predict(other).sd().max() < 0.05 * OFF.predict(other).sd().max()
+
+
+def test_an_instrument_takes_nothing_from_what_errors_have_in_common() -> None:
+    seen = ObservedSurrogate(Alike(), (catalogue()["force-offset"],), MOTION)
+    theta, more = away([0.1, 0.0, 0.1, 0.0, 0.0]), [0.02]
+    found = seen.correlation(np.append(theta, more)[None], np.append(THETA, [-0.1]))
+    np.testing.assert_array_equal(found, Alike().correlation(theta, THETA))
+    exact = np.array([False] * 5 + [True])
+    expected = [0.3, 0.5, 0.2, 4.0, LONGEST, np.inf]
+    np.testing.assert_allclose(error_lengths(seen, np.append(THETA, more), exact), expected, rtol=1e-6)
+    plain = ObservedSurrogate(SURE, seen.mechanisms, MOTION)
+    np.testing.assert_array_equal(
+        error_lengths(plain, np.append(THETA, more), exact), [LENGTH] * 5 + [np.inf]
+    )
