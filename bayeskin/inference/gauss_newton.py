@@ -20,7 +20,7 @@ from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
 from bayeskin.inference.noise_model import NoiseChain, innovations
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.straighten import Shear
-from bayeskin.types import Array, NDArray
+from bayeskin.types import Array, NDArray, Prediction
 
 STEP = 1e-4  # of the box, for differences
 DAMPED = (0.0, 1e-2, 1.0, 1e2, 1e4)  # shares of the information added to its diagonal
@@ -56,20 +56,31 @@ def gauss_newton(
     """
     low, high = log_posterior.bounds
     x = np.clip(np.asarray(start, dtype=float), low, high)
-    value = float(log_posterior.log_prob(x[None])[0])
+    here = log_posterior.predict(log_posterior.from_sampling(x))
+    value = float(log_posterior.log_prob_given(x[None], here)[0])
     small = made = 0
     while np.isfinite(value) and made < rounds and small < 2:
         made += 1
         before = value
-        linear = _Linear(log_posterior, x)
+        linear = _Linear(log_posterior, x, here)
         x = linear.with_noise(quick)
-        trials = _trials(linear, x, shear)
-        values = log_posterior.log_prob(trials)
-        best = int(np.argmax(values))
-        x, value = trials[best], float(values[best])
+        x, value, here = _best(log_posterior, _trials(linear, x, shear))
         small = small + 1 if value - before < ENOUGH else 0
-    last = _Linear(log_posterior, x)
+    last = _Linear(log_posterior, x, here)
     return Top(x, value, *last.curvature(), made)
+
+
+def _best(log_posterior: LogPosterior, trials: Array) -> tuple[Array, float, Prediction]:
+    """The most probable of trials (n, D), its log density and the prediction at it."""
+    there = log_posterior.predict(log_posterior.from_sampling(trials))
+    values = log_posterior.log_prob_given(trials, there)
+    best = int(np.argmax(values))
+    one = slice(best, best + 1)
+    return (
+        trials[best],
+        float(values[best]),
+        Prediction(there.mean[one], there.factor[one], there.diagonal[one]),
+    )
 
 
 def promise(
@@ -80,7 +91,8 @@ def promise(
     Of each its row, the nats, the best multiple of that change, and `vector` with what is `free` (D,) moved
     to make room, within the box; all by the force's linear approximation (a score test).
     """
-    linear = _Linear(log_posterior, vector)
+    here = log_posterior.predict(log_posterior.from_sampling(vector))
+    linear = _Linear(log_posterior, vector, here)
     inner = linear.inner
     others = free[:inner]
     bins = linear.chain.bins
@@ -129,8 +141,8 @@ def _trials(linear: _Linear, x: Array, shear: Shear | None) -> Array:
 class _Linear:
     """The force linear about one point of the material parameters, and the noise there."""
 
-    def __init__(self, log_posterior: LogPosterior, x: Array) -> None:
-        self.log_posterior, self.x = log_posterior, x
+    def __init__(self, log_posterior: LogPosterior, x: Array, here: Prediction) -> None:
+        self.log_posterior, self.x, self.here = log_posterior, x, here
         self.chain: NoiseChain = log_posterior.chain
         self.low, self.high = log_posterior.bounds
         self.inner = log_posterior.surrogate.space.dim
@@ -139,7 +151,6 @@ class _Linear:
         points = np.repeat(x[None], self.inner + 1, axis=0)
         points[1:, : self.inner] += np.diag(side * STEP * width[: self.inner])
         theta = log_posterior.from_sampling(points)
-        self.here = log_posterior.predict(theta[:1])
         mean, bins = log_posterior.predict_mean(theta), self.chain.bins
         slope = (mean[1:] - mean[0])[:, bins] / (side * STEP)[:, None]
         self.slope = slope.T  # (k, inner), a box width

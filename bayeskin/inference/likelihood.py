@@ -9,8 +9,8 @@ whitened by the chain, w and G, the innovations are eps(z) = w - G z, independen
 N is the normal density within three sd; beyond, its logarithm falls by 50 (|z| - 3)^2 more, since a
 surrogate that were wrong by tens of its sd could explain any misfit by an error that it denies. The integral
 is Gaussian and exact for nu = inf within three sd. For finite nu it is Laplace's approximation about the
-mode, found by reweighted least squares and then Newton steps (Tierney & Kadane 1986, JASA 81:82; Lange,
-Little & Taylor 1989, JASA 84:881). Float64 throughout; one thread; one call for any number of points.
+mode, found by reweighted least squares and then Newton steps, whose curvature is kept while it serves
+(Tierney & Kadane 1986, JASA 81:82; Lange, Little & Taylor 1989, JASA 84:881). Float64 throughout; one thread; one call for any number of points.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ from bayeskin.types import Array, NDArray, Prediction
 _STEPS = 40  # bound on the mode search; five or six are usual
 FARTHEST, STIFF = 3.0, 100.0  # sd of the surrogate's error that z is normal to, and the stiffness beyond
 _REWEIGHTED = 2  # steps of reweighted least squares before Newton, which needs a start near the mode
+_SLOW = 0.1  # of the decrement before: more, and the curvature is summed anew
+_BACK = 0.3  # of a step that went too far
 _DECREMENT = 1e-8  # of the log density, at which the mode is found
 # Sums may be reordered for SIMD; infinities and NaN keep their meaning.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -133,50 +135,62 @@ def _innovations(plain: Array, now: Array, before: Array, out: Array) -> None:
 
 @nb.njit(fastmath=_FAST, inline="always")
 def _marginal(white: Array, design: Array, rank: int, nu: float, work: Array) -> float:
-    """Log of the integral over z of N(z; 0, I) prod_j t_nu(white_j - design[:, j] z)."""
+    """Log of the integral over z of N(z; 0, I) prod_j t_nu(white_j - design[:, j] z).
+
+    The curvature, which is what costs, is summed anew only where steps by a former one go too slowly.
+    """
     gaussian = math.isinf(nu)
-    z, best, gradient = np.zeros(len(design)), np.zeros(rank), np.empty(rank)
-    gram, curvature = np.empty((rank, len(design))), np.empty((rank, rank))
-    eps, pulled, bend, row = work[0], work[1], work[2], work[3]
-    newton, lowest = False, np.inf
-    value = np.inf
+    z, best, gradient, change = np.zeros(len(design)), np.zeros(rank), np.empty(rank), np.empty(rank)
+    gram, curvature = np.empty((len(design), len(design))), np.empty((rank, rank))
+    eps, pulled, bend = work[0], work[1], work[2]
+    value, lowest, decrement = np.inf, np.inf, np.inf
     for step in range(_STEPS):
         value = _energy(white, design, rank, z, nu, eps)
         if step == 1 and gaussian and np.all(np.abs(z) <= FARTHEST):
             break  # the integrand is a normal density: one step is exact
-        if newton and value > lowest + 1e-9:  # Newton overshot: back, and reweight from there on
-            newton, lowest = False, np.inf
-            z[:rank] = best
-            value = _energy(white, design, rank, z, nu, eps)
-        elif step == _REWEIGHTED and not gaussian:
-            newton = True
-        lowest = value
+        if value > lowest + 1e-9:  # too far
+            z[:rank] = best + _BACK * (z[:rank] - best)
+            continue
+        lowest, before = value, decrement
         best[:] = z[:rank]
-        _weights(eps, nu, step, newton, pulled, bend)
+        _weights(eps, nu, step, step >= _REWEIGHTED, pulled, bend)
         _slope(design, z, pulled, gradient)
-        if step == 0 or not gaussian:
-            _gram(design, bend, row, gram)
-        if not _factored(gram, z, curvature):
-            newton = False
-            _weights(eps, nu, step, False, pulled, bend)
-            _gram(design, bend, row, gram)
-            _factored(gram, z, curvature)
-        decrement = _solve(curvature, gradient)
-        z[:rank] += gradient
-        value -= 0.5 * decrement
+        if step == 0:
+            _gram(design, bend, gram)
+        sound, decrement = _solved(gram, z, gradient, change, curvature)
+        if step > 0 and not gaussian and (not sound or decrement > _SLOW * before):
+            _gram(design, bend, gram)
+            sound, decrement = _solved(gram, z, gradient, change, curvature)
+            if not sound:
+                _weights(eps, nu, step, False, pulled, bend)
+                _gram(design, bend, gram)
+                sound, decrement = _solved(gram, z, gradient, change, curvature)
         if step > 0 and decrement < _DECREMENT:
+            value -= 0.5 * decrement
             break
-    if not gaussian and not newton:  # Laplace takes the curvature of the density, not of its bound
+        z[:rank] += change
+    else:
+        z[:rank] = best
         value = _energy(white, design, rank, z, nu, eps)
+    if not gaussian:  # Laplace takes the curvature of the density, not of a bound or of a former point
         _weights(eps, nu, _STEPS, True, pulled, bend)
-        _gram(design, bend, row, gram)
+        _gram(design, bend, gram)
         if not _factored(gram, z, curvature):
             _weights(eps, nu, _STEPS, False, pulled, bend)
-            _gram(design, bend, row, gram)
+            _gram(design, bend, gram)
             _factored(gram, z, curvature)
     for a in range(rank):
         value += math.log(curvature[a, a])
     return len(white) * _log_norm(nu) - value
+
+
+@nb.njit(fastmath=_FAST, inline="always")
+def _solved(gram: Array, z: Array, gradient: Array, change: Array, lower: Array) -> tuple[bool, float]:
+    """Fills `change` with Newton's step; whether the curvature is positive, and the decrement."""
+    if not _factored(gram, z, lower):
+        return False, np.inf
+    change[:] = gradient
+    return True, _solve(lower, change)
 
 
 @nb.njit(fastmath=_FAST, inline="always")
@@ -238,22 +252,28 @@ def _slope(design: Array, z: Array, pulled: Array, gradient: Array) -> None:
 
 
 @nb.njit(fastmath=_FAST, inline="always")
-def _gram(design: Array, bend: Array, row: Array, gram: Array) -> None:
-    """Lower triangle of G' diag(bend) G, four entries at once; `row` (k,) is work."""
-    k = len(row)
-    for a in range(len(gram)):
-        own = design[a]
-        for j in range(k):
-            row[j] = own[j] * bend[j]
-        for b in range(0, a + 1, 4):
+def _gram(design: Array, bend: Array, gram: Array) -> None:
+    """Lower triangle of G' diag(bend) G, eight entries at once."""
+    k = len(bend)
+    for a in range(0, len(gram), 2):
+        upper, under = design[a], design[a + 1]
+        for b in range(0, a + 2, 4):
             one, two, three, four = design[b], design[b + 1], design[b + 2], design[b + 3]
             first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
+            fifth, sixth, seventh, eighth = 0.0, 0.0, 0.0, 0.0
             for j in range(k):
-                first += row[j] * one[j]
-                second += row[j] * two[j]
-                third += row[j] * three[j]
-                fourth += row[j] * four[j]
+                left, right = upper[j] * bend[j], under[j] * bend[j]
+                first += left * one[j]
+                second += left * two[j]
+                third += left * three[j]
+                fourth += left * four[j]
+                fifth += right * one[j]
+                sixth += right * two[j]
+                seventh += right * three[j]
+                eighth += right * four[j]
             gram[a, b], gram[a, b + 1], gram[a, b + 2], gram[a, b + 3] = first, second, third, fourth
+            gram[a + 1, b], gram[a + 1, b + 1] = fifth, sixth
+            gram[a + 1, b + 2], gram[a + 1, b + 3] = seventh, eighth
 
 
 @nb.njit(inline="always")

@@ -126,15 +126,21 @@ class LogPosterior:
         out = np.full(len(vectors), -np.inf)
         inside = np.flatnonzero(np.all((vectors >= low) & (vectors <= high), axis=1))
         for part in _chunks(inside):
-            log_prior = self.space.log_density(vectors[part])
-            value = self.log_likelihood(self.from_sampling(vectors[part])) + log_prior
-            out[part] = np.where(np.isnan(value), -np.inf, value)
+            out[part] = self.log_prob_given(vectors[part], self.predict(self.from_sampling(vectors[part])))
         return out
+
+    def log_prob_given(self, vectors: Array, prediction: Prediction) -> Array:
+        """The same (n,) at vectors (n, D) inside the box, the prediction at them given."""
+        theta = self.from_sampling(vectors)
+        value = self._log_likelihood(theta, prediction) + self.space.log_density(vectors)
+        return np.where(np.isnan(value), -np.inf, value)
 
     def log_likelihood(self, theta: ArrayLike) -> Array:
         """Log-likelihood (n,) at SI values (n, D) in the box."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
-        prediction = self.predict(theta)
+        return self._log_likelihood(theta, self.predict(theta))
+
+    def _log_likelihood(self, theta: Array, prediction: Prediction) -> Array:
         found = log_likelihood(self.chain, prediction, self.split(theta)[1])
         return np.where(self.impossible(theta, prediction), -np.inf, found)
 

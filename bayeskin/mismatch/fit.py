@@ -321,13 +321,17 @@ def likely(log_posterior: LogPosterior, trials: Array, count: int) -> list[Array
     """The most probable of trials (n, D), among those whose force is nearest to the recorded one."""
     if not len(trials):
         return []
-    chain, theta = log_posterior.chain, log_posterior.from_sampling(trials)
-    prediction = log_posterior.predict(theta)
-    away = np.sum((chain.force_n - prediction.mean[:, chain.bins]) ** 2, axis=1)
-    away[log_posterior.impossible(theta, prediction)] = np.inf
-    trials = trials[np.argsort(away)[: NEAREST * count]]
-    values = log_posterior.log_prob(trials)
-    return [trials[i] for i in np.argsort(-values)[:count] if np.isfinite(values[i])]
+    bins, recorded = log_posterior.chain.bins, log_posterior.chain.force_n
+    mean = log_posterior.predict_mean(log_posterior.from_sampling(trials))[:, bins]
+    trials = trials[np.argsort(np.sum((recorded - mean) ** 2, axis=1))]
+    found, values, weighed = trials[:0], np.empty(0), NEAREST * count
+    for start in range(0, len(trials), weighed):  # in order, until so many of them are possible
+        value = log_posterior.log_prob(part := trials[start : start + weighed])
+        possible = np.isfinite(value)
+        found, values = np.concatenate([found, part[possible]]), np.concatenate([values, value[possible]])
+        if len(found) >= weighed:
+            break
+    return list(found[:weighed][np.argsort(-values[:weighed])[:count]])
 
 
 def _climbed(log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None) -> Top:
