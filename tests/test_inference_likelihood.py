@@ -8,12 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import optimize, stats
 from toy_inference import NOISE, TRUTH, empty_recording, toy_problem
 
 from bayeskin.errors import InputError
-from bayeskin.inference.likelihood import log_likelihood
-from bayeskin.inference.noise_model import NoiseChain, bins_in_windows, draw_noise, noise_chain, scales
+from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
+from bayeskin.inference.noise_model import (
+    NoiseChain,
+    bins_in_windows,
+    draw_noise,
+    innovations,
+    noise_chain,
+    scales,
+)
 from bayeskin.types import Array, BinnedForce, Prediction
 
 
@@ -167,6 +174,38 @@ def test_the_latent_mode_is_found_beside_outliers() -> None:
     z = np.linspace(-7, 7, 4001)[:, None]
     exact = np.logaddexp.reduce(heights_over(binned, prediction, noise, 0, z)) + np.log(z[1, 0] - z[0, 0])
     assert log_likelihood(noise_chain(binned), prediction, noise)[0] == pytest.approx(exact, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("far", "seed"), [(4.0, 0), (8.0, 1), (30.0, 2), (100.0, 9)]
+)  # Newton overshoots in 9
+def test_latents_beyond_what_a_surrogate_denies_are_found_as_by_a_general_optimiser(
+    far: float, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    base = irregular_recording(100, rng)
+    prediction, noise = prediction_of(100, 4, rng, points=1), noise_vectors(4, 60.0, rng, points=1)
+    latent = far * rng.standard_normal(4)
+    shift = prediction.factor[0] @ latent
+    binned = dataclasses.replace(base, force_n=prediction.mean[0] + shift)
+    chain, nu = noise_chain(binned), noise[0, -1]
+    columns = np.column_stack([shift, prediction.factor[0]])[chain.bins]
+    white = innovations(chain, noise[0], prediction.diagonal[0, chain.bins], columns)
+
+    def energy(z: Array) -> float:
+        beyond = np.maximum(np.abs(z) - FARTHEST, 0.0)
+        logs = np.log1p((white[:, 0] - white[:, 1:] @ z) ** 2 / nu)
+        return 0.5 * float(z @ z + STIFF * beyond @ beyond) + 0.5 * (nu + 1.0) * float(logs.sum())
+
+    tops = [optimize.minimize(energy, share * latent, tol=1e-10) for share in (0.0, 0.2, 1.0)]
+    z = min(tops, key=lambda top: top.fun).x
+    square = (white[:, 0] - white[:, 1:] @ z) ** 2
+    bend = (nu + 1.0) * (nu - square) / (nu + square) ** 2
+    curvature = (white[:, 1:].T * bend) @ white[:, 1:] + np.diag(1.0 + STIFF * (np.abs(z) > FARTHEST))
+    scale, rho = scales(chain, noise, prediction.diagonal[:, chain.bins])
+    density = len(white) * stats.t.logpdf(0.0, nu) - np.log(scale * np.sqrt(1.0 - rho**2)).sum()
+    expected = density - energy(z) - 0.5 * np.linalg.slogdet(curvature)[1]
+    assert log_likelihood(chain, prediction, noise)[0] == pytest.approx(expected, rel=1e-6, abs=1e-3)
 
 
 def test_drawn_noise_has_the_chain_s_covariance() -> None:
