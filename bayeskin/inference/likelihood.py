@@ -10,7 +10,8 @@ N is the normal density within three sd; beyond, its logarithm falls by 50 (|z| 
 surrogate that were wrong by tens of its sd could explain any misfit by an error that it denies. The integral
 is Gaussian and exact for nu = inf within three sd. For finite nu it is Laplace's approximation about the
 mode, found by reweighted least squares and then Newton steps, whose curvature is kept while it serves
-(Tierney & Kadane 1986, JASA 81:82; Lange, Little & Taylor 1989, JASA 84:881). Float64 throughout; one thread; one call for any number of points.
+(Tierney & Kadane 1986, JASA 81:82; Lange, Little & Taylor 1989, JASA 84:881). Float64 throughout; one thread;
+one call for any number of points.
 """
 
 from __future__ import annotations
