@@ -28,7 +28,8 @@ _STEPS = 40  # bound on the mode search; five or six are usual
 FARTHEST, STIFF = 3.0, 100.0  # sd of the surrogate's error that z is normal to, and the stiffness beyond
 _REWEIGHTED = 2  # steps of reweighted least squares before Newton, which needs a start near the mode
 _SLOW = 0.1  # of the decrement before: more, and the curvature is summed anew
-_BACK = 0.3  # of a step that went too far
+_PATIENT = 8  # steps that may go too far: one often lands on the right side of three sd for the next
+_BACK = 0.3  # of a step that went too far after these
 _DECREMENT = 1e-8  # of the log density, at which the mode is found
 # Sums may be reordered for SIMD; infinities and NaN keep their meaning.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -149,11 +150,13 @@ def _marginal(white: Array, design: Array, rank: int, nu: float, work: Array) ->
         value = _energy(white, design, rank, z, nu, eps)
         if step == 1 and gaussian and np.all(np.abs(z) <= FARTHEST):
             break  # the integrand is a normal density: one step is exact
-        if value > lowest + 1e-9:  # too far
-            z[:rank] = best + _BACK * (z[:rank] - best)
+        before = decrement
+        if value <= lowest + 1e-9:
+            lowest = value
+            best[:] = z[:rank]
+        elif step >= _PATIENT:
+            z[:rank] = best + (0.0 if step == _PATIENT else _BACK) * (z[:rank] - best)
             continue
-        lowest, before = value, decrement
-        best[:] = z[:rank]
         _weights(eps, nu, step, step >= _REWEIGHTED, pulled, bend)
         _slope(design, z, pulled, gradient)
         if step == 0:
