@@ -52,9 +52,9 @@ def cli() -> None:
 
     \b
     Start here:
-      bayeskin doctor                       does it work here
-      bayeskin run runs/demo.toml           everything, on the shipped recording
-      bayeskin new test.xlsx -o test.toml   a configuration for your own
+      bayeskin doctor                          does it work here
+      bayeskin new && bayeskin run demo.toml   everything, on the demo
+      bayeskin new test.xlsx -o test.toml      a configuration for your own
       bayeskin run test.toml
 
     \b
@@ -149,10 +149,10 @@ a_scheduler = click.option(
 )
 
 
-def _stage_command(name: str, text: str) -> None:
+def _stage_command(name: str, text: str, example: str = "runs/demo.toml") -> None:
     @cli.command(name, help=f"{text}\n\nWhat it needs of earlier stages is done first.\n\n"
-                            f"\b\nExample:\n  bayeskin {name} runs/demo.toml\n"
-                            f"  bayeskin {name} runs/demo.toml --json")  # fmt: skip
+                            f"\b\nExample:\n  bayeskin {name} {example}\n"
+                            f"  bayeskin {name} {example} --json")  # fmt: skip
     @a_config
     @a_scheduler
     @as_json
@@ -162,7 +162,12 @@ def _stage_command(name: str, text: str) -> None:
 
 _stage_command("design", "Run the full model at the design's points, wave by wave.")
 _stage_command("train", "Train the surrogate on the design, validate it on held-out points.")
-_stage_command("effects", "Learn what each tissue mechanism does to the force, by full runs.")
+_stage_command(
+    "effects",
+    "Learn what each tissue mechanism does to the force, by full runs: hours.\n\n"
+    "For the demo and the article's protocol they are shipped; what is learnt here goes before those.",
+    "runs/test.toml",
+)
 _stage_command("map", "Find the most probable point and check it by the full model.")
 _stage_command("sample", "Sample the posterior, check it at draws; bands on the force.")
 _stage_command("sobol", "Sobol' indices of the force over time.")

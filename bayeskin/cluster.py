@@ -9,6 +9,7 @@ the full model uses a core.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -27,6 +28,8 @@ def on_scheduler(address: str) -> Iterator[Map]:
     Raises InputError where nobody answers.
     """
     distributed = extra("distributed")
+    if not re.fullmatch(r"(\w+://)?[^\s/]+:\d+", address):  # its client would wait, and end in a traceback
+        raise InputError(f"scheduler {address}", "no host and port", "the address of a Dask scheduler")
     try:
         client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
@@ -90,4 +93,4 @@ def extra(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise InputError("cluster", f"no {name} installed", "pip install 'bayeskin[cluster]'") from None
+        raise InputError("cluster", f"no {name} installed", "pip install '.[cluster]'") from None

@@ -396,6 +396,8 @@ def _input_error(path: Path | str, error: ValidationError) -> InputError:
     kind, given = first["type"], first["input"]
     if kind == "extra_forbidden":
         return InputError(f"{path}: {key}", "an unknown key", _one_of(_keys_beside(first["loc"])))
+    if kind == "missing" and isinstance(first["loc"][-1], int):
+        return InputError(f"{path}: {key}", "nothing", "one entry more")
     if kind == "missing":
         return InputError(f"{path}: {key}", "nothing", "this key: it has no default")
     if kind == "value_error":  # ours, "key: found X; expected Y"
@@ -404,6 +406,10 @@ def _input_error(path: Path | str, error: ValidationError) -> InputError:
         where = f"{key}.{own}" if key else own
         return InputError(f"{path}: {where}", found, expected)
     expected = first["msg"].removeprefix("Input should be ").removeprefix("Value should be ")
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        expected = "a table"
+    elif kind == "too_long":
+        expected = f"at most {first['ctx']['max_length']} entries"
     shown = "a table" if isinstance(given, Mapping) else json.dumps(given, default=str)
     return InputError(f"{path}: {key}", shown, expected[0].lower() + expected[1:])
 

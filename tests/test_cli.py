@@ -351,6 +351,7 @@ def test_a_simulation_that_fails_exits_with_1_and_writes_nothing(
         (["--set", "E_c=stiff"], "'stiff'"),
         (["--set", "E_c=-3"], "positive"),
         (["--set", "E_c=nan"], "finite"),
+        (["--mechanism", "pad-slip", "--set", "slip_rate=-1"], "at least 0"),
         (["--mesh", "absent.msh"], "no such file"),
         (["--observation", "article", "--mesh", "bricks"], "gmsh"),
         (["--observation", "power"], "--observation"),

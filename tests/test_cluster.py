@@ -109,6 +109,8 @@ def test_an_address_where_nobody_answers_is_told_in_a_line(monkeypatch: pytest.M
         pass
     with pytest.raises(InputError, match="the address of a Dask scheduler"), on_scheduler("nowhere://x"):
         pass
+    with pytest.raises(InputError, match="foo: found no host and port"), on_scheduler("foo"):
+        pass
 
 
 def test_slurm_is_asked_for_single_threads(monkeypatch: pytest.MonkeyPatch) -> None:

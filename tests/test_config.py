@@ -63,7 +63,9 @@ def test_the_hash_follows_the_content_and_ignores_the_workers(tmp_path: Path) ->
         ),
         (SMALLEST + "[fit]\nbin_width_s = 0.0\n", "fit.bin_width_s", "found 0.0; expected greater than 0"),
         (SMALLEST + "[fit]\nwindows_s = [[75.0, 18.8]]\n", "fit.windows_s", "start below end"),
-        (SMALLEST + "[fit]\nwindows_s = [[75.0]]\n", "fit.windows_s.0.1", "found nothing"),
+        (SMALLEST + "[fit]\nwindows_s = [[75.0]]\n", "fit.windows_s.0.1", "nothing; expected one entry more"),
+        (SMALLEST + "[noise]\nnu = [1, 2, 3]\n", "noise.nu", "expected at most 2 entries"),
+        ("fit = 3\n" + SMALLEST, "fit", "found 3; expected a table"),
         (
             SMALLEST + "[noise]\nsd_n = [0.3, 1e-4]\n",
             "noise.sd_n",

@@ -19,6 +19,7 @@ from bayeskin.design import default_space
 from bayeskin.errors import InputError
 from bayeskin.inference import NoisePriors
 from bayeskin.pipeline import stages
+from bayeskin.pipeline.effects import effect_files
 from bayeskin.pipeline.engine import Silent, open_run
 from bayeskin.pipeline.new import new_config, new_demo
 from bayeskin.pipeline.shipping import shipped_files
@@ -112,8 +113,14 @@ def test_what_cannot_be_done_is_refused_in_one_line_and_nothing_written(
     assert "ending .toml" in refused(capsys, "new", own, "-o", tmp_path / "own.yaml")
     assert "no such file" in refused(capsys, "new", tmp_path / "absent.csv")
     assert ".: found a folder; expected a recording" in refused(capsys, "new", Path())
-    assert "absent" in refused(capsys, "new", own, "-o", tmp_path / "absent" / "own.toml")
     assert [path.name for path in tmp_path.iterdir()] == ["own.h5"]
+
+
+def test_a_folder_that_is_not_there_is_made(own: Path, tmp_path: Path) -> None:
+    new_config(own, tmp_path / "a" / "b" / "own.toml")
+    new_demo(tmp_path / "c" / "demo.toml")
+    assert open_run(tmp_path / "a" / "b" / "own.toml", Silent()).config.recording.file == "../../own.h5"
+    assert (tmp_path / "c" / "demo-recording.h5").is_file()
 
 
 def test_a_name_that_toml_or_a_run_cannot_take_as_it_is(
@@ -170,6 +177,26 @@ def test_effects_that_come_with_a_surrogate_of_ones_own_are_tried_before_they_ar
     case.write_text('[recording]\nfile = "a.h5"\n[surrogate]\nfile = "mine.h5"\n')
     with pytest.raises(InputError, match=r"bottom-adherence.h5: found not readable as HDF5"):
         shipped_files(open_run(case, Silent()))
+
+
+def test_learnt_effects_go_before_shipped_ones_part_by_part(demo: Path) -> None:
+    new_config(demo)
+    run = open_run(demo.with_suffix(".toml"), Silent())
+    known = effect_files(run)
+    learnt = run.folder / "effects"
+    learnt.mkdir(parents=True)
+    (learnt / "stage.json").write_text("{}")  # as an attempt leaves it that was stopped at once
+    assert effect_files(run) == known
+    shutil.copy(known[2], learnt)
+    assert effect_files(run) == [*known[:2], learnt / known[2].name, *known[3:]]
+
+
+def test_a_window_without_a_bin_is_refused_before_anything_is_run(own: Path) -> None:
+    new_config(own)
+    case = own.with_suffix(".toml")
+    case.write_text(case.read_text() + "\n[fit]\nwindows_s = [[0.0, 20.0], [60.2, 90.0]]\n")
+    with pytest.raises(InputError, match=r"fit.windows_s: found \[60.2, 90\]; expected .*, 0 to 60 s"):
+        stages.run(case, "recording", Silent())
 
 
 @pytest.mark.parametrize(

@@ -310,6 +310,12 @@ def test_uniform_edges_are_whole_bins_from_zero() -> None:
     assert uniform_edges(recording(FORCE_N))[-1] == 130.0
 
 
+def test_a_force_that_never_changes_has_no_noise_to_measure() -> None:
+    flat = recording(np.full_like(FORCE_N, 0.25))
+    with pytest.raises(InputError, match=r"force: found 0.25 N throughout; expected a force that changes"):
+        phase_noise(flat, PHASES)
+
+
 def test_a_recording_too_coarse_to_tell_noise_is_refused() -> None:
     time_s = np.arange(0.0, 130.0, 1.0)
     made = recording(true_force(time_s), MOTION, time_s)

@@ -221,6 +221,21 @@ def test_a_fault_is_named_with_its_place(tmp_path: Path, rows: list[list[str]], 
     assert "\n" not in str(caught.value)
 
 
+def test_a_force_against_the_pull_is_remarked(tmp_path: Path) -> None:
+    turned = [[*row[:2], f"{-float(row[2]):g}"] for row in ROWS]
+    remarks = [
+        [note for note in read_recording(written(tmp_path / "a.csv", rows, ";")).notes if "reversed" in note]
+        for rows in ([HEADER, *ROWS], [HEADER, *turned])
+    ]
+    assert [len(found) for found in remarks] == [0, 1]
+
+
+def test_a_sheet_of_a_text_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.csv", [HEADER, *ROWS], ";")
+    with pytest.raises(InputError, match=r"sheet 'Test 3': found ending '.csv'; expected a workbook"):
+        read_recording(path, sheet="Test 3")
+
+
 @pytest.mark.parametrize(
     ("name", "data", "said"),
     [

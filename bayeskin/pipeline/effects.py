@@ -328,11 +328,11 @@ def _runs(
 
 
 def effect_files(run: Run) -> list[Path]:
-    """Of the effects that this run has learnt, else of those shipped with its surrogate; [] without any."""
-    folder = run.folder / "effects"
-    if not list(folder.glob("*.json")) and run.config.surrogate.file is not None:
-        folder = effects_beside(shipped_files(run).surrogate)
-    return effects_in(folder)
+    """Of the effects that this run has learnt, and of other parts those shipped with its surrogate."""
+    shipped = run.config.surrogate.file is not None
+    known = effects_in(effects_beside(shipped_files(run).surrogate)) if shipped else []
+    learnt = {path.name: path for path in effects_in(run.folder / "effects")}
+    return sorted(({path.name: path for path in known} | learnt).values(), key=lambda path: path.name)
 
 
 def effects_of(run: Run) -> list[Effect]:

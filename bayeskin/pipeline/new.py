@@ -86,6 +86,7 @@ def new_config(file: Path, out: Path | None = None) -> dict[str, Any]:
     surrogate = shipped_for(pad_motion("reaction", recording, phases, "idealised"))
     reference = Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix()
     text = _configuration(_name(out), reference, found, surrogate.name if surrogate else None)
+    out.parent.mkdir(parents=True, exist_ok=True)
     with open(out, "x", encoding="utf-8") as handle:
         handle.write(text)
     way = f"the shipped surrogate {surrogate.name}" if surrogate else "a design of full runs of its own"
@@ -107,6 +108,7 @@ def new_demo(out: Path | None = None) -> dict[str, Any]:
         if file.exists():
             raise InputError(file, "a file that is there already", "a folder without one")
     text = shipped("runs/demo.toml").read_text(encoding="utf-8")
+    out.parent.mkdir(parents=True, exist_ok=True)
     recording.write_bytes(shipped("data/demo.h5").read_bytes())
     out.write_text(text.replace('"../data/demo.h5"', '"demo-recording.h5"'), encoding="utf-8")
     return plain({"ok": True, "out": out, "text": f"written to {out}\nnext: bayeskin run {out}"})

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from bayeskin import report, storage
+from bayeskin.errors import InputError
+from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.provenance import caption
 from bayeskin.recordings import (
@@ -60,12 +62,25 @@ def prepared(run: Run, recording: Recording) -> Prepared:
 def _work(run: Run) -> Mapping[str, Any]:
     recording = read_recording(run.beside(run.config.recording.file))
     made = prepared(run, recording)
+    _refuse_empty_windows(run, made.binned)
     storage.save(run.at("recording", "recording.h5"), recording)
     storage.save(run.at("recording", "motion.h5"), made.motion)
     storage.save(run.at("recording", "binned.h5"), made.binned)
     figure = report.figure_recording(recording, made.binned)
     report.save_figure(figure, run.at("recording", "recording"), caption(run))
     return describe_json(recording, made.phases, summarise(made.analysis, made.phases))
+
+
+def _refuse_empty_windows(run: Run, binned: BinnedForce) -> None:
+    """Raises InputError for a window to fit that holds no bin: later stages would find out after hours."""
+    windows = run.config.fit.windows_s or ()
+    held = set(bins_in_windows(binned, windows or None).tolist())
+    for index, (start, end) in enumerate(windows):
+        if index not in held:
+            where = f"{run.config_path}: fit.windows_s"
+            first, last = binned.edges_s[[0, -1]]
+            expected = f"windows that hold a bin of the recording's, {first:g} to {last:g} s"
+            raise InputError(where, f"[{start:g}, {end:g}]", expected)
 
 
 def _files(run: Run) -> Iterable[Path]:

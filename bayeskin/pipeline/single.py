@@ -147,8 +147,10 @@ def _refuse_other_stresses(
 
 def _refuse_senseless(parameter: Parameter, value: float) -> None:
     positive = parameter.in_log and parameter.offset == 0.0
-    if not np.isfinite(value) or (positive and value <= 0.0):
-        expected = "a finite positive number" if positive else "a finite number"
+    least = "positive number" if positive else "number of at least 0" if parameter.in_log else "number"
+    below = parameter.in_log and (value < 0.0 or (positive and value == 0.0))
+    if not np.isfinite(value) or below:
+        expected = f"a finite {least}"
         raise InputError(f"--set {parameter.name}", f"{value:g}", expected)
 
 

@@ -131,7 +131,12 @@ def analyse(recording: Recording, phases: Sequence[Phase], window_s: float = WIN
 
     window_s : over which the force under the noise is a parabola, 20 samples at least; in a shorter one slow
         swings of the force, which a long one takes for noise, are no noise either
+
+    Raises InputError for a force that never changes, and as `phase_noise`.
     """
+    if np.ptp(recording.force_n) == 0.0:
+        found = f"{recording.force_n[0]:g} N throughout"
+        raise InputError(f"{recording.name}: force", found, "a force that changes")
     time_s = recording.time_s
     bounds = np.searchsorted(time_s, [*(p.start_s for p in phases), np.inf])
     bounds[0] = 0

@@ -50,6 +50,8 @@ def read_recording(path: Path | str, *, sheet: str | None = None) -> Recording:
     kind, known = path.suffix.lower(), _WORKBOOKS | _TEXTS | _STORED
     if kind not in known:
         raise InputError(path, f"ending {kind!r}", f"one of {', '.join(sorted(known))}")
+    if sheet is not None and kind not in _WORKBOOKS:
+        raise InputError(f"{path}: sheet {sheet!r}", f"ending {kind!r}", "a workbook, .xlsx or .xlsm")
     if kind in _STORED:
         return _read_stored(path)
     data = bytes_of(path, "a recording")
@@ -86,7 +88,16 @@ def _to_recording(name: str, table: Table, sha256: str) -> Recording:
     time_s, displacement_m, force_n = values["time"], values["displacement"], values["force"]
     _refuse_unsound(table.where, table.first_row, time_s, displacement_m, force_n)
     recording = Recording(time_s, displacement_m, force_n, name, sha256)
-    return replace(recording, time_s=time_s - time_s[0], notes=(*notes, *_remarks_on_clock(time_s)))
+    remarks = (*notes, *_remarks_on_clock(time_s), *_remarks_on_sign(displacement_m, force_n))
+    return replace(recording, time_s=time_s - time_s[0], notes=remarks)
+
+
+def _remarks_on_sign(displacement_m: Array, force_n: Array) -> list[str]:
+    with np.errstate(all="ignore"):  # forces that hardly change
+        together = np.corrcoef(displacement_m, force_n)[0, 1]
+    if not together < -0.5:
+        return []
+    return ["the force falls where the displacement grows: is the sign of one of them reversed?"]
 
 
 def _remarks_on_clock(time_s: Array) -> list[str]:
