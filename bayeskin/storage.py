@@ -156,6 +156,8 @@ def checked(value: T, where: object) -> T:
 def _is(value: Any, kind: Any) -> bool:
     """Whether a value read is what an annotation says; of arrays their kind of numbers, no shape."""
     origin, parts = get_origin(kind) or kind, get_args(kind)
+    if hasattr(origin, "__value__"):  # an alias by a name, which numpy's NDArray is from Python 3.12 on
+        return _is(value, origin.__value__[parts])
     if origin is Literal:
         return isinstance(value, str) and value in parts
     if origin is np.ndarray:

@@ -288,6 +288,21 @@ def test_a_mechanism_whose_parameter_has_the_models_name_is_refused() -> None:
         model.input_sizes({"mechanisms": ["force-offset"]})
 
 
+def test_a_function_that_cannot_be_imported_is_not_offered(case: Path) -> None:
+    (case.parent / "broken.py").write_text("import no_such_package\n\ndef force(*_): pass\n")
+    for forward, says in (("broken.py:force", "no_such_package"), ("spring.py:pull", "no function pull")):
+        with pytest.raises(InputError, match=says):
+            open_server(configured(case.parent / "other.toml", forward), "127.0.0.1", 0, Silent())
+
+
+def test_a_server_that_does_not_answer_is_not_offered(case: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        url = f"http://127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(Unavailable, match=url):
+            open_server(configured(case.parent / "other.toml", url), "127.0.0.1", 0, Silent())
+
+
 def test_instrument_mechanisms_bring_their_parameters(served: str) -> None:
     model, config = umbridge.HTTPModel(served, "bayeskin"), {"mechanisms": ["force-offset", "sensor-drift"]}
     assert model.get_input_sizes(config) == [5]
@@ -481,7 +496,9 @@ def test_the_command_serves_on_loopback_until_it_is_interrupted(case: Path) -> N
     )
     text = ""
     while not text.endswith("}\n"):
-        text += process.stdout.readline()
+        line = process.stdout.readline()
+        assert line, f"it ended after {text!r}"
+        text += line
     said = json.loads(text)
     assert said["url"].startswith("http://127.0.0.1:")
     assert umbridge.supported_models(said["url"]) == ["bayeskin"]

@@ -41,6 +41,14 @@ def identity(forward: str) -> str:
     return hashlib.sha256(json.dumps(["own", name, code]).encode()).hexdigest()
 
 
+def check_own(forward: str) -> None:
+    """Raises InputError where a function cannot be imported, Unavailable where a server does not answer."""
+    if _is_url(forward):
+        Client(forward).name()
+    else:
+        _function(forward)
+
+
 def simulate_own(forward: str, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
     """A run of the model that `forward` names.
 

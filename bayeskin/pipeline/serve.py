@@ -13,6 +13,7 @@ import numpy as np
 from bayeskin.config import parameter_space
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, bin_means, catalogue, laws, solved
+from bayeskin.model.own import check_own
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline.engine import Reporter, Run, open_run
 from bayeskin.pipeline.model import model_spec
@@ -128,6 +129,8 @@ def open_server(
 
 def _served(run: Run) -> ServedModel:
     spec, space = model_spec(run), parameter_space(run.config, run.config_path)
+    if spec.forward is not None:
+        check_own(spec.forward)
     recording = read_recording(run.beside(run.config.recording.file))
     motion = pad_motion(spec.observation, recording, segment(recording), run.config.recording.protocol)
     edges_s = uniform_edges(covered_s(recording, motion), run.config.fit.bin_width_s)
