@@ -32,7 +32,6 @@ from bayeskin.surrogates.kernels import (
 from bayeskin.types import Array, _FreezesArrays
 
 CHUNK = 128  # points whose kernel rows stay in the cache
-CACHED = 2**16  # of their numbers, on which the kernel's steps work one after the other
 WORTH_IT = 100  # rows: with fewer the products cost next to nothing
 SPARED = 0.1  # of the nugget, by which a variance may be larger at a row
 LEAST_NUGGET = 1e-6  # with smaller ones no row is near a subspace, or rounding hides it
@@ -95,12 +94,7 @@ class _Stack(NamedTuple):
         mapped = np.ones((len(self.latents), k, d + 2))
         np.matmul(centred, self.maps, out=mapped[:, :, :d])
         mapped[:, :, d] = -0.5 * np.einsum("qki,qki->qk", mapped[:, :, :d], mapped[:, :, :d])
-        q, n = len(self.latents), self.inputs.shape[2]
-        rows, together = np.empty((q, k, n)), max(1, CACHED // (k * n))
-        for start in range(0, q, together):
-            part = slice(start, start + together)
-            correlations(self.name, np.matmul(mapped[part], self.inputs[part], out=rows[part]))
-        return rows
+        return correlations(self.name, mapped @ self.inputs)
 
 
 @nb.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
