@@ -164,7 +164,7 @@ _stage_command("design", "Run the full model at the design's points, wave by wav
 _stage_command("train", "Train the surrogate on the design, validate it on held-out points.")
 _stage_command(
     "effects",
-    "Learn what each tissue mechanism does to the force, by full runs.\n\n"
+    "Learn what mechanisms that the full model solves do to the force, by full runs.\n\n"
     "Takes hours. For the demo and the article's protocol they are shipped; those learnt here go first.",
     "runs/test.toml",
 )

@@ -44,7 +44,7 @@ from bayeskin.mismatch.locate import _chance, locate, model_error
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.resample import resample
 from bayeskin.mismatch.search import PRIOR, Made, Search, search, sure, weight
-from bayeskin.mismatch.verdict import Evidence, _named, judge, set_probability, unknown_probability
+from bayeskin.mismatch.verdict import Evidence, _named, frail, judge, set_probability, unknown_probability
 from bayeskin.mismatch.wrapper import Sure, Wrapper, innermost, skins
 from bayeskin.proof.cases import shipped_screen
 from bayeskin.proof.protocol import MOTION
@@ -474,37 +474,50 @@ def test_what_a_surrogate_s_error_costs_is_what_it_would_gain_without_one(allowe
 
 
 def tried(weights: dict[tuple[str, ...], float]) -> Search:
-    """A search that has tried sets of these weights; x and y are of the tissue, drift is not."""
+    """A search that has tried sets of these weights; what x, y and z do was learnt, of drift it is exact."""
     base = fit_base(concealing(0), 1, None)
     odds = float(np.log(PRIOR / (1.0 - PRIOR)))
-    found = Search(tissue=frozenset("xyz"))
+    found = Search(learnt=frozenset("xyz"))
     for names, nats in weights.items():
         found.add(Made(dataclasses.replace(base, names=names, log_evidence=nats - len(names) * odds), True))
     return found
 
 
-def test_the_full_model_s_word_on_some_sets_moves_all_with_their_tissue() -> None:
+def test_the_full_model_s_word_on_some_sets_moves_all_like_them() -> None:
     found = tried(
         {(): 0.0, ("x",): 90.0, ("drift", "x"): 100.0, ("y",): 70.0, ("drift",): 95.0, ("y", "z"): 60.0}
     )
     assert found.best.names == ("drift", "x")
-    assert [one.names for one in found.rivals()] == [("y",)]  # not drift alone, which says nothing of tissue
+    assert [one.names for one in found.rivals()] == [("y",)]  # not drift alone
     assert found.probability(["y"]) < 1e-9
     found.full = {(): 5.0, ("drift", "x"): 80.0, ("y",): 120.0}
     assert found.best.names == ("y",)
     assert found.weight(found.fits["x",]) == pytest.approx(70.0)
-    assert found.weight(found.fits["drift",]) == pytest.approx(100.0)  # as the model without any tissue's
+    assert found.weight(found.fits["drift",]) == pytest.approx(100.0)  # as the model without any
     assert found.weight(found.fits["y", "z"]) == pytest.approx(60.0)  # of which nothing was said
     assert found.probability(["y"]) > 0.9999
-    found.full = {(): 5.0, ("drift", "x"): 80.0, ("y",): -np.inf}  # no run of it converges
+    found.full = {(): 5.0, ("drift", "x"): 80.0, ("x",): 79.0, ("y",): -np.inf}  # no run of it converges
+    assert found.weight(found.fits["x",]) == 79.0
     assert found.best.names == ("drift", "x")
     assert found.probability(["y"]) < 0.01
 
 
-def test_each_tissue_mechanism_of_the_best_has_a_rival_without_it() -> None:
+def test_each_learnt_mechanism_of_the_best_has_a_rival_without_it() -> None:
     found = tried({(): 0.0, ("x", "y"): 100.0, ("x",): 90.0, ("y", "z"): 80.0, ("z",): 70.0})
     assert {one.names for one in found.rivals()} == {("y", "z"), ("x",)}
     assert not tried({(): 0.0, ("drift",): 50.0, ("x",): 40.0}).rivals()
+
+
+def test_what_explains_less_than_is_left_has_to_stand_by_the_full_model(monkeypatch) -> None:
+    found = tried({(): 0.0, ("x", "y"): 100.0, ("x",): 90.0, ("y",): 80.0, ("z",): 70.0})
+    left = {("x", "y"): 1.0, ("x",): 1.2, ("y",): 8.0, ("z",): 3.0, (): 9.0}
+    monkeypatch.setattr("bayeskin.mismatch.verdict._rms", lambda one: left[one.names])
+    assert [one.names for one in frail(found)] == [("x",)]
+    left["x",] = 1.5
+    assert not frail(found)
+    alone = tried({(): 0.0, ("x",): 100.0})
+    left["x",] = 8.9
+    assert not frail(alone)  # the model without any is fitted anyway
 
 
 def test_a_set_that_counts_is_not_unsure_too() -> None:

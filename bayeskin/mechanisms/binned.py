@@ -9,7 +9,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from bayeskin.mechanisms.lines import interpolated
-from bayeskin.mechanisms.mechanism import Bins, ForceOfTime, Mechanism, Tissue
+from bayeskin.mechanisms.mechanism import Bins, ForceOfTime, Mechanism
 from bayeskin.types import Array, PadMotion
 
 
@@ -52,7 +52,7 @@ class BinnedForces:
 
 @dataclass(frozen=True)
 class BinnedEstimate:
-    """A tissue mechanism's estimate of its effect, of bins' means: see `Tissue.estimate`.
+    """A mechanism's estimate of its effect, of bins' means: see `Mechanism.estimate`.
 
     `own` names the parameters that are given; the mechanism's others are neutral.
     """
@@ -64,12 +64,11 @@ class BinnedEstimate:
 
     def __call__(self, own: Array, mean_n: Array) -> Array:
         """What the mechanism adds (n, m), at its own parameters (n, k), to a force without it (n, m)."""
-        act = self.mechanism.act
-        assert isinstance(act, Tissue)
-        assert act.estimate is not None
+        estimate = self.mechanism.estimate
+        assert estimate is not None
         neutral = {name: np.full(len(own), value) for name, value in self.mechanism.neutral.items()}
         values = {**neutral, **dict(zip(self.own, own.T, strict=True))}
-        return self._forces.change(partial(act.estimate, values, self.motion), mean_n)
+        return self._forces.change(partial(estimate, values, self.motion), mean_n)
 
     @cached_property
     def _forces(self) -> BinnedForces:
@@ -81,7 +80,7 @@ def estimate_of(
 ) -> BinnedEstimate | None:
     """None for a mechanism without an estimate, and for what two do beyond both."""
     mechanism = mechanisms[0]
-    if len(mechanisms) > 1 or not isinstance(mechanism.act, Tissue) or mechanism.act.estimate is None:
+    if len(mechanisms) > 1 or mechanism.estimate is None:
         return None
     return BinnedEstimate(mechanism, tuple(own), motion, edges_s)
 

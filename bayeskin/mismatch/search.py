@@ -17,7 +17,7 @@ are followed: from single mechanisms that the best set does not have, and from t
 where there is one.
 
 Probabilities are shares of weight over all sets that were tried and count: those of sets never tried count
-as nothing. What the full model, fitted with some of them, says of a choice of tissue mechanisms moves the
+as nothing. What the full model, fitted with some of them, says of a choice of learnt mechanisms moves the
 weights of all sets with these; the best is then one that it has been fitted with.
 """
 
@@ -58,13 +58,13 @@ class Made:
 class Search:
     """All sets tried, by their names sorted, and the best of them; those that do not count are `unsure`.
 
-    tissue : mechanisms that the surrogate knows with an error; full : weights by the full model of the sets
+    learnt : mechanisms that the surrogate knows with an error; full : weights by the full model of the sets
     that it was fitted with, where the best is one of them
     """
 
     fits: dict[tuple[str, ...], Fit] = field(default_factory=dict)
     unsure: dict[tuple[str, ...], Fit] = field(default_factory=dict)
-    tissue: frozenset[str] = frozenset()
+    learnt: frozenset[str] = frozenset()
     full: Mapping[tuple[str, ...], float] = field(default_factory=dict)
 
     def add(self, made: Made) -> None:
@@ -87,7 +87,9 @@ class Search:
         return max(self.fits.values(), key=weight)
 
     def weight(self, one: Fit) -> float:
-        """Logarithm of a set's weight, moved as the full model has moved the likeliest with its tissue."""
+        """Logarithm of a set's weight: by the full model, or moved as that moved the likeliest like it."""
+        if one.names in self.full:
+            return self.full[one.names]
         same = [names for names in self.full if self._inner(self.fits[names]) == self._inner(one)]
         if not same:
             return weight(one)
@@ -95,7 +97,7 @@ class Search:
         return weight(one) + self.full[likeliest] - weight(self.fits[likeliest])
 
     def rivals(self) -> list[Fit]:
-        """For each of the best's tissue mechanisms the most hopeful set without it, if others are in that."""
+        """For each of the best's learnt mechanisms the most hopeful set without it, if others are in that."""
         found: dict[tuple[str, ...], Fit] = {}
         for name in sorted(self._inner(self.best)):
             others = [one for one in self.fits.values() if name not in one.names and self._inner(one)]
@@ -105,7 +107,7 @@ class Search:
         return list(found.values())
 
     def _inner(self, one: Fit) -> frozenset[str]:
-        return self.tissue & set(one.names)
+        return self.learnt & set(one.names)
 
     def probability(self, names: Sequence[str]) -> float:
         """Share of the weight of sets with any of these mechanisms."""

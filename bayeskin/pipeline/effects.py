@@ -1,4 +1,4 @@
-"""A stage by itself: what each tissue mechanism does to the force, beside the base's surrogate.
+"""A stage by itself: what the mechanisms that the full model solves do to the force, beside its surrogate.
 
 Each part of a mechanism is run with and without at the same base parameters, the other parts neutral: at
 many points on the coarsest bricks, and at some of the base's design in the full model itself, which correct
@@ -24,7 +24,7 @@ from bayeskin.design import Wave, fine_wave, next_wave, sobol_points
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, catalogue, laws
 from bayeskin.mechanisms.binned import estimate_of, estimates_by_name
-from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.mechanisms.mechanism import Tissue, solved
 from bayeskin.mismatch.fit import soft_on_stiff
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline.crew import crew
@@ -181,26 +181,30 @@ def name_of(parts: Sequence[Part]) -> str:
 
 
 def _chosen(run: Run) -> list[Mechanism]:
-    tissue = {name: m for name, m in catalogue().items() if isinstance(m.act, Tissue)}
-    names = run.config.effects.mechanisms or list(tissue)
+    known = {mechanism.name: mechanism for mechanism in solved(catalogue().values())}
+    names = run.config.effects.mechanisms or list(known)
     for name in names:
-        if name not in tissue:
+        if name not in known:
             where = f"{run.config_path}: effects.mechanisms"
-            raise InputError(where, name, f"some of {', '.join(tissue)}")
-    return [tissue[name] for name in names]
+            raise InputError(where, name, f"some of {', '.join(known)}")
+    return [known[name] for name in names]
 
 
 def _pairs(run: Run) -> list[tuple[Part, ...]]:
-    known = {part.name: part for mechanism in catalogue().values() if isinstance(mechanism.act, Tissue)
-             for part in parts_of(mechanism)}  # fmt: skip
+    known = {part.name: part for mechanism in solved(catalogue().values()) for part in parts_of(mechanism)}
     for names in run.config.effects.pairs:
         where, found = f"{run.config_path}: effects.pairs", " and ".join(names)
         if not set(names) <= set(known):
             raise InputError(where, found, f"two of {', '.join(known)}")
         if len({known[name].mechanism.name for name in names}) < 2:
             raise InputError(where, found, "parts of two mechanisms")
-    pairs = (sorted(names, key=lambda name: known[name].mechanism.name) for names in run.config.effects.pairs)
-    return [tuple(known[name] for name in names) for names in pairs]
+    pairs = ([known[name] for name in names] for names in run.config.effects.pairs)
+    return [tuple(sorted(pair, key=lambda part: _from_within([part.mechanism]))) for pair in pairs]
+
+
+def _from_within(mechanisms: Sequence[Mechanism]) -> tuple[bool, list[str]]:
+    """Orders mechanisms as they act: those of the tissue, then what lies between it and the pads."""
+    return not all(isinstance(one.act, Tissue) for one in mechanisms), [one.name for one in mechanisms]
 
 
 def _learn(run: Run, parts: Sequence[Part]) -> dict[str, Any]:
@@ -336,10 +340,12 @@ def effect_files(run: Run) -> list[Path]:
 
 
 def effects_of(run: Run) -> list[Effect]:
-    """The effects in `effect_files`. Raises InputError for files of another model."""
+    """The effects in `effect_files`, as they act. Raises InputError for files of another model."""
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
-    estimates = estimates_by_name(catalogue(), motion)
-    return [load_effect(path, estimates, model_spec(run).hash) for path in effect_files(run)]
+    known = catalogue()
+    estimates = estimates_by_name(known, motion)
+    found = [load_effect(path, estimates, model_spec(run).hash) for path in effect_files(run)]
+    return sorted(found, key=lambda effect: _from_within([known[name] for name in effect.mechanisms]))
 
 
 def _train(run: Run, parts: Sequence[Part], coarse: Pair, fine: Pair) -> tuple[Effect, Validation]:
@@ -410,7 +416,7 @@ def _errors(
 
 STAGE = Stage(
     "effects",
-    "learns what each tissue mechanism does to the force",
+    "learns what each mechanism that the full model solves does to the force",
     ("recording", "design", "train"),
     ("seed", "model", "parameters", "design", "surrogate", "fit", "effects"),
     _work,

@@ -60,8 +60,8 @@ class Workbench:
         return model_spec(self.run)
 
     @property
-    def tissue(self) -> frozenset[str]:
-        """Mechanisms that the surrogate has learnt, with an error."""
+    def learnt(self) -> frozenset[str]:
+        """Mechanisms of which the surrogate knows what they do, with an error."""
         return frozenset(name for effect in self.effects for name in effect.mechanisms)
 
     def refuted(self, found: Fit) -> list[str]:
@@ -87,7 +87,9 @@ class Workbench:
         """Of the full model on its mesh, with a set of mechanisms."""
         parts = effects_among(self.effects, names)
         skin: Surrogate = with_effects(self.base, parts)  # type: ignore[arg-type]
-        instrument = tuple(self.known[n] for n in names if isinstance(self.known[n].act, Instrument))
+        instrument = tuple(
+            self.known[n] for n in names if isinstance(self.known[n].act, Instrument) and n not in self.learnt
+        )
         return ObservedSurrogate(skin, instrument, self.motion) if instrument else skin
 
     def posterior(self, until_s: float | None, names: Sequence[str]) -> LogPosterior:

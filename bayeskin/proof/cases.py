@@ -190,12 +190,13 @@ class _Straight:
 
 @cache
 def shipped_screen() -> Screen:
-    """With the surrogates that come with bayeskin."""
+    """With the surrogates that come with bayeskin; of the instrument's mechanisms the shortcut is enough."""
     path = shipped(SURROGATE)
     known = catalogue()
     estimates = estimates_by_name(known, MOTION)
-    files = effects_in(effects_beside(path))
-    return Screen(Refit(load_surrogate(path)), tuple(load_effect(one, estimates) for one in files), known)
+    effects = (load_effect(one, estimates) for one in effects_in(effects_beside(path)))
+    tissue = (one for one in effects if all(isinstance(known[n].act, Tissue) for n in one.mechanisms))
+    return Screen(Refit(load_surrogate(path)), tuple(tissue), known)
 
 
 def draw(plan: Plan, attempt: int, screen: Screen) -> Case:

@@ -1,4 +1,4 @@
-"""What tissue mechanisms do to the force, beside a surrogate of the base model.
+"""What mechanisms that the full model solves do to the force, beside a surrogate of the base model.
 
 With theta the base parameters, phi those of one part of a mechanism, s its strength and F the force,
 
@@ -16,8 +16,9 @@ the estimate's RMS over time, |D|:
 so that H / c is near one everywhere and has a logarithm, whatever the sign of what is left.
 
 Effects of several parts add up, and an estimate is of the force F_0 that the mechanisms before it make, those
-without an estimate first (`composed`). What two do to each other beyond that (`benchmarks/pairs.py`) is an
-effect of its own, s the product of their strengths, where that is worth it, and else left to full runs.
+without an estimate first, then in the order in which they are given (`composed`). What two do to each other
+beyond that (`benchmarks/pairs.py`) is an effect of its own, s the product of their strengths, where that is
+worth it, and else left to full runs.
 """
 
 from __future__ import annotations
@@ -137,8 +138,8 @@ def strength(similarity: Similarity, neutral: Mapping[str, float], theta: Array)
 def composed(
     neither_n: Array, alone_n: Sequence[Array], own: Sequence[Array], estimates: Sequence[Estimate | None]
 ) -> Array:
-    """Force (n, m) that exact surrogates of effects of several mechanisms, in the order of these names, make
-    together, from runs without and with each.
+    """Force (n, m) that exact surrogates of effects of several mechanisms make together, in the order given,
+    from runs without and with each.
 
     Those without an estimate add up. Each with one is then taken of the force so far.
     neither_n, alone_n (n, m) each; own (n, k): each effect's parameters, for its estimate where it has one
@@ -290,7 +291,7 @@ class WithEffects:
         are its own space's, and which ones (the base is 0) make the force that it is an estimate of."""
         place = {name: column for column, name in enumerate(self.space.names)}
         found: list[tuple[Effect, list[int], list[int], list[int]]] = []
-        for effect in sorted(self.effects, key=lambda one: (one.estimate is not None, one.mechanisms)):
+        for effect in sorted(self.effects, key=lambda one: one.estimate is not None):
             columns = [place[name] for name in effect.space.names]
             before = [
                 i
