@@ -153,7 +153,7 @@ class SurrogateConfig(_Section):
 
 
 class EffectsConfig(_Section):
-    """Mechanisms that the full model solves (by default all) to learn, and pairs of their parts; runs of each.
+    """Mechanisms that the full model solves (by default all) to learn, pairs of their parts; runs of each.
 
     `coarse` of them on the coarsest bricks, with and without the mechanism; `points` and `held_out` of the
     model itself, which correct those and test the correction; `plausible` more of it, and a third as many

@@ -305,14 +305,14 @@ def test_the_best_set_is_the_one_that_the_full_model_makes_it() -> None:
         return SimpleNamespace(full_weight=weight)
 
     before, after, rival = taken(5.0), taken(80.0), taken(95.0)
-    likeliest = diagnosis._likeliest(found, before, after, found.rivals(), [rival])
+    likeliest = diagnosis._likeliest(found, before, after, found.rivals(None), [rival])
     assert likeliest is rival
     assert found.best.names == ("y",)
     found.full = {}
-    assert diagnosis._likeliest(found, before, after, found.rivals(), [taken(None)]) is after
+    assert diagnosis._likeliest(found, before, after, found.rivals(None), [taken(None)]) is after
     found.full = {}
-    assert diagnosis._likeliest(found, before, taken(1.0), found.rivals(), [taken(2.0)]) is before
+    assert diagnosis._likeliest(found, before, taken(1.0), found.rivals(None), [taken(2.0)]) is before
     found.full = {}
     none = taken(None)
-    assert diagnosis._likeliest(found, none, none, found.rivals(), [none]) is none
+    assert diagnosis._likeliest(found, none, none, found.rivals(None), [none]) is none
     assert found.best.names == ("x",)

@@ -96,13 +96,14 @@ class Search:
         likeliest = max(same, key=lambda names: self.full[names])
         return weight(one) + self.full[likeliest] - weight(self.fits[likeliest])
 
-    def rivals(self) -> list[Fit]:
-        """For each of the best's learnt mechanisms the most hopeful set without it, if others are in that."""
+    def rivals(self, full_weight: float | None) -> list[Fit]:
+        """For each of the best's mechanisms the most hopeful set without it but with others, where that may
+        have a larger weight than the best's by the full model (None: that failed)."""
         found: dict[tuple[str, ...], Fit] = {}
-        for name in sorted(self._inner(self.best)):
-            others = [one for one in self.fits.values() if name not in one.names and self._inner(one)]
-            if others:
-                rival = max(others, key=lambda one: weight(one) + one.hope)
+        for name in self.best.names:
+            others = (one for one in self.fits.values() if one.names and name not in one.names)
+            rival = max(others, key=_hopeful_weight, default=None)
+            if rival is not None and (full_weight is None or _hopeful_weight(rival) > full_weight):
                 found[rival.names] = rival
         return list(found.values())
 
@@ -120,6 +121,11 @@ class Search:
 def weight(found: Fit) -> float:
     """Logarithm of a set's weight."""
     return found.log_evidence + len(found.names) * float(np.log(PRIOR / (1.0 - PRIOR)))
+
+
+def _hopeful_weight(found: Fit) -> float:
+    """The largest that the full model may make it."""
+    return weight(found) + found.hope
 
 
 def search(

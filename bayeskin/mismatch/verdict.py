@@ -126,23 +126,9 @@ def explains(found: Search, name: str) -> float:
 
     What another mechanism could explain in its place is for the probabilities to say.
     """
-    return float(np.sqrt(max(_rms(_without(found, name)) ** 2 - _rms(found.best) ** 2, 0.0)))
-
-
-def _without(found: Search, name: str) -> Fit:
-    """The likeliest of the best set's subsets tried that leave a mechanism out."""
     rest = set(found.best.names) - {name}
-    return max((one for one in found.fits.values() if set(one.names) <= rest), key=found.weight)
-
-
-def frail(found: Search) -> list[Fit]:
-    """What is likeliest without one of several mechanisms that explains less than is left: the surrogate's
-    error of the others may be all that it explains, and the full model tells."""
-    names = found.best.names
-    return [
-        _without(found, name) for name in names
-        if len(names) > 1 and explains(found, name) < _rms(found.best)
-    ]  # fmt: skip
+    without = max((one for one in found.fits.values() if set(one.names) <= rest), key=found.weight)
+    return float(np.sqrt(max(_rms(without) ** 2 - _rms(found.best) ** 2, 0.0)))
 
 
 def beyond_allowed(located: Located) -> float:

@@ -22,7 +22,7 @@ from bayeskin.mismatch.fit import Fit, restored, stored
 from bayeskin.mismatch.full_fit import FullFit
 from bayeskin.mismatch.locate import Located
 from bayeskin.mismatch.search import Build, Made, Search, search
-from bayeskin.mismatch.verdict import Diagnosis, frail, judge, set_probability
+from bayeskin.mismatch.verdict import Diagnosis, judge, set_probability
 from bayeskin.pipeline import design, recording, training
 from bayeskin.pipeline.diagnosis_outputs import (
     Found,
@@ -71,9 +71,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     )
     held_out = begins or [None]
     before, after = taken[0], taken[-1]
-    others = [*frail(whole), *(whole.rivals() if after.doubtful else [])]
-    rivals = list({one.names: one for one in others if one.names}.values())
-    if rivals:
+    if after.full is not None and (rivals := whole.rivals(after.full_weight)):
         run.reporter.log("the full model takes up what else it may be")
         after = _likeliest(whole, before, after, rivals, take_up(run, rivals, whole.best.theta, [], None)[0])
     probability = set_probability(whole.best.names, before.evidence, after.evidence)

@@ -26,7 +26,7 @@ from bayeskin.mismatch.blocked import errors_left_out
 from bayeskin.mismatch.contributions import Contribution, Force, contributions
 from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun
 from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
-from bayeskin.mismatch.fit import Fit, fit_near, hopeful, much_left, other_tops, restored, stored
+from bayeskin.mismatch.fit import Fit, fit_near, hopeful, other_tops, restored, stored
 from bayeskin.mismatch.form import Form, propose_form
 from bayeskin.mismatch.full_fit import FullFit, at_run, fit_full
 from bayeskin.mismatch.locate import Located, locate
@@ -63,7 +63,6 @@ class TakenUp:
     """What follows a search's fit on the whole recording.
 
     full : the full model's fit; full_weight : logarithm of the set's weight by it, None without that;
-    doubtful : whether that may be of a lesser top, or of the wrong set;
     draws : of the posterior; coverage90 : share of bins in its predictive band;
     left_out_n : RMS error of phases that the fit is made without, None where there is but one;
     evidence : of the best run, with the noise that is no mismatch; located : windows that it leaves;
@@ -72,7 +71,6 @@ class TakenUp:
 
     full: FullResult
     full_weight: float | None
-    doubtful: bool
     draws: Resampled
     coverage90: float
     left_out_n: float | None
@@ -127,8 +125,7 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
     some = inference.evenly(draws.draws, PREDICTIVE_DRAWS)
     bands = inference.bands(found.log_posterior, some, np.random.default_rng(seed))
     return TakenUp(
-        full, full_weight, full is not None and _doubtful(found.log_posterior, full),
-        draws, inference.coverage(bench.binned, *bands.interval(0.9)),
+        full, full_weight, draws, inference.coverage(bench.binned, *bands.interval(0.9)),
         _left_out(sure, shear), Evidence(left.without_log_evidence, left.log_evidence),
         locate(there, noise, seed),
         tuple(contributions(found.names, found.theta, force, bench.known)),
@@ -156,11 +153,6 @@ def _begun_apart(source: Path, plain: Mapping[str, Any], until_s: float | None) 
         straight = find_shear(alone)
         straight = straight.among(alone.names, found.log_posterior.names) if straight else None
     return _full(bench, found, straight)[0]
-
-
-def _doubtful(log_posterior: LogPosterior, full: FullFit | str) -> bool:
-    """Whether the full model's fit failed, has not settled, or leaves all the noise that may be."""
-    return isinstance(full, str) or not full.settled or much_left(log_posterior, full.theta)
 
 
 def _full(bench: Workbench, found: Fit, shear: Shear | None) -> tuple[FullResult, CorrectedSurrogate | None]:
