@@ -13,10 +13,14 @@ class InputError(ValueError):
     where : file, field or row at fault, e.g. ``"runs/a.toml: design.points"``
     found : what stands there
     expected : what should stand there
+
+    Line breaks in these become spaces.
     """
 
     def __init__(self, where: object, found: object, expected: object) -> None:
-        self.where, self.found, self.expected = str(where), str(found), str(expected)
+        self.where, self.found, self.expected = (
+            " ".join(line.strip() for line in str(part).splitlines()) for part in (where, found, expected)
+        )
         super().__init__(f"{self.where}: found {self.found}; expected {self.expected}")
 
 

@@ -4,6 +4,7 @@ import os
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from bayeskin.config import load_config, parameter_space
@@ -168,3 +169,9 @@ def test_what_is_no_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=f": found {found}; expected a TOML"):
             load_config(path)
+
+
+def test_what_was_found_is_told_in_one_line_whatever_it_was() -> None:
+    assert str(InputError("a\nb", np.ones((2, 2)), "version 5")) == (
+        "a b: found [[1. 1.] [1. 1.]]; expected version 5"
+    )

@@ -14,7 +14,12 @@ from toy_inference import ToySurrogate, empty_recording
 from bayeskin.config import config_of
 from bayeskin.inference import LogPosterior
 from bayeskin.mechanisms import catalogue
+from bayeskin.mechanisms.binned import estimates_by_name
 from bayeskin.pipeline.workbench import Workbench
+from bayeskin.proof.cases import shipped_screen
+from bayeskin.proof.protocol import MOTION, SURROGATE
+from bayeskin.shipped import shipped
+from bayeskin.surrogates import effects_beside, effects_in, load_effect
 from bayeskin.types import BinnedForce
 
 KNOWN = {"force-offset": catalogue()["force-offset"]}
@@ -71,3 +76,23 @@ def test_a_fit_to_the_beginning_knows_nothing_of_what_follows() -> None:
     assert whole.sure_within_n is not None
     assert second.sure_within_n is not None
     assert whole.sure_within_n > 10.0 * second.sure_within_n
+
+
+def test_what_was_learnt_of_a_mechanism_stands_in_its_shortcut_s_place() -> None:
+    """Pads that slip act once: by their effect, not by the shortcut on the force as well."""
+    files = effects_in(effects_beside(shipped(SURROGATE)))
+    estimates = estimates_by_name(catalogue(), MOTION)
+    effects = {effect.part: effect for effect in (load_effect(file, estimates) for file in files)}
+    names = ["force-offset", "pad-slip", "solid-viscoelasticity"]
+    known = {name: catalogue()[name] for name in names}
+    made = dataclasses.replace(bench(binned_force()), base=shipped_screen().refit.surrogate, known=known)
+
+    def parts(*learnt: str) -> tuple[list[str], list[str]]:
+        surrogate: Any = dataclasses.replace(made, effects=tuple(effects[n] for n in learnt)).surrogate(names)
+        return [m.name for m in surrogate.mechanisms], list(surrogate.inner.space.names[5:])
+
+    relaxing = "solid-viscoelasticity-g_1"
+    assert parts(relaxing) == (["force-offset", "pad-slip"], ["g_1", "tau_1"])
+    assert parts(relaxing, "pad-slip") == (
+        ["force-offset"], ["g_1", "tau_1", "slip_rate", "slip_threshold"]
+    )  # fmt: skip
