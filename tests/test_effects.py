@@ -286,6 +286,8 @@ def test_a_pair_is_of_two_mechanisms_that_there_are() -> None:
 
     (found,) = _pairs(run(("pre-stretch", "solid-viscoelasticity-g_2")))
     assert name_of(found) == "pre-stretch-with-solid-viscoelasticity-g_2"
+    (found,) = _pairs(run(("backlash", "pre-stretch")))
+    assert name_of(found) == "pre-stretch-with-backlash"  # which acts on what the tissue makes
     for pair, says in (
         (("pre-stretch", "lotion"), "x.toml: effects.pairs: found pre-stretch and lotion"),
         (("solid-viscoelasticity-g_1", "solid-viscoelasticity-g_2"), "parts of two mechanisms"),
