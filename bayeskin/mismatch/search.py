@@ -11,10 +11,12 @@ The first step tries all, those that promise less by one climb each. A set that 
 once more from a larger one's top, and from a smaller one's that is ahead of it: one path stops where another
 goes on.
 
+Of several taken ones each is at last exchanged for the most promising others, and the best set of another
+search is tried, where there is one: of what one path has taken first, it does not let go by itself.
+
 Where the noise of the best set is still as large as it may be, much is left. Then each taken one is searched
-for anew beside the others as they have become, and the most promising other one in its place; and other paths
-are followed: from single mechanisms that the best set does not have, and from the best set of another search,
-where there is one.
+for anew, too, beside the others as they have become; and other paths are followed: from single mechanisms
+that the best set does not have, and from the best set of the other search.
 
 Probabilities are shares of weight over all sets that were tried and count: those of sets never tried count
 as nothing. What the full model, fitted with some of them, says of a choice of learnt mechanisms moves the
@@ -38,7 +40,7 @@ PRIOR = 0.05  # of a mechanism to be at work, before the recording is seen
 MOST = 8  # mechanisms of a set, from which on no further one is tried
 SHORTLIST = 5  # mechanisms of a step that are tried thoroughly
 PATHS = 2  # at most
-EXCHANGES = 1  # mechanisms that are tried in another's place
+EXCHANGES = 2  # mechanisms that are tried in another's place
 GAIN = 1.0  # nats: less is no reason to go on from the same set
 UNSURE = 0.5  # of what a mechanism adds, RMS: sd of the surrogate's error in it
 
@@ -142,7 +144,7 @@ def search(
 
     done : what a search that was stopped had made, in order, which is not made again
     on_fit : is told each new fit
-    another : the best of another search, on a part of the recording say; asked for where much is left
+    another : the best of another search, on a part of the recording say
     refuted : whether something else that is known of the recording speaks against a fit
     """
     forward = _Forward(build, known, seed, progress or (lambda share, note: None), done, on_fit, refuted)
@@ -155,10 +157,10 @@ def search(
             break
         singles.remove(starts[0])
         forward.path(starts[0], f"path {count}")
-    if much_left(found.best.log_posterior, found.best.theta) and (other := another()) is not None:
+    if (other := another()) is not None and other.names:
         here = replace(other, theta={**found.best.theta, **other.theta})  # noise that the other knows not
-        start = forward.tried(other.names, here)
-        if start is not None:
+        best, start = found.best, forward.tried(other.names, here)
+        if start is not None and (much_left(best.log_posterior, best.theta) or start is found.best):
             forward.path(start, "path from another search")
     return found
 
@@ -195,7 +197,7 @@ class _Forward:
             ahead = current
             if len(current.names) < MOST:
                 ahead = self._step(current, f"{label}, mechanism {len(current.names) + 1}")
-            if ahead is current and much_left(current.log_posterior, current.theta):
+            if ahead is current:
                 ahead = self._renewed(current, label)
 
     def tried(
@@ -244,11 +246,12 @@ class _Forward:
         return max(fits, key=weight)
 
     def _renewed(self, current: Fit, label: str) -> Fit:
-        """The best set that is reached by searching for each mechanism anew, and for another in its place."""
-        best = current
-        for count, name in enumerate(current.names):
+        """The best set that is reached with another in the place of each mechanism of several; where much is
+        left, by searching for each anew, too."""
+        best, anew = current, much_left(current.log_posterior, current.theta)
+        for count, name in enumerate(current.names if anew or len(current.names) > 1 else ()):
             if name in best.names and (rest := self._leaving(best, name)) is not None:
-                fits = [self.tried(best.names, rest, again=True)]
+                fits = [self.tried(best.names, rest, again=True)] if anew else []
                 others = self._by_promise(rest, best.names)[:EXCHANGES]
                 fits += [self.tried(names, rest) for _, names in others]
                 best = max([best, *(one for one in fits if one is not None)], key=weight)
