@@ -164,8 +164,9 @@ _stage_command("design", "Run the full model at the design's points, wave by wav
 _stage_command("train", "Train the surrogate on the design, validate it on held-out points.")
 _stage_command(
     "effects",
-    "Learn what mechanisms that the full model solves do to the force, by full runs.\n\n"
-    "Takes hours. For the demo and the article's protocol they are shipped; those learnt here go first.",
+    "Learn what mechanisms do to the force, by full runs.\n\n"
+    "Of all that the full model solves, which takes hours. For the demo and the article's protocol some are\n"
+    "shipped; those learnt here go first.",
     "runs/test.toml",
 )
 _stage_command("map", "Find the most probable point and check it by the full model.")
