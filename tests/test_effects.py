@@ -311,11 +311,13 @@ def test_lines_along_the_pull_make_a_skin_as_many_times_as_stiff_and_others_less
 
 @dataclass(frozen=True)
 class Spec:
-    """Stands in for a model's; `mesh` and `refinement` are what the stage changes."""
+    """Stands in for a model's, on a mesh of its own."""
 
-    mesh: str = "own"
-    refinement: int = 1
     hash: str = "toy"
+
+    @property
+    def coarsest(self) -> Spec:
+        return self
 
 
 def toy_simulate_with(mechanisms: Sequence[str], spec: Any, motion: Any, theta: Mapping[str, float]) -> Any:
