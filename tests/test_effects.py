@@ -26,12 +26,17 @@ from bayeskin.mechanisms.strain_stiffening import first_modulus
 from bayeskin.pipeline import effects as effects_stage
 from bayeskin.pipeline.effects import _pairs, coarse_wave, force_at, name_of, parts_of, with_own
 from bayeskin.proof.cases import shipped_screen
+from bayeskin.proof.protocol import MOTION, SURROGATE
 from bayeskin.runner import run_design
+from bayeskin.shipped import shipped
 from bayeskin.surrogates import (
     Pair,
     composed,
     effect_of,
     effects_among,
+    effects_beside,
+    effects_in,
+    load_manifest,
     load_surrogate,
     manifest_of,
     save_surrogate,
@@ -294,6 +299,21 @@ def test_a_pair_is_of_two_mechanisms_that_there_are() -> None:
     ):
         with pytest.raises(InputError, match=says):
             _pairs(run(pair))
+
+
+def test_what_lies_between_skin_and_drive_acts_on_all_that_the_tissue_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    base = shipped(SURROGATE)
+    made_by = SimpleNamespace(hash=load_manifest(base)["model_hash"])
+    monkeypatch.setattr(effects_stage, "model_spec", lambda run: made_by)
+    monkeypatch.setattr(effects_stage, "effect_files", lambda run: effects_in(effects_beside(base)))
+    storage.save(tmp_path / "motion.h5", MOTION)
+    run: Any = SimpleNamespace(at=lambda *parts: tmp_path / parts[-1])
+    whole = WithEffects(load_surrogate(base), tuple(effects_stage.effects_of(run)))
+    acts = [effect.mechanisms for effect, *_ in whole._ordered]
+    assert acts[-3:] == [("backlash",), ("pad-slip",), ("slow-recovery",)]
+    assert ("solid-viscoelasticity",) in acts
 
 
 def test_lines_along_the_pull_make_a_skin_as_many_times_as_stiff_and_others_less() -> None:

@@ -87,9 +87,9 @@ class Workbench:
         """Of the full model on its mesh, with a set of mechanisms."""
         parts = effects_among(self.effects, names)
         skin: Surrogate = with_effects(self.base, parts)  # type: ignore[arg-type]
-        instrument = tuple(
-            self.known[n] for n in names if isinstance(self.known[n].act, Instrument) and n not in self.learnt
-        )
+        learnt = {name for effect in parts for name in effect.mechanisms}
+        others = (self.known[name] for name in names if name not in learnt)
+        instrument = tuple(mechanism for mechanism in others if isinstance(mechanism.act, Instrument))
         return ObservedSurrogate(skin, instrument, self.motion) if instrument else skin
 
     def posterior(self, until_s: float | None, names: Sequence[str]) -> LogPosterior:
