@@ -4,16 +4,18 @@ Each round makes the noise parameters the most probable ones for the present for
 as linear in the material parameters, by one-sided differences, and solves the robust regression on them
 and on the surrogate's own error, within the prior box. Steps of several damped lengths are tried, straight
 and along the ridge of the moduli (`straighten`); the best of them is taken if the posterior itself rises. The
-information matrix that the last round used is the posterior's curvature by Fisher scoring, with the t's
-(nu + 1) / (nu + 3) for each innovation (Lange, Little & Taylor 1989, JASA 84:881).
+information is the posterior's curvature by Fisher scoring, with the t's (nu + 1) / (nu + 3) for each
+innovation (Lange, Little & Taylor 1989, JASA 84:881).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, cached_property
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_solve, solve_triangular
 from scipy.optimize import minimize
 
 from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
@@ -23,27 +25,41 @@ from bayeskin.inference.straighten import Shear
 from bayeskin.types import Array, NDArray, Prediction
 
 STEP = 1e-4  # of the box, for differences
-DAMPED = (0.0, 1e-2, 1.0, 1e2, 1e4)  # shares of the information added to its diagonal
+DAMPED = ((0.0, 1e-2, 1.0), (1e2, 1e4))  # shares of the information added to its diagonal, in turn
 ENOUGH = 0.02  # nats a round
-REWEIGHTED = 4  # steps of the regression with t weights
+REWEIGHTED, QUICK_REWEIGHTED = 4, 2  # steps of the regression with t weights
 NOISE_STEPS = (0.03, 0.1, 0.3, 1.0)  # of Newton's, for the noise
 FARTHEST_NOISE = 0.5  # of the box, a step of the noise
+SPRUNG = 6  # steps at most, after which it is settled which errors are beyond three sd
+ROUNDING = 1e-12  # of the sum of a precision's diagonal
+ERRORS = 8  # draws of the surrogate's error, over which a quick step of the noise averages
 
 
 @dataclass(frozen=True)
 class Top:
-    """Where a climb ended: sampling coordinates (D,), log density, information (D, D) and gradient (D,).
+    """Where a climb ended: sampling coordinates (D,) and log density, after so many rounds.
 
-    Both are those of the log density over the unit cube; the material and the noise do not mix in the
-    information. latent (r,): the surrogate's error there, in sd of each column of its factor. `rounds` made.
+    information (D, D) and gradient (D,) are those of the log density over the unit cube; the material and the
+    noise do not mix in the information. latent (r,): the surrogate's error there, in sd of each column of its
+    factor.
     """
 
     vector: Array
     value: float
-    information: Array
-    gradient: Array
-    latent: Array
     rounds: int
+    _linear: _Linear
+
+    @property
+    def information(self) -> Array:
+        return self._linear.curvature[0]
+
+    @property
+    def gradient(self) -> Array:
+        return self._linear.curvature[1]
+
+    @property
+    def latent(self) -> Array:
+        return self._linear.curvature[2]
 
 
 def gauss_newton(
@@ -51,23 +67,27 @@ def gauss_newton(
 ) -> Top:
     """From `start` (D,) in sampling coordinates; `shear` straightens this posterior, where it is known.
 
-    quick : for the first rounds of many climbs, of which the best goes on without: the noise makes a Newton
-        step a round only, at half the cost, and a climb across a ridge may end on its side
+    quick : for the first rounds of many climbs, of which the best goes on without: a round's step of the
+        noise is one of expectation maximisation, weights are found in fewer steps, the first round that gains
+        next to nothing is the last, and a climb across a ridge may end on its side
     """
     low, high = log_posterior.bounds
     x = np.clip(np.asarray(start, dtype=float), low, high)
     here = log_posterior.predict(log_posterior.from_sampling(x))
     value = float(log_posterior.log_prob_given(x[None], here)[0])
     small = made = 0
-    while np.isfinite(value) and made < rounds and small < 2:
+    while np.isfinite(value) and made < rounds and small < (1 if quick else 2):
         made += 1
         before = value
         linear = _Linear(log_posterior, x, here)
-        x = linear.with_noise(quick)
-        x, value, here = _best(log_posterior, _trials(linear, x, shear))
+        for trials in _trials(linear, linear.with_noise(quick), shear, quick):
+            found = _best(log_posterior, trials)
+            if found[1] > value:
+                x, value, here = found
+            if value > before + ENOUGH:
+                break
         small = small + 1 if value - before < ENOUGH else 0
-    last = _Linear(log_posterior, x, here)
-    return Top(x, value, *last.curvature(), made)
+    return Top(x, value, made, _Linear(log_posterior, x, here))
 
 
 def _best(log_posterior: LogPosterior, trials: Array) -> tuple[Array, float, Prediction]:
@@ -118,24 +138,28 @@ def promise(
             int(i),
             float(gain[i]),
             float(multiple[i]),
-            vector + linear.step(vector, 0.0, multiple[i] * change[:, i], others),
+            vector + linear.steps(vector, (0.0,), REWEIGHTED, multiple[i] * change[:, i], others)[0],
         )
         for i in chosen
     ]
 
 
-def _trials(linear: _Linear, x: Array, shear: Shear | None) -> Array:
-    """The present point and those that the linear force proposes, (n, D), in the box."""
+def _trials(linear: _Linear, x: Array, shear: Shear | None, quick: bool) -> list[Array]:
+    """The point and those that the linear force proposes, (n, D), in the box, for each part of `DAMPED`."""
     low, high = linear.log_posterior.bounds
-    trials = [x]
-    for share in DAMPED:
-        step = linear.step(x, share)
-        trials.append(x + step)
-        if shear is not None:
-            here = shear.straight(x[None])
-            ahead = (shear.straight((x + 1e-6 * step)[None]) - here) / 1e-6
-            trials.append(shear.back(here + ahead)[0])
-    return np.clip(np.array(trials), low, high)
+    steps = iter(linear.steps(x, sum(DAMPED, ()), QUICK_REWEIGHTED if quick else REWEIGHTED))
+    found = []
+    for dampings in DAMPED:
+        trials = [x]
+        for _ in dampings:
+            step = next(steps)
+            trials.append(x + step)
+            if shear is not None:
+                here = shear.straight(x[None])
+                ahead = (shear.straight((x + 1e-6 * step)[None]) - here) / 1e-6
+                trials.append(shear.back(here + ahead)[0])
+        found.append(np.clip(np.array(trials), low, high))
+    return found
 
 
 class _Linear:
@@ -176,14 +200,31 @@ class _Linear:
         return better if values[1] > values[0] else None
 
     def _stepped(self, unit: Array) -> Array | None:
-        """The best of several lengths of Newton's step, each coordinate by its own second derivative."""
-        value, gradient, second = self._differences(unit)
+        """The best of several lengths of Newton's step, each coordinate by its own second derivative.
+
+        Of what expectation maximisation climbs: the log-likelihood without the surrogate's error, averaged
+        over draws of what that is by the recording (Dempster, Laird & Rubin 1977, JRSS B 39:1).
+        """
+        residual, _, factor = self.columns()
+        drawn = _drawn_errors(residual, factor, self.nu)
+        mean = self.here.mean[0] + (self.here.factor[0] @ drawn).T  # (ERRORS, m)
+
+        def values(tried: Array) -> Array:
+            there = Prediction(
+                np.tile(mean, (len(tried), 1)),
+                np.zeros((ERRORS * len(tried), mean.shape[1], 1)),
+                np.repeat(self.here.diagonal, ERRORS * len(tried), axis=0),
+            )
+            found = log_likelihood(self.chain, there, np.repeat(self._noise(tried), ERRORS, axis=0))
+            return np.asarray(found.reshape(-1, ERRORS).mean(axis=1))
+
+        value, gradient, second = _differences(values, unit)
         far = np.maximum(np.abs(second), np.abs(gradient) / FARTHEST_NOISE)
         step = np.divide(gradient, far, out=np.zeros_like(gradient), where=far > 0.0)
         tried = np.clip(unit + np.outer(NOISE_STEPS, step), 0.0, 1.0)
-        values = self._values(tried)
-        best = int(np.argmax(values))
-        return tried[best] if values[best] > value else None
+        found = values(tried)
+        best = int(np.argmax(found))
+        return tried[best] if found[best] > value else None
 
     def _minus(self, unit: Array) -> tuple[float, Array]:
         """Minus the value, and its gradient (q,) by one-sided differences."""
@@ -193,19 +234,14 @@ class _Linear:
 
     def _values(self, unit: Array) -> Array:
         """Log-likelihoods (n,) at noise parameters (n, q) of the unit cube."""
+        return log_likelihood(self.chain, self.here, self._noise(unit))
+
+    def _noise(self, unit: Array) -> Array:
+        """Noise (n, q) in SI from the unit cube."""
         low, high = self.low[self.inner :], self.high[self.inner :]
         rows = np.repeat(self.x[None], len(unit), axis=0)
         rows[:, self.inner :] = low + np.clip(unit, 0.0, 1.0) * (high - low)
-        noise = self.log_posterior.split(self.log_posterior.from_sampling(rows))[1]
-        return log_likelihood(self.chain, self.here, noise)
-
-    def _differences(self, unit: Array) -> tuple[float, Array, Array]:
-        """Value, gradient (q,) and second derivatives (q,) by the noise, one inside the bounds."""
-        eye = STEP * np.eye(len(unit))
-        centre = np.clip(unit, STEP, 1.0 - STEP)
-        values = self._values(np.concatenate([unit[None], centre[None], centre + eye, centre - eye]))
-        up, down = values[2:].reshape(2, -1)
-        return float(values[0]), (up - down) / (2 * STEP), (up + down - 2 * values[1]) / STEP**2
+        return self.log_posterior.split(self.log_posterior.from_sampling(rows))[1]
 
     def white(self, columns: Array) -> Array:
         """Columns (k, n) in innovations of the noise at hand."""
@@ -233,12 +269,14 @@ class _Linear:
         inner = curvature[: self.inner, : self.inner]
         return width * gradient[: self.inner], np.outer(width, width) * inner
 
-    def step(
-        self, x: Array, damping: float, explained: Array | float = 0.0, free: NDArray[np.bool_] | None = None
-    ) -> Array:
-        """Change (D,) of the sampling coordinates that the regression asks for, within the box.
+    def steps(
+        self, x: Array, dampings: Sequence[float], reweighted: int, explained: Array | float = 0.0,
+        free: NDArray[np.bool_] | None = None,
+    ) -> list[Array]:  # fmt: skip
+        """Changes (D,) of the sampling coordinates that the regression asks for, within the box, damped each.
 
-        `explained` (k,), in innovations, is taken from the residual first; only `free` ones move.
+        `explained` (k,), in innovations, is taken from the residual first; only `free` ones move. The weights
+        are those of the first damping, after so many steps.
         """
         residual, slopes, factor = self.columns()
         residual = residual - explained
@@ -251,25 +289,32 @@ class _Linear:
         pull, bend = self.prior(x)
         if free is not None:
             pull, bend = pull * free, bend * np.outer(free, free)
-        change: Array = np.zeros(design.shape[1])
-        for _ in range(REWEIGHTED):
-            left = residual - design @ change
-            weight = (self.nu + 1.0) / (self.nu + left**2)
-            weighted = (design * weight[:, None]).T
-            normal = weighted @ design
+
+        def solved(normal: Array, target: Array, change: Array, damping: float) -> Array:
             penalty = np.full(design.shape[1], 1e-6)
             penalty[: self.inner] += damping * np.maximum(np.diag(normal)[: self.inner], 1e-6)
-            target = weighted @ residual
             penalty[self.inner :], rest = _spring(change[self.inner :])
+            normal, target = normal.copy(), target.copy()
             target[self.inner :] += rest
             target[: self.inner] += pull
             normal[: self.inner, : self.inner] += bend
             normal[np.diag_indices(len(normal))] += penalty
-            change = _bounded(normal, target, room_down, room_up, self.inner)
-        step = np.zeros(len(x))
-        step[: self.inner] = change[: self.inner] * width
-        return step
+            return _bounded(normal, target, room_down, room_up, self.inner)
 
+        change: Array = np.zeros(design.shape[1])
+        for _ in range(reweighted):
+            root = np.sqrt(_weight(residual - design @ change, self.nu))
+            weighted = design * root[:, None]
+            normal, target = weighted.T @ weighted, weighted.T @ (root * residual)
+            change = solved(normal, target, change, dampings[0])
+        found = []
+        for one in (change, *(solved(normal, target, change, damping) for damping in dampings[1:])):
+            step = np.zeros(len(x))
+            step[: self.inner] = one[: self.inner] * width
+            found.append(step)
+        return found
+
+    @cached_property
     def curvature(self) -> tuple[Array, Array, Array]:
         """Information (D, D) and gradient (D,) over the unit cube; the surrogate's error (r,)."""
         residual, slopes, factor = self.columns()
@@ -278,13 +323,50 @@ class _Linear:
         taken = _orthonormal(np.sqrt(weight) * factor, _spring(latent)[0])[0].T @ slopes
         material = weight * (slopes.T @ slopes - taken.T @ taken)
         left = residual - factor @ latent
-        steep = slopes.T @ ((self.nu + 1.0) / (self.nu + left**2) * left)
+        steep = slopes.T @ (_weight(left, self.nu) * left)
         low, high = self.low[self.inner :], self.high[self.inner :]
-        _, noise_gradient, second = self._differences((self.noise - low) / (high - low))
+        _, noise_gradient, second = _differences(self._values, (self.noise - low) / (high - low))
         information = np.diag(np.concatenate([np.zeros(self.inner), np.maximum(-second, 0.0)]))
         pull, bend = self.prior(self.x)
         information[: self.inner, : self.inner] = material + bend
         return information, np.concatenate([steep + pull, noise_gradient]), latent
+
+
+def _differences(values: Callable[[Array], Array], unit: Array) -> tuple[float, Array, Array]:
+    """Value, gradient (q,) and second derivatives (q,) at a point of the unit cube, one inside the bounds."""
+    eye = STEP * np.eye(len(unit))
+    centre = np.clip(unit, STEP, 1.0 - STEP)
+    found = values(np.concatenate([unit[None], centre[None], centre + eye, centre - eye]))
+    up, down = found[2:].reshape(2, -1)
+    return float(found[0]), (up - down) / (2 * STEP), (up + down - 2 * found[1]) / STEP**2
+
+
+@cache
+def _normals(rank: int) -> Array:
+    """The same ones each time, (rank, ERRORS), each with its opposite."""
+    half = np.random.default_rng(rank).standard_normal((rank, ERRORS // 2))
+    return np.concatenate([half, -half], axis=1)
+
+
+def _weight(left: Array, nu: float) -> Array:
+    """Of innovations in a regression whose errors are t."""
+    return np.asarray((nu + 1.0) / (nu + left**2))
+
+
+def _drawn_errors(residual: Array, factor: Array, nu: float) -> Array:
+    """Draws (r, ERRORS) of the surrogate's error given the residual, normal about the most probable one."""
+    latent, weight = np.zeros(factor.shape[1]), np.ones(len(residual))
+    for _ in range(QUICK_REWEIGHTED):
+        weight = _weight(residual - factor @ latent, nu)
+        weighted = factor * np.sqrt(weight)[:, None]
+        gram, target = weighted.T @ weighted, factor.T @ (weight * residual)
+        for _ in range(SPRUNG):
+            stiffness, rest = _spring(latent)
+            lower = np.linalg.cholesky(gram + np.diag(stiffness + ROUNDING * np.trace(gram)))
+            latent, before = cho_solve((lower, True), target + rest), latent
+            if np.array_equal(np.abs(latent) > FARTHEST, np.abs(before) > FARTHEST):
+                break
+    return np.asarray(latent[:, None] + solve_triangular(lower.T, _normals(len(latent))))
 
 
 def surrogate_error(residual: Array, factor: Array, nu: float) -> Array:
@@ -294,7 +376,7 @@ def surrogate_error(residual: Array, factor: Array, nu: float) -> Array:
     """
     latent: Array = np.zeros(factor.shape[1])
     for _ in range(REWEIGHTED):
-        root = np.sqrt((nu + 1.0) / (nu + (residual - factor @ latent) ** 2))
+        root = np.sqrt(_weight(residual - factor @ latent, nu))
         stiffness, rest = _spring(latent)
         columns, own, triangle = _orthonormal(root[:, None] * factor, stiffness)
         target = columns.T @ (root * residual) + own.T @ (rest / np.sqrt(stiffness))

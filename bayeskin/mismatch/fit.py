@@ -49,7 +49,9 @@ APART = 0.1  # of the prior's width, in some parameter: tops that are nearer are
 BASE_STARTS, STARTS = 10, 2
 NEAREST = 8  # trials that are weighed for each that is climbed from
 REDRAWN = 1  # times that the parameters of a part are drawn anew, about the best so far
-FIRST_ROUNDS, ROUNDS = 6, 25  # of every climb, and of the one that is then ahead
+FIRST_ROUNDS, FIRST_KEPT = (2, 4), 3  # of climbs: of every one, then of so many that are ahead
+ROUNDS = 25  # of the one that is then ahead
+FAR, NEAR, NEXT = 5.0, 1e-4, 1.6  # sd on either side of a top, of the prior's width, and from place to place
 EDGE = 1e-6  # of the unit cube: on a bound
 AT_BOUND = 0.999  # of the noise's range
 
@@ -265,12 +267,12 @@ def _searched(
     trials = _drawn(alone, columns, DRAWS, low, high, rng)
     top = _climbed(
         log_posterior, [vector, *_promising(log_posterior, alone, trials, part, later, neutral)], shear
-    )
+    )[0]
     for _ in range(REDRAWN if len(columns) > 1 else 0):
         near = _about(top.vector, columns, low, high, len(trials), rng)
         trials[:, columns] = near[:, columns]
         starts = _promising(log_posterior, alone, trials, part, later, neutral)
-        top = max(top, _climbed(log_posterior, [top.vector, *starts], shear), key=lambda one: one.value)
+        top = _climbed(log_posterior, [top.vector, *starts], shear)[0]
     return top.vector
 
 
@@ -334,18 +336,22 @@ def likely(log_posterior: LogPosterior, trials: Array, count: int) -> list[Array
     return list(found[:weighed][np.argsort(-values[:weighed])[:count]])
 
 
-def _climbed(log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None) -> Top:
-    """The one ahead after a few rounds."""
-    tops = [gauss_newton(log_posterior, start, shear, FIRST_ROUNDS, quick=True) for start in starts]
-    return max(tops, key=lambda one: one.value)
+def _climbed(log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None) -> list[Top]:
+    """Tops after a few rounds, of those that were ahead after the first of them; the best first."""
+    tops: list[Top] = []
+    for rounds in FIRST_ROUNDS:
+        tops = [gauss_newton(log_posterior, start, shear, rounds, quick=True) for start in starts]
+        tops = sorted(tops, key=lambda one: -one.value)[:FIRST_KEPT]
+        starts = [top.vector for top in tops]
+    return tops
 
 
 def _best(
     names: Sequence[str], log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None, seed: int
 ) -> Fit:  # fmt: skip
-    ahead = _climbed(log_posterior, starts, shear)
+    ahead = _climbed(log_posterior, starts, shear)[0]
     others = _other_starts(ahead.vector, log_posterior, shear, seed, SKIN_STARTS)
-    ahead = max(ahead, _climbed(log_posterior, [ahead.vector, *others], shear), key=lambda one: one.value)
+    ahead = _climbed(log_posterior, [ahead.vector, *others], shear)[0]
     return _fit_at(names, log_posterior, gauss_newton(log_posterior, ahead.vector, shear, ROUNDS))
 
 
@@ -360,7 +366,7 @@ def other_tops(found: Fit, shear: Shear | None, seed: int, count: int) -> list[F
     low, high = log_posterior.bounds
     skin = skins(log_posterior.surrogate)[-1]
     starts = _other_starts(low + found.unit * (high - low), log_posterior, shear, seed, 2 * count)
-    tops = [gauss_newton(log_posterior, start, shear, FIRST_ROUNDS, quick=True) for start in starts]
+    tops = [gauss_newton(log_posterior, start, shear, sum(FIRST_ROUNDS), quick=True) for start in starts]
     chosen = [found]
     for one in sorted((_fit_at(found.names, log_posterior, top) for top in tops), key=hopeful, reverse=True):
         if all(np.max(np.abs(one.unit - other.unit)[:skin]) > APART for other in chosen):
@@ -441,9 +447,14 @@ def evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
 
 
 def _room(log_posterior: LogPosterior, top: Top, unit: Array, i: int) -> float:
-    """Integral over one coordinate of the unit cube of the density relative to the top's, the others held."""
+    """Integral over one coordinate of the unit cube of the density relative to the top's, the others held.
+
+    As far as the Gaussian of its information reaches.
+    """
     low, high = log_posterior.bounds
-    away = np.logspace(-5.0, 0.0, 26)
+    far = min(FAR / np.sqrt(max(top.information[i, i], 1.0)), 1.0)
+    near = min(NEAR, far / 100.0)
+    away = np.geomspace(far, near, 1 + round(np.log(far / near) / np.log(NEXT)))
     places = np.unique(np.clip(np.concatenate([unit[i] - away, unit[i : i + 1], unit[i] + away]), 0.0, 1.0))
     points = np.repeat(unit[None], len(places), axis=0)
     points[:, i] = places

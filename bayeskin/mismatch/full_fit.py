@@ -26,6 +26,7 @@ from bayeskin.types import Array, ParameterSpace, Surrogate
 TRUST, SMALLEST, LARGEST = 0.1, 0.005, 0.4  # of the prior's width, either side
 COMMON = 100.0  # variance of the mean of errors of added effects, over that of the rest
 ENOUGH = 2.0  # nats still to be gained, where the residual is noise: the posterior is about the run
+BEHIND = 3.0  # nats, of what is still promised, from which on a fit is not worth going on with
 AHEAD = 0.5  # nats by which another climb has to be better: what is not informed stays as it is
 STARTS = 3  # climbs of a round: from the best point, and from others in the trust region
 CLIMB = 20  # rounds of each
@@ -54,7 +55,7 @@ class FullFit:
 def fit_full(
     log_posterior: LogPosterior, start: Mapping[str, float], full: Full, exact: Sequence[str], rounds: int,
     seed: int, allow: Callable[[Surrogate], Surrogate] = lambda surrogate: surrogate,
-    given: Sequence[FullRun] = (), several: bool = True,
+    given: Sequence[FullRun] = (), several: bool = True, at_least: float = -np.inf,
 ) -> tuple[FullFit, CorrectedSurrogate] | str:  # fmt: skip
     """From `start` (all parameters), at most so many runs; the message of the first, where that fails.
 
@@ -67,6 +68,8 @@ def fit_full(
     allow : puts the full model's own error into a surrogate that has none
     given : runs of the same model made before
     several : whether the surrogate adds up several effects, so that its errors go far; climbs take them to
+    at_least : log posterior that makes the fit worth having; from the second run on one that promises less
+        is left as it is
     """
     surrogate, rng = log_posterior.surrogate, np.random.default_rng(seed)
     space, trial, trust = surrogate.space, dict(start), TRUST
@@ -104,6 +107,8 @@ def fit_full(
         trial, promised, force_n = _maximum(local, best.theta, trust, exact, rng)
         if promised - best.value < ENOUGH * _excess(local, trial, force_n):
             best = replace(best, settled=trust >= TRUST)
+            break
+        if count > 1 and promised < at_least - BEHIND:
             break
     assert best is not None
     return best, CorrectedSurrogate(surrogate, runs, lengths, COMMON if several else 0.0)

@@ -26,7 +26,8 @@ from bayeskin.mismatch.wrapper import skins
 from bayeskin.types import Array
 
 ENSEMBLES, FEWEST_WALKERS = 2, 40
-LEGS, FORGOTTEN, EVERY = (300, 600, 900), 1 / 3, 5  # steps after which draws may do; their share forgotten
+LEGS = (120, 300, 600, 900)  # steps after which draws may do
+FORGOTTEN, EVERY = 1 / 3, 5  # of these steps, at least; one of so many is kept
 MODES = 6  # climbs from other skins
 NEAR = 0.5  # of Laplace's sd, about a mode
 LIMITS = Limits(effective_samples=200.0, lengths=5.0, rhat=1.1)  # for intervals, not for tails
@@ -54,10 +55,10 @@ class Resampled:
         }
 
 
-def resample(found: Fit, shear: Shear | None, seed: int) -> Resampled:
+def resample(found: Fit, shear: Shear | None, seed: int, legs: Sequence[int] = LEGS) -> Resampled:
     """Draws of the posterior about `found`; `shear` as for `fit`.
 
-    They end after the first of `LEGS` by which they have settled.
+    They end after the first of `legs` by which they have settled.
     """
     log_posterior = found.log_posterior
     rng = np.random.default_rng([seed, 7])
@@ -76,7 +77,7 @@ def resample(found: Fit, shear: Shear | None, seed: int) -> Resampled:
         for _ in samplers
     ]
     made = 0
-    for steps in LEGS:
+    for steps in legs:
         states = [
             sampler.run_mcmc(state, steps - made, skip_initial_state_check=True)
             for sampler, state in zip(samplers, states, strict=True)
@@ -107,7 +108,7 @@ def _starts(found: Fit, shear: Shear | None, seed: int, rng: np.random.Generator
     best = low + found.unit * (high - low)
     whole = skins(log_posterior.surrogate)[-1]
     others = likely(log_posterior, other_skins(best, log_posterior, shear, seed, whole), MODES)
-    tops = [gauss_newton(log_posterior, start, shear, FIRST_ROUNDS) for start in others]
+    tops = [gauss_newton(log_posterior, start, shear, sum(FIRST_ROUNDS)) for start in others]
     centres = np.array([best, *(top.vector for top in tops)])
     masses = np.array([found.log_evidence, *(evidence(log_posterior, top)[0] for top in tops)])
     share = np.exp(masses - masses.max())

@@ -37,7 +37,7 @@ from bayeskin.pipeline.effects import effect_files
 from bayeskin.pipeline.engine import Reporter, Run, Silent, Stage, run_stages
 from bayeskin.pipeline.folder import plain, read_lines, sha256_of, write_json
 from bayeskin.pipeline.provenance import caption
-from bayeskin.pipeline.taking_up import FullResult, TakenUp, take_up
+from bayeskin.pipeline.taking_up import FullResult, TakenUp, take_up, take_up_rivals
 from bayeskin.pipeline.workbench import Workbench, opened, workbench
 from bayeskin.types import Array, BinnedForce
 from bayeskin.workers import Lost, run_parallel
@@ -73,7 +73,8 @@ def _work(run: Run) -> Mapping[str, Any]:
     before, after = taken[0], taken[-1]
     if after.full is not None and (rivals := whole.rivals(after.full_weight)):
         run.reporter.log("the full model takes up what else it may be")
-        after = _likeliest(whole, before, after, rivals, take_up(run, rivals, whole.best.theta, [], None)[0])
+        judged = take_up_rivals(run, rivals, whole.best.theta, after.full_weight)
+        after = _likeliest(whole, before, after, rivals, judged)
     probability = set_probability(whole.best.names, before.evidence, after.evidence)
     found = judge(
         whole, bench.known, before.located, after.located, (before.full_weight, after.full_weight),
@@ -121,15 +122,19 @@ def _work(run: Run) -> Mapping[str, Any]:
 
 
 def _likeliest(
-    whole: Search, before: TakenUp, after: TakenUp, rivals: Sequence[Fit], taken: Sequence[TakenUp]
-) -> TakenUp:
+    whole: Search, before: TakenUp, after: TakenUp, rivals: Sequence[Fit],
+    judged: Sequence[TakenUp | float | None],
+) -> TakenUp:  # fmt: skip
     """What follows the best set, which is the one of it and its rivals that the full model makes it."""
-    found = {whole.best.names: after, **{one.names: its for one, its in zip(rivals, taken, strict=True)}}
-    judged = {(): before, **found}
-    weights = {names: its.full_weight for names, its in judged.items() if its.full_weight is not None}
-    if weights:
-        whole.full = {**dict.fromkeys(judged, -np.inf), **weights}
-    return judged[whole.best.names]
+    full = {(): before.full_weight, whole.best.names: after.full_weight}
+    taken = {(): before, whole.best.names: after}
+    for rival, its in zip(rivals, judged, strict=True):
+        full[rival.names] = its.full_weight if isinstance(its, TakenUp) else its
+        if isinstance(its, TakenUp):
+            taken[rival.names] = its
+    if any(one is not None for one in full.values()):
+        whole.full = {names: -np.inf if one is None else one for names, one in full.items()}
+    return taken[whole.best.names]
 
 
 def _base_and_best(found: Search) -> list[Fit]:

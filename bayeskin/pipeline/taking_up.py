@@ -2,7 +2,7 @@
 
 A first run of the model's own mesh shows by how much the coarsest bricks are off. These, whose runs are quick
 and carry their derivatives, are fitted with that difference added, then the model's own mesh with their
-derivatives. Others of these fits begin at other tops of the surrogate that promise more than was found.
+derivatives. Where much is left, others of these fits begin at other tops of the surrogate that promise more.
 Without mechanisms the slopes of the base's surrogate come first, and last where they are good enough. Sampled
 and taken apart is the posterior of the surrogate corrected by the runs of the model's own mesh; located is
 the mismatch beside the best of these runs. The article's formulation and models of one's own keep the
@@ -26,11 +26,11 @@ from bayeskin.mismatch.blocked import errors_left_out
 from bayeskin.mismatch.contributions import Contribution, Force, contributions
 from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun
 from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
-from bayeskin.mismatch.fit import Fit, fit_near, hopeful, other_tops, restored, stored
+from bayeskin.mismatch.fit import Fit, fit_near, hopeful, much_left, other_tops, restored, stored
 from bayeskin.mismatch.form import Form, propose_form
-from bayeskin.mismatch.full_fit import FullFit, at_run, fit_full
+from bayeskin.mismatch.full_fit import BEHIND, FullFit, at_run, fit_full
 from bayeskin.mismatch.locate import Located, locate
-from bayeskin.mismatch.resample import Resampled, resample
+from bayeskin.mismatch.resample import LEGS, Resampled, resample
 from bayeskin.mismatch.search import weight
 from bayeskin.mismatch.verdict import Evidence
 from bayeskin.mismatch.wrapper import Sure
@@ -89,24 +89,42 @@ def take_up(
     """
     apart: list[partial[Any]] = [partial(_whole_apart, run.config_path, stored(one), noise) for one in whole]
     apart += [partial(_begun_apart, run.config_path, stored(one), until_s) for one in begun]
-    order = sorted(range(len(apart)), key=lambda i: -len([*whole, *begun][i].names))  # the longest first
-    done = {order[i]: found for i, found in run_parallel(_call, [apart[i] for i in order], 2)}
-    found = [apart[i]() if isinstance(done[i], Lost) else done[i] for i in range(len(apart))]
+    found = _in_two_processes(apart, [*whole, *begun])
     return found[: len(whole)], found[len(whole) :]
+
+
+def take_up_rivals(
+    run: Run, rivals: Sequence[Fit], noise: Mapping[str, float], full_weight: float | None
+) -> list[TakenUp | float | None]:
+    """What follows each rival where it has more weight than `full_weight` (None: any has) by the full model;
+    elsewhere that weight, as far as it was worth going, None where the full model failed."""
+    ahead = -np.inf if full_weight is None else full_weight
+    apart = [partial(_whole_apart, run.config_path, stored(one), noise, ahead) for one in rivals]
+    return _in_two_processes(apart, rivals)
+
+
+def _in_two_processes(apart: Sequence[partial[Any]], fits: Sequence[Fit]) -> list[Any]:
+    """What tasks, one of each fit, return; those of the most mechanisms, which take the longest, go first."""
+    order = sorted(range(len(apart)), key=lambda i: -len(fits[i].names))
+    done = {order[i]: found for i, found in run_parallel(_call, [apart[i] for i in order], 2)}
+    return [apart[i]() if isinstance(done[i], Lost) else done[i] for i in range(len(apart))]
 
 
 def _call(task: partial[Any]) -> Any:
     return task()
 
 
-def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, float]) -> TakenUp:
-    """In a process of its own: mechanisms have no copies."""
+def _whole_apart(
+    source: Path, plain: Mapping[str, Any], noise: Mapping[str, float], ahead: float | None = None
+) -> TakenUp | float | None:
+    """In a process of its own: mechanisms have no copies. `ahead` of rivals only, as in `take_up_rivals`."""
     bench = workbench(opened(source, Silent()))
     seed, build = bench.run.config.seed, partial(bench.posterior, None)
     alone, found = build(()), restored(plain, build(plain["names"]))
     straight = find_shear(alone)
     shear = straight.among(alone.names, found.log_posterior.names) if straight else None
-    full, corrected = _full(bench, found, shear)
+    at_least = -np.inf if ahead is None else ahead - weight(found) + found.value
+    full, corrected = _full(bench, found, shear, at_least)
     force: Force = partial(_surrogate_force, bench)
     full_weight, sure, there = None, found, found
     if corrected is not None and isinstance(full, FullFit):
@@ -117,11 +135,14 @@ def _whole_apart(source: Path, plain: Mapping[str, Any], noise: Mapping[str, flo
         # Mechanisms have to be worth what a run has shown, the model without them what is promised.
         full_weight = weight(found) + (full.value - found.value if found.names else 0.0)
         force = _coarse(bench)
+    if ahead is not None and (full_weight is None or full_weight <= ahead):
+        return full_weight
     force_names = there.log_posterior.surrogate.space.names
     quiet = {name: noise[name] for name in there.log_posterior.names if name not in force_names}
     there = replace(there, theta={**there.theta, **quiet})
     left = discrepancy(there, bench.motion)
-    draws = resample(found, shear, seed)
+    refuted = not found.names and much_left(found.log_posterior, found.theta)
+    draws = resample(found, shear, seed, LEGS[:1] if refuted else LEGS)
     some = inference.evenly(draws.draws, PREDICTIVE_DRAWS)
     bands = inference.bands(found.log_posterior, some, np.random.default_rng(seed))
     return TakenUp(
@@ -155,8 +176,10 @@ def _begun_apart(source: Path, plain: Mapping[str, Any], until_s: float | None) 
     return _full(bench, found, straight)[0]
 
 
-def _full(bench: Workbench, found: Fit, shear: Shear | None) -> tuple[FullResult, CorrectedSurrogate | None]:
-    """The full model's own fit from a search's, and the surrogate about it."""
+def _full(
+    bench: Workbench, found: Fit, shear: Shear | None, at_least: float = -np.inf
+) -> tuple[FullResult, CorrectedSurrogate | None]:
+    """The full model's own fit from a search's, and the surrogate about it; `at_least` as for `fit_full`."""
     if bench.spec.observation != "reaction":
         return None, None
     beyond = [bench.known[name] for name in found.names if bench.known[name].act.bind is None]
@@ -200,7 +223,7 @@ def _full(bench: Workbench, found: Fit, shear: Shear | None) -> tuple[FullResult
     plain = replace(found.log_posterior, surrogate=bench.surrogate(found.names))
     fitted = partial(
         fit_full, plain, exact=exact, seed=bench.run.config.seed, allow=bench.with_mesh_error,
-        several=len(effects_among(bench.effects, found.names)) > 1,
+        several=len(effects_among(bench.effects, found.names)) > 1, at_least=at_least,
     )  # fmt: skip
     start = found.theta
     if not found.names:
@@ -212,11 +235,15 @@ def _full(bench: Workbench, found: Fit, shear: Shear | None) -> tuple[FullResult
     first = fitted(start, partial(lifted, start), rounds=COARSE_RUNS if found.names else BASE_RUNS)
     if found.names:
         for top in other_tops(found, shear, bench.run.config.seed, OTHER_TOPS):
-            if not isinstance(first, str) and hopeful(top) <= first[0].value:
+            beat = at_least if isinstance(first, str) else max(first[0].value, at_least)
+            explained = not isinstance(first, str) and not much_left(found.log_posterior, first[0].theta)
+            if explained or hopeful(top) <= beat:
                 break
-            other = fitted(top.theta, partial(lifted, top.theta), rounds=COARSE_RUNS)
+            other = fitted(top.theta, partial(lifted, top.theta), rounds=COARSE_RUNS, at_least=beat)
             if isinstance(first, str) or (not isinstance(other, str) and other[0].value > first[0].value):
                 first = other
+    if not isinstance(first, str) and first[0].value < at_least - BEHIND:
+        return first
     last = fitted(start if isinstance(first, str) else first[0].theta, whole, rounds=FULL_RUNS, given=made())
     again = fitted(start, whole, rounds=1)  # no new run
     if not isinstance(again, str) and (isinstance(last, str) or again[0].value > last[0].value):
