@@ -293,9 +293,12 @@ class Landscape:
             surrogate=SimpleNamespace(space=SimpleNamespace(dim=4)), of="".join(names),
         )  # fmt: skip
 
-    def best(self, known: str, another: Callable[[], Fit | None] = lambda: None) -> tuple[str, float]:
+    def best(
+        self, known: str, another: Callable[[], Fit | None] = lambda: None, exchanges: bool = True
+    ) -> tuple[str, float]:
         """What a search among mechanisms of one letter ends at."""
-        found = search(self.build, dict.fromkeys(known, KNOWN["force-offset"]), 1, another=another).best
+        letters = dict.fromkeys(known, KNOWN["force-offset"])
+        found = search(self.build, letters, 1, another=another, exchanges=exchanges).best
         return "".join(found.names), found.value
 
 
@@ -338,6 +341,7 @@ def test_another_mechanism_is_tried_in_the_place_of_each_of_several(
     monkeypatch.setattr("bayeskin.mismatch.search.promised", known)
     monkeypatch.setattr("bayeskin.mismatch.search.SHORTLIST", 1)
     assert landscape.best("abc") == ("bc", 60.0)
+    assert landscape.best("abc", exchanges=False) == ("ab", 30.0)
     monkeypatch.setattr("bayeskin.mismatch.search.EXCHANGES", 0)
     assert landscape.best("abc") == ("ab", 30.0)
 
@@ -520,6 +524,11 @@ def test_each_mechanism_of_the_best_has_a_rival_that_may_come_out_ahead() -> Non
     assert not tried({(): 0.0, ("drift",): 50.0}).rivals(None)
 
 
+def test_the_full_model_is_asked_about_the_most_hopeful_rivals_only() -> None:
+    found = tried({(): 0.0, ("x", "y", "z"): 100.0, ("x", "y"): 70.0, ("y", "z"): 90.0, ("x", "z"): 80.0})
+    assert [one.names for one in found.rivals(None)] == [("y", "z"), ("x", "z")]
+
+
 def test_a_set_that_counts_is_not_unsure_too() -> None:
     base = fit_base(concealing(0), 1, None)
     for order in ((True, False), (False, True)):
@@ -559,6 +568,18 @@ def test_a_climb_never_ends_below_its_start_nor_outside_the_box() -> None:
         top = gauss_newton(problem, x, None, 6)
         assert top.value >= problem.log_prob(x[None])[0]
         assert np.all((top.vector >= low) & (top.vector <= high))
+
+
+def test_a_quick_climb_goes_on_as_far_as_a_thorough_one() -> None:
+    """From noise that is much too large; the surrogate's error is not small."""
+    problem = toy_problem()
+    assert problem.predict(problem.from_sampling(np.mean(problem.bounds, axis=0))).factor[0].any()
+    start = problem.vector({**TRUTH, **NOISE})
+    kinds = [i for i, name in enumerate(problem.names) if name.startswith("sd_")]
+    start[kinds] = problem.bounds[1][kinds]
+    quick, thorough = (gauss_newton(problem, start, None, quick=quick) for quick in (True, False))
+    assert quick.value > float(problem.log_prob(start[None])[0]) + 50.0
+    assert quick.value > thorough.value - 2.0
 
 
 def test_a_promise_points_at_the_moment_of_a_step() -> None:
@@ -801,6 +822,27 @@ def test_without_slopes_of_its_own_the_full_model_is_fitted_with_the_surrogate_s
     at_truth = {**found.theta, **TRUTH}
     truth = dataclasses.replace(recorded, surrogate=Scaled(alone.surrogate, 1.05))
     assert found.value > float(truth.log_prob(truth.vector(at_truth)[None])[0]) - 0.5
+
+
+def test_a_full_fit_that_is_not_worth_having_is_left_after_two_runs() -> None:
+    """The full model's cutis stiffens with the cube of what the surrogate thinks, so that runs are many."""
+    alone = dataclasses.replace(concealing(0), noise_priors=QUIET)
+    noise = {f"sd_{kind}": 2e-3 for kind in ("rest", "load", "hold", "unload")}
+    start = {**TRUTH, **noise, "tau_noise": 0.5, "nu_noise": 20.0, "E_c": 1.25 * TRUTH["E_c"]}
+
+    def full(theta, changes):
+        bent = {**theta, "E_c": TRUTH["E_c"] * (theta["E_c"] / TRUTH["E_c"]) ** 3}
+        return alone.surrogate.predict([bent[n] for n in alone.surrogate.space.names]).mean[0], None
+
+    answers = [fit_full(alone, start, full, (), 12, 1)]
+    assert not isinstance(answers[0], str)
+    whole = answers[0][0]
+    answers += [
+        fit_full(alone, start, full, (), 12, 1, at_least=at_least)
+        for at_least in (whole.value, whole.value + 50.0)
+    ]
+    assert [one[0].runs for one in answers if not isinstance(one, str)] == [whole.runs, whole.runs, 2]
+    assert whole.runs > 2
 
 
 def test_a_full_fit_that_leaves_much_settles_for_what_much_is() -> None:

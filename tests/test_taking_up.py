@@ -152,6 +152,19 @@ def test_the_fit_begins_at_other_tops_too_that_promise_more(
     assert reached[1] < reached[0] - 5.0
 
 
+def test_a_set_that_stays_behind_is_left_before_the_model_s_own_mesh(runs: Runs) -> None:
+    names = ("force-offset",)
+    bench, start, exact = bench_of(names)
+    best = fit_near(names, exact, start.theta, None)
+    behind, _ = taking_up._full(bench, start, None, best.value + 100.0)
+    assert isinstance(behind, taking_up.FullFit)
+    assert len(runs.fine) == 1
+    assert behind.value < best.value + 3.0
+    ahead, _ = taking_up._full(bench, start, None, best.value - 5.0)
+    assert isinstance(ahead, taking_up.FullFit)
+    assert ahead.value == taking_up._full(bench, start, None)[0].value  # type: ignore[union-attr]
+
+
 def test_the_mismatch_is_located_beside_the_best_run(runs: Runs, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not beside the surrogate about it, whose error would take up what is missing."""
     bench, start, _ = bench_of(())

@@ -11,8 +11,9 @@ The first step tries all, those that promise less by one climb each. A set that 
 once more from a larger one's top, and from a smaller one's that is ahead of it: one path stops where another
 goes on.
 
-Of several taken ones each is at last exchanged for the most promising others, and the best set of another
-search is tried, where there is one: of what one path has taken first, it does not let go by itself.
+Of several taken ones each is at last exchanged for the most promising others, where that is asked for, and
+the best set of another search is tried, where there is one: of what one path has taken first, it does not let
+go by itself.
 
 Where the noise of the best set is still as large as it may be, much is left. Then each taken one is searched
 for anew, too, beside the others as they have become; and other paths are followed: from single mechanisms
@@ -42,6 +43,7 @@ SHORTLIST = 5  # mechanisms of a step that are tried thoroughly
 PATHS = 2  # at most
 EXCHANGES = 2  # mechanisms that are tried in another's place
 GAIN = 1.0  # nats: less is no reason to go on from the same set
+RIVALS = 2  # sets, the most hopeful, that the full model is asked about beside the best
 UNSURE = 0.5  # of what a mechanism adds, RMS: sd of the surrogate's error in it
 
 Build = Callable[[Sequence[str]], LogPosterior]  # the posterior with a set of mechanisms
@@ -99,15 +101,15 @@ class Search:
         return weight(one) + self.full[likeliest] - weight(self.fits[likeliest])
 
     def rivals(self, full_weight: float | None) -> list[Fit]:
-        """For each of the best's mechanisms the most hopeful set without it but with others, where that may
-        have a larger weight than the best's by the full model (None: that failed)."""
+        """Of each of the best's mechanisms the most hopeful set without it but with others, where that may
+        have a larger weight than the best's by the full model (None: that failed); `RIVALS` of these."""
         found: dict[tuple[str, ...], Fit] = {}
         for name in self.best.names:
             others = (one for one in self.fits.values() if one.names and name not in one.names)
             rival = max(others, key=_hopeful_weight, default=None)
             if rival is not None and (full_weight is None or _hopeful_weight(rival) > full_weight):
                 found[rival.names] = rival
-        return list(found.values())
+        return sorted(found.values(), key=_hopeful_weight, reverse=True)[:RIVALS]
 
     def _inner(self, one: Fit) -> frozenset[str]:
         return self.learnt & set(one.names)
@@ -139,6 +141,7 @@ def search(
     on_fit: Callable[[Made], None] | None = None,
     another: Callable[[], Fit | None] = lambda: None,
     refuted: Callable[[Fit], bool] = lambda one: False,
+    exchanges: bool = True,
 ) -> Search:
     """Forward from the fit without any mechanism, then backward.
 
@@ -146,8 +149,11 @@ def search(
     on_fit : is told each new fit
     another : the best of another search, on a part of the recording say
     refuted : whether something else that is known of the recording speaks against a fit
+    exchanges : whether others are tried in the place of mechanisms that were taken
     """
-    forward = _Forward(build, known, seed, progress or (lambda share, note: None), done, on_fit, refuted)
+    forward = _Forward(
+        build, known, seed, progress or (lambda share, note: None), done, on_fit, refuted, exchanges
+    )
     found = forward.found
     forward.path(forward.base(), "path 1")
     singles = sorted((one for one in found.fits.values() if len(one.names) == 1), key=weight, reverse=True)
@@ -171,10 +177,12 @@ class _Forward:
     def __init__(
         self, build: Build, known: Mapping[str, Mechanism], seed: int, progress: Progress,
         done: Sequence[Made], on_fit: Callable[[Made], None] | None, refuted: Callable[[Fit], bool],
+        exchanges: bool,
     ) -> None:  # fmt: skip
         self.found = Search()
         self._build, self._known, self._seed = build, known, seed
         self._progress, self._on_fit, self._refuted = progress, on_fit, refuted
+        self._exchanges = exchanges
         self._made = {made.fit.names: [m for m in done if m.fit.names == made.fit.names] for made in done}
         self._alone = build(())
         self._straight = find_shear(self._alone)
@@ -197,7 +205,7 @@ class _Forward:
             ahead = current
             if len(current.names) < MOST:
                 ahead = self._step(current, f"{label}, mechanism {len(current.names) + 1}")
-            if ahead is current:
+            if ahead is current and self._exchanges:
                 ahead = self._renewed(current, label)
 
     def tried(

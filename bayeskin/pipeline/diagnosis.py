@@ -129,9 +129,10 @@ def _likeliest(
     full = {(): before.full_weight, whole.best.names: after.full_weight}
     taken = {(): before, whole.best.names: after}
     for rival, its in zip(rivals, judged, strict=True):
-        full[rival.names] = its.full_weight if isinstance(its, TakenUp) else its
-        if isinstance(its, TakenUp):
-            taken[rival.names] = its
+        if its is None or isinstance(its, float):
+            full[rival.names] = its
+        else:
+            full[rival.names], taken[rival.names] = its.full_weight, its
     if any(one is not None for one in full.values()):
         whole.full = {names: -np.inf if one is None else one for names, one in full.items()}
     return taken[whole.best.names]
@@ -211,7 +212,7 @@ def _searched(
         return search(
             build, bench.known, run.config.seed,
             lambda share, note: run.reporter.progress(label, share, note), done, on_fit, another,
-            lambda one: bool(bench.refuted(one)),
+            lambda one: bool(bench.refuted(one)), exchanges=until_s is None,
         )  # fmt: skip
 
 

@@ -43,7 +43,7 @@ from bayeskin.workers import Lost, run_parallel
 
 COARSE_RUNS, BASE_RUNS = 8, 4  # at most, with mechanisms and without
 FULL_RUNS = 4  # at most, of the model's own mesh with the coarse one's slopes
-OTHER_TOPS = 2  # at most, from which the coarse mesh is fitted, too, where they promise more than it found
+OTHER_TOPS = 1  # at most, from which the coarse mesh is fitted, too, where they promise more than it found
 DIRECT_RUNS = 2  # at most, of the model's own mesh with the slopes of the base's surrogate
 PREDICTIVE_DRAWS = 300
 
