@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import sys
 from functools import partial
 from pathlib import Path
@@ -322,3 +323,22 @@ def shown(table: str) -> bool:
     """Whether a page of the documentation has the rows of a table."""
     page = (Path(__file__).parents[1] / "docs" / "inference.md").read_text()
     return all(line in page for line in table.splitlines()[2:])
+
+
+def test_the_page_of_the_recording_says_what_the_diagnosis_says(benchmark):
+    page = benchmark("healthy_skin_page")
+    folder = Path(__file__).parents[1] / "data" / "development" / "verdicts"
+    answers = [json.loads(path.read_text())["answer"] for path in sorted(folder.glob("*.json"))]
+    answer = next(one for one in answers if len(one.get("mechanisms", ())) == 2)
+    after = answer["fit"]["after"]
+    whole = page.fits(answer)
+    assert f"{1e3 * after['full_model']['rmse']:.1f} mN | 12 mN |" in whole
+    assert f"{1e3 * after['full_model']['rmse_held_out']:.1f} mN | 18 mN |" in whole
+    assert whole.count("12 mN") == whole.count("18 mN") == 1
+    alone = {when: {**answer["fit"][when], "full_model": None} for when in ("before", "after")}
+    surrogate = page.fits({**answer, "fit": alone})
+    assert f"{1e3 * after['rmse']:.1f} mN | 12 mN |" in surrogate
+    assert "full model" not in surrogate
+    names = page.named(answer)
+    assert all(f"| {one['name']} | {one['probability']:.2f} |" in names for one in answer["mechanisms"])
+    assert f"`{answer['verdict']}`" in names
