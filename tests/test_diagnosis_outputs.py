@@ -23,6 +23,7 @@ from bayeskin.mismatch.contributions import Contribution, contributions
 from bayeskin.mismatch.discrepancy import discrepancy
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
+from bayeskin.mismatch.full_fit import FullFit
 from bayeskin.mismatch.locate import Located, Window
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.search import Search
@@ -31,13 +32,16 @@ from bayeskin.pipeline import diagnosis
 from bayeskin.pipeline.diagnosis_outputs import (
     Found,
     Remainder,
+    Shown,
     candidates,
     draw,
     in_words,
     mechanism,
+    shown,
     unexplained,
 )
 from bayeskin.pipeline.folder import plain
+from bayeskin.pipeline.taking_up import TakenUp
 
 CREEP_S = 20.0
 VALUES = {
@@ -77,6 +81,17 @@ def located(residual_n: np.ndarray, *windows: Window) -> Located:
 
 
 WINDOW = Window(15.0, 45.0, "hold", 1, 5e-3, 1e-3)
+PARAMETERS = ALONE.surrogate.space.parameters
+
+
+def drawn(left_n: float, held_out_by: float | None = None) -> Shown:
+    """A fit that leaves so much of every bin, in a band of 3 mN to either side."""
+    force_n = BINNED.force_n - left_n
+    held_out_n = None if held_out_by is None else BINNED.force_n - held_out_by
+    values = {
+        p.name: {"mean": 0.5 * (p.lower + p.upper), "interval90": [p.lower, p.upper]} for p in PARAMETERS
+    }
+    return Shown(force_n, (force_n - 3e-3, force_n + 3e-3), held_out_n, located(0.0 * force_n), values)
 
 
 # Parts of the force
@@ -207,18 +222,63 @@ def test_each_figure_is_written_where_it_has_something_to_show(
     monkeypatch: pytest.MonkeyPatch, remainder: Remainder
 ) -> None:
     monkeypatch.setattr(report, "save_figure", lambda figure, stem, made_by: (stem.with_suffix(".png"),))
-    best = fitted("force-offset")
-    search = Search({(): fitted(), best.names: best})
-    empty = located(np.zeros(len(BINNED.force_n)))
     rows = [{"name": "force-offset", "delta_score": 3.0, "standard_error": 1.0}]
     written = []
     for parts, left in ((parts_of("force-offset"), remainder), ([], None)):
-        found = Found(search, ["did not converge", None], empty, empty, parts, left)
+        found = Found(drawn(8e-3), drawn(2e-3), None, PARAMETERS, parts, left)
         written.append({path.name for path in draw(Path("x"), "", BINNED, toy.MOTION, found, rows)})
     assert written[0] - written[1] == {"contributions.png", "discrepancy.png"}
     assert {Path(name).stem for name in written[1]} == {
-        "located", "candidates", "before_after", "residual_by_phase"
+        "located", "candidates", "before_after", "residual_by_phase", "base_parameters"
     }  # fmt: skip
+
+
+def test_a_fit_is_drawn_by_the_full_model_where_there_is_a_run() -> None:
+    fit, begun, run = fitted("force-offset"), fitted(), np.full(len(BINNED.force_n), 0.25)
+    full = FullFit({}, 0.0, run, 0.0 * run, 1, 0.0)
+    taken = cast(TakenUp, SimpleNamespace(full=full, band_n=(run, run), located=None,
+                                          draws=SimpleNamespace(summary={})))  # fmt: skip
+    both = shown(fit, taken, begun, full)
+    assert both.force_n is run
+    assert both.held_out_n is run
+    failed = cast(TakenUp, SimpleNamespace(**{**vars(taken), "full": "did not converge"}))
+    neither = shown(fit, failed, begun, None)
+    np.testing.assert_array_equal(neither.force_n, fit.force_n)
+    np.testing.assert_array_equal(neither.held_out_n, begun.force_n)  # type: ignore[arg-type]
+    assert shown(fit, taken, None, None).held_out_n is None
+
+
+def test_before_and_after_have_their_band_and_what_was_not_fitted() -> None:
+    before, after = drawn(8e-3, held_out_by=2e-2), drawn(2e-3, held_out_by=5e-3)
+    figure = report.figure_before_after(BINNED, toy.MOTION, before, after, 60.0)
+    assert headline(figure) == "RMS residual 8.0 mN before, 2.0 mN after"
+    titles = {ax.get_title(loc="left")[-60:]: ax for ax in figure.axes}
+    assert [title.split("  ")[-1] for title in titles][1:4:2] == [
+        "in the 90 % bands: 0 → 100 % of bins", "fitted up to 60 s; beyond that 20.0 → 5.0 mN RMS"
+    ]  # fmt: skip
+    residual, left = figure.axes[1], figure.axes[3]
+    (band,) = residual.collections[:1]
+    edges = band.get_paths()[0].vertices[:, 1]  # type: ignore[index]
+    np.testing.assert_allclose([edges.min(), edges.max()], [-3.0, 3.0], atol=1e-9)
+    assert [line.get_xdata()[0] for line in left.get_lines() if line.get_linestyle() == "--"] == [60.0]  # type: ignore[index]
+    whole = report.figure_before_after(BINNED, toy.MOTION, drawn(8e-3), drawn(2e-3), None)
+    assert len(whole.axes) == 3
+
+
+def test_the_base_s_parameters_that_leave_their_intervals_are_said() -> None:
+    values = {p.name: {"mean": TRUTH[p.name], "interval90": [0.9 * TRUTH[p.name], 1.1 * TRUTH[p.name]]}
+              for p in PARAMETERS}  # fmt: skip
+    stays = report.figure_base_parameters(PARAMETERS, values, values)
+    assert headline(stays) == "No parameter of the base leaves its interval"
+    assert len(stays.axes) == len(PARAMETERS)
+    far = {
+        **values,
+        "E_c": {"mean": 2.0 * TRUTH["E_c"], "interval90": [1.8 * TRUTH["E_c"], 2.2 * TRUTH["E_c"]]},
+    }
+    moves = report.figure_base_parameters(PARAMETERS, values, far)
+    assert headline(moves).endswith("leaves its interval")
+    before, after = (line.get_xdata() for line in moves.axes[0].get_lines()[::2])
+    np.testing.assert_allclose(10.0 ** (np.array(after) - before), 2.0)  # a log-uniform prior
 
 
 def test_residuals_by_phase_have_a_line_a_cycle_and_the_rms_of_their_kind() -> None:

@@ -30,6 +30,7 @@ from bayeskin.pipeline.diagnosis_outputs import (
     draw,
     in_words,
     mechanism,
+    shown,
     unexplained,
     window,
 )
@@ -115,7 +116,11 @@ def _work(run: Run) -> Mapping[str, Any]:
     write_json(run.at(STAGE.name, "diagnosis.json"), answer)
     figures = draw(
         run.folder / STAGE.name, caption(run), bench.binned, bench.motion,
-        Found(whole, [before.full, after.full], before.located, after.located, after.parts, remainder),
+        Found(
+            shown(whole.base, before, begun.base if begun else None, held_out[0]),
+            shown(whole.best, after, begun.best if begun else None, held_out[-1]),
+            split_s, whole.base.log_posterior.surrogate.space.parameters, after.parts, remainder,
+        ),
         answer["candidates"],
     )  # fmt: skip
     return {**answer, "figures": [figure.name for figure in figures]}
@@ -248,7 +253,7 @@ def _fit(
         "rmse_held_out": None if begun is None else _rms(binned.force_n - begun.force_n, rest),
         "full_model": _full(taken, held_out, found.force_n, binned, usable, rest),
         "rmse_left_out": taken.left_out_n,
-        "coverage90": taken.coverage90,
+        "coverage90": inference.coverage(binned, *taken.band_n),
         "log_evidence": found.log_evidence,
         "theta": taken.draws.summary,
         "sampled": {

@@ -17,22 +17,49 @@ from bayeskin.mismatch.full_fit import FullFit
 from bayeskin.mismatch.locate import Located, Window
 from bayeskin.mismatch.search import Search
 from bayeskin.mismatch.verdict import Named
-from bayeskin.pipeline.taking_up import FullResult, Remainder
-from bayeskin.types import Array, BinnedForce, PadMotion
+from bayeskin.pipeline.taking_up import FullResult, Remainder, TakenUp
+from bayeskin.types import Array, BinnedForce, PadMotion, Parameter
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A fit as it is drawn.
+
+    force_n (m,) : the full model's where there is a run, else the surrogate's; band_n : edges of the
+    predictive band of 90 %, (m,) each; held_out_n (m,) : as force_n, of a fit to the beginning, None where
+    there is none; located : windows that it leaves; values : summaries of its parameters
+    """
+
+    force_n: Array
+    band_n: tuple[Array, Array]
+    held_out_n: Array | None
+    located: Located
+    values: Mapping[str, Mapping[str, Any]]
+
+
+def shown(found: Fit, taken: TakenUp, begun: Fit | None, held_out: FullResult) -> Shown:
+    """Of a fit, what follows it, and the same of the recording's beginning."""
+    held_out_n = None if begun is None else _full_or_fit(held_out, begun)
+    force_n = _full_or_fit(taken.full, found)
+    return Shown(force_n, taken.band_n, held_out_n, taken.located, taken.draws.summary)
+
+
+def _full_or_fit(full: FullResult, found: Fit) -> Array:
+    return full.force_n if isinstance(full, FullFit) else found.force_n
 
 
 @dataclass(frozen=True)
 class Found:
-    """What is known of a mismatch: sets tried, residuals without and with the best, its parts of the force.
+    """What is drawn of a mismatch: fits without and with the best set, what that has of the force.
 
-    full : the full model without and with the best; remainder : None where the verdict leaves nothing to
-    describe
+    split_s : until when what is `held_out_n` was fitted; base : parameters of the model without mechanisms;
+    remainder : None where the verdict leaves nothing to describe
     """
 
-    search: Search
-    full: Sequence[FullResult]
-    before: Located
-    after: Located
+    before: Shown
+    after: Shown
+    split_s: float | None
+    base: Sequence[Parameter]
     parts: Sequence[Contribution]
     remainder: Remainder | None
 
@@ -110,12 +137,13 @@ def draw(
     candidates: Sequence[Mapping[str, Any]],
 ) -> list[Path]:  # fmt: skip
     """Writes the figures into a folder, the run in their metadata; returns their paths."""
-    before_n, after_n = _full_or_fit(found)
+    before, after = found.before, found.after
     figures = {
-        "located": report.figure_located(binned, motion, found.before, before_n),
+        "located": report.figure_located(binned, motion, before.located, before.force_n),
         "candidates": report.figure_candidates(candidates),
-        "before_after": report.figure_before_after(binned, motion, before_n, after_n),
-        "residual_by_phase": report.figure_residual_by_phase(binned, motion, found.before, found.after),
+        "before_after": report.figure_before_after(binned, motion, before, after, found.split_s),
+        "residual_by_phase": report.figure_residual_by_phase(binned, motion, before.located, after.located),
+        "base_parameters": report.figure_base_parameters(found.base, before.values, after.values),
     }
     if found.parts:
         figures["contributions"] = report.figure_contributions(binned, motion, found.parts)
@@ -126,13 +154,6 @@ def draw(
         for name, figure in figures.items()
         for path in report.save_figure(figure, folder / name, made_by)
     ]
-
-
-def _full_or_fit(found: Found) -> list[Array]:
-    """Forces (m,) before and after: the full model's where there is a run, else the fit's."""
-    fits = (found.search.base.force_n, found.search.best.force_n)
-    pairs = zip(found.full, fits, strict=True)
-    return [full.force_n if isinstance(full, FullFit) else fit for full, fit in pairs]
 
 
 def in_words(answer: Mapping[str, Any]) -> str:

@@ -63,7 +63,7 @@ class TakenUp:
     """What follows a search's fit on the whole recording.
 
     full : the full model's fit; full_weight : logarithm of the set's weight by it, None without that;
-    draws : of the posterior; coverage90 : share of bins in its predictive band;
+    draws : of the posterior; band_n : edges of its predictive band of 90 %, (m,) each;
     left_out_n : RMS error of phases that the fit is made without, None where there is but one;
     evidence : of the best run, with the noise that is no mismatch; located : windows that it leaves;
     parts : what each mechanism contributes; remainder : what is left
@@ -72,7 +72,7 @@ class TakenUp:
     full: FullResult
     full_weight: float | None
     draws: Resampled
-    coverage90: float
+    band_n: tuple[Array, Array]
     left_out_n: float | None
     evidence: Evidence
     located: Located
@@ -146,7 +146,7 @@ def _whole_apart(
     some = inference.evenly(draws.draws, PREDICTIVE_DRAWS)
     bands = inference.bands(found.log_posterior, some, np.random.default_rng(seed))
     return TakenUp(
-        full, full_weight, draws, inference.coverage(bench.binned, *bands.interval(0.9)),
+        full, full_weight, draws, bands.interval(0.9),
         _left_out(sure, shear), Evidence(left.without_log_evidence, left.log_evidence),
         locate(there, noise, seed),
         tuple(contributions(found.names, found.theta, force, bench.known)),

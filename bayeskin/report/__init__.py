@@ -5,6 +5,7 @@ from bayeskin.report.discrepancy import figure_discrepancy, figure_experiments
 from bayeskin.report.fields import SurfaceField, figure_fields
 from bayeskin.report.fit import figure_fit
 from bayeskin.report.mismatch import (
+    figure_base_parameters,
     figure_before_after,
     figure_candidates,
     figure_contributions,
@@ -25,6 +26,7 @@ from bayeskin.report.waves import figure_waves
 
 __all__ = [
     "SurfaceField",
+    "figure_base_parameters",
     "figure_before_after",
     "figure_candidates",
     "figure_contributions",

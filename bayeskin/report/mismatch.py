@@ -16,19 +16,25 @@ from bayeskin.report.style import (
     ACCENT,
     FAINT,
     GREY,
+    INK,
     MODEL,
     PAGE_IN,
     RECORDED,
+    axis_values,
+    list_symbols,
     new_figure,
     panel_title,
+    parameter_label,
     plain_log,
     state_finding,
     styled,
 )
 from bayeskin.report.timeline import PHASE_COLORS, phase_legend, shade_phases
-from bayeskin.types import Array, BinnedForce, PadMotion, Phase, PhaseKind
+from bayeskin.types import Array, BinnedForce, PadMotion, Parameter, Phase, PhaseKind
 
+Summaries = Mapping[str, Mapping[str, Any]]  # of parameters by name: mean, interval90
 Z90 = 1.645
+BAND = "#B9D6EA"  # about what is drawn in MODEL
 BELOW = "#882255"  # windows where the recorded force is below what the model allows; above: ACCENT
 WORDS: dict[PhaseKind, str] = {
     "load": "while loading", "unload": "while unloading", "hold": "in holds", "rest": "at rest",
@@ -53,6 +59,17 @@ class _Contribution(Protocol):
     def force_n(self) -> Array: ...
     @property
     def size_n(self) -> float: ...
+
+
+class _Shown(Protocol):
+    """A fit: its force (m,), the predictive band's edges and the force of a fit to the beginning alone."""
+
+    @property
+    def force_n(self) -> Array: ...
+    @property
+    def band_n(self) -> tuple[Array, Array]: ...
+    @property
+    def held_out_n(self) -> Array | None: ...
 
 
 class _Located(Protocol):
@@ -156,33 +173,141 @@ def figure_candidates(candidates: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 @styled
-def figure_before_after(binned: BinnedForce, motion: PadMotion, before_n: Array, after_n: Array) -> Figure:
-    """Force and residual over time and force over displacement, without and with the best set; (m,) each."""
-    figure = new_figure(PAGE_IN, 4.2)
-    grid = figure.add_gridspec(2, 2, width_ratios=(1.9, 1))
+def figure_before_after(
+    binned: BinnedForce, motion: PadMotion, before: _Shown, after: _Shown, split_s: float | None
+) -> Figure:
+    """Force and residual over time and force over displacement, without and with the best set.
+
+    split_s : until when fits to the beginning alone were fitted, None where there are none
+    """
+    held_out = split_s is not None and before.held_out_n is not None and after.held_out_n is not None
+    rows = 3 if held_out else 2
+    figure = new_figure(PAGE_IN, 1.5 + 1.4 * rows)
+    grid = figure.add_gridspec(rows, 2, width_ratios=(1.9, 1))
     force = figure.add_subplot(grid[0, 0])
     residual = figure.add_subplot(grid[1, 0], sharex=force)
-    loops = figure.add_subplot(grid[:, 1])
+    loops = figure.add_subplot(grid[:2, 1])
     time_s, displacement_mm = binned.time_s, 1e3 * motion.at(binned.time_s)
-    force.plot(time_s, 1e3 * binned.force_n, ".", ms=1.5, color=RECORDED, label="recorded")
-    loops.plot(displacement_mm, 1e3 * binned.force_n, ".", ms=1.5, color=RECORDED)
-    for values, color, label in ((before_n, GREY, "before"), (after_n, MODEL, "after")):
-        force.plot(time_s, 1e3 * values, color=color, lw=0.9, label=label)
-        residual.plot(time_s, 1e3 * (binned.force_n - values), color=color, lw=0.8)
-        loops.plot(displacement_mm, 1e3 * values, color=color, lw=0.8)
-    for ax in (force, residual):
+    recorded = {"ls": "none", "marker": ".", "ms": 1.5, "color": RECORDED}
+    low_n, high_n = after.band_n
+    force.fill_between(time_s, 1e3 * low_n, 1e3 * high_n, color=BAND, lw=0, label="its 90 % band")
+    left = (1e3 * (low_n - after.force_n), 1e3 * (high_n - after.force_n))
+    residual.fill_between(time_s, *left, color=BAND, lw=0)
+    force.plot(time_s, 1e3 * binned.force_n, label="recorded", **recorded)  # type: ignore[arg-type]
+    loops.plot(displacement_mm, 1e3 * binned.force_n, **recorded)  # type: ignore[arg-type]
+    for one, color, label in ((before, GREY, "before"), (after, MODEL, "after")):
+        force.plot(time_s, 1e3 * one.force_n, color=color, lw=0.9, label=label)
+        residual.plot(time_s, 1e3 * (binned.force_n - one.force_n), color=color, lw=0.8)
+        loops.plot(displacement_mm, 1e3 * one.force_n, color=color, lw=0.8)
+    over_time = [force, residual]
+    if split_s is not None and held_out:
+        over_time.append(figure.add_subplot(grid[2, 0], sharex=force))
+        _draw_held_out(
+            over_time[-1], figure.add_subplot(grid[2, 1]), binned, motion, (before, after), split_s
+        )
+    for ax in over_time:
         shade_phases(ax, binned.phases, cycles=ax is force)
+        ax.tick_params(labelbottom=ax is over_time[-1])
     force.margins(y=0.14)  # room for the cycles' names
-    _key_above(force)
-    force.tick_params(labelbottom=False)
+    handles, labels = force.get_legend_handles_labels()
+    order = [labels.index(label) for label in ("recorded", "before", "after", "its 90 % band")]
+    force.legend(
+        [handles[i] for i in order], [labels[i] for i in order], loc="lower right", bbox_to_anchor=(1.0, 1.0),
+        ncols=4, borderaxespad=0.2,
+    )  # fmt: skip
     force.set_ylabel("force [mN]")
-    residual.set(xlabel="time [s]", ylabel="recorded − model [mN]")
+    residual.set_ylabel("recorded − model [mN]")
+    over_time[-1].set_xlabel("time [s]")
     loops.set(xlabel="displacement [mm]", ylabel="force [mN]")
-    for ax, letter in zip((force, residual, loops), "abc", strict=True):
-        panel_title(ax, letter)
-    rms = [1e3 * float(np.sqrt(np.nanmean((binned.force_n - values) ** 2))) for values in (before_n, after_n)]
-    state_finding(figure, f"RMS residual {rms[0]:.1f} mN before, {rms[1]:.1f} mN after", "")
+    inside = [100.0 * _share(binned, one.band_n) for one in (before, after)]
+    panel_title(force, "a")
+    panel_title(residual, "b", "in the 90 % bands: {:.0f} → {:.0f} % of bins".format(*inside))
+    panel_title(loops, "c")
+    rms = [_rms_mn(binned.force_n - one.force_n) for one in (before, after)]
+    state_finding(
+        figure,
+        "RMS residual {:.1f} mN before, {:.1f} mN after".format(*rms),
+        "Before: the base model's best fit. After: that with the best set of mechanisms. Bands: predictive, "
+        "noise and all."
+        + (" d, e: both, chosen and fitted up to the dashed line alone." if held_out else ""),
+    )
     return figure
+
+
+def _draw_held_out(
+    over_time: Axes,
+    loops: Axes,
+    binned: BinnedForce,
+    motion: PadMotion,
+    both: Sequence[_Shown],
+    split_s: float,
+) -> None:
+    """What fits to the beginning leave, over time, and of the rest over displacement."""
+    rest = binned.time_s > split_s
+    sizes = []
+    for one, color in zip(both, (GREY, MODEL), strict=True):
+        assert one.held_out_n is not None
+        left_n = binned.force_n - one.held_out_n
+        over_time.plot(binned.time_s, 1e3 * left_n, color=color, lw=0.8)
+        loops.plot(1e3 * motion.at(binned.time_s[rest]), 1e3 * left_n[rest], ".", ms=1.5, color=color)
+        sizes.append(_rms_mn(left_n[rest]))
+    over_time.axvline(split_s, color=INK, lw=0.8, ls="--")
+    over_time.set_ylabel("recorded − model [mN]")
+    loops.set(xlabel="displacement [mm]", ylabel="recorded − model [mN]")
+    panel_title(
+        over_time, "d", "fitted up to {:.0f} s; beyond that {:.1f} → {:.1f} mN RMS".format(split_s, *sizes)
+    )
+    panel_title(loops, "e", "what was not fitted")
+
+
+def _share(binned: BinnedForce, band_n: tuple[Array, Array]) -> float:
+    """Of recorded bins, those in a band."""
+    usable = np.isfinite(binned.force_n)
+    return float(np.mean(((binned.force_n >= band_n[0]) & (binned.force_n <= band_n[1]))[usable]))
+
+
+def _rms_mn(values_n: Array) -> float:
+    return 1e3 * float(np.sqrt(np.nanmean(values_n**2)))
+
+
+@styled
+def figure_base_parameters(parameters: Sequence[Parameter], before: Summaries, after: Summaries) -> Figure:
+    """Posterior mean and 90 % interval of each of the base's parameters, without and with the best set."""
+    figure = new_figure(PAGE_IN, 1.0 + 0.42 * len(parameters))
+    panels = np.atleast_1d(figure.subplots(len(parameters), 1))
+    moved = []
+    for ax, parameter in zip(panels, parameters, strict=True):
+        for place, said, color in ((1, before, GREY), (0, after, MODEL)):
+            one = said[parameter.name]
+            low, mean, high = axis_values(
+                parameter, [one["interval90"][0], one["mean"], one["interval90"][1]]
+            )
+            ax.plot([low, high], [place, place], color=color, lw=2.0, solid_capstyle="butt")
+            ax.plot(mean, place, "o", ms=3.0, color=color)
+        ax.set_xlim(*axis_values(parameter, [parameter.lower, parameter.upper]))
+        ax.set_ylim(-0.7, 1.7)
+        ax.set_yticks([])
+        ax.spines["left"].set_visible(False)
+        ax.set_ylabel(parameter_label(parameter), rotation=0, ha="right", va="center")
+        if not _overlap(before[parameter.name], after[parameter.name]):
+            moved.append(parameter.name)
+    handles = [Line2D([], [], color=GREY, label="before"), Line2D([], [], color=MODEL, label="after")]
+    panels[0].legend(
+        handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.2
+    )
+    leave = "leaves its interval" if len(moved) == 1 else "leave their intervals"
+    state_finding(
+        figure,
+        f"{list_symbols(moved)} {leave}" if moved else "No parameter of the base leaves its interval",
+        "Posterior means and 90 % intervals without and with the best set of mechanisms. Axes: the prior's "
+        "range.",
+    )
+    return figure
+
+
+def _overlap(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    (low, high), (its_low, its_high) = one["interval90"], other["interval90"]
+    return bool(low <= its_high and its_low <= high)
 
 
 @styled

@@ -78,7 +78,12 @@ _KNOWN = {
     ),
     ("diagnose", "before_after"): (
         "The fit before and after",
-        "Force and residual over time and force over displacement, without and with the mechanisms found.",
+        "Force and residual over time and force over displacement, without and with the mechanisms found; "
+        "the predictive band, and what fits to the beginning leave of the rest.",
+    ),
+    ("diagnose", "base_parameters"): (
+        "What becomes of the base's parameters",
+        "Posterior means and 90 % intervals of the base's parameters, without and with the mechanisms found.",
     ),
     ("diagnose", "residual_by_phase"): (
         "The residual by phase",
