@@ -334,7 +334,7 @@ def test_the_page_of_the_recording_says_what_the_diagnosis_says(benchmark):
     whole = page.fits(answer)
     assert f"{1e3 * after['full_model']['rmse']:.1f} mN | 12 mN |" in whole
     assert f"{1e3 * after['full_model']['rmse_held_out']:.1f} mN | 18 mN |" in whole
-    assert whole.count("12 mN") == whole.count("18 mN") == 1
+    assert whole.count("| 12 mN |") == whole.count("| 18 mN |") == 1
     alone = {when: {**answer["fit"][when], "full_model": None} for when in ("before", "after")}
     surrogate = page.fits({**answer, "fit": alone})
     assert f"{1e3 * after['rmse']:.1f} mN | 12 mN |" in surrogate
