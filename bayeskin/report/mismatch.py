@@ -12,6 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from bayeskin import inference
+from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.report.style import (
     ACCENT,
     FAINT,
@@ -134,7 +136,7 @@ def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, fo
 
 def _key_above(ax: Axes) -> None:
     """The key over the axes at the right, where it hides nothing."""
-    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.2)
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.2)
 
 
 @styled
@@ -180,27 +182,24 @@ def figure_before_after(
 
     split_s : until when fits to the beginning alone were fitted, None where there are none
     """
-    held_out = split_s is not None and before.held_out_n is not None and after.held_out_n is not None
-    rows = 3 if held_out else 2
+    rows = 2 if split_s is None else 3
     figure = new_figure(PAGE_IN, 1.5 + 1.4 * rows)
     grid = figure.add_gridspec(rows, 2, width_ratios=(1.9, 1))
     force = figure.add_subplot(grid[0, 0])
     residual = figure.add_subplot(grid[1, 0], sharex=force)
     loops = figure.add_subplot(grid[:2, 1])
     time_s, displacement_mm = binned.time_s, 1e3 * motion.at(binned.time_s)
-    recorded = {"ls": "none", "marker": ".", "ms": 1.5, "color": RECORDED}
-    low_n, high_n = after.band_n
-    force.fill_between(time_s, 1e3 * low_n, 1e3 * high_n, color=BAND, lw=0, label="its 90 % band")
-    left = (1e3 * (low_n - after.force_n), 1e3 * (high_n - after.force_n))
-    residual.fill_between(time_s, *left, color=BAND, lw=0)
-    force.plot(time_s, 1e3 * binned.force_n, label="recorded", **recorded)  # type: ignore[arg-type]
-    loops.plot(displacement_mm, 1e3 * binned.force_n, **recorded)  # type: ignore[arg-type]
+    force.plot(time_s, 1e3 * binned.force_n, ".", ms=1.5, color=RECORDED, label="recorded")
+    loops.plot(displacement_mm, 1e3 * binned.force_n, ".", ms=1.5, color=RECORDED)
     for one, color, label in ((before, GREY, "before"), (after, MODEL, "after")):
         force.plot(time_s, 1e3 * one.force_n, color=color, lw=0.9, label=label)
         residual.plot(time_s, 1e3 * (binned.force_n - one.force_n), color=color, lw=0.8)
         loops.plot(displacement_mm, 1e3 * one.force_n, color=color, lw=0.8)
+    for ax, zero_n in ((force, 0.0), (residual, after.force_n)):
+        low_mn, high_mn = (1e3 * (edge_n - zero_n) for edge_n in after.band_n)
+        ax.fill_between(time_s, low_mn, high_mn, color=BAND, lw=0, zorder=0.5, label="its 90 % band")
     over_time = [force, residual]
-    if split_s is not None and held_out:
+    if split_s is not None:
         over_time.append(figure.add_subplot(grid[2, 0], sharex=force))
         _draw_held_out(
             over_time[-1], figure.add_subplot(grid[2, 1]), binned, motion, (before, after), split_s
@@ -209,27 +208,21 @@ def figure_before_after(
         shade_phases(ax, binned.phases, cycles=ax is force)
         ax.tick_params(labelbottom=ax is over_time[-1])
     force.margins(y=0.14)  # room for the cycles' names
-    handles, labels = force.get_legend_handles_labels()
-    order = [labels.index(label) for label in ("recorded", "before", "after", "its 90 % band")]
-    force.legend(
-        [handles[i] for i in order], [labels[i] for i in order], loc="lower right", bbox_to_anchor=(1.0, 1.0),
-        ncols=4, borderaxespad=0.2,
-    )  # fmt: skip
+    _key_above(force)
     force.set_ylabel("force [mN]")
     residual.set_ylabel("recorded − model [mN]")
     over_time[-1].set_xlabel("time [s]")
     loops.set(xlabel="displacement [mm]", ylabel="force [mN]")
-    inside = [100.0 * _share(binned, one.band_n) for one in (before, after)]
+    inside = [100.0 * inference.coverage(binned, *one.band_n) for one in (before, after)]
     panel_title(force, "a")
     panel_title(residual, "b", "in the 90 % bands: {:.0f} → {:.0f} % of bins".format(*inside))
     panel_title(loops, "c")
-    rms = [_rms_mn(binned.force_n - one.force_n) for one in (before, after)]
+    rms = [1e3 * inference.rmse(binned, one.force_n).whole_n for one in (before, after)]
     state_finding(
         figure,
         "RMS residual {:.1f} mN before, {:.1f} mN after".format(*rms),
         "Before: the base model's best fit. After: that with the best set of mechanisms. Bands: predictive, "
-        "noise and all."
-        + (" d, e: both, chosen and fitted up to the dashed line alone." if held_out else ""),
+        "noise and all." + (" d, e: both, chosen and fitted up to the dashed line alone." if split_s else ""),
     )
     return figure
 
@@ -243,31 +236,21 @@ def _draw_held_out(
     split_s: float,
 ) -> None:
     """What fits to the beginning leave, over time, and of the rest over displacement."""
-    rest = binned.time_s > split_s
+    rest = [(split_s, float(binned.edges_s[-1]))]
+    bins = bins_in_windows(binned, rest) >= 0
     sizes = []
     for one, color in zip(both, (GREY, MODEL), strict=True):
         assert one.held_out_n is not None
         left_n = binned.force_n - one.held_out_n
         over_time.plot(binned.time_s, 1e3 * left_n, color=color, lw=0.8)
-        loops.plot(1e3 * motion.at(binned.time_s[rest]), 1e3 * left_n[rest], ".", ms=1.5, color=color)
-        sizes.append(_rms_mn(left_n[rest]))
+        loops.plot(1e3 * motion.at(binned.time_s[bins]), 1e3 * left_n[bins], ".", ms=1.5, color=color)
+        sizes.append(1e3 * inference.rmse(binned, one.held_out_n, rest).by_window_n[0])
     over_time.axvline(split_s, color=INK, lw=0.8, ls="--")
     over_time.set_ylabel("recorded − model [mN]")
     loops.set(xlabel="displacement [mm]", ylabel="recorded − model [mN]")
-    panel_title(
-        over_time, "d", "fitted up to {:.0f} s; beyond that {:.1f} → {:.1f} mN RMS".format(split_s, *sizes)
-    )
+    title = "fitted up to {:.0f} s; beyond that {:.1f} → {:.1f} mN RMS".format(split_s, *sizes)
+    panel_title(over_time, "d", title)
     panel_title(loops, "e", "what was not fitted")
-
-
-def _share(binned: BinnedForce, band_n: tuple[Array, Array]) -> float:
-    """Of recorded bins, those in a band."""
-    usable = np.isfinite(binned.force_n)
-    return float(np.mean(((binned.force_n >= band_n[0]) & (binned.force_n <= band_n[1]))[usable]))
-
-
-def _rms_mn(values_n: Array) -> float:
-    return 1e3 * float(np.sqrt(np.nanmean(values_n**2)))
 
 
 @styled
