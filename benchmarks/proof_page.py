@@ -1,15 +1,16 @@
-"""The scoreboard of the shipped proof as tables of docs/mismatch.md, and its figure.
+"""The scoreboards of the shipped proof and of the sets beside it as tables of docs/mismatch.md, and figures.
 
     python benchmarks/proof_page.py
 
-Scores the stored verdicts (`bayeskin prove --at-most 0`), diagnoses nothing, and writes between the markers
-of the page.
+Scores the stored verdicts (`bayeskin prove FOLDER --at-most 0`), diagnoses nothing, and writes between the
+markers of the page.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,13 @@ from demo_gallery import FIGURES, smaller
 
 from bayeskin.pipeline.engine import Silent
 from bayeskin.pipeline.proof import prove
+from bayeskin.proof.score import share
+from bayeskin.report import half_in_words
 
-PAGE = Path(__file__).parents[1] / "docs" / "mismatch.md"
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "mismatch.md"
+PROOF, NOTHING, SIZES = (ROOT / "data" / name for name in ("proof", "nothing", "sizes"))
+CLEAR = 3.0  # of the floor
 SHARES = (
     ("false alarms where nothing is concealed", ("false_alarms",), "at most 5 %"),
     ("clear effects named right", ("named", "clear"), "90 %"),
@@ -99,6 +105,41 @@ def each(board: Mapping[str, Any]) -> str:
     return rows.markdown(("concealed", "size [noise floors]", "named", ""), table)
 
 
+def nothing(boards: Mapping[str, Mapping[str, Any]]) -> str:
+    """False alarms and the base's parameters where nothing is concealed, set by set and all together."""
+    empty = {
+        name: [one for one in board["each"] if one["kind"] == "nothing"] for name, board in boards.items()
+    }
+    empty["together"] = list(chain.from_iterable(empty.values()))
+    table = []
+    for name, some in empty.items():
+        alarms = share(one["answer"] != "nothing-missing" for one in some)
+        inside = [hit for one in some for hit in one["inside_base"].values()]
+        table.append([
+            name, f"{alarms['hits']} of {alarms['of']}",
+            f"{100 * alarms['low']:.0f} to {100 * alarms['high']:.0f} %",
+            f"{sum(inside)} of {len(inside)}, {100 * np.mean(inside):.0f} %",
+        ])  # fmt: skip
+    return rows.markdown(("", "false alarms", "90 % interval", "base's parameters in 90 % intervals"), table)
+
+
+def sizes(board: Mapping[str, Any]) -> str:
+    """Of each mechanism how many are named right, and how large an effect has to be."""
+    table = []
+    for name, one in board["by_mechanism"].items():
+        answers = list(zip(one["sizes"], one["right"], one["up_to"], strict=True))
+        clear = [right for size, right, _ in answers if size >= CLEAR]
+        below = [right for size, right, _ in answers if size < CLEAR]
+        alike = sum(up_to and not right for _, right, up_to in answers)
+        table.append([
+            name, f"{min(one['sizes']):.1f} to {max(one['sizes']):.1f}", f"{sum(clear)} of {len(clear)}",
+            f"{sum(below)} of {len(below)}", str(alike), half_in_words(one).removeprefix("half: "),
+        ])  # fmt: skip
+    head = ("", "sizes [noise floors]", "clear, named right", "smaller, named right", "a look-alike named",
+            "half are named at")  # fmt: skip
+    return rows.markdown(head, table)
+
+
 def _worth(one: Mapping[str, Any]) -> str:
     if one["kind"] == "outside":
         return "right" if one["answer"] == "unknown" else ("missed" if not one["named"] else "wrong")
@@ -118,16 +159,26 @@ def _at(board: Mapping[str, Any], path: Sequence[str]) -> Mapping[str, Any]:
 
 
 def main() -> None:
-    made = prove(None, Silent(), at_most=0)
-    folder = Path(made["folder"])
-    seconds = {
-        path.stem: json.loads(path.read_text())["answer"]["seconds"]
-        for path in sorted((folder / "verdicts").glob("*.json"))
-    }
-    for name, table in (("proof", scores(made["scoreboard"], seconds)), ("each", each(made["scoreboard"]))):
+    made = {folder.name: prove(folder, Silent(), at_most=0) for folder in (PROOF, NOTHING, SIZES)}
+    boards = {name: one["scoreboard"] for name, one in made.items()}
+    proof, every = boards[PROOF.name], {}
+    for folder in (PROOF, SIZES):
+        every[folder.name] = {
+            path.stem: json.loads(path.read_text())["answer"]["seconds"]
+            for path in sorted((folder / "verdicts").glob("*.json"))
+        }
+    for name, table in (
+        ("proof", scores(proof, every[PROOF.name])),
+        ("each", each(proof)),
+        ("nothing", nothing({name: boards[name] for name in (PROOF.name, NOTHING.name)})),
+        ("sizes", sizes(boards[SIZES.name])),
+        ("sizes-scores", scores(boards[SIZES.name], every[SIZES.name])),
+        ("sizes-each", each(boards[SIZES.name])),
+    ):
         rows.into_docs(PAGE, name, table)
         print(table)
-    smaller(folder / "scoreboard.png", FIGURES / "proof.png")
+    smaller(PROOF / "scoreboard.png", FIGURES / "proof.png")
+    smaller(SIZES / "detectability.png", FIGURES / "detectability.png")
 
 
 if __name__ == "__main__":

@@ -126,7 +126,11 @@ def _kept(
         with locked(folder):
             _record(folder, sources, current, board)
             stamp = f"bayeskin {bayeskin.__version__}, {folder.name}"
-            return report.save_figure(report.figure_proof(board), folder / "scoreboard", stamp)
+            figures = [*report.save_figure(report.figure_proof(board), folder / "scoreboard", stamp)]
+            if board["by_mechanism"]:
+                curves = report.figure_detectability(board["by_mechanism"])
+                figures += report.save_figure(curves, folder / "detectability", stamp)
+            return figures
     except InputError as error:
         reporter.log(f"{error}: neither figure nor scoring is kept")
     except OSError as error:  # a set that came with an installation

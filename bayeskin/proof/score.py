@@ -21,6 +21,7 @@ import numpy as np
 from scipy.stats import norm
 
 from bayeskin.mechanisms import catalogue
+from bayeskin.proof.curves import FEWEST, curve
 from bayeskin.proof.noise import floor_after
 from bayeskin.proof.protocol import EDGES_S, HELD_OUT_FROM_S
 
@@ -96,10 +97,7 @@ def score(keys: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Mapping[s
         },
         "confusion": confusion(found),
         "detectability": detectability(inside),
-        "by_mechanism": {
-            name: detectability([one for one in inside if one.label == name])
-            for name in sorted({one.label for one in inside if one.kind == "alone"})
-        },
+        "by_mechanism": by_mechanism([one for one in inside if one.kind == "alone"]),
         "each": [_row(one) for one in found],
     }
 
@@ -273,6 +271,18 @@ def detectability(found: Sequence[Judged]) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def by_mechanism(alone: Sequence[Judged]) -> dict[str, dict[str, Any]]:
+    """Of each mechanism that is concealed by itself often enough: every answer by size, and their curve."""
+    found = {}
+    for name in sorted({one.label for one in alone}):
+        some = sorted((one for one in alone if one.label == name), key=lambda one: one.size)
+        if len(some) >= FEWEST:
+            sizes, right = [one.size for one in some], [one.right for one in some]
+            up_to = [one.right_group for one in some]
+            found[name] = {"sizes": sizes, "right": right, "up_to": up_to, "curve": curve(sizes, right)}
+    return found
 
 
 def _row(one: Judged) -> dict[str, Any]:

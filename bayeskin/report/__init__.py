@@ -15,7 +15,7 @@ from bayeskin.report.mismatch import (
 from bayeskin.report.posterior import figure_posterior
 from bayeskin.report.prior import figure_prior_predictive
 from bayeskin.report.profiles import figure_profiles
-from bayeskin.report.proof import figure_proof
+from bayeskin.report.proof import figure_detectability, figure_proof, half_in_words
 from bayeskin.report.recording import figure_recording
 from bayeskin.report.residuals import figure_residuals
 from bayeskin.report.save import save_figure
@@ -30,6 +30,7 @@ __all__ = [
     "figure_before_after",
     "figure_candidates",
     "figure_contributions",
+    "figure_detectability",
     "figure_discrepancy",
     "figure_experiments",
     "figure_fields",
@@ -48,5 +49,6 @@ __all__ = [
     "figure_traces",
     "figure_validation",
     "figure_waves",
+    "half_in_words",
     "save_figure",
 ]

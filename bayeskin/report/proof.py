@@ -47,6 +47,64 @@ def figure_proof(board: Mapping[str, Any]) -> Figure:
     return figure
 
 
+@styled
+def figure_detectability(mechanisms: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """Each answer by size, and the share named with its 90 % band, of each mechanism of a scoreboard."""
+    columns = min(len(mechanisms), 3)
+    rows = -(-len(mechanisms) // columns)
+    figure = new_figure(PAGE_IN, 1.3 + 1.7 * rows)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for ax in grid.flat[len(mechanisms) :]:
+        ax.remove()
+    for ax, (name, one) in zip(grid.flat, mechanisms.items(), strict=False):
+        _draw_curve(ax, one)
+        ax.set_title(f"{name}\n{half_in_words(one)}", linespacing=1.3)
+    for ax in grid[-1]:
+        ax.set_xlabel("size [noise floors]")
+    for ax in grid[:, 0]:
+        ax.set_ylabel("share named right")
+    right = [answer for one in mechanisms.values() for answer in one["right"]]
+    state_finding(
+        figure,
+        f"How large an effect has to be to be named: {sum(right)} of {len(right)} are",
+        "Each mark is one recording: dots named right, squares a look-alike named, crosses neither. Curve: "
+        "logistic in the logarithm of size, mean and 90 % band of its posterior. Half: the size at which "
+        "half are named, with its 90 % interval. Size: what remains of the effect after the base model's "
+        "best refit, over the noise floor of 0.5 s means; dotted: 3.",
+    )
+    return figure
+
+
+def _draw_curve(ax: Axes, one: Mapping[str, Any]) -> None:
+    at, curve = np.array(one["curve"]["at"]), one["curve"]
+    ax.fill_between(at, curve["low"], curve["high"], color=MODEL, alpha=0.18)
+    ax.plot(at, curve["mean"], color=MODEL)
+    sizes, right = np.array(one["sizes"]), np.array(one["right"], bool)
+    alike = np.array(one["up_to"], bool) & ~right
+    for of, place, marker, color in (
+        (right, 1.0, "o", INK),
+        (alike, 0.0, "s", GREY),
+        (~right & ~alike, 0.0, "x", ACCENT),
+    ):
+        ax.plot(sizes[of], np.full(of.sum(), place), marker, ls="none", color=color)
+    ax.axvline(3.0, color=ACCENT, lw=0.6, ls=":")
+    ax.set_xscale("log")
+    ax.set(xlim=(at[0], at[-1]), ylim=(-0.05, 1.05))
+    plain_log(ax.xaxis)
+
+
+def half_in_words(one: Mapping[str, Any]) -> str:
+    """The size at which half are named, no further than there were recordings."""
+    half, least, largest = one["curve"]["half"], min(one["sizes"]), max(one["sizes"])
+    if half["median"] > largest:
+        return f"half: above {max(half['low'], least):.1f}"
+    if half["median"] < least:
+        return f"half: below {min(half['high'], largest):.1f}"
+    low = f"below {least:.1f}" if half["low"] < least else f"{half['low']:.1f}"
+    high = f"above {largest:.1f}" if half["high"] > largest else f"{half['high']:.1f}"
+    return f"half: {half['median']:.1f} ({low} to {high})"
+
+
 def _finding(board: Mapping[str, Any]) -> str:
     named, alarms = board["named_up_to_look_alikes"]["clear"], board["false_alarms"]
     return (

@@ -1,0 +1,55 @@
+"""How large an effect has to be to be named: a curve through single answers, each yes or no.
+
+The share named at a size s is
+
+    p(s) = 1 / (1 + exp(-(ln s - ln m) / w)) ,
+
+m the size at which half are named and w how slowly the share rises. Both are summed over on a grid, ln m with
+a uniform prior and w with a log-uniform one, so that few answers leave a wide curve and none is given that
+they do not bear. Kuss, Jakel & Wichmann, J. Vision 5 (2005), 478-492.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+FEWEST = 4  # answers, from which on a curve is drawn
+HALF = np.exp(np.linspace(np.log(0.1), np.log(300.0), 401))  # m, of the floor
+WIDTH = np.exp(np.linspace(np.log(0.05), np.log(1.5), 41))  # w
+AT = np.exp(np.linspace(np.log(0.5), np.log(40.0), 41))  # sizes at which the curve is given
+LOW, HIGH = 0.05, 0.95
+
+
+def curve(sizes: Sequence[float], named: Sequence[bool]) -> dict[str, Any]:
+    """The share named by size, of answers at sizes (n,) of the floor: `at`, and there its `mean`, `low` and
+    `high` (90 %); `half`, the size at which half are named, as median, `low` and `high`."""
+    log_p, log_q = _logs(np.asarray(sizes, dtype=float))
+    yes = np.asarray(named, dtype=bool)
+    density = np.where(yes, log_p, log_q).sum(axis=2)
+    weight = np.exp(density - density.max())
+    weight /= weight.sum()
+    share = np.exp(_logs(AT)[0])
+    ends = np.array([_quantiles(share[:, :, i], weight, (LOW, HIGH)) for i in range(len(AT))])
+    half = _quantiles(np.broadcast_to(HALF[:, None], weight.shape), weight, (LOW, 0.5, HIGH))
+    return {
+        "at": AT.tolist(),
+        "mean": np.tensordot(weight, share, axes=2).tolist(),
+        "low": ends[:, 0].tolist(),
+        "high": ends[:, 1].tolist(),
+        "half": dict(zip(("low", "median", "high"), half, strict=True)),
+    }
+
+
+def _logs(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Logarithms of p and of 1 - p, (m, w, n)."""
+    z = (np.log(sizes) - np.log(HALF)[:, None, None]) / WIDTH[None, :, None]
+    return -np.logaddexp(0.0, -z), -np.logaddexp(0.0, z)
+
+
+def _quantiles(values: np.ndarray, weight: np.ndarray, at: Sequence[float]) -> list[float]:
+    order = np.argsort(values, axis=None)
+    reached = np.cumsum(weight.ravel()[order])
+    return [float(values.ravel()[order[np.searchsorted(reached, q * reached[-1])]]) for q in at]
