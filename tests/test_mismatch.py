@@ -766,6 +766,21 @@ def test_a_full_fit_has_in_its_force_what_its_mesh_is_wrong_by() -> None:
     np.testing.assert_allclose(found.force_n - found.mesh_n, 1.02 * right)
 
 
+@pytest.mark.parametrize(("of_sd", "there"), [(2.0, False), (30.0, True)])
+def test_what_is_allowed_for_takes_up_no_more_than_is_believed_of_it(of_sd: float, there: bool) -> None:
+    """A force that bends with displacement as a mesh's error does, by so many sd of what that may be."""
+    alone = concealing(0)
+    allowed = Discretised(Sure(alone.surrogate), toy.MOTION, 0.01)
+    factor = allowed.predict([TRUTH[n] for n in alone.surrogate.space.names]).factor[0]
+    bend = 2  # column of the factor: `Sure` has one, of no error, and the scale is the next
+    binned = dataclasses.replace(alone.binned, force_n=alone.binned.force_n + of_sd * factor[:, bend])
+    latent = np.zeros(factor.shape[1])
+    latent[bend] = min(of_sd, 3.0)
+    off = dataclasses.replace(alone, binned=binned, surrogate=allowed)
+    at = Fit((), off, {**TRUTH, **NOISE}, 0.0, 0.0, 1e-6 * np.eye(off.dim), latent)
+    assert (locate(at, at.theta, 1).chance < 0.01) == there
+
+
 def test_a_mismatch_is_located_beside_the_run_and_not_beside_what_the_surrogate_might_be() -> None:
     """A surrogate so unsure that its error could take up all that the run leaves."""
     alone = dataclasses.replace(concealing(0), noise_priors=QUIET)

@@ -18,8 +18,10 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from bayeskin.inference import LogPosterior
+from bayeskin.inference.likelihood import FARTHEST
 from bayeskin.inference.noise_model import draw_noise
 from bayeskin.mismatch.discretised import Discretised
 from bayeskin.mismatch.fit import Fit
@@ -33,6 +35,7 @@ MODEL_ERROR = 4e-4  # of the force's range
 MESH_ERROR = 1e-3  # the same
 PRIOR_PRECISION = 12.0  # of a uniform prior over the unit cube
 STEP = 1e-4  # of the unit cube, inwards, for derivatives
+EDGE = 1e-6  # of the unit cube: on a bound
 
 
 @dataclass(frozen=True)
@@ -88,11 +91,11 @@ def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
     for span, sd in zip(spans, scale, strict=True):
         centred = _means(spread, *span)
         tall = np.maximum(tall, np.abs(centred - centred.mean()) / sd)
-    tested = refitted(residual[None])
-    z = np.array([_means(tested, *span)[0] for span in spans]) / scale
+    tested = refitted(residual)
+    z = np.array([_means(tested[None], *span)[0] for span in spans]) / scale
     windows = []
     for a, b in _chosen(spans, z, float(np.quantile(tall, 1.0 - LEVEL))):
-        mean, left = float(residual[a:b].mean()), float(tested[0, a:b].mean())
+        mean, left = float(residual[a:b].mean()), float(tested[a:b].mean())
         sd = float(_means(spread, a, b).std())
         within = log_posterior.binned.phases[phase[a]]
         edges = log_posterior.binned.edges_s
@@ -123,7 +126,11 @@ def _allowed(
     found: Fit, noise: Mapping[str, float], rng: np.random.Generator
 ) -> tuple[Array, Callable[[Array], Array]]:
     """Draws (n, k) of the residual that noise, parameters and what the surrogate leaves open allow; and what
-    is left of residuals (n, k) when parameters have taken up what they can, as of the draws."""
+    is left of a residual (k,) when these have taken up what they can, as of the draws.
+
+    Of a residual they take up no more than is believed: parameters in their box, errors within `FARTHEST` sd,
+    or as far as they are. Noise alone does not bring a draw's there.
+    """
     log_posterior, chain = found.log_posterior, found.log_posterior.chain
     own = [noise[name] for name in log_posterior.names[log_posterior.surrogate.space.dim :]]
     point = log_posterior.from_sampling(log_posterior.vector(found.theta))[None]
@@ -133,24 +140,40 @@ def _allowed(
     # What parameters and the surrogate's latent error leave open is what the recording does not fix: noise,
     # seen through the fit, moves both; a fit to each draw would take that part out of it again.
     weight = 1.0 / np.maximum(drawn.var(axis=0), 1e-18)
-    design = np.concatenate([_slopes(found), best.factor[0, chain.bins]], axis=1)
+    free = _free(found)
+    unit = found.unit[free]
+    design = np.concatenate([_slopes(found, free), best.factor[0, chain.bins]], axis=1)
     prior = np.concatenate([np.full(design.shape[1] - best.factor.shape[2], PRIOR_PRECISION),
                             np.ones(best.factor.shape[2])])  # fmt: skip
     normal = (design * weight[:, None]).T @ design + np.diag(prior)
 
+    root, own = np.sqrt(weight)[:, None], np.diag(np.sqrt(prior))
+    reach = np.maximum(np.abs(found.latent), FARTHEST)
+    lower = np.concatenate([-unit, -reach - found.latent])
+    upper = np.concatenate([1.0 - unit, reach - found.latent])
+
     def refitted(residual: Array) -> Array:
-        taken = design @ np.linalg.solve(normal, (design * weight[:, None]).T @ residual.T)
-        return np.asarray(residual - taken.T)
+        taken = lsq_linear(
+            np.concatenate([root * design, own]),
+            np.concatenate([root[:, 0] * residual, np.zeros(len(prior))]),
+            (lower, upper),
+        )
+        return np.asarray(residual - design @ taken.x)
 
-    return refitted(drawn), refitted
+    taken = design @ np.linalg.solve(normal, (design * weight[:, None]).T @ drawn.T)
+    return drawn - taken.T, refitted
 
 
-def _slopes(found: Fit) -> Array:
-    """Derivatives (k, d) [N] by the material parameters that are not on a bound, over the unit cube."""
+def _free(found: Fit) -> list[int]:
+    """Which material parameters are not on a bound."""
+    inner = found.log_posterior.surrogate.space.dim
+    return [i for i in range(inner) if EDGE < found.unit[i] < 1.0 - EDGE]
+
+
+def _slopes(found: Fit, free: list[int]) -> Array:
+    """Derivatives (k, d) [N] by these parameters, over the unit cube."""
     log_posterior = found.log_posterior
     low, high = log_posterior.bounds
-    inner = log_posterior.surrogate.space.dim
-    free = [i for i in range(inner) if 1e-6 < found.unit[i] < 1.0 - 1e-6]
     if not free:
         return np.zeros((len(log_posterior.chain.bins), 0))
     step = np.where(found.unit[free] < 0.5, STEP, -STEP)
