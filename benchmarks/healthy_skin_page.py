@@ -42,6 +42,7 @@ def fits(answer: Mapping[str, Any]) -> str:
     aims = ("", "") if table else (WHOLE_MN, HELD_OUT_MN)
     table += [
         ["surrogate, RMSE over the whole recording", *_mn(both, "rmse"), aims[0]],
+        ["without what its own error takes up", *_mn(both, "rmse_of_mean"), ""],
         [f"its {' / '.join(KINDS)}", *(_by_phase(one) for one in both), ""],
         ["surrogate selected and fitted up to the end of the second hold, RMSE on the rest",
          *_mn(both, "rmse_held_out"), aims[1]],

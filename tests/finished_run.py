@@ -151,7 +151,7 @@ def summaries() -> dict[str, dict[str, Any]]:
                            {"name": "backlash", "delta_score": -1.5, "standard_error": 0.2}],
             "fit": {
                 when: {"rmse": rmse, "rmse_by_phase": {"rest": rmse}, "rmse_held_out": None,
-                       "coverage90": 0.9, "rmse_left_out": rmse,
+                       "coverage90": 0.9, "rmse_left_out": rmse, "rmse_of_mean": rmse,
                        "full_model": {"rmse": full, "rmse_by_phase": {"rest": full}, "rmse_held_out": None}}
                 for when, rmse, full in (("before", 0.08, 0.078), ("after", 0.0247, 0.0213))
             },

@@ -330,6 +330,8 @@ def test_the_page_of_the_recording_says_what_the_diagnosis_says(benchmark):
     folder = Path(__file__).parents[1] / "data" / "development" / "verdicts"
     answers = [json.loads(path.read_text())["answer"] for path in sorted(folder.glob("*.json"))]
     answer = next(one for one in answers if len(one.get("mechanisms", ())) == 2)
+    for fit in answer["fit"].values():  # these are of a state that did not tell
+        fit["rmse_of_mean"] = 1.5 * fit["rmse"]
     after = answer["fit"]["after"]
     whole = page.fits(answer)
     assert f"{1e3 * after['full_model']['rmse']:.1f} mN | 12 mN |" in whole

@@ -181,6 +181,7 @@ def test_words_say_what_is_left_only_where_something_is(remainder: Remainder) ->
     fits = {
         "rmse": 1e-3,
         "rmse_held_out": None,
+        "rmse_of_mean": 5e-3,
         "rmse_left_out": 4e-3,
         "full_model": {"rmse": 2.5e-3, "rmse_held_out": 3e-3, "fit_off_by": 4e-4, "runs": 2},
         "sampled": {"settled": True, "rhat": 1.37, "effective": 150.0},
@@ -199,6 +200,7 @@ def test_words_say_what_is_left_only_where_something_is(remainder: Remainder) ->
     rough = {**fits, "sampled": {**fits["sampled"], "settled": False}}
     assert "R-hat of the draws 1.37" in in_words({**answer, "fit": {"before": rough, "after": fits}})
     assert "each phase by a fit without it: RMSE 4.0 mN" in in_words(answer)
+    assert "without what the surrogate's own error takes up: 5.0 mN" in in_words(answer)
     said = "full model: RMSE 2.5 mN, 3.0 mN on what follows the second hold, not fitted; the surrogate's fit"
     assert f"{said} is off by 0.4 mN" in in_words(answer)
     said = unexplained(remainder)

@@ -779,6 +779,8 @@ def test_what_is_allowed_for_takes_up_no_more_than_is_believed_of_it(of_sd: floa
     off = dataclasses.replace(alone, binned=binned, surrogate=allowed)
     at = Fit((), off, {**TRUTH, **NOISE}, 0.0, 0.0, 1e-6 * np.eye(off.dim), latent)
     assert (locate(at, at.theta, 1).chance < 0.01) == there
+    np.testing.assert_allclose(at.force_n, at.mean_n + factor @ latent, atol=1e-9)
+    assert np.max(np.abs(at.force_n - at.mean_n)) > 1e-3
 
 
 def test_a_mismatch_is_located_beside_the_run_and_not_beside_what_the_surrogate_might_be() -> None:

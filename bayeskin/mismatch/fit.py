@@ -121,6 +121,12 @@ class Fit:
         return self.log_posterior.force_n(self.log_posterior.vector(self.theta), self.latent)
 
     @cached_property
+    def mean_n(self) -> Array:
+        """The surrogate's mean on all bins (m,): the force without what its own error is believed to be."""
+        values = self.log_posterior.from_sampling(self.log_posterior.vector(self.theta))
+        return np.asarray(self.log_posterior.predict_mean(values[None])[0])
+
+    @cached_property
     def unit(self) -> Array:
         """The point in the unit cube, (D,)."""
         low, high = self.log_posterior.bounds

@@ -147,14 +147,14 @@ def _allowed(
                             np.ones(best.factor.shape[2])])  # fmt: skip
     normal = (design * weight[:, None]).T @ design + np.diag(prior)
 
-    root, own = np.sqrt(weight)[:, None], np.diag(np.sqrt(prior))
+    root, held = np.sqrt(weight)[:, None], np.diag(np.sqrt(prior))
     reach = np.maximum(np.abs(found.latent), FARTHEST)
     lower = np.concatenate([-unit, -reach - found.latent])
     upper = np.concatenate([1.0 - unit, reach - found.latent])
 
     def refitted(residual: Array) -> Array:
         taken = lsq_linear(
-            np.concatenate([root * design, own]),
+            np.concatenate([root * design, held]),
             np.concatenate([root[:, 0] * residual, np.zeros(len(prior))]),
             (lower, upper),
         )

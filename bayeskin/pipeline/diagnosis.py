@@ -241,7 +241,8 @@ def _fit(
     bench: Workbench, found: Fit, taken: TakenUp, begun: Fit | None, held_out: FullResult,
     split_s: float | None,
 ) -> dict[str, Any]:  # fmt: skip
-    """RMSE [N] of a fit: whole, by phase, of phases left out; of one to the beginning, of what follows."""
+    """RMSE [N] of a fit: whole, without the surrogate's error (`rmse_of_mean`), by phase, of phases left out;
+    of one to the beginning, of what follows."""
     binned = bench.binned
     usable = bins_in_windows(binned, None) >= 0
     rest = usable
@@ -249,6 +250,7 @@ def _fit(
         rest = bins_in_windows(binned, ((split_s, float(binned.edges_s[-1])),)) >= 0
     return {
         "rmse": _rms(binned.force_n - found.force_n, usable),
+        "rmse_of_mean": _rms(binned.force_n - found.mean_n, usable),
         "rmse_by_phase": dict(inference.rmse(binned, found.force_n).by_kind_n),
         "rmse_held_out": None if begun is None else _rms(binned.force_n - begun.force_n, rest),
         "full_model": _full(taken, held_out, found.force_n, binned, usable, rest),
