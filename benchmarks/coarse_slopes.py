@@ -35,7 +35,7 @@ CASES = {
 
 
 def relative(case: str) -> dict[str, tuple[float, float]]:
-    """Of each parameter the derivative of the model's own mesh [N], RMS, and the coarse one's error over it."""
+    """By each parameter the derivative on the model's own mesh [N], RMS, and the coarse one's share of error."""
     point, values = CASES[case]
     names = [name for name, one in catalogue().items() if {p.name for p in one.parameters} & set(values)]
     base = load_surrogate(shipped(SURROGATE)).space
