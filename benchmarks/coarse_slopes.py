@@ -35,7 +35,7 @@ CASES = {
 
 
 def relative(case: str) -> dict[str, tuple[float, float]]:
-    """By each parameter the derivative on the model's own mesh [N], RMS, and the coarse one's share of error."""
+    """By each parameter the own mesh's derivative [N], RMS over bins, and over it the coarse one's error."""
     point, values = CASES[case]
     names = [name for name, one in catalogue().items() if {p.name for p in one.parameters} & set(values)]
     base = load_surrogate(shipped(SURROGATE)).space

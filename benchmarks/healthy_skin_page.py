@@ -36,7 +36,7 @@ def fits(answer: Mapping[str, Any]) -> str:
             ["full model, RMSE over the whole recording", *_mn(full, "rmse"), WHOLE_MN],
             [f"its {' / '.join(KINDS)}", *(_by_phase(one) for one in full), ""],
             ["without what is allowed for its mesh and the load cell", *_mn(full, "rmse_of_run"), ""],
-            ["full model selected and fitted up to the end of the second hold, RMSE on the rest",
+            ["full model selected and fitted up to the end of the second hold, RMSE on what follows",
              *_mn(full, "rmse_held_out"), HELD_OUT_MN],
         ]  # fmt: skip
     aims = ("", "") if table else (WHOLE_MN, HELD_OUT_MN)
@@ -44,7 +44,7 @@ def fits(answer: Mapping[str, Any]) -> str:
         ["surrogate, RMSE over the whole recording", *_mn(both, "rmse"), aims[0]],
         ["without what its own error takes up", *_mn(both, "rmse_of_mean"), ""],
         [f"its {' / '.join(KINDS)}", *(_by_phase(one) for one in both), ""],
-        ["surrogate selected and fitted up to the end of the second hold, RMSE on the rest",
+        ["surrogate selected and fitted up to the end of the second hold, RMSE on what follows",
          *_mn(both, "rmse_held_out"), aims[1]],
         ["each phase by parameters fitted without it", *_mn(both, "rmse_left_out"), ""],
         ["recorded bins in the 90 % band", *(f"{100 * one['coverage90']:.0f} %" for one in both), ""],

@@ -119,16 +119,16 @@ def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, fo
     residual.set(xlabel="time [s]", ylabel="force left [mN]")
     loops.set(xlabel="displacement [mm]", ylabel="force [mN]")
     panel_title(force, "a", "best fit")
-    panel_title(residual, "b", "what no other values take up")
+    panel_title(residual, "b", "recorded − model")
     panel_title(loops, "c")
     count = len(located.windows)
     state_finding(
         figure,
-        f"The recording leaves what the model allows in {count} window{'s' * (count != 1)}"
+        f"The recording differs from the model in {count} window{'s' * (count != 1)}"
         if count
         else "The recording stays within what the model allows",
-        "b: recorded less modelled force, without what other values of the parameters could take up. Orange: "
-        "windows where it is positive; purple: negative. Allowed: measured noise, the model's own error, the "
+        "Orange: windows where the recording is above the model by more than is allowed and than other values "
+        "of the parameters take up; purple: below; grey: neither. Allowed: measured noise, the model's error, "
         "parameters' uncertainty. One search in twenty finds a window where nothing is missing.",
     )
     return figure
@@ -168,8 +168,8 @@ def figure_candidates(candidates: Sequence[Mapping[str, Any]]) -> Figure:
     state_finding(
         figure,
         finding,
-        "All other parameters free again for each. Lines: standard error over phases. Not shown: mechanisms "
-        "of whose best fit the surrogate is unsure.",
+        "All other parameters free again for each. Lines: standard error over phases. Not shown: what "
+        "the recording's samples refute, and mechanisms of whose best fit the surrogate is unsure.",
     )
     return figure
 
@@ -222,7 +222,8 @@ def figure_before_after(
         figure,
         "RMS residual {:.1f} mN before, {:.1f} mN after".format(*rms),
         "Before: the base model's best fit. After: that with the best set of mechanisms. Bands: predictive, "
-        "noise and all." + (" d, e: both, chosen and fitted up to the dashed line alone." if split_s else ""),
+        "noise and all; b: less the force after."
+        + (" d, e: both, chosen and fitted up to the dashed line alone." if split_s else ""),
     )
     return figure
 
