@@ -141,6 +141,8 @@ def sizes(board: Mapping[str, Any]) -> str:
 
 
 def _worth(one: Mapping[str, Any]) -> str:
+    if one["answer"] == "nothing-missing" and one["size"] < 1.0:
+        return "below the floor"
     if one["kind"] == "outside":
         return "right" if one["answer"] == "unknown" else ("missed" if not one["named"] else "wrong")
     if one["right"]:

@@ -127,9 +127,10 @@ def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, fo
         f"The recording differs from the model in {count} window{'s' * (count != 1)}"
         if count
         else "The recording stays within what the model allows",
-        "Orange: windows where the recording is above the model by more than is allowed and than other values "
-        "of the parameters take up; purple: below; grey: neither. Allowed: measured noise, the model's error, "
-        "parameters' uncertainty. One search in twenty finds a window where nothing is missing.",
+        "Orange: windows where the recording is above the model by more than is allowed and than other "
+        "values of the parameters take up; purple: below; grey: neither. Allowed: measured noise, the "
+        "model's own error, the parameters' uncertainty. One search in twenty finds a window where "
+        "nothing is missing.",
     )
     return figure
 
