@@ -164,16 +164,15 @@ def _draw_detectability(ax: Axes, classes: Sequence[Mapping[str, Any]]) -> None:
 
 def _draw_shares(ax: Axes, board: Mapping[str, Any]) -> None:
     lines = (
-        ("named right", board["named"]["clear"], 0.9),
-        ("to look-alikes", board["named_up_to_look_alikes"]["clear"], 0.95),
-        ("unknown outside", board["unknown_outside"]["clear"], 0.8),
-        ("effect in 90 %", board["effect_in_interval"]["clear"], None),
-        ("base in 90 %", board["base_in_interval"]["clear"], None),
-        ("false alarms", board["false_alarms"], 0.05),
+        ("named right", board["named"]["clear"], (0.9, 1.0)),
+        ("to look-alikes", board["named_up_to_look_alikes"]["clear"], (0.95, 1.0)),
+        ("unknown outside", board["unknown_outside"]["clear"], (0.8, 1.0)),
+        ("effect in 90 %", board["effect_in_interval"]["clear"], (0.8, 0.97)),
+        ("base in 90 %", board["base_in_interval"]["clear"], (0.8, 0.97)),
+        ("false alarms", board["false_alarms"], (0.0, 0.05)),
     )
     for place, (_, found, wanted) in enumerate(reversed(lines)):
-        if wanted is not None:
-            ax.plot(wanted, place, "|", ms=9, mew=1.2, color=ACCENT)
+        ax.hlines(place, *wanted, color=ACCENT, lw=5.0, alpha=0.35)
         if found["of"]:
             ax.hlines(place, found["low"], found["high"], color=MODEL, lw=1.0)
             ax.plot(found["share"], place, "o", color=MODEL)
