@@ -20,6 +20,7 @@ from demo_gallery import FIGURES, smaller
 
 from bayeskin.pipeline.engine import Silent
 from bayeskin.pipeline.proof import prove
+from bayeskin.proof import seals
 from bayeskin.proof.score import share
 from bayeskin.report import half_in_words
 
@@ -160,27 +161,36 @@ def _at(board: Mapping[str, Any], path: Sequence[str]) -> Mapping[str, Any]:
     return dict(found)
 
 
+def judged(folder: Path) -> bool:
+    """Whether each recording of a set has a verdict: keys are opened only then."""
+    return {path.stem for path in (folder / "verdicts").glob("*.json")} == set(seals.read_index(folder))
+
+
 def main() -> None:
-    made = {folder.name: prove(folder, Silent(), at_most=0) for folder in (PROOF, NOTHING, SIZES)}
-    boards = {name: one["scoreboard"] for name, one in made.items()}
-    proof, every = boards[PROOF.name], {}
-    for folder in (PROOF, SIZES):
-        every[folder.name] = {
-            path.stem: json.loads(path.read_text())["answer"]["seconds"]
-            for path in sorted((folder / "verdicts").glob("*.json"))
+    boards, seconds = {}, {}
+    for folder in (PROOF, NOTHING, SIZES):
+        if not judged(folder):
+            print(f"{folder.name}: not judged to the end, left out")
+            continue
+        boards[folder.name] = prove(folder, Silent(), at_most=0)["scoreboard"]
+        answers = {path.stem: json.loads(path.read_text()) for path in (folder / "verdicts").glob("*.json")}
+        seconds[folder.name] = {number: one["answer"]["seconds"] for number, one in answers.items()}
+    proof = boards[PROOF.name]
+    tables = {"proof": scores(proof, seconds[PROOF.name]), "each": each(proof)}
+    smaller(PROOF / "scoreboard.png", FIGURES / "proof.png")
+    if NOTHING.name in boards:
+        tables["nothing"] = nothing({name: boards[name] for name in (PROOF.name, NOTHING.name)})
+    if SIZES.name in boards:
+        board = boards[SIZES.name]
+        tables |= {
+            "sizes": sizes(board),
+            "sizes-scores": scores(board, seconds[SIZES.name]),
+            "sizes-each": each(board),
         }
-    for name, table in (
-        ("proof", scores(proof, every[PROOF.name])),
-        ("each", each(proof)),
-        ("nothing", nothing({name: boards[name] for name in (PROOF.name, NOTHING.name)})),
-        ("sizes", sizes(boards[SIZES.name])),
-        ("sizes-scores", scores(boards[SIZES.name], every[SIZES.name])),
-        ("sizes-each", each(boards[SIZES.name])),
-    ):
+        smaller(SIZES / "detectability.png", FIGURES / "detectability.png")
+    for name, table in tables.items():
         rows.into_docs(PAGE, name, table)
         print(table)
-    smaller(PROOF / "scoreboard.png", FIGURES / "proof.png")
-    smaller(SIZES / "detectability.png", FIGURES / "detectability.png")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import shutil
 import sys
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,8 @@ from bayeskin import storage
 from bayeskin.inference import NoisePriors
 from bayeskin.model import ModelSpec
 from bayeskin.model.problem import build_problem
+from bayeskin.proof import score, seals
+from bayeskin.proof.curves import curve
 from bayeskin.recordings import read_recording
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_surrogate
@@ -344,3 +347,26 @@ def test_the_page_of_the_recording_says_what_the_diagnosis_says(benchmark):
     names = page.named(answer)
     assert all(f"| {one['name']} | {one['probability']:.2f} |" in names for one in answer["mechanisms"])
     assert f"`{answer['verdict']}`" in names
+
+
+def test_the_page_of_the_proof_counts_all_sets_and_leaves_out_what_is_not_judged(benchmark, tmp_path):
+    page, folder = benchmark("proof_page"), Path(__file__).parents[1] / "data" / "development"
+    assert page.judged(folder)
+    for path in ("index.json", "verdicts/001.json"):
+        (tmp_path / path).parent.mkdir(exist_ok=True)
+        shutil.copy(folder / path, tmp_path / path)
+    assert not page.judged(tmp_path)
+    answers = {
+        path.stem: json.loads(path.read_text())["answer"] for path in (folder / "verdicts").glob("*.json")
+    }
+    board = score(seals.read_keys(folder), answers)
+    table = page.nothing({"one": board, "two": board}).splitlines()
+    assert [line.split("|")[2].strip() for line in table[2:]] == ["0 of 20", "0 of 20", "0 of 40"]
+
+
+def test_the_table_of_sizes_tells_clear_effects_from_smaller_ones(benchmark):
+    sizes, right = [1.0, 2.0, 4.0, 8.0], [False, True, True, True]
+    one = {"sizes": sizes, "right": right, "up_to": [True] * 4, "curve": curve(sizes, right)}
+    line = benchmark("proof_page").sizes({"by_mechanism": {"pad-slip": one}}).splitlines()[-1]
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    assert cells[:5] == ["pad-slip", "1.0 to 8.0", "2 of 2", "1 of 2", "1"]
