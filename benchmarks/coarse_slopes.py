@@ -17,9 +17,12 @@ import rows
 from healthy_skin import HEALTHY_SKIN, POINTS
 
 from bayeskin.mechanisms import catalogue
+from bayeskin.mismatch.full_fit import change
 from bayeskin.model import ModelSpec
 from bayeskin.pipeline.reported import FullForce
+from bayeskin.pipeline.taking_up import nearest_factor
 from bayeskin.proof.protocol import EDGES_S, SURROGATE
+from bayeskin.proof.remains import rms
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_surrogate
 from bayeskin.types import ParameterSpace
@@ -41,9 +44,8 @@ def relative(case: str) -> dict[str, tuple[float, float]]:
     base = load_surrogate(shipped(SURROGATE)).space
     space = ParameterSpace((*base.parameters, *(p for n in names for p in catalogue()[n].parameters)))
     theta = {**POINTS[point], **values}
-    unit, h = space.box.to_unit(np.array([theta[name] for name in space.names])), 1e-6
-    change = (space.box.from_unit(unit + h) - space.box.from_unit(unit - h)) / (2.0 * h)
-    changes = dict(zip(space.names, change, strict=True))
+    by_coordinate = change(space, np.array([theta[name] for name in space.names]))
+    changes = dict(zip(space.names, by_coordinate, strict=True))
     own = ModelSpec()
     found = [
         FullForce(spec, HEALTHY_SKIN, EDGES_S).with_slopes((names, theta), changes)
@@ -52,16 +54,12 @@ def relative(case: str) -> dict[str, tuple[float, float]]:
     if any(isinstance(one, str) for one in found):
         raise SystemExit(f"{case}: {found}")
     (own_n, own_slopes), (coarse_n, coarse_slopes) = found  # type: ignore[misc]
-    factor = float(coarse_n @ own_n / (coarse_n @ coarse_n))
+    coarse_slopes = nearest_factor(coarse_n, own_n) * coarse_slopes
     return {
-        name: (_rms(own_slopes[:, i]), _rms(factor * coarse_slopes[:, i] - own_slopes[:, i]) / size)
+        name: (float(size), float(rms(coarse_slopes[:, i] - own_slopes[:, i]) / size))
         for i, name in enumerate(space.names)
-        if (size := _rms(own_slopes[:, i])) > 1e-4  # the initial pressure moves no force
+        if (size := rms(own_slopes[:, i])) > 1e-4  # the initial pressure moves no force
     }
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def main() -> None:
@@ -70,7 +68,7 @@ def main() -> None:
         for name, (slope_n, error) in relative(case).items():
             table.append([case, name, f"{1e3 * slope_n:.1f} mN", f"{100 * error:.1f} %"])
             errors.append(error)
-    table.append(["all", "RMS", "", f"{100 * _rms(np.array(errors)):.0f} %"])
+    table.append(["all", "RMS", "", f"{100 * rms(np.array(errors)):.0f} %"])
     text = rows.markdown(("skin", "by", "derivative, RMS", "the coarse one's error"), table)
     print(text)
     rows.into_docs(PAGE, "coarse-slopes", text)

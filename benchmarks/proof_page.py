@@ -21,13 +21,12 @@ from demo_gallery import FIGURES, smaller
 from bayeskin.pipeline.engine import Silent
 from bayeskin.pipeline.proof import prove
 from bayeskin.proof import seals
-from bayeskin.proof.score import share
+from bayeskin.proof.score import CLEAR, share
 from bayeskin.report import half_in_words
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "mismatch.md"
 PROOF, NOTHING, SIZES = (ROOT / "data" / name for name in ("proof", "nothing", "sizes"))
-CLEAR = 3.0  # of the floor
 SHARES = (
     ("false alarms where nothing is concealed", ("false_alarms",), "at most 5 %"),
     ("clear effects named right", ("named", "clear"), "90 %"),
@@ -74,7 +73,8 @@ def scores(board: Mapping[str, Any], seconds: Mapping[str, float]) -> str:
         table.append([what, found, interval, to_reach])
     for what, path, to_reach in MEDIANS:
         one = _at(board, path)
-        table.append([f"{what}, median", f"{one['median']:.2f} of {one['of']}", "", to_reach])
+        middle = "none" if one["median"] is None else f"{one['median']:.2f} of {one['of']}"
+        table.append([f"{what}, median", middle, "", to_reach])
     nothing = [seconds[one["number"]] for one in board["each"] if one["kind"] == "nothing"]
     every = list(seconds.values())
     table += [
@@ -91,8 +91,9 @@ def scores(board: Mapping[str, Any], seconds: Mapping[str, float]) -> str:
             "",
         ],
         ["longest", f"{max(every) / 60.0:.0f} minutes", "", ""],
-        ["where nothing is concealed, median", f"{np.median(nothing):.0f} s", "", ""],
     ]
+    if nothing:
+        table.append(["where nothing is concealed, median", f"{np.median(nothing):.0f} s", "", ""])
     return rows.markdown(("", "found", "90 % interval", "to reach"), table)
 
 
@@ -134,7 +135,7 @@ def sizes(board: Mapping[str, Any]) -> str:
         alike = sum(up_to and not right for _, right, up_to in answers)
         table.append([
             name, f"{min(one['sizes']):.1f} to {max(one['sizes']):.1f}", f"{sum(clear)} of {len(clear)}",
-            f"{sum(below)} of {len(below)}", str(alike), half_in_words(one).removeprefix("half: "),
+            f"{sum(below)} of {len(below)}", str(alike), half_in_words(one),
         ])  # fmt: skip
     head = ("", "sizes [noise floors]", "clear, named right", "smaller, named right", "a look-alike named",
             "half are named at")  # fmt: skip

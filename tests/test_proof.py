@@ -781,15 +781,15 @@ def test_only_mechanisms_with_several_recordings_have_a_curve() -> None:
     one = found["device-friction"]
     assert (one["sizes"], one["right"]) == ([1.0, 2.0, 4.0, 8.0], [False, False, True, True])
     assert one["up_to"] == [True] * 4
-    assert half_in_words(one).startswith("half: ")
+    assert half_in_words(one).endswith(")")
 
 
 def test_no_half_is_told_beyond_the_sizes_that_there_were() -> None:
     def words(named: bool) -> str:
         return half_in_words({"sizes": [2.0, 4.0], "curve": curve([2.0, 4.0], [named] * 2)})
 
-    assert words(True).startswith("half: below")
-    assert words(False).startswith("half: above")
+    assert words(True).startswith("below")
+    assert words(False).startswith("above")
 
 
 def test_the_figure_of_sizes_is_drawn(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def fit_full(
     local = log_posterior
     for count in range(1, rounds + 1):
         theta = np.array([trial[name] for name in space.names])
-        found = full(trial, dict(zip(space.names, _change(space, theta), strict=True)))
+        found = full(trial, dict(zip(space.names, change(space, theta), strict=True)))
         if isinstance(found, str):
             if best is None:
                 return found
@@ -134,7 +134,7 @@ def _excess(local: LogPosterior, theta: Mapping[str, float], force_n: Array) -> 
     return max(float(np.mean(((nu + 1.0) * eps / (nu + eps**2)) ** 2)), 1.0)
 
 
-def _change(space: ParameterSpace, theta: Array) -> Array:
+def change(space: ParameterSpace, theta: Array) -> Array:
     """Of each parameter (d,), by one coordinate of the box."""
     unit, h = space.box.to_unit(theta), 1e-6
     return np.asarray((space.box.from_unit(unit + h) - space.box.from_unit(unit - h)) / (2.0 * h))

@@ -12,7 +12,7 @@ of draws; the largest over all windows has its distribution from the draws thems
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -24,7 +24,7 @@ from bayeskin.inference import LogPosterior
 from bayeskin.inference.likelihood import FARTHEST
 from bayeskin.inference.noise_model import draw_noise
 from bayeskin.mismatch.discretised import Discretised
-from bayeskin.mismatch.fit import Fit
+from bayeskin.mismatch.fit import EDGE, Fit
 from bayeskin.types import Array
 
 DRAWS = 1000
@@ -35,7 +35,6 @@ MODEL_ERROR = 4e-4  # of the force's range
 MESH_ERROR = 1e-3  # the same
 PRIOR_PRECISION = 12.0  # of a uniform prior over the unit cube
 STEP = 1e-4  # of the unit cube, inwards, for derivatives
-EDGE = 1e-6  # of the unit cube: on a bound
 
 
 @dataclass(frozen=True)
@@ -82,7 +81,7 @@ def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
     chain = log_posterior.chain
     residual = chain.force_n - found.force_n[chain.bins]
     phase = log_posterior.binned.phase[chain.bins]
-    spread, refitted = _allowed(found, noise, rng)
+    spread, tested = _allowed(found, noise, residual, rng)
     error_n = model_error(log_posterior) * rng.standard_normal((DRAWS, len(log_posterior.binned.phases)))
     spread += error_n[:, phase]
     spans = _spans(phase)
@@ -91,7 +90,6 @@ def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
     for span, sd in zip(spans, scale, strict=True):
         centred = _means(spread, *span)
         tall = np.maximum(tall, np.abs(centred - centred.mean()) / sd)
-    tested = refitted(residual)
     z = np.array([_means(tested[None], *span)[0] for span in spans]) / scale
     windows = []
     for a, b in _chosen(spans, z, float(np.quantile(tall, 1.0 - LEVEL))):
@@ -123,12 +121,12 @@ def _chance(tall: Array, height: float) -> float:
 
 
 def _allowed(
-    found: Fit, noise: Mapping[str, float], rng: np.random.Generator
-) -> tuple[Array, Callable[[Array], Array]]:
+    found: Fit, noise: Mapping[str, float], residual: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
     """Draws (n, k) of the residual that noise, parameters and what the surrogate leaves open allow; and what
-    is left of a residual (k,) when these have taken up what they can, as of the draws.
+    is left of the recorded one (k,) when these have taken up what they can, as of the draws.
 
-    Of a residual they take up no more than is believed: parameters in their box, errors within `FARTHEST` sd,
+    Of that they take up no more than is believed: parameters in their box, errors within `FARTHEST` sd,
     or as far as they are. Noise alone does not bring a draw's there.
     """
     log_posterior, chain = found.log_posterior, found.log_posterior.chain
@@ -146,22 +144,15 @@ def _allowed(
     prior = np.concatenate([np.full(design.shape[1] - best.factor.shape[2], PRIOR_PRECISION),
                             np.ones(best.factor.shape[2])])  # fmt: skip
     normal = (design * weight[:, None]).T @ design + np.diag(prior)
-
-    root, held = np.sqrt(weight)[:, None], np.diag(np.sqrt(prior))
-    reach = np.maximum(np.abs(found.latent), FARTHEST)
-    lower = np.concatenate([-unit, -reach - found.latent])
-    upper = np.concatenate([1.0 - unit, reach - found.latent])
-
-    def refitted(residual: Array) -> Array:
-        taken = lsq_linear(
-            np.concatenate([root * design, held]),
-            np.concatenate([root[:, 0] * residual, np.zeros(len(prior))]),
-            (lower, upper),
-        )
-        return np.asarray(residual - design @ taken.x)
-
     taken = design @ np.linalg.solve(normal, (design * weight[:, None]).T @ drawn.T)
-    return drawn - taken.T, refitted
+    reach = np.maximum(np.abs(found.latent), FARTHEST)
+    root = np.sqrt(weight)
+    at = lsq_linear(
+        np.concatenate([root[:, None] * design, np.diag(np.sqrt(prior))]),
+        np.concatenate([root * residual, np.zeros(len(prior))]),
+        (np.concatenate([-unit, -reach - found.latent]), np.concatenate([1.0 - unit, reach - found.latent])),
+    )
+    return drawn - taken.T, residual - design @ at.x
 
 
 def _free(found: Fit) -> list[int]:

@@ -173,8 +173,8 @@ def in_words(answer: Mapping[str, Any]) -> str:
         held = fits[when]["rmse_held_out"]
         rest = "" if held is None else f", {1e3 * held:.1f} mN on what follows the second hold, not fitted"
         lines.append(f"{when}: RMSE {1e3 * fits[when]['rmse']:.1f} mN{rest}")
-        own = 1e3 * fits[when]["rmse_of_mean"]
-        lines.append(f"  without what the surrogate's own error takes up: {own:.1f} mN")
+        if (own := fits[when].get("rmse_of_mean")) is not None:
+            lines.append(f"  without what the surrogate's own error takes up: {1e3 * own:.1f} mN")
         lines += _full_in_words(fits[when]["full_model"])
         if (left := fits[when].get("rmse_left_out")) is not None:
             lines.append(f"  each phase by a fit without it: RMSE {1e3 * left:.1f} mN")

@@ -208,13 +208,13 @@ def _full(
         here, there, own = quick(theta, changes), quick(start, changes), alone(start, changes)
         if isinstance(here, str) or isinstance(there, str) or isinstance(own, str):
             return here
-        return here[0] + own[0] - there[0], here[1] * _factor(there[0], own[0])
+        return here[0] + own[0] - there[0], here[1] * nearest_factor(there[0], own[0])
 
     def whole(theta: Mapping[str, float], changes: Mapping[str, float]) -> tuple[Array, Array] | str:
         slopes, own = quick(theta, changes), alone(theta, changes)
         if isinstance(slopes, str) or isinstance(own, str):
             return slopes if isinstance(slopes, str) else str(own)
-        return own[0], slopes[1] * _factor(slopes[0], own[0])
+        return own[0], slopes[1] * nearest_factor(slopes[0], own[0])
 
     def made() -> list[FullRun]:
         return [FullRun(np.array(key), force, None) for key, force in fine_runs.items()
@@ -253,7 +253,7 @@ def _full(
     return replace(last[0], runs=len(fine_runs)), last[1]
 
 
-def _factor(coarse_n: Array, own_n: Array) -> float:
+def nearest_factor(coarse_n: Array, own_n: Array) -> float:
     """On a coarse force that brings it nearest to the model's own."""
     return float(coarse_n @ own_n / (coarse_n @ coarse_n))
 

@@ -32,13 +32,13 @@ def curve(sizes: Sequence[float], named: Sequence[bool]) -> dict[str, Any]:
     weight = np.exp(density - density.max())
     weight /= weight.sum()
     share = np.exp(_logs(AT)[0])
-    ends = np.array([_quantiles(share[:, :, i], weight, (LOW, HIGH)) for i in range(len(AT))])
-    half = _quantiles(np.broadcast_to(HALF[:, None], weight.shape), weight, (LOW, 0.5, HIGH))
+    ends = [_quantiles(one, weight.ravel(), (LOW, HIGH)) for one in share.reshape(-1, len(AT)).T]
+    half = _quantiles(HALF, weight.sum(axis=1), (LOW, 0.5, HIGH))
     return {
         "at": AT.tolist(),
         "mean": np.tensordot(weight, share, axes=2).tolist(),
-        "low": ends[:, 0].tolist(),
-        "high": ends[:, 1].tolist(),
+        "low": [low for low, _ in ends],
+        "high": [high for _, high in ends],
         "half": dict(zip(("low", "median", "high"), half, strict=True)),
     }
 
@@ -50,6 +50,5 @@ def _logs(sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _quantiles(values: np.ndarray, weight: np.ndarray, at: Sequence[float]) -> list[float]:
-    order = np.argsort(values, axis=None)
-    reached = np.cumsum(weight.ravel()[order])
-    return [float(values.ravel()[order[np.searchsorted(reached, q * reached[-1])]]) for q in at]
+    found: list[float] = np.quantile(values, at, weights=weight, method="inverted_cdf").tolist()
+    return found

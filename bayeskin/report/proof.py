@@ -58,7 +58,7 @@ def figure_detectability(mechanisms: Mapping[str, Mapping[str, Any]]) -> Figure:
         ax.remove()
     for ax, (name, one) in zip(grid.flat, mechanisms.items(), strict=False):
         _draw_curve(ax, one)
-        ax.set_title(f"{name}\n{half_in_words(one)}", linespacing=1.3)
+        ax.set_title(f"{name}\nhalf: {half_in_words(one)}", linespacing=1.3)
     for ax in grid[-1]:
         ax.set_xlabel("size [noise floors]")
     for ax in grid[:, 0]:
@@ -97,12 +97,12 @@ def half_in_words(one: Mapping[str, Any]) -> str:
     """The size at which half are named, no further than there were recordings."""
     half, least, largest = one["curve"]["half"], min(one["sizes"]), max(one["sizes"])
     if half["median"] > largest:
-        return f"half: above {max(half['low'], least):.1f}"
+        return f"above {max(half['low'], least):.1f}"
     if half["median"] < least:
-        return f"half: below {min(half['high'], largest):.1f}"
+        return f"below {min(half['high'], largest):.1f}"
     low = f"below {least:.1f}" if half["low"] < least else f"{half['low']:.1f}"
     high = f"above {largest:.1f}" if half["high"] > largest else f"{half['high']:.1f}"
-    return f"half: {half['median']:.1f} ({low} to {high})"
+    return f"{half['median']:.1f} ({low} to {high})"
 
 
 def _finding(board: Mapping[str, Any]) -> str:
