@@ -56,9 +56,13 @@ def figure_detectability(mechanisms: Mapping[str, Mapping[str, Any]]) -> Figure:
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for ax in grid.flat[len(mechanisms) :]:
         ax.remove()
+    ends: list[float] = []
     for ax, (name, one) in zip(grid.flat, mechanisms.items(), strict=False):
         _draw_curve(ax, one)
+        shown = [*one["curve"]["at"], *one["sizes"]]
+        ends += [0.9 * min(shown), 1.1 * max(shown)]
         ax.set_title(f"{name}\nhalf: {half_in_words(one)}", linespacing=1.3)
+    grid[0, 0].set_xlim(min(ends), max(ends))
     for ax in grid[-1]:
         ax.set_xlabel("size [noise floors]")
     for ax in grid[:, 0]:
@@ -89,7 +93,7 @@ def _draw_curve(ax: Axes, one: Mapping[str, Any]) -> None:
         ax.plot(sizes[of], np.full(of.sum(), place), marker, ls="none", color=color)
     ax.axvline(3.0, color=ACCENT, lw=0.6, ls=":")
     ax.set_xscale("log")
-    ax.set(xlim=(at[0], at[-1]), ylim=(-0.05, 1.05))
+    ax.set_ylim(-0.05, 1.05)
     plain_log(ax.xaxis)
 
 
