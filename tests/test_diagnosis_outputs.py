@@ -364,7 +364,7 @@ def test_the_best_set_is_the_one_that_the_full_model_makes_it() -> None:
     found = tried({(): 0.0, ("x",): 90.0, ("y",): 70.0})
 
     def taken(weight: float | None) -> Any:
-        return SimpleNamespace(full_weight=weight)
+        return SimpleNamespace(full_weight=weight, full=None)
 
     before, after, rival = taken(5.0), taken(80.0), taken(95.0)
     likeliest = diagnosis._likeliest(found, before, after, found.rivals(None), [rival])
@@ -378,3 +378,27 @@ def test_the_best_set_is_the_one_that_the_full_model_makes_it() -> None:
     none = taken(None)
     assert diagnosis._likeliest(found, none, none, found.rivals(None), [none]) is none
     assert found.best.names == ("x",)
+
+
+def test_a_set_that_the_full_model_cannot_run_goes_for_none_that_leaves_much() -> None:
+    found = tried({(): 0.0, ("x",): 90.0, ("y",): 70.0})
+
+    def taken(weight: float | None, left: str) -> Any:
+        fit = found.base
+        noise = [name for name in fit.log_posterior.names if name.startswith("sd_")]
+        end = fit.log_posterior.bounds[left == "much"]
+        widest = fit.log_posterior.named(fit.log_posterior.from_sampling(np.asarray(end)))
+        theta = {**fit.theta, **{name: widest[name] for name in noise}}
+        full = FullFit(theta, 0.0, fit.force_n, fit.force_n, 1, 0.0)
+        return SimpleNamespace(full_weight=weight, full="the skin folds" if weight is None else full)
+
+    rivals = [found.fits["y",]]
+    for before, rival, best in (("much", "much", "x"), ("much", "little", "y"), ("little", "much", "")):
+        found.full = {}
+        without, failed, other = taken(5.0, before), taken(None, ""), taken(70.0, rival)
+        after = diagnosis._likeliest(found, without, failed, rivals, [other])
+        assert after is {"x": failed, "y": other, "": without}[best]
+        assert "".join(found.best.names) == best
+    found.full = {}
+    runs = taken(60.0, "much")
+    assert diagnosis._likeliest(found, taken(5.0, "much"), runs, rivals, [taken(70.0, "much")]) is not runs

@@ -18,7 +18,7 @@ from bayeskin import inference
 from bayeskin.errors import InputError
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.mechanisms import with_one
-from bayeskin.mismatch.fit import Fit, restored, stored
+from bayeskin.mismatch.fit import Fit, much_left, restored, stored
 from bayeskin.mismatch.full_fit import FullFit
 from bayeskin.mismatch.locate import Located
 from bayeskin.mismatch.search import Build, Made, Search, search
@@ -130,7 +130,10 @@ def _likeliest(
     whole: Search, before: TakenUp, after: TakenUp, rivals: Sequence[Fit],
     judged: Sequence[TakenUp | float | None],
 ) -> TakenUp:  # fmt: skip
-    """What follows the best set, which is the one of it and its rivals that the full model makes it."""
+    """What follows the best set, which is the one of it and its rivals that the full model makes it.
+
+    One that the full model cannot run goes for none that it can run and that leaves much.
+    """
     full = {(): before.full_weight, whole.best.names: after.full_weight}
     taken = {(): before, whole.best.names: after}
     for rival, its in zip(rivals, judged, strict=True):
@@ -138,6 +141,10 @@ def _likeliest(
             full[rival.names] = its
         else:
             full[rival.names], taken[rival.names] = its.full_weight, its
+    if after.full_weight is None:
+        for names, one in taken.items():
+            if isinstance(one.full, FullFit) and much_left(whole.fits[names].log_posterior, one.full.theta):
+                full[names] = None
     if any(one is not None for one in full.values()):
         whole.full = {names: -np.inf if one is None else one for names, one in full.items()}
     return taken[whole.best.names]
