@@ -72,9 +72,10 @@ def figure_detectability(mechanisms: Mapping[str, Mapping[str, Any]]) -> Figure:
         figure,
         f"How large an effect has to be to be named: {sum(right)} of {len(right)} are",
         "Each mark is one recording: dots named right, squares a look-alike named, crosses neither. Curve: "
-        "logistic in the logarithm of size, mean and 90 % band of its posterior. Half: the size at which "
-        "half are named, with its 90 % interval. Size: what remains of the effect after the base model's "
-        "best refit, over the noise floor of 0.5 s means; dotted: 3.",
+        "logistic in the logarithm of size, mean and 90 % band of its posterior, dashed where no recording "
+        "is. Half: the size at which half are named, with its 90 % interval, or a bound of 95 %, within the "
+        "sizes made. Size: what remains of the effect after the base model's best refit, over the noise "
+        "floor of 0.5 s means; dotted: 3.",
     )
     return figure
 
@@ -82,8 +83,10 @@ def figure_detectability(mechanisms: Mapping[str, Mapping[str, Any]]) -> Figure:
 def _draw_curve(ax: Axes, one: Mapping[str, Any]) -> None:
     at, curve = np.array(one["curve"]["at"]), one["curve"]
     ax.fill_between(at, curve["low"], curve["high"], color=MODEL, alpha=0.18)
-    ax.plot(at, curve["mean"], color=MODEL)
     sizes, right = np.array(one["sizes"]), np.array(one["right"], bool)
+    made = (at >= sizes.min()) & (at <= sizes.max())
+    ax.plot(at, curve["mean"], color=MODEL, lw=0.7, ls="--")
+    ax.plot(at[made], np.array(curve["mean"])[made], color=MODEL)
     alike = np.array(one["up_to"], bool) & ~right
     for of, place, marker, color in (
         (right, 1.0, "o", INK),
@@ -101,9 +104,9 @@ def half_in_words(one: Mapping[str, Any]) -> str:
     """The size at which half are named, no further than there were recordings."""
     half, least, largest = one["curve"]["half"], min(one["sizes"]), max(one["sizes"])
     if half["median"] > largest:
-        return f"above {max(half['low'], least):.1f}"
+        return f"above {min(max(half['low'], least), largest):.1f}"
     if half["median"] < least:
-        return f"below {min(half['high'], largest):.1f}"
+        return f"below {max(min(half['high'], largest), least):.1f}"
     low = f"below {least:.1f}" if half["low"] < least else f"{half['low']:.1f}"
     high = f"above {largest:.1f}" if half["high"] > largest else f"{half['high']:.1f}"
     return f"{half['median']:.1f} ({low} to {high})"
