@@ -132,6 +132,28 @@ def nothing(boards: Mapping[str, Mapping[str, Any]]) -> str:
     return rows.markdown(("", "false alarms", "90 % interval", "base's parameters in 90 % intervals"), table)
 
 
+def faint(boards: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Mapping[str, Any]]) -> str:
+    """Of all sets, what was called `nothing-missing` though a set of mechanisms fitted better, and not."""
+    kinds = {
+        "nothing": "nothing",
+        "alone": "an effect of the catalogue",
+        "pair": "an effect of the catalogue",
+        "outside": "one outside",
+    }
+    called: dict[tuple[str, str], list[Mapping[str, bool]]] = {}
+    for name, board in boards.items():
+        for one in board["each"]:
+            if one["answer"] == "nothing-missing":
+                better = "yes" if answers[name][one["number"]]["best_set"] else "no"
+                called.setdefault((kinds[one["kind"]], better), []).append(one["inside_base"])
+    table = []
+    for (kind, better), inside in sorted(called.items()):
+        hits = share_of_parts(inside)
+        table.append([kind, better, str(len(inside)), f"{hits['hits']} of {hits['of']}"])
+    head = ("concealed", "a set fits better", "recordings", "base's parameters in 90 % intervals")
+    return rows.markdown(head, table)
+
+
 def sizes(board: Mapping[str, Any]) -> str:
     """Of each mechanism how many are named right, and how large an effect has to be."""
     table = []
@@ -175,14 +197,15 @@ def judged(folder: Path) -> bool:
 
 
 def main() -> None:
-    boards, seconds = {}, {}
+    boards, answers, seconds = {}, {}, {}
     for folder in (PROOF, NOTHING, SIZES):
         if not judged(folder):
             print(f"{folder.name}: not judged to the end, left out")
             continue
         boards[folder.name] = prove(folder, Silent(), at_most=0)["scoreboard"]
-        answers = {path.stem: json.loads(path.read_text()) for path in (folder / "verdicts").glob("*.json")}
-        seconds[folder.name] = {number: one["answer"]["seconds"] for number, one in answers.items()}
+        verdicts = (folder / "verdicts").glob("*.json")
+        answers[folder.name] = {path.stem: json.loads(path.read_text())["answer"] for path in verdicts}
+        seconds[folder.name] = {number: one["seconds"] for number, one in answers[folder.name].items()}
     proof = boards[PROOF.name]
     tables = {"proof": scores(proof, seconds[PROOF.name]), "each": each(proof)}
     smaller(PROOF / "scoreboard.png", FIGURES / "proof.png")
@@ -196,6 +219,7 @@ def main() -> None:
             "sizes-each": each(board),
         }
         smaller(SIZES / "detectability.png", FIGURES / "detectability.png")
+    tables["faint"] = faint(boards, answers)
     for name, table in tables.items():
         rows.into_docs(PAGE, name, table)
         print(table)

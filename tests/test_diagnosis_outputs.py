@@ -195,6 +195,13 @@ def test_words_say_what_is_left_only_where_something_is(remainder: Remainder) ->
     assert "outside this catalogue: probability at most 0.97" in in_words(answer)
     assert "unexplained" not in in_words(answer)
     assert "R-hat" not in in_words(answer)
+    faint = in_words(
+        {**answer, "verdict": "nothing-missing", "best_set": ["pre-stretch"], "set_probability": 0.9}
+    )
+    assert "With pre-stretch it would fit better" in faint
+    assert "not to be relied on" in faint
+    for alike in ({"verdict": "nothing-missing", "best_set": []}, {"verdict": "unknown", "best_set": ["x"]}):
+        assert "would fit better" not in in_words({**answer, **alike, "set_probability": None})
     believed = in_words({**answer, "best_set": ["pad-slip", "backlash"], "set_probability": 0.034})
     assert "pad-slip, backlash: probability against something smooth without a name 0.03" in believed
     rough = {**fits, "sampled": {**fits["sampled"], "settled": False}}

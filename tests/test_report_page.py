@@ -162,7 +162,11 @@ def test_errors_of_one_model_are_compared() -> None:
             "something that several causes would explain",
             "that several mechanisms of the catalogue would explain",
         ),
-        ({"verdict": "nothing-missing", "unknown_probability": 0.05}, "nothing", "leaves nothing out"),
+        (
+            {"verdict": "nothing-missing", "unknown_probability": 0.05},
+            "nothing that could be named",
+            "leaves nothing out",
+        ),
     ],
 )
 def test_what_is_missing_is_said_alike_in_a_word_and_a_sentence(
@@ -175,8 +179,16 @@ def test_what_is_missing_is_said_alike_in_a_word_and_a_sentence(
         "Of the catalogue pad-slip, backlash fits best, with a probability of 0.023 against something smooth"
     )
     assert (said in text) == (changed["verdict"] == "unknown")
+    faint = text.count("With pad-slip, backlash it would fit better")
+    assert faint == (2 if changed["verdict"] == "nothing-missing" else 0)
     assert sentence in text
     assert f"Something outside the catalogue: probability {changed['unknown_probability']} at most." in text
+
+
+def test_nothing_is_missing_where_no_set_fits_better() -> None:
+    text = diagnosed_as({"verdict": "nothing-missing", "best_set": [], "set_probability": None})
+    assert "What is missing? nothing The recording stays" in text
+    assert "would fit better" not in text
 
 
 def test_the_table_of_parameters_has_prior_interval_unit_and_sentence(whole: str) -> None:

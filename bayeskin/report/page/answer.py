@@ -134,7 +134,10 @@ def _missing(facts: RunFacts) -> Verdict:
     both = [quantity(one[model]["rmse"], "N") for one in fits]
     if said["verdict"] == "nothing-missing":
         within = f"The recording stays within what the model allows ({both[0]} RMSE)."
-        return Verdict("nothing", "good", [within, *_beyond_the_catalogue(said)])
+        lines = [within, *_beyond_the_catalogue(said)]
+        if faint := faint_in_words(said):
+            return Verdict("nothing that could be named", "doubt", [faint, *lines])
+        return Verdict("nothing", "good", lines)
     lines = [f"{one['statement']} (probability {number(one['probability'])})" for one in said["mechanisms"]]
     lines.append(f"RMSE {both[0]} without, {both[1]} with what was found.")
     left = len(said["remaining"])
@@ -153,6 +156,17 @@ def _missing(facts: RunFacts) -> Verdict:
         else "something that several causes would explain"
     )
     return Verdict(word, "doubt", lines)
+
+
+def faint_in_words(said: Mapping[str, Any]) -> str:
+    """What fits better than nothing does, where nothing could be named; empty where that is none."""
+    if said["verdict"] != "nothing-missing" or not said.get("best_set"):
+        return ""
+    better = ", ".join(said["best_set"])
+    return (
+        f"With {better} it would fit better, by less than the model's own error: too little for a name, but "
+        "the skin's values depend on it and are not to be relied on."
+    )
 
 
 def is_outside(said: Mapping[str, Any]) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bayeskin.report.page.answer import fits_of, is_outside
+from bayeskin.report.page.answer import faint_in_words, fits_of, is_outside
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
 from bayeskin.report.page.numbers import number, percent, quantity
@@ -26,7 +26,8 @@ def mismatch(facts: RunFacts) -> Section:
     said = facts.said("diagnose")
     blocks: list[Block] = list(absent(facts, "diagnose"))
     if said:
-        blocks.append(Text([_VERDICTS.get(said["verdict"], _OUTSIDE if is_outside(said) else _SEVERAL)]))
+        verdict = _VERDICTS.get(said["verdict"], _OUTSIDE if is_outside(said) else _SEVERAL)
+        blocks.append(Text([f"{verdict} {faint}" if (faint := faint_in_words(said)) else verdict]))
         if said["mechanisms"]:
             blocks.append(_mechanisms(said["mechanisms"]))
         blocks.append(_fits(said["fit"]))
