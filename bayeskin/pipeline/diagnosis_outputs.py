@@ -18,7 +18,6 @@ from bayeskin.mismatch.locate import Located, Window
 from bayeskin.mismatch.search import Search
 from bayeskin.mismatch.verdict import Named
 from bayeskin.pipeline.taking_up import FullResult, Remainder, TakenUp
-from bayeskin.report.page import faint_in_words
 from bayeskin.types import Array, BinnedForce, PadMotion, Parameter
 
 
@@ -169,7 +168,7 @@ def in_words(answer: Mapping[str, Any]) -> str:
     if (believed := answer.get("set_probability")) is not None:
         text = "probability against something smooth without a name"
         lines.append(f"  {', '.join(answer['best_set'])}: {text} {believed:.2f}")
-    if faint := faint_in_words(answer):
+    if faint := report.faint_in_words(answer):
         lines.append(f"  {faint}")
     lines.append(f"{len(answer['located'])} windows before, {len(answer['remaining'])} after")
     for when in ("before", "after"):

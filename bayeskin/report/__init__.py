@@ -5,6 +5,7 @@ from bayeskin.report.discrepancy import figure_discrepancy, figure_experiments
 from bayeskin.report.fields import SurfaceField, figure_fields
 from bayeskin.report.fit import figure_fit
 from bayeskin.report.mismatch import (
+    faint_in_words,
     figure_base_parameters,
     figure_before_after,
     figure_candidates,
@@ -26,6 +27,7 @@ from bayeskin.report.waves import figure_waves
 
 __all__ = [
     "SurfaceField",
+    "faint_in_words",
     "figure_base_parameters",
     "figure_before_after",
     "figure_candidates",

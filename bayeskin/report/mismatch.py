@@ -388,3 +388,14 @@ def figure_contributions(binned: BinnedForce, motion: PadMotion, parts: Sequence
         "The force at the best fit, less that without the mechanism and all else as it is.",
     )
     return figure
+
+
+def faint_in_words(said: Mapping[str, Any]) -> str:
+    """What fits better than nothing does, where nothing could be named; empty where that is none."""
+    if said["verdict"] != "nothing-missing" or not said.get("best_set"):
+        return ""
+    better = ", ".join(said["best_set"])
+    return (
+        f"With {better} it would fit better, by less than the model's own error: too little for a name, but "
+        "the skin's values depend on it and are not to be relied on."
+    )

@@ -1,7 +1,6 @@
 """The report of a run: one HTML file that needs nothing beside it."""
 
-from bayeskin.report.page.answer import faint_in_words
 from bayeskin.report.page.facts import RunFacts, StageFacts
 from bayeskin.report.page.render import render_page
 
-__all__ = ["RunFacts", "StageFacts", "faint_in_words", "render_page"]
+__all__ = ["RunFacts", "StageFacts", "render_page"]

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from bayeskin.report.mismatch import faint_in_words
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.numbers import interval, number, percent, quantity, scale, with_unit
 from bayeskin.report.page.parts import Answer, Bar, Made, Verdict
@@ -156,17 +157,6 @@ def _missing(facts: RunFacts) -> Verdict:
         else "something that several causes would explain"
     )
     return Verdict(word, "doubt", lines)
-
-
-def faint_in_words(said: Mapping[str, Any]) -> str:
-    """What fits better than nothing does, where nothing could be named; empty where that is none."""
-    if said["verdict"] != "nothing-missing" or not said.get("best_set"):
-        return ""
-    better = ", ".join(said["best_set"])
-    return (
-        f"With {better} it would fit better, by less than the model's own error: too little for a name, but "
-        "the skin's values depend on it and are not to be relied on."
-    )
 
 
 def is_outside(said: Mapping[str, Any]) -> bool:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bayeskin.report.page.answer import faint_in_words, fits_of, is_outside
+from bayeskin.report.mismatch import faint_in_words
+from bayeskin.report.page.answer import fits_of, is_outside
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
 from bayeskin.report.page.numbers import number, percent, quantity
