@@ -10,7 +10,15 @@ from toy import MOTION
 from toy_inference import TRUTH, ToySurrogate
 
 from bayeskin.mechanisms import catalogue
-from bayeskin.mismatch.corrected import LENGTH, LONGEST, CorrectedSurrogate, FullRun, error_lengths, slopes
+from bayeskin.mismatch.corrected import (
+    LENGTH,
+    LONGEST,
+    CorrectedSurrogate,
+    FullRun,
+    Undiminished,
+    error_lengths,
+    slopes,
+)
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.wrapper import Sure
 
@@ -165,6 +173,19 @@ def test_errors_that_the_surrogate_denies_leave_it_less_sure() -> None:
     sd = CorrectedSurrogate(denying, (run,), ALL).predict(theta).sd()
     k = np.exp(-0.5 * (0.3 / LENGTH) ** 2)
     np.testing.assert_allclose(sd, times * np.sqrt(1 - k**2) * denying.predict(theta).sd(), rtol=1e-3)
+
+
+def test_undiminished_it_is_as_unsure_at_a_run_as_away_from_it() -> None:
+    corrected = CorrectedSurrogate(OFF, (run_at(THETA, sloped=True),), ALL)
+    denied = CorrectedSurrogate(ToySurrogate(sd_n=1e-4), corrected.runs, ALL)
+    theta = np.array([THETA, away([0.1, -0.1, 0.2, 0.0, 0.1])])
+    for one in (corrected, denied):
+        found, own = Undiminished(one).predict(theta), one.inner.predict(theta)
+        np.testing.assert_array_equal(found.mean, one.predict_mean(theta))
+        np.testing.assert_allclose(found.sd(), np.sqrt(one.excess) * own.sd(), rtol=1e-12)
+        assert (found.sd()[0] > 10.0 * one.predict(theta).sd()[0]).all()
+    assert corrected.excess == 1.0
+    assert denied.excess > 10.0
 
 
 def test_what_the_surrogate_has_exactly_moves_nothing_away() -> None:

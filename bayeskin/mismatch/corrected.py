@@ -69,7 +69,7 @@ class CorrectedSurrogate(Wrapper):
         shared = self._correlation(theta)
         weights = shared @ self._inverse
         left = 1.0 + self.common - np.einsum("na,na->n", weights, shared)
-        left = self._excess * np.maximum(left, 0.0)[:, None]
+        left = self.excess * np.maximum(left, 0.0)[:, None]
         rows = found.factor.transpose(0, 2, 1) * np.sqrt(left)[:, None]
         mean = found.mean + _size(found.mean) * (weights @ self._errors)
         return Prediction(mean, rows.transpose(0, 2, 1), found.diagonal * left)
@@ -142,7 +142,7 @@ class CorrectedSurrogate(Wrapper):
         both = np.eye(self._places.shape[1]) - apart[:, :, :, None] * apart[:, :, None, :]
         both = both * near[np.ix_(s, s)][:, :, None, None]
         inner = both.transpose(0, 2, 1, 3).reshape(count, count)
-        sd = np.sqrt(self._excess) * self._sd[s, None]
+        sd = np.sqrt(self.excess) * self._sd[s, None]
         wrong = SLOPES * np.sqrt(np.mean(self._slopes**2, axis=2)) / sd
         forces = near + self.common + ROUNDING * np.eye(len(self.runs))
         return np.block([[forces, sides], [sides.T, inner + np.diag(wrong.ravel() ** 2)]])
@@ -152,7 +152,7 @@ class CorrectedSurrogate(Wrapper):
         return np.asarray(np.linalg.inv(self._known))
 
     @cached_property
-    def _excess(self) -> float:
+    def excess(self) -> float:
         """Mean square of the errors at the runs, in what the surrogate says of them; 1 at least."""
         own = (self._runs_n - self._here.mean) / self._sd[:, None]
         return max(float(np.mean(own**2)), 1.0)
@@ -173,6 +173,23 @@ class CorrectedSurrogate(Wrapper):
             growth = (theirs @ mean[i]) / (mean[i] @ mean[i])  # of the size of the force
             rows.append((own - theirs) / size[i] - growth[:, None] * errors[i])
         return np.concatenate(rows)
+
+
+@dataclass(frozen=True)
+class Undiminished(Wrapper):
+    """The corrected force of `inner` with all of the surrogate's variance, at the runs as away from them.
+
+    Draws are made by this. Where the variance grows with the distance from a run, along a ridge of parameters
+    whose effects cancel, the density there falls by the volume of what is not known, not by any misfit: they
+    would crowd about the runs, the more so the less the surrogate knows.
+    """
+
+    inner: CorrectedSurrogate
+
+    def predict(self, theta: ArrayLike) -> Prediction:
+        """Force at theta (n, d) or (d,). Raises InputError outside the box."""
+        own, excess = self.inner.inner.predict(theta), self.inner.excess
+        return Prediction(self.inner.predict_mean(theta), np.sqrt(excess) * own.factor, excess * own.diagonal)
 
 
 def _size(mean_n: Array) -> Array:
