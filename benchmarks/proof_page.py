@@ -94,6 +94,9 @@ def scores(board: Mapping[str, Any], seconds: Mapping[str, float]) -> str:
     ]
     if nothing:
         table.append(["where nothing is concealed, median", f"{np.median(nothing):.0f} s", "", ""])
+    effect = [seconds[one["number"]] for one in board["each"] if one["kind"] != "nothing"]
+    if effect:
+        table.append(["where something is, median", f"{np.median(effect):.0f} s", "", ""])
     return rows.markdown(("", "found", "90 % interval", "to reach"), table)
 
 
@@ -130,6 +133,26 @@ def nothing(boards: Mapping[str, Mapping[str, Any]]) -> str:
             f"{sum(inside)} of {len(inside)}, {100 * np.mean(inside):.0f} %",
         ])  # fmt: skip
     return rows.markdown(("", "false alarms", "90 % interval", "base's parameters in 90 % intervals"), table)
+
+
+def inside(boards: Mapping[str, Mapping[str, Any]]) -> str:
+    """Of all sets, the base's parameters in their intervals, each and together, by what was concealed."""
+    groups: dict[str, list[Mapping[str, bool]]] = {}
+    for one in chain.from_iterable(board["each"] for board in boards.values()):
+        known = one["inside_base"]
+        if one["kind"] == "nothing":
+            groups.setdefault("nothing", []).append(known)
+        elif one["right"] and one["size"] >= CLEAR:
+            groups.setdefault("clear, named right", []).append(known)
+            groups.setdefault(one["label"], []).append(known)
+        elif one["answer"] == "nothing-missing" and one["kind"] != "outside":
+            groups.setdefault(f"{one['label']}, called nothing", []).append(known)
+    names = list(groups["nothing"][0])
+    table = []
+    for group, some in sorted(groups.items(), key=lambda item: -len(item[1])):
+        hits = [sum(one[name] for one in some) for name in names]
+        table.append([group, str(len(some)), *map(str, hits), f"{sum(hits)} of {len(names) * len(some)}"])
+    return rows.markdown(("concealed", "recordings", *names, "together"), table)
 
 
 def faint(boards: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Mapping[str, Any]]) -> str:
@@ -219,7 +242,7 @@ def main() -> None:
             "sizes-each": each(board),
         }
         smaller(SIZES / "detectability.png", FIGURES / "detectability.png")
-    tables["faint"] = faint(boards, answers)
+    tables |= {"inside": inside(boards), "faint": faint(boards, answers)}
     for name, table in tables.items():
         rows.into_docs(PAGE, name, table)
         print(table)

@@ -173,10 +173,11 @@ def test_the_mismatch_is_located_beside_the_best_run(runs: Runs, monkeypatch: py
     bench.binned = dataclasses.replace(start.log_posterior.binned, force_n=bumped)
     posterior = dataclasses.replace(start.log_posterior, binned=bench.binned)
     bench.posterior = lambda until_s, names: posterior
+    sampled: list[Fit] = []
     for name, stand_in in (
         ("opened", lambda *rest: None), ("workbench", lambda run: bench),
         ("restored", lambda plain, posterior: dataclasses.replace(start, log_posterior=posterior)),
-        ("resample", lambda found, *rest: SimpleNamespace(draws=found.draws(20, 0))),
+        ("resample", lambda found, *rest: sampled.append(found) or SimpleNamespace(draws=found.draws(20, 0))),
         ("propose_form", lambda *rest: None),
         ("discrepancy", lambda *rest: SimpleNamespace(without_log_evidence=1.0, log_evidence=2.0)),
     ):  # fmt: skip
@@ -188,3 +189,11 @@ def test_the_mismatch_is_located_beside_the_best_run(runs: Runs, monkeypatch: py
     assert taken.located.residual_n == pytest.approx(left, abs=1e-6)
     assert taken.located.windows
     assert taken.evidence == Evidence(1.0, 2.0)
+    # What draws are made by is as unsure where the model was run as the surrogate itself.
+    (drawn,) = sampled
+    at = [taken.full.theta[name] for name in drawn.log_posterior.surrogate.space.names]
+    unsure, own = (one.predict(at).sd() for one in (drawn.log_posterior.surrogate, bench.surrogate(())))
+    assert np.mean(unsure**2) >= np.mean(own**2)
+    # A rival that stays behind is left without draws.
+    assert taking_up._whole_apart(Path("x"), {"names": []}, start.theta, 1e9) == taken.full_weight
+    assert len(sampled) == 1

@@ -126,13 +126,13 @@ def _whole_apart(
     at_least = -np.inf if ahead is None else ahead - weight(found) + found.value
     full, corrected = _full(bench, found, shear, at_least)
     force: Force = partial(_surrogate_force, bench)
-    full_weight, sure, there, wide = None, found, found, found
+    full_weight, sure, there, unsure = None, found, found, found.log_posterior
     if corrected is not None and isinstance(full, FullFit):
         found = fit_near(found.names, _about(bench, found, corrected), full.theta, shear)
         # An error that is let go takes up what is missing, which no phase left out and no window would show.
         sure = replace(found, log_posterior=_about(bench, found, Sure(corrected)))
         there = at_run(sure, full)
-        wide = fit_near(found.names, _about(bench, found, Undiminished(corrected)), full.theta, shear)
+        unsure = _about(bench, found, Undiminished(corrected))
         # Mechanisms have to be worth what a run has shown, the model without them what is promised.
         full_weight = weight(found) + (full.value - found.value if found.names else 0.0)
         force = _coarse(bench)
@@ -143,9 +143,10 @@ def _whole_apart(
     there = replace(there, theta={**there.theta, **quiet})
     left = discrepancy(there, bench.motion)
     refuted = not found.names and much_left(found.log_posterior, found.theta)
+    wide = found if unsure is found.log_posterior else fit_near(found.names, unsure, found.theta, shear)
     draws = resample(wide, shear, seed, LEGS[:1] if refuted else LEGS)
     some = inference.evenly(draws.draws, PREDICTIVE_DRAWS)
-    bands = inference.bands(wide.log_posterior, some, np.random.default_rng(seed))
+    bands = inference.bands(unsure, some, np.random.default_rng(seed))
     return TakenUp(
         full, full_weight, draws, bands.interval(0.9),
         _left_out(sure, shear), Evidence(left.without_log_evidence, left.log_evidence),
