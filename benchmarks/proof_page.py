@@ -136,7 +136,7 @@ def nothing(boards: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def inside(boards: Mapping[str, Mapping[str, Any]]) -> str:
-    """Of all sets, the base's parameters in their intervals, each and together, by what was concealed."""
+    """Of some sets, the base's parameters in their intervals, each and together, by what was concealed."""
     groups: dict[str, list[Mapping[str, bool]]] = {}
     for one in chain.from_iterable(board["each"] for board in boards.values()):
         known = one["inside_base"]
@@ -147,7 +147,7 @@ def inside(boards: Mapping[str, Mapping[str, Any]]) -> str:
             groups.setdefault(one["label"], []).append(known)
         elif one["answer"] == "nothing-missing" and one["kind"] != "outside":
             groups.setdefault(f"{one['label']}, called nothing", []).append(known)
-    names = list(groups["nothing"][0])
+    names = list(next(iter(groups.values()))[0])
     table = []
     for group, some in sorted(groups.items(), key=lambda item: -len(item[1])):
         hits = [sum(one[name] for one in some) for name in names]
@@ -156,7 +156,7 @@ def inside(boards: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def faint(boards: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Mapping[str, Any]]) -> str:
-    """Of all sets, what was called `nothing-missing` though a set of mechanisms fitted better, and not."""
+    """Of some sets, what was called `nothing-missing` though a set of mechanisms fitted better, and not."""
     kinds = {
         "nothing": "nothing",
         "alone": "an effect of the catalogue",
@@ -242,7 +242,10 @@ def main() -> None:
             "sizes-each": each(board),
         }
         smaller(SIZES / "detectability.png", FIGURES / "detectability.png")
-    tables |= {"inside": inside(boards), "faint": faint(boards, answers)}
+    beside = {name: board for name, board in boards.items() if name != PROOF.name}  # by earlier sources
+    for mark, some in (("", {PROOF.name: proof}), ("-beside", beside)):
+        if some:
+            tables |= {f"inside{mark}": inside(some), f"faint{mark}": faint(some, answers)}
     for name, table in tables.items():
         rows.into_docs(PAGE, name, table)
         print(table)

@@ -370,3 +370,30 @@ def test_the_table_of_sizes_tells_clear_effects_from_smaller_ones(benchmark):
     line = benchmark("proof_page").sizes({"by_mechanism": {"pad-slip": one}}).splitlines()[-1]
     cells = [cell.strip() for cell in line.strip("|").split("|")]
     assert cells[:5] == ["pad-slip", "1.0 to 8.0", "2 of 2", "1 of 2", "1"]
+
+
+def test_the_coarse_ones_error_is_what_one_factor_on_force_and_slopes_leaves(benchmark, monkeypatch):
+    page = benchmark("coarse_slopes")
+    rng = np.random.default_rng(4)
+    force, slopes = rng.normal(size=40), rng.normal(size=(40, 5))
+    slopes[:, 4] = 1e-6  # the initial pressure
+    off = np.zeros_like(slopes)
+    off[:, 2] = 0.25 * slopes[:, 2]
+
+    class Forces:
+        def __init__(self, spec, motion, edges_s):
+            self.own = spec == ModelSpec()
+
+        def with_slopes(self, point, changes):
+            assert point[0] == []
+            assert list(changes) == ["E_c", "E_s", "k_c", "k_s", "p_init"]
+            return (force, slopes) if self.own else (0.8 * force, 0.8 * (slopes + off))
+
+    monkeypatch.setattr(page, "FullForce", Forces)
+    found = page.relative("A")
+    assert list(found) == ["E_c", "E_s", "k_c", "k_s"]
+    assert [error for _, error in found.values()] == pytest.approx([0.0, 0.0, 0.25, 0.0], abs=1e-12)
+    assert found["E_s"][0] == pytest.approx(np.sqrt(np.mean(slopes[:, 1] ** 2)))
+    monkeypatch.setattr(Forces, "with_slopes", lambda *_: "the skin folds")
+    with pytest.raises(SystemExit, match="the skin folds"):
+        page.relative("A")
