@@ -396,6 +396,6 @@ def faint_in_words(said: Mapping[str, Any]) -> str:
         return ""
     better = ", ".join(said["best_set"])
     return (
-        f"With {better} it would fit better, by less than the model's own error: too little for a name, but "
-        "the skin's values depend on it and are not to be relied on."
+        f"With {better} it would fit better, too little or not surely enough for a name, but the skin's "
+        "values depend on it and are not to be relied on."
     )
