@@ -9,6 +9,7 @@ markers of the page.
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -147,6 +148,8 @@ def inside(boards: Mapping[str, Mapping[str, Any]]) -> str:
             groups.setdefault(one["label"], []).append(known)
         elif one["answer"] == "nothing-missing" and one["kind"] != "outside":
             groups.setdefault(f"{one['label']}, called nothing", []).append(known)
+        elif _worth(one) == "wrong":
+            groups.setdefault("a wrong name", []).append(known)
     names = list(next(iter(groups.values()))[0])
     table = []
     for group, some in sorted(groups.items(), key=lambda item: -len(item[1])):
@@ -175,6 +178,20 @@ def faint(boards: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Mapping
         table.append([kind, better, str(len(inside)), f"{hits['hits']} of {hits['of']}"])
     head = ("concealed", "a set fits better", "recordings", "base's parameters in 90 % intervals")
     return rows.markdown(head, table)
+
+
+def unsure(board: Mapping[str, Any], answers: Mapping[str, Mapping[str, Any]]) -> str:
+    """Of which mechanisms the surrogate was not sure, on how many recordings with and without an effect."""
+    counts: dict[str, Counter[bool]] = {}
+    kinds = Counter(one["kind"] == "nothing" for one in board["each"])
+    for one in board["each"]:
+        for name in answers[one["number"]]["unsure"]:
+            counts.setdefault(name, Counter())[one["kind"] == "nothing"] += 1
+    table = [
+        [name, f"{count[False]} of {kinds[False]}", f"{count[True]} of {kinds[True]}"]
+        for name, count in sorted(counts.items(), key=lambda item: -item[1].total())
+    ]
+    return rows.markdown(("", "not sure of it, with an effect", "with nothing concealed"), table)
 
 
 def sizes(board: Mapping[str, Any]) -> str:
@@ -231,6 +248,7 @@ def main() -> None:
         seconds[folder.name] = {number: one["seconds"] for number, one in answers[folder.name].items()}
     proof = boards[PROOF.name]
     tables = {"proof": scores(proof, seconds[PROOF.name]), "each": each(proof)}
+    tables["unsure"] = unsure(proof, answers[PROOF.name])
     smaller(PROOF / "scoreboard.png", FIGURES / "proof.png")
     if NOTHING.name in boards:
         tables["nothing"] = nothing({name: boards[name] for name in (PROOF.name, NOTHING.name)})

@@ -364,6 +364,39 @@ def test_the_page_of_the_proof_counts_all_sets_and_leaves_out_what_is_not_judged
     assert [line.split("|")[2].strip() for line in table[2:]] == ["0 of 20", "0 of 20", "0 of 40"]
 
 
+def test_the_skins_parameters_and_what_is_unsure_are_counted_by_what_was_concealed(benchmark):
+    page = benchmark("proof_page")
+
+    def one(number, kind, label, named, right, size, hits):
+        inside = dict(zip(("E_c", "E_s"), hits, strict=True))
+        answer = " + ".join(named) or "nothing-missing"
+        return {"number": number, "kind": kind, "label": label, "named": named, "answer": answer,
+                "right": right, "size": size, "inside_base": inside}  # fmt: skip
+
+    each = [
+        one("1", "nothing", "nothing", [], False, 0.0, (True, True)),
+        one("2", "alone", "pad-slip", ["pad-slip"], True, 5.0, (True, False)),
+        one("3", "alone", "pre-stretch", [], False, 1.0, (False, False)),
+        one("4", "outside", "peeling", ["pad-slip"], False, 2.0, (False, True)),
+    ]
+    cells = {
+        line.split(" | ")[0].strip("| "): [cell.strip(" |") for cell in line.split(" | ")[1:]]
+        for line in page.inside({"one": {"each": each}}).splitlines()[2:]
+    }
+    assert cells == {
+        "nothing": ["1", "1", "1", "2 of 2"],
+        "clear, named right": ["1", "1", "0", "1 of 2"],
+        "pad-slip": ["1", "1", "0", "1 of 2"],
+        "pre-stretch, called nothing": ["1", "0", "0", "0 of 2"],
+        "a wrong name": ["1", "0", "1", "1 of 2"],
+    }
+    answers = {"1": ["backlash"], "2": ["backlash", "pad-slip"], "3": [], "4": ["backlash"]}
+    table = page.unsure({"each": each}, {number: {"unsure": names} for number, names in answers.items()})
+    assert [line.strip("| ") for line in table.splitlines()[2:]] == [
+        "backlash | 2 of 3 | 1 of 1", "pad-slip | 1 of 3 | 0 of 1",
+    ]  # fmt: skip
+
+
 def test_the_table_of_sizes_tells_clear_effects_from_smaller_ones(benchmark):
     sizes, right = [1.0, 2.0, 4.0, 8.0], [False, True, True, True]
     one = {"sizes": sizes, "right": right, "up_to": [True] * 4, "curve": curve(sizes, right)}
