@@ -21,10 +21,12 @@ BASE = {
     "distinct",
     "off_limits",
     "polynomials",
+    "behaviour",
 }
 SIBLINGS = {"recordings", "model", "design", "surrogates"}
 BELOW = {
     "errors": set(),
+    "behaviour": set(),
     "types": {"errors"},
     "polynomials": {"types"},
     "storage": {"types", "errors"},

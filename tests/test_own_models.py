@@ -127,10 +127,16 @@ def test_a_function_in_a_file_is_fitted_with_parameters_of_its_own(case: Path, u
     assert answer["rmse_of_full_model"]["fitted_n"] < NOISE_N
 
 
-def test_a_change_of_the_file_makes_the_runs_again_and_nothing_else_does(case: Path, undrawn: None) -> None:
+def test_a_change_of_what_the_file_does_makes_the_runs_again_and_nothing_else(
+    case: Path, undrawn: None
+) -> None:
     assert stages.run(case, "design", Silent())["skipped"] == []
     assert stages.run(case, "design", Silent())["skipped"] == ["recording", "design"]
     before = load_design(case.parent / "case" / "design" / "design.h5")
+    reworded = SPRING.replace("parallel.", "parallel:").replace("    pull =", "    # Hooke\n    pull =")
+    (case.parent / "spring.py").write_text(reworded)
+    assert stages.run(case, "design", Silent())["skipped"] == ["recording", "design"]
+    assert identity(f"{case.parent / 'spring.py'}:force") == before.model_hash
     (case.parent / "spring.py").write_text(SPRING.replace("return pull", "return 2 * pull"))
     assert stages.run(case, "design", Silent())["skipped"] == ["recording"]
     after = load_design(case.parent / "case" / "design" / "design.h5")

@@ -471,9 +471,9 @@ def test_a_scoring_by_another_scorer_is_recorded(
 
     once = recorded()
     assert recorded() == once
-    hashed = pipeline.sha256_of_file
+    hashed = pipeline.sha256_of_input
     monkeypatch.setattr(
-        pipeline, "sha256_of_file", lambda path: "other" if path.name == "score.py" else hashed(path)
+        pipeline, "sha256_of_input", lambda path: "other" if path.name == "score.py" else hashed(path)
     )
     assert recorded() == once + 1
 

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from bayeskin.behaviour import sha256_of_behaviour
 from bayeskin.errors import InputError
 from bayeskin.types import Array, PadMotion, Simulation, frozen_array
 from bayeskin.umbridge import Client, Refused
@@ -32,11 +33,11 @@ Force = Callable[[Mapping[str, float], Array, Array], ArrayLike]
 
 
 def identity(forward: str) -> str:
-    """sha256 that changes with the function's file, or with the server's address.
+    """Returns a sha256 that changes with the behaviour of the function's file, or with the server's address.
 
-    Raises InputError for a function that cannot be found.
+    Comments and docstrings of the file do not count. Raises InputError for a function that cannot be found.
     """
-    code = "" if _is_url(forward) else hashlib.sha256(_source(forward).read_bytes()).hexdigest()
+    code = "" if _is_url(forward) else sha256_of_behaviour(_source(forward).read_bytes())
     name = forward if _is_url(forward) else forward.rpartition(":")[2]
     return hashlib.sha256(json.dumps(["own", name, code]).encode()).hexdigest()
 

@@ -1,4 +1,4 @@
-"""A hash of all that the verdict of a diagnosis depends on: whether a stored one still holds."""
+"""A hash of all that the verdict of a diagnosis depends on, by which a stored one is known to still hold."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import bayeskin
 from bayeskin import mechanisms
 from bayeskin.pipeline import diagnosis
-from bayeskin.pipeline.folder import sha256_of, sha256_of_file
+from bayeskin.pipeline.folder import sha256_of, sha256_of_input
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import effects_beside
 
@@ -18,17 +18,21 @@ PACKAGE = Path(bayeskin.__file__).parent
 
 
 def diagnosing_sources() -> str:
-    """sha256 over the modules that a diagnosis imports, all mechanisms, the model's tables, surrogates."""
+    """Returns the sha256 of what a diagnosis is made by: its sources' behaviour, and the bytes of data.
+
+    The sources are the modules that a diagnosis imports and all mechanisms; the data are the model's tables
+    and the manifests of the shipped surrogates. A corrected comment or docstring changes nothing.
+    """
     files = sorted({*imported(Path(diagnosis.__file__)), *Path(mechanisms.__file__).parent.glob("*.py")})
     files += sorted(PACKAGE.glob("model/*.json"))
     surrogate = shipped("surrogates/healthy-skin-reaction.h5")
     files += sorted(surrogate.parent.glob("healthy-skin-reaction*.json"))
     files += sorted(effects_beside(surrogate).glob("*.json"))
-    return sha256_of([[path.name, sha256_of_file(path)] for path in files])
+    return sha256_of([[path.name, sha256_of_input(path)] for path in files])
 
 
 def imported(module: Path) -> set[Path]:
-    """The files of the package that `module` imports, itself among them, directly or by way of others."""
+    """Returns the files of the package that `module` imports, itself among them, also by way of others."""
     found: set[Path] = set()
     waiting = {module}
     while waiting:

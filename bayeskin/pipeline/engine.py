@@ -155,7 +155,7 @@ def _inputs_sha256(run: Run, stage: Stage) -> str:
         {
             "version": bayeskin.__version__,
             "config": {section: config[section] for section in stage.sections},
-            "files": [folder.sha256_of_file(path) for path in stage.files(run)],
+            "files": [folder.sha256_of_input(path) for path in stage.files(run)],
             "stages": {name: record.sha256 for name, record in records.items() if record is not None},
         }
     )

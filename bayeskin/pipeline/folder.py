@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from bayeskin.behaviour import sha256_of_behaviour
 from bayeskin.errors import InputError
 
 RECORD = "stage.json"
@@ -186,8 +187,22 @@ def sha256_of(value: Any) -> str:
     return hashlib.sha256(json.dumps(plain(value), sort_keys=True).encode()).hexdigest()
 
 
+def sha256_of_input(path: Path) -> str:
+    """Returns the hash of a Python source's behaviour, or of any other file's bytes.
+
+    Results that were computed from the file still hold while this stays the same. It is empty when the file
+    cannot be read.
+    """
+    if path.suffix != ".py":
+        return sha256_of_file(path)
+    try:
+        return sha256_of_behaviour(path.read_bytes())
+    except OSError:
+        return ""
+
+
 def sha256_of_file(path: Path) -> str:
-    """Hash of a file's bytes; empty when it cannot be read."""
+    """Returns the hash of a file's bytes; empty when it cannot be read."""
     try:
         with open(path, "rb") as handle:
             return hashlib.file_digest(handle, "sha256").hexdigest()

@@ -19,7 +19,7 @@ from bayeskin.errors import InputError
 from bayeskin.pipeline import diagnosis
 from bayeskin.pipeline.diagnosing_sources import diagnosing_sources
 from bayeskin.pipeline.engine import Reporter
-from bayeskin.pipeline.folder import locked, plain, sha256_of, sha256_of_file, write_json
+from bayeskin.pipeline.folder import locked, plain, sha256_of, sha256_of_file, sha256_of_input, write_json
 from bayeskin.proof import seals
 from bayeskin.shipped import shipped
 
@@ -202,7 +202,7 @@ def _record(folder: Path, sources: str, current: int, board: Mapping[str, Any]) 
     path = folder / seals.SCORINGS
     before = seals.read_json(path) if path.is_file() else []
     verdicts = sha256_of([sha256_of_file(p) for p in sorted((folder / seals.VERDICTS).glob("*.json"))])
-    scorer = sha256_of_file(Path(proof.__file__).with_name("score.py"))
+    scorer = sha256_of_input(Path(proof.__file__).with_name("score.py"))
     of = {"sources_sha256": sources, "verdicts_sha256": verdicts, "scorer_sha256": scorer}
     if any(of.items() <= one.items() for one in before):
         return
