@@ -17,13 +17,10 @@ from test_model_consolidation import EDGE_M, Point, block, by_layer, corner_poin
 from test_model_physics import LAM, MU, drained_bar
 
 from bayeskin.mechanisms import laws, observed
-from bayeskin.mechanisms.backlash import Backlash, trailing
-from bayeskin.mechanisms.pad_slip import PadSlip
-from bayeskin.mechanisms.preconditioning import Damage
+from bayeskin.mechanisms.backlash import trailing
+from bayeskin.mechanisms.preconditioning import damaged
 from bayeskin.mechanisms.series import mean_beyond
-from bayeskin.mechanisms.slow_recovery import KelvinVoigt, SlowRecovery
-from bayeskin.mechanisms.solid_viscoelasticity import Relaxation
-from bayeskin.mechanisms.strain_dependent_permeability import StrainDependentPermeability
+from bayeskin.mechanisms.slow_recovery import KelvinVoigt
 from bayeskin.model import ModelSpec, simulate
 from bayeskin.model.lagrangian import LagrangianModel, State
 from bayeskin.model.mesh import brick_mesh
@@ -52,10 +49,17 @@ def elastic_force(stretch):
     return MU * (stretch - 1 / stretch) + LAM * np.log(stretch * across**2) / stretch, across
 
 
+BAR = drained_bar("bricks")
+
+
+def bound(name, **values):
+    """A mechanism's law at the points of the bar."""
+    return SOLVED[name].act.bind(values, BAR.problem.sites)
+
+
 def pulled(law, motion, steps=24):
     """Times and forces a unit area of a drained bar with a law, in equal steps of each phase."""
-    bar = drained_bar("bricks")
-    held = LagrangianModel(bar.problem, bar.material, motion, (law,))
+    held = LagrangianModel(BAR.problem, BAR.material, motion, (law,))
     past = [held.initial_state(0.0)]
     found = [(0.0, 0.0)]
     for start, end in pairwise(held.motion.time_s):
@@ -69,7 +73,7 @@ def pulled(law, motion, steps=24):
 
 def test_a_step_stretch_relaxes_by_the_branches_exponentials():
     """Ramp of a microsecond, then a hold whose steps are far longer than the first relaxation time."""
-    law = Relaxation([0.8, 0.4], [0.5, 30.0])
+    law = bound("solid-viscoelasticity", g_1=0.8, tau_1=0.5, g_2=0.4, tau_2=30.0)
     time_s, force = pulled(
         law, PadMotion(np.array([0.0, 1e-6, 100.0]), 2 * STRETCH_M * np.array([0, 1.0, 1.0])), steps=8
     )
@@ -84,7 +88,7 @@ def test_a_ramp_relaxes_as_the_convolution_says():
     """Stress that grows with the stretch, against the hereditary integral by quadrature, to 0.5 %."""
     strength, tau, ramp_s = 1.0, 4.0, 10.0
     time_s, force = pulled(
-        Relaxation([strength], [tau]),
+        bound("solid-viscoelasticity", g_1=strength, tau_1=tau, g_2=0.0, tau_2=1.0),
         PadMotion(np.array([0.0, ramp_s, 30.0]), 2 * STRETCH_M * np.array([0, 1.0, 1.0])),
     )
     fine = np.linspace(0.0, 30.0, 3001)
@@ -99,9 +103,7 @@ def test_a_ramp_relaxes_as_the_convolution_says():
 
 def test_damage_follows_the_largest_energy_and_later_cycles_repeat():
     most, scale = 0.5, 300.0
-    bar = drained_bar("bricks")
-    n = len(bar.material.mu)
-    law = Damage(most, scale, np.full(n, MU), np.full(n, LAM))
+    law = damaged(most, scale, BAR.problem.sites.table(MU, LAM))
     u = 2 * STRETCH_M * np.array([0.0, 0.7, 0.0, 1.0, 0.0, 1.0])
     time_s, force = pulled(law, PadMotion(10.0 * np.arange(6.0), u))
     stretch = 1 + 0.5 * np.interp(time_s, 10.0 * np.arange(6.0), u)
@@ -164,7 +166,7 @@ def test_permeability_follows_the_volume_in_a_confined_column():
         return x[fixed]
 
     model = driven(space.mesh, by_layer(space.mesh.cutis, layer, layer), fixed, values, space=space)
-    model.laws = (StrainDependentPermeability(exponent),)
+    model.laws = (SOLVED["strain-dependent-permeability"].act.bind({"M_k": exponent}, model.problem.sites),)
     grid = np.union1d(np.concatenate([np.linspace(0.1, 10, 40), 10 + np.geomspace(0.02, 20, 40)]), times)
     found = {}
     for t, step in zip(grid, march(model, model.initial_state(0.0), grid, corner_s=ramp), strict=True):
@@ -218,7 +220,9 @@ BAR_MOTION = PadMotion(
 
 def test_slow_recovery_is_a_kelvin_voigt_element_in_series():
     compliance, tau = 1e-5, 6.0
-    time_s, force = pulled(SlowRecovery(compliance, tau), BAR_MOTION)
+    time_s, force = pulled(
+        bound("slow-recovery", recovery_compliance=compliance, recovery_time=tau), BAR_MOTION
+    )
     t, expected = solved_series(lambda f, s: (compliance * f - s) / tau, BAR_MOTION)
     np.testing.assert_allclose(2 * force, np.interp(time_s, t, expected), atol=4e-3 * expected.max())
     assert (
@@ -229,7 +233,7 @@ def test_slow_recovery_is_a_kelvin_voigt_element_in_series():
 
 def test_slip_goes_on_beyond_its_threshold_and_stays():
     rate, threshold = 2e-6, 4e3
-    time_s, force = pulled(PadSlip(rate, threshold), BAR_MOTION)
+    time_s, force = pulled(bound("pad-slip", slip_rate=rate, slip_threshold=threshold), BAR_MOTION)
     t, expected = solved_series(lambda f, s: rate * np.sign(f) * max(abs(f) - threshold, 0.0), BAR_MOTION)
     np.testing.assert_allclose(2 * force, np.interp(time_s, t, expected), atol=6e-3 * expected.max())
     assert expected[-1] < -0.05 * expected.max()  # the pads stand closer than the skin is long
@@ -237,7 +241,7 @@ def test_slip_goes_on_beyond_its_threshold_and_stays():
 
 def test_a_gap_and_a_compliant_frame_delay_each_reversal():
     gap, compliance = 0.05, 1e-5
-    time_s, force = pulled(Backlash(gap, compliance), BAR_MOTION)
+    time_s, force = pulled(bound("backlash", gap=gap, frame_compliance=compliance), BAR_MOTION)
     behind = trailing(BAR_MOTION, gap)
     t, expected = solved_series(lambda f, s: 0.0, behind, compliance)
     np.testing.assert_allclose(2 * force, np.interp(time_s, t, expected), atol=1e-3 * expected.max())

@@ -54,7 +54,7 @@ SLOWLY = ("fibres", "memory", "opened")
 
 def model(theta: dict[str, float], laws: Sequence[Bind] = (), refinement: int = 1) -> LagrangianModel:
     problem = problem_of("bricks", refinement)
-    bound = tuple(bind(theta, problem) for bind in laws)
+    bound = tuple(bind(theta, problem.sites) for bind in laws)
     return LagrangianModel(problem, material(theta, problem.mesh.cutis), MOTION, bound)
 
 

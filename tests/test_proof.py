@@ -311,7 +311,7 @@ def problem():
 @pytest.mark.parametrize("name", ["hardening", "strain-softening"])
 def test_the_tangent_of_a_law_outside_is_the_derivative_of_its_residual(problem, name: str) -> None:
     change = OUTSIDE[name].change(0.3)
-    bound = tuple(bind(THETA, problem) for bind in change.laws)
+    bound = tuple(bind(THETA, problem.sites) for bind in change.laws)
     still = PadMotion(np.array([0.0, 1.0]), np.zeros(2))
     model = LagrangianModel(problem, material(THETA, problem.mesh.cutis), still, bound)
     rng, n = np.random.default_rng(0), 3 * problem.space.n_nodes

@@ -15,7 +15,7 @@ import numpy as np
 
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values
 from bayeskin.mechanisms.series import lost_in_series
-from bayeskin.model.problem import Problem
+from bayeskin.model.problem import Sites
 from bayeskin.model.tissue import SeriesElement, TissueLaw
 from bayeskin.types import Array, PadMotion, Parameter
 from bayeskin.words import number
@@ -45,7 +45,7 @@ def trailing(motion: PadMotion, gap_m: float) -> PadMotion:
 
 
 class Play(SeriesElement):
-    """Memory: what the frame yields [m]."""
+    """A gap [m] and a compliance [m/N]; its memory is what the frame yields [m]."""
 
     remembers = 1
 
@@ -59,16 +59,9 @@ class Play(SeriesElement):
         return np.array([self._compliance * force_n])
 
 
-class Backlash(TissueLaw):
-    """A gap [m] and a compliance [m/N]."""
-
-    def __init__(self, gap_m: float, compliance: float) -> None:
-        self.series = Play(gap_m, compliance)
-
-
-def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
-    """The law of `gap` and `frame_compliance`."""
-    return Backlash(values["gap"], values["frame_compliance"])
+def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+    """Returns the law of `gap` and `frame_compliance`."""
+    return TissueLaw(series=Play(values["gap"], values["frame_compliance"]))
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.problem import Problem
+from bayeskin.model.problem import Problem, Sites
 from bayeskin.model.tissue import SurfaceTerm, TissueLaw, displacement_rows, surface_mass
 from bayeskin.types import Array, Parameter
 from bayeskin.words import number
@@ -25,25 +25,23 @@ def tangential(point: Array, i: int, j: int) -> Array:
     return float(i == j) - normal[i] * normal[j]
 
 
-class BottomAdherence(TissueLaw):
-    """Springs of a stiffness [Pa/m] on the bottom face."""
+def springs(problem: Problem) -> sp.csr_matrix:
+    """Returns the matrix (dofs, dofs) of springs of 1 Pa/m on the bottom face."""
+    bottom, space = problem.mesh.facets["bottom"], problem.space
 
-    def __init__(self, stiffness: float, problem: Problem) -> None:
-        bottom, space = problem.mesh.facets["bottom"], problem.space
+    def spring(i: int, j: int) -> sp.csr_matrix:
+        mass = surface_mass(problem, bottom, True, partial(tangential, i=i, j=j))
+        return displacement_rows(space, mass, i, j)
 
-        def spring(i: int, j: int) -> sp.csr_matrix:
-            mass = surface_mass(problem, bottom, True, partial(tangential, i=i, j=j))
-            return displacement_rows(space, mass, i, j)
-
-        matrix = spring(0, 0)
-        for i, j in ((1, 1), (1, 2), (2, 1), (2, 2)):
-            matrix = matrix + spring(i, j)
-        self.surfaces = (SurfaceTerm(stiffness * matrix),)
+    matrix = spring(0, 0)
+    for i, j in ((1, 1), (1, 2), (2, 1), (2, 2)):
+        matrix = matrix + spring(i, j)
+    return matrix
 
 
-def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
-    """The law of `adherence`."""
-    return BottomAdherence(values["adherence"], problem)
+def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+    """Returns the law of `adherence`."""
+    return TissueLaw(surfaces=(SurfaceTerm(values["adherence"], springs),))
 
 
 MECHANISM = Mechanism(

@@ -20,19 +20,18 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bayeskin.mechanisms.fibres import Fibres
+from bayeskin.mechanisms.fibres import fibres
 from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Tissue, Values
-from bayeskin.model.problem import Problem
+from bayeskin.model.problem import Sites
 from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import PadMotion, Parameter
 
 AT_ANY_ANGLE = 0.2  # of the ratio's excess over 1
 
 
-def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
-    """Fibres in the cutis at `langer_angle` to x in the planes that are parallel to the surface."""
-    points = problem.space.quadrature_points()
-    around = np.arctan2(points[1], points[2])  # the tangent there is (0, cos, -sin)
+def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+    """Returns fibres in the cutis at `langer_angle` to x in the planes that are parallel to the surface."""
+    around = np.arctan2(sites.points_m[1], sites.points_m[2])  # the tangent there is (0, cos, -sin)
     angle = values["langer_angle"]
     direction = np.stack(
         [
@@ -42,8 +41,8 @@ def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
         ],
         axis=-1,
     )
-    k1 = np.where(problem.mesh.cutis, 0.25 * (values["langer_ratio"] - 1.0) * values["E_c"], 0.0)
-    return Fibres(np.ascontiguousarray(direction), k1, 0.0, tension_only=False)
+    k1 = np.where(sites.cutis, 0.25 * (values["langer_ratio"] - 1.0) * values["E_c"], 0.0)
+    return fibres(sites, direction, k1, 0.0, tension_only=False)
 
 
 def estimate(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:

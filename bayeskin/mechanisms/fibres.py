@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayeskin.model.assembly import Chunk, compiled
-from bayeskin.model.tissue import Passage, TissueLaw
+from bayeskin.model.assembly import compiled
+from bayeskin.model.kernels import linearise_kernel, respond_kernel
+from bayeskin.model.problem import Sites
+from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Array
 
 
@@ -32,58 +34,65 @@ def _strain(f, a, kappa, gradient):
     return kappa * (trace - 3.0) + (1.0 - 3.0 * kappa) * (along - 1.0)
 
 
-@compiled
-def add_stress(deformation, direction, k1, k2, kappa, tension_only, stress):
-    """Adds the fibres' stress (e, q, 3, 3); k1 per cell (e,)."""
-    gradient = np.empty((3, 3))
-    for e in range(stress.shape[0]):
-        if k1[e] == 0.0:
+@respond_kernel
+def add_stress(
+    time_s, elapsed_s, par, data, deformation, pressure, gradient, before, after, stress, content, flux
+):  # fmt: skip
+    """Adds the fibres' stress."""
+    k2, kappa, everywhere = par[0], par[1], par[2] != 0.0
+    slope = np.empty((3, 3))
+    for n in range(len(pressure)):
+        k1 = data[n, 0]
+        if k1 == 0.0:
             continue
-        for q in range(stress.shape[1]):
-            strain = _strain(deformation[e, q], direction[e, q], kappa, gradient)
-            if strain > 0.0 or not tension_only:
-                slope = k1[e] * strain * np.exp(k2 * strain * strain)
-                for i in range(3):
-                    for k in range(3):
-                        stress[e, q, i, k] += slope * gradient[i, k]
+        strain = _strain(deformation[n], data[n, 1:], kappa, slope)
+        if strain > 0.0 or everywhere:
+            size = k1 * strain * np.exp(k2 * strain * strain)
+            for i in range(3):
+                for k in range(3):
+                    stress[n, i, k] += size * slope[i, k]
 
 
-@compiled
-def add_derivatives(deformation, direction, k1, k2, kappa, tension_only, stress_f):
+@linearise_kernel
+def add_derivatives(
+    time_s, elapsed_s, par, data, deformation, pressure, gradient,
+    before, stress_f, stress_p, content_f, content_p, flux_f, flux_g,
+):  # fmt: skip
     """dP = W'' D (D : dF) + W' (2 kappa dF + 2 (1 - 3 kappa) dF a (x) a)."""
-    gradient = np.empty((3, 3))
-    for e in range(stress_f.shape[0]):
-        if k1[e] == 0.0:
+    k2, kappa, everywhere = par[0], par[1], par[2] != 0.0
+    slope = np.empty((3, 3))
+    for point in range(len(pressure)):
+        k1, a = data[point, 0], data[point, 1:]
+        if k1 == 0.0:
             continue
-        for q in range(stress_f.shape[1]):
-            a = direction[e, q]
-            strain = _strain(deformation[e, q], a, kappa, gradient)
-            if strain > 0.0 or not tension_only:
-                grown = k1[e] * np.exp(k2 * strain * strain)
-                slope, curvature = grown * strain, grown * (1.0 + 2.0 * k2 * strain * strain)
-                for i in range(3):
-                    for k in range(3):
-                        row = 3 * i + k
-                        for m in range(3):
-                            for n in range(3):
-                                stress_f[e, q, row, 3 * m + n] += curvature * gradient[i, k] * gradient[m, n]
-                        stress_f[e, q, row, row] += 2.0 * slope * kappa
+        strain = _strain(deformation[point], a, kappa, slope)
+        if strain > 0.0 or everywhere:
+            grown = k1 * np.exp(k2 * strain * strain)
+            size, curvature = grown * strain, grown * (1.0 + 2.0 * k2 * strain * strain)
+            for i in range(3):
+                for k in range(3):
+                    row = 3 * i + k
+                    for m in range(3):
                         for n in range(3):
-                            stress_f[e, q, row, 3 * i + n] += 2.0 * slope * (1.0 - 3.0 * kappa) * a[k] * a[n]
+                            stress_f[point, row, 3 * m + n] += curvature * slope[i, k] * slope[m, n]
+                    stress_f[point, row, row] += 2.0 * size * kappa
+                    for n in range(3):
+                        stress_f[point, row, 3 * i + n] += 2.0 * size * (1.0 - 3.0 * kappa) * a[k] * a[n]
 
 
-class Fibres(TissueLaw):
-    """direction (e, q, 3), of length one in the reference configuration; k1 (e,) [Pa]; k2, kappa [-]."""
+def fibres(
+    sites: Sites,
+    direction: Array,
+    k1: Array | float,
+    k2: float,
+    kappa: float = 0.0,
+    tension_only: bool = True,
+) -> TissueLaw:
+    """Returns the law of fibres.
 
-    def __init__(
-        self, direction: Array, k1: Array, k2: float, kappa: float = 0.0, tension_only: bool = True
-    ) -> None:
-        self._direction, self._k1, self._rest = direction, k1, (float(k2), float(kappa), tension_only)
-
-    def respond(self, chunk: Chunk, passage: Passage) -> None:
-        c = chunk.cells
-        add_stress(chunk.at.deformation, self._direction[c], self._k1[c], *self._rest, chunk.found.stress)
-
-    def linearise(self, chunk: Chunk, passage: Passage) -> None:
-        c = chunk.cells
-        add_derivatives(chunk.at.deformation, self._direction[c], self._k1[c], *self._rest, chunk.by.stress_f)
+    direction (n, 3) : of length one in the reference configuration, or (3,) for all points
+    k1 (n,) [Pa], or one for all; k2, kappa [-] : as above; tension_only : whether they go slack when pushed
+    """
+    along = np.broadcast_to(direction, (len(sites.cutis), 3))
+    par = np.array([k2, kappa, 0.0 if tension_only else 1.0])
+    return TissueLaw(par=par, data=sites.table(k1, along), respond=add_stress, linearise=add_derivatives)

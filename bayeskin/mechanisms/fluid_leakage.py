@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+import scipy.sparse as sp
 
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
 from bayeskin.model.mesh import ARM_RADIUS_M, LENGTH_M
-from bayeskin.model.problem import Problem
+from bayeskin.model.problem import Problem, Sites
 from bayeskin.model.tissue import SurfaceTerm, TissueLaw, pressure_rows, surface_mass
 from bayeskin.types import Parameter
 from bayeskin.words import number
@@ -23,17 +24,14 @@ def open_surface(problem: Problem) -> np.ndarray:
     return np.setdiff1d(outside[top], np.concatenate([named["pad"], named["guard"]]))
 
 
-class FluidLeakage(TissueLaw):
-    """Outflow of a conductance [m/(Pa s)]; the fluid's balance has the sign of `assembly`."""
-
-    def __init__(self, conductance: float, problem: Problem) -> None:
-        mass = surface_mass(problem, open_surface(problem), False)
-        self.surfaces = (SurfaceTerm(-conductance * pressure_rows(problem.space, mass), per_second=True),)
+def outflow(problem: Problem) -> sp.csr_matrix:
+    """Returns the matrix (dofs, dofs) of a conductance of 1 m/(Pa s); its sign is that of `assembly`."""
+    return -pressure_rows(problem.space, surface_mass(problem, open_surface(problem), False))
 
 
-def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
-    """The law of `leakage`."""
-    return FluidLeakage(values["leakage"], problem)
+def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+    """Returns the law of `leakage`."""
+    return TissueLaw(surfaces=(SurfaceTerm(values["leakage"], outflow, per_second=True),))
 
 
 MECHANISM = Mechanism(

@@ -13,14 +13,14 @@ import numpy as np
 
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values
 from bayeskin.mechanisms.series import lost_in_series, mean_beyond
-from bayeskin.model.problem import Problem
+from bayeskin.model.problem import Sites
 from bayeskin.model.tissue import SeriesElement, TissueLaw
 from bayeskin.types import Array, PadMotion, Parameter
 from bayeskin.words import number
 
 
 class Slip(SeriesElement):
-    """Memory: slip [m], force [N]."""
+    """Slip at a rate [m/(N s)] beyond a threshold [N]; its memory is the slip [m] and the force [N]."""
 
     def __init__(self, rate: float, threshold_n: float) -> None:
         self._rate, self._threshold_n = rate, threshold_n
@@ -30,16 +30,9 @@ class Slip(SeriesElement):
         return np.array([before[0] + more, force_n])
 
 
-class PadSlip(TissueLaw):
-    """The slip of a rate [m/(N s)] beyond a threshold [N]."""
-
-    def __init__(self, rate: float, threshold_n: float) -> None:
-        self.series = Slip(rate, threshold_n)
-
-
-def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
-    """The law of `slip_rate` and `slip_threshold`."""
-    return PadSlip(values["slip_rate"], values["slip_threshold"])
+def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+    """Returns the law of `slip_rate` and `slip_threshold`."""
+    return TissueLaw(series=Slip(values["slip_rate"], values["slip_threshold"]))
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:

@@ -11,23 +11,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.problem import Problem
+from bayeskin.model.problem import Sites
 from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Parameter
 
 HALF_GAUGE_M = 18e-3  # from the plane of symmetry to the pad
 
 
-class PreStretch(TissueLaw):
-    """Pads opened by a share of the half gauge length, each."""
-
-    def __init__(self, share: float) -> None:
-        self.opening_m = 2.0 * share * HALF_GAUGE_M
-
-
-def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
-    """The law of `opening`."""
-    return PreStretch(values["opening"])
+def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+    """Returns the law of pads that were each opened by a share `opening` of the half gauge length."""
+    return TissueLaw(opening_m=2.0 * values["opening"] * HALF_GAUGE_M)
 
 
 MECHANISM = Mechanism(

@@ -18,9 +18,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.assembly import Chunk, compiled, inverse_and_determinant
-from bayeskin.model.problem import Problem, material
-from bayeskin.model.tissue import Passage, TissueLaw
+from bayeskin.model.assembly import compiled, inverse_and_determinant
+from bayeskin.model.kernels import linearise_kernel, respond_kernel
+from bayeskin.model.problem import Sites, material
+from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Array, Parameter
 from bayeskin.words import number
 
@@ -37,69 +38,67 @@ def stored_energy(f, mu, lam, inverse, slope):
     return 0.5 * mu * (square - 3.0 - 2.0 * log) + 0.5 * lam * log * log, log
 
 
-@compiled
-def weaken(deformation, mu, lam, most, scale, before, stress, after):
-    """Takes D dW/dF off the stress; `before`, `after` (e, q, 1) hold W_max."""
+@respond_kernel
+def weaken(
+    time_s, elapsed_s, par, data, deformation, pressure, gradient, before, after, stress, content, flux
+):  # fmt: skip
+    """Takes D dW/dF off the stress; `par` holds d and W_d, `data` mu and lambda, the memory W_max."""
+    most, scale = par[0], par[1]
     inverse, slope = np.empty((3, 3)), np.empty((3, 3))
-    for e in range(stress.shape[0]):
-        for q in range(stress.shape[1]):
-            energy, _ = stored_energy(deformation[e, q], mu[e], lam[e], inverse, slope)
-            largest = max(energy, before[e, q, 0])
-            after[e, q, 0] = largest
-            damage = most * (1.0 - np.exp(-largest / scale))
-            for i in range(3):
-                for k in range(3):
-                    stress[e, q, i, k] -= damage * slope[i, k]
+    for n in range(len(pressure)):
+        energy, _ = stored_energy(deformation[n], data[n, 0], data[n, 1], inverse, slope)
+        largest = max(energy, before[n, 0])
+        after[n, 0] = largest
+        damage = most * (1.0 - np.exp(-largest / scale))
+        for i in range(3):
+            for k in range(3):
+                stress[n, i, k] -= damage * slope[i, k]
 
 
-@compiled
-def weaken_derivatives(deformation, mu, lam, most, scale, before, stress_f):
+@linearise_kernel
+def weaken_derivatives(
+    time_s, elapsed_s, par, data, deformation, pressure, gradient,
+    before, stress_f, stress_p, content_f, content_p, flux_f, flux_g,
+):  # fmt: skip
     """- D d2W/dF2 and, while W is the largest, - dD/dW dW/dF (x) dW/dF."""
+    most, scale = par[0], par[1]
     inverse, slope = np.empty((3, 3)), np.empty((3, 3))
-    for e in range(stress_f.shape[0]):
-        for q in range(stress_f.shape[1]):
-            energy, log = stored_energy(deformation[e, q], mu[e], lam[e], inverse, slope)
-            left = np.exp(-max(energy, before[e, q, 0]) / scale)
-            damage, growth = most * (1.0 - left), 0.0
-            if energy >= before[e, q, 0]:
-                growth = most * left / scale
-            transposed = damage * (mu[e] - lam[e] * log)
-            for i in range(3):
-                for k in range(3):
-                    row = 3 * i + k
-                    for m in range(3):
-                        for n in range(3):
-                            stress_f[e, q, row, 3 * m + n] -= (
-                                transposed * inverse[k, m] * inverse[n, i]
-                                + damage * lam[e] * inverse[k, i] * inverse[n, m]
-                                + growth * slope[i, k] * slope[m, n]
-                            )
-                    stress_f[e, q, row, row] -= damage * mu[e]
+    for point in range(len(pressure)):
+        mu, lam = data[point, 0], data[point, 1]
+        energy, log = stored_energy(deformation[point], mu, lam, inverse, slope)
+        left = np.exp(-max(energy, before[point, 0]) / scale)
+        damage, growth = most * (1.0 - left), 0.0
+        if energy >= before[point, 0]:
+            growth = most * left / scale
+        transposed = damage * (mu - lam * log)
+        for i in range(3):
+            for k in range(3):
+                row = 3 * i + k
+                for m in range(3):
+                    for n in range(3):
+                        stress_f[point, row, 3 * m + n] -= (
+                            transposed * inverse[k, m] * inverse[n, i]
+                            + damage * lam * inverse[k, i] * inverse[n, m]
+                            + growth * slope[i, k] * slope[m, n]
+                        )
+                stress_f[point, row, row] -= damage * mu
 
 
-class Damage(TissueLaw):
-    """Largest damage d [-] and its energy scale [Pa], for Lame's constants (e,) of the cells."""
-
-    remembers = 1
-
-    def __init__(self, most: float, scale: float, mu: Array, lam: Array) -> None:
-        self._damage, self._mu, self._lam = (float(most), float(scale)), mu, lam
-
-    def respond(self, chunk: Chunk, passage: Passage) -> None:
-        c, found = chunk.cells, chunk.found
-        lame = (self._mu[c], self._lam[c])
-        weaken(chunk.at.deformation, *lame, *self._damage, passage.before, found.stress, passage.after)
-
-    def linearise(self, chunk: Chunk, passage: Passage) -> None:
-        c, by = chunk.cells, chunk.by
-        lame = (self._mu[c], self._lam[c])
-        weaken_derivatives(chunk.at.deformation, *lame, *self._damage, passage.before, by.stress_f)
+def damaged(most: float, scale_pa: float, lame: Array) -> TissueLaw:
+    """Returns the law of a largest damage [-] and its energy scale [Pa]; lame (n, 2): mu and lambda [Pa]."""
+    return TissueLaw(
+        remembers=1,
+        par=np.array([most, scale_pa]),
+        data=lame,
+        respond=weaken,
+        linearise=weaken_derivatives,
+    )
 
 
-def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
-    """The law of `damage` in both layers."""
-    solid = material(values, problem.mesh.cutis)
-    return Damage(values["damage"], values["damage_energy"], solid.mu, solid.lam)
+def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+    """Returns the law of `damage` in both layers."""
+    solid = material(values, sites.cutis)
+    return damaged(values["damage"], values["damage_energy"], sites.table(solid.mu, solid.lam))
 
 
 MECHANISM = Mechanism(

@@ -21,14 +21,14 @@ import numpy as np
 
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values
 from bayeskin.mechanisms.series import lost_in_series
-from bayeskin.model.problem import Problem
+from bayeskin.model.problem import Sites
 from bayeskin.model.tissue import SeriesElement, TissueLaw
 from bayeskin.types import Array, PadMotion, Parameter
 from bayeskin.words import number
 
 
 class KelvinVoigt(SeriesElement):
-    """Memory: what is lost [m], force [N]."""
+    """An element of a compliance [m/N] and a time [s]; its memory is what is lost [m] and the force [N]."""
 
     def __init__(self, compliance: float, time_s: float) -> None:
         self._compliance, self._time_s = compliance, time_s
@@ -40,16 +40,9 @@ class KelvinVoigt(SeriesElement):
         return np.array([keep * before[0] + self._compliance * force, force_n])
 
 
-class SlowRecovery(TissueLaw):
-    """The element of a compliance [m/N] and a time [s]."""
-
-    def __init__(self, compliance: float, time_s: float) -> None:
-        self.series = KelvinVoigt(compliance, time_s)
-
-
-def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
-    """The law of `recovery_compliance` and `recovery_time`."""
-    return SlowRecovery(values["recovery_compliance"], values["recovery_time"])
+def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+    """Returns the law of `recovery_compliance` and `recovery_time`."""
+    return TissueLaw(series=KelvinVoigt(values["recovery_compliance"], values["recovery_time"]))
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:

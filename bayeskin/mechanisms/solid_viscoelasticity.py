@@ -20,17 +20,18 @@ Int. J. Numer. Methods Eng. 2 (1970), 45-59.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from bayeskin.mechanisms.elastic import elastic_stress, scale_elastic
 from bayeskin.mechanisms.lines import stretch_of, strict
 from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Tissue, Values
-from bayeskin.model.assembly import Chunk, compiled, inverse_and_determinant
+from bayeskin.model.assembly import compiled, inverse_and_determinant
+from bayeskin.model.kernels import linearise_kernel, respond_kernel
 from bayeskin.model.lagrangian import PAD_EDGE_M
-from bayeskin.model.problem import Problem
-from bayeskin.model.tissue import Passage, Rank, TissueLaw
+from bayeskin.model.problem import Sites
+from bayeskin.model.tissue import Rank, TissueLaw
 from bayeskin.types import Array, PadMotion, Parameter
 from bayeskin.words import number
 
@@ -38,90 +39,87 @@ STEPS_A_PHASE = 100
 
 
 @compiled
-def relax(deformation, pressure, before, keep, from_old, from_new, over, stress, after):
-    """Adds the branches' stress; `before`, `after` (e, q, 9 + 9 b) hold S_e and each A_b, row by row.
+def _decay(elapsed_s, tau_s):
+    """e^-z and phi over a time, z = h / tau."""
+    z = elapsed_s / tau_s
+    return np.exp(-z), -np.expm1(-z) / z
 
-    keep, from_old, from_new (b,) : weights of A_0, S_0, S_1 in A_1; over = sum of g_b
-    """
+
+@respond_kernel
+def relax(
+    time_s, elapsed_s, par, data, deformation, pressure, gradient, before, after, stress, content, flux
+):  # fmt: skip
+    """Adds the branches' stress; `par` holds g and tau of each, the memory S_e and each A, row by row."""
+    count = len(par) // 2
+    weight, over = np.empty((count, 3)), 0.0  # of A_0, S_0 and S_1 in A_1; sum of g
+    for b in range(count):
+        g = par[2 * b]
+        keep, phi = _decay(elapsed_s, par[2 * b + 1])
+        weight[b, 0], weight[b, 1], weight[b, 2] = keep, g * (phi - keep), g * (1.0 - phi)
+        over += g
     inverse, elastic, second = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for e in range(stress.shape[0]):
-        for q in range(stress.shape[1]):
-            f = deformation[e, q]
-            elastic_stress(f, pressure[e, q], stress[e, q], inverse, elastic)
-            for i in range(3):
-                for k in range(3):
-                    total = 0.0
-                    for m in range(3):
-                        total += inverse[i, m] * elastic[m, k]
-                    second[i, k] = over * total
-                    after[e, q, 3 * i + k] = total
-            for b in range(len(keep)):
-                for r in range(9):
-                    grown = (
-                        keep[b] * before[e, q, 9 * (b + 1) + r]
-                        + from_old[b] * before[e, q, r]
-                        + from_new[b] * after[e, q, r]
-                    )
-                    after[e, q, 9 * (b + 1) + r] = grown
-                    second[r // 3, r % 3] -= grown
-            for i in range(3):
-                for k in range(3):
-                    for m in range(3):
-                        stress[e, q, i, k] += f[i, m] * second[m, k]
+    for n in range(len(pressure)):
+        f = deformation[n]
+        elastic_stress(f, pressure[n], stress[n], inverse, elastic)
+        for i in range(3):
+            for k in range(3):
+                total = 0.0
+                for m in range(3):
+                    total += inverse[i, m] * elastic[m, k]
+                second[i, k] = over * total
+                after[n, 3 * i + k] = total
+        for b in range(count):
+            for r in range(9):
+                place = 9 * (b + 1) + r
+                grown = (
+                    weight[b, 0] * before[n, place] + weight[b, 1] * before[n, r] + weight[b, 2] * after[n, r]
+                )
+                after[n, place] = grown
+                second[r // 3, r % 3] -= grown
+        for i in range(3):
+            for k in range(3):
+                for m in range(3):
+                    stress[n, i, k] += f[i, m] * second[m, k]
 
 
-@compiled
-def relax_derivatives(deformation, pressure, before, keep, from_old, left, stress_f):
+@linearise_kernel
+def relax_derivatives(
+    time_s, elapsed_s, par, data, deformation, pressure, gradient,
+    before, stress_f, stress_p, content_f, content_p, flux_f, flux_g,
+):  # fmt: skip
     """dP = (1 + left) dP_e - dF C, `left` = sum of g_b phi_b, C the part of A_1 that the past has left."""
+    count, left = len(par) // 2, 0.0
+    weight = np.empty((count, 2))  # of A_0 and S_0 in A_1
+    for b in range(count):
+        g = par[2 * b]
+        keep, phi = _decay(elapsed_s, par[2 * b + 1])
+        weight[b, 0], weight[b, 1] = keep, g * (phi - keep)
+        left += g * phi
     inverse, past = np.empty((3, 3)), np.empty(9)
-    for e in range(stress_f.shape[0]):
-        for q in range(stress_f.shape[1]):
-            j = inverse_and_determinant(deformation[e, q], inverse)
-            scale_elastic(1.0 + left, pressure[e, q], j, inverse, stress_f[e, q])
-            past[:] = 0.0
-            for b in range(len(keep)):
-                for r in range(9):
-                    past[r] += keep[b] * before[e, q, 9 * (b + 1) + r] + from_old[b] * before[e, q, r]
-            for i in range(3):
-                for k in range(3):
-                    for n in range(3):
-                        stress_f[e, q, 3 * i + k, 3 * i + n] -= past[3 * n + k]
+    for point in range(len(pressure)):
+        j = inverse_and_determinant(deformation[point], inverse)
+        scale_elastic(1.0 + left, pressure[point], j, inverse, stress_f[point])
+        past[:] = 0.0
+        for b in range(count):
+            for r in range(9):
+                past[r] += weight[b, 0] * before[point, 9 * (b + 1) + r] + weight[b, 1] * before[point, r]
+        for i in range(3):
+            for k in range(3):
+                for n in range(3):
+                    stress_f[point, 3 * i + k, 3 * i + n] -= past[3 * n + k]
 
 
-class Relaxation(TissueLaw):
-    """Branches of strength g [-] and time tau [s]."""
-
-    rank = Rank.VISCOUS
-
-    def __init__(self, strength: Sequence[float], time_s: Sequence[float]) -> None:
-        self._strength, self._time_s = np.array(strength, dtype=float), np.array(time_s, dtype=float)
-        self.remembers = 9 * (1 + len(self._strength))
-
-    def _weights(self, elapsed_s: float) -> tuple[Array, Array, Array]:
-        """Of A_0, S_0 and S_1 in A_1, (b,) each."""
-        z = elapsed_s / self._time_s
-        phi = -np.expm1(-z) / z
-        return np.exp(-z), self._strength * (phi - np.exp(-z)), self._strength * (1.0 - phi)
-
-    def respond(self, chunk: Chunk, passage: Passage) -> None:
-        at = chunk.at
-        relax(
-            at.deformation, at.pressure, passage.before, *self._weights(passage.elapsed_s),
-            float(self._strength.sum()), chunk.found.stress, passage.after,
-        )  # fmt: skip
-
-    def linearise(self, chunk: Chunk, passage: Passage) -> None:
-        at = chunk.at
-        keep, from_old, from_new = self._weights(passage.elapsed_s)
-        left = float((self._strength - from_new).sum())
-        relax_derivatives(
-            at.deformation, at.pressure, passage.before, keep, from_old, left, chunk.by.stress_f
-        )
-
-
-def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
-    """The law of two branches, in both layers."""
-    return Relaxation([values["g_1"], values["g_2"]], [values["tau_1"], values["tau_2"]])
+def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+    """Returns the law of two branches, in both layers."""
+    par = np.array([values["g_1"], values["tau_1"], values["g_2"], values["tau_2"]])
+    return TissueLaw(
+        rank=Rank.VISCOUS,
+        remembers=9 * (1 + len(par) // 2),
+        par=par,
+        data=sites.table(),
+        respond=relax,
+        linearise=relax_derivatives,
+    )
 
 
 def estimate(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:

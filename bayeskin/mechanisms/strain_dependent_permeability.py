@@ -11,61 +11,52 @@ from collections.abc import Mapping
 import numpy as np
 
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.assembly import Chunk, compiled, inverse_and_determinant
-from bayeskin.model.problem import Problem
-from bayeskin.model.tissue import Passage, TissueLaw
+from bayeskin.model.assembly import inverse_and_determinant
+from bayeskin.model.kernels import linearise_kernel, respond_kernel
+from bayeskin.model.problem import Sites
+from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Parameter
 
 
-@compiled
-def scale(deformation, exponent, flux):
-    """Multiplies the flux (e, q, 3) by k / k0."""
+@respond_kernel
+def scale(
+    time_s, elapsed_s, par, data, deformation, pressure, gradient, before, after, stress, content, flux
+):  # fmt: skip
+    """Multiplies the flux by k / k0; `par` holds M."""
     inverse = np.empty((3, 3))
-    for e in range(flux.shape[0]):
-        for q in range(flux.shape[1]):
-            j = inverse_and_determinant(deformation[e, q], inverse)
-            factor = np.exp(exponent * (j - 1.0))
-            for i in range(3):
-                flux[e, q, i] *= factor
+    for n in range(len(pressure)):
+        j = inverse_and_determinant(deformation[n], inverse)
+        factor = np.exp(par[0] * (j - 1.0))
+        for i in range(3):
+            flux[n, i] *= factor
 
 
-@compiled
-def scale_derivatives(deformation, gradient, exponent, flux_f, flux_g):
+@linearise_kernel
+def scale_derivatives(
+    time_s, elapsed_s, par, data, deformation, pressure, gradient,
+    before, stress_f, stress_p, content_f, content_p, flux_f, flux_g,
+):  # fmt: skip
     """d(f Q) = f dQ + f M J tr(F^-1 dF) Q, with Q = dQ/dg g."""
-    inverse = np.empty((3, 3))
-    for e in range(flux_f.shape[0]):
-        for q in range(flux_f.shape[1]):
-            j = inverse_and_determinant(deformation[e, q], inverse)
-            factor = np.exp(exponent * (j - 1.0))
-            for i in range(3):
-                flux = 0.0
-                for k in range(3):
-                    flux += flux_g[e, q, i, k] * gradient[e, q, k]
-                    flux_g[e, q, i, k] *= factor
-                for m in range(3):
-                    for n in range(3):
-                        flux_f[e, q, i, 3 * m + n] = factor * (
-                            flux_f[e, q, i, 3 * m + n] + exponent * j * inverse[n, m] * flux
-                        )
+    exponent, inverse = par[0], np.empty((3, 3))
+    for point in range(len(pressure)):
+        j = inverse_and_determinant(deformation[point], inverse)
+        factor = np.exp(exponent * (j - 1.0))
+        for i in range(3):
+            flux = 0.0
+            for k in range(3):
+                flux += flux_g[point, i, k] * gradient[point, k]
+                flux_g[point, i, k] *= factor
+            for m in range(3):
+                for n in range(3):
+                    flux_f[point, i, 3 * m + n] = factor * (
+                        flux_f[point, i, 3 * m + n] + exponent * j * inverse[n, m] * flux
+                    )
 
 
-class StrainDependentPermeability(TissueLaw):
-    """The law with the exponent M."""
-
-    def __init__(self, exponent: float) -> None:
-        self._exponent = exponent
-
-    def respond(self, chunk: Chunk, passage: Passage) -> None:
-        scale(chunk.at.deformation, self._exponent, chunk.found.flux)
-
-    def linearise(self, chunk: Chunk, passage: Passage) -> None:
-        at, by = chunk.at, chunk.by
-        scale_derivatives(at.deformation, at.gradient, self._exponent, by.flux_f, by.flux_g)
-
-
-def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
-    """The law of `M_k`."""
-    return StrainDependentPermeability(float(values["M_k"]))
+def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+    """Returns the law of `M_k`."""
+    exponent = np.array([values["M_k"]])
+    return TissueLaw(par=exponent, data=sites.table(), respond=scale, linearise=scale_derivatives)
 
 
 MECHANISM = Mechanism(

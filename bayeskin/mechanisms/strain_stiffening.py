@@ -18,9 +18,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bayeskin.mechanisms.fibres import Fibres
+from bayeskin.mechanisms.fibres import fibres
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.problem import Problem
+from bayeskin.model.problem import Sites
 from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Parameter
 from bayeskin.words import number
@@ -29,19 +29,17 @@ STRETCH = 1.25
 
 
 def first_modulus(values: Mapping[str, float]) -> float:
-    """k1 [Pa] of the fibre stress S, of k2 and of the dispersion."""
+    """Returns k1 [Pa] that the fibre stress S, k2 and the dispersion make."""
     kappa = values["dispersion"]
     strain = kappa * (STRETCH**2 + 2.0 / STRETCH - 3.0) + (1.0 - 3.0 * kappa) * (STRETCH**2 - 1.0)
     slope = 2.0 * (1.0 - 2.0 * kappa) * strain * float(np.exp(values["k2"] * strain**2))
     return values["fibre_stress"] / slope
 
 
-def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
-    """Fibres along x in the cutis."""
-    direction = np.zeros((*problem.space.weight.shape, 3))
-    direction[..., 0] = 1.0
-    k1 = np.where(problem.mesh.cutis, first_modulus(values), 0.0)
-    return Fibres(direction, k1, values["k2"], values["dispersion"])
+def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+    """Returns fibres along x in the cutis."""
+    k1 = np.where(sites.cutis, first_modulus(values), 0.0)
+    return fibres(sites, np.array([1.0, 0.0, 0.0]), k1, values["k2"], values["dispersion"])
 
 
 MECHANISM = Mechanism(

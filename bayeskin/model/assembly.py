@@ -13,6 +13,7 @@ inner loops run over shape functions.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numba
@@ -21,12 +22,24 @@ import numpy as np
 from bayeskin.types import Array
 
 CHUNK = 256  # cells
-compiled = numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz", "arcp"})
+FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+SETTINGS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": FASTMATH}
+compiled = numba.njit(**SETTINGS)
+
+
+class AtPoints:
+    """Arrays (e, q, ...) at e cells' q quadrature points."""
+
+    @cached_property
+    def flat(self) -> tuple[Array, ...]:
+        """Returns views (e q, ...) of the arrays, in their order, cell by cell."""
+        arrays = (getattr(self, f.name) for f in fields(self))  # type: ignore[arg-type]
+        return tuple(a.reshape(-1, *a.shape[2:]) for a in arrays)
 
 
 @dataclass(frozen=True)
-class Points:
-    """What a law is given at e cells' q quadrature points: F (e, q, 3, 3), p (e, q), grad p (e, q, 3)."""
+class Points(AtPoints):
+    """The place where a law acts: F (e, q, 3, 3), p (e, q), grad p (e, q, 3)."""
 
     deformation: Array
     pressure: Array
@@ -34,8 +47,8 @@ class Points:
 
 
 @dataclass(frozen=True)
-class Response:
-    """What a law answers: stress (e, q, 3, 3), fluid content (e, q), and flux (e, q, 3) over the step."""
+class Response(AtPoints):
+    """A law's answer: stress (e, q, 3, 3), fluid content (e, q), and flux (e, q, 3) over the step."""
 
     stress: Array
     content: Array
@@ -43,7 +56,7 @@ class Response:
 
 
 @dataclass(frozen=True)
-class Linearised:
+class Linearised(AtPoints):
     """Derivatives of a `Response`; deformations and stresses as rows of nine.
 
     stress_f (e, q, 9, 9), stress_p (e, q, 9), content_f (e, q, 9), content_p (e, q),
@@ -60,16 +73,20 @@ class Linearised:
 
 @dataclass(frozen=True)
 class Chunk:
-    """Some cells, few enough that what is computed of them stays in the cache, and room for it."""
+    """Some cells, few enough that what is computed of them stays in the cache, and room for it.
+
+    points : places of their quadrature points among all, cell by cell
+    """
 
     cells: slice
+    points: slice
     at: Points
     found: Response
     by: Linearised
 
 
 def chunks(shape: tuple[int, int]) -> list[Chunk]:
-    """All (e, q) points, chunk by chunk; the chunks share one room, so each is done with before the next."""
+    """Returns all (e, q) points, chunk by chunk, which share one room: each is done with before the next."""
     size = min(CHUNK, shape[0]), shape[1]
     room = (
         Points(np.empty((*size, 3, 3)), np.empty(size), np.empty((*size, 3))),
@@ -77,7 +94,10 @@ def chunks(shape: tuple[int, int]) -> list[Chunk]:
         Linearised(*(np.zeros((*size, *tail)) for tail in ((9, 9), (9,), (9,), (), (3, 9), (3, 3)))),
     )
     ends = ((start, min(start + CHUNK, shape[0])) for start in range(0, shape[0], CHUNK))
-    return [Chunk(slice(a, b), *(_first(b - a, arrays) for arrays in room)) for a, b in ends]
+    return [
+        Chunk(slice(a, b), slice(a * shape[1], b * shape[1]), *(_first(b - a, arrays) for arrays in room))
+        for a, b in ends
+    ]
 
 
 def _first(count: int, arrays: Any) -> Any:

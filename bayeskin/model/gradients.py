@@ -70,7 +70,7 @@ class _Varied:
 
 @dataclass(frozen=True)
 class _Slopes:
-    """Derivatives of a `State` by r parameters: x (dofs, r), J and p (e, q, r), memories (e, q, k, r), what
+    """Derivatives of a `State` by r parameters: x (dofs, r), J and p (e, q, r), memories (e q, m, r), what
     is lost in series (k, r). With such elements a last column of x is the response to the pads' travel."""
 
     state: State
@@ -287,7 +287,7 @@ def _varied(
 ) -> _Varied:
     """Raises InputError for a change that makes of a run another one."""
     values = {**theta, name: theta[name] + by}
-    bound = tuple(sorted((bind(values, model.problem) for bind in laws), key=lambda law: law.rank))
+    bound = tuple(sorted((bind(values, model.problem.sites) for bind in laws), key=lambda law: law.rank))
     motion, starts_s = model.on_the_way(bound)
     if starts_s != model.starts_s:
         raise InputError(f"gradients: {name}", theta[name], "pads that were opened before the test")

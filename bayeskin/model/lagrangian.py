@@ -15,12 +15,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from bayeskin.model import assembly, poroelastic
-from bayeskin.model.newton import (
-    Equations,
-    NewtonSolver,
-)
+from bayeskin.model.newton import Equations, NewtonSolver
 from bayeskin.model.problem import Material, Problem
-from bayeskin.model.tissue import Passage, TissueLaw
+from bayeskin.model.tissue import SurfaceTerm, TissueLaw
 from bayeskin.types import Array, PadMotion
 
 OPENED_S, REST_S = 1e3, 1e6  # pads that were opened before the test: by then, and when it starts
@@ -36,7 +33,7 @@ SOLVER_TOLERANCE = 1e-4  # of the largest displacement and pressure, before the 
 class State:
     """Everything that the next step needs: x (dofs,), J and p (e, q) at the quadrature points.
 
-    memory : (e, q, k) of each law; lost : (k,) of each element in series with the skin
+    memory : (e q, m) of each law; lost : (k,) of each element in series with the skin
     """
 
     time_s: float
@@ -48,7 +45,7 @@ class State:
 
 
 class Evaluated(NamedTuple):
-    """The residual (dofs,) at some unknowns, with J and p (e, q) and each law's memory (e, q, k) there."""
+    """The residual (dofs,) at some unknowns, with J and p (e, q) and each law's memory (e q, m) there."""
 
     residual: Array
     volume: Array
@@ -114,9 +111,6 @@ class LagrangianModel:
         # the reaction's derivative (free,) by the free unknowns, at the last tangent
         self.pad_gradient = np.zeros(len(self.problem.pattern.free))
         self._on_pad = np.isin(self.problem.pattern.fixed, self.problem.pad_x).astype(float)
-        self._surfaces = [
-            (term, *self.problem.pattern.places(term.matrix)) for law in self.laws for term in law.surfaces
-        ]
         self._answer: tuple[float, Array] | None = None  # of force and unknowns to a metre that is lost
         self._travel: Array | None = None  # change of the unknowns a metre of the pads' travel
 
@@ -154,7 +148,7 @@ class LagrangianModel:
         x = np.zeros(space.dofs)
         x[3 * space.n_nodes :] = p_init
         shape = space.weight.shape
-        memory = tuple(np.zeros((*shape, law.remembers)) for law in self.laws)
+        memory = tuple(np.zeros((space.weight.size, law.remembers)) for law in self.laws)
         lost = tuple(np.zeros(element.remembers) for element in self._series)
         return State(0.0, x, np.ones(shape), np.full(shape, float(p_init)), memory, lost)
 
@@ -172,7 +166,8 @@ class LagrangianModel:
         """
         s, (m, laws) = self.problem.space, changed or (self.material, self.laws)
         volume, pressure, out = np.empty(s.weight.shape), np.empty(s.weight.shape), np.zeros(s.dofs)
-        passages = self._passages(old, h if elapsed_s is None else elapsed_s)
+        elapsed_s = h if elapsed_s is None else elapsed_s
+        memory = tuple(np.empty_like(before) for before in old.memory)
         for chunk in self._chunks:
             c, at, found = chunk.cells, chunk.at, chunk.found
             self._evaluate(x, chunk)
@@ -183,15 +178,19 @@ class LagrangianModel:
             )  # fmt: skip
             if not smallest > 0.0:
                 return None
-            for law, passage in zip(laws, passages, strict=True):
-                law.respond(chunk, _part(passage, c))
+            for law, before, after in zip(laws, old.memory, memory, strict=True):
+                if law.respond is not None:
+                    n = chunk.points
+                    law.respond(
+                        self._since_start(old, elapsed_s), elapsed_s, law.par, law.data[n], *at.flat,
+                        before[n], after[n], *found.flat,
+                    )  # fmt: skip
             assembly.residual(
                 s.n_nodes, s.nodes_u[c], s.nodes_p[c], s.grad_u[c], s.grad_p[c], s.value_p, s.weight[c],
                 found.stress, found.content, found.flux, out,
             )  # fmt: skip
-        for term in [term for law in laws for term in law.surfaces]:
-            out += (h if term.per_second else 1.0) * (term.matrix @ x)
-        memory = tuple(passage.after for passage in passages)
+        for term in _surfaces(laws):
+            out += _factor(term, h) * (self.problem.linear(term.unit).matrix @ x)
         return Evaluated(out, volume, pressure, memory) if np.isfinite(out).all() else None
 
     def tangent(
@@ -199,7 +198,7 @@ class LagrangianModel:
     ) -> tuple[sp.csr_matrix, sp.csr_matrix]:
         """Derivative of the residual's free rows by the free and by the fixed unknowns."""
         s, m, data = self.problem.space, self.material, self._data
-        passages = self._passages(old, h if elapsed_s is None else elapsed_s)
+        elapsed_s = h if elapsed_s is None else elapsed_s
         data[:] = 0.0
         for chunk in self._chunks:
             c, at, by = chunk.cells, chunk.at, chunk.by
@@ -209,14 +208,20 @@ class LagrangianModel:
                 m.storage[c], h, old.pressure[c],
                 by.stress_f, by.stress_p, by.content_f, by.content_p, by.flux_f, by.flux_g,
             )  # fmt: skip
-            for law, passage in zip(self.laws, passages, strict=True):
-                law.linearise(chunk, _part(passage, c))
+            for law, before in zip(self.laws, old.memory, strict=True):
+                if law.linearise is not None:
+                    n = chunk.points
+                    law.linearise(
+                        self._since_start(old, elapsed_s), elapsed_s, law.par, law.data[n], *at.flat,
+                        before[n], *by.flat,
+                    )  # fmt: skip
             assembly.tangent(
                 s.grad_u[c], s.grad_p[c], s.value_p, s.weight[c], by.stress_f, by.stress_p, by.content_f,
                 by.content_p, by.flux_f, by.flux_g, self.problem.pattern.position[c], data,
             )  # fmt: skip
-        for term, place, value in self._surfaces:
-            np.add.at(data, place, (h if term.per_second else 1.0) * value)
+        for term in _surfaces(self.laws):
+            linear = self.problem.linear(term.unit)
+            np.add.at(data, linear.place, _factor(term, h) * linear.value)
         free_free, free_fixed = self.problem.pattern.matrices(data)
         self.pad_gradient = 2.0 * (free_fixed @ self._on_pad)
         return free_free, free_fixed
@@ -228,8 +233,9 @@ class LagrangianModel:
             at.deformation, at.pressure, at.gradient,
         )  # fmt: skip
 
-    def _passages(self, old: State, elapsed_s: float) -> list[Passage]:
-        return [Passage(elapsed_s, before, np.empty_like(before)) for before in old.memory]
+    def _since_start(self, old: State, elapsed_s: float) -> float:
+        """Time of the test [s] when a solve ends that began at `old`; 0 before the test."""
+        return max(old.time_s + elapsed_s - self.starts_s, 0.0)
 
     def equations(self, h: float, old: State, elapsed_s: float | None = None) -> Equations:
         s, m, pattern = self.problem.space, self.material, self.problem.pattern
@@ -397,5 +403,10 @@ def _total(lost: tuple[Array, ...]) -> float:
     return sum(float(memory[0]) for memory in lost)
 
 
-def _part(passage: Passage, cells: slice) -> Passage:
-    return Passage(passage.elapsed_s, passage.before[cells], passage.after[cells])
+def _surfaces(laws: Sequence[TissueLaw]) -> list[SurfaceTerm]:
+    return [term for law in laws for term in law.surfaces]
+
+
+def _factor(term: SurfaceTerm, h: float) -> float:
+    """Factor of a term's unit matrix over a stage of length h."""
+    return term.value * (h if term.per_second else 1.0)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 
 from bayeskin.model.mesh import SkinMesh
 from bayeskin.model.space import Sparsity, TaylorHood, sparsity, taylor_hood
@@ -54,6 +57,28 @@ def material(theta: Mapping[str, float], cutis: np.ndarray, fixed: Constants | N
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Sites:
+    """The n points at which laws act: which lie in the cutis (n,), and where (3, n) on the rolled arm [m]."""
+
+    cutis: np.ndarray
+    points_m: Array
+
+    def table(self, *columns: Array | float) -> Array:
+        """Returns constants of the points side by side, (n, d), from columns (n,), (n, j) or one for all."""
+        n = len(self.cutis)
+        parts = [c.reshape(n, -1) if np.ndim(c) else np.full((n, 1), c) for c in map(np.asarray, columns)]
+        return np.ascontiguousarray(np.concatenate([np.empty((n, 0)), *parts], axis=1))
+
+
+class LinearTerm(NamedTuple):
+    """A matrix (dofs, dofs), and where its entries stand in the tangent, with their values."""
+
+    matrix: sp.csr_matrix
+    place: np.ndarray
+    value: Array
+
+
 @dataclass(frozen=True)
 class Problem:
     """A mesh with its space, prescribed dofs and sparsity; shared by every run on that mesh.
@@ -66,6 +91,21 @@ class Problem:
     pattern: Sparsity
     pad: np.ndarray
     pads: np.ndarray
+    _linear: dict[object, LinearTerm] = field(init=False, repr=False, default_factory=dict)
+
+    @cached_property
+    def sites(self) -> Sites:
+        """Returns the quadrature points, cell by cell."""
+        points = self.space.quadrature_points()
+        cutis = np.repeat(self.mesh.cutis, points.shape[2])
+        return Sites(cutis, np.ascontiguousarray(points.reshape(3, -1)))
+
+    def linear(self, unit: Callable[[Problem], sp.csr_matrix]) -> LinearTerm:
+        """Returns the matrix that `unit` makes of this problem, made at the first call."""
+        if unit not in self._linear:
+            matrix = unit(self)
+            self._linear[unit] = LinearTerm(matrix, *self.pattern.places(matrix))
+        return self._linear[unit]
 
     @property
     def pad_x(self) -> np.ndarray:

@@ -233,7 +233,7 @@ def _run_reaction(
     falls_too: bool = True,
 ) -> _Outcome:
     """Fills the history; returns a message, empty for a run that finished."""
-    bound = tuple(bind(theta, problem) for bind in laws)
+    bound = tuple(bind(theta, problem.sites) for bind in laws)
     model = LagrangianModel(problem, solid, motion, bound)
     slopes = ForceGradients(model, theta, gradients, laws) if gradients else None
     at_start: list[float] = []

@@ -1,22 +1,21 @@
 """Where physics beyond the base model enters its equations.
 
-A tissue law is bound to values of its parameters and to a problem before a run. It changes what the base
-law answers at the quadrature points, and its derivatives, in place; or it adds linear terms on surfaces; or
-it lies in series with the skin, between the drive and the pads.
+A tissue law is bound to values of its parameters and to the points of a model before a run. It changes what
+the base law answers at the points, and its derivatives, in place; or it adds linear terms on surfaces; or it
+lies in series with the skin, between the drive and the pads.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
 import scipy.sparse as sp
 import skfem
 
-from bayeskin.model.assembly import Chunk
-from bayeskin.model.problem import Problem
+from bayeskin.model.problem import Problem, Sites
 from bayeskin.model.space import TaylorHood
 from bayeskin.types import Array, PadMotion
 
@@ -24,26 +23,24 @@ SURFACE_QUADRATURE_DEGREE = 4
 
 
 class Rank(IntEnum):
-    """Which laws answer first: viscous ones act on the elastic stress that those before left."""
+    """Which laws answer first: each acts on the elastic stress that those of lower rank left."""
 
     ELASTIC = 0
-    VISCOUS = 1
+    AGEING = 1
+    VISCOUS = 2
 
 
-@dataclass(frozen=True)
-class Passage:
-    """A law's memory (e, q, k) through one solve: `before`, earlier; `after`, which `respond` fills."""
-
-    elapsed_s: float
-    before: Array
-    after: Array
+Kernel = Callable[..., None]  # compiled, of the signatures of `kernels`
 
 
+@dataclass(frozen=True, eq=False)
 class TissueLaw:
-    """Changes nothing; what a law changes, it overrides.
+    """A law with the values of a run; by default it changes nothing.
 
     rank : when it answers, among others
-    remembers : numbers that it keeps at each quadrature point, 0 at the start
+    remembers : numbers that it keeps at each point, 0 at the start
+    par (k,), data (n, d) : what its kernels are given, of the run and of each point (`Sites.table`)
+    respond, linearise : compiled kernels (`kernels`), or None where it leaves the points' response alone
     surfaces : terms that are added to the residual
     opening_m : how far the pads were moved apart, and all was let come to rest, before the test [m, LVDT]
     series : what lies between drive and skin, if anything
@@ -51,18 +48,16 @@ class TissueLaw:
 
     rank: Rank = Rank.ELASTIC
     remembers: int = 0
+    par: Array = field(default_factory=lambda: np.empty(0))
+    data: Array = field(default_factory=lambda: np.empty((0, 0)))
+    respond: Kernel | None = None
+    linearise: Kernel | None = None
     surfaces: tuple[SurfaceTerm, ...] = ()
     opening_m: float = 0.0
     series: SeriesElement | None = None
 
-    def respond(self, chunk: Chunk, passage: Passage) -> None:
-        """Changes `chunk.found` (stress, content, flux) given `chunk.at`; fills `passage.after`."""
 
-    def linearise(self, chunk: Chunk, passage: Passage) -> None:
-        """Changes `chunk.by` to the derivatives of what `respond` leaves."""
-
-
-Bind = Callable[[Mapping[str, float], Problem], TissueLaw]  # of all parameters' values, SI
+Bind = Callable[[Mapping[str, float], Sites], TissueLaw]  # of all parameters' values, SI
 
 
 class SeriesElement:
@@ -85,18 +80,23 @@ class SeriesElement:
 
 @dataclass(frozen=True)
 class SurfaceTerm:
-    """``matrix @ x`` in the residual, matrix (dofs, dofs); times the stage's length where it is a rate."""
+    """``value * unit(problem) @ x`` in the residual, times the stage's length where it is a rate.
 
-    matrix: sp.csr_matrix
+    unit : a function of a module, so that its matrix (dofs, dofs) is made once a problem (`Problem.linear`)
+    """
+
+    value: float
+    unit: Callable[[Problem], sp.csr_matrix]
     per_second: bool = False
 
 
 def surface_mass(
     problem: Problem, facets: np.ndarray, displacement: bool, weight: Callable[[Array], Array] | None = None
 ) -> sp.coo_matrix:
-    """Integral over `facets` of the products of shape functions, (nodes, nodes) or (corners, corners) [m^2].
+    """Returns integrals over `facets` of products of shape functions, (nodes, nodes) or (corners, corners).
 
-    displacement : of the quadratic ones, else of the linear ones; weight : of points (3, ...), 1 if None
+    displacement : of the quadratic ones, else of the linear ones
+    weight : of points (3, ...), 1 if None; the result's unit is the weight's times m^2
     """
     mesh = problem.mesh.geometry
     bricks = isinstance(mesh, skfem.MeshHex)

@@ -18,7 +18,6 @@ from bayeskin.mechanisms import Mechanism, catalogue, laws, solved
 from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.problem import Problem
 from bayeskin.model.simulate import ModelSpec, problem_of, simulate
-from bayeskin.model.tissue import TissueLaw
 from bayeskin.pipeline.engine import Reporter, Run
 from bayeskin.pipeline.field_outputs import FieldOutputs, moments_of
 from bayeskin.pipeline.folder import plain
@@ -140,7 +139,7 @@ def _refuse_other_stresses(
     """Fields are those of the base law: a mechanism that changes it at a point has others."""
     for mechanism in mechanisms:
         bind = mechanism.act.bind
-        if bind is not None and type(bind(values, problem)).respond is not TissueLaw.respond:
+        if bind is not None and bind(values, problem.sites).respond is not None:
             expected = "none that changes the tissue's stress or flow: fields are of the base law"
             raise InputError("--fields, --figures", f"--mechanism {mechanism.name}", expected)
 

@@ -7,7 +7,7 @@ of the skin, the arm, the solid's law over time or strain, the motion that the s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,10 +16,12 @@ from scipy.signal import lfilter
 
 from bayeskin.mechanisms.elastic import elastic_stress, scale_elastic
 from bayeskin.mechanisms.mechanism import ForceOfTime
-from bayeskin.model.assembly import Chunk, compiled
+from bayeskin.mechanisms.stiffness_drift import Piece, drifting
+from bayeskin.model.assembly import inverse_and_determinant
+from bayeskin.model.kernels import linearise_kernel, respond_kernel
 from bayeskin.model.mesh import ARM_RADIUS_M, CUTIS_BOTTOM_M, LENGTH_M
-from bayeskin.model.problem import Constants, Material, Problem, material
-from bayeskin.model.tissue import Bind, Passage, TissueLaw
+from bayeskin.model.problem import Constants, Material, Sites, material
+from bayeskin.model.tissue import Bind, TissueLaw
 from bayeskin.proof.protocol import MOTION
 from bayeskin.types import Array, PadMotion
 
@@ -66,114 +68,65 @@ class Outside:
     change: Callable[[float], Change]
 
 
-@compiled
-def factored(deformation, pressure, factor, stress):
-    """Multiplies the elastic part of the stress (e, q, 3, 3) by a factor."""
+@respond_kernel
+def softened(
+    time_s, elapsed_s, par, data, deformation, pressure, gradient, before, after, stress, content, flux
+):  # fmt: skip
+    """Divides the elastic part of the stress by 1 + a (tr C - 3); `par` holds the loss a."""
     inverse, elastic = np.empty((3, 3)), np.empty((3, 3))
-    for e in range(stress.shape[0]):
-        for q in range(stress.shape[1]):
-            elastic_stress(deformation[e, q], pressure[e, q], stress[e, q], inverse, elastic)
-            for i in range(3):
-                for k in range(3):
-                    stress[e, q, i, k] += (factor - 1.0) * elastic[i, k]
+    for n in range(len(pressure)):
+        f = deformation[n]
+        elastic_stress(f, pressure[n], stress[n], inverse, elastic)
+        left = 1.0 / (1.0 + par[0] * max((f * f).sum() - 3.0, 0.0))
+        for i in range(3):
+            for k in range(3):
+                stress[n, i, k] += (left - 1.0) * elastic[i, k]
 
 
-@compiled
-def factored_derivatives(deformation, pressure, factor, stress_f):
-    """The same of its derivative."""
-    inverse, elastic, none = np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
-    for e in range(stress_f.shape[0]):
-        for q in range(stress_f.shape[1]):
-            f, p = deformation[e, q], pressure[e, q]
-            j = elastic_stress(f, p, none, inverse, elastic)
-            scale_elastic(factor, p, j, inverse, stress_f[e, q])
+@linearise_kernel
+def softened_derivatives(
+    time_s, elapsed_s, par, data, deformation, pressure, gradient,
+    before, stress_f, stress_p, content_f, content_p, flux_f, flux_g,
+):  # fmt: skip
+    """dP = (1 / b) dP_e - (2 a / b^2) (P_e (x) F) : dF, b = 1 + a (tr C - 3); `data` holds mu and lambda."""
+    loss, inverse = par[0], np.empty((3, 3))
+    for point in range(len(pressure)):
+        f, mu, lam = deformation[point], data[point, 0], data[point, 1]
+        j = inverse_and_determinant(f, inverse)
+        strain = (f * f).sum() - 3.0
+        left = 1.0 / (1.0 + loss * max(strain, 0.0))
+        scale_elastic(left, pressure[point], j, inverse, stress_f[point])
+        if strain <= 0.0:
+            continue
+        spherical = lam * np.log(j) - mu
+        for i in range(3):
+            for k in range(3):
+                own = mu * f[i, k] + spherical * inverse[k, i]
+                for m in range(3):
+                    for n in range(3):
+                        stress_f[point, 3 * i + k, 3 * m + n] -= 2.0 * loss * left**2 * own * f[m, n]
 
 
-class Ageing(TissueLaw):
-    """Moduli of both layers times a factor that time alone decides: P_e f(t)."""
+def ageing(pieces: Sequence[Piece]) -> Change:
+    """Returns moduli that follow a factor of the time, in pieces (`stiffness_drift`)."""
 
-    remembers = 1  # the time
-
-    def __init__(self, factor: Callable[[float], float]) -> None:
-        self._factor = factor
-
-    def _now(self, passage: Passage) -> float:
-        return self._factor(float(passage.before.flat[0]) + passage.elapsed_s)
-
-    def respond(self, chunk: Chunk, passage: Passage) -> None:
-        passage.after[...] = passage.before + passage.elapsed_s
-        factored(chunk.at.deformation, chunk.at.pressure, self._now(passage), chunk.found.stress)
-
-    def linearise(self, chunk: Chunk, passage: Passage) -> None:
-        factored_derivatives(chunk.at.deformation, chunk.at.pressure, self._now(passage), chunk.by.stress_f)
-
-
-@compiled
-def softened(deformation, pressure, loss, stress):
-    """Divides the elastic part of the stress by 1 + a (tr C - 3)."""
-    inverse, elastic = np.empty((3, 3)), np.empty((3, 3))
-    for e in range(stress.shape[0]):
-        for q in range(stress.shape[1]):
-            f = deformation[e, q]
-            elastic_stress(f, pressure[e, q], stress[e, q], inverse, elastic)
-            left = 1.0 / (1.0 + loss * max((f * f).sum() - 3.0, 0.0))
-            for i in range(3):
-                for k in range(3):
-                    stress[e, q, i, k] += (left - 1.0) * elastic[i, k]
-
-
-@compiled
-def softened_derivatives(deformation, pressure, loss, mu, lam, stress_f):
-    """dP = (1 / b) dP_e - (2 a / b^2) (P_e (x) F) : dF, b = 1 + a (tr C - 3)."""
-    inverse, elastic, zero = np.empty((3, 3)), np.empty((3, 3)), np.zeros((3, 3))
-    for e in range(stress_f.shape[0]):
-        for q in range(stress_f.shape[1]):
-            f, p = deformation[e, q], pressure[e, q]
-            j = elastic_stress(f, p, zero, inverse, elastic)
-            strain = (f * f).sum() - 3.0
-            left = 1.0 / (1.0 + loss * max(strain, 0.0))
-            scale_elastic(left, p, j, inverse, stress_f[e, q])
-            if strain <= 0.0:
-                continue
-            spherical = lam[e] * np.log(j) - mu[e]
-            for i in range(3):
-                for k in range(3):
-                    own = mu[e] * f[i, k] + spherical * inverse[k, i]
-                    for m in range(3):
-                        for n in range(3):
-                            stress_f[e, q, 3 * i + k, 3 * m + n] -= 2.0 * loss * left**2 * own * f[m, n]
-
-
-class Softening(TissueLaw):
-    """The solid yields ever more easily the further it is stretched; loss a [-], moduli (e,) of the cells."""
-
-    def __init__(self, loss: float, mu: Array, lam: Array) -> None:
-        self._loss, self._mu, self._lam = loss, mu, lam
-
-    def respond(self, chunk: Chunk, passage: Passage) -> None:
-        softened(chunk.at.deformation, chunk.at.pressure, self._loss, chunk.found.stress)
-
-    def linearise(self, chunk: Chunk, passage: Passage) -> None:
-        c, at = chunk.cells, chunk.at
-        lame = (self._mu[c], self._lam[c])
-        softened_derivatives(at.deformation, at.pressure, self._loss, *lame, chunk.by.stress_f)
-
-
-def ageing(factor: Callable[[float], float]) -> Change:
-    """Moduli that follow a factor of the time [s]."""
-
-    def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
-        return Ageing(factor)
+    def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+        return drifting(sites, pieces)
 
     return Change(laws=(bind,))
 
 
 def softening(loss: float) -> Change:
-    """See `Softening`."""
+    """Returns a solid that yields ever more easily the further it is stretched; loss a [-]."""
 
-    def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
-        solid = material(values, problem.mesh.cutis)
-        return Softening(loss, solid.mu, solid.lam)
+    def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+        solid = material(values, sites.cutis)
+        return TissueLaw(
+            par=np.array([loss]),
+            data=sites.table(solid.mu, solid.lam),
+            respond=softened,
+            linearise=softened_derivatives,
+        )
 
     return Change(laws=(bind,))
 
@@ -182,20 +135,14 @@ SETTING_S, LOOSENING_S = 15.0, 3.0  # a tissue that loosens while it is moved, a
 
 
 def thixotropy(loss: float) -> Change:
-    """Moduli less a share that grows while the drive moves and vanishes while it stands."""
+    """Returns moduli less a share that grows while the drive moves and vanishes while it stands."""
     moving = np.diff(MOTION.displacement_m) != 0.0
-    at_corner = [0.0]
-    for moves, lasts_s in zip(moving, np.diff(MOTION.time_s), strict=True):
+    loose, pieces = 0.0, []
+    for moves, start_s, lasts_s in zip(moving, MOTION.time_s[:-1], np.diff(MOTION.time_s), strict=True):
         end, tau = (1.0, LOOSENING_S) if moves else (0.0, SETTING_S)
-        at_corner.append(end + (at_corner[-1] - end) * float(np.exp(-lasts_s / tau)))
-
-    def factor(time_s: float) -> float:
-        i = min(max(int(np.searchsorted(MOTION.time_s, time_s)) - 1, 0), len(moving) - 1)
-        end, tau = (1.0, LOOSENING_S) if moving[i] else (0.0, SETTING_S)
-        loose = end + (at_corner[i] - end) * np.exp(-(time_s - MOTION.time_s[i]) / tau)
-        return float(1.0 - loss * loose)
-
-    return ageing(factor)
+        pieces.append((float(start_s), 1.0 - loss * loose, -loss * (end - loose) / tau, tau))
+        loose = end + (loose - end) * float(np.exp(-lasts_s / tau))
+    return ageing(pieces)
 
 
 YIELD_M = 4e-3
@@ -267,6 +214,7 @@ def _of(**changed: Any) -> Change:
     return Change(constants=Constants(**changed))
 
 
+FATIGUE_S = 60.0
 TOP_M = LENGTH_M[2]
 OUTSIDE: dict[str, Outside] = {
     "poisson-cutis": Outside("Poisson's ratio of the cutis", (0.2, 0.4), lambda s: _of(nu_c=s)),
@@ -284,11 +232,11 @@ OUTSIDE: dict[str, Outside] = {
     "soft-fat": Outside("a third layer, of moduli times", (0.03, 0.3), lambda s: Change(deep=s)),
     "hardening": Outside(
         "moduli grow evenly, by this share in all", (0.03, 0.4),
-        lambda s: ageing(lambda t: 1.0 + s * t / END_S),
+        lambda s: ageing([(0.0, 1.0, s / END_S, np.inf)]),
     ),
     "fatigue": Outside(
         "moduli fall by this share, most of it within a minute", (0.03, 0.4),
-        lambda s: ageing(lambda t: 1.0 - s * (1.0 - float(np.exp(-t / 60.0)))),
+        lambda s: ageing([(0.0, 1.0, -s / FATIGUE_S, FATIGUE_S)]),
     ),
     "thixotropy": Outside("moduli lose this share while the skin is moved", (0.03, 0.4), thixotropy),
     "strain-softening": Outside("loss of stiffness by tr C - 3", (0.3, 10.0), softening),
