@@ -11,6 +11,7 @@ import bayeskin
 PACKAGE = Path(bayeskin.__file__).parent
 BASE = {
     "errors",
+    "geometry",
     "types",
     "storage",
     "shipped",
@@ -25,6 +26,7 @@ BASE = {
 SIBLINGS = {"recordings", "model", "design", "surrogates"}
 BELOW = {
     "errors": set(),
+    "geometry": {"errors"},
     "types": {"errors"},
     "polynomials": {"types"},
     "storage": {"types", "errors"},

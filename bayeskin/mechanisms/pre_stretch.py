@@ -15,19 +15,17 @@ from bayeskin.model.problem import Problem
 from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Parameter
 
-HALF_GAUGE_M = 18e-3  # from the plane of symmetry to the pad
-
 
 class PreStretch(TissueLaw):
-    """Pads opened by a share of the half gauge length, each."""
+    """Pads opened by a share of half the gauge [m], each."""
 
-    def __init__(self, share: float) -> None:
-        self.opening_m = 2.0 * share * HALF_GAUGE_M
+    def __init__(self, share: float, half_gauge_m: float) -> None:
+        self.opening_m = 2.0 * share * half_gauge_m
 
 
 def bind(values: Mapping[str, float], problem: Problem) -> TissueLaw:
     """The law of `opening`."""
-    return PreStretch(values["opening"])
+    return PreStretch(values["opening"], problem.lengths.half_gauge_m)
 
 
 MECHANISM = Mechanism(

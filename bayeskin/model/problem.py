@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bayeskin.geometry import Geometry
 from bayeskin.model.mesh import SkinMesh
 from bayeskin.model.space import Sparsity, TaylorHood, sparsity, taylor_hood
 from bayeskin.types import Array
@@ -59,6 +60,7 @@ class Problem:
     """A mesh with its space, prescribed dofs and sparsity; shared by every run on that mesh.
 
     pad, pads : displacement nodes of the central pad; of pad and guard together
+    measured_x : x dofs of what the load cell holds, where the reaction is summed
     """
 
     mesh: SkinMesh
@@ -68,9 +70,13 @@ class Problem:
     pads: np.ndarray
 
     @property
-    def pad_x(self) -> np.ndarray:
-        """x dofs of the central pad, where the reaction is summed."""
-        return 3 * self.pad
+    def lengths(self) -> Geometry:
+        """Device and tissue."""
+        return self.mesh.lengths
+
+    @property
+    def measured_x(self) -> np.ndarray:
+        return 3 * (self.pad if self.lengths.force_on == "pad" else self.pads)
 
     def prescribe(self, x: Array, pad_displacement_m: float) -> Array:
         """A copy of x (dofs,) with every prescribed dof at its value: u_x of the pads, zero elsewhere."""
@@ -80,8 +86,8 @@ class Problem:
         return out
 
     def reaction(self, residual: Array) -> float:
-        """Force on the whole pad [N]: consistent nodal reactions along x, doubled for the y-symmetry."""
-        return float(2.0 * residual[self.pad_x].sum())
+        """Force on what the load cell holds [N]: nodal reactions along x, doubled for the y-symmetry."""
+        return float(2.0 * residual[self.measured_x].sum())
 
 
 def build_problem(mesh: SkinMesh) -> Problem:
