@@ -15,8 +15,9 @@ from unittest import mock
 
 import numpy as np
 
+from bayeskin.geometry import Geometry
 from bayeskin.model import mesh as mesh_module
-from bayeskin.model.mesh import brick_lines
+from bayeskin.model.bricks import brick_lines
 from bayeskin.model.simulate import ModelSpec, _mesh, problem_of
 from bayeskin.proof.protocol import MOTION
 from bayeskin.types import Array, PadMotion
@@ -68,9 +69,11 @@ def spec_on(mesh: str, tolerance: float) -> Iterator[ModelSpec]:
             _forget_meshes()
 
 
-def halved_lines(refinement: int) -> tuple[Array, ...]:
+def halved_lines(
+    refinement: int, geometry: Geometry = Geometry(), like: Geometry | None = None
+) -> tuple[Array, ...]:
     """Lines of the bricks with one more in the middle of every cell [m]."""
-    lines = brick_lines(refinement)
+    lines = brick_lines(refinement, geometry, like)
     return tuple(np.sort(np.concatenate([axis, 0.5 * (axis[1:] + axis[:-1])])) for axis in lines)
 
 

@@ -21,10 +21,10 @@ from typing import Any
 import arviz as az
 import emcee
 import h5py
-import meshio
 import numpy as np
 import openpyxl
 import pytest
+from gmsh_file import coarse_tetrahedra, gmsh_text
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from toy import EDGES_S, MOTION, SPACE, toy_bin_means, toy_force
@@ -32,9 +32,10 @@ from toy import EDGES_S, MOTION, SPACE, toy_bin_means, toy_force
 from bayeskin import probe, storage
 from bayeskin.config import load_config
 from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
 from bayeskin.inference import chains, draws_of, inference_data, load_inference_data, save_inference_data
 from bayeskin.journal import Journal, Run
-from bayeskin.model.mesh import GMSH_LAYERS, GMSH_NAMES, read_gmsh
+from bayeskin.model.gmsh import read_gmsh
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline import folder
 from bayeskin.pipeline.serve import Asked, ServedModel
@@ -86,17 +87,12 @@ def as_workbook() -> bytes:
     return out.getvalue()
 
 
-def as_mesh(tmp: Path) -> bytes:
-    """Two tetrahedra with the article's names for layers and boundaries, in gmsh's text."""
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], dtype=float)
-    solid = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])
-    faces = np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 4], [1, 3, 4]])
-    tags = [np.array([1, 2]), np.arange(3, 8)]
-    data = {"gmsh:physical": tags, "gmsh:geometrical": tags}
-    mesh = meshio.Mesh(points, [("tetra", solid), ("triangle", faces)], cell_data=data)
-    mesh.field_data = {name: np.array([n, 2]) for n, name in enumerate((*GMSH_LAYERS, *GMSH_NAMES), start=1)}
-    mesh.write(tmp / "sound.msh", file_format="gmsh22", binary=False)
-    return (tmp / "sound.msh").read_bytes()
+FLAT = Geometry(arm_radius_m=None)
+
+
+def as_mesh() -> bytes:
+    """Flat skin as gmsh writes it."""
+    return gmsh_text(coarse_tetrahedra(FLAT)).encode()
 
 
 def as_journal(tmp: Path) -> bytes:
@@ -164,7 +160,7 @@ READERS: dict[str, tuple[Callable[[Path], object], Callable[[Path], bytes], int]
     "a.txt": (read_and_segment, lambda tmp: as_text(" "), 1),
     "a.xlsx": (read_and_segment, lambda tmp: as_workbook(), 1),
     "a.toml": (load_config, lambda tmp: (ROOT / "runs/demo.toml").read_bytes(), 10),
-    "a.msh": (read_gmsh, as_mesh, 4),
+    "a.msh": (lambda path: read_gmsh(path, FLAT), lambda tmp: as_mesh(), 4),
     "a.journal": (read_journal, as_journal, 10),
     "stage.json": (read_stage, lambda tmp: json.dumps(STAGE).encode(), 10),
     "answer.json": (read_answer, lambda tmp: b'{"output": [[1.0, 2.0]], "inputSizes": [5]}', 10),

@@ -11,6 +11,7 @@ import bayeskin
 PACKAGE = Path(bayeskin.__file__).parent
 BASE = {
     "errors",
+    "geometry",
     "types",
     "storage",
     "shipped",
@@ -27,6 +28,7 @@ SIBLINGS = {"recordings", "model", "design", "surrogates"}
 BELOW = {
     "errors": set(),
     "behaviour": set(),
+    "geometry": {"errors"},
     "types": {"errors"},
     "polynomials": {"types"},
     "storage": {"types", "errors"},

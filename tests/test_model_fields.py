@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from skin_test import supplement
 
+from bayeskin.geometry import Geometry
 from bayeskin.model.fields import FieldWriter, StatesAt, fields_of
-from bayeskin.model.mesh import layered_mesh, read_gmsh
+from bayeskin.model.gmsh import read_gmsh
+from bayeskin.model.mesh import layered_mesh
 from bayeskin.model.problem import build_problem, material
 from bayeskin.model.simulate import ModelSpec, problem_of, simulate
 from bayeskin.model.surface import PARTS, _divided_triangle, seen_surface, surface_state
@@ -73,11 +75,11 @@ def test_fluid_runs_down_the_pressure_gradient_relative_to_the_solid(problem):
 def test_the_solid_s_velocity_is_its_mean_over_a_cell(tetrahedra):
     """Quadratic over the depth, on straight cells, whose means are known from their corners."""
     lines = [np.array(axis) for axis in ([0.0, 0.01, 0.03], [0.0, 0.02], [0.0, 0.004, 0.01])]
-    radius_m = 1e4
-    mesh = layered_mesh(lines, "straight", tetrahedra, 4e-3, radius_m)
+    flat = Geometry(cutis_m=6e-3, subcutis_m=4e-3, arm_radius_m=None)
+    mesh = layered_mesh(lines, "straight", tetrahedra, flat)
     problem = build_problem(mesh)
     space = problem.space
-    z = space.points_u[2] - radius_m
+    z = space.points_u[2]
     x, rate = np.zeros(space.dofs), np.zeros(space.dofs)
     rate[2 : 3 * space.n_nodes : 3] = z**2
     corners = z[space.nodes_u[:, : 4 if tetrahedra else 8]]

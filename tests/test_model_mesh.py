@@ -8,7 +8,9 @@ from skin_test import supplement
 
 from bayeskin.errors import InputError
 from bayeskin.model import ModelSpec, simulate
-from bayeskin.model.mesh import ARM_RADIUS_M, brick_lines, brick_mesh, read_gmsh, roll
+from bayeskin.model.bricks import brick_lines
+from bayeskin.model.gmsh import read_gmsh
+from bayeskin.model.mesh import brick_mesh, roll, unroll
 from bayeskin.model.problem import build_problem
 from bayeskin.types import PadMotion
 
@@ -18,10 +20,12 @@ THETA = {"E_c": 6e4, "E_s": 2e4, "k_c": 1e-14, "k_s": 5e-13, "p_init": 700.0}
 
 def test_rolling_keeps_arc_lengths_and_radii():
     flat = np.random.default_rng(0).uniform(0, 1, (3, 50)) * np.array([[0.105], [0.084], [0.01]])
-    x, y, z = roll(flat)
-    np.testing.assert_allclose(np.hypot(y, z), ARM_RADIUS_M + flat[2], rtol=1e-14)
+    x, y, z = roll(flat, 48e-3)
+    np.testing.assert_allclose(np.hypot(y, z), 48e-3 + flat[2], rtol=1e-14)
     np.testing.assert_allclose(np.arctan2(y, z) * np.hypot(y, z), flat[1], atol=1e-16)
     np.testing.assert_array_equal(x, flat[0])
+    np.testing.assert_allclose(unroll(roll(flat, 48e-3), 48e-3), flat, atol=1e-16)
+    np.testing.assert_array_equal(roll(flat, None), flat)
 
 
 def test_bricks_are_refined_beside_the_pads_edges_only():

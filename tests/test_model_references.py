@@ -15,7 +15,7 @@ from skin_test import supplement
 
 from bayeskin.model import ModelSpec, article, simulate
 from bayeskin.model.article import ArticleModel
-from bayeskin.model.mesh import read_gmsh
+from bayeskin.model.gmsh import read_gmsh
 from bayeskin.model.problem import build_problem, material
 from bayeskin.types import PadMotion
 

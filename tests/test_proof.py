@@ -337,7 +337,7 @@ def test_every_effect_outside_changes_something() -> None:
         for change in changes:
             parts = [
                 getattr(change, part) != getattr(none, part)
-                for part in ("constants", "cutis_bottom_m", "radius_m", "deep", "laws")
+                for part in ("constants", "geometry", "deep", "laws")
             ]
             time_s = np.linspace(0.0, 347.0, 701)
             force = change.reported(lambda t: np.atleast_2d(100.0 * MOTION.at(t)))(time_s)

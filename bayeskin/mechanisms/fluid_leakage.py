@@ -8,7 +8,6 @@ import numpy as np
 import scipy.sparse as sp
 
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.mesh import ARM_RADIUS_M, LENGTH_M
 from bayeskin.model.problem import Problem, Sites
 from bayeskin.model.tissue import SurfaceTerm, TissueLaw, pressure_rows, surface_mass
 from bayeskin.types import Parameter
@@ -17,11 +16,8 @@ from bayeskin.words import number
 
 def open_surface(problem: Problem) -> np.ndarray:
     """Facets of the top that no pad covers."""
-    mesh, named = problem.mesh.geometry, problem.mesh.facets
-    outside = mesh.boundary_facets()
-    corners = mesh.p[:, mesh.facets[:, outside]]
-    top = np.isclose(np.hypot(corners[1], corners[2]), ARM_RADIUS_M + LENGTH_M[2]).all(axis=0)
-    return np.setdiff1d(outside[top], np.concatenate([named["pad"], named["guard"]]))
+    named = problem.mesh.facets
+    return np.setdiff1d(problem.mesh.top(), np.concatenate([named["pad"], named["guard"]]))
 
 
 def outflow(problem: Problem) -> sp.csr_matrix:

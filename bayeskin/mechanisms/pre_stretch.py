@@ -15,12 +15,10 @@ from bayeskin.model.problem import Sites
 from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Parameter
 
-HALF_GAUGE_M = 18e-3  # from the plane of symmetry to the pad
-
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
     """Returns the law of pads that were each opened by a share `opening` of the half gauge length."""
-    return TissueLaw(opening_m=2.0 * values["opening"] * HALF_GAUGE_M)
+    return TissueLaw(opening_m=2.0 * values["opening"] * sites.lengths.half_gauge_m)
 
 
 MECHANISM = Mechanism(

@@ -24,12 +24,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from bayeskin.geometry import Geometry
 from bayeskin.mechanisms.elastic import elastic_stress, scale_elastic
 from bayeskin.mechanisms.lines import stretch_of, strict
 from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Tissue, Values
 from bayeskin.model.assembly import compiled, inverse_and_determinant
 from bayeskin.model.kernels import linearise_kernel, respond_kernel
-from bayeskin.model.lagrangian import PAD_EDGE_M
 from bayeskin.model.problem import Sites
 from bayeskin.model.tissue import Rank, TissueLaw
 from bayeskin.types import Array, PadMotion, Parameter
@@ -169,8 +169,8 @@ def recall(grid, rate, strength, tau_s, left, times, more):
 
 
 def _stretch(motion: PadMotion, time_s: Array) -> Array:
-    """Mean stretch of the skin between the plane of symmetry and the pad's near edge."""
-    return np.asarray(1.0 + 0.5 * motion.at(time_s) / PAD_EDGE_M)
+    """Mean stretch of the skin between the article's pads: surrogates learn what an estimate leaves."""
+    return np.asarray(1.0 + 0.5 * motion.at(time_s) / Geometry().half_gauge_m)
 
 
 MECHANISM = Mechanism(

@@ -32,7 +32,6 @@ from bayeskin.types import Array
 
 SOLVER_TOLERANCE = 1e-4  # of the largest displacement and pressure, before the last correction
 FACE_QUADRATURE_DEGREE = 6
-PAD_AREA_M2 = 32e-6  # the quarter's share of the pad
 SMALLEST_STRESS = 1e-3  # of the shear modulus, below which no force is told from rounding
 SWING = 0.05  # of the largest force so far, to and fro at a steady speed: no relaxation does that
 
@@ -157,7 +156,7 @@ class ArticleModel:
         size_u = max(float(np.abs(old[:n]).max()), 1e-4)
         size_p = max(float(np.abs(old[n:]).max()), 1e-3 * float(m.mu.min()))
         size = np.where(np.arange(s.dofs) < n, size_u, size_p)
-        scale = np.where(np.arange(s.dofs) < n, 1.0, float(m.mu.max()) / 2e-3)
+        scale = np.where(np.arange(s.dofs) < n, 1.0, float(m.mu.max()) / self.problem.lengths.cutis_m)
         return Equations(
             pattern.free,
             residual,
@@ -201,7 +200,7 @@ def run(
     corners = model.problem.mesh.geometry.p.T.copy()
     past, old_speed = [(0.0, x)], np.nan  # states since the pads' speed last changed
     forces = [0.0]  # at those states
-    largest = SMALLEST_STRESS * float(model.material.mu.max()) * PAD_AREA_M2
+    largest = SMALLEST_STRESS * float(model.material.mu.max()) * model.problem.lengths.quarter_pad_m2
     for n in range(1, len(time_s)):
         dt = float(time_s[n] - time_s[n - 1])
         speed = (displacement_m[n] - displacement_m[n - 1]) / dt

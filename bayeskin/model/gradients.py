@@ -217,7 +217,7 @@ class ForceGradients:
             tried = [*tried, (x[free] * weight, correction * weight)][-ANDERSON_DEPTH:]
             x[free] += _accelerated(tried) / weight
             self.corrections += 1
-        return x, found, 2.0 * found.residual[model.problem.pad_x].sum(axis=0) + missing_n
+        return x, found, 2.0 * found.residual[model.problem.measured_x].sum(axis=0) + missing_n
 
     def _dual(self, place: Array) -> Array:
         """M^-1 g (free,) with the factorisation M that was made at `place`, solved for once."""

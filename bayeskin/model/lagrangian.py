@@ -22,8 +22,6 @@ from bayeskin.types import Array, PadMotion
 
 OPENED_S, REST_S = 1e3, 1e6  # pads that were opened before the test: by then, and when it starts
 SMALLEST_MOTION_M = 1e-4  # so that a protocol without motion has a scale too
-CUTIS_THICKNESS_M, SUBCUTIS_THICKNESS_M = 2e-3, 8e-3
-PAD_WIDTH_M, PAD_EDGE_M = 8e-3, 18e-3  # both halves of the pad; distance of its inner edge from x = 0
 SERIES_TOLERANCE = 1e-5  # of the largest displacement, in what is lost before the skin
 MOST_TRIALS = 8  # of what is lost
 SOLVER_TOLERANCE = 1e-4  # of the largest displacement and pressure, before the last correction
@@ -110,7 +108,7 @@ class LagrangianModel:
         self._data = np.empty(self.problem.pattern.size)  # overwritten by each tangent
         # the reaction's derivative (free,) by the free unknowns, at the last tangent
         self.pad_gradient = np.zeros(len(self.problem.pattern.free))
-        self._on_pad = np.isin(self.problem.pattern.fixed, self.problem.pad_x).astype(float)
+        self._measured = np.isin(self.problem.pattern.fixed, self.problem.measured_x).astype(float)
         self._answer: tuple[float, Array] | None = None  # of force and unknowns to a metre that is lost
         self._travel: Array | None = None  # change of the unknowns a metre of the pads' travel
 
@@ -223,7 +221,7 @@ class LagrangianModel:
             linear = self.problem.linear(term.unit)
             np.add.at(data, linear.place, _factor(term, h) * linear.value)
         free_free, free_fixed = self.problem.pattern.matrices(data)
-        self.pad_gradient = 2.0 * (free_fixed @ self._on_pad)
+        self.pad_gradient = 2.0 * (free_fixed @ self._measured)
         return free_free, free_fixed
 
     def _evaluate(self, x: Array, chunk: assembly.Chunk) -> None:
@@ -251,7 +249,7 @@ class LagrangianModel:
         size_u = np.abs(self.problem_scale(old.x[:n]))
         size_p = max(float(np.abs(old.x[n:]).max()), 1e-3 * float(m.mu.min()))
         weight = np.concatenate([np.full(n, 1.0 / size_u), np.full(s.n_corners, 1.0 / size_p)])
-        scale = np.where(np.arange(s.dofs) < n, 1.0, float(m.mu.max()) / CUTIS_THICKNESS_M)
+        scale = np.where(np.arange(s.dofs) < n, 1.0, float(m.mu.max()) / self.problem.lengths.cutis_m)
         return Equations(
             pattern.free,
             residual,
@@ -270,12 +268,13 @@ class LagrangianModel:
         return np.concatenate([drag.ravel(), np.zeros(s.n_corners)])[self.problem.pattern.free]
 
     def nominal_force(self) -> float:
-        """Scale of the force [N]: both layers pulled over the pad's width from the plane x = 0."""
+        """Scale of the force [N]: both layers pulled from the plane x = 0, as wide as the load cell holds."""
         young = self.material.mu * (3 * self.material.lam + 2 * self.material.mu)
         young = young / (self.material.lam + self.material.mu)
-        cutis = self.problem.mesh.cutis
-        tension = young[cutis].max() * CUTIS_THICKNESS_M + young[~cutis].max() * SUBCUTIS_THICKNESS_M
-        return float(tension * PAD_WIDTH_M * self.problem_scale(np.zeros(1)) / PAD_EDGE_M)
+        cutis, lengths = self.problem.mesh.cutis, self.problem.lengths
+        tension = young[cutis].max() * lengths.cutis_m + young[~cutis].max() * lengths.subcutis_m
+        moved_m = self.problem_scale(np.zeros(1))
+        return float(tension * lengths.measured_width_m * moved_m / lengths.half_gauge_m)
 
     def problem_scale(self, u: Array) -> float:
         """Largest displacement of the protocol [m], against which a correction is small."""

@@ -1,39 +1,25 @@
-"""The quarter of the upper arm as a mesh: graded bricks of our own, or a gmsh file.
+"""The quarter of the skin as a mesh: what a mesh is, and graded bricks of our own (`gmsh` reads files).
 
-Both are made flat (x 0..105 mm, y 0..84 mm, z 0..10 mm) and rolled onto the arm:
-``theta = y / (R + z)``, ``y' = (R + z) sin(theta)``, ``z' = (R + z) cos(theta)``, R = 48 mm.
+Both are made flat, as `bayeskin.geometry` has it, and rolled onto an arm of radius R:
+``theta = y / (R + z)``, ``y' = (R + z) sin(theta)``, ``z' = (R + z) cos(theta)``.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
 from collections.abc import Sequence
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
-from itertools import pairwise
-from pathlib import Path
 
-import meshio
 import numpy as np
 import skfem
 from skfem.mapping import MappingIsoparametric
 
-from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
+from bayeskin.model.bricks import brick_lines
 from bayeskin.types import Array
 
-ARM_RADIUS_M = 48e-3
-LENGTH_M = (105e-3, 84e-3, 10e-3)
-CUTIS_BOTTOM_M = 8e-3
+TOP_TOLERANCE_M = 1e-6  # of what lies on the skin's outer face
 BOUNDARIES = ("pad", "guard", "symmetry_x", "symmetry_y", "bottom")
-GMSH_NAMES = {
-    "right_patch": "pad",
-    "u_right": "guard",
-    "left": "symmetry_x",
-    "back": "symmetry_y",
-    "bottom": "bottom",
-}
-GMSH_LAYERS = {"bottom_layer": "subcutis", "top_layer": "cutis"}
 
 
 @dataclass(frozen=True)
@@ -41,15 +27,17 @@ class SkinMesh:
     """A rolled mesh with the facets of each boundary and the cells of the cutis.
 
     geometry : scikit-fem mesh, coordinates in metres, already rolled
-    facets : indices of `geometry.facets` for each name in BOUNDARIES
+    facets : indices of `geometry.facets` for each name in BOUNDARIES; none of a guard that is not there
     cutis : (cells,) True in the cutis, False in the subcutis
     name : for messages and records
+    lengths : device and tissue that it is a mesh of
     """
 
     geometry: skfem.Mesh
     facets: dict[str, np.ndarray]
     cutis: np.ndarray
     name: str
+    lengths: Geometry = Geometry()
 
     @property
     def hash(self) -> str:
@@ -60,6 +48,14 @@ class SkinMesh:
         for array in (nanometres, *(np.asarray(part, dtype=np.int64) for part in whole)):
             digest.update(f"{array.shape}".encode() + np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
+
+    def top(self) -> np.ndarray:
+        """Facets of the skin's outer face, under pads and guard, too."""
+        mesh = self.geometry
+        outside = mesh.boundary_facets()
+        corners = unroll(mesh.p[:, mesh.facets[:, outside]], self.lengths.arm_radius_m)
+        on_top = np.isclose(corners[2], self.lengths.thickness_m, rtol=0.0, atol=TOP_TOLERANCE_M)
+        return outside[on_top.all(axis=0)]
 
     def facet_mapping(self) -> skfem.Mapping | None:
         """With which scikit-fem's FacetBasis can place points on facets; None for its own."""
@@ -80,83 +76,75 @@ class _BrickMapping(MappingIsoparametric):
         return np.asarray(super().invF(x, tind, newton_max_iters, newton_tol))
 
 
-def roll(points: Array, radius_m: float = ARM_RADIUS_M) -> Array:
-    """Flat coordinates (3, n) [m] onto the arm, (3, n) [m] (the article's script, after loading)."""
+def roll(points: Array, radius_m: float | None) -> Array:
+    """Flat coordinates (3, n) [m] onto an arm, (3, n) [m] (the article's script, after loading).
+
+    Without a radius they stay as they are.
+    """
+    if radius_m is None:
+        return points
     x, y, z = points
     theta = y / (radius_m + z)
     return np.stack([x, (radius_m + z) * np.sin(theta), (radius_m + z) * np.cos(theta)])
 
 
-def brick_mesh(refinement: int = 1) -> SkinMesh:
-    """Bricks graded toward the pads' edges; 27-node geometry, so the arm is curved.
+def unroll(points: Array, radius_m: float | None) -> Array:
+    """The flat coordinates (3, ...) [m] of points (3, ...) on an arm: what `roll` made them from."""
+    if radius_m is None:
+        return points
+    x, y, z = points
+    radius = np.hypot(y, z)
+    return np.stack([x, radius * np.arctan2(y, z), radius - radius_m])
 
-    There a clamped surface meets a free one and the stress is singular, so that is where they are small
-    and where `refinement` divides them: 1 gives 448 bricks, 2 gives 1,540, each finer one a further line on
-    either side of every edge, a quarter of the cell's width from it.
+
+def brick_mesh(
+    refinement: int = 1, geometry: Geometry = Geometry(), like: Geometry | None = None
+) -> SkinMesh:
+    """Bricks graded toward the edges of pads and guard; 27-node cells, so the arm is curved.
+
+    There a clamped surface meets a free one and the stress is singular, so that is where they are small and
+    where `refinement` divides them: 1 gives the article's device 448 bricks, 2 gives 1,540, each finer one
+    a further line on either side of every edge, a quarter of the cell's width from it.
+
+    like : the same device on other skin, whose mesh this one is, cell by cell, with its nodes moved to this
+        skin's layers and arm
+
+    Raises InputError for another device than that of `like`.
     """
-    return layered_mesh(brick_lines(refinement), name=f"bricks, refinement {refinement}")
+    lines = brick_lines(refinement, geometry, like)
+    return layered_mesh(lines, f"bricks, refinement {refinement}", geometry=geometry)
 
 
 def layered_mesh(
-    lines: Sequence[Array],
-    name: str,
-    tetrahedra: bool = False,
-    cutis_bottom_m: float = CUTIS_BOTTOM_M,
-    radius_m: float = ARM_RADIUS_M,
+    lines: Sequence[Array], name: str, tetrahedra: bool = False, geometry: Geometry = Geometry()
 ) -> SkinMesh:
     """Curved bricks between `lines` along x, y, z before rolling [m], or straight tetrahedra cut from them.
 
-    The pads' edges and `cutis_bottom_m` are among the lines; rolled onto an arm of `radius_m`.
+    The edges of pads and guard, and where the layers meet, are among the lines.
     """
     flat = skfem.MeshHex.init_tensor(*lines)
     flat = flat.to_meshtet() if tetrahedra else flat
-    facets = _flat_boundaries(flat.p[:, flat.facets].mean(axis=1))
-    cutis = flat.p[2, flat.t].mean(axis=0) > cutis_bottom_m
-    if tetrahedra:
-        return SkinMesh(skfem.MeshTet(roll(flat.p, radius_m), flat.t), facets, cutis, name)
-    curved = skfem.MeshHex2.from_mesh(flat)
-    return SkinMesh(skfem.MeshHex2(roll(curved.doflocs, radius_m), curved.t), facets, cutis, name)
+    facets = _flat_boundaries(flat.p[:, flat.facets].mean(axis=1), geometry)
+    cutis = flat.p[2, flat.t].mean(axis=0) > geometry.subcutis_m
+    if not tetrahedra:
+        flat = skfem.MeshHex2.from_mesh(flat)
+    rolled = type(flat)(roll(flat.doflocs, geometry.arm_radius_m), flat.t)
+    return SkinMesh(rolled, facets, cutis, name, geometry)
 
 
-# Lines of the bricks [mm], edges of the pads and z = 8, where the layers meet, among them.
-_COARSEST_LINES_MM = (
-    (0.0, 12.0, 18.0, 22.0, 26.0, 27.0, 35.0, 50.0, 105.0),
-    (0.0, 4.0, 5.0, 12.0, 30.0, 84.0),
-    (0.0, 8.0, 10.0),
-)
-_COARSE_LINES_MM = (
-    # coarse beyond the guard: there a soft cutis on a stiff subcutis would fold, and fine bricks try to
-    (0.0, 9.0, 16.5, 18.0, 19.5, 24.5, 26.0, 27.0, 28.5, 33.0, 35.0, 40.0, 48.0, 65.0, 105.0),
-    (0.0, 3.0, 4.0, 5.0, 8.5, 12.0, 18.0, 38.0, 84.0),
-    (0.0, 5.0, 8.0, 9.5, 10.0),
-)
-_EDGES_MM = ((18.0, 26.0, 27.0, 35.0), (4.0, 5.0, 12.0), (10.0,))
-_TOWARD_EDGE = 0.25  # where a cell beside an edge is divided: a quarter of its width from it
-
-
-def brick_lines(refinement: int) -> tuple[Array, ...]:
-    """Coordinates of the bricks' faces along x, y and z before rolling [m]."""
-    lines: tuple[tuple[float, ...], ...] = _COARSE_LINES_MM if refinement else _COARSEST_LINES_MM
-    for _ in range(refinement - 1):
-        lines = tuple(_divided(axis, edges) for axis, edges in zip(lines, _EDGES_MM, strict=True))
-    return tuple(1e-3 * np.array(axis) for axis in lines)
-
-
-def _divided(lines: tuple[float, ...], edges: tuple[float, ...]) -> tuple[float, ...]:
-    new = [a + _TOWARD_EDGE * (b - a) for a, b in pairwise(lines) if a in edges]
-    new += [b - _TOWARD_EDGE * (b - a) for a, b in pairwise(lines) if b in edges]
-    return tuple(sorted({*lines, *new}))
-
-
-def _flat_boundaries(centre: Array) -> dict[str, np.ndarray]:
+def _flat_boundaries(centre: Array, geometry: Geometry) -> dict[str, np.ndarray]:
     """Facets of each boundary from the facet centres (3, facets) of the flat mesh [m]."""
-    x, y, z = 1e3 * centre
-    top = np.isclose(z, 10.0)
-    pad = top & (x > 18) & (x < 26) & (y < 4)
-    guard = top & (x > 18) & (x < 35) & (y < 12) & ((y > 5) | (x > 27))
+    x, y, z = centre
+    top = np.isclose(z, geometry.thickness_m)
+    pad = _within(x, y, geometry.along_m[1], geometry.across_m[0])
+    guard = np.zeros_like(top)
+    if geometry.guard is not None:
+        inside = _within(x, y, geometry.along_m[2], geometry.across_m[1])
+        guard = _within(x, y, geometry.along_m[3], geometry.across_m[2]) & ~inside
+    device = top & (x > geometry.half_gauge_m)
     sets = {
-        "pad": pad,
-        "guard": guard,
+        "pad": device & pad,
+        "guard": device & guard,
         "symmetry_x": np.isclose(x, 0.0),
         "symmetry_y": np.isclose(y, 0.0),
         "bottom": np.isclose(z, 0.0),
@@ -164,60 +152,5 @@ def _flat_boundaries(centre: Array) -> dict[str, np.ndarray]:
     return {name: np.flatnonzero(inside) for name, inside in sets.items()}
 
 
-def read_gmsh(path: Path | str) -> SkinMesh:
-    """A flat gmsh file with the article's names for boundaries and layers, rolled after loading.
-
-    Raises InputError if the file is absent or unreadable, holds no tetrahedra, or lacks a name.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(path, "no such file", "a gmsh mesh")
-    try:
-        with redirect_stderr(io.StringIO()), redirect_stdout(io.StringIO()):  # meshio complains at length
-            return _assembled(path, meshio.read(path, file_format="gmsh"))
-    except InputError:
-        raise
-    except (Exception, SystemExit) as error:  # a damaged file: meshio and the indices raise of every kind
-        raise InputError(path, f"not readable as gmsh ({type(error).__name__})", "a gmsh 4.1 mesh") from None
-
-
-def _assembled(path: Path, raw: meshio.Mesh) -> SkinMesh:
-    missing = [n for n in (*GMSH_NAMES, *GMSH_LAYERS) if n not in raw.field_data]
-    if missing:
-        raise InputError(path, f"no boundary or layer named {', '.join(missing)}", "the article's names")
-    tetrahedra, volume_tags = _cells(raw, "tetra")
-    triangles, surface_tags = _cells(raw, "triangle")
-    if not len(tetrahedra):
-        raise InputError(path, "no tetrahedra", "a volume mesh")
-    used, compact = np.unique(tetrahedra, return_inverse=True)
-    corners = np.ascontiguousarray(compact.reshape(tetrahedra.shape).T)
-    flat = skfem.MeshTet(np.ascontiguousarray(raw.points[used].T), corners)
-    number = np.full(len(raw.points), -1)
-    number[used] = np.arange(len(used))
-    facets = {}
-    for gmsh_name, name in GMSH_NAMES.items():
-        nodes = number[triangles[surface_tags == raw.field_data[gmsh_name][0]]]
-        facets[name] = _facet_indices(flat, nodes)
-        if not len(facets[name]):
-            raise InputError(path, f"boundary {gmsh_name} without triangles", "at least one")
-    cutis = volume_tags == raw.field_data["top_layer"][0]
-    rolled = skfem.MeshTet(roll(flat.p), flat.t)
-    return SkinMesh(rolled, facets, cutis, path.name)
-
-
-def _cells(raw: meshio.Mesh, kind: str) -> tuple[np.ndarray, np.ndarray]:
-    pairs = [
-        (block.data, tags)
-        for block, tags in zip(raw.cells, raw.cell_data["gmsh:physical"], strict=True)
-        if block.type == kind
-    ]
-    width = {"tetra": 4, "triangle": 3}[kind]
-    if not pairs:
-        return np.empty((0, width), int), np.empty(0, int)
-    return np.concatenate([d for d, _ in pairs]), np.concatenate([t for _, t in pairs])
-
-
-def _facet_indices(mesh: skfem.Mesh, nodes: np.ndarray) -> np.ndarray:
-    """Indices of the facets with the corner nodes given, (n, 3)."""
-    keys = {tuple(sorted(f)): i for i, f in enumerate(mesh.facets.T.tolist())}
-    return np.array(sorted(keys[tuple(sorted(n))] for n in nodes.tolist()), dtype=int)
+def _within(x: Array, y: Array, end_m: float, half_width_m: float) -> np.ndarray:
+    return (x < end_m) & (y < half_width_m)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
+from bayeskin.geometry import Geometry
 from bayeskin.model.mesh import SkinMesh
 from bayeskin.model.space import Sparsity, TaylorHood, sparsity, taylor_hood
 from bayeskin.types import Array
@@ -59,10 +60,15 @@ def material(theta: Mapping[str, float], cutis: np.ndarray, fixed: Constants | N
 
 @dataclass(frozen=True, eq=False)
 class Sites:
-    """The n points at which laws act: which lie in the cutis (n,), and where (3, n) on the rolled arm [m]."""
+    """The n points at which laws act.
+
+    cutis (n,) : True in the cutis; points_m (3, n) : coordinates on the rolled arm [m]
+    lengths : device and tissue
+    """
 
     cutis: np.ndarray
     points_m: Array
+    lengths: Geometry = Geometry()
 
     def table(self, *columns: Array | float) -> Array:
         """Returns constants of the points side by side, (n, d), from columns (n,), (n, j) or one for all."""
@@ -84,6 +90,7 @@ class Problem:
     """A mesh with its space, prescribed dofs and sparsity; shared by every run on that mesh.
 
     pad, pads : displacement nodes of the central pad; of pad and guard together
+    measured_x : x dofs of what the load cell holds, where the reaction is summed
     """
 
     mesh: SkinMesh
@@ -98,7 +105,7 @@ class Problem:
         """Returns the quadrature points, cell by cell."""
         points = self.space.quadrature_points()
         cutis = np.repeat(self.mesh.cutis, points.shape[2])
-        return Sites(cutis, np.ascontiguousarray(points.reshape(3, -1)))
+        return Sites(cutis, np.ascontiguousarray(points.reshape(3, -1)), self.lengths)
 
     def linear(self, unit: Callable[[Problem], sp.csr_matrix]) -> LinearTerm:
         """Returns the matrix that `unit` makes of this problem, made at the first call."""
@@ -108,9 +115,13 @@ class Problem:
         return self._linear[unit]
 
     @property
-    def pad_x(self) -> np.ndarray:
-        """x dofs of the central pad, where the reaction is summed."""
-        return 3 * self.pad
+    def lengths(self) -> Geometry:
+        """Device and tissue."""
+        return self.mesh.lengths
+
+    @property
+    def measured_x(self) -> np.ndarray:
+        return 3 * (self.pad if self.lengths.force_on == "pad" else self.pads)
 
     def prescribe(self, x: Array, pad_displacement_m: float) -> Array:
         """A copy of x (dofs,) with every prescribed dof at its value: u_x of the pads, zero elsewhere."""
@@ -120,8 +131,8 @@ class Problem:
         return out
 
     def reaction(self, residual: Array) -> float:
-        """Force on the whole pad [N]: consistent nodal reactions along x, doubled for the y-symmetry."""
-        return float(2.0 * residual[self.pad_x].sum())
+        """Force on what the load cell holds [N]: nodal reactions along x, doubled for the y-symmetry."""
+        return float(2.0 * residual[self.measured_x].sum())
 
 
 def build_problem(mesh: SkinMesh) -> Problem:

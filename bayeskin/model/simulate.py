@@ -13,11 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
 from bayeskin.model import article
+from bayeskin.model.gmsh import read_gmsh
 from bayeskin.model.gradients import ForceGradients
 from bayeskin.model.lagrangian import LagrangianModel, Step
 from bayeskin.model.linear import SOLVER_NAME
-from bayeskin.model.mesh import SkinMesh, brick_mesh, read_gmsh
+from bayeskin.model.mesh import SkinMesh, brick_mesh
 from bayeskin.model.newton import NewtonSolver
 from bayeskin.model.own import identity, simulate_own
 from bayeskin.model.problem import PARAMETERS, Constants, Material, Problem, build_problem, material
@@ -33,15 +35,16 @@ OnState = Callable[[float, Array, float], None]  # time_s, x (dofs,), force_n
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """Which model: what force is observed, on which mesh, to what tolerance.
+    """Which model: of which device and tissue, what force is observed, on which mesh, to what tolerance.
 
-    observation : "reaction" (what a load cell on the pad measures), "article" (its released code), or "own"
+    observation : "reaction" (what the load cell measures), "article" (its released code), or "own"
     mesh : "bricks" (our graded bricks) or the path of a gmsh file with the article's names
     refinement : of the bricks, toward the edges of the pads; 1 gives 448 of them, 0 gives 80
     tolerance : estimated local error of the reaction a step, relative to the nominal force; the
         article's steps are its own
     forward : with observation "own": where the model is that stands in this one's place, as
         `bayeskin.model.own` says; mesh, refinement and tolerance are then nothing to it
+    geometry : device and tissue; the observations "article" and "own" know the article's only
     """
 
     observation: Observation = "reaction"
@@ -49,12 +52,16 @@ class ModelSpec:
     refinement: int = 1
     tolerance: float = 1e-3
     forward: str | None = None
+    geometry: Geometry = Geometry()
 
     def __post_init__(self) -> None:
         if (self.observation == "own") != (self.forward is not None):
             raise InputError("model.forward", self.forward, "one with observation 'own', and only there")
         if self.observation == "article" and self.mesh == "bricks":
             raise InputError("model.mesh", "bricks", "the article's gmsh mesh for observation 'article'")
+        if self.observation != "reaction" and self.geometry != Geometry():
+            found = f"another than the article's, with observation {self.observation!r}"
+            raise InputError("geometry", found, "observation 'reaction', or the article's device and tissue")
 
     @property
     def coarsest(self) -> ModelSpec:
@@ -64,7 +71,7 @@ class ModelSpec:
     @property
     def mesh_hash(self) -> str:
         """By which `accuracy.mesh_error` knows the mesh."""
-        return _mesh(self.mesh, self.refinement).hash
+        return _mesh(self.mesh, self.refinement, self.geometry).hash
 
     @property
     def hash(self) -> str:
@@ -72,21 +79,21 @@ class ModelSpec:
         if self.forward is not None:
             return identity(self.forward)
         steps = ARTICLE_STEP_S if self.observation == "article" else self.tolerance
-        text = json.dumps(
-            [PHYSICS_VERSION, self.observation, self.mesh_hash, steps, asdict(Constants())], sort_keys=True
-        )
-        return hashlib.sha256(text.encode()).hexdigest()
+        known = [PHYSICS_VERSION, self.observation, self.mesh_hash, steps, asdict(Constants())]
+        if self.geometry != Geometry():  # hashes of the article's device are older than any other
+            known.append(self.geometry.hash)
+        return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
 
 
 @lru_cache(maxsize=2)
-def _mesh(mesh: str, refinement: int) -> SkinMesh:
-    return brick_mesh(refinement) if mesh == "bricks" else read_gmsh(Path(mesh))
+def _mesh(mesh: str, refinement: int, geometry: Geometry) -> SkinMesh:
+    return brick_mesh(refinement, geometry) if mesh == "bricks" else read_gmsh(Path(mesh), geometry)
 
 
 @lru_cache(maxsize=2)
-def problem_of(mesh: str, refinement: int) -> Problem:
-    """The boundary-value problem of a mesh, built once a process."""
-    return build_problem(_mesh(mesh, refinement))
+def problem_of(mesh: str, refinement: int, geometry: Geometry = Geometry()) -> Problem:
+    """Builds the boundary-value problem of a mesh, once a process."""
+    return build_problem(_mesh(mesh, refinement, geometry))
 
 
 def simulate(
@@ -123,7 +130,7 @@ def simulate(
     if spec.forward is not None:
         return simulate_own(spec.forward, motion, theta)
     started = time.perf_counter()
-    problem = problem_of(spec.mesh, spec.refinement)
+    problem = problem_of(spec.mesh, spec.refinement, spec.geometry)
     history = _History(motion, on_progress, on_state)
     if spec.observation == "reaction":
         solid = material(theta, problem.mesh.cutis)

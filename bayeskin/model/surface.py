@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 import skfem
 
-from bayeskin.model.mesh import ARM_RADIUS_M, LENGTH_M
+from bayeskin.model.bricks import brick_lines
+from bayeskin.model.mesh import unroll
 from bayeskin.model.problem import Constants, Problem, material
 from bayeskin.types import Array
 
-NEAR_M = (65e-3, 38e-3)  # along the arm and around it: well beyond the pads, and where bricks end
 DIVISIONS = {"brick": 6, "tetrahedron": 3}  # of the edges of a facet
 PARTS = ("subcutis", "cutis", "top", "pad", "guard")
 
@@ -79,7 +79,7 @@ def seen_surface(problem: Problem) -> Surface:
     part = np.where(plane == 0, PARTS.index("top"), problem.mesh.cutis[mesh.f2t[0, facets]])
     for name in ("pad", "guard"):
         part[np.isin(facets, problem.mesh.facets[name])] = PARTS.index(name)
-    near = _near(corners[:, small].mean(axis=2))
+    near = _near(problem, corners[:, small].mean(axis=2))
     return Surface(
         faces=point[:, small][near],
         part=np.broadcast_to(part[:, None], near.shape)[near],
@@ -137,21 +137,18 @@ def _divided_triangle(n: int) -> tuple[Array, np.ndarray]:
     return np.array(list(number)).T / n, np.array(triangles)
 
 
-def _near(points: Array) -> np.ndarray:
-    """Which of the points (..., 3) of the mesh lie near the pads (...,)."""
-    x, y, z = np.moveaxis(points, -1, 0)
-    return (x < NEAR_M[0]) & (np.arctan2(y, z) * np.hypot(y, z) < NEAR_M[1])
+def _near(problem: Problem, points: Array) -> np.ndarray:
+    """Which of the points (..., 3) lie near the pads (...,): not where the default bricks are longest."""
+    along, across, _ = brick_lines(1, problem.lengths)
+    x, y, _ = unroll(np.moveaxis(points, -1, 0), problem.lengths.arm_radius_m)
+    return np.asarray((x < along[-2]) & (y < across[-2]))
 
 
 def _seen_facets(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Facets that reach near the pads, and the plane of each."""
     mesh, named = problem.mesh.geometry, problem.mesh.facets
     corners = mesh.doflocs[:, mesh.facets]  # (3, corners, facets)
-    radius = np.hypot(corners[1], corners[2])
-    outside = ARM_RADIUS_M + LENGTH_M[2]
-    top = mesh.boundary_facets()
-    top = top[np.all(np.isclose(radius[:, top], outside, rtol=0.0, atol=1e-6), axis=0)]
-    sets = (top, named["symmetry_y"], named["symmetry_x"])
+    sets = (problem.mesh.top(), named["symmetry_y"], named["symmetry_x"])
     facets, plane = np.concatenate(sets), np.repeat(np.arange(3), [len(part) for part in sets])
-    near = _near(corners[:, :, facets].transpose(2, 1, 0)).any(axis=1)
+    near = _near(problem, corners[:, :, facets].transpose(2, 1, 0)).any(axis=1)
     return facets[near], plane[near]

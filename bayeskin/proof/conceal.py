@@ -18,9 +18,10 @@ import numpy as np
 import bayeskin
 from bayeskin import storage
 from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import bin_means, catalogue, laws, observed
 from bayeskin.mechanisms.mechanism import ForceOfTime
-from bayeskin.model.mesh import layered_mesh
+from bayeskin.model.mesh import layered_mesh, unroll
 from bayeskin.model.problem import Problem, build_problem, material
 from bayeskin.model.simulate import simulate_on
 from bayeskin.proof import seals
@@ -35,7 +36,7 @@ from bayeskin.workers import Lost, Map, local
 # Lines of the bricks [mm]: more of them, and graded otherwise, than those of the shipped surrogates' model.
 _X_MM = (0.0, 9.0, 16.0, 18.0, 19.0, 22.0, 25.0, 26.0, 27.0, 28.0, 31.0, 34.0, 35.0, 37.0, 43.0, 58.0, 105.0)
 _Y_MM = (0.0, 2.5, 4.0, 5.0, 6.5, 10.0, 12.0, 15.0, 24.0, 45.0, 84.0)
-_HEIGHT_MM, _DEEP, _OUTER = 10.0, 0.5, 0.65  # subcutis divided in the middle, cutis nearer to its surface
+_DEEP, _OUTER = 0.5, 0.65  # subcutis divided in the middle, cutis nearer to its surface
 TOLERANCE = 5e-4  # of a step; the surrogates' runs have twice that
 ATTEMPTS = 8
 LVDT_STEP_M, CELL_STEP_N = 1e-5, 2.0**-13
@@ -57,22 +58,22 @@ Made = Concealed | tuple[str, str, str]  # or where, what was found and expected
 
 
 @lru_cache(maxsize=3)
-def problem_of(tetrahedra: bool, cutis_bottom_m: float, radius_m: float) -> Problem:
-    """The test on the proof's own mesh."""
-    bottom = 1e3 * cutis_bottom_m
-    z = (0.0, _DEEP * bottom, bottom, bottom + _OUTER * (_HEIGHT_MM - bottom), _HEIGHT_MM)
+def problem_of(tetrahedra: bool, geometry: Geometry) -> Problem:
+    """Builds the test on the proof's own mesh, for the article's device."""
+    bottom, height = 1e3 * geometry.subcutis_m, 1e3 * geometry.thickness_m
+    z = (0.0, _DEEP * bottom, bottom, bottom + _OUTER * (height - bottom), height)
     lines = [1e-3 * np.array(axis) for axis in (_X_MM, _Y_MM, z)]
-    return build_problem(layered_mesh(lines, "the proof's mesh", tetrahedra, 1e-3 * float(bottom), radius_m))
+    return build_problem(layered_mesh(lines, "the proof's mesh", tetrahedra, geometry))
 
 
 def full_run(case: Case, names: Sequence[str], change: Change) -> Simulation:
     """The full model with the mechanisms `names` and a change."""
     known = catalogue()
-    problem = problem_of(case.plan.tetrahedra, change.cutis_bottom_m, change.radius_m)
+    problem, lengths = problem_of(case.plan.tetrahedra, change.geometry), change.geometry
     corners = problem.mesh.geometry.p[:, problem.mesh.geometry.t]
-    height = np.hypot(corners[1], corners[2]).mean(axis=0) - change.radius_m
+    height = unroll(corners, lengths.arm_radius_m)[2].mean(axis=0)
     solid = change.solid(
-        material(case.theta, problem.mesh.cutis, change.constants), height / change.cutis_bottom_m
+        material(case.theta, problem.mesh.cutis, change.constants), height / lengths.subcutis_m
     )
     along = {p.name: case.values[p.name] for name in names for p in known[name].parameters}
     binds = [*laws([known[name] for name in names]), *change.laws]

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
+from bayeskin.geometry import Geometry
 from bayeskin.mechanisms.elastic import elastic_stress, scale_elastic
 from bayeskin.mechanisms.mechanism import ForceOfTime
 from bayeskin.mechanisms.stiffness_drift import Piece, drifting
 from bayeskin.model.assembly import inverse_and_determinant
 from bayeskin.model.kernels import linearise_kernel, respond_kernel
-from bayeskin.model.mesh import ARM_RADIUS_M, CUTIS_BOTTOM_M, LENGTH_M
 from bayeskin.model.problem import Constants, Material, Sites, material
 from bayeskin.model.tissue import Bind, TissueLaw
 from bayeskin.proof.protocol import MOTION
@@ -41,8 +41,7 @@ class Change:
     """
 
     constants: Constants = Constants()  # noqa: RUF009 - frozen
-    cutis_bottom_m: float = CUTIS_BOTTOM_M
-    radius_m: float = ARM_RADIUS_M
+    geometry: Geometry = Geometry()
     deep: float = 1.0
     laws: tuple[Bind, ...] = ()
     moved: Callable[[PadMotion], PadMotion] = _as_it_is
@@ -215,19 +214,25 @@ def _of(**changed: Any) -> Change:
 
 
 FATIGUE_S = 60.0
-TOP_M = LENGTH_M[2]
+
+
+def _as_thick(cutis_m: float) -> Change:
+    """Another cutis [m], and so much more or less subcutis that both are as thick as the article's."""
+    return Change(geometry=Geometry(cutis_m=cutis_m, subcutis_m=Geometry().thickness_m - cutis_m))
+
+
+def _on_an_arm(radius_m: float) -> Change:
+    return Change(geometry=Geometry(arm_radius_m=radius_m))
+
+
 OUTSIDE: dict[str, Outside] = {
     "poisson-cutis": Outside("Poisson's ratio of the cutis", (0.2, 0.4), lambda s: _of(nu_c=s)),
     "poisson-subcutis-high": Outside("Poisson's ratio of the subcutis", (0.4, 0.48), lambda s: _of(nu_s=s)),
     "poisson-subcutis-low": Outside("Poisson's ratio of the subcutis", (0.01, 0.15), lambda s: _of(nu_s=s)),
-    "thin-cutis": Outside(
-        "thickness of the cutis [m]", (1e-3, 1.6e-3), lambda s: Change(cutis_bottom_m=TOP_M - s)
-    ),
-    "thick-cutis": Outside(
-        "thickness of the cutis [m]", (2.5e-3, 4e-3), lambda s: Change(cutis_bottom_m=TOP_M - s)
-    ),
-    "thin-arm": Outside("radius below the subcutis [m]", (0.03, 0.042), lambda s: Change(radius_m=s)),
-    "thick-arm": Outside("radius below the subcutis [m]", (0.058, 0.09), lambda s: Change(radius_m=s)),
+    "thin-cutis": Outside("thickness of the cutis [m]", (1e-3, 1.6e-3), _as_thick),
+    "thick-cutis": Outside("thickness of the cutis [m]", (2.5e-3, 4e-3), _as_thick),
+    "thin-arm": Outside("radius below the subcutis [m]", (0.03, 0.042), _on_an_arm),
+    "thick-arm": Outside("radius below the subcutis [m]", (0.058, 0.09), _on_an_arm),
     "muscle": Outside("a third layer, stiffer by a factor", (4.0, 40.0), lambda s: Change(deep=s)),
     "soft-fat": Outside("a third layer, of moduli times", (0.03, 0.3), lambda s: Change(deep=s)),
     "hardening": Outside(
