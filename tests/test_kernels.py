@@ -20,7 +20,8 @@ STRONG = {
     "fibre_stress": 2e5, "k2": 5.0, "dispersion": 0.1, "M_k": 30.0, "adherence": 1e7, "leakage": 1e-9,
     "langer_ratio": 3.0, "langer_angle": 0.7, "opening": 0.05, "g_1": 0.6, "tau_1": 1.5, "g_2": 0.3,
     "tau_2": 40.0, "damage": 0.5, "damage_energy": 1e3, "recovery_compliance": 1e-3, "recovery_time": 20.0,
-    "gap": 2e-4, "frame_compliance": 1e-3, "slip_rate": 1e-4, "slip_threshold": 0.02,
+    "gap": 2e-4, "frame_compliance": 1e-3, "slip_rate": 1e-4, "slip_threshold": 0.02, "set_share": 0.5,
+    "yield_stretch": 1.02, "stiffness_rate": -1e-3, "stiffness_time": 300.0,
 }  # fmt: skip
 KNOWN = catalogue()
 SOLVED = {name: mechanism.act.bind for name, mechanism in KNOWN.items() if mechanism.act.bind is not None}

@@ -32,7 +32,8 @@ STRONG = {
     "fibre_stress": 2e5, "k2": 5.0, "dispersion": 0.1, "M_k": 30.0, "adherence": 1e7, "leakage": 1e-9,
     "langer_ratio": 3.0, "langer_angle": 0.7, "opening": 0.05, "g_1": 0.6, "tau_1": 1.5, "g_2": 0.3,
     "tau_2": 40.0, "damage": 0.5, "damage_energy": 1.0, "recovery_compliance": 1e-3, "recovery_time": 20.0,
-    "gap": 2e-4, "frame_compliance": 1e-3, "slip_rate": 1e-4, "slip_threshold": 0.02,
+    "gap": 2e-4, "frame_compliance": 1e-3, "slip_rate": 1e-4, "slip_threshold": 0.02, "nu_c": 0.3,
+    "nu_s": 0.1, "stiffness_rate": -1e-3, "stiffness_time": 300.0, "set_share": 0.5, "yield_stretch": 1.02,
 }  # fmt: skip
 ONE = Sites(np.array([True]), np.array([[0.0], [0.0], [0.05]]))  # a point in the cutis
 
@@ -52,10 +53,17 @@ def answered(law, f):
     return stress[0]
 
 
+def strong(*names, **values):
+    """The base's parameters, and those of mechanisms at the values given, else strong ones."""
+    own = {p.name for n in names for p in SOLVED[n].parameters}
+    return THETA | {name: value for name, value in (STRONG | values).items() if name in own}
+
+
 def skin(problem, *names, **values):
     """The model with mechanisms at the values given, else strong ones."""
-    bound = [bind(THETA | STRONG | values, problem.sites) for bind in laws([SOLVED[n] for n in names])]
-    return LagrangianModel(problem, material(THETA, problem.mesh.cutis), STILL, tuple(bound))
+    theta = strong(*names, **values)
+    bound = tuple(bind(theta, problem.sites) for bind in laws([SOLVED[n] for n in names]))
+    return LagrangianModel(problem, material(theta, problem.mesh.cutis), STILL, bound)
 
 
 def unknowns(problem, seed, size=1.0):
@@ -87,7 +95,7 @@ def test_a_mechanism_off_its_neutral_value_changes_the_residual(problem, name):
     ]
     assert max(changed) > 1e-4
     assert name in TISSUE[name].group
-    assert TISSUE[name].statement(THETA | STRONG).endswith(".")
+    assert TISSUE[name].statement(strong(name)).endswith(".")
 
 
 def test_the_tangent_of_all_together_is_the_derivative_of_the_residual(problem):
@@ -162,7 +170,7 @@ def test_anisotropy_multiplies_youngs_modulus_along_the_lines():
 
 
 def test_langer_lines_lie_in_the_skins_plane(problem):
-    direction = TISSUE["fibre-anisotropy"].act.bind(THETA | STRONG, problem.sites).data[:, 1:]
+    direction = TISSUE["fibre-anisotropy"].act.bind(strong("fibre-anisotropy"), problem.sites).data[:, 1:]
     x, y, z = problem.space.quadrature_points().reshape(3, -1)
     radial = np.stack([0 * x, y, z], axis=-1)
     np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1.0)
@@ -227,7 +235,7 @@ def test_pre_stretched_skin_pulls_as_skin_that_was_pulled_slowly_before():
     motion = PadMotion(np.array([0.0, 10.0]), np.array([0.0, 4e-3]))
     whole = PadMotion(np.array([0.0, 10.0, 20.0]), np.array([0.0, opening_m, opening_m + 4e-3]))
     spec = ModelSpec()
-    found = simulate(spec, motion, theta | STRONG, laws=laws([TISSUE["pre-stretch"]]))
+    found = simulate(spec, motion, strong("pre-stretch") | theta, laws=laws([TISSUE["pre-stretch"]]))
     slow = simulate(spec, whole, theta)
     times = np.linspace(0.0, 10.0, 6)
     assert found.status == "ok"

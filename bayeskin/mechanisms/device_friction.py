@@ -72,6 +72,6 @@ MECHANISM = Mechanism(
         f"The slide rubs: {1e3 * v['Fc']:.0f} mN against each motion, turning over within "
         f"{number(1e3 * v['presliding'], 2)} mm after a reversal and kept during holds."
     ),
-    group=("device-friction", "viscous-drag"),
+    group=("device-friction", "viscous-drag", "plastic-set"),
     act=Instrument(Place.DRIVE, observe),
 )

@@ -36,7 +36,12 @@ MECHANISM = Mechanism(
     statement=lambda v: (
         f"Friction that a stop locks in relaxes with a time constant of {number(v['friction_tau'], 3)} s."
     ),
-    group=("friction-creep", "solid-viscoelasticity", "strain-dependent-permeability"),
+    group=(
+        "friction-creep",
+        "solid-viscoelasticity",
+        "strain-dependent-permeability",
+        "skeleton-compressibility",
+    ),
     act=Instrument(Place.DRIVE, observe),
     needs=("device-friction",),
 )

@@ -62,6 +62,6 @@ MECHANISM = Mechanism(
         f"The pads slip on the skin, {number(1e3 * v['slip_rate'], 2)} mm a second for each newton beyond "
         f"{number(v['slip_threshold'], 2)} N, and do not come back."
     ),
-    group=("pad-slip", "preconditioning", "slow-recovery"),
+    group=("pad-slip", "preconditioning", "slow-recovery", "plastic-set"),
     act=Instrument(Place.PADS, observe, bind, adds=False),
 )

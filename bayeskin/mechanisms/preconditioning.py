@@ -120,6 +120,6 @@ MECHANISM = Mechanism(
         f"The first stretch softens the skin, by {100 * v['damage']:.0f} % at most, most of it where it "
         f"has stored {number(1e-3 * v['damage_energy'], 3)} kPa; later cycles repeat."
     ),
-    group=("preconditioning", "pad-slip", "slow-recovery"),
+    group=("preconditioning", "pad-slip", "slow-recovery", "plastic-set"),
     act=Tissue(bind),
 )

@@ -187,7 +187,12 @@ MECHANISM = Mechanism(
         f"than in the long run; {100 * v['g_1']:.0f} % of the long-run force fade with a time constant of "
         f"{number(v['tau_1'], 2)} s, {100 * v['g_2']:.0f} % with one of {number(v['tau_2'], 2)} s."
     ),
-    group=("solid-viscoelasticity", "strain-dependent-permeability", "friction-creep"),
+    group=(
+        "solid-viscoelasticity",
+        "strain-dependent-permeability",
+        "friction-creep",
+        "skeleton-compressibility",
+    ),
     act=Tissue(bind, estimate),
     parts=(("g_1", "tau_1"), ("g_2", "tau_2")),
 )

@@ -1,23 +1,32 @@
 """All moduli change slowly with time, as tissue dries, warms or swells: P_e f(t), in both layers.
 
-    f = f_0 + r T (1 - exp(-(t - t_0) / T)) ,   straight, f_0 + r (t - t_0), for T -> infinity,
+    f = 1 + r T (1 - exp(-t / T))
 
-piece by piece, each with its own start t_0. The factor is on the elastic stress of all that is elastic,
-fibres too; branches of a viscous solid then relax what is left. It never falls below `LEAST`.
+with t from the start of the test, a straight 1 + r t for T -> infinity. The factor is on the elastic stress
+of all that is elastic, fibres too; branches of a viscous solid then relax what is left. The kernels know
+factors of several such pieces too, each with its own start t_0 and its factor f_0 there.
+
+Moduli do not vanish: a rate below -1 / T, with which they would, is refused, and where the factor would fall
+below `LEAST` it stays there, for a rate near -1 / T after some four to five times T.
+
+Range: chosen for this test, a change of up to a third in its 347 s.
 """
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from bayeskin.errors import InputError
 from bayeskin.mechanisms.elastic import elastic_stress, scale_elastic
+from bayeskin.mechanisms.mechanism import Mechanism, Tissue
 from bayeskin.model.assembly import compiled, inverse_and_determinant
 from bayeskin.model.kernels import linearise_kernel, respond_kernel
 from bayeskin.model.problem import Sites
 from bayeskin.model.tissue import Rank, TissueLaw
+from bayeskin.types import Parameter
 
 LEAST = 0.01
 Piece = tuple[float, float, float, float]  # start t_0 [s], factor f_0 and its rate r [1/s] there, T [s]
@@ -70,3 +79,37 @@ def drifting(sites: Sites, pieces: Sequence[Piece]) -> TissueLaw:
         respond=factored,
         linearise=factored_derivatives,
     )
+
+
+def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+    """Returns the law of `stiffness_rate`.
+
+    Raises InputError for a rate with which the moduli would vanish.
+    """
+    rate, time_s = values["stiffness_rate"], values["stiffness_time"]
+    if 1.0 + rate * time_s < -LEAST:  # bounds of the prior may be passed by a difference quotient's step
+        expected = f"at least {-1.0 / time_s:g} 1/s with a time constant of {time_s:g} s: moduli would vanish"
+        raise InputError("parameters: stiffness_rate", f"{rate:g}", expected)
+    return drifting(sites, [(0.0, 1.0, rate, time_s)])
+
+
+def _told(values: Mapping[str, float]) -> str:
+    rate, time_s = values["stiffness_rate"], values["stiffness_time"]
+    word = "softens" if rate < 0.0 else "stiffens"
+    return (
+        f"The tissue {word} with time: its moduli change by {6e3 * rate:+.2f} % a minute at first, ever more "
+        f"slowly with a time constant of {time_s:.0f} s."
+    )
+
+
+MECHANISM = Mechanism(
+    name="stiffness-drift",
+    parameters=(
+        Parameter("stiffness_rate", "1/s", -1e-3, 1e-3, "uniform", "change of all moduli at first, as share"),
+        Parameter("stiffness_time", "s", 30.0, 1000.0, "log-uniform", "over which that change comes to rest"),
+    ),
+    neutral={"stiffness_rate": 0.0, "stiffness_time": 300.0},
+    statement=_told,
+    group=("stiffness-drift",),
+    act=Tissue(bind),
+)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
+from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.model.mesh import SkinMesh
 from bayeskin.model.space import Sparsity, TaylorHood, sparsity, taylor_hood
@@ -42,13 +43,22 @@ class Material:
 
 
 def material(theta: Mapping[str, float], cutis: np.ndarray, fixed: Constants | None = None) -> Material:
-    """Cell constants from the sampled parameters (E_c, E_s [Pa], k_c, k_s [m^2]) and the fixed ones."""
+    """Returns constants of cells or points from a run's parameters and the fixed ones.
+
+    theta : E_c, E_s [Pa], k_c, k_s [m^2], and drained Poisson's ratios nu_c, nu_s in place of the fixed ones
+    cutis : (e,), which cells or points lie in the cutis
+    Raises InputError for a ratio of no stable solid.
+    """
     c = fixed or Constants()
+    ratios = [theta.get(name, getattr(c, name)) for name in ("nu_c", "nu_s")]
+    for name, ratio in zip(("nu_c", "nu_s"), ratios, strict=True):
+        if not -1.0 < ratio < 0.5:
+            raise InputError(f"parameters: {name}", f"{ratio:g}", "a number above -1 and below 0.5")
 
     def by_layer(in_cutis: float, in_subcutis: float) -> Array:
         return np.where(cutis, in_cutis, in_subcutis).astype(float)
 
-    young, nu = by_layer(theta["E_c"], theta["E_s"]), by_layer(c.nu_c, c.nu_s)
+    young, nu = by_layer(theta["E_c"], theta["E_s"]), by_layer(*ratios)
     porosity = by_layer(c.porosity_c, c.porosity_s)
     return Material(
         mu=young / (2 * (1 + nu)),

@@ -1,0 +1,107 @@
+"""The tissue yields: beyond a stretch along the pull its rest length grows, and does not return.
+
+With l = |F e_x| the stretch along x, l_max the largest up to now at the same point, a threshold y and the
+share s of the excess that stays,
+
+    l_p = 1 + s max(l_max - y, 0) ,   F_p = diag(l_p, l_p^-1/2, l_p^-1/2) ,   W = W_e(F F_p^-1)
+
+with the base solid's energy W_e. As det F_p = 1, the stress differs from the base's by the first term only,
+
+    P = P_base + mu F (C_p^-1 - I) ,   C_p^-1 = diag(l_p^-2, l_p, l_p) .
+
+Force still grows with stretch as long as s y < 1. Fibres of other mechanisms do not yield, and damage of
+`preconditioning` goes by the whole stretch.
+
+Source: the split F = F_e F_p: Lee, J. Appl. Mech. 36 (1969), 1-6.
+"""
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bayeskin.mechanisms.mechanism import Mechanism, Tissue
+from bayeskin.model.assembly import compiled
+from bayeskin.model.kernels import linearise_kernel, respond_kernel
+from bayeskin.model.problem import Sites, material
+from bayeskin.model.tissue import TissueLaw
+from bayeskin.types import Array, Parameter
+
+
+@compiled
+def stretch_along(f):
+    """|F e_x|"""
+    return np.sqrt(f[0, 0] * f[0, 0] + f[1, 0] * f[1, 0] + f[2, 0] * f[2, 0])
+
+
+@respond_kernel
+def set_free(
+    time_s, elapsed_s, par, data, deformation, pressure, gradient, before, after, stress, content, flux
+):  # fmt: skip
+    """Adds mu F (C_p^-1 - I); `par` holds s and y, `data` mu, the memory l_max."""
+    for n in range(len(pressure)):
+        f, mu = deformation[n], data[n, 0]
+        largest = max(stretch_along(f), before[n, 0])
+        after[n, 0] = largest
+        grown = 1.0 + par[0] * max(largest - par[1], 0.0)
+        along, across = mu * (1.0 / (grown * grown) - 1.0), mu * (grown - 1.0)
+        for i in range(3):
+            stress[n, i, 0] += along * f[i, 0]
+            stress[n, i, 1] += across * f[i, 1]
+            stress[n, i, 2] += across * f[i, 2]
+
+
+@linearise_kernel
+def set_free_derivatives(
+    time_s, elapsed_s, par, data, deformation, pressure, gradient,
+    before, stress_f, stress_p, content_f, content_p, flux_f, flux_g,
+):  # fmt: skip
+    """mu dF (C_p^-1 - I) and, while it yields, mu F dC_p^-1/dl_p s dl with dl = (F e_x) . (dF e_x) / l."""
+    for n in range(len(pressure)):
+        f, mu = deformation[n], data[n, 0]
+        stretch = stretch_along(f)
+        grown = 1.0 + par[0] * max(max(stretch, before[n, 0]) - par[1], 0.0)
+        along, across = mu * (1.0 / (grown * grown) - 1.0), mu * (grown - 1.0)
+        growth = par[0] / stretch if stretch >= before[n, 0] and stretch > par[1] else 0.0
+        for i in range(3):
+            for k in range(3):
+                row = 3 * i + k
+                stress_f[n, row, row] += along if k == 0 else across
+                slope = mu * f[i, k] * growth * (-2.0 / grown**3 if k == 0 else 1.0)
+                for m in range(3):
+                    stress_f[n, row, 3 * m] += slope * f[m, 0]
+
+
+def setting(share: float, threshold: float, mu: Array) -> TissueLaw:
+    """Returns the law of a share that stays and a threshold of stretch [-]; mu (n, 1) [Pa]."""
+    return TissueLaw(
+        remembers=1,
+        par=np.array([share, threshold]),
+        data=mu,
+        respond=set_free,
+        linearise=set_free_derivatives,
+    )
+
+
+def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
+    """Returns the law of `set_share` in both layers."""
+    mu = sites.table(material(values, sites.cutis).mu)
+    return setting(values["set_share"], values["yield_stretch"], mu)
+
+
+MECHANISM = Mechanism(
+    name="plastic-set",
+    parameters=(
+        Parameter("set_share", "-", 0.0, 0.6, "uniform", "share of the stretch beyond that stays"),
+        Parameter("yield_stretch", "-", 1.02, 1.3, "uniform", "stretch along the pull from which it stays"),
+    ),
+    neutral={"set_share": 0.0, "yield_stretch": 1.1},
+    statement=lambda v: (
+        f"Skin that is stretched by more than {100 * (v['yield_stretch'] - 1):.0f} % along the pull stays "
+        f"longer, by {100 * v['set_share']:.0f} % of what is beyond; later cycles start later and lower."
+    ),
+    group=("plastic-set", "preconditioning", "pad-slip", "device-friction"),
+    act=Tissue(bind),
+)
