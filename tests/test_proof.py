@@ -118,6 +118,19 @@ def test_a_seed_decides_which_cases_there_are_and_another_gives_others() -> None
     assert [p.label for p in plans(7, 64)] != [p.label for p in plans(8, 64)]
 
 
+@pytest.mark.parametrize("name", ["proof", "sizes", "nothing", "development"])
+def test_the_seed_of_a_committed_set_draws_what_it_conceals(name: str) -> None:
+    """Whatever the catalogue has since."""
+    folder = Path(__file__).parents[1] / "data" / name / seals.SEALS
+    asked = seals.read_json(folder / seals.SET)
+    drawn = plans(asked["seed"], asked["count"], asked.get("only", ()))
+    for number, plan in enumerate(drawn, 1):
+        kept = seals.read_json(folder / f"{number:03d}.json")
+        assert (kept["label"], kept["outside"]) == (plan.label, plan.outside)
+        assert (tuple(kept["mechanisms"]), tuple(kept["numbers"])) == (plan.mechanisms, plan.numbers)
+        assert (kept["kind"], kept["tetrahedra"]) == (plan.kind, plan.tetrahedra)
+
+
 def test_a_set_of_64_has_every_mechanism_alone_and_at_least_15_effects_outside() -> None:
     found = plans(3, 64)
     of = {kind: [p for p in found if p.kind == kind] for kind in ("nothing", "alone", "pair", "outside")}

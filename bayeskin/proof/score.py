@@ -2,11 +2,11 @@
 
 A verdict names right when it names what is concealed and nothing else; it is right up to look-alikes when
 each name it gives stands for one that is concealed and lies in one of its groups (`LOOK_ALIKES`). A verdict
-whose own group has others than those of its name is wrong, and so is a diagnosis that failed. What is held
-out is the full model's, where that has made a fit, over the floor of what is held out. Beside recordings
-single mechanisms are counted: how many of those that add enough to be named are, whatever else is, and how
-many of the named are there. Shares have 90 % Wilson intervals; those of parameters and of single mechanisms
-count recordings, since those of one go together.
+whose own group is larger than one of those is wrong, and so is a diagnosis that failed. What is held out is
+the full model's, where that has made a fit, over the floor of what is held out. Beside recordings single
+mechanisms are counted: how many of those that add enough to be named are, whatever else is, and how many of
+the named are there. Shares have 90 % Wilson intervals; those of parameters and of single mechanisms count
+recordings, since those of one go together.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 from scipy.stats import norm
 
 from bayeskin.mechanisms import catalogue
+from bayeskin.proof.cases import CONCEALED
 from bayeskin.proof.curves import FEWEST, curve
 from bayeskin.proof.noise import floor_after
 from bayeskin.proof.protocol import EDGES_S, HELD_OUT_FROM_S
@@ -31,18 +32,14 @@ LOOK_ALIKES = (
     {"device-friction", "viscous-drag"},
     {"preconditioning", "pad-slip", "slow-recovery"},
     {"force-offset", "device-friction"},
-    *({"skeleton-compressibility", other} for other in (
-        "solid-viscoelasticity", "slow-recovery", "friction-creep", "strain-dependent-permeability"
-    )),
-    *({"plastic-set", other} for other in ("preconditioning", "pad-slip", "device-friction")),
-)  # fmt: skip
+)
 TAKEN_FOR_EACH_OTHER = ({"pre-stretch"}, {"force-offset", "strain-stiffening"})  # only both together
 CLEAR = 3.0  # of the floor: sizes from here on are to be named
 SIZE_EDGES = (0.0, 1.0, 1.5, 2.2, 3.0, 5.0, 8.0, 15.0, np.inf)  # eight sizes, of the floor
 WITHIN_SD = float(norm.ppf(0.95))
 BASE = ("E_c", "E_s", "k_c", "k_s")
 SEVERAL = "several names"
-TOO_LARGE = "group too large"  # has others than the look-alikes that are listed
+TOO_LARGE = "group too large"  # of look-alikes, larger than any that is listed
 
 
 @dataclass(frozen=True)
@@ -139,13 +136,14 @@ def judge(number: str, key: Mapping[str, Any], answer: Mapping[str, Any]) -> Jud
 
 
 def is_listed(name: str, group: Iterable[str]) -> bool:
-    """Returns whether all of a mechanism's group are known to look like it."""
-    together = set.union(*TAKEN_FOR_EACH_OTHER)
-    return set(group) <= group_of(name) | (together if name in together else set())
+    """Returns whether a mechanism and its group, as far as sets conceal these, are known to look alike."""
+    listed = (*LOOK_ALIKES, set.union(*TAKEN_FOR_EACH_OTHER))
+    concealed = {name, *group} & set(CONCEALED)
+    return name not in CONCEALED or len(concealed) == 1 or any(concealed <= known for known in listed)
 
 
 def group_of(name: str) -> set[str]:
-    """Returns the mechanism and all that may be taken for it."""
+    """The mechanism and all that may be taken for it."""
     return {name}.union(*(group for group in LOOK_ALIKES if name in group))
 
 
