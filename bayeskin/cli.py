@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import click
 
 import bayeskin
+from bayeskin.errors import InputError
 from bayeskin.terminal import NOT_TRUSTED, Terminal, exit_code
 
 # Its matrices are small: threads of linear algebra would cost more than they give. Read when numpy loads.
@@ -22,6 +23,9 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON document on stdout.")
 a_config = click.argument("config", type=click.Path(path_type=Path))
+a_device = click.option(
+    "--device", type=click.Path(path_type=Path), help="TOML file with [device] and [tissue]."
+)
 
 
 class _Workflow(click.Group):
@@ -89,22 +93,27 @@ def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
 @click.option(
     "-o", "out", type=click.Path(path_type=Path), help="TOML file to write; default: beside RECORDING."
 )
+@a_device
 @as_json
-def new(recording: Path | None, out: Path | None, as_json: bool) -> None:
+def new(recording: Path | None, out: Path | None, device: Path | None, as_json: bool) -> None:
     """Write a commented configuration for a recording of your own; without RECORDING the demo, to try.
 
     Reads the recording, says what it found, and takes a shipped surrogate where one knows its protocol, else
-    a design of full runs. Never writes over a file. The demo's recording comes with its configuration.
+    a design of full runs. Never writes over a file. The demo's recording comes with its configuration. With
+    --device its sections [device] and [tissue] are written into the configuration; without, they are the
+    article's.
 
     \b
     Example:
       bayeskin new && bayeskin run demo.toml
-      bayeskin new test.xlsx -o runs/test.toml
+      bayeskin new test.xlsx -o runs/test.toml --device device.toml
       bayeskin new runs/test.h5 && bayeskin run runs/test.toml
     """
     from bayeskin.pipeline.new import new_config, new_demo
 
-    _answer(new_demo(out) if recording is None else new_config(recording, out), as_json)
+    if recording is None and device is not None:
+        raise InputError(f"--device {device}", "no RECORDING", "one: the demo is of the article's device")
+    _answer(new_demo(out) if recording is None else new_config(recording, out, device), as_json)
 
 
 @cli.command(short_help="One run of the full model on a recording's displacement.")
@@ -114,6 +123,7 @@ def new(recording: Path | None, out: Path | None, as_json: bool) -> None:
 )
 @click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A parameter, in SI units.")
 @click.option("--mechanism", "mechanisms", multiple=True, metavar="NAME", help="Physics to add; repeatable.")
+@a_device
 @click.option("--mesh", help="'bricks' or a gmsh file; default as in CONFIG.")
 @click.option("--observation", type=click.Choice(["reaction", "article"]), help="Default as in CONFIG.")
 @click.option("-o", "out", required=True, type=click.Path(path_type=Path), help="File to write: .csv or .h5.")
@@ -136,6 +146,7 @@ def simulate(as_json: bool, **options: Any) -> None:
       bayeskin simulate --set E_c=300e3 --set k_s=1e-13 -o force.csv --fields fields
       bayeskin simulate -o force.csv --figures figures --at 14.4 --at 30 --at 54.4
       bayeskin simulate -o force.csv --mechanism device-friction --set Fc=0.03
+      bayeskin simulate -o force.csv --device device.toml
     """
     from bayeskin.pipeline import single
 

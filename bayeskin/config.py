@@ -9,22 +9,21 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from bayeskin.design import default_space
+from bayeskin.device import DeviceConfig, StatedGeometry, TissueConfig, stated_geometry
 from bayeskin.errors import InputError
-from bayeskin.probe import bytes_of
+from bayeskin.geometry import Geometry
+from bayeskin.sections import Section, checked, one_of, read_toml
 from bayeskin.types import Correlation, Parameter, ParameterSpace
 
-MOST_BYTES = 1_000_000  # of a configuration
 EXPECTED = "a TOML configuration, as `bayeskin new RECORDING` writes one"
-TOO_DEEP = "tables or lists nested too deeply"
 FEWEST_CHECKED = 8  # draws: of fewer, weights say next to nothing
 # Upper bounds refuse slips of the pen, which would take all memory; no computation comes near them.
 Positive = Annotated[int, Field(gt=0, le=10**9)]
@@ -35,18 +34,14 @@ Refinement = Annotated[int, Field(ge=0, le=6)]
 WHO_RUNS: Any = {"design": {"workers", "scheduler"}, "slurm": True}  # no result depends on it
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-
-class RecordingConfig(_Section):
+class RecordingConfig(Section):
     """Which recording, and whether the model follows its displacement closely or its corners, rounded."""
 
     file: str
     protocol: Literal["recorded", "idealised"] = "idealised"
 
 
-class ModelConfig(_Section):
+class ModelConfig(Section):
     """Which force the model reports, on which mesh (the generator's bricks or a gmsh file), how finely.
 
     `forward`: a model of one's own instead, "FILE.py:FUNCTION" (beside the configuration),
@@ -78,7 +73,7 @@ class ModelConfig(_Section):
         return self
 
 
-class PriorConfig(_Section):
+class PriorConfig(Section):
     """What replaces the default prior of one parameter; what is not given stays as it was.
 
     `mean` and `sd` belong to a normal prior, `median` and `factor` (of one sd) to a log-normal one; both are
@@ -118,7 +113,7 @@ class PriorConfig(_Section):
         return 0.0, 1.0
 
 
-class DesignConfig(_Section):
+class DesignConfig(Section):
     """Full runs: training points of each wave, held-out points of each wave, worker processes.
 
     With `coarse`, a refinement below the model's, the waves run on coarser bricks, and the model itself at
@@ -135,7 +130,7 @@ class DesignConfig(_Section):
     scheduler: str | None = None
 
 
-class SlurmConfig(_Section):
+class SlurmConfig(Section):
     """Full runs as jobs of SLURM through dask-jobqueue: how many, and what it is told of each."""
 
     jobs: Annotated[int, Field(gt=0, le=100_000)]
@@ -145,14 +140,14 @@ class SlurmConfig(_Section):
     walltime: str = "04:00:00"
 
 
-class SurrogateConfig(_Section):
+class SurrogateConfig(Section):
     """Kind of surrogate, or a shipped one that spares the design."""
 
     kind: Literal["auto", "gp", "chaos"] = "auto"
     file: str | None = None
 
 
-class EffectsConfig(_Section):
+class EffectsConfig(Section):
     """Mechanisms that the full model solves (by default all) to learn, pairs of their parts; runs of each.
 
     `coarse` of them on the coarsest bricks, with and without the mechanism; `points` and `held_out` of the
@@ -168,7 +163,7 @@ class EffectsConfig(_Section):
     plausible: Annotated[int, Field(ge=0, le=100_000)] = 0
 
 
-class FitConfig(_Section):
+class FitConfig(Section):
     """The stretches of the recording that are fitted (default: all of it) and the bins of its means."""
 
     windows_s: list[tuple[float, float]] | None = None
@@ -184,7 +179,7 @@ class FitConfig(_Section):
         return self
 
 
-class NoiseConfig(_Section):
+class NoiseConfig(Section):
     """Bounds of the log-uniform priors on the noise: sd [N], correlation time [s], tail index."""
 
     sd_n: tuple[float, float] | None = None
@@ -200,7 +195,7 @@ class NoiseConfig(_Section):
         return self
 
 
-class SampleConfig(_Section):
+class SampleConfig(Section):
     """Independent ensembles of walkers, and when to stop."""
 
     ensembles: Annotated[int, Field(ge=2, le=1000)] = 4
@@ -209,7 +204,7 @@ class SampleConfig(_Section):
     max_steps: Positive = 20000
 
 
-class CheckConfig(_Section):
+class CheckConfig(Section):
     """Posterior draws that the full model runs again, and how often they may join the design."""
 
     draws: Annotated[int, Field(ge=0, le=100_000)] = 24
@@ -222,26 +217,28 @@ class CheckConfig(_Section):
         return self
 
 
-class MapConfig(_Section):
+class MapConfig(Section):
     """Starts of the search for the most probable point, and evaluations that each may spend."""
 
     starts: Annotated[int, Field(gt=0, le=100_000)] = 8
     evaluations: Positive = 20000
 
 
-class SobolConfig(_Section):
+class SobolConfig(Section):
     """Samples a matrix of the pick-freeze estimate on the Gaussian process."""
 
     samples: Annotated[int, Field(gt=0, le=2**20)] = 2048
 
 
-class Config(_Section):
+class Config(Section):
     """A whole run. `load_config` makes it from a file."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
     recording: RecordingConfig
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
     model: ModelConfig = ModelConfig()
+    device: DeviceConfig = DeviceConfig()
+    tissue: TissueConfig = TissueConfig()
     parameters: dict[str, PriorConfig] = {}
     design: DesignConfig = DesignConfig()
     slurm: SlurmConfig | None = None
@@ -269,7 +266,27 @@ class Config(_Section):
     def sha256(self) -> str:
         """Hash of all that can change a result; who makes the runs cannot."""
         plain = self.model_dump(mode="json", exclude=WHO_RUNS)
+        for name, usual in (("device", DeviceConfig()), ("tissue", TissueConfig())):
+            if getattr(self, name) == usual:  # hashes are older than these sections
+                del plain[name]
         return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+    def geometry(self, where: object = "configuration") -> StatedGeometry:
+        """Device and tissue of the sections. Raises InputError, of `where`, for what cannot be."""
+        stated = stated_geometry(self.device, self.tissue, where)
+        if self.model.observation != "reaction" and stated != StatedGeometry(Geometry()):
+            section = "device" if self.device != DeviceConfig() else "tissue"
+            found = f"another than the article's, with observation {self.model.observation!r}"
+            raise InputError(f"{where}: {section}", found, "observation 'reaction' with it")
+        return stated
+
+    def certain_geometry(self, where: object) -> Geometry:
+        """The geometry of a run. Raises InputError, of `where`, for a length that is uncertain."""
+        stated = self.geometry(where)
+        for name in stated.sd_m:
+            expected = "a number: an uncertain thickness or radius needs the reduced model"
+            raise InputError(f"{where}: tissue.{name}m", "a mean and an sd", expected)
+        return stated.geometry
 
 
 def load_config(path: Path | str) -> Config:
@@ -279,30 +296,16 @@ def load_config(path: Path | str) -> Config:
     or range, bounds upside down.
     """
     path = Path(path)
-    data = bytes_of(path, EXPECTED, MOST_BYTES)
-    try:
-        plain = tomllib.loads(data.decode("utf-8-sig"))
-    except UnicodeDecodeError:
-        raise InputError(path, "bytes that are not text in UTF-8", EXPECTED) from None
-    except RecursionError:
-        raise InputError(path, TOO_DEEP, EXPECTED) from None
-    except ValueError as error:  # of TOML, or of a number with thousands of digits
-        raise InputError(path, str(error), EXPECTED) from None
+    plain = read_toml(path, EXPECTED)
     plain.setdefault("name", path.stem)
     return config_of(plain, path)
 
 
 def config_of(plain: Mapping[str, Any], where: Path | str) -> Config:
     """Checks a configuration's sections. Raises InputError as `load_config`, saying that it is of `where`."""
-    try:
-        config = Config.model_validate_json(json.dumps(plain, default=str))
-    except ValidationError as error:
-        raise _input_error(where, error) from None
-    except RecursionError:
-        raise InputError(where, TOO_DEEP, EXPECTED) from None
-    except ValueError as error:  # of a number with thousands of digits
-        raise InputError(where, str(error), EXPECTED) from None
+    config = checked(Config, plain, where, EXPECTED)
     parameter_space(config, where)
+    config.geometry(where)
     return config
 
 
@@ -345,7 +348,7 @@ def _changed_space(config: Config, where: object) -> ParameterSpace:
     unknown = sorted(set(config.parameters) - set(default.names))
     if unknown:
         where = f"{where}: parameters.{unknown[0]}"
-        raise InputError(where, "an unknown parameter", _one_of(default.names))
+        raise InputError(where, "an unknown parameter", one_of(default.names))
     return ParameterSpace(
         tuple(_overridden(p, config.parameters.get(p.name), where) for p in default.parameters)
     )
@@ -387,42 +390,3 @@ def _overridden(default: Parameter, change: PriorConfig | None, where: object) -
     return replace(
         default, lower=lower, upper=upper, prior=prior, source=change.source, centre=centre, spread=spread
     )
-
-
-def _input_error(path: Path | str, error: ValidationError) -> InputError:
-    """The first complaint of pydantic as the project's one line."""
-    first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"])
-    kind, given = first["type"], first["input"]
-    if kind == "extra_forbidden":
-        return InputError(f"{path}: {key}", "an unknown key", _one_of(_keys_beside(first["loc"])))
-    if kind == "missing" and isinstance(first["loc"][-1], int):
-        return InputError(f"{path}: {key}", "nothing", "one entry more")
-    if kind == "missing":
-        return InputError(f"{path}: {key}", "nothing", "this key: it has no default")
-    if kind == "value_error":  # ours, "key: found X; expected Y"
-        own, _, rest = str(first["ctx"]["error"]).partition(": found ")
-        found, _, expected = rest.partition("; expected ")
-        where = f"{key}.{own}" if key else own
-        return InputError(f"{path}: {where}", found, expected)
-    expected = first["msg"].removeprefix("Input should be ").removeprefix("Value should be ")
-    if kind in ("model_type", "model_attributes_type", "dict_type"):
-        expected = "a table"
-    elif kind == "too_long":
-        expected = f"at most {first['ctx']['max_length']} entries"
-    shown = "a table" if isinstance(given, Mapping) else json.dumps(given, default=str)
-    return InputError(f"{path}: {key}", shown, expected[0].lower() + expected[1:])
-
-
-def _keys_beside(location: tuple[Any, ...]) -> tuple[str, ...]:
-    """Names of the keys allowed in the table that `location` points into."""
-    section: Any = Config
-    for part in location[:-1]:
-        if section is Config and part == "parameters":
-            return tuple(PriorConfig.model_fields)
-        section = section.model_fields[part].annotation
-    return tuple(section.model_fields)
-
-
-def _one_of(names: tuple[str, ...]) -> str:
-    return "one of " + ", ".join(names)

@@ -42,7 +42,9 @@ BELOW = {
     "cluster": {"errors", "workers"},
     **dict.fromkeys(SIBLINGS, BASE),
     "journal": BASE,
-    "config": BASE | {"design"},
+    "sections": {"errors", "probe"},
+    "device": {"errors", "geometry", "sections"},
+    "config": BASE | {"design", "device", "sections"},
     "mechanisms": BASE | {"model"},
     "runner": BASE | SIBLINGS | {"journal"},
     "inference": BASE,  # a Surrogate is all that these two know of a model
@@ -56,6 +58,7 @@ BELOW = {
     | {
         "mechanisms",
         "config",
+        "device",
         "runner",
         "cluster",
         "mismatch",

@@ -21,17 +21,28 @@ _TOWARD_EDGE = 0.25  # where a cell beside an edge is divided: a quarter of its 
 # The pattern of each stretch: its length in the article's device, and its inner lines, from its start [mm].
 # Along x: half the gauge, pad, gap, guard, free skin beyond. Along y: half the pad, gap, guard, free skin.
 # Along z: subcutis, cutis. Free skin has coarse bricks: a soft cutis on a stiff subcutis would fold there,
-# and fine bricks try to.
-Pattern = tuple[tuple[float, tuple[float, ...]], ...]
-_COARSEST: tuple[Pattern, ...] = (
+# and fine bricks try to. Without a guard the pad's edges carry all of the force, and need smaller bricks.
+Stretch = tuple[float, tuple[float, ...]]
+Pattern = tuple[tuple[Stretch, ...], ...]
+_COARSEST: Pattern = (
     ((18.0, (12.0,)), (8.0, (4.0,)), (1.0, ()), (8.0, ()), (70.0, (15.0,))),
     ((4.0, ()), (1.0, ()), (7.0, ()), (72.0, (18.0,))),
     ((8.0, ()), (2.0, ())),
 )
-_COARSE: tuple[Pattern, ...] = (
+_COARSE: Pattern = (
     ((18.0, (9.0, 16.5)), (8.0, (1.5, 6.5)), (1.0, ()), (8.0, (1.5, 6.0)), (70.0, (5.0, 13.0, 30.0))),
     ((4.0, (3.0,)), (1.0, ()), (7.0, (3.5,)), (72.0, (6.0, 26.0))),
     ((8.0, (5.0,)), (2.0, (1.5,))),
+)
+_COARSEST_UNGUARDED: Pattern = (
+    ((18.0, (12.0, 16.5)), (8.0, (1.5,)), (70.0, (4.0, 20.0))),
+    ((4.0, (3.0,)), (72.0, (4.0, 24.0))),
+    ((8.0, ()), (2.0, ())),
+)
+_COARSE_UNGUARDED: Pattern = (
+    ((18.0, (9.0, 15.0, 17.5)), (8.0, (0.5, 2.5, 6.8)), (70.0, (1.2, 5.0, 12.0, 30.0))),
+    ((4.0, (2.2, 3.75)), (72.0, (0.8, 4.0, 12.0, 32.0))),
+    ((8.0, (5.0,)), (2.0, (1.2, 1.8))),
 )
 
 
@@ -62,7 +73,10 @@ def _lines_mm(refinement: int, geometry: Geometry) -> list[tuple[float, ...]]:
         [0.0, *edges[1], _mm(width)],
         [0.0, _mm(geometry.subcutis_m), *edges[2]],
     ]
-    lines = [_drawn(*axis) for axis in zip(stops, _COARSE if refinement else _COARSEST, strict=True)]
+    guarded = _COARSE if refinement else _COARSEST
+    unguarded = _COARSE_UNGUARDED if refinement else _COARSEST_UNGUARDED
+    pattern = unguarded if geometry.guard is None else guarded
+    lines = [_drawn(*axis) for axis in zip(stops, pattern, strict=True)]
     for _ in range(refinement - 1):
         lines = [_divided(*axis) for axis in zip(lines, edges, strict=True)]
     return lines
@@ -73,11 +87,10 @@ def _mm(length_m: float) -> float:
     return round(1e3 * length_m, 12)
 
 
-def _drawn(stops: Sequence[float], pattern: Pattern) -> tuple[float, ...]:
-    """Lines between the stops of one axis; without a guard, the pattern's stretches of it are left out."""
-    kept = pattern if len(pattern) == len(stops) - 1 else (*pattern[:-3], pattern[-1])
+def _drawn(stops: Sequence[float], stretches: Sequence[Stretch]) -> tuple[float, ...]:
+    """Lines of one axis: the pattern's stretches, each drawn between two stops."""
     lines = [stops[0]]
-    for (start, end), (length, inner) in zip(pairwise(stops), kept, strict=True):
+    for (start, end), (length, inner) in zip(pairwise(stops), stretches, strict=True):
         lines += [*(start + (end - start) * line / length for line in inner), end]
     return tuple(lines)
 

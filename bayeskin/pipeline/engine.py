@@ -96,8 +96,12 @@ class Outcome:
 
 
 def open_run(config_path: Path, reporter: Reporter, folder: Path | None = None) -> Run:
-    """A run from its configuration; its folder lies beside the configuration unless given."""
+    """A run from its configuration; its folder lies beside the configuration unless given.
+
+    Raises InputError for a configuration that is wrong, or whose lengths are uncertain.
+    """
     config = load_config(config_path)
+    config.certain_geometry(config_path)
     return Run(config, config_path, folder or config_path.resolve().parent / config.name, reporter)
 
 

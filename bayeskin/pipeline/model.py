@@ -14,9 +14,9 @@ def model_spec(run: Run, mesh: str | None = None, observation: str | None = None
     """The configuration's model; a mesh file or an observation given here goes before the configuration's.
 
     A mesh file in the configuration lies beside it, one given here in the working folder.
-    Raises InputError for a mesh that does not exist or does not fit the observation.
+    Raises InputError for a mesh that does not exist or does not fit the observation, or uncertain lengths.
     """
-    model = run.config.model
+    model, geometry = run.config.model, run.config.certain_geometry(run.config_path)
     if model.forward is not None and mesh is None and observation is None:
         return ModelSpec(observation="own", forward=_beside(run, model.forward))
     if model.observation == "own" and observation is None:
@@ -27,6 +27,7 @@ def model_spec(run: Run, mesh: str | None = None, observation: str | None = None
         observation=observation or model.observation,  # type: ignore[arg-type]
         mesh=mesh,
         refinement=model.refinement,
+        geometry=geometry,
     )
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from bayeskin.config import Config, DesignConfig, RecordingConfig
 from bayeskin.design import default_space
+from bayeskin.device import DeviceFile, device_lines, load_device_file, stated_geometry
 from bayeskin.errors import InputError
 from bayeskin.inference import NoisePriors
 from bayeskin.pipeline.folder import plain
@@ -18,7 +19,7 @@ from bayeskin.pipeline.recording import pad_motion
 from bayeskin.pipeline.shipping import shipped_for
 from bayeskin.recordings import describe, describe_json, phase_noise, read_recording, segment
 from bayeskin.shipped import shipped
-from bayeskin.types import Parameter
+from bayeskin.types import PadMotion, Parameter
 
 _SECONDS_A_RUN = (4, 15)  # of one core, on the default mesh
 _SHIPPED_KNOWS = (
@@ -68,12 +69,15 @@ _SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
 )  # fmt: skip
 
 
-def new_config(file: Path, out: Path | None = None) -> dict[str, Any]:
+def new_config(file: Path, out: Path | None = None, device: Path | None = None) -> dict[str, Any]:
     """Writes a configuration that fits `file`, by default beside it, and says what was found in it.
 
-    It takes a shipped surrogate where one knows the recording's protocol, else a design of its own.
-    Raises InputError, with nothing written, for no recording of a test, or an `out` that is there already.
+    It takes a shipped surrogate where one knows the recording's protocol and device, else a design of its
+    own. The sections of the file `device` are written into it.
+    Raises InputError, with nothing written, for no recording of a test, a device that cannot be, or an `out`
+    that is there already.
     """
+    stated = None if device is None else load_device_file(device)
     recording = read_recording(file)
     out = out or file.with_suffix(".toml")
     if out.suffix != ".toml":
@@ -83,9 +87,9 @@ def new_config(file: Path, out: Path | None = None) -> dict[str, Any]:
     phases = segment(recording)
     noise = phase_noise(recording, phases)
     found = describe(recording, phases, noise)
-    surrogate = shipped_for(pad_motion("reaction", recording, phases, "idealised"))
+    surrogate = _shipped_surrogate(pad_motion("reaction", recording, phases, "idealised"), stated)
     reference = Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix()
-    text = _configuration(_name(out), reference, found, surrogate.name if surrogate else None)
+    text = _configuration(_name(out), reference, found, surrogate.name if surrogate else None, stated)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open(out, "x", encoding="utf-8") as handle:
         handle.write(text)
@@ -114,12 +118,22 @@ def new_demo(out: Path | None = None) -> dict[str, Any]:
     return plain({"ok": True, "out": out, "text": f"written to {out}\nnext: bayeskin run {out}"})
 
 
+def _shipped_surrogate(motion: PadMotion, stated: DeviceFile | None) -> Path | None:
+    """The shipped surrogate of a protocol and a device."""
+    if stated is None:
+        return shipped_for(motion)
+    found = stated_geometry(stated.device, stated.tissue, "device")
+    return None if found.sd_m else shipped_for(motion, found.geometry)
+
+
 def _name(out: Path) -> str:
     """A run's name from a file's: what a configuration does not allow becomes a hyphen."""
     return re.sub(r"^[^A-Za-z0-9]+", "", re.sub(r"[^A-Za-z0-9._-]", "-", out.stem)) or "run"
 
 
-def _configuration(name: str, reference: str, found: str, surrogate: str | None) -> str:
+def _configuration(
+    name: str, reference: str, found: str, surrogate: str | None, stated: DeviceFile | None
+) -> str:
     config = Config(name=name, recording=RecordingConfig(file=reference))
     parts = [
         [f"name = {_quoted(name)}", f"seed = {config.seed}"],
@@ -129,11 +143,13 @@ def _configuration(name: str, reference: str, found: str, surrogate: str | None)
             f"file = {_quoted(reference)}  # relative to this file",
             f'# protocol = {_quoted(config.recording.protocol)}  # or "recorded": as it was, dearer',
         ],
+        *([device_lines(stated.device, stated.tissue)] if stated else []),
         _surrogate(surrogate) if surrogate else _design(config.design),
         [
             "# What can be set besides, with its default. To change one, take the # from its line and from",
             "# that of the section above it.",
             *(_SHIPPED_KNOWS if surrogate else ()),
+            *([] if stated else _commented_device(config)),
             *_optional(config),
         ],
     ]
@@ -163,7 +179,7 @@ def _design(design: DesignConfig) -> list[str]:
     quick, slow = _SECONDS_A_RUN
     low, high = (seconds * runs / (60 * design.workers) for seconds in _SECONDS_A_RUN)
     return [
-        "# No shipped surrogate knows this recording's protocol, so the full model is run first, here:",
+        "# No shipped surrogate knows this protocol on this device, so the full model is run first, here:",
         f"# {runs} runs of some {quick} to {slow} s each, {low:.0f} to {high:.0f} minutes with "
         f"{design.workers} workers.",
         "[design]",
@@ -182,6 +198,10 @@ def _optional(config: Config) -> list[str]:
     for parameter in default_space().parameters:
         lines += ["", *_prior(parameter)]
     return lines
+
+
+def _commented_device(config: Config) -> list[str]:
+    return ["", *(f"# {line}" if line else "" for line in device_lines(config.device, config.tissue))]
 
 
 def _toml(value: object, key: str) -> str:

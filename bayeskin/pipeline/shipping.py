@@ -12,6 +12,7 @@ import numpy as np
 
 from bayeskin.config import parameter_space
 from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
 from bayeskin.pipeline.engine import Run
 from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.model import model_spec, waves_spec
@@ -61,8 +62,13 @@ def _shipped_folder() -> Path:
     return shipped("surrogates/README.md").parent
 
 
-def shipped_for(motion: PadMotion) -> Path | None:
-    """The shipped surrogate of the reaction on the generator's bricks for a protocol, if there is one."""
+def shipped_for(motion: PadMotion, geometry: Geometry = Geometry()) -> Path | None:
+    """The shipped surrogate of the reaction on the generator's bricks for a protocol, if there is one.
+
+    All of them are of the article's device and tissue.
+    """
+    if geometry != Geometry():
+        return None
     for path in sorted(_shipped_folder().glob("*.json")):
         said = json.loads(path.read_text(encoding="utf-8"))
         ours = (said.get("observation"), said.get("mesh")) == ("reaction", "bricks")
@@ -78,6 +84,7 @@ def origin(run: Run, motion: PadMotion, records: Sequence[Mapping[str, Any]]) ->
         "observation": model.observation,
         "mesh": Path(model.mesh).name,
         "motion_sha256": motion_sha256(motion),
+        "geometry_sha256": model_spec(run).geometry.hash,
         "waves": list(records),
     }
 
@@ -89,6 +96,9 @@ def check_fits(run: Run, files: ShippedFiles, design: Design, binned: BinnedForc
     waves = said.get("waves")
     if not isinstance(waves, list) or not all(isinstance(w, dict) and "kept_fraction" in w for w in waves):
         raise InputError(f"{where}: manifest: waves", f"{waves!r:.60}", "how the points of each were chosen")
+    if said.get("geometry_sha256", Geometry().hash) != model_spec(run).geometry.hash:
+        expected = "one of this configuration's [device] and [tissue], or a design"
+        raise InputError(where, "a surrogate of another device or tissue", expected)
     if (design.model_hash, said.get("model_hash")) != (waves_spec(run).hash, model_spec(run).hash):
         raise InputError(where, "a surrogate of another model", "one of this configuration's model")
     if said.get("motion_sha256") != motion_sha256(motion):

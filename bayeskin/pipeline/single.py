@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from bayeskin import storage
-from bayeskin.config import load_config, parameter_space
+from bayeskin.config import Config, load_config, parameter_space
+from bayeskin.device import load_device_file
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, catalogue, laws, solved
 from bayeskin.model.accuracy import mesh_error
@@ -51,6 +52,7 @@ def simulate_once(
     reporter: Reporter,
     out: Path,
     config: Path | None = None,
+    device: Path | None = None,
     recording: Path | None = None,
     settings: Sequence[str] = (),
     mechanisms: Sequence[str] = (),
@@ -62,7 +64,8 @@ def simulate_once(
 ) -> dict[str, Any]:
     """One full run on a recording's displacement, into `out` (.csv or .h5); its fields into folders.
 
-    What is not given is the configuration's, or the demo's. Parameters that `settings` ("NAME=VALUE", SI)
+    What is not given is the configuration's, or the demo's; the sections of the file `device` go before its
+    own. What is uncertain of the tissue stands at its mean. Parameters that `settings` ("NAME=VALUE", SI)
     leave out stand at the median of their prior; those of the `mechanisms` named are among them. The
     figure shows the fields at the times `at_s`, or at four moments of the protocol. A run that fails is
     told, and nothing is written.
@@ -71,7 +74,7 @@ def simulate_once(
     _check_suffix(out, (".csv", ".h5"))
     _check_folders(fields, figures, at_s)
     config_path = config or shipped("runs/demo.toml")
-    run = Run(load_config(config_path), config_path, Path(), reporter)
+    run = Run(_with_device(load_config(config_path), device), config_path, Path(), reporter)
     added = _mechanisms(mechanisms)
     spec = model_spec(run, mesh, observation)
     if spec.forward is not None and (fields or figures or added):
@@ -93,7 +96,7 @@ def simulate_once(
         if spec.observation == "article":
             found = "model.observation 'article', whose stresses are not those of the fields"
             raise InputError("--fields, --figures", found, "'reaction'")
-        problem = problem_of(spec.mesh, spec.refinement)
+        problem = problem_of(spec.mesh, spec.refinement, spec.geometry)
         _refuse_other_stresses(added, theta | along, problem)
         outputs = FieldOutputs(problem, theta, motion, moments, fields, figures)
     simulation = simulate(
@@ -106,6 +109,12 @@ def simulate_once(
         write_simulation(out, simulation)
         files = [out, *(outputs.write(caption(run)) if outputs else ())]
     return _answer(simulation, spec, files)
+
+
+def _with_device(config: Config, device: Path | None) -> Config:
+    """The configuration with the sections of a device's file, and all uncertain lengths at their means."""
+    stated = config if device is None else load_device_file(device)
+    return config.model_copy(update={"device": stated.device, "tissue": stated.tissue.at_means})
 
 
 def _on_mesh(spec: ModelSpec) -> str:

@@ -1,0 +1,97 @@
+"""Checked sections of a TOML file: how it is read, and one line on what is wrong with it."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from bayeskin.errors import InputError
+from bayeskin.probe import bytes_of
+
+MOST_BYTES = 1_000_000
+TOO_DEEP = "tables or lists nested too deeply"
+
+
+class Section(BaseModel):
+    """A table of known keys, frozen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+Checked = TypeVar("Checked", bound=Section)
+
+
+def read_toml(path: Path, expected: str) -> dict[str, Any]:
+    """The tables of a file. Raises InputError for a file that is absent, not text or not TOML."""
+    data = bytes_of(path, expected, MOST_BYTES)
+    try:
+        return tomllib.loads(data.decode("utf-8-sig"))
+    except UnicodeDecodeError:
+        raise InputError(path, "bytes that are not text in UTF-8", expected) from None
+    except RecursionError:
+        raise InputError(path, TOO_DEEP, expected) from None
+    except ValueError as error:  # of TOML, or of a number with thousands of digits
+        raise InputError(path, str(error), expected) from None
+
+
+def checked(kind: type[Checked], plain: Mapping[str, Any], where: Path | str, expected: str) -> Checked:
+    """The tables as a checked value. Raises InputError for the first thing in them that is wrong."""
+    try:
+        return kind.model_validate_json(json.dumps(plain, default=str))
+    except ValidationError as error:
+        raise _input_error(where, error, kind) from None
+    except RecursionError:
+        raise InputError(where, TOO_DEEP, expected) from None
+    except ValueError as error:  # of a number with thousands of digits
+        raise InputError(where, str(error), expected) from None
+
+
+def _input_error(path: Path | str, error: ValidationError, root: type[Section]) -> InputError:
+    """The first complaint of pydantic as the project's one line."""
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"] if not str(part).startswith("<"))  # a form's name
+    kind, given = first["type"], first["input"]
+    if kind == "extra_forbidden":
+        return InputError(f"{path}: {key}", "an unknown key", one_of(_keys_beside(root, first["loc"])))
+    if kind == "missing" and isinstance(first["loc"][-1], int):
+        return InputError(f"{path}: {key}", "nothing", "one entry more")
+    if kind == "missing":
+        return InputError(f"{path}: {key}", "nothing", "this key: it has no default")
+    if kind == "value_error":  # ours, "key: found X; expected Y"
+        own, _, rest = str(first["ctx"]["error"]).partition(": found ")
+        found, _, expected = rest.partition("; expected ")
+        where = f"{key}.{own}" if key else own
+        return InputError(f"{path}: {where}", found, expected)
+    expected = first["msg"].removeprefix("Input should be ").removeprefix("Value should be ")
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        expected = "a table"
+    elif kind == "too_long":
+        expected = f"at most {first['ctx']['max_length']} entries"
+    shown = "a table" if isinstance(given, Mapping) else json.dumps(given, default=str)
+    return InputError(f"{path}: {key}", shown, expected[0].lower() + expected[1:])
+
+
+def _keys_beside(root: type[Section], location: tuple[Any, ...]) -> tuple[str, ...]:
+    """Names of the keys allowed in the table that `location` points into."""
+    section: type[BaseModel] = root
+    for part in location[:-1]:  # others are a parameter's name, or that of a form that a value has
+        if part in section.model_fields:
+            section = next(_models_in(section.model_fields[part].annotation))
+    return tuple(section.model_fields)
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _models_in(part)
+
+
+def one_of(names: tuple[str, ...]) -> str:
+    """The names that are allowed, as a complaint states them."""
+    return "one of " + ", ".join(names)
