@@ -46,6 +46,7 @@ BELOW = {
     "device": {"errors", "geometry", "sections"},
     "config": BASE | {"design", "device", "sections"},
     "mechanisms": BASE | {"model"},
+    "reduced": BASE | {"model", "mechanisms"},
     "runner": BASE | SIBLINGS | {"journal"},
     "inference": BASE,  # a Surrogate is all that these two know of a model
     "sensitivity": BASE,

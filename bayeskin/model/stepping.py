@@ -15,14 +15,15 @@ meshes wrinkles may follow each other without end; a run whose falls become too 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
-from bayeskin.model.lagrangian import LagrangianModel, State, Step
+from bayeskin.model.lagrangian import Stage, State, Step
 from bayeskin.model.newton import EXTRAPOLATION_POINTS, extrapolate, extrapolation_weights
-from bayeskin.types import Array
+from bayeskin.types import Array, PadMotion
 
 GAMMA = 1.0 - np.sqrt(0.5)
 FIRST_STEP_S = 1.0
@@ -32,14 +33,49 @@ MOST_CRAWLS = 3000  # of a run: steps of its falls, some 150 each
 STEPS_PER_PHASE = 5  # fewer, longer ones cost as much: their guesses are worse, their tangents further apart
 
 
-def advance(model: LagrangianModel, past: list[State], h: float) -> Step | None:
+class Solver(Protocol):
+    """What a model solves with; counts : what was spent, "crawls" and "falls" among it."""
+
+    @property
+    def counts(self) -> Mapping[str, int]: ...
+
+
+class Equations(Protocol):
+    """What step control asks of a model, full or reduced: `LagrangianModel` describes each."""
+
+    @property
+    def motion(self) -> PadMotion: ...
+
+    @property
+    def solver(self) -> Solver: ...
+
+    def initial_state(self, p_init: float) -> State: ...
+
+    def nominal_force(self) -> float: ...
+
+    def remember_travel(self, past: list[State]) -> None: ...
+
+    def solve_stage(
+        self,
+        time_s: float,
+        length_s: float,
+        sources: tuple[tuple[float, State], ...],
+        guess: Array,
+        jump: bool,
+        fall: bool = False,
+    ) -> Stage | None: ...
+
+    def finish(self, stages: tuple[Stage, ...], mass: Array) -> Step: ...
+
+
+def advance(model: Equations, past: list[State], h: float) -> Step | None:
     """One step of length h [s] from the last of `past`, the states of this phase up to now."""
     if len(past) < EXTRAPOLATION_POINTS:
         return _runge_kutta(model, past, h)
     return _backward_difference(model, past, h)
 
 
-def _runge_kutta(model: LagrangianModel, past: list[State], h: float) -> Step | None:
+def _runge_kutta(model: Equations, past: list[State], h: float) -> Step | None:
     first = GAMMA * h
     state = past[-1]
     t1, t2 = state.time_s + first, state.time_s + h
@@ -55,7 +91,7 @@ def _runge_kutta(model: LagrangianModel, past: list[State], h: float) -> Step | 
     return model.finish((one, two), mass)
 
 
-def _backward_difference(model: LagrangianModel, past: list[State], h: float) -> Step | None:
+def _backward_difference(model: Equations, past: list[State], h: float) -> Step | None:
     older, old, state = past[-3:]
     before, earlier = state.time_s - old.time_s, old.time_s - older.time_s
     ratio = h / before
@@ -74,7 +110,7 @@ def _backward_difference(model: LagrangianModel, past: list[State], h: float) ->
     return model.finish((stage,), mass)
 
 
-def _fall(model: LagrangianModel, state: State, h: float) -> Step | None:
+def _fall(model: Equations, state: State, h: float) -> Step | None:
     """A step across a fold of the equilibria, of backward Euler, which extrapolates no jump.
 
     As error of the fluid mass all that moves is taken, since nothing tells which part of it is right.
@@ -89,7 +125,7 @@ def _guess(past: list[State], time_s: float) -> Array:
 
 
 def integrate(
-    model: LagrangianModel,
+    model: Equations,
     p_init: float,
     tolerance: float,
     on_step: Callable[[Step], None],

@@ -1,0 +1,45 @@
+"""Law kernels called by the address of their machine code from compiled code.
+
+The kernels of a mechanism all have one of two signatures (`bayeskin.model.kernels`). So one compiled driver
+calls those of any set of mechanisms, whose addresses are among its arguments, and no set needs a compilation
+of its own.
+"""
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import types
+from numba.extending import intrinsic
+
+from bayeskin.model.kernels import LINEARISE, RESPOND
+
+
+def address(kernel: Any) -> int:
+    """Returns where the machine code of a law kernel lies, or 0 for None."""
+    if kernel is None:
+        return 0
+    (compilation,) = kernel.overloads.values()
+    return int(compilation.library.get_pointer_to_function(compilation.fndesc.llvm_func_name))
+
+
+def _call(context, builder, signature, args):
+    """Calls the function at the address args[0] with the rest of args, in numba's calling convention."""
+    arguments = signature.args[1:]
+    pointer = context.call_conv.get_function_type(types.none, arguments).as_pointer()
+    function = builder.inttoptr(args[0], pointer)
+    context.call_conv.call_function(builder, function, types.none, arguments, args[1:])
+    return context.get_dummy_value()
+
+
+@intrinsic
+def call_respond(typing, at, time_s, elapsed_s, par, data, f, p, g, before, after, stress, content, flux):
+    """Calls the respond kernel at an address."""
+    return types.void(types.int64, *RESPOND.args), _call
+
+
+@intrinsic
+def call_linearise(typing, at, time_s, elapsed_s, par, data, f, p, g, before, sf, sp, cf, cp, ff, fg):
+    """Calls the linearise kernel at an address."""
+    return types.void(types.int64, *LINEARISE.args), _call

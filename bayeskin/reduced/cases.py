@@ -1,0 +1,125 @@
+"""Training cases of a reduced model: skins of the prior, sets of mechanisms, geometries and short protocols.
+
+A reduced model knows no protocol. It learns from random ones with all that a protocol may do: unload fully,
+hold at zero, load slowly or fast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayeskin.geometry import Geometry
+from bayeskin.types import PadMotion, ParameterSpace
+
+BASE = "base"  # the kind of runs without a mechanism
+STIFFEST_SUBCUTIS = 2.0  # of the cutis' modulus: softer cutis on stiffer subcutis folds
+ACCOMPANIED = 0.5  # share of a mechanism's runs in which one or two others act as well
+MOVED = {BASE: 0.5}  # share of the runs on other layers and another arm
+MOVED_OTHERWISE = 0.25
+THICKNESS_RANGE, RADIUS_RANGE = 0.4, 0.3  # shares by which layers and arm differ at most
+
+
+@dataclass(frozen=True)
+class Protocols:
+    """Bounds of the random protocols: the largest displacement [m], speeds [m/s] and holds [s].
+
+    returns, rests : shares of the protocols that unload fully, and that hold after unloading
+    """
+
+    largest_m: float = 10e-3
+    speeds_m_s: tuple[float, float] = (0.1e-3, 5e-3)
+    holds_s: tuple[float, float] = (2.0, 60.0)
+    returns: float = 0.3
+    rests: float = 0.6
+
+
+@dataclass(frozen=True)
+class Case:
+    """One training run: values of all parameters, names of mechanisms, geometry and protocol."""
+
+    theta: Mapping[str, float]
+    mechanisms: tuple[str, ...]
+    geometry: Geometry
+    motion: PadMotion
+
+
+@dataclass(frozen=True)
+class Trained:
+    """The region that a reduced model is trained for: priors, geometry and protocols.
+
+    base : of the model without mechanisms; mechanisms : of each one's parameters, by its name
+    """
+
+    geometry: Geometry
+    base: ParameterSpace
+    mechanisms: Mapping[str, ParameterSpace]
+    protocols: Protocols = Protocols()
+
+    def case(self, kind: str, index: int, seed: int) -> Case:
+        """Returns training case `index` of a kind: "base", or the name of a mechanism that acts in it."""
+        rng = np.random.default_rng([seed, index, *kind.encode()])
+        names = () if kind == BASE else self._names(kind, rng)
+        return Case(
+            self._theta(names, rng), names, self._moved(MOVED.get(kind, MOVED_OTHERWISE), rng),
+            random_motion(rng, self.protocols),
+        )  # fmt: skip
+
+    def _names(self, kind: str, rng: np.random.Generator) -> tuple[str, ...]:
+        others = sorted(set(self.mechanisms) - {kind})
+        count = int(rng.integers(1, 3)) if rng.uniform() < ACCOMPANIED else 0
+        return tuple(sorted([kind, *rng.choice(others, min(count, len(others)), replace=False).tolist()]))
+
+    def _theta(self, names: Sequence[str], rng: np.random.Generator) -> dict[str, float]:
+        theta: dict[str, float] = {}
+        while not theta or theta["E_s"] > STIFFEST_SUBCUTIS * theta["E_c"]:
+            theta = _drawn(self.base, rng)
+        for name in names:
+            theta |= _drawn(self.mechanisms[name], rng)
+        return theta
+
+    def _moved(self, share: float, rng: np.random.Generator) -> Geometry:
+        g, (cutis, subcutis, radius) = self.geometry, rng.uniform(-1.0, 1.0, 3)
+        if rng.uniform() >= share:
+            return g
+        return replace(
+            g,
+            cutis_m=g.cutis_m * (1.0 + THICKNESS_RANGE * cutis),
+            subcutis_m=g.subcutis_m * (1.0 + THICKNESS_RANGE * subcutis),
+            arm_radius_m=None if g.arm_radius_m is None else g.arm_radius_m * (1.0 + RADIUS_RANGE * radius),
+        )
+
+
+def _drawn(space: ParameterSpace, rng: np.random.Generator) -> dict[str, float]:
+    return dict(zip(space.names, map(float, space.from_unit(rng.uniform(size=space.dim))), strict=True))
+
+
+def random_motion(rng: np.random.Generator, bounds: Protocols) -> PadMotion:
+    """Returns a random protocol of four or five phases: load, hold, unload, often hold, load."""
+    smallest_m = 0.03 * bounds.largest_m
+    time_s, height_m = [0.0], [0.0]
+
+    def go(to_m: float) -> None:
+        if abs(to_m - height_m[-1]) < smallest_m:
+            to_m = height_m[-1] + smallest_m
+        time_s.append(time_s[-1] + abs(to_m - height_m[-1]) / float(_log_uniform(rng, bounds.speeds_m_s)))
+        height_m.append(to_m)
+
+    def hold() -> None:
+        time_s.append(time_s[-1] + float(_log_uniform(rng, bounds.holds_s)))
+        height_m.append(height_m[-1])
+
+    first_m = rng.uniform(0.3, 1.0) * bounds.largest_m
+    go(first_m)
+    hold()
+    go(0.0 if rng.uniform() < bounds.returns else rng.uniform(0.0, 0.7) * first_m)
+    if rng.uniform() < bounds.rests:
+        hold()
+    go(rng.uniform(0.7 * first_m, bounds.largest_m))
+    return PadMotion(np.array(time_s), np.array(height_m))
+
+
+def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+    return float(np.exp(rng.uniform(np.log(bounds[0]), np.log(bounds[1]))))

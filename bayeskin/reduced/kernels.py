@@ -1,0 +1,476 @@
+"""Compiled core of the reduced model: residual, tangent and the whole solve of a stage at weighted points.
+
+Unknowns are coefficients x = (d, 0, displacement modes, pressure modes): d is the pads' displacement, and the
+second entry, always zero, belongs to the dual field, whose row of the residual is half the measured force.
+Mechanisms' laws are called by address (`calls`), so Python is in no loop over points or iterations.
+
+What the base law does to first order at rest is integrated exactly: `System.solid`, `coupling` and `flow`
+hold the difference between all points and the chosen ones, by which the sum over the latter is corrected.
+"""
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from bayeskin.model import poroelastic
+from bayeskin.model.assembly import compiled
+from bayeskin.reduced.calls import call_linearise, call_respond
+from bayeskin.types import Array
+
+CONVERGED, INSIDE_OUT, SLOW, NOT_FINITE = range(4)
+MOST_ITERATIONS, MOST_RENEWALS = 60, 12
+SLOW_CONTRACTION = 0.3  # a larger one asks for a new tangent
+SMALLEST_DAMPING = 1e-3
+BLOCK = 16  # points whose modes stay in the first cache
+
+
+class System(NamedTuple):
+    """Modes and weights at n points, the base law's constants there, and what the points leave out.
+
+    gradient (n, 9, k) : displacement gradients of the k = 2 + modes fields
+    pressure (n, m), slope (n, 3, m) : pressure modes and their gradients
+    weight (n,) [m^3]; mu, lam, mobility, storage (n,) : of the base law
+    solid (k, k), coupling (k, m), flow (m, m) : added to the residual; flow is a rate
+    """
+
+    gradient: Array
+    pressure: Array
+    slope: Array
+    weight: Array
+    mu: Array
+    lam: Array
+    mobility: Array
+    storage: Array
+    solid: Array
+    coupling: Array
+    flow: Array
+
+
+class Laws(NamedTuple):
+    """The laws of mechanisms in the order in which they answer.
+
+    respond, linearise (l,) : addresses, 0 for none; par, data : constants of all laws, flat; par_at, data_at,
+    memory_at (l + 1,) : where each law's begin; widths are a point's
+    """
+
+    respond: np.ndarray
+    linearise: np.ndarray
+    par: Array
+    par_at: np.ndarray
+    data: Array
+    data_width: np.ndarray
+    data_at: np.ndarray
+    memory_width: np.ndarray
+    memory_at: np.ndarray
+
+
+class History(NamedTuple):
+    """What a stage knows of the past: J*, p* (n,), the laws' memory (flat), coefficients x* (k,), times.
+
+    length_s : h*; elapsed_s : since the memory; time_s : at the stage's end since the test started
+    """
+
+    volume: Array
+    pressure: Array
+    memory: Array
+    displacement: Array
+    length_s: float
+    elapsed_s: float
+    time_s: float
+
+
+class Room(NamedTuple):
+    """Arrays at n points that a solve fills: kinematics, the laws' answers, and the state at its end."""
+
+    deformation: Array
+    at_pressure: Array
+    at_slope: Array
+    stress: Array
+    content: Array
+    flux: Array
+    volume: Array
+    memory: Array
+
+
+@compiled
+def residual(system, laws, past, x, room, out):
+    """Fills out (k + m,) and the room; returns the smallest J (not positive: a point is inside out)."""
+    n, k = system.weight.shape[0], system.gradient.shape[2]
+    m = system.pressure.shape[1]
+    out[:] = 0.0
+    smallest = np.inf
+    for start in range(0, n, BLOCK):
+        end = min(start + BLOCK, n)
+        _kinematics(system, x, start, end, room)
+        least = _answer(system, laws, past, start, end, room)
+        if not least > 0.0:
+            return least
+        smallest = min(smallest, least)
+        _project(system, start, end, room, out)
+    force, fluid = x[:k], x[k:]
+    for i in range(k):
+        total = 0.0
+        for j in range(k):
+            total += system.solid[i, j] * force[j]
+        for j in range(m):
+            total += system.coupling[i, j] * fluid[j]
+        out[i] += total
+    for i in range(m):
+        total = 0.0
+        for j in range(m):
+            total += system.flow[i, j] * fluid[j]
+        total *= past.length_s
+        for j in range(k):
+            total += system.coupling[j, i] * (force[j] - past.displacement[j])
+        out[k + i] += total
+    return smallest
+
+
+@compiled
+def _kinematics(system, x, start, end, room):
+    """Fills F, p and grad p at some points."""
+    k, m = system.gradient.shape[2], system.pressure.shape[1]
+    for q in range(start, end):
+        for i in range(3):
+            for j in range(3):
+                total = 0.0
+                for c in range(k):
+                    total += system.gradient[q, 3 * i + j, c] * x[c]
+                room.deformation[q, i, j] = total
+            room.deformation[q, i, i] += 1.0
+        total = 0.0
+        for c in range(m):
+            total += system.pressure[q, c] * x[k + c]
+        room.at_pressure[q] = total
+        for i in range(3):
+            total = 0.0
+            for c in range(m):
+                total += system.slope[q, i, c] * x[k + c]
+            room.at_slope[q, i] = total
+
+
+@compiled
+def _answer(system, laws, past, start, end, room):
+    """Fills stress, content, flux, J and memory at some points; returns the smallest J."""
+    smallest = _base(system, past, start, end, room)
+    if not smallest > 0.0:
+        return smallest
+    for one in range(len(laws.respond)):
+        if laws.respond[one] != 0:
+            before, after, data, par = _of_law(laws, one, start, end, past.memory, room.memory)
+            call_respond(
+                laws.respond[one], past.time_s, past.elapsed_s, par, data,
+                room.deformation[start:end], room.at_pressure[start:end], room.at_slope[start:end],
+                before, after, room.stress[start:end], room.content[start:end], room.flux[start:end],
+            )  # fmt: skip
+    return smallest
+
+
+@compiled
+def _base(system, past, start, end, room):
+    """The base law's answer at some points; returns the smallest J."""
+    e = end - start
+    return poroelastic.respond(
+        room.deformation[start:end].reshape(e, 1, 3, 3), room.at_pressure[start:end].reshape(e, 1),
+        room.at_slope[start:end].reshape(e, 1, 3), system.mu[start:end], system.lam[start:end],
+        system.mobility[start:end], system.storage[start:end], past.length_s,
+        past.volume[start:end].reshape(e, 1), past.pressure[start:end].reshape(e, 1),
+        room.stress[start:end].reshape(e, 1, 3, 3), room.content[start:end].reshape(e, 1),
+        room.flux[start:end].reshape(e, 1, 3), room.volume[start:end].reshape(e, 1),
+    )  # fmt: skip
+
+
+@compiled
+def _of_law(laws, one, start, end, old, new):
+    """A law's memory before and after, constants at some points, and constants of the run."""
+    width, at = laws.memory_width[one], laws.memory_at[one]
+    before = old[at + start * width : at + end * width].reshape(end - start, width)
+    after = new[at + start * width : at + end * width].reshape(end - start, width)
+    wide, place = laws.data_width[one], laws.data_at[one]
+    data = laws.data[place + start * wide : place + end * wide].reshape(end - start, wide)
+    return before, after, data, laws.par[laws.par_at[one] : laws.par_at[one + 1]]
+
+
+@compiled
+def _project(system, start, end, room, out):
+    """Adds what some points answer to the residual."""
+    k, m = system.gradient.shape[2], system.pressure.shape[1]
+    for q in range(start, end):
+        w = system.weight[q]
+        for i in range(3):
+            for j in range(3):
+                s = w * room.stress[q, i, j]
+                for c in range(k):
+                    out[c] += s * system.gradient[q, 3 * i + j, c]
+        content = w * room.content[q]
+        f0, f1, f2 = w * room.flux[q, 0], w * room.flux[q, 1], w * room.flux[q, 2]
+        for c in range(m):
+            out[k + c] -= (
+                content * system.pressure[q, c]
+                + f0 * system.slope[q, 0, c]
+                + f1 * system.slope[q, 1, c]
+                + f2 * system.slope[q, 2, c]
+            )
+
+
+@compiled
+def tangent(system, laws, past, x, room):
+    """Derivative of the residual by x, (k + m, k + m); F, p and grad p in the room are those at x."""
+    n = system.weight.shape[0]
+    stress_f, stress_p, content_f = np.empty((n, 9, 9)), np.empty((n, 9)), np.empty((n, 9))
+    content_p, flux_f, flux_g = np.empty(n), np.empty((n, 3, 9)), np.empty((n, 3, 3))
+    poroelastic.linearise(
+        room.deformation.reshape(n, 1, 3, 3), room.at_pressure.reshape(n, 1), room.at_slope.reshape(n, 1, 3),
+        system.mu, system.lam, system.mobility, system.storage, past.length_s, past.pressure.reshape(n, 1),
+        stress_f.reshape(n, 1, 9, 9), stress_p.reshape(n, 1, 9), content_f.reshape(n, 1, 9),
+        content_p.reshape(n, 1), flux_f.reshape(n, 1, 3, 9), flux_g.reshape(n, 1, 3, 3),
+    )  # fmt: skip
+    for one in range(len(laws.linearise)):
+        if laws.linearise[one] != 0:
+            before, _, data, par = _of_law(laws, one, 0, n, past.memory, room.memory)
+            call_linearise(
+                laws.linearise[one], past.time_s, past.elapsed_s, par, data, room.deformation,
+                room.at_pressure, room.at_slope, before, stress_f, stress_p, content_f, content_p, flux_f,
+                flux_g,
+            )  # fmt: skip
+    return _assembled(system, past, stress_f, stress_p, content_f, content_p, flux_f, flux_g)
+
+
+@compiled
+def _assembled(system, past, stress_f, stress_p, content_f, content_p, flux_f, flux_g):
+    """The tangent from the laws' derivatives at the points."""
+    n, k, m = system.weight.shape[0], system.gradient.shape[2], system.pressure.shape[1]
+    solid, column, row = np.empty((n, 9, k)), np.empty((n, k)), np.empty((n, k))
+    turned, flow = np.empty((n, 3, k)), np.empty((n, 3, m))
+    stored = np.empty((n, m))
+    for q in range(n):
+        w, b = system.weight[q], system.gradient[q]
+        solid[q] = np.dot(w * stress_f[q], b)
+        turned[q] = np.dot(w * flux_f[q], b)
+        flow[q] = np.dot(w * flux_g[q], system.slope[q])
+        for c in range(k):
+            up = down = 0.0
+            for i in range(9):
+                up += stress_p[q, i] * b[i, c]
+                down += content_f[q, i] * b[i, c]
+            column[q, c], row[q, c] = w * up, w * down
+        for c in range(m):
+            stored[q, c] = w * content_p[q] * system.pressure[q, c]
+    gradient, slope = system.gradient.reshape(9 * n, k), system.slope.reshape(3 * n, m)
+    out = np.empty((k + m, k + m))
+    out[:k, :k] = np.dot(gradient.T, solid.reshape(9 * n, k)) + system.solid
+    out[:k, k:] = np.dot(column.T, system.pressure) + system.coupling
+    out[k:, :k] = system.coupling.T
+    out[k:, :k] -= np.dot(system.pressure.T, row) + np.dot(slope.T, turned.reshape(3 * n, k))
+    out[k:, k:] = past.length_s * system.flow
+    out[k:, k:] -= np.dot(system.pressure.T, stored) + np.dot(slope.T, flow.reshape(3 * n, m))
+    return out
+
+
+@compiled
+def renew(system, laws, past, x, room, inverse, force_row, by_pads):
+    """Fills the inverse of the free part of the tangent at x, the force's row and the pads' column.
+
+    The rows of the pads' and of the dual field are no equations of the solve: the free ones follow them.
+    """
+    _kinematics(system, x, 0, system.weight.shape[0], room)
+    whole = tangent(system, laws, past, x, room)
+    free = whole[2:, 2:].copy()
+    scale = np.empty(free.shape[0])
+    for i in range(len(scale)):
+        scale[i] = 1.0 / np.sqrt(abs(free[i, i]) + 1e-300)
+    for i in range(len(scale)):
+        for j in range(len(scale)):
+            free[i, j] *= scale[i] * scale[j]
+    inverse[:] = np.linalg.inv(free)
+    for i in range(len(scale)):
+        for j in range(len(scale)):
+            inverse[i, j] *= scale[i] * scale[j]
+    force_row[:] = 2.0 * whole[1, 2:]
+    by_pads[: len(scale)] = whole[2:, 0]
+    by_pads[len(scale)] = 2.0 * whole[1, 0]
+
+
+@compiled
+def solve(system, laws, past, x, tolerance, nominal_n, room, inverse, force_row, by_pads, counts):
+    """Solves a stage from the guess x, whose first entry is the pads' displacement, in place.
+
+    inverse, force_row, by_pads : of the last tangent, renewed where they contract badly
+    counts (3,) : iterations, residuals and tangents, added up
+    Returns the status and the force [N], corrected to first order by the last step.
+    """
+    free = x[2:]
+    k = system.gradient.shape[2]
+    right, after = np.empty(len(x)), np.empty(len(x))
+    counts[1] += 1
+    if not residual(system, laws, past, x, room, right) > 0.0:
+        return INSIDE_OUT, 0.0
+    before, renewals = np.inf, 0
+    for iteration in range(MOST_ITERATIONS):
+        counts[0] += 1
+        step = -np.dot(inverse, right[2:])
+        force_step = np.dot(force_row, step)
+        size = max(0.1 * np.abs(step[: k - 2]).max(), abs(force_step) / nominal_n) / tolerance
+        if not np.isfinite(size):
+            return NOT_FINITE, 0.0
+        if (size < 1.0 and iteration > 0) or size < 0.01:
+            return CONVERGED, 2.0 * right[1] + force_step
+        if iteration > 0 and size > SLOW_CONTRACTION * before:
+            if renewals == MOST_RENEWALS:
+                return SLOW, 0.0
+            renewals += 1
+            counts[2] += 1
+            renew(system, laws, past, x, room, inverse, force_row, by_pads)
+            step = -np.dot(inverse, right[2:])
+            before = np.inf
+        else:
+            before = size
+        damping = 1.0
+        while True:
+            moved = x.copy()
+            moved[2:] = free + damping * step
+            counts[1] += 1
+            if residual(system, laws, past, moved, room, after) > 0.0:
+                break
+            damping *= 0.5
+            if damping < SMALLEST_DAMPING:
+                return INSIDE_OUT, 0.0
+        if damping == 1.0:
+            _update(inverse, step, after[2:] - right[2:])
+        free[:] = moved[2:]
+        right[:] = after
+    return SLOW, 0.0
+
+
+@compiled
+def _update(inverse, step, change):
+    """Broyden's rank-one correction of an inverse (his good method), in place."""
+    answer = np.dot(inverse, change)
+    row = np.dot(step, inverse)
+    along = np.dot(row, change)
+    if abs(along) > 1e-3 * np.dot(step, step):
+        for i in range(len(step)):
+            share = (step[i] - answer[i]) / along
+            for j in range(len(step)):
+                inverse[i, j] += share * row[j]
+
+
+class Varied(NamedTuple):
+    """A run's constants where one of r parameters is a step further, and derivatives of its exact parts.
+
+    mu, lam, mobility (r, n); par (r, .), data (r, .) : as in `System` and `Laws`, at the changed values
+    solid_units (s, k, k), flow_units (t, m, m) : what `System.solid` and `flow` are combinations of
+    solid_by (r, s), flow_by (r, t) : derivatives of the coefficients; step : the change, in units of one
+    """
+
+    mu: Array
+    lam: Array
+    mobility: Array
+    par: Array
+    data: Array
+    solid_units: Array
+    flow_units: Array
+    solid_by: Array
+    flow_by: Array
+    step: float
+
+
+class Slopes(NamedTuple):
+    """Derivatives by r parameters of a state: x (r, k + m), J and p (r, n), memory (r, .)."""
+
+    x: Array
+    volume: Array
+    pressure: Array
+    memory: Array
+
+
+@compiled
+def differentiate(system, laws, past, x, room, varied, before, pads_by, inverse, force_row, by_pads, out):
+    """Fills `out`, the derivatives of a solved stage's end, and returns those of the force [N], (r,).
+
+    room : as `solve` left it at x; before : derivatives of the history (x those of x*)
+    pads_by (r,) : of the pads' displacement
+
+    The tangent at x is made anew and left in inverse, force_row and by_pads.
+    """
+    n, k, m = system.weight.shape[0], system.gradient.shape[2], system.pressure.shape[1]
+    r = len(pads_by)
+    step = varied.step
+    renew(system, laws, past, x, room, inverse, force_row, by_pads)
+    other = Room(
+        room.deformation.copy(), room.at_pressure.copy(), room.at_slope.copy(), np.empty((n, 3, 3)),
+        np.empty(n), np.empty((n, 3)), np.empty(n), np.empty(len(room.memory)),
+    )  # fmt: skip
+    stress, content, flux = np.empty((r, 9 * n)), np.empty((r, n)), np.empty((r, 3 * n))
+    for i in range(r):
+        _answer_varied(system, laws, past, varied, before, i, other)
+        for q in range(n):
+            w = system.weight[q] / step
+            content[i, q] = w * (other.content[q] - room.content[q])
+            for a in range(3):
+                flux[i, 3 * q + a] = w * (other.flux[q, a] - room.flux[q, a])
+                for b in range(3):
+                    stress[i, 9 * q + 3 * a + b] = w * (other.stress[q, a, b] - room.stress[q, a, b])
+    gradient, slope = system.gradient.reshape(9 * n, k), system.slope.reshape(3 * n, m)
+    right = np.empty((r, k + m))
+    right[:, :k] = np.dot(stress, gradient)
+    right[:, k:] = -(np.dot(content, system.pressure) + np.dot(flux, slope))
+    _add_exact(system, past, x, varied, before, right)
+    free = right[:, 2:] + np.outer(pads_by, by_pads[:-1])
+    out.x[:, 0] = pads_by
+    out.x[:, 1] = 0.0
+    out.x[:, 2:] = -np.dot(free, inverse.T)
+    force = 2.0 * right[:, 1] + np.dot(out.x[:, 2:].copy(), force_row) + pads_by * by_pads[-1]
+    deformed = np.dot(out.x[:, :k].copy(), gradient.T)
+    pressed, sloped = np.dot(out.x[:, k:].copy(), system.pressure.T), np.dot(out.x[:, k:].copy(), slope.T)
+    for i in range(r):
+        for q in range(n):
+            other.at_pressure[q] = room.at_pressure[q] + step * pressed[i, q]
+            for a in range(3):
+                other.at_slope[q, a] = room.at_slope[q, a] + step * sloped[i, 3 * q + a]
+                for b in range(3):
+                    change = step * deformed[i, 9 * q + 3 * a + b]
+                    other.deformation[q, a, b] = room.deformation[q, a, b] + change
+        _answer_varied(system, laws, past, varied, before, i, other)
+        out.volume[i] = (other.volume - room.volume) / step
+        out.memory[i] = (other.memory - room.memory) / step
+        out.pressure[i] = pressed[i]
+    return force
+
+
+@compiled
+def _answer_varied(system, laws, past, varied, before, i, other):
+    """Fills `other` with the answers where parameter i and the history are a step further."""
+    step = varied.step
+    changed = System(
+        system.gradient, system.pressure, system.slope, system.weight, varied.mu[i], varied.lam[i],
+        varied.mobility[i], system.storage, system.solid, system.coupling, system.flow,
+    )  # fmt: skip
+    acting = Laws(
+        laws.respond, laws.linearise, varied.par[i], laws.par_at, varied.data[i], laws.data_width,
+        laws.data_at, laws.memory_width, laws.memory_at,
+    )  # fmt: skip
+    older = History(
+        past.volume + step * before.volume[i], past.pressure + step * before.pressure[i],
+        past.memory + step * before.memory[i], past.displacement, past.length_s, past.elapsed_s, past.time_s,
+    )  # fmt: skip
+    _answer(changed, acting, older, 0, system.weight.shape[0], other)
+
+
+@compiled
+def _add_exact(system, past, x, varied, before, right):
+    """Adds the derivatives of the exactly integrated parts to right (r, k + m)."""
+    k = system.gradient.shape[2]
+    force, fluid = x[:k].copy(), x[k:].copy()
+    for s in range(varied.solid_units.shape[0]):
+        answer = np.dot(varied.solid_units[s], force)
+        for i in range(right.shape[0]):
+            right[i, :k] += varied.solid_by[i, s] * answer
+    for t in range(varied.flow_units.shape[0]):
+        answer = np.dot(varied.flow_units[t], fluid)
+        for i in range(right.shape[0]):
+            right[i, k:] += past.length_s * varied.flow_by[i, t] * answer
+    right[:, k:] -= np.dot(before.x[:, :k].copy(), system.coupling)

@@ -1,0 +1,123 @@
+"""What a basis becomes at the quadrature points of a mesh, and the exact linear parts of the base law."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from bayeskin.model.problem import Problem
+from bayeskin.types import Array
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Fields of a reduced model on the nodes of a mesh; the most important modes first.
+
+    moving, dual (3 nodes,) : one on all pads along x; one on what the load cell measures (`basis.Inner`)
+    displacement (u, 3 nodes) : modes [m]; pressure (p, corners) : modes [Pa], the first one constant
+    """
+
+    moving: Array
+    dual: Array
+    displacement: Array
+    pressure: Array
+
+    @property
+    def fields(self) -> Array:
+        """All fields of the displacement (2 + u, 3 nodes)."""
+        return np.concatenate([[self.moving, self.dual], self.displacement])
+
+
+@dataclass(frozen=True)
+class PointFields:
+    """Gradients and values of the fields of a basis at n quadrature points, with their weights.
+
+    gradient (n, 9, k), slope (n, 3, m), pressure (n, m), weight (n,); cutis (n,) bool; points_m (3, n)
+    """
+
+    gradient: Array
+    slope: Array
+    pressure: Array
+    weight: Array
+    cutis: np.ndarray
+    points_m: Array
+
+    def at(self, rule: Rule) -> PointFields:
+        """The fields at the points of a rule, with its weights."""
+        i = rule.points
+        return PointFields(
+            self.gradient[i], self.slope[i], self.pressure[i], rule.weight(self.weight), self.cutis[i],
+            np.ascontiguousarray(self.points_m[:, i]),
+        )  # fmt: skip
+
+    @cached_property
+    def linear(self) -> LinearParts:
+        """The base law's linear part at rest, integrated at these points."""
+        return linear_parts(self)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A cubature: numbers of the chosen points, and factors (n,) on their own weights."""
+
+    points: np.ndarray
+    factor: Array
+
+    def weight(self, weight: Array) -> Array:
+        """The chosen points' weights, of those of all points."""
+        return np.asarray(self.factor * weight[self.points])
+
+
+@dataclass(frozen=True)
+class LinearParts:
+    """Matrices of the base law's linear part by layer (first axis: cutis, subcutis), and of what couples.
+
+    shear, bulk (2, k, k) : by mu and lambda; flow (2, m, m) : by mobility; coupling (k, m) : - div u p
+    """
+
+    shear: Array
+    bulk: Array
+    flow: Array
+    coupling: Array
+
+    def __sub__(self, other: LinearParts) -> LinearParts:
+        return LinearParts(
+            self.shear - other.shear, self.bulk - other.bulk, self.flow - other.flow,
+            self.coupling - other.coupling,
+        )  # fmt: skip
+
+
+def linear_parts(at: PointFields) -> LinearParts:
+    """Integrates the base law's linear part at rest at weighted points."""
+    shear, bulk, flow = [], [], []
+    divergence = at.gradient[:, 0] + at.gradient[:, 4] + at.gradient[:, 8]
+    for layer in (at.cutis, ~at.cutis):
+        b, w, g, trace = at.gradient[layer], at.weight[layer], at.slope[layer], divergence[layer]
+        n, _, k = b.shape
+        both = b + b.reshape(n, 3, 3, k).transpose(0, 2, 1, 3).reshape(n, 9, k)
+        shear.append(b.reshape(n * 9, k).T @ (both * w[:, None, None]).reshape(n * 9, k))
+        bulk.append(trace.T @ (trace * w[:, None]))
+        flow.append(g.reshape(n * 3, -1).T @ (g * w[:, None, None]).reshape(n * 3, -1))
+    coupling = -(divergence * at.weight[:, None]).T @ at.pressure
+    return LinearParts(np.array(shear), np.array(bulk), np.array(flow), coupling)
+
+
+def point_fields(problem: Problem, basis: Basis) -> PointFields:
+    """Returns the fields of a basis at all quadrature points of a problem, cell by cell."""
+    s = problem.space
+    fields, (e, q) = basis.fields, s.weight.shape
+    nodal = fields.T.reshape(-1, 3, len(fields))[s.nodes_u]  # (e, a, 3, k)
+    gradient = np.einsum("eqja,eaik->eqijk", s.grad_u, nodal, optimize=True)
+    corners = basis.pressure.T[s.nodes_p]  # (e, b, m)
+    return PointFields(
+        gradient=np.ascontiguousarray(gradient.reshape(e * q, 9, -1)),
+        slope=np.ascontiguousarray(
+            np.einsum("eqjb,ebm->eqjm", s.grad_p, corners, optimize=True).reshape(e * q, 3, -1)
+        ),
+        pressure=np.ascontiguousarray(np.einsum("qb,ebm->eqm", s.value_p, corners).reshape(e * q, -1)),
+        weight=s.weight.ravel(),
+        cutis=np.repeat(problem.mesh.cutis, q),
+        points_m=s.quadrature_points().reshape(3, -1),
+    )

@@ -1,0 +1,74 @@
+"""A reduced run followed on all points of the mesh: what the chosen points see, and what they leave out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayeskin.model.lagrangian import Stage, State
+from bayeskin.reduced import kernels
+from bayeskin.reduced.equations import Bound, ReducedEquations, ReducedSpace
+from bayeskin.types import Array, PadMotion
+
+REMEMBERED = 8  # states whose followers are kept; a step asks for three at most
+
+
+@dataclass(frozen=True)
+class Followed:
+    """One stage on all points: the arrays there, the history, and the residual (k + m,) of all points."""
+
+    room: kernels.Room
+    past: kernels.History
+    residual: Array
+
+
+class Shadow:
+    """Follows the stages of a reduced run on all points, at the unknowns that the run solved for."""
+
+    def __init__(
+        self, whole: ReducedSpace, run: Bound, motion: PadMotion, theta: Mapping[str, float]
+    ) -> None:
+        self.equations = ReducedEquations(whole, run, motion, nominal_n=1.0)
+        start = self.equations.initial_state(theta["p_init"])
+        self._start = start
+        self._known: dict[int, tuple[State, State]] = {}  # by identity of the run's state, kept alive
+
+    def follow(self, stage: Stage, time_s: float) -> Followed | None:
+        """The stage on all points, time_s after the test started; None where one is inside out."""
+        eq, k = self.equations, self.equations.space.modes[0]
+        sources = [(weight, self._of(state), state) for weight, state in stage.sources]
+        past = kernels.History(
+            np.asarray(sum(w * s.volume for w, s, _ in sources)),
+            np.asarray(sum(w * s.pressure for w, s, _ in sources)), sources[-1][1].memory[0],
+            np.asarray(sum(w * own.x[:k] for w, _, own in sources)), stage.length_s, stage.elapsed_s, time_s,
+        )  # fmt: skip
+        room, out = eq.make_room(), np.empty(len(stage.state.x))
+        if not kernels.residual(eq.system, eq.packed, past, stage.state.x, room, out) > 0.0:
+            return None
+        end = State(stage.state.time_s, stage.state.x, room.volume, room.at_pressure, (room.memory,))
+        self._known[id(stage.state)] = stage.state, end
+        for old in list(self._known)[:-REMEMBERED]:
+            del self._known[old]
+        return Followed(room, past, out)
+
+    def _of(self, state: State) -> State:
+        known = self._known.get(id(state))
+        return self._start if known is None else known[1]
+
+    def nonlinear_integrands(self, followed: Followed) -> Array:
+        """What each point adds to each row of the residual, over its weight, (n, k + m), without the base
+        law's linear part at rest, which is integrated exactly."""
+        room, past, system = followed.room, followed.past, self.equations.system
+        at = self.equations.space.at
+        n, strain = len(at.weight), room.deformation - np.eye(3)
+        trace = strain.trace(axis1=1, axis2=2)
+        stress = room.stress - system.mu[:, None, None] * (strain + strain.transpose(0, 2, 1))
+        stress[:, [0, 1, 2], [0, 1, 2]] -= (system.lam * trace - room.at_pressure)[:, None]
+        old_trace = at.gradient[:, [0, 4, 8]].sum(axis=1) @ past.displacement
+        content = room.content - (trace - old_trace)
+        flux = room.flux - (past.length_s * system.mobility)[:, None] * room.at_slope
+        solid = np.matmul(stress.reshape(n, 1, 9), at.gradient)[:, 0]
+        fluid = at.pressure * content[:, None] + np.matmul(flux[:, None], at.slope)[:, 0]
+        return np.concatenate([solid, -fluid], axis=1)

@@ -1,0 +1,115 @@
+"""Training runs of the full model, kept as the few weighted modes that make up their states."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayeskin.model.lagrangian import LagrangianModel, Step
+from bayeskin.model.problem import Problem, material
+from bayeskin.model.stepping import integrate
+from bayeskin.model.tissue import Bind
+from bayeskin.reduced.basis import Inner, weighted_modes
+from bayeskin.reduced.cases import Case
+from bayeskin.types import Array
+
+DUAL_EVERY = 8  # steps between the adjoint solutions that are kept
+DUAL_SCALE_M = 5e-3  # displacement by which adjoint solutions are weighted beside states
+KEPT = 1e-5  # modes of a run with singular values below this share of the largest are left out
+MOST_MODES = 24  # of a run
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """One full run as weighted modes: its states and adjoint solutions are combinations of them.
+
+    displacement (a, 3 nodes) [m], without the parts that move with the pads
+    pressure (b, corners), over the run's peak force [Pa/N], without their means
+    time_s, force_n (n,) : the steps and the force
+    message : empty, or why the run ended early
+    """
+
+    displacement: Array
+    pressure: Array
+    time_s: Array
+    force_n: Array
+    message: str
+
+
+class _States:
+    """Collects the unknowns of each step of a run, and adjoint solutions of some."""
+
+    def __init__(self, model: LagrangianModel) -> None:
+        self.model = model
+        self.unknowns: list[Array] = []
+        self.duals: list[Array] = []
+        self.time_s, self.force_n = [0.0], [0.0]
+        self._at_start: list[float] = []
+
+    def on_step(self, step: Step) -> None:
+        model = self.model
+        time_s = step.state.time_s - model.starts_s
+        if time_s > -1e-6:
+            self._at_start.append(step.force_n)
+            model.zero_n = self._at_start[0]
+        if not step.stages:
+            return
+        if time_s > 0.0:
+            self.time_s.append(time_s)
+            self.force_n.append(step.force_n - model.zero_n)
+        self.unknowns.append(step.state.x)
+        if step.corner or len(self.unknowns) % DUAL_EVERY == 1:
+            self.duals.append(self._dual(step))
+
+    def _dual(self, step: Step) -> Array:
+        """The adjoint of half the force at the end of a step (dofs,)."""
+        model, stage = self.model, step.stages[-1]
+        equations = model.equations(stage.length_s, stage.history, stage.elapsed_s)
+        model.solver.renew(equations, stage.state.x)
+        dual = np.zeros(model.problem.space.dofs)
+        dual[equations.free] = -0.5 * model.solver.back_substitute(model.pad_gradient)
+        dual[model.problem.measured_x] = 1.0
+        return dual
+
+
+def training_run(
+    problem: Problem,
+    inner: Inner,
+    case: Case,
+    binds: Sequence[Bind],
+    tolerance: float = 1e-3,
+) -> TrainingRun:
+    """Runs the full model of a case, whose mechanisms' laws are `binds`, and compresses its states."""
+    laws = tuple(bind(case.theta, problem.sites) for bind in binds)
+    model = LagrangianModel(problem, material(case.theta, problem.mesh.cutis), case.motion, laws)
+    states = _States(model)
+    try:
+        message = integrate(model, case.theta["p_init"], tolerance, states.on_step, falls_too=False)
+    except FloatingPointError as error:
+        message = str(error)
+    model.solver.release()
+    force_n = np.array(states.force_n)
+    peak_n = max(float(np.abs(force_n).max()), 1e-9)
+    states_u, states_p = _weighted(states.unknowns, inner.moving, inner, peak_n, 1.0)
+    duals_u, duals_p = _weighted(states.duals, inner.dual, inner, peak_n, DUAL_SCALE_M)
+    return TrainingRun(
+        np.concatenate([states_u, duals_u]).astype(np.float32),
+        np.concatenate([states_p, duals_p]).astype(np.float32),
+        np.array(states.time_s), force_n, message,
+    )  # fmt: skip
+
+
+def _weighted(
+    unknowns: Sequence[Array], along: Array, inner: Inner, peak_n: float, scale: float
+) -> tuple[Array, Array]:
+    """Returns weighted modes of displacements less `along` times the pads', and of pressures less means."""
+    states, n = np.array(unknowns), inner.displacement.shape[0]
+    u = states[:, :n] - np.outer(states[:, inner.pad_dof], along)
+    p = inner.without_mean(states[:, n:] / peak_n)
+    size = scale / np.sqrt(len(states))
+    return (
+        weighted_modes(size * u, inner.displacement, KEPT, MOST_MODES),
+        weighted_modes(size * p, inner.pressure, KEPT, MOST_MODES),
+    )
