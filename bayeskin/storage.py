@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
@@ -214,3 +215,19 @@ def _read_dataclass(group: h5py.Group, name: str) -> Any:
     if found not in _STORED:
         raise InputError(group.name, f"type {found!r}", "a type that bayeskin stores")
     return read(group, _STORED[found], name)
+
+
+def contents_hash(handle: h5py.File) -> str:
+    """SHA-256 over every dataset and attribute below the root, in the order of their names."""
+    digest = hashlib.sha256()
+    names: list[str] = []
+    handle.visit(names.append)
+    for name in sorted(names):
+        node = handle[name]
+        for key in sorted(node.attrs):
+            digest.update(f"{name}@{key}={node.attrs[key]!s};".encode())
+        if isinstance(node, h5py.Dataset):
+            values = np.ascontiguousarray(node[()])
+            digest.update(f"{name}:{values.dtype.str}{values.shape};".encode())
+            digest.update(values.tobytes())
+    return digest.hexdigest()

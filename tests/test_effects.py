@@ -29,6 +29,7 @@ from bayeskin.proof.cases import shipped_screen
 from bayeskin.proof.protocol import MOTION, SURROGATE
 from bayeskin.runner import run_design
 from bayeskin.shipped import shipped
+from bayeskin.storage import contents_hash
 from bayeskin.surrogates import (
     Pair,
     composed,
@@ -44,7 +45,6 @@ from bayeskin.surrogates import (
     train_effect,
 )
 from bayeskin.surrogates.effects import WithEffects
-from bayeskin.surrogates.files import contents_hash
 from bayeskin.surrogates.screening import active_inputs
 from bayeskin.types import Array, BinnedForce, Design, Parameter, ParameterSpace, Phase, Prediction
 

@@ -41,8 +41,8 @@ from bayeskin.pipeline import folder
 from bayeskin.pipeline.serve import Asked, ServedModel
 from bayeskin.recordings import phase_noise, read_recording, segment
 from bayeskin.runner import load_waves
+from bayeskin.storage import contents_hash
 from bayeskin.surrogates import load_manifest, manifest_of, save_surrogate, train
-from bayeskin.surrogates.files import contents_hash
 from bayeskin.types import Design, Recording
 from bayeskin.umbridge import Refused, _understood
 

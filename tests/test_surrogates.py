@@ -21,6 +21,7 @@ from bayeskin.design import default_space
 from bayeskin.errors import InputError
 from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.shipped import shipped
+from bayeskin.storage import contents_hash
 from bayeskin.surrogates import (
     Effect,
     WithEffects,
@@ -32,7 +33,6 @@ from bayeskin.surrogates import (
     validate,
 )
 from bayeskin.surrogates.chaos import LatentChaos, fit_sparse
-from bayeskin.surrogates.files import contents_hash
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.hyperparameters import LatentFit, _Data, _likelihood, fit_latent
 from bayeskin.surrogates.kernels import KERNELS, kernel, squared_distances, trend_basis, trend_degree

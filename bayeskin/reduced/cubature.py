@@ -35,8 +35,8 @@ class CubatureSettings:
     batch : points added at once
     """
 
-    every: int = 4
-    mixtures: int = 8
+    every: int = 5
+    mixtures: int = 6
     force: float = 30.0
     pressure: float = 3.0
     mode_m: float = 5e-3

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from bayeskin.model.problem import Problem
 from bayeskin.types import Array
+
+CELLS_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -51,11 +52,6 @@ class PointFields:
             self.gradient[i], self.slope[i], self.pressure[i], rule.weight(self.weight), self.cutis[i],
             np.ascontiguousarray(self.points_m[:, i]),
         )  # fmt: skip
-
-    @cached_property
-    def linear(self) -> LinearParts:
-        """The base law's linear part at rest, integrated at these points."""
-        return linear_parts(self)
 
 
 @dataclass(frozen=True)
@@ -104,20 +100,39 @@ def linear_parts(at: PointFields) -> LinearParts:
     return LinearParts(np.array(shear), np.array(bulk), np.array(flow), coupling)
 
 
-def point_fields(problem: Problem, basis: Basis) -> PointFields:
-    """Returns the fields of a basis at all quadrature points of a problem, cell by cell."""
+def point_fields(problem: Problem, basis: Basis, cells: np.ndarray | slice = slice(None)) -> PointFields:
+    """Returns the fields of a basis at the quadrature points of some cells of a problem, cell by cell."""
     s = problem.space
-    fields, (e, q) = basis.fields, s.weight.shape
-    nodal = fields.T.reshape(-1, 3, len(fields))[s.nodes_u]  # (e, a, 3, k)
-    gradient = np.einsum("eqja,eaik->eqijk", s.grad_u, nodal, optimize=True)
-    corners = basis.pressure.T[s.nodes_p]  # (e, b, m)
+    fields, nodes_u, nodes_p = basis.fields, s.nodes_u[cells], s.nodes_p[cells]
+    (e, q), sites = s.weight[cells].shape, problem.sites
+    numbers = (np.arange(len(s.weight))[cells, None] * q + np.arange(q)).ravel()
+    nodal = fields.T.reshape(-1, 3, len(fields))[nodes_u]  # (e, a, 3, k)
+    gradient = np.einsum("eqja,eaik->eqijk", s.grad_u[cells], nodal, optimize=True)
+    corners = basis.pressure.T[nodes_p]  # (e, b, m)
+    slope = np.einsum("eqjb,ebm->eqjm", s.grad_p[cells], corners, optimize=True)
     return PointFields(
         gradient=np.ascontiguousarray(gradient.reshape(e * q, 9, -1)),
-        slope=np.ascontiguousarray(
-            np.einsum("eqjb,ebm->eqjm", s.grad_p, corners, optimize=True).reshape(e * q, 3, -1)
-        ),
+        slope=np.ascontiguousarray(slope.reshape(e * q, 3, -1)),
         pressure=np.ascontiguousarray(np.einsum("qb,ebm->eqm", s.value_p, corners).reshape(e * q, -1)),
-        weight=s.weight.ravel(),
-        cutis=np.repeat(problem.mesh.cutis, q),
-        points_m=s.quadrature_points().reshape(3, -1),
+        weight=s.weight[cells].ravel(),
+        cutis=sites.cutis[numbers],
+        points_m=np.ascontiguousarray(sites.points_m[:, numbers]),
     )
+
+
+def fields_at(problem: Problem, basis: Basis, rule: Rule) -> PointFields:
+    """Returns the fields of a basis at the points of a rule, with its weights."""
+    q = problem.space.weight.shape[1]
+    cells, place = np.unique(rule.points // q, return_inverse=True)
+    local = Rule(place * q + rule.points % q, rule.factor)
+    return point_fields(problem, basis, cells).at(local)
+
+
+def whole_linear_parts(problem: Problem, basis: Basis) -> LinearParts:
+    """Integrates the base law's linear part at rest at all points of a problem, some cells at a time."""
+    count = len(problem.space.weight)
+    parts = [
+        linear_parts(point_fields(problem, basis, slice(start, min(start + CELLS_AT_ONCE, count))))
+        for start in range(0, count, CELLS_AT_ONCE)
+    ]
+    return LinearParts(*(np.sum([getattr(p, f.name) for p in parts], axis=0) for f in fields(LinearParts)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -73,7 +72,7 @@ def save_surrogate(path: Path | str, surrogate: ShapeSurrogate, manifest: Mappin
         storage.write(handle.create_group("latents"), latents)
         handle.create_dataset("edges_s", data=surrogate.edges_s)
         handle.create_dataset("active", data=surrogate.active)
-        digest = contents_hash(handle)
+        digest = storage.contents_hash(handle)
         text = json.dumps({**manifest, "arrays_sha256": digest}, indent=2, sort_keys=True)
         handle.attrs.update(
             format=FORMAT, format_version=FORMAT_VERSION, version=__version__, arrays_sha256=digest,
@@ -162,21 +161,5 @@ def _refuse_unfit(path: Path, handle: h5py.File) -> None:
     version = str(handle.attrs["format_version"])
     if version not in map(str, READABLE):
         raise InputError(path, f"format version {version:.40}", f"format version {FORMAT_VERSION}")
-    if contents_hash(handle) != handle.attrs["arrays_sha256"]:
+    if storage.contents_hash(handle) != handle.attrs["arrays_sha256"]:
         raise InputError(path, "contents that differ from their stored hash", "an unaltered file")
-
-
-def contents_hash(handle: h5py.File) -> str:
-    """SHA-256 over every dataset and attribute below the root, in the order of their names."""
-    digest = hashlib.sha256()
-    names: list[str] = []
-    handle.visit(names.append)
-    for name in sorted(names):
-        node = handle[name]
-        for key in sorted(node.attrs):
-            digest.update(f"{name}@{key}={node.attrs[key]!s};".encode())
-        if isinstance(node, h5py.Dataset):
-            values = np.ascontiguousarray(node[()])
-            digest.update(f"{name}:{values.dtype.str}{values.shape};".encode())
-            digest.update(values.tobytes())
-    return digest.hexdigest()

@@ -1,0 +1,149 @@
+"""A reduced model to and from one HDF5 file, with its manifest inside and beside it: arrays and text."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from bayeskin import __version__, storage
+from bayeskin.behaviour import sha256_of_behaviour
+from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry, Guard
+from bayeskin.mechanisms import catalogue
+from bayeskin.model.simulate import ModelSpec
+from bayeskin.reduced.cases import Protocols, Trained
+from bayeskin.reduced.library import Library, Modes
+from bayeskin.reduced.model import Cubatures, ReducedModel
+from bayeskin.reduced.operators import Rule
+from bayeskin.types import Array, ParameterSpace, frozen_array
+
+FORMAT, FORMAT_VERSION = "bayeskin reduced model", 1
+EXPECTED = "a reduced model that `bayeskin reduce` wrote"
+
+
+def save_reduced(path: Path, model: ReducedModel, manifest: Mapping[str, Any]) -> None:
+    """Writes a reduced model and, beside it as ``.json``, its manifest; each whole or not at all.
+
+    Modes beyond the base's are stored in half precision, each over its largest value.
+    Raises InputError where it cannot be written.
+    """
+    text = ""
+
+    def fill(handle: h5py.File) -> None:
+        nonlocal text
+        _write_modes(handle.create_group("base"), model.library.base, np.float32)
+        for name, modes in model.library.beyond.items():
+            _write_modes(handle.create_group(f"beyond/{name}"), modes, np.float16)
+        for name, rule in asdict(model.cubatures).items():
+            group = handle.create_group(f"cubatures/{name}")
+            group["points"], group["factor"] = rule["points"].astype(np.int32), rule["factor"]
+        storage.write(handle.create_group("space"), model.trained.base)
+        for name, space in model.trained.mechanisms.items():
+            storage.write(handle.create_group(f"mechanisms/{name}"), space)
+        digest = storage.contents_hash(handle)
+        said = {
+            **manifest, "geometry": asdict(model.trained.geometry), "refinement": model.refinement,
+            "protocols": asdict(model.trained.protocols), "full_model_hash": model.full_hash,
+            "laws": law_hashes(model.trained.mechanisms), "arrays_sha256": digest,
+        }  # fmt: skip
+        text = json.dumps(said, indent=2, sort_keys=True)
+        handle.attrs.update(
+            format=FORMAT, format_version=FORMAT_VERSION, version=__version__, arrays_sha256=digest,
+            manifest=text,
+        )  # fmt: skip
+
+    storage.write_hdf5(path, fill)
+    storage.write_bytes(path.with_suffix(".json"), f"{text}\n".encode())
+
+
+def _write_modes(group: h5py.Group, modes: Modes, kind: type) -> None:
+    for name, values in asdict(modes).items():
+        size = np.abs(values).max(axis=1, initial=1e-300) if len(values) else np.zeros(0)
+        group.create_dataset(
+            name, data=(values / size[:, None]).astype(kind), compression="gzip", shuffle=True
+        )
+        group[f"{name}_size"] = size
+
+
+def _read_modes(group: h5py.Group) -> Modes:
+    def values(name: str) -> Array:
+        return frozen_array(group[name][()].astype(float) * group[f"{name}_size"][()][:, None])
+
+    return Modes(values("displacement"), values("pressure"))
+
+
+@lru_cache(maxsize=4)
+def load_reduced(path: Path) -> ReducedModel:
+    """Reads what `save_reduced` wrote.
+
+    Raises InputError if the file is absent, truncated, foreign or altered, or if it was made from another
+    version of the full model or of a mechanism's law.
+    """
+    with storage.reading(path, EXPECTED) as handle:
+        if handle.attrs.get("format") != FORMAT:
+            raise InputError(path, "an HDF5 file of another origin", EXPECTED)
+        version = int(handle.attrs["format_version"])
+        if version != FORMAT_VERSION:
+            raise InputError(path, f"format version {version}", f"format version {FORMAT_VERSION}")
+        if storage.contents_hash(handle) != handle.attrs["arrays_sha256"]:
+            raise InputError(path, "contents that differ from their stored hash", "an unaltered file")
+        said = json.loads(handle.attrs["manifest"])
+        model = ReducedModel(
+            trained=Trained(
+                _geometry(said["geometry"]), storage.read(handle["space"], ParameterSpace, path),
+                {name: storage.read(group, ParameterSpace, path)
+                 for name, group in handle["mechanisms"].items()},
+                Protocols(**{name: _tupled(value) for name, value in said["protocols"].items()}),
+            ),
+            refinement=int(said["refinement"]),
+            library=Library(
+                _read_modes(handle["base"]),
+                {name: _read_modes(group) for name, group in handle.get("beyond", {}).items()},
+            ),
+            cubatures=Cubatures(**{
+                name: Rule(group["points"][()].astype(np.int64), frozen_array(group["factor"][()]))
+                for name, group in handle["cubatures"].items()
+            }),
+            full_hash=str(said["full_model_hash"]),
+            hash=str(handle.attrs["arrays_sha256"]),
+        )  # fmt: skip
+    _refuse_other_laws(path, model, said["laws"])
+    return model
+
+
+def _tupled(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _geometry(said: Mapping[str, Any]) -> Geometry:
+    guard = said["guard"]
+    return Geometry(**{**said, "guard": None if guard is None else Guard(**guard)})
+
+
+def law_hashes(names: Mapping[str, object]) -> dict[str, str]:
+    """Returns what each mechanism's file does, as a hash, by the mechanism's name."""
+    import inspect
+
+    known = catalogue()
+    return {
+        name: sha256_of_behaviour(Path(inspect.getfile(known[name].act.bind)).read_bytes())  # type: ignore[arg-type]
+        for name in names
+    }
+
+
+def _refuse_other_laws(path: Path, model: ReducedModel, laws: Mapping[str, str]) -> None:
+    spec = ModelSpec(refinement=model.refinement, geometry=model.trained.geometry)
+    remedy = "one of this version: make it anew with `bayeskin reduce`"
+    if model.full_hash != spec.hash:
+        raise InputError(path, "a reduced model of another version of the full model", remedy)
+    known = catalogue()
+    for name, digest in laws.items():
+        if name not in known or law_hashes({name: None})[name] != digest:
+            raise InputError(path, f"a reduced model of another version of {name}", remedy)

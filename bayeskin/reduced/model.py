@@ -1,0 +1,113 @@
+"""A reduced model of one device: its modes, its cubatures and the region that it was trained for.
+
+It runs with any set of the mechanisms that it was trained for, on any protocol and on layers and arms near
+its own. The spaces that it makes of its modes are kept, so only the first run of a set prepares anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.linalg
+
+from bayeskin.geometry import Geometry
+from bayeskin.model.mesh import brick_mesh
+from bayeskin.model.problem import Problem, build_problem
+from bayeskin.model.simulate import problem_of
+from bayeskin.reduced.basis import Inner, inner_products
+from bayeskin.reduced.cases import Trained
+from bayeskin.reduced.equations import ReducedSpace, SurfaceUnit
+from bayeskin.reduced.library import Library
+from bayeskin.reduced.operators import Basis, Rule, fields_at, linear_parts, whole_linear_parts
+from bayeskin.types import Array
+
+MOST_SPACES = 8  # kept
+
+
+@dataclass(frozen=True)
+class Cubatures:
+    """Rules for the base model, and for sets of mechanisms."""
+
+    base: Rule
+    sets: Rule
+
+    def of(self, mechanisms: Sequence[str]) -> Rule:
+        """The rule for a set of mechanisms."""
+        return self.sets if mechanisms else self.base
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedModel:
+    """A reduced model as it is stored.
+
+    trained : region and geometry; refinement : of the bricks that it stands for
+    full_hash : of the full model that it was made from (`ModelSpec.hash`); hash : of its own arrays
+    """
+
+    trained: Trained
+    refinement: int
+    library: Library
+    cubatures: Cubatures
+    full_hash: str
+    hash: str = ""
+    _spaces: dict[object, ReducedSpace] = field(init=False, repr=False, default_factory=dict)
+
+    def problem(self, geometry: Geometry | None = None) -> Problem:
+        """The full model's problem: on the geometry trained for, or its mesh moved to another."""
+        own = self.trained.geometry
+        if geometry is None or geometry == own:
+            return problem_of("bricks", self.refinement, own)
+        return build_problem(brick_mesh(self.refinement, geometry, own))
+
+    def basis(self, mechanisms: Sequence[str]) -> Basis:
+        """The fields of a set of mechanisms on the nodes of the mesh."""
+        return self.library.basis(mechanisms, _inner(self.problem()))
+
+    def space(self, mechanisms: Sequence[str], geometry: Geometry | None = None) -> ReducedSpace:
+        """What a run with a set of mechanisms is solved in."""
+        key = tuple(mechanisms), geometry or self.trained.geometry
+        if key not in self._spaces:
+            while len(self._spaces) >= MOST_SPACES:
+                del self._spaces[next(iter(self._spaces))]
+            problem, basis = self.problem(geometry), self.basis(mechanisms)
+            self._spaces[key] = reduced_space(problem, basis, self.cubatures.of(mechanisms))
+        return self._spaces[key]
+
+
+def reduced_space(problem: Problem, basis: Basis, rule: Rule) -> ReducedSpace:
+    """Returns a basis at the points of a rule, with the linear parts that the points leave out."""
+    few = fields_at(problem, basis, rule)
+    exact = whole_linear_parts(problem, basis) - linear_parts(few)
+    return ReducedSpace(problem.lengths, few, exact, SurfacesOf(problem, basis))
+
+
+class SurfacesOf:
+    """Unit surface terms, projected on all fields of a basis at the first call."""
+
+    def __init__(self, problem: Problem, basis: Basis) -> None:
+        self._problem, self._basis = problem, basis
+        self._known: dict[SurfaceUnit, Array] = {}
+
+    def __call__(self, unit: SurfaceUnit) -> Array:
+        if unit not in self._known:
+            self._known[unit] = projected(self._problem, self._basis, unit)
+        return self._known[unit]
+
+
+def projected(problem: Problem, basis: Basis, unit: SurfaceUnit) -> Array:
+    """Returns a unit surface term's matrix on all fields of a basis, (k + m, k + m)."""
+    matrix, n = problem.linear(unit).matrix, 3 * problem.space.n_nodes
+    u, p = basis.fields, basis.pressure
+    return np.asarray(scipy.linalg.block_diag(u @ (matrix[:n, :n] @ u.T), p @ (matrix[n:, n:] @ p.T)))
+
+
+_known_inner: dict[int, tuple[Problem, Inner]] = {}
+
+
+def _inner(problem: Problem) -> Inner:
+    """The inner products of a problem, made once."""
+    if id(problem) not in _known_inner:
+        _known_inner[id(problem)] = problem, inner_products(problem)
+    return _known_inner[id(problem)][1]

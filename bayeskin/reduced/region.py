@@ -1,0 +1,65 @@
+"""Where a reduced model can be trusted: the region that it was trained for, and signs of an unstable skin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from bayeskin.geometry import Geometry
+from bayeskin.reduced.cases import RADIUS_RANGE, STIFFEST_SUBCUTIS, THICKNESS_RANGE, Trained
+from bayeskin.types import PadMotion, ParameterSpace
+
+FASTER = 2.0  # than the fastest training protocol: faster ones leave the skin as undrained as it is
+
+
+def outside(
+    trained: Trained,
+    theta: Mapping[str, float],
+    mechanisms: Sequence[str],
+    geometry: Geometry,
+    motion: PadMotion,
+) -> str:
+    """Returns one line that says where a run leaves the trained region; empty inside it."""
+    unknown = [name for name in mechanisms if name not in trained.mechanisms]
+    if unknown:
+        return f"mechanism {unknown[0]} was not trained"
+    spaces = [trained.base, *(trained.mechanisms[name] for name in mechanisms)]
+    lines = [line for space in spaces if (line := _beyond(space, theta))]
+    if theta["E_s"] > STIFFEST_SUBCUTIS * theta["E_c"]:
+        lines.append(f"E_s is more than {STIFFEST_SUBCUTIS:g} times E_c")
+    largest_m, lowest_m = float(motion.displacement_m.max()), float(motion.displacement_m.min())
+    if largest_m > trained.protocols.largest_m * (1.0 + 1e-9):
+        lines.append(f"the pads open by {1e3 * largest_m:.2f} mm, trained up to "
+                     f"{1e3 * trained.protocols.largest_m:g} mm")  # fmt: skip
+    if lowest_m < -1e-6:
+        lines.append(f"the pads are pushed together by {-1e3 * lowest_m:.2f} mm")
+    fastest = float(np.abs(np.diff(motion.displacement_m) / np.diff(motion.time_s)).max(initial=0.0))
+    if fastest > FASTER * trained.protocols.speeds_m_s[1]:
+        lines.append(f"the pads move at {1e3 * fastest:.3g} mm/s")
+    lines += _other_geometry(trained.geometry, geometry)
+    return "; ".join(lines)
+
+
+def _beyond(space: ParameterSpace, theta: Mapping[str, float]) -> str:
+    for parameter in space.parameters:
+        value = theta[parameter.name]
+        slack = 1e-9 * (parameter.upper - parameter.lower)
+        if not parameter.lower - slack <= value <= parameter.upper + slack:
+            return f"{parameter.name} is {value:g}, trained {parameter.lower:g} to {parameter.upper:g}"
+    return ""
+
+
+def _other_geometry(trained: Geometry, geometry: Geometry) -> list[str]:
+    """How layers and arm differ by more than in training; the device must be the same."""
+    lines = []
+    for name, share in (
+        ("cutis_m", THICKNESS_RANGE), ("subcutis_m", THICKNESS_RANGE), ("arm_radius_m", RADIUS_RANGE)
+    ):  # fmt: skip
+        one, other = getattr(trained, name), getattr(geometry, name)
+        if (one is None) != (other is None):
+            lines.append("the arm is flat" if other is None else "the arm is round")
+        elif one is not None and abs(other / one - 1.0) > share * (1.0 + 1e-9):
+            lines.append(f"{name.removesuffix('_m')} is {1e3 * other:.3g} mm, trained {1e3 * one:.3g} mm "
+                         f"+- {100 * share:.0f} %")  # fmt: skip
+    return lines

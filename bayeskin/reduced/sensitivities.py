@@ -1,0 +1,154 @@
+"""Derivatives of a reduced run's force by any of its parameters: tangent sensitivities, all at once.
+
+Differentiating a solved stage R(x, history; theta) = 0 gives K dx = -dR/dtheta - dR/dhistory dhistory with
+the stage's own tangent K, whose inverse is at hand. The right-hand side is found by differences of what the
+laws answer at the points, one parameter a step further, at fixed kinematics; once dx is known, a second
+difference tells how J and the laws' memories change (`kernels.differentiate`). Steps in time are held.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayeskin.errors import InputError
+from bayeskin.model.lagrangian import Stage, State, Step
+from bayeskin.model.series import Memories, lost_slopes, memory_slopes, on_the_way, yielding
+from bayeskin.model.tissue import Bind
+from bayeskin.reduced import kernels
+from bayeskin.reduced.equations import Bound, ReducedEquations, bound
+from bayeskin.types import Array, PadMotion
+
+STEP = 1e-6  # of a parameter's change: truncation 1e-6, rounding 1e-10
+REMEMBERED = 8  # states whose derivatives are kept; a step asks for three at most
+
+
+@dataclass(frozen=True)
+class _Known:
+    """Derivatives of a state, with those (k, r) of what is lost in series."""
+
+    state: State
+    slopes: kernels.Slopes
+    lost: Memories
+
+
+class ReducedGradients:
+    """Follows a reduced run step by accepted step; `force_n` then holds the derivatives of each step's force.
+
+    changes : of each parameter, by name, what counts as one; derivatives are in newtons for that
+    Raises InputError for a parameter that the run does not have.
+    """
+
+    def __init__(
+        self, equations: ReducedEquations, theta: Mapping[str, float], changes: Mapping[str, float],
+        binds: Sequence[Bind], protocol: PadMotion,
+    ) -> None:  # fmt: skip
+        unknown = [name for name in changes if name not in theta]
+        if unknown:
+            raise InputError("gradients", unknown[0], f"among {', '.join(theta)}")
+        self.names = tuple(changes)
+        self._equations = equations
+        further = [{**theta, name: theta[name] + STEP * change} for name, change in changes.items()]
+        runs = [bound(equations.space, values, binds) for values in further]
+        self._drives = [on_the_way(protocol, run.laws) for run in runs]
+        self._in_series = bool(equations.drive.elements)
+        self._varied = _varied(equations, [*runs, *([equations.run] if self._in_series else [])])
+        self._reach_m = equations.drive.largest_m
+        self._start = self._at_rest(changes.get("p_init", 0.0))
+        self._known: dict[int, _Known] = {}
+        self._zero_n = np.zeros(len(changes))
+        self.force_n: list[Array] = [np.zeros(len(changes))]
+
+    def _at_rest(self, change: float) -> _Known:
+        eq, (k, m) = self._equations, self._equations.space.modes
+        r, n = len(self._varied.mu), len(eq.space.at.weight)
+        by_p_init = change * np.array([float(name == "p_init") for name in self.names] + [0.0])[:r]
+        x = np.zeros((r, k + m))
+        x[:, k] = by_p_init / eq.space.at.pressure[0, 0]
+        state = eq.initial_state(0.0)
+        pressure = np.zeros((r, n)) + by_p_init[:, None]
+        memory = np.zeros((r, len(state.memory[0])))
+        lost = tuple(np.zeros((*before.shape, len(self.names))) for before in state.lost)
+        return _Known(state, kernels.Slopes(x, np.zeros((r, n)), pressure, memory), lost)
+
+    def follow(self, step: Step) -> None:
+        """Differentiates an accepted step; appends the force's derivatives [N], (r,), to `force_n`."""
+        for stage in step.stages:
+            known, force = self._differentiate(stage)
+            self._known[id(stage.state)] = known
+        if abs(step.state.time_s - self._equations.starts_s) < 1e-6:
+            self._zero_n = force
+        self.force_n.append(force)
+        self._known = dict(list(self._known.items())[-REMEMBERED:])
+
+    def _of(self, state: State) -> _Known:
+        return self._known.get(id(state), self._start)
+
+    def _differentiate(self, stage: Stage) -> tuple[_Known, Array]:
+        eq, k = self._equations, self._equations.space.modes[0]
+        sources = [(weight, self._of(state)) for weight, state in stage.sources]
+        last = sources[-1][1]
+        before = kernels.Slopes(
+            np.asarray(sum(w * s.slopes.x[:, :k] for w, s in sources)),
+            np.asarray(sum(w * s.slopes.volume for w, s in sources)),
+            np.asarray(sum(w * s.slopes.pressure for w, s in sources)), last.slopes.memory,
+        )  # fmt: skip
+        past, room = eq.past_of(stage), eq.make_room()
+        x, t = stage.state.x.copy(), eq.tangent
+        kernels.residual(eq.system, eq.packed, past, x, room, np.empty(len(x)))
+        out = kernels.Slopes(*(np.empty_like(values) for values in last.slopes))
+        force = kernels.differentiate(
+            eq.system, eq.packed, past, x, room, self._varied, before,
+            self._pads_by(stage.state.time_s, last.lost), t.inverse, t.force_row, t.by_pads, out,
+        )  # fmt: skip
+        eq.spent += (0, 1, 1)
+        if self._in_series:
+            return self._less_lost(stage, last.lost, out, force)
+        return _Known(stage.state, out, last.lost), force
+
+    def _pads_by(self, time_s: float, lost: Memories) -> Array:
+        """Derivatives of the pads' displacement [m], with what was lost before; and their travel."""
+        here = self._equations.drive.motion.at(time_s)
+        moved = np.array([(float(drive.motion.at(time_s)) - here) / STEP for drive in self._drives])
+        moved = moved - sum(memory[0] for memory in lost)
+        return 0.5 * np.append(moved, [2.0 * self._reach_m] * self._in_series)
+
+    def _less_lost(
+        self, stage: Stage, held: Memories, out: kernels.Slopes, force: Array
+    ) -> tuple[_Known, Array]:
+        """All derivatives once what lies in series with the skin has answered to the force's."""
+        eq, r = self._equations, len(self.names)
+        stiffness, own = float(force[r]) / (2.0 * self._reach_m), force[:r]
+        more, lost = np.zeros(r), held
+        if eq.drive.yields(stage.state.time_s):
+            force_n = 2.0 * float(stage.residual[1]) - eq.zero_n
+            before = stage.history.lost
+
+            def memories(slopes_n: Array) -> Memories:
+                return memory_slopes(
+                    self._drives, STEP, force_n, slopes_n, stage.elapsed_s, before, held, stage.state.lost
+                )
+
+            softness = yielding(
+                lambda f: eq.drive.follow(f, stage.elapsed_s, before), force_n, 1e-5 * eq.nominal_force()
+            )
+            held_m = np.asarray(sum((memory[0] for memory in held), np.zeros(r)))
+            more, lost = lost_slopes(own - self._zero_n, held_m, softness, stiffness, memories)
+            own = own - stiffness * more
+        travel = np.append(more, 0.0) / (2.0 * self._reach_m)
+        for values in out:
+            values -= np.outer(travel, values[r])
+        return _Known(stage.state, out, lost), own
+
+
+def _varied(equations: ReducedEquations, runs: Sequence[Bound]) -> kernels.Varied:
+    """Constants of runs that are each a step further in one parameter, as the kernels are given them."""
+    own, (solid_units, flow_units) = equations.run, equations.units
+    return kernels.Varied(
+        *(np.array([getattr(run.solid, name) for run in runs]) for name in ("mu", "lam", "mobility")),
+        np.array([run.par for run in runs]), np.array([run.data for run in runs]), solid_units, flow_units,
+        np.array([(run.solid_by - own.solid_by) / STEP for run in runs]),
+        np.array([(run.flow_by - own.flow_by) / STEP for run in runs]), STEP,
+    )  # fmt: skip
