@@ -33,7 +33,7 @@ class _Workflow(click.Group):
 
     ORDER: ClassVar[dict[str, tuple[str, ...]]] = {
         "From a recording to an answer": ("doctor", "new", "import", "run", "diagnose", "report"),
-        "Single stages": ("design", "train", "map", "sample", "sobol", "effects"),
+        "Single stages": ("reduce", "design", "train", "map", "sample", "sobol", "effects"),
         "Further": ("experiment", "simulate", "serve", "prove", "conceal"),
     }
 
@@ -116,6 +116,37 @@ def new(recording: Path | None, out: Path | None, device: Path | None, as_json: 
     _answer(new_demo(out) if recording is None else new_config(recording, out, device), as_json)
 
 
+a_scheduler = click.option(
+    "--scheduler", metavar="ADDRESS", help="Dask scheduler that makes the full runs, as tcp://HOST:PORT."
+)
+
+
+@cli.command("reduce", short_help="Build the reduced model of a device: once, for all protocols.")
+@click.argument("source", required=False, type=click.Path(path_type=Path))
+@click.option(
+    "-o", "out", type=click.Path(path_type=Path), help="HDF5 file to write; default: beside SOURCE."
+)
+@a_scheduler
+@as_json
+def reduce_(source: Path | None, out: Path | None, scheduler: str | None, as_json: bool) -> None:
+    """Build the reduced model of a device: once, for all protocols.
+
+    SOURCE is a configuration, or a file with the sections [device] and [tissue]; without it the article's
+    device. The base model comes first, within minutes, and can be used while the mechanisms follow. Training
+    runs of the full model are kept, so that the command can be interrupted and goes on.
+
+    \b
+    Example:
+      bayeskin reduce device.toml
+      bayeskin reduce device.toml -o device-reduced.h5 --scheduler tcp://10.0.0.5:8786
+    """
+    from bayeskin.pipeline.reducing import reduce
+
+    with Terminal() as terminal:
+        document = reduce(source, out, terminal, scheduler)
+    _answer(document, as_json)
+
+
 @cli.command(short_help="One run of the full model on a recording's displacement.")
 @click.argument("config", required=False, type=click.Path(path_type=Path))
 @click.option(
@@ -127,6 +158,7 @@ def new(recording: Path | None, out: Path | None, device: Path | None, as_json: 
 @click.option("--mesh", help="'bricks' or a gmsh file; default as in CONFIG.")
 @click.option("--observation", type=click.Choice(["reaction", "article"]), help="Default as in CONFIG.")
 @click.option("-o", "out", required=True, type=click.Path(path_type=Path), help="File to write: .csv or .h5.")
+@click.option("--reduced", is_flag=True, help="Run the device's reduced model in the full one's place.")
 @click.option("--fields", type=click.Path(path_type=Path), help="Folder for the fields over time (ParaView).")
 @click.option("--figures", type=click.Path(path_type=Path), help="Folder for a figure of the fields.")
 @click.option("--at", "at_s", multiple=True, type=float, metavar="SECONDS", help="A time that it shows.")
@@ -137,6 +169,10 @@ def simulate(as_json: bool, **options: Any) -> None:
     Parameters that are not set stand at the median of their prior, a mechanism's among them. The CSV has the
     columns time_s, displacement_m, force_n.
 
+    With --reduced the device's reduced model runs instead, many times faster, and says how large its error
+    is: the one that `bayeskin reduce` made beside CONFIG or the device's file, or the shipped one of the
+    article's device. Where the run leaves what it was trained for, it says so, and exits with 1.
+
     The figure (fields.png, fields.svg) shows displacement, pressure and fluid velocity near the pads at the
     times given by --at, which can be repeated, or at four moments: the end of the first loading, the middle
     of its hold, the end of its unloading, and the middle of the last phase.
@@ -146,6 +182,7 @@ def simulate(as_json: bool, **options: Any) -> None:
       bayeskin simulate --set E_c=300e3 --set k_s=1e-13 -o force.csv --fields fields
       bayeskin simulate -o force.csv --figures figures --at 14.4 --at 30 --at 54.4
       bayeskin simulate -o force.csv --mechanism device-friction --set Fc=0.03
+      bayeskin simulate --reduced -o force.csv --mechanism solid-viscoelasticity --json
       bayeskin simulate -o force.csv --device device.toml
     """
     from bayeskin.pipeline import single
@@ -153,11 +190,6 @@ def simulate(as_json: bool, **options: Any) -> None:
     with Terminal() as terminal:
         document = single.simulate_once(reporter=terminal, **options)
     _answer(document, as_json)
-
-
-a_scheduler = click.option(
-    "--scheduler", metavar="ADDRESS", help="Dask scheduler that makes the full runs, as tcp://HOST:PORT."
-)
 
 
 def _stage_command(name: str, text: str, example: str = "runs/demo.toml") -> None:

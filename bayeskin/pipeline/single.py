@@ -18,15 +18,17 @@ from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, catalogue, laws, solved
 from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.problem import Problem
-from bayeskin.model.simulate import ModelSpec, problem_of, simulate
+from bayeskin.model.simulate import ModelSpec, OnState, problem_of, simulate
 from bayeskin.pipeline.engine import Reporter, Run
 from bayeskin.pipeline.field_outputs import FieldOutputs, moments_of
 from bayeskin.pipeline.folder import plain
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.recording import pad_motion
+from bayeskin.pipeline.reducing import reduced_for
 from bayeskin.pipeline.reported import reported
 from bayeskin.recordings import describe, describe_json, phase_noise, read_recording, segment
+from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, Parameter, ParameterSpace, Simulation
 from bayeskin.words import number
@@ -58,17 +60,18 @@ def simulate_once(
     mechanisms: Sequence[str] = (),
     mesh: str | None = None,
     observation: str | None = None,
+    reduced: bool = False,
     fields: Path | None = None,
     figures: Path | None = None,
     at_s: Sequence[float] = (),
 ) -> dict[str, Any]:
-    """One full run on a recording's displacement, into `out` (.csv or .h5); its fields into folders.
+    """Runs the model once on a recording's displacement, into `out` (.csv or .h5); its fields into folders.
 
     What is not given is the configuration's, or the demo's; the sections of the file `device` go before its
     own. What is uncertain of the tissue stands at its mean. Parameters that `settings` ("NAME=VALUE", SI)
     leave out stand at the median of their prior; those of the `mechanisms` named are among them. The
-    figure shows the fields at the times `at_s`, or at four moments of the protocol. A run that fails is
-    told, and nothing is written.
+    figure shows the fields at the times `at_s`, or at four moments of the protocol. With `reduced` the
+    device's reduced model runs in the full one's place. A run that fails is told, and nothing is written.
     Raises InputError for bad input.
     """
     _check_suffix(out, (".csv", ".h5"))
@@ -99,16 +102,37 @@ def simulate_once(
         problem = problem_of(spec.mesh, spec.refinement, spec.geometry)
         _refuse_other_stresses(added, theta | along, problem)
         outputs = FieldOutputs(problem, theta, motion, moments, fields, figures)
-    simulation = simulate(
-        spec, motion, theta | along, lambda share: reporter.progress("simulation", share),
-        outputs.on_state if outputs else None, laws=laws(added),
-    )  # fmt: skip
+    on_state = outputs.on_state if outputs else None
+    if reduced:
+        simulation = _reduced_run(spec, (device, config), motion, theta | along, added, on_state)
+    else:
+        simulation = simulate(
+            spec, motion, theta | along, lambda share: reporter.progress("simulation", share), on_state,
+            laws=laws(added),
+        )  # fmt: skip
     files: list[Path] = []
     if simulation.status == "ok":
         simulation = _reported(simulation, added, values, motion)
         write_simulation(out, simulation)
         files = [out, *(outputs.write(caption(run)) if outputs else ())]
-    return _answer(simulation, spec, files)
+    return _answer(simulation, spec, files, reduced)
+
+
+def _reduced_run(
+    spec: ModelSpec, sources: Sequence[Path | None], motion: PadMotion, theta: Mapping[str, float],
+    mechanisms: Sequence[Mechanism], on_state: OnState | None,
+) -> Simulation:  # fmt: skip
+    """A run of the reduced model that fits, with its estimated error.
+
+    Raises InputError where there is none for this device, mesh or observation.
+    """
+    if (spec.observation, spec.mesh, spec.refinement) != ("reaction", "bricks", 1):
+        found = f"observation {spec.observation!r} on {spec.mesh!r}, refinement {spec.refinement}"
+        raise InputError("--reduced", found, "observation 'reaction' on 'bricks', refinement 1")
+    model = reduced_for(spec.geometry, [source for source in sources if source is not None])
+    return simulate_reduced(
+        model, motion, theta, mechanisms, geometry=spec.geometry, estimate=True, on_state=on_state
+    )
 
 
 def _with_device(config: Config, device: Path | None) -> Config:
@@ -194,18 +218,20 @@ def _values(space: ParameterSpace, settings: Sequence[str]) -> dict[str, float]:
     return theta
 
 
-def _answer(simulation: Simulation, spec: ModelSpec, files: Sequence[Path]) -> dict[str, Any]:
-    """What a run says of itself; `files` are those that it wrote, the force first."""
+def _answer(simulation: Simulation, spec: ModelSpec, files: Sequence[Path], reduced: bool) -> dict[str, Any]:
+    """Returns what a run says of itself; `files` are those that it wrote, the force first."""
     ok, stats = simulation.status == "ok", simulation.stats
     text = f"failed: {simulation.message}"
     if ok:
         own = spec.forward is not None
-        steps = "one run" if own else f"{stats['steps']:.0f} steps of {stats['dofs']:.0f} unknowns"
+        unknowns = stats.get("modes") if reduced else stats.get("dofs")
+        steps = "one run" if own else f"{stats['steps']:.0f} steps of {unknowns:.0f} unknowns"
         text = (
             f"{steps} in {stats['seconds']:.1f} s, peak force {number(stats['peak_force_n'], 4)} N, "
             f"written to {', '.join(map(str, files))}"
         )
-        text += "".join(f"\n{line}" for line in _accuracy(simulation, spec))
+        lines = _reduced_accuracy(simulation) if reduced else _accuracy(simulation, spec)
+        text += "".join(f"\n{line}" for line in lines)
     answer = {"ok": ok, "status": simulation.status, "message": simulation.message, "theta": simulation.theta}
     model = {"observation": spec.observation, "mesh": spec.mesh, "model_hash": simulation.model_hash}
     written = {
@@ -214,7 +240,29 @@ def _answer(simulation: Simulation, spec: ModelSpec, files: Sequence[Path]) -> d
         "figures": [file for file in files if file.suffix in (".png", ".svg")],
         "files": files,
     }
-    return plain({**answer, **model, "stats": stats, **written, "text": text})
+    told = _told_of_reduced(simulation) if reduced else {}
+    return plain({**answer, **model, "stats": stats, **told, **written, "text": text})
+
+
+def _told_of_reduced(simulation: Simulation) -> dict[str, Any]:
+    """What a program asks of a reduced run first."""
+    stats = simulation.stats
+    return {
+        "seconds": stats["seconds"],
+        "error_estimate_n": stats.get("error_estimate_n"),
+        "inside": stats["inside"] == 1.0,
+    }
+
+
+def _reduced_accuracy(simulation: Simulation) -> list[str]:
+    """The estimated error of a reduced run beside the full model on the same mesh."""
+    stats = simulation.stats
+    error_n = stats["error_estimate_n"]
+    share = 100 * error_n / stats["peak_force_n"] if stats["peak_force_n"] > 0.0 else 0.0
+    return [
+        f"estimated error beside the full model: {number(1e3 * error_n, 2)} mN, {number(share, 2)} % of peak",
+        f"{stats['seconds_of_run']:.2f} s of these the run itself, the rest its preparation and the estimate",
+    ]
 
 
 def _accuracy(simulation: Simulation, spec: ModelSpec) -> list[str]:

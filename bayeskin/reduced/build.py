@@ -8,32 +8,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 
 import h5py
 import numpy as np
+import scipy.sparse as sp
 
 from bayeskin import storage
 from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import catalogue
 from bayeskin.model.mesh import brick_mesh
 from bayeskin.model.problem import Problem, build_problem
 from bayeskin.model.simulate import ModelSpec, problem_of
 from bayeskin.model.tissue import Bind
-from bayeskin.reduced.basis import Inner, inner_products, pod
+from bayeskin.reduced.basis import Inner, pod
 from bayeskin.reduced.cases import BASE, Case, Trained
 from bayeskin.reduced.cubature import CubatureSettings, Taken, choose_points, take, with_volumes
 from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
 from bayeskin.reduced.library import Library, Modes, library
-from bayeskin.reduced.model import Cubatures, ReducedModel, SurfacesOf, reduced_space
-from bayeskin.reduced.operators import Basis, LinearParts, Rule, point_fields
+from bayeskin.reduced.model import Cubatures, ReducedModel, SurfacesOf, inner_of, reduced_space
+from bayeskin.reduced.operators import Basis, LinearParts, PointFields, Rule, point_fields
 from bayeskin.reduced.shadow import Shadow
-from bayeskin.reduced.training import training_run
+from bayeskin.reduced.training import TrainingRun, training_run
 from bayeskin.types import Array
 from bayeskin.workers import Lost, Map
 
 Progress = Callable[[str, float], None]
+RUN_ARRAYS = ("displacement", "pressure", "time_s", "force_n")
 
 
 @dataclass(frozen=True)
@@ -61,42 +63,50 @@ class BuildSettings:
 
 
 @dataclass(frozen=True)
-class TrainingTask:
-    """Runs one training case and keeps its modes in a file; picklable, for workers.
+class RunTask:
+    """Makes the full run of a case and keeps its modes in a file; picklable, for workers.
 
-    Given (kind, index) it returns the message of a run that ended early, else an empty one.
+    geometry, refinement : of the mesh whose nodes the modes are on; a case's own geometry moves them
+    Given (case, path) it returns the message of a run that ended early, else an empty one.
     """
 
-    trained: Trained
+    geometry: Geometry
     refinement: int
-    seed: int
-    folder: Path
 
-    def __call__(self, item: tuple[str, int]) -> str:
-        kind, index = item
-        case = self.trained.case(kind, index, self.seed)
-        own = self.trained.geometry
-        nominal = problem_of("bricks", self.refinement, own)
-        moved = case.geometry != own
-        problem = build_problem(brick_mesh(self.refinement, case.geometry, own)) if moved else nominal
-        run = training_run(problem, _inner_of(self.refinement, own), case, _binds(case.mechanisms))
+    def __call__(self, item: tuple[Case, Path]) -> str:
+        case, path = item
+        nominal = problem_of("bricks", self.refinement, self.geometry)
+        moved = case.geometry != self.geometry
+        mesh = brick_mesh(self.refinement, case.geometry, self.geometry) if moved else None
+        problem = nominal if mesh is None else build_problem(mesh)
+        run = training_run(problem, inner_of(nominal), case, _binds(case.mechanisms))
 
         def fill(handle: h5py.File) -> None:
             handle.attrs["message"] = run.message
-            handle["displacement"], handle["pressure"] = run.displacement, run.pressure
+            for name in RUN_ARRAYS:
+                handle[name] = getattr(run, name)
 
-        storage.write_hdf5(run_path(self.folder, kind, index), fill)
+        storage.write_hdf5(path, fill)
         return run.message
 
 
-def run_path(folder: Path, kind: str, index: int) -> Path:
-    """Returns where a training run is kept."""
-    return folder / f"{kind}-{index:04d}.h5"
+def read_run(path: Path) -> TrainingRun:
+    """Reads a run that a `RunTask` kept. Raises InputError for a file that is damaged."""
+    with storage.reading(path, "a training run") as handle:
+        arrays = {name: handle[name][()] for name in RUN_ARRAYS}
+        return TrainingRun(**arrays, message=str(handle.attrs["message"]))
 
 
-@cache
-def _inner_of(refinement: int, geometry: object) -> Inner:
-    return inner_products(problem_of("bricks", refinement, geometry))  # type: ignore[arg-type]
+def make_runs(task: RunTask, wanted: Sequence[tuple[Case, Path]], run_all: Map, progress: Progress) -> None:
+    """Makes the runs whose files are not there yet. Raises InputError where a worker is lost."""
+    todo = [item for item in wanted if not item[1].is_file()]
+    done = len(wanted) - len(todo)
+    progress("full runs", done / max(len(wanted), 1))
+    for number, result in run_all(task, todo):
+        if isinstance(result, Lost):
+            raise InputError(f"full run {todo[number][1].stem}", result.reason, "a worker that finishes it")
+        done += 1
+        progress("full runs", done / len(wanted))
 
 
 def _binds(mechanisms: Sequence[str]) -> list[Bind]:
@@ -104,37 +114,38 @@ def _binds(mechanisms: Sequence[str]) -> list[Bind]:
     return [bind for name in mechanisms if (bind := known[name].act.bind) is not None]
 
 
-def train(
-    trained: Trained, refinement: int, kinds: Sequence[str], settings: BuildSettings, folder: Path,
-    run_all: Map, progress: Progress,
-) -> None:  # fmt: skip
-    """Makes the training runs that are not in `folder` yet. Raises InputError where a worker is lost."""
-    wanted = [(kind, index) for index in range(settings.runs) for kind in kinds]
-    todo = [item for item in wanted if not run_path(folder, *item).is_file()]
-    task = TrainingTask(trained, refinement, settings.seed, folder)
-    done = len(wanted) - len(todo)
-    progress("training runs", done / max(len(wanted), 1))
-    for number, result in run_all(task, todo):
-        if isinstance(result, Lost):
-            raise InputError(f"training run {todo[number]}", result.reason, "a worker that finishes it")
-        done += 1
-        progress("training runs", done / len(wanted))
+def training_cases(
+    trained: Trained, kinds: Sequence[str], settings: BuildSettings, folder: Path
+) -> list[tuple[Case, Path]]:
+    """Returns the training cases of some kinds, in turn, and where their runs are kept."""
+    return [
+        (trained.case(kind, index, settings.seed), run_path(folder, kind, index))
+        for index in range(settings.runs)
+        for kind in kinds
+    ]
+
+
+def run_path(folder: Path, kind: str, index: int) -> Path:
+    """Returns where a training run is kept."""
+    return folder / f"{kind}-{index:04d}.h5"
 
 
 def weighted_of(kind: str, settings: BuildSettings, folder: Path, inner: Inner) -> Modes:
-    """Returns the modes of a kind's training runs, each times its singular value, without failed runs."""
-    rows: tuple[list[Array], list[Array]] = ([], [])
-    for index in range(settings.runs):
-        with storage.reading(run_path(folder, kind, index), "a training run") as handle:
-            if not handle.attrs["message"]:
-                for kept, name in zip(rows, ("displacement", "pressure"), strict=True):
-                    kept.append(handle[name][()].astype(float))
-    if not rows[0]:
+    """Returns the modes of a kind's training runs, each times its singular value, without failed runs.
+
+    Raises InputError where none has finished.
+    """
+    runs = [read_run(run_path(folder, kind, index)) for index in range(settings.runs)]
+    finished = [run for run in runs if not run.message]
+    if not finished:
         raise InputError(f"{folder}: {kind}", "no training run that finished", "one at least")
-    u, p = (
-        pod(np.concatenate(r), i) for r, i in zip(rows, (inner.displacement, inner.pressure), strict=True)
-    )
-    return Modes(u[0][:, None] * u[1], p[0][:, None] * p[1])
+
+    def weighted(name: str, product: sp.csr_matrix) -> Array:
+        rows = np.concatenate([getattr(run, name) for run in finished]).astype(float)
+        values, modes = pod(rows, product)
+        return values[:, None] * modes
+
+    return Modes(weighted("displacement", inner.displacement), weighted("pressure", inner.pressure))
 
 
 def assemble(
@@ -144,7 +155,7 @@ def assemble(
     """Returns the reduced model of the modes of each kind, with its cubatures trained."""
     spec = ModelSpec(refinement=refinement, geometry=trained.geometry)
     problem = problem_of("bricks", refinement, trained.geometry)
-    inner = _inner_of(refinement, trained.geometry)
+    inner = inner_of(problem)
     modes = library(weighted, inner, settings.base, settings.each)
     teacher = _Teacher(trained, problem, inner, modes, settings, progress)
     base = teacher.base_rule()
@@ -196,9 +207,13 @@ class _Teacher:
             self._rows.append(taken.rows)
 
     def _rule(self, points: int) -> Rule:
-        s = self._settings.cubature
-        rows = with_volumes(np.concatenate(self._rows), self._volumes, s)
-        return choose_points(rows, [points], s)[points][0]
+        return rule_of(self._volumes, self._rows, points, self._settings.cubature)
+
+
+def rule_of(at: PointFields, rows: Sequence[Array], points: int, settings: CubatureSettings) -> Rule:
+    """Returns a cubature of so many points for integrands at all points `at`."""
+    whole = with_volumes(np.concatenate(rows), at, settings)
+    return choose_points(whole, [points], settings)[points][0]
 
 
 def shadowed(

@@ -31,14 +31,9 @@ class DualWeightedResidual:
     """
 
     def __init__(self, model: LagrangianModel, basis: Basis) -> None:
-        self._model, self._fields, self._pressure = model, basis.fields, basis.pressure
+        self._model, self._basis = model, basis
         self._known: dict[int, tuple[State, State]] = {}
         self._dual: tuple[float, Array] | None = None  # pads' displacement, adjoint (free,)
-
-    def nodal(self, x: Array) -> Array:
-        """The unknowns of the full model (dofs,) for the coefficients of a reduced one."""
-        k = len(self._fields)
-        return np.concatenate([x[:k] @ self._fields, x[k:] @ self._pressure])
 
     def follow(self, stage: Stage, force_n: float | None) -> float | None:
         """Follows a stage; with its force [N] given, returns the estimated error of that force [N]."""
@@ -51,7 +46,7 @@ class DualWeightedResidual:
             last.time_s, last.x, np.asarray(sum(w * s.volume for w, s in sources)),
             np.asarray(sum(w * s.pressure for w, s in sources)), last.memory,
         )  # fmt: skip
-        x = self.nodal(stage.state.x)
+        x = self._basis.nodal(stage.state.x)
         found = model.residual(x, stage.length_s, old, stage.elapsed_s)
         if found is None:
             return np.inf
@@ -69,7 +64,7 @@ class DualWeightedResidual:
         known = self._known.get(id(state))
         if known is not None:
             return known[1]
-        x, rest = self.nodal(state.x), self._model.initial_state(0.0)
+        x, rest = self._basis.nodal(state.x), self._model.initial_state(0.0)
         found = self._model.residual(x, 1.0, rest)  # its history is nothing to J and p
         return rest if found is None else State(state.time_s, x, found.volume, found.pressure, rest.memory)
 

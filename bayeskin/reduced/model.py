@@ -63,7 +63,7 @@ class ReducedModel:
 
     def basis(self, mechanisms: Sequence[str]) -> Basis:
         """The fields of a set of mechanisms on the nodes of the mesh."""
-        return self.library.basis(mechanisms, _inner(self.problem()))
+        return self.library.basis(mechanisms, inner_of(self.problem()))
 
     def space(self, mechanisms: Sequence[str], geometry: Geometry | None = None) -> ReducedSpace:
         """What a run with a set of mechanisms is solved in."""
@@ -103,11 +103,11 @@ def projected(problem: Problem, basis: Basis, unit: SurfaceUnit) -> Array:
     return np.asarray(scipy.linalg.block_diag(u @ (matrix[:n, :n] @ u.T), p @ (matrix[n:, n:] @ p.T)))
 
 
-_known_inner: dict[int, tuple[Problem, Inner]] = {}
+_inner_products: dict[int, tuple[Problem, Inner]] = {}
 
 
-def _inner(problem: Problem) -> Inner:
-    """The inner products of a problem, made once."""
-    if id(problem) not in _known_inner:
-        _known_inner[id(problem)] = problem, inner_products(problem)
-    return _known_inner[id(problem)][1]
+def inner_of(problem: Problem) -> Inner:
+    """Returns the inner products of a problem, made once."""
+    if id(problem) not in _inner_products:
+        _inner_products[id(problem)] = problem, inner_products(problem)
+    return _inner_products[id(problem)][1]

@@ -30,6 +30,11 @@ class Basis:
         """All fields of the displacement (2 + u, 3 nodes)."""
         return np.concatenate([[self.moving, self.dual], self.displacement])
 
+    def nodal(self, x: Array) -> Array:
+        """The full model's unknowns (dofs,) for the coefficients (2 + u + p,) of a reduced state."""
+        k = 2 + len(self.displacement)
+        return np.concatenate([x[:k] @ self.fields, x[k:] @ self.pressure])
+
 
 @dataclass(frozen=True)
 class PointFields:

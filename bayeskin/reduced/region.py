@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,7 +38,7 @@ def outside(
     fastest = float(np.abs(np.diff(motion.displacement_m) / np.diff(motion.time_s)).max(initial=0.0))
     if fastest > FASTER * trained.protocols.speeds_m_s[1]:
         lines.append(f"the pads move at {1e3 * fastest:.3g} mm/s")
-    lines += _other_geometry(trained.geometry, geometry)
+    lines += other_geometry(trained.geometry, geometry)
     return "; ".join(lines)
 
 
@@ -50,9 +51,16 @@ def _beyond(space: ParameterSpace, theta: Mapping[str, float]) -> str:
     return ""
 
 
-def _other_geometry(trained: Geometry, geometry: Geometry) -> list[str]:
-    """How layers and arm differ by more than in training; the device must be the same."""
+def other_geometry(trained: Geometry, geometry: Geometry) -> list[str]:
+    """Returns how a geometry differs from the trained one by more than training runs did."""
     lines = []
+    tissue = {
+        "cutis_m": trained.cutis_m,
+        "subcutis_m": trained.subcutis_m,
+        "arm_radius_m": trained.arm_radius_m,
+    }
+    if replace(geometry, **tissue) != trained:
+        lines.append("pads, guard or load cell are others")
     for name, share in (
         ("cutis_m", THICKNESS_RANGE), ("subcutis_m", THICKNESS_RANGE), ("arm_radius_m", RADIUS_RANGE)
     ):  # fmt: skip

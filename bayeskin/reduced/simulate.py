@@ -12,6 +12,7 @@ from bayeskin.mechanisms import Mechanism, solved
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.model.lagrangian import LagrangianModel, Step
 from bayeskin.model.problem import material
+from bayeskin.model.simulate import OnState
 from bayeskin.model.stepping import integrate
 from bayeskin.model.tissue import Bind
 from bayeskin.reduced.equations import ReducedEquations
@@ -33,6 +34,7 @@ def simulate_reduced(
     gradients: Mapping[str, float] | None = None,
     geometry: Geometry | None = None,
     estimate: bool = False,
+    on_state: OnState | None = None,
 ) -> Simulation:
     """Runs a reduced model over the whole motion, with those of `mechanisms` that the full model solves.
 
@@ -40,6 +42,7 @@ def simulate_reduced(
     gradients : also the force's derivatives by these parameters, each for the change that stands with it
     geometry : layers and arm that differ from the model's
     estimate : whether the force's error is estimated, which takes longer than the run
+    on_state : called with time [s], the full model's unknowns (dofs,) and force [N] of each step of the test
 
     A run that fails, or that leaves the trained region, is a Simulation with status "failed" and a message;
     `stats` has "error_estimate_n" [N], RMS over the states looked at, where it was asked for.
@@ -49,6 +52,7 @@ def simulate_reduced(
     tissue = sorted(m.name for m in mechanisms if isinstance(m.act, Tissue))
     shape = geometry or model.trained.geometry
     message = outside(model.trained, theta, tissue, shape, motion)
+    inside = not message
     history = _History()
     stats: dict[str, float] = {}
     slopes = None
@@ -58,12 +62,15 @@ def simulate_reduced(
         equations = ReducedEquations(space, theta, binds, motion)
         slopes = ReducedGradients(equations, theta, gradients, binds, motion) if gradients else None
         message = _integrated(equations, theta["p_init"], history, slopes)
+        ran = time.perf_counter()
         iterations, residuals, tangents = map(float, equations.spent)
         (k, m), points = space.modes, len(space.at.weight)
         stats = {
-            "seconds_to_prepare": prepared - started, "modes": float(k - 2 + m), "points": float(points),
+            "seconds_of_run": ran - prepared, "modes": float(k - 2 + m), "points": float(points),
             "iterations": iterations, "residuals": residuals, "tangents": tangents,
         }  # fmt: skip
+        if on_state is not None:
+            _show(model, equations, tissue, history, on_state)
         if estimate and not message:
             stats["error_estimate_n"] = _estimated(
                 model, equations, binds, theta, tissue, shape, motion, history
@@ -79,7 +86,7 @@ def simulate_reduced(
         message=message,
         stats={
             "seconds": time.perf_counter() - started, "steps": float(len(force_n) - 1),
-            "peak_force_n": float(np.abs(force_n).max()), **stats,
+            "peak_force_n": float(np.abs(force_n).max()), "inside": float(inside), **stats,
         },
         model_hash=model.hash,
         gradient_names=slopes.names if slopes else (),
@@ -116,6 +123,18 @@ def _integrated(
         return integrate(equations, p_init, TOLERANCE, on_step, falls_too=False)
     except FloatingPointError as error:
         return str(error)
+
+
+def _show(
+    model: ReducedModel, equations: ReducedEquations, tissue: Sequence[str], history: _History,
+    on_state: OnState,
+) -> None:  # fmt: skip
+    """Shows each step of the test on the nodes of the full model's mesh."""
+    basis = model.basis(tissue)
+    for step in history.steps:
+        time_s = step.state.time_s - equations.starts_s
+        if time_s > -1e-6:
+            on_state(max(time_s, 0.0), basis.nodal(step.state.x), step.force_n - equations.zero_n)
 
 
 def _beyond_start(slopes: ReducedGradients, count: int) -> np.ndarray:

@@ -1,0 +1,169 @@
+"""The reduced model of a device: building it, and finding the one that fits a geometry."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from bayeskin.cluster import on_scheduler
+from bayeskin.config import load_config
+from bayeskin.design import default_space
+from bayeskin.device import load_device, stated_geometry
+from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
+from bayeskin.mechanisms import catalogue
+from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.model.simulate import problem_of
+from bayeskin.pipeline.engine import Reporter
+from bayeskin.pipeline.folder import locked, plain
+from bayeskin.reduced.build import (
+    BuildSettings,
+    RunTask,
+    assemble,
+    make_runs,
+    training_cases,
+    weighted_of,
+)
+from bayeskin.reduced.cases import BASE, Trained
+from bayeskin.reduced.files import load_reduced, save_reduced
+from bayeskin.reduced.model import ReducedModel, inner_of
+from bayeskin.reduced.region import other_geometry
+from bayeskin.shipped import shipped
+from bayeskin.types import ParameterSpace
+from bayeskin.workers import Map, local
+
+SHIPPED = "surrogates/article-device-reduced.h5"
+REFINEMENT = 1  # of the bricks that reduced models stand for
+WORKERS = 2
+
+
+def reduce(
+    source: Path | None, out: Path | None, reporter: Reporter, scheduler: str | None = None
+) -> dict[str, Any]:
+    """Builds the reduced model of a device, the base model first and then all mechanisms of the tissue.
+
+    source : a configuration, or a file with the sections `device` and `tissue`; None is the article's device
+    out : HDF5 file to write; by default beside the source, with "-reduced" after its name
+    scheduler : address of a Dask scheduler that makes the training runs; else processes of this machine
+
+    Training runs are kept in a folder beside `out` until the model is finished, so the same command goes on.
+    Raises InputError for bad input, with nothing written; an `out` that is finished stays as it is.
+    """
+    geometry = _geometry(source)
+    path = out or default_path(source)
+    if path.suffix != ".h5":
+        raise InputError(f"-o {path}", f"ending {path.suffix!r}", "ending .h5")
+    trained = trained_for(geometry)
+    finished = _finished(path, trained)
+    if finished:
+        return _answer(path, load_reduced(path), 0.0, "done before, unchanged")
+    folder, started = path.with_name(f"{path.stem}-training"), time.perf_counter()
+    settings = BuildSettings()
+    with locked(folder):
+        if scheduler is None:
+            _build(path, trained, settings, folder, local(WORKERS), reporter)
+        else:
+            with on_scheduler(scheduler) as over:
+                _build(path, trained, settings, folder, over, reporter)
+    shutil.rmtree(folder)
+    return _answer(path, load_reduced(path), time.perf_counter() - started, "built")
+
+
+def _build(
+    path: Path, trained: Trained, settings: BuildSettings, folder: Path, run_all: Map, reporter: Reporter
+) -> None:
+    """Builds the base model and keeps it, so that it can be used meanwhile; then the whole one."""
+    inner = inner_of(problem_of("bricks", REFINEMENT, trained.geometry))
+    task = RunTask(trained.geometry, REFINEMENT)
+
+    def progress(what: str, share: float) -> None:
+        reporter.progress(what, share)
+
+    base_only = replace(trained, mechanisms={})
+    if not path.is_file():
+        reporter.log(f"{settings.runs} training runs of the base model")
+        make_runs(task, training_cases(trained, [BASE], settings, folder), run_all, progress)
+        weighted = {BASE: weighted_of(BASE, settings, folder, inner)}
+        save_reduced(path, assemble(base_only, REFINEMENT, weighted, settings, progress), _manifest(settings))
+        reporter.log(f"{path}: the base model can be used; {len(trained.mechanisms)} mechanisms follow")
+    kinds = [BASE, *sorted(trained.mechanisms)]
+    make_runs(task, training_cases(trained, kinds, settings, folder), run_all, progress)
+    weighted = {kind: weighted_of(kind, settings, folder, inner) for kind in kinds}
+    save_reduced(path, assemble(trained, REFINEMENT, weighted, settings, progress), _manifest(settings))
+
+
+def _manifest(settings: BuildSettings) -> dict[str, Any]:
+    return {"settings": asdict(settings), "made_by": "bayeskin reduce"}
+
+
+def trained_for(geometry: Geometry) -> Trained:
+    """Returns the region that the reduced model of a device is trained for: all priors of the catalogue."""
+    tissue = {
+        name: ParameterSpace(m.parameters) for name, m in catalogue().items() if isinstance(m.act, Tissue)
+    }
+    return Trained(geometry, default_space(), tissue)
+
+
+def _geometry(source: Path | None) -> Geometry:
+    if source is None:
+        return Geometry()
+    if not source.is_file():
+        raise InputError(source, "no such file", "a configuration, or a file with [device] and [tissue]")
+    try:
+        return load_device(source).geometry
+    except InputError:
+        config = load_config(source)
+        return stated_geometry(config.device, config.tissue, source).geometry
+
+
+def default_path(source: Path | None) -> Path:
+    """Returns where a source's reduced model is looked for, and written by default."""
+    return (
+        Path("article-device-reduced.h5") if source is None else source.with_name(f"{source.stem}-reduced.h5")
+    )
+
+
+def _finished(path: Path, trained: Trained) -> bool:
+    """Whether a file holds the whole model already. Raises InputError for one of another device."""
+    if not path.is_file():
+        return False
+    there = load_reduced(path)
+    if there.trained.geometry != trained.geometry:
+        raise InputError(f"-o {path}", "a reduced model of another geometry", "a name that is free")
+    return set(there.trained.mechanisms) == set(trained.mechanisms)
+
+
+def reduced_for(geometry: Geometry, beside: Sequence[Path]) -> ReducedModel:
+    """Returns the reduced model that fits a geometry: one beside the files given, else the shipped one.
+
+    Raises InputError where there is none, or where the one beside is of another geometry.
+    """
+    for source in beside:
+        path = default_path(source)
+        if path.is_file():
+            model = load_reduced(path)
+            found = other_geometry(model.trained.geometry, geometry)
+            if found:
+                raise InputError(path, f"a reduced model of another geometry: {found[0]}", "one of this one")
+            return model
+    model = load_reduced(shipped(SHIPPED))
+    if other_geometry(model.trained.geometry, geometry):
+        expected = "one that `bayeskin reduce` makes of its file: half an hour to two hours, once"
+        raise InputError("reduced model", "none for this device and tissue", expected)
+    return model
+
+
+def _answer(path: Path, model: ReducedModel, seconds: float, done: str) -> dict[str, Any]:
+    base, (u, p) = model.cubatures, (model.library.base.displacement, model.library.base.pressure)
+    text = (
+        f"{path}: {done}; {len(u)} displacement and {len(p) + 1} pressure modes of the base model at "
+        f"{len(base.base.points)} points, {len(model.library.beyond)} mechanisms"
+    )
+    return plain({
+        "ok": True, "out": path, "seconds": seconds, "mechanisms": sorted(model.library.beyond),
+        "modes": [len(u), len(p) + 1], "points": len(base.base.points), "text": text,
+    })  # fmt: skip
