@@ -21,7 +21,8 @@ _TOWARD_EDGE = 0.25  # where a cell beside an edge is divided: a quarter of its 
 # The pattern of each stretch: its length in the article's device, and its inner lines, from its start [mm].
 # Along x: half the gauge, pad, gap, guard, free skin beyond. Along y: half the pad, gap, guard, free skin.
 # Along z: subcutis, cutis. Free skin has coarse bricks: a soft cutis on a stiff subcutis would fold there,
-# and fine bricks try to. Without a guard the pad's edges carry all of the force, and need smaller bricks.
+# and fine bricks try to. Bricks are smaller at the edges that carry what the load cell measures: those of the
+# article's pad are shielded by its guard, those of a bare pad, and of a guard that is measured, too, are not.
 Stretch = tuple[float, tuple[float, ...]]
 Pattern = tuple[tuple[Stretch, ...], ...]
 _COARSEST: Pattern = (
@@ -33,6 +34,16 @@ _COARSE: Pattern = (
     ((18.0, (9.0, 16.5)), (8.0, (1.5, 6.5)), (1.0, ()), (8.0, (1.5, 6.0)), (70.0, (5.0, 13.0, 30.0))),
     ((4.0, (3.0,)), (1.0, ()), (7.0, (3.5,)), (72.0, (6.0, 26.0))),
     ((8.0, (5.0,)), (2.0, (1.5,))),
+)
+_COARSEST_BOTH: Pattern = (
+    ((18.0, (12.0, 16.5)), (8.0, (2.0,)), (1.0, ()), (8.0, ()), (70.0, (4.0, 20.0))),
+    ((4.0, ()), (1.0, ()), (7.0, (5.6,)), (72.0, (4.0, 24.0))),
+    ((8.0, ()), (2.0, ())),
+)
+_COARSE_BOTH: Pattern = (
+    ((18.0, (9.0, 15.0, 17.5)), (8.0, (0.5, 3.0)), (1.0, ()), (8.0, (6.8,)), (70.0, (1.2, 5.0, 12.0, 30.0))),
+    ((4.0, ()), (1.0, ()), (7.0, (4.0, 6.5)), (72.0, (0.8, 4.0, 12.0, 32.0))),
+    ((8.0, (5.0,)), (2.0, (1.7,))),
 )
 _COARSEST_UNGUARDED: Pattern = (
     ((18.0, (12.0, 16.5)), (8.0, (1.5,)), (70.0, (4.0, 20.0))),
@@ -73,13 +84,21 @@ def _lines_mm(refinement: int, geometry: Geometry) -> list[tuple[float, ...]]:
         [0.0, *edges[1], _mm(width)],
         [0.0, _mm(geometry.subcutis_m), *edges[2]],
     ]
-    guarded = _COARSE if refinement else _COARSEST
-    unguarded = _COARSE_UNGUARDED if refinement else _COARSEST_UNGUARDED
-    pattern = unguarded if geometry.guard is None else guarded
+    coarsest, coarse = _patterns(geometry)
+    pattern = coarse if refinement else coarsest
     lines = [_drawn(*axis) for axis in zip(stops, pattern, strict=True)]
     for _ in range(refinement - 1):
         lines = [_divided(*axis) for axis in zip(lines, edges, strict=True)]
     return lines
+
+
+def _patterns(geometry: Geometry) -> tuple[Pattern, Pattern]:
+    """Those of refinement 0 and 1."""
+    if geometry.guard is None:
+        return _COARSEST_UNGUARDED, _COARSE_UNGUARDED
+    if geometry.force_on == "pad and guard":
+        return _COARSEST_BOTH, _COARSE_BOTH
+    return _COARSEST, _COARSE
 
 
 def _mm(length_m: float) -> float:

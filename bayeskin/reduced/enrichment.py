@@ -1,9 +1,9 @@
 """A reduced model for one recording: a few full runs near a point, on the recording's own protocol.
 
-Over all of the prior a set of mechanisms needs many modes; over the skins that a recording leaves plausible few will
-do. Full runs at and near a point, on the recording's protocol, give these modes, and reduced runs near by the
-cubature. Each further full run is first predicted: that measures the error, and when it is below what is asked
-the model is done; else the run joins it. All full runs are kept.
+Over all of the prior a set of mechanisms needs many modes; over the skins that a recording leaves plausible
+few will do. Full runs at and near a point, on the recording's protocol, give these modes, and reduced runs near
+by the cubature. Each further full run is first predicted, which measures the error. When it is below what is
+asked the model is done; else the run joins it. All full runs are kept.
 """
 
 from __future__ import annotations
@@ -158,10 +158,8 @@ def _fitted(
     if not finished:
         raise InputError("enrichment", "no full run that finishes near this point", "a point away from folds")
     modes = Modes(
-        _largest(
-            [run.displacement for run in finished], inner.displacement, settings.modes[0], settings.kept
-        ),
-        _largest([run.pressure for run in finished], inner.pressure, settings.modes[1], settings.kept),
+        _largest([run.displacement for run in finished], inner.displacement, settings, 0),
+        _largest([run.pressure for run in finished], inner.pressure, settings, 1),
     )
     basis, rows, rule = scaled_basis(modes, inner), list[Array](), None
     at = point_fields(problem, basis)
@@ -188,10 +186,10 @@ def _fitted(
     )  # fmt: skip
 
 
-def _largest(rows: Sequence[Array], inner: sp.csr_matrix, most: int, kept: float) -> Array:
-    """The modes of weighted rows with the largest singular values."""
+def _largest(rows: Sequence[Array], inner: sp.csr_matrix, settings: EnrichmentSettings, field: int) -> Array:
+    """The modes of weighted rows with the largest singular values; field : 0 displacement, 1 pressure."""
     values, modes = pod(np.concatenate(rows).astype(float), inner)
-    return modes[: min(most, int((values > kept * values[0]).sum()))]
+    return modes[: min(settings.modes[field], int((values > settings.kept * values[0]).sum()))]
 
 
 def _error(model: ReducedModel, case: Case, run: TrainingRun) -> float:
