@@ -1,8 +1,8 @@
 """A reduced model for one recording: a few full runs near a point, on the recording's own protocol.
 
 Over all of the prior a set of mechanisms needs many modes; over the skins that a recording leaves plausible
-few will do. Full runs at and near a point, on the recording's protocol, give these modes, and reduced runs near
-by the cubature. Each further full run is first predicted, which measures the error. When it is below what is
+few will do. Full runs at and near a point, on the recording's protocol, give these modes, and reduced runs
+near by the cubature. Each further full run is first predicted, which measures the error. When it is below what is
 asked the model is done; else the run joins it. All full runs are kept.
 """
 

@@ -96,11 +96,11 @@ def linear_parts(at: PointFields) -> LinearParts:
     divergence = at.gradient[:, 0] + at.gradient[:, 4] + at.gradient[:, 8]
     for layer in (at.cutis, ~at.cutis):
         b, w, g, trace = at.gradient[layer], at.weight[layer], at.slope[layer], divergence[layer]
-        n, _, k = b.shape
+        (n, _, k), m = b.shape, g.shape[2]
         both = b + b.reshape(n, 3, 3, k).transpose(0, 2, 1, 3).reshape(n, 9, k)
         shear.append(b.reshape(n * 9, k).T @ (both * w[:, None, None]).reshape(n * 9, k))
         bulk.append(trace.T @ (trace * w[:, None]))
-        flow.append(g.reshape(n * 3, -1).T @ (g * w[:, None, None]).reshape(n * 3, -1))
+        flow.append(g.reshape(n * 3, m).T @ (g * w[:, None, None]).reshape(n * 3, m))
     coupling = -(divergence * at.weight[:, None]).T @ at.pressure
     return LinearParts(np.array(shear), np.array(bulk), np.array(flow), coupling)
 
