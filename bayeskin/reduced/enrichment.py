@@ -2,8 +2,8 @@
 
 Over all of the prior a set of mechanisms needs many modes; over the skins that a recording leaves plausible
 few will do. Full runs at and near a point, on the recording's protocol, give these modes, and reduced runs
-near by the cubature. Each further full run is first predicted, which measures the error. When it is below what is
-asked the model is done; else the run joins it. All full runs are kept.
+near by the cubature. Each further full run is first predicted, which measures the error. When that is below
+what is asked the model is done; else the run joins it. All full runs are kept.
 """
 
 from __future__ import annotations

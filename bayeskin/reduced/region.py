@@ -54,12 +54,13 @@ def _beyond(space: ParameterSpace, theta: Mapping[str, float]) -> str:
 def other_geometry(trained: Geometry, geometry: Geometry) -> list[str]:
     """Returns how a geometry differs from the trained one by more than training runs did."""
     lines = []
-    tissue = {
-        "cutis_m": trained.cutis_m,
-        "subcutis_m": trained.subcutis_m,
-        "arm_radius_m": trained.arm_radius_m,
-    }
-    if replace(geometry, **tissue) != trained:
+    same_tissue = replace(
+        geometry,
+        cutis_m=trained.cutis_m,
+        subcutis_m=trained.subcutis_m,
+        arm_radius_m=trained.arm_radius_m,
+    )
+    if same_tissue != trained:
         lines.append("pads, guard or load cell are others")
     for name, share in (
         ("cutis_m", THICKNESS_RANGE), ("subcutis_m", THICKNESS_RANGE), ("arm_radius_m", RADIUS_RANGE)

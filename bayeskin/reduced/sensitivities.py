@@ -147,7 +147,8 @@ def _varied(equations: ReducedEquations, runs: Sequence[Bound]) -> kernels.Varie
     """Constants of runs that are each a step further in one parameter, as the kernels are given them."""
     own, (solid_units, flow_units) = equations.run, equations.units
     return kernels.Varied(
-        *(np.array([getattr(run.solid, name) for run in runs]) for name in ("mu", "lam", "mobility")),
+        np.array([run.solid.mu for run in runs]), np.array([run.solid.lam for run in runs]),
+        np.array([run.solid.mobility for run in runs]),
         np.array([run.par for run in runs]), np.array([run.data for run in runs]), solid_units, flow_units,
         np.array([(run.solid_by - own.solid_by) / STEP for run in runs]),
         np.array([(run.flow_by - own.flow_by) / STEP for run in runs]), STEP,

@@ -1,0 +1,197 @@
+"""How far the shipped reduced model is from the full one, on skins and protocols that it never saw, and its cost.
+
+    OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/reduced_model.py [--full] [--estimates]
+
+Twenty-three skins drawn from the priors: four of the base model, one of each of the eleven mechanisms of the
+tissue, four pairs and four triples of them; the article's protocol and four others. Forces of the full model are in
+results/reduced_held_out.h5; with --full those that are missing there are made, some ten seconds each. With
+--estimates the reduced runs estimate their own error, and the share of true errors within twice that is told.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import h5py
+import numpy as np
+
+from bayeskin.design import default_space
+from bayeskin.mechanisms import catalogue, laws
+from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.model.simulate import ModelSpec, simulate
+from bayeskin.pipeline.reducing import SHIPPED
+from bayeskin.proof.protocol import MOTION
+from bayeskin.reduced.files import load_reduced
+from bayeskin.reduced.model import ReducedModel
+from bayeskin.reduced.simulate import simulate_reduced
+from bayeskin.shipped import shipped
+from bayeskin.types import PadMotion, ParameterSpace
+
+RESULTS = Path(__file__).with_name("results") / "reduced_held_out.h5"
+SEED = 20261127
+
+
+def motion(time_s: Sequence[float], height_mm: Sequence[float]) -> PadMotion:
+    """A protocol from its corners."""
+    return PadMotion(np.array(time_s, float), np.round(1e-3 * np.array(height_mm, float), 12))
+
+
+PROTOCOLS = {
+    "article": MOTION,
+    "staircase": motion(
+        (0, 3, 33, 36, 66, 69, 99, 102, 132, 138, 178), (0, 2.5, 2.5, 5, 5, 7.5, 7.5, 9.5, 9.5, 0, 0)
+    ),
+    "triangles": motion((0, 9, 18, 27, 36, 45, 54, 63, 72), (0, 9, 0, 9, 0, 9, 0, 9, 0)),
+    "slow": motion((0, 90, 120, 210, 240), (0, 9, 9, 0, 0)),
+    "fast": motion((0, 1.8, 61.8, 63.6, 93.6, 95.4, 125.4), (0, 9, 9, 0, 0, 9, 9)),
+}
+
+
+class Skin(NamedTuple):
+    """A held-out skin: values of all parameters, and the mechanisms that act in it."""
+
+    theta: dict[str, float]
+    mechanisms: tuple[str, ...]
+
+    @property
+    def group(self) -> str:
+        """A row of the table."""
+        return {0: "base", 1: "".join(self.mechanisms)}.get(
+            len(self.mechanisms), f"sets of {len(self.mechanisms)}"
+        )
+
+
+def held_out() -> list[Skin]:
+    """The skins, drawn anew from their seed."""
+    rng, base = np.random.default_rng(SEED), default_space()
+    spaces = {
+        name: ParameterSpace(m.parameters) for name, m in catalogue().items() if isinstance(m.act, Tissue)
+    }
+    tissue = list(spaces)
+    sets: list[tuple[str, ...]] = [()] * 4 + [(name,) for name in tissue]
+    sets += [
+        tuple(sorted(rng.choice(tissue, n, replace=False).tolist())) for n in (2,) * 4 + (3,) * 4 + (4,) * 4
+    ]
+    skins = []
+    for names in sets:
+        theta: dict[str, float] = {}
+        while not theta or theta["E_s"] > 2.0 * theta["E_c"]:
+            theta = drawn(base, rng)
+        for name in names:
+            theta |= drawn(spaces[name], rng)
+        skins.append(Skin(theta, names))
+    return skins[:23]
+
+
+def drawn(space: ParameterSpace, rng: np.random.Generator) -> dict[str, float]:
+    """A draw of a prior by name."""
+    return dict(zip(space.names, map(float, space.from_unit(rng.uniform(size=space.dim))), strict=True))
+
+
+def make_missing(skins: Sequence[Skin]) -> None:
+    """Runs the full model where its force is not in the results."""
+    with h5py.File(RESULTS, "a") as handle:
+        for number, skin in enumerate(skins):
+            for name, protocol in PROTOCOLS.items():
+                key = f"{number:02d}/{name}"
+                if key in handle:
+                    continue
+                acting = [catalogue()[m] for m in skin.mechanisms]
+                run = simulate(ModelSpec(), protocol, skin.theta, laws=laws(acting), falls_too=False)
+                group = handle.create_group(key)
+                group["time_s"], group["force_n"] = run.time_s, run.force_n.astype(np.float32)
+                group["corner"] = run.corner
+                group.attrs["message"], group.attrs["seconds"] = run.message, run.stats["seconds"]
+                handle.flush()
+                print(key, skin.mechanisms, run.message or f"{run.stats['seconds']:.1f} s", file=sys.stderr)
+
+
+class Row(NamedTuple):
+    """A reduced run beside a full one: errors over the peak, the estimate, CPU seconds, or why there is none."""
+
+    rms: float
+    largest: float
+    estimate: float
+    seconds: float
+    full_seconds: float
+    message: str
+
+
+def compared(model: ReducedModel, skin: Skin, protocol: PadMotion, group: h5py.Group, estimates: bool) -> Row:
+    """Runs the reduced model and compares it at the full run's own steps."""
+    acting, started = [catalogue()[name] for name in skin.mechanisms], time.process_time()
+    run = simulate_reduced(model, protocol, skin.theta, acting)
+    seconds = time.process_time() - started
+    full_seconds = float(group.attrs["seconds"])
+    if run.status != "ok":
+        return Row(np.nan, np.nan, np.nan, seconds, full_seconds, run.message)
+    time_s, force_n = group["time_s"][()], group["force_n"][()].astype(float)
+    wrong, peak = run.at(time_s) - force_n, np.abs(force_n).max()
+    weight = np.gradient(time_s)
+    estimate = np.nan
+    if estimates:
+        told = simulate_reduced(model, protocol, skin.theta, acting, estimate=True)
+        estimate = told.stats["error_estimate_n"] / peak
+    rms = float(np.sqrt(np.average(wrong**2, weights=weight)) / peak)
+    return Row(rms, float(np.abs(wrong).max() / peak), estimate, seconds, full_seconds, "")
+
+
+def table(model: ReducedModel, estimates: bool) -> list[str]:
+    """The table as lines of Markdown: RMS and largest error in % of the peak, which are mN at 1 N times ten."""
+    skins, rows = held_out(), dict[tuple[str, str], list[Row]]()
+    with h5py.File(RESULTS) as handle:
+        for number, skin in enumerate(skins):
+            for name, protocol in PROTOCOLS.items():
+                group = handle[f"{number:02d}/{name}"]
+                if not group.attrs["message"]:
+                    row = compared(model, skin, protocol, group, estimates)
+                    rows.setdefault((skin.group, name), []).append(row)
+                    print(number, name, skin.mechanisms, row, file=sys.stderr, flush=True)
+    groups = list(dict.fromkeys(group for group, _ in rows))
+    lines = ["| skins | " + " | ".join(f"{name}: rms, max [% of peak]" for name in PROTOCOLS) + " |"]
+    lines.append("| --- " * (1 + len(PROTOCOLS)) + "|")
+    lines += [f"| {group} | " + " | ".join(_cell(rows.get((group, name), [])) for name in PROTOCOLS) + " |"
+              for group in groups]  # fmt: skip
+    return [*lines, "", *_summary(model, rows)]
+
+
+def _cell(rows: Sequence[Row]) -> str:
+    fine = [row for row in rows if not row.message]
+    failed = f", {len(rows) - len(fine)} refused" if len(fine) < len(rows) else ""
+    if not fine:
+        return failed.lstrip(", ") or "–"
+    rms, largest = (100 * np.median([getattr(row, name) for row in fine]) for name in ("rms", "largest"))
+    return f"{rms:.3f}, {largest:.3f}{failed}"
+
+
+def _summary(model: ReducedModel, rows: dict[tuple[str, str], list[Row]]) -> list[str]:
+    every = [row for found in rows.values() for row in found if not row.message]
+    lines = []
+    for title, wanted in (("base", lambda g: g == "base"), ("sets of mechanisms", lambda g: g != "base")):
+        seconds = [row.seconds for (g, name), found in rows.items() for row in found
+                   if wanted(g) and name == "article" and not row.message]  # fmt: skip
+        full = [row.full_seconds for (g, name), found in rows.items() for row in found
+                if wanted(g) and name == "article" and not row.message]  # fmt: skip
+        lines.append(f"Article's protocol, {title}: {np.median(seconds):.2f} CPU s a reduced run (median), the full "
+                     f"model's {np.median(full):.1f} s.")  # fmt: skip
+    known = np.array([[row.rms, row.estimate] for row in every if np.isfinite(row.estimate)])
+    if len(known):
+        lines.append(f"True error at most twice the estimate: {np.mean(known[:, 0] <= 2 * known[:, 1]):.2f}, at most "
+                     f"four times: {np.mean(known[:, 0] <= 4 * known[:, 1]):.2f} of {len(known)} runs.")  # fmt: skip
+    return lines
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Prints the table."""
+    if "--full" in arguments:
+        make_missing(held_out())
+    model = load_reduced(shipped(SHIPPED))
+    print("\n".join(table(model, "--estimates" in arguments)))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,243 @@
+"""A reduced model beside the full one: forces, derivatives, error, other layers, files, enrichment."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from toys.small_reduced import NAMES, SETTINGS, built, one_by_one
+
+from bayeskin import storage
+from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
+from bayeskin.mechanisms import Mechanism, catalogue, laws
+from bayeskin.model.simulate import ModelSpec, simulate
+from bayeskin.reduced.build import RunTask, make_runs, training_cases
+from bayeskin.reduced.cases import BASE
+from bayeskin.reduced.enrichment import EnrichmentSettings, enrich
+from bayeskin.reduced.files import load_reduced, save_reduced
+from bayeskin.reduced.library import Library, Modes
+from bayeskin.reduced.model import ReducedModel
+from bayeskin.reduced.simulate import simulate_reduced
+from bayeskin.types import PadMotion, Simulation
+
+THETA = {"E_c": 9e4, "E_s": 2e4, "k_c": 3e-14, "k_s": 4e-13, "p_init": 300.0}
+STRONG = {"damage": 0.3, "damage_energy": 2e3, "g_1": 0.5, "tau_1": 2.0, "g_2": 0.3, "tau_2": 60.0}
+MOTION = PadMotion(
+    np.array([0.0, 8.0, 30.0, 38.0, 45.0, 55.0, 80.0]), 1e-3 * np.array([0.0, 8.0, 8.0, 1.0, 1.0, 9.0, 9.0])
+)
+SPEC = ModelSpec(refinement=0)
+
+
+def of(names: Sequence[str]) -> list[Mechanism]:
+    return [catalogue()[name] for name in names]
+
+
+def full(theta, names=(), spec=SPEC) -> Simulation:
+    found = simulate(spec, MOTION, theta, laws=laws(of(names)))
+    assert found.status == "ok"
+    return found
+
+
+def rms(found: Simulation, right: Simulation) -> float:
+    """RMS over the peak."""
+    time_s = np.arange(0.0, MOTION.time_s[-1], 0.5)
+    wrong = found.at(time_s) - right.at(time_s)
+    return float(np.sqrt(np.mean(wrong**2)) / np.abs(right.force_n).max())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("training")
+
+
+@pytest.fixture(scope="module")
+def model(folder) -> ReducedModel:
+    return built(folder)
+
+
+@pytest.mark.parametrize("names", [(), ("preconditioning",), NAMES], ids=["base", "one", "two"])
+def test_the_force_is_near_the_full_models_on_a_protocol_never_seen(model, names) -> None:
+    theta = THETA | (STRONG if names else {})
+    found = simulate_reduced(model, MOTION, theta, of(names), estimate=True)
+    right = full(theta, names)
+    assert found.status == "ok"
+    assert found.stats["inside"] == 1.0
+    assert rms(found, right) < 6e-3
+    estimate = found.stats["error_estimate_n"] / found.stats["peak_force_n"]
+    assert rms(found, right) / 6.0 < estimate < 2e-2
+
+
+def test_the_estimate_sees_modes_that_are_missing(model) -> None:
+    base = model.library.base
+    poor = replace(
+        model, library=Library(Modes(base.displacement[:8], base.pressure[:8]), model.library.beyond)
+    )
+    errors = [simulate_reduced(m, MOTION, THETA, estimate=True) for m in (model, poor)]
+    whole, few = (found.stats["error_estimate_n"] for found in errors)
+    missed = rms(errors[1], full(THETA)) * errors[1].stats["peak_force_n"]
+    assert few > 3.0 * whole
+    assert few > missed / 4.0
+
+
+@pytest.mark.parametrize(
+    ("names", "changes"),
+    [
+        ((), {"E_c": 9e4, "E_s": 2e4, "k_c": 3e-14, "k_s": 4e-13, "p_init": 100.0}),
+        (NAMES, {"E_s": 2e4, "k_c": 3e-14, "damage": 0.1, "damage_energy": 2e3, "g_1": 0.1, "tau_2": 60.0}),
+        (("pre-stretch",), {"opening": 0.01, "E_c": 9e4}),
+        (("slow-recovery", "solid-viscoelasticity"), {"recovery_compliance": 1e-4, "tau_1": 2.0, "E_c": 9e4}),
+        (("backlash",), {"gap": 1e-5, "frame_compliance": 1e-4}),
+    ],
+    ids=["base", "memory", "opened", "in series", "play"],
+)
+def test_derivatives_are_those_of_two_runs(model, names, changes) -> None:
+    """On the central difference of two runs, whose own steps differ a little."""
+    extra = {
+        "opening": 0.03, "recovery_compliance": 5e-4, "recovery_time": 20.0, "gap": 1e-4,
+        "frame_compliance": 5e-4,
+    }  # fmt: skip
+    known = model if "pre-stretch" not in names else replace(
+        model, trained=replace(model.trained, mechanisms={
+            **model.trained.mechanisms, "pre-stretch": model.trained.mechanisms["preconditioning"]}),
+        library=Library(model.library.base, {**model.library.beyond, "pre-stretch": Modes(
+            model.library.base.displacement[:0], model.library.base.pressure[:0])}))  # fmt: skip
+    if "pre-stretch" in names:
+        from bayeskin.types import ParameterSpace
+
+        own = ParameterSpace(catalogue()["pre-stretch"].parameters)
+        known = replace(known, trained=replace(known.trained, mechanisms={"pre-stretch": own}))
+    parameters = {p.name for m in of(names) for p in m.parameters} | set(THETA)
+    theta = {name: value for name, value in (THETA | STRONG | extra).items() if name in parameters}
+    found = simulate_reduced(known, MOTION, theta, of(names), gradients=changes)
+    assert found.status == "ok", found.message
+    assert found.gradient_names == tuple(changes)
+    time_s = np.linspace(1.0, 79.0, 60)
+    for name, change, column in zip(changes, changes.values(), found.gradient_n.T, strict=True):
+        step = 0.01 * change
+        ends = [
+            simulate_reduced(known, MOTION, theta | {name: theta[name] + sign * step}, of(names))
+            for sign in (1.0, -1.0)
+        ]
+        difference = (ends[0].at(time_s) - ends[1].at(time_s)) / 0.02
+        own = replace(found, force_n=column).at(time_s)
+        np.testing.assert_allclose(own, difference, atol=0.02 * np.abs(difference).max(), err_msg=name)
+
+
+def test_other_layers_move_the_nodes(model) -> None:
+    geometry = replace(Geometry(), cutis_m=2.4e-3, subcutis_m=6.5e-3, arm_radius_m=42e-3)
+    found = simulate_reduced(model, MOTION, THETA, geometry=geometry)
+    moved = full(THETA, spec=ModelSpec(refinement=0, geometry=geometry))
+    assert found.status == "ok"
+    assert rms(found, moved) < 1.2e-2
+    assert rms(found, full(THETA)) > 3.0 * rms(found, moved)
+
+
+def test_outside_of_the_trained_region_nothing_runs(model) -> None:
+    found = simulate_reduced(model, MOTION, THETA | {"E_c": 5e6})
+    assert found.status == "failed"
+    assert found.stats["inside"] == 0.0
+    assert "E_c is 5e+06" in found.message
+    unknown = simulate_reduced(model, MOTION, THETA | {"leakage": 1e-9}, of(["fluid-leakage"]))
+    assert "fluid-leakage was not trained" in unknown.message
+
+
+def test_training_runs_are_made_once(model, folder) -> None:
+    def refuse(function, items):
+        assert items == []
+        yield from ()
+
+    cases = training_cases(model.trained, (BASE, *NAMES), SETTINGS, folder)
+    make_runs(RunTask(Geometry(), 0), cases, refuse, lambda what, share: None)
+    cases[3][1].unlink()
+    made: list[str] = []
+    make_runs(
+        RunTask(Geometry(), 0), cases,
+        lambda function, items: (made.append(str(i)) or (n, function(i)) for n, i in enumerate(items)),
+        lambda what, share: None,
+    )  # fmt: skip
+    assert len(made) == 1
+    assert cases[3][1].is_file()
+
+
+@pytest.fixture(scope="module")
+def kept(model, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("kept") / "small-reduced.h5"
+    save_reduced(path, model, {"made_by": "a test"})
+    return path
+
+
+def test_a_file_holds_the_model(model, kept) -> None:
+    again = load_reduced(kept)
+    assert again.trained == model.trained
+    before, after = (simulate_reduced(m, MOTION, THETA | STRONG, of(NAMES)) for m in (model, again))
+    assert rms(after, before) < 1e-3
+    manifest = json.loads(kept.with_suffix(".json").read_text())
+    assert manifest["full_model_hash"] == SPEC.hash
+    assert set(manifest["laws"]) == set(NAMES)
+
+
+def test_a_damaged_file_is_refused_in_one_line(kept, tmp_path) -> None:
+    whole = kept.read_bytes()
+    damaged = {"short.h5": whole[: len(whole) // 2], "text.h5": b"no", "empty.h5": b""}
+    for name, contents in damaged.items():
+        (tmp_path / name).write_bytes(contents)
+        with pytest.raises(InputError, match=name):
+            load_reduced(tmp_path / name)
+    with pytest.raises(InputError, match="no such file"):
+        load_reduced(tmp_path / "none.h5")
+    altered = tmp_path / "altered.h5"
+    altered.write_bytes(whole)
+    with h5py.File(altered, "r+") as handle:
+        handle["cubatures/base/factor"][0] *= 2.0
+    with pytest.raises(InputError, match="stored hash"):
+        load_reduced(altered)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda said: said["laws"].update(preconditioning="0" * 64), "another version of preconditioning"),
+        (lambda said: said.update(full_model_hash="0" * 64), "another version of the full model"),
+    ],
+)
+def test_another_version_of_the_laws_is_refused(kept, tmp_path, change, says) -> None:
+    path = tmp_path / "other.h5"
+    path.write_bytes(kept.read_bytes())
+    with h5py.File(path, "r+") as handle:
+        said = json.loads(handle.attrs["manifest"])
+        change(said)
+        handle.attrs["manifest"] = json.dumps(said)
+        assert storage.contents_hash(handle) == handle.attrs["arrays_sha256"]
+    with pytest.raises(InputError, match=says):
+        load_reduced(path)
+
+
+def test_enrichment_ends_where_the_measured_error_is_small(model, tmp_path) -> None:
+    settings = EnrichmentSettings(
+        first=3, most=6, points=260, shadows=4, wanted=2e-3, modes=(60, 40), width=0.03
+    )
+    calls: list[int] = []
+
+    def counted(function, items):
+        calls.append(len(items))
+        yield from one_by_one(function, items)
+
+    theta = THETA | STRONG
+    found = enrich(model, theta, NAMES, MOTION, settings, tmp_path, counted, lambda what, share: None)
+    assert found.error <= settings.wanted
+    assert sum(calls) == found.full_runs == len(list(tmp_path.glob("*.h5")))
+    there = simulate_reduced(found.model, MOTION, theta, of(NAMES))
+    before = simulate_reduced(model, MOTION, theta, of(NAMES))
+    right = full(theta, NAMES)
+    assert rms(there, right) < min(2e-3, rms(before, right))
+    far = simulate_reduced(found.model, MOTION, theta | {"E_c": 1e6}, of(NAMES))
+    assert far.stats["inside"] == 0.0
+    calls.clear()
+    enrich(model, theta, NAMES, MOTION, settings, tmp_path, counted, lambda what, share: None)
+    assert sum(calls) == 0

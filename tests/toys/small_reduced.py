@@ -1,0 +1,44 @@
+"""A small reduced model of the article's device on 80 bricks, built as `bayeskin reduce` does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
+from typing import Any
+
+from bayeskin.design import default_space
+from bayeskin.geometry import Geometry
+from bayeskin.mechanisms import catalogue
+from bayeskin.model.simulate import problem_of
+from bayeskin.reduced.build import BuildSettings, RunTask, assemble, make_runs, training_cases, weighted_of
+from bayeskin.reduced.cases import BASE, Trained
+from bayeskin.reduced.model import ReducedModel, inner_of
+from bayeskin.types import ParameterSpace
+
+NAMES = ("preconditioning", "solid-viscoelasticity")
+SETTINGS = BuildSettings(
+    runs=9, base=(36, 30), each=(14, 8), base_points=220, set_points=280, base_shadows=8, set_shadows=2
+)
+
+
+def one_by_one(
+    function: Callable[[Any], Any], items: Sequence[Any]
+) -> Generator[tuple[int, Any], None, None]:
+    """Maps in this process."""
+    yield from ((number, function(item)) for number, item in enumerate(items))
+
+
+def trained() -> Trained:
+    """The region: all priors, two mechanisms."""
+    spaces = {name: ParameterSpace(catalogue()[name].parameters) for name in NAMES}
+    return Trained(Geometry(), default_space(), spaces)
+
+
+def built(folder: Path) -> ReducedModel:
+    """The reduced model, from training runs in a folder."""
+    region, kinds = trained(), (BASE, *NAMES)
+    cases = training_cases(region, kinds, SETTINGS, folder)
+    make_runs(RunTask(Geometry(), 0), cases, one_by_one, lambda what, share: None)
+    inner = inner_of(problem_of("bricks", 0))
+    weighted = {kind: weighted_of(kind, SETTINGS, folder, inner) for kind in kinds}
+    return assemble(region, 0, weighted, SETTINGS, lambda what, share: None)
