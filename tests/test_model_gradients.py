@@ -7,17 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from toys.same_steps import on_steps_of, start_at_zero
 
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import catalogue, laws
-from bayeskin.model import ModelSpec, lagrangian, simulate
+from bayeskin.model import ModelSpec, lagrangian, series, simulate
 from bayeskin.model.directional import TangentAction
 from bayeskin.model.gradients import ForceGradients, logarithms
 from bayeskin.model.lagrangian import Evaluated, LagrangianModel, Stage, State, Step
-from bayeskin.model.newton import EXTRAPOLATION_POINTS
 from bayeskin.model.problem import Material, material
 from bayeskin.model.simulate import problem_of
-from bayeskin.model.stepping import advance, integrate
+from bayeskin.model.stepping import integrate
 from bayeskin.model.tissue import Bind
 from bayeskin.types import PadMotion
 
@@ -63,24 +63,10 @@ def model(theta: dict[str, float], laws: Sequence[Bind] = (), refinement: int = 
     return LagrangianModel(problem, material(theta, problem.mesh.cutis), MOTION, bound)
 
 
-def start_at_zero(skin: LagrangianModel, step: Step) -> None:
-    """As a load cell that is zeroed when the test starts."""
-    if abs(step.state.time_s - skin.starts_s) < 1e-6:
-        skin.zero_n = step.force_n
-
-
 def forces_on_the_same_steps(skin: LagrangianModel, p_init: float, steps: list[Step]) -> np.ndarray:
-    past, forces = [skin.initial_state(p_init)], [0.0]
-    for step in steps[1:]:
-        made = advance(skin, past, step.state.time_s - past[-1].time_s)
-        forces.append(made.force_n)
-        start_at_zero(skin, made)
-        past = [*past, made.state][-EXTRAPOLATION_POINTS:]
-        if step.corner:
-            skin.remember_travel(past)
-            past = past[-1:]
+    forces = on_steps_of(skin, p_init, steps)
     skin.solver.release()
-    return np.array(forces)
+    return forces
 
 
 @pytest.mark.parametrize(
@@ -88,7 +74,7 @@ def forces_on_the_same_steps(skin: LagrangianModel, p_init: float, steps: list[S
 )
 def test_derivatives_are_central_differences(monkeypatch, case):
     monkeypatch.setattr(lagrangian, "SOLVER_TOLERANCE", 1e-7)
-    monkeypatch.setattr(lagrangian, "SERIES_TOLERANCE", 1e-9)
+    monkeypatch.setattr(series, "SERIES_TOLERANCE", 1e-9)
     refinement = 0
     theta = THETA | {name: value for values in WITH[case].values() for name, value in values.items()}
     binds = laws([catalogue()[name] for name in WITH[case]])

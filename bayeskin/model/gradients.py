@@ -15,11 +15,9 @@ it, with the reaction's derivative g by the unknowns; as M is symmetric, M^-1 g 
 What is small enough is added and no correction made, so that the force's error is the product of the errors
 of v and of the factorisation.
 
-What lies in series with the skin loses a displacement s(F, theta) before it reaches the pads. With the
-stage's response y to the pads' travel alone, whose reaction is the skin's stiffness K_u, and the derivatives
-F' and x' with s held,
-
-    ds = (ds/dtheta + ds/dF F') / (1 + ds/dF K_u) ,   dF = F' - K_u ds ,   dx = x' - y ds .
+What lies in series with the skin loses a displacement before it reaches the pads. Its derivatives ds follow
+(`series`) from those of the force with s held and the reaction of the stage's response y to the pads' travel
+alone; with the derivatives x' for s held, dx = x' - y ds.
 
 Forces scale with stresses: were the fluid incompressible, F(c E_c, c E_s, k_c / c, k_s / c) = c F. Of the
 base model's four derivatives three are therefore solved for and E_c's follows, to 3e-7 of the largest one
@@ -41,8 +39,9 @@ from bayeskin.model.directional import TangentAction
 from bayeskin.model.lagrangian import Evaluated, LagrangianModel, Stage, State, Step
 from bayeskin.model.newton import Equations
 from bayeskin.model.problem import Material, material
+from bayeskin.model.series import Drive, Memories, lost_slopes, memory_slopes, on_the_way, yielding
 from bayeskin.model.tissue import Bind, TissueLaw
-from bayeskin.types import Array, PadMotion
+from bayeskin.types import Array
 
 SCALING = {"E_c": 1.0, "E_s": 1.0, "k_c": -1.0, "k_s": -1.0}  # F = sum of these times dF/dlog, base model
 EPSILON = 1e-5  # of a parameter's change: truncation 1e-5, rounding 1e-9
@@ -65,7 +64,7 @@ class _Varied:
 
     material: Material
     laws: tuple[TissueLaw, ...]
-    motion: PadMotion
+    drive: Drive
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ class _Slopes:
     volume: Array
     pressure: Array
     memory: tuple[Array, ...]
-    lost: tuple[Array, ...]
+    lost: Memories
 
 
 _Evaluated = Union[Evaluated, "_Differences"]
@@ -104,8 +103,8 @@ class ForceGradients:
         self._varied = [_varied(model, theta, name, EPSILON * changes[name], laws) for name in self._solved]
         back = [_varied(model, theta, name, -EPSILON * changes[name], laws) for name in self._solved]
         self._rates = _rates([one.material for one in self._varied], [one.material for one in back])
-        self._in_series = any(law.series for law in model.laws)
-        self._reach_m = 2.0 * model.problem_scale(np.zeros(1))
+        self._in_series = bool(model.drive.elements)
+        self._reach_m = 2.0 * model.drive.largest_m
         self._start = self._at_rest(theta["p_init"], changes.get("p_init", 0.0))
         self._known: dict[int, _Slopes] = {}  # by identity of the state, which they keep alive
         self._phase: list[_Slopes] = [self._start]  # ends of this phase's stages
@@ -150,7 +149,8 @@ class ForceGradients:
         self._phase = [end]
 
     def _way_m(self, start: State, end: State) -> float:
-        return self._model.pad_displacement(end.time_s) - self._model.pad_displacement(start.time_s)
+        drive = self._model.drive
+        return drive.pads_m(end.time_s, 0.0) - drive.pads_m(start.time_s, 0.0)
 
     def _of(self, state: State) -> _Slopes:
         return self._known.get(id(state), self._start)
@@ -190,7 +190,7 @@ class ForceGradients:
     def _of_pads(self, time_s: float, before: _Slopes) -> Array:
         """Derivatives of the pads' displacement [m], with what was lost before; and their travel."""
         here = self._model.motion.at(time_s)
-        moved = np.array([(float(one.motion.at(time_s)) - here) / EPSILON for one in self._varied])
+        moved = np.array([(float(one.drive.motion.at(time_s)) - here) / EPSILON for one in self._varied])
         moved = moved - sum(lost[0] for lost in before.lost)
         return 0.5 * np.append(moved, [self._reach_m] * self._in_series)
 
@@ -239,15 +239,9 @@ class ForceGradients:
         """All derivatives once what lies in series with the skin has answered to the force's."""
         model, r = self._model, len(self._varied)
         travel, stiffness = x[:, r] / self._reach_m, float(force[r]) / self._reach_m
-        own, lost, more = force[:r], before.lost, np.zeros(r)
-        if stage.state.time_s > model.starts_s + 1e-9:
-            force_n = model.problem.reaction(stage.residual) - model.zero_n
-            held = sum(one[0] for one in before.lost)
-            yielding = _yielding(model, stage, force_n)
-            asked = sum(one[0] for one in self._lost(stage, before, force_n, own - self._zero_n))
-            more = (asked - held) / (1.0 + yielding * stiffness)
-            own = own - stiffness * more
-            lost = self._lost(stage, before, force_n, own - self._zero_n)
+        lost, more = before.lost, np.zeros(r)
+        if model.drive.yields(stage.state.time_s):
+            more, lost = self._lost(stage, before, force[:r], stiffness)
         columns = x.copy()
         columns[:, :r] -= np.outer(travel, more)
 
@@ -255,31 +249,28 @@ class ForceGradients:
             return np.asarray(values[..., :r] - values[..., r:] / self._reach_m * more)
 
         memory = tuple(less(one) for one in found.memory)
-        return _Slopes(stage.state, columns, less(found.volume), less(found.pressure), memory, lost), own
+        slopes = _Slopes(stage.state, columns, less(found.volume), less(found.pressure), memory, lost)
+        return slopes, force[:r] - stiffness * more
 
-    def _lost(self, stage: Stage, before: _Slopes, force_n: float, slopes_n: Array) -> tuple[Array, ...]:
-        """Derivatives (k, r) of each series element's memory, from the force's (r,)."""
-        found: list[list[Array]] = []
-        for r, one in enumerate(self._varied):
-            varied = [law.series for law in one.laws if law.series is not None]
-            found.append([
-                (element.follow(force_n + EPSILON * float(slopes_n[r]), stage.elapsed_s,
-                                old + EPSILON * slope[:, r]) - now) / EPSILON
-                for element, old, slope, now in zip(
-                    varied, stage.history.lost, before.lost, stage.state.lost, strict=True)
-            ])  # fmt: skip
-        return tuple(np.stack(columns, axis=1) for columns in zip(*found, strict=True))
+    def _lost(self, stage: Stage, before: _Slopes, force: Array, stiffness: float) -> tuple[Array, Memories]:
+        """Derivatives (r,) of what is lost beyond those before, and of the elements' memories (k, r).
 
+        force (r,), stiffness : the force's derivatives with the lost held, and by what is lost [N/m]
+        """
+        model, elapsed_s, old = self._model, stage.elapsed_s, stage.history.lost
+        force_n = model.problem.reaction(stage.residual) - model.zero_n
+        drives = [one.drive for one in self._varied]
 
-def _yielding(model: LagrangianModel, stage: Stage, force_n: float) -> float:
-    """How much more is lost in series for a newton more [m/N]."""
-    by_n = EPSILON * model.nominal_force()
-    elements = [law.series for law in model.laws if law.series is not None]
-    return sum(
-        float((element.follow(force_n + by_n, stage.elapsed_s, old)[0]
-               - element.follow(force_n, stage.elapsed_s, old)[0]) / by_n)
-        for element, old in zip(elements, stage.history.lost, strict=True)
-    )  # fmt: skip
+        def follow(slopes_n: Array) -> Memories:
+            return memory_slopes(
+                drives, EPSILON, force_n, slopes_n, elapsed_s, old, before.lost, stage.state.lost
+            )
+
+        softness = yielding(
+            lambda n: model.drive.follow(n, elapsed_s, old), force_n, EPSILON * model.nominal_force()
+        )
+        held_m = np.asarray(sum(memory[0] for memory in before.lost))
+        return lost_slopes(force - self._zero_n, held_m, softness, stiffness, follow)
 
 
 def _varied(
@@ -288,10 +279,10 @@ def _varied(
     """Raises InputError for a change that makes of a run another one."""
     values = {**theta, name: theta[name] + by}
     bound = tuple(sorted((bind(values, model.problem.sites) for bind in laws), key=lambda law: law.rank))
-    motion, starts_s = model.on_the_way(bound)
-    if starts_s != model.starts_s:
+    drive = on_the_way(model.protocol, bound)
+    if drive.starts_s != model.starts_s:
         raise InputError(f"gradients: {name}", theta[name], "pads that were opened before the test")
-    return _Varied(material(values, model.problem.mesh.cutis), bound, motion)
+    return _Varied(material(values, model.problem.mesh.cutis), bound, drive)
 
 
 def _rates(up: Sequence[Material], down: Sequence[Material]) -> tuple[Array, Array, Array]:

@@ -1,7 +1,7 @@
 """The total-Lagrangian model's equations: one implicit stage of a step in time, and what it needs.
 
 A stage is one solve of J - J* ... = h* div(...) with a history J*, p* and a length h* that `stepping` gives
-it. What lies in series with the skin is solved along: it loses a displacement that depends on the force.
+it. What lies in series with the skin is solved along (`series`).
 """
 
 from __future__ import annotations
@@ -16,14 +16,11 @@ import scipy.sparse as sp
 
 from bayeskin.model import assembly, poroelastic
 from bayeskin.model.newton import Equations, NewtonSolver
-from bayeskin.model.problem import Material, Problem
+from bayeskin.model.problem import Material, Problem, nominal_force
+from bayeskin.model.series import Drive, Memories, SeriesSolver, Solved, on_the_way
 from bayeskin.model.tissue import SurfaceTerm, TissueLaw
 from bayeskin.types import Array, PadMotion
 
-OPENED_S, REST_S = 1e3, 1e6  # pads that were opened before the test: by then, and when it starts
-SMALLEST_MOTION_M = 1e-4  # so that a protocol without motion has a scale too
-SERIES_TOLERANCE = 1e-5  # of the largest displacement, in what is lost before the skin
-MOST_TRIALS = 8  # of what is lost
 SOLVER_TOLERANCE = 1e-4  # of the largest displacement and pressure, before the last correction
 
 
@@ -39,7 +36,7 @@ class State:
     volume: Array
     pressure: Array
     memory: tuple[Array, ...] = ()
-    lost: tuple[Array, ...] = ()
+    lost: Memories = ()
 
 
 class Evaluated(NamedTuple):
@@ -81,27 +78,25 @@ class Step:
 
 @dataclass
 class LagrangianModel:
-    """The equations of one run: a problem, a material and a motion; knows nothing of step control.
+    """The equations of one run: a problem, a material and a protocol; knows nothing of step control.
 
-    motion : the protocol; then that of the pads, with what `laws` make of it
-    starts_s, zero_n : when the test starts and the force then; what lies in series with the skin acts from
-    then on, on the force beyond that
+    zero_n : the force when the test starts; what lies in series with the skin acts on the force beyond that
+    drive : what `laws` leave of the protocol on its way to the pads
     """
 
     problem: Problem
     material: Material
-    motion: PadMotion
+    protocol: PadMotion
     laws: tuple[TissueLaw, ...] = ()
     solver: NewtonSolver = field(default_factory=NewtonSolver)
     zero_n: float = 0.0
-    starts_s: float = field(init=False)
+    drive: Drive = field(init=False)
     full_residual: Array = field(init=False)
 
     def __post_init__(self) -> None:
         self.laws = tuple(sorted(self.laws, key=lambda law: law.rank))
-        self._series = [law.series for law in self.laws if law.series is not None]
-        self._protocol = self.motion
-        self.motion, self.starts_s = self.on_the_way(self.laws)
+        self.drive = on_the_way(self.protocol, self.laws)
+        self._series = SeriesSolver(self.drive)
         self.full_residual = np.zeros(self.problem.space.dofs)
         shape = self.problem.space.weight.shape
         self._chunks = assembly.chunks(shape)
@@ -109,33 +104,25 @@ class LagrangianModel:
         # the reaction's derivative (free,) by the free unknowns, at the last tangent
         self.pad_gradient = np.zeros(len(self.problem.pattern.free))
         self._measured = np.isin(self.problem.pattern.fixed, self.problem.measured_x).astype(float)
-        self._answer: tuple[float, Array] | None = None  # of force and unknowns to a metre that is lost
         self._travel: Array | None = None  # change of the unknowns a metre of the pads' travel
 
-    def on_the_way(self, laws: Sequence[TissueLaw]) -> tuple[PadMotion, float]:
-        """What laws leave of the protocol on its way to the pads, whatever the force; and when it starts.
+    @property
+    def motion(self) -> PadMotion:
+        """The protocol less what is lost whatever the force, from the opening of the pads on."""
+        return self.drive.motion
 
-        Pads that were opened before are slowly moved apart and left to rest.
-        """
-        motion, opening_m = self._protocol, sum(law.opening_m for law in laws)
-        if opening_m != 0.0:
-            time_s = np.concatenate([[0.0, OPENED_S], REST_S + motion.time_s])
-            motion = PadMotion(time_s, np.concatenate([[0.0, opening_m], opening_m + motion.displacement_m]))
-        for law in laws:
-            motion = law.series.moved(motion) if law.series else motion
-        return motion, REST_S if opening_m != 0.0 else 0.0
+    @property
+    def starts_s(self) -> float:
+        """When the test starts [s]."""
+        return self.drive.starts_s
 
     def remember_travel(self, past: list[State]) -> None:
         """Keeps how the unknowns went with the pads, to guess how they set out again."""
         if len(past) < 2:
             return
         way_m = self._pad_of(past[-1]) - self._pad_of(past[-2])
-        if abs(way_m) > 1e-3 * self.problem_scale(np.zeros(1)):
+        if abs(way_m) > 1e-3 * self.drive.largest_m:
             self._travel = (past[-1].x - past[-2].x) / way_m
-
-    def pad_displacement(self, time_s: float, lost_m: float = 0.0) -> float:
-        """Half the LVDT displacement [m] that is not lost before it reaches the pads."""
-        return 0.5 * (float(self.motion.at(time_s)) - lost_m)
 
     def _pad_of(self, state: State) -> float:
         """Where the pads were then [m]."""
@@ -147,8 +134,7 @@ class LagrangianModel:
         x[3 * space.n_nodes :] = p_init
         shape = space.weight.shape
         memory = tuple(np.zeros((space.weight.size, law.remembers)) for law in self.laws)
-        lost = tuple(np.zeros(element.remembers) for element in self._series)
-        return State(0.0, x, np.ones(shape), np.full(shape, float(p_init)), memory, lost)
+        return State(0.0, x, np.ones(shape), np.full(shape, float(p_init)), memory, self.drive.at_rest)
 
     def residual(
         self,
@@ -256,7 +242,7 @@ class LagrangianModel:
             lambda x: self.tangent(x, h, old, elapsed_s),
             weight[pattern.free] / SOLVER_TOLERANCE,
             scale[pattern.free],
-            np.array([np.log2(h), self.pad_displacement(old.time_s) / size_u]),
+            np.array([np.log2(h), self.drive.pads_m(old.time_s, 0.0) / size_u]),
         )
 
     @cached_property
@@ -268,19 +254,14 @@ class LagrangianModel:
         return np.concatenate([drag.ravel(), np.zeros(s.n_corners)])[self.problem.pattern.free]
 
     def nominal_force(self) -> float:
-        """Scale of the force [N]: both layers pulled from the plane x = 0, as wide as the load cell holds."""
-        young = self.material.mu * (3 * self.material.lam + 2 * self.material.mu)
-        young = young / (self.material.lam + self.material.mu)
-        cutis, lengths = self.problem.mesh.cutis, self.problem.lengths
-        tension = young[cutis].max() * lengths.cutis_m + young[~cutis].max() * lengths.subcutis_m
-        moved_m = self.problem_scale(np.zeros(1))
-        return float(tension * lengths.measured_width_m * moved_m / lengths.half_gauge_m)
+        """Scale of the force [N] over the protocol."""
+        return nominal_force(
+            self.material, self.problem.mesh.cutis, self.problem.lengths, self.drive.largest_m
+        )
 
     def problem_scale(self, u: Array) -> float:
         """Largest displacement of the protocol [m], against which a correction is small."""
-        return max(
-            0.5 * float(np.abs(self.motion.displacement_m).max()), float(np.abs(u).max()), SMALLEST_MOTION_M
-        )
+        return max(self.drive.largest_m, float(np.abs(u).max()))
 
     def solve_stage(
         self,
@@ -291,7 +272,7 @@ class LagrangianModel:
         jump: bool,
         fall: bool = False,
     ) -> Stage | None:
-        """One implicit equation for time_s; `jump`: the guess knows nothing of the pads' motion.
+        """Solves one implicit equation for time_s; `jump`: the guess knows nothing of the pads' motion.
 
         The last source's unknowns are where the pads have been. `fall`: solved for where the guess comes to
         rest, which may be far from it.
@@ -305,31 +286,39 @@ class LagrangianModel:
             last.memory,
             last.lost,
         )
-        equations = self.equations(length_s, old, time_s - old.time_s)
-        yields = bool(self._series) and time_s > self.starts_s + 1e-9
-        lost_m = _total(old.lost)
-        if yields and not (jump or fall):
-            lost_m = float(self.motion.at(time_s)) - 2.0 * float(guess[3 * self.problem.pads[0]])
-        pad_m = self.pad_displacement(time_s, lost_m)
-        if fall:
-            x = self.solver.relax(equations, self.problem.prescribe(guess, pad_m), self._drag)
-        else:
-            x = self._solve(equations, old, guess, pad_m, jump)
-        lost = old.lost
-        if yields:
-            x, lost = self._solve_in_series(equations, old, x, time_s, lost_m)
-        if x is None:
+        elapsed_s = time_s - old.time_s
+        equations = self.equations(length_s, old, elapsed_s)
+
+        def first(pad_m: float) -> Solved | None:
+            return self._solve(equations, old, guess, pad_m, jump, fall)
+
+        def again(near: Array, pad_m: float) -> Solved | None:
+            return self._solve(equations, old, near, pad_m)
+
+        known = self.drive.elements and not (jump or fall)
+        expected_m = float(guess[3 * self.problem.pads[0]]) if known else None
+        solved = self._series.solve(time_s, elapsed_s, old.lost, expected_m, first, again)
+        if solved is None:
             return None
+        (x, _), lost = solved
         state = State(time_s, x, self._found.volume, self._found.pressure, self._found.memory, lost)
-        return Stage(state, length_s, time_s - old.time_s, old, sources, self.full_residual)
+        return Stage(state, length_s, elapsed_s, old, sources, self.full_residual)
 
     def _solve(
-        self, equations: Equations, old: State, guess: Array, pad_m: float, jump: bool
-    ) -> Array | None:
-        """The unknowns with the pads at `pad_m`; None if they were not found."""
+        self,
+        equations: Equations,
+        old: State,
+        guess: Array,
+        pad_m: float,
+        jump: bool = False,
+        fall: bool = False,
+    ) -> Solved | None:
+        """The unknowns with the pads at `pad_m`, and the force beyond that at the start; None if none."""
         target = self.problem.prescribe(guess, pad_m)
         x = None
-        if not jump:
+        if fall:
+            x = self.solver.relax(equations, target, self._drag)
+        elif not jump:
             x = self.solver.solve(equations, target)
         elif self._travel is not None:
             ride = self._travel * (pad_m - self._pad_of(old))
@@ -337,44 +326,7 @@ class LagrangianModel:
         if x is None and jump:
             start = self.solver.respond(equations, guess, target, self.problem.pattern.fixed)
             x = None if start is None else self.solver.solve(equations, start)
-        return x
-
-    def _solve_in_series(
-        self, equations: Equations, old: State, x: Array | None, time_s: float, lost_m: float
-    ) -> tuple[Array | None, tuple[Array, ...]]:
-        """From the unknowns with `lost_m` lost: those where what is lost fits the force.
-
-        How unknowns and force answer to what is lost is remembered from the last two that were solved for.
-        """
-        allowed_m = SERIES_TOLERANCE * self.problem_scale(np.zeros(1))
-        before: tuple[float, float, Array] | None = None  # lost, force, unknowns
-        for _ in range(MOST_TRIALS):
-            if x is None:
-                break
-            force_n = self.problem.reaction(self.full_residual) - self.zero_n
-            lost = self._lost(force_n, time_s, old)
-            missing = _total(lost) - lost_m
-            if abs(missing) < allowed_m:
-                return x, lost
-            if before is not None and abs(lost_m - before[0]) > allowed_m:
-                more_m = lost_m - before[0]
-                self._answer = (force_n - before[1]) / more_m, (x - before[2]) / more_m
-            before = lost_m, force_n, x
-            stiffness, ride = self._answer or (0.0, np.zeros_like(x))
-            by_n = 1e-3 * abs(force_n) + 1e-9
-            yielding = (_total(self._lost(force_n + by_n, time_s, old)) - _total(lost)) / by_n
-            step_m = missing / max(1.0 - yielding * stiffness, 0.5)
-            lost_m += step_m
-            pad_m = self.pad_displacement(time_s, lost_m)
-            x = self._solve(equations, old, x + step_m * ride, pad_m, False)
-        return None, old.lost
-
-    def _lost(self, force_n: float, time_s: float, old: State) -> tuple[Array, ...]:
-        """The memory of each element in series under a force, of what it was."""
-        return tuple(
-            element.follow(force_n, time_s - old.time_s, before)
-            for element, before in zip(self._series, old.lost, strict=True)
-        )
+        return None if x is None else (x, self.problem.reaction(self.full_residual) - self.zero_n)
 
     def finish(self, stages: tuple[Stage, ...], mass: Array) -> Step:
         """The step made of `stages`, with the local error `mass` (e, q) of the fluid mass."""
@@ -395,11 +347,6 @@ class LagrangianModel:
             return np.inf
         before = self.problem.reaction(self.full_residual)
         return abs(self.problem.reaction(found.residual) - before)
-
-
-def _total(lost: tuple[Array, ...]) -> float:
-    """Displacement [m] that all elements in series lose."""
-    return sum(float(memory[0]) for memory in lost)
 
 
 def _surfaces(laws: Sequence[TissueLaw]) -> list[SurfaceTerm]:

@@ -145,6 +145,17 @@ class Problem:
         return float(2.0 * residual[self.measured_x].sum())
 
 
+def nominal_force(solid: Material, cutis: np.ndarray, lengths: Geometry, moved_m: float) -> float:
+    """Returns a scale of the force [N]: both layers pulled from x = 0, as wide as the load cell holds.
+
+    cutis (e,) : which cells or points of the solid lie in the cutis; moved_m : how far a pad moves
+    """
+    young = solid.mu * (3 * solid.lam + 2 * solid.mu)
+    young = young / (solid.lam + solid.mu)
+    tension = young[cutis].max() * lengths.cutis_m + young[~cutis].max() * lengths.subcutis_m
+    return float(tension * lengths.measured_width_m * moved_m / lengths.half_gauge_m)
+
+
 def build_problem(mesh: SkinMesh) -> Problem:
     """Space, prescribed dofs and sparsity of a mesh (design: pads move along x, bottom u_z = 0)."""
     space = taylor_hood(mesh)

@@ -65,6 +65,8 @@ def take(run: ReducedEquations, shadow: Shadow, p_init: float, settings: Cubatur
     forces, count = [0.0], [0]
 
     def on_step(step: Step) -> None:
+        if abs(step.state.time_s - run.starts_s) < 1e-6:
+            run.zero_n = step.force_n
         followed = None
         for stage in step.stages:
             followed = shadow.follow(stage, max(stage.state.time_s - run.starts_s, 0.0))

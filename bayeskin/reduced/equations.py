@@ -10,7 +10,8 @@ import scipy.sparse as sp
 
 from bayeskin.geometry import Geometry
 from bayeskin.model.lagrangian import Stage, State, Step
-from bayeskin.model.problem import Material, Problem, Sites, material
+from bayeskin.model.problem import Material, Problem, Sites, material, nominal_force
+from bayeskin.model.series import SeriesSolver, Solved, on_the_way
 from bayeskin.model.tissue import Bind, SurfaceTerm, TissueLaw
 from bayeskin.reduced import kernels
 from bayeskin.reduced.calls import address
@@ -18,6 +19,7 @@ from bayeskin.reduced.operators import LinearParts, PointFields
 from bayeskin.types import Array, PadMotion
 
 SOLVER_TOLERANCE = 1e-5  # of the amplitude of displacements, and of the nominal force
+MOST_LONGER = 4.0  # times, a stage than that which a tangent was made for
 SurfaceUnit = Callable[[Problem], sp.csr_matrix]
 
 
@@ -124,27 +126,43 @@ def packed(laws: Sequence[TissueLaw], points: int) -> kernels.Laws:
 
 
 class Tangent:
-    """The inverse of the last tangent, with the force's row and the pads' column; corrected as solves go."""
+    """The inverse of the last tangent, with the force's row and the pads' column; corrected as solves go.
+
+    length_s : of the stage that it was made for, or None where there is none yet
+    """
 
     def __init__(self, size: int) -> None:
-        self.inverse, self.force_row, self.by_pads = (
-            np.zeros((size, size)),
-            np.zeros(size),
-            np.zeros(size + 1),
-        )
-        self.known = False
+        self.inverse, self.force_row = np.zeros((size, size)), np.zeros(size)
+        self.by_pads = np.zeros(size + 1)
+        self.length_s: float | None = None
+
+    def serves(self, length_s: float) -> bool:
+        """Says whether it tells how far a stage of some length is from its solution.
+
+        A far longer stage drains what a short one does not, so its corrections of a short one are too small.
+        """
+        made_for_s = self.length_s
+        return made_for_s is not None and 1.0 / MOST_LONGER <= length_s / made_for_s <= MOST_LONGER
 
 
 class ReducedEquations:
-    """The equations of one run: a reduced space, bound laws and a protocol; knows nothing of step control.
+    """The equations of one run: a reduced space, parameters, mechanisms and a protocol; no step control.
 
-    nominal_n : scale of the force [N]; motion, starts_s : of the pads, and when the test starts
+    theta : values of all parameters; binds : of the mechanisms' laws
+    zero_n : the force when the test starts; what lies in series with the skin acts on the force beyond that
     """
 
     def __init__(
-        self, space: ReducedSpace, run: Bound, motion: PadMotion, nominal_n: float, starts_s: float = 0.0
+        self,
+        space: ReducedSpace,
+        theta: Mapping[str, float],
+        binds: Sequence[Bind],
+        protocol: PadMotion,
     ) -> None:
-        self.space, self.run, self.motion, self.starts_s = space, run, motion, starts_s
+        self.space, self.run = space, bound(space, theta, binds)
+        run = self.run
+        self.drive = on_the_way(protocol, run.laws)
+        self._series = SeriesSolver(self.drive)
         k, m = space.modes
         units = exact_units(space, run.laws)
         at, solid = space.at, run.solid
@@ -158,7 +176,7 @@ class ReducedEquations:
         self.tangent = Tangent(k + m - 2)
         self.spent = np.zeros(3, np.int64)  # iterations, residuals, tangents
         self.zero_n = 0.0
-        self._nominal_n = nominal_n
+        self._nominal_n = nominal_force(solid, at.cutis, space.lengths, self.drive.largest_m)
         self._travel: Array | None = None
         self.room: kernels.Room | None = None
         self.past: kernels.History | None = None
@@ -170,13 +188,18 @@ class ReducedEquations:
         return self
 
     def nominal_force(self) -> float:
-        """Scale of the force [N]."""
+        """Scale of the force [N] over the protocol."""
         return self._nominal_n
 
     @property
-    def largest_m(self) -> float:
-        """The largest displacement of a pad [m]."""
-        return max(0.5 * float(np.abs(self.motion.displacement_m).max()), 1e-4)
+    def motion(self) -> PadMotion:
+        """The protocol less what is lost whatever the force, from the opening of the pads on."""
+        return self.drive.motion
+
+    @property
+    def starts_s(self) -> float:
+        """When the test starts [s]."""
+        return self.drive.starts_s
 
     def initial_state(self, p_init: float) -> State:
         """The skin at rest under a pressure [Pa]."""
@@ -185,14 +208,14 @@ class ReducedEquations:
         x = np.zeros(k + m)
         x[k] = p_init / self.space.at.pressure[0, 0]
         memory = np.zeros(int(self.packed.memory_at[-1]))
-        return State(0.0, x, np.ones(n), np.full(n, float(p_init)), (memory,))
+        return State(0.0, x, np.ones(n), np.full(n, float(p_init)), (memory,), self.drive.at_rest)
 
     def remember_travel(self, past: list[State]) -> None:
         """Keeps how the unknowns went with the pads, to guess how they set out again."""
         if len(past) < 2:
             return
         way_m = past[-1].x[0] - past[-2].x[0]
-        if abs(way_m) > 1e-3 * self.largest_m:
+        if abs(way_m) > 1e-3 * self.drive.largest_m:
             self._travel = (past[-1].x - past[-2].x) / way_m
 
     def solve_stage(
@@ -204,7 +227,7 @@ class ReducedEquations:
         jump: bool,
         fall: bool = False,
     ) -> Stage | None:
-        """One implicit equation for time_s, as `LagrangianModel.solve_stage`; it follows no fall."""
+        """Solves one implicit equation for time_s, as `LagrangianModel.solve_stage`; it follows no fall."""
         if fall:
             return None
         last, k = sources[-1][1], self.space.modes[0]
@@ -214,17 +237,25 @@ class ReducedEquations:
             np.asarray(sum(w * s.x[:k] for w, s in sources)), length_s, time_s - last.time_s,
             max(time_s - self.starts_s, 0.0),
         )  # fmt: skip
-        pads_m = 0.5 * float(self.motion.at(time_s))
-        x = self._set_out(past, last, pads_m) if jump or not self.tangent.known else guess.copy()
-        x[0], x[1] = pads_m, 0.0
-        force_n = self._solve(past, x)
-        if force_n is None:
+        if not self.tangent.serves(length_s):
+            self._renew(past, last.x)
+
+        def first(pads_m: float) -> Solved | None:
+            return self._solve(past, self._set_out(past, last, pads_m) if jump else guess, pads_m)
+
+        def again(near: Array, pads_m: float) -> Solved | None:
+            return self._solve(past, near, pads_m)
+
+        expected_m = None if jump else float(guess[0])
+        solved = self._series.solve(time_s, past.elapsed_s, last.lost, expected_m, first, again)
+        if solved is None:
             return None
-        room = self.room
+        ((x, force_n), lost), room = solved, self.room
         assert room is not None
-        state = State(time_s, x, room.volume, room.at_pressure, (room.memory,))
-        history = State(last.time_s, last.x, past.volume, past.pressure, last.memory)
-        return Stage(state, length_s, past.elapsed_s, history, sources, np.array([0.0, 0.5 * force_n]))
+        state = State(time_s, x, room.volume, room.at_pressure, (room.memory,), lost)
+        history = State(last.time_s, last.x, past.volume, past.pressure, last.memory, last.lost)
+        residual = np.array([0.0, 0.5 * (force_n + self.zero_n)])
+        return Stage(state, length_s, past.elapsed_s, history, sources, residual)
 
     def make_room(self) -> kernels.Room:
         n = len(self.space.at.weight)
@@ -234,31 +265,38 @@ class ReducedEquations:
         )  # fmt: skip
 
     def _set_out(self, past: kernels.History, last: State, pads_m: float) -> Array:
-        """A guess where the pads set out from the last state: as they did before, or by a new tangent."""
+        """A guess where the pads set out from the last state: as they did before, or by the tangent."""
         way_m = pads_m - last.x[0]
-        if self._travel is not None and self.tangent.known:
+        if self._travel is not None:
             return np.asarray(last.x + self._travel * way_m)
-        t, room = self.tangent, self.make_room()
-        kernels.renew(self.system, self.packed, past, last.x, room, t.inverse, t.force_row, t.by_pads)
-        t.known = True
-        self.spent += (0, 1, 1)
-        right = np.empty(len(last.x))
-        kernels.residual(self.system, self.packed, past, last.x, room, right)
-        x = last.x.copy()
-        x[2:] -= t.inverse @ (right[2:] + t.by_pads[:-1] * way_m)
+        right, x = np.empty(len(last.x)), last.x.copy()
+        kernels.residual(self.system, self.packed, past, x, self.make_room(), right)
+        self.spent[1] += 1
+        x[2:] -= self.tangent.inverse @ (right[2:] + self.tangent.by_pads[:-1] * way_m)
         return x
 
-    def _solve(self, past: kernels.History, x: Array) -> float | None:
-        """Solves for x in place; returns the force [N], or None where no solution was found."""
-        t, room = self.tangent, self.make_room()
+    def _renew(self, past: kernels.History, x: Array) -> None:
+        """Makes the tangent anew for a stage, at the unknowns x."""
+        t = self.tangent
+        kernels.renew(self.system, self.packed, past, x, self.make_room(), t.inverse, t.force_row, t.by_pads)
+        t.length_s = past.length_s
+        self.spent[2] += 1
+
+    def _solve(self, past: kernels.History, guess: Array, pads_m: float) -> Solved | None:
+        """The unknowns with the pads at `pads_m`, and the force beyond that at the start; None if none."""
+        t, room, x, tangents = self.tangent, self.make_room(), guess.copy(), self.spent[2]
+        x[0], x[1] = pads_m, 0.0
         status, force_n = kernels.solve(
             self.system, self.packed, past, x, SOLVER_TOLERANCE, self._nominal_n, room, t.inverse,
             t.force_row, t.by_pads, self.spent,
         )  # fmt: skip
         if status != kernels.CONVERGED:
+            t.length_s = None
             return None
+        if self.spent[2] > tangents:
+            t.length_s = past.length_s
         self.room, self.past = room, past
-        return float(force_n)
+        return x, float(force_n) - self.zero_n
 
     def finish(self, stages: tuple[Stage, ...], mass: Array) -> Step:
         """The step made of `stages`, with the local error that an error (n,) of the fluid mass makes."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from bayeskin.model.lagrangian import Stage, State
+from bayeskin.model.tissue import Bind
 from bayeskin.reduced import kernels
-from bayeskin.reduced.equations import Bound, ReducedEquations, ReducedSpace
+from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
 from bayeskin.types import Array, PadMotion
 
 REMEMBERED = 8  # states whose followers are kept; a step asks for three at most
@@ -28,11 +29,10 @@ class Shadow:
     """Follows the stages of a reduced run on all points, at the unknowns that the run solved for."""
 
     def __init__(
-        self, whole: ReducedSpace, run: Bound, motion: PadMotion, theta: Mapping[str, float]
+        self, whole: ReducedSpace, theta: Mapping[str, float], binds: Sequence[Bind], protocol: PadMotion
     ) -> None:
-        self.equations = ReducedEquations(whole, run, motion, nominal_n=1.0)
-        start = self.equations.initial_state(theta["p_init"])
-        self._start = start
+        self.equations = ReducedEquations(whole, theta, binds, protocol)
+        self._start = self.equations.initial_state(theta["p_init"])
         self._known: dict[int, tuple[State, State]] = {}  # by identity of the run's state, kept alive
 
     def follow(self, stage: Stage, time_s: float) -> Followed | None:

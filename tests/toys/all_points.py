@@ -1,0 +1,57 @@
+"""A reduced model that leaves no point out, on the modes of one full run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.sparse as sp
+
+from bayeskin.mechanisms import catalogue, laws
+from bayeskin.model.lagrangian import LagrangianModel
+from bayeskin.model.problem import Problem, material
+from bayeskin.model.tissue import Bind
+from bayeskin.reduced.basis import Inner, pod
+from bayeskin.reduced.cases import Case
+from bayeskin.reduced.equations import ReducedSpace, SurfaceUnit
+from bayeskin.reduced.library import Modes, scaled_basis
+from bayeskin.reduced.operators import Basis, point_fields
+from bayeskin.reduced.training import training_run
+from bayeskin.types import Array
+
+KEPT = 1e-6  # modes with singular values below this share of the largest are left out
+
+
+def binds_of(names: Sequence[str]) -> list[Bind]:
+    """The laws of mechanisms by their names."""
+    return laws([catalogue()[name] for name in names])
+
+
+def full_model(problem: Problem, case: Case) -> LagrangianModel:
+    """The full model of a case."""
+    bound = tuple(bind(case.theta, problem.sites) for bind in binds_of(case.mechanisms))
+    return LagrangianModel(problem, material(case.theta, problem.mesh.cutis), case.motion, bound)
+
+
+def snapshot_basis(problem: Problem, inner: Inner, case: Case) -> Basis:
+    """The modes of one full run: its states and adjoint solutions."""
+    run = training_run(problem, inner, case, binds_of(case.mechanisms))
+    assert run.message == ""
+    u, p = _modes(run.displacement, inner.displacement), _modes(run.pressure, inner.pressure)
+    return scaled_basis(Modes(u, p), inner)
+
+
+def _modes(rows: Array, inner: sp.csr_matrix) -> Array:
+    values, modes = pod(rows.astype(float), inner)
+    return modes[values > KEPT * values[0]]
+
+
+def all_points(problem: Problem, basis: Basis) -> ReducedSpace:
+    """A reduced space of all quadrature points of a mesh, which leave nothing to exact parts."""
+    at = point_fields(problem, basis)
+    nodal = sp.block_diag([basis.fields, basis.pressure])
+
+    def surfaces(unit: SurfaceUnit) -> Array:
+        return np.asarray((nodal @ problem.linear(unit).matrix @ nodal.T).todense())
+
+    return ReducedSpace(problem.lengths, at, at.linear - at.linear, surfaces)
