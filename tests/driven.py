@@ -11,6 +11,7 @@ import skfem
 from bayeskin.model.lagrangian import LagrangianModel, State
 from bayeskin.model.mesh import SkinMesh, roll
 from bayeskin.model.problem import Material, Problem
+from bayeskin.model.series import Drive, SeriesSolver
 from bayeskin.model.space import TaylorHood, sparsity, taylor_hood
 from bayeskin.model.stepping import advance
 from bayeskin.types import Array, PadMotion
@@ -25,10 +26,17 @@ class DrivenProblem(Problem):
 
     values: Callable[[float], Array] | None = None
 
-    def prescribe(self, x, pad_displacement_m):
+    def prescribe(self, x, time_s):
         out = x.copy()
-        out[self.pattern.fixed] = self.values(pad_displacement_m)  # a DrivenModel passes the time here
+        out[self.pattern.fixed] = self.values(time_s)
         return out
+
+
+class Clock(Drive):
+    """A drive that tells the time in place of the pads' displacement."""
+
+    def pads_m(self, time_s, lost_m):
+        return time_s
 
 
 class TightModel(LagrangianModel):
@@ -47,9 +55,8 @@ class DrivenModel(TightModel):
     def __init__(self, problem, material, load: Load | None = None):
         super().__init__(problem, material, STILL)
         self.load, self.time_s = load, 0.0
-
-    def pad_displacement(self, time_s, lost_m=0.0):
-        return time_s
+        self.drive = Clock(STILL, 0.0, ())
+        self._series = SeriesSolver(self.drive)
 
     def _pad_of(self, state):
         return state.time_s

@@ -6,13 +6,14 @@ from itertools import chain
 
 import numpy as np
 import pytest
-from toys.all_points import all_points, binds_of, full_model, snapshot_basis
 from toys.same_steps import on_steps_of, run
+from toys.snapshots import binds_of, full_model, snapshot_basis
 
 from bayeskin.geometry import Geometry
 from bayeskin.model.mesh import brick_mesh
 from bayeskin.model.problem import build_problem
 from bayeskin.reduced.basis import inner_products
+from bayeskin.reduced.build import whole_space
 from bayeskin.reduced.cases import Case
 from bayeskin.reduced.cubature import CubatureSettings, take
 from bayeskin.reduced.equations import ReducedEquations
@@ -55,7 +56,7 @@ def test_the_force_is_the_full_models_on_the_same_steps(problem, inner, names):
     full = full_model(problem, case)
     steps = run(full, case.theta["p_init"])
     full.solver.release()
-    space = all_points(problem, snapshot_basis(problem, inner, case))
+    space = whole_space(problem, snapshot_basis(problem, inner, case))
     reduced = ReducedEquations(space, case.theta, binds_of(names), MOTION)
     forces_n = np.array([step.force_n for step in steps])
     found_n = on_steps_of(reduced, case.theta["p_init"], steps)
@@ -68,7 +69,7 @@ def test_a_run_for_a_cubature_zeroes_the_load_cell_where_the_test_starts(problem
     """All points as the chosen ones miss nothing, and pads that were opened pull before the test."""
     case = case_of(*TOGETHER)
     p_init, binds = case.theta["p_init"], binds_of(TOGETHER)
-    space = all_points(problem, snapshot_basis(problem, inner, case))
+    space = whole_space(problem, snapshot_basis(problem, inner, case))
     reduced = ReducedEquations(space, case.theta, binds, MOTION)
     shadow, settings = Shadow(space, case.theta, binds, MOTION), CubatureSettings()
     taken = take(reduced, shadow, p_init, settings, np.random.default_rng(0), tolerance=1e-3)

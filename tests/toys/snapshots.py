@@ -1,10 +1,9 @@
-"""A reduced model that leaves no point out, on the modes of one full run."""
+"""Modes of one full run, for a reduced model that holds them all."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import scipy.sparse as sp
 
 from bayeskin.mechanisms import catalogue, laws
@@ -13,9 +12,8 @@ from bayeskin.model.problem import Problem, material
 from bayeskin.model.tissue import Bind
 from bayeskin.reduced.basis import Inner, pod
 from bayeskin.reduced.cases import Case
-from bayeskin.reduced.equations import ReducedSpace, SurfaceUnit
 from bayeskin.reduced.library import Modes, scaled_basis
-from bayeskin.reduced.operators import Basis, point_fields
+from bayeskin.reduced.operators import Basis
 from bayeskin.reduced.training import training_run
 from bayeskin.types import Array
 
@@ -44,14 +42,3 @@ def snapshot_basis(problem: Problem, inner: Inner, case: Case) -> Basis:
 def _modes(rows: Array, inner: sp.csr_matrix) -> Array:
     values, modes = pod(rows.astype(float), inner)
     return modes[values > KEPT * values[0]]
-
-
-def all_points(problem: Problem, basis: Basis) -> ReducedSpace:
-    """A reduced space of all quadrature points of a mesh, which leave nothing to exact parts."""
-    at = point_fields(problem, basis)
-    nodal = sp.block_diag([basis.fields, basis.pressure])
-
-    def surfaces(unit: SurfaceUnit) -> Array:
-        return np.asarray((nodal @ problem.linear(unit).matrix @ nodal.T).todense())
-
-    return ReducedSpace(problem.lengths, at, at.linear - at.linear, surfaces)
