@@ -1,7 +1,7 @@
-"""Where a reduced model can be trusted: the region that it was trained for, and skin that is not near folding.
+"""Where a reduced model can be trusted: in the region that it was trained for, away from folds of the skin.
 
-Relaxed skin that is pushed together folds: the smallest eigenvalue of its stiffness falls to zero. Near there a
-small error of the modes is a large one of the force.
+Relaxed skin that is pushed together folds: the smallest eigenvalue of its stiffness falls to zero. Near there
+a small error of the modes is a large one of the force.
 """
 
 from __future__ import annotations
