@@ -31,6 +31,7 @@ from toy import EDGES_S, MOTION, SPACE, toy_bin_means, toy_force
 
 from bayeskin import probe, storage
 from bayeskin.config import load_config
+from bayeskin.device import load_device
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.inference import chains, draws_of, inference_data, load_inference_data, save_inference_data
@@ -88,6 +89,7 @@ def as_workbook() -> bytes:
 
 
 FLAT = Geometry(arm_radius_m=None)
+DEVICE = b"[device]\nguard_mm = { gap = 1, width = 8 }\n[tissue]\ncutis_mm = { mean = 2, sd = 0.2 }\n"
 
 
 def as_mesh() -> bytes:
@@ -160,6 +162,7 @@ READERS: dict[str, tuple[Callable[[Path], object], Callable[[Path], bytes], int]
     "a.txt": (read_and_segment, lambda tmp: as_text(" "), 1),
     "a.xlsx": (read_and_segment, lambda tmp: as_workbook(), 1),
     "a.toml": (load_config, lambda tmp: (ROOT / "runs/demo.toml").read_bytes(), 10),
+    "device.toml": (load_device, lambda tmp: DEVICE, 10),
     "a.msh": (lambda path: read_gmsh(path, FLAT), lambda tmp: as_mesh(), 4),
     "a.journal": (read_journal, as_journal, 10),
     "stage.json": (read_stage, lambda tmp: json.dumps(STAGE).encode(), 10),

@@ -79,7 +79,7 @@ def test_the_force_is_near_the_full_models_on_a_protocol_never_seen(model, names
     assert found.stats["inside"] == 1.0
     assert rms(found, right) < 6e-3
     estimate = found.stats["error_estimate_n"] / found.stats["peak_force_n"]
-    assert rms(found, right) / 6.0 < estimate < 2e-2
+    assert rms(found, right) / 2.0 < estimate < 5e-2
 
 
 def test_the_estimate_sees_modes_that_are_missing(model) -> None:
@@ -91,7 +91,7 @@ def test_the_estimate_sees_modes_that_are_missing(model) -> None:
     whole, few = (found.stats["error_estimate_n"] for found in errors)
     missed = rms(errors[1], full(THETA)) * errors[1].stats["peak_force_n"]
     assert few > 3.0 * whole
-    assert few > missed / 4.0
+    assert few > missed / 2.0
 
 
 @pytest.mark.parametrize(
@@ -125,10 +125,10 @@ def test_derivatives_are_those_of_two_runs(model, names, changes) -> None:
     for name, change, column in zip(changes, changes.values(), np.array(slopes.force_n).T, strict=True):
         ends = []
         for sign in (1.0, -1.0):
-            moved = theta | {name: theta[name] + 0.003 * sign * change}
+            moved = theta | {name: theta[name] + 0.01 * sign * change}
             ends.append(on_steps_of(ReducedEquations(space, moved, binds, MOTION), moved["p_init"], steps))
-        difference = (ends[0] - ends[1]) / 0.006
-        allowed = 0.01 * np.abs(difference).max() + 1e-5 * np.abs(ends[0]).max()
+        difference = (ends[0] - ends[1]) / 0.02
+        allowed = 0.01 * np.abs(difference).max() + 1e-4 * np.abs(ends[0]).max()
         np.testing.assert_allclose(column, difference, rtol=0, atol=allowed, err_msg=name)
 
 

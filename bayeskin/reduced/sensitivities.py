@@ -3,7 +3,7 @@
 Differentiating a solved stage R(x, history; theta) = 0 gives K dx = -dR/dtheta - dR/dhistory dhistory with
 the stage's own tangent K, whose inverse is at hand. The right-hand side is found by differences of what the
 laws answer at the points, one parameter a step further, at fixed kinematics; once dx is known, a second
-difference tells how J and the laws' memories change (`kernels.differentiate`). Steps in time are held.
+difference tells how J and the laws' memories change (`slopes.differentiate`). Steps in time are held.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bayeskin.errors import InputError
 from bayeskin.model.lagrangian import Stage, State, Step
 from bayeskin.model.series import Memories, lost_slopes, memory_slopes, on_the_way, yielding
 from bayeskin.model.tissue import Bind
-from bayeskin.reduced import kernels
+from bayeskin.reduced import kernels, slopes
 from bayeskin.reduced.equations import Bound, ReducedEquations, bound
 from bayeskin.types import Array, PadMotion
 
@@ -30,7 +30,7 @@ class _Known:
     """Derivatives of a state, with those (k, r) of what is lost in series."""
 
     state: State
-    slopes: kernels.Slopes
+    slopes: slopes.Slopes
     lost: Memories
 
 
@@ -71,7 +71,7 @@ class ReducedGradients:
         pressure = np.zeros((r, n)) + by_p_init[:, None]
         memory = np.zeros((r, len(state.memory[0])))
         lost = tuple(np.zeros((*before.shape, len(self.names))) for before in state.lost)
-        return _Known(state, kernels.Slopes(x, np.zeros((r, n)), pressure, memory), lost)
+        return _Known(state, slopes.Slopes(x, np.zeros((r, n)), pressure, memory), lost)
 
     def follow(self, step: Step) -> None:
         """Differentiates an accepted step; appends the force's derivatives [N], (r,), to `force_n`."""
@@ -90,7 +90,7 @@ class ReducedGradients:
         eq, k = self._equations, self._equations.space.modes[0]
         sources = [(weight, self._of(state)) for weight, state in stage.sources]
         last = sources[-1][1]
-        before = kernels.Slopes(
+        before = slopes.Slopes(
             np.asarray(sum(w * s.slopes.x[:, :k] for w, s in sources)),
             np.asarray(sum(w * s.slopes.volume for w, s in sources)),
             np.asarray(sum(w * s.slopes.pressure for w, s in sources)), last.slopes.memory,
@@ -98,8 +98,8 @@ class ReducedGradients:
         past, room = eq.past_of(stage), eq.make_room()
         x, t = stage.state.x.copy(), eq.tangent
         kernels.residual(eq.system, eq.packed, past, x, room, np.empty(len(x)))
-        out = kernels.Slopes(*(np.empty_like(values) for values in last.slopes))
-        force = kernels.differentiate(
+        out = slopes.Slopes(*(np.empty_like(values) for values in last.slopes))
+        force = slopes.differentiate(
             eq.system, eq.packed, past, x, room, self._varied, before,
             self._pads_by(stage.state.time_s, last.lost), t.inverse, t.force_row, t.by_pads, out,
         )  # fmt: skip
@@ -117,7 +117,7 @@ class ReducedGradients:
         return 0.5 * np.append(moved, [2.0 * self._reach_m] * self._in_series)
 
     def _less_lost(
-        self, stage: Stage, held: Memories, out: kernels.Slopes, force: Array
+        self, stage: Stage, held: Memories, out: slopes.Slopes, force: Array
     ) -> tuple[_Known, Array]:
         """All derivatives once what lies in series with the skin has answered to the force's."""
         eq, r = self._equations, len(self.names)
@@ -144,10 +144,10 @@ class ReducedGradients:
         return _Known(stage.state, out, lost), own
 
 
-def _varied(equations: ReducedEquations, runs: Sequence[Bound]) -> kernels.Varied:
+def _varied(equations: ReducedEquations, runs: Sequence[Bound]) -> slopes.Varied:
     """Constants of runs that are each a step further in one parameter, as the kernels are given them."""
     own, (solid_units, flow_units) = equations.run, equations.units
-    return kernels.Varied(
+    return slopes.Varied(
         np.array([run.solid.mu for run in runs]), np.array([run.solid.lam for run in runs]),
         np.array([run.solid.mobility for run in runs]),
         np.array([run.par for run in runs]), np.array([run.data for run in runs]), solid_units, flow_units,

@@ -17,7 +17,7 @@ from bayeskin.types import ParameterSpace
 
 NAMES = ("preconditioning", "solid-viscoelasticity")
 SETTINGS = BuildSettings(
-    runs=9, base=(36, 30), each=(14, 8), base_points=220, set_points=280, base_shadows=8, set_shadows=2
+    runs=7, base=(34, 26), each=(14, 8), base_points=200, set_points=260, base_shadows=6, set_shadows=1
 )
 
 
