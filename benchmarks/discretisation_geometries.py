@@ -5,7 +5,7 @@ healthy-skin recording's: loading, a hold of some ten seconds, unloading. The re
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/discretisation_geometries.py
 
-Takes some five minutes of one core. Writes the table between the markers of docs/discretisation.md.
+Takes some ten minutes of one core. Writes the table between the markers of docs/discretisation.md.
 """
 
 from __future__ import annotations

@@ -186,8 +186,8 @@ def timed(model: ReducedModel, skin: Skin) -> str:
         spent.append(time.process_time() - started)
     reduced, slopes, full = spent
     return (
-        f"{', '.join(skin.mechanisms) or 'base model'}: {reduced:.2f} CPU s, {slopes:.2f} with {len(changes)} "
-        f"derivatives; the full model {full:.1f}, {full / reduced:.0f} times as much."
+        f"{', '.join(skin.mechanisms) or 'base model'}: {reduced:.2f} CPU s, {slopes:.2f} with "
+        f"{len(changes)} derivatives; the full model {full:.1f}, {full / reduced:.0f} times as much."
     )
 
 

@@ -13,6 +13,7 @@ import openpyxl
 import pytest
 from skin_test import supplement
 
+from bayeskin.geometry import Geometry
 from bayeskin.model import ModelSpec, article, simulate
 from bayeskin.model.article import ArticleModel
 from bayeskin.model.gmsh import read_gmsh
@@ -131,7 +132,7 @@ class ScriptedForces:
         self.forces = iter(forces)
         space = SimpleNamespace(dofs=4, n_nodes=1)
         mesh = SimpleNamespace(geometry=SimpleNamespace(p=np.zeros((3, 1))))
-        self.problem = SimpleNamespace(space=space, mesh=mesh)
+        self.problem = SimpleNamespace(space=space, mesh=mesh, lengths=Geometry())
         self.material = SimpleNamespace(mu=np.array([1e5]))
 
     def step(self, x, corners, dt, pad, guess):

@@ -46,7 +46,7 @@ class FullModel:
 
 @dataclass(frozen=True)
 class ReducedOrFull:
-    """Runs the reduced model of a file in the region that it was trained for, and the full model elsewhere.
+    """Runs the reduced model of a file, and the full model where that fails or was not trained.
 
     The message of a run that the full model made says why.
     """
@@ -61,7 +61,7 @@ class ReducedOrFull:
     def __call__(self, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
         model = load_reduced(self.file)
         run = simulate_reduced(model, motion, theta, geometry=self.full.spec.geometry)
-        if not run.stats["inside"]:
+        if run.status != "ok":
             full = self.full(motion, theta)
             run = full if full.message else replace(full, message=f"run by the full model: {run.message}")
         return replace(run, model_hash=self.hash)

@@ -317,6 +317,15 @@ class ReducedEquations:
         error_n = abs(float(t.force_row @ (t.inverse @ right)))
         return Step(stages[-1].state, 2.0 * float(stages[-1].residual[1]), error_n, False, stages)
 
+    def solid_stiffness(self) -> Array:
+        """The tangent of the displacement modes (u, u) at the last solved stage, its symmetric part."""
+        assert self.room is not None
+        assert self.past is not None
+        k = self.space.modes[0]
+        whole = kernels.tangent(self.system, self.packed, self.past, self.room)
+        solid = whole[2:k, 2:k]
+        return np.asarray(0.5 * (solid + solid.T))
+
     def dual(self) -> Array:
         """The adjoint of half the force (k + m,) by the last tangent."""
         out = np.zeros(sum(self.space.modes))

@@ -217,8 +217,8 @@ def _project(system, start, end, room, out):
 
 
 @compiled
-def tangent(system, laws, past, x, room):
-    """Derivative of the residual by x, (k + m, k + m); F, p and grad p in the room are those at x."""
+def tangent(system, laws, past, room):
+    """Derivative of the residual by the unknowns, (k + m, k + m), whose F, p and grad p are in the room."""
     n = system.weight.shape[0]
     stress_f, stress_p, content_f = np.empty((n, 9, 9)), np.empty((n, 9)), np.empty((n, 9))
     content_p, flux_f, flux_g = np.empty(n), np.empty((n, 3, 9)), np.empty((n, 3, 3))
@@ -277,7 +277,7 @@ def renew(system, laws, past, x, room, inverse, force_row, by_pads):
     The rows of the pads' and of the dual field are no equations of the solve: the free ones follow them.
     """
     _kinematics(system, x, 0, system.weight.shape[0], room)
-    whole = tangent(system, laws, past, x, room)
+    whole = tangent(system, laws, past, room)
     free = whole[2:, 2:].copy()
     scale = np.empty(free.shape[0])
     for i in range(len(scale)):

@@ -1,16 +1,24 @@
-"""Where a reduced model can be trusted: the region that it was trained for, and signs of an unstable skin."""
+"""Where a reduced model can be trusted: in the region that it was trained for, away from folds of the skin.
+
+Relaxed skin that is pushed together folds: the smallest eigenvalue of its stiffness falls to zero. Near there
+a small error of the modes is a large one of the force.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import scipy.linalg
 
 from bayeskin.geometry import Geometry
+from bayeskin.model.lagrangian import Step
 from bayeskin.reduced.cases import RADIUS_RANGE, STIFFEST_SUBCUTIS, THICKNESS_RANGE, Protocols, Trained
-from bayeskin.types import PadMotion, ParameterSpace
+from bayeskin.types import Array, PadMotion, ParameterSpace
 
+LEAST_STIFFNESS = 0.05  # smallest eigenvalue of the stiffness, over that at rest
+LOW = 0.3  # of the largest displacement: at corners below it the stiffness is looked at
 FASTER = 2.0  # than the fastest training protocol: faster ones leave the skin as undrained as it is
 
 
@@ -80,3 +88,33 @@ def other_geometry(trained: Geometry, geometry: Geometry) -> list[str]:
             lines.append(f"{name.removesuffix('_m')} is {1e3 * other:.3g} mm, trained {1e3 * one:.3g} mm "
                          f"+- {100 * share:.0f} %")  # fmt: skip
     return lines
+
+
+class Stability:
+    """Looks at the stiffness of the skin where the pads have come back, for how near it is to folding.
+
+    left : the smallest eigenvalue so far, over those at rest; 1 where there was nothing to look at
+    """
+
+    def __init__(self, largest_m: float) -> None:
+        self._low_m = LOW * largest_m
+        self._rest: Array | None = None
+        self.left = 1.0
+
+    def look(self, step: Step, stiffness: Callable[[], Array]) -> None:
+        """Takes an accepted step; `stiffness` (u, u) is asked for at the first and where it may be small."""
+        if self._rest is None:
+            self._rest = stiffness()
+        elif step.corner and abs(float(step.state.x[0])) <= self._low_m:
+            smallest = scipy.linalg.eigh(stiffness(), self._rest, eigvals_only=True, subset_by_index=[0, 0])
+            self.left = min(self.left, float(smallest[0]))
+
+    @property
+    def message(self) -> str:
+        """One line where the skin came near folding, else empty."""
+        if self.left >= LEAST_STIFFNESS:
+            return ""
+        return (
+            f"the skin is near folding where the pads come back: {100 * self.left:.1f} % of its stiffness is "
+            "left; run the full model"
+        )

@@ -103,6 +103,7 @@ class ReducedGradients:
             eq.system, eq.packed, past, x, room, self._varied, before,
             self._pads_by(stage.state.time_s, last.lost), t.inverse, t.force_row, t.by_pads, out,
         )  # fmt: skip
+        t.length_s = stage.length_s
         eq.spent += (0, 1, 1)
         if self._in_series:
             return self._less_lost(stage, last.lost, out, force)

@@ -14,11 +14,10 @@ from bayeskin.model.lagrangian import LagrangianModel, Step
 from bayeskin.model.problem import material
 from bayeskin.model.simulate import OnState
 from bayeskin.model.stepping import integrate
-from bayeskin.model.tissue import Bind
 from bayeskin.reduced.equations import ReducedEquations
 from bayeskin.reduced.error import DualWeightedResidual
 from bayeskin.reduced.model import ReducedModel
-from bayeskin.reduced.region import outside
+from bayeskin.reduced.region import Stability, outside
 from bayeskin.reduced.sensitivities import ReducedGradients
 from bayeskin.types import PadMotion, Simulation, frozen_array
 
@@ -48,34 +47,26 @@ def simulate_reduced(
     `stats` has "error_estimate_n" [N], RMS over the states looked at, where it was asked for.
     """
     started = time.perf_counter()
-    binds = [m.act.bind for m in solved(mechanisms) if m.act.bind is not None]
     tissue = sorted(m.name for m in mechanisms if isinstance(m.act, Tissue))
     shape = geometry or model.trained.geometry
     message = outside(model.trained, theta, tissue, shape, motion)
-    inside = not message
-    history = _History()
-    stats: dict[str, float] = {}
-    slopes = None
+    history, run = _History(), None
+    stats = {"inside": 0.0}
     if not message:
-        space = model.space(tissue, shape)
-        prepared = time.perf_counter()
-        equations = ReducedEquations(space, theta, binds, motion)
-        slopes = ReducedGradients(equations, theta, gradients, binds, motion) if gradients else None
-        message = _integrated(equations, theta["p_init"], history, slopes)
-        ran = time.perf_counter()
-        iterations, residuals, tangents = map(float, equations.spent)
-        (k, m), points = space.modes, len(space.at.weight)
-        stats = {
-            "seconds_of_run": ran - prepared, "modes": float(k - 2 + m), "points": float(points),
-            "iterations": iterations, "residuals": residuals, "tangents": tangents,
-        }  # fmt: skip
+        run = _Run(model, motion, theta, mechanisms, tissue, shape, gradients)
+        message = run.integrate(history)
+        stats = run.stats
         if on_state is not None:
-            _show(model, equations, tissue, history, on_state)
+            run.show(history, on_state)
         if estimate and not message:
-            stats["error_estimate_n"] = _estimated(
-                model, equations, binds, theta, tissue, shape, motion, history
-            )
+            stats["error_estimate_n"] = run.estimated_error_n(history)
     force_n = np.array(history.force_n)
+    stats |= {
+        "seconds": time.perf_counter() - started,
+        "steps": float(len(force_n) - 1),
+        "peak_force_n": float(np.abs(force_n).max()),
+    }
+    slopes = None if run is None else run.slopes
     return Simulation(
         theta={name: float(value) for name, value in theta.items()},
         time_s=np.array(history.time_s),
@@ -84,14 +75,11 @@ def simulate_reduced(
         corner=frozen_array(history.corner, bool),
         status="failed" if message else "ok",
         message=message,
-        stats={
-            "seconds": time.perf_counter() - started, "steps": float(len(force_n) - 1),
-            "peak_force_n": float(np.abs(force_n).max()), "inside": float(inside), **stats,
-        },
+        stats=stats,
         model_hash=model.hash,
         gradient_names=slopes.names if slopes else (),
         gradient_n=_beyond_start(slopes, len(force_n)) if slopes else np.zeros((0, 0)),
-    )  # fmt: skip
+    )
 
 
 class _History:
@@ -102,64 +90,90 @@ class _History:
         self.steps: list[Step] = []
 
 
-def _integrated(
-    equations: ReducedEquations, p_init: float, history: _History, slopes: ReducedGradients | None
-) -> str:
-    """Fills the history; returns a message, empty for a run that finished."""
+class _Run:
+    """One reduced run with what follows it: derivatives, stability, and its error on the full mesh."""
 
-    def on_step(step: Step) -> None:
-        history.steps.append(step)
-        if abs(step.state.time_s - equations.starts_s) < 1e-6:
-            equations.zero_n = step.force_n
-        time_s = step.state.time_s - equations.starts_s
-        if slopes is not None and step.stages:
-            slopes.follow(step)
-        if time_s > 1e-6:
-            history.time_s.append(time_s)
-            history.force_n.append(step.force_n - equations.zero_n)
-            history.corner.append(step.corner)
+    def __init__(
+        self, model: ReducedModel, motion: PadMotion, theta: Mapping[str, float],
+        mechanisms: Sequence[Mechanism], tissue: Sequence[str], geometry: Geometry,
+        gradients: Mapping[str, float] | None,
+    ) -> None:  # fmt: skip
+        self._model, self._motion, self._theta = model, motion, theta
+        self._tissue, self._geometry = tissue, geometry
+        self._binds = [m.act.bind for m in solved(mechanisms) if m.act.bind is not None]
+        self._equations = ReducedEquations(model.space(tissue, geometry), theta, self._binds, motion)
+        self._stability = Stability(self._equations.drive.largest_m)
+        self.slopes = None
+        if gradients:
+            self.slopes = ReducedGradients(self._equations, theta, gradients, self._binds, motion)
+        self._seconds = 0.0
 
-    try:
-        return integrate(equations, p_init, TOLERANCE, on_step, falls_too=False)
-    except FloatingPointError as error:
-        return str(error)
+    def integrate(self, history: _History) -> str:
+        """Fills the history; returns a message, empty for a run that finished and kept from folding."""
+        equations = self._equations
 
+        def on_step(step: Step) -> None:
+            history.steps.append(step)
+            if abs(step.state.time_s - equations.starts_s) < 1e-6:
+                equations.zero_n = step.force_n
+            time_s = step.state.time_s - equations.starts_s
+            if step.stages:
+                self._stability.look(step, equations.solid_stiffness)
+                if self.slopes is not None:
+                    self.slopes.follow(step)
+            if time_s > 1e-6:
+                history.time_s.append(time_s)
+                history.force_n.append(step.force_n - equations.zero_n)
+                history.corner.append(step.corner)
 
-def _show(
-    model: ReducedModel, equations: ReducedEquations, tissue: Sequence[str], history: _History,
-    on_state: OnState,
-) -> None:  # fmt: skip
-    """Shows each step of the test on the nodes of the full model's mesh."""
-    basis = model.basis(tissue)
-    for step in history.steps:
-        time_s = step.state.time_s - equations.starts_s
-        if time_s > -1e-6:
-            on_state(max(time_s, 0.0), basis.nodal(step.state.x), step.force_n - equations.zero_n)
+        started = time.perf_counter()
+        try:
+            message = integrate(equations, self._theta["p_init"], TOLERANCE, on_step, falls_too=False)
+        except FloatingPointError as error:
+            message = str(error)
+        self._seconds = time.perf_counter() - started
+        return message or self._stability.message
+
+    @property
+    def stats(self) -> dict[str, float]:
+        """Counts and sizes of the run; "inside" is 1 where it kept from folding."""
+        space = self._equations.space
+        counts = dict(zip(("iterations", "residuals", "tangents"), self._equations.spent, strict=True))
+        return {
+            "inside": float(not self._stability.message), "stiffness_left": self._stability.left,
+            "seconds_of_run": self._seconds, "modes": float(sum(space.modes) - 2),
+            "points": float(len(space.at.weight)), **{name: float(count) for name, count in counts.items()},
+        }  # fmt: skip
+
+    def show(self, history: _History, on_state: OnState) -> None:
+        """Shows each step of the test on the nodes of the full model's mesh."""
+        basis, equations = self._model.basis(self._tissue), self._equations
+        for step in history.steps:
+            time_s = step.state.time_s - equations.starts_s
+            if time_s > -1e-6:
+                on_state(max(time_s, 0.0), basis.nodal(step.state.x), step.force_n - equations.zero_n)
+
+    def estimated_error_n(self, history: _History) -> float:
+        """The RMS of the force's estimated error [N] over some states of the test."""
+        problem, starts_s = self._model.problem(self._geometry), self._equations.starts_s
+        laws = tuple(bind(self._theta, problem.sites) for bind in self._binds)
+        solid = material(self._theta, problem.mesh.cutis)
+        full = LagrangianModel(problem, solid, self._motion, laws)
+        residual = DualWeightedResidual(full, self._model.basis(self._tissue))
+        test = [step for step in history.steps if step.stages and step.state.time_s > starts_s + 1e-6]
+        every = max(1, len(test) // ESTIMATES)
+        wanted = {id(step) for number, step in enumerate(test, 1) if step.corner or number % every == 0}
+        errors = []
+        for step in history.steps:
+            for stage in step.stages:
+                looked_at = stage is step.stages[-1] and id(step) in wanted
+                error_n = residual.follow(stage, step.force_n if looked_at else None)
+                if error_n is not None:
+                    errors.append(error_n)
+        full.solver.release()
+        return float(np.sqrt(np.mean(np.square(errors))))
 
 
 def _beyond_start(slopes: ReducedGradients, count: int) -> np.ndarray:
     rows = np.array(slopes.force_n[-count:])
     return rows - rows[0]
-
-
-def _estimated(
-    model: ReducedModel, equations: ReducedEquations, binds: Sequence[Bind], theta: Mapping[str, float],
-    tissue: Sequence[str], geometry: Geometry, motion: PadMotion, history: _History,
-) -> float:  # fmt: skip
-    """The RMS of the force's estimated error [N] over some states of a run."""
-    problem = model.problem(geometry)
-    laws = tuple(bind(theta, problem.sites) for bind in binds)
-    full = LagrangianModel(problem, material(theta, problem.mesh.cutis), motion, laws)
-    residual = DualWeightedResidual(full, model.basis(tissue))
-    test = [step for step in history.steps if step.stages and step.state.time_s > equations.starts_s + 1e-6]
-    every = max(1, len(test) // ESTIMATES)
-    wanted = {id(step) for number, step in enumerate(test) if step.corner or number % every == every - 1}
-    errors = []
-    for step in history.steps:
-        for stage in step.stages:
-            looked_at = stage is step.stages[-1] and id(step) in wanted
-            error_n = residual.follow(stage, step.force_n if looked_at else None)
-            if error_n is not None:
-                errors.append(error_n)
-    full.solver.release()
-    return float(np.sqrt(np.mean(np.square(errors))))

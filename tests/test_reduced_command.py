@@ -1,0 +1,132 @@
+"""`bayeskin reduce` and `bayeskin simulate --reduced` as a user meets them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bayeskin import cli
+from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
+from bayeskin.pipeline.reducing import SHIPPED, default_path, reduced_for
+from bayeskin.shipped import shipped
+
+DEVICE = "[device]\ngauge_mm = 30\n"
+NEAR = "[tissue]\ncutis_mm = 2.3\nsubcutis_mm = 6\narm_radius_mm = 44\n"
+
+
+@pytest.fixture
+def bayeskin(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Runs the command; gives exit code, stdout and stderr."""
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as stop:
+            cli.main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return int(stop.value.code or 0), captured.out, captured.err
+
+    return call
+
+
+def test_a_reduced_run_is_near_the_full_one_and_says_how_near(bayeskin, tmp_path) -> None:
+    """On the demo's protocol, which no training run had."""
+    set_ = ("--set", "E_c=80e3", "--set", "E_s=15e3")
+    reduced, full = tmp_path / "reduced.csv", tmp_path / "full.csv"
+    code, out, _ = bayeskin("simulate", "--reduced", *set_, "-o", reduced, "--json")
+    said = json.loads(out)
+    assert code == 0
+    assert said["inside"] is True
+    assert said["seconds"] > 0.0
+    assert bayeskin("simulate", *set_, "-o", full)[0] == 0
+    (t, _, f), (t0, _, f0) = (np.loadtxt(p, delimiter=",", skiprows=1).T for p in (reduced, full))
+    wrong = np.interp(t0, t, f) - f0
+    assert np.sqrt(np.mean(wrong**2)) < 2e-3 * f0.max()
+    assert np.sqrt(np.mean(wrong**2)) < 5.0 * said["error_estimate_n"]
+
+
+def test_other_layers_within_the_trained_range_run(bayeskin, tmp_path) -> None:
+    device = tmp_path / "device.toml"
+    device.write_text(NEAR)
+    code, out, _ = bayeskin("simulate", "--reduced", "--device", device, "-o", tmp_path / "f.csv", "--json")
+    assert code == 0
+    assert json.loads(out)["inside"] is True
+
+
+def test_outside_of_the_trained_region_it_says_so_and_writes_nothing(bayeskin, tmp_path) -> None:
+    out = tmp_path / "force.csv"
+    code, text, _ = bayeskin("simulate", "--reduced", "--set", "E_c=9e6", "-o", out, "--json")
+    said = json.loads(text)
+    assert code == 1
+    assert said["inside"] is False
+    assert "E_c is 9e+06" in said["message"]
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--device", "device.toml"), "none for this device"),
+        (("--mesh", "none.msh"), "none.msh"),
+        (("--observation", "article"), "bricks"),
+    ],
+)
+def test_what_no_reduced_model_fits_is_one_line(bayeskin, tmp_path, monkeypatch, options, says) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("device.toml").write_text(DEVICE)
+    code, out, error = bayeskin("simulate", "--reduced", *options, "-o", "force.csv")
+    assert (code, out) == (2, "")
+    assert says in error.splitlines()[-1]
+    assert not Path("force.csv").exists()
+
+
+def test_one_beside_the_source_goes_before_the_shipped_one(tmp_path) -> None:
+    source = tmp_path / "device.toml"
+    source.write_text(NEAR)
+    shutil.copy(shipped(SHIPPED), default_path(source))
+    assert reduced_for(Geometry(), [source]).hash == reduced_for(Geometry(), []).hash
+    with pytest.raises(InputError, match="another geometry"):
+        reduced_for(Geometry(gauge_m=30e-3), [source])
+    default_path(source).write_bytes(b"cut off")
+    with pytest.raises(InputError, match=r"device-reduced\.h5"):
+        reduced_for(Geometry(), [source])
+
+
+@pytest.mark.parametrize(
+    ("contents", "options", "says"),
+    [
+        ("[device]\ngauge_mm = 0.036\n", (), "0.036 mm"),
+        ("[device]\nguard_mm = { gap = -1, width = 8 }\n", (), "inside the pad"),
+        ("[device]\nlength = 3\n", (), "unknown key"),
+        (NEAR, ("-o", "model.csv"), "ending .h5"),
+        (None, (), "no such file"),
+    ],
+)
+def test_bad_input_of_reduce_is_one_line(bayeskin, tmp_path, monkeypatch, contents, options, says) -> None:
+    monkeypatch.chdir(tmp_path)
+    if contents is not None:
+        Path("device.toml").write_text(contents)
+    code, out, error = bayeskin("reduce", "device.toml", *options)
+    assert (code, out) == (2, "")
+    assert says in error.splitlines()[-1]
+    assert [p.name for p in tmp_path.iterdir()] == ([] if contents is None else ["device.toml"])
+
+
+def test_a_finished_model_stays_as_it_is(bayeskin, tmp_path) -> None:
+    path = tmp_path / "model.h5"
+    shutil.copy(shipped(SHIPPED), path)
+    before = path.read_bytes()
+    code, out, _ = bayeskin("reduce", "-o", path)
+    assert code == 0
+    assert "done before" in out
+    assert path.read_bytes() == before
+    device = tmp_path / "device.toml"
+    device.write_text(DEVICE)
+    code, _, error = bayeskin("reduce", device, "-o", path)
+    assert code == 2
+    assert "another geometry" in error
+    assert path.read_bytes() == before
