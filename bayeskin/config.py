@@ -116,18 +116,25 @@ class PriorConfig(Section):
 class DesignConfig(Section):
     """Full runs: training points of each wave, held-out points of each wave, worker processes.
 
-    With `coarse`, a refinement below the model's, the waves run on coarser bricks, and the model itself at
-    `fine_points` and `fine_held_out` of their points, to correct what the coarser ones gave. `scheduler`,
-    the address of a Dask scheduler, has the runs made there.
+    With `coarse` the waves run a quicker model, and the model itself at `fine_points` and `fine_held_out` of
+    their points, to correct what the quicker one gave: coarser bricks, of a refinement below the model's, or
+    "reduced", the reduced model of the device. `scheduler`, the address of a Dask scheduler, has the runs
+    made there.
     """
 
     points: Annotated[list[Runs], Field(min_length=1, max_length=100)] = [128, 96, 64]
     held_out: Runs = 16
-    coarse: Refinement | None = None
+    coarse: Refinement | Literal["reduced"] | None = None
     fine_points: Runs = 16
     fine_held_out: Runs = 6
     workers: Annotated[int, Field(gt=0, le=4096)] = 2
     scheduler: str | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _a_reduced_model_needs_less_correction(cls, given: Any) -> Any:
+        reduced = isinstance(given, dict) and given.get("coarse") == "reduced"
+        return {"fine_points": 8, "fine_held_out": 4, **given} if reduced else given
 
 
 class SlurmConfig(Section):
@@ -254,9 +261,14 @@ class Config(Section):
     @model_validator(mode="after")
     def _coarse_is_coarser(self) -> Config:
         coarse, model = self.design.coarse, self.model
-        if coarse is not None and (model.mesh != "bricks" or coarse >= model.refinement):
-            found = f"{coarse} with model.mesh {model.mesh!r}, model.refinement {model.refinement}"
-            raise ValueError(f"design.coarse: found {found}; expected bricks of a higher refinement")
+        below = 0 if coarse == "reduced" else coarse
+        if below is not None and (model.mesh != "bricks" or below >= model.refinement):
+            found = (
+                f"{coarse} with model.observation {model.observation!r}, model.mesh {model.mesh!r}, "
+                f"model.refinement {model.refinement}"
+            )
+            expected = "refinement 1 or more" if coarse == "reduced" else "a higher refinement"
+            raise ValueError(f"design.coarse: found {found}; expected bricks of {expected}")
         if model.forward is not None and (coarse is not None or self.surrogate.file is not None):
             key = "design.coarse" if coarse is not None else "surrogate.file"
             raise ValueError(f"{key}: found one with model.forward; expected none: it is the full model's")

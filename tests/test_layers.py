@@ -58,6 +58,7 @@ BELOW = {
     | SIBLINGS
     | {
         "mechanisms",
+        "reduced",
         "config",
         "device",
         "runner",

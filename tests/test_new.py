@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from bayeskin import cli, storage
-from bayeskin.config import Config, RecordingConfig, load_config, parameter_space
+from bayeskin.config import Config, DesignConfig, RecordingConfig, load_config, parameter_space
 from bayeskin.design import default_space
 from bayeskin.errors import InputError
 from bayeskin.inference import NoisePriors
@@ -27,6 +27,8 @@ from bayeskin.pipeline.workbench import opened
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_manifest
 from bayeskin.types import Recording
+
+REDUCED = DesignConfig.model_validate({"coarse": "reduced"})
 
 
 @pytest.fixture
@@ -70,7 +72,17 @@ def test_an_unknown_protocol_gets_a_design_of_its_own(own: Path) -> None:
     said = new_config(own)
     config = load_config(own.with_suffix(".toml"))
     assert (said["surrogate"], config.surrogate.file) == (None, None)
-    assert config == Config(name="own", recording=RecordingConfig(file="own.h5"))
+    assert config == Config(name="own", recording=RecordingConfig(file="own.h5"), design=REDUCED)
+    text = own.with_suffix(".toml").read_text()
+    assert "# 336 by the reduced model article-device-reduced.h5" in text
+    assert "some 35 to 93 are of the full model, 1 to 13 minutes with 2 workers." in text
+
+
+def test_a_device_without_a_reduced_model_gets_a_design_of_full_runs(own: Path) -> None:
+    device = own.with_name("device.toml")
+    device.write_text("[device]\ngauge_mm = 30.0\n")
+    new_config(own, device=device)
+    assert load_config(own.with_suffix(".toml")).design == DesignConfig()
     assert "# 336 runs of some 4 to 15 s each, 11 to 42 minutes with 2 workers." in (
         own.with_suffix(".toml").read_text()
     )
@@ -84,7 +96,7 @@ def test_every_key_that_is_commented_out_is_a_default(own: Path) -> None:
     own.with_suffix(".toml").write_text(with_keys.replace("windows_s = [[0.0, 60.0]]", ""))
     config = load_config(own.with_suffix(".toml"))
     assert set(tomllib.loads(with_keys)) == {*Config.model_fields} - {"slurm", "surrogate"}
-    default = Config(name="own", recording=RecordingConfig(file="own.h5"))
+    default = Config(name="own", recording=RecordingConfig(file="own.h5"), design=REDUCED)
     assert config.model_copy(update={"parameters": {}, "noise": default.noise}) == default
     assert dict(config.noise) == dataclasses.asdict(NoisePriors())
     space = parameter_space(config)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from html import unescape
 from pathlib import Path
@@ -16,14 +18,14 @@ from toy import MOTION, SPACE, toy_force
 
 from bayeskin import report, storage
 from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data
-from bayeskin.pipeline import design, maximum, refining, stages
+from bayeskin.pipeline import design, maximum, model, stages
 from bayeskin.pipeline.calibration import refined_posterior
 from bayeskin.pipeline.checking import checked_posterior, with_full_model
 from bayeskin.pipeline.engine import Silent, open_run
 from bayeskin.pipeline.indices import nearby
 from bayeskin.report.page.prose import prose
 from bayeskin.runner import load_design
-from bayeskin.types import Design, Recording, Simulation
+from bayeskin.types import Design, PadMotion, Recording, Simulation
 
 TRUE = {"E_c": 200e3, "E_s": 30e3, "k_c": 1e-14, "k_s": 1e-13, "p_init": 300.0}
 CONFIG = """
@@ -71,13 +73,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "save_figure", drawn)  # rendering is most of a small run's time
-        patch.setattr(design, "simulate", toy_model.simulate)
-        patch.setattr(refining, "simulate", toy_model.simulate)
+        patch.setattr(model, "FullModel", toy_model.ToyModel)
         patch.setattr(maximum, "simulate", interrupted)
         with pytest.raises(KeyboardInterrupt):
             stages.run(where / "case.toml", None, Silent())
         patch.setattr(maximum, "simulate", toy_model.simulate)
-        patch.setattr(design, "simulate", interrupted)  # must not be needed again
+        patch.setattr(design, "run_wave", interrupted)  # must not be needed again
         answer = stages.run(where / "case.toml", None, Silent())
     (where / "answer.json").write_text(json.dumps(answer, allow_nan=False))
     return where
@@ -202,11 +203,16 @@ def test_the_full_model_weighs_draws_of_the_posterior(folder: Path) -> None:
     assert said["corrected"] is None or set(said["corrected"]) == set(said["parameters"])
 
 
-def steeper(
-    spec: object, motion: object, theta: dict[str, float], about_pa: float, power: float
-) -> Simulation:
-    run = toy_model.simulate(spec, motion, theta)
-    return dataclasses.replace(run, force_n=(theta["E_c"] / about_pa) ** power * run.force_n)
+@dataclass(frozen=True)
+class Steeper(toy_model.ToyModel):
+    """The toy whose force depends more on E_c."""
+
+    about_pa: float
+    power: float
+
+    def __call__(self, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
+        run = super().__call__(motion, theta)
+        return dataclasses.replace(run, force_n=(theta["E_c"] / self.about_pa) ** self.power * run.force_n)
 
 
 @pytest.mark.parametrize(("power", "rounds"), [(0.0, 1), (300.0, 3)])
@@ -218,7 +224,7 @@ def test_draws_join_the_design_where_the_full_model_is_elsewhere(
     shutil.rmtree(run.folder / "runs")  # of the model as it was
     problem, asked = refined_posterior(run), []
     theta = run.summary("map")["theta"]
-    monkeypatch.setattr(refining, "simulate", partial(steeper, about_pa=theta["E_c"], power=power))
+    monkeypatch.setattr(model, "FullModel", partial(Steeper, about_pa=theta["E_c"], power=power))
     large = {
         name: 0.05 for name in problem.names if name.startswith("sd_")
     }  # beside the toy surrogate's error
@@ -253,7 +259,7 @@ def test_longer_sampling_repeats_no_stage_before_it_and_keeps_the_chains(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(report, "save_figure", lambda *arguments: None)
-    monkeypatch.setattr(refining, "simulate", toy_model.simulate)
+    monkeypatch.setattr(model, "FullModel", toy_model.ToyModel)
     chains = list((folder / "case" / "chains").iterdir())
     (folder / "case.toml").write_text(CONFIG.format(steps=250))
     answer = stages.run(folder / "case.toml", "sample", Silent())

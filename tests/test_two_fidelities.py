@@ -14,7 +14,7 @@ from toy import EDGES_S, MOTION, SPACE, toy_bin_means, toy_force
 from bayeskin import report, storage
 from bayeskin.design import fine_wave, first_wave, spread_out
 from bayeskin.errors import InputError
-from bayeskin.pipeline import design, maximum, refining, stages
+from bayeskin.pipeline import maximum, model, stages
 from bayeskin.pipeline.engine import Silent
 from bayeskin.surrogates import Similarity, correct, load_surrogate, save_surrogate, train
 from bayeskin.types import Design, Recording
@@ -176,9 +176,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "save_figure", drawn)
-        patch.setattr(design, "simulate", toy_model.simulate)
+        patch.setattr(model, "FullModel", toy_model.ToyModel)
         patch.setattr(maximum, "simulate", toy_model.simulate)
-        patch.setattr(refining, "simulate", toy_model.simulate)
         stages.run(where / "case.toml", "map", Silent())
     return where / "case"
 

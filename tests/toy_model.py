@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from toy import SPACE, toy_force
@@ -54,6 +55,20 @@ def simulate(
         gradient_names=names,
         gradient_n=np.array(slopes).T if names else np.zeros((0, 0)),
     )
+
+
+@dataclass(frozen=True)
+class ToyModel:
+    """Stands in the place of `bayeskin.pipeline.model.FullModel`."""
+
+    spec: ModelSpec
+
+    @property
+    def hash(self) -> str:
+        return self.spec.hash
+
+    def __call__(self, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
+        return simulate(self.spec, motion, theta)
 
 
 def finer(refinement: int, theta: Mapping[str, float]) -> float:

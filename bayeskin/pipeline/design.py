@@ -1,6 +1,6 @@
 """Second stage: full runs in waves, each drawn where the last surrogate cannot rule the force out.
 
-With `design.coarse` the waves run a coarser model, and then some of their points the model itself.
+With `design.coarse` the waves run a quicker model, and then some of their points the model itself.
 """
 
 from __future__ import annotations
@@ -21,11 +21,17 @@ from bayeskin.config import parameter_space
 from bayeskin.design import Wave, fine_wave, first_wave, next_wave
 from bayeskin.errors import InputError
 from bayeskin.inference.noise_model import bins_in_windows
-from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline.crew import crew
 from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
 from bayeskin.pipeline.folder import sha256_of, write_json
-from bayeskin.pipeline.model import model_spec, own_files, waves_spec
+from bayeskin.pipeline.model import (
+    ForceModel,
+    check_protocol,
+    full_model,
+    own_files,
+    reduced_files,
+    waves_model,
+)
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.shipping import check_fits, shipped_files
 from bayeskin.runner import load_design, run_design
@@ -85,12 +91,13 @@ def _work(run: Run) -> Mapping[str, Any]:
 
 def _run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design, list[Mapping[str, Any]]]:
     """All waves of the configuration. Runs are kept by what they depend on, so none is made twice."""
-    spec, config = waves_spec(run), run.config.design
+    check_protocol(run, motion)
+    model, config = waves_model(run), run.config.design
     space = parameter_space(run.config, run.config_path).box  # a surrogate learns all of it alike
-    file = runs_file(run, spec, motion, binned.edges_s, space)
+    file = runs_file(run, model, motion, binned.edges_s, space)
     waves: list[Wave] = []
-    if spec.forward is not None and not file.is_file():
-        _try_once(run, spec, motion, space)
+    if run.config.model.forward is not None and not file.is_file():
+        _try_once(run, model, motion, space)
     for number, count in enumerate(config.points):
         drawn = run.at("design", f"wave-{number}.json")
         if not drawn.is_file():
@@ -98,48 +105,49 @@ def _run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design
             write_json(drawn, {"theta": wave.theta, "held_out": wave.held_out, "record": wave.record})
         waves.append(_load_wave(drawn, space, number, run.config.seed))
         label = f"wave {number + 1} of {len(config.points)}"
-        _run_wave(run, label, file, waves[-1], binned.edges_s, spec, motion)
+        run_wave(run, label, file, waves[-1], binned.edges_s, model, motion)
     return rows_of(load_design(file), waves), [wave.record for wave in waves]
 
 
-def _try_once(run: Run, spec: ModelSpec, motion: PadMotion, space: ParameterSpace) -> None:
+def _try_once(run: Run, model: ForceModel, motion: PadMotion, space: ParameterSpace) -> None:
     """A model of one's own in the middle of the box. Raises InputError where it cannot be used at all."""
-    run.reporter.log(f"one run of {spec.forward}")
+    forward = run.config.model.forward
+    run.reporter.log(f"one run of {forward}")
     middle = dict(zip(space.names, space.from_unit([0.5] * space.dim).tolist(), strict=True))
-    found = simulate(spec, motion, middle)
+    found = model(motion, middle)
     if found.status != "ok":
-        raise InputError(spec.forward, found.message, f"a force at {middle}")
+        raise InputError(forward, found.message, f"a force at {middle}")
 
 
 def _run_fine(run: Run, design: Design, motion: PadMotion) -> Design:
     """The configuration's model at some points of the coarser one's design."""
-    spec, config = model_spec(run), run.config.design
+    model, config = full_model(run), run.config.design
     inputs = Similarity(design.space).inputs(design.theta)
     wave = fine_wave(design, inputs, config.fine_points, config.fine_held_out, run.config.seed)
-    file = runs_file(run, spec, motion, design.edges_s, design.space)
-    _run_wave(run, "fine model", file, wave, design.edges_s, spec, motion)
+    file = runs_file(run, model, motion, design.edges_s, design.space)
+    run_wave(run, "fine model", file, wave, design.edges_s, model, motion)
     return rows_of(load_design(file), [wave])
 
 
-def runs_file(run: Run, spec: ModelSpec, motion: PadMotion, edges_s: Array, space: ParameterSpace) -> Path:
-    """Where all runs of one model on one protocol are kept."""
-    identity = sha256_of([spec.hash, vars(motion), edges_s, [vars(p) for p in space.parameters]])
+def runs_file(run: Run, model: ForceModel, motion: PadMotion, edges_s: Array, space: ParameterSpace) -> Path:
+    """Returns the path where all runs of one model on one protocol are kept."""
+    identity = sha256_of([model.hash, vars(motion), edges_s, [vars(p) for p in space.parameters]])
     return run.folder / "runs" / f"{identity[:16]}.h5"
 
 
-def _run_wave(
-    run: Run, label: str, runs_file: Path, wave: Wave, edges_s: Array, spec: ModelSpec, motion: PadMotion
+def run_wave(
+    run: Run, label: str, runs_file: Path, wave: Wave, edges_s: Array, model: ForceModel, motion: PadMotion
 ) -> None:
-    run.reporter.log(f"{label}: {len(wave.theta)} full runs")
+    """Runs the points of a wave that are not in the file yet, and keeps them there."""
+    run.reporter.log(f"{label}: {len(wave.theta)} runs")
     with crew(run) as run_all:
         run_design(
-            runs_file, wave, edges_s, partial(simulate, spec, motion), spec.hash, run_all,
-            partial(tell, run, label),
-        )  # fmt: skip
+            runs_file, wave, edges_s, partial(model, motion), model.hash, run_all, partial(tell, run, label)
+        )
 
 
 def tell(run: Run, label: str, done: int, total: int, failed: int) -> None:
-    """Progress of a design, in words."""
+    """Tells the progress of a design in words."""
     run.reporter.progress(label, done / max(total, 1), f"{done} of {total} runs, {failed} failed")
 
 
@@ -225,12 +233,12 @@ def _draw(run: Run, design: Design, records: Sequence[Mapping[str, Any]]) -> Non
 def _files(run: Run) -> Iterable[Path]:
     files = [run.beside(run.config.model.mesh)] if run.config.model.mesh != "bricks" else []
     ready = shipped_files(run).present if run.config.surrogate.file is not None else ()
-    return [*files, *own_files(run), *ready]
+    return [*files, *own_files(run), *reduced_files(run), *ready]
 
 
 STAGE = Stage(
     "design",
-    "runs the full model at the design's points",
+    "runs the model at the design's points",
     ("recording",),
     ("seed", "model", "parameters", "design", "surrogate", "fit"),
     _work,

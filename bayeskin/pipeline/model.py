@@ -1,13 +1,70 @@
-"""The full model that a configuration asks for."""
+"""The models that a configuration asks for: the full model, and the one that makes a design's waves."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 from bayeskin.errors import InputError
-from bayeskin.model.simulate import ModelSpec
+from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline.engine import Run
+from bayeskin.pipeline.folder import sha256_of
+from bayeskin.pipeline.reducing import reduced_file
+from bayeskin.reduced.files import load_reduced
+from bayeskin.reduced.region import protocol_outside
+from bayeskin.reduced.simulate import simulate_reduced
+from bayeskin.types import PadMotion, Simulation
+
+
+class ForceModel(Protocol):
+    """A model whose runs make a design. It is frozen and can be pickled, so that it travels to workers.
+
+    hash : sha256 of all that the force depends on besides motion and parameters, which each run carries
+    """
+
+    @property
+    def hash(self) -> str: ...
+
+    def __call__(self, motion: PadMotion, theta: Mapping[str, float]) -> Simulation: ...
+
+
+@dataclass(frozen=True)
+class FullModel:
+    """Runs the model of a specification: the full model on any mesh, or a model of one's own."""
+
+    spec: ModelSpec
+
+    @property
+    def hash(self) -> str:
+        return self.spec.hash
+
+    def __call__(self, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
+        return simulate(self.spec, motion, theta)
+
+
+@dataclass(frozen=True)
+class ReducedOrFull:
+    """Runs the reduced model of a file, and the full model where that fails or was not trained.
+
+    The message of a run that the full model made says why.
+    """
+
+    file: Path
+    full: FullModel
+
+    @property
+    def hash(self) -> str:
+        return sha256_of([load_reduced(self.file).hash, self.full.hash])
+
+    def __call__(self, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
+        model = load_reduced(self.file)
+        run = simulate_reduced(model, motion, theta, geometry=self.full.spec.geometry)
+        if run.status != "ok":
+            full = self.full(motion, theta)
+            run = full if full.message else replace(full, message=f"run by the full model: {run.message}")
+        return replace(run, model_hash=self.hash)
 
 
 def model_spec(run: Run, mesh: str | None = None, observation: str | None = None) -> ModelSpec:
@@ -43,7 +100,39 @@ def _beside(run: Run, forward: str) -> str:
     return f"{files[0]}:{forward.rpartition(':')[2]}" if files else forward
 
 
-def waves_spec(run: Run) -> ModelSpec:
-    """The model that the design's waves run: the configuration's, or a coarser one that it corrects."""
-    coarse = run.config.design.coarse
-    return model_spec(run) if coarse is None else replace(model_spec(run), refinement=coarse)
+def full_model(run: Run) -> ForceModel:
+    """Returns the configuration's model. Raises InputError as `model_spec`."""
+    return FullModel(model_spec(run))
+
+
+def waves_model(run: Run) -> ForceModel:
+    """Returns the model that the design's waves run: the configuration's, or a quicker one that it corrects.
+
+    Raises InputError as `model_spec`, and where the configuration's device has no reduced model.
+    """
+    coarse, spec = run.config.design.coarse, model_spec(run)
+    if coarse is None:
+        return FullModel(spec)
+    if coarse != "reduced":
+        return FullModel(replace(spec, refinement=coarse))
+    (file,) = reduced_files(run)
+    return ReducedOrFull(file, FullModel(replace(spec, refinement=load_reduced(file).refinement)))
+
+
+def reduced_files(run: Run) -> list[Path]:
+    """Returns the file of the reduced model that makes the design's waves; none where another model does.
+
+    Raises InputError where the configuration's device has no reduced model.
+    """
+    if run.config.design.coarse != "reduced":
+        return []
+    return [reduced_file(run.config.certain_geometry(run.config_path), [run.config_path])]
+
+
+def check_protocol(run: Run, motion: PadMotion) -> None:
+    """Raises InputError where a reduced model makes the waves and does not know the protocol."""
+    for file in reduced_files(run):
+        lines = protocol_outside(load_reduced(file).trained.protocols, motion)
+        if lines:
+            found = f"'reduced' on a protocol that {file.name} does not know: {lines[0]}"
+            raise InputError(f"{run.config_path}: design.coarse", found, "coarse = 0, or no such key")

@@ -13,15 +13,23 @@ from bayeskin.config import Config, DesignConfig, RecordingConfig
 from bayeskin.design import default_space
 from bayeskin.device import DeviceFile, device_lines, load_device_file, stated_geometry
 from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
 from bayeskin.inference import NoisePriors
 from bayeskin.pipeline.folder import plain
 from bayeskin.pipeline.recording import pad_motion
+from bayeskin.pipeline.reducing import find_reduced
 from bayeskin.pipeline.shipping import shipped_for
 from bayeskin.recordings import describe, describe_json, phase_noise, read_recording, segment
+from bayeskin.reduced.files import load_reduced
+from bayeskin.reduced.region import protocol_outside
 from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, Parameter
 
 _SECONDS_A_RUN = (4, 15)  # of one core, on the default mesh
+_REDUCED_SECONDS_A_RUN = (0.1, 0.4)
+# Shares of points whose subcutis is too stiff for a reduced model: of the default prior, and of what a
+# recording leaves of it where that is many.
+_BEYOND_REDUCED = (0.16, 0.3)
 _SHIPPED_KNOWS = (
     "# Another model, bin width or wider bounds need another surrogate: take [surrogate] above out.",
 )
@@ -73,7 +81,7 @@ def new_config(file: Path, out: Path | None = None, device: Path | None = None) 
     """Writes a configuration that fits `file`, by default beside it, and says what was found in it.
 
     It takes a shipped surrogate where one knows the recording's protocol and device, else a design of its
-    own. The sections of the file `device` are written into it.
+    own, by the reduced model where the device has one. The sections of the file `device` are written into it.
     Raises InputError, with nothing written, for no recording of a test, a device that cannot be, or an `out`
     that is there already.
     """
@@ -87,13 +95,15 @@ def new_config(file: Path, out: Path | None = None, device: Path | None = None) 
     phases = segment(recording)
     noise = phase_noise(recording, phases)
     found = describe(recording, phases, noise)
-    surrogate = _shipped_surrogate(pad_motion("reaction", recording, phases, "idealised"), stated)
+    motion, geometry = pad_motion("reaction", recording, phases, "idealised"), _certain_geometry(stated)
+    surrogate = shipped_for(motion, geometry) if geometry else None
+    reduced = _reduced_for(motion, geometry, out) if geometry and not surrogate else None
+    way, section = _way(surrogate, reduced)
     reference = Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix()
-    text = _configuration(_name(out), reference, found, surrogate.name if surrogate else None, stated)
+    text = _configuration(_name(out), reference, found, section, surrogate is not None, stated)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open(out, "x", encoding="utf-8") as handle:
         handle.write(text)
-    way = f"the shipped surrogate {surrogate.name}" if surrogate else "a design of full runs of its own"
     facts = describe_json(recording, phases, noise)
     answer = {"ok": True, "out": out, "surrogate": surrogate.name if surrogate else None, **facts}
     return plain({**answer, "text": f"{found}\n\nwritten to {out}, with {way}\nnext: bayeskin run {out}"})
@@ -118,12 +128,28 @@ def new_demo(out: Path | None = None) -> dict[str, Any]:
     return plain({"ok": True, "out": out, "text": f"written to {out}\nnext: bayeskin run {out}"})
 
 
-def _shipped_surrogate(motion: PadMotion, stated: DeviceFile | None) -> Path | None:
-    """The shipped surrogate of a protocol and a device."""
+def _certain_geometry(stated: DeviceFile | None) -> Geometry | None:
+    """The geometry of a device; None where a length of it is uncertain."""
     if stated is None:
-        return shipped_for(motion)
+        return Geometry()
     found = stated_geometry(stated.device, stated.tissue, "device")
-    return None if found.sd_m else shipped_for(motion, found.geometry)
+    return None if found.sd_m else found.geometry
+
+
+def _reduced_for(motion: PadMotion, geometry: Geometry, out: Path) -> Path | None:
+    """The file of a reduced model that a run of the configuration `out` can make its design with."""
+    file = find_reduced(geometry, [out])
+    known = file is not None and not protocol_outside(load_reduced(file).trained.protocols, motion)
+    return file if known else None
+
+
+def _way(surrogate: Path | None, reduced: Path | None) -> tuple[str, list[str]]:
+    """How a run comes by its surrogate, in words and as a section."""
+    if surrogate is not None:
+        return f"the shipped surrogate {surrogate.name}", _surrogate(surrogate.name)
+    if reduced is not None:
+        return f"a design of the reduced model {reduced.name}", _reduced_design(reduced.name)
+    return "a design of full runs of its own", _full_design()
 
 
 def _name(out: Path) -> str:
@@ -132,7 +158,7 @@ def _name(out: Path) -> str:
 
 
 def _configuration(
-    name: str, reference: str, found: str, surrogate: str | None, stated: DeviceFile | None
+    name: str, reference: str, found: str, section: list[str], ready: bool, stated: DeviceFile | None
 ) -> str:
     config = Config(name=name, recording=RecordingConfig(file=reference))
     parts = [
@@ -144,11 +170,11 @@ def _configuration(
             f'# protocol = {_quoted(config.recording.protocol)}  # or "recorded": as it was, dearer',
         ],
         *([device_lines(stated.device, stated.tissue)] if stated else []),
-        _surrogate(surrogate) if surrogate else _design(config.design),
+        section,
         [
             "# What can be set besides, with its default. To change one, take the # from its line and from",
             "# that of the section above it.",
-            *(_SHIPPED_KNOWS if surrogate else ()),
+            *(_SHIPPED_KNOWS if ready else ()),
             *([] if stated else _commented_device(config)),
             *_optional(config),
         ],
@@ -174,15 +200,50 @@ def _surrogate(file: str) -> list[str]:
     ]
 
 
-def _design(design: DesignConfig) -> list[str]:
-    runs = sum(design.points) + len(design.points) * design.held_out
-    quick, slow = _SECONDS_A_RUN
+def _full_design() -> list[str]:
+    design = DesignConfig()
+    runs, (quick, slow) = _runs(design), _SECONDS_A_RUN
     low, high = (seconds * runs / (60 * design.workers) for seconds in _SECONDS_A_RUN)
     return [
         "# No shipped surrogate knows this protocol on this device, so the full model is run first, here:",
         f"# {runs} runs of some {quick} to {slow} s each, {low:.0f} to {high:.0f} minutes with "
         f"{design.workers} workers.",
+        "# `bayeskin reduce` with this file makes a reduced model of the device, once, in half an hour to",
+        '# two hours; with it, coarse = "reduced" takes minutes, if the pads open no further than it knows.',
         "[design]",
+        *_waves(design),
+    ]
+
+
+def _reduced_design(file: str) -> list[str]:
+    design = DesignConfig.model_validate({"coarse": "reduced"})
+    first = design.points[0] + design.held_out
+    beyond, most = _BEYOND_REDUCED
+    fewest = design.fine_points + design.fine_held_out + round(beyond * first)
+    full = fewest, fewest + round(most * (_runs(design) - first))
+    low, high = (
+        (seconds * runs + quick * _runs(design)) / (60 * design.workers)
+        for runs, seconds, quick in zip(full, _SECONDS_A_RUN, _REDUCED_SECONDS_A_RUN, strict=True)
+    )
+    return [
+        "# No shipped surrogate knows this protocol on this device, so runs are made first, here:",
+        f"# {_runs(design)} by the reduced model {file}, but for those whose subcutis is too stiff for it.",
+        f"# With the correction some {full[0]} to {full[1]} are of the full model, "
+        f"{low:.0f} to {high:.0f} minutes with {design.workers} workers.",
+        "[design]",
+        'coarse = "reduced"  # the model that makes the waves',
+        f"fine_points = {design.fine_points}  # full runs that correct it",
+        f"fine_held_out = {design.fine_held_out}  # full runs that measure the surrogate's error",
+        *_waves(design),
+    ]
+
+
+def _runs(design: DesignConfig) -> int:
+    return sum(design.points) + len(design.points) * design.held_out
+
+
+def _waves(design: DesignConfig) -> list[str]:
+    return [
         f"points = {list(design.points)}  # training runs of each wave",
         f"held_out = {design.held_out}  # of each wave, to measure the surrogate's error",
         f"workers = {design.workers}  # processes",

@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from bayeskin.reduced.build import (
     weighted_of,
 )
 from bayeskin.reduced.cases import BASE, Trained
-from bayeskin.reduced.files import load_reduced, save_reduced
+from bayeskin.reduced.files import load_reduced, save_reduced, trained_geometry
 from bayeskin.reduced.model import ReducedModel, inner_of
 from bayeskin.reduced.region import other_geometry
 from bayeskin.shipped import shipped
@@ -137,24 +138,26 @@ def _finished(path: Path, trained: Trained) -> bool:
     return set(there.trained.mechanisms) == set(trained.mechanisms)
 
 
-def reduced_for(geometry: Geometry, beside: Sequence[Path]) -> ReducedModel:
-    """Returns the reduced model that fits a geometry: one beside the files given, else the shipped one.
+def find_reduced(geometry: Geometry, beside: Sequence[Path]) -> Path | None:
+    """Returns the file of a reduced model that fits a geometry, or None where there is none.
 
-    Raises InputError where there is none, or where the one beside is of another geometry.
+    It is one named as `default_path` names it, beside the files given, or the shipped one; where several fit,
+    the first that was made for this very geometry. Raises InputError for such a file that cannot be read.
     """
-    for source in beside:
-        path = default_path(source)
-        if path.is_file():
-            model = load_reduced(path)
-            found = other_geometry(model.trained.geometry, geometry)
-            if found:
-                raise InputError(path, f"a reduced model of another geometry: {found[0]}", "one of this one")
-            return model
-    model = load_reduced(shipped(SHIPPED))
-    if other_geometry(model.trained.geometry, geometry):
+    own = [path for source in beside for path in sorted(source.resolve().parent.glob("*-reduced.h5"))]
+    known = [(trained_geometry(path), path) for path in (*own, shipped(SHIPPED))]
+    fitting = [(trained != geometry, path) for trained, path in known
+               if trained is not None and not other_geometry(trained, geometry)]  # fmt: skip
+    return min(fitting, key=itemgetter(0))[1] if fitting else None
+
+
+def reduced_file(geometry: Geometry, beside: Sequence[Path]) -> Path:
+    """Returns the file that `find_reduced` finds. Raises InputError where it finds none."""
+    found = find_reduced(geometry, beside)
+    if found is None:
         expected = "one that `bayeskin reduce` makes of its file: half an hour to two hours, once"
         raise InputError("reduced model", "none for this device and tissue", expected)
-    return model
+    return found
 
 
 def _answer(path: Path, model: ReducedModel, seconds: float, done: str) -> dict[str, Any]:

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from functools import partial
 
 import numpy as np
 
 from bayeskin import storage
 from bayeskin.design import Wave
-from bayeskin.model.simulate import ModelSpec, simulate
-from bayeskin.pipeline.crew import crew
-from bayeskin.pipeline.design import rows_of, runs_file, tell
+from bayeskin.pipeline.design import rows_of, run_wave, runs_file
 from bayeskin.pipeline.engine import Run
-from bayeskin.pipeline.model import model_spec, waves_spec
+from bayeskin.pipeline.model import ForceModel, full_model, waves_model
 from bayeskin.pipeline.training import corrected, fine_design, trained
-from bayeskin.runner import load_design, run_design
+from bayeskin.runner import load_design
 from bayeskin.surrogates import load_manifest, load_surrogate, manifest_of, save_surrogate
 from bayeskin.types import Array, BinnedForce, Design, PadMotion, Simulation, Surrogate
 
@@ -38,7 +35,9 @@ class Refining:
 
     def learn(self, runs: Design) -> Surrogate:
         """With runs of the configuration's model, those that failed left out."""
-        waves = runs if self.fine is None else full_runs(self.run, "coarse model", runs, waves_spec(self.run))
+        waves = runs
+        if self.fine is not None:
+            waves = runs_at(self.run, "coarse model", runs, waves_model(self.run))
         self.design = _joined(self.design, waves)
         self.surrogate, validation = trained(self.run, self.design, self.binned)
         if self.fine is not None:
@@ -55,18 +54,18 @@ class Refining:
             storage.save(self.run.at(stage, "fine.h5"), self.fine)
 
 
-def full_runs(run: Run, label: str, points: Design, spec: ModelSpec | None = None) -> Design:
-    """The points of a design run by `spec` (the configuration's model): kept, so that none is made twice."""
-    spec = spec or model_spec(run)
+def full_runs(run: Run, label: str, points: Design) -> Design:
+    """Returns the points of a design as the configuration's model runs them."""
+    return runs_at(run, label, points, full_model(run))
+
+
+def runs_at(run: Run, label: str, points: Design, model: ForceModel) -> Design:
+    """Returns the points of a design as a model runs them: kept, so that no run is made twice."""
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     training = np.zeros(len(points.theta), bool)
     wave = Wave(points.space, points.theta, training, 0, run.config.seed, {"rule": label})
-    file = runs_file(run, spec, motion, points.edges_s, points.space)
-    with crew(run) as run_all:
-        run_design(
-            file, wave, points.edges_s, partial(simulate, spec, motion), spec.hash, run_all,
-            partial(tell, run, label),
-        )  # fmt: skip
+    file = runs_file(run, model, motion, points.edges_s, points.space)
+    run_wave(run, label, file, wave, points.edges_s, model, motion)
     return rows_of(load_design(file), [wave])
 
 

@@ -15,7 +15,7 @@ from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.pipeline.engine import Run
 from bayeskin.pipeline.folder import sha256_of
-from bayeskin.pipeline.model import model_spec, waves_spec
+from bayeskin.pipeline.model import model_spec, waves_model
 from bayeskin.probe import refuse_damaged
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import effects_beside, effects_in, load_manifest
@@ -45,7 +45,7 @@ def shipped_files(run: Run) -> ShippedFiles:
     brought = own.is_file() and name != run.config.recording.file
     path = own if brought else _shipped_folder() / name
     if not path.is_file():
-        ready = ", ".join(f"{file.stem}.h5" for file in sorted(_shipped_folder().glob("*.json")))
+        ready = ", ".join(f"{file.stem}.h5" for file in _shipped_manifests())
         expected = f"a file beside the configuration, or one that is shipped: {ready}"
         raise InputError(f"{run.config_path}: surrogate.file", f"no file {own}", expected)
     fine = None if run.config.design.coarse is None else path.with_name(f"{path.stem}-fine.h5")
@@ -62,6 +62,13 @@ def _shipped_folder() -> Path:
     return shipped("surrogates/README.md").parent
 
 
+def _shipped_manifests() -> dict[Path, Mapping[str, Any]]:
+    """What the manifests of the shipped surrogates say, by their files; a reduced model's is none of them."""
+    files = sorted(_shipped_folder().glob("*.json"))
+    said = {path: json.loads(path.read_text(encoding="utf-8")) for path in files}
+    return {path: manifest for path, manifest in said.items() if "motion_sha256" in manifest}
+
+
 def shipped_for(motion: PadMotion, geometry: Geometry = Geometry()) -> Path | None:
     """The shipped surrogate of the reaction on the generator's bricks for a protocol, if there is one.
 
@@ -69,8 +76,7 @@ def shipped_for(motion: PadMotion, geometry: Geometry = Geometry()) -> Path | No
     """
     if geometry != Geometry():
         return None
-    for path in sorted(_shipped_folder().glob("*.json")):
-        said = json.loads(path.read_text(encoding="utf-8"))
+    for path, said in _shipped_manifests().items():
         ours = (said.get("observation"), said.get("mesh")) == ("reaction", "bricks")
         if ours and said.get("motion_sha256") == motion_sha256(motion):
             return path.with_suffix(".h5")
@@ -99,7 +105,7 @@ def check_fits(run: Run, files: ShippedFiles, design: Design, binned: BinnedForc
     if said.get("geometry_sha256", Geometry().hash) != model_spec(run).geometry.hash:
         expected = "one of this configuration's [device] and [tissue], or a design"
         raise InputError(where, "a surrogate of another device or tissue", expected)
-    if (design.model_hash, said.get("model_hash")) != (waves_spec(run).hash, model_spec(run).hash):
+    if (design.model_hash, said.get("model_hash")) != (waves_model(run).hash, model_spec(run).hash):
         raise InputError(where, "a surrogate of another model", "one of this configuration's model")
     if said.get("motion_sha256") != motion_sha256(motion):
         raise InputError(where, "a surrogate of another protocol", "one of this recording's protocol")

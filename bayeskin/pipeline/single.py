@@ -25,9 +25,10 @@ from bayeskin.pipeline.folder import plain
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.recording import pad_motion
-from bayeskin.pipeline.reducing import reduced_for
+from bayeskin.pipeline.reducing import reduced_file
 from bayeskin.pipeline.reported import reported
 from bayeskin.recordings import describe, describe_json, phase_noise, read_recording, segment
+from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, Parameter, ParameterSpace, Simulation
@@ -129,7 +130,7 @@ def _reduced_run(
     if (spec.observation, spec.mesh, spec.refinement) != ("reaction", "bricks", 1):
         found = f"observation {spec.observation!r} on {spec.mesh!r}, refinement {spec.refinement}"
         raise InputError("--reduced", found, "observation 'reaction' on 'bricks', refinement 1")
-    model = reduced_for(spec.geometry, [source for source in sources if source is not None])
+    model = load_reduced(reduced_file(spec.geometry, [source for source in sources if source is not None]))
     return simulate_reduced(
         model, motion, theta, mechanisms, geometry=spec.geometry, estimate=True, on_state=on_state
     )

@@ -79,6 +79,17 @@ def _read_modes(group: h5py.Group) -> Modes:
     return Modes(values("displacement"), values("pressure"))
 
 
+def trained_geometry(path: Path) -> Geometry | None:
+    """Returns the geometry that the reduced model of a file was made for; None where it holds no such model.
+
+    Raises InputError for a file that is absent, or no HDF5.
+    """
+    with storage.reading(path, EXPECTED) as handle:
+        if handle.attrs.get("format") != FORMAT:
+            return None
+        return _geometry(json.loads(handle.attrs["manifest"])["geometry"])
+
+
 @lru_cache(maxsize=4)
 def load_reduced(path: Path) -> ReducedModel:
     """Reads what `save_reduced` wrote.
@@ -99,7 +110,7 @@ def load_reduced(path: Path) -> ReducedModel:
             trained=Trained(
                 _geometry(said["geometry"]), storage.read(handle["space"], ParameterSpace, path),
                 {name: storage.read(group, ParameterSpace, path)
-                 for name, group in handle["mechanisms"].items()},
+                 for name, group in handle.get("mechanisms", {}).items()},
                 Protocols(**{name: _tupled(value) for name, value in said["protocols"].items()}),
             ),
             refinement=int(said["refinement"]),

@@ -14,7 +14,7 @@ import scipy.linalg
 
 from bayeskin.geometry import Geometry
 from bayeskin.model.lagrangian import Step
-from bayeskin.reduced.cases import RADIUS_RANGE, STIFFEST_SUBCUTIS, THICKNESS_RANGE, Trained
+from bayeskin.reduced.cases import RADIUS_RANGE, STIFFEST_SUBCUTIS, THICKNESS_RANGE, Protocols, Trained
 from bayeskin.types import Array, PadMotion, ParameterSpace
 
 LEAST_STIFFNESS = 0.05  # smallest eigenvalue of the stiffness, over that at rest
@@ -37,17 +37,25 @@ def outside(
     lines = [line for space in spaces if (line := _beyond(space, theta))]
     if theta["E_s"] > STIFFEST_SUBCUTIS * theta["E_c"]:
         lines.append(f"E_s is more than {STIFFEST_SUBCUTIS:g} times E_c")
+    lines += protocol_outside(trained.protocols, motion)
+    lines += other_geometry(trained.geometry, geometry)
+    return "; ".join(lines)
+
+
+def protocol_outside(trained: Protocols, motion: PadMotion) -> list[str]:
+    """Returns how a protocol leaves those that a reduced model was trained on; empty where it does not."""
+    lines = []
     largest_m, lowest_m = float(motion.displacement_m.max()), float(motion.displacement_m.min())
-    if largest_m > trained.protocols.largest_m * (1.0 + 1e-9):
-        lines.append(f"the pads open by {1e3 * largest_m:.2f} mm, trained up to "
-                     f"{1e3 * trained.protocols.largest_m:g} mm")  # fmt: skip
+    if largest_m > trained.largest_m * (1.0 + 1e-9):
+        lines.append(
+            f"the pads open by {1e3 * largest_m:.2f} mm, trained up to {1e3 * trained.largest_m:g} mm"
+        )
     if lowest_m < -1e-6:
         lines.append(f"the pads are pushed together by {-1e3 * lowest_m:.2f} mm")
     fastest = float(np.abs(np.diff(motion.displacement_m) / np.diff(motion.time_s)).max(initial=0.0))
-    if fastest > FASTER * trained.protocols.speeds_m_s[1]:
+    if fastest > FASTER * trained.speeds_m_s[1]:
         lines.append(f"the pads move at {1e3 * fastest:.3g} mm/s")
-    lines += other_geometry(trained.geometry, geometry)
-    return "; ".join(lines)
+    return lines
 
 
 def _beyond(space: ParameterSpace, theta: Mapping[str, float]) -> str:

@@ -1,4 +1,4 @@
-"""A small reduced model of the article's device on 80 bricks, built as `bayeskin reduce` does."""
+"""Small reduced models: on 80 bricks, built as `bayeskin reduce` does, and one that cannot run."""
 
 from __future__ import annotations
 
@@ -6,13 +6,18 @@ from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from bayeskin.design import default_space
 from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import catalogue
-from bayeskin.model.simulate import problem_of
+from bayeskin.model.simulate import ModelSpec, problem_of
 from bayeskin.reduced.build import BuildSettings, RunTask, assemble, make_runs, training_cases, weighted_of
 from bayeskin.reduced.cases import BASE, Trained
-from bayeskin.reduced.model import ReducedModel, inner_of
+from bayeskin.reduced.files import save_reduced
+from bayeskin.reduced.library import Library, Modes
+from bayeskin.reduced.model import Cubatures, ReducedModel, inner_of
+from bayeskin.reduced.operators import Rule
 from bayeskin.types import ParameterSpace
 
 NAMES = ("preconditioning", "solid-viscoelasticity")
@@ -42,3 +47,15 @@ def built(folder: Path) -> ReducedModel:
     inner = inner_of(problem_of("bricks", 0))
     weighted = {kind: weighted_of(kind, SETTINGS, folder, inner) for kind in kinds}
     return assemble(region, 0, weighted, SETTINGS, lambda what, share: None)
+
+
+def hollow(path: Path, geometry: Geometry = Geometry(), size: float = 1.0) -> Path:
+    """The file of a reduced model that knows its region, and has no modes to run with."""
+    nothing, rule = size * np.ones((1, 3)), Rule(np.zeros(1, dtype=np.int64), np.ones(1))
+    spec = ModelSpec(geometry=geometry)
+    model = ReducedModel(
+        Trained(geometry, default_space(), {}), spec.refinement, Library(Modes(nothing, nothing), {}),
+        Cubatures(rule, rule), spec.hash,
+    )  # fmt: skip
+    save_reduced(path, model, {})
+    return path

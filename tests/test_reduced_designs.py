@@ -1,0 +1,199 @@
+"""Designs whose waves a reduced model makes: which one, where the full model runs, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import toy_model
+from toy import MOTION, toy_force
+from toys.small_reduced import hollow
+
+from bayeskin import cli, report, storage
+from bayeskin.config import load_config
+from bayeskin.geometry import Geometry
+from bayeskin.model.simulate import ModelSpec
+from bayeskin.pipeline import maximum, model, reducing, stages
+from bayeskin.pipeline.engine import Silent, open_run, standing
+from bayeskin.pipeline.model import FullModel, ReducedOrFull, full_model, waves_model
+from bayeskin.pipeline.new import new_config
+from bayeskin.pipeline.reducing import find_reduced
+from bayeskin.types import Design, PadMotion, Recording, Simulation
+
+TRUE = {"E_c": 200e3, "E_s": 30e3, "k_c": 1e-14, "k_s": 1e-13, "p_init": 300.0}
+FOLDING = {**TRUE, "E_s": 2.5 * TRUE["E_c"]}
+THICK = Geometry(cutis_m=4e-3)
+CONFIG = """
+[recording]
+file = "measured.h5"
+[model]
+refinement = 3
+[fit]
+bin_width_s = 1.0
+[design]
+points = [40, 24]
+held_out = 8
+coarse = "reduced"
+workers = 1
+[map]
+starts = 2
+evaluations = 1000
+"""
+
+
+@dataclass(frozen=True)
+class ToyReduced(ReducedOrFull):
+    """The toy on its coarsest mesh in a reduced model's place."""
+
+    def __call__(self, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
+        spec = replace(self.full.spec, refinement=1)
+        return replace(toy_model.simulate(spec, motion, theta), model_hash=self.hash)
+
+
+@pytest.fixture(autouse=True)
+def ships(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A hollow model in the shipped one's place."""
+    path = hollow(tmp_path_factory.mktemp("shipped") / "article-device-reduced.h5")
+    monkeypatch.setattr(reducing, "SHIPPED", str(path))
+    return path
+
+
+def measured(where: Path, largest_m: float = float(MOTION.displacement_m.max())) -> Path:
+    """A configuration whose waves a reduced model makes, with its recording."""
+    time_s = np.arange(0.0, 130.001, 0.1)
+    force_n = toy_model.SCALE * toy_force(np.array([list(TRUE.values())]), time_s)[0]
+    force_n = toy_model.finer(3, TRUE) * force_n
+    force_n += 0.02 * np.random.default_rng(5).standard_normal(len(time_s))
+    displacement_m = MOTION.at(time_s) * largest_m / MOTION.displacement_m.max()
+    storage.save(where / "measured.h5", Recording(time_s, displacement_m, force_n, "toy", "0" * 64))
+    (where / "case.toml").write_text(CONFIG)
+    return where / "case.toml"
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    with pytest.raises(SystemExit) as end:
+        cli.main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    last = captured.err.splitlines()[-1]
+    assert (end.value.code, captured.out) == (2, "")
+    assert "Traceback" not in captured.err
+    return last
+
+
+def test_a_run_with_a_reduced_design_is_corrected_by_the_full_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = measured(tmp_path)
+    monkeypatch.setattr(report, "save_figure", lambda figure, stem, provenance: None)
+    monkeypatch.setattr(model, "FullModel", toy_model.ToyModel)
+    monkeypatch.setattr(model, "ReducedOrFull", ToyReduced)
+    monkeypatch.setattr(maximum, "simulate", toy_model.simulate)
+    stages.run(case, "map", Silent())
+    run = open_run(case, Silent())
+    waves, fine = (storage.load(run.at("design", f"{name}.h5"), Design) for name in ("design", "fine"))
+    assert (waves.model_hash, fine.model_hash) == (waves_model(run).hash, full_model(run).hash)
+    assert waves.model_hash != fine.model_hash
+    few = run.config.design
+    assert (fine.training.sum(), fine.testing.sum()) == (few.fine_points, few.fine_held_out)
+    check = json.loads(run.at("map", "stage.json").read_text())["summary"]["checks"][-1]
+    assert check["rms_n"] < 0.005 * toy_model.SCALE * 2000  # the toy's coarsest mesh is off by 3 %
+    hollow(tmp_path / "mine-reduced.h5", size=2.0)
+    assert standing(run, stages.STAGES)["design"][0] == "out of date"
+    assert waves_model(run).hash != waves.model_hash
+
+
+def test_the_full_model_runs_where_the_reduced_one_was_not_trained(
+    ships: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waves = ReducedOrFull(ships, toy_model.ToyModel(ModelSpec()))
+    found = pickle.loads(pickle.dumps(waves))(MOTION, FOLDING)
+    right = toy_model.simulate(ModelSpec(), MOTION, FOLDING)
+    np.testing.assert_array_equal(found.force_n, right.force_n)
+    assert (found.status, found.model_hash) == ("ok", waves.hash)
+    assert found.message == "run by the full model: E_s is more than 2 times E_c"
+    inside = replace(right, stats={"inside": 1.0}, force_n=2.0 * right.force_n)
+    monkeypatch.setattr(model, "simulate_reduced", lambda *arguments, **more: inside)
+    found = waves(MOTION, TRUE)
+    np.testing.assert_array_equal(found.force_n, inside.force_n)
+    assert (found.model_hash, found.message) == (waves.hash, "")
+
+
+def test_the_hash_is_of_the_reduced_model_and_of_the_full_one(ships: Path, tmp_path: Path) -> None:
+    other = hollow(tmp_path / "other-reduced.h5", size=2.0)
+    thick = ModelSpec(geometry=replace(Geometry(), cutis_m=2.1e-3))
+    models = [
+        ReducedOrFull(ships, FullModel(ModelSpec())),
+        ReducedOrFull(other, FullModel(ModelSpec())),
+        ReducedOrFull(ships, FullModel(thick)),
+    ]
+    assert len({one.hash for one in models} | {FullModel(ModelSpec()).hash}) == 4
+
+
+def test_the_reduced_model_of_the_very_geometry_goes_first(ships: Path, tmp_path: Path) -> None:
+    config = tmp_path / "case.toml"
+    assert find_reduced(THICK, [config]) is None
+    near = hollow(tmp_path / "a-reduced.h5", Geometry(cutis_m=3.5e-3))
+    storage.save(tmp_path / "recording-reduced.h5", MOTION)  # is none
+    assert find_reduced(THICK, [config]) == near
+    assert find_reduced(Geometry(), [config]) == ships
+    assert find_reduced(Geometry(cutis_m=2.5e-3), [config]) == near
+    very = hollow(tmp_path / "b-reduced.h5", THICK)
+    assert find_reduced(THICK, [config]) == very
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"refinement = 3": 'mesh = "skin.msh"'}, "bricks of refinement 1 or more"),
+        ({"refinement = 3": 'mesh = "skin.msh"\nobservation = "article"'}, "bricks of refinement 1 or more"),
+        ({"refinement = 3": "refinement = 0"}, "bricks of refinement 1 or more"),
+        ({"refinement = 3": 'forward = "own.py:force"'}, "none: it is the full model's"),
+        ({'"reduced"': '"redced"'}, "design.coarse"),
+        ({"[map]": "[tissue]\ncutis_mm = 4.0\n[map]"}, "one that `bayeskin reduce` makes"),
+    ],
+    ids=["gmsh", "article", "coarsest", "own", "misspelt", "device"],
+)
+def test_what_has_no_reduced_model_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], changes: dict[str, str], says: str
+) -> None:
+    case = measured(tmp_path)
+    text = CONFIG
+    for old, new in changes.items():
+        text = text.replace(old, new)
+    case.write_text(text)
+    assert says in refused(capsys, "design", case)
+
+
+def test_a_protocol_beyond_the_training_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    case = measured(tmp_path, 12e-3)
+    line = refused(capsys, "design", case)
+    assert "design.coarse: found 'reduced' on a protocol that article-device-reduced.h5 does not know" in line
+    assert "the pads open by 12.00 mm, trained up to 10 mm" in line
+
+
+def test_new_takes_the_reduced_model_where_it_knows_device_and_protocol(tmp_path: Path) -> None:
+    (tmp_path / "device.toml").write_text("[tissue]\ncutis_mm = 4.0\n")
+    measured(tmp_path)
+    recording = tmp_path / "measured.h5"
+
+    def coarse(name: str, *device: Path) -> object:
+        said = new_config(recording, tmp_path / name, *device)
+        text = (tmp_path / name).read_text()
+        config = load_config(tmp_path / name).design
+        assert ("a design of the reduced model" in said["text"]) == (config.coarse == "reduced")
+        assert ("`bayeskin reduce`" in text) == (config.coarse is None)
+        return config.coarse
+
+    assert coarse("near.toml") == "reduced"
+    assert coarse("thick.toml", tmp_path / "device.toml") is None
+    hollow(tmp_path / "device-reduced.h5", THICK)
+    assert coarse("known.toml", tmp_path / "device.toml") == "reduced"
+    recording = measured(tmp_path, 12e-3).with_name("measured.h5")
+    assert coarse("far.toml") is None
