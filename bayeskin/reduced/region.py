@@ -17,7 +17,7 @@ from bayeskin.model.lagrangian import Step
 from bayeskin.reduced.cases import RADIUS_RANGE, STIFFEST_SUBCUTIS, THICKNESS_RANGE, Protocols, Trained
 from bayeskin.types import Array, PadMotion, ParameterSpace
 
-LEAST_STIFFNESS = 0.05  # smallest eigenvalue of the stiffness, over that at rest
+LEAST_STIFFNESS = 0.4  # smallest eigenvalue of the stiffness over that at rest (docs/reduced.md)
 LOW = 0.3  # of the largest displacement: at corners below it the stiffness is looked at
 FASTER = 2.0  # than the fastest training protocol: faster ones leave the skin as undrained as it is
 
