@@ -13,7 +13,7 @@ import pytest
 from bayeskin import cli
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
-from bayeskin.pipeline.reducing import SHIPPED, default_path, reduced_for
+from bayeskin.pipeline.reducing import SHIPPED, default_path, reduced_file
 from bayeskin.shipped import shipped
 
 DEVICE = "[device]\ngauge_mm = 30\n"
@@ -88,12 +88,13 @@ def test_one_beside_the_source_goes_before_the_shipped_one(tmp_path) -> None:
     source = tmp_path / "device.toml"
     source.write_text(NEAR)
     shutil.copy(shipped(SHIPPED), default_path(source))
-    assert reduced_for(Geometry(), [source]).hash == reduced_for(Geometry(), []).hash
-    with pytest.raises(InputError, match="another geometry"):
-        reduced_for(Geometry(gauge_m=30e-3), [source])
+    assert reduced_file(Geometry(), [source]) == default_path(source)
+    assert reduced_file(Geometry(), []) == shipped(SHIPPED)
+    with pytest.raises(InputError, match="none for this device"):
+        reduced_file(Geometry(gauge_m=30e-3), [source])
     default_path(source).write_bytes(b"cut off")
     with pytest.raises(InputError, match=r"device-reduced\.h5"):
-        reduced_for(Geometry(), [source])
+        reduced_file(Geometry(), [source])
 
 
 @pytest.mark.parametrize(
