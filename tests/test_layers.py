@@ -60,6 +60,7 @@ BELOW = {
         "mechanisms",
         "reduced",
         "config",
+        "sections",
         "device",
         "runner",
         "cluster",

@@ -33,6 +33,7 @@ from bayeskin.reduced.cases import BASE, Trained
 from bayeskin.reduced.files import load_reduced, save_reduced, trained_geometry
 from bayeskin.reduced.model import ReducedModel, inner_of
 from bayeskin.reduced.region import other_geometry
+from bayeskin.sections import read_toml
 from bayeskin.shipped import shipped
 from bayeskin.types import ParameterSpace
 from bayeskin.workers import Map, local
@@ -40,6 +41,7 @@ from bayeskin.workers import Map, local
 SHIPPED = "surrogates/article-device-reduced.h5"
 REFINEMENT = 1  # of the bricks that reduced models stand for
 WORKERS = 2
+EXPECTED = "a configuration, or a file with [device] and [tissue]"
 
 
 def reduce(
@@ -113,12 +115,11 @@ def _geometry(source: Path | None) -> Geometry:
     if source is None:
         return Geometry()
     if not source.is_file():
-        raise InputError(source, "no such file", "a configuration, or a file with [device] and [tissue]")
-    try:
+        raise InputError(source, "no such file", EXPECTED)
+    if "recording" not in read_toml(source, EXPECTED):
         return load_device(source).geometry
-    except InputError:
-        config = load_config(source)
-        return stated_geometry(config.device, config.tissue, source).geometry
+    config = load_config(source)
+    return stated_geometry(config.device, config.tissue, source).geometry
 
 
 def default_path(source: Path | None) -> Path:

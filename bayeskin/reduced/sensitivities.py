@@ -141,6 +141,7 @@ class ReducedGradients:
         travel = np.append(more, 0.0) / (2.0 * self._reach_m)
         for values in out:
             values -= np.outer(travel, values[r])
+            values[r] = 0.0  # the next stage's travel knows no history
         return _Known(stage.state, out, lost), own
 
 
