@@ -551,7 +551,7 @@ def test_a_shell_completes_commands_and_options() -> None:
         )
         return told.stdout.splitlines()[1::3]
 
-    assert completed("bayeskin re") == ["report"]
+    assert completed("bayeskin rep") == ["report"]
     assert completed("bayeskin simulate --ob") == ["--observation"]
     assert completed("bayeskin simulate --observation ") == ["reaction", "article"]
 
