@@ -132,7 +132,7 @@ def reduce_(source: Path | None, out: Path | None, scheduler: str | None, as_jso
     """Build the reduced model of a device: once, for all protocols.
 
     SOURCE is a configuration, or a file with the sections [device] and [tissue]; without it the article's
-    device. The base model comes first, within minutes, and can be used while the mechanisms follow. Training
+    device. The base model comes first, and can be used while the mechanisms follow. Training
     runs of the full model are kept, so that the command can be interrupted and goes on.
 
     \b

@@ -156,7 +156,7 @@ def reduced_file(geometry: Geometry, beside: Sequence[Path]) -> Path:
     """Returns the file that `find_reduced` finds. Raises InputError where it finds none."""
     found = find_reduced(geometry, beside)
     if found is None:
-        expected = "one that `bayeskin reduce` makes of its file: half an hour to two hours, once"
+        expected = "one that `bayeskin reduce` makes of its file, once"
         raise InputError("reduced model", "none for this device and tissue", expected)
     return found
 

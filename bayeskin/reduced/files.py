@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -140,8 +141,6 @@ def _geometry(said: Mapping[str, Any]) -> Geometry:
 
 def law_hashes(names: Mapping[str, object]) -> dict[str, str]:
     """Returns what each mechanism's file does, as a hash, by the mechanism's name."""
-    import inspect
-
     known = catalogue()
     return {
         name: sha256_of_behaviour(Path(inspect.getfile(known[name].act.bind)).read_bytes())  # type: ignore[arg-type]

@@ -23,9 +23,7 @@ from bayeskin.types import PadMotion, Simulation, frozen_array
 
 TOLERANCE = 1e-3  # of a step's error in time, relative to the nominal force: the full model's default
 ESTIMATES = 12  # states at which the error is estimated, beside the corners
-SAFETY = (
-    3.0  # on what the residual tells of them, which knows little of errors that built up (docs/reduced.md)
-)
+SAFETY = 3.0  # on what the residual tells of them: chosen on the skins of docs/reduced.md
 
 
 def simulate_reduced(
