@@ -208,7 +208,7 @@ def _full_design() -> list[str]:
         "# No shipped surrogate knows this protocol on this device, so the full model is run first, here:",
         f"# {runs} runs of some {quick} to {slow} s each, {low:.0f} to {high:.0f} minutes with "
         f"{design.workers} workers.",
-        "# `bayeskin reduce` with this file makes a reduced model of the device, once, from hundreds of runs;",
+        "# `bayeskin reduce` with this file makes a reduced model of the device once, from hundreds of runs;",
         '# with it, coarse = "reduced" takes minutes, if the pads open no further than it knows.',
         "[design]",
         *_waves(design),
