@@ -9,12 +9,14 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 from bayeskin.errors import InputError
 
 ForceOn = Literal["pad", "pad and guard"]
+LENGTHS = ("cutis_m", "subcutis_m", "arm_radius_m")  # of the tissue: they may be parameters of a run
 
 # The box reaches so many times as far as the device, or as the skin is thick where that is more: along the
 # pull, where the pads are, and across it.
@@ -80,7 +82,7 @@ class Geometry:
         if self.force_on == "pad and guard" and self.guard is None:
             raise InputError("force_on", "'pad and guard' without a guard", "'pad', or a guard")
         if self.arm_radius_m is not None and self.box_m[1] > math.pi * self.arm_radius_m:
-            least = _mm(self.box_m[1] / math.pi)
+            least = _mm(self.least_radius_m)
             expected = f"at least {least}, so that skin as wide as this device needs does not meet itself"
             raise InputError("arm_radius_m", _mm(self.arm_radius_m), expected)
 
@@ -123,6 +125,11 @@ class Geometry:
         return _exact(BOX_ALONG * reach), _exact(BOX_ACROSS * reach), self.thickness_m
 
     @property
+    def least_radius_m(self) -> float:
+        """Radius of the arm [m] below which the modelled skin would meet itself."""
+        return self.box_m[1] / math.pi
+
+    @property
     def measured_width_m(self) -> float:
         """Whole width, across the pull, of what the load cell holds [m]."""
         return self.pad_width_m if self.force_on == "pad" else _exact(2 * self.across_m[-1])
@@ -136,6 +143,15 @@ class Geometry:
     def hash(self) -> str:
         """sha256 of all lengths and of what the load cell holds."""
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+
+
+def moved(geometry: Geometry, theta: Mapping[str, float]) -> Geometry:
+    """Returns a geometry with those lengths of the tissue [m] that are among the parameters theta.
+
+    Raises InputError for lengths that cannot be.
+    """
+    lengths = {name: theta[name] for name in LENGTHS if name in theta}
+    return replace(geometry, **lengths) if lengths else geometry  # type: ignore[arg-type]
 
 
 def _exact(length_m: float) -> float:

@@ -79,7 +79,7 @@ def test_derivatives_are_central_differences(monkeypatch, case):
     theta = THETA | {name: value for values in WITH[case].values() for name, value in values.items()}
     binds = laws([catalogue()[name] for name in WITH[case]])
     skin, steps = model(theta, binds, refinement), []
-    slopes = ForceGradients(skin, theta, theta, binds)
+    slopes = ForceGradients(skin, theta, theta, binds, lambda values: skin.problem)
 
     def on_step(step: Step) -> None:
         steps.append(step)

@@ -116,7 +116,7 @@ def test_derivatives_are_those_of_two_runs(model, names, changes, monkeypatch) -
     space = model.space([name for name in names if name in NAMES])
     binds = laws(of(names))
     equations = ReducedEquations(space, theta, binds, MOTION)
-    slopes = ReducedGradients(equations, theta, changes, binds, MOTION)
+    slopes = ReducedGradients(equations, theta, changes, binds, MOTION, lambda values: space)
     steps: list[Step] = []
 
     def on_step(step: Step) -> None:

@@ -6,7 +6,8 @@ with the stage's own tangent K. For a guess v of dx the right-hand side less K v
     -r = [R(x + eps v, J* + eps dJ*, p* + eps dp*; theta + eps) - R(x, J*, p*; theta)] / eps
 
 so that no tangent is formed: of the base model r is found exactly and for all parameters at once
-(`directional`), with laws beyond it from two residuals a parameter. The guess combines the stages before as
+(`directional`), with laws beyond it from two residuals a parameter, and with a length of the tissue among
+these too: there the residual further on is that of moved nodes, at the same unknowns. The guess combines the stages before as
 their unknowns best combine to those of this one, and is corrected by back-substitutions of r with the kept
 factorisation M nearest to the stage, with laws with the stage's own, which costs less than a correction.
 
@@ -35,10 +36,11 @@ from typing import Union
 import numpy as np
 
 from bayeskin.errors import InputError
+from bayeskin.geometry import LENGTHS
 from bayeskin.model.directional import TangentAction
 from bayeskin.model.lagrangian import Evaluated, LagrangianModel, Stage, State, Step
 from bayeskin.model.newton import Equations
-from bayeskin.model.problem import Material, material
+from bayeskin.model.problem import Material, Problem, material
 from bayeskin.model.series import Drive, Memories, lost_slopes, memory_slopes, on_the_way, yielding
 from bayeskin.model.tissue import Bind, TissueLaw
 from bayeskin.types import Array
@@ -54,14 +56,18 @@ DUALS = 10  # kept
 
 
 def logarithms(theta: Mapping[str, float]) -> dict[str, float]:
-    """The changes by which `simulate` gives derivatives by the logarithms of the base's four parameters."""
-    return {name: theta[name] for name in SCALING}
+    """The changes by which `simulate` gives derivatives by logarithms of the base's four and of lengths."""
+    return {name: theta[name] for name in (*SCALING, *LENGTHS) if name in theta}
 
 
 @dataclass(frozen=True)
 class _Varied:
-    """What a run is made of, where one parameter is EPSILON of its change further."""
+    """What a run is made of, where one parameter is EPSILON of its change further.
 
+    model : has the nodes where they are then; its own material and laws are the run's
+    """
+
+    model: LagrangianModel
     material: Material
     laws: tuple[TissueLaw, ...]
     drive: Drive
@@ -81,18 +87,20 @@ class _Slopes:
 
 
 _Evaluated = Union[Evaluated, "_Differences"]
+ProblemAt = Callable[[Mapping[str, float]], Problem]
 
 
 class ForceGradients:
     """Follows a run, step by accepted step; `force_n` then holds the derivatives of each step's force.
 
     changes : of each parameter, by name, what counts as one; derivatives are in newtons for that
+    problem_at : the model's problem with its nodes where parameters have them
     Raises InputError for a parameter that the run does not have.
     """
 
     def __init__(
         self, model: LagrangianModel, theta: Mapping[str, float], changes: Mapping[str, float],
-        laws: Sequence[Bind] = (),
+        laws: Sequence[Bind], problem_at: ProblemAt,
     ) -> None:  # fmt: skip
         unknown = [name for name in changes if name not in theta]
         if unknown:
@@ -100,9 +108,15 @@ class ForceGradients:
         self.names = tuple(changes)
         self._model, self._follows = model, _follows(model, theta, changes)
         self._solved = tuple(name for name in changes if not (self._follows and name == "E_c"))
-        self._varied = [_varied(model, theta, name, EPSILON * changes[name], laws) for name in self._solved]
-        back = [_varied(model, theta, name, -EPSILON * changes[name], laws) for name in self._solved]
-        self._rates = _rates([one.material for one in self._varied], [one.material for one in back])
+        self._by_differences = bool(model.laws) or not set(LENGTHS).isdisjoint(changes)
+        self._varied = [
+            _varied(model, theta, name, EPSILON * changes[name], laws, problem_at) for name in self._solved
+        ]
+        back = [{**theta, name: theta[name] - EPSILON * changes[name]} for name in self._solved]
+        self._rates = _rates(
+            [one.material for one in self._varied],
+            [material(values, model.problem.mesh.cutis) for values in back],
+        )
         self._in_series = bool(model.drive.elements)
         self._reach_m = 2.0 * model.drive.largest_m
         self._start = self._at_rest(theta["p_init"], changes.get("p_init", 0.0))
@@ -203,7 +217,7 @@ class ForceGradients:
     ) -> tuple[Array, _Evaluated, Array]:
         """From a guess x (dofs, r) whose fixed rows are right: x, what is `Evaluated` there, the force."""
         model, solver, free = self._model, self._model.solver, self._model.problem.pattern.free
-        if model.laws:
+        if self._by_differences:
             solver.renew(equations, stage.state.x)
         dual = self._dual(solver.toward(equations.place))
         weight, allowed_n = equations.weight[:, None], TOLERANCE * model.nominal_force()
@@ -229,9 +243,9 @@ class ForceGradients:
 
     def _action(self, stage: Stage, before: _Slopes) -> Callable[[Array], _Evaluated]:
         """Derivatives of all that is `Evaluated` at the stage's end, from those of the unknowns there."""
-        if not self._model.laws:
-            return TangentAction(self._model, stage, self._rates, before.volume, before.pressure)
-        return lambda x: _Differences(self._model, self._varied, stage, before, x)
+        if self._by_differences:
+            return lambda x: _Differences(self._model, self._varied, stage, before, x)
+        return TangentAction(self._model, stage, self._rates, before.volume, before.pressure)
 
     def _less_lost(
         self, stage: Stage, before: _Slopes, x: Array, found: _Evaluated, force: Array
@@ -274,15 +288,18 @@ class ForceGradients:
 
 
 def _varied(
-    model: LagrangianModel, theta: Mapping[str, float], name: str, by: float, laws: Sequence[Bind]
-) -> _Varied:
+    model: LagrangianModel, theta: Mapping[str, float], name: str, by: float, laws: Sequence[Bind],
+    problem_at: ProblemAt,
+) -> _Varied:  # fmt: skip
     """Raises InputError for a change that makes of a run another one."""
     values = {**theta, name: theta[name] + by}
+    if name in LENGTHS:
+        model = LagrangianModel(problem_at(values), model.material, model.protocol, model.laws)
     bound = tuple(sorted((bind(values, model.problem.sites) for bind in laws), key=lambda law: law.rank))
     drive = on_the_way(model.protocol, bound)
     if drive.starts_s != model.starts_s:
         raise InputError(f"gradients: {name}", theta[name], "pads that were opened before the test")
-    return _Varied(material(values, model.problem.mesh.cutis), bound, drive)
+    return _Varied(model, material(values, model.problem.mesh.cutis), bound, drive)
 
 
 def _rates(up: Sequence[Material], down: Sequence[Material]) -> tuple[Array, Array, Array]:
@@ -319,11 +336,12 @@ class _Differences:
     ) -> None:
         self._base, self._columns = stage.state, []
         for r, column in enumerate(x.T):
-            old, to = stage.history, (model.material, model.laws)
+            at, old, to = model, stage.history, (model.material, model.laws)
             if r < len(varied):
-                to, old = (varied[r].material, varied[r].laws), _moved(old, before, r)
+                one, old = varied[r], _moved(old, before, r)
+                at, to = one.model, (one.material, one.laws)
             moved = self._base.x + EPSILON * column
-            found = model.residual(moved, stage.length_s, old, stage.elapsed_s, to)
+            found = at.residual(moved, stage.length_s, old, stage.elapsed_s, to)
             if found is None:  # the cells were upright a moment ago, at the same unknowns to a millionth
                 at_s = self._base.time_s
                 raise FloatingPointError(f"no derivative at t = {at_s:.3f} s: a cell is all but flat")

@@ -172,3 +172,8 @@ def build_problem(mesh: SkinMesh) -> Problem:
         )
     )
     return Problem(mesh, space, sparsity(space, fixed), pad, pads)
+
+
+def moved_problem(problem: Problem, mesh: SkinMesh) -> Problem:
+    """The problem on a mesh with the same cells, whose nodes alone are elsewhere."""
+    return Problem(mesh, taylor_hood(mesh), problem.pattern, problem.pad, problem.pads)

@@ -7,13 +7,13 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from bayeskin.errors import InputError
-from bayeskin.geometry import Geometry
+from bayeskin.geometry import LENGTHS, Geometry, moved
 from bayeskin.model import article
 from bayeskin.model.gmsh import read_gmsh
 from bayeskin.model.gradients import ForceGradients
@@ -22,7 +22,15 @@ from bayeskin.model.linear import SOLVER_NAME
 from bayeskin.model.mesh import SkinMesh, brick_mesh
 from bayeskin.model.newton import NewtonSolver
 from bayeskin.model.own import identity, simulate_own
-from bayeskin.model.problem import PARAMETERS, Constants, Material, Problem, build_problem, material
+from bayeskin.model.problem import (
+    PARAMETERS,
+    Constants,
+    Material,
+    Problem,
+    build_problem,
+    material,
+    moved_problem,
+)
 from bayeskin.model.stepping import integrate
 from bayeskin.model.tissue import Bind
 from bayeskin.types import Array, Observation, PadMotion, Simulation, frozen_array
@@ -96,6 +104,19 @@ def problem_of(mesh: str, refinement: int, geometry: Geometry = Geometry()) -> P
     return build_problem(_mesh(mesh, refinement, geometry))
 
 
+def problem_at(spec: ModelSpec, theta: Mapping[str, float]) -> Problem:
+    """Returns the problem of a specification, its nodes moved to the tissue's lengths that are in theta.
+
+    Raises InputError for lengths that cannot be, and for a gmsh mesh, whose nodes stay where they are.
+    """
+    nominal, geometry = problem_of(spec.mesh, spec.refinement, spec.geometry), moved(spec.geometry, theta)
+    if geometry == spec.geometry:
+        return nominal
+    if spec.mesh != "bricks":
+        raise InputError("model.mesh", f"{spec.mesh!r} with another length of the tissue", "'bricks'")
+    return moved_problem(nominal, brick_mesh(spec.refinement, geometry, spec.geometry))
+
+
 def simulate(
     spec: ModelSpec,
     motion: PadMotion,
@@ -108,11 +129,12 @@ def simulate(
 ) -> Simulation:
     """Runs the full model over the whole motion.
 
-    theta : E_c, E_s [Pa], k_c, k_s [m^2], p_init [Pa], and the parameters of `laws`
+    theta : E_c, E_s [Pa], k_c, k_s [m^2], p_init [Pa], the parameters of `laws`, and lengths of the tissue
+        [m] in place of the specification's
     on_progress : called with the fraction of the motion that is done
     on_state : called with time [s], all unknowns (dofs,) and force [N] of each accepted step
     gradients : also the force's derivatives by these parameters, each for the change that stands with it,
-        `reaction` only (`gradients.logarithms`: by the logarithms of the base's four)
+        `reaction` only (`gradients.logarithms`: by the logarithms of the base's four and of lengths)
     falls_too : whether a skin that folds is followed across the fold, which takes minutes; else it has failed
     laws : physics beyond the base model, `reaction` only; with pads that were opened before the test the
         force is relative to that at its start, where all is at rest
@@ -130,16 +152,27 @@ def simulate(
     if spec.forward is not None:
         return simulate_own(spec.forward, motion, theta)
     started = time.perf_counter()
-    problem = problem_of(spec.mesh, spec.refinement, spec.geometry)
+    problem = problem_at(spec, theta)
     history = _History(motion, on_progress, on_state)
     if spec.observation == "reaction":
         solid = material(theta, problem.mesh.cutis)
         outcome = _run_reaction(
-            problem, solid, spec.tolerance, laws, motion, theta, history, gradients, falls_too
-        )
+            problem, solid, spec.tolerance, laws, motion, theta, history,
+            partial(_slopes, spec, theta, gradients, laws) if gradients else None, falls_too,
+        )  # fmt: skip
     else:
         outcome = (*_run_article(problem, motion, theta, history), None)
     return _simulation(problem, motion, theta, history, outcome, time.perf_counter() - started, spec.hash)
+
+
+def _slopes(
+    spec: ModelSpec,
+    theta: Mapping[str, float],
+    changes: Mapping[str, float],
+    laws: Sequence[Bind],
+    model: LagrangianModel,
+) -> ForceGradients:
+    return ForceGradients(model, theta, changes, laws, partial(problem_at, spec))
 
 
 def simulate_on(
@@ -236,13 +269,13 @@ def _run_reaction(
     motion: PadMotion,
     theta: Mapping[str, float],
     history: _History,
-    gradients: Mapping[str, float] | None,
+    slopes_of: Callable[[LagrangianModel], ForceGradients] | None,
     falls_too: bool = True,
 ) -> _Outcome:
     """Fills the history; returns a message, empty for a run that finished."""
     bound = tuple(bind(theta, problem.sites) for bind in laws)
     model = LagrangianModel(problem, solid, motion, bound)
-    slopes = ForceGradients(model, theta, gradients, laws) if gradients else None
+    slopes = slopes_of(model) if slopes_of is not None else None
     at_start: list[float] = []
 
     def on_step(step: Step) -> None:
@@ -286,8 +319,8 @@ def _check(theta: Mapping[str, float], more: bool) -> None:
     for name, value in theta.items():
         if not np.isfinite(value):
             raise InputError(f"parameters: {name}", value, "a finite number")
-        if name not in PARAMETERS and not more:
+        if name not in (*PARAMETERS, *LENGTHS) and not more:
             raise InputError("parameters", name, f"one of {', '.join(PARAMETERS)}")
 
 
-__all__ = ["SOLVER_NAME", "ModelSpec", "problem_of", "simulate", "simulate_on"]
+__all__ = ["SOLVER_NAME", "ModelSpec", "problem_at", "problem_of", "simulate", "simulate_on"]

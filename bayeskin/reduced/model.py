@@ -14,7 +14,7 @@ import scipy.linalg
 
 from bayeskin.geometry import Geometry
 from bayeskin.model.mesh import brick_mesh
-from bayeskin.model.problem import Problem, build_problem
+from bayeskin.model.problem import Problem, moved_problem
 from bayeskin.model.simulate import problem_of
 from bayeskin.reduced.basis import Inner, inner_products
 from bayeskin.reduced.cases import Trained
@@ -57,9 +57,10 @@ class ReducedModel:
     def problem(self, geometry: Geometry | None = None) -> Problem:
         """The full model's problem: on the geometry trained for, or its mesh moved to another."""
         own = self.trained.geometry
+        nominal = problem_of("bricks", self.refinement, own)
         if geometry is None or geometry == own:
-            return problem_of("bricks", self.refinement, own)
-        return build_problem(brick_mesh(self.refinement, geometry, own))
+            return nominal
+        return moved_problem(nominal, brick_mesh(self.refinement, geometry, own))
 
     def basis(self, mechanisms: Sequence[str]) -> Basis:
         """The fields of a set of mechanisms on the nodes of the mesh."""

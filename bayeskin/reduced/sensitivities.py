@@ -4,21 +4,26 @@ Differentiating a solved stage R(x, history; theta) = 0 gives K dx = -dR/dtheta 
 the stage's own tangent K, whose inverse is at hand. The right-hand side is found by differences of what the
 laws answer at the points, one parameter a step further, at fixed kinematics; once dx is known, a second
 difference tells how J and the laws' memories change (`slopes.differentiate`). Steps in time are held.
+
+A length of the tissue moves the nodes, and with them kinematics, weights and all that is integrated exactly.
+Its right-hand side is the difference of two residuals at the same unknowns, of the moved space and of the
+run's own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from bayeskin.errors import InputError
+from bayeskin.geometry import LENGTHS
 from bayeskin.model.lagrangian import Stage, State, Step
 from bayeskin.model.series import Memories, lost_slopes, memory_slopes, on_the_way, yielding
 from bayeskin.model.tissue import Bind
 from bayeskin.reduced import kernels, slopes
-from bayeskin.reduced.equations import Bound, ReducedEquations, bound
+from bayeskin.reduced.equations import Bound, ReducedEquations, ReducedSpace, bound
 from bayeskin.types import Array, PadMotion
 
 STEP = 1e-6  # of a parameter's change: truncation 1e-6, rounding 1e-10
@@ -38,20 +43,29 @@ class ReducedGradients:
     """Follows a reduced run step by accepted step; `force_n` then holds the derivatives of each step's force.
 
     changes : of each parameter, by name, what counts as one; derivatives are in newtons for that
+    space_at : the run's space with its nodes where parameters have them
     Raises InputError for a parameter that the run does not have.
     """
 
     def __init__(
         self, equations: ReducedEquations, theta: Mapping[str, float], changes: Mapping[str, float],
         binds: Sequence[Bind], protocol: PadMotion,
+        space_at: Callable[[Mapping[str, float]], ReducedSpace],
     ) -> None:  # fmt: skip
         unknown = [name for name in changes if name not in theta]
         if unknown:
             raise InputError("gradients", unknown[0], f"among {', '.join(theta)}")
         self.names = tuple(changes)
         self._equations = equations
-        further = [{**theta, name: theta[name] + STEP * change} for name, change in changes.items()]
-        runs = [bound(equations.space, values, binds) for values in further]
+        further = {name: {**theta, name: theta[name] + STEP * change} for name, change in changes.items()}
+        self._moved = {
+            self.names.index(name): ReducedEquations(space_at(values), values, binds, protocol)
+            for name, values in further.items()
+            if name in LENGTHS
+        }
+        runs = [bound(equations.space, values, binds) for values in further.values()]
+        for place, one in self._moved.items():
+            runs[place] = one.run
         self._drives = [on_the_way(protocol, run.laws) for run in runs]
         self._in_series = bool(equations.drive.elements)
         self._varied = _varied(equations, [*runs, *([equations.run] if self._in_series else [])])
@@ -97,17 +111,45 @@ class ReducedGradients:
         )  # fmt: skip
         past, room = eq.past_of(stage), eq.make_room()
         x, t = stage.state.x.copy(), eq.tangent
-        kernels.residual(eq.system, eq.packed, past, x, room, np.empty(len(x)))
+        residual, pads_by = np.empty(len(x)), self._pads_by(stage.state.time_s, last.lost)
+        kernels.residual(eq.system, eq.packed, past, x, room, residual)
         out = slopes.Slopes(*(np.empty_like(values) for values in last.slopes))
         force = slopes.differentiate(
-            eq.system, eq.packed, past, x, room, self._varied, before,
-            self._pads_by(stage.state.time_s, last.lost), t.inverse, t.force_row, t.by_pads, out,
+            eq.system, eq.packed, past, x, room, self._varied, before, pads_by, t.inverse, t.force_row,
+            t.by_pads, out,
         )  # fmt: skip
+        for i in self._moved:
+            force[i] = self._by_length(i, past, x, residual, room, before, pads_by[i], out)
         t.length_s = stage.length_s
         eq.spent += (0, 1, 1)
         if self._in_series:
             return self._less_lost(stage, last.lost, out, force)
         return _Known(stage.state, out, last.lost), force
+
+    def _by_length(
+        self, i: int, past: kernels.History, x: Array, residual: Array, room: kernels.Room,
+        before: slopes.Slopes, pads_by: float, out: slopes.Slopes,
+    ) -> float:  # fmt: skip
+        """Fills row i of `out`, the derivatives by a length, and returns the force's.
+
+        residual, room : at the unknowns x; the tangent there is the last one made
+        """
+        eq, moved, t = self._equations, self._moved[i], self._equations.tangent
+        further, other = np.empty(len(x)), eq.make_room()
+        older = kernels.History(
+            past.volume + STEP * before.volume[i], past.pressure + STEP * before.pressure[i],
+            past.memory + STEP * before.memory[i], past.displacement + STEP * before.x[i], past.length_s,
+            past.elapsed_s, past.time_s,
+        )  # fmt: skip
+        kernels.residual(moved.system, moved.packed, older, x, other, further)
+        right = (further - residual) / STEP
+        out.x[i, :2] = pads_by, 0.0
+        out.x[i, 2:] = -t.inverse @ (right[2:] + pads_by * t.by_pads[:-1])
+        kernels.residual(moved.system, moved.packed, older, x + STEP * out.x[i], other, further)
+        out.volume[i] = (other.volume - room.volume) / STEP
+        out.pressure[i] = (other.at_pressure - room.at_pressure) / STEP
+        out.memory[i] = (other.memory - room.memory) / STEP
+        return float(2.0 * right[1] + t.force_row @ out.x[i, 2:] + pads_by * t.by_pads[-1])
 
     def _pads_by(self, time_s: float, lost: Memories) -> Array:
         """Derivatives of the pads' displacement [m], with what was lost before; and their travel."""

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
-from bayeskin.geometry import Geometry
+from bayeskin.geometry import Geometry, moved
 from bayeskin.mechanisms import Mechanism, solved
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.model.lagrangian import LagrangianModel, Step
 from bayeskin.model.problem import material
 from bayeskin.model.simulate import OnState
 from bayeskin.model.stepping import integrate
-from bayeskin.reduced.equations import ReducedEquations
+from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
 from bayeskin.reduced.error import DualWeightedResidual
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.region import Stability, outside
@@ -38,9 +39,10 @@ def simulate_reduced(
 ) -> Simulation:
     """Runs a reduced model over the whole motion, with those of `mechanisms` that the full model solves.
 
-    theta : E_c, E_s [Pa], k_c, k_s [m^2], p_init [Pa], and the mechanisms' parameters
+    theta : E_c, E_s [Pa], k_c, k_s [m^2], p_init [Pa], the mechanisms' parameters, and lengths of the tissue
+        [m] in place of the geometry's
     gradients : also the force's derivatives by these parameters, each for the change that stands with it
-    geometry : layers and arm that differ from the model's
+    geometry : the layers and the arm where they differ from the model's
     estimate : whether the force's error is estimated, which takes longer than the run
     on_state : called with time [s], the full model's unknowns (dofs,) and force [N] of each step of the test
 
@@ -49,7 +51,7 @@ def simulate_reduced(
     """
     started = time.perf_counter()
     tissue = sorted(m.name for m in mechanisms if isinstance(m.act, Tissue))
-    shape = geometry or model.trained.geometry
+    shape = moved(geometry or model.trained.geometry, theta)
     message = outside(model.trained, theta, tissue, shape, motion)
     history, run = _History(), None
     stats = {"inside": 0.0}
@@ -106,7 +108,8 @@ class _Run:
         self._stability = Stability(self._equations.drive.largest_m)
         self.slopes = None
         if gradients:
-            self.slopes = ReducedGradients(self._equations, theta, gradients, self._binds, motion)
+            space_at = partial(_space_at, model, tissue, geometry)
+            self.slopes = ReducedGradients(self._equations, theta, gradients, self._binds, motion, space_at)
         self._seconds = 0.0
 
     def integrate(self, history: _History) -> str:
@@ -173,6 +176,12 @@ class _Run:
                     errors.append(error_n)
         full.solver.release()
         return SAFETY * float(np.sqrt(np.mean(np.square(errors))))
+
+
+def _space_at(
+    model: ReducedModel, tissue: Sequence[str], geometry: Geometry, theta: Mapping[str, float]
+) -> ReducedSpace:
+    return model.space(tissue, moved(geometry, theta))
 
 
 def _beyond_start(slopes: ReducedGradients, count: int) -> np.ndarray:
