@@ -17,9 +17,16 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from bayeskin.design import default_space
-from bayeskin.device import DeviceConfig, StatedGeometry, TissueConfig, stated_geometry
+from bayeskin.device import (
+    ROOM,
+    DeviceConfig,
+    StatedGeometry,
+    TissueConfig,
+    length_parameters,
+    stated_geometry,
+)
 from bayeskin.errors import InputError
-from bayeskin.geometry import Geometry
+from bayeskin.geometry import LENGTHS, Geometry, moved
 from bayeskin.sections import Section, checked, one_of, read_toml
 from bayeskin.types import Correlation, Parameter, ParameterSpace
 
@@ -284,21 +291,28 @@ class Config(Section):
         return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
     def geometry(self, where: object = "configuration") -> StatedGeometry:
-        """Device and tissue of the sections. Raises InputError, of `where`, for what cannot be."""
+        """Device and tissue of the sections. Raises InputError, of `where`, for what cannot be.
+
+        An uncertain length moves nodes, so it needs the generator's bricks.
+        """
         stated = stated_geometry(self.device, self.tissue, where)
+        if stated.sd_m and (self.model.observation, self.model.mesh) != ("reaction", "bricks"):
+            name, model = next(iter(stated.sd_m)), self.model
+            own = model.observation if model.observation != "reaction" else model.mesh
+            found = f"a mean and an sd, with {own!r} in [model]"
+            expected = "a number, or observation 'reaction' on mesh 'bricks'"
+            raise InputError(f"{where}: tissue.{name}m", found, expected)
         if self.model.observation != "reaction" and stated != StatedGeometry(Geometry()):
             section = "device" if self.device != DeviceConfig() else "tissue"
             found = f"another than the article's, with observation {self.model.observation!r}"
             raise InputError(f"{where}: {section}", found, "observation 'reaction' with it")
         return stated
 
-    def certain_geometry(self, where: object) -> Geometry:
-        """The geometry of a run. Raises InputError, of `where`, for a length that is uncertain."""
-        stated = self.geometry(where)
-        for name in stated.sd_m:
-            expected = "a number: an uncertain thickness or radius needs the reduced model"
+    def refuse_uncertain(self, where: object, command: str) -> None:
+        """Raises InputError, of `where`, for a length that is uncertain, which a command cannot have."""
+        for name in self.geometry(where).sd_m:
+            expected = f"a number: `bayeskin {command}` takes no uncertain length, `bayeskin run` does"
             raise InputError(f"{where}: tissue.{name}m", "a mean and an sd", expected)
-        return stated.geometry
 
 
 def load_config(path: Path | str) -> Config:
@@ -339,8 +353,8 @@ def _table(plain: Mapping[str, Any], name: str = "") -> list[str]:
 def parameter_space(config: Config, where: object = "configuration") -> ParameterSpace:
     """The prior box: the defaults with the configuration's changes, or that of a forward model of one's own.
 
-    Raises InputError for an unknown parameter, bounds upside down, a log prior that reaches zero, or
-    correlations that cannot be.
+    Uncertain lengths of the tissue follow the defaults. Raises InputError for an unknown parameter, bounds
+    upside down, a log prior that reaches zero, lengths that cannot be, or correlations that cannot be.
     """
     space = _own_space(config, where) if config.model.forward is not None else _changed_space(config, where)
     stated = tuple(
@@ -355,15 +369,33 @@ def parameter_space(config: Config, where: object = "configuration") -> Paramete
 
 
 def _changed_space(config: Config, where: object) -> ParameterSpace:
-    """The default one with the configuration's changes."""
-    default = default_space()
+    """The default one and uncertain lengths, with the configuration's changes."""
+    stated = config.geometry(where)
+    default = ParameterSpace((*default_space().parameters, *length_parameters(stated)))
     unknown = sorted(set(config.parameters) - set(default.names))
     if unknown:
         where = f"{where}: parameters.{unknown[0]}"
         raise InputError(where, "an unknown parameter", one_of(default.names))
-    return ParameterSpace(
+    space = ParameterSpace(
         tuple(_overridden(p, config.parameters.get(p.name), where) for p in default.parameters)
     )
+    _check_lengths(space, stated.geometry, where)
+    return space
+
+
+def _check_lengths(space: ParameterSpace, geometry: Geometry, where: object) -> None:
+    """Raises InputError for bounds of lengths between which some cannot be meshed."""
+    lengths = [p for p in space.parameters if p.name in LENGTHS]
+    low = {p.name: p.lower / (1.0 + ROOM) for p in lengths}
+    high = {p.name: p.upper / (1.0 - ROOM) for p in lengths}
+    thickest = {name: low[name] if name == "arm_radius_m" else value for name, value in high.items()}
+    for corner in (low, high, thickest):
+        try:
+            moved(geometry, corner)
+        except InputError as error:
+            raise InputError(
+                f"{where}: parameters.{error.where}", f"bounds that reach {error.found}", error.expected
+            ) from None
 
 
 def _own_space(config: Config, where: object) -> ParameterSpace:
@@ -394,7 +426,7 @@ def _overridden(default: Parameter, change: PriorConfig | None, where: object) -
         raise InputError(at, f"lower {lower:g}, upper {upper:g} {default.unit}", "lower below upper")
     if prior.startswith("log") and lower <= 0:
         raise InputError(f"{at}.lower", f"{lower:g} with a {prior} prior", "a bound above zero")
-    centre, spread = change.centre_and_spread
+    centre, spread = change.centre_and_spread if change.prior else (default.centre, default.spread)
     if prior.endswith("normal") and not lower <= centre <= upper:
         raise InputError(
             at, f"a prior about {centre:g} {default.unit}", f"{lower:g} to {upper:g}, its bounds"

@@ -6,18 +6,26 @@ Lengths in them are millimetres. Those of the tissue may be uncertain, a mean an
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag
 
 from bayeskin.errors import InputError
-from bayeskin.geometry import ForceOn, Geometry, Guard
+from bayeskin.geometry import BOUNDS_MM, ForceOn, Geometry, Guard, moved
 from bayeskin.sections import Section, checked, read_toml
+from bayeskin.types import Parameter
 
 EXPECTED = "the sections [device] and [tissue] in TOML"
 LARGEST_SD = 1 / 3  # of the mean: a normal prior that reaches zero is of no thickness
+REACH = 3.0  # sd on either side of the mean, to which the prior of a length reaches
+ROOM = 1e-3  # of a length, between its bounds and lengths that cannot be: derivatives take small steps
+_MEANING = {
+    "cutis_m": "thickness of the cutis",
+    "subcutis_m": "thickness of the subcutis",
+    "arm_radius_m": "radius of the arm below the skin",
+}
 _KEYS = {
     "gauge_m": "device.gauge_mm",
     "pad_length_m": "device.pad_mm",
@@ -84,11 +92,6 @@ class TissueConfig(Section):
     subcutis_mm: Length = 8.0
     arm_radius_mm: Radius = 48.0
 
-    @property
-    def at_means(self) -> TissueConfig:
-        """The same with the mean of what is uncertain."""
-        return TissueConfig(**{name: _mean(value) for name, value in self})
-
 
 class DeviceFile(Section):
     """A file that states a device, and the tissue that it is on."""
@@ -149,6 +152,24 @@ def stated_geometry(device: DeviceConfig, tissue: TissueConfig, where: object) -
                 raise InputError(f"{where}: tissue.{name}", found, "an sd of at most a third of the mean")
             sd_m[name.removesuffix("m")] = _metres(value.sd)
     return StatedGeometry(geometry, sd_m)
+
+
+def length_parameters(stated: StatedGeometry) -> tuple[Parameter, ...]:
+    """The parameters of a geometry's uncertain lengths [m]: normal priors, cut to what can be meshed."""
+    found: dict[str, Parameter] = {}
+    for name, sd in stated.sd_m.items():
+        mean = getattr(stated.geometry, name)
+        low, high = (1e-3 * bound for bound in BOUNDS_MM[name])
+        if name == "arm_radius_m":
+            thickest = {layer: p.upper for layer, p in found.items()}
+            flat = replace(stated.geometry, arm_radius_m=None)
+            low = max(low, moved(flat, thickest).least_radius_m)
+        lower, upper = max(mean - REACH * sd, low * (1.0 + ROOM)), min(mean + REACH * sd, high * (1.0 - ROOM))
+        found[name] = Parameter(
+            name, "m", lower, upper, "normal", _MEANING[name], "[tissue] of the configuration",
+            centre=mean, spread=sd,
+        )  # fmt: skip
+    return tuple(found.values())
 
 
 def device_lines(device: DeviceConfig, tissue: TissueConfig) -> list[str]:

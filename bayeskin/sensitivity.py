@@ -30,6 +30,7 @@ from scipy.stats import qmc
 from bayeskin.errors import InputError
 from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.types import Array, Parameter, ParameterSpace, Surrogate, _FreezesArrays
+from bayeskin.words import at_edge
 
 Function = Callable[[Array], Array]
 NEGLIGIBLE_VARIANCE = 1e-8  # of the largest bin's: an index there would be rounding
@@ -233,8 +234,10 @@ def describe(space: ParameterSpace) -> str:
 
 
 def _described(p: Parameter) -> str:
-    about = f" about {p.centre:g} ({p.spread:g})" if p.peaked else ""
-    return f"{p.name} {p.prior}{about} {p.lower:g} to {p.upper:g} {p.unit}".rstrip()
+    factor, unit = at_edge(p.unit)
+    scale = 1.0 if p.in_log else factor  # of a log-normal prior's spread, a logarithm
+    about = f" about {factor * p.centre:g} ({scale * p.spread:g})" if p.peaked else ""
+    return f"{p.name} {p.prior}{about} {factor * p.lower:g} to {factor * p.upper:g} {unit}".rstrip()
 
 
 def _sobol_points(dim: int, samples: int, rng: np.random.Generator) -> Array:

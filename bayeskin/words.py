@@ -7,6 +7,11 @@ import numpy as np
 _LOW, _HIGH = 1e-4, 1e7  # beyond, powers of ten are easier to read
 
 
+def at_edge(unit: str) -> tuple[float, str]:
+    """Returns the factor and the unit by which values in an SI unit are shown: lengths in millimetres."""
+    return (1e3, "mm") if unit == "m" else (1.0, unit)
+
+
 def number(value: float, digits: int, sign: bool = False) -> str:
     """A number to so many significant digits, such as 280, 0.05 or 2e-14; with `sign` also a plus."""
     if value and not _LOW <= abs(value) < _HIGH:

@@ -10,7 +10,7 @@ import pytest
 from gmsh_file import coarse_tetrahedra, gmsh_text
 
 from bayeskin import cli, storage
-from bayeskin.config import load_config
+from bayeskin.config import load_config, parameter_space
 from bayeskin.geometry import Geometry
 from bayeskin.model import ModelSpec, simulate
 from bayeskin.recordings import idealised_motion, read_recording, segment
@@ -125,9 +125,10 @@ def test_new_writes_the_device_into_the_configuration(bayeskin: Command, tmp_pat
     assert config.device.pad_mm == (10.0, 12.5)
     assert config.geometry().sd_m == {"cutis_m": 0.25e-3}
     assert config.surrogate.file is None  # the shipped one is of another device
-    code, line = bayeskin("run", tmp_path / "case.toml")
+    assert parameter_space(config).names[-1] == "cutis_m"
+    code, line = bayeskin("diagnose", tmp_path / "case.toml")
     assert code == 2
-    assert "needs the reduced model" in line
+    assert "`bayeskin diagnose` takes no uncertain length" in line
     assert not (tmp_path / "case").exists()
 
 

@@ -43,7 +43,7 @@ BELOW = {
     **dict.fromkeys(SIBLINGS, BASE),
     "journal": BASE,
     "sections": {"errors", "probe"},
-    "device": {"errors", "geometry", "sections"},
+    "device": {"errors", "geometry", "sections", "types"},
     "config": BASE | {"design", "device", "sections"},
     "mechanisms": BASE | {"model"},
     "reduced": BASE | {"model", "mechanisms"},

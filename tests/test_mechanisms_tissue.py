@@ -171,7 +171,7 @@ def test_anisotropy_multiplies_youngs_modulus_along_the_lines():
 
 def test_langer_lines_lie_in_the_skins_plane(problem):
     direction = TISSUE["fibre-anisotropy"].act.bind(strong("fibre-anisotropy"), problem.sites).data[:, 1:]
-    x, y, z = problem.space.quadrature_points().reshape(3, -1)
+    x, y, z = problem.space.quadrature_points.reshape(3, -1)
     radial = np.stack([0 * x, y, z], axis=-1)
     np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1.0)
     np.testing.assert_allclose(np.sum(direction * radial, axis=-1), 0.0, atol=1e-16)

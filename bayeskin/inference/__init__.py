@@ -20,6 +20,7 @@ from bayeskin.inference.inference_data import (
     save_inference_data,
     to_inference_data,
 )
+from bayeskin.inference.lengths import DueToLengths, due_to_lengths
 from bayeskin.inference.noise_model import NoisePriors
 from bayeskin.inference.optimise import MapResult, StartResult, find_map
 from bayeskin.inference.polish import Polished, polish_map
@@ -32,6 +33,7 @@ __all__ = [
     "Bands",
     "Convergence",
     "Corrected",
+    "DueToLengths",
     "ForceDraws",
     "Identifiability",
     "KindCheck",
@@ -59,6 +61,7 @@ __all__ = [
     "corrected",
     "coverage",
     "draws_of",
+    "due_to_lengths",
     "evenly",
     "find_map",
     "identifiability",

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.stats import rankdata
 
 from bayeskin.types import Array, Parameter, ParameterSpace
+from bayeskin.words import at_edge
 
 _NOTHING_NATS, _NOTHING_CONTRACTION = 0.03, 0.1  # below both, posterior and prior are the same
 _WEAK = 0.5  # contraction below which the data narrows little
@@ -145,11 +146,12 @@ def _statement(
 ) -> str:
     if gain < _NOTHING_NATS and abs(contraction) < _NOTHING_CONTRACTION:
         return f"{p.name}: the data does not inform it (posterior = prior)"
-    low, middle, high = quantiles
-    of_unit = "" if p.unit == "1" else f" {p.unit}"
+    factor, unit_name = at_edge(p.unit)
+    low, middle, high = (factor * value for value in quantiles)
+    of_unit = "" if unit_name == "1" else f" {unit_name}"
     numbers = f"median {middle:.3g}, 90 % interval {low:.3g} to {high:.3g}{of_unit}"
     leans = [
-        f"leans on the prior's {side} bound, {bound:.3g}{of_unit}, so the prior shapes it"
+        f"leans on the prior's {side} bound, {factor * bound:.3g}{of_unit}, so the prior shapes it"
         for side, bound, mass in (
             ("lower", p.lower, np.mean(unit < _EDGE)), ("upper", p.upper, np.mean(unit > 1 - _EDGE)),
         )
@@ -158,7 +160,7 @@ def _statement(
     ranges = parts(unit)
     if len(ranges) > 1 and not p.peaked:
         box = ParameterSpace((p,))
-        ends = [box.from_unit(np.array(one)[:, None])[:, 0] for one in ranges]
+        ends = [factor * box.from_unit(np.array(one)[:, None])[:, 0] for one in ranges]
         said = " and ".join(f"{a:.3g} to {b:.3g}{of_unit}" for a, b in ends)
         leans.append(f"{len(ranges)} separate ranges fit: {said}")
     strength = "the data informs it" if contraction >= _WEAK else "the data informs it weakly"
@@ -166,14 +168,15 @@ def _statement(
 
 
 def _sentence(p: Parameter, contraction: float, gain: float, quantiles: tuple[float, float, float]) -> str:
-    unit = "" if p.unit == "1" else f" {p.unit}"
+    factor, name = at_edge(p.unit)
+    unit = "" if name == "1" else f" {name}"
     what = f"{p.description or 'parameter'} ({p.name})"
     if gain < _NOTHING_NATS and abs(contraction) < _NOTHING_CONTRACTION:
         return (
             f"This test says nothing of the {what}: what is known of it is what was assumed, "
-            f"{p.lower:.3g} to {p.upper:.3g}{unit}."
+            f"{factor * p.lower:.3g} to {factor * p.upper:.3g}{unit}."
         )
-    low, middle, high = quantiles
+    low, middle, high = (factor * value for value in quantiles)
     range_ = f"{low:.3g} to {high:.3g}{unit}"
     if contraction < _WEAK:
         return f"This test narrows the {what} only a little: with 90 % probability it is {range_}."

@@ -7,9 +7,11 @@ with the stage's own tangent K. For a guess v of dx the right-hand side less K v
 
 so that no tangent is formed: of the base model r is found exactly and for all parameters at once
 (`directional`), with laws beyond it from two residuals a parameter, and with a length of the tissue among
-these too: there the residual further on is that of moved nodes, at the same unknowns. The guess combines the stages before as
-their unknowns best combine to those of this one, and is corrected by back-substitutions of r with the kept
-factorisation M nearest to the stage, with laws with the stage's own, which costs less than a correction.
+these too: there the residual further on is that of moved nodes, at the same unknowns.
+
+The guess combines the stages before as their unknowns best combine to those of this one, and is corrected by
+back-substitutions of r with the kept factorisation M nearest to the stage. Where residuals are differenced M
+is the stage's own, which costs less than a correction.
 
 The reaction's derivative is that of the same residual on the pad's rows. A correction would add g M^-1 r to
 it, with the reaction's derivative g by the unknowns; as M is symmetric, M^-1 g tells so before it is made.

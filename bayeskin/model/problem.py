@@ -113,7 +113,7 @@ class Problem:
     @cached_property
     def sites(self) -> Sites:
         """Returns the quadrature points, cell by cell."""
-        points = self.space.quadrature_points()
+        points = self.space.quadrature_points
         cutis = np.repeat(self.mesh.cutis, points.shape[2])
         return Sites(cutis, np.ascontiguousarray(points.reshape(3, -1)), self.lengths)
 

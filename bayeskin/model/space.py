@@ -27,7 +27,7 @@ class TaylorHood:
     nodes_u (e, a), nodes_p (e, b) : numbers of nodes and of corners
     grad_u (e, q, 3, a), grad_p (e, q, 3, b) : gradients [1/m]; value_p (q, b)
     weight (e, q) : quadrature weight times volume element [m^3]
-    points_u (3, nodes) : coordinates of the displacement nodes [m]
+    points_u (3, nodes), quadrature_points (3, e, q) : coordinates of displacement nodes and of points [m]
     """
 
     mesh: SkinMesh
@@ -38,6 +38,7 @@ class TaylorHood:
     value_p: Array
     weight: Array
     points_u: Array
+    quadrature_points: Array
     n_nodes: int
     n_corners: int
 
@@ -54,10 +55,6 @@ class TaylorHood:
     def facet_nodes(self, name: str) -> np.ndarray:
         """Displacement nodes on a named boundary, sorted."""
         return np.unique(self._basis().get_dofs(self.mesh.facets[name]).all())
-
-    def quadrature_points(self) -> Array:
-        """Coordinates (3, e, q) [m]."""
-        return np.asarray(self._basis().global_coordinates())
 
     def _basis(self) -> skfem.CellBasis:
         return skfem.Basis(self.mesh.geometry, _element(self.mesh)[0], intorder=QUADRATURE_DEGREE)
@@ -88,6 +85,7 @@ def taylor_hood(mesh: SkinMesh) -> TaylorHood:
         value_p=np.ascontiguousarray(np.stack([np.array(shape[0])[0] for shape in corner.basis]).T),
         weight=np.ascontiguousarray(basis.dx),
         points_u=basis.doflocs,
+        quadrature_points=np.asarray(basis.global_coordinates()),
         n_nodes=basis.N,
         n_corners=corner.N,
     )

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 import bayeskin
 from bayeskin.config import WHO_RUNS, Config, load_config
+from bayeskin.device import DeviceConfig, TissueConfig
 from bayeskin.errors import InputError
 from bayeskin.pipeline import folder
 from bayeskin.pipeline.folder import Record
@@ -98,10 +99,9 @@ class Outcome:
 def open_run(config_path: Path, reporter: Reporter, folder: Path | None = None) -> Run:
     """A run from its configuration; its folder lies beside the configuration unless given.
 
-    Raises InputError for a configuration that is wrong, or whose lengths are uncertain.
+    Raises InputError for a configuration that is wrong.
     """
     config = load_config(config_path)
-    config.certain_geometry(config_path)
     return Run(config, config_path, folder or config_path.resolve().parent / config.name, reporter)
 
 
@@ -155,10 +155,14 @@ def _needed(stages: Mapping[str, Stage], last: str | None) -> set[str]:
 def _inputs_sha256(run: Run, stage: Stage) -> str:
     records = {name: folder.read_record(run.folder / name) for name in stage.needs}
     config = run.config.model_dump(mode="json", exclude=WHO_RUNS)
+    sections = stage.sections
+    if "model" in sections:  # whose device and tissue they are; records are older than these sections
+        usual = {"device": DeviceConfig(), "tissue": TissueConfig()}
+        sections += tuple(name for name, value in usual.items() if getattr(run.config, name) != value)
     return folder.sha256_of(
         {
             "version": bayeskin.__version__,
-            "config": {section: config[section] for section in stage.sections},
+            "config": {section: config[section] for section in sections},
             "files": [folder.sha256_of_input(path) for path in stage.files(run)],
             "stages": {name: record.sha256 for name, record in records.items() if record is not None},
         }

@@ -71,9 +71,10 @@ def model_spec(run: Run, mesh: str | None = None, observation: str | None = None
     """The configuration's model; a mesh file or an observation given here goes before the configuration's.
 
     A mesh file in the configuration lies beside it, one given here in the working folder.
-    Raises InputError for a mesh that does not exist or does not fit the observation, or uncertain lengths.
+    Uncertain lengths stand at their means; a run has them among its parameters.
+    Raises InputError for a mesh that does not exist or does not fit the observation.
     """
-    model, geometry = run.config.model, run.config.certain_geometry(run.config_path)
+    model, geometry = run.config.model, run.config.geometry(run.config_path).geometry
     if model.forward is not None and mesh is None and observation is None:
         return ModelSpec(observation="own", forward=_beside(run, model.forward))
     if model.observation == "own" and observation is None:
@@ -126,7 +127,7 @@ def reduced_files(run: Run) -> list[Path]:
     """
     if run.config.design.coarse != "reduced":
         return []
-    return [reduced_file(run.config.certain_geometry(run.config_path), [run.config_path])]
+    return [reduced_file(run.config.geometry(run.config_path).geometry, [run.config_path])]
 
 
 def check_protocol(run: Run, motion: PadMotion) -> None:

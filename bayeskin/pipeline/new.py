@@ -11,7 +11,7 @@ from typing import Any
 
 from bayeskin.config import Config, DesignConfig, RecordingConfig
 from bayeskin.design import default_space
-from bayeskin.device import DeviceFile, device_lines, load_device_file, stated_geometry
+from bayeskin.device import DeviceFile, StatedGeometry, device_lines, load_device_file, stated_geometry
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.inference import NoisePriors
@@ -95,9 +95,9 @@ def new_config(file: Path, out: Path | None = None, device: Path | None = None) 
     phases = segment(recording)
     noise = phase_noise(recording, phases)
     found = describe(recording, phases, noise)
-    motion, geometry = pad_motion("reaction", recording, phases, "idealised"), _certain_geometry(stated)
-    surrogate = shipped_for(motion, geometry) if geometry else None
-    reduced = _reduced_for(motion, geometry, out) if geometry and not surrogate else None
+    motion, geometry = pad_motion("reaction", recording, phases, "idealised"), _geometry(stated)
+    surrogate = None if geometry.sd_m else shipped_for(motion, geometry.geometry)
+    reduced = None if surrogate else _reduced_for(motion, geometry.geometry, out)
     way, section = _way(surrogate, reduced)
     reference = Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix()
     text = _configuration(_name(out), reference, found, section, surrogate is not None, stated)
@@ -128,12 +128,10 @@ def new_demo(out: Path | None = None) -> dict[str, Any]:
     return plain({"ok": True, "out": out, "text": f"written to {out}\nnext: bayeskin run {out}"})
 
 
-def _certain_geometry(stated: DeviceFile | None) -> Geometry | None:
-    """The geometry of a device; None where a length of it is uncertain."""
-    if stated is None:
-        return Geometry()
-    found = stated_geometry(stated.device, stated.tissue, "device")
-    return None if found.sd_m else found.geometry
+def _geometry(stated: DeviceFile | None) -> StatedGeometry:
+    """The geometry of a device, by default the article's."""
+    file = stated or DeviceFile()
+    return stated_geometry(file.device, file.tissue, "device")
 
 
 def _reduced_for(motion: PadMotion, geometry: Geometry, out: Path) -> Path | None:

@@ -165,6 +165,10 @@ def _sampled(checked: Checked, bands: inference.Bands, residuals: inference.Resi
             }
             for one in learned.parameters
         },
+        "lengths": {
+            one.name: {"share": one.share, "sentence": one.sentence}
+            for one in inference.due_to_lengths(posterior.space, posterior.flat)
+        },
         "full_model": [said_of(one) for one in checked.rounds],
         "corrected": corrected_table(checked),
         "rmse": rmse_table(log_posterior, bands.mean_n),

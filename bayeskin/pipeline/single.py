@@ -15,10 +15,11 @@ from bayeskin import storage
 from bayeskin.config import Config, load_config, parameter_space
 from bayeskin.device import load_device_file
 from bayeskin.errors import InputError
+from bayeskin.geometry import LENGTHS, Geometry
 from bayeskin.mechanisms import Mechanism, catalogue, laws, solved
 from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.problem import Problem
-from bayeskin.model.simulate import ModelSpec, OnState, problem_of, simulate
+from bayeskin.model.simulate import ModelSpec, OnState, problem_at, simulate
 from bayeskin.pipeline.engine import Reporter, Run
 from bayeskin.pipeline.field_outputs import FieldOutputs, moments_of
 from bayeskin.pipeline.folder import plain
@@ -69,8 +70,8 @@ def simulate_once(
     """Runs the model once on a recording's displacement, into `out` (.csv or .h5); its fields into folders.
 
     What is not given is the configuration's, or the demo's; the sections of the file `device` go before its
-    own. What is uncertain of the tissue stands at its mean. Parameters that `settings` ("NAME=VALUE", SI)
-    leave out stand at the median of their prior; those of the `mechanisms` named are among them. The
+    own. Parameters that `settings` ("NAME=VALUE", SI) leave out stand at the median of their prior, uncertain
+    lengths of the tissue at their mean; those of the `mechanisms` named are among them. The
     figure shows the fields at the times `at_s`, or at four moments of the protocol. With `reduced` the
     device's reduced model runs in the full one's place. A run that fails is told, and nothing is written.
     Raises InputError for bad input.
@@ -85,7 +86,7 @@ def simulate_once(
         raise InputError("simulate", f"the model {spec.forward}", "no fields, figures or mechanisms with it")
     base = parameter_space(run.config, config_path)
     more = tuple(p for mechanism in added for p in mechanism.parameters)
-    values = _values(ParameterSpace((*base.parameters, *more)), settings)
+    values = _values(ParameterSpace((*base.parameters, *more)), spec.geometry, settings)
     for parameter in more:
         _refuse_senseless(parameter, values[parameter.name])
     theta = {name: values[name] for name in base.names}
@@ -100,7 +101,7 @@ def simulate_once(
         if spec.observation == "article":
             found = "model.observation 'article', whose stresses are not those of the fields"
             raise InputError("--fields, --figures", found, "'reaction'")
-        problem = problem_of(spec.mesh, spec.refinement, spec.geometry)
+        problem = problem_at(spec, theta)
         _refuse_other_stresses(added, theta | along, problem)
         outputs = FieldOutputs(problem, theta, motion, moments, fields, figures)
     on_state = outputs.on_state if outputs else None
@@ -137,9 +138,11 @@ def _reduced_run(
 
 
 def _with_device(config: Config, device: Path | None) -> Config:
-    """The configuration with the sections of a device's file, and all uncertain lengths at their means."""
-    stated = config if device is None else load_device_file(device)
-    return config.model_copy(update={"device": stated.device, "tissue": stated.tissue.at_means})
+    """The configuration with the sections of a device's file."""
+    if device is None:
+        return config
+    stated = load_device_file(device)
+    return config.model_copy(update={"device": stated.device, "tissue": stated.tissue})
 
 
 def _on_mesh(spec: ModelSpec) -> str:
@@ -206,8 +209,9 @@ def _reported(
     )
 
 
-def _values(space: ParameterSpace, settings: Sequence[str]) -> dict[str, float]:
+def _values(space: ParameterSpace, geometry: Geometry, settings: Sequence[str]) -> dict[str, float]:
     theta = dict(zip(space.names, space.from_unit([0.5] * space.dim).tolist(), strict=True))
+    theta |= {name: getattr(geometry, name) for name in LENGTHS if name in theta}
     for setting in settings:
         name, equals, value = setting.partition("=")
         if not equals or name not in theta:

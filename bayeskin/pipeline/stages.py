@@ -11,6 +11,7 @@ from bayeskin.pipeline.crew import made_by
 from bayeskin.pipeline.engine import Outcome, Reporter, Run, Stage, open_run, run_stages, standing
 from bayeskin.pipeline.folder import plain, read_record, write_json
 from bayeskin.pipeline.page import write_page
+from bayeskin.words import at_edge
 
 BEFORE_REPORT = (
     recording.STAGE, design.STAGE, training.STAGE, maximum.STAGE, posterior.STAGE, indices.STAGE,
@@ -42,6 +43,7 @@ def _summarise(run: Run) -> Mapping[str, Any]:
         "posterior": sampled["parameters"],
         "identifiability": [*sampled["identifiability"], *sampled["ridges"]],
         "learned": sampled["learned"],
+        "lengths": sampled.get("lengths", {}),
         "profiles": sampled["profiles"],
         "full_model_at_draws": sampled["full_model"],
         "corrected": sampled["corrected"],
@@ -86,6 +88,8 @@ def run(
     A run to the report ends with the page, also when a stage before it failed.
     """
     opened = open_run(config, reporter)
+    if last == "effects":
+        opened.config.refuse_uncertain(config, last)
     if scheduler is not None:
         opened = made_by(opened, scheduler)
     outcomes = run_stages(opened, stages, last or "report")
@@ -148,7 +152,7 @@ def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str
             [
                 *(said["verdict"], *said["reasons"], *said["remarks"]),
                 *_table(said["parameters"]),
-                *_identified([*said["identifiability"], *said["ridges"]]),
+                *_identified([*said["identifiability"], *said["ridges"], *_lengths(said["lengths"])]),
                 *_priors(said["parameters"]),
             ]
         ),
@@ -181,7 +185,7 @@ def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
         [
             f"{said['name']}: {said['verdict']}: {'; '.join(said['because'])}",
             *_table(said["posterior"]),
-            *_identified(said["identifiability"]),
+            *_identified([*said["identifiability"], *_lengths(said["lengths"])]),
             *_priors(said["posterior"]),
             *said["remarks"],
             f"{model}: RMSE {', '.join(off)}",
@@ -195,20 +199,26 @@ def _identified(sentences: Sequence[str]) -> list[str]:
     return ["what the data says of each:", *(f"  {sentence}" for sentence in sentences)]
 
 
+def _lengths(due: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    return [one["sentence"] for one in due.values()]
+
+
 def _priors(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Each prior with its bounds and where it comes from."""
     return ["priors:", *(f"  {name}: {_prior(p['prior'], p['unit'])}" for name, p in parameters.items())]
 
 
 def _prior(prior: Mapping[str, Any], unit: str) -> str:
-    about = f" about {prior['centre']:.4g} {unit}" if prior["kind"].endswith("normal") else ""
-    return f"{prior['kind']}{about}, {prior['lower']:.4g} to {prior['upper']:.4g} {unit}; {prior['source']}"
+    factor, unit = at_edge(unit)
+    about = f" about {factor * prior['centre']:.4g} {unit}" if prior["kind"].endswith("normal") else ""
+    low, high = factor * prior["lower"], factor * prior["upper"]
+    return f"{prior['kind']}{about}, {low:.4g} to {high:.4g} {unit}; {prior['source']}"
 
 
 def _table(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    rows = [("", "unit", "mean", "sd", "median", "5 %", "95 %")]
-    rows += [
-        (name, p["unit"], *(f"{p[key]:.4g}" for key in ("mean", "sd", "median", "low_90", "high_90")))
-        for name, p in parameters.items()
-    ]
+    rows: list[tuple[str, ...]] = [("", "unit", "mean", "sd", "median", "5 %", "95 %")]
+    for name, p in parameters.items():
+        factor, unit = at_edge(p["unit"])
+        values = (factor * p[key] for key in ("mean", "sd", "median", "low_90", "high_90"))
+        rows.append((name, unit, *(f"{value:.4g}" for value in values)))
     return ["  ".join(f"{cell:>{10 if i else 9}}" for i, cell in enumerate(row)) for row in rows]

@@ -121,7 +121,9 @@ def _up_to(binned: BinnedForce, until_s: float | None) -> BinnedForce:
 def opened(source: Path, reporter: Reporter) -> Run:
     """A configuration's run, or that of a recording by itself beside it. Raises InputError as `diagnose`."""
     if source.suffix == ".toml":
-        return open_run(source, reporter)
+        run = open_run(source, reporter)
+        run.config.refuse_uncertain(source, "diagnose")
+        return run
     found = read_recording(source)
     surrogate = shipped_for(recording.pad_motion("reaction", found, segment(found), "idealised"))
     if surrogate is None:

@@ -20,7 +20,9 @@ from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import ArrayLike
 
+from bayeskin.geometry import LENGTHS
 from bayeskin.types import Array, Parameter
+from bayeskin.words import at_edge
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -134,6 +136,7 @@ def plain_log(axis: Axis) -> None:
 
 def symbol(name: str) -> str:
     """A parameter's name as it is printed: ``E_c`` set as a symbol, ``gap_width`` as words."""
+    name = name.removesuffix("_m") if name in LENGTHS else name
     name = re.sub(rf"^([A-Z](?=[a-z\d]$)|[a-z](?=\d$)|(?:{'|'.join(GREEK)})(?=\d$))", r"\1_", name)
     head, _, tail = name.partition("_")
     head = "sigma" if head == "sd" and tail else head
@@ -155,14 +158,14 @@ def unit_text(unit: str) -> str:
 
 def parameter_label(parameter: Parameter) -> str:
     """Axis label of a parameter; log10 of its value in SI where the prior is log-uniform."""
-    unit, name = unit_text(parameter.unit), symbol(parameter.name)
+    name = symbol(parameter.name)
     space = " " if name.startswith("$") else "\n"  # words take a line of their own
     if len(name) > 12:
         name = name.replace(" ", space, 1)
     if parameter.in_log:
+        unit = unit_text(parameter.unit)
         return f"log$_{{10}}$ {name}" + (f"{space}/ {unit}" if unit else "")
-    power = _power(parameter)
-    unit = " ".join(part for part in (unit_text(f"10^{power}") if power else "", unit) if part)
+    unit = _axis(parameter)[1]
     return name + (f"{space}[{unit}]" if unit else "")
 
 
@@ -176,13 +179,16 @@ def parameter_colors(names: Sequence[str]) -> list[str]:
 def axis_values(parameter: Parameter, values: ArrayLike) -> Array:
     """Values of one parameter as they stand on its axis, the one that `parameter_label` names."""
     values = np.asarray(values, dtype=float)
-    return np.log10(values) if parameter.in_log else values / 10.0 ** _power(parameter)
+    return np.log10(values) if parameter.in_log else values * _axis(parameter)[0]
 
 
-def _power(parameter: Parameter) -> int:
-    """Power of ten (a multiple of 3) taken out of an axis whose numbers would be long."""
-    reach = max(abs(parameter.lower), abs(parameter.upper))
-    return 3 * int(np.floor(np.log10(reach) / 3)) if reach > 0 and not 0.01 <= reach < 1e4 else 0
+def _axis(parameter: Parameter) -> tuple[float, str]:
+    """Factor and unit of an axis that is not logarithmic; a power of ten is taken out of long numbers."""
+    factor, unit = at_edge(parameter.unit)
+    reach = factor * max(abs(parameter.lower), abs(parameter.upper))
+    power = 3 * int(np.floor(np.log10(reach) / 3)) if reach > 0 and not 0.01 <= reach < 1e4 else 0
+    parts = unit_text(f"10^{power}") if power else "", unit_text(unit)
+    return factor / 10.0**power, " ".join(part for part in parts if part)
 
 
 def list_symbols(names: Sequence[str]) -> str:

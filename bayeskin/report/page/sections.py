@@ -153,7 +153,11 @@ def posterior(facts: RunFacts) -> Section:
         blocks += [_parameters(facts, said["parameters"]), *pictures(facts, "sample", ["posterior"])]
         if said["ridges"]:
             blocks.insert(1, Text([f"{ridge}." for ridge in said["ridges"]], listed=True))
-        blocks += [*_taught(said), *pictures(facts, "sample", ["profiles", "posterior_noise"])]
+        blocks += [
+            *_taught(said),
+            *_lengths(said),
+            *pictures(facts, "sample", ["profiles", "posterior_noise"]),
+        ]
         sources = [f"{name}: {one['prior']['source']}." for name, one in said["parameters"].items()]
         blocks.append(Folded("Where the priors come from", [Text(sources, listed=True)]))
         blocks += pictures(facts, "train", ["prior_predictive"])
@@ -179,6 +183,19 @@ def _taught(said: Mapping[str, Any]) -> list[Block]:
     head = ("parameter", "contraction", "information gained [nats]", "90 % interval by the fit alone")
     sentences = [said["learned"][name]["sentence"] for name in said["profiles"]]
     return [Text(sentences, listed=True), Table("What the test taught", head, rows, symbols=True)]
+
+
+def _lengths(said: Mapping[str, Any]) -> list[Block]:
+    """What uncertain lengths explain of the other parameters' posterior variances; nothing without any."""
+    due = said.get("lengths")
+    if not due:
+        return []
+    rows = [row((name, Cell(percent(one["share"]), one["share"]))) for name, one in due.items()]
+    table = Table(
+        "Share of the posterior variance that uncertain lengths explain", ("parameter", "share"), rows,
+        symbols=True,
+    )  # fmt: skip
+    return [Text([one["sentence"] for one in due.values()], listed=True), table]
 
 
 def _parameters(facts: RunFacts, table: Mapping[str, Mapping[str, Any]]) -> Table:
