@@ -393,9 +393,9 @@ def _check_lengths(space: ParameterSpace, geometry: Geometry, where: object) -> 
         try:
             moved(geometry, corner)
         except InputError as error:
-            raise InputError(
-                f"{where}: parameters.{error.where}", f"bounds that reach {error.found}", error.expected
-            ) from None
+            p = next((p for p in lengths if p.name == error.where), lengths[0])
+            found = f"{1e3 * p.lower:g} to {1e3 * p.upper:g} mm"
+            raise InputError(f"{where}: parameters.{p.name}", found, error.expected) from None
 
 
 def _own_space(config: Config, where: object) -> ParameterSpace:

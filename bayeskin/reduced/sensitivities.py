@@ -63,9 +63,10 @@ class ReducedGradients:
             for name, values in further.items()
             if name in LENGTHS
         }
-        runs = [bound(equations.space, values, binds) for values in further.values()]
-        for place, one in self._moved.items():
-            runs[place] = one.run
+        runs = [
+            self._moved[i].run if i in self._moved else bound(equations.space, values, binds)
+            for i, values in enumerate(further.values())
+        ]
         self._drives = [on_the_way(protocol, run.laws) for run in runs]
         self._in_series = bool(equations.drive.elements)
         self._varied = _varied(equations, [*runs, *([equations.run] if self._in_series else [])])
