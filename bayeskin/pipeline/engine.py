@@ -156,7 +156,7 @@ def _inputs_sha256(run: Run, stage: Stage) -> str:
     records = {name: folder.read_record(run.folder / name) for name in stage.needs}
     config = run.config.model_dump(mode="json", exclude=WHO_RUNS)
     sections = stage.sections
-    if "model" in sections:  # whose device and tissue they are; records are older than these sections
+    if "parameters" in sections:  # of a model on this device and tissue; records are older than both sections
         usual = {"device": DeviceConfig(), "tissue": TissueConfig()}
         sections += tuple(name for name, value in usual.items() if getattr(run.config, name) != value)
     return folder.sha256_of(
