@@ -128,7 +128,10 @@ def _run_fine(run: Run, design: Design, motion: PadMotion) -> Design:
     """The configuration's model at some points of the coarser one's design."""
     model, config = full_model(run), run.config.design
     inputs = Similarity(design.space).inputs(design.theta)
-    wave = fine_wave(design, inputs, config.fine_points, config.fine_held_out, run.config.seed)
+    among = design
+    if config.coarse == "reduced" and design.wave.max() >= FIRST_OF_POSTERIOR:
+        among = dataclasses.replace(design, ok=design.ok & (design.wave == design.wave.max()))
+    wave = fine_wave(among, inputs, config.fine_points, config.fine_held_out, run.config.seed)
     file = runs_file(run, model, motion, design.edges_s, design.space)
     run_wave(run, "fine model", file, wave, design.edges_s, model, motion)
     return rows_of(load_design(file), [wave])
