@@ -1,9 +1,9 @@
 """How long a recording of a protocol that no file knows takes to a trusted posterior, stage by stage.
 
-The full model makes a staircase test of random holds on a skin, with correlated noise; `bayeskin new` writes its
-configuration and the stages run as `bayeskin run` has them. Prints seconds of the clock and of the processors of
-each stage, full runs, effective draws of the check, the verdict, and whether the true values lie in the 90 %
-intervals. A second start of the same folder goes on, and repeats nothing.
+The full model makes a staircase test of random holds on a skin, with correlated noise; `bayeskin new` writes
+its configuration and the stages run as `bayeskin run` has them. Prints seconds of the clock and of the
+processors of each stage, full runs, effective draws of the check, the verdict, and whether true values lie
+in the 90 % intervals. A second start with the same folder goes on, and repeats nothing.
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/unknown_protocol.py --seed 1 --folder /tmp/unknown-1
 """
@@ -116,7 +116,9 @@ def covered(posterior: Mapping[str, Mapping[str, Any]], theta: Mapping[str, floa
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--folder", type=Path, help="where the run stays; by default nowhere")
     options = parser.parse_args()

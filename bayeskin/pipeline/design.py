@@ -125,12 +125,15 @@ def _try_once(run: Run, model: ForceModel, motion: PadMotion, space: ParameterSp
 
 
 def _run_fine(run: Run, design: Design, motion: PadMotion) -> Design:
-    """The configuration's model at some points of the coarser one's design."""
+    """The configuration's model at some points of the coarser one's design.
+
+    Where the last wave is drawn from the posterior, the points that correct lie in it.
+    """
     model, config = full_model(run), run.config.design
-    inputs = Similarity(design.space).inputs(design.theta)
-    among = design
-    if config.coarse == "reduced" and design.wave.max() >= FIRST_OF_POSTERIOR:
-        among = dataclasses.replace(design, ok=design.ok & (design.wave == design.wave.max()))
+    inputs, among = Similarity(design.space).inputs(design.theta), design
+    if config.coarse == "reduced" and len(config.points) > FIRST_OF_POSTERIOR:
+        near = design.held_out | (design.wave == design.wave.max())
+        among = dataclasses.replace(design, ok=design.ok & near)
     wave = fine_wave(among, inputs, config.fine_points, config.fine_held_out, run.config.seed)
     file = runs_file(run, model, motion, design.edges_s, design.space)
     run_wave(run, "fine model", file, wave, design.edges_s, model, motion)
@@ -179,9 +182,7 @@ def _draw_wave(
         nearest = design.theta[int(np.argmax(np.where(design.training, weights, 0.0)))]
         draws = _posterior_draws(run, log_posterior_of(run, surrogate, binned), nearest)
         inputs = surrogate.inputs(draws)
-        return posterior_wave(
-            space, draws, inputs, count, config.design.held_out, number, config.seed
-        )
+        return posterior_wave(space, draws, inputs, count, config.design.held_out, number, config.seed)
     floor_n = noise_floor_n(binned, fitted)
     wave = next_wave(
         space, surrogate.predict, binned.force_n, fitted, floor_n, count, config.design.held_out,

@@ -9,6 +9,7 @@ leave-one-out in closed form: Dubrule (1983), Math. Geology 15, 687.
 
 from __future__ import annotations
 
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +39,8 @@ class LatentFit(NamedTuple):
     """Hyperparameters of one latent, and what cross-validation says of them.
 
     error: weighted mean squared error of rows whose hyperparameters were fitted without them; inflation:
-    ratio of those errors' weighted 90 % quantile (of few rows the RMS) to what the predicted variance promises.
+    ratio of those errors' weighted 90 % quantile (of few rows the RMS) to what the predicted variance
+    promises.
     """
 
     kernel: str
@@ -167,12 +169,13 @@ def _one_length(data: _Data, weights: Array, deviation: float) -> LatentFit:
     So few rows tell no two lengths apart, and a search that tries all the same promises far too much.
     """
     eye = np.eye(data.inputs.shape[1])
-    choices = [(rate * eye, float(nugget)) for rate in ONE_LENGTH_RATES for nugget in ONE_LENGTH_NUGGETS]
-    at = min(choices, key=lambda choice: _likelihood("gaussian", *choice, data).value)
-    found = _likelihood("gaussian", *at, data)
+    choices = product(ONE_LENGTH_RATES, ONE_LENGTH_NUGGETS)
+    rate, nugget = min(choices, key=lambda at: _likelihood("gaussian", at[0] * eye, at[1], data).value)
+    found = _likelihood("gaussian", rate * eye, nugget, data)
     error = float(np.average(found.residual**2, weights=weights))
     promised = found.variance * float(np.average(found.spread**2, weights=weights))
-    return LatentFit("gaussian", *at, error * deviation**2, max(float(np.sqrt(error / promised)), 1.0))
+    inflation = max(float(np.sqrt(error / promised)), 1.0)
+    return LatentFit("gaussian", rate * eye, float(nugget), error * deviation**2, inflation)
 
 
 def _cross_validate(
