@@ -240,6 +240,21 @@ def test_what_components_leave_is_that_of_the_rows_that_count():
     assert none.truncation.mean() == pytest.approx(np.mean((shapes[:30] - none.mean) ** 2), rel=1e-6)
 
 
+def test_fits_of_few_rows_are_off_by_what_they_state():
+    rng = np.random.default_rng(11)
+    squares = []
+    for _ in range(40):
+        bend, unit, fresh = rng.standard_normal((4, 4)), rng.uniform(size=(8, 4)), rng.uniform(size=(20, 4))
+        target, truth = (
+            np.sum(((x - 0.5) @ bend) * (x - 0.5), axis=1) + 0.3 * x @ bend[0] for x in (unit, fresh)
+        )
+        fit = fit_latent(unit, target, np.ones(8))
+        mean, variance = LatentGPs.assemble(unit, target[:, None], [fit]).predict(fresh)
+        squares.append((np.mean((mean[:, 0] - truth) ** 2), np.mean(variance)))
+    missed, stated = np.sqrt(np.mean(squares, axis=0))
+    assert 0.7 * stated < missed < 1.5 * stated  # lengths and directions of their own: 0.13
+
+
 def test_a_shape_that_nothing_predicts_is_an_error_of_all_bins_together():
     rng = np.random.default_rng(8)
     shape = np.sin(np.linspace(0.0, 6.0, DESIGN.force_n.shape[1]))
