@@ -125,7 +125,8 @@ class DesignConfig(Section):
 
     With `coarse` the waves run a quicker model, and the model itself at `fine_points` and `fine_held_out` of
     their points, to correct what the quicker one gave: coarser bricks, of a refinement below the model's, or
-    "reduced", the reduced model of the device. `scheduler`, the address of a Dask scheduler, has the runs
+    "reduced", the reduced model of the device, whose waves from the third on are drawn from the posterior by
+    the surrogate of the waves before. `scheduler`, the address of a Dask scheduler, has the runs
     made there.
     """
 
@@ -141,7 +142,8 @@ class DesignConfig(Section):
     @classmethod
     def _a_reduced_model_needs_less_correction(cls, given: Any) -> Any:
         reduced = isinstance(given, dict) and given.get("coarse") == "reduced"
-        return {"fine_points": 8, "fine_held_out": 4, **given} if reduced else given
+        usual = {"points": [128, 96, 64, 64], "fine_points": 8, "fine_held_out": 4}
+        return {**usual, **given} if reduced else given
 
 
 class SlurmConfig(Section):

@@ -171,6 +171,30 @@ def next_wave(
     return _wave(space, theta, wave, seed, record)
 
 
+def posterior_wave(
+    space: ParameterSpace, draws: Array, inputs: Array, n: int, held_out: int, wave: int, seed: int
+) -> Wave:
+    """`n` training and `held_out` test points among draws (k, d) of a posterior; fewer where there are fewer.
+
+    Test points are every so many of the draws, as the posterior has them. Training points spread out over the
+    rest in `inputs` (k, q), coordinates in which forces are alike, in sd of each: they reach the tails.
+    """
+    rows = np.unique(draws, axis=0, return_index=True)[1]
+    rows.sort()
+    testing = rows[np.linspace(0, len(rows) - 1, min(held_out, len(rows))).astype(int)]
+    rows = np.setdiff1d(rows, testing)
+    scaled = inputs[rows] / np.maximum(inputs.std(axis=0), np.finfo(float).tiny)
+    training = rows[spread_out(scaled, n)]
+    region, chosen = _enclosing(space.to_unit(draws)), draws[[*training, *testing]]
+    record = {
+        "rule": "spread out over draws of the posterior by the surrogate of the waves before",
+        "kept_fraction": min(region.volume, 1.0),
+        "lower": dict(zip(space.names, chosen.min(axis=0).tolist(), strict=True)),
+        "upper": dict(zip(space.names, chosen.max(axis=0).tolist(), strict=True)),
+    }
+    return _wave(space, [draws[training], draws[testing]], wave, seed, record)
+
+
 def fine_wave(design: Design, inputs: Array, n: int, held_out: int, seed: int) -> Wave:
     """`n` training and `held_out` held-out points of a design at which a finer model is run too.
 

@@ -41,7 +41,11 @@ def cut(surrogate: ShapeSurrogate, count: int, shapes: Array) -> ShapeSurrogate:
         latents.inputs, latents.targets[:, :kept], latents.linear_maps[:kept], latents.nuggets[:kept],
         latents.inflation[:kept], latents.kernels[:kept],
     )  # fmt: skip
-    return replace(surrogate, transform=surrogate.transform.keep(count, shapes), latents=fewer)
+    return replace(
+        surrogate,
+        transform=surrogate.transform.keep(count, shapes, np.ones(len(shapes)), fitted=count + 1),
+        latents=fewer,
+    )
 
 
 def unexplained(error_n: Array, factor: Array, diagonal: Array) -> float:

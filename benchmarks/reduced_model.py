@@ -2,8 +2,9 @@
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/reduced_model.py [--full] [--estimates]
 
-Twenty-three skins drawn from the priors: four of the base model, one of each of the eleven mechanisms of the
-tissue, four pairs and four triples of them; the article's protocol and four others. Forces of the full model
+Thirty-one skins drawn from the priors: four of the base model, one of each of the eleven mechanisms of the
+tissue, four pairs, triples and quadruples of them, and four of the base model whose subcutis is more than
+twice as stiff as the cutis; the article's protocol and four others. Forces of the full model
 are in results/reduced_held_out.h5; with --full those that are missing there are made, some ten seconds each.
 With --estimates the reduced runs estimate their own error, and the share of true errors within it is told.
 """
@@ -33,6 +34,7 @@ from bayeskin.types import PadMotion, ParameterSpace
 
 RESULTS = Path(__file__).with_name("results") / "reduced_held_out.h5"
 SEED = 20261127
+STIFF_SUBCUTIS = 2.0  # times the cutis' modulus
 
 
 def motion(time_s: Sequence[float], height_mm: Sequence[float]) -> PadMotion:
@@ -60,9 +62,11 @@ class Skin(NamedTuple):
     @property
     def group(self) -> str:
         """A row of the table."""
-        return {0: "base", 1: "".join(self.mechanisms)}.get(
-            len(self.mechanisms), f"sets of {len(self.mechanisms)}"
-        )
+        count = len(self.mechanisms)
+        if count == 0:
+            stiff = self.theta["E_s"] > STIFF_SUBCUTIS * self.theta["E_c"]
+            return "base, stiff subcutis" if stiff else "base"
+        return self.mechanisms[0] if count == 1 else f"sets of {count}"
 
 
 def held_out() -> list[Skin]:
@@ -78,13 +82,19 @@ def held_out() -> list[Skin]:
     ]
     skins = []
     for names in sets:
-        theta: dict[str, float] = {}
-        while not theta or theta["E_s"] > 2.0 * theta["E_c"]:
-            theta = drawn(base, rng)
+        theta = where(base, rng, stiff_subcutis=False)
         for name in names:
             theta |= drawn(spaces[name], rng)
         skins.append(Skin(theta, names))
-    return skins[:23]
+    return [*skins, *(Skin(where(base, rng, stiff_subcutis=True), ()) for _ in range(4))]
+
+
+def where(base: ParameterSpace, rng: np.random.Generator, stiff_subcutis: bool) -> dict[str, float]:
+    """A draw of the priors whose subcutis is more than twice as stiff as the cutis, or is not."""
+    while True:
+        theta = drawn(base, rng)
+        if (theta["E_s"] > STIFF_SUBCUTIS * theta["E_c"]) == stiff_subcutis:
+            return theta
 
 
 def drawn(space: ParameterSpace, rng: np.random.Generator) -> dict[str, float]:

@@ -1,9 +1,10 @@
-"""The full model against other programs over the whole recording: how far off, and in what CPU time.
+"""Our models against other programs over the whole recording: how far off they are, and in what CPU time.
 
-- `reaction` against an independent solver at three points (`reference/reaction_independent_A.csv`, B, C);
+- `reaction` against an independent solver at three points (`reference/reaction_independent_A.csv`, B, C): the
+  full model on the solver's own mesh and on the default mesh, and the shipped reduced model;
 - `article` against its released script (`reference/article_forward.csv`).
 
-Run with the supplement's folder in BAYESKIN_SUPPLEMENT, some eight minutes:  python benchmarks/references.py
+Run with the supplement's folder in BAYESKIN_SUPPLEMENT, some nine minutes:  python benchmarks/references.py
 """
 
 from __future__ import annotations
@@ -11,12 +12,18 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from bayeskin.model import ModelSpec, simulate
-from bayeskin.types import Array, PadMotion
+from bayeskin.pipeline.reducing import SHIPPED
+from bayeskin.reduced.files import load_reduced
+from bayeskin.reduced.simulate import simulate_reduced
+from bayeskin.shipped import shipped
+from bayeskin.types import Array, PadMotion, Simulation
 
 POINTS = {
     "A": {"E_c": 60e3, "E_s": 20e3, "k_c": 1e-14, "k_s": 5e-13, "p_init": 700.0},
@@ -33,16 +40,22 @@ def main() -> int:
         print("BAYESKIN_SUPPLEMENT: found nothing; expected the supplement's folder", file=sys.stderr)
         return 2
     mesh, reference = str(Path(folder) / "data" / "Mesh_SKIN.msh"), Path(folder) / "reference"
+    reduced = partial(simulate_reduced, load_reduced(shipped(SHIPPED)))
     for case, theta in POINTS.items():
         time_s, pad_m, force_n = _read(reference / f"reaction_independent_{case}.csv")
         speed = np.diff(pad_m) / np.diff(time_s)
         corners = 1 + np.flatnonzero(np.abs(np.diff(speed)) > CORNER_M_S)
         kept = np.concatenate([[0], corners, [len(time_s) - 1]])
         motion = PadMotion(time_s[kept], 2.0 * pad_m[kept])
-        _compare(f"reaction {case}", ModelSpec(mesh=mesh), motion, theta, time_s, force_n)
+        for name, model in {
+            "its mesh": partial(simulate, ModelSpec(mesh=mesh)),
+            "default mesh": partial(simulate, ModelSpec()),
+            "reduced": reduced,
+        }.items():
+            _compare(f"reaction {case}, {name}", model, motion, theta, time_s, force_n)
     time_s, pad_m, force_n = _read(reference / "article_forward.csv")
     motion = PadMotion(time_s, 2.0 * pad_m)
-    _compare("article", ModelSpec("article", mesh), motion, POINTS["C"], time_s, force_n)
+    _compare("article", partial(simulate, ModelSpec("article", mesh)), motion, POINTS["C"], time_s, force_n)
     return 0
 
 
@@ -55,22 +68,22 @@ def _read(path: Path) -> tuple[Array, Array, Array]:
 
 def _compare(
     label: str,
-    spec: ModelSpec,
+    model: Callable[[PadMotion, Mapping[str, float]], Simulation],
     motion: PadMotion,
-    theta: dict[str, float],
+    theta: Mapping[str, float],
     time_s: Array,
     force_n: Array,
 ) -> None:
     started = time.process_time()
-    run = simulate(spec, motion, theta)
+    run = model(motion, theta)
     cpu_s = time.process_time() - started
     if run.status != "ok":
         raise SystemExit(f"{label}: {run.message}")
     off = run.at(time_s) - force_n
     rmse, most, peak = np.sqrt(np.mean(off**2)), np.abs(off).max(), np.abs(force_n).max()
     print(
-        f"{label:>24}: RMSE {1e3 * rmse:.4f} mN ({100 * rmse / peak:.3f} % of the peak), at most "
-        f"{1e3 * most:.4f} mN, {len(run.time_s) - 1} steps, {cpu_s:.0f} CPU s",
+        f"{label:>26}: RMSE {1e3 * rmse:.4f} mN ({100 * rmse / peak:.3f} % of the peak), at most "
+        f"{1e3 * most:.4f} mN, {len(run.time_s) - 1} steps, {cpu_s:.1f} CPU s",
         flush=True,
     )
 

@@ -19,6 +19,7 @@ from bayeskin.design import (
     misfit_bounds,
     next_wave,
     plausible,
+    posterior_wave,
     sobol_points,
 )
 from bayeskin.errors import InputError
@@ -190,3 +191,18 @@ def test_a_waves_points_cannot_be_changed() -> None:
     with pytest.raises(ValueError, match="read-only"):
         wave.theta[0, 0] = 1.0
     assert not replace(wave, theta=wave.theta[:2], held_out=wave.held_out[:2]).theta.flags.writeable
+
+
+def test_a_wave_of_a_posterior_reaches_its_tails_and_is_tested_where_its_draws_lie() -> None:
+    rng = np.random.default_rng(3)
+    draws = np.clip([0.5, 0.6] + [1e-3, 0.1] * rng.standard_normal((600, 2)), 0.0, 1.0)
+    draws = np.concatenate([draws, draws[:50]])  # walkers that stayed
+    wave = posterior_wave(SQUARE, draws, draws, 40, 30, 3, 1)
+    assert (wave.number, wave.held_out.sum(), len(wave.theta)) == (3, 30, 70)
+    assert len(np.unique(wave.theta, axis=0)) == 70
+    apart = (wave.theta - draws.mean(axis=0)) / draws.std(axis=0)
+    assert np.all(apart[~wave.held_out].std(axis=0) > 1.3)
+    assert np.all(np.abs(apart[wave.held_out].std(axis=0) - 1.0) < 0.3)
+    assert wave.record["kept_fraction"] < 0.01
+    few = posterior_wave(SQUARE, draws[:10], draws[:10], 40, 4, 3, 1)
+    assert (few.held_out.sum(), len(few.theta)) == (4, 10)

@@ -88,6 +88,14 @@ def test_three_kinds_of_search_end_at_one_maximum() -> None:
     assert "by controlled random search, differential evolution, Gauss-Newton" in found.message
 
 
+def test_no_more_starts_are_made_where_every_kind_of_search_agrees() -> None:
+    found = find_map(line_problem(), seed=0, starts=8, evaluations=4000)
+    assert [start.search for start in found.starts] == list(optimise.SEARCHES)
+    assert found.agreement == 1.0
+    ridge = find_map(toy_problem(windows=HOLDS), seed=1, starts=5, evaluations=4000)
+    assert len(ridge.starts) == 5
+
+
 @pytest.mark.parametrize("kind", optimise.SEARCHES)
 def test_each_kind_of_search_climbs_before_the_polish(kind: str) -> None:
     problem = toy_problem(windows=HOLDS)

@@ -74,8 +74,8 @@ def test_an_unknown_protocol_gets_a_design_of_its_own(own: Path) -> None:
     assert (said["surrogate"], config.surrogate.file) == (None, None)
     assert config == Config(name="own", recording=RecordingConfig(file="own.h5"), design=REDUCED)
     text = own.with_suffix(".toml").read_text()
-    assert "# 336 by the reduced model article-device-reduced.h5" in text
-    assert "some 35 to 93 are of the full model, 1 to 13 minutes with 2 workers." in text
+    assert "# 416 by the reduced model article-device-reduced.h5" in text
+    assert "and 12 by the full model, which correct them: 1 to 3 minutes with 2 workers." in text
 
 
 def test_a_device_without_a_reduced_model_gets_a_design_of_full_runs(own: Path) -> None:

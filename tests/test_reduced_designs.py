@@ -23,10 +23,10 @@ from bayeskin.pipeline.engine import Silent, open_run, standing
 from bayeskin.pipeline.model import FullModel, ReducedOrFull, full_model, waves_model
 from bayeskin.pipeline.new import new_config
 from bayeskin.pipeline.reducing import find_reduced
-from bayeskin.types import Design, PadMotion, Recording, Simulation
+from bayeskin.types import BinnedForce, Design, PadMotion, Recording, Simulation
 
 TRUE = {"E_c": 200e3, "E_s": 30e3, "k_c": 1e-14, "k_s": 1e-13, "p_init": 300.0}
-FOLDING = {**TRUE, "E_s": 2.5 * TRUE["E_c"]}
+STIFF = {**TRUE, "E_c": 3e6}
 THICK = Geometry(cutis_m=4e-3)
 CONFIG = """
 [recording]
@@ -36,7 +36,7 @@ refinement = 3
 [fit]
 bin_width_s = 1.0
 [design]
-points = [40, 24]
+points = [40, 24, 24]
 held_out = 8
 coarse = "reduced"
 workers = 1
@@ -99,6 +99,9 @@ def test_a_run_with_a_reduced_design_is_corrected_by_the_full_model(
     assert (waves.model_hash, fine.model_hash) == (waves_model(run).hash, full_model(run).hash)
     assert waves.model_hash != fine.model_hash
     few = run.config.design
+    recorded_n = storage.load(run.at("recording", "binned.h5"), BinnedForce).force_n
+    left_n = np.sqrt(np.mean((waves.force_n - recorded_n) ** 2, axis=1))
+    assert np.median(left_n[waves.wave == 2]) < 0.7 * np.median(left_n[waves.wave == 1])
     assert (fine.training.sum(), fine.testing.sum()) == (few.fine_points, few.fine_held_out)
     check = json.loads(run.at("map", "stage.json").read_text())["summary"]["checks"][-1]
     assert check["rms_n"] < 0.005 * toy_model.SCALE * 2000  # the toy's coarsest mesh is off by 3 %
@@ -111,11 +114,11 @@ def test_the_full_model_runs_where_the_reduced_one_was_not_trained(
     ships: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waves = ReducedOrFull(ships, toy_model.ToyModel(ModelSpec()))
-    found = pickle.loads(pickle.dumps(waves))(MOTION, FOLDING)
-    right = toy_model.simulate(ModelSpec(), MOTION, FOLDING)
+    found = pickle.loads(pickle.dumps(waves))(MOTION, STIFF)
+    right = toy_model.simulate(ModelSpec(), MOTION, STIFF)
     np.testing.assert_array_equal(found.force_n, right.force_n)
     assert (found.status, found.model_hash) == ("ok", waves.hash)
-    assert found.message == "run by the full model: E_s is more than 2 times E_c"
+    assert found.message == "run by the full model: E_c is 3e+06, trained 10000 to 2e+06"
     inside = replace(right, stats={"inside": 1.0}, force_n=2.0 * right.force_n)
     monkeypatch.setattr(model, "simulate_reduced", lambda *arguments, **more: inside)
     found = waves(MOTION, TRUE)

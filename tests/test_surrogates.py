@@ -225,12 +225,34 @@ def test_components_and_their_truncation_account_for_all_variance():
     amplitude, shapes = split(DESIGN.force_n)
     np.testing.assert_allclose(np.exp(amplitude)[:, None] * shapes, DESIGN.force_n, rtol=1e-12)
     full, variances = all_components(shapes, np.ones(len(shapes)))
-    kept = full.keep(2, shapes)
+    kept = full.keep(2, shapes, np.ones(len(shapes)), fitted=3)
     expected = variances[2:].sum() * len(shapes) / (len(shapes) - 3)
     assert kept.truncation.sum() == pytest.approx(expected, rel=1e-10)
     latent = kept.encode(DESIGN.force_n)
     rest = DESIGN.force_n - kept.decode(latent, np.zeros_like(latent)).mean
     assert np.linalg.norm(rest) < 3e-3 * np.linalg.norm(DESIGN.force_n)
+
+
+def test_what_components_leave_is_that_of_the_rows_that_count():
+    rng = np.random.default_rng(4)
+    shapes = np.concatenate([0.1 * rng.standard_normal((30, 50)), 3.0 * rng.standard_normal((30, 50))])
+    none = all_components(shapes, np.ones(60))[0].keep(0, shapes, np.repeat([1.0, 1e-9], 30), fitted=0)
+    assert none.truncation.mean() == pytest.approx(np.mean((shapes[:30] - none.mean) ** 2), rel=1e-6)
+
+
+def test_fits_of_few_rows_are_off_by_what_they_state():
+    rng = np.random.default_rng(11)
+    squares = []
+    for _ in range(40):
+        bend, unit, fresh = rng.standard_normal((4, 4)), rng.uniform(size=(8, 4)), rng.uniform(size=(20, 4))
+        target, truth = (
+            np.sum(((x - 0.5) @ bend) * (x - 0.5), axis=1) + 0.3 * x @ bend[0] for x in (unit, fresh)
+        )
+        fit = fit_latent(unit, target, np.ones(8))
+        mean, variance = LatentGPs.assemble(unit, target[:, None], [fit]).predict(fresh)
+        squares.append((np.mean((mean[:, 0] - truth) ** 2), np.mean(variance)))
+    missed, stated = np.sqrt(np.mean(squares, axis=0))
+    assert 0.7 * stated < missed < 1.5 * stated  # lengths and directions of their own: 0.13
 
 
 def test_a_shape_that_nothing_predicts_is_an_error_of_all_bins_together():

@@ -89,7 +89,8 @@ def find_map(
     """Maximum of the posterior density in sampling coordinates.
 
     The starts take the kinds of `SEARCHES` in turn, each on at most half of `evaluations`, then Gauss-Newton,
-    L-BFGS and Sbplx from there, in straightened coordinates (`straighten`). NLopt's failures become a start's
+    L-BFGS and Sbplx from there, in straightened coordinates (`straighten`). Where the first of every kind end
+    at one value, no others are made. NLopt's failures become a start's
     status. NLopt draws from its own generator, seeded for each start. Raises InputError when there is no
     start to make.
     """
@@ -102,6 +103,8 @@ def find_map(
         results.append(_one_start(space, list(SEARCHES)[index % len(SEARCHES)], int(state), evaluations))
         if progress:
             progress((index + 1) / starts, f"start {index + 1} of {starts}: {results[-1].value:.2f}")
+        if index + 1 == len(SEARCHES) and np.ptp([r.value for r in results]) <= _AGREE:
+            break
     best = max(results, key=lambda r: r.value)
     agreement = float(np.mean([r.value >= best.value - _AGREE for r in results]))
     return MapResult(best.theta, best.value, tuple(results), agreement)

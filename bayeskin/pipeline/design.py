@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -18,9 +19,11 @@ from numpy.typing import NDArray
 
 from bayeskin import report, storage
 from bayeskin.config import parameter_space
-from bayeskin.design import Wave, fine_wave, first_wave, next_wave
+from bayeskin.design import Wave, fine_wave, first_wave, next_wave, posterior_wave
 from bayeskin.errors import InputError
+from bayeskin.inference import LogPosterior, SampleSettings, sample
 from bayeskin.inference.noise_model import bins_in_windows
+from bayeskin.pipeline.calibration import log_posterior_of
 from bayeskin.pipeline.crew import crew
 from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
 from bayeskin.pipeline.folder import sha256_of, write_json
@@ -39,6 +42,8 @@ from bayeskin.surrogates import Similarity, load_manifest, train
 from bayeskin.types import Array, BinnedForce, Design, PadMotion, ParameterSpace
 
 FEWEST_PER_INPUT = 4  # training runs below which no surrogate is worth its name
+FIRST_OF_POSTERIOR = 2  # wave of a quick model that is drawn from the posterior by the surrogate before it
+SHORT_RUN, WALKERS_A_PARAMETER = 500, 4  # steps and size of the ensembles that say where that is
 FEWEST_COUNTING = 5  # training runs an input, weighted, below which components and errors are anecdotes
 
 
@@ -120,10 +125,16 @@ def _try_once(run: Run, model: ForceModel, motion: PadMotion, space: ParameterSp
 
 
 def _run_fine(run: Run, design: Design, motion: PadMotion) -> Design:
-    """The configuration's model at some points of the coarser one's design."""
+    """The configuration's model at some points of the coarser one's design.
+
+    Where the last wave is drawn from the posterior, the points that correct lie in it.
+    """
     model, config = full_model(run), run.config.design
-    inputs = Similarity(design.space).inputs(design.theta)
-    wave = fine_wave(design, inputs, config.fine_points, config.fine_held_out, run.config.seed)
+    inputs, among = Similarity(design.space).inputs(design.theta), design
+    if config.coarse == "reduced" and len(config.points) > FIRST_OF_POSTERIOR:
+        near = design.held_out | (design.wave == design.wave.max())
+        among = dataclasses.replace(design, ok=design.ok & near)
+    wave = fine_wave(among, inputs, config.fine_points, config.fine_held_out, run.config.seed)
     file = runs_file(run, model, motion, design.edges_s, design.space)
     run_wave(run, "fine model", file, wave, design.edges_s, model, motion)
     return rows_of(load_design(file), [wave])
@@ -164,7 +175,14 @@ def _draw_wave(
     if not before:
         return first_wave(space, count, config.design.held_out, config.seed)
     design, fitted = enough(rows_of(load_design(runs_file), before)), fitted_bins(run, binned)
-    surrogate, _ = train(design, config.surrogate.kind, config.seed, focus(design, binned, fitted))
+    weights = focus(design, binned, fitted)
+    surrogate, _ = train(design, config.surrogate.kind, config.seed, weights)
+    if config.design.coarse == "reduced" and number >= FIRST_OF_POSTERIOR:
+        run.reporter.log(f"wave {number + 1}: a short run of the sampler says where the posterior is")
+        nearest = design.theta[int(np.argmax(np.where(design.training, weights, 0.0)))]
+        draws = _posterior_draws(run, log_posterior_of(run, surrogate, binned), nearest)
+        inputs = surrogate.inputs(draws)
+        return posterior_wave(space, draws, inputs, count, config.design.held_out, number, config.seed)
     floor_n = noise_floor_n(binned, fitted)
     wave = next_wave(
         space, surrogate.predict, binned.force_n, fitted, floor_n, count, config.design.held_out,
@@ -173,6 +191,17 @@ def _draw_wave(
     kept = wave.record["kept_fraction"]
     run.reporter.log(f"wave {number + 1}: drawn in {kept:.2g} of the prior's volume")
     return wave
+
+
+def _posterior_draws(run: Run, log_posterior: LogPosterior, theta: Array) -> Array:
+    """Draws (n, d) of the model's parameters by a short run that sets out from about theta (d,)."""
+    middle = 0.5 * np.sum(log_posterior.bounds, axis=0)
+    start = log_posterior.named(np.append(theta, log_posterior.from_sampling(middle)[len(theta) :]))
+    settings = SampleSettings(2, WALKERS_A_PARAMETER * log_posterior.dim, SHORT_RUN)
+    with tempfile.TemporaryDirectory() as folder:
+        threads = run.config.design.workers
+        posterior = sample(log_posterior, folder, run.config.seed, start, settings, threads=threads)
+    return log_posterior.split(posterior.flat)[0]
 
 
 def _load_wave(path: Path, space: ParameterSpace, number: int, seed: int) -> Wave:
@@ -240,7 +269,7 @@ STAGE = Stage(
     "design",
     "runs the model at the design's points",
     ("recording",),
-    ("seed", "model", "parameters", "design", "surrogate", "fit"),
+    ("seed", "model", "parameters", "design", "surrogate", "fit", "noise"),
     _work,
     _files,
 )

@@ -27,9 +27,6 @@ from bayeskin.types import PadMotion, Parameter
 
 _SECONDS_A_RUN = (4, 15)  # of one core, on the default mesh
 _REDUCED_SECONDS_A_RUN = (0.1, 0.4)
-# Shares of points whose subcutis is too stiff for a reduced model: of the default prior, and of what a
-# recording leaves of it where that is many.
-_BEYOND_REDUCED = (0.16, 0.3)
 _SHIPPED_KNOWS = (
     "# Another model, bin width or wider bounds need another surrogate: take [surrogate] above out.",
 )
@@ -215,19 +212,16 @@ def _full_design() -> list[str]:
 
 def _reduced_design(file: str) -> list[str]:
     design = DesignConfig.model_validate({"coarse": "reduced"})
-    first = design.points[0] + design.held_out
-    beyond, most = _BEYOND_REDUCED
-    fewest = design.fine_points + design.fine_held_out + round(beyond * first)
-    full = fewest, fewest + round(most * (_runs(design) - first))
+    full = design.fine_points + design.fine_held_out
     low, high = (
-        (seconds * runs + quick * _runs(design)) / (60 * design.workers)
-        for runs, seconds, quick in zip(full, _SECONDS_A_RUN, _REDUCED_SECONDS_A_RUN, strict=True)
+        (seconds * full + quick * _runs(design)) / (60 * design.workers)
+        for seconds, quick in zip(_SECONDS_A_RUN, _REDUCED_SECONDS_A_RUN, strict=True)
     )
     return [
         "# No shipped surrogate knows this protocol on this device, so runs are made first, here:",
-        f"# {_runs(design)} by the reduced model {file}, but for those whose subcutis is too stiff for it.",
-        f"# With the correction some {full[0]} to {full[1]} are of the full model, "
-        f"{low:.0f} to {high:.0f} minutes with {design.workers} workers.",
+        f"# {_runs(design)} by the reduced model {file}, but for skins that fold,",
+        f"# and {full} by the full model, which correct them: {low:.0f} to {high:.0f} minutes with "
+        f"{design.workers} workers.",
         "[design]",
         'coarse = "reduced"  # the model that makes the waves',
         f"fine_points = {design.fine_points}  # full runs that correct it",

@@ -88,7 +88,7 @@ def _build(
 
     base_only = replace(trained, mechanisms={})
     if not path.is_file():
-        reporter.log(f"{settings.runs} training runs of the base model")
+        reporter.log(f"{settings.base_runs} training runs of the base model")
         make_runs(task, training_cases(trained, [BASE], settings, folder), run_all, progress)
         weighted = {BASE: weighted_of(BASE, settings, folder, inner)}
         save_reduced(path, assemble(base_only, REFINEMENT, weighted, settings, progress), _manifest(settings))

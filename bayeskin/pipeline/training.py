@@ -58,29 +58,32 @@ def _work(run: Run) -> Mapping[str, Any]:
     design, fine = storage.load(run.at("design", "design.h5"), Design), fine_design(run, "design")
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    uncorrected = None
     if run.config.surrogate.file is not None:
         ready = shipped_files(run).surrogate
         surrogate, manifest = load_surrogate(ready), load_manifest(ready)
     else:
         surrogate, validation = trained(run, design, binned)
         if fine is not None:
-            surrogate, validation = corrected(run, surrogate, fine, binned)
+            uncorrected = surrogate
+            surrogate, validation = corrected(run, uncorrected, fine, binned)
         records = json.loads(run.at("design", "waves.json").read_text())
         manifest = {**manifest_of(surrogate, validation), **origin(run, motion, records)}
     save_surrogate(run.at("train", "surrogate.h5"), surrogate, manifest)
-    _draw(run, design, fine, binned, surrogate)
+    _draw(run, design, fine, binned, surrogate, uncorrected)
     return {name: value for name, value in manifest.items() if name not in ("waves", "parameters")}
 
 
 def _draw(
-    run: Run, design: Design, fine: Design | None, binned: BinnedForce, surrogate: ShapeSurrogate
-) -> None:
+    run: Run, design: Design, fine: Design | None, binned: BinnedForce, surrogate: ShapeSurrogate,
+    uncorrected: ShapeSurrogate | None,
+) -> None:  # fmt: skip
     held_out = design if fine is None else fine
     testing = held_out.testing
     truth, prediction = held_out.force_n[testing], surrogate.predict(held_out.theta[testing])
     noise_sd_n = np.sqrt(binned.variance_n2)
     scale = np.sqrt(np.mean(truth**2, axis=1))
-    means = [*_former(run, design, binned, held_out), prediction.mean]
+    means = [*_former(run, design, binned, held_out, uncorrected), prediction.mean]
     errors = np.array([np.sqrt(np.mean((mean - truth) ** 2, axis=1)) / scale for mean in means])
     figure = report.figure_validation(
         design.edges_s, truth, prediction, noise_sd_n, errors, corrected=fine is not None
@@ -93,21 +96,22 @@ def _draw(
     report.save_figure(figure, run.at("train", "prior_predictive"), caption(run))
 
 
-def _former(run: Run, design: Design, binned: BinnedForce, held_out: Design) -> list[Array]:
+def _former(
+    run: Run, design: Design, binned: BinnedForce, held_out: Design, uncorrected: ShapeSurrogate | None
+) -> list[Array]:
     """What surrogates trained on the waves up to each but the last predict at held-out points, (n, m) each.
 
     With a fine model's held-out points, the last is of the uncorrected surrogate, of all waves. NaN where
     the surrogate was trained elsewhere.
     """
     waves = np.unique(design.wave[design.ok])
-    theta, found = held_out.theta[held_out.testing], []
-    for wave in waves[:-1] if held_out is design else waves:
-        part = dataclasses.replace(design, ok=design.ok & (design.wave <= wave))
-        if run.config.surrogate.file is None:
-            found.append(trained(run, part, binned)[0].predict_mean(theta))
-        else:
-            found.append(np.full((len(theta), design.force_n.shape[1]), np.nan))
-    return found
+    theta, before = held_out.theta[held_out.testing], waves[:-1]
+    if run.config.surrogate.file is not None:
+        count = len(before) if held_out is design else len(waves)
+        return [np.full((len(theta), design.force_n.shape[1]), np.nan)] * count
+    parts = [dataclasses.replace(design, ok=design.ok & (design.wave <= wave)) for wave in before]
+    found = [trained(run, part, binned)[0].predict_mean(theta) for part in parts]
+    return found if uncorrected is None else [*found, uncorrected.predict_mean(theta)]
 
 
 STAGE = Stage(

@@ -42,7 +42,7 @@ RUN_ARRAYS = ("displacement", "pressure", "time_s", "force_n")
 class BuildSettings:
     """How large a reduced model is and what it learns from.
 
-    runs : training runs of the base model and of each mechanism
+    base_runs, runs : training runs of the base model, and of each mechanism
     base, each : displacement and pressure modes of the base model, and of each mechanism beyond the base's
     base_points, set_points : of the cubatures
     base_shadows, set_shadows : reduced runs that train the cubatures, of the base model and of each mechanism
@@ -50,16 +50,21 @@ class BuildSettings:
     seed : of the training cases; those of the cubatures have others
     """
 
+    base_runs: int = 128
     runs: int = 38
     base: tuple[int, int] = (76, 72)
     each: tuple[int, int] = (30, 20)
-    base_points: int = 350
+    base_points: int = 450
     set_points: int = 700
-    base_shadows: int = 40
+    base_shadows: int = 80
     set_shadows: int = 4
     trusted: float = 0.1
     seed: int = 1
     cubature: CubatureSettings = field(default_factory=CubatureSettings)
+
+    def runs_of(self, kind: str) -> int:
+        """Number of training runs of a kind."""
+        return self.base_runs if kind == BASE else self.runs
 
 
 @dataclass(frozen=True)
@@ -118,10 +123,12 @@ def training_cases(
     trained: Trained, kinds: Sequence[str], settings: BuildSettings, folder: Path
 ) -> list[tuple[Case, Path]]:
     """Returns the training cases of some kinds, in turn, and where their runs are kept."""
+    most = max(settings.runs_of(kind) for kind in kinds)
     return [
         (trained.case(kind, index, settings.seed), run_path(folder, kind, index))
-        for index in range(settings.runs)
+        for index in range(most)
         for kind in kinds
+        if index < settings.runs_of(kind)
     ]
 
 
@@ -135,7 +142,7 @@ def weighted_of(kind: str, settings: BuildSettings, folder: Path, inner: Inner) 
 
     Raises InputError where none has finished.
     """
-    runs = [read_run(run_path(folder, kind, index)) for index in range(settings.runs)]
+    runs = [read_run(run_path(folder, kind, index)) for index in range(settings.runs_of(kind))]
     finished = [run for run in runs if not run.message]
     if not finished:
         raise InputError(f"{folder}: {kind}", "no training run that finished", "one at least")
@@ -181,7 +188,7 @@ class _Teacher:
         rule: Rule | None = None
         for index in range(s.base_shadows):
             self._learn(basis, self._trained.case(BASE, index, s.seed + 1), rule)
-            if index + 1 in (4, 10, 20):
+            if index + 1 in (4, 10, 20, 40):
                 rule = self._rule(s.base_points)
             self._progress("cubature of the base model", (index + 1) / s.base_shadows)
         return self._rule(s.base_points)

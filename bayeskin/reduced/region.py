@@ -35,8 +35,8 @@ def outside(
         return f"mechanism {unknown[0]} was not trained"
     spaces = [trained.base, *(trained.mechanisms[name] for name in mechanisms)]
     lines = [line for space in spaces if (line := _beyond(space, theta))]
-    if theta["E_s"] > STIFFEST_SUBCUTIS * theta["E_c"]:
-        lines.append(f"E_s is more than {STIFFEST_SUBCUTIS:g} times E_c")
+    if mechanisms and theta["E_s"] > STIFFEST_SUBCUTIS * theta["E_c"]:
+        lines.append(f"E_s is more than {STIFFEST_SUBCUTIS:g} times E_c, with mechanisms")
     lines += protocol_outside(trained.protocols, motion)
     lines += other_geometry(trained.geometry, geometry)
     return "; ".join(lines)

@@ -9,6 +9,7 @@ leave-one-out in closed form: Dubrule (1983), Math. Geology 15, 687.
 
 from __future__ import annotations
 
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,9 @@ DIAGONAL_WIDTH, OBLIQUE_WIDTH = 3.0, 0.25  # prior standard deviations of W's en
 ROWS_TO_SEARCH = 320  # with more rows the search begins on so many of them
 ALIGNED_STEPS, OBLIQUE_STEPS, ALL_ROWS_STEPS = 15, 40, 20
 ALL_ROWS_NUGGET = 1e-4  # at most, to begin with: what few rows take for noise, more of them can follow
+FEWEST_TO_SEARCH = 3  # rows for each input and the nugget; fewer have one length for all inputs
+ONE_LENGTH_RATES = (0.3, 1.0, 3.0)  # over the box's width
+ONE_LENGTH_NUGGETS = np.logspace(-6.0, 0.0, 13)
 FOLDS = 3
 FOLD_WORK = 640  # rows times search steps of a fold: few rows mislead the search more, and cost less
 NORMAL_90 = 1.6448536269514722  # 90 % of a standard normal lies within
@@ -35,7 +39,8 @@ class LatentFit(NamedTuple):
     """Hyperparameters of one latent, and what cross-validation says of them.
 
     error: weighted mean squared error of rows whose hyperparameters were fitted without them; inflation:
-    ratio of those errors' 90 % quantile to what the predicted variance promises.
+    ratio of those errors' weighted 90 % quantile (of few rows the RMS) to what the predicted variance
+    promises.
     """
 
     kernel: str
@@ -140,6 +145,8 @@ def fit_latent(unit: Array, target: Array, weights: Array) -> LatentFit:
         return LatentFit("gaussian", np.eye(dim), 1.0, 0.0, 1.0)
     basis = trend_basis(unit, trend_degree(len(unit), dim))
     data = _Data(unit - 0.5, basis, (target - target.mean()) / deviation)
+    if len(unit) < FEWEST_TO_SEARCH * (dim + 1):
+        return _one_length(data, weights, deviation)
     aligned, oblique = np.eye(dim, dtype=bool), np.tri(dim, dtype=bool)
     few = data.rows(np.arange(len(unit)) % -(-len(unit) // ROWS_TO_SEARCH) == 0)
     found = []
@@ -154,6 +161,21 @@ def fit_latent(unit: Array, target: Array, weights: Array) -> LatentFit:
     _, name, at = min(found, key=lambda kernel: kernel[0])
     best = _cross_validate(name, data, oblique, at, weights)
     return best._replace(error=best.error * deviation**2)
+
+
+def _one_length(data: _Data, weights: Array, deviation: float) -> LatentFit:
+    """A fit for few rows: the most probable of some lengths, the same along all inputs, and of some nuggets.
+
+    So few rows tell no two lengths apart, and a search that tries all the same promises far too much.
+    """
+    eye = np.eye(data.inputs.shape[1])
+    choices = product(ONE_LENGTH_RATES, ONE_LENGTH_NUGGETS)
+    rate, nugget = min(choices, key=lambda at: _likelihood("gaussian", at[0] * eye, at[1], data).value)
+    found = _likelihood("gaussian", rate * eye, nugget, data)
+    error = float(np.average(found.residual**2, weights=weights))
+    promised = found.variance * float(np.average(found.spread**2, weights=weights))
+    inflation = max(float(np.sqrt(error / promised)), 1.0)
+    return LatentFit("gaussian", rate * eye, float(nugget), error * deviation**2, inflation)
 
 
 def _cross_validate(
@@ -175,5 +197,7 @@ def _cross_validate(
         out = fold == k
         residual[out] = all_rows.residual[out]
         ratio[out] = residual[out] / (all_rows.spread[out] * np.sqrt(variance))
-    inflation = float(np.quantile(np.abs(ratio), 0.9)) / NORMAL_90
+    order = np.argsort(np.abs(ratio))
+    share = (np.cumsum(weights[order]) - 0.5 * weights[order]) / weights.sum()
+    inflation = float(np.interp(0.9, share, np.abs(ratio)[order])) / NORMAL_90
     return LatentFit(name, at[0], at[1], float(np.average(residual**2, weights=weights)), inflation)

@@ -26,13 +26,17 @@ class ShapeTransform(_FreezesArrays):
     components: Array
     truncation: Array
 
-    def keep(self, count: int, shapes: Array) -> ShapeTransform:
-        """The first `count` components; what they leave of `shapes` (n, m) becomes the truncation."""
+    def keep(self, count: int, shapes: Array, weights: Array, fitted: int) -> ShapeTransform:
+        """The first `count` components; what they leave of `shapes` (n, m) becomes the truncation.
+
+        weights (n,) of the rows; fitted: how many of the mean and components follow these very rows.
+        """
         components = self.components[:count]
         centred = shapes - self.mean
         rest = centred - (centred @ components.T) @ components
-        freedom = max(len(shapes) - 1 - count, 1)
-        return ShapeTransform(self.mean, components, np.sum(rest**2, axis=0) / freedom)
+        counting = weights.sum() ** 2 / np.sum(weights**2)  # rows
+        freedom = max(counting - fitted, 1.0) / counting
+        return ShapeTransform(self.mean, components, weights @ rest**2 / (weights.sum() * freedom))
 
     def encode(self, force_n: Array) -> Array:
         """Latent vectors (n, 1 + K) of histories (n, m)."""

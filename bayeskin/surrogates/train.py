@@ -144,7 +144,7 @@ def fit_latents(
         fits.append(fit)
         error += fit.error
         left -= float(variances[k])
-    transform = full.keep(len(fits) - 1, shapes)
+    transform = full.keep(len(fits) - 1, shapes, weights, fitted=len(fits))
     targets = transform.encode(force_n)
     targets[:, 0] -= log_scale
     return transform, targets, fits

@@ -91,7 +91,7 @@ def correct(
     theta, force_n = fine.theta[training], fine.force_n[training]
     inputs, weights = surrogate.inputs(theta), focus[training]
     known = coarse.predict(inputs)[0]
-    transform = surrogate.transform.keep(known.shape[1] - 1, split(force_n)[1])
+    transform = surrogate.transform.keep(known.shape[1] - 1, split(force_n)[1], weights, fitted=0)
     change = transform.encode(force_n) - known
     change[:, 0] -= similarity.log_scale(theta)
     fits = [fit_latent(inputs, column, weights) for column in change.T]
@@ -132,4 +132,4 @@ def _beyond(
         fits.append(fit_latent(inputs, rest @ found[k], weights))
         error += fits[-1].error
     whole = replace(transform, components=np.concatenate([transform.components, found[: len(fits)]]))
-    return whole.keep(len(whole.components), shapes), fits
+    return whole.keep(len(whole.components), shapes, weights, fitted=len(fits)), fits

@@ -22,7 +22,14 @@ from bayeskin.types import ParameterSpace
 
 NAMES = ("preconditioning", "solid-viscoelasticity")
 SETTINGS = BuildSettings(
-    runs=7, base=(34, 26), each=(14, 8), base_points=200, set_points=260, base_shadows=6, set_shadows=1
+    base_runs=7,
+    runs=7,
+    base=(34, 26),
+    each=(14, 8),
+    base_points=200,
+    set_points=260,
+    base_shadows=6,
+    set_shadows=1,
 )
 
 

@@ -1,0 +1,143 @@
+"""How long a recording of a protocol that no file knows takes to a trusted posterior, stage by stage.
+
+The full model makes a staircase test of random holds on a skin, with correlated noise; `bayeskin new` writes
+its configuration and the stages run as `bayeskin run` has them. Prints seconds of the clock and of the
+processors of each stage, full runs, effective draws of the check, the verdict, and whether true values lie
+in the 90 % intervals. A second start with the same folder goes on, and repeats nothing.
+
+    OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/unknown_protocol.py --seed 1 --folder /tmp/unknown-1
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import resource
+import tempfile
+import time
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rows
+from scipy.signal import lfilter
+
+from bayeskin import storage
+from bayeskin.model import ModelSpec, simulate
+from bayeskin.pipeline.engine import Silent
+from bayeskin.pipeline.new import new_config
+from bayeskin.pipeline.stages import BEFORE_REPORT, run
+from bayeskin.types import Array, PadMotion, Recording
+
+TRUTH = {"E_c": 300e3, "E_s": 20e3, "k_c": 3e-14, "k_s": 2e-13, "p_init": 300.0}
+SPREAD = 0.3  # sd of the logarithms of a seed's skin about it
+REST_S, STEP_MM, STEPS, SPEED_MM_S = 5.0, 3.0, 3, 1.0
+HOLDS_S = (20.0, 40.0)
+RATE_HZ = 20.0
+WHITE_N, SLOW_N, SLOW_S = 4e-3, 2e-3, 0.5  # white noise, and correlated noise with its time
+
+
+def skin(rng: np.random.Generator) -> dict[str, float]:
+    """A skin about `TRUTH`, SI; the initial pressure is its own."""
+    return {
+        name: value if name == "p_init" else float(value * np.exp(SPREAD * rng.standard_normal()))
+        for name, value in TRUTH.items()
+    }
+
+
+def staircase(rng: np.random.Generator) -> PadMotion:
+    """Steps of 3 mm with holds between `HOLDS_S`, one unload, and a rest."""
+    time_s, height_mm = [0.0, REST_S], [0.0, 0.0]
+    for level in (*(STEP_MM * (step + 1) for step in range(STEPS)), 0.0):
+        ramp_s = abs(level - height_mm[-1]) / SPEED_MM_S
+        hold_s = round(float(rng.uniform(*HOLDS_S)), 1)
+        time_s += [time_s[-1] + ramp_s, time_s[-1] + ramp_s + hold_s]
+        height_mm += [level, level]
+    return PadMotion(np.array(time_s), 1e-3 * np.array(height_mm))
+
+
+def noise(rng: np.random.Generator, count: int) -> Array:
+    """Noise [N] of so many samples, (count,)."""
+    keep = np.exp(-1.0 / (RATE_HZ * SLOW_S))
+    slow = lfilter([SLOW_N * np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(count))
+    return np.asarray(WHITE_N * rng.standard_normal(count) + slow)
+
+
+def make(file: Path, seed: int) -> dict[str, float]:
+    """Writes a seed's recording, if it is not there, and returns its skin."""
+    rng = np.random.default_rng([seed, 30])
+    theta, motion = skin(rng), staircase(rng)
+    if not file.exists():
+        simulation = simulate(ModelSpec(), motion, theta)
+        if simulation.status != "ok":
+            raise SystemExit(simulation.message)
+        time_s = np.arange(0.0, motion.time_s[-1] + 0.5 / RATE_HZ, 1.0 / RATE_HZ)
+        force_n = simulation.at(time_s) + noise(rng, len(time_s))
+        sha256 = hashlib.sha256(force_n.tobytes()).hexdigest()
+        storage.save(file, Recording(time_s, motion.at(time_s), force_n, file.stem, sha256))
+    return theta
+
+
+def spent_s() -> tuple[float, float]:
+    """Seconds of the clock, and of the processors in this process and those that it has ended."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return time.perf_counter(), sum(one.ru_utime + one.ru_stime for one in used)
+
+
+class Log(Silent):
+    """Tells on stderr what stages log."""
+
+    def log(self, message: str) -> None:
+        rows.say(message)
+
+
+def stage_by_stage(config: Path) -> tuple[list[list[str]], dict[str, Any]]:
+    """A table row of each stage, the first with the reading of the recording, and the summary of the run."""
+    table, begin = [], spent_s()
+    for name in (*(stage.name for stage in BEFORE_REPORT[1:]), None):
+        before = spent_s()
+        said = run(config, name, Log())
+        table.append([name or "report", *(f"{b - a:.1f}" for a, b in zip(before, spent_s(), strict=True))])
+    table.append(["all", *(f"{b - a:.1f}" for a, b in zip(begin, spent_s(), strict=True))])
+    return table, said
+
+
+def covered(posterior: Mapping[str, Mapping[str, Any]], theta: Mapping[str, float]) -> list[list[str]]:
+    """A table row of each parameter: the true value, the 90 % interval, and whether it lies inside."""
+    return [
+        [
+            name, *(f"{value:.4g}" for value in (theta[name], p["low_90"], p["high_90"])),
+            "yes" if p["low_90"] <= theta[name] <= p["high_90"] else "no",
+        ]
+        for name, p in posterior.items() if name in theta
+    ]  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--folder", type=Path, help="where the run stays; by default nowhere")
+    options = parser.parse_args()
+    with ExitStack() as stack:
+        folder = options.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder.mkdir(parents=True, exist_ok=True)
+        theta = make(folder / "staircase.h5", options.seed)
+        config = folder / "staircase.toml"
+        if not config.exists():
+            new_config(folder / "staircase.h5")
+        table, said = stage_by_stage(config)
+    print(rows.markdown(["stage", "seconds", "CPU seconds"], table))
+    print(rows.markdown(["", "true", "5 %", "95 %", "inside"], covered(said["posterior"], theta)))
+    for one in said["full_model_at_draws"]:
+        print(one["message"])
+    polished = said["map"]["polished"] or {"full_runs": 0}
+    print(f"{polished['full_runs']} full runs polish the maximum")
+    print(f"{said['verdict']}: {'; '.join(said['because'])}")
+
+
+if __name__ == "__main__":
+    main()
