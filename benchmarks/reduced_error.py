@@ -126,7 +126,7 @@ def figure(rows: Sequence[Row]) -> Figure:
     ax.plot(ends, ends, color=INK, lw=1.0)
     ax.set(xlim=ends, ylim=ends, xlabel="true RMS error [% of the peak force]",
            ylabel="estimated RMS error [% of the peak force]")  # fmt: skip
-    ax.legend(loc="upper left", fontsize=7)
+    ax.legend(loc="lower right", fontsize=7)
     within = sum(row.true <= row.estimate for row in fine)
     state_finding(
         out, f"The true error is within its estimate in {within} of {len(fine)} fresh runs.",

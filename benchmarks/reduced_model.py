@@ -1,12 +1,12 @@
 """How far the shipped reduced model is from the full one on skins and protocols never seen, and its cost.
 
-    OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/reduced_model.py [--full] [--estimates]
+    OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/reduced_model.py [--full]
 
 Thirty-one skins drawn from the priors: four of the base model, one of each of the eleven mechanisms of the
 tissue, four pairs, triples and quadruples of them, and four of the base model whose subcutis is more than
 twice as stiff as the cutis; the article's protocol and four others. Forces of the full model
 are in results/reduced_held_out.h5; with --full those that are missing there are made, some ten seconds each.
-With --estimates the reduced runs estimate their own error, and the share of true errors within it is told.
+What the model says of its own error is tested by reduced_error.py.
 """
 
 from __future__ import annotations
@@ -120,29 +120,26 @@ def make_missing(skins: Sequence[Skin]) -> None:
 
 
 class Row(NamedTuple):
-    """A reduced run beside a full one: errors and estimate over the peak, or why there is none."""
+    """A reduced run beside a full one: errors over the peak, or why there is none."""
 
     rms: float
     largest: float
-    estimate: float
     message: str
 
 
-def compared(model: ReducedModel, skin: Skin, protocol: PadMotion, group: h5py.Group, estimates: bool) -> Row:
+def compared(model: ReducedModel, skin: Skin, protocol: PadMotion, group: h5py.Group) -> Row:
     """Runs the reduced model and compares it at the full run's own steps."""
     acting = [catalogue()[name] for name in skin.mechanisms]
-    run = simulate_reduced(model, protocol, skin.theta, acting, estimate=estimates)
+    run = simulate_reduced(model, protocol, skin.theta, acting)
     if run.status != "ok":
-        return Row(np.nan, np.nan, np.nan, run.message)
+        return Row(np.nan, np.nan, run.message)
     time_s, force_n = group["time_s"][()], group["force_n"][()].astype(float)
     wrong, peak = run.at(time_s) - force_n, np.abs(force_n).max()
-    weight = np.gradient(time_s)
-    estimate = run.stats.get("error_estimate_n", np.nan) / peak
-    rms = float(np.sqrt(np.average(wrong**2, weights=weight)) / peak)
-    return Row(rms, float(np.abs(wrong).max() / peak), estimate, "")
+    rms = float(np.sqrt(np.average(wrong**2, weights=np.gradient(time_s))) / peak)
+    return Row(rms, float(np.abs(wrong).max() / peak), "")
 
 
-def table(model: ReducedModel, estimates: bool) -> list[str]:
+def table(model: ReducedModel) -> list[str]:
     """The table in Markdown: medians of RMS and largest error in % of the peak; 0.1 % is 1 mN at 1 N."""
     skins, rows = held_out(), dict[tuple[str, str], list[Row]]()
     with h5py.File(RESULTS) as handle:
@@ -150,15 +147,16 @@ def table(model: ReducedModel, estimates: bool) -> list[str]:
             for name, protocol in PROTOCOLS.items():
                 group = handle[f"{number:02d}/{name}"]
                 if not group.attrs["message"]:
-                    row = compared(model, skin, protocol, group, estimates)
+                    row = compared(model, skin, protocol, group)
                     rows.setdefault((skin.group, name), []).append(row)
                     print(number, name, skin.mechanisms, row, file=sys.stderr, flush=True)
-    groups = list(dict.fromkeys(group for group, _ in rows))
+    groups = sorted({group for group, _ in rows}, key=[skin.group for skin in skins].index)
+    groups.sort(key=lambda group: not group.startswith("base"))
     lines = ["| skins | " + " | ".join(f"{name}: rms, max [% of peak]" for name in PROTOCOLS) + " |"]
     lines.append("| --- " * (1 + len(PROTOCOLS)) + "|")
     lines += [f"| {group} | " + " | ".join(_cell(rows.get((group, name), [])) for name in PROTOCOLS) + " |"
               for group in groups]  # fmt: skip
-    return [*lines, "", *_coverage([row for found in rows.values() for row in found])]
+    return lines
 
 
 def _cell(rows: Sequence[Row]) -> str:
@@ -168,16 +166,6 @@ def _cell(rows: Sequence[Row]) -> str:
         return failed.lstrip(", ") or "–"
     rms, largest = (100 * np.median([getattr(row, name) for row in fine]) for name in ("rms", "largest"))
     return f"{rms:.3f}, {largest:.3f}{failed}"
-
-
-def _coverage(rows: Sequence[Row]) -> list[str]:
-    """How often the true error is at most so many times the estimate."""
-    known = np.array([[row.rms, row.estimate] for row in rows if np.isfinite(row.estimate)]).reshape(-1, 2)
-    if not len(known):
-        return []
-    shares = [f"{factor} times in {100 * np.mean(known[:, 0] <= factor * known[:, 1]):.0f} %"
-              for factor in (1, 2, 4)]  # fmt: skip
-    return [f"True error over its estimate, {len(known)} runs: at most {', '.join(shares)}."]
 
 
 def timed(model: ReducedModel, skin: Skin) -> str:
@@ -206,7 +194,7 @@ def main(arguments: Sequence[str]) -> None:
     if "--full" in arguments:
         make_missing(held_out())
     model = load_reduced(shipped(SHIPPED))
-    print("\n".join(table(model, "--estimates" in arguments)))
+    print("\n".join(table(model)))
     for skin in (held_out()[0], held_out()[19]):
         print(timed(model, skin))
 

@@ -55,9 +55,9 @@ class BuildSettings:
     base: tuple[int, int] = (76, 72)
     each: tuple[int, int] = (30, 20)
     base_points: int = 450
-    set_points: int = 800
+    set_points: int = 700
     base_shadows: int = 80
-    set_shadows: int = 8
+    set_shadows: int = 4
     trusted: float = 0.1
     seed: int = 1
     cubature: CubatureSettings = field(default_factory=CubatureSettings)
@@ -178,41 +178,43 @@ class _Teacher:
     ) -> None:  # fmt: skip
         self._trained, self._problem, self._inner, self._modes = trained, problem, inner, modes
         self._settings, self._progress = settings, progress
+        self._rng = np.random.default_rng([settings.seed, 2])
+        self._rows: list[Array] = []
         self._volumes = point_fields(problem, modes.basis((), inner))
 
     def base_rule(self) -> Rule:
         """Trains the cubature of the base model: on all points first, then on the points of a first rule."""
         s, basis = self._settings, self._modes.basis((), self._inner)
-        rule, rows, rng = None, list[Array](), np.random.default_rng([s.seed, 2])
+        rule: Rule | None = None
         for index in range(s.base_shadows):
-            rows += self._learnt(basis, self._trained.case(BASE, index, s.seed + 1), rule, rng)
+            self._learn(basis, self._trained.case(BASE, index, s.seed + 1), rule)
             if index + 1 in (4, 10, 20, 40):
-                rule = self._rule(rows, s.base_points)
+                rule = self._rule(s.base_points)
             self._progress("cubature of the base model", (index + 1) / s.base_shadows)
-        return self._rule(rows, s.base_points)
+        return self._rule(s.base_points)
 
     def set_rule(self, base: Rule) -> Rule:
         """The cubature of sets of mechanisms; `base` where there are none."""
         s, kinds = self._settings, sorted(self._modes.beyond)
         if not kinds:
             return base
-        rule, rows, rng = None, list[Array](), np.random.default_rng([s.seed, 3])
+        rule: Rule | None = None
         for index in range(s.set_shadows):
             for number, kind in enumerate(kinds):
                 case = self._trained.case(kind, index, s.seed + 1)
-                rows += self._learnt(self._modes.basis(case.mechanisms, self._inner), case, rule, rng)
+                self._learn(self._modes.basis(case.mechanisms, self._inner), case, rule)
                 self._progress("cubature of sets", (index + (number + 1) / len(kinds)) / s.set_shadows)
-            rule = self._rule(rows, s.set_points)
+            rule = self._rule(s.set_points)
         return rule if rule is not None else base
 
-    def _learnt(self, basis: Basis, case: Case, rule: Rule | None, rng: np.random.Generator) -> list[Array]:
-        """What a reduced run teaches, on the points of a rule or on all; nothing if it went astray."""
-        taken = shadowed(self._problem, basis, case, rule, self._settings.cubature, rng)
-        near = len(taken.missing) and np.abs(taken.missing).max() < self._settings.trusted
-        return [taken.rows] if near else []
+    def _learn(self, basis: Basis, case: Case, rule: Rule | None) -> None:
+        """Adds what a reduced run teaches, on the points of a rule or on all, unless it went astray."""
+        taken = shadowed(self._problem, basis, case, rule, self._settings.cubature, self._rng)
+        if len(taken.missing) and np.abs(taken.missing).max() < self._settings.trusted:
+            self._rows.append(taken.rows)
 
-    def _rule(self, rows: Sequence[Array], points: int) -> Rule:
-        return rule_of(self._volumes, rows, points, self._settings.cubature)
+    def _rule(self, points: int) -> Rule:
+        return rule_of(self._volumes, self._rows, points, self._settings.cubature)
 
 
 def rule_of(at: PointFields, rows: Sequence[Array], points: int, settings: CubatureSettings) -> Rule:

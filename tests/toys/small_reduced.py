@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import catalogue
 from bayeskin.model.simulate import ModelSpec, problem_of
 from bayeskin.reduced.build import BuildSettings, RunTask, assemble, make_runs, training_cases, weighted_of
-from bayeskin.reduced.cases import BASE, Trained
+from bayeskin.reduced.cases import BASE, Protocols, Trained
 from bayeskin.reduced.files import save_reduced
 from bayeskin.reduced.library import Library, Modes
 from bayeskin.reduced.model import Cubatures, ReducedModel, inner_of
@@ -41,9 +42,13 @@ def one_by_one(
 
 
 def trained() -> Trained:
-    """The region: all priors, two mechanisms."""
+    """The region: a subcutis at most twice as stiff as the cutis, short holds, two mechanisms."""
     spaces = {name: ParameterSpace(catalogue()[name].parameters) for name in NAMES}
-    return Trained(Geometry(), default_space(), spaces)
+    base = tuple(
+        replace(p, **{"E_c": {"lower": 50e3}, "E_s": {"upper": 100e3}}.get(p.name, {}))
+        for p in default_space().parameters
+    )
+    return Trained(Geometry(), ParameterSpace(base), spaces, Protocols(base_holds_s=(2.0, 60.0)))
 
 
 def built(folder: Path) -> ReducedModel:
