@@ -13,20 +13,17 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import h5py
 import numpy as np
 from matplotlib.figure import Figure
+from reduced_model import Row, compared, keep_full_run
 
 from bayeskin.geometry import LENGTHS
-from bayeskin.mechanisms import catalogue, laws
-from bayeskin.model.simulate import ModelSpec, simulate
+from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline.reducing import SHIPPED, trained_for
 from bayeskin.reduced.cases import BASE, Case
 from bayeskin.reduced.files import load_reduced
-from bayeskin.reduced.model import ReducedModel
-from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.report.style import INK, PAGE_IN, new_figure, state_finding, styled
 from bayeskin.shipped import shipped
 
@@ -34,15 +31,6 @@ RESULTS = Path(__file__).with_name("results") / "reduced_fresh.h5"
 SEED = 20261128  # of no training case
 EACH = 4  # cases of a kind
 GROUPS = {0: ("base model", "#0072B2"), 1: ("one mechanism", "#009E73"), 2: ("sets of 2 and 3", "#D55E00")}
-
-
-class Row(NamedTuple):
-    """A reduced run beside a full one: true and estimated RMS error over the peak, or why there is none."""
-
-    case: Case
-    true: float
-    estimate: float
-    message: str
 
 
 def fresh() -> dict[str, Case]:
@@ -57,46 +45,19 @@ def theta_of(case: Case) -> dict[str, float]:
     return {**case.theta, **{name: getattr(case.geometry, name) for name in LENGTHS}}
 
 
-def make_missing(cases: dict[str, Case]) -> None:
-    """Runs the full model where its force is not in the results."""
-    for name, case in cases.items():
-        with h5py.File(RESULTS, "a") as handle:
-            if name in handle:
-                continue
-        acting = [catalogue()[mechanism] for mechanism in case.mechanisms]
-        run = simulate(ModelSpec(), case.motion, theta_of(case), laws=laws(acting), falls_too=False)
-        with h5py.File(RESULTS, "a") as handle:
-            group = handle.create_group(name)
-            group["time_s"], group["force_n"] = run.time_s, run.force_n.astype(np.float32)
-            group.attrs["message"] = run.message
-        print(name, run.message or f"{run.stats['seconds']:.1f} s", file=sys.stderr, flush=True)
-
-
-def compared(model: ReducedModel, case: Case, group: h5py.Group) -> Row:
-    """Runs the reduced model with its estimate and compares it at the full run's own steps."""
-    acting = [catalogue()[mechanism] for mechanism in case.mechanisms]
-    run = simulate_reduced(model, case.motion, theta_of(case), acting, estimate=True)
-    if run.status != "ok":
-        return Row(case, np.nan, np.nan, run.message)
-    time_s, force_n = group["time_s"][()], group["force_n"][()].astype(float)
-    peak_n, wrong_n = np.abs(force_n).max(), run.at(time_s) - force_n
-    rms_n = float(np.sqrt(np.average(wrong_n**2, weights=np.gradient(time_s))))
-    return Row(case, rms_n / peak_n, run.stats["error_estimate_n"] / peak_n, "")
-
-
-def told(rows: Sequence[Row]) -> list[str]:
+def told(rows: Sequence[tuple[Case, Row]]) -> list[str]:
     """How often the true error is within the estimate, and what was refused, in sentences."""
-    fine = [row for row in rows if not row.message]
+    fine = [(case, row) for case, row in rows if not row.message]
     refused = len(rows) - len(fine)
     lines = [f"{len(rows)} cases that the full model finishes; the reduced model refuses {refused} of them."]
     for label, some in (
         ("all cases", fine),
-        ("the trained geometry", [row for row in fine if row.case.geometry == ModelSpec().geometry]),
-        ("other layers and arms", [row for row in fine if row.case.geometry != ModelSpec().geometry]),
-        *((label, [row for row in fine if min(len(row.case.mechanisms), 2) == count])
+        ("the trained geometry", [one for one in fine if one[0].geometry == ModelSpec().geometry]),
+        ("other layers and arms", [one for one in fine if one[0].geometry != ModelSpec().geometry]),
+        *((label, [one for one in fine if min(len(one[0].mechanisms), 2) == count])
           for count, (label, _) in GROUPS.items()),
     ):  # fmt: skip
-        true, estimate = np.array([[row.true, row.estimate] for row in some]).T
+        true, estimate = np.array([[row.rms, row.estimate] for _, row in some]).T
         shares = ", ".join(
             f"{np.sum(true <= factor * estimate)} within {word}"
             for factor, word in ((1, "the estimate"), (2, "twice it"), (4, "four times it"))
@@ -109,25 +70,25 @@ def told(rows: Sequence[Row]) -> list[str]:
 
 
 @styled
-def figure(rows: Sequence[Row]) -> Figure:
+def figure(rows: Sequence[tuple[Case, Row]]) -> Figure:
     """Estimated against true error, both in % of the peak force."""
-    fine = [row for row in rows if not row.message]
+    fine = [(case, row) for case, row in rows if not row.message]
     out = new_figure(0.7 * PAGE_IN, 0.62 * PAGE_IN)
     ax = out.subplots()
     for count, (label, colour) in GROUPS.items():
         for moved, marker in ((False, "o"), (True, "^")):
-            some = [row for row in fine if min(len(row.case.mechanisms), 2) == count
-                    and (row.case.geometry != ModelSpec().geometry) == moved]  # fmt: skip
-            ax.loglog([100 * row.true for row in some], [100 * row.estimate for row in some], marker, ms=5,
+            some = [row for case, row in fine if min(len(case.mechanisms), 2) == count
+                    and (case.geometry != ModelSpec().geometry) == moved]  # fmt: skip
+            ax.loglog([100 * row.rms for row in some], [100 * row.estimate for row in some], marker, ms=5,
                       color=colour, mew=0, alpha=0.85,
                       label=label + (", other layers and arm" if moved else ""))  # fmt: skip
-    values = [100 * value for row in fine for value in (row.true, row.estimate)]
+    values = [100 * value for _, row in fine for value in (row.rms, row.estimate)]
     ends = 0.7 * min(values), 1.4 * max(values)
     ax.plot(ends, ends, color=INK, lw=1.0)
     ax.set(xlim=ends, ylim=ends, xlabel="true RMS error [% of the peak force]",
            ylabel="estimated RMS error [% of the peak force]")  # fmt: skip
     ax.legend(loc="lower right", fontsize=7)
-    within = sum(row.true <= row.estimate for row in fine)
+    within = sum(row.rms <= row.estimate for _, row in fine)
     state_finding(
         out, f"The true error is within its estimate in {within} of {len(fine)} fresh runs.",
         "Above the line the estimate is larger than the true error.",
@@ -139,13 +100,16 @@ def main(arguments: Sequence[str]) -> None:
     """Prints the coverage, and draws the figure where a file is named."""
     cases = fresh()
     if "--full" in arguments:
-        make_missing(cases)
+        for name, case in cases.items():
+            keep_full_run(RESULTS, name, case.motion, theta_of(case), case.mechanisms)
     model, rows = load_reduced(shipped(SHIPPED)), []
     with h5py.File(RESULTS) as handle:
         for name, case in cases.items():
-            if not handle[name].attrs["message"]:
-                rows.append(compared(model, case, handle[name]))
-                print(name, *rows[-1][1:], file=sys.stderr, flush=True)
+            group = handle[name]
+            if not group.attrs["message"]:
+                row = compared(model, case.motion, theta_of(case), case.mechanisms, group, estimate=True)
+                rows.append((case, row))
+                print(name, row, file=sys.stderr, flush=True)
     print("\n".join(told(rows)))
     if "--figure" in arguments:
         figure(rows).savefig(arguments[arguments.index("--figure") + 1], dpi=200)

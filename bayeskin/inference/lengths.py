@@ -1,4 +1,4 @@
-"""How much of what a posterior leaves open comes from lengths of the tissue that are not known exactly."""
+"""The share of a posterior's variance that comes from lengths of the tissue which are not known exactly."""
 
 from __future__ import annotations
 

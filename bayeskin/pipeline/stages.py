@@ -152,7 +152,7 @@ def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str
             [
                 *(said["verdict"], *said["reasons"], *said["remarks"]),
                 *_table(said["parameters"]),
-                *_identified([*said["identifiability"], *said["ridges"], *_lengths(said["lengths"])]),
+                *_identified([*said["identifiability"], *said["ridges"], *_lengths(said.get("lengths", {}))]),
                 *_priors(said["parameters"]),
             ]
         ),
@@ -185,7 +185,7 @@ def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
         [
             f"{said['name']}: {said['verdict']}: {'; '.join(said['because'])}",
             *_table(said["posterior"]),
-            *_identified([*said["identifiability"], *_lengths(said["lengths"])]),
+            *_identified([*said["identifiability"], *_lengths(said.get("lengths", {}))]),
             *_priors(said["posterior"]),
             *said["remarks"],
             f"{model}: RMSE {', '.join(off)}",

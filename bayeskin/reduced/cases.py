@@ -15,7 +15,7 @@ from bayeskin.geometry import Geometry
 from bayeskin.types import PadMotion, ParameterSpace
 
 BASE = "base"  # the kind of runs without a mechanism
-STIFFEST_SUBCUTIS = 2.0  # of the cutis' modulus, with mechanisms: a stiffer one folds, and runs take minutes
+STIFFEST_SUBCUTIS = 2.0  # of the cutis' modulus, in runs with mechanisms
 ACCOMPANIED = 0.5  # share of a mechanism's runs in which one or two others act as well
 MOVED = {BASE: 0.5}  # share of the runs on other layers and another arm
 MOVED_OTHERWISE = 0.25
