@@ -91,7 +91,7 @@ def test_pressures_without_their_mean_have_none(inner) -> None:
 @given(st.integers(0, 10**6))
 def test_protocols_stay_within_their_bounds(seed: int) -> None:
     bounds = Protocols()
-    motion = random_motion(np.random.default_rng(seed), bounds, bounds.holds_s)
+    motion = random_motion(np.random.default_rng(seed), bounds)
     speed = np.abs(np.diff(motion.displacement_m) / np.diff(motion.time_s))
     moving = speed > 0.0
     assert np.all(np.diff(motion.time_s) > 0.0)
@@ -116,7 +116,6 @@ def test_training_cases_lie_in_the_trained_region(kind: str, index: int) -> None
     ("theta", "names", "geometry", "motion", "says"),
     [
         ({"E_c": 5e6}, (), Geometry(), MOTION, "E_c is 5e+06"),
-        (SOFT_CUTIS | ACTING, NAMES[:1], Geometry(), MOTION, "E_s is more than 2 times E_c, with mechanisms"),
         ({}, ("fluid-leakage",), Geometry(), MOTION, "mechanism fluid-leakage was not trained"),
         ({}, (), Geometry(cutis_m=4e-3), MOTION, "cutis is 4 mm"),
         ({}, (), Geometry(gauge_m=30e-3), MOTION, "pads, guard or load cell"),
@@ -131,8 +130,9 @@ def test_what_lies_outside_is_said(theta, names, geometry, motion, says) -> None
     assert outside(TRAINED, THETA, (), Geometry(), MOTION) == ""
 
 
-def test_the_base_model_knows_a_subcutis_stiffer_than_the_cutis() -> None:
-    assert outside(TRAINED, THETA | SOFT_CUTIS, (), Geometry(), MOTION) == ""
+def test_a_subcutis_stiffer_than_the_cutis_was_trained() -> None:
+    for names in ((), NAMES[:1]):
+        assert outside(TRAINED, THETA | SOFT_CUTIS | ACTING, names, Geometry(), MOTION) == ""
 
 
 def test_a_cubature_integrates_what_it_was_taught_with_positive_weights() -> None:

@@ -51,7 +51,7 @@ class BuildSettings:
     """
 
     base_runs: int = 128
-    runs: int = 38
+    runs: int = 48
     base: tuple[int, int] = (76, 72)
     each: tuple[int, int] = (30, 20)
     base_points: int = 450

@@ -15,7 +15,6 @@ from bayeskin.geometry import Geometry
 from bayeskin.types import PadMotion, ParameterSpace
 
 BASE = "base"  # the kind of runs without a mechanism
-STIFFEST_SUBCUTIS = 2.0  # of the cutis' modulus, in runs with mechanisms
 ACCOMPANIED = 0.5  # share of a mechanism's runs in which one or two others act as well
 MOVED = {BASE: 0.5}  # share of the runs on other layers and another arm
 MOVED_OTHERWISE = 0.25
@@ -26,14 +25,12 @@ THICKNESS_RANGE, RADIUS_RANGE = 0.4, 0.3  # shares by which layers and arm diffe
 class Protocols:
     """Bounds of the random protocols: the largest displacement [m], speeds [m/s] and holds [s].
 
-    base_holds_s : of runs without a mechanism, which are quick
     returns, rests : shares of the protocols that unload fully, and that hold after unloading
     """
 
     largest_m: float = 10e-3
     speeds_m_s: tuple[float, float] = (0.1e-3, 5e-3)
-    holds_s: tuple[float, float] = (2.0, 60.0)
-    base_holds_s: tuple[float, float] = (2.0, 300.0)
+    holds_s: tuple[float, float] = (2.0, 300.0)
     returns: float = 0.3
     rests: float = 0.6
 
@@ -64,10 +61,9 @@ class Trained:
         """Returns training case `index` of a kind: "base", or the name of a mechanism that acts in it."""
         rng = np.random.default_rng([seed, index, *kind.encode()])
         names = () if kind == BASE else self._names(kind, rng)
-        holds_s = self.protocols.holds_s if names else self.protocols.base_holds_s
         return Case(
             self._theta(names, rng), names, self._moved(MOVED.get(kind, MOVED_OTHERWISE), rng),
-            random_motion(rng, self.protocols, holds_s),
+            random_motion(rng, self.protocols),
         )  # fmt: skip
 
     def _names(self, kind: str, rng: np.random.Generator) -> tuple[str, ...]:
@@ -76,9 +72,7 @@ class Trained:
         return tuple(sorted([kind, *rng.choice(others, min(count, len(others)), replace=False).tolist()]))
 
     def _theta(self, names: Sequence[str], rng: np.random.Generator) -> dict[str, float]:
-        theta: dict[str, float] = {}
-        while not theta or (names and theta["E_s"] > STIFFEST_SUBCUTIS * theta["E_c"]):
-            theta = _drawn(self.base, rng)
+        theta = _drawn(self.base, rng)
         for name in names:
             theta |= _drawn(self.mechanisms[name], rng)
         return theta
@@ -99,11 +93,8 @@ def _drawn(space: ParameterSpace, rng: np.random.Generator) -> dict[str, float]:
     return dict(zip(space.names, map(float, space.from_unit(rng.uniform(size=space.dim))), strict=True))
 
 
-def random_motion(rng: np.random.Generator, bounds: Protocols, holds_s: tuple[float, float]) -> PadMotion:
-    """Returns a random protocol of four or five phases: load, hold, unload, often hold, load.
-
-    holds_s : the shortest and the longest hold
-    """
+def random_motion(rng: np.random.Generator, bounds: Protocols) -> PadMotion:
+    """Returns a random protocol of four or five phases: load, hold, unload, often hold, load."""
     smallest_m = 0.03 * bounds.largest_m
     time_s, height_m = [0.0], [0.0]
 
@@ -114,7 +105,7 @@ def random_motion(rng: np.random.Generator, bounds: Protocols, holds_s: tuple[fl
         height_m.append(to_m)
 
     def hold() -> None:
-        time_s.append(time_s[-1] + float(_log_uniform(rng, holds_s)))
+        time_s.append(time_s[-1] + float(_log_uniform(rng, bounds.holds_s)))
         height_m.append(height_m[-1])
 
     first_m = rng.uniform(0.3, 1.0) * bounds.largest_m

@@ -25,7 +25,7 @@ from bayeskin.reduced.model import Cubatures, ReducedModel
 from bayeskin.reduced.operators import Rule
 from bayeskin.types import Array, ParameterSpace, frozen_array
 
-FORMAT, FORMAT_VERSION = "bayeskin reduced model", 1
+FORMAT, FORMAT_VERSION = "bayeskin reduced model", 2
 EXPECTED = "a reduced model that `bayeskin reduce` wrote"
 
 

@@ -14,7 +14,7 @@ import scipy.linalg
 
 from bayeskin.geometry import Geometry
 from bayeskin.model.lagrangian import Step
-from bayeskin.reduced.cases import RADIUS_RANGE, STIFFEST_SUBCUTIS, THICKNESS_RANGE, Protocols, Trained
+from bayeskin.reduced.cases import RADIUS_RANGE, THICKNESS_RANGE, Protocols, Trained
 from bayeskin.types import Array, PadMotion, ParameterSpace
 
 LEAST_STIFFNESS = 0.4  # smallest eigenvalue of the stiffness over that at rest (docs/reduced.md)
@@ -35,8 +35,6 @@ def outside(
         return f"mechanism {unknown[0]} was not trained"
     spaces = [trained.base, *(trained.mechanisms[name] for name in mechanisms)]
     lines = [line for space in spaces if (line := _beyond(space, theta))]
-    if mechanisms and theta["E_s"] > STIFFEST_SUBCUTIS * theta["E_c"]:
-        lines.append(f"E_s is more than {STIFFEST_SUBCUTIS:g} times E_c, with mechanisms")
     lines += protocol_outside(trained.protocols, motion)
     lines += other_geometry(trained.geometry, geometry)
     return "; ".join(lines)

@@ -42,13 +42,13 @@ def one_by_one(
 
 
 def trained() -> Trained:
-    """The region: a subcutis at most twice as stiff as the cutis, short holds, two mechanisms."""
+    """The region: no subcutis stiffer than twice the softest cutis, short holds, two mechanisms."""
     spaces = {name: ParameterSpace(catalogue()[name].parameters) for name in NAMES}
     base = tuple(
         replace(p, **{"E_c": {"lower": 50e3}, "E_s": {"upper": 100e3}}.get(p.name, {}))
         for p in default_space().parameters
     )
-    return Trained(Geometry(), ParameterSpace(base), spaces, Protocols(base_holds_s=(2.0, 60.0)))
+    return Trained(Geometry(), ParameterSpace(base), spaces, Protocols(holds_s=(2.0, 60.0)))
 
 
 def built(folder: Path) -> ReducedModel:
