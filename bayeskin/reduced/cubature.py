@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from bayeskin.model.lagrangian import Step
 from bayeskin.model.stepping import integrate
@@ -117,44 +118,70 @@ def choose_points(
     rows: Array, counts: Sequence[int], settings: CubatureSettings
 ) -> dict[int, tuple[Rule, float]]:
     """Returns cubatures of about `counts` points, increasing, for rows (r, n), and what each leaves."""
-    right = rows.astype(np.float64).sum(axis=1)
+    right = rows.sum(axis=1, dtype=np.float64)
     norm = np.sqrt(np.einsum("ij,ij->j", rows, rows, dtype=np.float64))
     norm = np.maximum(norm, 1e-6 * norm.max())
-    points, factor, chosen = np.zeros(0, np.int64), np.zeros(0), np.zeros((len(right), 0))
+    points, fit = np.zeros(0, np.int64), _NonNegative(right)
     found: dict[int, tuple[Rule, float]] = {}
     wanted = list(counts)
     while wanted:
-        gain = ((right - chosen @ factor).astype(np.float32) @ rows) / norm
+        gain = (fit.left().astype(np.float32) @ rows) / norm
         gain[points] = -np.inf
         more = min(settings.batch if len(points) > 20 else 2, max(1, wanted[0] - len(points)))
         new = np.argpartition(-gain, more)[:more]
-        points = np.concatenate([points, new])
-        chosen = np.concatenate([chosen, rows[:, new].astype(np.float64)], axis=1)
-        kept, factor = _non_negative(chosen, right, np.concatenate([factor, np.zeros(more)]))
-        points, chosen = points[kept], chosen[:, kept]
+        kept = fit.add(rows[:, new].astype(np.float64))
+        points = np.concatenate([points, new])[kept]
         if len(points) >= wanted[0]:
-            left = float(np.linalg.norm(right - chosen @ factor) / np.linalg.norm(right))
-            found[wanted.pop(0)] = Rule(points.copy(), factor.copy()), left
+            left = float(np.linalg.norm(fit.left()) / np.linalg.norm(right))
+            found[wanted.pop(0)] = Rule(points.copy(), fit.factor.copy()), left
     return found
 
 
-def _non_negative(columns: Array, right: Array, start: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Non-negative least squares from a feasible start: numbers of the columns kept, and their factors."""
-    gram, projected = columns.T @ columns, columns.T @ right
-    gram[np.diag_indices_from(gram)] *= 1.0 + 1e-12
-    kept, factor = np.arange(columns.shape[1]), start
-    while True:
-        trial = np.linalg.solve(gram[np.ix_(kept, kept)], projected[kept])
-        if trial.min() > 0.0:
-            return kept, trial
-        negative = trial <= 0.0
-        idle = negative & (factor == 0.0)
-        if idle.any():
-            stays = ~idle
-        else:
-            share = np.min(factor[negative] / (factor[negative] - trial[negative]))
-            factor = factor + share * (trial - factor)
-            stays = factor > 1e-12 * factor.max()
-            if stays.all():
-                stays = np.arange(len(factor)) != np.argmin(np.where(negative, factor, np.inf))
-        kept, factor = kept[stays], factor[stays]
+class _NonNegative:
+    """Non-negative least squares of columns that come one batch after another.
+
+    factor (c,) : of the columns kept so far, all positive
+    """
+
+    def __init__(self, right: Array) -> None:
+        self.factor = np.zeros(0)
+        self._right = right
+        self._columns = np.zeros((len(right), 0), order="F")
+        self._gram, self._projected = np.zeros((0, 0)), np.zeros(0)
+
+    def left(self) -> Array:
+        """What the columns leave of the right-hand side."""
+        return self._right - self._columns @ self.factor
+
+    def add(self, new: Array) -> np.ndarray:
+        """Adds columns and solves again; returns the numbers of those that are kept, the new ones last."""
+        cross, own = self._columns.T @ new, new.T @ new
+        own[np.diag_indices_from(own)] *= 1.0 + 1e-12
+        self._gram = np.block([[self._gram, cross], [cross.T, own]])
+        self._projected = np.concatenate([self._projected, new.T @ self._right])
+        self._columns = np.concatenate([self._columns, new], axis=1)
+        kept = self._solved(np.concatenate([self.factor, np.zeros(new.shape[1])]))
+        self._gram, self._projected = self._gram[np.ix_(kept, kept)], self._projected[kept]
+        self._columns = self._columns[:, kept]
+        return kept
+
+    def _solved(self, factor: Array) -> np.ndarray:
+        """Lawson and Hanson's inner loop from a feasible start."""
+        kept = np.arange(len(factor))
+        while True:
+            factored = cho_factor(self._gram[np.ix_(kept, kept)], overwrite_a=True, check_finite=False)
+            trial = cho_solve(factored, self._projected[kept], check_finite=False)
+            if trial.min() > 0.0:
+                self.factor = trial
+                return kept
+            negative = trial <= 0.0
+            idle = negative & (factor == 0.0)
+            if idle.any():
+                stays = ~idle
+            else:
+                share = np.min(factor[negative] / (factor[negative] - trial[negative]))
+                factor = factor + share * (trial - factor)
+                stays = factor > 1e-12 * factor.max()
+                if stays.all():
+                    stays = np.arange(len(factor)) != np.argmin(np.where(negative, factor, np.inf))
+            kept, factor = kept[stays], factor[stays]
