@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 from toys.same_steps import on_steps_of, start_at_zero
-from toys.small_reduced import NAMES, SETTINGS, built, one_by_one
+from toys.small_reduced import NAMES, SETTINGS, built, one_by_one, unheard
 
 from bayeskin import storage
 from bayeskin.errors import InputError
@@ -22,13 +22,13 @@ from bayeskin.model.lagrangian import Step
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.model.stepping import integrate
 from bayeskin.reduced import equations as equations_module
-from bayeskin.reduced.build import RunTask, make_runs, training_cases
-from bayeskin.reduced.cases import BASE
+from bayeskin.reduced.cases import BASE, Case
 from bayeskin.reduced.enrichment import EnrichmentSettings, enrich
 from bayeskin.reduced.equations import ReducedEquations
 from bayeskin.reduced.files import load_reduced, save_reduced
 from bayeskin.reduced.library import Library, Modes
 from bayeskin.reduced.model import ReducedModel
+from bayeskin.reduced.runs import FullRuns
 from bayeskin.reduced.sensitivities import ReducedGradients
 from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.types import PadMotion, Simulation
@@ -178,22 +178,29 @@ def test_relaxed_skin_that_is_pushed_together_is_near_folding(model) -> None:
     assert found.stats["stiffness_left"] < 0.4 < soft.stats["stiffness_left"]
 
 
-def test_training_runs_are_made_once(model, folder) -> None:
+def test_full_runs_are_made_once(model, folder) -> None:
     def refuse(function, items):
         assert items == []
         yield from ()
 
-    cases = training_cases(model.trained, (BASE, *NAMES), SETTINGS, folder)
-    make_runs(RunTask(Geometry(), 0), cases, refuse, lambda what, share: None)
-    cases[3][1].unlink()
-    made: list[str] = []
-    make_runs(
-        RunTask(Geometry(), 0), cases,
-        lambda function, items: (made.append(str(i)) or (n, function(i)) for n, i in enumerate(items)),
-        lambda what, share: None,
+    cases = [case for kind in (BASE, *NAMES) for case in SETTINGS.cases(model.trained, kind)]
+    runs = FullRuns(Geometry(), 0, folder)
+    runs.make(cases, refuse, unheard)
+    runs.path(cases[3]).unlink()
+    made: list[Case] = []
+    runs.make(
+        cases, lambda function, items: (made.append(c) or (n, function(c)) for n, c in enumerate(items)),
+        unheard,
     )  # fmt: skip
-    assert len(made) == 1
-    assert cases[3][1].is_file()
+    assert made == [cases[3]]
+    assert runs.path(cases[3]).is_file()
+
+
+def test_a_full_run_of_another_law_is_not_taken_for_it(model, folder, monkeypatch) -> None:
+    runs, case = FullRuns(Geometry(), 0, folder), SETTINGS.cases(model.trained, NAMES[0])[0]
+    assert runs.path(case).is_file()
+    monkeypatch.setattr("bayeskin.reduced.runs.law_hashes", dict.fromkeys)
+    assert not runs.path(case).is_file()
 
 
 @pytest.fixture(scope="module")
@@ -261,7 +268,7 @@ def test_enrichment_ends_where_the_measured_error_is_small(model, tmp_path) -> N
         yield from one_by_one(function, items)
 
     theta = THETA | STRONG
-    found = enrich(model, theta, NAMES, MOTION, settings, tmp_path, counted, lambda what, share: None)
+    found = enrich(model, theta, NAMES, MOTION, settings, tmp_path, counted, unheard)
     assert found.error <= settings.wanted
     assert sum(calls) == found.full_runs == len(list(tmp_path.glob("*.h5")))
     there = simulate_reduced(found.model, MOTION, theta, of(NAMES))
@@ -271,5 +278,5 @@ def test_enrichment_ends_where_the_measured_error_is_small(model, tmp_path) -> N
     far = simulate_reduced(found.model, MOTION, theta | {"E_c": 1e6}, of(NAMES))
     assert far.stats["inside"] == 0.0
     calls.clear()
-    enrich(model, theta, NAMES, MOTION, settings, tmp_path, counted, lambda what, share: None)
+    enrich(model, theta, NAMES, MOTION, settings, tmp_path, counted, unheard)
     assert sum(calls) == 0

@@ -17,9 +17,9 @@ from bayeskin.mechanisms import catalogue
 from bayeskin.model.mesh import brick_mesh
 from bayeskin.model.problem import build_problem
 from bayeskin.reduced.basis import inner_products, pod, weighted_modes
-from bayeskin.reduced.cases import BASE, Protocols, Trained, random_motion
+from bayeskin.reduced.cases import BASE, SETS, Protocols, Trained, random_motion
 from bayeskin.reduced.cubature import CubatureSettings, choose_points
-from bayeskin.reduced.library import Modes, library, scaled_basis
+from bayeskin.reduced.library import Library, Modes, modes_beyond, modes_of, scaled_basis
 from bayeskin.reduced.model import reduced_space
 from bayeskin.reduced.operators import Rule, linear_parts, point_fields, whole_linear_parts
 from bayeskin.reduced.region import outside
@@ -102,12 +102,13 @@ def test_protocols_stay_within_their_bounds(seed: int) -> None:
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.sampled_from([BASE, *NAMES]), st.integers(0, 10**4))
+@given(st.sampled_from([BASE, SETS, *NAMES]), st.integers(0, 10**4))
 def test_training_cases_lie_in_the_trained_region(kind: str, index: int) -> None:
     case = TRAINED.case(kind, index, 3)
     again = TRAINED.case(kind, index, 3)
     assert case.theta == again.theta
-    assert (kind in case.mechanisms) == (kind != BASE)
+    assert (kind in case.mechanisms) == (kind in NAMES)
+    assert bool(case.mechanisms) == (kind != BASE)
     motion = PadMotion(case.motion.time_s, np.minimum(case.motion.displacement_m, 10e-3))
     assert outside(TRAINED, case.theta, case.mechanisms, case.geometry, motion) == ""
 
@@ -197,7 +198,8 @@ def test_a_set_has_the_modes_of_its_members_beside_the_base_models(problem, inne
     weighted = {
         kind: random_modes(problem, inner, count, seed) for seed, (kind, count) in enumerate(kinds.items())
     }
-    modes = library(weighted, inner, (4, 3), (2, 2))
+    own = modes_of(weighted[BASE], inner, (4, 3))
+    modes = Library(own, {name: modes_beyond(own, weighted[name], inner, (2, 2)) for name in "ab"})
     basis = modes.basis(("a", "b"), inner)
     assert len(basis.displacement) == 4 + 2 + 2
     assert len(basis.pressure) == 1 + 3 + 2 + 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -18,21 +18,14 @@ from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.mechanism import Tissue
-from bayeskin.model.simulate import problem_of
 from bayeskin.pipeline.engine import Reporter
 from bayeskin.pipeline.folder import locked, plain
-from bayeskin.reduced.build import (
-    BuildSettings,
-    RunTask,
-    assemble,
-    make_runs,
-    training_cases,
-    weighted_of,
-)
-from bayeskin.reduced.cases import BASE, Trained
+from bayeskin.reduced.build import BuildSettings, base_model, with_mechanisms
+from bayeskin.reduced.cases import Trained
 from bayeskin.reduced.files import load_reduced, save_reduced, trained_geometry
-from bayeskin.reduced.model import ReducedModel, inner_of
+from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.region import other_geometry
+from bayeskin.reduced.runs import FullRuns
 from bayeskin.sections import read_toml
 from bayeskin.shipped import shipped
 from bayeskin.types import ParameterSpace
@@ -80,23 +73,17 @@ def _build(
     path: Path, trained: Trained, settings: BuildSettings, folder: Path, run_all: Map, reporter: Reporter
 ) -> None:
     """Builds the base model and keeps it, so that it can be used meanwhile; then the whole one."""
-    inner = inner_of(problem_of("bricks", REFINEMENT, trained.geometry))
-    task = RunTask(trained.geometry, REFINEMENT)
+    full = FullRuns(trained.geometry, REFINEMENT, folder)
 
     def progress(what: str, share: float) -> None:
         reporter.progress(what, share)
 
-    base_only = replace(trained, mechanisms={})
     if not path.is_file():
-        reporter.log(f"{settings.base_runs} training runs of the base model")
-        make_runs(task, training_cases(trained, [BASE], settings, folder), run_all, progress)
-        weighted = {BASE: weighted_of(BASE, settings, folder, inner)}
-        save_reduced(path, assemble(base_only, REFINEMENT, weighted, settings, progress), _manifest(settings))
+        reporter.log(f"the base model learns from {settings.base_runs} full runs")
+        save_reduced(path, base_model(trained, full, settings, run_all, progress), _manifest(settings))
         reporter.log(f"{path}: the base model can be used; {len(trained.mechanisms)} mechanisms follow")
-    kinds = [BASE, *sorted(trained.mechanisms)]
-    make_runs(task, training_cases(trained, kinds, settings, folder), run_all, progress)
-    weighted = {kind: weighted_of(kind, settings, folder, inner) for kind in kinds}
-    save_reduced(path, assemble(trained, REFINEMENT, weighted, settings, progress), _manifest(settings))
+    whole = with_mechanisms(load_reduced(path), trained, full, settings, run_all, progress)
+    save_reduced(path, whole, _manifest(settings))
 
 
 def _manifest(settings: BuildSettings) -> dict[str, Any]:

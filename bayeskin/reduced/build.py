@@ -1,51 +1,43 @@
-"""Building a reduced model: training runs of the full model, then modes, then cubatures.
+"""Building a reduced model: full runs, then modes, then cubatures; the base model first, then mechanisms.
 
-The base model comes first and can be used by itself. Training runs are independent of each other, and each is
-kept as soon as it is finished, so that an interrupted building goes on; modes and cubatures take minutes.
+The base model can be used by itself. Full runs and the reduced runs that train cubatures are independent of
+each other, and workers make them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
-import h5py
 import numpy as np
 import scipy.sparse as sp
 
-from bayeskin import storage
 from bayeskin.errors import InputError
-from bayeskin.geometry import Geometry
-from bayeskin.mechanisms import catalogue
-from bayeskin.model.mesh import brick_mesh
-from bayeskin.model.problem import Problem, build_problem
+from bayeskin.model.problem import Problem
 from bayeskin.model.simulate import ModelSpec, problem_of
-from bayeskin.model.tissue import Bind
 from bayeskin.reduced.basis import Inner, pod
-from bayeskin.reduced.cases import BASE, Case, Trained
+from bayeskin.reduced.cases import BASE, SETS, Case, Trained
 from bayeskin.reduced.cubature import CubatureSettings, Taken, choose_points, take, with_volumes
 from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
-from bayeskin.reduced.library import Library, Modes, library
+from bayeskin.reduced.library import Library, Modes, modes_beyond, modes_of
 from bayeskin.reduced.model import Cubatures, ReducedModel, SurfacesOf, inner_of, reduced_space
 from bayeskin.reduced.operators import Basis, LinearParts, PointFields, Rule, point_fields
+from bayeskin.reduced.runs import FullRuns, Progress, binds_of, tissue_of
 from bayeskin.reduced.shadow import Shadow
-from bayeskin.reduced.training import TrainingRun, training_run
 from bayeskin.types import Array
 from bayeskin.workers import Lost, Map
 
-Progress = Callable[[str, float], None]
-RUN_ARRAYS = ("displacement", "pressure", "time_s", "force_n")
+ROUNDS = (4, 10, 20, 40)  # reduced runs after which a cubature is trained anew, for those that follow
 
 
 @dataclass(frozen=True)
 class BuildSettings:
     """How large a reduced model is and what it learns from.
 
-    base_runs, runs : training runs of the base model, and of each mechanism
+    base_runs, runs : full runs of the base model, and of each mechanism
     base, each : displacement and pressure modes of the base model, and of each mechanism beyond the base's
     base_points, set_points : of the cubatures
-    base_shadows, set_shadows : reduced runs that train the cubatures, of the base model and of each mechanism
+    base_shadows, set_shadows : reduced runs that train the cubatures
     trusted : the largest share of the peak force that points left out in a run whose integrands are learnt
     seed : of the training cases; those of the cubatures have others
     """
@@ -55,97 +47,68 @@ class BuildSettings:
     base: tuple[int, int] = (76, 72)
     each: tuple[int, int] = (30, 20)
     base_points: int = 450
-    set_points: int = 700
+    set_points: int = 800
     base_shadows: int = 80
-    set_shadows: int = 4
+    set_shadows: int = 120
     trusted: float = 0.1
     seed: int = 1
     cubature: CubatureSettings = field(default_factory=CubatureSettings)
 
-    def runs_of(self, kind: str) -> int:
-        """Number of training runs of a kind."""
-        return self.base_runs if kind == BASE else self.runs
+    def cases(self, trained: Trained, kind: str) -> list[Case]:
+        """Returns the cases of the full runs of a kind."""
+        count = self.base_runs if kind == BASE else self.runs
+        return [trained.case(kind, index, self.seed) for index in range(count)]
 
 
-@dataclass(frozen=True)
-class RunTask:
-    """Makes the full run of a case and keeps its modes in a file; picklable, for workers.
+def base_model(
+    trained: Trained, full: FullRuns, settings: BuildSettings, run_all: Map, progress: Progress
+) -> ReducedModel:
+    """Returns the reduced model without mechanisms, from full runs that are made where they are not kept.
 
-    geometry, refinement : of the mesh whose nodes the modes are on; a case's own geometry moves them
-    Given (case, path) it returns the message of a run that ended early, else an empty one.
+    Raises InputError where no full run finishes, or a worker is lost.
     """
-
-    geometry: Geometry
-    refinement: int
-
-    def __call__(self, item: tuple[Case, Path]) -> str:
-        case, path = item
-        nominal = problem_of("bricks", self.refinement, self.geometry)
-        moved = case.geometry != self.geometry
-        mesh = brick_mesh(self.refinement, case.geometry, self.geometry) if moved else None
-        problem = nominal if mesh is None else build_problem(mesh)
-        run = training_run(problem, inner_of(nominal), case, _binds(case.mechanisms))
-
-        def fill(handle: h5py.File) -> None:
-            handle.attrs["message"] = run.message
-            for name in RUN_ARRAYS:
-                handle[name] = getattr(run, name)
-
-        storage.write_hdf5(path, fill)
-        return run.message
+    cases = settings.cases(trained, BASE)
+    full.make(cases, run_all, progress)
+    spec = ModelSpec(refinement=full.refinement, geometry=trained.geometry)
+    inner = inner_of(problem_of("bricks", full.refinement, trained.geometry))
+    library = Library(modes_of(weighted_modes_of(full, cases, inner), inner, settings.base), {})
+    teacher = Teacher(full, library, settings, "cubature of the base model")
+    shadows = [trained.case(BASE, index, settings.seed + 1) for index in range(settings.base_shadows)]
+    rule = teacher.rule(shadows, settings.base_points, run_all, progress)
+    region = replace(trained, mechanisms={})
+    return ReducedModel(region, full.refinement, library, Cubatures(rule, rule), spec.hash)
 
 
-def read_run(path: Path) -> TrainingRun:
-    """Reads a run that a `RunTask` kept. Raises InputError for a file that is damaged."""
-    with storage.reading(path, "a training run") as handle:
-        arrays = {name: handle[name][()] for name in RUN_ARRAYS}
-        return TrainingRun(**arrays, message=str(handle.attrs["message"]))
+def with_mechanisms(
+    base: ReducedModel, trained: Trained, full: FullRuns, settings: BuildSettings, run_all: Map,
+    progress: Progress,
+) -> ReducedModel:  # fmt: skip
+    """Returns a base model with all mechanisms of a region, from full runs that are made where not kept.
+
+    Raises InputError where no full run of a mechanism finishes, or a worker is lost.
+    """
+    cases = {kind: settings.cases(trained, kind) for kind in sorted(trained.mechanisms)}
+    full.make([case for turn in zip(*cases.values(), strict=True) for case in turn], run_all, progress)
+    inner, own = inner_of(base.problem()), base.library.base
+    beyond = {
+        kind: modes_beyond(own, weighted_modes_of(full, of_kind, inner), inner, settings.each)
+        for kind, of_kind in cases.items()
+    }
+    library = Library(own, beyond)
+    teacher = Teacher(full, library, settings, "cubature of sets")
+    shadows = [trained.case(SETS, index, settings.seed + 1) for index in range(settings.set_shadows)]
+    rule = teacher.rule(shadows, settings.set_points, run_all, progress)
+    return replace(base, trained=trained, library=library, cubatures=Cubatures(base.cubatures.base, rule))
 
 
-def make_runs(task: RunTask, wanted: Sequence[tuple[Case, Path]], run_all: Map, progress: Progress) -> None:
-    """Makes the runs whose files are not there yet. Raises InputError where a worker is lost."""
-    todo = [item for item in wanted if not item[1].is_file()]
-    done = len(wanted) - len(todo)
-    progress("full runs", done / max(len(wanted), 1))
-    for number, result in run_all(task, todo):
-        if isinstance(result, Lost):
-            raise InputError(f"full run {todo[number][1].stem}", result.reason, "a worker that finishes it")
-        done += 1
-        progress("full runs", done / len(wanted))
-
-
-def _binds(mechanisms: Sequence[str]) -> list[Bind]:
-    known = catalogue()
-    return [bind for name in mechanisms if (bind := known[name].act.bind) is not None]
-
-
-def training_cases(
-    trained: Trained, kinds: Sequence[str], settings: BuildSettings, folder: Path
-) -> list[tuple[Case, Path]]:
-    """Returns the training cases of some kinds, in turn, and where their runs are kept."""
-    most = max(settings.runs_of(kind) for kind in kinds)
-    return [
-        (trained.case(kind, index, settings.seed), run_path(folder, kind, index))
-        for index in range(most)
-        for kind in kinds
-        if index < settings.runs_of(kind)
-    ]
-
-
-def run_path(folder: Path, kind: str, index: int) -> Path:
-    """Returns where a training run is kept."""
-    return folder / f"{kind}-{index:04d}.h5"
-
-
-def weighted_of(kind: str, settings: BuildSettings, folder: Path, inner: Inner) -> Modes:
-    """Returns the modes of a kind's training runs, each times its singular value, without failed runs.
+def weighted_modes_of(full: FullRuns, cases: Sequence[Case], inner: Inner) -> Modes:
+    """Returns the modes of full runs, each times its singular value, without runs that ended early.
 
     Raises InputError where none has finished.
     """
-    runs = [read_run(run_path(folder, kind, index)) for index in range(settings.runs_of(kind))]
-    finished = [run for run in runs if not run.message]
+    finished = [run for run in map(full.read, cases) if not run.message]
     if not finished:
-        raise InputError(f"{folder}: {kind}", "no training run that finished", "one at least")
+        raise InputError(f"{full.folder}", "no full run that finished", "one at least")
 
     def weighted(name: str, product: sp.csr_matrix) -> Array:
         rows = np.concatenate([getattr(run, name) for run in finished]).astype(float)
@@ -155,66 +118,57 @@ def weighted_of(kind: str, settings: BuildSettings, folder: Path, inner: Inner) 
     return Modes(weighted("displacement", inner.displacement), weighted("pressure", inner.pressure))
 
 
-def assemble(
-    trained: Trained, refinement: int, weighted: Mapping[str, Modes], settings: BuildSettings,
-    progress: Progress,
-) -> ReducedModel:  # fmt: skip
-    """Returns the reduced model of the modes of each kind, with its cubatures trained."""
-    spec = ModelSpec(refinement=refinement, geometry=trained.geometry)
-    problem = problem_of("bricks", refinement, trained.geometry)
-    inner = inner_of(problem)
-    modes = library(weighted, inner, settings.base, settings.each)
-    teacher = _Teacher(trained, problem, inner, modes, settings, progress)
-    base = teacher.base_rule()
-    return ReducedModel(trained, refinement, modes, Cubatures(base, teacher.set_rule(base)), spec.hash)
+@dataclass(frozen=True)
+class Teacher:
+    """Trains a cubature on reduced runs that are followed on all points; picklable, for workers.
 
+    full : says the mesh; label : what progress is told of
+    known : the rule on whose points it runs, or None for all points
+    Given a case and the number of its random mixtures' stream, it returns what the run teaches.
+    """
 
-class _Teacher:
-    """Trains cubatures on reduced runs that are followed on all points."""
+    full: FullRuns
+    library: Library
+    settings: BuildSettings
+    label: str
+    known: Rule | None = None
 
-    def __init__(
-        self, trained: Trained, problem: Problem, inner: Inner, modes: Library, settings: BuildSettings,
-        progress: Progress,
-    ) -> None:  # fmt: skip
-        self._trained, self._problem, self._inner, self._modes = trained, problem, inner, modes
-        self._settings, self._progress = settings, progress
-        self._rng = np.random.default_rng([settings.seed, 2])
-        self._rows: list[Array] = []
-        self._volumes = point_fields(problem, modes.basis((), inner))
+    def __call__(self, item: tuple[Case, int]) -> Taken:
+        case, number = item
+        problem = problem_of("bricks", self.full.refinement, self.full.geometry)
+        basis = self.library.basis(tissue_of(case.mechanisms), inner_of(problem))
+        rng = np.random.default_rng([self.settings.seed, 2, number])
+        return shadowed(problem, basis, case, self.known, self.settings.cubature, rng)
 
-    def base_rule(self) -> Rule:
-        """Trains the cubature of the base model: on all points first, then on the points of a first rule."""
-        s, basis = self._settings, self._modes.basis((), self._inner)
-        rule: Rule | None = None
-        for index in range(s.base_shadows):
-            self._learn(basis, self._trained.case(BASE, index, s.seed + 1), rule)
-            if index + 1 in (4, 10, 20, 40):
-                rule = self._rule(s.base_points)
-            self._progress("cubature of the base model", (index + 1) / s.base_shadows)
-        return self._rule(s.base_points)
+    def rule(self, cases: Sequence[Case], points: int, run_all: Map, progress: Progress) -> Rule:
+        """Returns a cubature of so many points, from runs on all points first, then on those of a first one.
 
-    def set_rule(self, base: Rule) -> Rule:
-        """The cubature of sets of mechanisms; `base` where there are none."""
-        s, kinds = self._settings, sorted(self._modes.beyond)
-        if not kinds:
-            return base
-        rule: Rule | None = None
-        for index in range(s.set_shadows):
-            for number, kind in enumerate(kinds):
-                case = self._trained.case(kind, index, s.seed + 1)
-                self._learn(self._modes.basis(case.mechanisms, self._inner), case, rule)
-                self._progress("cubature of sets", (index + (number + 1) / len(kinds)) / s.set_shadows)
-            rule = self._rule(s.set_points)
-        return rule if rule is not None else base
+        Raises InputError where no run stays near the full model, or a worker is lost.
+        """
+        problem = problem_of("bricks", self.full.refinement, self.full.geometry)
+        at = point_fields(problem, self.library.basis((), inner_of(problem)))
+        taught, rule, done = list[Array](), None, 0
+        ends = [end for end in ROUNDS if end < len(cases)]
+        for end in (*ends, len(cases)):
+            items = [(case, done + number) for number, case in enumerate(cases[done:end])]
+            found: dict[int, Taken] = {}
+            for number, taken in run_all(replace(self, known=rule), items):
+                if isinstance(taken, Lost):
+                    raise InputError(self.label, taken.reason, "a worker that finishes a reduced run")
+                found[number] = taken
+                progress(self.label, (done + len(found)) / len(cases))
+            taught += [found[number].rows for number in sorted(found) if self._near(found[number])]
+            if not taught:
+                none = "no reduced run that stays near the full model"
+                raise InputError(self.label, none, "a point away from folds")
+            rule = rule_of(at, taught, points, self.settings.cubature)
+            done = end
+        assert rule is not None
+        return rule
 
-    def _learn(self, basis: Basis, case: Case, rule: Rule | None) -> None:
-        """Adds what a reduced run teaches, on the points of a rule or on all, unless it went astray."""
-        taken = shadowed(self._problem, basis, case, rule, self._settings.cubature, self._rng)
-        if len(taken.missing) and np.abs(taken.missing).max() < self._settings.trusted:
-            self._rows.append(taken.rows)
-
-    def _rule(self, points: int) -> Rule:
-        return rule_of(self._volumes, self._rows, points, self._settings.cubature)
+    def _near(self, taken: Taken) -> bool:
+        """Whether a run did not go astray, so that its integrands are worth learning."""
+        return bool(len(taken.missing)) and float(np.abs(taken.missing).max()) < self.settings.trusted
 
 
 def rule_of(at: PointFields, rows: Sequence[Array], points: int, settings: CubatureSettings) -> Rule:
@@ -228,7 +182,7 @@ def shadowed(
     rng: np.random.Generator,
 ) -> Taken:  # fmt: skip
     """Runs a case by the reduced model on the points of a rule, or on all, and follows it on all points."""
-    binds = _binds(case.mechanisms)
+    binds = binds_of(case.mechanisms)
     whole = whole_space(problem, basis)
     space = whole if rule is None else reduced_space(problem, basis, rule)
     run = ReducedEquations(space, case.theta, binds, case.motion)

@@ -15,6 +15,7 @@ from bayeskin.geometry import Geometry
 from bayeskin.types import PadMotion, ParameterSpace
 
 BASE = "base"  # the kind of runs without a mechanism
+SETS = "sets"  # the kind of runs with one to four mechanisms
 ACCOMPANIED = 0.5  # share of a mechanism's runs in which one or two others act as well
 MOVED = {BASE: 0.5}  # share of the runs on other layers and another arm
 MOVED_OTHERWISE = 0.25
@@ -58,18 +59,24 @@ class Trained:
     protocols: Protocols = Protocols()
 
     def case(self, kind: str, index: int, seed: int) -> Case:
-        """Returns training case `index` of a kind: "base", or the name of a mechanism that acts in it."""
+        """Returns case `index` of a kind: "base", "sets", or the name of a mechanism that acts in it."""
         rng = np.random.default_rng([seed, index, *kind.encode()])
-        names = () if kind == BASE else self._names(kind, rng)
+        names = self._names(kind, rng)
         return Case(
             self._theta(names, rng), names, self._moved(MOVED.get(kind, MOVED_OTHERWISE), rng),
             random_motion(rng, self.protocols),
         )  # fmt: skip
 
     def _names(self, kind: str, rng: np.random.Generator) -> tuple[str, ...]:
-        others = sorted(set(self.mechanisms) - {kind})
-        count = int(rng.integers(1, 3)) if rng.uniform() < ACCOMPANIED else 0
-        return tuple(sorted([kind, *rng.choice(others, min(count, len(others)), replace=False).tolist()]))
+        if kind == BASE:
+            return ()
+        first = [] if kind == SETS else [kind]
+        others = sorted(set(self.mechanisms) - set(first))
+        if kind == SETS:
+            count = int(rng.integers(1, 5))
+        else:
+            count = int(rng.integers(1, 3)) if rng.uniform() < ACCOMPANIED else 0
+        return tuple(sorted([*first, *rng.choice(others, min(count, len(others)), replace=False).tolist()]))
 
     def _theta(self, names: Sequence[str], rng: np.random.Generator) -> dict[str, float]:
         theta = _drawn(self.base, rng)

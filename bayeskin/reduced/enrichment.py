@@ -8,8 +8,6 @@ what is asked the model is done; else the run joins it. All full runs are kept.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,12 +17,12 @@ import scipy.sparse as sp
 
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import catalogue
-from bayeskin.reduced.basis import pod
-from bayeskin.reduced.build import BuildSettings, Progress, RunTask, make_runs, read_run, rule_of, shadowed
-from bayeskin.reduced.cases import Case
-from bayeskin.reduced.library import Library, Modes, scaled_basis
+from bayeskin.reduced.basis import Inner, pod
+from bayeskin.reduced.build import BuildSettings, Teacher
+from bayeskin.reduced.cases import Case, Trained
+from bayeskin.reduced.library import Library, Modes
 from bayeskin.reduced.model import Cubatures, ReducedModel, inner_of
-from bayeskin.reduced.operators import point_fields
+from bayeskin.reduced.runs import FullRuns, Progress, tissue_of
 from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.reduced.training import TrainingRun
 from bayeskin.types import Array, PadMotion, ParameterSpace
@@ -82,15 +80,26 @@ def enrich(
     near = _Near(model, mechanisms, motion, settings.width)
     cases = [near.case(theta, None), *(near.case(theta, rng) for _ in range(settings.most - 1))]
     shadows = [near.case(theta, rng) for _ in range(settings.shadows)]
-    task = RunTask(model.trained.geometry, model.refinement)
-    runs = _full_runs(task, cases[: settings.first], folder, run_all, progress)
+    full = FullRuns(model.trained.geometry, model.refinement, folder)
+
+    def made(some: Sequence[Case]) -> list[TrainingRun]:
+        full.make(some, run_all, progress)
+        return [full.read(case) for case in some]
+
+    runs = made(cases[: settings.first])
     errors: list[float] = []
     while True:
-        fitted = _fitted(model, near, theta, runs, shadows, settings)
+        library = _library(near, runs, inner_of(model.problem()), settings)
+        teacher = Teacher(full, library, settings.build, "cubature near the point")
+        rule = teacher.rule(shadows, settings.points, run_all, progress)
+        fitted = replace(
+            model, trained=near.region(model.trained, theta), library=library,
+            cubatures=Cubatures(rule, rule), hash=f"{model.hash}, enriched",
+        )  # fmt: skip
         ahead = cases[len(runs)] if len(runs) < len(cases) else None
         if ahead is None:
             break
-        (run,) = _full_runs(task, [ahead], folder, run_all, progress)
+        (run,) = made([ahead])
         errors.append(_error(fitted, ahead, run))
         if errors[-1] <= settings.wanted:
             break
@@ -118,8 +127,14 @@ class _Near:
         values = dict(zip(self.space.names, map(float, self.space.from_unit(unit)), strict=True))
         return Case(values, self.mechanisms, self._geometry, self._motion)
 
-    def box(self, space: ParameterSpace, theta: Mapping[str, float]) -> ParameterSpace:
-        """The part of priors within twice the width of a point: where the model is trusted."""
+    def region(self, trained: Trained, theta: Mapping[str, float]) -> Trained:
+        """The part of a trained region within twice the width of a point: where the model is trusted."""
+        known = catalogue()
+        spaces = {name: ParameterSpace(known[name].parameters) for name in tissue_of(self.mechanisms)}
+        mechanisms = {name: self._part(space, theta) for name, space in spaces.items()}
+        return replace(trained, base=self._part(trained.base, theta), mechanisms=mechanisms)
+
+    def _part(self, space: ParameterSpace, theta: Mapping[str, float]) -> ParameterSpace:
         unit = space.to_unit([theta[name] for name in space.names])
         low = space.from_unit(np.clip(unit - 2.0 * self._width, 0.0, 1.0))
         high = space.from_unit(np.clip(unit + 2.0 * self._width, 0.0, 1.0))
@@ -129,31 +144,8 @@ class _Near:
         ))  # fmt: skip
 
 
-def _full_runs(
-    task: RunTask, cases: Sequence[Case], folder: Path, run_all: Map, progress: Progress
-) -> list[TrainingRun]:
-    """Full runs of cases, made where they are not kept."""
-    paths = [folder / f"{case_hash(case)}.h5" for case in cases]
-    make_runs(task, list(zip(cases, paths, strict=True)), run_all, progress)
-    return [read_run(path) for path in paths]
-
-
-def case_hash(case: Case) -> str:
-    """Returns the sha256 of all that a case's full run depends on but the model."""
-    said = [
-        sorted(case.theta.items()), case.mechanisms, case.geometry.hash,
-        case.motion.time_s.tolist(), case.motion.displacement_m.tolist(),
-    ]  # fmt: skip
-    return hashlib.sha256(json.dumps(said).encode()).hexdigest()
-
-
-def _fitted(
-    model: ReducedModel, near: _Near, theta: Mapping[str, float], runs: Sequence[TrainingRun],
-    shadows: Sequence[Case], settings: EnrichmentSettings,
-) -> ReducedModel:  # fmt: skip
-    """The reduced model of full runs."""
-    problem = model.problem()
-    inner, rng = inner_of(problem), np.random.default_rng([settings.seed, 8])
+def _library(near: _Near, runs: Sequence[TrainingRun], inner: Inner, settings: EnrichmentSettings) -> Library:
+    """The modes of full runs, as those of the base model; the mechanisms have none beside them."""
     finished = [run for run in runs if not run.message]
     if not finished:
         raise InputError("enrichment", "no full run that finishes near this point", "a point away from folds")
@@ -161,29 +153,8 @@ def _fitted(
         _largest([run.displacement for run in finished], inner.displacement, settings, 0),
         _largest([run.pressure for run in finished], inner.pressure, settings, 1),
     )
-    basis, rows, rule = scaled_basis(modes, inner), list[Array](), None
-    at = point_fields(problem, basis)
-    for number, case in enumerate(shadows):
-        taken = shadowed(problem, basis, case, rule, settings.build.cubature, rng)
-        if len(taken.missing) and np.abs(taken.missing).max() < settings.build.trusted:
-            rows.append(taken.rows)
-        if number >= 1 and rows:
-            rule = rule_of(at, rows, settings.points, settings.build.cubature)
-    if rule is None:
-        raise InputError(
-            "enrichment", "no reduced run that stays near the full model", "a point away from folds"
-        )
     empty = Modes(np.zeros((0, modes.displacement.shape[1])), np.zeros((0, modes.pressure.shape[1])))
-    known = catalogue()
-    tissue = [name for name in near.mechanisms if name in model.trained.mechanisms]
-    trained = replace(
-        model.trained, base=near.box(model.trained.base, theta),
-        mechanisms={name: near.box(ParameterSpace(known[name].parameters), theta) for name in tissue},
-    )  # fmt: skip
-    return ReducedModel(
-        trained, model.refinement, Library(modes, dict.fromkeys(tissue, empty)), Cubatures(rule, rule),
-        model.full_hash, f"{model.hash}, enriched",
-    )  # fmt: skip
+    return Library(modes, dict.fromkeys(tissue_of(near.mechanisms), empty))
 
 
 def _largest(rows: Sequence[Array], inner: sp.csr_matrix, settings: EnrichmentSettings, field: int) -> Array:

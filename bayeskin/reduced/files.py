@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -14,10 +13,10 @@ import h5py
 import numpy as np
 
 from bayeskin import __version__, storage
-from bayeskin.behaviour import sha256_of_behaviour
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry, Guard
 from bayeskin.mechanisms import catalogue
+from bayeskin.mechanisms.hashes import law_hashes
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.reduced.cases import Protocols, Trained
 from bayeskin.reduced.library import Library, Modes
@@ -139,15 +138,6 @@ def _geometry(said: Mapping[str, Any]) -> Geometry:
     return Geometry(**{**said, "guard": None if guard is None else Guard(**guard)})
 
 
-def law_hashes(names: Mapping[str, object]) -> dict[str, str]:
-    """Returns what each mechanism's file does, as a hash, by the mechanism's name."""
-    known = catalogue()
-    return {
-        name: sha256_of_behaviour(Path(inspect.getfile(known[name].act.bind)).read_bytes())  # type: ignore[arg-type]
-        for name in names
-    }
-
-
 def _refuse_other_laws(path: Path, model: ReducedModel, laws: Mapping[str, str]) -> None:
     spec = ModelSpec(refinement=model.refinement, geometry=model.trained.geometry)
     remedy = "one of this version: make it anew with `bayeskin reduce`"
@@ -155,5 +145,5 @@ def _refuse_other_laws(path: Path, model: ReducedModel, laws: Mapping[str, str])
         raise InputError(path, "a reduced model of another version of the full model", remedy)
     known = catalogue()
     for name, digest in laws.items():
-        if name not in known or law_hashes({name: None})[name] != digest:
+        if name not in known or law_hashes([name])[name] != digest:
             raise InputError(path, f"a reduced model of another version of {name}", remedy)

@@ -61,26 +61,19 @@ def _union(first: Array, others: Sequence[Array], inner: sp.csr_matrix) -> Array
     return np.concatenate([first, modes[values > DEPENDENT]])
 
 
-def library(
-    weighted: Mapping[str, Modes], inner: Inner, base: tuple[int, int], each: tuple[int, int]
-) -> Library:
-    """Returns the modes of a library from the weighted modes of each kind of training runs.
+def modes_of(weighted: Modes, inner: Inner, most: tuple[int, int]) -> Modes:
+    """Returns the largest displacement and pressure modes of weighted ones, `most` of each at most."""
+    u, p = pod(weighted.displacement, inner.displacement)[1], pod(weighted.pressure, inner.pressure)[1]
+    return Modes(u[: most[0]], p[: most[1]])
 
-    weighted : of "base" and of each mechanism, each mode times its singular value
-    base, each : numbers of displacement and pressure modes of the base model, and of each mechanism
-    """
-    own = weighted["base"]
-    u = pod(own.displacement, inner.displacement)[1][: base[0]]
-    p = pod(own.pressure, inner.pressure)[1][: base[1]]
-    beyond = {
-        name: Modes(
-            pod(_less(modes.displacement, u, inner.displacement), inner.displacement)[1][: each[0]],
-            pod(_less(modes.pressure, p, inner.pressure), inner.pressure)[1][: each[1]],
-        )
-        for name, modes in weighted.items()
-        if name != "base"
-    }
-    return Library(Modes(u, p), beyond)
+
+def modes_beyond(own: Modes, weighted: Modes, inner: Inner, most: tuple[int, int]) -> Modes:
+    """Returns the largest modes of what weighted ones have beyond orthonormal modes `own`."""
+    left = Modes(
+        _less(weighted.displacement, own.displacement, inner.displacement),
+        _less(weighted.pressure, own.pressure, inner.pressure),
+    )
+    return modes_of(left, inner, most)
 
 
 def _less(rows: Array, modes: Array, inner: sp.csr_matrix) -> Array:

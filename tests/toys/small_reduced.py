@@ -12,13 +12,14 @@ import numpy as np
 from bayeskin.design import default_space
 from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import catalogue
-from bayeskin.model.simulate import ModelSpec, problem_of
-from bayeskin.reduced.build import BuildSettings, RunTask, assemble, make_runs, training_cases, weighted_of
-from bayeskin.reduced.cases import BASE, Protocols, Trained
+from bayeskin.model.simulate import ModelSpec
+from bayeskin.reduced.build import BuildSettings, base_model, with_mechanisms
+from bayeskin.reduced.cases import Protocols, Trained
 from bayeskin.reduced.files import save_reduced
 from bayeskin.reduced.library import Library, Modes
-from bayeskin.reduced.model import Cubatures, ReducedModel, inner_of
+from bayeskin.reduced.model import Cubatures, ReducedModel
 from bayeskin.reduced.operators import Rule
+from bayeskin.reduced.runs import FullRuns
 from bayeskin.types import ParameterSpace
 
 NAMES = ("preconditioning", "solid-viscoelasticity")
@@ -30,7 +31,7 @@ SETTINGS = BuildSettings(
     base_points=200,
     set_points=260,
     base_shadows=6,
-    set_shadows=1,
+    set_shadows=12,
 )
 
 
@@ -52,13 +53,14 @@ def trained() -> Trained:
 
 
 def built(folder: Path) -> ReducedModel:
-    """The reduced model, from training runs in a folder."""
-    region, kinds = trained(), (BASE, *NAMES)
-    cases = training_cases(region, kinds, SETTINGS, folder)
-    make_runs(RunTask(Geometry(), 0), cases, one_by_one, lambda what, share: None)
-    inner = inner_of(problem_of("bricks", 0))
-    weighted = {kind: weighted_of(kind, SETTINGS, folder, inner) for kind in kinds}
-    return assemble(region, 0, weighted, SETTINGS, lambda what, share: None)
+    """The reduced model, from full runs in a folder."""
+    full = FullRuns(Geometry(), 0, folder)
+    base = base_model(trained(), full, SETTINGS, one_by_one, unheard)
+    return with_mechanisms(base, trained(), full, SETTINGS, one_by_one, unheard)
+
+
+def unheard(what: str, share: float) -> None:
+    """Takes a word of progress."""
 
 
 def hollow(path: Path, geometry: Geometry = Geometry(), size: float = 1.0) -> Path:

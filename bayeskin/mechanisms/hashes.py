@@ -1,0 +1,44 @@
+"""Hashes of what mechanisms do, by which stored results know whether they still hold."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import sys
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+from bayeskin.behaviour import sha256_of_behaviour
+from bayeskin.mechanisms import catalogue, mechanism
+
+PACKAGE = "bayeskin.mechanisms."
+
+
+def law_hashes(names: Iterable[str]) -> dict[str, str]:
+    """Returns what the files behave like in which each mechanism's law is written, as a sha256 by its name.
+
+    These are the mechanism's own file and those of this package that it takes functions from.
+    Raises KeyError for a name that is not in the catalogue.
+    """
+    known = catalogue()
+    return {name: _hash(sys.modules[known[name].act.bind.__module__]) for name in names}
+
+
+@cache
+def _hash(module: ModuleType) -> str:
+    files = sorted(_files(module, set()))
+    return hashlib.sha256("\n".join(sha256_of_behaviour(f.read_bytes()) for f in files).encode()).hexdigest()
+
+
+def _files(module: ModuleType, seen: set[Path]) -> set[Path]:
+    """The file of a module and, beside those `seen`, of what it takes from others of the package."""
+    own = Path(inspect.getfile(module))
+    if own not in seen:
+        seen.add(own)
+        sources = {getattr(value, "__module__", None) or "" for value in vars(module).values()}
+        for name in sorted(sources - {mechanism.__name__, module.__name__}):
+            if name.startswith(PACKAGE):
+                _files(sys.modules[name], seen)
+    return seen

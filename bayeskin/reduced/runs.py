@@ -1,0 +1,100 @@
+"""Full runs that reduced models learn from: made by workers, kept in a folder, found again by their case.
+
+Each is kept as soon as it is finished, so that an interrupted building goes on, and under a name that says
+all that it depends on, so that none of another version of the laws is taken for it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+
+from bayeskin import storage
+from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
+from bayeskin.mechanisms import catalogue
+from bayeskin.mechanisms.hashes import law_hashes
+from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.model.mesh import brick_mesh
+from bayeskin.model.problem import build_problem
+from bayeskin.model.simulate import ModelSpec, problem_of
+from bayeskin.model.tissue import Bind
+from bayeskin.reduced.cases import Case
+from bayeskin.reduced.model import inner_of
+from bayeskin.reduced.training import TrainingRun, training_run
+from bayeskin.workers import Lost, Map
+
+Progress = Callable[[str, float], None]
+RUN_ARRAYS = ("displacement", "pressure", "time_s", "force_n")
+
+
+@dataclass(frozen=True)
+class FullRuns:
+    """The full runs of one device in one folder; picklable, for workers.
+
+    geometry, refinement : of the mesh whose nodes the modes are on; a case's own geometry moves them
+    Given a case, it makes the run, keeps its modes and returns the message of a run that ended early.
+    """
+
+    geometry: Geometry
+    refinement: int
+    folder: Path
+
+    def __call__(self, case: Case) -> str:
+        nominal = problem_of("bricks", self.refinement, self.geometry)
+        moved = case.geometry != self.geometry
+        mesh = brick_mesh(self.refinement, case.geometry, self.geometry) if moved else None
+        problem = nominal if mesh is None else build_problem(mesh)
+        run = training_run(problem, inner_of(nominal), case, binds_of(case.mechanisms))
+
+        def fill(handle: h5py.File) -> None:
+            handle.attrs["message"] = run.message
+            for name in RUN_ARRAYS:
+                handle[name] = getattr(run, name)
+
+        storage.write_hdf5(self.path(case), fill)
+        return run.message
+
+    def path(self, case: Case) -> Path:
+        """Where the run of a case is kept: its name is the sha256 of all that it depends on."""
+        spec = ModelSpec(refinement=self.refinement, geometry=self.geometry)
+        said = [
+            spec.hash, law_hashes(case.mechanisms), sorted(case.theta.items()), case.geometry.hash,
+            case.motion.time_s.tolist(), case.motion.displacement_m.tolist(),
+        ]  # fmt: skip
+        return self.folder / f"{hashlib.sha256(json.dumps(said).encode()).hexdigest()}.h5"
+
+    def read(self, case: Case) -> TrainingRun:
+        """Returns the run of a case that was made. Raises InputError for a file that is damaged."""
+        with storage.reading(self.path(case), "a training run") as handle:
+            arrays = {name: handle[name][()] for name in RUN_ARRAYS}
+            return TrainingRun(**arrays, message=str(handle.attrs["message"]))
+
+    def make(self, wanted: Sequence[Case], run_all: Map, progress: Progress) -> None:
+        """Makes the runs that are not there yet. Raises InputError where a worker is lost."""
+        todo = [case for case in wanted if not self.path(case).is_file()]
+        done = len(wanted) - len(todo)
+        progress("full runs", done / max(len(wanted), 1))
+        for number, result in run_all(self, todo):
+            if isinstance(result, Lost):
+                where = f"full run {self.path(todo[number]).stem}"
+                raise InputError(where, result.reason, "a worker that finishes it")
+            done += 1
+            progress("full runs", done / len(wanted))
+
+
+def binds_of(mechanisms: Sequence[str]) -> list[Bind]:
+    """Returns what binds the laws of the mechanisms that have one."""
+    known = catalogue()
+    return [bind for name in mechanisms if (bind := known[name].act.bind) is not None]
+
+
+def tissue_of(mechanisms: Sequence[str]) -> list[str]:
+    """Returns those of the mechanisms that change the tissue, and so have modes of their own."""
+    known = catalogue()
+    return [name for name in mechanisms if isinstance(known[name].act, Tissue)]
