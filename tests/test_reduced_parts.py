@@ -23,6 +23,7 @@ from bayeskin.reduced.library import Library, Modes, modes_beyond, modes_of, sca
 from bayeskin.reduced.model import reduced_space
 from bayeskin.reduced.operators import Rule, linear_parts, point_fields, whole_linear_parts
 from bayeskin.reduced.region import outside
+from bayeskin.reduced.training import training_run
 from bayeskin.types import PadMotion, ParameterSpace
 
 NAMES = ("solid-viscoelasticity", "strain-stiffening", "pre-stretch")
@@ -111,6 +112,16 @@ def test_training_cases_lie_in_the_trained_region(kind: str, index: int) -> None
     assert bool(case.mechanisms) == (kind != BASE)
     motion = PadMotion(case.motion.time_s, np.minimum(case.motion.displacement_m, 10e-3))
     assert outside(TRAINED, case.theta, case.mechanisms, case.geometry, motion) == ""
+
+
+def test_a_full_run_that_fails_at_once_is_kept_without_modes(problem, inner, monkeypatch) -> None:
+    def fails(*_: object, **__: object) -> str:
+        raise FloatingPointError("inside out")
+
+    monkeypatch.setattr("bayeskin.reduced.training.integrate", fails)
+    run = training_run(problem, inner, TRAINED.case(BASE, 0, 1), ())
+    assert run.message == "inside out"
+    assert len(run.displacement) == len(run.pressure) == 0
 
 
 @pytest.mark.parametrize(

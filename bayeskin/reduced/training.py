@@ -105,10 +105,11 @@ def _weighted(
     unknowns: Sequence[Array], along: Array, inner: Inner, peak_n: float, scale: float
 ) -> tuple[Array, Array]:
     """Returns weighted modes of displacements less `along` times the pads', and of pressures less means."""
-    states, n = np.array(unknowns), inner.displacement.shape[0]
+    n, corners = inner.displacement.shape[0], inner.pressure.shape[0]
+    states = np.array(unknowns).reshape(-1, n + corners)
     u = states[:, :n] - np.outer(states[:, inner.pad_dof], along)
     p = inner.without_mean(states[:, n:] / peak_n)
-    size = scale / np.sqrt(len(states))
+    size = scale / np.sqrt(max(len(states), 1))
     return (
         weighted_modes(size * u, inner.displacement, KEPT, MOST_MODES),
         weighted_modes(size * p, inner.pressure, KEPT, MOST_MODES),
