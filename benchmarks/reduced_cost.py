@@ -1,0 +1,94 @@
+"""How the reduced model's cost grows with its modes and its points.
+
+    OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/reduced_cost.py
+
+Milliseconds of the processor for one residual and of one new tangent, medians of many, of the base model and of a set of three
+mechanisms of the shipped model, with fewer of its modes and points; and how many of each a run of the
+article's protocol takes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import rows
+from reduced_model import PROTOCOLS, Skin, held_out
+
+from bayeskin.model.stepping import integrate
+from bayeskin.pipeline.reducing import SHIPPED
+from bayeskin.reduced import kernels
+from bayeskin.reduced.equations import ReducedEquations
+from bayeskin.reduced.files import load_reduced
+from bayeskin.reduced.model import ReducedModel, reduced_space
+from bayeskin.reduced.operators import Basis, Rule
+from bayeskin.reduced.runs import binds_of, tissue_of
+from bayeskin.shipped import shipped
+
+SHARES = (0.5, 1.0)  # of the modes
+POINTS = (0.25, 0.5, 1.0)  # of the points
+REPEATS = 15
+
+
+def equations(model: ReducedModel, skin: Skin, modes: float, points: float) -> ReducedEquations:
+    """The equations of a run with the first of the modes and points."""
+    problem, basis = model.problem(), model.basis(tissue_of(skin.mechanisms))
+    u, p = (int(modes * len(fields)) for fields in (basis.displacement, basis.pressure))
+    fewer = Basis(basis.moving, basis.dual, basis.displacement[:u], basis.pressure[:p])
+    rule = model.cubatures.of(skin.mechanisms)
+    count = int(points * len(rule.points))
+    space = reduced_space(problem, fewer, Rule(rule.points[:count], rule.factor[:count]))
+    return ReducedEquations(space, skin.theta, binds_of(skin.mechanisms), PROTOCOLS["article"])
+
+
+def median_ms(call: Callable[[], object]) -> float:
+    """Milliseconds of a call, the median of some after a first one."""
+    call()
+    spent = []
+    for _ in range(REPEATS):
+        started = time.process_time()
+        call()
+        spent.append(time.process_time() - started)
+    return 1e3 * float(np.median(spent))
+
+
+def row(label: str, eq: ReducedEquations, p_init: float) -> list[str]:
+    """The table's row of one size: milliseconds of a residual and of a tangent."""
+    state = eq.initial_state(p_init)
+    past = kernels.History(
+        state.volume, state.pressure, state.memory[0], state.x[: eq.space.modes[0]], 1.0, 1.0, 1.0
+    )
+    room, out, t = eq.make_room(), np.empty(len(state.x)), eq.tangent
+    residual = median_ms(lambda: kernels.residual(eq.system, eq.packed, past, state.x, room, out))
+    tangent = median_ms(
+        lambda: kernels.renew(
+            eq.system, eq.packed, past, state.x, room, t.inverse, t.force_row, t.by_pads
+        )
+    )  # fmt: skip
+    k, m = eq.space.modes
+    return [label, f"{k - 2} + {m}", str(len(eq.space.at.weight)), f"{residual:.2f}", f"{tangent:.1f}"]
+
+
+def counted(eq: ReducedEquations, p_init: float) -> str:
+    """How many residuals and tangents a run takes."""
+    message = integrate(eq, p_init, 1e-3, lambda step: None, falls_too=False)
+    return message or f"{eq.spent[1]} residuals and {eq.spent[2]} tangents"
+
+
+def main() -> None:
+    """Prints the table."""
+    model, table = load_reduced(shipped(SHIPPED)), list[list[str]]()
+    skins: Sequence[tuple[str, Skin]] = [("base", held_out()[0]), ("three mechanisms", held_out()[19])]
+    for label, skin in skins:
+        for modes in SHARES:
+            for points in POINTS:
+                table.append(row(label, equations(model, skin, modes, points), skin.theta["p_init"]))
+    print(rows.markdown(["model", "modes", "points", "residual [ms]", "tangent [ms]"], table))
+    for label, skin in skins:
+        whole = equations(model, skin, 1.0, 1.0)
+        print(f"{', '.join(skin.mechanisms) or label}: {counted(whole, skin.theta['p_init'])}")
+
+
+if __name__ == "__main__":
+    main()
