@@ -44,6 +44,9 @@ class Equations(Protocol):
     """What step control asks of a model, full or reduced: `LagrangianModel` describes each."""
 
     @property
+    def starts_s(self) -> float: ...
+
+    @property
     def motion(self) -> PadMotion: ...
 
     @property
@@ -144,10 +147,10 @@ def integrate(
         past, h = [state], min(FIRST_STEP_S, 0.5 * (end - start))
         longest, shortest = (end - start) / STEPS_PER_PHASE, SHORTEST_STEP * (end - start)
         while state.time_s < end - 1e-9:
-            spent = model.solver.counts
+            spent, at_s = model.solver.counts, state.time_s - model.starts_s
             if spent["crawls"] > MOST_CRAWLS:
                 return (
-                    f"step {count + 1} at t = {state.time_s:.3f} s: the skin has folded and snapped "
+                    f"step {count + 1} at t = {at_s:.3f} s: the skin has folded and snapped "
                     f"{spent['falls']} times; try layers less unlike in stiffness, or a coarser mesh"
                 )
             h = _landing(max(h, shortest), end - state.time_s, longest)
@@ -155,14 +158,14 @@ def integrate(
             falls = step is None and h <= shortest
             if falls and not falls_too:
                 return (
-                    f"step {count + 1} at t = {state.time_s:.3f} s: the skin folds, or does not converge; "
+                    f"step {count + 1} at t = {at_s:.3f} s: the skin folds, or does not converge; "
                     "try layers less unlike in stiffness, or a coarser mesh"
                 )
             if falls:
                 step = _fall(model, state, h)
                 if step is None:
                     return (
-                        f"step {count + 1} at t = {state.time_s:.3f} s did not converge down to "
+                        f"step {count + 1} at t = {at_s:.3f} s did not converge down to "
                         f"{shortest:.2g} s; try a finer mesh or parameters nearer to a skin's"
                     )
             excess = step.error_n / allowed_n if step else np.inf

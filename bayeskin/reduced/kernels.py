@@ -22,7 +22,7 @@ from bayeskin.types import Array
 
 CONVERGED, INSIDE_OUT, SLOW, NOT_FINITE = range(4)
 MOST_ITERATIONS, MOST_RENEWALS = 60, 12
-SLOW_CONTRACTION = 0.3  # a larger one asks for a new tangent
+SLOW_CONTRACTION = 0.6  # a larger one asks for a new tangent, which costs as much as twenty residuals
 SMALLEST_DAMPING = 1e-3
 BLOCK = 16  # points whose modes stay in the first cache
 
