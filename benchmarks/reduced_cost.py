@@ -2,9 +2,9 @@
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/reduced_cost.py
 
-Milliseconds of the processor for one residual and of one new tangent, medians of many, of the base model and of a set of three
-mechanisms of the shipped model, with fewer of its modes and points; and how many of each a run of the
-article's protocol takes.
+Milliseconds of the processor for one residual and for one new tangent, medians of many, of the base model and
+of a set of three mechanisms of the shipped model, with fewer of its modes and points; and how many of each a
+run of the article's protocol takes.
 """
 
 from __future__ import annotations

@@ -33,6 +33,8 @@ class CubatureSettings:
     force : weight of the force's own rows beside a mixture's
     pressure : size of a pressure coefficient a newton of the peak force; mode_m : of a displacement's [m]
     volume : weight of the layers' volumes
+    most : largest norm of a row; a state with a larger one, such as fibres stretched beyond all measure,
+        counts for less, since a single one would outweigh all others
     batch : points added at once
     """
 
@@ -42,6 +44,7 @@ class CubatureSettings:
     pressure: float = 3.0
     mode_m: float = 5e-3
     volume: float = 1.0
+    most: float = 20.0
     batch: int = 8
 
 
@@ -104,8 +107,9 @@ def _tested(
     mixture[k:] *= settings.pressure * peak_n
     mixed = (integrand @ mixture).T / (peak_n * settings.mode_m)
     force = settings.force * 2.0 * (integrand @ dual) / peak_n
-    rows = np.concatenate([mixed, [force * at.cutis, force * ~at.cutis]])
-    return np.asarray(rows * at.weight, dtype=np.float32)
+    rows = np.concatenate([mixed, [force * at.cutis, force * ~at.cutis]]) * at.weight
+    largest = float(np.linalg.norm(rows, axis=1).max())
+    return np.asarray(rows * (settings.most / max(largest, settings.most)), dtype=np.float32)
 
 
 def with_volumes(rows: Array, at: PointFields, settings: CubatureSettings) -> Array:
