@@ -18,7 +18,7 @@ from bayeskin.model.mesh import brick_mesh
 from bayeskin.model.problem import build_problem
 from bayeskin.reduced.basis import inner_products, pod, weighted_modes
 from bayeskin.reduced.cases import BASE, SETS, Protocols, Trained, random_motion
-from bayeskin.reduced.cubature import CubatureSettings, choose_points
+from bayeskin.reduced.cubature import CubatureSettings, _tested, choose_points
 from bayeskin.reduced.library import Library, Modes, modes_beyond, modes_of, scaled_basis
 from bayeskin.reduced.model import reduced_space
 from bayeskin.reduced.operators import Rule, linear_parts, point_fields, whole_linear_parts
@@ -224,3 +224,18 @@ def test_a_flat_arm_has_no_radius_to_leave() -> None:
     flat = replace(TRAINED, geometry=Geometry(arm_radius_m=None))
     assert outside(flat, THETA, (), Geometry(arm_radius_m=None), MOTION) == ""
     assert "round" in outside(flat, THETA, (), Geometry(), MOTION)
+
+
+def test_a_state_beyond_all_measure_outweighs_no_other(problem, inner) -> None:
+    at = point_fields(problem, scaled_basis(random_modes(problem, inner, 3), inner))
+    shape = len(at.weight), at.gradient.shape[2] + at.pressure.shape[1]
+    own, dual = CubatureSettings(), np.ones(shape[1])
+    integrand = np.random.default_rng(2).standard_normal(shape)
+    rows = {
+        size: _tested(size * integrand, dual, at, 1.0, own, np.random.default_rng(3))
+        for size in (1.0, 10.0, 1e9)
+    }
+    norms = {size: np.linalg.norm(r, axis=1).max() for size, r in rows.items()}
+    assert norms[1.0] < 0.1 * own.most
+    np.testing.assert_allclose(rows[10.0], 10.0 * rows[1.0], rtol=1e-4)
+    assert norms[1e9] == pytest.approx(own.most, rel=1e-4)
