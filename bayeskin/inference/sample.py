@@ -12,7 +12,6 @@ from threading import Event
 
 import emcee
 import numpy as np
-from numpy.typing import NDArray
 
 from bayeskin.errors import InputError
 from bayeskin.inference import chains as store
@@ -20,12 +19,14 @@ from bayeskin.inference.convergence import Convergence, Limits, assess
 from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.inference.moves import mixed_moves
 from bayeskin.inference.problem import LogPosterior
+from bayeskin.inference.proposal import Product
 from bayeskin.inference.straighten import find_shear
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
 _FIRST_CHECK = 500
-# Steps at which walkers that lag behind are brought back; all before the last that did is burn-in.
-_RESCUES = (200, 400, 800, 1600)
+# Steps after which the draws so far teach what moves propose; all before the last of them is burn-in.
+_LESSONS = (50, 100, 150, 200, 250, 300, 400, 500)
+_POINTS = 8000  # draws at most that a lesson takes
 _REFRESH = 100  # steps between two words of progress
 Progress = Callable[[float, str], None]
 
@@ -84,9 +85,8 @@ def sample(
     backends = [store.load(f, log_posterior.names, identity) if f.exists() else None for f in files]
     runs = _ensembles(log_posterior, log_posterior.vector(start), seed, settings.walkers, backends)
     convergence: Convergence | None = None
-    goal = 0
-    while True:
-        goal = _next_check(goal, settings.max_steps)
+    settled = 0
+    for goal, judged in _stops(settings.max_steps):
         with closing(_advanced(runs, goal, threads)) as advanced:
             for e, at in advanced:
                 if at < goal:
@@ -96,12 +96,30 @@ def sample(
                     store.save(files[e], runs[e].backend, log_posterior.names, identity)
                     runs[e].changed = False
         chains = np.stack([r.backend.chain[:goal] for r in runs])
-        log_prob = np.stack([r.backend.log_prob[:goal] for r in runs])
-        settled = max((run.last_rescue(goal) for run in runs), default=0)
-        convergence = assess(chains, log_prob, log_posterior.names, settings.limits, settled)
-        _tell(progress, convergence, settings, convergence.verdict.reasons[0])
-        if convergence.verdict.trusted or goal >= settings.max_steps:
-            return _posterior(log_posterior, chains, log_prob, convergence, seed)
+        if judged:
+            log_prob = np.stack([r.backend.log_prob[:goal] for r in runs])
+            convergence = assess(chains, log_prob, log_posterior.names, settings.limits, settled)
+            _tell(progress, convergence, settings, convergence.verdict.reasons[0])
+            if convergence.verdict.trusted:
+                break
+        if goal in _LESSONS:
+            _teach(runs, chains, log_posterior, np.random.default_rng([seed, goal]))
+            settled = goal
+    return _posterior(log_posterior, chains, log_prob, convergence, seed)
+
+
+def _teach(
+    runs: Sequence[_Ensemble], chains: Array, log_posterior: LogPosterior, rng: np.random.Generator
+) -> None:
+    """Lets the ensembles propose from a distribution fitted to the later half of all their chains so far,
+    (E, n, W, D). Parameters of the model hardly depend on those of the noise."""
+    late = chains[:, chains.shape[1] // 2 :]
+    draws = late[:, :: -(-late[..., 0].size // _POINTS)].reshape(-1, log_posterior.dim)
+    model = log_posterior.surrogate.space.dim
+    blocks = (slice(0, model), slice(model, log_posterior.dim))
+    known = Product.of(runs[0].coordinates.forward(draws), blocks, rng)
+    for run in runs:
+        run.propose_from(known)
 
 
 def load_chains(folder: Path | str, log_posterior: LogPosterior, ensembles: int) -> Array:
@@ -157,60 +175,35 @@ class _Ensemble:
         coordinates: MoveCoordinates,
         backend: emcee.backends.Backend,
         state: emcee.State,
-        seed: np.random.SeedSequence,
     ) -> None:
         self.changed = False
+        self.coordinates = coordinates
         self.backend = backend
         self.state = state
-        self._seed = seed
+        self._log_prob = log_posterior.log_prob
+        self.propose_from(None)
+
+    def propose_from(self, known: Product | None) -> None:
+        """Lets the moves of further steps know a distribution to propose from."""
         self.sampler = emcee.EnsembleSampler(
-            backend.nwalkers,
-            log_posterior.dim,
-            log_posterior.log_prob,
-            moves=mixed_moves(coordinates, backend.nwalkers),
-            backend=backend,
+            self.backend.nwalkers,
+            self.state.coords.shape[1],
+            self._log_prob,
+            moves=mixed_moves(self.coordinates, self.backend.nwalkers, known),
+            backend=self.backend,
             vectorize=True,
         )
 
     def advance(self, goal: int) -> Iterator[int]:
         """Steps to `goal`, if not there yet; yields the step now and then."""
-        while self.backend.iteration < goal:
-            self.changed = True
-            if self.backend.iteration in _RESCUES:
-                self._rescue()
-            stop = min([goal, *(at for at in _RESCUES if at > self.backend.iteration)])
-            missing = stop - self.backend.iteration
-            for state in self.sampler.sample(self.state, iterations=missing, skip_initial_state_check=True):
-                self.state = state
-                if self.backend.iteration % _REFRESH == 0 and self.backend.iteration < goal:
-                    yield self.backend.iteration
-
-    def _rescue(self) -> None:
-        """Puts walkers that lag behind where one of the others has been.
-
-        What is drawn depends on the step alone (Vrugt et al. 2009, section 3.3).
-        """
-        at = self.backend.iteration
-        lagging = self._lagging(at)
-        good = np.flatnonzero(~lagging)
-        rng = np.random.default_rng([*self._seed.generate_state(4), at])
-        steps = rng.integers(at // 2, at, lagging.sum())
-        picks = rng.choice(good, lagging.sum())
-        coords, log_prob = self.state.coords.copy(), self.state.log_prob.copy()
-        coords[lagging] = self.backend.chain[steps, picks]
-        log_prob[lagging] = self.backend.log_prob[steps, picks]
-        self.state = emcee.State(coords, log_prob=log_prob, random_state=self.state.random_state)
-
-    def _lagging(self, at: int) -> NDArray[np.bool_]:
-        """Walkers (W,) whose mean log density over the last half of the run to step `at` lies two
-        interquartile ranges below the lower quartile."""
-        level = self.backend.log_prob[at // 2 : at].mean(axis=0)
-        low, high = np.quantile(level, [0.25, 0.75])
-        return np.asarray(level < low - 2.0 * (high - low))
-
-    def last_rescue(self, goal: int) -> int:
-        """The last step before `goal` at which walkers were brought back, or 0."""
-        return max((at for at in _RESCUES if at < goal and self._lagging(at).any()), default=0)
+        missing = goal - self.backend.iteration
+        if missing <= 0:
+            return
+        self.changed = True
+        for state in self.sampler.sample(self.state, iterations=missing, skip_initial_state_check=True):
+            self.state = state
+            if self.backend.iteration % _REFRESH == 0 and self.backend.iteration < goal:
+                yield self.backend.iteration
 
 
 def _ensembles(
@@ -237,7 +230,7 @@ def _ensembles(
             state = emcee.State(coords, random_state=generator.get_state())
         else:
             state = backend.get_last_sample()
-        runs.append(_Ensemble(log_posterior, coordinates, backend, state, own))
+        runs.append(_Ensemble(log_posterior, coordinates, backend, state))
     return runs
 
 
@@ -262,9 +255,16 @@ def initial_walkers(
     )
 
 
-def _next_check(steps: int, max_steps: int) -> int:
-    # Fixed by the step count alone, so that an interruption cannot move the point where a run stops.
-    return min(max(_FIRST_CHECK, steps + max(_FIRST_CHECK // 2, steps // 5)), max_steps)
+def _stops(max_steps: int) -> Iterator[tuple[int, bool]]:
+    """Steps at which the ensembles wait for each other, and whether convergence is judged there.
+
+    Fixed by the step count alone, so that an interruption cannot move the point where a run stops.
+    """
+    check = 0
+    while check < max_steps:
+        before, check = check, min(max(_FIRST_CHECK, check + max(_FIRST_CHECK // 2, check // 5)), max_steps)
+        yield from ((at, False) for at in _LESSONS if before < at < check)
+        yield check, True
 
 
 def _check(settings: SampleSettings, dim: int) -> None:
