@@ -24,9 +24,11 @@ from bayeskin.inference.straighten import find_shear
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
 _FIRST_CHECK = 500
-# Steps after which the draws so far teach what moves propose; all before the last of them is burn-in.
-_LESSONS = (50, 100, 150, 200, 250, 300, 400, 500)
-_POINTS = 8000  # draws at most that a lesson takes
+# Steps at which the draws since the one before teach what moves propose, and the power of the density that
+# these are drawn from: the posterior's parts are not yet apart at low ones. All before the last is burn-in.
+_LESSONS = {50: 0.1, 100: 0.15, 150: 0.25, 200: 0.4, 250: 0.6, 300: 0.8, 400: 1.0, 500: 1.0}
+_LATE = 0.4  # of the steps so far, after which draws are taken: those of lower powers widen what is learnt
+_POINTS = 16000  # draws at most that a lesson takes
 _REFRESH = 100  # steps between two words of progress
 Progress = Callable[[float, str], None]
 
@@ -103,7 +105,7 @@ def sample(
             if convergence.verdict.trusted:
                 break
         if goal in _LESSONS:
-            _teach(runs, chains, log_posterior, np.random.default_rng([seed, goal]))
+            _teach(runs, chains[:, int(_LATE * goal) :], log_posterior, np.random.default_rng([seed, goal]))
             settled = goal
     return _posterior(log_posterior, chains, log_prob, convergence, seed)
 
@@ -111,10 +113,11 @@ def sample(
 def _teach(
     runs: Sequence[_Ensemble], chains: Array, log_posterior: LogPosterior, rng: np.random.Generator
 ) -> None:
-    """Lets the ensembles propose from a distribution fitted to the later half of all their chains so far,
-    (E, n, W, D). Parameters of the model hardly depend on those of the noise."""
-    late = chains[:, chains.shape[1] // 2 :]
-    draws = late[:, :: -(-late[..., 0].size // _POINTS)].reshape(-1, log_posterior.dim)
+    """Lets the ensembles propose from a distribution fitted to draws of them all, (E, n, W, D).
+
+    Parameters of the model hardly depend on those of the noise.
+    """
+    draws = chains[:, :: -(-chains[..., 0].size // _POINTS)].reshape(-1, log_posterior.dim)
     model = log_posterior.surrogate.space.dim
     blocks = (slice(0, model), slice(model, log_posterior.dim))
     known = Product.of(runs[0].coordinates.forward(draws), blocks, rng)
@@ -184,26 +187,36 @@ class _Ensemble:
         self.propose_from(None)
 
     def propose_from(self, known: Product | None) -> None:
-        """Lets the moves of further steps know a distribution to propose from."""
-        self.sampler = emcee.EnsembleSampler(
-            self.backend.nwalkers,
-            self.state.coords.shape[1],
-            self._log_prob,
-            moves=mixed_moves(self.coordinates, self.backend.nwalkers, known),
-            backend=self.backend,
-            vectorize=True,
-        )
+        """Gives the moves of further steps a distribution to propose from."""
+        self._moves = mixed_moves(self.coordinates, self.backend.nwalkers, known)
 
     def advance(self, goal: int) -> Iterator[int]:
         """Steps to `goal`, if not there yet; yields the step now and then."""
-        missing = goal - self.backend.iteration
-        if missing <= 0:
+        begun = self.backend.iteration
+        power = next((power for at, power in _LESSONS.items() if at >= goal), 1.0)
+        if begun >= goal:
             return
         self.changed = True
-        for state in self.sampler.sample(self.state, iterations=missing, skip_initial_state_check=True):
-            self.state = state
+        sampler = emcee.EnsembleSampler(
+            self.backend.nwalkers,
+            self.state.coords.shape[1],
+            lambda vectors: power * self._log_prob(vectors),
+            moves=self._moves,
+            backend=self.backend,
+            vectorize=True,
+        )
+        state = self._at_power(power)
+        for state in sampler.sample(state, iterations=goal - begun, skip_initial_state_check=True):
             if self.backend.iteration % _REFRESH == 0 and self.backend.iteration < goal:
                 yield self.backend.iteration
+        self.state = state
+        self.state = self._at_power(1.0 / power)
+        self.backend.log_prob[begun:] *= 1.0 / power
+
+    def _at_power(self, power: float) -> emcee.State:
+        """The walkers with their log densities times `power`."""
+        log_prob = None if self.state.log_prob is None else power * self.state.log_prob
+        return emcee.State(self.state.coords, log_prob=log_prob, random_state=self.state.random_state)
 
 
 def _ensembles(
