@@ -74,10 +74,13 @@ def sample(
 ) -> Posterior:
     """Runs ensembles from around `start` (the MAP, SI by name) until the verdict is trust, or to max_steps.
 
+    The first steps draw from powers of the posterior, from low to whole, and teach what moves propose: from
+    then on all ensembles propose from one distribution, so that R-hat compares what they made of it.
+
     `folder` keeps one file an ensemble, ``ensemble_0.h5`` ..., in emcee's own HDF5 form with its random
     state, each replaced as a whole after every stretch. An interrupted run goes on from there and gives
     the draws that an uninterrupted one gives, and so does any number of `threads`, over which the ensembles
-    are spread. Raises InputError when the files there belong to another
+    are spread. Raises InputError for fewer than 500 steps, and when the files there belong to another
     posterior, seed or number of walkers; they stay as they are.
     """
     settings = settings or SampleSettings()
@@ -98,8 +101,8 @@ def sample(
                     store.save(files[e], runs[e].backend, log_posterior.names, identity)
                     runs[e].changed = False
         chains = np.stack([r.backend.chain[:goal] for r in runs])
+        log_prob = np.stack([r.backend.log_prob[:goal] for r in runs])
         if judged:
-            log_prob = np.stack([r.backend.log_prob[:goal] for r in runs])
             convergence = assess(chains, log_prob, log_posterior.names, settings.limits, settled)
             _tell(progress, convergence, settings, convergence.verdict.reasons[0])
             if convergence.verdict.trusted:
@@ -107,6 +110,7 @@ def sample(
         if goal in _LESSONS:
             _teach(runs, chains[:, int(_LATE * goal) :], log_posterior, np.random.default_rng([seed, goal]))
             settled = goal
+    assert convergence is not None
     return _posterior(log_posterior, chains, log_prob, convergence, seed)
 
 
@@ -205,18 +209,18 @@ class _Ensemble:
             backend=self.backend,
             vectorize=True,
         )
-        state = self._at_power(power)
+        state = _scaled(self.state, power)
         for state in sampler.sample(state, iterations=goal - begun, skip_initial_state_check=True):
             if self.backend.iteration % _REFRESH == 0 and self.backend.iteration < goal:
                 yield self.backend.iteration
-        self.state = state
-        self.state = self._at_power(1.0 / power)
+        self.state = _scaled(state, 1.0 / power)
         self.backend.log_prob[begun:] *= 1.0 / power
 
-    def _at_power(self, power: float) -> emcee.State:
-        """The walkers with their log densities times `power`."""
-        log_prob = None if self.state.log_prob is None else power * self.state.log_prob
-        return emcee.State(self.state.coords, log_prob=log_prob, random_state=self.state.random_state)
+
+def _scaled(state: emcee.State, factor: float) -> emcee.State:
+    """The walkers with `factor` times their log densities, where these are known."""
+    log_prob = None if state.log_prob is None else factor * state.log_prob
+    return emcee.State(state.coords, log_prob=log_prob, random_state=state.random_state)
 
 
 def _ensembles(
@@ -287,10 +291,13 @@ def _check(settings: SampleSettings, dim: int) -> None:
             settings.walkers,
             f"at least {2 * dim + 2}, twice the {dim} parameters and 2 more",
         )
-    if settings.ensembles < 1 or settings.max_steps < 10:
+    if settings.ensembles < 1:
+        raise InputError("sample.ensembles", settings.ensembles, "at least 1")
+    if settings.max_steps < _FIRST_CHECK:
         raise InputError(
-            "sample", f"{settings.ensembles} ensembles, {settings.max_steps} steps", "1 and 10 at least"
-        )
+            "sample.max_steps", settings.max_steps,
+            f"at least {_FIRST_CHECK}: the first steps are not yet of the posterior",
+        )  # fmt: skip
 
 
 def _tell(progress: Progress | None, state: Convergence | None, settings: SampleSettings, text: str) -> None:
