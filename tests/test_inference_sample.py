@@ -13,6 +13,7 @@ import emcee
 import numpy as np
 import pytest
 from scipy import stats
+from toys import banana
 from toy_inference import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
 
 from bayeskin.errors import InputError
@@ -20,11 +21,12 @@ from bayeskin.inference import Limits, LogPosterior, SampleSettings, identifiabi
 from bayeskin.inference.convergence import assess, autocorrelation_steps, split_rhat
 from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.inference.moves import SnookerMove, SubspaceMove, TriesMove, mixed_moves
+from bayeskin.inference.proposal import Mixture, Product
 from bayeskin.inference.straighten import Shear, find_shear
 from bayeskin.types import Array
 
 LINE_START = {"a": 0.2, "b": -0.3, "sd_hold": 0.05002, "tau_noise": 0.0010005, "nu_noise": 1.0005e6}
-SHORT = SampleSettings(ensembles=2, walkers=16, max_steps=60)
+SHORT = SampleSettings(ensembles=2, walkers=16, max_steps=500)
 
 
 def unit_normal_variance(moves: object, dim: int, steps: int) -> tuple[float, float]:
@@ -49,6 +51,13 @@ def walled(shear: Shear | None) -> MoveCoordinates:
     return MoveCoordinates(shear, np.full(5, -9.0), np.full(5, 9.0))
 
 
+def learnt(shear: Shear | None) -> Product:
+    """From draws of another distribution than the unit normal, so that tries are weighed."""
+    rng = np.random.default_rng(3)
+    draws = 0.3 + 1.2 * rng.standard_normal((3000, 5))
+    return Product.of(walled(shear).forward(draws), (slice(0, 2), slice(2, 5)), rng)
+
+
 @pytest.mark.parametrize(
     "moves",
     [
@@ -56,18 +65,24 @@ def walled(shear: Shear | None) -> MoveCoordinates:
         SubspaceMove(),
         TriesMove(walled(curved_shear(5))),
         TriesMove(walled(None)),
+        TriesMove(walled(None), learnt(None)),
+        TriesMove(walled(curved_shear(5)), learnt(curved_shear(5))),
         mixed_moves(walled(curved_shear(5)), 30),
         mixed_moves(walled(None), 30),
         mixed_moves(walled(None), 14),
+        mixed_moves(walled(curved_shear(5)), 30, learnt(curved_shear(5))),
     ],
     ids=[
         "snooker",
         "subspace",
         "tries, straightened",
         "tries, normal scores",
+        "learnt tries, normal scores",
+        "learnt tries, straightened",
         "all, straightened",
         "all, normal scores",
         "without tries",
+        "all, learnt tries",
     ],
 )
 def test_a_move_keeps_a_unit_normal(moves: object) -> None:
@@ -97,6 +112,35 @@ def test_tries_keep_the_shares_of_two_modes_between_walls() -> None:
     error = np.std(means, ddof=1) / np.sqrt(20)
     assert abs(np.mean(means) - 1.4) < 4 * error
     assert error < 0.01
+
+
+def test_a_mixture_s_density_is_that_of_its_draws() -> None:
+    """E_q[p / q] is 1 for a density p that q covers; and components follow two parts of unequal share."""
+    rng = np.random.default_rng(4)
+    left = rng.random(4000) < 0.3
+    draws = rng.standard_normal((4000, 3)) * 0.2 + np.where(left, -2.0, 1.0)[:, None]
+    mixture = Mixture.of(draws, rng)
+    points = mixture.draw(40000, np.random.RandomState(5))
+    ratio = np.exp(stats.multivariate_normal(np.ones(3), 0.04).logpdf(points) - mixture.log_density(points))
+    assert np.mean(ratio) == pytest.approx(1.0, abs=4 * np.std(ratio) / 200)
+    assert np.mean(points[:, 0] < -0.5) == pytest.approx(np.mean(left), abs=0.02)
+
+
+def test_a_thin_curved_ridge_is_sampled_to_its_ends(tmp_path: Path) -> None:
+    start = dict.fromkeys(banana.NAMES, 0.0) | {"b": -1.0}
+    posterior = sample(banana.Banana(), tmp_path, 1, start, SampleSettings(4, 40, 1250), threads=2)  # type: ignore[arg-type]
+    assert posterior.convergence.verdict.trusted, posterior.convergence.verdict.reasons
+    draws, error = posterior.flat, np.sqrt(banana.VARIANCE / posterior.convergence.ess)
+    assert np.abs((draws.mean(axis=0) - banana.MEAN) / error).max() < 4.0
+    kurtosis = ((draws - banana.MEAN) ** 4).mean(axis=0) / banana.VARIANCE**2
+    spread = np.sqrt((kurtosis - 1.0) / posterior.convergence.ess)
+    assert np.abs((draws.var(axis=0) / banana.VARIANCE - 1.0) / spread).max() < 4.0
+
+
+def test_fewer_steps_than_lead_to_the_posterior_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"sample\.max_steps.*499.*at least 500"):
+        sample(line_problem(), tmp_path / "new", 7, LINE_START, dataclasses.replace(SHORT, max_steps=499))
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_walker_on_top_of_its_anchor_stays_where_it_is() -> None:
@@ -173,21 +217,23 @@ def test_data_of_one_hold_cover_the_truth_and_leave_p_init_alone(tmp_path: Path)
 
 def test_a_run_in_two_parts_is_the_run_in_one(tmp_path: Path) -> None:
     problem = line_problem()
-    whole = sample(problem, tmp_path / "one", 7, LINE_START, SHORT)
-    sample(problem, tmp_path / "two", 7, LINE_START, dataclasses.replace(SHORT, max_steps=23))
-    parts = sample(problem, tmp_path / "two", 7, LINE_START, SHORT)
+    longer = dataclasses.replace(SHORT, max_steps=600, limits=Limits(effective_samples=1e9))
+    whole = sample(problem, tmp_path / "one", 7, LINE_START, longer)
+    sample(problem, tmp_path / "two", 7, LINE_START, SHORT)
+    parts = sample(problem, tmp_path / "two", 7, LINE_START, longer)
     assert np.array_equal(whole.draws, parts.draws)
     assert np.array_equal(*(load_chains(tmp_path / part, problem, 2) for part in ("one", "two")))
-    other = sample(problem, tmp_path / "three", 8, LINE_START, SHORT)
+    other = sample(problem, tmp_path / "three", 8, LINE_START, longer)
     assert not np.array_equal(whole.log_prob, other.log_prob)
     assert not np.array_equal(*load_chains(tmp_path / "one", problem, 2))  # ensembles are independent
 
 
 def test_chains_of_more_ensembles_than_are_asked_for_are_left_alone(tmp_path: Path) -> None:
     problem = line_problem()
-    sample(problem, tmp_path, 7, LINE_START, dataclasses.replace(SHORT, ensembles=3, max_steps=10))
-    sample(problem, tmp_path, 7, LINE_START, dataclasses.replace(SHORT, ensembles=2, max_steps=30))
-    assert load_chains(tmp_path, problem, 2).shape[:2] == (2, 30)
+    sample(problem, tmp_path, 7, LINE_START, dataclasses.replace(SHORT, ensembles=3))
+    further = SampleSettings(2, 16, 520, Limits(effective_samples=1e9))
+    sample(problem, tmp_path, 7, LINE_START, further)
+    assert load_chains(tmp_path, problem, 2).shape[:2] == (2, 520)
 
 
 def test_threads_change_nothing(tmp_path: Path) -> None:
@@ -199,10 +245,10 @@ def test_threads_change_nothing(tmp_path: Path) -> None:
 
 
 def test_an_error_in_a_thread_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(self: object) -> None:
+    def fail(self: object, goal: int) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr(sys.modules["bayeskin.inference.sample"]._Ensemble, "_rescue", fail)
+    monkeypatch.setattr(sys.modules["bayeskin.inference.sample"]._Ensemble, "advance", fail)
     with pytest.raises(ZeroDivisionError):
         sample(line_problem(), tmp_path, 7, LINE_START, SampleSettings(2, 16, 600), threads=2)
 

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import emcee
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from bayeskin.inference.coordinates import MoveCoordinates
+from bayeskin.inference.proposal import Mixture, Product
 from bayeskin.types import Array
 
 _CROSSOVER = (0.15, 0.3, 1.0)  # shares of the coordinates that a step moves
 _JUMP, _JITTER = 0.1, 1e-5  # share of steps of full length, from mode to mode; noise that fills space
-_TRIES, _FREEDOM = 5, 5.0  # points that a walker chooses from; of the t-distribution that they are from
+_TRIES = 5  # points that a walker chooses from
 _WALKERS_A_COORDINATE = 3  # or no tries
 _GAMMA = 1.7  # of about 2.38 / sqrt(2), optimal for the difference of two projected points
 
@@ -72,81 +71,67 @@ class SubspaceMove(emcee.moves.red_blue.RedBlueMove):
 
 
 class TriesMove(emcee.moves.Move):
-    """Moves each walker to one of several points of a t-distribution, fitted to the other half's walkers.
+    """Moves each walker to one of several points of a distribution that does not depend on where it is.
 
-    A step that does not depend on where the walker is forgets that at once; of several tries one is more
-    often worth it, and their densities cost little more together than one. Independent multiple-try
-    Metropolis: Martino (2018), Digital Signal Processing 75:134, section 4.2.
+    Such a step forgets that at once; of several tries one is more often worth it, and their densities cost
+    little more together than one. The distribution is `known`, or a t-distribution fitted to the other half's
+    walkers. Independent multiple-try Metropolis: Martino (2018), Digital Signal Processing 75:134, section 4.2.
     """
 
-    def __init__(self, coordinates: MoveCoordinates) -> None:
-        self.coordinates = coordinates
+    def __init__(self, coordinates: MoveCoordinates, known: Product | None = None) -> None:
+        self.coordinates, self.known = coordinates, known
 
     def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, NDArray[np.bool_]]:
-        """One step of all walkers, half after half, and which of them moved, (walkers,)."""
+        """One step of all walkers, and which of them moved, (walkers,)."""
         count = len(state.coords)
-        accepted, half = np.zeros(count, dtype=bool), np.arange(count) % 2
+        accepted = np.zeros(count, dtype=bool)
+        if self.known is not None:
+            self._move(np.arange(count), self.known, model, state, accepted)
+            return state, accepted
+        half = np.arange(count) % 2
         model.random.shuffle(half)
         for part in (0, 1):
-            own = np.flatnonzero(half == part)
-            y = self.coordinates.forward(state.coords)
-            around = _Around.of(y[half != part])
-            tried = around.draw(len(own) * _TRIES, model.random)
-            points = self.coordinates.back(tried)
-            log_prob, _ = model.compute_log_prob_fn(points)
-            weight = log_prob + self.coordinates.log_volume(tried) - around.log_density(tried)
-            weight = weight.reshape(len(own), _TRIES)
-            stay = state.log_prob[own] + self.coordinates.log_volume(y[own]) - around.log_density(y[own])
-            top = np.maximum(weight.max(axis=1), stay)
-            weight, stay = np.exp(weight - top[:, None]), np.exp(stay - top)
-            total = weight.sum(axis=1)
-            row, level = np.arange(len(own)), model.random.random_sample(len(own)) * total
-            chosen = np.minimum((np.cumsum(weight, axis=1) < level[:, None]).sum(axis=1), _TRIES - 1)
-            moves = model.random.random_sample(len(own)) * (total - weight[row, chosen] + stay) < total
-            to, picks = own[moves], (row * _TRIES + chosen)[moves]
-            state.coords[to], state.log_prob[to], accepted[to] = points[picks], log_prob[picks], True
+            others = self.coordinates.forward(state.coords[half != part])
+            self._move(np.flatnonzero(half == part), Mixture.around(others), model, state, accepted)
         return state, accepted
 
-
-@dataclass(frozen=True)
-class _Around:
-    """A t-distribution: its centre (d,) and the Cholesky factor (d, d) of its spread."""
-
-    centre: Array
-    root: Array
-
-    @classmethod
-    def of(cls, points: Array) -> _Around:
-        """With the mean and covariance of points (n, d), correlations shrunk where these are few."""
-        count, dim = points.shape
-        spread = np.cov(points.T)
-        own = np.diag(spread.diagonal())
-        spread = (count * spread + dim * own) / (count + dim) + 1e-10 * np.eye(dim)
-        return cls(points.mean(axis=0), np.linalg.cholesky(spread))
-
-    def draw(self, count: int, random: Any) -> Array:
-        """Points (count, d)."""
-        size = np.sqrt(random.chisquare(_FREEDOM, (count, 1)) / _FREEDOM)
-        return self.centre + random.standard_normal((count, len(self.centre))) / size @ self.root.T
-
-    def log_density(self, points: Array) -> Array:
-        """At points (n, d), up to a constant, (n,)."""
-        apart = solve_triangular(self.root, (points - self.centre).T, lower=True)
-        squared = np.sum(apart**2, axis=0)
-        return np.asarray(-0.5 * (_FREEDOM + len(self.centre)) * np.log1p(squared / _FREEDOM))
+    def _move(
+        self, own: NDArray[np.int64], proposal: Mixture | Product, model: Any, state: emcee.State,
+        accepted: NDArray[np.bool_],
+    ) -> None:  # fmt: skip
+        """Moves the walkers `own` in `state`, and notes which of them have moved."""
+        y = self.coordinates.forward(state.coords[own])
+        tried = proposal.draw(len(own) * _TRIES, model.random)
+        points = self.coordinates.back(tried)
+        log_prob, _ = model.compute_log_prob_fn(points)
+        weight = log_prob + self.coordinates.log_volume(tried) - proposal.log_density(tried)
+        weight = weight.reshape(len(own), _TRIES)
+        stay = state.log_prob[own] + self.coordinates.log_volume(y) - proposal.log_density(y)
+        top = np.maximum(weight.max(axis=1), stay)
+        weight, stay = np.exp(weight - top[:, None]), np.exp(stay - top)
+        total = weight.sum(axis=1)
+        row, level = np.arange(len(own)), model.random.random_sample(len(own)) * total
+        chosen = np.minimum((np.cumsum(weight, axis=1) < level[:, None]).sum(axis=1), _TRIES - 1)
+        moves = model.random.random_sample(len(own)) * (total - weight[row, chosen] + stay) < total
+        to, picks = own[moves], (row * _TRIES + chosen)[moves]
+        state.coords[to], state.log_prob[to], accepted[to] = points[picks], log_prob[picks], True
 
 
-def mixed_moves(coordinates: MoveCoordinates, walkers: int) -> list[tuple[emcee.moves.Move, float]]:
-    """The moves with their shares, all made in `coordinates`.
+def mixed_moves(
+    coordinates: MoveCoordinates, walkers: int, known: Product | None = None
+) -> list[tuple[emcee.moves.Move, float]]:
+    """The moves with their shares, all made in `coordinates`; tries from the distribution that is `known`.
 
-    Tries only where half of the walkers tell a distribution in so many coordinates; elsewhere they miss.
+    Where none is, tries only where half of the walkers tell a distribution in so many coordinates; elsewhere
+    they miss.
     """
     # Tries forget fastest where they are accepted; differential evolution goes on where they are not, and the
     # others keep it from any one scale.
-    tries = 0.6 if walkers >= _WALKERS_A_COORDINATE * len(coordinates.low) else 0.0
+    told = walkers >= _WALKERS_A_COORDINATE * len(coordinates.low)
+    tries = 0.8 if known is not None else 0.6 if told else 0.0
     kinds = ((SubspaceMove, 0.8), (emcee.moves.StretchMove, 0.1), (SnookerMove, 0.1))
     moves = [(_local(kind)(coordinates), (1.0 - tries) * share) for kind, share in kinds]
-    return [(TriesMove(coordinates), tries), *moves] if tries else moves
+    return [(TriesMove(coordinates, known), tries), *moves] if tries else moves
 
 
 def _local(kind: type) -> type:

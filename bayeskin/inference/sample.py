@@ -12,7 +12,6 @@ from threading import Event
 
 import emcee
 import numpy as np
-from numpy.typing import NDArray
 
 from bayeskin.errors import InputError
 from bayeskin.inference import chains as store
@@ -20,12 +19,16 @@ from bayeskin.inference.convergence import Convergence, Limits, assess
 from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.inference.moves import mixed_moves
 from bayeskin.inference.problem import LogPosterior
+from bayeskin.inference.proposal import Product
 from bayeskin.inference.straighten import find_shear
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
 _FIRST_CHECK = 500
-# Steps at which walkers that lag behind are brought back; all before the last that did is burn-in.
-_RESCUES = (200, 400, 800, 1600)
+# Steps at which the draws since the one before teach what moves propose, and the power of the density that
+# these are drawn from: the posterior's parts are not yet apart at low ones. All before the last is burn-in.
+_LESSONS = {50: 0.1, 100: 0.15, 150: 0.25, 200: 0.4, 250: 0.6, 300: 0.8, 400: 1.0, 500: 1.0}
+_LATE = 0.4  # of the steps so far, after which draws are taken: those of lower powers widen what is learnt
+_POINTS = 16000  # draws at most that a lesson takes
 _REFRESH = 100  # steps between two words of progress
 Progress = Callable[[float, str], None]
 
@@ -71,10 +74,13 @@ def sample(
 ) -> Posterior:
     """Runs ensembles from around `start` (the MAP, SI by name) until the verdict is trust, or to max_steps.
 
+    The first steps draw from powers of the posterior, from low to whole, and teach what moves propose: from
+    then on all ensembles propose from one distribution, so that R-hat compares what they made of it.
+
     `folder` keeps one file an ensemble, ``ensemble_0.h5`` ..., in emcee's own HDF5 form with its random
     state, each replaced as a whole after every stretch. An interrupted run goes on from there and gives
     the draws that an uninterrupted one gives, and so does any number of `threads`, over which the ensembles
-    are spread. Raises InputError when the files there belong to another
+    are spread. Raises InputError for fewer than 500 steps, and when the files there belong to another
     posterior, seed or number of walkers; they stay as they are.
     """
     settings = settings or SampleSettings()
@@ -84,9 +90,8 @@ def sample(
     backends = [store.load(f, log_posterior.names, identity) if f.exists() else None for f in files]
     runs = _ensembles(log_posterior, log_posterior.vector(start), seed, settings.walkers, backends)
     convergence: Convergence | None = None
-    goal = 0
-    while True:
-        goal = _next_check(goal, settings.max_steps)
+    settled = 0
+    for goal, judged in _stops(settings.max_steps):
         with closing(_advanced(runs, goal, threads)) as advanced:
             for e, at in advanced:
                 if at < goal:
@@ -97,11 +102,31 @@ def sample(
                     runs[e].changed = False
         chains = np.stack([r.backend.chain[:goal] for r in runs])
         log_prob = np.stack([r.backend.log_prob[:goal] for r in runs])
-        settled = max((run.last_rescue(goal) for run in runs), default=0)
-        convergence = assess(chains, log_prob, log_posterior.names, settings.limits, settled)
-        _tell(progress, convergence, settings, convergence.verdict.reasons[0])
-        if convergence.verdict.trusted or goal >= settings.max_steps:
-            return _posterior(log_posterior, chains, log_prob, convergence, seed)
+        if judged:
+            convergence = assess(chains, log_prob, log_posterior.names, settings.limits, settled)
+            _tell(progress, convergence, settings, convergence.verdict.reasons[0])
+            if convergence.verdict.trusted:
+                break
+        if goal in _LESSONS:
+            _teach(runs, chains[:, int(_LATE * goal) :], log_posterior, np.random.default_rng([seed, goal]))
+            settled = goal
+    assert convergence is not None
+    return _posterior(log_posterior, chains, log_prob, convergence, seed)
+
+
+def _teach(
+    runs: Sequence[_Ensemble], chains: Array, log_posterior: LogPosterior, rng: np.random.Generator
+) -> None:
+    """Lets the ensembles propose from a distribution fitted to draws of them all, (E, n, W, D).
+
+    Parameters of the model hardly depend on those of the noise.
+    """
+    draws = chains[:, :: -(-chains[..., 0].size // _POINTS)].reshape(-1, log_posterior.dim)
+    model = log_posterior.surrogate.space.dim
+    blocks = (slice(0, model), slice(model, log_posterior.dim))
+    known = Product.of(runs[0].coordinates.forward(draws), blocks, rng)
+    for run in runs:
+        run.propose_from(known)
 
 
 def load_chains(folder: Path | str, log_posterior: LogPosterior, ensembles: int) -> Array:
@@ -157,60 +182,45 @@ class _Ensemble:
         coordinates: MoveCoordinates,
         backend: emcee.backends.Backend,
         state: emcee.State,
-        seed: np.random.SeedSequence,
     ) -> None:
         self.changed = False
+        self.coordinates = coordinates
         self.backend = backend
         self.state = state
-        self._seed = seed
-        self.sampler = emcee.EnsembleSampler(
-            backend.nwalkers,
-            log_posterior.dim,
-            log_posterior.log_prob,
-            moves=mixed_moves(coordinates, backend.nwalkers),
-            backend=backend,
-            vectorize=True,
-        )
+        self._log_prob = log_posterior.log_prob
+        self.propose_from(None)
+
+    def propose_from(self, known: Product | None) -> None:
+        """Gives the moves of further steps a distribution to propose from."""
+        self._moves = mixed_moves(self.coordinates, self.backend.nwalkers, known)
 
     def advance(self, goal: int) -> Iterator[int]:
         """Steps to `goal`, if not there yet; yields the step now and then."""
-        while self.backend.iteration < goal:
-            self.changed = True
-            if self.backend.iteration in _RESCUES:
-                self._rescue()
-            stop = min([goal, *(at for at in _RESCUES if at > self.backend.iteration)])
-            missing = stop - self.backend.iteration
-            for state in self.sampler.sample(self.state, iterations=missing, skip_initial_state_check=True):
-                self.state = state
-                if self.backend.iteration % _REFRESH == 0 and self.backend.iteration < goal:
-                    yield self.backend.iteration
+        begun = self.backend.iteration
+        power = next((power for at, power in _LESSONS.items() if at >= goal), 1.0)
+        if begun >= goal:
+            return
+        self.changed = True
+        sampler = emcee.EnsembleSampler(
+            self.backend.nwalkers,
+            self.state.coords.shape[1],
+            lambda vectors: power * self._log_prob(vectors),
+            moves=self._moves,
+            backend=self.backend,
+            vectorize=True,
+        )
+        state = _scaled(self.state, power)
+        for state in sampler.sample(state, iterations=goal - begun, skip_initial_state_check=True):
+            if self.backend.iteration % _REFRESH == 0 and self.backend.iteration < goal:
+                yield self.backend.iteration
+        self.state = _scaled(state, 1.0 / power)
+        self.backend.log_prob[begun:] *= 1.0 / power
 
-    def _rescue(self) -> None:
-        """Puts walkers that lag behind where one of the others has been.
 
-        What is drawn depends on the step alone (Vrugt et al. 2009, section 3.3).
-        """
-        at = self.backend.iteration
-        lagging = self._lagging(at)
-        good = np.flatnonzero(~lagging)
-        rng = np.random.default_rng([*self._seed.generate_state(4), at])
-        steps = rng.integers(at // 2, at, lagging.sum())
-        picks = rng.choice(good, lagging.sum())
-        coords, log_prob = self.state.coords.copy(), self.state.log_prob.copy()
-        coords[lagging] = self.backend.chain[steps, picks]
-        log_prob[lagging] = self.backend.log_prob[steps, picks]
-        self.state = emcee.State(coords, log_prob=log_prob, random_state=self.state.random_state)
-
-    def _lagging(self, at: int) -> NDArray[np.bool_]:
-        """Walkers (W,) whose mean log density over the last half of the run to step `at` lies two
-        interquartile ranges below the lower quartile."""
-        level = self.backend.log_prob[at // 2 : at].mean(axis=0)
-        low, high = np.quantile(level, [0.25, 0.75])
-        return np.asarray(level < low - 2.0 * (high - low))
-
-    def last_rescue(self, goal: int) -> int:
-        """The last step before `goal` at which walkers were brought back, or 0."""
-        return max((at for at in _RESCUES if at < goal and self._lagging(at).any()), default=0)
+def _scaled(state: emcee.State, factor: float) -> emcee.State:
+    """The walkers with `factor` times their log densities, where these are known."""
+    log_prob = None if state.log_prob is None else factor * state.log_prob
+    return emcee.State(state.coords, log_prob=log_prob, random_state=state.random_state)
 
 
 def _ensembles(
@@ -237,7 +247,7 @@ def _ensembles(
             state = emcee.State(coords, random_state=generator.get_state())
         else:
             state = backend.get_last_sample()
-        runs.append(_Ensemble(log_posterior, coordinates, backend, state, own))
+        runs.append(_Ensemble(log_posterior, coordinates, backend, state))
     return runs
 
 
@@ -262,9 +272,16 @@ def initial_walkers(
     )
 
 
-def _next_check(steps: int, max_steps: int) -> int:
-    # Fixed by the step count alone, so that an interruption cannot move the point where a run stops.
-    return min(max(_FIRST_CHECK, steps + max(_FIRST_CHECK // 2, steps // 5)), max_steps)
+def _stops(max_steps: int) -> Iterator[tuple[int, bool]]:
+    """Steps at which the ensembles wait for each other, and whether convergence is judged there.
+
+    Fixed by the step count alone, so that an interruption cannot move the point where a run stops.
+    """
+    check = 0
+    while check < max_steps:
+        before, check = check, min(max(_FIRST_CHECK, check + max(_FIRST_CHECK // 2, check // 5)), max_steps)
+        yield from ((at, False) for at in _LESSONS if before < at < check)
+        yield check, True
 
 
 def _check(settings: SampleSettings, dim: int) -> None:
@@ -274,10 +291,13 @@ def _check(settings: SampleSettings, dim: int) -> None:
             settings.walkers,
             f"at least {2 * dim + 2}, twice the {dim} parameters and 2 more",
         )
-    if settings.ensembles < 1 or settings.max_steps < 10:
+    if settings.ensembles < 1:
+        raise InputError("sample.ensembles", settings.ensembles, "at least 1")
+    if settings.max_steps < _FIRST_CHECK:
         raise InputError(
-            "sample", f"{settings.ensembles} ensembles, {settings.max_steps} steps", "1 and 10 at least"
-        )
+            "sample.max_steps", settings.max_steps,
+            f"at least {_FIRST_CHECK}: the first steps are not yet of the posterior",
+        )  # fmt: skip
 
 
 def _tell(progress: Progress | None, state: Convergence | None, settings: SampleSettings, text: str) -> None:
