@@ -162,7 +162,7 @@ def main(arguments: Sequence[str]) -> None:
     rows = ran(model, inside)
     print("\n".join(told(rows)))
     reduced_runs.outside = lambda *_: ""  # type: ignore[assignment]
-    print("\n".join(["Outside of the trained region:", *told(ran(model, leaving))]))
+    print("\n".join(["Outside of the trained region:", *told(ran(model, leaving))[:2]]))
     if "--figure" in arguments:
         figure(rows).savefig(arguments[arguments.index("--figure") + 1], dpi=200)
 

@@ -22,6 +22,7 @@ from bayeskin.model.lagrangian import Step
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.model.stepping import integrate
 from bayeskin.reduced import equations as equations_module
+from bayeskin.reduced import simulate as simulate_module
 from bayeskin.reduced.cases import BASE, Case
 from bayeskin.reduced.enrichment import EnrichmentSettings, enrich
 from bayeskin.reduced.equations import ReducedEquations
@@ -176,6 +177,14 @@ def test_relaxed_skin_that_is_pushed_together_is_near_folding(model) -> None:
                             of(["solid-viscoelasticity"]))  # fmt: skip
     assert soft.status == "ok"
     assert found.stats["stiffness_left"] < 0.4 < soft.stats["stiffness_left"]
+
+
+def test_a_run_that_is_inside_out_between_its_points_has_failed(model, monkeypatch) -> None:
+    monkeypatch.setattr(simulate_module.DualWeightedResidual, "follow", lambda *_: np.inf)
+    found = simulate_reduced(model, MOTION, THETA, (), estimate=True)
+    assert found.status == "failed"
+    assert found.stats["inside"] == 0.0
+    assert "inside out; run the full model" in found.message
 
 
 def test_full_runs_are_made_once(model, folder) -> None:

@@ -24,6 +24,7 @@ from bayeskin.types import PadMotion, Simulation, frozen_array
 
 TOLERANCE = 1e-3  # of a step's error in time, relative to the nominal force: the full model's default
 ESTIMATES = 12  # states at which the error is estimated, beside the corners
+INSIDE_OUT = "between the points of the cubature the mesh is inside out; run the full model"
 SAFETY = 3.0  # on what the residual tells of them: chosen on the skins of docs/reduced.md
 
 
@@ -46,8 +47,8 @@ def simulate_reduced(
     estimate : whether the force's error is estimated, which takes longer than the run
     on_state : called with time [s], the full model's unknowns (dofs,) and force [N] of each step of the test
 
-    A run that fails, or that leaves the trained region, is a Simulation with status "failed" and a message;
-    `stats` has "error_estimate_n" [N] of the RMS error where it was asked for.
+    A run that fails, or that leaves the trained region, is a Simulation with status "failed" and a message, and
+    so is one whose error is estimated and found to be without bound; `stats` has "error_estimate_n" [N] of the RMS error where it was asked for.
     """
     started = time.perf_counter()
     tissue = sorted(m.name for m in mechanisms if isinstance(m.act, Tissue))
@@ -63,6 +64,8 @@ def simulate_reduced(
             run.show(history, on_state)
         if estimate and not message:
             stats["error_estimate_n"] = run.estimated_error_n(history)
+            if not np.isfinite(stats["error_estimate_n"]):
+                message, stats["inside"] = INSIDE_OUT, 0.0
     force_n = np.array(history.force_n)
     stats |= {
         "seconds": time.perf_counter() - started,
