@@ -13,8 +13,8 @@ import emcee
 import numpy as np
 import pytest
 from scipy import stats
-from toys import banana
 from toy_inference import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
+from toys import banana
 
 from bayeskin.errors import InputError
 from bayeskin.inference import Limits, LogPosterior, SampleSettings, identifiability, load_chains, sample
@@ -128,7 +128,7 @@ def test_a_mixture_s_density_is_that_of_its_draws() -> None:
 
 def test_a_thin_curved_ridge_is_sampled_to_its_ends(tmp_path: Path) -> None:
     start = dict.fromkeys(banana.NAMES, 0.0) | {"b": -1.0}
-    posterior = sample(banana.Banana(), tmp_path, 1, start, SampleSettings(4, 40, 1250), threads=2)  # type: ignore[arg-type]
+    posterior = sample(banana.Banana(), tmp_path, 1, start, SampleSettings(4, 40, 500), threads=2)  # type: ignore[arg-type]
     assert posterior.convergence.verdict.trusted, posterior.convergence.verdict.reasons
     draws, error = posterior.flat, np.sqrt(banana.VARIANCE / posterior.convergence.ess)
     assert np.abs((draws.mean(axis=0) - banana.MEAN) / error).max() < 4.0

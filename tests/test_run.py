@@ -62,7 +62,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     noise_n = 0.003 * np.random.default_rng(5).standard_normal(len(time_s))
     recording = Recording(time_s, MOTION.at(time_s), force_n + noise_n, "toy", "0" * 64)
     storage.save(where / "measured.h5", recording)
-    (where / "case.toml").write_text(CONFIG.format(steps=200))
+    (where / "case.toml").write_text(CONFIG.format(steps=500))
 
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -97,7 +97,7 @@ def test_the_summary_answers_what_a_reader_asks(folder: Path) -> None:
     assert list(summary["posterior"])[:5] == list(SPACE.names)
     for name, row in summary["posterior"].items():
         assert row["low_90"] < row["median"] < row["high_90"], name
-    assert summary["verdict"] == "not trusted"  # 200 steps cannot be enough, and it says so
+    assert summary["verdict"] == "not trusted"  # 500 steps cannot be enough, and it says so
     reasons = json.loads((folder / "case" / "sample" / "stage.json").read_text())["summary"]["reasons"]
     assert any("needed" in reason for reason in reasons)
     assert summary["because"][-1] == reasons[0]
@@ -261,10 +261,10 @@ def test_longer_sampling_repeats_no_stage_before_it_and_keeps_the_chains(
     monkeypatch.setattr(report, "save_figure", lambda *arguments: None)
     monkeypatch.setattr(model, "FullModel", toy_model.ToyModel)
     chains = list((folder / "case" / "chains").iterdir())
-    (folder / "case.toml").write_text(CONFIG.format(steps=250))
+    (folder / "case.toml").write_text(CONFIG.format(steps=600))
     answer = stages.run(folder / "case.toml", "sample", Silent())
     assert answer["skipped"] == ["recording", "design", "train", "map"]
-    assert answer["steps"] == 250
+    assert answer["steps"] == 600
     assert list((folder / "case" / "chains").iterdir()) == chains
 
 

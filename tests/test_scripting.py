@@ -83,7 +83,7 @@ def test_the_full_model_weighs_the_documented_draws(said: dict[str, Any]) -> Non
 def test_a_folder_keeps_the_chains_and_the_same_call_repeats_the_draws(tmp_path: Path) -> None:
     recording = bk.load_recording(ROOT / "data" / "demo.h5")
     small = {
-        "sample": {"ensembles": 2, "walkers": 24, "max_steps": 60},
+        "sample": {"ensembles": 2, "walkers": 24, "max_steps": 500},
         "map": {"starts": 1, "evaluations": 200},
     }
     one = bk.calibrate(recording, folder=tmp_path, **small)  # the shipped surrogate that knows the protocol
@@ -139,7 +139,7 @@ def test_a_script_that_diagnoses_needs_no_guard(tmp_path: Path) -> None:
 
 def test_numbers_of_numpy_are_settings_too(tmp_path: Path) -> None:
     recording = bk.load_recording(ROOT / "data" / "demo.h5")
-    small = {"sample": {"ensembles": np.int64(2), "walkers": 24, "max_steps": 40}, "map": {"starts": 1}}
+    small = {"sample": {"ensembles": np.int64(2), "walkers": 24, "max_steps": 500}, "map": {"starts": 1}}
     made = bk.calibrate(
         recording, seed=np.int64(3), fit={"windows_s": np.array([[0.0, 75.0]])}, folder=tmp_path, **small
     )

@@ -75,7 +75,8 @@ class TriesMove(emcee.moves.Move):
 
     Such a step forgets that at once; of several tries one is more often worth it, and their densities cost
     little more together than one. The distribution is `known`, or a t-distribution fitted to the other half's
-    walkers. Independent multiple-try Metropolis: Martino (2018), Digital Signal Processing 75:134, section 4.2.
+    walkers. Independent multiple-try Metropolis: Martino (2018), Digital Signal Processing 75:134, section
+    4.2.
     """
 
     def __init__(self, coordinates: MoveCoordinates, known: Product | None = None) -> None:

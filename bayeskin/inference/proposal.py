@@ -87,7 +87,9 @@ class Mixture(_FreezesArrays):
         """Of each component, its weight included, (n, k)."""
         dim = self.centres.shape[1]
         sizes = np.log(np.diagonal(self.roots, axis1=1, axis2=2)).sum(axis=1)
-        norm = gammaln(0.5 * (_FREEDOM + dim)) - gammaln(0.5 * _FREEDOM) - 0.5 * dim * np.log(_FREEDOM * np.pi)
+        norm = (
+            gammaln(0.5 * (_FREEDOM + dim)) - gammaln(0.5 * _FREEDOM) - 0.5 * dim * np.log(_FREEDOM * np.pi)
+        )
         bend = 0.5 * (_FREEDOM + dim) * np.log1p(squared / _FREEDOM)
         return np.asarray(np.log(self.weights) - sizes + norm - bend)
 

@@ -209,11 +209,12 @@ class _Ensemble:
             backend=self.backend,
             vectorize=True,
         )
-        state = _scaled(self.state, power)
-        for state in sampler.sample(state, iterations=goal - begun, skip_initial_state_check=True):
+        start = _scaled(self.state, power)
+        for state in sampler.sample(start, iterations=goal - begun, skip_initial_state_check=True):
+            self.state = state
             if self.backend.iteration % _REFRESH == 0 and self.backend.iteration < goal:
                 yield self.backend.iteration
-        self.state = _scaled(state, 1.0 / power)
+        self.state = _scaled(self.state, 1.0 / power)
         self.backend.log_prob[begun:] *= 1.0 / power
 
 

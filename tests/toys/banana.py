@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 
 from bayeskin.types import Array, Parameter, ParameterSpace
 
-THIN = 0.02
+THIN = 0.1
 NAMES = ("a", "b", "c", "d", "e", "f")
 # b is about a^2 - 1 and c about a^3 / 3, within THIN; the others are independent.
 MEAN = np.zeros(6)
@@ -21,7 +22,7 @@ class Banana:
     low = np.array([-5.0, -3.0, -40.0, -8.0, -8.0, -8.0])
     high = np.array([5.0, 26.0, 40.0, 8.0, 8.0, 8.0])
     names, dim, bounds = NAMES, 6, (low, high)
-    identity = {"posterior": "banana"}
+    identity: ClassVar = {"posterior": "banana"}
     space = ParameterSpace(
         tuple(Parameter(n, "1", a, b, "uniform") for n, a, b in zip(NAMES, low, high, strict=True))
     )
