@@ -161,7 +161,7 @@ def test_ranks_and_intervals_are_those_of_the_draws(benchmark):
 
 def test_a_recording_is_made_inferred_and_ranked_in_one_row(benchmark):
     calibration = benchmark("calibration")
-    settings = calibration.SampleSettings(2, 24, 40, calibration.Limits())
+    settings = calibration.SampleSettings(2, 24, 500, calibration.Limits())
     item = {"surrogate": calibration.surrogate_hash(), "data": "surrogate", "seed": 1, "index": 3}
     rows = [calibration.replicate(item, calibration.problem(), settings) for _ in range(2)]
     assert set(rows[0]) == set(calibration.ROWS.columns)
