@@ -47,8 +47,9 @@ def simulate_reduced(
     estimate : whether the force's error is estimated, which takes longer than the run
     on_state : called with time [s], the full model's unknowns (dofs,) and force [N] of each step of the test
 
-    A run that fails, or that leaves the trained region, is a Simulation with status "failed" and a message, and
-    so is one whose error is estimated and found to be without bound; `stats` has "error_estimate_n" [N] of the RMS error where it was asked for.
+    A run that fails, or that leaves the trained region, is a Simulation with status "failed" and a message,
+    and so is one whose error is estimated and found to be without bound; `stats` has "error_estimate_n" [N]
+    of the RMS error where it was asked for.
     """
     started = time.perf_counter()
     tissue = sorted(m.name for m in mechanisms if isinstance(m.act, Tissue))
