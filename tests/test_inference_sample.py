@@ -195,7 +195,10 @@ def test_a_linear_model_gets_its_gaussian_posterior(tmp_path: Path) -> None:
     assert (posterior.flat[:, :2].mean(axis=0) - mean) / sd == pytest.approx(0, abs=0.1)
     assert posterior.flat[:, :2].std(axis=0) / sd == pytest.approx(1, abs=0.07)
     assert posterior.convergence.ess.min() > 1500
-    assert len(posterior.flat) == pytest.approx(posterior.convergence.ess.min(), rel=0.15)
+    # Thinned by the autocorrelation time, rounded up: so many times fewer draws than effective samples.
+    found = posterior.convergence
+    rounded = found.thin / found.tau_steps.max()
+    assert len(posterior.flat) == pytest.approx(found.ess.min() / rounded, rel=0.15)
 
 
 def test_data_of_one_hold_cover_the_truth_and_leave_p_init_alone(tmp_path: Path) -> None:
@@ -293,7 +296,7 @@ def test_a_killed_process_leaves_chains_that_go_on(tmp_path: Path) -> None:
     process.wait()
     problem = line_problem()
     reached = emcee.backends.HDFBackend(str(last), read_only=True).iteration
-    settings = SampleSettings(2, 16, reached + 20)
+    settings = SampleSettings(2, 16, max(500, reached + 20))
     settings = dataclasses.replace(settings, limits=Limits(effective_samples=1e9))
     whole = sample(problem, tmp_path / "one", 7, LINE_START, settings)
     assert np.array_equal(whole.draws, sample(problem, tmp_path / "two", 7, LINE_START, settings).draws)

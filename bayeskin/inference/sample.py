@@ -28,7 +28,7 @@ _FIRST_CHECK = 500
 # these are drawn from: the posterior's parts are not yet apart at low ones. All before the last is burn-in.
 _LESSONS = {50: 0.1, 100: 0.15, 150: 0.25, 200: 0.4, 250: 0.6, 300: 0.8, 400: 1.0, 500: 1.0}
 _LATE = 0.4  # of the steps so far, after which draws are taken: those of lower powers widen what is learnt
-_POINTS = 16000  # draws at most that a lesson takes
+_POINTS = 8000  # draws at most that a lesson takes
 _REFRESH = 100  # steps between two words of progress
 Progress = Callable[[float, str], None]
 
