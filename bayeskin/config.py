@@ -217,7 +217,7 @@ class SampleConfig(Section):
     ensembles: Annotated[int, Field(ge=2, le=1000)] = 4
     walkers: Annotated[int, Field(ge=4, le=100_000)] = 40
     effective_samples: Positive = 5000
-    max_steps: Annotated[int, Field(ge=500)] = 20000  # the first 400 only lead to the posterior
+    max_steps: Annotated[int, Field(ge=500)] = 20000  # the first 300 only lead to the posterior
 
 
 class CheckConfig(Section):

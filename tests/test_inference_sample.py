@@ -137,6 +137,15 @@ def test_a_thin_curved_ridge_is_sampled_to_its_ends(tmp_path: Path) -> None:
     assert np.abs((draws.var(axis=0) / banana.VARIANCE - 1.0) / spread).max() < 4.0
 
 
+def test_densities_on_file_are_the_posterior_s_at_every_step(tmp_path: Path) -> None:
+    """Also at those that are drawn from a power of it."""
+    problem = line_problem()
+    sample(problem, tmp_path, 7, LINE_START, SHORT)
+    stored = emcee.backends.HDFBackend(str(tmp_path / "ensemble_0.h5"), read_only=True)
+    expected = problem.log_prob(stored.get_chain().reshape(-1, problem.dim)).reshape(500, 16)
+    assert stored.get_log_prob() == pytest.approx(expected, rel=1e-10)
+
+
 def test_fewer_steps_than_lead_to_the_posterior_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"sample\.max_steps.*499.*at least 500"):
         sample(line_problem(), tmp_path / "new", 7, LINE_START, dataclasses.replace(SHORT, max_steps=499))

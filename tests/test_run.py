@@ -265,7 +265,8 @@ def test_longer_sampling_repeats_no_stage_before_it_and_keeps_the_chains(
     answer = stages.run(folder / "case.toml", "sample", Silent())
     assert answer["skipped"] == ["recording", "design", "train", "map"]
     assert answer["steps"] == 600
-    assert list((folder / "case" / "chains").iterdir()) == chains
+    # Chains that have converged may send the surrogate back to training; what it then samples is added.
+    assert set(chains) <= set((folder / "case" / "chains").iterdir())
 
 
 def test_nearby_is_a_tenth_either_way_inside_the_prior() -> None:

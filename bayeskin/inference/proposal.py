@@ -18,7 +18,7 @@ from bayeskin.types import Array, _FreezesArrays
 _FREEDOM = 5.0  # of the t-distributions: tails that reach where no draw has been yet
 _COMPONENTS, _ROUNDS = 24, 15  # at most; of expectation maximisation
 _PRIOR = 5.0  # draws a coordinate that the prior on a component's spread is worth
-_FIRST, _NARROW = 0.1, 0.02  # of the covariance of all draws: the spread at first, and a priori
+_FIRST, _NARROW = 0.1, 0.005  # of the covariance of all draws: the spread at first, and a priori
 
 
 @dataclass(frozen=True)

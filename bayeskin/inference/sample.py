@@ -23,11 +23,14 @@ from bayeskin.inference.proposal import Product
 from bayeskin.inference.straighten import find_shear
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
-_FIRST_CHECK = 500
-# Steps at which the draws since the one before teach what moves propose, and the power of the density that
-# these are drawn from: the posterior's parts are not yet apart at low ones. All before the last is burn-in.
-_LESSONS = {50: 0.1, 100: 0.15, 150: 0.25, 200: 0.4, 250: 0.6, 300: 0.8, 400: 1.0, 500: 1.0}
-_LATE = 0.4  # of the steps so far, after which draws are taken: those of lower powers widen what is learnt
+_FIRST_CHECK, _BETWEEN = 500, 250
+# Steps at which draws so far teach what moves propose, and the power of the density that is drawn from until
+# then. Parts of the posterior are not yet apart at low powers, and what is learnt from 0.7 is wider than the
+# posterior: tails that a proposal lacks would hardly be visited. All before the last lesson is burn-in.
+_LESSONS = {
+    30: 0.1, 60: 0.1, 90: 0.2, 120: 0.2, 150: 0.35, 180: 0.35, 210: 0.5, 240: 0.5, 270: 0.7, 300: 0.7,
+}  # fmt: skip
+_LATE = 0.4  # of the steps so far, after which draws are taken
 _POINTS = 16000  # draws at most that a lesson takes
 _REFRESH = 100  # steps between two words of progress
 Progress = Callable[[float, str], None]
@@ -280,7 +283,7 @@ def _stops(max_steps: int) -> Iterator[tuple[int, bool]]:
     """
     check = 0
     while check < max_steps:
-        before, check = check, min(max(_FIRST_CHECK, check + max(_FIRST_CHECK // 2, check // 5)), max_steps)
+        before, check = check, min(max(_FIRST_CHECK, check + max(_BETWEEN, check // 5)), max_steps)
         yield from ((at, False) for at in _LESSONS if before < at < check)
         yield check, True
 
