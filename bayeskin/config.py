@@ -42,14 +42,14 @@ WHO_RUNS: Any = {"design": {"workers", "scheduler"}, "slurm": True}  # no result
 
 
 class RecordingConfig(Section):
-    """Which recording, and whether the model follows its displacement closely or its corners, rounded."""
+    """The recording, and whether the model follows its displacement closely or its corners, rounded."""
 
     file: str
     protocol: Literal["recorded", "idealised"] = "idealised"
 
 
 class ModelConfig(Section):
-    """Which force the model reports, on which mesh (the generator's bricks or a gmsh file), how finely.
+    """The force that the model reports, on which mesh (the generator's bricks or a gmsh file), how finely.
 
     `forward`: a model of one's own instead, "FILE.py:FUNCTION" (beside the configuration),
     "PACKAGE.MODULE:FUNCTION" or the URL of a UM-Bridge server; its observation is "own".
@@ -81,7 +81,7 @@ class ModelConfig(Section):
 
 
 class PriorConfig(Section):
-    """What replaces the default prior of one parameter; what is not given stays as it was.
+    """Values that replace the default prior of one parameter; what is not given stays as it was.
 
     `mean` and `sd` belong to a normal prior, `median` and `factor` (of one sd) to a log-normal one; both are
     cut to the bounds. `correlations` are with normal priors of other parameters, by their names, stated once.
@@ -112,7 +112,7 @@ class PriorConfig(Section):
 
     @property
     def centre_and_spread(self) -> tuple[float, float]:
-        """Of the prior on its line; of a uniform one what says nothing."""
+        """Returns the centre and spread of the prior on its line; those of a uniform prior say nothing."""
         if self.mean is not None and self.sd is not None:
             return self.mean, self.sd
         if self.median is not None and self.factor is not None:

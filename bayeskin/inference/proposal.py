@@ -84,7 +84,7 @@ class Mixture(_FreezesArrays):
         return np.stack([np.einsum("nd,nd->n", one, one) for one in away], axis=1)
 
     def _log_densities(self, squared: Array) -> Array:
-        """Of each component, its weight included, (n, k)."""
+        """Returns log densities of the components times their weights (n, k)."""
         dim = self.centres.shape[1]
         sizes = np.log(np.diagonal(self.roots, axis1=1, axis2=2)).sum(axis=1)
         norm = (

@@ -34,14 +34,14 @@ STEPS_PER_PHASE = 5  # fewer, longer ones cost as much: their guesses are worse,
 
 
 class Solver(Protocol):
-    """What a model solves with; counts : what was spent, "crawls" and "falls" among it."""
+    """The solver of a model; counts : of its work, "crawls" and "falls" among them."""
 
     @property
     def counts(self) -> Mapping[str, int]: ...
 
 
 class Equations(Protocol):
-    """What step control asks of a model, full or reduced: `LagrangianModel` describes each."""
+    """The model, full or reduced, that step control integrates: `LagrangianModel` describes each member."""
 
     @property
     def starts_s(self) -> float: ...

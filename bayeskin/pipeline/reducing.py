@@ -117,7 +117,7 @@ def default_path(source: Path | None) -> Path:
 
 
 def _finished(path: Path, trained: Trained) -> bool:
-    """Whether a file holds the whole model already. Raises InputError for one of another device."""
+    """Returns whether a file holds the whole model already. Raises InputError for one of another device."""
     if not path.is_file():
         return False
     there = load_reduced(path)

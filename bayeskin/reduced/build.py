@@ -21,7 +21,7 @@ from bayeskin.reduced.cubature import CubatureSettings, Taken, choose_points, ta
 from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
 from bayeskin.reduced.library import Library, Modes, modes_beyond, modes_of
 from bayeskin.reduced.model import Cubatures, ReducedModel, SurfacesOf, inner_of, reduced_space
-from bayeskin.reduced.operators import Basis, LinearParts, PointFields, Rule, point_fields
+from bayeskin.reduced.operators import Basis, LinearParts, Rule, point_fields
 from bayeskin.reduced.runs import FullRuns, Progress, binds_of, tissue_of
 from bayeskin.reduced.shadow import Shadow
 from bayeskin.types import Array
@@ -32,7 +32,7 @@ ROUNDS = (4, 10, 20, 40)  # reduced runs after which a cubature is trained anew,
 
 @dataclass(frozen=True)
 class BuildSettings:
-    """How large a reduced model is and what it learns from.
+    """Sizes of a reduced model and of its training.
 
     base_runs, runs : full runs of the base model, and of each mechanism
     base, each : displacement and pressure modes of the base model, and of each mechanism beyond the base's
@@ -161,20 +161,15 @@ class Teacher:
             if not taught:
                 none = "no reduced run that stays near the full model"
                 raise InputError(self.label, none, "a point away from folds")
-            rule = rule_of(at, taught, points, self.settings.cubature)
+            whole = with_volumes(np.concatenate(taught), at, self.settings.cubature)
+            rule = choose_points(whole, [points], self.settings.cubature)[points][0]
             done = end
         assert rule is not None
         return rule
 
     def _near(self, taken: Taken) -> bool:
-        """Whether a run did not go astray, so that its integrands are worth learning."""
+        """Returns whether the points of a run left out so little that its integrands are worth learning."""
         return bool(len(taken.missing)) and float(np.abs(taken.missing).max()) < self.settings.trusted
-
-
-def rule_of(at: PointFields, rows: Sequence[Array], points: int, settings: CubatureSettings) -> Rule:
-    """Returns a cubature of so many points for integrands at all points `at`."""
-    whole = with_volumes(np.concatenate(rows), at, settings)
-    return choose_points(whole, [points], settings)[points][0]
 
 
 def shadowed(

@@ -70,13 +70,13 @@ class Trained:
     def _names(self, kind: str, rng: np.random.Generator) -> tuple[str, ...]:
         if kind == BASE:
             return ()
-        first = [] if kind == SETS else [kind]
-        others = sorted(set(self.mechanisms) - set(first))
+        own = () if kind == SETS else (kind,)
         if kind == SETS:
             count = int(rng.integers(1, 5))
         else:
             count = int(rng.integers(1, 3)) if rng.uniform() < ACCOMPANIED else 0
-        return tuple(sorted([*first, *rng.choice(others, min(count, len(others)), replace=False).tolist()]))
+        others = sorted(set(self.mechanisms) - set(own))
+        return tuple(sorted([*own, *rng.choice(others, min(count, len(others)), replace=False).tolist()]))
 
     def _theta(self, names: Sequence[str], rng: np.random.Generator) -> dict[str, float]:
         theta = _drawn(self.base, rng)

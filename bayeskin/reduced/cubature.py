@@ -26,15 +26,14 @@ from bayeskin.types import Array
 
 @dataclass(frozen=True)
 class CubatureSettings:
-    """How a cubature is trained.
+    """Settings of the training of a cubature.
 
     every : steps between the states that are taken
     mixtures : random test vectors a state
     force : weight of the force's own rows beside a mixture's
     pressure : size of a pressure coefficient a newton of the peak force; mode_m : of a displacement's [m]
     volume : weight of the layers' volumes
-    most : largest norm of a row; a state with a larger one, such as fibres stretched beyond all measure,
-        counts for less, since a single one would outweigh all others
+    most : largest norm of a row; states with larger ones are scaled down, so that none outweighs all others
     batch : points added at once
     """
 
@@ -50,7 +49,7 @@ class CubatureSettings:
 
 @dataclass(frozen=True)
 class Taken:
-    """What one reduced run gives to train or test a cubature.
+    """Integrands of one reduced run, to train or test a cubature.
 
     rows (r, n) : integrands times weights, over the peak force
     missing (s,) : force on all points less that of the run, over its peak, at the states taken
@@ -150,11 +149,11 @@ class _NonNegative:
     def __init__(self, right: Array) -> None:
         self.factor = np.zeros(0)
         self._right = right
-        self._columns = np.zeros((len(right), 0), order="F")
+        self._columns = np.zeros((len(right), 0))
         self._gram, self._projected = np.zeros((0, 0)), np.zeros(0)
 
     def left(self) -> Array:
-        """What the columns leave of the right-hand side."""
+        """Returns the residual of the right-hand side."""
         return self._right - self._columns @ self.factor
 
     def add(self, new: Array) -> np.ndarray:

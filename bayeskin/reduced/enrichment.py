@@ -31,7 +31,7 @@ from bayeskin.workers import Map
 
 @dataclass(frozen=True)
 class EnrichmentSettings:
-    """How a reduced model is fitted to a recording.
+    """Settings of the fit of a reduced model to a recording.
 
     width : share of each prior within which full and reduced runs lie, around the point
     first : full runs before the first prediction; most : full runs at most

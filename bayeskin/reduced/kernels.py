@@ -68,7 +68,7 @@ class Laws(NamedTuple):
 
 
 class History(NamedTuple):
-    """What a stage knows of the past: J*, p* (n,), the laws' memory (flat), coefficients x* (k,), times.
+    """The past of a stage: J*, p* (n,), the laws' memory (flat), coefficients x* (k,), times.
 
     length_s : h*; elapsed_s : since the memory; time_s : at the stage's end since the test started
     """

@@ -77,5 +77,5 @@ def modes_beyond(own: Modes, weighted: Modes, inner: Inner, most: tuple[int, int
 
 
 def _less(rows: Array, modes: Array, inner: sp.csr_matrix) -> Array:
-    """What rows have beyond orthonormal modes."""
+    """Returns what rows have beyond orthonormal modes."""
     return np.asarray(rows - (rows @ (inner @ modes.T)) @ modes)

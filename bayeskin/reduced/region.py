@@ -1,4 +1,4 @@
-"""Where a reduced model can be trusted: in the region that it was trained for, away from folds of the skin.
+"""The region in which a reduced model can be trusted: where it was trained, away from folds of the skin.
 
 Relaxed skin that is pushed together folds: the smallest eigenvalue of its stiffness falls to zero. Near there
 a small error of the modes is a large one of the force.

@@ -61,7 +61,7 @@ class FullRuns:
         return run.message
 
     def path(self, case: Case) -> Path:
-        """Where the run of a case is kept: its name is the sha256 of all that it depends on."""
+        """Returns the file of a case's run, whose name is the sha256 of all that the run depends on."""
         spec = ModelSpec(refinement=self.refinement, geometry=self.geometry)
         said = [
             spec.hash, law_hashes(case.mechanisms), sorted(case.theta.items()), case.geometry.hash,
