@@ -13,6 +13,7 @@ from bayeskin.model.gradients import logarithms
 from bayeskin.model.simulate import simulate
 from bayeskin.pipeline.calibration import log_posterior_of, rmse_table
 from bayeskin.pipeline.engine import Run, Stage
+from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.model import model_spec
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.refining import Refining
@@ -20,26 +21,28 @@ from bayeskin.types import Array, BinnedForce, PadMotion, Simulation
 
 
 class _FullModel:
-    """Full runs, with `gradients` or without, kept, so that an interrupted search makes none twice."""
+    """Full runs, with derivatives where the model has them, kept by their parameters, so that none is made
+    twice."""
 
-    def __init__(self, run: Run, gradients: bool = False) -> None:
-        self.run, self.spec, self.gradients = run, model_spec(run), gradients
+    def __init__(self, run: Run) -> None:
+        self.run, self.spec = run, model_spec(run)
         self.motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
-        self.count = 0
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether its runs carry derivatives."""
+        return self.spec.observation == "reaction"
 
     def __call__(self, theta: Mapping[str, float]) -> Simulation:
-        kept = self.run.at("map", f"{'polish' if self.gradients else 'full'}-run-{self.count}.h5")
-        self.count += 1
+        kept = self.run.at("map", f"full-run-{sha256_of([self.spec.hash, dict(theta)])[:16]}.h5")
         if kept.is_file():
-            stored = storage.load(kept, Simulation)
-            if dict(stored.theta) == dict(theta):
-                return stored
-        self.run.reporter.log("map: full run at " + ", ".join(f"{k} = {v:.4g}" for k, v in theta.items()))
-        label = f"full run {self.count}"
+            return storage.load(kept, Simulation)
+        said = ", ".join(f"{name} = {value:.4g}" for name, value in theta.items())
+        self.run.reporter.log(f"map: full run at {said}")
         tell = self.run.reporter.progress
         simulation = simulate(
-            self.spec, self.motion, theta, lambda share: tell(label, share),
-            gradients=logarithms(theta) if self.gradients else None,
+            self.spec, self.motion, theta, lambda share: tell("full run", share),
+            gradients=logarithms(theta) if self.differentiable else None,
         )  # fmt: skip
         if simulation.status == "ok":  # what failed may be mended meanwhile
             storage.save(kept, simulation)
@@ -49,21 +52,20 @@ class _FullModel:
 def _find(run: Run) -> Mapping[str, Any]:
     config = run.config
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
-    refining = Refining(run, binned, "design", "train")
+    refining, full = Refining(run, binned, "design", "train"), _FullModel(run)
     refined = inference.refine_map(
-        log_posterior_of(run, refining.surrogate, binned), _FullModel(run), refining.retrain, config.seed,
+        log_posterior_of(run, refining.surrogate, binned), full, refining.retrain, config.seed,
         config.map.starts, config.map.evaluations,
     )  # fmt: skip
     refining.save("map")
     _draw_check(run, binned, refined)
-    return {**_found(refined, binned), "polished": _polish(run, refined)}
+    return {**_found(refined, binned), "polished": _polish(full, refined)}
 
 
-def _polish(run: Run, refined: RefinedMap) -> dict[str, Any] | None:
+def _polish(full: _FullModel, refined: RefinedMap) -> dict[str, Any] | None:
     """The maximum of the full model itself, where it has derivatives."""
-    if run.config.model.observation != "reaction" or not refined.passes:
+    if not full.differentiable or not refined.passes:
         return None
-    full = _FullModel(run, gradients=True)
     found = inference.polish_map(refined.log_posterior, full, refined.map.theta)
     return {
         "theta": dict(found.theta),
