@@ -17,6 +17,7 @@ from typing import Any
 
 import bayeskin.model
 from bayeskin.behaviour import sha256_of_behaviour
+from bayeskin.pipeline.engine import Silent
 
 RESULTS = Path(__file__).parent / "results"
 Row = dict[str, str]
@@ -101,6 +102,13 @@ def warn_of_mixed_code(rows: Sequence[Row]) -> None:
     found = sorted({row["code"] for row in rows})
     if len(found) > 1:
         say(f"warning: rows from {len(found)} states of bayeskin/model ({', '.join(found)}) in one table")
+
+
+class Log(Silent):
+    """Tells on stderr what stages log."""
+
+    def log(self, message: str) -> None:
+        say(message)
 
 
 def say(text: str) -> None:

@@ -26,7 +26,6 @@ from scipy.signal import lfilter
 
 from bayeskin import storage
 from bayeskin.model import ModelSpec, simulate
-from bayeskin.pipeline.engine import Silent
 from bayeskin.pipeline.new import new_config
 from bayeskin.pipeline.stages import BEFORE_REPORT, run
 from bayeskin.types import Array, PadMotion, Recording
@@ -86,19 +85,12 @@ def spent_s() -> tuple[float, float]:
     return time.perf_counter(), sum(one.ru_utime + one.ru_stime for one in used)
 
 
-class Log(Silent):
-    """Tells on stderr what stages log."""
-
-    def log(self, message: str) -> None:
-        rows.say(message)
-
-
 def stage_by_stage(config: Path) -> tuple[list[list[str]], dict[str, Any]]:
     """A table row of each stage, the first with the reading of the recording, and the summary of the run."""
     table, begin = [], spent_s()
     for name in (*(stage.name for stage in BEFORE_REPORT[1:]), None):
         before = spent_s()
-        said = run(config, name, Log())
+        said = run(config, name, rows.Log())
         table.append([name or "report", *(f"{b - a:.1f}" for a, b in zip(before, spent_s(), strict=True))])
     table.append(["all", *(f"{b - a:.1f}" for a, b in zip(begin, spent_s(), strict=True))])
     return table, said

@@ -20,6 +20,7 @@ from bayeskin.mechanisms import catalogue
 from bayeskin.reduced.basis import Inner, pod
 from bayeskin.reduced.build import BuildSettings, Teacher
 from bayeskin.reduced.cases import Case, Trained
+from bayeskin.reduced.cubature import CubatureSettings
 from bayeskin.reduced.library import Library, Modes
 from bayeskin.reduced.model import Cubatures, ReducedModel, inner_of
 from bayeskin.reduced.runs import FullRuns, Progress, tissue_of
@@ -37,20 +38,23 @@ class EnrichmentSettings:
     first : full runs before the first prediction; most : full runs at most
     kept : modes with singular values below this share of the largest are left out
     modes : displacement and pressure modes at most
-    points, shadows : of the cubature, and reduced runs that train it
+    points, shadows : of the cubature, and reduced runs that train it; so few runs need many test vectors a
+        state, or the cubature is exact on these vectors alone
     wanted : RMS error of a predicted run, as a share of its peak, at which the model is done
     """
 
     width: float = 0.05
     first: int = 4
     most: int = 10
-    kept: float = 3e-5
+    kept: float = 3e-4
     modes: tuple[int, int] = (90, 60)
-    points: int = 400
-    shadows: int = 8
+    points: int = 600
+    shadows: int = 6
     wanted: float = 1e-3
     seed: int = 1
-    build: BuildSettings = field(default_factory=BuildSettings)
+    build: BuildSettings = field(
+        default_factory=lambda: BuildSettings(cubature=CubatureSettings(every=3, mixtures=40))
+    )
 
 
 @dataclass(frozen=True)
