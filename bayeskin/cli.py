@@ -258,11 +258,15 @@ def run(config: Path, scheduler: str | None, as_json: bool) -> None:
 
 @cli.command(short_help="What the model leaves out: where, which physics.")
 @click.argument("source", type=click.Path(path_type=Path))
+@click.option(
+    "--device", type=click.Path(path_type=Path), metavar="FILE", help="The device that made a recording."
+)
 @as_json
-def diagnose(source: Path, as_json: bool) -> None:
+def diagnose(source: Path, device: Path | None, as_json: bool) -> None:
     """What the model leaves out of a recording: where, which physics, how much better.
 
-    SOURCE is a configuration, or a recording by itself, whose protocol a shipped surrogate knows.
+    SOURCE is a configuration, or a recording by itself. Where no shipped surrogate knows its protocol, the
+    reduced model of the device solves the mechanisms of a set together: any protocol will do.
 
     Tries each mechanism of the catalogue that acts on the instrument, and each of the tissue's that
     `bayeskin effects` has learnt or that is shipped with the surrogate, with all other parameters free
@@ -278,7 +282,7 @@ def diagnose(source: Path, as_json: bool) -> None:
     from bayeskin.pipeline import diagnosis
 
     with Terminal() as terminal:
-        document = diagnosis.diagnose(source, terminal)
+        document = diagnosis.diagnose(source, terminal, device)
     _answer(document, as_json)
 
 

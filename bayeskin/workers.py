@@ -30,7 +30,8 @@ ONE_THREAD = {
 }
 
 
-Map = Callable[[Callable[[Any], Any], Sequence[Any]], Generator[tuple[int, Any], None, None]]
+Results = Generator[tuple[int, Any], None, None]
+Map = Callable[[Callable[[Any], Any], Sequence[Any]], Results]
 
 
 def local(workers: int) -> Map:
@@ -53,9 +54,21 @@ class _Worker:
     item: int | None = None
 
 
-def run_parallel(
-    function: Callable[[Any], Any], items: Sequence[Any], workers: int
-) -> Generator[tuple[int, Any], None, None]:
+@contextmanager
+def standing(function: Callable[[Any], Any], workers: int) -> Iterator[Callable[[Sequence[Any]], Results]]:
+    """Yields what `run_parallel` does for one function, with workers that stay from one call to the next.
+
+    What the function keeps in its process, it keeps for later items.
+    """
+    crew: list[_Worker] = []
+    try:
+        yield lambda items: _run(function, items, workers, crew)
+    finally:
+        for worker in crew:
+            _end(worker)
+
+
+def run_parallel(function: Callable[[Any], Any], items: Sequence[Any], workers: int) -> Results:
     """Yields ``(index, function(items[index]))`` as results come; `Lost` for an item that kills its worker.
 
     `function` must be importable by a fresh interpreter (picklable) and raise nothing; it runs with
@@ -63,7 +76,13 @@ def run_parallel(
     in all. Closing the iterator ends the workers, as does the death of this process.
     Raises InputError when workers die before they are ready.
     """
-    todo, attempts, crew, false_starts = deque(range(len(items))), Counter[int](), list[_Worker](), 0
+    with standing(function, workers) as run_all:
+        yield from run_all(items)
+
+
+def _run(function: Callable[[Any], Any], items: Sequence[Any], workers: int, crew: list[_Worker]) -> Results:
+    todo, attempts, false_starts = deque(range(len(items))), Counter[int](), 0
+    _hand_out(crew, items, todo, attempts)
     try:
         while todo or any(worker.item is not None for worker in crew):
             busy = sum(worker.item is not None for worker in crew)
@@ -90,7 +109,8 @@ def run_parallel(
                 if done is not None:
                     yield done, result
     finally:
-        for worker in crew:
+        for worker in [worker for worker in crew if worker.item is not None]:  # what it does is not wanted
+            crew.remove(worker)
             _end(worker)
 
 

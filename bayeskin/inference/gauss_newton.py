@@ -104,20 +104,23 @@ def _best(log_posterior: LogPosterior, trials: Array) -> tuple[Array, float, Pre
 
 
 def promise(
-    log_posterior: LogPosterior, vector: Array, trials: Array, free: NDArray[np.bool_], count: int
-) -> list[tuple[int, float, float, Array]]:
+    log_posterior: LogPosterior, vector: Array, trials: Array, free: NDArray[np.bool_], count: int,
+    mean_n: Array | None = None,
+) -> list[tuple[int, float, float, Array]]:  # fmt: skip
     """The `count` of `trials` (n, D) along whose change of force most is to be gained from `vector` (D,).
 
     Of each its row, the nats, the best multiple of that change, and `vector` with what is `free` (D,) moved
-    to make room, within the box; all by the force's linear approximation (a score test).
+    to make room, within the box; all by the force's linear approximation (a score test). `mean_n` (n, m) is
+    the force at the trials, where the surrogate is not to say it.
     """
     here = log_posterior.predict(log_posterior.from_sampling(vector))
     linear = _Linear(log_posterior, vector, here)
     inner = linear.inner
     others = free[:inner]
     bins = linear.chain.bins
-    mean = log_posterior.predict_mean(log_posterior.from_sampling(trials))[:, bins]
-    change = linear.white((mean - linear.here.mean[:, bins]).T)
+    if mean_n is None:
+        mean_n = log_posterior.predict_mean(log_posterior.from_sampling(trials))
+    change = linear.white((mean_n - linear.here.mean)[:, bins].T)
     residual, slopes, factor = linear.columns()
     room = np.concatenate([slopes[:, others], factor], axis=1)
     moved = int(others.sum())

@@ -23,7 +23,7 @@ from bayeskin.mismatch.full_fit import FullFit
 from bayeskin.mismatch.locate import Located
 from bayeskin.mismatch.search import Build, Made, Search, search
 from bayeskin.mismatch.verdict import Diagnosis, judge, set_probability
-from bayeskin.pipeline import design, recording, training
+from bayeskin.pipeline import design, joint_diagnosis, recording, training
 from bayeskin.pipeline.diagnosis_outputs import (
     Found,
     candidates,
@@ -44,17 +44,20 @@ from bayeskin.types import Array, BinnedForce
 from bayeskin.workers import Lost, run_parallel
 
 
-def diagnose(source: Path, reporter: Reporter) -> dict[str, Any]:
+def diagnose(source: Path, reporter: Reporter, device: Path | None = None) -> dict[str, Any]:
     """The answer of `bayeskin diagnose` on a configuration's run, or on a recording by itself.
 
-    Outputs go to the run's folder, or to STEM-diagnosis beside the recording. Raises InputError for bad
-    input, among it a recording whose protocol no shipped surrogate knows.
+    `device` is the file of the device that a recording by itself was made with. Outputs go to the run's
+    folder, or to STEM-diagnosis beside the recording. Raises InputError for bad input, among it a device
+    without a reduced model.
     """
-    run = opened(source, reporter)
-    stages = {stage.name: stage for stage in (recording.STAGE, design.STAGE, training.STAGE, STAGE)}
-    outcome = run_stages(run, stages)[-1]
+    run = opened(source, reporter, device)
+    by_reduced_model = run.config.design.coarse == "reduced"
+    own = (joint_diagnosis.STAGE,) if by_reduced_model else (design.STAGE, training.STAGE, STAGE)
+    outcome = run_stages(run, {stage.name: stage for stage in (recording.STAGE, *own)})[-1]
     answer = {**outcome.record.summary, "ok": outcome.ok, "folder": run.folder / STAGE.name}
-    text = in_words(answer) if outcome.record.done else f"{outcome.stage}: failed: {answer['message']}"
+    said = joint_diagnosis.in_words if by_reduced_model else in_words
+    text = said(answer) if outcome.record.done else f"{outcome.stage}: failed: {answer['message']}"
     return plain({**answer, "text": text})
 
 

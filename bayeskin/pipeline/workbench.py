@@ -7,11 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from bayeskin import storage
-from bayeskin.config import Config, RecordingConfig, SurrogateConfig, parameter_space
+from bayeskin.config import Config, DesignConfig, RecordingConfig, SurrogateConfig, parameter_space
+from bayeskin.device import load_device_file
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior
 from bayeskin.mechanisms import Mechanism, catalogue
@@ -118,33 +120,52 @@ def _up_to(binned: BinnedForce, until_s: float | None) -> BinnedForce:
     return replace(binned, force_n=force_n, variance_n2=variance_n2)
 
 
-def opened(source: Path, reporter: Reporter) -> Run:
-    """A configuration's run, or that of a recording by itself beside it. Raises InputError as `diagnose`."""
+def opened(source: Path, reporter: Reporter, device: Path | None = None) -> Run:
+    """A configuration's run, or that of a recording by itself beside it, made with the device of a file.
+
+    A recording by itself takes a shipped surrogate where one knows its protocol, else the reduced model of
+    its device. Raises InputError for bad input, and for a device beside a configuration, which states its own.
+    """
     if source.suffix == ".toml":
+        if device is not None:
+            raise InputError(
+                "--device", f"{device} beside a configuration", "the device in [device] and [tissue]"
+            )
         run = open_run(source, reporter)
         run.config.refuse_uncertain(source, "diagnose")
         return run
     found = read_recording(source)
-    surrogate = shipped_for(recording.pad_motion("reaction", found, segment(found), "idealised"))
-    if surrogate is None:
-        raise InputError(
-            source, "a protocol that no shipped surrogate was trained on",
-            "a configuration with a design of its own: bayeskin diagnose CONFIG.toml",
-        )  # fmt: skip
+    sections: dict[str, Any] = {}
+    shipped = None
+    if device is not None:
+        sections = dict(load_device_file(device))
+    else:
+        shipped = shipped_for(recording.pad_motion("reaction", found, segment(found), "idealised"))
+    if shipped is not None:
+        sections["surrogate"] = SurrogateConfig(file=shipped.name)
+    else:
+        sections["design"] = DesignConfig(coarse="reduced", workers=2)
     config = Config(
         name=re.sub(r"[^A-Za-z0-9._-]", "-", f"run-{source.stem}"),
-        recording=RecordingConfig(file=source.name), surrogate=SurrogateConfig(file=surrogate.name),
+        recording=RecordingConfig(file=source.name), **sections,
     )  # fmt: skip
+    config.refuse_uncertain(device, "diagnose")
     return Run(config, source, source.resolve().with_name(f"{source.stem}-diagnosis"), reporter)
+
+
+def calm_bins(folder: Path) -> tuple[BinnedForce, Jumps, PadMotion]:
+    """What the stage `recording` left in its folder: bins, whose noise is what is quick of it, what the
+    samples allow the force to jump by, and the protocol."""
+    samples = storage.load(folder / "recording.h5", Recording)
+    binned = storage.load(folder / "binned.h5", BinnedForce)
+    quick = bin_recording(samples, binned.phases, binned.edges_s, analyse(samples, binned.phases, QUICK_S))
+    motion = storage.load(folder / "motion.h5", PadMotion)
+    return without_swings(binned, quick.variance_n2), jumps_of(samples, binned.phases), motion
 
 
 def workbench(run: Run) -> Workbench:
     """Of a run whose stages up to `train` are done."""
-    samples = storage.load(run.at("recording", "recording.h5"), Recording)
-    binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
-    quick = bin_recording(samples, binned.phases, binned.edges_s, analyse(samples, binned.phases, QUICK_S))
-    binned, jumps = without_swings(binned, quick.variance_n2), jumps_of(samples, binned.phases)
-    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    binned, jumps, motion = calm_bins(run.folder / "recording")
     effects = effects_of(run) if run.config.model.observation == "reaction" else []
     learnt = {effect.mechanisms[0] for effect in effects if len(effect.mechanisms) == 1}
     known = {n: m for n, m in catalogue().items() if isinstance(m.act, Instrument) or n in learnt}

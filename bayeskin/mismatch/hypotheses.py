@@ -1,0 +1,110 @@
+"""One rule for the verdict: probabilities of hypotheses in one family.
+
+A hypothesis is a set of mechanisms, with or without something smooth beside it that has no name (a Gaussian
+process, `discrepancy`). Each mechanism is there with the same prior probability, and so is what has no name.
+The evidence of both kinds is that of the force linear about the set's fit, with the measured noise
+(`Unexplained.log_evidence`). Probabilities are shares of all hypotheses that were weighed; sets that were
+never fitted count as nothing.
+
+A mechanism is named where it has nine chances in ten, or its look-alikes have them together and it is the
+likeliest of these. Where none is named the mismatch is unknown if something smooth is likelier than not;
+elsewhere nothing is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from bayeskin.mechanisms import Mechanism
+from bayeskin.mismatch.search import PRIOR
+
+PROBABLE = 0.9  # of a mechanism or its look-alikes, to be named
+LIKELIER_THAN_NOT = 0.5
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A set of mechanisms, with something smooth beside it or not; the logarithm of its weight."""
+
+    names: tuple[str, ...]
+    smooth: bool
+    log_weight: float
+
+
+@dataclass(frozen=True)
+class NamedMechanism:
+    """A mechanism that is named: probability of itself, and of any of the look-alikes `group`."""
+
+    name: str
+    probability: float
+    group: tuple[str, ...]
+    group_probability: float
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The verdict; probability that nothing is missing, and that something smooth without a name acts."""
+
+    verdict: Literal["nothing-missing", "named", "unknown"]
+    named: tuple[NamedMechanism, ...]
+    nothing_probability: float
+    smooth_probability: float
+
+
+def hypotheses_of(names: tuple[str, ...], alone: float, with_smooth: float) -> tuple[Hypothesis, Hypothesis]:
+    """Of a set by its log evidences, `alone` and with something smooth beside it."""
+    odds = float(np.log(PRIOR / (1.0 - PRIOR)))
+    own = len(names) * odds
+    return Hypothesis(names, False, alone + own), Hypothesis(names, True, with_smooth + own + odds)
+
+
+@dataclass(frozen=True)
+class Family:
+    """All hypotheses that are compared."""
+
+    hypotheses: Sequence[Hypothesis]
+
+    def probability(self, names: Collection[str]) -> float:
+        """That any of these mechanisms acts."""
+        return self._share([bool(set(names) & set(one.names)) for one in self.hypotheses])
+
+    def probability_of_set(self, names: tuple[str, ...]) -> float:
+        """That just these mechanisms act, with something smooth beside them or not."""
+        return self._share([one.names == names for one in self.hypotheses])
+
+    @property
+    def smooth(self) -> float:
+        """Probability that something smooth without a name acts."""
+        return self._share([one.smooth for one in self.hypotheses])
+
+    @property
+    def nothing(self) -> float:
+        """Probability that nothing is missing."""
+        return self._share([not one.names and not one.smooth for one in self.hypotheses])
+
+    def _share(self, among: Sequence[bool]) -> float:
+        logs = np.array([one.log_weight for one in self.hypotheses])
+        share = np.exp(logs - logs.max())
+        return float(share[np.array(among)].sum() / share.sum())
+
+
+def judge_family(family: Family, known: Mapping[str, Mechanism]) -> Judgement:
+    """Returns the verdict."""
+    alone = {name: family.probability([name]) for name in known}
+    named: list[NamedMechanism] = []
+    for name, probability in sorted(alone.items(), key=lambda item: -item[1]):
+        likelier = [one.name for one in named]
+        group = [other for other in known[name].group if other not in likelier]
+        together = family.probability(group)
+        likeliest = probability >= max(alone[other] for other in group)
+        if probability >= PROBABLE or (likeliest and together >= PROBABLE):
+            named.append(NamedMechanism(name, probability, known[name].group, together))
+    if named:
+        verdict: Literal["nothing-missing", "named", "unknown"] = "named"
+    else:
+        verdict = "unknown" if family.smooth > LIKELIER_THAN_NOT else "nothing-missing"
+    return Judgement(verdict, tuple(named), family.nothing, family.smooth)

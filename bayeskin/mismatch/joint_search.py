@@ -1,0 +1,310 @@
+"""Which mechanisms: a search in which the forward model solves all mechanisms of a set together.
+
+The search goes forward from the fit without any mechanism. A score test of every other mechanism beside the
+set at hand orders them. The most promising are fitted, each with all other parameters free again, and the
+likeliest is taken if its weight is larger. A mechanism with a shortcut for the force is tested, and its
+values are searched for, on the tangent of the set's last run. One that only the model can solve is tested by
+a few runs. Every set that is taken is fitted from other skins, too, since a missing mechanism leads the skin
+astray; then each of its mechanisms is left out in turn. A set's weight is its evidence times the prior of its
+mechanisms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import qmc
+
+from bayeskin.inference.gauss_newton import promise
+from bayeskin.mechanisms import Mechanism, with_one, without_one
+from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.mismatch.corrected import FullRun
+from bayeskin.mismatch.joint_fit import JointFit
+from bayeskin.mismatch.search import weight
+from bayeskin.mismatch.tangent import Tangent
+from bayeskin.types import Array, BinnedForce, ParameterSpace
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """Settings of a search.
+
+    skins : runs of the base model over its prior, from which fits set out
+    starts, first, best : fits of the base model from the nearest of these, their runs, and how many go on
+    probes : runs of each part of a mechanism that the model solves, and how far off neutral, of the prior
+    shortlist, promised : mechanisms that are fitted beside a set, and nats that each must promise
+    others, tried : skins that a set is run with, and how many of them it is fitted from
+    runs : of a fit; gain : nats of weight, less is no reason to go on; most : mechanisms of a set
+    """
+
+    skins: int = 32
+    starts: int = 4
+    first: int = 4
+    best: int = 2
+    probes: int = 3
+    off: float = 0.25
+    shortlist: int = 4
+    promised: float = 3.0
+    others: int = 24
+    tried: int = 3
+    runs: int = 9
+    gain: float = 1.0
+    most: int = 6
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Asks for the force of a set at values, by the forward model alone: (m,) or why it failed."""
+
+    names: tuple[str, ...]
+    theta: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Climb:
+    """Asks for the fit of a set from values, in so many runs at most."""
+
+    names: tuple[str, ...]
+    start: Mapping[str, float]
+    runs: int
+
+
+@dataclass(frozen=True)
+class Promise:
+    """Asks how many nats a mechanism with a shortcut for the force promises beside a fit, about its run."""
+
+    names: tuple[str, ...]
+    theta: Mapping[str, float]
+    run: FullRun
+    name: str
+
+
+@dataclass(frozen=True)
+class Join:
+    """Asks for the fit of a set with one such mechanism more, first searched for on the tangent of a run."""
+
+    names: tuple[str, ...]
+    theta: Mapping[str, float]
+    run: FullRun
+    name: str
+    runs: int
+
+
+Task = Probe | Climb | Promise | Join
+Ask = Callable[[Sequence[Task]], list[object]]  # answers in the order of the tasks
+Tell = Callable[[str], None]
+
+
+@dataclass
+class JointSearch:
+    """All sets fitted, by their names sorted: of each the likeliest fit."""
+
+    fits: dict[tuple[str, ...], JointFit] = field(default_factory=dict)
+
+    def add(self, found: object) -> None:
+        """Keeps a fit where it is the likeliest of its set; answers of another kind are failures."""
+        if isinstance(found, JointFit) and np.isfinite(found.fit.value):
+            names = found.fit.names
+            if names not in self.fits or weight(found.fit) > weight(self.fits[names].fit):
+                self.fits[names] = found
+
+    @property
+    def best(self) -> JointFit:
+        """The set with the largest weight."""
+        return max(self.fits.values(), key=lambda one: weight(one.fit))
+
+
+def search_jointly(
+    ask: Ask, binned: BinnedForce, base: ParameterSpace, known: Mapping[str, Mechanism],
+    noise: Mapping[str, float], seed: int, tell: Tell, settings: SearchSettings | None = None,
+) -> JointSearch:  # fmt: skip
+    """Returns the fits of all sets that a search comes by.
+
+    base : the base model's priors; noise : values of the noise's parameters to begin with
+    """
+    searcher = _Searcher(ask, binned, base, known, noise, seed, tell, settings or SearchSettings())
+    searcher.base()
+    searcher.forward()
+    return searcher.found
+
+
+class _Searcher:
+    def __init__(
+        self, ask: Ask, binned: BinnedForce, base: ParameterSpace, known: Mapping[str, Mechanism],
+        noise: Mapping[str, float], seed: int, tell: Tell, settings: SearchSettings,
+    ) -> None:  # fmt: skip
+        self.found = JointSearch()
+        self._ask, self._binned, self._base, self._known = ask, binned, base, known
+        self._noise, self._seed, self._tell, self._settings = noise, seed, tell, settings
+        self._neutral = {name: value for m in known.values() for name, value in m.neutral.items()}
+        self._skins: list[dict[str, float]] = []
+
+    def base(self) -> None:
+        """Fits the model without mechanisms."""
+        settings = self._settings
+        unit = qmc.Sobol(self._base.dim, rng=self._seed).random(settings.skins)
+        drawn = [dict(zip(self._base.names, map(float, row), strict=True))
+                 for row in self._base.from_unit(unit)]  # fmt: skip
+        self._skins = self._nearest((), [skin for skin in drawn if skin["E_s"] <= 2.0 * skin["E_c"]], {})
+        starts = [Climb((), {**self._noise, **skin}, settings.first)
+                  for skin in self._skins[: settings.starts]]  # fmt: skip
+        first = [one for one in self._ask(starts) if isinstance(one, JointFit)]
+        first.sort(key=lambda one: -one.fit.value)
+        for one in (*first, *self._ask([Climb((), one.fit.theta, settings.runs)
+                                        for one in first[: settings.best] if not one.settled])):  # fmt: skip
+            self.found.add(one)
+
+    def forward(self) -> None:
+        """Adds mechanisms to the set as long as that gains weight."""
+        current: JointFit | None = None
+        while current is not self.found.best and len(self.found.best.fit.names) < self._settings.most:
+            current = self.found.best
+            self._beside(current)
+            if self.found.best is current or self._gained(current) < self._settings.gain:
+                return
+            self._from_other_skins(self.found.best)
+            self._leaner(self.found.best)
+
+    def _gained(self, before: JointFit) -> float:
+        return weight(self.found.best.fit) - weight(before.fit)
+
+    def _nearest(
+        self, names: tuple[str, ...], skins: Sequence[Mapping[str, float]], values: Mapping[str, float]
+    ) -> list[dict[str, float]]:
+        """Skins, those whose force comes nearest to the recorded one first, each as stiff as suits it best.
+
+        With all moduli c times and all permeabilities 1/c times what they were the force is c times as large.
+        """
+        usable = np.isfinite(self._binned.force_n)
+        recorded, rows = self._binned.force_n[usable], []
+        answers = self._ask([Probe(names, {**values, **skin}) for skin in skins])
+        for skin, force_n in zip(skins, answers, strict=True):
+            if isinstance(force_n, str):
+                continue
+            force = np.asarray(force_n)[usable]
+            powers = {p.name: p.stress_power for p in self._base.parameters if p.stress_power}
+            least, most = self._room(skin, powers)
+            factor = float(np.clip(force @ recorded / (force @ force), least, most))
+            scaled = {name: value * factor ** powers.get(name, 0) for name, value in skin.items()}
+            rows.append((float(np.sum((recorded - factor * force) ** 2)), scaled))
+        return [skin for _, skin in sorted(rows, key=lambda row: row[0])]
+
+    def _room(self, skin: Mapping[str, float], powers: Mapping[str, int]) -> tuple[float, float]:
+        """Factors between which all scaled parameters stay within their priors."""
+        least, most = 0.0, np.inf
+        for p in self._base.parameters:
+            if power := powers.get(p.name, 0):
+                ends = sorted((end / skin[p.name]) ** (1.0 / power) for end in (p.lower, p.upper))
+                least, most = max(least, ends[0] * 1.001), min(most, ends[1] / 1.001)
+        return min(least, 1.0), max(most, 1.0)
+
+    def _beside(self, current: JointFit) -> None:
+        """Fits the sets with one mechanism more that promise most."""
+        names, settings = current.fit.names, self._settings
+        others = [name for name in self._known if name not in names]
+        solved = [name for name in others if isinstance(self._known[name].act, Tissue)]
+        quick = [name for name in others if name not in solved]
+        probes = [(name, values) for name in solved for values in self._probes(self._known[name])]
+        theta = {**self._neutral, **current.fit.theta}
+        tasks: list[Task] = [
+            Probe(with_one(names, name, self._known), {**theta, **values}) for name, values in probes
+        ]
+        answers = self._ask(
+            [*tasks, *(Promise(names, current.fit.theta, current.run, name) for name in quick)]
+        )
+        promised: dict[str, float] = {}
+        starts: dict[str, Mapping[str, float]] = {}
+        for (name, values), force_n in zip(probes, answers, strict=False):
+            if isinstance(force_n, str):
+                continue
+            gain, start = self._score(current, name, values, np.asarray(force_n))
+            if gain > promised.get(name, 0.0):
+                promised[name], starts[name] = gain, start
+        for name, nats in zip(quick, answers[len(probes) :], strict=True):
+            promised[name] = float(nats)  # type: ignore[arg-type]
+        order = sorted(promised, key=lambda name: -promised[name])
+        chosen = [name for name in order if promised[name] > settings.promised][: settings.shortlist]
+        self._tell("promised: " + ", ".join(f"{name} {promised[name]:.0f} nats" for name in order[:5]))
+        fits = self._ask([
+            Climb(with_one(names, name, self._known), starts[name], settings.runs) if name in starts
+            else Join(names, current.fit.theta, current.run, name, settings.runs)
+            for name in chosen
+        ])  # fmt: skip
+        for name, one in zip(chosen, fits, strict=True):
+            self.found.add(one)
+            gained = f"{weight(one.fit) - weight(current.fit):+.1f}" if isinstance(one, JointFit) else one
+            self._tell(f"{', '.join((*names, name))}: {gained}")
+
+    def _probes(self, mechanism: Mechanism) -> list[dict[str, float]]:
+        """Values of each part of a mechanism, at which the model is run."""
+        by_name, rows = {p.name: p for p in mechanism.parameters}, []
+        for strength, *shapes in mechanism.whole_or_parts:
+            space = ParameterSpace((by_name[strength],))
+            neutral = float(space.to_unit([mechanism.neutral[strength]])[0])
+            side = 1.0 if neutral <= 0.5 else -1.0
+            off = {strength: float(space.from_unit([neutral + side * self._settings.off])[0])}
+            if not shapes:
+                rows.append(off)
+                continue
+            others = ParameterSpace(tuple(by_name[name] for name in shapes))
+            unit = qmc.Halton(others.dim, scramble=False).random(self._settings.probes + 1)[1:]
+            rows += [{**off, **dict(zip(others.names, map(float, row), strict=True))}
+                     for row in others.from_unit(unit)]  # fmt: skip
+        return rows
+
+    def _score(
+        self, current: JointFit, name: str, values: Mapping[str, float], force_n: Array
+    ) -> tuple[float, dict[str, float]]:
+        """Nats that a mechanism promises along the change of force that a run shows, and where it would be.
+
+        The change of the skin's force counts as that of the reported one.
+        """
+        about, mechanism = current.fit.log_posterior, self._known[name]
+        low, high = about.bounds
+        vector = np.clip(about.vector(current.fit.theta), low, high)
+        skin = about.surrogate.space.names[: len(current.run.theta)]
+        here = _skin_force(current, np.array([current.fit.theta[one] for one in skin]))
+        mean = about.predict_mean(about.from_sampling(vector)) + (force_n - here)
+        free = np.full(len(vector), True)
+        ((_, gain, multiple, moved),) = promise(about, vector, vector[None], free, 1, mean)
+        strength = next(iter(values))
+        parameter = next(p for p in mechanism.parameters if p.name == strength)
+        neutral = mechanism.neutral[strength]
+        wanted = neutral + multiple * (values[strength] - neutral)
+        inside = float(np.clip(wanted, parameter.lower, parameter.upper))
+        if (inside - neutral) * (wanted - neutral) <= 0.0:  # the other way than its prior allows
+            return 0.0, {}
+        named = about.named(about.from_sampling(np.clip(moved, low, high)))
+        return gain, {**self._neutral, **named, **values, strength: inside}
+
+    def _from_other_skins(self, current: JointFit) -> None:
+        """Fits a set from other skins, with its mechanisms as they are."""
+        settings = self._settings
+        skins = self._nearest(current.fit.names, self._skins[: settings.others], current.fit.theta)
+        tasks = [Climb(current.fit.names, {**current.fit.theta, **skin}, settings.runs)
+                 for skin in skins[: settings.tried]]  # fmt: skip
+        for one in self._ask(tasks):
+            self.found.add(one)
+        self._tell(f"from other skins: {weight(self.found.best.fit) - weight(current.fit):+.1f}")
+
+    def _leaner(self, current: JointFit) -> None:
+        """Fits the sets with one mechanism fewer that were not fitted yet."""
+        names = current.fit.names
+        fewer = {without_one(names, name, self._known) for name in names} - {()}
+        tasks = [Climb(one, current.fit.theta, self._settings.runs)
+                 for one in sorted(fewer) if one not in self.found.fits]  # fmt: skip
+        for one in self._ask(tasks):
+            self.found.add(one)
+
+
+def _skin_force(found: JointFit, theta: Array) -> Array:
+    """Force (m,) of the skin about a fit's run."""
+    about = found.fit.log_posterior
+    space = ParameterSpace(about.surrogate.space.parameters[: len(found.run.theta)])
+    run: FullRun = found.run
+    assert run.slopes_n is not None
+    return Tangent(space, about.surrogate.edges_s, run.theta, run.force_n, run.slopes_n).predict_mean(theta)[
+        0
+    ]

@@ -1,0 +1,275 @@
+"""What a diagnosis by the reduced model works on: a recording, the model of its device, and tasks on them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import bayeskin
+from bayeskin.inference import LogPosterior
+from bayeskin.mechanisms import Mechanism, catalogue, with_one
+from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.mismatch.corrected import FullRun
+from bayeskin.mismatch.discretised import CALIBRATION, Discretised
+from bayeskin.mismatch.fit import (
+    fit,
+    instrument_noise,
+    promised,
+    restored,
+    soft_on_stiff,
+    stored,
+)
+from bayeskin.mismatch.full_fit import change
+from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, within
+from bayeskin.mismatch.joint_search import Ask, Climb, Join, Probe, Promise, Task
+from bayeskin.mismatch.observed import ObservedSurrogate
+from bayeskin.mismatch.tangent import Tangent
+from bayeskin.model.accuracy import mesh_error
+from bayeskin.model.simulate import ModelSpec
+from bayeskin.pipeline.folder import read_lines, sha256_of
+from bayeskin.pipeline.workbench import calm_bins
+from bayeskin.reduced.files import load_reduced
+from bayeskin.reduced.model import ReducedModel
+from bayeskin.reduced.simulate import simulate_reduced
+from bayeskin.types import Array, ParameterSpace, Surrogate
+from bayeskin.workers import Lost, standing
+
+BESIDE = 1e-4  # of the prior's width, by which derivatives are taken beside a neutral value
+UNKNOWN_MESH = 5e-3  # RMS error of bricks that no study was made of, over the force (docs/discretisation.md)
+TRUST = 0.15  # of the prior's width about a run, within which a mechanism is searched for on its tangent
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a bench is opened from.
+
+    recording : folder of a run's stage `recording`; model : file of the reduced model; base : priors of the
+    base model; noise : bounds of the noise's parameters that the configuration states
+    """
+
+    recording: Path
+    model: Path
+    seed: int
+    base: ParameterSpace
+    noise: tuple[tuple[str, tuple[float, float]], ...] = ()
+
+
+class JointBench:
+    """A recording's bins and protocol, the reduced model, and posteriors of sets about its runs."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.binned, self.jumps, self.motion = calm_bins(source.recording)
+        self.model: ReducedModel = load_reduced(source.model)
+        self.known: Mapping[str, Mechanism] = _trained(self.model)
+        self.base = source.base
+        self._seed = source.seed
+        self._noise = replace(instrument_noise(self.binned), **dict(source.noise))  # type: ignore[arg-type]
+        self._neutral = {name: value for m in self.known.values() for name, value in m.neutral.items()}
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Values of the noise's parameters to begin with: the middle of their priors."""
+        named = {}
+        for kind in sorted({phase.kind for phase in self.binned.phases}):
+            named[f"sd_{kind}"] = float(np.sqrt(np.prod(self._noise.sd_n)))
+        middle = (float(np.sqrt(np.prod(ends))) for ends in (self._noise.tau_s, self._noise.nu))
+        return {**named, **dict(zip(("tau_noise", "nu_noise"), middle, strict=True))}
+
+    def space(self, names: Sequence[str]) -> ParameterSpace:
+        """Parameters that the forward model solves for a set: the base's, then each mechanism's."""
+        own = tuple(p for m in self._solved(names) for p in m.parameters)
+        return ParameterSpace((*self.base.parameters, *own))
+
+    def force(self, names: Sequence[str], theta: Mapping[str, float]) -> Array | str:
+        """Force (m,) of the skin with a set at values, or why the run failed."""
+        found = self._run(names, theta, slopes=False)
+        return found if isinstance(found, str) else found.force_n
+
+    def reported(self, case: tuple[Sequence[str], Mapping[str, float]]) -> Array | str:
+        """Force (m,) as the instrument reports it, with a set at values."""
+        names, theta = case
+        run = self._run(names, theta, slopes=False)
+        if isinstance(run, str):
+            return run
+        flat = FullRun(run.theta, run.force_n, np.zeros((len(run.force_n), len(run.theta))))
+        seen = self._seen(names, (), flat)
+        return seen.predict_mean(np.array([theta[name] for name in seen.space.names]))[0]
+
+    def skin(self, names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
+        """A run with derivatives of a set at values, or why it failed."""
+        return self._run(names, theta, slopes=True)
+
+    def local(self, names: Sequence[str], run: FullRun) -> LogPosterior:
+        """The posterior of a set about a run of it."""
+        return self._posterior(self._seen(names, (), run))
+
+    def _run(self, names: Sequence[str], theta: Mapping[str, float], slopes: bool) -> FullRun | str:
+        mechanisms, space = self._solved(names), self.space(names)
+        at = np.array([theta[name] for name in space.names])
+        by = dict(zip(space.names, map(float, change(space, at)), strict=True))
+        values = dict(zip(space.names, map(float, at), strict=True))
+        if slopes:  # at its neutral value a law may not be there at all, and has no derivative
+            neutral = {name: value for m in mechanisms for name, value in m.neutral.items()}
+            values |= {
+                name: values[name] + BESIDE * by[name] for name in by if values[name] == neutral.get(name)
+            }
+        found = simulate_reduced(self.model, self.motion, values, mechanisms, by if slopes else None)
+        if found.status != "ok":
+            return found.message
+        force_n = found.bin_means(self.binned.edges_s)
+        if not slopes:
+            return FullRun(at, force_n, None)
+        slopes_n = found.gradient_bin_means(self.binned.edges_s)
+        aside = np.array([(values[name] - here) / by[name] for name, here in zip(by, at, strict=True)])
+        return FullRun(at, force_n - slopes_n @ aside, slopes_n)
+
+    def _solved(self, names: Sequence[str]) -> list[Mechanism]:
+        return [self.known[name] for name in sorted(names) if self.known[name].act.bind is not None]
+
+    def _seen(self, names: Sequence[str], more: Sequence[str], run: FullRun) -> Surrogate:
+        """The reported force about a run of a set, with `more` mechanisms by what they do to a force."""
+        assert run.slopes_n is not None
+        skin = Tangent(self.space(names), self.binned.edges_s, run.theta, run.force_n, run.slopes_n)
+        beyond = tuple(
+            self.known[name] for name in sorted({*names, *more})
+            if name in more or self.known[name].act.bind is None
+        )  # fmt: skip
+        return ObservedSurrogate(skin, beyond, self.motion) if beyond else skin
+
+    def _posterior(self, seen: Surrogate) -> LogPosterior:
+        spec = ModelSpec(refinement=self.model.refinement, geometry=self.model.trained.geometry)
+        known = mesh_error(spec.mesh_hash)
+        amplitude = float(np.hypot(UNKNOWN_MESH if known is None else known.rms, CALIBRATION))
+        return LogPosterior(
+            Discretised(seen, self.motion, amplitude),
+            self.binned,
+            None,
+            self._noise,
+            None,
+            None,
+            soft_on_stiff,
+        )
+
+    def done(self, task: Task) -> dict[str, Any]:
+        """The answer to a task, as JSON has it."""
+        if isinstance(task, Probe):
+            force = self.force(task.names, task.theta)
+            return {"message": force} if isinstance(force, str) else {"force_n": force.tolist()}
+        if isinstance(task, Promise):
+            return {"nats": self._promised(task)}
+        if isinstance(task, Join):
+            names = with_one(task.names, task.name, self.known)
+            start = {**self._neutral, **task.theta, **self._searched(task)}
+            return self._climbed(Climb(names, start, task.runs))
+        return self._climbed(task)
+
+    def _climbed(self, task: Climb) -> dict[str, Any]:
+        start = dict(task.start)
+        start["E_c"] = max(start["E_c"], start["E_s"] / 1.9)  # a stiffer subcutis is ruled out
+        found = fit_jointly(task.names, start, self.skin, self.local, TrustSettings(runs=task.runs))
+        return {"message": found} if isinstance(found, str) else as_json(found)
+
+    def _promised(self, task: Promise) -> float:
+        """Nats that a mechanism promises by what it does to a force."""
+        about, new = self._beside(task)
+        parts = [part for name in new for part in self.known[name].whole_or_parts]
+        return promised(about, task.theta, self._neutral, parts, self._seed)
+
+    def _searched(self, task: Join) -> Mapping[str, float]:
+        """Values of a set with a mechanism more, on the tangent of the run without it."""
+        about, new = self._beside(task)
+        vector = np.clip(about.vector({**self._neutral, **task.theta}), *about.bounds)
+        parts = [part for name in new for part in self.known[name].whole_or_parts]
+        near = within(about, vector, TRUST)
+        return fit((*task.names, *new), near, task.theta, self._neutral, self._seed, None, parts).theta
+
+    def _beside(self, task: Promise | Join) -> tuple[LogPosterior, list[str]]:
+        new = [name for name in with_one(task.names, task.name, self.known) if name not in task.names]
+        return self._posterior(self._seen(task.names, new, task.run)), new
+
+    def answered(self, task: Task, said: Mapping[str, Any]) -> object:
+        """What a search makes of an answer."""
+        if "message" in said:
+            return said["message"]
+        if isinstance(task, Probe):
+            return np.array(said["force_n"])
+        if isinstance(task, Promise):
+            return said["nats"]
+        run = FullRun(*(np.array(said["run"][name]) for name in ("theta", "force_n", "slopes_n")))
+        about = self.local(said["fit"]["names"], run)
+        return JointFit(restored(said["fit"], about), run, said["runs"], said["settled"])
+
+
+def as_json(found: JointFit) -> dict[str, Any]:
+    """A joint fit, as `JointBench.answered` reads it."""
+    assert found.run.slopes_n is not None
+    run = {
+        "theta": found.run.theta.tolist(), "force_n": found.run.force_n.tolist(),
+        "slopes_n": found.run.slopes_n.tolist(),
+    }  # fmt: skip
+    return {"fit": stored(found.fit), "run": run, "runs": found.runs, "settled": found.settled}
+
+
+def _trained(model: ReducedModel) -> dict[str, Mechanism]:
+    """Mechanisms of the catalogue that a reduced model can run, or that act on the force."""
+    known = {
+        name: m for name, m in catalogue().items()
+        if name in model.trained.mechanisms or not isinstance(m.act, Tissue)
+    }  # fmt: skip
+    return {name: m for name, m in known.items() if set(m.needs) <= set(known)}
+
+
+@dataclass(frozen=True)
+class _Worker:
+    """Answers tasks in a process of its own, whose bench stays from one to the next."""
+
+    source: Source
+
+    def __call__(self, task: Task) -> dict[str, Any]:
+        return _bench(self.source).done(task)
+
+
+@lru_cache(maxsize=1)
+def _bench(source: Source) -> JointBench:
+    return JointBench(source)
+
+
+@contextmanager
+def asked(bench: JointBench, file: Path, workers: int) -> Iterator[Ask]:
+    """Yields what answers tasks, in so many processes; answers are kept in a file, and found there again.
+
+    Raises InputError for a file that holds something else.
+    """
+    kept = {row["task"]: row["answer"] for row in read_lines(file)}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with standing(_Worker(bench.source), workers) as run_all, open(file, "a", encoding="utf-8") as handle:
+
+        def ask(tasks: Sequence[Task]) -> list[object]:
+            keys = [sha256_of([type(task).__name__, asdict(task)]) for task in tasks]
+            new = [i for i, key in enumerate(keys) if key not in kept]
+            for i, answer in run_all([tasks[i] for i in new]):
+                said = {"message": answer.reason} if isinstance(answer, Lost) else answer
+                kept[keys[new[i]]] = said
+                handle.write(json.dumps({"task": keys[new[i]], "answer": said}) + "\n")
+                handle.flush()
+            return [bench.answered(task, kept[key]) for task, key in zip(tasks, keys, strict=True)]
+
+        yield ask
+
+
+def searches_file(run_folder: Path, bench: JointBench) -> Path:
+    """Where answers to a bench's tasks are kept, by what they are of."""
+    identity = [
+        bayeskin.__version__, bench.source.seed, repr(bench.source.base), bench.source.noise,
+        bench.model.hash, asdict(bench.binned), asdict(bench.motion),
+        [repr(m.parameters) for m in bench.known.values()],
+    ]  # fmt: skip
+    return run_folder / "searches" / f"{sha256_of(identity)[:16]}-joint.jsonl"

@@ -1,0 +1,229 @@
+"""What the model leaves out of a recording of any protocol and device, by the reduced model."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from bayeskin import inference
+from bayeskin.config import parameter_space
+from bayeskin.inference.noise_model import bins_in_windows
+from bayeskin.mismatch.contributions import contributions
+from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
+from bayeskin.mismatch.fit import Fit
+from bayeskin.mismatch.form import propose_form
+from bayeskin.mismatch.hypotheses import Family, Judgement, hypotheses_of, judge_family
+from bayeskin.mismatch.joint_fit import JointFit
+from bayeskin.mismatch.joint_search import JointSearch, search_jointly
+from bayeskin.mismatch.locate import Located, locate
+from bayeskin.mismatch.search import Made, Search, weight
+from bayeskin.pipeline.diagnosis_outputs import Found, Shown, candidates, draw, unexplained, window
+from bayeskin.pipeline.engine import Run, Stage
+from bayeskin.pipeline.folder import write_json
+from bayeskin.pipeline.joint_bench import JointBench, Source, asked, searches_file
+from bayeskin.pipeline.model import check_protocol, model_spec, reduced_files
+from bayeskin.pipeline.provenance import caption
+from bayeskin.pipeline.reported import FullForce
+from bayeskin.pipeline.taking_up import Remainder
+from bayeskin.types import Array
+
+WEIGHED = 6  # sets, the likeliest and that without mechanisms, whose hypotheses are compared
+DRAWS = 2000  # of Laplace's Gaussian, for intervals and bands
+NAME = "diagnose"
+
+
+def _work(run: Run) -> Mapping[str, Any]:
+    started, seed = time.monotonic(), run.config.seed
+    (model,) = reduced_files(run)
+    stated = tuple((name, bounds) for name, bounds in run.config.noise if bounds is not None)
+    source = Source(
+        run.folder / "recording", model, seed, parameter_space(run.config, run.config_path), stated
+    )
+    bench = JointBench(source)
+    check_protocol(run, bench.motion)
+    tell = partial(_tell, run)
+    with asked(bench, searches_file(run.folder, bench), run.config.design.workers) as ask:
+        found = search_jointly(ask, bench.binned, bench.base, bench.known, bench.noise, seed, tell)
+    weighed = _weighed(found)
+    left = {names: discrepancy(found.fits[names].fit, bench.motion) for names in weighed}
+    family = Family([
+        one for names in weighed
+        for one in hypotheses_of(names, left[names].without_log_evidence, left[names].log_evidence)
+    ])  # fmt: skip
+    judged = judge_family(family, bench.known)
+    best = max(weighed, key=lambda names: family.probability_of_set(names))
+    noise = found.fits[best].fit.theta
+    base, chosen = found.fits[()].fit, found.fits[best].fit
+    before, after = (locate(fit, {**fit.theta, **_noise_of(fit, noise)}, seed) for fit in (base, chosen))
+    parts = contributions(best, chosen.theta, bench.reported, bench.known)
+    remainder = None
+    if judged.verdict == "unknown" or (judged.named and after.windows):
+        remainder = Remainder(left[best], propose_form(chosen, bench.motion, seed))
+    tried = _as_search(found)
+    answer: dict[str, Any] = {
+        "verdict": judged.verdict,
+        "nothing_probability": judged.nothing_probability,
+        "unknown_probability": judged.smooth_probability,
+        "located": [window(one) for one in before.windows],
+        "remaining": [window(one) for one in after.windows],
+        "mechanisms": _mechanisms(judged, chosen, bench, {part.name: part.size_n for part in parts}),
+        "unexplained": None if remainder is None else unexplained(remainder),
+        "candidates": candidates(tried, bench.known),
+        "sets": [_set(names, found, left, family) for names in weighed],
+        "fit": {
+            "before": _fit(bench, base), "after": _fit(bench, chosen),
+        },
+        "best_set": list(best),
+        "full_model": _checked(run, bench, chosen),
+        "seconds": time.monotonic() - started,
+    }  # fmt: skip
+    write_json(run.at(NAME, "diagnosis.json"), answer)
+    figures = draw(
+        run.folder / NAME, caption(run), bench.binned, bench.motion,
+        Found(_shown(base, before), _shown(chosen, after), None, bench.base.parameters, parts, remainder),
+        answer["candidates"],
+    )  # fmt: skip
+    return {**answer, "figures": [figure.name for figure in figures]}
+
+
+def _tell(run: Run, text: str) -> None:
+    run.reporter.log(f"search: {text}")
+
+
+def _weighed(found: JointSearch) -> list[tuple[str, ...]]:
+    """Names of the sets whose hypotheses are compared."""
+    order = sorted(found.fits, key=lambda names: -weight(found.fits[names].fit))
+    return [*[names for names in order if names][: WEIGHED - 1], ()]
+
+
+def _as_search(found: JointSearch) -> Search:
+    whole = Search()
+    for one in found.fits.values():
+        whole.add(Made(one.fit, True))
+    return whole
+
+
+def _noise_of(fit: Fit, values: Mapping[str, float]) -> dict[str, float]:
+    """Values of the noise's parameters among others'."""
+    space = fit.log_posterior.surrogate.space.names
+    return {name: values[name] for name in fit.log_posterior.names if name not in space}
+
+
+def _mechanisms(
+    judged: Judgement, chosen: Fit, bench: JointBench, sizes: Mapping[str, float]
+) -> list[dict[str, Any]]:
+    rows = []
+    values = _summaries(chosen)
+    for one in judged.named:
+        known = bench.known[one.name]
+        rows.append({
+            "name": one.name, "probability": one.probability, "group": list(one.group),
+            "group_probability": one.group_probability, "contribution_n": sizes.get(one.name),
+            "parameters": {p.name: {**values[p.name], "unit": p.unit}
+                           for p in known.parameters if p.name in values},
+            "statement": known.statement({**known.neutral, **chosen.theta}),
+        })  # fmt: skip
+    return rows
+
+
+def _summaries(fit: Fit) -> dict[str, dict[str, Any]]:
+    """Of each parameter mean, sd and the ends of the 90 % interval, by draws of Laplace's Gaussian."""
+    draws = fit.draws(DRAWS, 1)
+    low, high = np.quantile(draws, [0.05, 0.95], axis=0)
+    rows = zip(fit.log_posterior.names, draws.mean(axis=0), draws.std(axis=0), low, high, strict=True)
+    return {name: {"mean": float(mean), "sd": float(sd), "interval90": [float(a), float(b)]}
+            for name, mean, sd, a, b in rows}  # fmt: skip
+
+
+def _set(
+    names: tuple[str, ...], found: JointSearch, left: Mapping[tuple[str, ...], Discrepancy], family: Family
+) -> dict[str, Any]:
+    one: JointFit = found.fits[names]
+    return {
+        "mechanisms": list(names), "probability": family.probability_of_set(names),
+        "log_evidence": one.fit.log_evidence, "log_evidence_alone": left[names].without_log_evidence,
+        "log_evidence_with_smooth": left[names].log_evidence, "settled": one.settled, "runs": one.runs,
+    }  # fmt: skip
+
+
+def _fit(bench: JointBench, fit: Fit) -> dict[str, Any]:
+    binned = bench.binned
+    usable = bins_in_windows(binned, None) >= 0
+    return {
+        "rmse": _rms((binned.force_n - fit.force_n)[usable]),
+        "rmse_of_mean": _rms((binned.force_n - fit.mean_n)[usable]),
+        "rmse_by_phase": dict(inference.rmse(binned, fit.force_n).by_kind_n),
+        "coverage90": inference.coverage(binned, *_band(fit)),
+        "log_evidence": fit.log_evidence,
+        "theta": _summaries(fit),
+    }
+
+
+def _band(fit: Fit) -> tuple[Array, Array]:
+    rng = np.random.default_rng(1)
+    return inference.bands(fit.log_posterior, fit.draws(300, 1), rng).interval(0.9)
+
+
+def _shown(fit: Fit, located: Located) -> Shown:
+    return Shown(fit.force_n, _band(fit), None, located, _summaries(fit))
+
+
+def _checked(run: Run, bench: JointBench, chosen: Fit) -> dict[str, Any]:
+    """One run of the full model with the best set at its values, beside the reduced model's."""
+    full = FullForce(model_spec(run), bench.motion, bench.binned.edges_s)((chosen.names, chosen.theta))
+    reduced = bench.reported((chosen.names, chosen.theta))
+    if isinstance(full, str) or isinstance(reduced, str):
+        return {"message": full if isinstance(full, str) else str(reduced)}
+    usable = bins_in_windows(bench.binned, None) >= 0
+    return {
+        "reduced_off_by": _rms((full - reduced)[usable]),
+        "rmse": _rms((bench.binned.force_n - full)[usable]),
+    }
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def in_words(answer: Mapping[str, Any]) -> str:
+    """The answer as text."""
+    lines = [f"verdict: {answer['verdict']}"]
+    lines += [f"  {one['name']} (probability {one['probability']:.2f}): {one['statement']}"
+              for one in answer["mechanisms"]]  # fmt: skip
+    lines.append(f"  nothing is missing: probability {answer['nothing_probability']:.2f}")
+    lines.append(
+        f"  something smooth that is not in the catalogue: probability {answer['unknown_probability']:.2f}"
+    )
+    lines.append(
+        f"The model leaves the recording in {len(answer['located'])} windows, "
+        f"and in {len(answer['remaining'])} with {', '.join(answer['best_set']) or 'no mechanism'}."
+    )
+    for when in ("before", "after"):
+        lines.append(f"{when}: RMSE {1e3 * answer['fit'][when]['rmse']:.1f} mN")
+    full = answer["full_model"]
+    if "message" in full:
+        lines.append(f"The full model fails at the best values: {full['message']}")
+    else:
+        lines.append(
+            f"A run of the full model at the best values: RMSE {1e3 * full['rmse']:.1f} mN; "
+            f"the reduced model is off by {1e3 * full['reduced_off_by']:.2f} mN there."
+        )
+    best = ", ".join(f"{one['name']} {one['delta_score']:+.1f}" for one in answer["candidates"][:5])
+    if best:
+        lines.append(f"log evidence that single mechanisms gain: {best}")
+    lines.append(f"outputs in {answer['folder']}")
+    return "\n".join(lines)
+
+
+STAGE = Stage(
+    NAME,
+    "finds what the model leaves out",
+    ("recording",),
+    ("seed", "model", "parameters", "noise", "design"),
+    _work,
+    reduced_files,
+)
