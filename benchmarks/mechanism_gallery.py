@@ -33,8 +33,10 @@ MOTION = PadMotion(healthy_skin.HEALTHY_SKIN.time_s[:8], healthy_skin.HEALTHY_SK
 BASE = healthy_skin.POINTS["A"]
 TIMES_S = np.arange(0.0, MOTION.time_s[-1], 0.25)
 SHOWN = {  # values at which the effect is seen
+    "amplifier-lag": {"amplifier_time": 1.0},
     "backlash": {"gap": 3e-4, "frame_compliance": 1e-3},
     "bottom-adherence": {"adherence": 1e7},
+    "cell-nonlinearity": {"cell_bend": 0.2},
     "clock-delay": {"delay": 1.0},
     "device-friction": {"Fc": 0.03, "presliding": 5e-5, "friction_start": 0.0},
     "fibre-anisotropy": {"langer_ratio": 2.0, "langer_angle": 0.0},
@@ -42,6 +44,7 @@ SHOWN = {  # values at which the effect is seen
     "force-offset": {"F0": -0.03},
     "friction-creep": {"friction_tau": 20.0},
     "pad-slip": {"slip_rate": 2e-4, "slip_threshold": 0.1},
+    "periodic-motion": {"motion_amplitude": 5e-3, "motion_period": 4.0, "motion_share": 0.05},
     "position-ripple": {"ripple_period": 1e-3, "ripple_amplitude": 0.015, "ripple_phase": 0.0},
     "plastic-set": {"set_share": 0.3, "yield_stretch": 1.1},
     "pre-stretch": {"opening": 0.1},

@@ -356,7 +356,7 @@ def test_a_simulation_that_fails_exits_with_1_and_writes_nothing(
         (["--observation", "article", "--mesh", "bricks"], "gmsh"),
         (["--observation", "power"], "--observation"),
         (["--depth", "3"], "--depth"),
-        (["--mechanism", "magnet"], "one of backlash, bottom-adherence"),
+        (["--mechanism", "magnet"], "one of amplifier-lag, backlash, bottom-adherence"),
         (["--mechanism", "device-friction", "--set", "presliding=0"], "finite positive"),
         (["--mechanism", "force-offset", "--set", "F0=inf"], "a finite number"),
         (["--set", "F0=0.1"], "F0"),

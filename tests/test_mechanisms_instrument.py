@@ -31,6 +31,16 @@ def skin(time_s: np.ndarray) -> np.ndarray:
     return np.atleast_2d(40.0 * MOTION.at(time_s) * (1.0 + 20.0 * MOTION.at(time_s)))
 
 
+def nothing(time_s: np.ndarray) -> np.ndarray:
+    """No force, one row."""
+    return np.zeros((1, np.shape(time_s)[-1]))
+
+
+def straight(time_s: np.ndarray) -> np.ndarray:
+    """A force in proportion to the displacement, one row."""
+    return np.atleast_2d(50.0 * MOTION.at(time_s))
+
+
 def values_of(*names: str, **chosen: float) -> dict[str, np.ndarray]:
     """Parameters of mechanisms at the middle of their priors, but for those chosen; one sample."""
     space = ParameterSpace(tuple(p for name in names for p in ALL[name].parameters))
@@ -52,7 +62,9 @@ def test_a_neutral_mechanism_changes_nothing(name):
     np.testing.assert_allclose(force, np.repeat(skin(TIMES_S), len(force), axis=0), rtol=0, atol=1e-15)
 
 
-OFF_NEUTRAL = {"F0": 0.03, "drift": 1e-4, "delay": 0.3, "event_1_step": 0.02, "friction_start": 0.5}
+OFF_NEUTRAL = {
+    "F0": 0.03, "drift": 1e-4, "delay": 0.3, "event_1_step": 0.02, "friction_start": 0.5, "cell_bend": 0.1,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -144,7 +156,7 @@ def test_bins_mean_a_ripple_over_all_its_cycles(period):
     chosen = {"ripple_period": period, "ripple_amplitude": 0.01, "ripple_phase": 0.3}
     edges_s = np.arange(5.0, 15.0)
     values = values_of("position-ripple", **chosen)
-    force = observed([ALL["position-ripple"]], values, MOTION, lambda t: np.zeros((1, np.shape(t)[-1])))
+    force = observed([ALL["position-ripple"]], values, MOTION, nothing)
     found = bin_means(force, MOTION, edges_s, [ALL["position-ripple"]])[0]
     phase = 2 * np.pi * MOTION.at(edges_s) / period + 0.3
     expected = -0.01 * np.diff(np.cos(phase)) / np.diff(phase)
@@ -159,6 +171,82 @@ def test_a_delayed_force_is_that_of_before():
     both = reported("clock-delay", "viscous-drag", delay=0.45, drag=20.0) + skin(TIMES_S)[0]
     drag = reported("viscous-drag", drag=20.0, time_s=np.maximum(before_s, 0.0))
     np.testing.assert_allclose(both[kept], (late + drag)[kept], atol=1e-12)  # the clock comes last
+
+
+@pytest.mark.parametrize("tau", [1e-4, 0.01, 0.3, 2.0, 500.0])
+@pytest.mark.parametrize("every_s", [0.004, 0.07, 3.1])
+def test_a_lagging_amplifier_solves_its_equation_for_straight_stretches(tau, every_s):
+    """The response of a first-order filter to each stretch, whatever its grid and the times asked for."""
+    time_s = np.arange(0.0, 130.0, every_s)
+    force = observed([ALL["amplifier-lag"]], {"amplifier_time": np.array([tau])}, MOTION, straight)
+    expected, lag = straight(time_s)[0], 0.0
+    for start_s, end_s in zip(MOTION.time_s[:-1], MOTION.time_s[1:], strict=True):
+        slope = float(np.diff(straight(np.array([start_s, end_s])))[0, 0] / (end_s - start_s))
+        here = (time_s >= start_s) & (time_s < end_s)
+        expected[here] += -tau * slope + (lag + tau * slope) * np.exp(-(time_s[here] - start_s) / tau)
+        lag = -tau * slope + (lag + tau * slope) * np.exp(-(end_s - start_s) / tau)
+    np.testing.assert_allclose(force(time_s)[0], expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("tau", [0.01, 0.04, 0.2])
+def test_a_jump_passes_a_lagging_amplifier_exponentially_and_bins_mean_that(tau):
+    values = values_of("amplifier-lag", "viscous-drag", amplifier_time=tau, drag=20.0)
+    both = [ALL["amplifier-lag"], ALL["viscous-drag"]]
+    force = observed(both, values, MOTION, nothing)
+    after_s = np.array([0.0, 0.003, 0.01, 0.1, 0.7])
+    np.testing.assert_allclose(force(5.0 + after_s)[0], -0.02 * np.expm1(-after_s / tau), atol=1e-6)
+    edges_s = np.array([4.5, 5.0, 5.5, 6.0, 8.0])
+    ends = np.maximum(edges_s - 5.0, 0.0)
+    expected = 0.02 * np.diff(ends + tau * np.exp(-ends / tau)) / np.diff(edges_s)
+    np.testing.assert_allclose(bin_means(force, MOTION, edges_s, both)[0], expected, atol=2e-5)
+
+
+def test_the_amplifier_smooths_steps_of_the_cell_s_zero():
+    after_s = np.array([0.3, 0.8])
+    found = reported(
+        "amplifier-lag", "sensor-events", time_s=65.0 + after_s,
+        amplifier_time=0.5, event_1_at=0.5, event_1_step=0.03, event_2_step=0.0,
+    ) - reported("amplifier-lag", time_s=65.0 + after_s, amplifier_time=0.5)  # fmt: skip
+    np.testing.assert_allclose(found, -0.03 * np.expm1(-after_s / 0.5), atol=1e-6)
+
+
+def test_a_bent_cell_adds_the_square_of_the_force_that_acts_on_it():
+    found = reported("cell-nonlinearity", "force-offset", cell_bend=-0.3, F0=0.04)
+    np.testing.assert_allclose(found, 0.04 - 0.3 * skin(TIMES_S)[0] ** 2, atol=1e-15)
+    force = observed([ALL["cell-nonlinearity"]], {"cell_bend": np.array([0.4])}, MOTION, straight)
+    edges_s = np.arange(5.0, 14.0)
+    ends = straight(edges_s)[0]
+    expected = np.diff(ends**2 / 2 + 0.4 * ends**3 / 3) / np.diff(ends)
+    np.testing.assert_allclose(bin_means(force, MOTION, edges_s)[0], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("period", [0.6, 0.83, 4.0, 8.0])
+@pytest.mark.parametrize("bin_s", [0.5, 2.35])
+def test_bins_mean_a_moving_arm_over_all_its_cycles(period, bin_s):
+    """The integral of (a + s F) sin in closed form, over even loading and at rest."""
+    moving = ALL["periodic-motion"]
+    chosen = {"motion_amplitude": 0.02, "motion_share": 0.05, "motion_period": period, "motion_phase": 0.3}
+    values = {name: np.array([value]) for name, value in chosen.items()}
+    force = observed([moving], values, MOTION, straight)
+    rate = 2 * np.pi / period
+    np.testing.assert_allclose(
+        force(TIMES_S), straight(TIMES_S) * (1 + 0.05 * np.sin(rate * TIMES_S + 0.3))
+        + 0.02 * np.sin(rate * TIMES_S + 0.3), atol=1e-15,
+    )  # fmt: skip
+    for edges_s in (np.arange(5.0, 14.4, bin_s), np.arange(14.4, 45.0, bin_s)):
+        at, pull = rate * edges_s + 0.3, straight(edges_s)[0]
+        slope = (pull[-1] - pull[0]) / (edges_s[-1] - edges_s[0])
+        swung = -(0.02 + 0.05 * pull) * np.cos(at) / rate + 0.05 * slope * np.sin(at) / rate**2
+        expected = (np.diff(swung) / np.diff(edges_s)) + 0.5 * (pull[1:] + pull[:-1])
+        np.testing.assert_allclose(bin_means(force, MOTION, edges_s, [moving])[0], expected, atol=6e-5)
+
+
+def test_the_arm_swings_the_skin_s_force_and_not_the_drive_s():
+    chosen = {"motion_amplitude": 0.0, "motion_share": 0.1, "motion_period": 4.0}
+    rubbing = {"Fc": 0.05, "presliding": 2e-5, "friction_start": 0.5}
+    both = reported("device-friction", "periodic-motion", **chosen, **rubbing)
+    apart = reported("periodic-motion", **chosen) + reported("device-friction", **rubbing)
+    np.testing.assert_allclose(both, apart, atol=1e-15)
 
 
 def test_events_are_refuted_where_samples_show_no_step():

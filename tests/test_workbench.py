@@ -20,7 +20,7 @@ from bayeskin.proof.cases import shipped_screen
 from bayeskin.proof.protocol import MOTION, SURROGATE
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import effects_beside, effects_in, load_effect
-from bayeskin.types import BinnedForce
+from bayeskin.types import BinnedForce, Jumps
 
 KNOWN = {"force-offset": catalogue()["force-offset"]}
 
@@ -96,3 +96,17 @@ def test_what_was_learnt_of_a_mechanism_stands_in_its_shortcut_s_place() -> None
     assert parts(relaxing, "pad-slip") == (
         ["force-offset"], ["g_1", "tau_1", "slip_rate", "slip_threshold"]
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("smoother", [None, "amplifier-lag", "clock-delay"])
+def test_samples_refute_no_step_beside_what_smooths_or_shifts_it(smoother: str | None) -> None:
+    names = ("sensor-events",) if smoother is None else ("sensor-events", smoother)
+    binned = binned_force()
+    known = {name: catalogue()[name] for name in names}
+    none = Jumps(binned.edges_s, *np.zeros((2, len(binned.edges_s))))
+    plain = bench(binned)
+    made = dataclasses.replace(plain, jumps=none, known=known)
+    theta = {name: value for one in known.values() for name, value in one.neutral.items()}
+    theta |= {"event_1_step": 0.03}
+    found: Any = SimpleNamespace(names=names, theta=theta, log_posterior=plain.posterior(None, []))
+    assert made.refuted(found) == ([] if smoother else ["sensor-events"])

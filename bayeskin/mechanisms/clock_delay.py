@@ -22,6 +22,6 @@ MECHANISM = Mechanism(
         f"The force is stamped {1e3 * abs(v['delay']):.0f} ms {'late' if v['delay'] > 0 else 'early'} "
         "beside the displacement."
     ),
-    group=("clock-delay",),
+    group=("clock-delay", "amplifier-lag"),
     act=Instrument(Place.CLOCK, observe, adds=False),
 )

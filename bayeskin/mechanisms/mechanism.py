@@ -23,15 +23,18 @@ ForceOfTime = Callable[[Array], Array]  # times (t,) or (n, t) [s] to forces (n,
 Observe = Callable[[Values, PadMotion, ForceOfTime], ForceOfTime]
 Refuted = Callable[[Values, PadMotion, Jumps], NDArray[np.bool_]]
 GAUSS_POINTS = 4  # between neighbouring edges, corners and repeats
+SETTLING = np.array([3.0, 12.0])  # time constants after a corner at which bins are cut
 
 
 class Place(IntEnum):
     """Where in the instrument a mechanism acts, from the skin outward; it sees what those before it made."""
 
     PADS = 0
-    DRIVE = 1
-    CELL = 2
-    CLOCK = 3
+    ARM = 1  # under the pads; what these lose goes by the force without its swings
+    DRIVE = 2
+    CELL = 3
+    AMPLIFIER = 4
+    CLOCK = 5
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,9 @@ class Instrument:
     adds : whether what it adds to a force does not depend on that force
     refuted : which values the samples of a recording speak against, by what they allow of jumps; None where
         they cannot
-    repeats_m : the shortest travel [m] after which what it does comes again, infinite where nothing does
+    repeats_m, repeats_s : the shortest travel [m], or time [s], after which what it does comes again,
+        infinite where nothing does
+    settles_s : the shortest time constant [s] with which its response to a corner fades, infinite without any
     """
 
     place: Place
@@ -52,6 +57,8 @@ class Instrument:
     adds: bool = True
     refuted: Refuted | None = None
     repeats_m: float = np.inf
+    repeats_s: float = np.inf
+    settles_s: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -138,15 +145,18 @@ def added(force: ForceOfTime, more: ForceOfTime) -> ForceOfTime:
 class Bins:
     """Means of forces over the bins between edges_s (m+1,), exact to high order between corners.
 
-    Of forces that `mechanisms` made, whatever repeats over the travel is followed too.
+    Of forces that `mechanisms` made, whatever repeats over the travel or time, or settles after a corner, is
+    followed too.
     """
 
     def __init__(self, motion: PadMotion, edges_s: Array, mechanisms: Iterable[Mechanism] = ()) -> None:
-        inside = motion.time_s[(motion.time_s > edges_s[0]) & (motion.time_s < edges_s[-1])]
-        repeats_m = min(
-            (m.act.repeats_m for m in mechanisms if isinstance(m.act, Instrument)), default=np.inf
-        )
-        cuts = _no_longer(np.union1d(edges_s, inside), motion, repeats_m)
+        acts = [m.act for m in mechanisms if isinstance(m.act, Instrument)]
+        settles_s = min((act.settles_s for act in acts), default=np.inf)
+        repeats_m = min((act.repeats_m for act in acts), default=np.inf)
+        repeats_s = min((act.repeats_s for act in acts), default=np.inf)
+        inside = np.union1d(motion.time_s, motion.time_s[:, None] + settles_s * SETTLING)
+        inside = inside[(inside > edges_s[0]) & (inside < edges_s[-1])]
+        cuts = _no_longer(np.union1d(edges_s, inside), motion, repeats_m, repeats_s)
         abscissa, weight = np.polynomial.legendre.leggauss(GAUSS_POINTS)
         self._width, self._weight, self._lasts_s = np.diff(cuts), 0.5 * weight, np.diff(edges_s)
         self._time_s = (cuts[:-1, None] + 0.5 * self._width[:, None] * (1.0 + abscissa)).ravel()
@@ -168,8 +178,10 @@ def bin_means(
     return Bins(motion, edges_s, mechanisms).means(force)
 
 
-def _no_longer(cuts: Array, motion: PadMotion, travel_m: float) -> Array:
-    """Times between which the pads move by `travel_m` or less, those of `cuts` among them."""
-    parts = np.ceil(np.abs(np.diff(motion.at(cuts))) / travel_m).astype(int).clip(1)
+def _no_longer(cuts: Array, motion: PadMotion, travel_m: float, lasts_s: float) -> Array:
+    """Times between which the pads move by `travel_m` or less and `lasts_s` pass or less, those of `cuts`
+    among them."""
+    longest = np.maximum(np.abs(np.diff(motion.at(cuts))) / travel_m, np.diff(cuts) / lasts_s)
+    parts = np.ceil(longest).astype(int).clip(1)
     pieces = zip(cuts[:-1], cuts[1:], parts, strict=True)
     return np.append(np.concatenate([np.linspace(a, b, n, endpoint=False) for a, b, n in pieces]), cuts[-1])

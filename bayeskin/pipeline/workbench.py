@@ -67,10 +67,11 @@ class Workbench:
         return frozenset(name for effect in self.effects for name in effect.mechanisms)
 
     def refuted(self, found: Fit) -> list[str]:
-        """Mechanisms of a fit that the samples it is of speak against; none beside a clock that is off."""
+        """Mechanisms of a fit that the samples it is of speak against; none beside an amplifier that smooths,
+        or a clock that is off."""
         acts = {name: self.known[name].act for name in found.names}
         instrument = {name: act for name, act in acts.items() if isinstance(act, Instrument)}
-        if any(act.place is Place.CLOCK for act in instrument.values()):
+        if any(act.place >= Place.AMPLIFIER for act in instrument.values()):
             return []
         values = {name: np.array([value]) for name, value in found.theta.items()}
         jumps = self.jumps.until(self.binned.edges_s[found.log_posterior.chain.bins[-1] + 1])

@@ -1,7 +1,7 @@
 """Effects that no mechanism of the catalogue was when the sets were made, from the full model.
 
-They are for the proof alone. Poisson's ratios, moduli that change evenly or within a minute, and a plastic
-set are in the catalogue since, the last in another form.
+They are for the proof alone. Poisson's ratios, moduli that change evenly or within a minute, breathing, a
+bent cell, a slow amplifier and a plastic set are in the catalogue since, the last in another form.
 
 Each has one strength, drawn log-uniformly between two bounds, and says what it changes: constants or layers
 of the skin, the arm, the solid's law over time or strain, the motion that the skin sees, or the force.

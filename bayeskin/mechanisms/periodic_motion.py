@@ -1,0 +1,60 @@
+"""Breathing or the pulse moves the arm under the device.
+
+    F + (a + s F) sin(2 pi t / T + phi)
+
+A small displacement to and fro changes the force by the skin's stiffness, and that of soft tissue grows in
+proportion to its force, dF/du = A (F + B) (Fung, Am. J. Physiol. 213 (1967), 1532-1544): hence a part of the
+amplitude that is there without force and one that goes with it. An arm that turns or swells under the pads
+changes the pull by a share of itself, which is s too.
+
+At rest adults breathe 12 to 20 times a minute (Chourpiliadis & Bhardwaj, Physiology, Respiratory Rate,
+StatPearls 2022); hearts beat 50 to 90 times (Nanchen, Heart 104 (2018), 1048). Amplitudes are chosen for
+this test: 30 mN are a displacement of 0.6 mm at 50 mN/mm. The period is the same throughout, as in paced
+breathing; free breathing falls out of step after some breaths. Means over bins of a width h do not tell a
+period T from 1 / (1 / h - 1 / T): with 0.5 s a pulse of 0.8 s looks like a smaller swing of 1.3 s.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values
+from bayeskin.types import Array, PadMotion, Parameter
+from bayeskin.words import number
+
+SHORTEST_S, LONGEST_S = 0.6, 8.0  # period
+
+
+def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
+    """Adds the swing."""
+    amplitude, share, period, phase = (
+        values[f"motion_{part}"][:, None] for part in ("amplitude", "share", "period", "phase")
+    )
+
+    def swinging(time_s: Array) -> Array:
+        still = force(time_s)
+        return np.asarray(still + (amplitude + share * still) * np.sin(2.0 * np.pi * time_s / period + phase))
+
+    return swinging
+
+
+MECHANISM = Mechanism(
+    name="periodic-motion",
+    parameters=(
+        Parameter("motion_amplitude", "N", 0.0, 0.03, "uniform", "half of the swing at no force"),
+        Parameter(
+            "motion_period", "s", SHORTEST_S, LONGEST_S, "log-uniform", "time after which the arm is back"
+        ),
+        Parameter("motion_phase", "rad", -np.pi, np.pi, "uniform", "phase of the swing at t = 0"),
+        Parameter("motion_share", "-", 0.0, 0.1, "uniform", "what the force adds to the amplitude, as share"),
+    ),
+    neutral={"motion_amplitude": 0.0, "motion_period": 4.0, "motion_phase": 0.0, "motion_share": 0.0},
+    statement=lambda v: (
+        f"The arm moves to and fro under the device every {number(v['motion_period'], 2)} s: the force "
+        f"swings by {1e3 * v['motion_amplitude']:.1f} mN and {number(100 * v['motion_share'], 2)} % "
+        "to either side."
+    ),
+    group=("periodic-motion",),
+    parts=(("motion_amplitude", "motion_period", "motion_phase"), ("motion_share",)),
+    act=Instrument(Place.ARM, observe, adds=False, repeats_s=SHORTEST_S),
+)
