@@ -47,4 +47,5 @@ MECHANISM = Mechanism(
     ),
     group=("position-ripple",),
     act=Instrument(Place.DRIVE, observe, repeats_m=SHORTEST_M),
+    parts=(("ripple_amplitude", "ripple_period", "ripple_phase"),),
 )

@@ -125,7 +125,8 @@ def opened(source: Path, reporter: Reporter, device: Path | None = None) -> Run:
     """A configuration's run, or that of a recording by itself beside it, made with the device of a file.
 
     A recording by itself takes a shipped surrogate where one knows its protocol, else the reduced model of
-    its device. Raises InputError for bad input, and for a device beside a configuration, which states its own.
+    its device. Raises InputError for bad input, and for a device beside a configuration, which states its
+    own.
     """
     if source.suffix == ".toml":
         if device is not None:
