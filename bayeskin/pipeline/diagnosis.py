@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 import bayeskin
 from bayeskin import inference
+from bayeskin.config import Config
 from bayeskin.errors import InputError
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.mechanisms import with_one
@@ -52,13 +53,22 @@ def diagnose(source: Path, reporter: Reporter, device: Path | None = None) -> di
     without a reduced model.
     """
     run = opened(source, reporter, device)
-    by_reduced_model = run.config.design.coarse == "reduced"
-    own = (joint_diagnosis.STAGE,) if by_reduced_model else (design.STAGE, training.STAGE, STAGE)
-    outcome = run_stages(run, {stage.name: stage for stage in (recording.STAGE, *own)})[-1]
+    outcome = run_stages(run, stages_of(run.config))[-1]
     answer = {**outcome.record.summary, "ok": outcome.ok, "folder": run.folder / STAGE.name}
-    said = joint_diagnosis.in_words if by_reduced_model else in_words
+    said = joint_diagnosis.in_words if by_reduced_model(run.config) else in_words
     text = said(answer) if outcome.record.done else f"{outcome.stage}: failed: {answer['message']}"
     return plain({**answer, "text": text})
+
+
+def by_reduced_model(config: Config) -> bool:
+    """Whether the reduced model solves the mechanisms of a set together, in place of learnt effects."""
+    return config.design.coarse == "reduced"
+
+
+def stages_of(config: Config) -> dict[str, Stage]:
+    """The stages of a diagnosis, in their order."""
+    own = (joint_diagnosis.STAGE,) if by_reduced_model(config) else (design.STAGE, training.STAGE, STAGE)
+    return {stage.name: stage for stage in (recording.STAGE, *own)}
 
 
 def _work(run: Run) -> Mapping[str, Any]:

@@ -56,6 +56,10 @@ def choose(source: Path, reporter: Reporter) -> dict[str, Any]:
     observation = run.config.model.observation
     if observation != "reaction":
         raise InputError(source, f"model.observation {observation!r}", "'reaction'")
+    if diagnosis.by_reduced_model(run.config):
+        why = "a diagnosis by the reduced model, which proposes no experiment yet"
+        expected = "a protocol that a shipped surrogate knows, or a design by the full model"
+        raise InputError(source, why, expected)
     diagnosed = diagnosis.diagnose(source, reporter)
     if "best_set" not in diagnosed:
         return diagnosed

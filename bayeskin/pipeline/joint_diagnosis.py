@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,14 +13,16 @@ import numpy as np
 from bayeskin import inference
 from bayeskin.config import parameter_space
 from bayeskin.inference.noise_model import bins_in_windows
-from bayeskin.mismatch.contributions import contributions
+from bayeskin.mechanisms import Mechanism
+from bayeskin.mismatch.contributions import Contribution, contributions
 from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.hypotheses import Family, Judgement, hypotheses_of, judge_family
-from bayeskin.mismatch.joint_fit import JointFit
+from bayeskin.mismatch.joint_fit import JointFit, within
 from bayeskin.mismatch.joint_search import JointSearch, search_jointly
 from bayeskin.mismatch.locate import Located, locate
+from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import Made, Search, weight
 from bayeskin.pipeline.diagnosis_outputs import Found, Shown, candidates, draw, unexplained, window
 from bayeskin.pipeline.engine import Run, Stage
@@ -29,10 +32,11 @@ from bayeskin.pipeline.model import check_protocol, model_spec, reduced_files
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.reported import FullForce
 from bayeskin.pipeline.taking_up import Remainder
-from bayeskin.types import Array
+from bayeskin.types import Array, BinnedForce
 
 WEIGHED = 6  # sets, the likeliest and that without mechanisms, whose hypotheses are compared
-DRAWS = 2000  # of Laplace's Gaussian, for intervals and bands
+PREDICTIVE_DRAWS = 300
+REACH = 0.5  # of the prior's width on either side of a run, within which its tangent is sampled
 NAME = "diagnose"
 
 
@@ -59,6 +63,8 @@ def _work(run: Run) -> Mapping[str, Any]:
     noise = found.fits[best].fit.theta
     base, chosen = found.fits[()].fit, found.fits[best].fit
     before, after = (locate(fit, {**fit.theta, **_noise_of(fit, noise)}, seed) for fit in (base, chosen))
+    run.reporter.log("draws of the posterior, without and with what was found")
+    drawn = {fit.names: _drawn(fit, seed) for fit in (base, chosen)}
     parts = contributions(best, chosen.theta, bench.reported, bench.known)
     remainder = None
     if judged.verdict == "unknown" or (judged.named and after.windows):
@@ -70,12 +76,12 @@ def _work(run: Run) -> Mapping[str, Any]:
         "unknown_probability": judged.smooth_probability,
         "located": [window(one) for one in before.windows],
         "remaining": [window(one) for one in after.windows],
-        "mechanisms": _mechanisms(judged, chosen, bench, {part.name: part.size_n for part in parts}),
+        "mechanisms": _mechanisms(judged, chosen, drawn[best].summary, bench.known, parts),
         "unexplained": None if remainder is None else unexplained(remainder),
         "candidates": candidates(tried, bench.known),
         "sets": [_set(names, found, left, family) for names in weighed],
         "fit": {
-            "before": _fit(bench, base), "after": _fit(bench, chosen),
+            "before": _fit(bench.binned, base, drawn[()]), "after": _fit(bench.binned, chosen, drawn[best]),
         },
         "best_set": list(best),
         "full_model": _checked(run, bench, chosen),
@@ -84,7 +90,10 @@ def _work(run: Run) -> Mapping[str, Any]:
     write_json(run.at(NAME, "diagnosis.json"), answer)
     figures = draw(
         run.folder / NAME, caption(run), bench.binned, bench.motion,
-        Found(_shown(base, before), _shown(chosen, after), None, bench.base.parameters, parts, remainder),
+        Found(
+            _shown(base, before, drawn[()]), _shown(chosen, after, drawn[best]), None, bench.base.parameters,
+            parts, remainder,
+        ),
         answer["candidates"],
     )  # fmt: skip
     return {**answer, "figures": [figure.name for figure in figures]}
@@ -113,30 +122,29 @@ def _noise_of(fit: Fit, values: Mapping[str, float]) -> dict[str, float]:
     return {name: values[name] for name in fit.log_posterior.names if name not in space}
 
 
+def _drawn(fit: Fit, seed: int) -> Resampled:
+    """Draws of the posterior about a fit's run, as far from it as `REACH`."""
+    about = fit.log_posterior
+    near = within(about, np.clip(about.vector(fit.theta), *about.bounds), REACH)
+    return resample(replace(fit, log_posterior=near), None, seed)
+
+
 def _mechanisms(
-    judged: Judgement, chosen: Fit, bench: JointBench, sizes: Mapping[str, float]
-) -> list[dict[str, Any]]:
+    judged: Judgement, chosen: Fit, values: Mapping[str, Mapping[str, Any]],
+    known: Mapping[str, Mechanism], parts: Sequence[Contribution],
+) -> list[dict[str, Any]]:  # fmt: skip
+    sizes = {part.name: part.size_n for part in parts}
     rows = []
-    values = _summaries(chosen)
     for one in judged.named:
-        known = bench.known[one.name]
+        mechanism = known[one.name]
         rows.append({
             "name": one.name, "probability": one.probability, "group": list(one.group),
             "group_probability": one.group_probability, "contribution_n": sizes.get(one.name),
             "parameters": {p.name: {**values[p.name], "unit": p.unit}
-                           for p in known.parameters if p.name in values},
-            "statement": known.statement({**known.neutral, **chosen.theta}),
+                           for p in mechanism.parameters if p.name in values},
+            "statement": mechanism.statement({**mechanism.neutral, **chosen.theta}),
         })  # fmt: skip
     return rows
-
-
-def _summaries(fit: Fit) -> dict[str, dict[str, Any]]:
-    """Of each parameter mean, sd and the ends of the 90 % interval, by draws of Laplace's Gaussian."""
-    draws = fit.draws(DRAWS, 1)
-    low, high = np.quantile(draws, [0.05, 0.95], axis=0)
-    rows = zip(fit.log_posterior.names, draws.mean(axis=0), draws.std(axis=0), low, high, strict=True)
-    return {name: {"mean": float(mean), "sd": float(sd), "interval90": [float(a), float(b)]}
-            for name, mean, sd, a, b in rows}  # fmt: skip
 
 
 def _set(
@@ -150,26 +158,28 @@ def _set(
     }  # fmt: skip
 
 
-def _fit(bench: JointBench, fit: Fit) -> dict[str, Any]:
-    binned = bench.binned
+def _fit(binned: BinnedForce, fit: Fit, drawn: Resampled) -> dict[str, Any]:
     usable = bins_in_windows(binned, None) >= 0
     return {
         "rmse": _rms((binned.force_n - fit.force_n)[usable]),
         "rmse_of_mean": _rms((binned.force_n - fit.mean_n)[usable]),
         "rmse_by_phase": dict(inference.rmse(binned, fit.force_n).by_kind_n),
-        "coverage90": inference.coverage(binned, *_band(fit)),
+        "rmse_held_out": None,
+        "coverage90": inference.coverage(binned, *_band(fit, drawn)),
         "log_evidence": fit.log_evidence,
-        "theta": _summaries(fit),
+        "theta": drawn.summary,
+        "sampled": {"settled": drawn.settled, "rhat": drawn.rhat, "effective": drawn.effective},
     }
 
 
-def _band(fit: Fit) -> tuple[Array, Array]:
-    rng = np.random.default_rng(1)
-    return inference.bands(fit.log_posterior, fit.draws(300, 1), rng).interval(0.9)
+def _band(fit: Fit, drawn: Resampled) -> tuple[Array, Array]:
+    """Edges (m,) of the predictive band of 90 %."""
+    some = inference.evenly(drawn.draws, PREDICTIVE_DRAWS)
+    return inference.bands(fit.log_posterior, some, np.random.default_rng(1)).interval(0.9)
 
 
-def _shown(fit: Fit, located: Located) -> Shown:
-    return Shown(fit.force_n, _band(fit), None, located, _summaries(fit))
+def _shown(fit: Fit, located: Located, drawn: Resampled) -> Shown:
+    return Shown(fit.force_n, _band(fit, drawn), None, located, drawn.summary)
 
 
 def _checked(run: Run, bench: JointBench, chosen: Fit) -> dict[str, Any]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from bayeskin.config import Config
 from bayeskin.pipeline import design, diagnosis, effects, indices, maximum, posterior, recording, training
 from bayeskin.pipeline.crew import made_by
 from bayeskin.pipeline.engine import Outcome, Reporter, Run, Stage, open_run, run_stages, standing
@@ -75,11 +76,17 @@ REPORT = Stage(
 STAGES = {stage.name: stage for stage in (*BEFORE_REPORT, REPORT, effects.STAGE, diagnosis.STAGE)}
 
 
+def stages_of(config: Config) -> Mapping[str, Stage]:
+    """Returns all stages of a configuration; the reduced model diagnoses where it makes the design."""
+    own = diagnosis.stages_of(config)
+    return {**STAGES, **{name: stage for name, stage in own.items() if name == "diagnose"}}
+
+
 def run(
     config: Path,
     last: str | None,
     reporter: Reporter,
-    stages: Mapping[str, Stage] = STAGES,
+    stages: Mapping[str, Stage] | None = None,
     scheduler: str | None = None,
 ) -> dict[str, Any]:
     """Runs a configuration to the stage `last` (None: to the report) and gives the command's answer.
@@ -88,6 +95,7 @@ def run(
     A run to the report ends with the page, also when a stage before it failed.
     """
     opened = open_run(config, reporter)
+    stages = stages or stages_of(opened.config)
     if last == "effects":
         opened.config.refuse_uncertain(config, last)
     if scheduler is not None:
@@ -108,12 +116,13 @@ def run(
     return plain({**said, "text": text})
 
 
-def report(config: Path, reporter: Reporter, stages: Mapping[str, Stage] = STAGES) -> dict[str, Any]:
+def report(config: Path, reporter: Reporter, stages: Mapping[str, Stage] | None = None) -> dict[str, Any]:
     """The page of whatever stages are done, and the command's answer; runs nothing but the summary.
 
     Raises InputError for a configuration that is wrong or whose recording is not there.
     """
     opened = open_run(config, reporter)
+    stages = stages or stages_of(opened.config)
     opened.beside(opened.config.recording.file)
     stands = {name: one[0] for name, one in standing(opened, stages).items()}
     missing = [name for name in stages["report"].needs if stands[name] != "done"]
