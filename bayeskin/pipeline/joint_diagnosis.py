@@ -219,8 +219,9 @@ def in_words(answer: Mapping[str, Any]) -> str:
         lines.append(f"The full model fails at the best values: {full['message']}")
     else:
         lines.append(
-            f"A run of the full model at the best values: RMSE {1e3 * full['rmse']:.1f} mN; "
-            f"the reduced model is off by {1e3 * full['reduced_off_by']:.2f} mN there."
+            f"A run of the full model at the best values, without what is allowed for its mesh and the load "
+            f"cell: RMSE {1e3 * full['rmse']:.1f} mN. The reduced model is off by "
+            f"{1e3 * full['reduced_off_by']:.2f} mN there."
         )
     best = ", ".join(f"{one['name']} {one['delta_score']:+.1f}" for one in answer["candidates"][:5])
     if best:
