@@ -5,11 +5,11 @@ With `design.coarse` the waves run a quicker model, and then some of their point
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
 from bayeskin.pipeline.folder import sha256_of, write_json
 from bayeskin.pipeline.model import (
     ForceModel,
+    ReducedOrFull,
     check_protocol,
     full_model,
     own_files,
@@ -110,8 +111,16 @@ def _run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design
             write_json(drawn, {"theta": wave.theta, "held_out": wave.held_out, "record": wave.record})
         waves.append(_load_wave(drawn, space, number, run.config.seed))
         label = f"wave {number + 1} of {len(config.points)}"
-        run_wave(run, label, file, waves[-1], binned.edges_s, model, motion)
+        run_wave(run, label, file, waves[-1], binned.edges_s, _of_wave(model, number), motion)
     return rows_of(load_design(file), waves), [wave.record for wave in waves]
+
+
+def _of_wave(model: ForceModel, number: int) -> ForceModel:
+    """The model of a wave: skins all over the prior that a reduced model cannot run, as those that fold, are
+    left out, since a full run of each takes minutes and few of them can be the recording's."""
+    if isinstance(model, ReducedOrFull) and number < FIRST_OF_POSTERIOR:
+        return replace(model, replaces=False)
+    return model
 
 
 def _try_once(run: Run, model: ForceModel, motion: PadMotion, space: ParameterSpace) -> None:
@@ -133,7 +142,7 @@ def _run_fine(run: Run, design: Design, motion: PadMotion) -> Design:
     inputs, among = Similarity(design.space).inputs(design.theta), design
     if config.coarse == "reduced" and len(config.points) > FIRST_OF_POSTERIOR:
         near = design.held_out | (design.wave == design.wave.max())
-        among = dataclasses.replace(design, ok=design.ok & near)
+        among = replace(design, ok=design.ok & near)
     wave = fine_wave(among, inputs, config.fine_points, config.fine_held_out, run.config.seed)
     file = runs_file(run, model, motion, design.edges_s, design.space)
     run_wave(run, "fine model", file, wave, design.edges_s, model, motion)
@@ -215,7 +224,7 @@ def rows_of(runs: Design, waves: Sequence[Wave]) -> Design:
     row_of = {theta.tobytes(): row for row, theta in enumerate(runs.theta)}
     points = np.concatenate([wave.theta for wave in waves])
     rows = np.array([row_of[theta.tobytes()] for theta in points])
-    return dataclasses.replace(
+    return replace(
         runs,
         theta=points,
         wave=np.concatenate([np.full(len(wave.theta), wave.number) for wave in waves]),

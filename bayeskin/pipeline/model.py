@@ -48,11 +48,12 @@ class FullModel:
 class ReducedOrFull:
     """Runs the reduced model of a file, and the full model where that fails or was not trained.
 
-    The message of a run that the full model made says why.
+    The message of a run that the full model made says why. replaces : whether the full model runs there
     """
 
     file: Path
     full: FullModel
+    replaces: bool = True
 
     @property
     def hash(self) -> str:
@@ -61,7 +62,7 @@ class ReducedOrFull:
     def __call__(self, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
         model = load_reduced(self.file)
         run = simulate_reduced(model, motion, theta, geometry=self.full.spec.geometry)
-        if run.status != "ok":
+        if run.status != "ok" and self.replaces:
             full = self.full(motion, theta)
             run = full if full.message else replace(full, message=f"run by the full model: {run.message}")
         return replace(run, model_hash=self.hash)
