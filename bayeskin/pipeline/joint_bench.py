@@ -30,6 +30,7 @@ from bayeskin.mismatch.full_fit import change
 from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, within
 from bayeskin.mismatch.joint_search import Ask, Climb, Join, Probe, Promise, Task
 from bayeskin.mismatch.observed import ObservedSurrogate
+from bayeskin.mismatch.refuted import refuted
 from bayeskin.mismatch.tangent import Tangent
 from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec
@@ -205,7 +206,9 @@ class JointBench:
             return said["nats"]
         run = FullRun(*(np.array(said["run"][name]) for name in ("theta", "force_n", "slopes_n")))
         about = self.local(said["fit"]["names"], run)
-        return JointFit(restored(said["fit"], about), run, said["runs"], said["settled"])
+        found = JointFit(restored(said["fit"], about), run, said["runs"], said["settled"])
+        against = refuted(found.fit, self.known, self.motion, self.jumps)
+        return f"the recording's samples show nothing of {', '.join(against)}" if against else found
 
 
 def as_json(found: JointFit) -> dict[str, Any]:

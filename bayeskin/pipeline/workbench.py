@@ -17,7 +17,7 @@ from bayeskin.device import load_device_file
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior
 from bayeskin.mechanisms import Mechanism, catalogue
-from bayeskin.mechanisms.mechanism import Instrument, Place
+from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.discretised import CALIBRATION, Discretised
 from bayeskin.mismatch.fit import (
     QUICK_S,
@@ -28,6 +28,7 @@ from bayeskin.mismatch.fit import (
     without_swings,
 )
 from bayeskin.mismatch.observed import ObservedSurrogate
+from bayeskin.mismatch.refuted import refuted
 from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline import recording
@@ -67,16 +68,8 @@ class Workbench:
         return frozenset(name for effect in self.effects for name in effect.mechanisms)
 
     def refuted(self, found: Fit) -> list[str]:
-        """Mechanisms of a fit that the samples it is of speak against; none beside an amplifier that smooths,
-        or a clock that is off."""
-        acts = {name: self.known[name].act for name in found.names}
-        instrument = {name: act for name, act in acts.items() if isinstance(act, Instrument)}
-        if any(act.place >= Place.AMPLIFIER for act in instrument.values()):
-            return []
-        values = {name: np.array([value]) for name, value in found.theta.items()}
-        jumps = self.jumps.until(self.binned.edges_s[found.log_posterior.chain.bins[-1] + 1])
-        return [name for name, act in instrument.items()
-                if act.refuted is not None and act.refuted(values, self.motion, jumps)[0]]  # fmt: skip
+        """Mechanisms of a fit that the samples it is of speak against."""
+        return refuted(found, self.known, self.motion, self.jumps)
 
     def with_mesh_error(self, skin: Surrogate) -> Surrogate:
         """A surrogate that allows for what a finer mesh would change, where that is known, and for the load
