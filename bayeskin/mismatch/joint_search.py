@@ -4,9 +4,9 @@ The search goes forward from the fit without any mechanism. A score test of ever
 set at hand orders them. The most promising are fitted, each with all other parameters free again, and the
 likeliest is taken if its weight is larger. A mechanism with a shortcut for the force is tested, and its
 values are searched for, on the tangent of the set's last run. One that only the model can solve is tested by
-a few runs. Every set that is taken is fitted from other skins, too, since a missing mechanism leads the skin
-astray; then each of its mechanisms is left out in turn. A set's weight is its evidence times the prior of its
-mechanisms.
+a few runs. The sets that gain most are fitted from other skins, too, since a missing mechanism leads the
+skin astray; then each mechanism of the best is left out in turn. A set's weight is its evidence times the
+prior of its mechanisms.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ class SearchSettings:
     starts, first, best : fits of the base model from the nearest of these, their runs, and how many go on
     probes : runs of each part of a mechanism that the model solves, and how far off neutral, of the prior
     shortlist, promised : mechanisms that are fitted beside a set, and nats that each must promise
+    near, alike : share of the best gain from which on sets are fitted from other skins, too; how many at most
     others, tried : skins that a set is run with, and how many of them it is fitted from
     runs : of a fit; gain : nats of weight, less is no reason to go on; most : mechanisms of a set
     """
@@ -47,8 +48,10 @@ class SearchSettings:
     off: float = 0.25
     shortlist: int = 4
     promised: float = 3.0
-    others: int = 24
-    tried: int = 3
+    near: float = 0.5
+    alike: int = 3
+    others: int = 16
+    tried: int = 2
     runs: int = 9
     gain: float = 1.0
     most: int = 6
@@ -161,14 +164,22 @@ class _Searcher:
         current: JointFit | None = None
         while current is not self.found.best and len(self.found.best.fit.names) < self._settings.most:
             current = self.found.best
-            self._beside(current)
-            if self.found.best is current or self._gained(current) < self._settings.gain:
+            sets = self._beside(current)
+            if self._gained(self.found.best, current) < self._settings.gain:
                 return
-            self._from_other_skins(self.found.best)
+            for one in self._hopeful(sets, current):
+                self._from_other_skins(one)
             self._leaner(self.found.best)
 
-    def _gained(self, before: JointFit) -> float:
-        return weight(self.found.best.fit) - weight(before.fit)
+    def _gained(self, one: JointFit, before: JointFit) -> float:
+        return weight(one.fit) - weight(before.fit)
+
+    def _hopeful(self, sets: Sequence[tuple[str, ...]], current: JointFit) -> list[JointFit]:
+        """The sets that gain most on the one at hand, as far as they gain much."""
+        fits = [self.found.fits[names] for names in sets if names in self.found.fits]
+        fits.sort(key=lambda one: -weight(one.fit))
+        least = self._settings.near * self._gained(fits[0], current)
+        return [one for one in fits[: self._settings.alike] if self._gained(one, current) >= least]
 
     def _nearest(
         self, names: tuple[str, ...], skins: Sequence[Mapping[str, float]], values: Mapping[str, float]
@@ -200,8 +211,8 @@ class _Searcher:
                 least, most = max(least, ends[0] * 1.001), min(most, ends[1] / 1.001)
         return min(least, 1.0), max(most, 1.0)
 
-    def _beside(self, current: JointFit) -> None:
-        """Fits the sets with one mechanism more that promise most."""
+    def _beside(self, current: JointFit) -> list[tuple[str, ...]]:
+        """Fits the sets with one mechanism more that promise most, and returns these sets."""
         names, settings = current.fit.names, self._settings
         others = [name for name in self._known if name not in names]
         solved = [name for name in others if isinstance(self._known[name].act, Tissue)]
@@ -234,8 +245,9 @@ class _Searcher:
         ])  # fmt: skip
         for name, one in zip(chosen, fits, strict=True):
             self.found.add(one)
-            gained = f"{weight(one.fit) - weight(current.fit):+.1f}" if isinstance(one, JointFit) else one
+            gained = f"{self._gained(one, current):+.1f} nats" if isinstance(one, JointFit) else one
             self._tell(f"{', '.join((*names, name))}: {gained}")
+        return [with_one(names, name, self._known) for name in chosen]
 
     def _probes(self, mechanism: Mechanism) -> list[dict[str, float]]:
         """Values of each part of a mechanism, at which the model is run."""
@@ -287,7 +299,9 @@ class _Searcher:
                  for skin in skins[: settings.tried]]  # fmt: skip
         for one in self._ask(tasks):
             self.found.add(one)
-        self._tell(f"from other skins: {weight(self.found.best.fit) - weight(current.fit):+.1f}")
+        names = current.fit.names
+        gained = self._gained(self.found.fits[names], current)
+        self._tell(f"{', '.join(names)} from other skins: {gained:+.1f} nats")
 
     def _leaner(self, current: JointFit) -> None:
         """Fits the sets with one mechanism fewer that were not fitted yet."""
