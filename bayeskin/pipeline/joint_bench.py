@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -75,6 +76,12 @@ class JointBench:
         self._noise = replace(instrument_noise(self.binned), **dict(source.noise))  # type: ignore[arg-type]
         self._neutral = {name: value for m in self.known.values() for name, value in m.neutral.items()}
 
+    def with_model(self, model: ReducedModel) -> JointBench:
+        """The same recording with another reduced model of its device."""
+        other = copy.copy(self)
+        other.model = model
+        return other
+
     @property
     def noise(self) -> dict[str, float]:
         """Values of the noise's parameters to begin with: the middle of their priors."""
@@ -86,7 +93,7 @@ class JointBench:
 
     def space(self, names: Sequence[str]) -> ParameterSpace:
         """Parameters that the forward model solves for a set: the base's, then each mechanism's."""
-        own = tuple(p for m in self._solved(names) for p in m.parameters)
+        own = tuple(p for m in self.solved(names) for p in m.parameters)
         return ParameterSpace((*self.base.parameters, *own))
 
     def force(self, names: Sequence[str], theta: Mapping[str, float]) -> Array | str:
@@ -113,7 +120,7 @@ class JointBench:
         return self._posterior(self._seen(names, (), run))
 
     def _run(self, names: Sequence[str], theta: Mapping[str, float], slopes: bool) -> FullRun | str:
-        mechanisms, space = self._solved(names), self.space(names)
+        mechanisms, space = self.solved(names), self.space(names)
         at = np.array([theta[name] for name in space.names])
         by = dict(zip(space.names, map(float, change(space, at)), strict=True))
         values = dict(zip(space.names, map(float, at), strict=True))
@@ -132,7 +139,8 @@ class JointBench:
         aside = np.array([(values[name] - here) / by[name] for name, here in zip(by, at, strict=True)])
         return FullRun(at, force_n - slopes_n @ aside, slopes_n)
 
-    def _solved(self, names: Sequence[str]) -> list[Mechanism]:
+    def solved(self, names: Sequence[str]) -> list[Mechanism]:
+        """Those of a set that the forward model solves, by their names' order."""
         return [self.known[name] for name in sorted(names) if self.known[name].act.bind is not None]
 
     def _seen(self, names: Sequence[str], more: Sequence[str], run: FullRun) -> Surrogate:
