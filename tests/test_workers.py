@@ -47,10 +47,15 @@ def test_what_a_function_keeps_in_its_process_it_has_in_the_next_call() -> None:
 
 
 def test_workers_end_where_a_caller_fails() -> None:
-    pids = []
-    with pytest.raises(ZeroDivisionError), standing(dead_once, 1) as run_all:
-        pids = [pid for _, pid in run_all([""])]
-        raise ZeroDivisionError
+    pids: list[int] = []
+
+    def fails() -> None:
+        with standing(dead_once, 1) as run_all:
+            pids.extend(pid for _, pid in run_all([""]))
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fails()
     assert len(pids) == 1
     assert not alive(pids[0])
 
