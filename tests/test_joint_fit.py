@@ -150,6 +150,42 @@ def test_a_fit_is_the_first_run_s_where_all_others_fail(bench: JointBench) -> No
     np.testing.assert_array_equal(found.run.theta[:5], [START[name] for name in BASE.names])
 
 
+def test_a_fit_takes_shorter_steps_where_long_ones_fail(bench: JointBench) -> None:
+    last, failed = np.array([START["E_c"], START["E_s"]]), []
+
+    def skin(names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
+        """Runs as far as moduli change by a third since the last run."""
+        nonlocal last
+        moduli = np.array([theta["E_c"], theta["E_s"]])
+        if np.max(np.abs(np.log(moduli / last))) > np.log(4.0 / 3.0):
+            failed.append(moduli)
+            return "near folding"
+        last = moduli
+        return bench.skin(names, theta)
+
+    found = fit_jointly(SET, start(bench), skin, bench.local, TrustSettings(runs=30))
+    assert isinstance(found, JointFit)
+    assert failed
+    assert found.settled
+    assert found.fit.value == pytest.approx(highest(bench)[0], abs=2.0 * TrustSettings().enough)
+
+
+def test_a_fit_does_not_go_on_from_a_run_that_is_worse(bench: JointBench) -> None:
+    made: list[FullRun] = []
+
+    def skin(names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
+        """Whose third run pulls ten times as hard as the second's slopes say."""
+        run = bench.skin(names, theta)
+        assert isinstance(run, FullRun)
+        made.append(dataclasses.replace(run, force_n=(10.0 if len(made) == 2 else 1.0) * run.force_n))
+        return made[-1]
+
+    found = fit_jointly(SET, start(bench), skin, bench.local, TrustSettings(runs=3))
+    assert isinstance(found, JointFit)
+    assert len(made) == found.runs == 3
+    assert found.run is made[1]
+
+
 @pytest.mark.parametrize("runs", [1, 2, 3, 5])
 def test_no_more_runs_are_made_than_asked_for_and_more_are_never_worse(bench: JointBench, runs: int) -> None:
     values = []

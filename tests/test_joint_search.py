@@ -98,6 +98,15 @@ def test_what_is_concealed_is_found(asked: Make, values: dict[str, float], names
     assert any("promised: " in line for line in one.told)
 
 
+@pytest.mark.parametrize("rate", [-9e-4, 9e-4])
+def test_a_mechanism_of_the_tissue_is_fitted_from_what_its_probes_promise(asked: Make, rate: float) -> None:
+    one = asked(stiffness_rate=rate, stiffness_time=200.0)
+    one.search()
+    starts = [task.start for task in one.tasks
+              if isinstance(task, Climb) and task.names == ("stiffness-drift",)]  # fmt: skip
+    assert 0.5 < starts[0]["stiffness_rate"] / rate < 1.5
+
+
 def test_nothing_is_found_where_nothing_is_concealed(asked: Make) -> None:
     for seed in range(3):
         found = asked(seed).search()
