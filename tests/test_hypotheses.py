@@ -119,6 +119,15 @@ def test_of_look_alikes_that_share_the_chances_the_likeliest_is_named() -> None:
     assert judged(of(sensor_drift=20.0, stiffness_drift=20.5)).verdict == "nothing-missing"  # not alike
 
 
+def test_a_mechanism_is_not_named_for_a_likelier_look_alike() -> None:
+    """Where the likelier of two is not said to look like the other."""
+    pair = ("sensor-drift", "stiffness-drift")
+    known = {**KNOWN, "sensor-drift": replace(KNOWN["sensor-drift"], group=pair)}
+    assert judge_family(of(sensor_drift=20.0, stiffness_drift=20.5), known).named == ()
+    (one,) = judge_family(of(sensor_drift=20.5, stiffness_drift=20.0), known).named
+    assert (one.name, one.group) == ("sensor-drift", pair)
+
+
 def test_a_device_whose_model_knows_few_mechanisms_has_a_verdict() -> None:
     """Look-alikes that the model was not trained for have no probability."""
     few = {name: KNOWN[name] for name in ("device-friction", "friction-creep")}
