@@ -554,20 +554,3 @@ def test_a_shell_completes_commands_and_options() -> None:
     assert completed("bayeskin rep") == ["report"]
     assert completed("bayeskin simulate --ob") == ["--observation"]
     assert completed("bayeskin simulate --observation ") == ["reaction", "article"]
-
-
-def test_a_recording_whose_protocol_no_surrogate_knows_is_refused_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    time_s = np.arange(0.0, 60.0, 0.1)
-    displacement_m = np.interp(time_s, [0.0, 5.0, 15.0, 40.0, 50.0, 60.0], [0.0, 0.0, 7e-3, 7e-3, 0.0, 0.0])
-    storage.save(
-        tmp_path / "own.h5", Recording(time_s, displacement_m, 30.0 * displacement_m, "own", "0" * 64)
-    )
-    with pytest.raises(SystemExit) as end:
-        cli.main(["diagnose", str(tmp_path / "own.h5")])
-    said = capsys.readouterr().err.strip()
-    assert end.value.code == 2
-    assert said.count("\n") == 0
-    assert "no shipped surrogate" in said
-    assert "CONFIG.toml" in said

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -159,3 +160,50 @@ def test_the_demo_comes_with_its_own_device(bayeskin: Command, tmp_path: Path) -
     assert code == 2
     assert "the demo is of the article's device" in line
     assert not (tmp_path / "demo.toml").exists()
+
+
+UNCERTAIN = "[tissue]\ncutis_mm = { mean = 2.0, sd = 0.2 }\n"
+
+
+@pytest.mark.parametrize(
+    ("device", "says"),
+    [
+        ("[tissue]\ncutis_mm = 4.0\n", "one that `bayeskin reduce` makes"),
+        ("[device]\ngauge_mm = 0\n", "device.gauge_mm: found 0 mm: the pads overlap"),
+        (UNCERTAIN, "`bayeskin diagnose` takes no uncertain length"),
+        (None, "device.toml: found no such file"),
+    ],
+    ids=["no reduced model", "impossible", "uncertain", "absent"],
+)
+def test_a_device_that_cannot_be_diagnosed_is_refused_in_one_line(
+    bayeskin: Command, short: Path, tmp_path: Path, device: str | None, says: str
+) -> None:
+    path = tmp_path / "device.toml"
+    if device is not None:
+        path.write_text(device)
+    code, line = bayeskin("diagnose", short, "--device", path)
+    assert (code, line[:10]) == (2, "bayeskin: ")
+    assert says in line
+    assert not (tmp_path / "short-diagnosis" / "diagnose" / "diagnosis.json").exists()
+
+
+def test_a_device_beside_a_configuration_which_states_its_own_is_refused(
+    bayeskin: Command, short: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "device.toml").write_text("[device]\ngauge_mm = 36\n")
+    (tmp_path / "case.toml").write_text(f'[recording]\nfile = "{short.name}"\n')
+    code, line = bayeskin("diagnose", tmp_path / "case.toml", "--device", tmp_path / "device.toml")
+    assert (code, line[:20]) == (2, "bayeskin: --device: ")
+    assert "device.toml beside a configuration; expected the device in [device] and [tissue]" in line
+    assert {file.name for file in tmp_path.iterdir()} == {"short.h5", "device.toml", "case.toml"}
+
+
+def test_a_recording_beyond_what_the_reduced_model_was_trained_for_is_refused(
+    bayeskin: Command, short: Path
+) -> None:
+    recording = storage.load(short, Recording)
+    storage.save(short, replace(recording, displacement_m=6.0 * recording.displacement_m))
+    code, line = bayeskin("diagnose", short)
+    assert code == 2
+    assert "short.h5: design.coarse: found 'reduced' on a protocol that" in line
+    assert "the pads open by 12.00 mm, trained up to 10 mm" in line

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,17 +11,23 @@ import numpy as np
 import pytest
 import toy
 from toy_inference import ToySurrogate, empty_recording
+from toys.small_reduced import hollow
 
+from bayeskin import storage
 from bayeskin.config import config_of
+from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
 from bayeskin.inference import LogPosterior
 from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.binned import estimates_by_name
-from bayeskin.pipeline.workbench import Workbench
+from bayeskin.pipeline.engine import Silent
+from bayeskin.pipeline.model import reduced_files
+from bayeskin.pipeline.workbench import Workbench, opened
 from bayeskin.proof.cases import shipped_screen
 from bayeskin.proof.protocol import MOTION, SURROGATE
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import effects_beside, effects_in, load_effect
-from bayeskin.types import BinnedForce, Jumps
+from bayeskin.types import BinnedForce, Jumps, Recording
 
 KNOWN = {"force-offset": catalogue()["force-offset"]}
 
@@ -110,3 +117,45 @@ def test_samples_refute_no_step_beside_what_smooths_or_shifts_it(smoother: str |
     theta |= {"event_1_step": 0.03}
     found: Any = SimpleNamespace(names=names, theta=theta, log_posterior=plain.posterior(None, []))
     assert made.refuted(found) == ([] if smoother else ["sensor-events"])
+
+
+def recording(path: Path) -> Path:
+    """Two ramps and holds, which no shipped surrogate knows."""
+    time_s = np.arange(0.0, 60.0, 0.1)
+    u_m = np.interp(time_s, [0.0, 5.0, 9.0, 30.0, 34.0, 60.0], [0.0, 0.0, 3e-3, 3e-3, 6e-3, 6e-3])
+    noise_n = 1e-3 * np.random.default_rng(1).standard_normal(len(time_s))
+    storage.save(path / "a test.h5", Recording(time_s, u_m, 30.0 * u_m + noise_n, "own", "0" * 64))
+    return path / "a test.h5"
+
+
+def test_a_protocol_that_no_surrogate_knows_takes_the_reduced_model(tmp_path: Path) -> None:
+    run = opened(recording(tmp_path), Silent())
+    assert (run.config.design.coarse, run.config.surrogate.file) == ("reduced", None)
+    assert run.config.geometry(run.config_path).geometry == Geometry()
+    assert run.folder == tmp_path / "a test-diagnosis"
+    (file,) = reduced_files(run)
+    assert file == shipped("surrogates/article-device-reduced.h5")
+
+
+def test_a_protocol_that_a_surrogate_knows_takes_that(tmp_path: Path) -> None:
+    (tmp_path / "mine.h5").write_bytes(shipped("data/demo.h5").read_bytes())
+    run = opened(tmp_path / "mine.h5", Silent())
+    assert (run.config.design.coarse, run.config.surrogate.file) == (None, "demo.h5")
+    assert reduced_files(run) == []
+
+
+def test_a_recording_of_a_stated_device_takes_that_device_s_reduced_model(tmp_path: Path) -> None:
+    """Though its protocol is that of a surrogate, which is of another device."""
+    thin = Geometry(cutis_m=1.5e-3)
+    (tmp_path / "mine.h5").write_bytes(shipped("data/demo.h5").read_bytes())
+    (tmp_path / "device.toml").write_text("[tissue]\ncutis_mm = 1.5\n")
+    run = opened(tmp_path / "mine.h5", Silent(), tmp_path / "device.toml")
+    assert (run.config.design.coarse, run.config.surrogate.file) == ("reduced", None)
+    assert run.config.geometry(run.config_path).geometry == thin
+    own = hollow(tmp_path / "device-reduced.h5", thin)
+    assert reduced_files(run) == [own]
+
+
+def test_a_device_stands_beside_no_configuration(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--device: found device\.toml beside a configuration"):
+        opened(tmp_path / "case.toml", Silent(), Path("device.toml"))

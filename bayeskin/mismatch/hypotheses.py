@@ -98,7 +98,7 @@ def judge_family(family: Family, known: Mapping[str, Mechanism]) -> Judgement:
     named: list[NamedMechanism] = []
     for name, probability in sorted(alone.items(), key=lambda item: -item[1]):
         likelier = [one.name for one in named]
-        group = [other for other in known[name].group if other not in likelier]
+        group = [other for other in known[name].group if other in known and other not in likelier]
         together = family.probability(group)
         likeliest = probability >= max(alone[other] for other in group)
         if probability >= PROBABLE or (likeliest and together >= PROBABLE):

@@ -20,7 +20,7 @@ from bayeskin.inference.gauss_newton import Top, gauss_newton
 from bayeskin.mismatch.corrected import FullRun
 from bayeskin.mismatch.fit import Fit, evidence
 from bayeskin.mismatch.wrapper import innermost
-from bayeskin.types import Array, ParameterSpace
+from bayeskin.types import Array
 
 
 @dataclass(frozen=True)
@@ -120,12 +120,12 @@ def within(about: LogPosterior, vector: Array, reach: float) -> LogPosterior:
     line = vector[: space.dim]
     lower, upper = (space.from_line(np.clip(line + sign * far, low[: space.dim], high[: space.dim]))
                     for sign in (-1.0, 1.0))  # fmt: skip
-    prior = (about.material or space).parameters
+    prior = about.material or space
     narrowed = tuple(
         replace(p, lower=float(max(a, p.lower)), upper=float(min(b, p.upper)))
-        for p, a, b in zip(prior, lower, upper, strict=True)
+        for p, a, b in zip(prior.parameters, lower, upper, strict=True)
     )
-    return replace(about, material=ParameterSpace(narrowed))
+    return replace(about, material=replace(prior, parameters=narrowed))
 
 
 def solved_columns(about: LogPosterior) -> Array:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.stats import qmc
 
+from bayeskin.errors import InputError
 from bayeskin.inference.gauss_newton import promise
 from bayeskin.mechanisms import Mechanism, with_one, without_one
 from bayeskin.mechanisms.mechanism import Tissue
@@ -126,6 +127,7 @@ def search_jointly(
     """Returns the fits of all sets that a search comes by.
 
     base : the base model's priors; noise : values of the noise's parameters to begin with
+    Raises InputError where the model runs with no skin of these priors.
     """
     searcher = _Searcher(ask, binned, base, known, noise, seed, tell, settings or SearchSettings())
     searcher.base()
@@ -145,7 +147,7 @@ class _Searcher:
         self._skins: list[dict[str, float]] = []
 
     def base(self) -> None:
-        """Fits the model without mechanisms."""
+        """Fits the model without mechanisms. Raises InputError where no skin runs."""
         settings = self._settings
         unit = qmc.Sobol(self._base.dim, rng=self._seed).random(settings.skins)
         drawn = [dict(zip(self._base.names, map(float, row), strict=True))
@@ -153,11 +155,16 @@ class _Searcher:
         self._skins = self._nearest((), [skin for skin in drawn if skin["E_s"] <= 2.0 * skin["E_c"]], {})
         starts = [Climb((), {**self._noise, **skin}, settings.first)
                   for skin in self._skins[: settings.starts]]  # fmt: skip
-        first = [one for one in self._ask(starts) if isinstance(one, JointFit)]
+        answers = self._ask(starts)
+        first = [one for one in answers if isinstance(one, JointFit)]
         first.sort(key=lambda one: -one.fit.value)
         for one in (*first, *self._ask([Climb((), one.fit.theta, settings.runs)
                                         for one in first[: settings.best] if not one.settled])):  # fmt: skip
             self.found.add(one)
+        if not self.found.fits:
+            why = next((f": {one}" for one in answers if isinstance(one, str)), "")
+            expected = "skins that the model runs, whose E_s is at most twice E_c"
+            raise InputError("priors", f"no skin that runs{why}", expected)
 
     def forward(self) -> None:
         """Adds mechanisms to the set as long as that gains weight."""
@@ -234,7 +241,8 @@ class _Searcher:
             if gain > promised.get(name, 0.0):
                 promised[name], starts[name] = gain, start
         for name, nats in zip(quick, answers[len(probes) :], strict=True):
-            promised[name] = float(nats)  # type: ignore[arg-type]
+            if isinstance(nats, float):
+                promised[name] = nats
         order = sorted(promised, key=lambda name: -promised[name])
         chosen = [name for name in order if promised[name] > settings.promised][: settings.shortlist]
         self._tell("promised: " + ", ".join(f"{name} {promised[name]:.0f} nats" for name in order[:5]))

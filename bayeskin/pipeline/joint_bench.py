@@ -162,7 +162,7 @@ class JointBench:
             self.binned,
             None,
             self._noise,
-            None,
+            ParameterSpace(seen.space.parameters, self.base.correlations),
             None,
             soft_on_stiff,
         )

@@ -1,0 +1,136 @@
+"""The rule of the verdict: probabilities that are shares of one family, whatever the evidences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bayeskin.mechanisms import catalogue
+from bayeskin.mismatch.hypotheses import Family, Judgement, hypotheses_of, judge_family
+
+# Look-alikes of each other, one whose group is not all known, and some that are like nothing else.
+NAMES = (
+    "device-friction", "force-offset", "friction-creep", "sensor-drift", "solid-viscoelasticity",
+    "stiffness-drift",
+)  # fmt: skip
+KNOWN = {name: catalogue()[name] for name in NAMES}
+ODDS = np.log(0.05 / 0.95)
+SETS = st.lists(st.sets(st.sampled_from(NAMES), max_size=4), max_size=5, unique_by=tuple)
+EVIDENCES = st.floats(-800.0, 800.0)
+
+
+@st.composite
+def families(draw: st.DrawFn) -> Family:
+    """Of a few sets, that without mechanisms among them; evidences near each other as often as far apart."""
+    names = {tuple(sorted(one)) for one in draw(SETS)} | {()}
+    near = st.floats(-4.0, 4.0)
+    evidence = draw(st.sampled_from([EVIDENCES, near]))
+    return Family([one for own in sorted(names)
+                   for one in hypotheses_of(own, draw(evidence), draw(evidence))])  # fmt: skip
+
+
+def judged(family: Family) -> Judgement:
+    return judge_family(family, KNOWN)
+
+
+@given(families())
+def test_probabilities_of_sets_add_up_to_one(family: Family) -> None:
+    sets = {one.names for one in family.hypotheses}
+    assert sum(family.probability_of_set(names) for names in sets) == pytest.approx(1.0)
+    assert family.nothing + family.smooth + family.probability(NAMES) >= 1.0 - 1e-9
+    assert family.probability_of_set(()) + family.probability(NAMES) == pytest.approx(1.0)
+    assert family.nothing <= family.probability_of_set(()) + 1e-12
+
+
+@given(families())
+def test_a_mechanism_is_no_likelier_than_its_look_alikes_together(family: Family) -> None:
+    for name, mechanism in KNOWN.items():
+        assert family.probability([name]) <= family.probability(mechanism.group) + 1e-12
+    for one in judged(family).named:
+        assert one.probability == family.probability([one.name])
+        assert one.probability <= one.group_probability + 1e-12
+        assert one.group_probability >= 0.9
+        assert one.name in one.group
+
+
+@given(families())
+def test_a_verdict_is_one_of_three_that_exclude_each_other(family: Family) -> None:
+    found = judged(family)
+    assert (found.verdict == "named") == bool(found.named)
+    assert (found.verdict == "unknown") == (not found.named and family.smooth > 0.5)
+    assert found.smooth_probability == family.smooth
+    assert found.nothing_probability == family.nothing
+    names = [one.name for one in found.named]
+    assert len(set(names)) == len(names)
+    certain = {name for name in NAMES if family.probability([name]) >= 0.9}
+    assert certain <= set(names)
+
+
+@given(families(), st.floats(-1e4, 1e4))
+def test_a_constant_more_in_all_evidences_changes_nothing(family: Family, constant: float) -> None:
+    moved = Family([replace(one, log_weight=one.log_weight + constant) for one in family.hypotheses])
+    for names in {one.names for one in family.hypotheses}:
+        assert moved.probability_of_set(names) == pytest.approx(family.probability_of_set(names), abs=1e-9)
+    assert moved.smooth == pytest.approx(family.smooth, abs=1e-9)
+    assert moved.nothing == pytest.approx(family.nothing, abs=1e-9)
+
+
+@given(st.sets(st.sampled_from(NAMES[:-1])), EVIDENCES, EVIDENCES)
+def test_each_mechanism_and_what_has_no_name_cost_the_same_prior(
+    names: set[str], alone: float, smooth: float
+) -> None:
+    fewer = hypotheses_of(tuple(sorted(names)), alone, smooth)
+    more = hypotheses_of((*sorted(names), "stiffness-drift"), alone, smooth)
+    for less, one in zip(fewer, more, strict=True):
+        assert one.log_weight - less.log_weight == pytest.approx(ODDS, abs=1e-9)
+    assert fewer[0].log_weight == pytest.approx(alone + len(names) * ODDS)
+    assert fewer[1].log_weight - fewer[0].log_weight == pytest.approx(smooth - alone + ODDS, abs=1e-9)
+    assert [one.smooth for one in fewer] == [False, True]
+
+
+def of(**nats: float) -> Family:
+    """Sets of one mechanism or none, by name with `_` for `-`, the base at 0, nothing smooth anywhere."""
+    rows = [hypotheses_of((), 0.0, -50.0)]
+    rows += [hypotheses_of((name.replace("_", "-"),), value, -50.0) for name, value in nats.items()]
+    return Family([one for row in rows for one in row])
+
+
+def test_the_verdicts_by_hand() -> None:
+    assert judged(of()).verdict == "nothing-missing"
+    # 19 to 1 against, e^6 for: 403 / (403 + 19)
+    found = judged(of(sensor_drift=6.0))
+    assert found.verdict == "named"
+    assert found.named[0].probability == pytest.approx(np.exp(6.0) / (np.exp(6.0) + 19.0))
+    assert judged(of(sensor_drift=5.0)).verdict == "nothing-missing"  # 148 / 167, below nine in ten
+    smooth = Family([*hypotheses_of((), 0.0, 3.5)])  # e^3.5 is 33, to 19
+    assert (judged(smooth).verdict, judged(smooth).named) == ("unknown", ())
+    assert judged(Family(hypotheses_of((), 0.0, 2.5))).verdict == "nothing-missing"
+
+
+def test_of_look_alikes_that_share_the_chances_the_likeliest_is_named() -> None:
+    (one,) = judged(of(device_friction=20.0, force_offset=20.5)).named
+    assert one.name == "force-offset"
+    assert one.probability < 0.9
+    assert one.group_probability == pytest.approx(1.0, abs=1e-6)
+    assert judged(of(sensor_drift=20.0, stiffness_drift=20.5)).verdict == "nothing-missing"  # not alike
+
+
+def test_a_mechanism_is_not_named_for_a_likelier_look_alike() -> None:
+    """Where the likelier of two is not said to look like the other."""
+    pair = ("sensor-drift", "stiffness-drift")
+    known = {**KNOWN, "sensor-drift": replace(KNOWN["sensor-drift"], group=pair)}
+    assert judge_family(of(sensor_drift=20.0, stiffness_drift=20.5), known).named == ()
+    (one,) = judge_family(of(sensor_drift=20.5, stiffness_drift=20.0), known).named
+    assert (one.name, one.group) == ("sensor-drift", pair)
+
+
+def test_a_device_whose_model_knows_few_mechanisms_has_a_verdict() -> None:
+    """Look-alikes that the model was not trained for have no probability."""
+    few = {name: KNOWN[name] for name in ("device-friction", "friction-creep")}
+    family = Family([*hypotheses_of((), 0.0, 0.0),
+                     *hypotheses_of(("device-friction", "friction-creep"), 30.0, 0.0)])  # fmt: skip
+    assert [one.name for one in judge_family(family, few).named] == ["device-friction", "friction-creep"]

@@ -1,0 +1,228 @@
+"""The force about a run, and the maximum that a fit reaches from run to run, on a skin in closed form."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from toys import solved
+from toys.solved import BASE, TRUTH, Exact, a_run
+
+from bayeskin.inference.gauss_newton import gauss_newton
+from bayeskin.mismatch.corrected import FullRun
+from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, solved_columns, within
+from bayeskin.mismatch.tangent import Tangent
+from bayeskin.mismatch.wrapper import innermost
+from bayeskin.pipeline.joint_bench import JointBench
+from bayeskin.types import Correlation, ParameterSpace
+
+SET = ("force-offset", "stiffness-drift")
+START = {
+    "E_c": 90e3, "E_s": 60e3, "k_c": 1e-13, "k_s": 1e-14, "p_init": 900.0,
+    "F0": 0.0, "stiffness_rate": 0.0, "stiffness_time": 300.0,
+}  # fmt: skip
+PEAKED = dataclasses.replace(BASE.parameters[0], prior="log-normal", centre=150e3, spread=0.5)
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> JointBench:
+    return solved.bench(monkeypatch, solved.recorded(0, F0=-0.03, stiffness_rate=-8e-4))
+
+
+def start(bench: JointBench) -> dict[str, float]:
+    return {**bench.noise, **START}
+
+
+def tangent(bench: JointBench, space: ParameterSpace = BASE) -> tuple[Tangent, FullRun]:
+    run = a_run(bench)
+    assert run.slopes_n is not None
+    return Tangent(space, solved.EDGES_S, run.theta, run.force_n, run.slopes_n), run
+
+
+@pytest.mark.parametrize("first", [BASE.parameters[0], PEAKED], ids=["flat", "peaked"])
+def test_a_tangent_has_the_value_and_the_slopes_of_its_run(bench: JointBench, first) -> None:
+    space = ParameterSpace((first, *BASE.parameters[1:]))
+    near, run = tangent(bench, space)
+    found = near.predict(run.theta)
+    np.testing.assert_allclose(found.mean[0], run.force_n, rtol=0, atol=1e-12)
+    assert not found.sd().any()
+    unit, step = space.box.to_unit(run.theta), 1e-5
+    for i in range(space.dim):
+        ends = space.box.from_unit(unit + step * np.outer([-1.0, 1.0], np.eye(space.dim)[i]))
+        back, ahead = near.predict_mean(ends)
+        np.testing.assert_allclose((ahead - back) / (2.0 * step), run.slopes_n[:, i], rtol=1e-5, atol=1e-9)
+        back, ahead = Exact(BASE).predict_mean(ends)
+        skin = (ahead - back) / (2.0 * step)  # between steps a force and its slope are interpolated each
+        largest = np.abs(run.slopes_n[:, i]).max()
+        np.testing.assert_allclose(skin, run.slopes_n[:, i], rtol=0, atol=1e-4 * largest)
+
+
+def test_a_tangent_is_a_straight_line_in_moduli_and_in_the_box_of_all_others(bench: JointBench) -> None:
+    near, run = tangent(bench)
+    share = np.linspace(0.0, 1.0, 5)[:, None]
+    moduli = run.theta * np.array([3.0, 0.2, 1.0, 1.0, 1.0])
+    others = run.theta * np.array([1.0, 1.0, 20.0, 0.1, 2.0])
+    here, there = BASE.to_unit(run.theta), BASE.to_unit(others)
+    for line in (run.theta + share * (moduli - run.theta), BASE.from_unit(here + share * (there - here))):
+        mean = near.predict_mean(line)
+        np.testing.assert_allclose(mean, mean[0] + share * (mean[-1] - mean[0]), rtol=0, atol=1e-12)
+        assert np.abs(mean[-1] - mean[0]).max() > 0.01
+
+
+@pytest.mark.parametrize("factor", [0.3, 4.0])
+def test_moduli_times_c_pull_c_times_as_hard_where_the_force_is_proportional_to_them(
+    bench: JointBench, factor: float
+) -> None:
+    run = a_run(bench)
+    width = np.log(BASE.upper[:2] / BASE.lower[:2])
+    slopes_n = np.zeros((len(run.force_n), BASE.dim))
+    slopes_n[:, :2] = np.outer(run.force_n, [0.7, 0.3]) * width  # by Euler: 70 % of it are the cutis's
+    near = Tangent(BASE, solved.EDGES_S, run.theta, run.force_n, slopes_n)
+    stiffer = run.theta * np.array([factor, factor, 1.0, 1.0, 1.0])
+    np.testing.assert_allclose(near.predict_mean(stiffer)[0], factor * run.force_n, rtol=1e-12, atol=1e-15)
+
+
+def highest(bench: JointBench) -> tuple[float, dict[str, float]]:
+    """Log density and values of the highest top of the set's posterior by the skin itself, of many climbs."""
+    about = bench.local(SET, a_run(bench, SET))
+    allowing: Any = about.surrogate  # for the mesh, about what the instrument does, about the skin
+    seen = dataclasses.replace(allowing.inner, inner=Exact(innermost(allowing).space))
+    whole = dataclasses.replace(about, surrogate=dataclasses.replace(allowing, inner=seen))
+    low, high = whole.bounds
+    rng = np.random.default_rng(0)
+    truth = whole.vector({**start(bench), **TRUTH, "F0": -0.03, "stiffness_rate": -8e-4})
+    starts = [truth, *(truth + 0.1 * rng.uniform(-1, 1, (6, len(low))) * (high - low))]
+    top = max((gauss_newton(whole, np.clip(x, low, high), None) for x in starts), key=lambda one: one.value)
+    return top.value, whole.named(whole.from_sampling(top.vector))
+
+
+def test_a_fit_reaches_the_maximum_of_the_skin_itself(bench: JointBench) -> None:
+    found = fit_jointly(SET, start(bench), bench.skin, bench.local)
+    value, theta = highest(bench)
+    assert isinstance(found, JointFit)
+    assert found.settled
+    assert found.fit.names == SET
+    assert found.fit.value == pytest.approx(value, abs=2.0 * TrustSettings().enough)
+    deviations = np.sqrt(np.diag(found.fit.covariance))
+    low, high = found.fit.log_posterior.bounds
+    there = (found.fit.log_posterior.vector(theta) - low) / (high - low)
+    assert np.all(np.abs(found.fit.unit - there) < np.maximum(deviations, 0.01))
+    assert found.fit.theta["F0"] == pytest.approx(-0.03, abs=2e-3)
+    np.testing.assert_allclose(found.fit.mean_n, found.fit.log_posterior.binned.force_n, atol=0.05)
+    at_run = [found.fit.theta[name] for name in found.fit.log_posterior.surrogate.space.names]
+    np.testing.assert_allclose(found.run.theta[:5], at_run[:5], rtol=1e-6)
+
+
+class Unsteady:
+    """Runs of a bench, some of which fail."""
+
+    def __init__(self, bench: JointBench, failing: Sequence[int]) -> None:
+        self.bench, self.failing, self.made = bench, failing, 0
+
+    def __call__(self, names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
+        self.made += 1
+        return "near folding" if self.made in self.failing else self.bench.skin(names, theta)
+
+
+@pytest.mark.parametrize("failing", [(2,), (3,), (2, 4)])
+def test_a_fit_goes_on_where_a_run_in_the_middle_fails(bench: JointBench, failing: tuple[int, ...]) -> None:
+    skin = Unsteady(bench, failing)
+    found = fit_jointly(SET, start(bench), skin, bench.local, TrustSettings(runs=14))
+    assert isinstance(found, JointFit)
+    assert found.runs == skin.made > max(failing)
+    assert found.settled
+    assert found.fit.value == pytest.approx(highest(bench)[0], abs=2.0 * TrustSettings().enough)
+
+
+def test_a_fit_whose_first_run_fails_is_its_message(bench: JointBench) -> None:
+    skin = Unsteady(bench, (1,))
+    assert fit_jointly(SET, start(bench), skin, bench.local) == "near folding"
+    assert skin.made == 1
+
+
+def test_a_fit_is_the_first_run_s_where_all_others_fail(bench: JointBench) -> None:
+    found = fit_jointly(SET, start(bench), Unsteady(bench, range(2, 99)), bench.local)
+    assert isinstance(found, JointFit)
+    assert not found.settled
+    np.testing.assert_array_equal(found.run.theta[:5], [START[name] for name in BASE.names])
+
+
+def test_a_fit_takes_shorter_steps_where_long_ones_fail(bench: JointBench) -> None:
+    last, failed = np.array([START["E_c"], START["E_s"]]), []
+
+    def skin(names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
+        """Runs as far as moduli change by a third since the last run."""
+        nonlocal last
+        moduli = np.array([theta["E_c"], theta["E_s"]])
+        if np.max(np.abs(np.log(moduli / last))) > np.log(4.0 / 3.0):
+            failed.append(moduli)
+            return "near folding"
+        last = moduli
+        return bench.skin(names, theta)
+
+    found = fit_jointly(SET, start(bench), skin, bench.local, TrustSettings(runs=30))
+    assert isinstance(found, JointFit)
+    assert failed
+    assert found.settled
+    assert found.fit.value == pytest.approx(highest(bench)[0], abs=2.0 * TrustSettings().enough)
+
+
+def test_a_fit_does_not_go_on_from_a_run_that_is_worse(bench: JointBench) -> None:
+    made: list[FullRun] = []
+
+    def skin(names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
+        """Whose third run pulls ten times as hard as the second's slopes say."""
+        run = bench.skin(names, theta)
+        assert isinstance(run, FullRun)
+        made.append(dataclasses.replace(run, force_n=(10.0 if len(made) == 2 else 1.0) * run.force_n))
+        return made[-1]
+
+    found = fit_jointly(SET, start(bench), skin, bench.local, TrustSettings(runs=3))
+    assert isinstance(found, JointFit)
+    assert len(made) == found.runs == 3
+    assert found.run is made[1]
+
+
+@pytest.mark.parametrize("runs", [1, 2, 3, 5])
+def test_no_more_runs_are_made_than_asked_for_and_more_are_never_worse(bench: JointBench, runs: int) -> None:
+    values = []
+    for most in (runs, runs + 1):
+        skin = Unsteady(bench, ())
+        found = fit_jointly(SET, start(bench), skin, bench.local, TrustSettings(runs=most))
+        assert isinstance(found, JointFit)
+        assert skin.made == found.runs <= most
+        values.append(found.fit.value)
+    assert values[1] >= values[0] - 1e-9
+
+
+@pytest.mark.parametrize("reach", [0.0, 0.15])
+def test_a_trust_region_holds_what_the_model_solves_and_nothing_else(bench: JointBench, reach: float) -> None:
+    about = bench.local(SET, a_run(bench, SET))
+    space, (low, high) = about.surrogate.space, about.bounds
+    assert [n for n, held in zip(space.names, solved_columns(about), strict=True) if not held] == ["F0"]
+    vector = np.clip(about.vector({**start(bench), **TRUTH}), low, high)
+    near = within(about, vector, reach)
+    lower, upper = near.bounds
+    held = np.append(solved_columns(about), np.zeros(about.dim - space.dim, bool))
+    far = max(reach, 1e-9) * (high - low)
+    np.testing.assert_allclose(lower[held], np.maximum(vector - far, low)[held], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(upper[held], np.minimum(vector + far, high)[held], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal((lower[~held], upper[~held]), (low[~held], high[~held]))
+    assert near.names == about.names
+
+
+def test_priors_that_go_together_do_so_in_a_fit_and_its_trust_region(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    other = dataclasses.replace(BASE.parameters[1], prior="log-normal", centre=30e3, spread=0.5)
+    together = (Correlation("E_c", "E_s", 0.6),)
+    base = ParameterSpace((PEAKED, other, *BASE.parameters[2:]), together)
+    bench = solved.bench(monkeypatch, solved.recorded(0), base)
+    for names in ((), ("force-offset",), SET):
+        about = bench.local(names, a_run(bench, names))
+        assert about.space.correlations == together
+        vector = np.clip(about.vector({**start(bench), **TRUTH}), *about.bounds)
+        assert within(about, vector, 0.1).space.correlations == together

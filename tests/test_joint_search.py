@@ -1,0 +1,194 @@
+"""Which mechanisms a search names on a skin in closed form, and what its tasks are."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from toys import solved
+from toys.solved import BASE, KNOWN
+
+from bayeskin.errors import InputError
+from bayeskin.mismatch.joint_search import (
+    Climb,
+    Join,
+    JointSearch,
+    Probe,
+    Promise,
+    SearchSettings,
+    Task,
+    search_jointly,
+)
+from bayeskin.mismatch.search import weight
+from bayeskin.pipeline.joint_bench import JointBench
+from bayeskin.types import ParameterSpace
+
+FEW = SearchSettings(skins=8, others=4, tried=1)
+
+
+class Asked:
+    """Answers tasks as processes do, through JSON, and keeps them."""
+
+    def __init__(self, bench: JointBench, lost: Callable[[Task], bool] = lambda task: False) -> None:
+        self.bench, self.lost = bench, lost
+        self.tasks: list[Task] = []
+        self.told: list[str] = []
+
+    def __call__(self, tasks: Sequence[Task]) -> list[object]:
+        return [self.answer(task) for task in tasks]
+
+    def answer(self, task: Task) -> object:
+        self.tasks.append(task)
+        said = {"message": "the worker ended"} if self.lost(task) else self.bench.done(task)
+        return self.bench.answered(task, json.loads(json.dumps(said)))
+
+    def search(self, seed: int = 1, settings: SearchSettings = FEW) -> JointSearch:
+        bench = self.bench
+        return search_jointly(
+            self, bench.binned, bench.base, KNOWN, bench.noise, seed, self.told.append, settings
+        )
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Asked]:
+    """What answers tasks on a recording of the toy with mechanisms of these values."""
+
+    def make(seed: int = 0, lost: Callable[[Task], bool] = lambda task: False, **values: float) -> Asked:
+        return Asked(solved.bench(monkeypatch, solved.recorded(seed, **values)), lost)
+
+    return make
+
+
+Make = Callable[..., Asked]
+
+
+def names_of(task: Task) -> tuple[str, ...]:
+    """The set that a task is to fit or to run."""
+    more = (task.name,) if isinstance(task, Join | Promise) else ()
+    return tuple(sorted({*task.names, *more}))
+
+
+@pytest.mark.parametrize(
+    ("values", "names"),
+    [
+        ({"F0": -0.03}, ("force-offset",)),
+        ({"drift": 3e-4}, ("sensor-drift",)),
+        ({"stiffness_rate": -9e-4, "stiffness_time": 200.0}, ("stiffness-drift",)),
+        ({"stiffness_rate": 9e-4, "F0": -0.03}, ("force-offset", "stiffness-drift")),
+    ],
+    ids=["offset", "drift", "tissue", "both"],
+)
+def test_what_is_concealed_is_found(asked: Make, values: dict[str, float], names: tuple[str, ...]) -> None:
+    one = asked(**values)
+    found = one.search()
+    best = found.best.fit
+    assert best.names == names
+    assert weight(best) > max(weight(other.fit) for other in found.fits.values() if other.fit is not best)
+    for name in ("F0", "drift", "stiffness_rate"):
+        if name in values:
+            at = best.log_posterior.names.index(name)
+            low, high = best.log_posterior.bounds
+            sd = np.sqrt(best.covariance[at, at]) * (high - low)[at]
+            assert abs(best.theta[name] - values[name]) < 4.0 * sd
+            assert sd < 0.5 * abs(values[name])
+    assert any("promised: " in line for line in one.told)
+
+
+@pytest.mark.parametrize("rate", [-9e-4, 9e-4])
+def test_a_mechanism_of_the_tissue_is_fitted_from_what_its_probes_promise(asked: Make, rate: float) -> None:
+    one = asked(stiffness_rate=rate, stiffness_time=200.0)
+    one.search()
+    starts = [task.start for task in one.tasks
+              if isinstance(task, Climb) and task.names == ("stiffness-drift",)]  # fmt: skip
+    assert 0.5 < starts[0]["stiffness_rate"] / rate < 1.5
+
+
+def test_nothing_is_found_where_nothing_is_concealed(asked: Make) -> None:
+    for seed in range(3):
+        found = asked(seed).search()
+        assert found.best.fit.names == ()
+        np.testing.assert_allclose(found.best.fit.mean_n, solved.means(solved.TRUTH)[0], atol=6e-3)
+
+
+def test_no_task_is_asked_twice_and_only_what_is_taken_is_fitted_from_other_skins(asked: Make) -> None:
+    one = asked(stiffness_rate=9e-4, F0=-0.03)
+    found = one.search()
+    assert set(Counter(key(task) for task in one.tasks).values()) == {1}
+    fitted = Counter(names_of(task) for task in one.tasks if isinstance(task, Climb | Join))
+    assert set(fitted) == set(found.fits)
+    again = {names: count - 1 for names, count in fitted.items() if names and count > 1}
+    taken = (("force-offset",), ("force-offset", "stiffness-drift"))  # one mechanism after the other
+    assert again == dict.fromkeys(taken, FEW.tried)
+
+
+def key(task: Task) -> str:
+    return json.dumps([type(task).__name__, asdict(task)], default=np.ndarray.tolist)
+
+
+def test_the_same_seed_gives_the_same_search(asked: Make) -> None:
+    first, second, other = (asked(F0=-0.03) for _ in range(3))
+    assert _as_values(first.search(3)) == _as_values(second.search(3))
+    assert len(first.tasks) == len(second.tasks)
+    assert _as_values(other.search(4)) != _as_values(first.search(3))
+
+
+def _as_values(found: JointSearch) -> dict[tuple[str, ...], tuple[float, dict[str, float]]]:
+    return {names: (one.fit.value, dict(one.fit.theta)) for names, one in found.fits.items()}
+
+
+def of_the_drift(task: Task) -> bool:
+    return isinstance(task, Probe) and "stiffness-drift" in task.names
+
+
+@pytest.mark.parametrize(
+    ("lost", "reached"),
+    [
+        (lambda task: isinstance(task, Promise), {"stiffness-drift"}),
+        (of_the_drift, {"force-offset", "sensor-drift"}),
+        (lambda task: isinstance(task, Climb | Join) and bool(names_of(task)), set()),
+    ],
+    ids=["promises", "probes of a mechanism", "fits with mechanisms"],
+)
+def test_tasks_that_fail_do_no_more_than_leave_mechanisms_out(
+    asked: Make, lost: Callable[[Task], bool], reached: set[str]
+) -> None:
+    found = asked(stiffness_rate=9e-4, F0=-0.03, lost=lost).search()
+    assert {name for names in found.fits for name in names} == reached
+    assert () in found.fits
+
+
+def test_a_mechanism_whose_probes_fail_in_part_is_still_found(asked: Make) -> None:
+    probes: Counter[float] = Counter()
+
+    def lost(task: Task) -> bool:
+        """All probes with the first shape that is tried."""
+        if not of_the_drift(task):
+            return False
+        probes[task.theta["stiffness_time"]] += 1
+        return task.theta["stiffness_time"] == next(iter(probes))
+
+    one = asked(stiffness_rate=-9e-4, stiffness_time=200.0, lost=lost)
+    assert one.search().best.fit.names == ("stiffness-drift",)
+    assert len(probes) > 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"), [(Probe, "no skin that runs;"), (Climb, "no skin that runs: the worker ended;")]
+)
+def test_a_recording_on_which_no_skin_runs_is_refused(asked: Make, kind: type, says: str) -> None:
+    one = asked(lost=lambda task: isinstance(task, kind))
+    with pytest.raises(InputError, match=says):
+        one.search()
+
+
+def test_priors_without_a_skin_that_can_be_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A subcutis more than twice as stiff as the cutis everywhere."""
+    soft, stiff = (replace(p, lower=low, upper=high) for p, low, high in
+                   zip(BASE.parameters[:2], (10e3, 200e3), (20e3, 400e3), strict=True))  # fmt: skip
+    base = ParameterSpace((soft, stiff, *BASE.parameters[2:]))
+    with pytest.raises(InputError, match="priors: found no skin that runs"):
+        Asked(solved.bench(monkeypatch, solved.recorded(0), base)).search()

@@ -1,0 +1,44 @@
+"""What worker processes do in tests: they say which one they are, wait for each other, or die."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+
+def met(folder: str) -> int:
+    """Returns the process's id when two processes are in the folder."""
+    (Path(folder) / f"{os.getpid()}.pid").touch()
+    patience = time.monotonic() + 60.0
+    while len(list(Path(folder).glob("*.pid"))) < 2 and time.monotonic() < patience:
+        time.sleep(0.02)
+    return os.getpid()
+
+
+def slept(item: tuple[str, float]) -> tuple[str, int]:
+    """Writes its process's id to a file, sleeps for some seconds, returns the file and the id."""
+    file, seconds = item
+    unfinished = Path(f"{file}.partial")
+    unfinished.write_text(str(os.getpid()))
+    unfinished.rename(file)
+    time.sleep(seconds)
+    return file, os.getpid()
+
+
+def dead_once(file: str) -> int:
+    """Kills its process where a file is not there yet, which it then is; else returns the process's id."""
+    if file and not Path(file).exists():
+        Path(file).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return os.getpid()
+
+
+kept: list[int] = []
+
+
+def counted(item: int) -> tuple[int, ...]:
+    """All items that this process has had."""
+    kept.append(item)
+    return tuple(kept)
