@@ -265,19 +265,19 @@ def run(config: Path, scheduler: str | None, as_json: bool) -> None:
 def diagnose(source: Path, device: Path | None, as_json: bool) -> None:
     """What the model leaves out of a recording: where, which physics, how much better.
 
-    SOURCE is a configuration, or a recording by itself. Where no shipped surrogate knows its protocol, the
-    reduced model of the device solves the mechanisms of a set together: any protocol will do.
+    SOURCE is a configuration, or a recording by itself. Where a shipped surrogate knows its protocol,
+    mechanisms of the tissue are tried whose effects are shipped or were learnt by `bayeskin effects`, and
+    selection and fit are repeated on the recording up to the end of the second hold and tested on what
+    follows. That takes minutes, with many mechanisms most of an hour.
 
-    Tries each mechanism of the catalogue that acts on the instrument, and each of the tissue's that
-    `bayeskin effects` has learnt or that is shipped with the surrogate, with all other parameters free
-    again; then sets of them. Where there are three holds or more, selection and fit are repeated on the
-    recording up to the end of the second and tested on what follows. It takes minutes, with many mechanisms
-    most of an hour. The exit code is 0 whatever the verdict.
+    Elsewhere the reduced model of the device solves all mechanisms of a set together, on any protocol, in one
+    to three minutes. The exit code is 0 whatever the verdict.
 
     \b
     Example:
       bayeskin diagnose runs/healthy-skin.toml
       bayeskin diagnose runs/healthy-skin.h5 --json
+      bayeskin diagnose first.h5 --device device.toml
     """
     from bayeskin.pipeline import diagnosis
 

@@ -219,7 +219,10 @@ class _Searcher:
         return min(least, 1.0), max(most, 1.0)
 
     def _beside(self, current: JointFit) -> list[tuple[str, ...]]:
-        """Fits the sets with one mechanism more that promise most, and returns these sets."""
+        """Fits the sets with one mechanism more that promise most, and returns these sets.
+
+        A fit that ends below the one without the mechanism begins again where that is.
+        """
         names, settings = current.fit.names, self._settings
         others = [name for name in self._known if name not in names]
         solved = [name for name in others if isinstance(self._known[name].act, Tissue)]
@@ -251,11 +254,19 @@ class _Searcher:
             else Join(names, current.fit.theta, current.run, name, settings.runs)
             for name in chosen
         ])  # fmt: skip
-        for name, one in zip(chosen, fits, strict=True):
+        fits += self._ask([
+            Climb(one.fit.names, {**self._neutral, **current.fit.theta}, settings.runs)
+            for one in fits
+            if isinstance(one, JointFit) and one.fit.log_likelihood < current.fit.log_likelihood
+        ])  # fmt: skip
+        for one in fits:
             self.found.add(one)
-            gained = f"{self._gained(one, current):+.1f} nats" if isinstance(one, JointFit) else one
+        sets = [with_one(names, name, self._known) for name in chosen]
+        for name, its in zip(chosen, sets, strict=True):
+            fitted = self.found.fits.get(its)
+            gained = "no fit" if fitted is None else f"{self._gained(fitted, current):+.1f} nats"
             self._tell(f"{', '.join((*names, name))}: {gained}")
-        return [with_one(names, name, self._known) for name in chosen]
+        return sets
 
     def _probes(self, mechanism: Mechanism) -> list[dict[str, float]]:
         """Values of each part of a mechanism, at which the model is run."""

@@ -29,11 +29,12 @@ from bayeskin.pipeline.diagnosis_outputs import Found, Shown, candidates, draw, 
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import write_json
 from bayeskin.pipeline.joint_bench import JointBench, Source, asked, searches_file
-from bayeskin.pipeline.model import check_protocol, model_spec, reduced_files
+from bayeskin.pipeline.model import model_spec, reduced_files
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.reported import FullForce
 from bayeskin.pipeline.taking_up import Remainder
 from bayeskin.reduced.enrichment import EnrichmentSettings, enrich
+from bayeskin.reduced.region import protocol_outside
 from bayeskin.types import Array, BinnedForce
 from bayeskin.workers import local
 
@@ -44,6 +45,7 @@ OFF, ENRICHED = (
     2,
 )  # error of the reduced model over the noise of a bin, RMS, that calls for enrichment; times
 REACH = 0.5  # of the prior's width on either side of a run, within which its tangent is sampled
+KNOWN = "pads that open, by what and as fast as the reduced model was trained on"
 NAME = "diagnose"
 
 
@@ -55,7 +57,8 @@ def _work(run: Run) -> Mapping[str, Any]:
         run.folder / "recording", model, seed, parameter_space(run.config, run.config_path), stated
     )
     bench = JointBench(source)
-    check_protocol(run, bench.motion)
+    if beyond := protocol_outside(bench.model.trained.protocols, bench.motion):
+        raise InputError(run.config_path, f"a protocol that {model.name} does not know: {beyond[0]}", KNOWN)
     tell = partial(_tell, run)
     with asked(bench, searches_file(run.folder, bench), run.config.design.workers) as ask:
         found = search_jointly(ask, bench.binned, bench.base, bench.known, bench.noise, seed, tell)

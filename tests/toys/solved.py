@@ -24,6 +24,7 @@ from bayeskin.pipeline.joint_bench import JointBench, Source
 from bayeskin.types import (
     Array,
     BinnedForce,
+    Jumps,
     PadMotion,
     ParameterSpace,
     Phase,
@@ -42,11 +43,12 @@ PHASES = tuple(
     for kind, a, b in zip(_KINDS, MOTION.time_s[:-1], MOTION.time_s[1:], strict=True)
 )
 EDGES_S = np.arange(0.0, 66.5, 0.5)
+NO_WORD = Jumps(np.zeros(1), np.full(1, -np.inf), np.full(1, np.inf))  # of samples on any jump
 TRUTH = {"E_c": 200e3, "E_s": 30e3, "k_c": 1e-14, "k_s": 1e-13, "p_init": 300.0}
 NOISE_N = 2e-3
 BASE = default_space()
 KNOWN = {name: catalogue()[name] for name in ("force-offset", "sensor-drift", "stiffness-drift")}
-TIME_S = np.unique(np.concatenate([np.arange(0.0, 66.25, 0.25), MOTION.time_s]))
+TIME_S = np.unique(np.concatenate([np.arange(0.0, 66.125, 0.125), MOTION.time_s]))
 
 
 def force(values: Mapping[str, ArrayLike], time_s: Array = TIME_S) -> Array:
@@ -137,7 +139,7 @@ def bench(patch: pytest.MonkeyPatch, binned: BinnedForce, base: ParameterSpace =
         trained=SimpleNamespace(geometry=Geometry(), mechanisms={"stiffness-drift": None}),
         refinement=2, hash="toy",
     )  # fmt: skip
-    patch.setattr(joint_bench, "calm_bins", lambda folder: (binned, None, MOTION))
+    patch.setattr(joint_bench, "calm_bins", lambda folder: (binned, NO_WORD, MOTION))
     patch.setattr(joint_bench, "load_reduced", lambda file: model)
     patch.setattr(joint_bench, "simulate_reduced", simulate)
     return JointBench(Source(Path("recording"), Path("model"), 1, base))
