@@ -205,5 +205,5 @@ def test_a_recording_beyond_what_the_reduced_model_was_trained_for_is_refused(
     storage.save(short, replace(recording, displacement_m=6.0 * recording.displacement_m))
     code, line = bayeskin("diagnose", short)
     assert code == 2
-    assert "short.h5: design.coarse: found 'reduced' on a protocol that" in line
+    assert "short.h5: found a protocol that article-device-reduced.h5 does not know" in line
     assert "the pads open by 12.00 mm, trained up to 10 mm" in line

@@ -285,7 +285,9 @@ def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
     record = Record("inputs", True, 1.0, {"diagnosis.json": "00"})
     (tmp_path / "x" / "diagnose").mkdir(parents=True)
     write_record(tmp_path / "x" / "diagnose", record)
-    config = SimpleNamespace(model=SimpleNamespace(observation="reaction"), seed=0)
+    config = SimpleNamespace(
+        model=SimpleNamespace(observation="reaction"), design=SimpleNamespace(coarse=None), seed=0
+    )
     run = SimpleNamespace(
         config=config, folder=tmp_path / "x", at=lambda *parts: tmp_path.joinpath("x", *parts)
     )

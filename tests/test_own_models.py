@@ -337,7 +337,7 @@ def test_instrument_mechanisms_bring_their_parameters(served: str) -> None:
         ),
         ([[1.0, 2.0, 3.0]], {"times_s": [3.0, 500.0]}, "times within the protocol's 0 to 130 s"),
         ([[1.0, 2.0, 3.0]], {"edges_s": [3.0]}, "1 edges"),
-        ([[1.0, 2.0, 3.0]], {"mechanisms": ["wings"]}, "'wings'; expected some of backlash"),
+        ([[1.0, 2.0, 3.0]], {"mechanisms": ["wings"]}, "'wings'; expected some of amplifier-lag"),
         ([[1.0, 2.0, 3.0]], {"mechanisms": ["solid-viscoelasticity"]}, "lengths [3]; expected lengths [7]"),
         (
             [[1.0, 2.0, 3.0, 0.1, 0.1, 1.0, 2.0]],
