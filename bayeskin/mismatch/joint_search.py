@@ -221,7 +221,8 @@ class _Searcher:
     def _beside(self, current: JointFit) -> list[tuple[str, ...]]:
         """Fits the sets with one mechanism more that promise most, and returns these sets.
 
-        A fit that ends below the one without the mechanism begins again where that is.
+        One that fails, or ends below the fit without the mechanism, begins again there, with the values of a
+        run that was finished.
         """
         names, settings = current.fit.names, self._settings
         others = [name for name in self._known if name not in names]
@@ -237,12 +238,13 @@ class _Searcher:
         )
         promised: dict[str, float] = {}
         starts: dict[str, Mapping[str, float]] = {}
+        ran: dict[str, Mapping[str, float]] = {}  # where the model is known to run with a mechanism
         for (name, values), force_n in zip(probes, answers, strict=False):
             if isinstance(force_n, str):
                 continue
             gain, start = self._score(current, name, values, np.asarray(force_n))
             if gain > promised.get(name, 0.0):
-                promised[name], starts[name] = gain, start
+                promised[name], starts[name], ran[name] = gain, start, {**theta, **values}
         for name, nats in zip(quick, answers[len(probes) :], strict=True):
             if isinstance(nats, float):
                 promised[name] = nats
@@ -254,10 +256,9 @@ class _Searcher:
             else Join(names, current.fit.theta, current.run, name, settings.runs)
             for name in chosen
         ])  # fmt: skip
+        worse = [name for name, one in zip(chosen, fits, strict=True) if not _better(one, current)]
         fits += self._ask([
-            Climb(one.fit.names, {**self._neutral, **current.fit.theta}, settings.runs)
-            for one in fits
-            if isinstance(one, JointFit) and one.fit.log_likelihood < current.fit.log_likelihood
+            Climb(with_one(names, name, self._known), ran.get(name, theta), settings.runs) for name in worse
         ])  # fmt: skip
         for one in fits:
             self.found.add(one)
@@ -330,6 +331,11 @@ class _Searcher:
                  for one in sorted(fewer) if one not in self.found.fits]  # fmt: skip
         for one in self._ask(tasks):
             self.found.add(one)
+
+
+def _better(one: object, current: JointFit) -> bool:
+    """Whether an answer is a fit that is not below another."""
+    return isinstance(one, JointFit) and one.fit.log_likelihood >= current.fit.log_likelihood
 
 
 def _skin_force(found: JointFit, theta: Array) -> Array:
