@@ -176,6 +176,20 @@ def test_a_mechanism_whose_probes_fail_in_part_is_still_found(asked: Make) -> No
     assert len(probes) > 1
 
 
+def test_a_mechanism_whose_first_fit_fails_is_fitted_from_where_a_probe_ran(asked: Make) -> None:
+    ran: list[float] = []
+
+    def lost(task: Task) -> bool:
+        """All fits but those that begin at the values of a probe."""
+        if of_the_drift(task):
+            ran.append(task.theta["stiffness_rate"])
+        climbs = isinstance(task, Climb) and "stiffness-drift" in task.names
+        return climbs and task.start["stiffness_rate"] not in ran
+
+    found = asked(stiffness_rate=-9e-4, stiffness_time=200.0, lost=lost).search()
+    assert found.best.fit.names == ("stiffness-drift",)
+
+
 @pytest.mark.parametrize(
     ("kind", "says"), [(Probe, "no skin that runs;"), (Climb, "no skin that runs: the worker ended;")]
 )
