@@ -20,6 +20,7 @@ from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.noise_model import innovations
 from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun, error_lengths
 from bayeskin.mismatch.fit import Fit
+from bayeskin.mismatch.joint_fit import in_box
 from bayeskin.mismatch.wrapper import Sure
 from bayeskin.types import Array, ParameterSpace, Surrogate
 
@@ -144,24 +145,9 @@ def _with_noise(there: LogPosterior, trial: Mapping[str, float]) -> tuple[Array,
     """The point (D,) with the noise that suits its force best, a climb with all else held; latent (r,)."""
     low, high = there.bounds
     vector = np.clip(there.vector(trial), low, high)
-    held = _within(there, vector, np.zeros(there.surrogate.space.dim))
+    held = in_box(there, vector, np.zeros(there.surrogate.space.dim))
     top = gauss_newton(held, np.clip(vector, *held.bounds), None, 3)
     return np.clip(top.vector, low, high), top.latent
-
-
-def _within(local: LogPosterior, vector: Array, reach: Array) -> LogPosterior:
-    """The same posterior in a smaller box: `reach` (d,) of the prior's width about a point (D,)."""
-    space, low, high = local.surrogate.space, *local.bounds
-    width = (high - low)[: space.dim]
-    reach = np.maximum(reach, 1e-9) * width
-    line = vector[: space.dim]
-    lower, upper = (space.from_line(np.clip(line + sign * reach, low[: space.dim], high[: space.dim]))
-                    for sign in (-1.0, 1.0))  # fmt: skip
-    narrowed = tuple(
-        replace(p, lower=float(max(a, p.lower)), upper=float(min(b, p.upper)))
-        for p, a, b in zip(space.parameters, lower, upper, strict=True)
-    )
-    return replace(local, material=replace(space, parameters=narrowed))
 
 
 def _maximum(
@@ -171,7 +157,7 @@ def _maximum(
     """The most probable point in the trust region, its log posterior and the force (m,) that it promises."""
     names = local.surrogate.space.names
     vector = local.vector(centre)
-    near = _within(local, vector, np.array([1.0 if name in exact else trust for name in names]))
+    near = in_box(local, vector, np.array([1.0 if name in exact else trust for name in names]))
     low, high = near.bounds
     starts = [np.clip(vector, low, high)]
     starts += [np.clip(starts[0] + 0.3 * rng.uniform(-1, 1, len(low)) * (high - low), low, high)

@@ -37,7 +37,7 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class NamedMechanism:
-    """A mechanism that is named: probability of itself, and of any of the look-alikes `group`."""
+    """A mechanism that is named, its probability, and that of its look-alikes that are not named already."""
 
     name: str
     probability: float
@@ -56,7 +56,7 @@ class Judgement:
 
 
 def hypotheses_of(names: tuple[str, ...], alone: float, with_smooth: float) -> tuple[Hypothesis, Hypothesis]:
-    """Of a set by its log evidences, `alone` and with something smooth beside it."""
+    """Returns both hypotheses of a set, by its log evidences alone and with something smooth beside it."""
     odds = float(np.log(PRIOR / (1.0 - PRIOR)))
     own = len(names) * odds
     return Hypothesis(names, False, alone + own), Hypothesis(names, True, with_smooth + own + odds)
@@ -69,11 +69,11 @@ class Family:
     hypotheses: Sequence[Hypothesis]
 
     def probability(self, names: Collection[str]) -> float:
-        """That any of these mechanisms acts."""
+        """Returns the probability that any of these mechanisms acts."""
         return self._share([bool(set(names) & set(one.names)) for one in self.hypotheses])
 
     def probability_of_set(self, names: tuple[str, ...]) -> float:
-        """That just these mechanisms act, with something smooth beside them or not."""
+        """Returns the probability that just these mechanisms act, something smooth beside them or not."""
         return self._share([one.names == names for one in self.hypotheses])
 
     @property

@@ -27,19 +27,24 @@ from bayeskin.types import Array
 class TrustSettings:
     """Half width of the trust region, of the prior's width: at first, at most and at last.
 
-    kept : share of the promised gain that a step has to reach for the region to stay as it is
+    kept : share of the promised gain that a step has to reach for the region to stay as it is; more : from
+        which on it grows; shrinks, grows : by what factors
     enough : nats still promised at which a fit is settled
     runs : at most
-    climb : rounds of Gauss-Newton in a trust region
+    climb, held : rounds of Gauss-Newton in a trust region, and with the model's parameters held
     """
 
     first: float = 0.15
     largest: float = 0.5
     smallest: float = 0.004
     kept: float = 0.3
+    more: float = 0.8
+    shrinks: float = 0.3
+    grows: float = 2.0
     enough: float = 0.3
     runs: int = 9
     climb: int = 15
+    held: int = 6
 
 
 # Names of a set and values by name to a run with derivatives, or why it failed.
@@ -70,7 +75,7 @@ def fit_jointly(
     if isinstance(run, str):
         return run
     about = local(names, run)
-    vector, value = _at_run(about, about.vector(start))
+    vector, value = _at_run(about, about.vector(start), settings.held)
     trust, settled, made = settings.first, False, 1
     while made < settings.runs and trust >= settings.smallest:
         near = within(about, vector, trust)
@@ -85,21 +90,21 @@ def fit_jointly(
         gained = -np.inf
         if not isinstance(there, str):
             other = local(names, there)
-            moved, its_value = _at_run(other, ahead)
+            moved, its_value = _at_run(other, ahead, settings.held)
             gained = its_value - value
         if gained > 0.0 and not isinstance(there, str):
             run, about, vector, value = there, other, moved, its_value
         if gained < settings.kept * promised:
-            trust *= 0.3
-        elif gained > 0.8 * promised:
-            trust = min(2.0 * trust, settings.largest)
+            trust *= settings.shrinks
+        elif gained > settings.more * promised:
+            trust = min(settings.grows * trust, settings.largest)
     return JointFit(_fit(names, about, vector), run, made, settled)
 
 
-def _at_run(about: LogPosterior, vector: Array) -> tuple[Array, float]:
-    """The point (D,) with what is exact at the run as the recording asks for, and its log density."""
+def _at_run(about: LogPosterior, vector: Array, rounds: int) -> tuple[Array, float]:
+    """Returns the most probable point (D,) with the model's parameters held, and its log density."""
     held = within(about, vector, 0.0)
-    top = gauss_newton(held, np.clip(vector, *held.bounds), None, 6)
+    top = gauss_newton(held, np.clip(vector, *held.bounds), None, rounds)
     better = np.clip(top.vector, *about.bounds)
     return better, float(about.log_prob(better[None])[0])
 
@@ -111,15 +116,22 @@ def _fit(names: Sequence[str], about: LogPosterior, vector: Array) -> Fit:
 
 
 def within(about: LogPosterior, vector: Array, reach: float) -> LogPosterior:
-    """The same posterior in a smaller box: `reach` of the prior's width on either side of a point (D,), in
-    the parameters that the model solves."""
+    """Returns the same posterior with the parameters that the model solves held near a point (D,).
+
+    reach : of the prior's width, on either side
+    """
+    return in_box(about, vector, np.where(solved_columns(about), reach, 1.0))
+
+
+def in_box(about: LogPosterior, vector: Array, reach: Array) -> LogPosterior:
+    """Returns the same posterior in a smaller box about a point (D,).
+
+    reach (d,) : of the prior's width, on either side, for each of the surrogate's parameters
+    """
     space, (low, high) = about.surrogate.space, about.bounds
-    solved = solved_columns(about)
-    width = (high - low)[: space.dim]
-    far = np.where(solved, max(reach, 1e-9), 1.0) * width
-    line = vector[: space.dim]
-    lower, upper = (space.from_line(np.clip(line + sign * far, low[: space.dim], high[: space.dim]))
-                    for sign in (-1.0, 1.0))  # fmt: skip
+    low, high, line = low[: space.dim], high[: space.dim], vector[: space.dim]
+    far = np.maximum(reach, 1e-9) * (high - low)
+    lower, upper = (space.from_line(np.clip(line + sign * far, low, high)) for sign in (-1.0, 1.0))
     prior = about.material or space
     narrowed = tuple(
         replace(p, lower=float(max(a, p.lower)), upper=float(min(b, p.upper)))
@@ -129,6 +141,6 @@ def within(about: LogPosterior, vector: Array, reach: float) -> LogPosterior:
 
 
 def solved_columns(about: LogPosterior) -> Array:
-    """Which of the surrogate's parameters (d,) the forward model solves: those of its innermost surrogate."""
+    """Returns whether the forward model solves each of the surrogate's parameters, (d,)."""
     inner = set(innermost(about.surrogate).space.names)
     return np.array([name in inner for name in about.surrogate.space.names])

@@ -1,4 +1,4 @@
-"""Which mechanisms: a search in which the forward model solves all mechanisms of a set together.
+"""A search for mechanisms in which the forward model solves all mechanisms of a set together.
 
 The search goes forward from the fit without any mechanism. A score test of every other mechanism beside the
 set at hand orders them. The most promising are fitted, each with all other parameters free again, and the
@@ -24,7 +24,7 @@ from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.mismatch.corrected import FullRun
 from bayeskin.mismatch.joint_fit import JointFit
 from bayeskin.mismatch.search import weight
-from bayeskin.mismatch.tangent import Tangent
+from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array, BinnedForce, ParameterSpace
 
 
@@ -296,8 +296,8 @@ class _Searcher:
         about, mechanism = current.fit.log_posterior, self._known[name]
         low, high = about.bounds
         vector = np.clip(about.vector(current.fit.theta), low, high)
-        skin = about.surrogate.space.names[: len(current.run.theta)]
-        here = _skin_force(current, np.array([current.fit.theta[one] for one in skin]))
+        skin = innermost(about.surrogate)
+        here = skin.predict_mean(np.array([current.fit.theta[one] for one in skin.space.names]))
         mean = about.predict_mean(about.from_sampling(vector)) + (force_n - here)
         free = np.full(len(vector), True)
         ((_, gain, multiple, moved),) = promise(about, vector, vector[None], free, 1, mean)
@@ -334,16 +334,5 @@ class _Searcher:
 
 
 def _better(one: object, current: JointFit) -> bool:
-    """Whether an answer is a fit that is not below another."""
+    """Returns whether an answer is a fit that is not below another."""
     return isinstance(one, JointFit) and one.fit.log_likelihood >= current.fit.log_likelihood
-
-
-def _skin_force(found: JointFit, theta: Array) -> Array:
-    """Force (m,) of the skin about a fit's run."""
-    about = found.fit.log_posterior
-    space = ParameterSpace(about.surrogate.space.parameters[: len(found.run.theta)])
-    run: FullRun = found.run
-    assert run.slopes_n is not None
-    return Tangent(space, about.surrogate.edges_s, run.theta, run.force_n, run.slopes_n).predict_mean(theta)[
-        0
-    ]

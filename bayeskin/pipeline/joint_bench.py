@@ -36,6 +36,7 @@ from bayeskin.mismatch.tangent import Tangent
 from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline.folder import read_lines, sha256_of
+from bayeskin.pipeline.reported import beside_neutral
 from bayeskin.pipeline.workbench import calm_bins
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.model import ReducedModel
@@ -43,7 +44,6 @@ from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.types import Array, ParameterSpace, Surrogate
 from bayeskin.workers import Lost, standing
 
-BESIDE = 1e-4  # of the prior's width, by which derivatives are taken beside a neutral value
 UNKNOWN_MESH = 5e-3  # RMS error of bricks that no study was made of, over the force (docs/discretisation.md)
 TRUST = 0.15  # of the prior's width about a run, within which a mechanism is searched for on its tangent
 
@@ -124,11 +124,8 @@ class JointBench:
         at = np.array([theta[name] for name in space.names])
         by = dict(zip(space.names, map(float, change(space, at)), strict=True))
         values = dict(zip(space.names, map(float, at), strict=True))
-        if slopes:  # at its neutral value a law may not be there at all, and has no derivative
-            neutral = {name: value for m in mechanisms for name, value in m.neutral.items()}
-            values |= {
-                name: values[name] + BESIDE * by[name] for name in by if values[name] == neutral.get(name)
-            }
+        if slopes:
+            values |= beside_neutral(values, by, mechanisms)
         found = simulate_reduced(self.model, self.motion, values, mechanisms, by if slopes else None)
         if found.status != "ok":
             return found.message

@@ -40,10 +40,8 @@ from bayeskin.workers import local
 
 WEIGHED = 6  # sets, the likeliest and that without mechanisms, whose hypotheses are compared
 PREDICTIVE_DRAWS = 300
-OFF, ENRICHED = (
-    0.3,
-    2,
-)  # error of the reduced model over the noise of a bin, RMS, that calls for enrichment; times
+OFF = 0.3  # of a bin's noise, RMS: a larger error of the reduced model calls for enrichment
+ENRICHED = 2  # times at most
 REACH = 0.5  # of the prior's width on either side of a run, within which its tangent is sampled
 KNOWN = "pads that open, by what and as fast as the reduced model was trained on"
 NAME = "diagnose"
@@ -77,6 +75,10 @@ def _work(run: Run) -> Mapping[str, Any]:
     before, after = (locate(fit, {**fit.theta, **_noise_of(fit, noise)}, seed) for fit in (base, chosen))
     run.reporter.log("draws of the posterior, without and with what was found")
     drawn = {fit.names: _drawn(fit, seed) for fit in (base, chosen)}
+    pictured = {
+        fit.names: _shown(fit, windows, drawn[fit.names])
+        for fit, windows in ((base, before), (chosen, after))
+    }
     parts = contributions(best, chosen.theta, bench.reported, bench.known)
     remainder = None
     if judged.verdict == "unknown" or (judged.named and after.windows):
@@ -85,7 +87,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     answer: dict[str, Any] = {
         "verdict": judged.verdict,
         "nothing_probability": judged.nothing_probability,
-        "unknown_probability": judged.smooth_probability,
+        "smooth_probability": judged.smooth_probability,
         "located": [window(one) for one in before.windows],
         "remaining": [window(one) for one in after.windows],
         "mechanisms": _mechanisms(judged, chosen, drawn[best].summary, bench.known, parts),
@@ -93,7 +95,8 @@ def _work(run: Run) -> Mapping[str, Any]:
         "candidates": candidates(tried, bench.known),
         "sets": [_set(names, found, left, family) for names in weighed],
         "fit": {
-            "before": _fit(bench.binned, base, drawn[()]), "after": _fit(bench.binned, chosen, drawn[best]),
+            "before": _fit(bench.binned, base, drawn[()], pictured[()]),
+            "after": _fit(bench.binned, chosen, drawn[best], pictured[best]),
         },
         "best_set": list(best),
         "full_model": checked if best == likeliest.fit.names else _checked(run, bench, chosen),
@@ -103,8 +106,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     figures = draw(
         run.folder / NAME, caption(run), bench.binned, bench.motion,
         Found(
-            _shown(base, before, drawn[()]), _shown(chosen, after, drawn[best]), None, bench.base.parameters,
-            parts, remainder,
+            pictured[()], pictured[best], None, bench.base.parameters, parts, remainder,
         ),
         answer["candidates"],
     )  # fmt: skip
@@ -170,28 +172,24 @@ def _set(
     }  # fmt: skip
 
 
-def _fit(binned: BinnedForce, fit: Fit, drawn: Resampled) -> dict[str, Any]:
+def _fit(binned: BinnedForce, fit: Fit, drawn: Resampled, shown: Shown) -> dict[str, Any]:
     usable = bins_in_windows(binned, None) >= 0
     return {
         "rmse": _rms((binned.force_n - fit.force_n)[usable]),
         "rmse_of_mean": _rms((binned.force_n - fit.mean_n)[usable]),
         "rmse_by_phase": dict(inference.rmse(binned, fit.force_n).by_kind_n),
         "rmse_held_out": None,
-        "coverage90": inference.coverage(binned, *_band(fit, drawn)),
+        "coverage90": inference.coverage(binned, *shown.band_n),
         "log_evidence": fit.log_evidence,
         "theta": drawn.summary,
         "sampled": {"settled": drawn.settled, "rhat": drawn.rhat, "effective": drawn.effective},
     }
 
 
-def _band(fit: Fit, drawn: Resampled) -> tuple[Array, Array]:
-    """Edges (m,) of the predictive band of 90 %."""
-    some = inference.evenly(drawn.draws, PREDICTIVE_DRAWS)
-    return inference.bands(fit.log_posterior, some, np.random.default_rng(1)).interval(0.9)
-
-
 def _shown(fit: Fit, located: Located, drawn: Resampled) -> Shown:
-    return Shown(fit.force_n, _band(fit, drawn), None, located, drawn.summary)
+    some = inference.evenly(drawn.draws, PREDICTIVE_DRAWS)
+    band_n = inference.bands(fit.log_posterior, some, np.random.default_rng(1)).interval(0.9)
+    return Shown(fit.force_n, band_n, None, located, drawn.summary)
 
 
 def _confirmed(run: Run, bench: JointBench, found: JointFit) -> tuple[JointFit, dict[str, Any]]:
@@ -252,7 +250,7 @@ def in_words(answer: Mapping[str, Any]) -> str:
               for one in answer["mechanisms"]]  # fmt: skip
     lines.append(f"  nothing is missing: probability {answer['nothing_probability']:.2f}")
     lines.append(
-        f"  something smooth that is not in the catalogue: probability {answer['unknown_probability']:.2f}"
+        f"  something smooth that is not in the catalogue: probability {answer['smooth_probability']:.2f}"
     )
     lines.append(
         f"The model leaves the recording in {len(answer['located'])} windows, "

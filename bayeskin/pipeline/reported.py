@@ -30,6 +30,17 @@ def reported(
     return observed(beyond, columns, motion, lambda t: np.atleast_2d(simulation.at(t)))
 
 
+def beside_neutral(
+    theta: Mapping[str, float], by: Mapping[str, float], mechanisms: Sequence[Mechanism]
+) -> dict[str, float]:
+    """Returns values beside those of `theta` that are neutral, by `BESIDE` of a change.
+
+    At its neutral value a law may not be there at all, and has no derivative (pads never opened).
+    """
+    neutral = {name: value for mechanism in mechanisms for name, value in mechanism.neutral.items()}
+    return {name: theta[name] + BESIDE * by[name] for name in by if theta[name] == neutral.get(name)}
+
+
 @dataclass(frozen=True)
 class FullForce:
     """A function of (names of mechanisms, values by name): bin means (m,) of a full run with them.
@@ -54,9 +65,7 @@ class FullForce:
         along = {p.name for mechanism in solved(mechanisms) for p in mechanism.parameters}
         theta = {name: value for name, value in values.items() if name in along or name in PARAMETERS}
         by = {name: change for name, change in changes.items() if name in theta}
-        # At its neutral value a law may not be there at all, and has no derivative (pads never opened).
-        neutral = {name: value for mechanism in mechanisms for name, value in mechanism.neutral.items()}
-        theta |= {name: theta[name] + BESIDE * by[name] for name in by if theta[name] == neutral.get(name)}
+        theta |= beside_neutral(theta, by, mechanisms)
         simulation = simulate(
             self.spec, self.motion, theta, laws=laws(mechanisms), gradients=by, falls_too=False
         )
