@@ -68,8 +68,9 @@ Make = Callable[..., Asked]
 
 def names_of(task: Task) -> tuple[str, ...]:
     """The set that a task is to fit or to run."""
-    more = (task.name,) if isinstance(task, Join | Promise) else ()
-    return tuple(sorted({*task.names, *more}))
+    asked = task.promise if isinstance(task, Join) else task
+    more = (asked.name,) if isinstance(asked, Promise) else ()
+    return tuple(sorted({*asked.names, *more}))
 
 
 @pytest.mark.parametrize(

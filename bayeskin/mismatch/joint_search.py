@@ -89,10 +89,7 @@ class Promise:
 class Join:
     """Asks for the fit of a set with one such mechanism more, first searched for on the tangent of a run."""
 
-    names: tuple[str, ...]
-    theta: Mapping[str, float]
-    run: FullRun
-    name: str
+    promise: Promise
     runs: int
 
 
@@ -253,7 +250,7 @@ class _Searcher:
         self._tell("promised: " + ", ".join(f"{name} {promised[name]:.0f} nats" for name in order[:5]))
         fits = self._ask([
             Climb(with_one(names, name, self._known), starts[name], settings.runs) if name in starts
-            else Join(names, current.fit.theta, current.run, name, settings.runs)
+            else Join(Promise(names, current.fit.theta, current.run, name), settings.runs)
             for name in chosen
         ])  # fmt: skip
         worse = [name for name, one in zip(chosen, fits, strict=True) if not _better(one, current)]

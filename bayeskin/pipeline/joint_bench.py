@@ -172,8 +172,9 @@ class JointBench:
         if isinstance(task, Promise):
             return {"nats": self._promised(task)}
         if isinstance(task, Join):
-            names = with_one(task.names, task.name, self.known)
-            start = {**self._neutral, **task.theta, **self._searched(task)}
+            beside = task.promise
+            names = with_one(beside.names, beside.name, self.known)
+            start = {**self._neutral, **beside.theta, **self._searched(beside)}
             return self._climbed(Climb(names, start, task.runs))
         return self._climbed(task)
 
@@ -189,7 +190,7 @@ class JointBench:
         parts = [part for name in new for part in self.known[name].whole_or_parts]
         return promised(about, task.theta, self._neutral, parts, self._seed)
 
-    def _searched(self, task: Join) -> Mapping[str, float]:
+    def _searched(self, task: Promise) -> Mapping[str, float]:
         """Values of a set with a mechanism more, on the tangent of the run without it."""
         about, new = self._beside(task)
         vector = np.clip(about.vector({**self._neutral, **task.theta}), *about.bounds)
@@ -197,7 +198,7 @@ class JointBench:
         near = within(about, vector, TRUST)
         return fit((*task.names, *new), near, task.theta, self._neutral, self._seed, None, parts).theta
 
-    def _beside(self, task: Promise | Join) -> tuple[LogPosterior, list[str]]:
+    def _beside(self, task: Promise) -> tuple[LogPosterior, list[str]]:
         new = [name for name in with_one(task.names, task.name, self.known) if name not in task.names]
         return self._posterior(self._seen(task.names, new, task.run)), new
 

@@ -175,6 +175,7 @@ def _set(
 def _fit(binned: BinnedForce, fit: Fit, drawn: Resampled, shown: Shown) -> dict[str, Any]:
     usable = bins_in_windows(binned, None) >= 0
     return {
+        "model": "reduced model",
         "rmse": _rms((binned.force_n - fit.force_n)[usable]),
         "rmse_of_mean": _rms((binned.force_n - fit.mean_n)[usable]),
         "rmse_by_phase": dict(inference.rmse(binned, fit.force_n).by_kind_n),

@@ -112,7 +112,7 @@ def _sure(facts: RunFacts) -> Verdict:
 def fits_of(fit: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """By model the fits without or with mechanisms, the last the best there is: the full model's, if any."""
     full = fit.get("full_model")
-    return {"surrogate": fit, **({"full model": full} if full and "rmse" in full else {})}
+    return {fit.get("model", "surrogate"): fit, **({"full model": full} if full and "rmse" in full else {})}
 
 
 def _beyond_the_catalogue(said: Mapping[str, Any]) -> list[str]:
@@ -131,8 +131,8 @@ def _missing(facts: RunFacts) -> Verdict:
         return Verdict("not known yet", "none", why, f"bayeskin diagnose {facts.config_path}")
     fit = said["fit"]
     fits = [fits_of(fit[when]) for when in ("before", "after")]
-    model = "full model" if all("full model" in one for one in fits) else "surrogate"
-    both = [quantity(one[model]["rmse"], "N") for one in fits]
+    last = all("full model" in one for one in fits)
+    both = [quantity(one["full model" if last else next(iter(one))]["rmse"], "N") for one in fits]
     if said["verdict"] == "nothing-missing":
         within = f"The recording stays within what the model allows ({both[0]} RMSE)."
         lines = [within, *_beyond_the_catalogue(said)]
