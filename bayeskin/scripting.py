@@ -171,7 +171,7 @@ def _workpiece(run: Run, recording: Recording) -> _Workpiece:
     made = prepared(run, recording)
     files = shipped_files(run)
     check_fits(run, files, load_design(files.design), made.binned, made.motion)
-    log_posterior = log_posterior_of(run, load_surrogate(files.surrogate), made.binned)
+    log_posterior = log_posterior_of(run, load_surrogate(files.surrogate), made.binned, made.motion)
     return _Workpiece(made.binned, made.motion, log_posterior)
 
 

@@ -3,7 +3,7 @@
 Skins of the default prior box whose subcutis is at most twice as stiff as the cutis (a scrambled Sobol'
 sequence), run with the `reaction` on 448 and on 1,540 bricks over the whole healthy-skin protocol. The
 difference of the two histories, in means over 0.5 s, is taken apart by least squares into the shapes of
-`bayeskin.mismatch.discretised`: a factor on the force, a bend of it with displacement, answers that relax.
+`bayeskin.inference.model_error`: a factor on the force, a bend of it with displacement, answers that relax.
 Prints the RMS of each over the skins, factor and bend in percent of the force, the rest of the peak.
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/mesh_shapes.py
@@ -23,7 +23,7 @@ import numpy as np
 import rows
 
 from bayeskin.design import default_space, sobol_points
-from bayeskin.mismatch.discretised import RELAXATION_S, errors, shapes
+from bayeskin.inference.model_error import RELAXATION_S, errors, shapes
 from bayeskin.mismatch.fit import STIFFEST_BELOW
 from bayeskin.model import simulate
 from bayeskin.model.simulate import ModelSpec

@@ -122,7 +122,7 @@ def summaries() -> dict[str, dict[str, Any]]:
                 for name, median in (("E_c", 51e3), ("p_init", 840.0), ("sd_rest", 0.0029))
             },
             "rmse": _RMSE, "coverage_90": 0.9462, "coverage_90_fitted": 0.9512,
-            "rms_sd_n": {"parameter": 0.0013, "surrogate": 0.0009, "noise": 0.0042},
+            "rms_sd_n": {"model": 0.0013, "surrogate": 0.0009, "noise": 0.0042},
         },
         "sobol": {
             name: {

@@ -17,9 +17,10 @@ from bayeskin.inference.noise_model import (
     NoiseChain,
     bins_in_windows,
     draw_noise,
+    innovation_sd,
     innovations,
     noise_chain,
-    scales,
+    noise_covariance,
 )
 from bayeskin.types import Array, BinnedForce, Prediction
 
@@ -49,14 +50,18 @@ def noise_vectors(kinds: int, nu: float, rng: np.random.Generator, points: int =
 
 
 def covariance(chain: NoiseChain, noise: Array, diagonal: Array) -> Array:
-    """Of the noise at one point: marginal variances, and products of neighbours' correlations."""
-    scale, rho = (a[0] for a in scales(chain, noise[None], diagonal[None, chain.bins]))
-    k = len(scale)
-    out = np.eye(k)
+    """Of the noise at one point, entry by entry: a noise with a memory, a quicker one, and a white one."""
+    k, sd = len(chain.bins), noise[chain.kind]
+    time_s, out = np.cumsum(chain.gap_s), np.diag(diagonal[chain.bins])
     for a in range(k):
-        for b in range(a + 1, k):
-            out[a, b] = out[b, a] = np.prod(rho[a + 1 : b + 1])
-    return scale[:, None] * out * scale
+        for b in range(a, k):
+            apart = chain.starts[a + 1 : b + 1].any()
+            memory = 0.0 if apart else np.exp(-(time_s[b] - time_s[a]) / noise[-2])
+            quick = 0.0 if apart else np.prod(chain.correlation[a + 1 : b + 1])
+            both = sd[a] * sd[b] * memory + quick * np.sqrt(chain.variance_n2[a] * chain.variance_n2[b])
+            out[a, b] += both
+            out[b, a] = out[a, b]
+    return out
 
 
 def drawn(binned: BinnedForce, prediction: Prediction, noise: Array, rng: np.random.Generator) -> BinnedForce:
@@ -94,12 +99,24 @@ def test_neighbours_covary_as_both_noises_say() -> None:
     own = binned.correlation * np.sqrt(binned.variance_n2[1:] * binned.variance_n2[:-1])
     sampled = sd[1:] * sd[:-1] * np.exp(-np.diff(binned.time_s) / noise[-2])
     assert np.diag(got, 1) == pytest.approx(own + sampled)
+    assert noise_covariance(chain, noise, np.zeros(30)) == pytest.approx(got)
+
+
+def test_innovations_of_the_noise_are_independent() -> None:
+    """They are the noise by the inverse of its covariance's Cholesky factor."""
+    rng = np.random.default_rng(8)
+    chain = noise_chain(irregular_recording(40, rng), [(0.0, 9.0), (9.0, 30.0)])
+    noise, diagonal = noise_vectors(len(chain.kinds), 5.0, rng)[0], rng.uniform(0, 1e-5, 40)
+    root = np.linalg.cholesky(covariance(chain, noise, diagonal))
+    columns = rng.standard_normal((len(chain.bins), 3))
+    own = diagonal[chain.bins]
+    assert innovations(chain, noise, own, columns) == pytest.approx(np.linalg.solve(root, columns))
+    assert innovation_sd(chain, noise, own) == pytest.approx(np.diag(root))
 
 
 def test_an_omitted_bin_is_a_marginalised_bin() -> None:
-    """Where the noise is one Ornstein-Uhlenbeck process, omitted bins leave its covariance."""
     rng = np.random.default_rng(2)
-    binned = dataclasses.replace(irregular_recording(40, rng), variance_n2=np.zeros(40))
+    binned = irregular_recording(40, rng)
     force = np.array(binned.force_n)
     force[[7, 8, 20]] = np.nan
     holed = dataclasses.replace(binned, force_n=force)
@@ -201,8 +218,8 @@ def test_latents_beyond_what_a_surrogate_denies_are_found_as_by_a_general_optimi
     square = (white[:, 0] - white[:, 1:] @ z) ** 2
     bend = (nu + 1.0) * (nu - square) / (nu + square) ** 2
     curvature = (white[:, 1:].T * bend) @ white[:, 1:] + np.diag(1.0 + STIFF * (np.abs(z) > FARTHEST))
-    scale, rho = scales(chain, noise, prediction.diagonal[:, chain.bins])
-    density = len(white) * stats.t.logpdf(0.0, nu) - np.log(scale * np.sqrt(1.0 - rho**2)).sum()
+    scale = innovation_sd(chain, noise[0], prediction.diagonal[0, chain.bins])
+    density = len(white) * stats.t.logpdf(0.0, nu) - np.log(scale).sum()
     expected = density - energy(z) - 0.5 * np.linalg.slogdet(curvature)[1]
     assert log_likelihood(chain, prediction, noise)[0] == pytest.approx(expected, rel=1e-6, abs=1e-3)
 
@@ -221,10 +238,9 @@ def test_drawn_noise_has_the_chain_s_covariance() -> None:
 
 
 def test_a_block_is_scored_given_the_others() -> None:
-    """With Gaussian tails, the conditional normal of the block; exact where the noise is one process."""
+    """With Gaussian tails, the conditional normal of the block."""
     problem = toy_problem()
-    quiet = dataclasses.replace(problem.binned, variance_n2=np.zeros(130))
-    problem = dataclasses.replace(problem, binned=quiet)
+    quiet = problem.binned
     problem.surrogate.predict = _without_diagonal(problem.surrogate.predict)
     theta = np.array([[*TRUTH.values(), *NOISE.values()]])
     theta[0, -1] = np.inf

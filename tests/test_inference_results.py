@@ -10,8 +10,20 @@ import nlopt
 import numpy as np
 import pytest
 import toy
+from numpy.typing import ArrayLike
 from scipy import stats
-from toy_inference import EDGES_S, NOISE, SCALE, TRUTH, ToySurrogate, full_run, line_problem, toy_problem
+from toy_inference import (
+    EDGES_S,
+    NOISE,
+    SCALE,
+    TRUTH,
+    LineSurrogate,
+    ToySurrogate,
+    empty_recording,
+    full_run,
+    line_problem,
+    toy_problem,
+)
 
 from bayeskin.errors import InputError
 from bayeskin.inference import (
@@ -36,7 +48,17 @@ from bayeskin.inference import (
 )
 from bayeskin.inference.identify import information_gain_nats, parts
 from bayeskin.inference.inference_data import _attributes
-from bayeskin.types import Array, Correlation, Parameter, ParameterSpace, Provenance, Simulation
+from bayeskin.inference.model_error import ModelError
+from bayeskin.inference.noise_model import draw_noise, noise_chain
+from bayeskin.types import (
+    Array,
+    Correlation,
+    Parameter,
+    ParameterSpace,
+    Prediction,
+    Provenance,
+    Simulation,
+)
 
 mpl.use("Agg")
 HOLDS = ((15.0, 45.0), (75.0, 105.0))
@@ -79,10 +101,22 @@ def test_starts_on_the_ridge_agree_on_its_height() -> None:
     assert "of 2 starts" in found.message
 
 
+class Folded(LineSurrogate):
+    """force = |a| + b t: one maximum for each sign of a, the lower one on the prior's bound."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        a, b = self.space.parameters
+        self.space = ParameterSpace((dataclasses.replace(a, lower=-0.19), b))
+
+    def predict(self, theta: ArrayLike) -> Prediction:
+        return super().predict(np.atleast_2d(theta) * [0.0, 1.0] + np.abs(np.atleast_2d(theta)) * [1.0, 0.0])
+
+
 def test_three_kinds_of_search_end_at_one_maximum() -> None:
-    problem = toy_problem(windows=HOLDS)
+    problem = dataclasses.replace(line_problem(1), surrogate=Folded())
     found = find_map(problem, seed=1, starts=6, evaluations=4000)
-    assert min(start.value for start in found.starts) < found.value - 1.0  # there is a lower one besides
+    assert min(start.value for start in found.starts) < found.value - 0.3  # there is a lower one besides
     assert list(found.by_search) == list(optimise.SEARCHES)
     assert all(found.value - value < 0.1 for value in found.by_search.values())
     assert "by controlled random search, differential evolution, Gauss-Newton" in found.message
@@ -92,8 +126,8 @@ def test_no_more_starts_are_made_where_every_kind_of_search_agrees() -> None:
     found = find_map(line_problem(), seed=0, starts=8, evaluations=4000)
     assert [start.search for start in found.starts] == list(optimise.SEARCHES)
     assert found.agreement == 1.0
-    ridge = find_map(toy_problem(windows=HOLDS), seed=1, starts=5, evaluations=4000)
-    assert len(ridge.starts) == 5
+    folded = dataclasses.replace(line_problem(1), surrogate=Folded())
+    assert len(find_map(folded, seed=1, starts=5, evaluations=4000).starts) == 5
 
 
 @pytest.mark.parametrize("kind", optimise.SEARCHES)
@@ -190,9 +224,9 @@ def test_the_parts_of_the_bands_are_what_they_are_called(sd_n: float) -> None:
     draws = around_truth(600, 0.01)
     draws[:, -1] = 100.0
     found = bands(problem, draws, np.random.default_rng(0))
-    prediction = problem.predict(draws)
-    assert found.sd_parameter_n == pytest.approx(prediction.mean.std(axis=0))
-    assert found.sd_surrogate_n == pytest.approx(prediction.sd()[0])
+    drawn = predictive_draws(problem, draws, np.random.default_rng(0))
+    assert found.sd_model_n == pytest.approx(drawn.mean_n.std(axis=0))
+    assert found.sd_surrogate_n == pytest.approx(problem.predict(draws).sd()[0])
     kinds = np.array([p.kind for p in problem.binned.phases])[problem.binned.phase]
     hold = found.sd_noise_n[kinds == "hold"]
     assert hold == pytest.approx(np.sqrt(NOISE["sd_hold"] ** 2 + 1e-6), rel=0.01)
@@ -202,14 +236,37 @@ def test_the_parts_of_the_bands_are_what_they_are_called(sd_n: float) -> None:
         found.interval(0.8)
 
 
-def test_bands_cover_recordings_as_often_as_they_say() -> None:
-    problem = toy_problem()
-    theta = np.tile([*TRUTH.values(), *NOISE.values()], (1000, 1))
+def test_bands_cover_further_recordings_of_the_same_skin_as_often_as_they_say() -> None:
+    """Its error, which is that of the first recording, is known from that one only."""
+    rng, covered = np.random.default_rng(2), []
+    theta = np.tile([*TRUTH.values(), *NOISE.values()], (500, 1))
+    surrogate = ToySurrogate(sd_n=1e-2)
+    prediction = surrogate.predict(theta[:1])
+    for _ in range(20):
+        truth = prediction.mean[0] + prediction.factor[0] @ rng.standard_normal(3)
+        chain = noise_chain(empty_recording())
+        first, *others = truth + draw_noise(
+            chain, theta[:6, 5:], np.repeat(prediction.diagonal, 6, axis=0), rng
+        )
+        problem = toy_problem(surrogate=surrogate)
+        problem = dataclasses.replace(problem, binned=dataclasses.replace(problem.binned, force_n=first))
+        low, high = bands(problem, theta, rng).interval(0.9)
+        covered += [coverage(dataclasses.replace(problem.binned, force_n=f), low, high) for f in others]
+    assert np.mean(covered) == pytest.approx(0.9, abs=0.02)
+
+
+def test_an_error_of_the_model_is_in_the_bands_as_the_recording_shows_it() -> None:
+    """A model that pulls two hundredths too hard: the bands are about the recording, and narrow."""
+    problem = toy_problem(surrogate=ToySurrogate(sd_n=1e-9))
+    error = ModelError(toy.MOTION, problem.binned.edges_s, 0.02)
+    mean = problem.predict([list(TRUTH.values())]).mean[0]
+    binned = dataclasses.replace(problem.binned, force_n=1.02 * mean)
+    problem = dataclasses.replace(problem, binned=binned, model_error=error)
+    theta = np.tile([*TRUTH.values(), *NOISE.values()], (200, 1))
     found = bands(problem, theta, np.random.default_rng(1))
-    low, high = found.interval(0.9)
-    fresh = predictive_draws(problem, theta[:200], np.random.default_rng(2)).force_n
-    inside = [coverage(dataclasses.replace(problem.binned, force_n=f), low, high) for f in fresh]
-    assert np.mean(inside) == pytest.approx(0.9, abs=0.01)
+    np.testing.assert_allclose(found.mean_n, 1.02 * mean, atol=2e-3)
+    assert found.sd_model_n.max() < 0.2 * 0.02 * mean.max()
+    assert found.sd_surrogate_n.max() < 1e-6
 
 
 def test_kinds_that_were_not_fitted_take_the_largest_noise() -> None:

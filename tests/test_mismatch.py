@@ -20,11 +20,11 @@ from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior, NoisePriors, find_map
 from bayeskin.inference.convergence import Limits
 from bayeskin.inference.gauss_newton import gauss_newton, promise, surrogate_error
+from bayeskin.inference.model_error import BEND, RELAXATION_S, RELAXING, ModelError, relaxing
 from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.blocked import errors_left_out, without
-from bayeskin.mismatch.discretised import BEND, RELAXATION_S, RELAXING, Discretised, relaxing
 from bayeskin.mismatch.fit import (
     APART,
     Fit,
@@ -372,11 +372,11 @@ def test_another_search_shows_where_no_path_of_its_own_leads(
 
 
 def test_means_alone_are_those_of_whole_predictions_of_all_that_is_shipped() -> None:
-    """Every effect, with estimates too, behind every mechanism of the instrument and the mesh's error."""
+    """Every effect, with estimates too, behind every mechanism of the instrument."""
     screen = shipped_screen()
     instrument = tuple(m for m in catalogue().values() if isinstance(m.act, Instrument))
     learnt = WithEffects(screen.refit.surrogate, screen.effects)
-    seen = ObservedSurrogate(Discretised(learnt, MOTION, 2e-3), instrument, MOTION)
+    seen = ObservedSurrogate(learnt, instrument, MOTION)
     assert innermost(seen) is learnt  # with parameters of tissue mechanisms
     assert skins(seen) == (screen.refit.surrogate.space.dim, learnt.space.dim)
     assert skins(learnt.base) == (screen.refit.surrogate.space.dim,)
@@ -415,11 +415,9 @@ def test_what_is_off_at_infinity_is_climbed_to_from_there() -> None:
 
 
 def test_whole_skins_are_drawn_anew_and_no_instrument_also_from_a_bound() -> None:
-    """Within Observed and Discretised all that the innermost surrogate has is drawn; rounding loses none."""
+    """All that the innermost surrogate has is drawn; rounding loses none."""
     plain = concealing(0)
-    inner = Discretised(
-        ObservedSurrogate(ToySurrogate(), (KNOWN["sensor-drift"],), toy.MOTION), toy.MOTION, 0.004
-    )
+    inner = ObservedSurrogate(ToySurrogate(), (KNOWN["sensor-drift"],), toy.MOTION)
     wide = dataclasses.replace(plain, surrogate=inner)
     low, high = wide.bounds
     for shear in (None, find_shear(plain)):
@@ -466,8 +464,7 @@ def test_what_a_surrogate_s_error_costs_is_what_it_would_gain_without_one(allowe
     alone = dataclasses.replace(alone, binned=dataclasses.replace(alone.binned, force_n=mean))
 
     def by(surrogate: Any) -> Any:
-        whole = Discretised(surrogate, toy.MOTION, allowed) if allowed else surrogate
-        return dataclasses.replace(alone, surrogate=whole)
+        return dataclasses.replace(alone, surrogate=surrogate, model_error=allowing(allowed))
 
     low, high = alone.bounds
     noise = alone.named(alone.from_sampling(0.5 * (low + high)))
@@ -612,10 +609,18 @@ def test_a_mechanism_that_does_nothing_gains_nothing() -> None:
     assert more.log_evidence < base.log_evidence + 2.0
 
 
+def allowing(amplitude: float) -> ModelError | None:
+    """Errors of the toy whose factor has this sd; none of 0."""
+    return ModelError(toy.MOTION, ToySurrogate().edges_s, amplitude) if amplitude else None
+
+
 def test_the_mesh_s_error_is_a_factor_and_a_bend_of_the_force_and_what_relaxes() -> None:
     skin = ToySurrogate()
     theta = np.array([list(TRUTH.values())] * 2)
-    plain, allowed = skin.predict(theta), Discretised(skin, toy.MOTION, 0.004).predict(theta)
+    plain = skin.predict(theta)
+    error = allowing(0.004)
+    assert error is not None
+    allowed = error.beside(plain)
     np.testing.assert_array_equal(allowed.mean, plain.mean)
     new = allowed.factor[0, :, plain.factor.shape[2] :]
     np.testing.assert_allclose(new[:, 0], 0.004 * plain.mean[0])
@@ -642,8 +647,8 @@ def test_a_mesh_that_is_off_by_a_factor_stays_inside_the_intervals() -> None:
     truth = right.surrogate.predict([list(TRUTH.values())]).mean[0].max()
     for allows, inside in ((False, False), (True, True)):
         skin = ToySurrogate(sd_n=1e-9)
-        allowing = Discretised(skin, toy.MOTION, 0.004) if allows else skin
-        alone = dataclasses.replace(right, binned=off, surrogate=allowing)
+        error = allowing(0.004 if allows else 0.0)
+        alone = dataclasses.replace(right, binned=off, surrogate=skin, model_error=error)
         found = resample(fit_base(alone, 1, None), find_shear(alone), 1)
         force = skin.predict(found.draws[:, : len(TRUTH)]).mean.max(axis=1)
         low, high = np.quantile(force, [0.05, 0.95])
@@ -754,14 +759,11 @@ def test_the_full_model_s_own_maximum_is_found_with_a_surrogate_s_wrong_slopes()
 
 def test_a_full_fit_has_in_its_force_what_its_mesh_is_wrong_by() -> None:
     """The full model pulls two hundredths too hard, its parameters held: the recording shows that."""
-    alone = dataclasses.replace(concealing(0), noise_priors=QUIET)
+    alone = dataclasses.replace(concealing(0), noise_priors=QUIET, model_error=allowing(0.02))
     noise = {f"sd_{kind}": 2e-3 for kind in ("rest", "load", "hold", "unload")}
     start = {**TRUTH, **noise, "tau_noise": 0.5, "nu_noise": 50.0}
     right = alone.surrogate.predict([TRUTH[n] for n in alone.surrogate.space.names]).mean[0]
-    found, _ = fit_full(
-        alone, start, lambda theta, changes: (1.02 * right, None), (), 1, 1,
-        lambda surrogate: Discretised(surrogate, toy.MOTION, 0.02),
-    )  # fmt: skip
+    found, _ = fit_full(alone, start, lambda theta, changes: (1.02 * right, None), (), 1, 1)
     np.testing.assert_allclose(found.force_n, right, atol=2e-3)
     np.testing.assert_allclose(found.force_n - found.mesh_n, 1.02 * right)
 
@@ -770,13 +772,13 @@ def test_a_full_fit_has_in_its_force_what_its_mesh_is_wrong_by() -> None:
 def test_what_is_allowed_for_takes_up_no_more_than_is_believed_of_it(of_sd: float, there: bool) -> None:
     """A force that bends with displacement as a mesh's error does, by so many sd of what that may be."""
     alone = concealing(0)
-    allowed = Discretised(Sure(alone.surrogate), toy.MOTION, 0.01)
+    allowed = dataclasses.replace(alone, surrogate=Sure(alone.surrogate), model_error=allowing(0.01))
     factor = allowed.predict([TRUTH[n] for n in alone.surrogate.space.names]).factor[0]
     bend = 2  # column of the factor: `Sure` has one, of no error, and the scale is the next
     binned = dataclasses.replace(alone.binned, force_n=alone.binned.force_n + of_sd * factor[:, bend])
     latent = np.zeros(factor.shape[1])
     latent[bend] = min(of_sd, 3.0)
-    off = dataclasses.replace(alone, binned=binned, surrogate=allowed)
+    off = dataclasses.replace(allowed, binned=binned)
     at = Fit((), off, {**TRUTH, **NOISE}, 0.0, 0.0, 1e-6 * np.eye(off.dim), latent)
     assert (locate(at, at.theta, 1).chance < 0.01) == there
     np.testing.assert_allclose(at.force_n, at.mean_n + factor @ latent, atol=1e-9)

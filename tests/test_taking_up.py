@@ -75,7 +75,7 @@ def bench_of(names: tuple[str, ...], effects: int = 0) -> tuple[Any, Fit, LogPos
     start = fit_near(names, wrong, {**truth, **noise, "nu_noise": 60.0}, None)
     learnt = [SimpleNamespace(mechanisms=names, own=(f"p{i}",)) for i in range(effects)]
     bench = SimpleNamespace(
-        spec=ModelSpec(), motion=toy.MOTION, binned=right.binned, with_mesh_error=lambda surrogate: surrogate,
+        spec=ModelSpec(), motion=toy.MOTION, binned=right.binned,
         surrogate=lambda names: skin, effects=learnt, posterior=lambda until_s, these: building(wrong, these),
         known={name: KNOWN[name] for name in names}, run=SimpleNamespace(config=SimpleNamespace(seed=1)),
     )  # fmt: skip

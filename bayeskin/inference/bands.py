@@ -9,16 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayeskin.errors import InputError
+from bayeskin.inference.gauss_newton import drawn_errors
 from bayeskin.inference.noise_model import (
     KINDS,
     NoiseChain,
     Windows,
     bins_in_windows,
     draw_noise,
+    innovations,
     noise_chain,
 )
 from bayeskin.inference.problem import LogPosterior
-from bayeskin.types import Array, BinnedForce, _FreezesArrays
+from bayeskin.types import Array, BinnedForce, Prediction, _FreezesArrays
 
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 _CHUNK = 256
@@ -26,7 +28,11 @@ _CHUNK = 256
 
 @dataclass(frozen=True)
 class ForceDraws(_FreezesArrays):
-    """Posterior predictive on all bins, (s, m) each [N]: model mean, surrogate error's sd, noisy force."""
+    """Posterior predictive on all bins, (s, m) each [N].
+
+    mean_n the force without noise, the errors of surrogate and model in it as the recording shows them;
+    surrogate_sd_n what the surrogate says of its own error; noise_sd_n; force_n with noise.
+    """
 
     mean_n: Array
     surrogate_sd_n: Array
@@ -38,21 +44,22 @@ class ForceDraws(_FreezesArrays):
 class Bands(_FreezesArrays):
     """Predictive bands over the bins, (m,) each [N], and the parts of their variance.
 
-    `sd_parameter_n` spread of the model's mean over the draws; `sd_surrogate_n` root of the mean variance
-    of the surrogate; `sd_noise_n` likewise of the noise (its Gaussian core, see `noise_model`).
-    quantiles_n (5, m): 5, 25, 50, 75 and 95 % of the predicted force, all parts in.
+    `sd_model_n` spread over the draws of the force without noise, which is what parameters and errors leave
+    open; `sd_noise_n` root of the mean variance of the noise (its Gaussian core, see `noise_model`);
+    `sd_surrogate_n` likewise of what the surrogate says of its own error, before the recording is known.
+    quantiles_n (5, m): 5, 25, 50, 75 and 95 % of the predicted force with noise.
     """
 
     time_s: Array
     mean_n: Array
-    sd_parameter_n: Array
+    sd_model_n: Array
     sd_surrogate_n: Array
     sd_noise_n: Array
     quantiles_n: Array
 
     @property
     def sd_total_n(self) -> Array:
-        return np.sqrt(self.sd_parameter_n**2 + self.sd_surrogate_n**2 + self.sd_noise_n**2)
+        return np.hypot(self.sd_model_n, self.sd_noise_n)
 
     def interval(self, level: float) -> tuple[Array, Array]:
         """Lower and upper edge (m,) [N] of the 50 % (0.5) or 90 % (0.9) band."""
@@ -74,8 +81,9 @@ class Rmse:
 def predictive_draws(log_posterior: LogPosterior, theta: ArrayLike, rng: np.random.Generator) -> ForceDraws:
     """One predicted recording for each draw theta (s, D) in SI, on all bins, fitted or not.
 
-    The noise is drawn afresh, not conditioned on the residual. Phases of a kind that was not fitted take
-    the largest of the fitted kinds' sd.
+    The errors of surrogate and model are those of this device and this skin: they are drawn given what the
+    draw leaves of the fitted bins. The noise is drawn afresh. Phases of a kind that was not fitted take the
+    largest of the fitted kinds' sd.
     """
     theta = np.atleast_2d(np.asarray(theta, dtype=float))
     fitted, chain = log_posterior.chain, _whole_chain(log_posterior.binned)
@@ -94,7 +102,7 @@ def bands_of(time_s: Array, draws: ForceDraws) -> Bands:
     return Bands(
         time_s=time_s,
         mean_n=draws.mean_n.mean(axis=0),
-        sd_parameter_n=draws.mean_n.std(axis=0),
+        sd_model_n=draws.mean_n.std(axis=0),
         sd_surrogate_n=np.sqrt((draws.surrogate_sd_n**2).mean(axis=0)),
         sd_noise_n=np.sqrt((draws.noise_sd_n**2).mean(axis=0)),
         quantiles_n=np.quantile(draws.force_n, LEVELS, axis=0),
@@ -147,9 +155,25 @@ def _predictive(
     sd = noise[:, : len(fitted.kinds)]
     columns = [sd[:, fitted.kinds.index(k)] if k in fitted.kinds else sd.max(axis=1) for k in chain.kinds]
     noise = np.column_stack([*columns, noise[:, -2:]])
-    prediction = log_posterior.predict(theta)
-    latent = rng.standard_normal((len(theta), prediction.factor.shape[2]))
-    force = prediction.mean + np.einsum("nmr,nr->nm", prediction.factor, latent)
-    force += draw_noise(chain, noise, prediction.diagonal, rng)
+    own = log_posterior.surrogate.predict(log_posterior.split(theta)[0])
+    prediction = log_posterior.with_model_error(own)
+    latent = _errors(log_posterior, theta, prediction, rng)
+    mean = prediction.mean + np.einsum("nmr,nr->nm", prediction.factor, latent)
+    force = mean + draw_noise(chain, noise, prediction.diagonal, rng)
     noise_sd = np.sqrt(noise[:, chain.kind] ** 2 + chain.variance_n2)
-    return prediction.mean, prediction.sd(), noise_sd, force
+    return mean, own.sd(), noise_sd, force
+
+
+def _errors(
+    log_posterior: LogPosterior, theta: Array, prediction: Prediction, rng: np.random.Generator
+) -> Array:
+    """Draws (n, r) of the errors given the fitted bins, in sd of each column of the factor: one a theta."""
+    chain, noise = log_posterior.chain, log_posterior.split(theta)[1]
+    normals = rng.standard_normal((len(theta), prediction.factor.shape[2]))
+    out = np.empty_like(normals)
+    for i in range(len(theta)):
+        residual = chain.force_n - prediction.mean[i, chain.bins]
+        columns = np.column_stack([residual, prediction.factor[i, chain.bins]])
+        white = innovations(chain, noise[i], prediction.diagonal[i, chain.bins], columns)
+        out[i] = drawn_errors(white[:, 0], white[:, 1:], float(noise[i, -1]), normals[i][:, None])[:, 0]
+    return out

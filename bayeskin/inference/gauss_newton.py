@@ -209,7 +209,7 @@ class _Linear:
         over draws of what that is by the recording (Dempster, Laird & Rubin 1977, JRSS B 39:1).
         """
         residual, _, factor = self.columns()
-        drawn = _drawn_errors(residual, factor, self.nu)
+        drawn = drawn_errors(residual, factor, self.nu, _normals(factor.shape[1]))
         mean = self.here.mean[0] + (self.here.factor[0] @ drawn).T  # (ERRORS, m)
 
         def values(tried: Array) -> Array:
@@ -356,8 +356,12 @@ def _weight(left: Array, nu: float) -> Array:
     return np.asarray((nu + 1.0) / (nu + left**2))
 
 
-def _drawn_errors(residual: Array, factor: Array, nu: float) -> Array:
-    """Draws (r, ERRORS) of the surrogate's error given the residual, normal about the most probable one."""
+def drawn_errors(residual: Array, factor: Array, nu: float, normals: Array) -> Array:
+    """Returns draws (r, s) of the force's error given the residual, normal about the most probable one.
+
+    In sd of each column of the factor; from standard normals (r, s). Residual (k,) and factor (k, r) are
+    whitened to innovations, of t noise with `nu` degrees of freedom.
+    """
     latent, weight = np.zeros(factor.shape[1]), np.ones(len(residual))
     for _ in range(QUICK_REWEIGHTED):
         weight = _weight(residual - factor @ latent, nu)
@@ -369,7 +373,7 @@ def _drawn_errors(residual: Array, factor: Array, nu: float) -> Array:
             latent, before = cho_solve((lower, True), target + rest), latent
             if np.array_equal(np.abs(latent) > FARTHEST, np.abs(before) > FARTHEST):
                 break
-    return np.asarray(latent[:, None] + solve_triangular(lower.T, _normals(len(latent))))
+    return np.asarray(latent[:, None] + solve_triangular(lower.T, normals))
 
 
 def surrogate_error(residual: Array, factor: Array, nu: float) -> Array:

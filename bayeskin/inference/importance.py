@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from bayeskin.inference.convergence import Verdict
 from bayeskin.inference.likelihood import log_likelihood
 from bayeskin.inference.problem import LogPosterior
-from bayeskin.types import Array, ParameterSpace, Prediction, _FreezesArrays
+from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
 SMOOTHED_FROM = 200  # draws
 KHAT_LIMIT = 0.7
@@ -62,9 +62,9 @@ def weigh(log_posterior: LogPosterior, theta: ArrayLike, force_n: ArrayLike) -> 
     """
     theta, force = np.atleast_2d(np.asarray(theta, dtype=float)), np.atleast_2d(np.asarray(force_n, float))
     ok = np.isfinite(force).all(axis=1)
-    exact = Prediction(force[ok], np.zeros((*force[ok].shape, 1)), np.zeros(force[ok].shape))
     log_ratio = np.full(len(theta), -np.inf)
     if ok.any():
+        exact = log_posterior.of_full_model(force[ok])
         full = log_likelihood(log_posterior.chain, exact, log_posterior.split(theta[ok])[1])
         log_ratio[ok] = full - log_posterior.log_likelihood(theta[ok])
     weights, khat = _weights(log_ratio)

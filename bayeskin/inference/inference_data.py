@@ -38,8 +38,8 @@ def to_inference_data(
 ) -> arviz.InferenceData:
     """Posterior (SI; chain = ensemble), lp, log-likelihood by phase, predictions, prior, data, attributes.
 
-    `predictive` draws, evenly taken from all ensembles, go into posterior_predictive: `force` with noise
-    and surrogate error, the model's `mean`, the `surrogate_sd` [N]. The log-likelihood is that of
+    `predictive` draws, evenly taken from all ensembles, go into posterior_predictive: `force` with noise,
+    its `mean` without, and the `surrogate_sd` [N] of the surrogate's own error. The log-likelihood is that of
     `LogPosterior.block_log_likelihood`, so that az.loo leaves out one phase at a time. Groups differ in
     their number of draws, as ArviZ allows.
     """

@@ -1,10 +1,10 @@
 """Log-likelihood of binned forces: correlated heavy-tailed noise and the surrogate's own error.
 
-Observed y = f + F z + e with f, F the surrogate's mean and factor, z ~ N(0, I_r), and e the noise chain
-of `noise_model` whose variance takes in the surrogate's diagonal. With the residual and the columns of F
-whitened by the chain, w and G, the innovations are eps(z) = w - G z, independent Student-t, and
+Observed y = f + F z + e with f, F the surrogate's mean and factor, z ~ N(0, I_r), and e the noise of
+`noise_model`, the surrogate's diagonal in it. With the residual and the columns of F as innovations of that
+noise over their sd s_j, w and G, the innovations are eps(z) = w - G z, independent Student-t, and
 
-    p(y) = prod_j 1/(s_j sqrt(1 - rho_j^2)) * int N(z; 0, I) prod_j t_nu(eps_j(z)) dz .
+    p(y) = prod_j 1/s_j * int N(z; 0, I) prod_j t_nu(eps_j(z)) dz .
 
 N is the normal density within three sd; beyond, its logarithm falls by 50 (|z| - 3)^2 more, since a
 surrogate that were wrong by tens of its sd could explain any misfit by an error that it denies. The integral
@@ -21,7 +21,7 @@ import math
 import numba as nb
 import numpy as np
 
-from bayeskin.inference.noise_model import NoiseChain
+from bayeskin.inference.noise_model import NoiseChain, filter_gains
 from bayeskin.types import Array, NDArray, Prediction
 
 _STEPS = 40  # bound on the mode search; five or six are usual
@@ -51,28 +51,31 @@ def log_likelihood(chain: NoiseChain, prediction: Prediction, noise: Array) -> A
         chain.bins,
         chain.force_n,
         chain.variance_n2,
-        chain.covariance_n2,
+        chain.correlation,
         chain.gap_s,
         chain.starts,
         chain.kind,
     )
 
 
+_gains = nb.njit(fastmath=_FAST, inline="always")(filter_gains)
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def _kernel(
     mean: Array, factor: Array, diagonal: Array, noise: Array,
-    bins: NDArray[np.int64], force: Array, variance: Array, covariance: Array,
+    bins: NDArray[np.int64], force: Array, variance: Array, correlation: Array,
     gap: Array, starts: NDArray[np.bool_], kind: NDArray[np.int64],
 ) -> Array:  # fmt: skip
     points, k, rank = len(noise), len(bins), factor.shape[1]
     out = np.empty(points)
     # Rows of zeros fill the last block of four: they add nothing, and the loops need no remainder.
-    white, design, work = np.empty(k), np.zeros((-(-rank // 4) * 4, k)), np.empty((4, k))
+    white, design, work = np.empty(k), np.zeros((-(-rank // 4) * 4, k)), np.empty((8, k))
     for i in range(points):
         p = i if len(mean) > 1 else 0
         log_scale = _whiten(
             mean[p], factor[p], diagonal[p], noise[i],
-            bins, force, variance, covariance, gap, starts, kind, white, design, work,
+            bins, force, variance, correlation, gap, starts, kind, white, design, work,
         )  # fmt: skip
         out[i] = _marginal(white, design, rank, noise[i, -1], work) - log_scale
     return out
@@ -81,58 +84,83 @@ def _kernel(
 @nb.njit(fastmath=_FAST, inline="always")
 def _whiten(
     mean: Array, factor: Array, diagonal: Array, noise: Array,
-    bins: NDArray[np.int64], force: Array, variance: Array, covariance: Array, gap: Array,
+    bins: NDArray[np.int64], force: Array, variance: Array, correlation: Array, gap: Array,
     starts: NDArray[np.bool_], kind: NDArray[np.int64], white: Array, design: Array, work: Array,
 ) -> float:  # fmt: skip
-    """Fills `white` (k,) and the first r rows of `design`; returns the sum of the innovations' log scales."""
+    """Fills `white` (k,) and the first r rows of `design`; returns the sum of the innovations' log sd.
+
+    The filter's states are kept as forces, what x and w are expected to add to a bin.
+    """
     k, tau = len(bins), noise[-2]
-    now, before, plain, inverse = work[0], work[1], work[2], work[3]
     decay, gap_before = 0.0, -1.0
+    sd, own, keep, keep_quick = work[0], work[1], work[2], work[3]
     for j in range(k):
         if gap[j] != gap_before:
             gap_before = gap[j]
             decay = math.exp(-gap_before / tau)
-        before[j] = decay
-    for j in range(k):
-        now[j] = noise[kind[j]]
-        plain[j] = force[j] - mean[bins[j]]
-        inverse[j] = now[j] * now[j] + variance[j] + diagonal[bins[j]]
-    for j in range(k):
-        inverse[j] = 1.0 / math.sqrt(inverse[j])
-    for j in range(1, k):
-        shared = now[j - 1] * now[j] * before[j] + covariance[j]
-        before[j] = 0.0 if starts[j] else shared * inverse[j] * inverse[j - 1]  # rho
-    before[0], now[0] = 0.0, inverse[0]
-    for j in range(1, k):
-        narrow = 1.0 / math.sqrt(1.0 - before[j] * before[j])
-        now[j] = narrow * inverse[j]
-        before[j] *= narrow * inverse[j - 1]
+        keep[j] = decay
+        sd[j], own[j] = noise[kind[j]], diagonal[bins[j]]
+    of_memory, of_quick, inverse = _gains(sd, variance, own, keep, correlation, starts)
     log_scale, product = 0.0, 1.0
     for j in range(k):
-        product *= now[j]
+        product *= inverse[j]
         if j % 8 == 7:  # one logarithm for eight factors
-            log_scale -= math.log(product)
+            log_scale += math.log(product)
             product = 1.0
-    _innovations(plain, now, before, white)
+    log_scale += math.log(product)
+    for j in range(k):
+        inverse[j] = 1.0 / inverse[j]
+        of_memory[j] *= sd[j]
+        quick = math.sqrt(variance[j])
+        of_quick[j] *= quick
+        own[j] = quick
+    for j in range(k - 1, 0, -1):
+        fresh = starts[j]
+        keep[j] = 0.0 if fresh else keep[j] * sd[j] / sd[j - 1]
+        keep_quick[j] = 0.0 if fresh or own[j - 1] == 0.0 else correlation[j] * own[j] / own[j - 1]
+    keep[0] = keep_quick[0] = 0.0
+    one, two, three, four = work[4], work[5], work[6], work[7]
+    for j in range(k):
+        one[j] = force[j] - mean[bins[j]]
+    _innovations(
+        one, one, one, one, keep, keep_quick, of_memory, of_quick, inverse, white, white, white, white
+    )
+    rank, last = len(factor), len(design)
     whole = bins[k - 1] - bins[0] == k - 1  # no gap: no need to gather
-    for a in range(len(factor)):
-        row = factor[a]
-        if whole:
-            row = row[bins[0] : bins[0] + k]
-        else:
-            for j in range(k):
-                plain[j] = row[bins[j]]
-            row = plain
-        _innovations(row, now, before, design[a])
-    return log_scale - math.log(product)
+    for a in range(0, last, 4):
+        for b in range(4):
+            row, target = factor[min(a + b, rank - 1)], work[4 + b]
+            if whole:
+                target[:] = row[bins[0] : bins[0] + k]
+            else:
+                for j in range(k):
+                    target[j] = row[bins[j]]
+            if a + b >= rank:
+                target[:] = 0.0
+        _innovations(
+            one, two, three, four, keep, keep_quick, of_memory, of_quick, inverse,
+            design[a], design[a + 1], design[a + 2], design[a + 3],
+        )  # fmt: skip
+    return log_scale
 
 
 @nb.njit(fastmath=_FAST, inline="always")
-def _innovations(plain: Array, now: Array, before: Array, out: Array) -> None:
-    """Each entry of `plain` (k,) scaled, less its share of the entry before it."""
-    out[0] = now[0] * plain[0]
-    for j in range(1, len(plain)):
-        out[j] = now[j] * plain[j] - before[j] * plain[j - 1]
+def _innovations(
+    one: Array, two: Array, three: Array, four: Array,
+    keep: Array, keep_quick: Array, of_memory: Array, of_quick: Array, inverse: Array,
+    first: Array, second: Array, third: Array, fourth: Array,
+) -> None:  # fmt: skip
+    """Innovations of four columns (k,) at once, so that the processor need not wait for each."""
+    m1, m2, m3, m4 = 0.0, 0.0, 0.0, 0.0
+    q1, q2, q3, q4 = 0.0, 0.0, 0.0, 0.0
+    for j in range(len(one)):
+        a, b, g, h, s = keep[j], keep_quick[j], of_memory[j], of_quick[j], inverse[j]
+        m1, m2, m3, m4 = a * m1, a * m2, a * m3, a * m4
+        q1, q2, q3, q4 = b * q1, b * q2, b * q3, b * q4
+        e1, e2, e3, e4 = one[j] - m1 - q1, two[j] - m2 - q2, three[j] - m3 - q3, four[j] - m4 - q4
+        first[j], second[j], third[j], fourth[j] = e1 * s, e2 * s, e3 * s, e4 * s
+        m1, m2, m3, m4 = m1 + g * e1, m2 + g * e2, m3 + g * e3, m4 + g * e4
+        q1, q2, q3, q4 = q1 + h * e1, q2 + h * e2, q3 + h * e3, q4 + h * e4
 
 
 @nb.njit(fastmath=_FAST, inline="always")

@@ -1,27 +1,29 @@
 """What the likelihood takes a recording's noise to be: its parameters, its order in time, its draws.
 
-The noise e of the bins is a Markov chain in time. With sd_j the sampled sd of bin j's phase kind, v_j
-the variance that the binned data carry themselves, d_j the surrogate's diagonal and c_j the correlation
-that neighbouring bins' own noise carries,
+The noise of bin j is the sum of three:
 
-    s_j^2 = sd_j^2 + v_j + d_j                                                (variance of bin j)
-    rho_j = (sd_{j-1} sd_j exp(-dt_j / tau) + c_j sqrt(v_{j-1} v_j)) / (s_{j-1} s_j)
-    eps_j = (e_j / s_j - rho_j e_{j-1} / s_{j-1}) / sqrt(1 - rho_j^2)         (innovation)
+    e_j = sd_j x_j + sqrt(v_j) w_j + sqrt(d_j) u_j ,
 
-and the innovations are independent Student-t of `nu_noise` degrees of freedom and unit *scale*. sd_j is
-hence the sd of the Gaussian core: the sd itself as nu_noise grows, and finite meaning at nu_noise = 2.
-Without v and d this is the Ornstein-Uhlenbeck process at the bins' own times, so unequal and omitted
-bins need no special case; with them, the variances and the covariances of neighbours stay exact and the
-rest follows from the Markov property (the completion of largest entropy; Dempster 1972, Biometrics
-28:157). A chain starts anew in each fit window.
+noise with a memory, whose sd is sampled for each kind of phase and which forgets within `tau_noise` (x is an
+Ornstein-Uhlenbeck process at the bins' own times); noise that is quicker, whose variance v_j and correlation
+of neighbours c_j the binned data carry themselves (w is a Markov chain); and the surrogate's diagonal, white.
+x and w have unit variance, and both start anew in each fit window.
+
+A Kalman filter over (x, w) turns the noise into innovations, each divided by its sd (Kalman 1960, J. Basic
+Eng. 82:35): with Gaussian noise they are independent and standard normal, exactly, for bins of any width
+and with any gap. They are taken to be independent Student-t of `nu_noise` degrees of freedom and unit
+*scale*. sd_j is hence the sd of the Gaussian core: the sd itself as nu_noise grows, and finite meaning at
+nu_noise = 2.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numba as nb
 import numpy as np
 
 from bayeskin.errors import InputError
@@ -45,7 +47,7 @@ class NoisePriors:
     """Bounds of the log-uniform priors on the noise: sd [N], correlation time [s], tail index."""
 
     sd_n: tuple[float, float] = (1e-4, 0.3)
-    tau_s: tuple[float, float] = (0.1, 100.0)
+    tau_s: tuple[float, float] = (0.1, 10.0)
     nu: tuple[float, float] = (2.0, 100.0)
 
 
@@ -53,15 +55,15 @@ class NoisePriors:
 class NoiseChain(_FreezesArrays):
     """The bins that enter a likelihood, in time order, with what does not depend on any parameter.
 
-    All (k,): `bins` index into the recording's bins; `force_n`; `variance_n2` own variance v;
-    `covariance_n2` with the bin before it, c sqrt(v v); `gap_s` time since the bin before;
-    `starts` True where a chain begins; `kind` index into `kinds`.
+    All (k,): `bins` index into the recording's bins; `force_n`; `variance_n2` of the quicker noise, v;
+    `correlation` of that with the bin before, c; `gap_s` time since the bin before; `starts` True where a
+    chain begins; `kind` index into `kinds`.
     """
 
     bins: NDArray[np.int64]
     force_n: Array
     variance_n2: Array
-    covariance_n2: Array
+    correlation: Array
     gap_s: Array
     starts: NDArray[np.bool_]
     kind: NDArray[np.int64]
@@ -118,15 +120,13 @@ def noise_chain(binned: BinnedForce, windows: Windows | None = None, omit: int |
     starts = np.concatenate([[True], np.diff(window[bins]) != 0])
     # A product of neighbours' correlations bridges omitted bins, as a Markov chain's does.
     neighbour = np.clip(np.nan_to_num(binned.correlation), -0.999, 0.999)
-    bridge = [np.prod(neighbour[a:b]) for a, b in pairwise(bins)]
-    covariance = np.zeros(len(bins))
-    covariance[1:] = np.array(bridge) * np.sqrt(variance[1:] * variance[:-1])
+    bridge = np.array([0.0, *(np.prod(neighbour[a:b]) for a, b in pairwise(bins))])
     of_kind = [kinds.index(binned.phases[p].kind) for p in binned.phase[bins]]
     return NoiseChain(
         bins=bins.astype(np.int64),
         force_n=binned.force_n[bins],
         variance_n2=variance,
-        covariance_n2=np.where(starts, 0.0, covariance),
+        correlation=np.where(starts, 0.0, bridge),
         # Equal gaps are equal to the last bit then, and share one exponential.
         gap_s=np.round(np.diff(binned.time_s[bins], prepend=binned.time_s[bins[0]]), 12),
         starts=starts,
@@ -140,36 +140,109 @@ def _kinds(binned: BinnedForce, bins: NDArray[np.int64]) -> tuple[PhaseKind, ...
     return tuple(kind for kind in KINDS if kind in present)
 
 
-def scales(chain: NoiseChain, noise: Array, diagonal: Array) -> tuple[Array, Array]:
-    """s (n, k) [N] and rho (n, k) of the module's equations; rho is 0 where a chain starts.
+def filter_gains(
+    sd: Array, variance: Array, diagonal: Array, decay: Array, correlation: Array, starts: NDArray[np.bool_]
+) -> tuple[Array, Array, Array]:
+    """Returns what the Kalman filter takes from each innovation [1/N], for x and for w, and its sd [N].
 
-    noise (n, q): columns of `noise_space(chain.kinds)`; diagonal (n, k) the surrogate's [N^2].
+    All (k,): sd of the noise with a memory, variances of the quicker noise and of the surrogate's diagonal
+    [N^2], correlations of x and of w with the bin before.
     """
-    sd = noise[:, chain.kind]
-    scale = np.sqrt(sd**2 + chain.variance_n2 + diagonal)
-    covariance = np.zeros_like(scale)
-    decay = np.exp(-chain.gap_s[1:] / noise[:, -2:-1])
-    covariance[:, 1:] = sd[:, 1:] * sd[:, :-1] * decay + chain.covariance_n2[1:]
-    rho = covariance
-    rho[:, 1:] /= scale[:, 1:] * scale[:, :-1]
-    rho[:, chain.starts] = 0.0
-    return scale, rho
+    k = len(sd)
+    of_memory, of_quick, scale = np.empty(k), np.empty(k), np.empty(k)
+    one, both, two = 1.0, 0.0, 1.0  # covariance of x and w
+    for j in range(k):
+        a, c = decay[j], correlation[j]
+        if starts[j]:
+            one, both, two = 1.0, 0.0, 1.0
+        else:
+            one, both, two = 1.0 - a * a * (1.0 - one), a * c * both, 1.0 - c * c * (1.0 - two)
+        quick = math.sqrt(variance[j])
+        first, second = sd[j] * one + quick * both, sd[j] * both + quick * two
+        square = sd[j] * first + quick * second + diagonal[j]
+        inverse = 1.0 / square
+        of_memory[j], of_quick[j], scale[j] = first * inverse, second * inverse, math.sqrt(square)
+        one -= first * of_memory[j]
+        both -= first * of_quick[j]
+        two -= second * of_quick[j]
+    return of_memory, of_quick, scale
+
+
+@nb.njit(cache=True)
+def _filtered(
+    sd: Array, variance: Array, decay: Array, correlation: Array, starts: NDArray[np.bool_],
+    gains: tuple[Array, Array, Array], columns: Array, forwards: bool,
+) -> Array:  # fmt: skip
+    """Innovations over their sd of columns (k, n) [N]; backwards, the columns that have these innovations."""
+    k, n = columns.shape
+    of_memory, of_quick, scale = gains
+    out, x, w = np.empty((k, n)), np.zeros(n), np.zeros(n)
+    for j in range(k):
+        quick = math.sqrt(variance[j])
+        a, c = (0.0, 0.0) if starts[j] else (decay[j], correlation[j])
+        for i in range(n):
+            x[i] *= a
+            w[i] *= c
+            expected = sd[j] * x[i] + quick * w[i]
+            if forwards:
+                new = columns[j, i] - expected
+                out[j, i] = new / scale[j]
+            else:
+                new = columns[j, i] * scale[j]
+                out[j, i] = expected + new
+            x[i] += of_memory[j] * new
+            w[i] += of_quick[j] * new
+    return out
+
+
+_gains = nb.njit(cache=True)(filter_gains)
+
+
+def _decay(chain: NoiseChain, noise: Array) -> Array:
+    return np.asarray(np.exp(-chain.gap_s / noise[-2]))
 
 
 def innovations(chain: NoiseChain, noise: Array, diagonal: Array, columns: Array) -> Array:
-    """eps (k, n) of the module's equations, of each of `columns` (k, n) [N]; noise (q,), diagonal (k,)."""
-    scale, rho = (one[0, :, None] for one in scales(chain, noise[None], diagonal[None]))
-    unit = columns / scale
-    before = np.concatenate([np.zeros((1, columns.shape[1])), unit[:-1]])
-    return np.asarray((unit - rho * before) / np.sqrt(1.0 - rho**2))
+    """Returns the innovations, over their sd, of each of `columns` (k, n) [N].
+
+    noise (q,): columns of `noise_space(chain.kinds)`; diagonal (k,) the surrogate's [N^2]
+    """
+    return _through(chain, noise, diagonal, columns, True)
+
+
+def innovation_sd(chain: NoiseChain, noise: Array, diagonal: Array) -> Array:
+    """Returns the sd [N] of the innovations (k,); noise and diagonal as in `innovations`."""
+    sd, decay = noise[chain.kind], _decay(chain, noise)
+    return np.asarray(_gains(sd, chain.variance_n2, diagonal, decay, chain.correlation, chain.starts)[2])
+
+
+def _through(chain: NoiseChain, noise: Array, diagonal: Array, columns: Array, forwards: bool) -> Array:
+    sd, decay = noise[chain.kind], _decay(chain, noise)
+    gains = _gains(sd, chain.variance_n2, diagonal, decay, chain.correlation, chain.starts)
+    columns = np.ascontiguousarray(columns, dtype=float)
+    return np.asarray(
+        _filtered(sd, chain.variance_n2, decay, chain.correlation, chain.starts, gains, columns, forwards)
+    )
+
+
+def noise_covariance(chain: NoiseChain, noise: Array, diagonal: Array) -> Array:
+    """Returns the covariance (k, k) [N^2] of the noise's Gaussian core; arguments as in `innovations`."""
+    sd, quick = noise[chain.kind], np.sqrt(chain.variance_n2)
+    memory = sd[:, None] * _markov(chain, _decay(chain, noise)) * sd
+    return np.asarray(memory + quick[:, None] * _markov(chain, chain.correlation) * quick + np.diag(diagonal))
+
+
+def _markov(chain: NoiseChain, with_the_one_before: Array) -> Array:
+    """Correlation (k, k) of a Markov chain."""
+    step = np.where(chain.starts, 0.0, with_the_one_before)
+    out = np.eye(len(step))
+    for i in range(1, len(step)):
+        out[i, :i] = step[i] * out[i - 1, :i]
+    return out + np.tril(out, -1).T
 
 
 def draw_noise(chain: NoiseChain, noise: Array, diagonal: Array, rng: np.random.Generator) -> Array:
-    """Noise [N] (n, k) drawn from the chain at n noise parameter vectors (n, q)."""
-    scale, rho = scales(chain, noise, diagonal)
-    innovation = rng.standard_t(noise[:, -1:], size=scale.shape)
-    unit = np.empty_like(scale)
-    unit[:, 0] = innovation[:, 0]
-    for j in range(1, scale.shape[1]):
-        unit[:, j] = rho[:, j] * unit[:, j - 1] + np.sqrt(1.0 - rho[:, j] ** 2) * innovation[:, j]
-    return scale * unit
+    """Returns noise [N] (n, k) drawn at n noise parameter vectors (n, q); diagonal (n, k) [N^2]."""
+    innovation = rng.standard_t(noise[:, -1:], size=diagonal.shape)
+    rows = zip(noise, diagonal, innovation, strict=True)
+    return np.stack([_through(chain, one, d, t[:, None], False)[:, 0] for one, d, t in rows])

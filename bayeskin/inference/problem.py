@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayeskin.errors import InputError
 from bayeskin.inference.likelihood import log_likelihood
+from bayeskin.inference.model_error import ModelError
 from bayeskin.inference.noise_model import NoiseChain, NoisePriors, noise_chain, noise_space
 from bayeskin.types import Array, BinnedForce, ParameterSpace, Prediction, Surrogate
 
@@ -29,6 +30,7 @@ _CHUNK = 256  # points predicted at once, so that factors of many bins stay smal
 class LogPosterior:
     """Posterior of material and noise parameters given one recording's bins.
 
+    `model_error` is what is allowed for the full model itself, beside the surrogate's own error.
     `fit_windows` [s] says which bins are fitted (those wholly inside one), None means all.
     `material` replaces the surrogate's own prior; its box must lie in the surrogate's. Where `excludes`
     says so of rows (n, d) of the surrogate's parameters, the prior is zero. Where the
@@ -44,6 +46,7 @@ class LogPosterior:
     material: ParameterSpace | None = None
     sure_within_n: float | None = None
     excludes: Callable[[ParameterSpace, Array], NDArray[np.bool_]] | None = None
+    model_error: ModelError | None = None
 
     def __post_init__(self) -> None:
         ours, theirs = self.binned.edges_s, self.surrogate.edges_s
@@ -101,9 +104,18 @@ class LogPosterior:
         return theta[:, :d], theta[:, d:]
 
     def predict(self, theta: ArrayLike) -> Prediction:
-        """The surrogate's prediction on all bins at SI values (n, D), (n, d) or (d,)."""
+        """The prediction on all bins, with the model's error, at SI values (n, D), (n, d) or (d,)."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
-        return self.surrogate.predict(theta[:, : self.surrogate.space.dim])
+        return self.with_model_error(self.surrogate.predict(theta[:, : self.surrogate.space.dim]))
+
+    def with_model_error(self, prediction: Prediction) -> Prediction:
+        """A prediction of the full model's force with what is allowed for that model."""
+        return prediction if self.model_error is None else self.model_error.beside(prediction)
+
+    def of_full_model(self, force_n: ArrayLike) -> Prediction:
+        """The prediction that runs of the full model make, whose forces (n, m) are known."""
+        force = np.atleast_2d(np.asarray(force_n, dtype=float))
+        return self.with_model_error(Prediction(force, np.zeros((*force.shape, 1)), np.zeros(force.shape)))
 
     def predict_mean(self, theta: ArrayLike) -> Array:
         """The mean (n, m) of `predict` alone."""
@@ -204,11 +216,18 @@ class LogPosterior:
             ),
             "recording": _sha256(repr(b.phases), *(np.ascontiguousarray(a).tobytes() for a in arrays)),
             "fit windows": _sha256(repr(self.fit_windows)),
+            "model error": _sha256(*self._allowed()),
         }
 
     def _limits(self) -> tuple[str, ...]:
         excludes = [] if self.excludes is None else [getattr(self.excludes, "__qualname__", "")]
         return (*excludes, *([] if self.sure_within_n is None else [f"{self.sure_within_n:.5g}"]))
+
+    def _allowed(self) -> tuple[str, ...]:
+        if self.model_error is None:
+            return ()
+        motion = self.model_error.motion
+        return (f"{self.model_error.amplitude:.5g}", repr(motion.time_s), repr(motion.displacement_m))
 
     def _probe(self) -> tuple[str, ...]:
         # Provenance may miss what changed (a patched file): the prediction itself does not. Five digits,

@@ -6,14 +6,17 @@ Three parts are added up, each with its own size s and length l of a squared-exp
     phase          over log(1 + time since the last corner); the same in all phases of a kind
     cycle          over the same time; its own in each phase of each cycle
 
-Sizes and lengths maximise the marginal likelihood, with the measured noise and the surrogate's error held.
-The prior is that of `unexplained`: orthogonal to all that the parameters could take up.
+The prior is that of `unexplained`: orthogonal to all that the parameters could take up. Sizes, lengths, and
+how large and how long-lived the noise with a memory is maximise the evidence, with and without a discrepancy;
+both evidences integrate over them. So what such noise can explain speaks for no discrepancy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +25,13 @@ from scipy.optimize import minimize
 
 from bayeskin.mismatch.features import describe
 from bayeskin.mismatch.fit import Fit, occam
-from bayeskin.mismatch.unexplained import Place, Unexplained, unexplained
+from bayeskin.mismatch.unexplained import Memory, Place, Unexplained, unexplained
 from bayeskin.types import Array, PadMotion
 
 PARTS = ("displacement", "phase", "cycle")
 SMALLEST, LARGEST = 0.01, 10.0  # size s: of the noise's sd, of the residual's RMS
 LENGTHS = ((0.05, 2.0), (0.2, 3.0), (0.2, 3.0))  # of the displacement's range; of log(1 + t / 1 s)
+LITTLE = 0.1  # of the fitted noise with a memory, from which a climb beside a discrepancy begins
 STEP = 1e-3  # of a hyperparameter's range, for second derivatives
 NOTICEABLE = 5.0  # nats over no discrepancy; noise alone gains less in 99 of 100 recordings
 
@@ -39,10 +43,10 @@ class Discrepancy:
     mean_n, sd_n (k,) of the discrepancy; parts_n: mean (k,) of each part, which add up to mean_n;
     beyond_n (k,) the residual beyond what parameters could still take up, and taken_n (k,) what they could;
     size_n the RMS of mean_n; share: of the squares of beyond_n those of mean_n, split by the parts' own;
-    size_by_part, length_by_part: hyperparameters; gain_nats: log marginal likelihood over that of no
-    discrepancy; log_evidence: of the fit with it, and without_log_evidence: without (`Unexplained`), sizes
-    and lengths integrated over log-uniform priors between their bounds; features: what it looks like, in
-    words.
+    size_by_part, length_by_part: hyperparameters; memory: the noise with a memory beside it; gain_nats: log
+    evidence at the best hyperparameters over that of no discrepancy at its best; log_evidence: of the fit
+    with it, and without_log_evidence: without (`Unexplained`), hyperparameters integrated over log-uniform
+    priors between their bounds; features: what it looks like, in words.
     """
 
     bins: NDArray[np.int64]
@@ -55,6 +59,7 @@ class Discrepancy:
     share: Mapping[str, float]
     size_by_part: Mapping[str, float]
     length_by_part: Mapping[str, float]
+    memory: Memory
     gain_nats: float
     log_evidence: float
     without_log_evidence: float
@@ -69,10 +74,12 @@ class Discrepancy:
 def discrepancy(found: Fit, motion: PadMotion) -> Discrepancy:
     """The discrepancy at a fit. `motion` is the recording's own."""
     rest = unexplained(found, motion)
-    squares = _squared_distances(rest.at)
-    masks = _masks(rest.at)
-    bounds = _bounds(rest)
-    line, value = _most_likely(rest, squares, masks, bounds)
+    squares, masks, bounds = _squared_distances(rest.at), _masks(rest.at), _bounds(rest)
+    noise_alone = _maximum(partial(_unlikely, rest=rest), _starts(rest), bounds[:2])
+    unlikely = partial(_unlikely, rest=rest, squares=squares, masks=masks)
+    top = _maximum(unlikely, _starts(rest, bounds), bounds)
+    alone, rest = rest.with_memory(noise_alone.line), rest.with_memory(top.line[:2])
+    line = top.line[2:]
     kernels = _kernels(line, squares, masks)
     reduced = rest.reduce @ rest.residual_n
     root = np.linalg.cholesky(rest.reduce @ np.sum(kernels, axis=0) @ rest.reduce.T + np.eye(len(reduced)))
@@ -85,7 +92,7 @@ def discrepancy(found: Fit, motion: PadMotion) -> Discrepancy:
     # The posterior covariance of a is I - S^-1, S = C + I with C the prior's.
     shrunk = solve_triangular(root, rest.expand.T, lower=True)
     sd = np.sqrt(np.maximum(np.sum(rest.expand**2, axis=1) - np.sum(shrunk**2, axis=0), 0.0))
-    gain = 0.5 * float(reduced @ reduced) - value
+    gain = noise_alone.value - top.value
     beyond = rest.beyond(rest.residual_n)
     own = {name: float(part @ part) for name, part in parts.items()}
     whole = float(beyond @ beyond) * sum(own.values())
@@ -96,9 +103,9 @@ def discrepancy(found: Fit, motion: PadMotion) -> Discrepancy:
         {name: float(mean @ mean) * one / whole if whole > 0.0 else 0.0 for name, one in own.items()},
         dict(zip(PARTS, np.exp(line[:3]).tolist(), strict=True)),
         dict(zip(PARTS, np.exp(line[3:]).tolist(), strict=True)),
-        gain,
-        rest.log_evidence(np.sum(kernels, axis=0)) + _integrated(line, bounds, rest, squares, masks),
-        rest.log_evidence(), features,
+        rest.memory, gain,
+        rest.log_evidence(np.sum(kernels, axis=0)) + top.share, alone.log_evidence() + noise_alone.share,
+        features,
     )  # fmt: skip
 
 
@@ -123,39 +130,70 @@ def _kernels(line: Array, squares: Array, masks: Array) -> Array:
 
 
 def _bounds(rest: Unexplained) -> Array:
-    """Of logarithms of sizes and lengths, (6, 2)."""
-    noise = float(np.sqrt(np.median(np.diag(rest.noise_n2))))
+    """Of logarithms of size and time of the noise with a memory, then of parts' sizes and lengths, (8, 2)."""
+    noise = float(np.sqrt(np.median(np.diag(rest.measured_n2))))
     rms = max(float(np.sqrt(np.mean(rest.beyond(rest.residual_n) ** 2))), noise)
-    return np.log([(SMALLEST * noise, LARGEST * rms)] * 3 + list(LENGTHS))
+    of_noise = [rest.memory.size_within, rest.memory.time_within]
+    return np.log([*of_noise, *[(SMALLEST * noise, LARGEST * rms)] * 3, *LENGTHS])
 
 
-def _most_likely(rest: Unexplained, squares: Array, masks: Array, bounds: Array) -> tuple[Array, float]:
-    """Logarithms of sizes and lengths (6,), and minus the log marginal likelihood there."""
-    rms = np.exp(bounds[0, 1]) / LARGEST
-    start = np.concatenate([np.full(3, np.log(rms / np.sqrt(3.0))), np.log([0.3, 0.8, 0.8])])
-    found = minimize(_unlikely, start, (rest, squares, masks), jac=True, method="L-BFGS-B", bounds=bounds)
-    return found.x, float(found.fun)
+def _starts(rest: Unexplained, bounds: Array | None = None) -> list[Array]:
+    """Where climbs begin: the noise as it was fitted, and next to none; with `bounds`, of parts as well."""
+    fitted = np.log([rest.memory.size, rest.memory.time_s])
+    noises = [fitted, fitted + np.log([LITTLE, 1.0])]
+    if bounds is None:
+        return noises
+    rms = np.exp(bounds[2, 1]) / LARGEST
+    parts = np.concatenate([np.full(3, np.log(rms / np.sqrt(3.0))), np.log([0.3, 0.8, 0.8])])
+    return [np.concatenate([noise, parts]) for noise in noises[1:]]
 
 
-def _integrated(line: Array, bounds: Array, rest: Unexplained, squares: Array, masks: Array) -> float:
-    """Laplace's logarithm of the share of the hyperparameters' box that the recording leaves, at the top."""
-    width = bounds[:, 1] - bounds[:, 0]
+class _Top(NamedTuple):
+    """Logarithms of the best hyperparameters; minus the log evidence there; Laplace's logarithm of the share
+    of their box that the recording leaves."""
+
+    line: Array
+    value: float
+    share: float
+
+
+def _maximum(
+    unlikely: Callable[[Array], tuple[float, Array]], starts: Sequence[Array], bounds: Array
+) -> _Top:
+    tops = [minimize(unlikely, np.clip(start, *bounds.T), jac=True, method="L-BFGS-B", bounds=bounds)
+            for start in starts]  # fmt: skip
+    best = min(tops, key=lambda top: top.fun)
+    line, width = np.asarray(best.x), bounds[:, 1] - bounds[:, 0]
     side = np.where(line + STEP * width < bounds[:, 1], STEP, -STEP)
-    there = [_unlikely(line + at, rest, squares, masks)[1] for at in (np.zeros(6), *np.diag(side * width))]
-    bend = np.array([(one - there[0]) * width / step for one, step in zip(there[1:], side, strict=True)])
-    return occam(np.linalg.eigvalsh(0.5 * (bend + bend.T)))
+    here = unlikely(line)[1]
+    there = [unlikely(line + at)[1] for at in np.diag(side * width)]
+    bend = np.array([(one - here) * width / step for one, step in zip(there, side, strict=True)])
+    return _Top(line, float(best.fun), occam(np.linalg.eigvalsh(0.5 * (bend + bend.T))))
 
 
-def _unlikely(line: Array, rest: Unexplained, squares: Array, masks: Array) -> tuple[float, Array]:
-    """Minus the log marginal likelihood, up to a constant, at `line` (6,) and its derivatives (6,)."""
-    reduced = rest.reduce @ rest.residual_n
-    kernels = _kernels(line, squares, masks)
-    prior = rest.reduce @ kernels.sum(axis=0) @ rest.reduce.T
-    root = np.linalg.cholesky(prior + np.eye(len(prior)))
-    inverse = cho_solve((root, True), np.eye(len(prior)))
-    weight = inverse @ reduced
-    value = 0.5 * float(reduced @ weight) + float(np.sum(np.log(np.diag(root))))
-    bend = rest.reduce.T @ (inverse - np.outer(weight, weight)) @ rest.reduce
+def _unlikely(
+    line: Array, rest: Unexplained, squares: Array | None = None, masks: Array | None = None
+) -> tuple[float, Array]:
+    """Minus the log evidence, up to a constant, at logarithms of hyperparameters, and its derivatives.
+
+    Size and time of the noise (2,), and with distances and masks those of parts after them (8,).
+    """
+    rest = rest.with_memory(line[:2])
+    memory = rest.memory.covariance_n2
+    covariance, kernels = rest.noise_n2 + rest.open_n2, None
+    if squares is not None and masks is not None:
+        kernels = _kernels(line[2:], squares, masks)
+        covariance = covariance + rest.beyond(rest.beyond(kernels.sum(axis=0)).T)
+    root = np.linalg.cholesky(covariance)
+    inverse = cho_solve((root, True), np.eye(len(root)))
+    weight = inverse @ rest.residual_n
+    value = 0.5 * float(rest.residual_n @ weight) + float(np.sum(np.log(np.diag(root))))
+    bend = inverse - np.outer(weight, weight)
+    forgetting = np.where(np.isfinite(rest.memory.apart_s), rest.memory.apart_s, 0.0) / rest.memory.time_s
+    slopes = [np.sum(bend * memory), 0.5 * np.sum(bend * memory * forgetting)]
+    if kernels is None or squares is None:
+        return value, np.array(slopes)
+    bend = rest.beyond(rest.beyond(bend).T)
     by_size = np.einsum("ij,pij->p", bend, kernels)
-    by_length = np.einsum("ij,pij,pij->p", bend, kernels, squares) * 0.5 * np.exp(-2.0 * line[3:])
-    return value, np.concatenate([by_size, by_length])
+    by_length = np.einsum("ij,pij,pij->p", bend, kernels, squares) * 0.5 * np.exp(-2.0 * line[5:])
+    return value, np.concatenate([slopes, by_size, by_length])

@@ -14,14 +14,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from bayeskin.errors import InputError
-from bayeskin.inference.noise_model import KINDS, noise_chain, scales
+from bayeskin.inference.noise_model import KINDS, noise_chain, noise_covariance
 from bayeskin.mechanisms import Mechanism, bin_means, laws, observed, solved
 from bayeskin.mechanisms.mechanism import ForceOfTime
 from bayeskin.mismatch import protocols as tests
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.information import FEWEST, expected_gain
 from bayeskin.mismatch.search import weight
-from bayeskin.mismatch.unexplained import chain_covariance
 from bayeskin.types import Array, BinnedForce, PadMotion, Simulation
 
 DRAWS = 12  # of each hypothesis
@@ -174,6 +173,5 @@ def noise_of(found: Fit, motion: PadMotion, edges_s: Array) -> Array:
     )  # fmt: skip
     ahead = noise_chain(planned)
     sds = [sd.get(kind, max(sd.values())) for kind in KINDS if kind in ahead.kinds]
-    noise = np.array([[*sds, found.theta["tau_noise"], np.inf]])
-    scale, rho = scales(ahead, noise, np.zeros((1, len(middle))))
-    return chain_covariance(scale[0], rho[0])
+    noise = np.array([*sds, found.theta["tau_noise"], np.inf])
+    return noise_covariance(ahead, noise, np.zeros(len(middle)))

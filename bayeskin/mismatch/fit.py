@@ -12,9 +12,9 @@ density along a coordinate, the others held, has less room than the Gaussian of 
 whose moment falls between two bins; a bound near by), both evidence and covariance shrink by that share.
 
 The noise of a diagnosis is what an instrument does from moment to moment: its sd is bounded by what the
-recording shows within bins, and it forgets within seconds. What is larger or lasts longer is for physics to
-explain; noise that could take it up would leave nothing to find. So swings of the force that are slower than
-a second, as a breath's, are not to pass for noise within bins.
+recording shows within bins, and it forgets within ten seconds. What is larger or lasts longer is for physics
+to explain; noise that could take it up would leave nothing to find. So swings of the force that are slower
+than a second, as a breath's, are not to pass for noise within bins.
 """
 
 from __future__ import annotations
@@ -32,13 +32,11 @@ from bayeskin.inference import LogPosterior, NoisePriors
 from bayeskin.inference.gauss_newton import Top, gauss_newton, promise
 from bayeskin.inference.likelihood import log_likelihood
 from bayeskin.inference.straighten import Shear
-from bayeskin.mismatch.discretised import without_own_error
-from bayeskin.mismatch.wrapper import skins
+from bayeskin.mismatch.wrapper import Sure, skins
 from bayeskin.types import Array, BinnedForce, ParameterSpace
 
-NOISE_SHARE = 1.5  # sd of the noise beyond that, at most, of the median sd of a bin's own mean
+NOISE_SHARE = 3.0  # sd of the noise with a memory, at most, of the median sd of a bin's own mean
 QUICK_S, QUICK_TIMES = 1.0, 2.5  # that sd is at most so many times what noise quicker than this makes it
-LONGEST_S = 2.0  # of the noise's memory
 FEWEST_TAILS = 50.0  # of the tail index: nearly normal, since spikes are gone from robust means of bins
 STIFFEST_BELOW = 2.0  # the subcutis over the cutis: on a stiffer one a cutis folds, and fat is the softer
 SURE = 0.03  # sd of the surrogate, RMS, at most, of the recorded force's range
@@ -81,7 +79,6 @@ def instrument_noise(binned: BinnedForce) -> NoisePriors:
     lowest = NoisePriors().sd_n[0]
     return NoisePriors(
         sd_n=(lowest, max(NOISE_SHARE * typical, 2.0 * lowest)),
-        tau_s=(NoisePriors().tau_s[0], LONGEST_S),
         nu=(FEWEST_TAILS, NoisePriors().nu[1]),
     )
 
@@ -145,7 +142,7 @@ class Fit:
         values = log_posterior.from_sampling(log_posterior.vector(self.theta))[None]
         free, none = (
             replace(log_posterior, surrogate=one).predict(values)
-            for one in (log_posterior.surrogate, without_own_error(log_posterior.surrogate))
+            for one in (log_posterior.surrogate, Sure(log_posterior.surrogate))
         )
         chain, noise = log_posterior.chain, log_posterior.split(values)[1]
         at_best = replace(chain, force_n=free.mean[0, chain.bins])

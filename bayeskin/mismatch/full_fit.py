@@ -22,7 +22,7 @@ from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun, error_lengt
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.joint_fit import in_box
 from bayeskin.mismatch.wrapper import Sure
-from bayeskin.types import Array, ParameterSpace, Surrogate
+from bayeskin.types import Array, ParameterSpace
 
 TRUST, SMALLEST, LARGEST = 0.1, 0.005, 0.4  # of the prior's width, either side
 COMMON = 100.0  # variance of the mean of errors of added effects, over that of the rest
@@ -55,18 +55,15 @@ class FullFit:
 
 def fit_full(
     log_posterior: LogPosterior, start: Mapping[str, float], full: Full, exact: Sequence[str], rounds: int,
-    seed: int, allow: Callable[[Surrogate], Surrogate] = lambda surrogate: surrogate,
-    given: Sequence[FullRun] = (), several: bool = True, at_least: float = -np.inf,
+    seed: int, given: Sequence[FullRun] = (), several: bool = True, at_least: float = -np.inf,
 ) -> tuple[FullFit, CorrectedSurrogate] | str:  # fmt: skip
     """From `start` (all parameters), at most so many runs; the message of the first, where that fails.
 
-    With the fit comes the surrogate of the force about it. That of `log_posterior` has no error of the full
-    model's own in its factor, nor has what is returned.
+    With the fit comes the surrogate of the force about it.
 
     full : of all parameters, and of changes of those of the force that count as one: bins' means (m,) and
         their derivatives (m, d) for these changes (None: the surrogate's), or why a run failed
     exact : parameters whose effect the surrogate has exactly, which no trust region holds
-    allow : puts the full model's own error into a surrogate that has none
     given : runs of the same model made before
     several : whether the surrogate adds up several effects, so that its errors go far; climbs take them to
     at_least : log posterior that makes the fit worth having; from the second run on one that promises less
@@ -90,7 +87,7 @@ def fit_full(
             others = (run for run in runs if not np.array_equal(run.theta, theta))
             runs = (*others, FullRun(theta, *found))
             ahead = Sure(CorrectedSurrogate(surrogate, runs, lengths, COMMON))
-            local = replace(log_posterior, surrogate=allow(ahead), sure_within_n=None)
+            local = replace(log_posterior, surrogate=ahead, sure_within_n=None)
             vector, latent = _with_noise(local, trial)
             values = local.from_sampling(vector)
             value = float(local.log_prob(vector[None])[0])

@@ -3,8 +3,8 @@
 What is allowed is the residual that noise alone leaves after a fit: draws of the noise, with its parameters
 of a fit that takes no mismatch for noise, less what parameters and the errors allowed for take up of each;
 and, in each phase, an error of `MODEL_ERROR` of the force's range, which mesh and time steps leave beyond
-what is allowed for (`discretised`; docs/discretisation.md: 0.02 and 0.04 %, RMS), or `MESH_ERROR`, which
-they leave beside a factor alone (0.10 %, there), where no shape of a mesh's error is allowed for. Mean
+what is allowed for (`inference.model_error`; docs/discretisation.md: 0.02 and 0.04 %, RMS), or `MESH_ERROR`,
+which they leave beside a factor alone (0.10 %, there), where no shape of a mesh's error is allowed for. Mean
 residuals over windows of every length inside each phase are counted in standard deviations of the same means
 of draws; the largest over all windows has its distribution from the draws themselves, so that one chance in
 `LEVEL` finds any window where nothing is missing (a scan statistic: Glaz, Naus & Wallenstein 2001).
@@ -23,7 +23,6 @@ from scipy.optimize import lsq_linear
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.likelihood import FARTHEST
 from bayeskin.inference.noise_model import draw_noise
-from bayeskin.mismatch.discretised import Discretised
 from bayeskin.mismatch.fit import EDGE, Fit
 from bayeskin.types import Array
 
@@ -66,7 +65,7 @@ class Located:
 def model_error(log_posterior: LogPosterior) -> float:
     """What the full model itself is wrong by [N], beyond the shapes that are allowed for."""
     force_n = log_posterior.binned.force_n
-    share = MODEL_ERROR if isinstance(log_posterior.surrogate, Discretised) else MESH_ERROR
+    share = MODEL_ERROR if log_posterior.model_error is not None else MESH_ERROR
     return share * float(np.nanmax(force_n) - np.nanmin(force_n))
 
 

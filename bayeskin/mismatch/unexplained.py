@@ -1,8 +1,8 @@
 """What a fit leaves over, with all that its parameters could still take up projected out of it.
 
 With r the residual at a fit, G the derivatives of the force by the surrogate's parameters (central
-differences in sampling coordinates), e the measured noise and the surrogate's own error, of covariance R,
-and d the discrepancy,
+differences in sampling coordinates), e the noise and the errors that are allowed for, of covariance R, and d
+the discrepancy,
 
     r = G b + d + e ,    G' d = 0 .
 
@@ -16,7 +16,7 @@ parameters can imitate of a true discrepancy is not seen. Evidence, which compar
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 
 from bayeskin.inference import LogPosterior
-from bayeskin.inference.noise_model import scales
+from bayeskin.inference.noise_model import noise_covariance
 from bayeskin.mismatch.fit import Fit, held_density
 from bayeskin.types import Array, PadMotion, Phase
 
@@ -68,22 +68,57 @@ def place(time_s: ArrayLike, phase: ArrayLike, phases: tuple[Phase, ...], motion
 
 
 @dataclass(frozen=True)
+class Memory:
+    """Noise with a memory: as many times sd_n (k,) as `size` says, forgotten within time_s.
+
+    apart_s (k, k) : between bins, infinite between fit windows
+    size_within, time_within : what its priors allow
+    """
+
+    sd_n: Array
+    apart_s: Array
+    size: float
+    time_s: float
+    size_within: tuple[float, float]
+    time_within: tuple[float, float]
+
+    @cached_property
+    def covariance_n2(self) -> Array:
+        """(k, k) [N^2]."""
+        return np.asarray(self.size**2 * np.outer(self.sd_n, self.sd_n) * np.exp(-self.apart_s / self.time_s))
+
+
+@dataclass(frozen=True)
 class Unexplained:
     """A fit's residual and what it takes to split it; k bins, r of them taken up by parameters.
 
-    residual_n (k,) recorded minus model; force_n (k,) the model's; noise_n2 (k, k) covariance of measured
-    noise and surrogate's error; slopes (k, d) of the force over the priors' widths of the d parameters that
-    move, and inwards (k, h) of those that a bound holds; basis (k, k - r) is N; at: where the bins stand.
+    residual_n (k,) recorded minus model; force_n (k,) the model's; measured_n2 (k, k) covariance of the
+    noise that the bins carry themselves and of the errors that are allowed for; memory: the noise with a
+    memory beside it; slopes (k, d) of the force over the priors' widths of the d parameters that move, and
+    inwards (k, h) of those that a bound holds; taken (k, r), an orthonormal basis of the slopes, and basis
+    (k, k - r), N; at: where the bins stand.
     """
 
     bins: NDArray[np.int64]
     residual_n: Array
     force_n: Array
-    noise_n2: Array
+    measured_n2: Array
+    memory: Memory
     slopes: Array
     inwards: Array
+    taken: Array
     basis: Array
     at: Place
+
+    @cached_property
+    def noise_n2(self) -> Array:
+        """R, (k, k) [N^2]."""
+        return self.measured_n2 + self.memory.covariance_n2
+
+    def with_memory(self, line: Array) -> Unexplained:
+        """The same beside noise of another size and time, from their logarithms (2,)."""
+        size, time_s = (float(value) for value in np.exp(line))
+        return replace(self, memory=replace(self.memory, size=size, time_s=time_s))
 
     def log_evidence(self, kernel_n2: Array | None = None) -> float:
         """Of the fit, with a discrepancy of covariance (k, k) or without any, its force linear in the
@@ -91,7 +126,7 @@ class Unexplained:
 
         b is normal, as dense at the fit as the uniform prior is; what a bound holds moves inwards only.
         """
-        covariance = self.noise_n2 + self.slopes @ self.slopes.T / (2.0 * np.pi)
+        covariance = self.noise_n2 + self.open_n2
         if kernel_n2 is not None:
             covariance = covariance + self.beyond(self.beyond(kernel_n2).T)
         root = np.linalg.cholesky(covariance)
@@ -100,6 +135,11 @@ class Unexplained:
         t, density = held_density(np.maximum(-moved.T @ white, 0.0), np.sum(moved**2, axis=0))
         mass = np.trapezoid(density, t, axis=1)
         return float(np.sum(np.log(mass)) - np.sum(np.log(np.diag(root))) - 0.5 * white @ white)
+
+    @cached_property
+    def open_n2(self) -> Array:
+        """Covariance (k, k) [N^2] of the force by what the priors leave open of the parameters."""
+        return np.asarray(self.slopes @ self.slopes.T / (2.0 * np.pi))
 
     @cached_property
     def _root(self) -> Array:
@@ -118,7 +158,7 @@ class Unexplained:
 
     def beyond(self, forces_n: Array) -> Array:
         """What parameters cannot take up of forces (k,) or (k, p), by least squares."""
-        return np.asarray(self.basis @ (self.basis.T @ forces_n))
+        return np.asarray(forces_n - self.taken @ (self.taken.T @ forces_n))
 
 
 def unexplained(found: Fit, motion: PadMotion) -> Unexplained:
@@ -128,9 +168,9 @@ def unexplained(found: Fit, motion: PadMotion) -> Unexplained:
     theta = log_posterior.from_sampling(log_posterior.vector(found.theta))[None]
     prediction = log_posterior.predict(theta)
     force = prediction.mean[0, chain.bins]
-    noise = log_posterior.split(theta)[1].copy()
-    noise[:, :-2] = log_posterior.noise_priors.sd_n[0]  # the measured noise alone
-    scale, rho = scales(chain, noise, prediction.diagonal[:, chain.bins])
+    noise = log_posterior.split(theta)[1][0]
+    measured = np.where(np.arange(len(noise)) < len(noise) - 2, 0.0, noise)
+    covariance = noise_covariance(chain, measured, prediction.diagonal[0, chain.bins])
     factor = prediction.factor[0, chain.bins]
     material = found.unit[: log_posterior.surrogate.space.dim]
     moves = (material > AT_BOUND) & (material < 1.0 - AT_BOUND)
@@ -140,9 +180,19 @@ def unexplained(found: Fit, motion: PadMotion) -> Unexplained:
     rank = int(np.sum(size > SMALLEST * size.max(initial=0.0)))
     at = place(binned.time_s[chain.bins], binned.phase[chain.bins], binned.phases, motion)
     return Unexplained(
-        chain.bins, chain.force_n - force, force, chain_covariance(scale[0], rho[0]) + factor @ factor.T,
-        slopes, inwards, left[:, rank:], at,
+        chain.bins, chain.force_n - force, force, covariance + factor @ factor.T,
+        _memory(log_posterior, noise), slopes, inwards, left[:, :rank], left[:, rank:], at,
     )  # fmt: skip
+
+
+def _memory(log_posterior: LogPosterior, noise: Array) -> Memory:
+    """The noise with a memory of a fit, with noise parameters (q,)."""
+    chain, priors = log_posterior.chain, log_posterior.noise_priors
+    window, sd_n = np.cumsum(chain.starts), noise[chain.kind]
+    time_s = np.cumsum(chain.gap_s)
+    apart_s = np.where(window[:, None] == window, np.abs(time_s[:, None] - time_s), np.inf)
+    low, high = (float(end / sd_n.max()) for end in priors.sd_n)
+    return Memory(sd_n, apart_s, 1.0, float(noise[-2]), (low, high), priors.tau_s)
 
 
 def derivatives(log_posterior: LogPosterior, unit: Array) -> Array:
@@ -155,12 +205,3 @@ def derivatives(log_posterior: LogPosterior, unit: Array) -> Array:
     points[d:, :d] -= STEP * np.eye(d)
     mean = log_posterior.predict_mean(log_posterior.from_sampling(low + points * (high - low)))
     return np.asarray((mean[:d] - mean[d:]).T / (2 * STEP))
-
-
-def chain_covariance(scale: Array, rho: Array) -> Array:
-    """Covariance (k, k) of a chain of standard deviations scale (k,) and correlations with the one before."""
-    correlation = np.eye(len(scale))
-    for i in range(1, len(scale)):
-        correlation[i, :i] = rho[i] * correlation[i - 1, :i]
-    correlation += np.tril(correlation, -1).T
-    return np.asarray(scale[:, None] * correlation * scale)

@@ -9,27 +9,31 @@ import numpy as np
 from bayeskin import inference, storage
 from bayeskin.config import parameter_space
 from bayeskin.inference import LogPosterior, NoisePriors
+from bayeskin.inference.model_error import model_error
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.pipeline.engine import Run
+from bayeskin.pipeline.model import model_spec
 from bayeskin.surrogates import load_surrogate
-from bayeskin.types import Array, BinnedForce, Surrogate
+from bayeskin.types import Array, BinnedForce, PadMotion, Surrogate
 
 ARTICLE_HOLDS_S = ((18.8, 75.0), (97.8, 145.0))  # its script's; the text says 20-75 and 98-140
 
 
-def log_posterior_of(run: Run, surrogate: Surrogate, binned: BinnedForce) -> LogPosterior:
-    """The posterior that the configuration asks for."""
+def log_posterior_of(run: Run, surrogate: Surrogate, binned: BinnedForce, motion: PadMotion) -> LogPosterior:
+    """Returns the posterior that the configuration asks for, of a recording's bins and protocol."""
     config = run.config
     noise = {name: bounds for name, bounds in config.noise if bounds is not None}
     windows = None if config.fit.windows_s is None else tuple(config.fit.windows_s)
     space = parameter_space(config, run.config_path)
-    return LogPosterior(surrogate, binned, windows, NoisePriors(**noise), space)
+    error = model_error(model_spec(run), motion, binned.edges_s)
+    return LogPosterior(surrogate, binned, windows, NoisePriors(**noise), space, model_error=error)
 
 
 def refined_posterior(run: Run) -> LogPosterior:
     """The posterior with the surrogate that the check at the most probable point left."""
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
-    return log_posterior_of(run, load_surrogate(run.at("map", "surrogate.h5")), binned)
+    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    return log_posterior_of(run, load_surrogate(run.at("map", "surrogate.h5")), binned, motion)
 
 
 def rmse_table(log_posterior: LogPosterior, force_n: Array) -> dict[str, Any]:

@@ -107,7 +107,7 @@ def _run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design
     for number, count in enumerate(config.points):
         drawn = run.at("design", f"wave-{number}.json")
         if not drawn.is_file():
-            wave = _draw_wave(run, number, count, space, binned, waves, file)
+            wave = _draw_wave(run, number, count, space, (binned, motion), waves, file)
             write_json(drawn, {"theta": wave.theta, "held_out": wave.held_out, "record": wave.record})
         waves.append(_load_wave(drawn, space, number, run.config.seed))
         label = f"wave {number + 1} of {len(config.points)}"
@@ -176,11 +176,11 @@ def _draw_wave(
     number: int,
     count: int,
     space: ParameterSpace,
-    binned: BinnedForce,
+    recorded: tuple[BinnedForce, PadMotion],
     before: Sequence[Wave],
     runs_file: Path,
 ) -> Wave:
-    config = run.config
+    config, (binned, motion) = run.config, recorded
     if not before:
         return first_wave(space, count, config.design.held_out, config.seed)
     design, fitted = enough(rows_of(load_design(runs_file), before)), fitted_bins(run, binned)
@@ -189,7 +189,7 @@ def _draw_wave(
     if config.design.coarse == "reduced" and number >= FIRST_OF_POSTERIOR:
         run.reporter.log(f"wave {number + 1}: a short run of the sampler says where the posterior is")
         nearest = design.theta[int(np.argmax(np.where(design.training, weights, 0.0)))]
-        draws = _posterior_draws(run, log_posterior_of(run, surrogate, binned), nearest)
+        draws = _posterior_draws(run, log_posterior_of(run, surrogate, binned, motion), nearest)
         inputs = surrogate.inputs(draws)
         return posterior_wave(space, draws, inputs, count, config.design.held_out, number, config.seed)
     floor_n = noise_floor_n(binned, fitted)

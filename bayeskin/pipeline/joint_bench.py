@@ -15,10 +15,10 @@ import numpy as np
 
 import bayeskin
 from bayeskin.inference import LogPosterior
+from bayeskin.inference.model_error import model_error
 from bayeskin.mechanisms import Mechanism, catalogue, with_one
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.mismatch.corrected import FullRun
-from bayeskin.mismatch.discretised import CALIBRATION, Discretised
 from bayeskin.mismatch.fit import (
     fit,
     instrument_noise,
@@ -33,7 +33,6 @@ from bayeskin.mismatch.joint_search import Ask, Climb, Join, Probe, Promise, Tas
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.refuted import refuted
 from bayeskin.mismatch.tangent import Tangent
-from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline.folder import read_lines, sha256_of
 from bayeskin.pipeline.reported import beside_neutral
@@ -44,7 +43,6 @@ from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.types import Array, ParameterSpace, Surrogate
 from bayeskin.workers import Lost, standing
 
-UNKNOWN_MESH = 5e-3  # RMS error of bricks that no study was made of, over the force (docs/discretisation.md)
 TRUST = 0.15  # of the prior's width about a run, within which a mechanism is searched for on its tangent
 
 
@@ -152,16 +150,15 @@ class JointBench:
 
     def _posterior(self, seen: Surrogate) -> LogPosterior:
         spec = ModelSpec(refinement=self.model.refinement, geometry=self.model.trained.geometry)
-        known = mesh_error(spec.mesh_hash)
-        amplitude = float(np.hypot(UNKNOWN_MESH if known is None else known.rms, CALIBRATION))
         return LogPosterior(
-            Discretised(seen, self.motion, amplitude),
+            seen,
             self.binned,
             None,
             self._noise,
             ParameterSpace(seen.space.parameters, self.base.correlations),
             None,
             soft_on_stiff,
+            model_error(spec, self.motion, self.binned.edges_s),
         )
 
     def done(self, task: Task) -> dict[str, Any]:

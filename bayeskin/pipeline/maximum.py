@@ -54,7 +54,7 @@ def _find(run: Run) -> Mapping[str, Any]:
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
     refining, full = Refining(run, binned, "design", "train"), _FullModel(run)
     refined = inference.refine_map(
-        log_posterior_of(run, refining.surrogate, binned), full, refining.retrain, config.seed,
+        log_posterior_of(run, refining.surrogate, binned, full.motion), full, refining.retrain, config.seed,
         config.map.starts, config.map.evaluations,
     )  # fmt: skip
     refining.save("map")

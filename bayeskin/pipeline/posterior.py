@@ -176,7 +176,7 @@ def _sampled(checked: Checked, bands: inference.Bands, residuals: inference.Resi
         "coverage_90_fitted": inference.coverage(log_posterior.binned, low, high, log_posterior.fit_windows),
         "rms_sd_n": {
             part: float(np.sqrt(np.mean(getattr(bands, f"sd_{part}_n") ** 2)))
-            for part in ("parameter", "surrogate", "noise")
+            for part in ("model", "surrogate", "noise")
         },
     }
 

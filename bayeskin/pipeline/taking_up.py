@@ -158,7 +158,7 @@ def _whole_apart(
 
 def _about(bench: Workbench, found: Fit, surrogate: Surrogate) -> LogPosterior:
     """The posterior by a surrogate of the full model on its mesh, however unsure."""
-    return replace(found.log_posterior, surrogate=bench.with_mesh_error(surrogate), sure_within_n=None)
+    return replace(found.log_posterior, surrogate=surrogate, sure_within_n=None)
 
 
 def _left_out(found: Fit, shear: Shear | None) -> float | None:
@@ -224,7 +224,7 @@ def _full(
 
     plain = replace(found.log_posterior, surrogate=bench.surrogate(found.names))
     fitted = partial(
-        fit_full, plain, exact=exact, seed=bench.run.config.seed, allow=bench.with_mesh_error,
+        fit_full, plain, exact=exact, seed=bench.run.config.seed,
         several=len(effects_among(bench.effects, found.names)) > 1, at_least=at_least,
     )  # fmt: skip
     start = found.theta

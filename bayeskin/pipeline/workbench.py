@@ -16,9 +16,9 @@ from bayeskin.config import Config, DesignConfig, RecordingConfig, SurrogateConf
 from bayeskin.device import load_device_file
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior
+from bayeskin.inference.model_error import model_error
 from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import Instrument
-from bayeskin.mismatch.discretised import CALIBRATION, Discretised
 from bayeskin.mismatch.fit import (
     QUICK_S,
     Fit,
@@ -29,7 +29,6 @@ from bayeskin.mismatch.fit import (
 )
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.refuted import refuted
-from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline import recording
 from bayeskin.pipeline.effects import effects_of
@@ -71,14 +70,6 @@ class Workbench:
         """Mechanisms of a fit that the samples it is of speak against."""
         return refuted(found, self.known, self.motion, self.jumps)
 
-    def with_mesh_error(self, skin: Surrogate) -> Surrogate:
-        """A surrogate that allows for what a finer mesh would change, where that is known, and for the load
-        cell's calibration; `reaction` only."""
-        error = mesh_error(self.spec.mesh_hash) if self.spec.observation == "reaction" else None
-        if error is None:
-            return skin
-        return Discretised(skin, self.motion, float(np.hypot(error.rms, CALIBRATION)))
-
     def surrogate(self, names: Sequence[str]) -> Surrogate:
         """Of the full model on its mesh, with a set of mechanisms."""
         parts = effects_among(self.effects, names)
@@ -92,11 +83,12 @@ class Workbench:
         """The posterior with a set of mechanisms, fitted up to a time (None: to the end)."""
         asked = {name: bounds for name, bounds in self.run.config.noise if bounds is not None}
         windows = None if until_s is None else ((0.0, until_s),)
-        seen, surrogate = _up_to(self.binned, until_s), self.with_mesh_error(self.surrogate(names))
+        seen, surrogate = _up_to(self.binned, until_s), self.surrogate(names)
         noise, material = replace(instrument_noise(seen), **asked), self._priors(surrogate.space)
         return LogPosterior(
-            surrogate, self.binned, windows, noise, material, surrogate_limit(seen), soft_on_stiff
-        )
+            surrogate, self.binned, windows, noise, material, surrogate_limit(seen), soft_on_stiff,
+            model_error(self.spec, self.motion, self.binned.edges_s),
+        )  # fmt: skip
 
     def _priors(self, space: ParameterSpace) -> ParameterSpace:
         """A surrogate's parameters with the configuration's priors where it has them."""

@@ -72,7 +72,7 @@ def figure_fit(
     for ax, letter, title in zip((force, residual, parts, loop, residual_loop), "abcde", titles, strict=True):
         panel_title(ax, letter, title)
     caption = (
-        f"Bands are pointwise and include parameters, surrogate error and noise; "
+        f"Bands are pointwise and include parameters, errors of model and surrogate, and noise; "
         f"{np.atleast_2d(np.asarray(force_n)).shape[0]} posterior draws. "
         "Residual: recorded minus posterior median. Open points, where there are any, were not fitted."
     )

@@ -32,7 +32,7 @@ COLUMN_IN, PAGE_IN = 3.5, 7.2  # widths of one and of two journal columns
 # Okabe & Ito (2008), told apart with every common colour blindness; then Tol's muted set.
 INK, GREY, FAINT = "#222222", "#767676", "#D0D0D0"
 RECORDED, MODEL, ACCENT = INK, "#0072B2", "#D55E00"
-PARTS = {"parameters": "#0072B2", "surrogate": "#D55E00", "noise": "#8C8C8C", "all": INK}
+PARTS = {"model": "#0072B2", "surrogate": "#D55E00", "noise": "#8C8C8C", "all": INK}
 _NAMED = {"E_c": "#0072B2", "E_s": "#D55E00", "k_c": "#56B4E9", "k_s": "#E69F00", "p_init": "#009E73"}
 _FURTHER = ("#CC79A7", "#332288", "#882255", "#999933", "#44AA99", "#AA4499", "#661100", "#888888")
 GREEK = {

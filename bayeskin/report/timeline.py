@@ -39,21 +39,21 @@ def predictive_bands(
 ) -> ForceBands:
     """Pointwise intervals in each bin from posterior predictive draws, (s, m) each [N].
 
-    mean_n: the model's mean at each draw; surrogate_sd_n, noise_sd_n: sd of surrogate error and noise at
-    it (or (m,), the same at all); force_n: the force drawn with all of them in. The intervals are
+    mean_n: the force without noise at each draw; surrogate_sd_n, noise_sd_n: sd of the surrogate's own error
+    and of the noise at it (or (m,), the same at all); force_n: the force with noise. The intervals are
     quantiles of force_n; what the surrogate and the noise would give alone is taken as normal.
     """
     mean, force = (np.atleast_2d(np.asarray(values, dtype=float)) for values in (mean_n, force_n))
     tails = np.array([(1 - level) / 2 for level in LEVELS])
     low, high = np.quantile(force, tails, axis=0), np.quantile(force, 1 - tails, axis=0)
-    parameter_low, parameter_high = np.quantile(mean, [tails[1], 1 - tails[1]], axis=0)
+    model_low, model_high = np.quantile(mean, [tails[1], 1 - tails[1]], axis=0)
     z = ndtri(0.5 + LEVELS[1] / 2)
     surrogate, noise = (
         z * np.sqrt(np.mean(np.atleast_2d(np.asarray(sd, dtype=float)) ** 2, axis=0))
         for sd in (surrogate_sd_n, noise_sd_n)
     )
     parts = {
-        "parameters": 0.5 * (parameter_high - parameter_low),
+        "model": 0.5 * (model_high - model_low),
         "surrogate": surrogate,
         "noise": noise,
         "all": 0.5 * (high[1] - low[1]),

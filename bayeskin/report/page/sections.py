@@ -139,9 +139,9 @@ def _bands(said: Mapping[str, Any]) -> Facts:
         [
             ("90 % band holds, of all bins", percent(said["coverage_90"])),
             ("of the fitted bins", percent(said["coverage_90_fitted"])),
-            ("sd from the parameters", quantity(parts["parameter"], "N")),
-            ("sd from the surrogate", quantity(parts["surrogate"], "N")),
-            ("sd from the noise", quantity(parts["noise"], "N")),
+            ("sd of the force without noise", quantity(parts["model"], "N")),
+            ("sd of the noise", quantity(parts["noise"], "N")),
+            ("sd that the surrogate states of its own error", quantity(parts["surrogate"], "N")),
         ]
     )
 

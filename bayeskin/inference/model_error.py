@@ -1,9 +1,9 @@
-"""A surrogate that allows for its model's mesh, and for the calibration of the load cell.
+"""What the full model itself may be wrong by: its mesh, and the calibration of the load cell.
 
 What a finer mesh would change is, within a tenth, a factor on the force; a cell's calibration is one, too.
 What that leaves goes with displacement, and relaxes after each movement, because a mesh resolves the flow of
 the fluid to its own size only (`benchmarks/mesh_shapes.py`). All are errors of the force at every point of
-the parameter space, so they belong to the surrogate's factor: columns of one sd each,
+the parameter space. They are added up from shapes of one sd each,
 
     a F(t) ,  b F(t) (2 d(t) / max d - 1)  and  c max |F| r_i(t) ,
 
@@ -14,18 +14,17 @@ noise alone lets them be.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from bayeskin.mismatch.wrapper import Sure, Wrapper
-from bayeskin.types import Array, PadMotion, Prediction, Surrogate
+from bayeskin.model.accuracy import mesh_error
+from bayeskin.model.simulate import ModelSpec
+from bayeskin.types import Array, PadMotion, Prediction
 
 CALIBRATION = 0.01  # sd of a factor on the force: what a load cell of class 1 is off by (ISO 7500-1:2018)
+UNKNOWN_MESH = 5e-3  # RMS error of bricks that no study was made of, over the force (docs/discretisation.md)
 BEND = 3e-3  # b, of the force
 RELAXING = 1.5e-3  # c, of the largest force
 RELAXATION_S = (
@@ -36,23 +35,19 @@ RELAXATION_S = (
 
 
 @dataclass(frozen=True)
-class Discretised(Wrapper):
-    """`inner` with its model's error, whose factor has the sd `amplitude`."""
+class ModelError:
+    """The errors of a force over the bins between edges_s (m+1,); `amplitude` is the sd of the factor, a."""
 
     motion: PadMotion
+    edges_s: Array
     amplitude: float
 
-    @property
-    def provenance(self) -> Mapping[str, Any]:
-        return {**self.inner.provenance, "mesh_error": [self.amplitude, BEND, RELAXING]}
-
-    def predict(self, theta: ArrayLike) -> Prediction:
-        """Force at theta (n, d) or (d,). Raises InputError outside the box."""
-        found = self.inner.predict(theta)
-        rows = found.factor.transpose(0, 2, 1)  # as they lie in memory
-        more = errors(found.mean, *self._shapes) * self._sd[:, None]
+    def beside(self, prediction: Prediction) -> Prediction:
+        """Returns the prediction with these errors as further columns of its factor."""
+        rows = prediction.factor.transpose(0, 2, 1)  # as they lie in memory
+        more = errors(prediction.mean, *self._shapes) * self._sd[:, None]
         factor = np.concatenate([rows, more], axis=1).transpose(0, 2, 1)
-        return Prediction(found.mean, factor, found.diagonal)
+        return Prediction(prediction.mean, factor, prediction.diagonal)
 
     @cached_property
     def _sd(self) -> Array:
@@ -63,22 +58,31 @@ class Discretised(Wrapper):
         return shapes(self.motion, self.edges_s)
 
 
-def without_own_error(surrogate: Surrogate) -> Surrogate:
-    """The same as if it had no error but what is allowed for its model."""
-    if isinstance(surrogate, Discretised):
-        return replace(surrogate, inner=Sure(surrogate.inner))
-    return Sure(surrogate)
+def model_error(spec: ModelSpec, motion: PadMotion, edges_s: Array) -> ModelError | None:
+    """Returns the errors that are allowed for of a model's force in bins.
+
+    None for the article's observation, which is defined on its own mesh and steps, and for a model of one's
+    own, of whose error nothing is known.
+    """
+    if spec.observation != "reaction":
+        return None
+    known = mesh_error(spec.mesh_hash)
+    mesh = UNKNOWN_MESH if known is None else known.rms
+    return ModelError(motion, edges_s, float(np.hypot(mesh, CALIBRATION)))
 
 
 def shapes(motion: PadMotion, edges_s: Array) -> tuple[Array, Array]:
-    """In bins: what multiplies the force (2, m), and the relaxing answers (k, m)."""
+    """Returns what multiplies the force in bins (2, m), and the relaxing answers (k, m)."""
     middle = 0.5 * (edges_s[1:] + edges_s[:-1])
     share = motion.at(middle) / float(np.max(np.abs(motion.displacement_m)))
     return np.stack([np.ones(len(middle)), 2.0 * share - 1.0]), relaxing(motion, middle)
 
 
 def relaxing(motion: PadMotion, time_s: Array) -> Array:
-    """Force of a spring and a dashpot in series at given times, (k, m), stretched by d / max d; exact."""
+    """Returns the force (k, m) at given times of springs and dashpots in series, stretched by d / max d.
+
+    Exact, as a protocol is straight between its corners.
+    """
     largest = float(np.max(np.abs(motion.displacement_m)))
     rate = np.diff(motion.displacement_m) / largest / np.diff(motion.time_s)
     out = np.zeros((len(RELAXATION_S), len(time_s)))
@@ -91,6 +95,6 @@ def relaxing(motion: PadMotion, time_s: Array) -> Array:
 
 
 def errors(mean_n: Array, multiplying: Array, added: Array) -> Array:
-    """All shapes (n, 2 + k, m) of the error of forces (n, m), of the size of the force."""
+    """Returns all shapes (n, 2 + k, m) of the error of forces (n, m), of the size of the force."""
     largest = np.max(np.abs(mean_n), axis=1)[:, None, None]
     return np.concatenate([mean_n[:, None, :] * multiplying, largest * added], axis=1)
