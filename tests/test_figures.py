@@ -193,7 +193,7 @@ def test_fit_tells_the_parts_of_the_uncertainty_apart(binned: BinnedForce, force
     }
     figure = drawn(report.figure_fit(binned, DISPLACEMENT_M, fitted, **predictive))
     force, residual, parts, loop, _ = figure.axes
-    assert {line.get_label() for line in parts.get_lines()} == {"parameters", "surrogate", "noise", "all"}
+    assert {line.get_label() for line in parts.get_lines()} == {"model", "surrogate", "noise", "all"}
     assert residual.get_ylabel() == "residual [mN]"
     assert len(residual.collections) == 2  # the 50 % and the 90 % band
     shown = next(line for line in residual.get_lines() if line.get_label() == "recorded")
@@ -239,15 +239,15 @@ def test_fit_without_any_uncertainty_and_with_a_phase_kind_missing(
 
 
 def test_predictive_bands_hold_what_they_promise() -> None:
-    """Parameters, surrogate and noise, all normal: sd 3, 4 and 12 add to 13."""
+    """Model and noise, both normal: sd 5 and 12 add to 13."""
     rng = np.random.default_rng(6)
-    mean = 3.0 * rng.normal(size=(20_000, 1))
-    force = mean + np.hypot(4.0, 12.0) * rng.normal(size=mean.shape)
+    mean = 5.0 * rng.normal(size=(20_000, 1))
+    force = mean + 12.0 * rng.normal(size=mean.shape)
     bands = timeline.predictive_bands(mean, np.array([4.0]), np.full_like(mean, 12.0), force)
     half = 0.5 * (bands.high_n - bands.low_n)[:, 0]
     np.testing.assert_allclose(half, [0.6745 * 13, 1.6449 * 13], rtol=0.03)
-    parts = [float(bands.parts_n[name][0]) for name in ("parameters", "surrogate", "noise", "all")]
-    np.testing.assert_allclose(parts, 1.6449 * np.array([3.0, 4.0, 12.0, 13.0]), rtol=0.03)
+    parts = [float(bands.parts_n[name][0]) for name in ("model", "surrogate", "noise", "all")]
+    np.testing.assert_allclose(parts, 1.6449 * np.array([5.0, 4.0, 12.0, 13.0]), rtol=0.03)
 
 
 def test_runs_of_true_cover_the_mask_exactly() -> None:

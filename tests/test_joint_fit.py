@@ -88,9 +88,9 @@ def test_moduli_times_c_pull_c_times_as_hard_where_the_force_is_proportional_to_
 def highest(bench: JointBench) -> tuple[float, dict[str, float]]:
     """Log density and values of the highest top of the set's posterior by the skin itself, of many climbs."""
     about = bench.local(SET, a_run(bench, SET))
-    allowing: Any = about.surrogate  # for the mesh, about what the instrument does, about the skin
-    seen = dataclasses.replace(allowing.inner, inner=Exact(innermost(allowing).space))
-    whole = dataclasses.replace(about, surrogate=dataclasses.replace(allowing, inner=seen))
+    seen: Any = about.surrogate  # what the instrument does, about the skin
+    exact = dataclasses.replace(seen, inner=Exact(innermost(seen).space))
+    whole = dataclasses.replace(about, surrogate=exact)
     low, high = whole.bounds
     rng = np.random.default_rng(0)
     truth = whole.vector({**start(bench), **TRUTH, "F0": -0.03, "stiffness_rate": -8e-4})
@@ -109,7 +109,7 @@ def test_a_fit_reaches_the_maximum_of_the_skin_itself(bench: JointBench) -> None
     deviations = np.sqrt(np.diag(found.fit.covariance))
     low, high = found.fit.log_posterior.bounds
     there = (found.fit.log_posterior.vector(theta) - low) / (high - low)
-    assert np.all(np.abs(found.fit.unit - there) < np.maximum(deviations, 0.01))
+    assert np.all(np.abs(found.fit.unit - there) < np.maximum(1.5 * deviations, 0.01))
     assert found.fit.theta["F0"] == pytest.approx(-0.03, abs=2e-3)
     np.testing.assert_allclose(found.fit.mean_n, found.fit.log_posterior.binned.force_n, atol=0.05)
     at_run = [found.fit.theta[name] for name in found.fit.log_posterior.surrogate.space.names]

@@ -32,6 +32,7 @@ NOISE_STEPS = (0.03, 0.1, 0.3, 1.0)  # of Newton's, for the noise
 FARTHEST_NOISE = 0.5  # of the box, a step of the noise
 SPRUNG = 6  # steps at most, after which it is settled which errors are beyond three sd
 ROUNDING = 1e-12  # of the sum of a precision's diagonal
+LESS_NOISE = (1.0, 0.3, 0.1)  # shares of a point's noise, by which what is missing from a force is tested
 ERRORS = 8  # draws of the surrogate's error, over which a quick step of the noise averages
 
 
@@ -110,41 +111,62 @@ def promise(
     """The `count` of `trials` (n, D) along whose change of force most is to be gained from `vector` (D,).
 
     Of each its row, the nats, the best multiple of that change, and `vector` with what is `free` (D,) moved
-    to make room, within the box; all by the force's linear approximation (a score test). `mean_n` (n, m) is
-    the force at the trials, where the surrogate is not to say it.
+    to make room, within the box; all by the force's linear approximation (a score test). What the noise has
+    taken up is given back: it is as large as at `vector`, or a part of that, whichever promises most.
+    `mean_n` (n, m) is the force at the trials, where the surrogate is not to say it.
     """
-    here = log_posterior.predict(log_posterior.from_sampling(vector))
-    linear = _Linear(log_posterior, vector, here)
-    inner = linear.inner
-    others = free[:inner]
-    bins = linear.chain.bins
     if mean_n is None:
         mean_n = log_posterior.predict_mean(log_posterior.from_sampling(trials))
-    change = linear.white((mean_n - linear.here.mean)[:, bins].T)
-    residual, slopes, factor = linear.columns()
-    room = np.concatenate([slopes[:, others], factor], axis=1)
-    moved = int(others.sum())
-    pull, bend = linear.prior(vector)
-    normal = room.T @ room + np.diag(np.r_[np.full(moved, 12.0), np.ones(factor.shape[1])])
-    normal[:moved, :moved] += bend[np.ix_(others, others)]
-    target = np.column_stack([residual, change])
-    right = room.T @ target
-    right[:moved, 0] += pull[others]
-    solved = np.linalg.solve(normal, right)
-    left = target - room @ solved
-    length = np.maximum(np.sum(change * left[:, 1:], axis=0), 1e-12)
-    multiple = (change.T @ left[:, 0]) / length
-    gain = 0.5 * multiple**2 * length
-    chosen = np.argsort(-gain)[:count]
+    value, found = float(log_posterior.log_prob(vector[None])[0]), []
+    for share in LESS_NOISE:
+        quieter = with_less_noise(log_posterior, vector, share)
+        lost = value - float(log_posterior.log_prob(quieter[None])[0])
+        found.append(_Promised(log_posterior, quieter, mean_n, free, lost))
+    best = np.argmax([one.gain for one in found], axis=0)
+    gain = np.max([one.gain for one in found], axis=0)
     return [
-        (
-            int(i),
-            float(gain[i]),
-            float(multiple[i]),
-            vector + linear.steps(vector, (0.0,), REWEIGHTED, multiple[i] * change[:, i], others)[0],
-        )
-        for i in chosen
+        (int(i), float(gain[i]), float(found[best[i]].multiple[i]), found[best[i]].moved(int(i)))
+        for i in np.argsort(-gain)[:count]
     ]
+
+
+def with_less_noise(log_posterior: LogPosterior, vector: Array, share: float) -> Array:
+    """Returns the point (D,) with a share of each kind of phase's noise with a memory, within the box."""
+    sds = np.array([name.startswith("sd_") for name in log_posterior.names])
+    low, high = log_posterior.bounds
+    return np.asarray(np.clip(np.where(sds, vector + np.log(share), vector), low, high))
+
+
+class _Promised:
+    """Score tests of changes of force at a point: nats (n,) less those `lost` by its noise, and multiples."""
+
+    def __init__(
+        self, log_posterior: LogPosterior, vector: Array, mean_n: Array, free: NDArray[np.bool_], lost: float
+    ) -> None:
+        here = log_posterior.predict(log_posterior.from_sampling(vector))
+        self._linear, self._vector = _Linear(log_posterior, vector, here), vector
+        linear = self._linear
+        self._others = free[: linear.inner]
+        self._change = linear.white((mean_n - here.mean)[:, linear.chain.bins].T)
+        residual, slopes, factor = linear.columns()
+        room = np.concatenate([slopes[:, self._others], factor], axis=1)
+        moved = int(self._others.sum())
+        pull, bend = linear.prior(vector)
+        normal = room.T @ room + np.diag(np.r_[np.full(moved, 12.0), np.ones(factor.shape[1])])
+        normal[:moved, :moved] += bend[np.ix_(self._others, self._others)]
+        target = np.column_stack([residual, self._change])
+        right = room.T @ target
+        right[:moved, 0] += pull[self._others]
+        left = target - room @ np.linalg.solve(normal, right)
+        length = np.maximum(np.sum(self._change * left[:, 1:], axis=0), 1e-12)
+        self.multiple = (self._change.T @ left[:, 0]) / length
+        self.gain = 0.5 * self.multiple**2 * length - lost
+
+    def moved(self, i: int) -> Array:
+        """The point (D,) with room made for the best multiple of a change."""
+        explained = self.multiple[i] * self._change[:, i]
+        step = self._linear.steps(self._vector, (0.0,), REWEIGHTED, explained, self._others)[0]
+        return np.asarray(self._vector + step)
 
 
 def _trials(linear: _Linear, x: Array, shear: Shear | None, quick: bool) -> list[Array]:

@@ -49,6 +49,11 @@ class ModelError:
         factor = np.concatenate([rows, more], axis=1).transpose(0, 2, 1)
         return Prediction(prediction.mean, factor, prediction.diagonal)
 
+    @property
+    def columns(self) -> int:
+        """How many there are."""
+        return 2 + len(RELAXATION_S)
+
     @cached_property
     def _sd(self) -> Array:
         return np.array([self.amplitude, BEND, *[RELAXING] * len(RELAXATION_S)])

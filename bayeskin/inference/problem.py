@@ -162,7 +162,10 @@ class LogPosterior:
         if self.excludes is not None:
             out |= self.excludes(self.surrogate.space, self.split(theta)[0])
         if self.sure_within_n is not None:
-            out |= np.mean(prediction.sd() ** 2, axis=1) > self.sure_within_n**2
+            own = (
+                prediction.factor[..., : -self.model_error.columns] if self.model_error else prediction.factor
+            )
+            out |= np.mean(np.sum(own**2, axis=2) + prediction.diagonal, axis=1) > self.sure_within_n**2
         return out
 
     @cached_property

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayeskin.inference import LogPosterior
-from bayeskin.inference.gauss_newton import Top, gauss_newton
+from bayeskin.inference.gauss_newton import LESS_NOISE, Top, gauss_newton, with_less_noise
 from bayeskin.mismatch.corrected import FullRun
 from bayeskin.mismatch.fit import Fit, evidence
 from bayeskin.mismatch.wrapper import innermost
@@ -78,10 +78,8 @@ def fit_jointly(
     vector, value = _at_run(about, about.vector(start), settings.held)
     trust, settled, made = settings.first, False, 1
     while made < settings.runs and trust >= settings.smallest:
-        near = within(about, vector, trust)
-        top = gauss_newton(near, np.clip(vector, *near.bounds), None, settings.climb)
-        ahead = np.clip(top.vector, *about.bounds)
-        promised = float(about.log_prob(ahead[None])[0]) - value
+        ahead, promised = _highest(about, within(about, vector, trust), vector, settings.climb)
+        promised -= value
         if promised < settings.enough:
             settled = True
             break
@@ -103,9 +101,17 @@ def fit_jointly(
 
 def _at_run(about: LogPosterior, vector: Array, rounds: int) -> tuple[Array, float]:
     """Returns the most probable point (D,) with the model's parameters held, and its log density."""
-    held = within(about, vector, 0.0)
-    top = gauss_newton(held, np.clip(vector, *held.bounds), None, rounds)
-    better = np.clip(top.vector, *about.bounds)
+    return _highest(about, within(about, vector, 0.0), vector, rounds)
+
+
+def _highest(about: LogPosterior, near: LogPosterior, vector: Array, rounds: int) -> tuple[Array, float]:
+    """Returns the most probable point (D,) of a part of the posterior, and its log density.
+
+    Climbs set out from the noise as it is and from little: noise that took up another run's misfit stays.
+    """
+    starts = [vector, with_less_noise(about, vector, LESS_NOISE[-1])]
+    tops = [gauss_newton(near, np.clip(start, *near.bounds), None, rounds) for start in starts]
+    better = np.clip(max(tops, key=lambda top: top.value).vector, *about.bounds)
     return better, float(about.log_prob(better[None])[0])
 
 

@@ -17,11 +17,12 @@ from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.contributions import Contribution, contributions
 from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
+from bayeskin.mismatch.emulate import Emulated, emulate
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.hypotheses import Family, Judgement, hypotheses_of, judge_family
 from bayeskin.mismatch.joint_fit import JointFit, fit_jointly, within
-from bayeskin.mismatch.joint_search import JointSearch, search_jointly
+from bayeskin.mismatch.joint_search import Ask, JointSearch, Probe, search_jointly
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import Made, Search, weight
@@ -60,24 +61,26 @@ def _work(run: Run) -> Mapping[str, Any]:
     tell = partial(_tell, run)
     with asked(bench, searches_file(run.folder, bench), run.config.design.workers) as ask:
         found = search_jointly(ask, bench.binned, bench.base, bench.known, bench.noise, seed, tell)
-    likeliest, checked = _confirmed(run, bench, found.best)
-    found.fits[likeliest.fit.names] = likeliest
-    weighed = _weighed(found)
-    left = {names: discrepancy(found.fits[names].fit, bench.motion) for names in weighed}
-    family = Family([
-        one for names in weighed
-        for one in hypotheses_of(names, left[names].without_log_evidence, left[names].log_evidence)
-    ])  # fmt: skip
-    judged = judge_family(family, bench.known)
-    best = max(weighed, key=lambda names: family.probability_of_set(names))
-    noise = found.fits[best].fit.theta
-    base, chosen = found.fits[()].fit, found.fits[best].fit
-    before, after = (locate(fit, {**fit.theta, **_noise_of(fit, noise)}, seed) for fit in (base, chosen))
-    run.reporter.log("draws of the posterior, without and with what was found")
-    drawn = {fit.names: _drawn(fit, seed) for fit in (base, chosen)}
+        likeliest, checked = _confirmed(run, bench, found.best)
+        found.fits[likeliest.fit.names] = likeliest
+        weighed = _weighed(found)
+        left = {names: discrepancy(found.fits[names].fit, bench.motion) for names in weighed}
+        family = Family([
+            one for names in weighed
+            for one in hypotheses_of(names, left[names].without_log_evidence, left[names].log_evidence)
+        ])  # fmt: skip
+        judged = judge_family(family, bench.known)
+        best = max(weighed, key=lambda names: family.probability_of_set(names))
+        run.reporter.log("runs where the posterior is, and draws of it")
+        emulated = _emulated(bench, ask, found.fits[best], seed)
+    base, chosen = found.fits[()].fit, emulated.fit
+    before, after = (
+        locate(fit, {**fit.theta, **_noise_of(fit, chosen.theta)}, seed) for fit in (base, chosen)
+    )
+    drawn = {(): _drawn(base, seed), best: emulated.draws}
     pictured = {
-        fit.names: _shown(fit, windows, drawn[fit.names])
-        for fit, windows in ((base, before), (chosen, after))
+        names: _shown(fit, windows, drawn[names])
+        for names, fit, windows in (((), base, before), (best, chosen, after))
     }
     parts = contributions(best, chosen.theta, bench.reported, bench.known)
     remainder = None
@@ -96,7 +99,12 @@ def _work(run: Run) -> Mapping[str, Any]:
         "sets": [_set(names, found, left, family) for names in weighed],
         "fit": {
             "before": _fit(bench.binned, base, drawn[()], pictured[()]),
-            "after": _fit(bench.binned, chosen, drawn[best], pictured[best]),
+            "after": {
+                **_fit(bench.binned, chosen, drawn[best], pictured[best]),
+                "emulator": {
+                    "runs": emulated.runs, "off_by": emulated.error_n, "settled": emulated.settled,
+                },
+            },
         },
         "best_set": list(best),
         "full_model": checked if best == likeliest.fit.names else _checked(run, bench, chosen),
@@ -141,6 +149,29 @@ def _drawn(fit: Fit, seed: int) -> Resampled:
     about = fit.log_posterior
     near = within(about, np.clip(about.vector(fit.theta), *about.bounds), REACH)
     return resample(replace(fit, log_posterior=near), None, seed)
+
+
+def _emulated(bench: JointBench, ask: Ask, found: JointFit, seed: int) -> Emulated:
+    """A set's posterior from runs of the reduced model where it is; about the fit's run where none finishes.
+
+    The runs are moved by what enrichment changed at the fit's run.
+    """
+    names, space = found.fit.names, bench.space(found.fit.names)
+    noise_n = float(np.sqrt(np.nanmean(bench.binned.variance_n2)))
+
+    def probes(points: Array) -> list[object]:
+        return ask([Probe(names, dict(zip(space.names, map(float, row), strict=True))) for row in points])
+
+    (there,) = probes(found.run.theta[None])
+    moved_n = 0.0 if isinstance(there, str) else found.run.force_n - np.asarray(there)
+
+    def forces(points: Array) -> list[Array | str]:
+        return [one if isinstance(one, str) else np.asarray(one) + moved_n for one in probes(points)]
+
+    emulated = emulate(found, forces, noise_n, seed)
+    if isinstance(emulated, str):
+        return Emulated(found.fit, _drawn(found.fit, seed), 0, None, False)
+    return emulated
 
 
 def _mechanisms(

@@ -1,0 +1,151 @@
+"""The posterior of a set of mechanisms, by an emulator that learns the force where the posterior is.
+
+The force about one run (`tangent`) leads to the most probable skin, but a posterior reaches farther than its
+force is linear: along a ridge of moduli and permeabilities it is curved. So the forward model runs at points
+that are spread over draws of the posterior, a Gaussian process learns the force from all runs so far, and the
+posterior is drawn anew with it. That is repeated until fresh runs agree with what the emulator says of them.
+Where it says that it is unsure the posterior is taken to be zero: the next wave comes nearer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bayeskin.inference import LogPosterior
+from bayeskin.mismatch.fit import Fit, fit_near
+from bayeskin.mismatch.joint_fit import JointFit, within
+from bayeskin.mismatch.resample import Resampled, resample
+from bayeskin.mismatch.wrapper import Wrapper, innermost
+from bayeskin.surrogates import train
+from bayeskin.types import Array, Design, ParameterSpace, Surrogate
+
+MOST = 1500  # draws, among which a wave's points are chosen
+
+# The skin's force (m,) with the set at points (n, d), or why a run failed.
+Forces = Callable[[Array], Sequence[Array | str]]
+
+
+@dataclass(frozen=True)
+class EmulationSettings:
+    """Settings of an emulation.
+
+    points, waves : runs of a wave, and how many waves at most
+    first : of the prior's width on either side of the fit's run, from where the first points are drawn
+    sure : sd of the emulator, RMS over bins, over the noise of a bin, up to which it is believed
+    enough : RMS error of the emulator at fresh runs, over the noise of a bin, with which it is done
+    """
+
+    points: int = 60
+    waves: int = 3
+    first: float = 0.5
+    sure: float = 2.0
+    enough: float = 0.1
+
+
+@dataclass(frozen=True)
+class Emulated:
+    """The most probable point by the emulator, draws of the posterior, runs made, the emulator's RMS error.
+
+    error_n : of the last emulator but one, at the runs that followed it [N]; None where none did
+    settled : whether that is small beside the noise
+    """
+
+    fit: Fit
+    draws: Resampled
+    runs: int
+    error_n: float | None
+    settled: bool
+
+
+def emulate(
+    found: JointFit, forces: Forces, noise_n: float, seed: int, settings: EmulationSettings | None = None
+) -> Emulated | str:
+    """Returns the posterior of a set about its fit; the message of a run where all of the first wave fail.
+
+    noise_n : sd of a bin's mean
+    """
+    settings, rng = settings or EmulationSettings(), np.random.default_rng([seed, 11])
+    about, names = found.fit.log_posterior, found.fit.names
+    space = innermost(about.surrogate).space
+    vector = np.clip(about.vector(found.fit.theta), *about.bounds)
+    near = replace(found.fit, log_posterior=within(about, vector, settings.first))
+    drawn, error_n = resample(near, None, seed), None
+    design = _none(space, about.surrogate.edges_s)
+    emulated: Emulated | None = None
+    for wave in range(settings.waves):
+        points = _spread(space, drawn.draws[:, : space.dim], design.theta, settings.points, rng)
+        if wave == 0:
+            points = np.concatenate([found.run.theta[None], points[1:]])
+        answers = forces(points)
+        ran = [i for i, answer in enumerate(answers) if not isinstance(answer, str)]
+        if not ran:
+            return str(answers[0]) if emulated is None else emulated
+        fresh = _design(design, points[ran], np.array([answers[i] for i in ran]))
+        if emulated is not None:
+            said = innermost(emulated.fit.log_posterior.surrogate).predict_mean(points[ran])
+            error_n = float(np.sqrt(np.mean((said - fresh.force_n[-len(ran) :]) ** 2)))
+        design = fresh
+        local = _posterior(about, design, settings.sure * noise_n, seed)
+        best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
+        drawn = resample(best, None, seed)
+        done = error_n is not None and error_n <= settings.enough * noise_n
+        emulated = Emulated(best, drawn, len(design.theta), error_n, done)
+        if done:
+            break
+    assert emulated is not None
+    return emulated
+
+
+def _posterior(about: LogPosterior, design: Design, unsure_n: float, seed: int) -> LogPosterior:
+    """The posterior with the skin's force learnt from runs."""
+    emulator: Surrogate = train(design, "gp", seed)[0]
+    seen = about.surrogate
+    surrogate = replace(seen, inner=emulator) if isinstance(seen, Wrapper) else emulator
+    return replace(about, surrogate=surrogate, sure_within_n=unsure_n)
+
+
+def _likeliest(local: LogPosterior, fit: Fit, theta: Array) -> dict[str, float]:
+    """Values at the most probable of the runs (n, d), with all else as it was fitted."""
+    rows = np.repeat(local.from_sampling(local.vector(fit.theta))[None], len(theta), axis=0)
+    rows[:, : theta.shape[1]] = theta
+    return local.named(rows[int(np.argmax(local.log_prob(local.to_sampling(rows))))])
+
+
+def _spread(
+    space: ParameterSpace, draws: Array, before: Array, count: int, rng: np.random.Generator
+) -> Array:
+    """So many of draws (n, d), each as far as can be from those before it, in sd of the draws."""
+    some = draws[rng.choice(len(draws), min(len(draws), MOST), replace=False)]
+    unit = space.box.to_unit(some)
+    scale = unit.std(axis=0) + 1e-9
+    unit = unit / scale
+    taken = space.box.to_unit(before) / scale if len(before) else unit.mean(axis=0)[None]
+    nearest = np.min([np.sum((unit - one) ** 2, axis=1) for one in taken], axis=0)
+    chosen = []
+    for _ in range(min(count, len(some))):
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, np.sum((unit - unit[chosen[-1]]) ** 2, axis=1))
+    return np.asarray(some[chosen])
+
+
+def _none(space: ParameterSpace, edges_s: Array) -> Design:
+    """A design without runs."""
+    bins = len(edges_s) - 1
+    return Design(
+        space=space.box, theta=np.empty((0, space.dim)), edges_s=edges_s, force_n=np.empty((0, bins)),
+        wave=np.empty(0, dtype=np.int64), held_out=np.empty(0, dtype=bool), ok=np.empty(0, dtype=bool),
+        messages=(), seconds=np.empty(0), seed=0, model_hash="",
+    )  # fmt: skip
+
+
+def _design(before: Design, theta: Array, force_n: Array) -> Design:
+    """A design with further runs, all to learn from."""
+    count = len(before.theta) + len(theta)
+    return replace(
+        before, theta=np.concatenate([before.theta, theta]),
+        force_n=np.concatenate([before.force_n, force_n]), wave=np.zeros(count, dtype=np.int64), held_out=np.zeros(count, dtype=bool),
+        ok=np.ones(count, dtype=bool), messages=("",) * count, seconds=np.zeros(count),
+    )  # fmt: skip
