@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 import toy
-from scipy.signal import lfilter
 from scipy.stats import kstest, norm
 from toy_inference import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
 
@@ -20,7 +19,7 @@ from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior, NoisePriors, find_map
 from bayeskin.inference.convergence import Limits
 from bayeskin.inference.gauss_newton import gauss_newton, promise, surrogate_error
-from bayeskin.inference.model_error import BEND, RELAXATION_S, RELAXING, ModelError, relaxing
+from bayeskin.inference.model_error import ModelError
 from bayeskin.inference.straighten import find_shear
 from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.mechanism import Instrument
@@ -612,33 +611,6 @@ def test_a_mechanism_that_does_nothing_gains_nothing() -> None:
 def allowing(amplitude: float) -> ModelError | None:
     """Errors of the toy whose factor has this sd; none of 0."""
     return ModelError(toy.MOTION, ToySurrogate().edges_s, amplitude) if amplitude else None
-
-
-def test_the_mesh_s_error_is_a_factor_and_a_bend_of_the_force_and_what_relaxes() -> None:
-    skin = ToySurrogate()
-    theta = np.array([list(TRUTH.values())] * 2)
-    plain = skin.predict(theta)
-    error = allowing(0.004)
-    assert error is not None
-    allowed = error.beside(plain)
-    np.testing.assert_array_equal(allowed.mean, plain.mean)
-    new = allowed.factor[0, :, plain.factor.shape[2] :]
-    np.testing.assert_allclose(new[:, 0], 0.004 * plain.mean[0])
-    middle = 0.5 * (skin.edges_s[1:] + skin.edges_s[:-1])
-    top, bottom = np.argmax(toy.MOTION.at(middle)), np.argmin(toy.MOTION.at(middle))
-    np.testing.assert_allclose(new[[top, bottom], 1], BEND * plain.mean[0, [top, bottom]] * [1, -1])
-    np.testing.assert_allclose(new[:, 2:].T, RELAXING * plain.mean[0].max() * relaxing(toy.MOTION, middle))
-
-
-def test_what_relaxes_is_the_answer_of_a_spring_and_a_dashpot() -> None:
-    """dr/dt = d(d / max d)/dt - r / tau, integrated in short steps."""
-    step_s = 1e-3
-    time_s = np.arange(0.0, toy.MOTION.time_s[-1], step_s)
-    share = toy.MOTION.at(time_s) / toy.MOTION.displacement_m.max()
-    for found, tau in zip(relaxing(toy.MOTION, time_s), RELAXATION_S, strict=True):
-        decay, slow = np.exp(-step_s / tau), np.exp(-0.5 * step_s / tau)
-        by_steps = lfilter([slow], [1.0, -decay], np.diff(share, prepend=share[0]))
-        np.testing.assert_allclose(found, by_steps, atol=2e-4)
 
 
 def test_a_mesh_that_is_off_by_a_factor_stays_inside_the_intervals() -> None:

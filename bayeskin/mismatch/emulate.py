@@ -146,6 +146,7 @@ def _design(before: Design, theta: Array, force_n: Array) -> Design:
     count = len(before.theta) + len(theta)
     return replace(
         before, theta=np.concatenate([before.theta, theta]),
-        force_n=np.concatenate([before.force_n, force_n]), wave=np.zeros(count, dtype=np.int64), held_out=np.zeros(count, dtype=bool),
+        force_n=np.concatenate([before.force_n, force_n]),
+        wave=np.zeros(count, dtype=np.int64), held_out=np.zeros(count, dtype=bool),
         ok=np.ones(count, dtype=bool), messages=("",) * count, seconds=np.zeros(count),
     )  # fmt: skip

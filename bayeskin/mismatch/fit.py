@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior, NoisePriors
-from bayeskin.inference.gauss_newton import Top, gauss_newton, promise
+from bayeskin.inference.gauss_newton import LESS_NOISE, Top, gauss_newton, promise, with_less_noise
 from bayeskin.inference.likelihood import log_likelihood
 from bayeskin.inference.straighten import Shear
 from bayeskin.mismatch.wrapper import Sure, skins
@@ -354,7 +354,8 @@ def _best(
 ) -> Fit:  # fmt: skip
     ahead = _climbed(log_posterior, starts, shear)[0]
     others = _other_starts(ahead.vector, log_posterior, shear, seed, SKIN_STARTS)
-    ahead = _climbed(log_posterior, [ahead.vector, *others], shear)[0]
+    quiet = with_less_noise(log_posterior, ahead.vector, LESS_NOISE[-1])
+    ahead = _climbed(log_posterior, [ahead.vector, quiet, *others], shear)[0]
     return _fit_at(names, log_posterior, gauss_newton(log_posterior, ahead.vector, shear, ROUNDS))
 
 

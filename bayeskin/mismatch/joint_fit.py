@@ -75,7 +75,7 @@ def fit_jointly(
     if isinstance(run, str):
         return run
     about = local(names, run)
-    vector, value = _at_run(about, about.vector(start), settings.held)
+    vector, value = _at_run(about, np.clip(about.vector(start), *about.bounds), settings.held)
     trust, settled, made = settings.first, False, 1
     while made < settings.runs and trust >= settings.smallest:
         ahead, promised = _highest(about, within(about, vector, trust), vector, settings.climb)

@@ -29,7 +29,7 @@ ENSEMBLES, FEWEST_WALKERS = 2, 40
 LEGS = (120, 300, 600, 900)  # steps after which draws may do
 FORGOTTEN, EVERY = 1 / 3, 5  # of these steps, at least; one of so many is kept
 MODES = 6  # climbs from other skins
-NEAR = 0.5  # of Laplace's sd, about a mode
+NEAR, NEARER = 0.5, 0.7  # of Laplace's sd, about a mode; of that, each time that too few walkers can be there
 LIMITS = Limits(effective_samples=200.0, lengths=5.0, rhat=1.1)  # for intervals, not for tails
 
 
@@ -115,12 +115,13 @@ def _starts(found: Fit, shear: Shear | None, seed: int, rng: np.random.Generator
     root = np.linalg.cholesky(found.covariance + 1e-12 * np.eye(len(low))) * (high - low)[:, None]
 
     def draw(count: int) -> Array:
-        out = np.empty((0, len(low)))
+        out, near = np.empty((0, len(low))), NEAR
         while len(out) < count:
             centre = centres[rng.choice(len(centres), count, p=share / share.sum())]
-            trial = centre + NEAR * rng.standard_normal((count, len(low))) @ root.T
+            trial = centre + near * rng.standard_normal((count, len(low))) @ root.T
             trial = low + np.abs(np.mod((trial - low) / (high - low) + 1.0, 2.0) - 1.0) * (high - low)
             out = np.concatenate([out, trial[np.isfinite(log_posterior.log_prob(trial))]])
+            near *= NEARER  # where next to nothing is possible farther away
         return out[:count]
 
     return draw

@@ -1,0 +1,103 @@
+"""The posterior by an emulator is that by the force itself, on a skin in closed form."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from toys import solved
+from toys.solved import TRUTH, Exact
+
+from bayeskin.mismatch.emulate import EmulationSettings, Forces, emulate
+from bayeskin.mismatch.fit import fit_near
+from bayeskin.mismatch.joint_fit import JointFit, fit_jointly, within
+from bayeskin.mismatch.resample import resample
+from bayeskin.mismatch.wrapper import innermost
+from bayeskin.pipeline.joint_bench import JointBench
+from bayeskin.types import Array
+
+SETS = ((), ("force-offset",))
+FEW = EmulationSettings(points=30)
+
+
+@pytest.fixture(params=SETS, ids=["base", "offset"])
+def fitted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tuple[JointBench, JointFit]:
+    names = request.param
+    bench = solved.bench(monkeypatch, solved.recorded(3, **({"F0": -0.03} if names else {})))
+    found = fit_jointly(names, {**bench.noise, **TRUTH, "F0": 0.0}, bench.skin, bench.local)
+    assert isinstance(found, JointFit)
+    return bench, found
+
+
+def by_the_toy(bench: JointBench, names: tuple[str, ...], asked: list[int]) -> Forces:
+    """Runs of the toy, which counts them."""
+
+    def forces(points: Array) -> Sequence[Array | str]:
+        asked.append(len(points))
+        space = bench.space(names)
+        return [bench.force(names, dict(zip(space.names, row, strict=True))) for row in points]
+
+    return forces
+
+
+def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[JointBench, JointFit]) -> None:
+    bench, found = fitted
+    asked: list[int] = []
+    emulated = emulate(found, by_the_toy(bench, found.fit.names, asked), solved.NOISE_N, 1, FEW)
+    assert not isinstance(emulated, str)
+    assert emulated.settled
+    assert emulated.runs == sum(asked)
+    assert 2 <= len(asked) <= FEW.waves
+    about = found.fit.log_posterior
+    exact = Exact(innermost(about.surrogate).space)
+    seen = dataclasses.replace(about.surrogate, inner=exact) if found.fit.names else exact
+    whole = dataclasses.replace(about, surrogate=seen)
+    there = fit_near(found.fit.names, whole, emulated.fit.theta, None)
+    assert emulated.fit.value == pytest.approx(there.value, abs=1.0)
+    # Permeabilities that change places make almost the same force: the toy has another mode far away.
+    near = within(whole, whole.vector(there.theta), 0.2)
+    right = resample(dataclasses.replace(there, log_posterior=near), None, 2)
+    draws = [whole.to_sampling(one.draws) for one in (emulated.draws, right)]
+    of_force = slice(0, whole.surrogate.space.dim)
+    (mean, sd), (exact_mean, exact_sd) = (
+        (one[:, of_force].mean(axis=0), one[:, of_force].std(axis=0)) for one in draws
+    )
+    assert np.all(np.abs(mean - exact_mean) < 0.3 * exact_sd)
+    assert np.all(np.abs(np.log(sd / exact_sd)) < np.log(1.3))
+
+
+def test_the_same_seed_gives_the_same_draws(fitted: tuple[JointBench, JointFit]) -> None:
+    bench, found = fitted
+    made = [emulate(found, by_the_toy(bench, found.fit.names, []), solved.NOISE_N, 1, FEW) for _ in range(2)]
+    assert not isinstance(made[0], str)
+    assert not isinstance(made[1], str)
+    np.testing.assert_array_equal(made[0].draws.draws, made[1].draws.draws)
+
+
+def test_runs_that_fail_are_done_without_and_are_the_answer_where_all_do(
+    fitted: tuple[JointBench, JointFit],
+) -> None:
+    bench, found = fitted
+    run = by_the_toy(bench, found.fit.names, [])
+
+    def some(points: Array) -> Sequence[Array | str]:
+        return ["near folding" if i % 5 == 4 else one for i, one in enumerate(run(points))]
+
+    emulated = emulate(found, some, solved.NOISE_N, 1, dataclasses.replace(FEW, waves=2))
+    assert not isinstance(emulated, str)
+    assert emulated.runs == 2 * 24
+    assert (
+        emulate(found, lambda points: ["near folding"] * len(points), solved.NOISE_N, 1, FEW)
+        == "near folding"
+    )
+
+
+def test_one_wave_alone_is_never_settled(fitted: tuple[JointBench, JointFit]) -> None:
+    bench, found = fitted
+    one = dataclasses.replace(FEW, waves=1)
+    emulated = emulate(found, by_the_toy(bench, found.fit.names, []), solved.NOISE_N, 1, one)
+    assert not isinstance(emulated, str)
+    assert emulated.error_n is None
+    assert not emulated.settled
