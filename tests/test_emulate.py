@@ -16,7 +16,8 @@ from bayeskin.mismatch.joint_fit import JointFit, fit_jointly, within
 from bayeskin.mismatch.resample import resample
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.pipeline.joint_bench import JointBench
-from bayeskin.types import Array
+from bayeskin.surrogates import train
+from bayeskin.types import Array, Design, Surrogate
 
 SETS = ((), ("force-offset",))
 FEW = EmulationSettings(points=30)
@@ -42,14 +43,31 @@ def by_the_toy(bench: JointBench, names: tuple[str, ...], asked: list[int]) -> F
     return forces
 
 
-def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[JointBench, JointFit]) -> None:
+def learnt(design: Design) -> Surrogate:
+    return train(design, "gp", 1)[0]
+
+
+def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[JointBench, JointFit]) -> None:
     bench, found = fitted
     asked: list[int] = []
-    emulated = emulate(found, by_the_toy(bench, found.fit.names, asked), solved.NOISE_N, 1, FEW)
+    emulated = emulate(found, by_the_toy(bench, found.fit.names, asked), learnt, solved.NOISE_N, 1, FEW)
     assert not isinstance(emulated, str)
     assert emulated.settled
-    assert emulated.runs == sum(asked)
-    assert 2 <= len(asked) <= FEW.waves
+    assert emulated.error_n is not None
+    assert emulated.error_n < FEW.enough * solved.NOISE_N
+    assert emulated.runs == sum(asked) == 2 * FEW.points
+    assert emulated.fit.value == pytest.approx(found.fit.value, abs=1.0)
+    low, high = np.quantile(emulated.draws.draws, [0.01, 0.99], axis=0)
+    truth = [{**TRUTH, "F0": -0.03}.get(name, np.nan) for name in emulated.draws.names]
+    inside = [bool(a < t < b) for a, t, b in zip(low, truth, high, strict=True) if np.isfinite(t)]
+    assert sum(inside) >= len(inside) - 1
+
+
+@pytest.mark.slow
+def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[JointBench, JointFit]) -> None:
+    bench, found = fitted
+    emulated = emulate(found, by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
+    assert not isinstance(emulated, str)
     about = found.fit.log_posterior
     exact = Exact(innermost(about.surrogate).space)
     seen = dataclasses.replace(about.surrogate, inner=exact) if found.fit.names else exact
@@ -58,19 +76,22 @@ def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[JointBench, Joint
     assert emulated.fit.value == pytest.approx(there.value, abs=1.0)
     # Permeabilities that change places make almost the same force: the toy has another mode far away.
     near = within(whole, whole.vector(there.theta), 0.2)
-    right = resample(dataclasses.replace(there, log_posterior=near), None, 2)
+    right = resample(dataclasses.replace(there, log_posterior=near), None, 2, (120,))
     draws = [whole.to_sampling(one.draws) for one in (emulated.draws, right)]
     of_force = slice(0, whole.surrogate.space.dim)
     (mean, sd), (exact_mean, exact_sd) = (
         (one[:, of_force].mean(axis=0), one[:, of_force].std(axis=0)) for one in draws
     )
-    assert np.all(np.abs(mean - exact_mean) < 0.3 * exact_sd)
-    assert np.all(np.abs(np.log(sd / exact_sd)) < np.log(1.3))
+    assert np.all(np.abs(mean - exact_mean) < 0.4 * exact_sd)
+    assert np.all(np.abs(np.log(sd / exact_sd)) < np.log(1.5))
 
 
 def test_the_same_seed_gives_the_same_draws(fitted: tuple[JointBench, JointFit]) -> None:
     bench, found = fitted
-    made = [emulate(found, by_the_toy(bench, found.fit.names, []), solved.NOISE_N, 1, FEW) for _ in range(2)]
+    made = [
+        emulate(found, by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
+        for _ in range(2)
+    ]
     assert not isinstance(made[0], str)
     assert not isinstance(made[1], str)
     np.testing.assert_array_equal(made[0].draws.draws, made[1].draws.draws)
@@ -85,11 +106,11 @@ def test_runs_that_fail_are_done_without_and_are_the_answer_where_all_do(
     def some(points: Array) -> Sequence[Array | str]:
         return ["near folding" if i % 5 == 4 else one for i, one in enumerate(run(points))]
 
-    emulated = emulate(found, some, solved.NOISE_N, 1, dataclasses.replace(FEW, waves=2))
+    emulated = emulate(found, some, learnt, solved.NOISE_N, 1, dataclasses.replace(FEW, waves=2))
     assert not isinstance(emulated, str)
     assert emulated.runs == 2 * 24
     assert (
-        emulate(found, lambda points: ["near folding"] * len(points), solved.NOISE_N, 1, FEW)
+        emulate(found, lambda points: ["near folding"] * len(points), learnt, solved.NOISE_N, 1, FEW)
         == "near folding"
     )
 
@@ -97,7 +118,7 @@ def test_runs_that_fail_are_done_without_and_are_the_answer_where_all_do(
 def test_one_wave_alone_is_never_settled(fitted: tuple[JointBench, JointFit]) -> None:
     bench, found = fitted
     one = dataclasses.replace(FEW, waves=1)
-    emulated = emulate(found, by_the_toy(bench, found.fit.names, []), solved.NOISE_N, 1, one)
+    emulated = emulate(found, by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, one)
     assert not isinstance(emulated, str)
     assert emulated.error_n is None
     assert not emulated.settled

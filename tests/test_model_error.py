@@ -18,14 +18,13 @@ from bayeskin.inference.model_error import (
     CALIBRATION,
     RELAXATION_S,
     RELAXING,
-    UNKNOWN_MESH,
     ModelError,
-    model_error,
     relaxing,
 )
 from bayeskin.inference.noise_model import noise_covariance
 from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec
+from bayeskin.pipeline.model import UNKNOWN_MESH, model_error
 
 
 def test_the_mesh_s_error_is_a_factor_and_a_bend_of_the_force_and_what_relaxes() -> None:

@@ -182,7 +182,7 @@ def test_json_knows_no_nan_and_no_numpy(tmp_path: Path) -> None:
 
 
 def bands_with(surrogate_n: float, noise_n: float) -> Bands:
-    constant = {"parameter": 0.0, "surrogate": surrogate_n, "noise": noise_n}
+    constant = {"model": 0.0, "surrogate": surrogate_n, "noise": noise_n}
     blank = {f.name: np.zeros(4) for f in dataclasses.fields(Bands)}
     return Bands(**{**blank, **{f"sd_{part}_n": np.full(4, sd) for part, sd in constant.items()}})
 

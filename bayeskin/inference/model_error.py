@@ -19,12 +19,9 @@ from functools import cached_property
 
 import numpy as np
 
-from bayeskin.model.accuracy import mesh_error
-from bayeskin.model.simulate import ModelSpec
 from bayeskin.types import Array, PadMotion, Prediction
 
 CALIBRATION = 0.01  # sd of a factor on the force: what a load cell of class 1 is off by (ISO 7500-1:2018)
-UNKNOWN_MESH = 5e-3  # RMS error of bricks that no study was made of, over the force (docs/discretisation.md)
 BEND = 3e-3  # b, of the force
 RELAXING = 1.5e-3  # c, of the largest force
 RELAXATION_S = (
@@ -61,19 +58,6 @@ class ModelError:
     @cached_property
     def _shapes(self) -> tuple[Array, Array]:
         return shapes(self.motion, self.edges_s)
-
-
-def model_error(spec: ModelSpec, motion: PadMotion, edges_s: Array) -> ModelError | None:
-    """Returns the errors that are allowed for of a model's force in bins.
-
-    None for the article's observation, which is defined on its own mesh and steps, and for a model of one's
-    own, of whose error nothing is known.
-    """
-    if spec.observation != "reaction":
-        return None
-    known = mesh_error(spec.mesh_hash)
-    mesh = UNKNOWN_MESH if known is None else known.rms
-    return ModelError(motion, edges_s, float(np.hypot(mesh, CALIBRATION)))
 
 
 def shapes(motion: PadMotion, edges_s: Array) -> tuple[Array, Array]:

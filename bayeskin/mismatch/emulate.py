@@ -19,13 +19,13 @@ from bayeskin.mismatch.fit import Fit, fit_near
 from bayeskin.mismatch.joint_fit import JointFit, within
 from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.wrapper import Wrapper, innermost
-from bayeskin.surrogates import train
 from bayeskin.types import Array, Design, ParameterSpace, Surrogate
 
 MOST = 1500  # draws, among which a wave's points are chosen
 
 # The skin's force (m,) with the set at points (n, d), or why a run failed.
 Forces = Callable[[Array], Sequence[Array | str]]
+Learn = Callable[[Design], Surrogate]  # a surrogate of a design's force, with its error
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,9 @@ class Emulated:
 
 
 def emulate(
-    found: JointFit, forces: Forces, noise_n: float, seed: int, settings: EmulationSettings | None = None
-) -> Emulated | str:
+    found: JointFit, forces: Forces, learn: Learn, noise_n: float, seed: int,
+    settings: EmulationSettings | None = None,
+) -> Emulated | str:  # fmt: skip
     """Returns the posterior of a set about its fit; the message of a run where all of the first wave fail.
 
     noise_n : sd of a bin's mean
@@ -88,7 +89,7 @@ def emulate(
             said = innermost(emulated.fit.log_posterior.surrogate).predict_mean(points[ran])
             error_n = float(np.sqrt(np.mean((said - fresh.force_n[-len(ran) :]) ** 2)))
         design = fresh
-        local = _posterior(about, design, settings.sure * noise_n, seed)
+        local = _posterior(about, learn(design), settings.sure * noise_n)
         best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
         drawn = resample(best, None, seed)
         done = error_n is not None and error_n <= settings.enough * noise_n
@@ -99,9 +100,8 @@ def emulate(
     return emulated
 
 
-def _posterior(about: LogPosterior, design: Design, unsure_n: float, seed: int) -> LogPosterior:
-    """The posterior with the skin's force learnt from runs."""
-    emulator: Surrogate = train(design, "gp", seed)[0]
+def _posterior(about: LogPosterior, emulator: Surrogate, unsure_n: float) -> LogPosterior:
+    """The posterior with the skin's force by an emulator."""
     seen = about.surrogate
     surrogate = replace(seen, inner=emulator) if isinstance(seen, Wrapper) else emulator
     return replace(about, surrogate=surrogate, sure_within_n=unsure_n)

@@ -48,7 +48,7 @@ class SearchSettings:
     probes: int = 3
     off: float = 0.25
     shortlist: int = 4
-    promised: float = 3.0
+    promised: float = 1.0
     near: float = 0.5
     alike: int = 3
     others: int = 16

@@ -9,10 +9,9 @@ import numpy as np
 from bayeskin import inference, storage
 from bayeskin.config import parameter_space
 from bayeskin.inference import LogPosterior, NoisePriors
-from bayeskin.inference.model_error import model_error
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.pipeline.engine import Run
-from bayeskin.pipeline.model import model_spec
+from bayeskin.pipeline.model import model_error, model_spec
 from bayeskin.surrogates import load_surrogate
 from bayeskin.types import Array, BinnedForce, PadMotion, Surrogate
 

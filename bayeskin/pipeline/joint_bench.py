@@ -15,7 +15,6 @@ import numpy as np
 
 import bayeskin
 from bayeskin.inference import LogPosterior
-from bayeskin.inference.model_error import model_error
 from bayeskin.mechanisms import Mechanism, catalogue, with_one
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.mismatch.corrected import FullRun
@@ -35,6 +34,7 @@ from bayeskin.mismatch.refuted import refuted
 from bayeskin.mismatch.tangent import Tangent
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline.folder import read_lines, sha256_of
+from bayeskin.pipeline.model import model_error
 from bayeskin.pipeline.reported import beside_neutral
 from bayeskin.pipeline.workbench import calm_bins
 from bayeskin.reduced.files import load_reduced

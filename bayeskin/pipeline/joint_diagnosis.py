@@ -36,6 +36,7 @@ from bayeskin.pipeline.reported import FullForce
 from bayeskin.pipeline.taking_up import Remainder
 from bayeskin.reduced.enrichment import EnrichmentSettings, enrich
 from bayeskin.reduced.region import protocol_outside
+from bayeskin.surrogates import train
 from bayeskin.types import Array, BinnedForce
 from bayeskin.workers import local
 
@@ -168,7 +169,7 @@ def _emulated(bench: JointBench, ask: Ask, found: JointFit, seed: int) -> Emulat
     def forces(points: Array) -> list[Array | str]:
         return [one if isinstance(one, str) else np.asarray(one) + moved_n for one in probes(points)]
 
-    emulated = emulate(found, forces, noise_n, seed)
+    emulated = emulate(found, forces, lambda design: train(design, "gp", seed)[0], noise_n, seed)
     if isinstance(emulated, str):
         return Emulated(found.fit, _drawn(found.fit, seed), 0, None, False)
     return emulated

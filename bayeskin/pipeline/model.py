@@ -7,7 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
+import numpy as np
+
 from bayeskin.errors import InputError
+from bayeskin.inference.model_error import CALIBRATION, ModelError
+from bayeskin.model.accuracy import mesh_error
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.pipeline.engine import Run
 from bayeskin.pipeline.folder import sha256_of
@@ -15,7 +19,9 @@ from bayeskin.pipeline.reducing import reduced_file
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.region import protocol_outside
 from bayeskin.reduced.simulate import simulate_reduced
-from bayeskin.types import PadMotion, Simulation
+from bayeskin.types import Array, PadMotion, Simulation
+
+UNKNOWN_MESH = 5e-3  # RMS error of bricks that no study was made of, over the force (docs/discretisation.md)
 
 
 class ForceModel(Protocol):
@@ -88,6 +94,19 @@ def model_spec(run: Run, mesh: str | None = None, observation: str | None = None
         refinement=model.refinement,
         geometry=geometry,
     )
+
+
+def model_error(spec: ModelSpec, motion: PadMotion, edges_s: Array) -> ModelError | None:
+    """Returns the errors that are allowed for of a model's force in bins.
+
+    None for the article's observation, which is defined on its own mesh and steps, and for a model of one's
+    own, of whose error nothing is known.
+    """
+    if spec.observation != "reaction":
+        return None
+    known = mesh_error(spec.mesh_hash)
+    mesh = UNKNOWN_MESH if known is None else known.rms
+    return ModelError(motion, edges_s, float(np.hypot(mesh, CALIBRATION)))
 
 
 def own_files(run: Run) -> list[Path]:

@@ -16,7 +16,6 @@ from bayeskin.config import Config, DesignConfig, RecordingConfig, SurrogateConf
 from bayeskin.device import load_device_file
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior
-from bayeskin.inference.model_error import model_error
 from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.fit import (
@@ -33,7 +32,7 @@ from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline import recording
 from bayeskin.pipeline.effects import effects_of
 from bayeskin.pipeline.engine import Reporter, Run, open_run
-from bayeskin.pipeline.model import model_spec
+from bayeskin.pipeline.model import model_error, model_spec
 from bayeskin.pipeline.shipping import shipped_for
 from bayeskin.pipeline.training import base_surrogate
 from bayeskin.recordings import analyse, bin_recording, jumps_of, read_recording, segment
