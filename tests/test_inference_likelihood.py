@@ -17,7 +17,6 @@ from bayeskin.inference.noise_model import (
     NoiseChain,
     bins_in_windows,
     draw_noise,
-    innovation_sd,
     innovations,
     noise_chain,
     noise_covariance,
@@ -111,7 +110,6 @@ def test_innovations_of_the_noise_are_independent() -> None:
     columns = rng.standard_normal((len(chain.bins), 3))
     own = diagonal[chain.bins]
     assert innovations(chain, noise, own, columns) == pytest.approx(np.linalg.solve(root, columns))
-    assert innovation_sd(chain, noise, own) == pytest.approx(np.diag(root))
 
 
 def test_an_omitted_bin_is_a_marginalised_bin() -> None:
@@ -218,7 +216,7 @@ def test_latents_beyond_what_a_surrogate_denies_are_found_as_by_a_general_optimi
     square = (white[:, 0] - white[:, 1:] @ z) ** 2
     bend = (nu + 1.0) * (nu - square) / (nu + square) ** 2
     curvature = (white[:, 1:].T * bend) @ white[:, 1:] + np.diag(1.0 + STIFF * (np.abs(z) > FARTHEST))
-    scale = innovation_sd(chain, noise[0], prediction.diagonal[0, chain.bins])
+    scale = np.diag(np.linalg.cholesky(covariance(chain, noise[0], prediction.diagonal[0])))
     density = len(white) * stats.t.logpdf(0.0, nu) - np.log(scale).sum()
     expected = density - energy(z) - 0.5 * np.linalg.slogdet(curvature)[1]
     assert log_likelihood(chain, prediction, noise)[0] == pytest.approx(expected, rel=1e-6, abs=1e-3)

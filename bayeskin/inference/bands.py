@@ -1,4 +1,4 @@
-"""What the posterior predicts for the force, how uncertain and from what, and how far off it is."""
+"""The force that a posterior predicts, the parts of its uncertainty, and its distance from the recording."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def coverage(binned: BinnedForce, low_n: Array, high_n: Array, windows: Windows 
 
 
 def rmse(binned: BinnedForce, force_n: ArrayLike, windows: Windows | None = None) -> Rmse:
-    """How far a predicted force (m,) [N] is from the recorded one; NaN for a window without bins.
+    """Returns how far a predicted force (m,) [N] is from the recorded one; NaN for a window without bins.
 
     `by_kind_n` is over the whole recording; `by_window_n` follows `windows`, one by one.
     """

@@ -38,7 +38,7 @@ ERRORS = 8  # draws of the surrogate's error, over which a quick step of the noi
 
 @dataclass(frozen=True)
 class Top:
-    """Where a climb ended: sampling coordinates (D,) and log density, after so many rounds.
+    """The end of a climb: sampling coordinates (D,) and log density, after so many rounds.
 
     information (D, D) and gradient (D,) are those of the log density over the unit cube; the material and the
     noise do not mix in the information. latent (r,): the surrogate's error there, in sd of each column of its
@@ -66,8 +66,9 @@ class Top:
 def gauss_newton(
     log_posterior: LogPosterior, start: Array, shear: Shear | None, rounds: int = 40, quick: bool = False
 ) -> Top:
-    """From `start` (D,) in sampling coordinates; `shear` straightens this posterior, where it is known.
+    """Returns the end of a climb from `start` (D,) in sampling coordinates.
 
+    shear : straightens this posterior, where it is known
     quick : for the first rounds of many climbs, of which the best goes on without: a round's step of the
         noise is one of expectation maximisation, weights are found in fewer steps, the first round that gains
         next to nothing is the last, and a climb across a ridge may end on its side
@@ -130,7 +131,7 @@ def promise(
     ]
 
 
-def with_less_noise(log_posterior: LogPosterior, vector: Array, share: float) -> Array:
+def with_less_noise(log_posterior: LogPosterior, vector: Array, share: float = LESS_NOISE[-1]) -> Array:
     """Returns the point (D,) with a share of each kind of phase's noise with a memory, within the box."""
     sds = np.array([name.startswith("sd_") for name in log_posterior.names])
     low, high = log_posterior.bounds
@@ -374,7 +375,7 @@ def _normals(rank: int) -> Array:
 
 
 def _weight(left: Array, nu: float) -> Array:
-    """Of innovations in a regression whose errors are t."""
+    """Returns weights of innovations in a regression whose errors are t."""
     return np.asarray((nu + 1.0) / (nu + left**2))
 
 
@@ -424,7 +425,7 @@ def _orthonormal(factor: Array, stiffness: Array) -> tuple[Array, Array, Array]:
 
 
 def _spring(latent: Array) -> tuple[Array, Array]:
-    """Of the prior of the surrogate's error (r,): its stiffness, and its pull where the error is zero."""
+    """Returns stiffness (r,) of the prior of the surrogate's error, and its pull where the error is zero."""
     beyond = np.abs(latent) > FARTHEST
     return np.where(beyond, 1.0 + STIFF, 1.0), np.where(beyond, STIFF * FARTHEST * np.sign(latent), 0.0)
 

@@ -260,7 +260,7 @@ def _energy(white: Array, design: Array, rank: int, z: Array, nu: float, eps: Ar
 
 @nb.njit(fastmath=_FAST, inline="always")
 def _weights(eps: Array, nu: float, step: int, newton: bool, pulled: Array, bend: Array) -> None:
-    """What the gradient sums, `pulled`, and weights of the curvature, `bend`, (k,); eps and 1 if Gaussian."""
+    """Fills terms of the gradient, `pulled`, and of the curvature, `bend`, (k,); eps and 1 if Gaussian."""
     if step == 0 or math.isinf(nu):
         pulled[:] = eps
         bend[:] = 1.0

@@ -1,9 +1,9 @@
-"""What the full model itself may be wrong by: its mesh, and the calibration of the load cell.
+"""The error of the full model itself: of its mesh, and of the calibration of the load cell.
 
-What a finer mesh would change is, within a tenth, a factor on the force; a cell's calibration is one, too.
-What that leaves goes with displacement, and relaxes after each movement, because a mesh resolves the flow of
-the fluid to its own size only (`benchmarks/mesh_shapes.py`). All are errors of the force at every point of
-the parameter space. They are added up from shapes of one sd each,
+A finer mesh changes the force, within a tenth of the change, by a factor; a cell's calibration is a factor,
+too. The rest of the change goes with displacement, and relaxes after each movement, because a mesh resolves
+the flow of the fluid to its own size only (`benchmarks/mesh_shapes.py`). All are errors of the force at every
+point of the parameter space. They are added up from shapes of one sd each,
 
     a F(t) ,  b F(t) (2 d(t) / max d - 1)  and  c max |F| r_i(t) ,
 
@@ -48,7 +48,7 @@ class ModelError:
 
     @property
     def columns(self) -> int:
-        """How many there are."""
+        """Returns the number of these errors."""
         return 2 + len(RELAXATION_S)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What the likelihood takes a recording's noise to be: its parameters, its order in time, its draws.
+"""The model of a recording's noise: its parameters, its order in time, its draws.
 
 The noise of bin j is the sum of three:
 
@@ -208,12 +208,6 @@ def innovations(chain: NoiseChain, noise: Array, diagonal: Array, columns: Array
     noise (q,): columns of `noise_space(chain.kinds)`; diagonal (k,) the surrogate's [N^2]
     """
     return _through(chain, noise, diagonal, columns, True)
-
-
-def innovation_sd(chain: NoiseChain, noise: Array, diagonal: Array) -> Array:
-    """Returns the sd [N] of the innovations (k,); noise and diagonal as in `innovations`."""
-    sd, decay = noise[chain.kind], _decay(chain, noise)
-    return np.asarray(_gains(sd, chain.variance_n2, diagonal, decay, chain.correlation, chain.starts)[2])
 
 
 def _through(chain: NoiseChain, noise: Array, diagonal: Array, columns: Array, forwards: bool) -> Array:

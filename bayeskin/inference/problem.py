@@ -157,7 +157,7 @@ class LogPosterior:
         return np.where(self.impossible(theta, prediction), -np.inf, found)
 
     def impossible(self, theta: Array, prediction: Prediction) -> NDArray[np.bool_]:
-        """Which rows (n, D) in SI `excludes` or `sure_within_n` rule out, the prediction at them given."""
+        """Returns which rows (n, D) in SI `excludes` or `sure_within_n` rules out, given the prediction."""
         out = np.zeros(len(prediction.mean), dtype=bool)
         if self.excludes is not None:
             out |= self.excludes(self.surrogate.space, self.split(theta)[0])
@@ -208,7 +208,7 @@ class LogPosterior:
 
     @cached_property
     def identity(self) -> dict[str, str]:
-        """What this posterior was made from, as hashes: a chain goes on only with the same ones."""
+        """Returns hashes of all that this posterior was made from: a chain goes on only with the same."""
         b = self.binned
         arrays = (b.edges_s, b.force_n, b.variance_n2, b.correlation, b.phase)
         return {

@@ -38,7 +38,7 @@ NOTICEABLE = 5.0  # nats over no discrepancy; noise alone gains less in 99 of 10
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """What the model leaves unexplained, on the fitted bins (k,).
+    """The force that the model leaves unexplained, on the fitted bins (k,).
 
     mean_n, sd_n (k,) of the discrepancy; parts_n: mean (k,) of each part, which add up to mean_n;
     beyond_n (k,) the residual beyond what parameters could still take up, and taken_n (k,) what they could;
@@ -67,7 +67,7 @@ class Discrepancy:
 
     @property
     def noticeable(self) -> bool:
-        """Whether there is more than noise."""
+        """Returns whether there is more than noise."""
         return self.gain_nats > NOTICEABLE
 
 
@@ -130,7 +130,7 @@ def _kernels(line: Array, squares: Array, masks: Array) -> Array:
 
 
 def _bounds(rest: Unexplained) -> Array:
-    """Of logarithms of size and time of the noise with a memory, then of parts' sizes and lengths, (8, 2)."""
+    """Returns bounds (8, 2) of logarithms: noise's size and memory, then the parts' sizes and lengths."""
     noise = float(np.sqrt(np.median(np.diag(rest.measured_n2))))
     rms = max(float(np.sqrt(np.mean(rest.beyond(rest.residual_n) ** 2))), noise)
     of_noise = [rest.memory.size_within, rest.memory.time_within]
@@ -138,7 +138,7 @@ def _bounds(rest: Unexplained) -> Array:
 
 
 def _starts(rest: Unexplained, bounds: Array | None = None) -> list[Array]:
-    """Where climbs begin: the noise as it was fitted, and next to none; with `bounds`, of parts as well."""
+    """Returns where climbs begin: at the fitted noise and at little; with `bounds`, at little alone."""
     fitted = np.log([rest.memory.size, rest.memory.time_s])
     noises = [fitted, fitted + np.log([LITTLE, 1.0])]
     if bounds is None:

@@ -117,7 +117,7 @@ def _likeliest(local: LogPosterior, fit: Fit, theta: Array) -> dict[str, float]:
 def _spread(
     space: ParameterSpace, draws: Array, before: Array, count: int, rng: np.random.Generator
 ) -> Array:
-    """So many of draws (n, d), each as far as can be from those before it, in sd of the draws."""
+    """Returns some of draws (n, d), each as far as possible from those before it, in sd of the draws."""
     some = draws[rng.choice(len(draws), min(len(draws), MOST), replace=False)]
     unit = space.box.to_unit(some)
     scale = unit.std(axis=0) + 1e-9

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior, NoisePriors
-from bayeskin.inference.gauss_newton import LESS_NOISE, Top, gauss_newton, promise, with_less_noise
+from bayeskin.inference.gauss_newton import Top, gauss_newton, promise, with_less_noise
 from bayeskin.inference.likelihood import log_likelihood
 from bayeskin.inference.straighten import Shear
 from bayeskin.mismatch.wrapper import Sure, skins
@@ -84,7 +84,7 @@ def instrument_noise(binned: BinnedForce) -> NoisePriors:
 
 
 def soft_on_stiff(space: ParameterSpace, theta: Array) -> NDArray[np.bool_]:
-    """Whether the subcutis is more than `STIFFEST_BELOW` times as stiff as the cutis, at rows (n, d)."""
+    """Returns where (n, d) the subcutis is more than `STIFFEST_BELOW` times as stiff as the cutis, (n,)."""
     names = space.names
     if not {"E_c", "E_s"} <= set(names):
         return np.zeros(len(theta), dtype=bool)
@@ -173,7 +173,7 @@ def restored(plain: Mapping[str, Any], log_posterior: LogPosterior) -> Fit:
 
 
 def much_left(log_posterior: LogPosterior, theta: Mapping[str, float]) -> bool:
-    """Whether the noise of some kind of phase is as large as it may be."""
+    """Returns whether the noise of some kind of phase is as large as it may be."""
     low, high = log_posterior.bounds
     unit = (log_posterior.vector(theta) - low) / (high - low)
     return any(unit[i] > AT_BOUND for i, name in enumerate(log_posterior.names) if name.startswith("sd_"))
@@ -354,7 +354,7 @@ def _best(
 ) -> Fit:  # fmt: skip
     ahead = _climbed(log_posterior, starts, shear)[0]
     others = _other_starts(ahead.vector, log_posterior, shear, seed, SKIN_STARTS)
-    quiet = with_less_noise(log_posterior, ahead.vector, LESS_NOISE[-1])
+    quiet = with_less_noise(log_posterior, ahead.vector)
     ahead = _climbed(log_posterior, [ahead.vector, quiet, *others], shear)[0]
     return _fit_at(names, log_posterior, gauss_newton(log_posterior, ahead.vector, shear, ROUNDS))
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayeskin.inference import LogPosterior
-from bayeskin.inference.gauss_newton import LESS_NOISE, gauss_newton, with_less_noise
+from bayeskin.inference.gauss_newton import gauss_newton, with_less_noise
 from bayeskin.inference.noise_model import innovations
 from bayeskin.mismatch.corrected import CorrectedSurrogate, FullRun, error_lengths
 from bayeskin.mismatch.fit import Fit
@@ -157,7 +157,7 @@ def _maximum(
     near = in_box(local, vector, np.array([1.0 if name in exact else trust for name in names]))
     low, high = near.bounds
     starts = [np.clip(vector, low, high)]
-    starts.append(np.clip(with_less_noise(local, starts[0], LESS_NOISE[-1]), low, high))
+    starts.append(np.clip(with_less_noise(local, starts[0]), low, high))
     starts += [np.clip(starts[0] + 0.3 * rng.uniform(-1, 1, len(low)) * (high - low), low, high)
                for _ in range(STARTS - 1)]  # fmt: skip
     top, *others = (gauss_newton(near, start, None, CLIMB) for start in starts)

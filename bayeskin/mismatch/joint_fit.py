@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayeskin.inference import LogPosterior
-from bayeskin.inference.gauss_newton import LESS_NOISE, Top, gauss_newton, with_less_noise
+from bayeskin.inference.gauss_newton import Top, gauss_newton, with_less_noise
 from bayeskin.mismatch.corrected import FullRun
 from bayeskin.mismatch.fit import Fit, evidence
 from bayeskin.mismatch.wrapper import innermost
@@ -109,7 +109,7 @@ def _highest(about: LogPosterior, near: LogPosterior, vector: Array, rounds: int
 
     Climbs set out from the noise as it is and from little: noise that took up another run's misfit stays.
     """
-    starts = [vector, with_less_noise(about, vector, LESS_NOISE[-1])]
+    starts = [vector, with_less_noise(about, vector)]
     tops = [gauss_newton(near, np.clip(start, *near.bounds), None, rounds) for start in starts]
     better = np.clip(max(tops, key=lambda top: top.value).vector, *about.bounds)
     return better, float(about.log_prob(better[None])[0])

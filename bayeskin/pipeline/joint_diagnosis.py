@@ -158,7 +158,6 @@ def _emulated(bench: JointBench, ask: Ask, found: JointFit, seed: int) -> Emulat
     The runs are moved by what enrichment changed at the fit's run.
     """
     names, space = found.fit.names, bench.space(found.fit.names)
-    noise_n = float(np.sqrt(np.nanmean(bench.binned.variance_n2)))
 
     def probes(points: Array) -> list[object]:
         return ask([Probe(names, dict(zip(space.names, map(float, row), strict=True))) for row in points])
@@ -169,7 +168,7 @@ def _emulated(bench: JointBench, ask: Ask, found: JointFit, seed: int) -> Emulat
     def forces(points: Array) -> list[Array | str]:
         return [one if isinstance(one, str) else np.asarray(one) + moved_n for one in probes(points)]
 
-    emulated = emulate(found, forces, lambda design: train(design, "gp", seed)[0], noise_n, seed)
+    emulated = emulate(found, forces, lambda design: train(design, "gp", seed)[0], _noise_n(bench), seed)
     if isinstance(emulated, str):
         return Emulated(found.fit, _drawn(found.fit, seed), 0, None, False)
     return emulated
@@ -232,7 +231,7 @@ def _confirmed(run: Run, bench: JointBench, found: JointFit) -> tuple[JointFit, 
     and the set fitted again from there, `ENRICHED` times at most.
     """
     checked = _checked(run, bench, found.fit)
-    floor_n = float(np.sqrt(np.nanmean(bench.binned.variance_n2)))
+    floor_n = _noise_n(bench)
     solved = tuple(m.name for m in bench.solved(found.fit.names))
     whole = bench.model
     for _ in range(ENRICHED):
@@ -270,6 +269,11 @@ def _checked(run: Run, bench: JointBench, chosen: Fit) -> dict[str, Any]:
         "reduced_off_by": _rms((full - reduced)[usable]),
         "rmse": _rms((bench.binned.force_n - full)[usable]),
     }
+
+
+def _noise_n(bench: JointBench) -> float:
+    """Returns the sd [N] of the noise in a bin's mean, RMS over bins."""
+    return float(np.sqrt(np.nanmean(bench.binned.variance_n2)))
 
 
 def _rms(values: Array) -> float:
