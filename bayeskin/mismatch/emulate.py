@@ -38,11 +38,11 @@ class EmulationSettings:
     enough : RMS error of the emulator at fresh runs, over the noise of a bin, with which it is done
     """
 
-    points: int = 60
-    waves: int = 3
+    points: int = 30
+    waves: int = 4
     first: float = 0.5
     sure: float = 2.0
-    enough: float = 0.1
+    enough: float = 0.2
 
 
 @dataclass(frozen=True)

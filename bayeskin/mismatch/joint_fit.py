@@ -54,24 +54,34 @@ Local = Callable[[Sequence[str], FullRun], LogPosterior]  # the posterior of a s
 
 @dataclass(frozen=True)
 class JointFit:
-    """A fit, the run it is about, how many runs it took, and whether little is left to be gained."""
+    """A fit, the run it is about, how many runs it took, and whether little is left to be gained.
+
+    off_n (m,) : what was added to the force of each run, since the forward model is off by it near by
+    """
 
     fit: Fit
     run: FullRun
     runs: int
     settled: bool
+    off_n: Array
 
 
 def fit_jointly(
     names: Sequence[str], start: Mapping[str, float], skin: Skin, local: Local,
-    settings: TrustSettings | None = None,
+    settings: TrustSettings | None = None, off_n: Array | None = None,
 ) -> JointFit | str:  # fmt: skip
     """Returns the maximum of a set that is reached from `start` (all parameters, SI).
 
+    off_n (m,) : added to the force of each run
     Returns the message of the first run where that fails.
     """
     settings = settings or TrustSettings()
-    run = skin(names, start)
+
+    def made_at(theta: Mapping[str, float]) -> FullRun | str:
+        run = skin(names, theta)
+        return run if isinstance(run, str) or off_n is None else replace(run, force_n=run.force_n + off_n)
+
+    run = made_at(start)
     if isinstance(run, str):
         return run
     about = local(names, run)
@@ -84,7 +94,7 @@ def fit_jointly(
             settled = True
             break
         made += 1
-        there = skin(names, about.named(about.from_sampling(ahead)))
+        there = made_at(about.named(about.from_sampling(ahead)))
         gained = -np.inf
         if not isinstance(there, str):
             other = local(names, there)
@@ -96,7 +106,8 @@ def fit_jointly(
             trust *= settings.shrinks
         elif gained > settings.more * promised:
             trust = min(settings.grows * trust, settings.largest)
-    return JointFit(_fit(names, about, vector), run, made, settled)
+    off_n = np.zeros_like(run.force_n) if off_n is None else off_n
+    return JointFit(_fit(names, about, vector), run, made, settled, off_n)
 
 
 def _at_run(about: LogPosterior, vector: Array, rounds: int) -> tuple[Array, float]:

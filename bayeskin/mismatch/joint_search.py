@@ -5,8 +5,13 @@ set at hand orders them. The most promising are fitted, each with all other para
 likeliest is taken if its weight is larger. A mechanism with a shortcut for the force is tested, and its
 values are searched for, on the tangent of the set's last run. One that only the model can solve is tested by
 a few runs. The sets that gain most are fitted from other skins, too, since a missing mechanism leads the
-skin astray; then each mechanism of the best is left out in turn. A set's weight is its evidence times the
-prior of its mechanisms.
+skin astray; then each mechanism of the best is left out in turn. Where nothing more is gained, each mechanism
+of the best is exchanged: left out, and every other one tried beside the rest.
+
+At the end a run of the full model at the fit of each likely set says by how much the forward model is off
+there. Where that is too much the set is fitted again, with the difference added to the force; so the sets are
+compared by forces that are as exact as the noise asks for. A set's weight is its evidence times the prior of
+its mechanisms.
 """
 
 from __future__ import annotations
@@ -39,6 +44,9 @@ class SearchSettings:
     near, alike : share of the best gain from which on sets are fitted from other skins, too; how many at most
     others, tried : skins that a set is run with, and how many of them it is fitted from
     runs : of a fit; gain : nats of weight, less is no reason to go on; most : mechanisms of a set
+    compared, behind : sets that are checked by the full model, and nats of weight behind the likeliest
+    exact : error of the forward model, RMS over bins, over that of the noise, that needs no correction
+    checks : rounds of them
     """
 
     skins: int = 32
@@ -56,6 +64,10 @@ class SearchSettings:
     runs: int = 9
     gain: float = 1.0
     most: int = 6
+    compared: int = 6
+    behind: float = 12.0
+    exact: float = 0.3
+    checks: int = 4
 
 
 @dataclass(frozen=True)
@@ -67,12 +79,21 @@ class Probe:
 
 
 @dataclass(frozen=True)
+class FullProbe:
+    """Asks for the force of a set at values by the full model: (m,) or why it failed."""
+
+    names: tuple[str, ...]
+    theta: Mapping[str, float]
+
+
+@dataclass(frozen=True)
 class Climb:
-    """Asks for the fit of a set from values, in so many runs at most."""
+    """Asks for the fit of a set from values, in so many runs at most; off_n (m,) is added to their force."""
 
     names: tuple[str, ...]
     start: Mapping[str, float]
     runs: int
+    off_n: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -91,18 +112,34 @@ class Join:
 
     promise: Promise
     runs: int
+    off_n: tuple[float, ...] = ()
 
 
-Task = Probe | Climb | Promise | Join
+Task = Probe | FullProbe | Climb | Promise | Join
 Ask = Callable[[Sequence[Task]], list[object]]  # answers in the order of the tasks
 Tell = Callable[[str], None]
 
 
+@dataclass(frozen=True)
+class Check:
+    """A run of the full model that checks a fit: its force (m,) of the skin, or why it failed.
+
+    theta : its values, those of the fit's own run or of another set's with the same mechanisms of the tissue
+    off : by how much the forward model is off there, beyond what was added to it, RMS over bins [N]; infinite
+        where the run failed
+    """
+
+    theta: Array
+    full_n: Array | str
+    off: float
+
+
 @dataclass
 class JointSearch:
-    """All sets fitted, by their names sorted: of each the likeliest fit."""
+    """All sets fitted, by their names sorted: of each the likeliest fit, and the last check of one."""
 
     fits: dict[tuple[str, ...], JointFit] = field(default_factory=dict)
+    checks: dict[tuple[str, ...], Check] = field(default_factory=dict)
 
     def add(self, found: object) -> None:
         """Keeps a fit where it is the likeliest of its set; answers of another kind are failures."""
@@ -116,6 +153,13 @@ class JointSearch:
         """The set with the largest weight."""
         return max(self.fits.values(), key=lambda one: weight(one.fit))
 
+    def likeliest(self, count: int) -> list[JointFit]:
+        """Returns so many of the sets with the largest weights, that without mechanisms always among them."""
+        order = sorted(self.fits.values(), key=lambda one: -weight(one.fit))
+        others = [one for one in order if one.fit.names]
+        chosen = [*others[: count - 1], self.fits[()]]
+        return sorted(chosen, key=lambda one: -weight(one.fit))
+
 
 def search_jointly(
     ask: Ask, binned: BinnedForce, base: ParameterSpace, known: Mapping[str, Mechanism],
@@ -128,7 +172,7 @@ def search_jointly(
     """
     searcher = _Searcher(ask, binned, base, known, noise, seed, tell, settings or SearchSettings())
     searcher.base()
-    searcher.forward()
+    searcher.search()
     return searcher.found
 
 
@@ -142,6 +186,7 @@ class _Searcher:
         self._noise, self._seed, self._tell, self._settings = noise, seed, tell, settings
         self._neutral = {name: value for m in known.values() for name, value in m.neutral.items()}
         self._skins: list[dict[str, float]] = []
+        self._expanded: set[tuple[str, ...]] = set()
 
     def base(self) -> None:
         """Fits the model without mechanisms. Raises InputError where no skin runs."""
@@ -163,17 +208,105 @@ class _Searcher:
             expected = "skins that the model runs, whose E_s is at most twice E_c"
             raise InputError("priors", f"no skin that runs{why}", expected)
 
-    def forward(self) -> None:
-        """Adds mechanisms to the set as long as that gains weight."""
-        current: JointFit | None = None
-        while current is not self.found.best and len(self.found.best.fit.names) < self._settings.most:
-            current = self.found.best
-            sets = self._beside(current)
-            if self._gained(self.found.best, current) < self._settings.gain:
+    def search(self) -> None:
+        """Adds, leaves out and exchanges mechanisms as long as that gains weight."""
+        current = self.found.best
+        while True:
+            if current.fit.names not in self._expanded and len(current.fit.names) < self._settings.most:
+                self._forward(current)
+            if not self._gains(current):
+                self._exchange(current)
+            if not self._gains(current):
+                self.check()
+            if not self._gains(current):
                 return
+            current = self.found.best
+
+    def _gains(self, current: JointFit) -> bool:
+        """Returns whether another set than the one at hand is better by enough to go on from it."""
+        before = self.found.fits[current.fit.names]
+        return self._gained(self.found.best, before) >= self._settings.gain
+
+    def _forward(self, current: JointFit) -> None:
+        """Fits sets with one mechanism more, and those that gain most from other skins and without others."""
+        sets = self._beside(current)
+        if self._gains(current):
             for one in self._hopeful(sets, current):
                 self._from_other_skins(one)
             self._leaner(self.found.best)
+
+    def _exchange(self, current: JointFit) -> None:
+        """Fits sets with another mechanism in the place of each of those at hand."""
+        if len(current.fit.names) > 1:
+            for name in current.fit.names:
+                rest = self.found.fits.get(without_one(current.fit.names, name, self._known))
+                if rest is not None and rest.fit.names not in self._expanded:
+                    self._beside(rest)
+
+    def check(self) -> None:
+        """Compares the likeliest sets by forces that are as exact as the noise asks for."""
+        for _ in range(self._settings.checks):
+            groups: dict[tuple[str, ...], list[JointFit]] = {}
+            for one in self._unchecked():
+                groups.setdefault(self._solved(one.fit.names), []).append(one)
+            if not groups:
+                return
+            first = [members[0] for members in groups.values()]
+            full = self._ask([FullProbe(names, self._skin_of(one))
+                              for names, one in zip(groups, first, strict=True)])  # fmt: skip
+            again: list[Climb] = []
+            for one, members, full_n in zip(first, groups.values(), full, strict=True):
+                again += self._corrected(one, members, full_n)
+            for task, answer in zip(again, self._ask(again), strict=True):
+                if isinstance(answer, JointFit):
+                    self.found.fits[task.names] = answer
+
+    def _unchecked(self) -> list[JointFit]:
+        """The likely sets that were never checked, and the likeliest if it has moved since."""
+        likely = self.found.likeliest(self._settings.compared)
+        best, found = likely[0], []
+        for one in likely:
+            check = self.found.checks.get(one.fit.names)
+            near = not one.fit.names or self._gained(best, one) <= self._settings.behind
+            moved = one is best and check is not None and not np.array_equal(check.theta, one.run.theta)
+            if (check is None and near) or moved:
+                found.append(one)
+        return found
+
+    def _corrected(self, first: JointFit, members: Sequence[JointFit], full_n: object) -> list[Climb]:
+        """Notes how a run of the full model at the first of some fits checks them; the fits that it asks for.
+
+        All have the same mechanisms of the tissue, so the forward model is taken to be off by the same.
+        """
+        tasks = []
+        for one in members:
+            said = ", ".join(one.fit.names) or "no mechanism"
+            if isinstance(full_n, str):
+                self.found.checks[one.fit.names] = Check(first.run.theta, full_n, np.inf)
+                self._tell(f"{said}: the full model fails there: {full_n}")
+                continue
+            off_n = np.asarray(full_n) - (first.run.force_n - first.off_n)
+            off = self._rms(off_n - one.off_n)
+            self.found.checks[one.fit.names] = Check(first.run.theta, np.asarray(full_n), off)
+            if off > self._settings.exact * noise_of(self._binned):
+                tasks.append(Climb(one.fit.names, one.fit.theta, self._settings.runs, tuple(off_n.tolist())))
+                self._tell(
+                    f"{said}: the reduced model is off by {1e3 * off:.1f} mN; fitted again beside that"
+                )
+        return tasks
+
+    def _solved(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Those of a set that the forward model solves."""
+        return tuple(name for name in sorted(names) if self._known[name].act.bind is not None)
+
+    def _skin_of(self, one: JointFit) -> dict[str, float]:
+        """Values of what the forward model solves, at a fit's run."""
+        names = innermost(one.fit.log_posterior.surrogate).space.names
+        return dict(zip(names, map(float, one.run.theta), strict=True))
+
+    def _rms(self, force_n: Array) -> float:
+        """RMS over the bins that were recorded."""
+        return float(np.sqrt(np.mean(np.square(force_n[np.isfinite(self._binned.force_n)]))))
 
     def _gained(self, one: JointFit, before: JointFit) -> float:
         return weight(one.fit) - weight(before.fit)
@@ -222,6 +355,8 @@ class _Searcher:
         run that was finished.
         """
         names, settings = current.fit.names, self._settings
+        self._expanded.add(names)
+        off_n = tuple(current.off_n.tolist())  # of the same tissue
         others = [name for name in self._known if name not in names]
         solved = [name for name in others if isinstance(self._known[name].act, Tissue)]
         quick = [name for name in others if name not in solved]
@@ -250,12 +385,13 @@ class _Searcher:
         self._tell("promised: " + ", ".join(f"{name} {promised[name]:.0f} nats" for name in order[:5]))
         fits = self._ask([
             Climb(with_one(names, name, self._known), starts[name], settings.runs) if name in starts
-            else Join(Promise(names, current.fit.theta, current.run, name), settings.runs)
+            else Join(Promise(names, current.fit.theta, current.run, name), settings.runs, off_n)
             for name in chosen
         ])  # fmt: skip
         worse = [name for name, one in zip(chosen, fits, strict=True) if not _better(one, current)]
         fits += self._ask([
-            Climb(with_one(names, name, self._known), ran.get(name, theta), settings.runs) for name in worse
+            Climb(with_one(names, name, self._known), ran.get(name, theta), settings.runs,
+                  () if name in starts else off_n) for name in worse
         ])  # fmt: skip
         for one in fits:
             self.found.add(one)
@@ -312,7 +448,8 @@ class _Searcher:
         """Fits a set from other skins, with its mechanisms as they are."""
         settings = self._settings
         skins = self._nearest(current.fit.names, self._skins[: settings.others], current.fit.theta)
-        tasks = [Climb(current.fit.names, {**current.fit.theta, **skin}, settings.runs)
+        off_n = tuple(current.off_n.tolist())
+        tasks = [Climb(current.fit.names, {**current.fit.theta, **skin}, settings.runs, off_n)
                  for skin in skins[: settings.tried]]  # fmt: skip
         for one in self._ask(tasks):
             self.found.add(one)
@@ -328,6 +465,11 @@ class _Searcher:
                  for one in sorted(fewer) if one not in self.found.fits]  # fmt: skip
         for one in self._ask(tasks):
             self.found.add(one)
+
+
+def noise_of(binned: BinnedForce) -> float:
+    """Returns the sd [N] of the noise in a bin's mean, RMS over bins."""
+    return float(np.sqrt(np.nanmean(binned.variance_n2)))
 
 
 def _better(one: object, current: JointFit) -> bool:

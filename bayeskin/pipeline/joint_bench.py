@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -28,14 +27,14 @@ from bayeskin.mismatch.fit import (
 )
 from bayeskin.mismatch.full_fit import change
 from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, within
-from bayeskin.mismatch.joint_search import Ask, Climb, Join, Probe, Promise, Task
+from bayeskin.mismatch.joint_search import Ask, Climb, FullProbe, Join, Probe, Promise, Task
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.refuted import refuted
 from bayeskin.mismatch.tangent import Tangent
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline.folder import read_lines, sha256_of
 from bayeskin.pipeline.model import model_error
-from bayeskin.pipeline.reported import beside_neutral
+from bayeskin.pipeline.reported import FullForce, beside_neutral
 from bayeskin.pipeline.workbench import calm_bins
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.model import ReducedModel
@@ -43,6 +42,8 @@ from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.types import Array, ParameterSpace, Surrogate
 from bayeskin.workers import Lost, standing
 
+FOLDING = 0.15  # of the stiffness at rest: nearer to folding the reduced model is of no use; runs of the full
+# model check what comes out
 TRUST = 0.15  # of the prior's width about a run, within which a mechanism is searched for on its tangent
 
 
@@ -74,12 +75,6 @@ class JointBench:
         self._noise = replace(instrument_noise(self.binned), **dict(source.noise))  # type: ignore[arg-type]
         self._neutral = {name: value for m in self.known.values() for name, value in m.neutral.items()}
 
-    def with_model(self, model: ReducedModel) -> JointBench:
-        """The same recording with another reduced model of its device."""
-        other = copy.copy(self)
-        other.model = model
-        return other
-
     @property
     def noise(self) -> dict[str, float]:
         """Values of the noise's parameters to begin with: the middle of their priors."""
@@ -99,14 +94,20 @@ class JointBench:
         found = self._run(names, theta, slopes=False)
         return found if isinstance(found, str) else found.force_n
 
+    def full(self, names: Sequence[str], theta: Mapping[str, float]) -> Array | str:
+        """Force (m,) of the skin with a set at values by the full model, or why its run failed."""
+        return FullForce(self._spec, self.motion, self.binned.edges_s)((self._solved_names(names), theta))
+
     def reported(self, case: tuple[Sequence[str], Mapping[str, float]]) -> Array | str:
         """Force (m,) as the instrument reports it, with a set at values."""
         names, theta = case
         run = self._run(names, theta, slopes=False)
-        if isinstance(run, str):
-            return run
-        flat = FullRun(run.theta, run.force_n, np.zeros((len(run.force_n), len(run.theta))))
-        seen = self._seen(names, (), flat)
+        return run if isinstance(run, str) else self.reported_of(names, theta, run.force_n)
+
+    def reported_of(self, names: Sequence[str], theta: Mapping[str, float], force_n: Array) -> Array:
+        """A force (m,) of the skin as the instrument reports it, with a set at values."""
+        at = np.array([theta[name] for name in self.space(names).names])
+        seen = self._seen(names, (), FullRun(at, force_n, np.zeros((len(force_n), len(at)))))
         return seen.predict_mean(np.array([theta[name] for name in seen.space.names]))[0]
 
     def skin(self, names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
@@ -124,7 +125,9 @@ class JointBench:
         values = dict(zip(space.names, map(float, at), strict=True))
         if slopes:
             values |= beside_neutral(values, by, mechanisms)
-        found = simulate_reduced(self.model, self.motion, values, mechanisms, by if slopes else None)
+        found = simulate_reduced(
+            self.model, self.motion, values, mechanisms, by if slopes else None, least_stiffness=FOLDING
+        )
         if found.status != "ok":
             return found.message
         force_n = found.bin_means(self.binned.edges_s)
@@ -148,8 +151,15 @@ class JointBench:
         )  # fmt: skip
         return ObservedSurrogate(skin, beyond, self.motion) if beyond else skin
 
+    @property
+    def _spec(self) -> ModelSpec:
+        """The full model, which the reduced one was made from."""
+        return ModelSpec(refinement=self.model.refinement, geometry=self.model.trained.geometry)
+
+    def _solved_names(self, names: Sequence[str]) -> tuple[str, ...]:
+        return tuple(m.name for m in self.solved(names))
+
     def _posterior(self, seen: Surrogate) -> LogPosterior:
-        spec = ModelSpec(refinement=self.model.refinement, geometry=self.model.trained.geometry)
         return LogPosterior(
             seen,
             self.binned,
@@ -158,13 +168,14 @@ class JointBench:
             ParameterSpace(seen.space.parameters, self.base.correlations),
             None,
             soft_on_stiff,
-            model_error(spec, self.motion, self.binned.edges_s),
+            model_error(self._spec, self.motion, self.binned.edges_s),
         )
 
     def done(self, task: Task) -> dict[str, Any]:
         """The answer to a task, as JSON has it."""
-        if isinstance(task, Probe):
-            force = self.force(task.names, task.theta)
+        if isinstance(task, Probe | FullProbe):
+            run = self.force if isinstance(task, Probe) else self.full
+            force = run(task.names, task.theta)
             return {"message": force} if isinstance(force, str) else {"force_n": force.tolist()}
         if isinstance(task, Promise):
             return {"nats": self._promised(task)}
@@ -172,13 +183,14 @@ class JointBench:
             beside = task.promise
             names = with_one(beside.names, beside.name, self.known)
             start = {**self._neutral, **beside.theta, **self._searched(beside)}
-            return self._climbed(Climb(names, start, task.runs))
+            return self._climbed(Climb(names, start, task.runs, task.off_n))
         return self._climbed(task)
 
     def _climbed(self, task: Climb) -> dict[str, Any]:
         start = dict(task.start)
         start["E_c"] = max(start["E_c"], start["E_s"] / 1.9)  # a stiffer subcutis is ruled out
-        found = fit_jointly(task.names, start, self.skin, self.local, TrustSettings(runs=task.runs))
+        off_n = np.array(task.off_n) if task.off_n else None
+        found = fit_jointly(task.names, start, self.skin, self.local, TrustSettings(runs=task.runs), off_n)
         return {"message": found} if isinstance(found, str) else as_json(found)
 
     def _promised(self, task: Promise) -> float:
@@ -203,13 +215,14 @@ class JointBench:
         """What a search makes of an answer."""
         if "message" in said:
             return said["message"]
-        if isinstance(task, Probe):
+        if isinstance(task, Probe | FullProbe):
             return np.array(said["force_n"])
         if isinstance(task, Promise):
             return said["nats"]
         run = FullRun(*(np.array(said["run"][name]) for name in ("theta", "force_n", "slopes_n")))
         about = self.local(said["fit"]["names"], run)
-        found = JointFit(restored(said["fit"], about), run, said["runs"], said["settled"])
+        fitted = restored(said["fit"], about)
+        found = JointFit(fitted, run, said["runs"], said["settled"], np.array(said["off_n"]))
         against = refuted(found.fit, self.known, self.motion, self.jumps)
         return f"the recording's samples show nothing of {', '.join(against)}" if against else found
 
@@ -221,7 +234,10 @@ def as_json(found: JointFit) -> dict[str, Any]:
         "theta": found.run.theta.tolist(), "force_n": found.run.force_n.tolist(),
         "slopes_n": found.run.slopes_n.tolist(),
     }  # fmt: skip
-    return {"fit": stored(found.fit), "run": run, "runs": found.runs, "settled": found.settled}
+    return {
+        "fit": stored(found.fit), "run": run, "runs": found.runs, "settled": found.settled,
+        "off_n": found.off_n.tolist(),
+    }  # fmt: skip
 
 
 def _trained(model: ReducedModel) -> dict[str, Mechanism]:

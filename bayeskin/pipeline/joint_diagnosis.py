@@ -21,29 +21,24 @@ from bayeskin.mismatch.emulate import Emulated, emulate
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.hypotheses import Family, Judgement, hypotheses_of, judge_family
-from bayeskin.mismatch.joint_fit import JointFit, fit_jointly, within
-from bayeskin.mismatch.joint_search import Ask, JointSearch, Probe, search_jointly
+from bayeskin.mismatch.joint_fit import JointFit, within
+from bayeskin.mismatch.joint_search import Ask, JointSearch, Probe, noise_of, search_jointly
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
-from bayeskin.mismatch.search import Made, Search, weight
+from bayeskin.mismatch.search import Made, Search
 from bayeskin.pipeline.diagnosis_outputs import Found, Shown, candidates, draw, unexplained, window
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import write_json
 from bayeskin.pipeline.joint_bench import JointBench, Source, asked, searches_file
-from bayeskin.pipeline.model import model_spec, reduced_files
+from bayeskin.pipeline.model import reduced_files
 from bayeskin.pipeline.provenance import caption
-from bayeskin.pipeline.reported import FullForce
 from bayeskin.pipeline.taking_up import Remainder
-from bayeskin.reduced.enrichment import EnrichmentSettings, enrich
 from bayeskin.reduced.region import protocol_outside
 from bayeskin.surrogates import train
-from bayeskin.types import Array, BinnedForce
-from bayeskin.workers import local
+from bayeskin.types import Array, BinnedForce, Design, Surrogate
 
 WEIGHED = 6  # sets, the likeliest and that without mechanisms, whose hypotheses are compared
 PREDICTIVE_DRAWS = 300
-OFF = 0.3  # of a bin's noise, RMS: a larger error of the reduced model calls for enrichment
-ENRICHED = 2  # times at most
 REACH = 0.5  # of the prior's width on either side of a run, within which its tangent is sampled
 KNOWN = "pads that open, by what and as fast as the reduced model was trained on"
 NAME = "diagnose"
@@ -62,9 +57,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     tell = partial(_tell, run)
     with asked(bench, searches_file(run.folder, bench), run.config.design.workers) as ask:
         found = search_jointly(ask, bench.binned, bench.base, bench.known, bench.noise, seed, tell)
-        likeliest, checked = _confirmed(run, bench, found.best)
-        found.fits[likeliest.fit.names] = likeliest
-        weighed = _weighed(found)
+        weighed = [one.fit.names for one in found.likeliest(WEIGHED)]
         left = {names: discrepancy(found.fits[names].fit, bench.motion) for names in weighed}
         family = Family([
             one for names in weighed
@@ -108,7 +101,7 @@ def _work(run: Run) -> Mapping[str, Any]:
             },
         },
         "best_set": list(best),
-        "full_model": checked if best == likeliest.fit.names else _checked(run, bench, chosen),
+        "full_model": _checked(bench, found, best),
         "seconds": time.monotonic() - started,
     }  # fmt: skip
     write_json(run.at(NAME, "diagnosis.json"), answer)
@@ -124,12 +117,6 @@ def _work(run: Run) -> Mapping[str, Any]:
 
 def _tell(run: Run, text: str) -> None:
     run.reporter.log(f"search: {text}")
-
-
-def _weighed(found: JointSearch) -> list[tuple[str, ...]]:
-    """Names of the sets whose hypotheses are compared."""
-    order = sorted(found.fits, key=lambda names: -weight(found.fits[names].fit))
-    return [*[names for names in order if names][: WEIGHED - 1], ()]
 
 
 def _as_search(found: JointSearch) -> Search:
@@ -153,25 +140,24 @@ def _drawn(fit: Fit, seed: int) -> Resampled:
 
 
 def _emulated(bench: JointBench, ask: Ask, found: JointFit, seed: int) -> Emulated:
-    """A set's posterior from runs of the reduced model where it is; about the fit's run where none finishes.
-
-    The runs are moved by what enrichment changed at the fit's run.
-    """
+    """A set's posterior from reduced runs where it is; about the fit's run where none of them finishes."""
     names, space = found.fit.names, bench.space(found.fit.names)
 
-    def probes(points: Array) -> list[object]:
-        return ask([Probe(names, dict(zip(space.names, map(float, row), strict=True))) for row in points])
-
-    (there,) = probes(found.run.theta[None])
-    moved_n = 0.0 if isinstance(there, str) else found.run.force_n - np.asarray(there)
-
     def forces(points: Array) -> list[Array | str]:
-        return [one if isinstance(one, str) else np.asarray(one) + moved_n for one in probes(points)]
+        answers = ask([
+            Probe(names, dict(zip(space.names, map(float, row), strict=True))) for row in points
+        ])  # fmt: skip
+        return [one if isinstance(one, str) else np.asarray(one) + found.off_n for one in answers]
 
-    emulated = emulate(found, forces, lambda design: train(design, "gp", seed)[0], _noise_n(bench), seed)
+    learn = partial(_learnt, seed=seed)
+    emulated = emulate(found, forces, learn, noise_of(bench.binned), seed)
     if isinstance(emulated, str):
         return Emulated(found.fit, _drawn(found.fit, seed), 0, None, False)
     return emulated
+
+
+def _learnt(design: Design, seed: int) -> Surrogate:
+    return train(design, "gp", seed)[0]
 
 
 def _mechanisms(
@@ -224,56 +210,14 @@ def _shown(fit: Fit, located: Located, drawn: Resampled) -> Shown:
     return Shown(fit.force_n, band_n, None, located, drawn.summary)
 
 
-def _confirmed(run: Run, bench: JointBench, found: JointFit) -> tuple[JointFit, dict[str, Any]]:
-    """A set's fit by a reduced model that is as exact there as the noise asks for, and its check.
-
-    Where a run of the full model shows that the reduced model is not, it is enriched about the fit's values,
-    and the set fitted again from there, `ENRICHED` times at most.
-    """
-    checked = _checked(run, bench, found.fit)
-    floor_n = _noise_n(bench)
-    solved = tuple(m.name for m in bench.solved(found.fit.names))
-    whole = bench.model
-    for _ in range(ENRICHED):
-        if "message" in checked or checked["reduced_off_by"] <= OFF * floor_n:
-            break
-        off_n = 1e3 * checked["reduced_off_by"]
-        run.reporter.log(f"the reduced model is off by {off_n:.1f} mN there: full runs near by enrich it")
-        space = bench.space(solved)
-        theta = {name: found.fit.theta[name] for name in space.names}
-        try:
-            enriched = enrich(
-                whole, theta, solved, bench.motion, EnrichmentSettings(), run.folder / "enriched",
-                local(run.config.design.workers), run.reporter.progress,
-            )  # fmt: skip
-        except InputError as error:
-            run.reporter.log(f"that failed: {error}")
-            break
-        bench = bench.with_model(enriched.model)
-        again = fit_jointly(found.fit.names, found.fit.theta, bench.skin, bench.local)
-        if isinstance(again, str):
-            run.reporter.log(f"that failed: {again}")
-            break
-        found, checked = again, _checked(run, bench, again.fit)
-    return found, checked
-
-
-def _checked(run: Run, bench: JointBench, chosen: Fit) -> dict[str, Any]:
-    """One run of the full model with the best set at its values, beside the reduced model's."""
-    full = FullForce(model_spec(run), bench.motion, bench.binned.edges_s)((chosen.names, chosen.theta))
-    reduced = bench.reported((chosen.names, chosen.theta))
-    if isinstance(full, str) or isinstance(reduced, str):
-        return {"message": full if isinstance(full, str) else str(reduced)}
+def _checked(bench: JointBench, found: JointSearch, names: tuple[str, ...]) -> dict[str, Any]:
+    """What a run of the full model says of a set's fit."""
+    check, fit = found.checks.get(names), found.fits[names].fit
+    if check is None or isinstance(check.full_n, str):
+        return {"message": "no run was made" if check is None else check.full_n}
+    full_n = bench.reported_of(names, fit.theta, check.full_n)
     usable = bins_in_windows(bench.binned, None) >= 0
-    return {
-        "reduced_off_by": _rms((full - reduced)[usable]),
-        "rmse": _rms((bench.binned.force_n - full)[usable]),
-    }
-
-
-def _noise_n(bench: JointBench) -> float:
-    """Returns the sd [N] of the noise in a bin's mean, RMS over bins."""
-    return float(np.sqrt(np.nanmean(bench.binned.variance_n2)))
+    return {"reduced_off_by": check.off, "rmse": _rms((bench.binned.force_n - full_n)[usable])}
 
 
 def _rms(values: Array) -> float:

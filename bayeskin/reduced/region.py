@@ -91,11 +91,12 @@ def other_geometry(trained: Geometry, geometry: Geometry) -> list[str]:
 class Stability:
     """Looks at the stiffness of the skin where the pads have come back, for how near it is to folding.
 
+    least : share of the stiffness at rest that has to be left
     left : the smallest eigenvalue so far, over those at rest; 1 where there was nothing to look at
     """
 
-    def __init__(self, largest_m: float) -> None:
-        self._low_m = LOW * largest_m
+    def __init__(self, largest_m: float, least: float) -> None:
+        self._low_m, self._least = LOW * largest_m, least
         self._rest: Array | None = None
         self.left = 1.0
 
@@ -110,7 +111,7 @@ class Stability:
     @property
     def message(self) -> str:
         """One line where the skin came near folding, else empty."""
-        if self.left >= LEAST_STIFFNESS:
+        if self.left >= self._least:
             return ""
         return (
             f"the skin is near folding where the pads come back: {100 * self.left:.1f} % of its stiffness is "

@@ -18,7 +18,7 @@ from bayeskin.model.stepping import integrate
 from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
 from bayeskin.reduced.error import DualWeightedResidual
 from bayeskin.reduced.model import ReducedModel
-from bayeskin.reduced.region import Stability, outside
+from bayeskin.reduced.region import LEAST_STIFFNESS, Stability, outside
 from bayeskin.reduced.sensitivities import ReducedGradients
 from bayeskin.types import PadMotion, Simulation, frozen_array
 
@@ -37,6 +37,7 @@ def simulate_reduced(
     geometry: Geometry | None = None,
     estimate: bool = False,
     on_state: OnState | None = None,
+    least_stiffness: float = LEAST_STIFFNESS,
 ) -> Simulation:
     """Runs a reduced model over the whole motion, with those of `mechanisms` that the full model solves.
 
@@ -46,6 +47,7 @@ def simulate_reduced(
     geometry : the layers and the arm where they differ from the model's
     estimate : whether the force's error is estimated, which takes longer than the run
     on_state : called with time [s], the full model's unknowns (dofs,) and force [N] of each step of the test
+    least_stiffness : share of the stiffness at rest below which the skin counts as near folding
 
     A run that fails, or that leaves the trained region, is a Simulation with status "failed" and a message,
     and so is one whose error is estimated and found to be without bound; `stats` has "error_estimate_n" [N]
@@ -58,7 +60,7 @@ def simulate_reduced(
     history, run = _History(), None
     stats = {"inside": 0.0}
     if not message:
-        run = _Run(model, motion, theta, mechanisms, tissue, shape, gradients)
+        run = _Run(model, motion, theta, mechanisms, tissue, shape, gradients, least_stiffness)
         message = run.integrate(history)
         stats = run.stats
         if on_state is not None:
@@ -103,13 +105,13 @@ class _Run:
     def __init__(
         self, model: ReducedModel, motion: PadMotion, theta: Mapping[str, float],
         mechanisms: Sequence[Mechanism], tissue: Sequence[str], geometry: Geometry,
-        gradients: Mapping[str, float] | None,
+        gradients: Mapping[str, float] | None, least_stiffness: float,
     ) -> None:  # fmt: skip
         self._model, self._motion, self._theta = model, motion, theta
         self._tissue, self._geometry = tissue, geometry
         self._binds = [m.act.bind for m in solved(mechanisms) if m.act.bind is not None]
         self._equations = ReducedEquations(model.space(tissue, geometry), theta, self._binds, motion)
-        self._stability = Stability(self._equations.drive.largest_m)
+        self._stability = Stability(self._equations.drive.largest_m, least_stiffness)
         self.slopes = None
         if gradients:
             space_at = partial(_space_at, model, tissue, geometry)
