@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from toys.solved import BASE, KNOWN
 from bayeskin.errors import InputError
 from bayeskin.mismatch.joint_search import (
     Climb,
+    FullProbe,
     Join,
     JointSearch,
     Probe,
@@ -25,7 +26,15 @@ from bayeskin.mismatch.joint_search import (
 )
 from bayeskin.mismatch.search import weight
 from bayeskin.pipeline.joint_bench import JointBench
-from bayeskin.types import ParameterSpace
+from bayeskin.types import Array, ParameterSpace
+
+Full = Callable[[Mapping[str, float]], Array | str]
+
+
+def exact(values: Mapping[str, float]) -> Array:
+    """The full model where the reduced one is exact."""
+    return solved.means(values)[0]
+
 
 FEW = SearchSettings(skins=8, others=4, tried=1)
 
@@ -57,8 +66,11 @@ class Asked:
 def asked(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Asked]:
     """What answers tasks on a recording of the toy with mechanisms of these values."""
 
-    def make(seed: int = 0, lost: Callable[[Task], bool] = lambda task: False, **values: float) -> Asked:
-        return Asked(solved.bench(monkeypatch, solved.recorded(seed, **values)), lost)
+    def make(
+        seed: int = 0, lost: Callable[[Task], bool] = lambda task: False, full: Full = exact, **values: float
+    ) -> Asked:
+        recorded = solved.recorded(seed, **values)
+        return Asked(solved.bench(monkeypatch, recorded, full=full), lost)
 
     return make
 
@@ -119,11 +131,73 @@ def test_no_task_is_asked_twice_and_only_what_is_taken_is_fitted_from_other_skin
     one = asked(stiffness_rate=9e-4, F0=-0.03)
     found = one.search()
     assert set(Counter(key(task) for task in one.tasks).values()) == {1}
-    fitted = Counter(names_of(task) for task in one.tasks if isinstance(task, Climb | Join))
-    assert set(fitted) == set(found.fits)
-    again = {names: count - 1 for names, count in fitted.items() if names and count > 1}
-    taken = (("force-offset",), ("force-offset", "stiffness-drift"))  # one mechanism after the other
-    assert again == dict.fromkeys(taken, FEW.tried)
+    fitted = {names_of(task) for task in one.tasks if isinstance(task, Climb | Join)}
+    assert fitted == set(found.fits)
+    skins = {task.names for task in one.tasks if isinstance(task, Probe) and of_other_skins(task, found)}
+    assert skins == {(), ("force-offset",), ("force-offset", "stiffness-drift")}
+
+
+def of_other_skins(task: Probe, found: JointSearch) -> bool:
+    """Whether a run is of another skin than that of a fit."""
+    return all(task.theta["p_init"] != one.fit.theta["p_init"] for one in found.fits.values())
+
+
+MIDDLE = 0.5 * (solved.EDGES_S[1:] + solved.EDGES_S[:-1])
+SHAPE = 3e-3 * np.sin(MIDDLE / 3.0)  # what the reduced model leaves out: RMS twice the noise
+
+
+def more(values: Mapping[str, float]) -> Array:
+    """A full model of which the reduced one leaves something out."""
+    return exact(values) + SHAPE
+
+
+@pytest.mark.parametrize(
+    "values", [{}, {"F0": -0.03}, {"stiffness_rate": 9e-4, "F0": -0.03}], ids=["nothing", "one", "two"]
+)
+def test_sets_are_compared_by_forces_that_runs_of_the_full_model_correct(
+    asked: Make, values: dict[str, float]
+) -> None:
+    """The recording is the full model's; what the reduced one leaves out of it is no mismatch."""
+    one = asked(full=more, **values)
+    one.bench.binned = replace(one.bench.binned, force_n=one.bench.binned.force_n + SHAPE)
+    found = one.search()
+    best = found.best
+    assert best.fit.names == tuple(sorted({"F0": "force-offset", "stiffness_rate": "stiffness-drift"}[name]
+                                          for name in values))  # fmt: skip
+    np.testing.assert_allclose(best.off_n, SHAPE, atol=1e-6)
+    check = found.checks[best.fit.names]
+    assert check.off < 1e-6
+    np.testing.assert_array_equal(check.theta, best.run.theta)
+    np.testing.assert_allclose(check.full_n, best.run.force_n, atol=1e-6)
+    compared = [names for names in found.fits if names in found.checks]
+    assert () in compared
+    full = Counter(task.names for task in one.tasks if isinstance(task, FullProbe))
+    assert set(full) <= {(), ("stiffness-drift",)}  # sets of the same tissue share runs
+    assert max(full.values()) <= FEW.checks
+
+
+def test_where_the_reduced_model_is_exact_a_check_changes_nothing(asked: Make) -> None:
+    found = asked(F0=-0.03).search()
+    assert all(not fit.off_n.any() for fit in found.fits.values())
+    assert found.checks[("force-offset",)].off < 1e-9
+
+
+def test_a_check_in_which_the_full_model_fails_is_told(asked: Make) -> None:
+    one = asked(full=lambda values: "the skin folds", F0=-0.03)
+    found = one.search()
+    assert found.best.fit.names == ("force-offset",)
+    assert found.checks[("force-offset",)].full_n == "the skin folds"
+    assert "force-offset: the full model fails there: the skin folds" in one.told
+
+
+def test_a_mechanism_that_stood_in_for_others_is_exchanged(asked: Make) -> None:
+    """Of a set of two each is left out in turn, and the others are tried beside the rest."""
+    one = asked(stiffness_rate=9e-4, F0=-0.03)
+    found = one.search()
+    assert found.best.fit.names == ("force-offset", "stiffness-drift")
+    tried = {names_of(task) for task in one.tasks if isinstance(task, Promise)}
+    assert ("sensor-drift", "stiffness-drift") in tried
+    assert ("force-offset", "sensor-drift") in tried
 
 
 def key(task: Task) -> str:

@@ -38,36 +38,39 @@ class SearchSettings:
     """Settings of a search.
 
     skins : runs of the base model over its prior, from which fits set out
-    starts, first, best : fits of the base model from the nearest of these, their runs, and how many go on
+    starts, best : fits of the base model from the nearest of these, and how many go on after their first runs
+    first, runs : of a fit, before those far behind are given up, and after
+    behind : nats of weight behind the likeliest set, from which on a fit is given up and needs no check
     probes : runs of each part of a mechanism that the model solves, and how far off neutral, of the prior
     shortlist, promised : mechanisms that are fitted beside a set, and nats that each must promise
-    near, alike : share of the best gain from which on sets are fitted from other skins, too; how many at most
+    astray : nats of weight gained, from which on a set may have led the smaller one to another skin
+    near, alike : share of the best gain from which on sets are fitted from other skins; how many at most
     others, tried : skins that a set is run with, and how many of them it is fitted from
-    runs : of a fit; gain : nats of weight, less is no reason to go on; most : mechanisms of a set
-    compared, behind : sets that are checked by the full model, and nats of weight behind the likeliest
+    gain : nats of weight, less is no reason to go on; most : mechanisms of a set
+    compared : sets that are checked by the full model; checks : rounds of them
     exact : error of the forward model, RMS over bins, over that of the noise, that needs no correction
-    checks : rounds of them
     """
 
     skins: int = 32
     starts: int = 4
-    first: int = 4
     best: int = 2
+    first: int = 4
+    runs: int = 9
+    behind: float = 12.0
     probes: int = 3
     off: float = 0.25
     shortlist: int = 4
     promised: float = 1.0
+    astray: float = 10.0
     near: float = 0.5
-    alike: int = 3
+    alike: int = 2
     others: int = 16
     tried: int = 2
-    runs: int = 9
     gain: float = 1.0
     most: int = 6
     compared: int = 6
-    behind: float = 12.0
-    exact: float = 0.3
     checks: int = 4
+    exact: float = 0.3
 
 
 @dataclass(frozen=True)
@@ -187,6 +190,7 @@ class _Searcher:
         self._neutral = {name: value for m in known.values() for name, value in m.neutral.items()}
         self._skins: list[dict[str, float]] = []
         self._expanded: set[tuple[str, ...]] = set()
+        self._shapes: dict[str, Mapping[str, float]] = {}  # by the strength: values that promised most
 
     def base(self) -> None:
         """Fits the model without mechanisms. Raises InputError where no skin runs."""
@@ -198,11 +202,7 @@ class _Searcher:
         starts = [Climb((), {**self._noise, **skin}, settings.first)
                   for skin in self._skins[: settings.starts]]  # fmt: skip
         answers = self._ask(starts)
-        first = [one for one in answers if isinstance(one, JointFit)]
-        first.sort(key=lambda one: -one.fit.value)
-        for one in (*first, *self._ask([Climb((), one.fit.theta, settings.runs)
-                                        for one in first[: settings.best] if not one.settled])):  # fmt: skip
-            self.found.add(one)
+        self._finish(answers)
         if not self.found.fits:
             why = next((f": {one}" for one in answers if isinstance(one, str)), "")
             expected = "skins that the model runs, whose E_s is at most twice E_c"
@@ -262,16 +262,17 @@ class _Searcher:
                     self.found.fits[task.names] = answer
 
     def _unchecked(self) -> list[JointFit]:
-        """The likely sets that were never checked, and the likeliest if it has moved since."""
-        likely = self.found.likeliest(self._settings.compared)
-        best, found = likely[0], []
-        for one in likely:
-            check = self.found.checks.get(one.fit.names)
-            near = not one.fit.names or self._gained(best, one) <= self._settings.behind
-            moved = one is best and check is not None and not np.array_equal(check.theta, one.run.theta)
-            if (check is None and near) or moved:
-                found.append(one)
-        return found
+        """The sets to check: likely ones, parts of the likeliest, and this one if it has moved since."""
+        order = self.found.likeliest(len(self.found.fits))
+        best = order[0]
+        near = [one for one in order[: self._settings.compared]
+                if self._gained(best, one) <= self._settings.behind]  # fmt: skip
+        parts = [one for one in order if set(one.fit.names) < set(best.fit.names)]
+        found = {one.fit.names: one for one in (*near, *parts) if one.fit.names not in self.found.checks}
+        check = self.found.checks.get(best.fit.names)
+        if check is not None and not np.array_equal(check.theta, best.run.theta):
+            found = {best.fit.names: best, **found}
+        return list(found.values())
 
     def _corrected(self, first: JointFit, members: Sequence[JointFit], full_n: object) -> list[Climb]:
         """Notes how a run of the full model at the first of some fits checks them; the fits that it asks for.
@@ -312,10 +313,10 @@ class _Searcher:
         return weight(one.fit) - weight(before.fit)
 
     def _hopeful(self, sets: Sequence[tuple[str, ...]], current: JointFit) -> list[JointFit]:
-        """The sets that gain most on the one at hand, as far as they gain much."""
+        """The sets that gain most on the one at hand, if so much that this may have had another skin."""
         fits = [self.found.fits[names] for names in sets if names in self.found.fits]
         fits.sort(key=lambda one: -weight(one.fit))
-        least = self._settings.near * self._gained(fits[0], current)
+        least = max(self._settings.near * self._gained(fits[0], current), self._settings.astray)
         return [one for one in fits[: self._settings.alike] if self._gained(one, current) >= least]
 
     def _nearest(
@@ -349,7 +350,7 @@ class _Searcher:
         return min(least, 1.0), max(most, 1.0)
 
     def _beside(self, current: JointFit) -> list[tuple[str, ...]]:
-        """Fits the sets with one mechanism more that promise most, and returns these sets.
+        """Fits the sets with one mechanism more that promise most, as far as they are new, and returns these.
 
         One that fails, or ends below the fit without the mechanism, begins again there, with the values of a
         run that was finished.
@@ -357,7 +358,10 @@ class _Searcher:
         names, settings = current.fit.names, self._settings
         self._expanded.add(names)
         off_n = tuple(current.off_n.tolist())  # of the same tissue
-        others = [name for name in self._known if name not in names]
+        others = [
+            name for name in self._known
+            if name not in names and with_one(names, name, self._known) not in self.found.fits
+        ]  # fmt: skip
         solved = [name for name in others if isinstance(self._known[name].act, Tissue)]
         quick = [name for name in others if name not in solved]
         probes = [(name, values) for name in solved for values in self._probes(self._known[name])]
@@ -369,12 +373,16 @@ class _Searcher:
             [*tasks, *(Promise(names, current.fit.theta, current.run, name) for name in quick)]
         )
         promised: dict[str, float] = {}
+        tested: dict[str, float] = {}
         starts: dict[str, Mapping[str, float]] = {}
         ran: dict[str, Mapping[str, float]] = {}  # where the model is known to run with a mechanism
         for (name, values), force_n in zip(probes, answers, strict=False):
             if isinstance(force_n, str):
                 continue
-            gain, start = self._score(current, name, values, np.asarray(force_n))
+            gain, start = self._score(current, name, values, np.asarray(force_n) + current.off_n)
+            strength = next(iter(values))
+            if gain > tested.get(strength, -1.0):
+                tested[strength], self._shapes[strength] = gain, values
             if gain > promised.get(name, 0.0):
                 promised[name], starts[name], ran[name] = gain, start, {**theta, **values}
         for name, nats in zip(quick, answers[len(probes) :], strict=True):
@@ -384,17 +392,16 @@ class _Searcher:
         chosen = [name for name in order if promised[name] > settings.promised][: settings.shortlist]
         self._tell("promised: " + ", ".join(f"{name} {promised[name]:.0f} nats" for name in order[:5]))
         fits = self._ask([
-            Climb(with_one(names, name, self._known), starts[name], settings.runs) if name in starts
-            else Join(Promise(names, current.fit.theta, current.run, name), settings.runs, off_n)
+            Climb(with_one(names, name, self._known), starts[name], settings.first) if name in starts
+            else Join(Promise(names, current.fit.theta, current.run, name), settings.first, off_n)
             for name in chosen
         ])  # fmt: skip
         worse = [name for name, one in zip(chosen, fits, strict=True) if not _better(one, current)]
         fits += self._ask([
-            Climb(with_one(names, name, self._known), ran.get(name, theta), settings.runs,
+            Climb(with_one(names, name, self._known), ran.get(name, theta), settings.first,
                   () if name in starts else off_n) for name in worse
         ])  # fmt: skip
-        for one in fits:
-            self.found.add(one)
+        self._finish(fits)
         sets = [with_one(names, name, self._known) for name in chosen]
         for name, its in zip(chosen, sets, strict=True):
             fitted = self.found.fits.get(its)
@@ -403,15 +410,16 @@ class _Searcher:
         return sets
 
     def _probes(self, mechanism: Mechanism) -> list[dict[str, float]]:
-        """Values of each part of a mechanism, at which the model is run."""
+        """Values of each part of a mechanism, at which the model is run: of several shapes at first, later of
+        that which promised most."""
         by_name, rows = {p.name: p for p in mechanism.parameters}, []
         for strength, *shapes in mechanism.whole_or_parts:
             space = ParameterSpace((by_name[strength],))
             neutral = float(space.to_unit([mechanism.neutral[strength]])[0])
             side = 1.0 if neutral <= 0.5 else -1.0
             off = {strength: float(space.from_unit([neutral + side * self._settings.off])[0])}
-            if not shapes:
-                rows.append(off)
+            if not shapes or strength in self._shapes:
+                rows.append({**off, **self._shapes.get(strength, {})})
                 continue
             others = ParameterSpace(tuple(by_name[name] for name in shapes))
             unit = qmc.Halton(others.dim, scramble=False).random(self._settings.probes + 1)[1:]
@@ -449,22 +457,36 @@ class _Searcher:
         settings = self._settings
         skins = self._nearest(current.fit.names, self._skins[: settings.others], current.fit.theta)
         off_n = tuple(current.off_n.tolist())
-        tasks = [Climb(current.fit.names, {**current.fit.theta, **skin}, settings.runs, off_n)
-                 for skin in skins[: settings.tried]]  # fmt: skip
-        for one in self._ask(tasks):
-            self.found.add(one)
+        self._finish(self._ask([
+            Climb(current.fit.names, {**current.fit.theta, **skin}, settings.first, off_n)
+            for skin in skins[: settings.tried]
+        ]))  # fmt: skip
         names = current.fit.names
         gained = self._gained(self.found.fits[names], current)
         self._tell(f"{', '.join(names)} from other skins: {gained:+.1f} nats")
+
+    def _finish(self, answers: Sequence[object]) -> None:
+        """Keeps fits, and goes on with those that are not settled: the best, and others not far behind."""
+        fits = sorted((one for one in answers if isinstance(one, JointFit)), key=lambda one: -weight(one.fit))
+        for one in fits:
+            self.found.add(one)
+        settings = self._settings
+        for again in self._ask([
+            Climb(one.fit.names, one.fit.theta, settings.runs - settings.first, tuple(one.off_n.tolist()))
+            for i, one in enumerate(fits)
+            if not one.settled
+            and (i < settings.best or self._gained(self.found.best, one) <= settings.behind)
+        ]):  # fmt: skip
+            self.found.add(again)
 
     def _leaner(self, current: JointFit) -> None:
         """Fits the sets with one mechanism fewer that were not fitted yet."""
         names = current.fit.names
         fewer = {without_one(names, name, self._known) for name in names} - {()}
-        tasks = [Climb(one, current.fit.theta, self._settings.runs)
-                 for one in sorted(fewer) if one not in self.found.fits]  # fmt: skip
-        for one in self._ask(tasks):
-            self.found.add(one)
+        self._finish(self._ask([
+            Climb(one, current.fit.theta, self._settings.first)
+            for one in sorted(fewer) if one not in self.found.fits
+        ]))  # fmt: skip
 
 
 def noise_of(binned: BinnedForce) -> float:

@@ -5,7 +5,7 @@ Two springs, each with a share that relaxes as its fluid flows; moduli and perme
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -79,7 +79,7 @@ def _relaxing(tau_s: Array, time_s: Array) -> Array:
 
 def simulate(
     model: object, motion: PadMotion, theta: Mapping[str, float], mechanisms: Sequence[Mechanism],
-    gradients: Mapping[str, float] | None = None,
+    gradients: Mapping[str, float] | None = None, least_stiffness: float = 1.0,
 ) -> Simulation:  # fmt: skip
     """Has the signature of `simulate_reduced`."""
     slopes = []
@@ -133,8 +133,11 @@ def recorded(seed: int, **values: float) -> BinnedForce:
     return BinnedForce(EDGES_S, force_n, np.full(count, NOISE_N**2), np.zeros(count - 1), phase, PHASES)
 
 
-def bench(patch: pytest.MonkeyPatch, binned: BinnedForce, base: ParameterSpace = BASE) -> JointBench:
-    """A diagnosis's bench whose reduced model is the toy."""
+def bench(
+    patch: pytest.MonkeyPatch, binned: BinnedForce, base: ParameterSpace = BASE,
+    full: Callable[[Mapping[str, float]], Array | str] = lambda values: means(values)[0],
+) -> JointBench:  # fmt: skip
+    """A diagnosis's bench whose reduced model is the toy, and whose full model is a function of values."""
     model: Any = SimpleNamespace(
         trained=SimpleNamespace(geometry=Geometry(), mechanisms={"stiffness-drift": None}),
         refinement=2, hash="toy",
@@ -142,6 +145,7 @@ def bench(patch: pytest.MonkeyPatch, binned: BinnedForce, base: ParameterSpace =
     patch.setattr(joint_bench, "calm_bins", lambda folder: (binned, NO_WORD, MOTION))
     patch.setattr(joint_bench, "load_reduced", lambda file: model)
     patch.setattr(joint_bench, "simulate_reduced", simulate)
+    patch.setattr(joint_bench, "FullForce", lambda spec, motion, edges_s: lambda case: full(case[1]))
     return JointBench(Source(Path("recording"), Path("model"), 1, base))
 
 
