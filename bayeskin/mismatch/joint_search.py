@@ -210,17 +210,26 @@ class _Searcher:
 
     def search(self) -> None:
         """Adds, leaves out and exchanges mechanisms as long as that gains weight."""
-        current = self.found.best
-        while True:
+        for _ in range(2 * self._settings.most):
+            current = self._exact()
             if current.fit.names not in self._expanded and len(current.fit.names) < self._settings.most:
                 self._forward(current)
             if not self._gains(current):
                 self._exchange(current)
             if not self._gains(current):
-                self.check()
+                self._check_all()
             if not self._gains(current):
                 return
-            current = self.found.best
+
+    def _exact(self) -> JointFit:
+        """The likeliest set, checked if it has mechanisms of the tissue: what the reduced model leaves out of
+        these would pass for further mechanisms."""
+        for _ in range(self._settings.checks):
+            best = self.found.best
+            if not self._solved(best.fit.names) or self._is_checked(best):
+                break
+            self._check([best])
+        return self.found.best
 
     def _gains(self, current: JointFit) -> bool:
         """Returns whether another set than the one at hand is better by enough to go on from it."""
@@ -243,23 +252,12 @@ class _Searcher:
                 if rest is not None and rest.fit.names not in self._expanded:
                     self._beside(rest)
 
-    def check(self) -> None:
+    def _check_all(self) -> None:
         """Compares the likeliest sets by forces that are as exact as the noise asks for."""
         for _ in range(self._settings.checks):
-            groups: dict[tuple[str, ...], list[JointFit]] = {}
-            for one in self._unchecked():
-                groups.setdefault(self._solved(one.fit.names), []).append(one)
-            if not groups:
+            if not (unchecked := self._unchecked()):
                 return
-            first = [members[0] for members in groups.values()]
-            full = self._ask([FullProbe(names, self._skin_of(one))
-                              for names, one in zip(groups, first, strict=True)])  # fmt: skip
-            again: list[Climb] = []
-            for one, members, full_n in zip(first, groups.values(), full, strict=True):
-                again += self._corrected(one, members, full_n)
-            for task, answer in zip(again, self._ask(again), strict=True):
-                if isinstance(answer, JointFit):
-                    self.found.fits[task.names] = answer
+            self._check(unchecked)
 
     def _unchecked(self) -> list[JointFit]:
         """The sets to check: likely ones, parts of the likeliest, and this one if it has moved since."""
@@ -269,10 +267,27 @@ class _Searcher:
                 if self._gained(best, one) <= self._settings.behind]  # fmt: skip
         parts = [one for one in order if set(one.fit.names) < set(best.fit.names)]
         found = {one.fit.names: one for one in (*near, *parts) if one.fit.names not in self.found.checks}
-        check = self.found.checks.get(best.fit.names)
-        if check is not None and not np.array_equal(check.theta, best.run.theta):
-            found = {best.fit.names: best, **found}
-        return list(found.values())
+        return list(found.values() if self._is_checked(best) else {best.fit.names: best, **found}.values())
+
+    def _is_checked(self, one: JointFit) -> bool:
+        """Returns whether the full model was run where a fit is."""
+        check = self.found.checks.get(one.fit.names)
+        return check is not None and np.array_equal(check.theta, one.run.theta)
+
+    def _check(self, sets: Sequence[JointFit]) -> None:
+        """Runs the full model at fits, and fits those again at which the reduced model is too far off."""
+        groups: dict[tuple[str, ...], list[JointFit]] = {}
+        for one in sets:
+            groups.setdefault(self._solved(one.fit.names), []).append(one)
+        first = [members[0] for members in groups.values()]
+        full = self._ask([FullProbe(names, self._skin_of(one))
+                          for names, one in zip(groups, first, strict=True)])  # fmt: skip
+        again: list[Climb] = []
+        for one, members, full_n in zip(first, groups.values(), full, strict=True):
+            again += self._corrected(one, members, full_n)
+        for task, answer in zip(again, self._ask(again), strict=True):
+            if isinstance(answer, JointFit):
+                self.found.fits[task.names] = answer
 
     def _corrected(self, first: JointFit, members: Sequence[JointFit], full_n: object) -> list[Climb]:
         """Notes how a run of the full model at the first of some fits checks them; the fits that it asks for.
