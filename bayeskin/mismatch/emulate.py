@@ -17,11 +17,12 @@ import numpy as np
 from bayeskin.inference import LogPosterior
 from bayeskin.mismatch.fit import Fit, fit_near
 from bayeskin.mismatch.joint_fit import JointFit, within
-from bayeskin.mismatch.resample import Resampled, resample
+from bayeskin.mismatch.resample import LEGS, Resampled, resample
 from bayeskin.mismatch.wrapper import Wrapper, innermost
 from bayeskin.types import Array, Design, ParameterSpace, Surrogate
 
 MOST = 1500  # draws, among which a wave's points are chosen
+BEFORE = (120,)  # steps of the ensembles whose draws a further wave begins with
 
 # The skin's force (m,) with the set at points (n, d), or why a run failed.
 Forces = Callable[[Array], Sequence[Array | str]]
@@ -73,7 +74,7 @@ def emulate(
     space = innermost(about.surrogate).space
     vector = np.clip(about.vector(found.fit.theta), *about.bounds)
     near = replace(found.fit, log_posterior=within(about, vector, settings.first))
-    drawn, error_n = resample(near, None, seed), None
+    drawn, error_n = resample(near, None, seed, BEFORE), None
     design = _none(space, about.surrogate.edges_s)
     emulated: Emulated | None = None
     for wave in range(settings.waves):
@@ -91,8 +92,8 @@ def emulate(
         design = fresh
         local = _posterior(about, learn(design), settings.sure * noise_n)
         best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
-        drawn = resample(best, None, seed)
         done = error_n is not None and error_n <= settings.enough * noise_n
+        drawn = resample(best, None, seed, LEGS if done or wave == settings.waves - 1 else BEFORE)
         emulated = Emulated(best, drawn, len(design.theta), error_n, done)
         if done:
             break

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
@@ -118,7 +119,14 @@ class Join:
     off_n: tuple[float, ...] = ()
 
 
-Task = Probe | FullProbe | Climb | Promise | Join
+@dataclass(frozen=True)
+class Weigh:
+    """Asks for the log evidences of a fit, as JSON has it, alone and with something smooth beside it."""
+
+    fit: Mapping[str, Any]
+
+
+Task = Probe | FullProbe | Climb | Promise | Join | Weigh
 Ask = Callable[[Sequence[Task]], list[object]]  # answers in the order of the tasks
 Tell = Callable[[str], None]
 
@@ -237,10 +245,21 @@ class _Searcher:
         return self._gained(self.found.best, before) >= self._settings.gain
 
     def _forward(self, current: JointFit) -> None:
-        """Fits sets with one mechanism more, and those that gain most from other skins and without others."""
+        """Fits sets with one mechanism more, and those that gain most from other skins and without others.
+
+        Where they gain much the set at hand is fitted again from their skins, and they from that of the best:
+        maybe they have found a better skin, and no mechanism.
+        """
         sets = self._beside(current)
         if self._gains(current):
-            for one in self._hopeful(sets, current):
+            hopeful = self._hopeful(sets, current)
+            starts = [(current, one.fit.theta) for one in hopeful]
+            starts += [(one, {**one.fit.theta, **self._skin(hopeful[0])}) for one in hopeful[1:]]
+            self._finish(self._ask([
+                Climb(one.fit.names, theta, self._settings.first, tuple(one.off_n.tolist()))
+                for one, theta in starts
+            ]))  # fmt: skip
+            for one in hopeful[:1]:
                 self._from_other_skins(one)
             self._leaner(self.found.best)
 
@@ -310,6 +329,10 @@ class _Searcher:
                     f"{said}: the reduced model is off by {1e3 * off:.1f} mN; fitted again beside that"
                 )
         return tasks
+
+    def _skin(self, one: JointFit) -> dict[str, float]:
+        """The base model's parameters of a fit."""
+        return {name: one.fit.theta[name] for name in self._base.names}
 
     def _solved(self, names: Sequence[str]) -> tuple[str, ...]:
         """Those of a set that the forward model solves."""

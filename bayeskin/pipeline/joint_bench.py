@@ -17,6 +17,7 @@ from bayeskin.inference import LogPosterior
 from bayeskin.mechanisms import Mechanism, catalogue, with_one
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.mismatch.corrected import FullRun
+from bayeskin.mismatch.discrepancy import discrepancy
 from bayeskin.mismatch.fit import (
     fit,
     instrument_noise,
@@ -27,7 +28,7 @@ from bayeskin.mismatch.fit import (
 )
 from bayeskin.mismatch.full_fit import change
 from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, within
-from bayeskin.mismatch.joint_search import Ask, Climb, FullProbe, Join, Probe, Promise, Task
+from bayeskin.mismatch.joint_search import Ask, Climb, FullProbe, Join, Probe, Promise, Task, Weigh
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.refuted import refuted
 from bayeskin.mismatch.tangent import Tangent
@@ -179,6 +180,9 @@ class JointBench:
             return {"message": force} if isinstance(force, str) else {"force_n": force.tolist()}
         if isinstance(task, Promise):
             return {"nats": self._promised(task)}
+        if isinstance(task, Weigh):
+            left = discrepancy(self._fitted(task.fit).fit, self.motion)
+            return {"alone": left.without_log_evidence, "with_smooth": left.log_evidence}
         if isinstance(task, Join):
             beside = task.promise
             names = with_one(beside.names, beside.name, self.known)
@@ -219,16 +223,21 @@ class JointBench:
             return np.array(said["force_n"])
         if isinstance(task, Promise):
             return said["nats"]
-        run = FullRun(*(np.array(said["run"][name]) for name in ("theta", "force_n", "slopes_n")))
-        about = self.local(said["fit"]["names"], run)
-        fitted = restored(said["fit"], about)
-        found = JointFit(fitted, run, said["runs"], said["settled"], np.array(said["off_n"]))
+        if isinstance(task, Weigh):
+            return said["alone"], said["with_smooth"]
+        found = self._fitted(said)
         against = refuted(found.fit, self.known, self.motion, self.jumps)
         return f"the recording's samples show nothing of {', '.join(against)}" if against else found
 
+    def _fitted(self, said: Mapping[str, Any]) -> JointFit:
+        """A fit from what `as_json` made of it."""
+        run = FullRun(*(np.array(said["run"][name]) for name in ("theta", "force_n", "slopes_n")))
+        fitted = restored(said["fit"], self.local(said["fit"]["names"], run))
+        return JointFit(fitted, run, said["runs"], said["settled"], np.array(said["off_n"]))
+
 
 def as_json(found: JointFit) -> dict[str, Any]:
-    """A joint fit, as `JointBench.answered` reads it."""
+    """A joint fit, as `JointBench` reads it."""
     assert found.run.slopes_n is not None
     run = {
         "theta": found.run.theta.tolist(), "force_n": found.run.force_n.tolist(),

@@ -16,20 +16,20 @@ from bayeskin.errors import InputError
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.contributions import Contribution, contributions
-from bayeskin.mismatch.discrepancy import Discrepancy, discrepancy
+from bayeskin.mismatch.discrepancy import discrepancy
 from bayeskin.mismatch.emulate import Emulated, emulate
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.hypotheses import Family, Judgement, hypotheses_of, judge_family
 from bayeskin.mismatch.joint_fit import JointFit, within
-from bayeskin.mismatch.joint_search import Ask, JointSearch, Probe, noise_of, search_jointly
+from bayeskin.mismatch.joint_search import Ask, JointSearch, Probe, Weigh, noise_of, search_jointly
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import Made, Search
 from bayeskin.pipeline.diagnosis_outputs import Found, Shown, candidates, draw, unexplained, window
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import write_json
-from bayeskin.pipeline.joint_bench import JointBench, Source, asked, searches_file
+from bayeskin.pipeline.joint_bench import JointBench, Source, as_json, asked, searches_file
 from bayeskin.pipeline.model import reduced_files
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.taking_up import Remainder
@@ -58,20 +58,21 @@ def _work(run: Run) -> Mapping[str, Any]:
     with asked(bench, searches_file(run.folder, bench), run.config.design.workers) as ask:
         found = search_jointly(ask, bench.binned, bench.base, bench.known, bench.noise, seed, tell)
         weighed = [one.fit.names for one in found.likeliest(WEIGHED)]
-        left = {names: discrepancy(found.fits[names].fit, bench.motion) for names in weighed}
-        family = Family([
-            one for names in weighed
-            for one in hypotheses_of(names, left[names].without_log_evidence, left[names].log_evidence)
-        ])  # fmt: skip
+        answers = ask([Weigh(as_json(found.fits[names])) for names in weighed])
+        evidences = {names: said for names, said in zip(weighed, answers, strict=True)
+                     if isinstance(said, tuple)}  # fmt: skip
+        family = Family([one for names, said in evidences.items() for one in hypotheses_of(names, *said)])
         judged = judge_family(family, bench.known)
-        best = max(weighed, key=lambda names: family.probability_of_set(names))
+        best = max(evidences, key=lambda names: family.probability_of_set(names))
         run.reporter.log("runs where the posterior is, and draws of it")
         emulated = _emulated(bench, ask, found.fits[best], seed)
     base, chosen = found.fits[()].fit, emulated.fit
     before, after = (
         locate(fit, {**fit.theta, **_noise_of(fit, chosen.theta)}, seed) for fit in (base, chosen)
     )
-    drawn = {(): _drawn(base, seed), best: emulated.draws}
+    drawn = {best: emulated.draws}
+    if best != ():
+        drawn[()] = _drawn(base, seed)
     pictured = {
         names: _shown(fit, windows, drawn[names])
         for names, fit, windows in (((), base, before), (best, chosen, after))
@@ -79,7 +80,8 @@ def _work(run: Run) -> Mapping[str, Any]:
     parts = contributions(best, chosen.theta, bench.reported, bench.known)
     remainder = None
     if judged.verdict == "unknown" or (judged.named and after.windows):
-        remainder = Remainder(left[best], propose_form(chosen, bench.motion, seed))
+        left = discrepancy(found.fits[best].fit, bench.motion)
+        remainder = Remainder(left, propose_form(chosen, bench.motion, seed))
     tried = _as_search(found)
     answer: dict[str, Any] = {
         "verdict": judged.verdict,
@@ -90,7 +92,7 @@ def _work(run: Run) -> Mapping[str, Any]:
         "mechanisms": _mechanisms(judged, chosen, drawn[best].summary, bench.known, parts),
         "unexplained": None if remainder is None else unexplained(remainder),
         "candidates": candidates(tried, bench.known),
-        "sets": [_set(names, found, left, family) for names in weighed],
+        "sets": [_set(names, found, said, family) for names, said in evidences.items()],
         "fit": {
             "before": _fit(bench.binned, base, drawn[()], pictured[()]),
             "after": {
@@ -179,13 +181,14 @@ def _mechanisms(
 
 
 def _set(
-    names: tuple[str, ...], found: JointSearch, left: Mapping[tuple[str, ...], Discrepancy], family: Family
+    names: tuple[str, ...], found: JointSearch, evidences: tuple[float, float], family: Family
 ) -> dict[str, Any]:
     one: JointFit = found.fits[names]
+    alone, with_smooth = evidences
     return {
         "mechanisms": list(names), "probability": family.probability_of_set(names),
-        "log_evidence": one.fit.log_evidence, "log_evidence_alone": left[names].without_log_evidence,
-        "log_evidence_with_smooth": left[names].log_evidence, "settled": one.settled, "runs": one.runs,
+        "log_evidence": one.fit.log_evidence, "log_evidence_alone": alone,
+        "log_evidence_with_smooth": with_smooth, "settled": one.settled, "runs": one.runs,
     }  # fmt: skip
 
 
