@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
@@ -43,6 +44,11 @@ def by_the_toy(bench: JointBench, names: tuple[str, ...], asked: list[int]) -> F
     return forces
 
 
+def unasked(points: Array) -> Sequence[Array | str]:
+    """The full model where the forward model is exact."""
+    raise AssertionError
+
+
 def learnt(design: Design) -> Surrogate:
     return train(design, "gp", 1)[0]
 
@@ -50,7 +56,9 @@ def learnt(design: Design) -> Surrogate:
 def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[JointBench, JointFit]) -> None:
     bench, found = fitted
     asked: list[int] = []
-    emulated = emulate(found, by_the_toy(bench, found.fit.names, asked), learnt, solved.NOISE_N, 1, FEW)
+    emulated = emulate(
+        found, by_the_toy(bench, found.fit.names, asked), unasked, learnt, solved.NOISE_N, 1, FEW
+    )
     assert not isinstance(emulated, str)
     assert emulated.settled
     assert emulated.error_n is not None
@@ -66,7 +74,7 @@ def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[JointBench, JointFit]
 @pytest.mark.slow
 def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[JointBench, JointFit]) -> None:
     bench, found = fitted
-    emulated = emulate(found, by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
+    emulated = emulate(found, by_the_toy(bench, found.fit.names, []), unasked, learnt, solved.NOISE_N, 1, FEW)
     assert not isinstance(emulated, str)
     about = found.fit.log_posterior
     exact = Exact(innermost(about.surrogate).space)
@@ -89,7 +97,7 @@ def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[JointBench, Joint
 def test_the_same_seed_gives_the_same_draws(fitted: tuple[JointBench, JointFit]) -> None:
     bench, found = fitted
     made = [
-        emulate(found, by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
+        emulate(found, by_the_toy(bench, found.fit.names, []), unasked, learnt, solved.NOISE_N, 1, FEW)
         for _ in range(2)
     ]
     assert not isinstance(made[0], str)
@@ -106,19 +114,63 @@ def test_runs_that_fail_are_done_without_and_are_the_answer_where_all_do(
     def some(points: Array) -> Sequence[Array | str]:
         return ["near folding" if i % 5 == 4 else one for i, one in enumerate(run(points))]
 
-    emulated = emulate(found, some, learnt, solved.NOISE_N, 1, dataclasses.replace(FEW, waves=2))
+    emulated = emulate(found, some, unasked, learnt, solved.NOISE_N, 1, dataclasses.replace(FEW, waves=2))
     assert not isinstance(emulated, str)
     assert emulated.runs == 2 * 24
     assert (
-        emulate(found, lambda points: ["near folding"] * len(points), learnt, solved.NOISE_N, 1, FEW)
+        emulate(found, lambda points: ["near folding"] * len(points), unasked, learnt, solved.NOISE_N, 1, FEW)
         == "near folding"
     )
+
+
+MIDDLE = 0.5 * (solved.EDGES_S[1:] + solved.EDGES_S[:-1])
+
+
+@pytest.mark.parametrize("fails", [False, True], ids=["all run", "one fails"])
+def test_an_error_that_changes_along_the_posterior_is_part_of_it(
+    monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    """The forward model lacks a force that depends on the skin: its values at the fit alone would mislead."""
+    shape = 5e-3 * np.sin(MIDDLE / 3.0)
+
+    def off(values: Mapping[str, float]) -> Array:
+        return shape * (1.0 + 10.0 * np.log(values["E_s"] / TRUTH["E_s"]))
+
+    recorded = solved.recorded(3)
+    recorded = dataclasses.replace(recorded, force_n=recorded.force_n + off(TRUTH))
+    bench = solved.bench(monkeypatch, recorded)
+    start = {**bench.noise, **TRUTH}
+    aside = off({**TRUTH, "E_s": 1.02 * TRUTH["E_s"]})  # where the fit was checked
+    local = functools.partial(bench.local, off_n=aside)
+    found = fit_jointly((), start, bench.skin, local, None, aside)
+    assert isinstance(found, JointFit)
+    run = by_the_toy(bench, (), [])
+    asked: list[int] = []
+
+    def full(points: Array) -> Sequence[Array | str]:
+        asked.append(len(points))
+        names = bench.space(()).names
+        forces = [np.asarray(force) + off(dict(zip(names, row, strict=True)))
+                  for force, row in zip(run(points), points, strict=True)]  # fmt: skip
+        return ["it folds", *forces[1:]] if fails else forces
+
+    emulated = emulate(found, run, full, learnt, solved.NOISE_N, 1, FEW)
+    assert not isinstance(emulated, str)
+    assert asked == [FEW.checks]
+    allowed = emulated.fit.log_posterior.model_error
+    assert allowed is not None
+    assert allowed.measured_n is not None
+    assert len(allowed.measured_n) == 1 + FEW.checks - fails
+    np.testing.assert_allclose(allowed.measured_n.sum(axis=0), 0.0, atol=1e-9)
+    low, high = np.quantile(emulated.draws.draws, [0.01, 0.99], axis=0)
+    at = emulated.draws.names.index("E_s")
+    assert low[at] < TRUTH["E_s"] < high[at]
 
 
 def test_one_wave_alone_is_never_settled(fitted: tuple[JointBench, JointFit]) -> None:
     bench, found = fitted
     one = dataclasses.replace(FEW, waves=1)
-    emulated = emulate(found, by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, one)
+    emulated = emulate(found, by_the_toy(bench, found.fit.names, []), unasked, learnt, solved.NOISE_N, 1, one)
     assert not isinstance(emulated, str)
     assert emulated.error_n is None
     assert not emulated.settled

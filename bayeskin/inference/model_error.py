@@ -33,23 +33,30 @@ RELAXATION_S = (
 
 @dataclass(frozen=True)
 class ModelError:
-    """The errors of a force over the bins between edges_s (m+1,); `amplitude` is the sd of the factor, a."""
+    """The errors of a force over the bins between edges_s (m+1,); `amplitude` is the sd of the factor, a.
+
+    measured_n (r, m) : further errors of one sd each, which runs near by have shown
+    """
 
     motion: PadMotion
     edges_s: Array
     amplitude: float
+    measured_n: Array | None = None
 
     def beside(self, prediction: Prediction) -> Prediction:
         """Returns the prediction with these errors as further columns of its factor."""
         rows = prediction.factor.transpose(0, 2, 1)  # as they lie in memory
         more = errors(prediction.mean, *self._shapes) * self._sd[:, None]
+        if self.measured_n is not None:
+            measured = np.broadcast_to(self.measured_n, (len(rows), *self.measured_n.shape))
+            more = np.concatenate([more, measured], axis=1)
         factor = np.concatenate([rows, more], axis=1).transpose(0, 2, 1)
         return Prediction(prediction.mean, factor, prediction.diagonal)
 
     @property
     def columns(self) -> int:
         """Returns the number of these errors."""
-        return 2 + len(RELAXATION_S)
+        return 2 + len(RELAXATION_S) + (0 if self.measured_n is None else len(self.measured_n))
 
     @cached_property
     def _sd(self) -> Array:

@@ -230,7 +230,13 @@ class LogPosterior:
         if self.model_error is None:
             return ()
         motion = self.model_error.motion
-        return (f"{self.model_error.amplitude:.5g}", repr(motion.time_s), repr(motion.displacement_m))
+        measured = repr(self.model_error.measured_n)
+        return (
+            f"{self.model_error.amplitude:.5g}",
+            repr(motion.time_s),
+            repr(motion.displacement_m),
+            measured,
+        )
 
     def _probe(self) -> tuple[str, ...]:
         # Provenance may miss what changed (a patched file): the prediction itself does not. Five digits,

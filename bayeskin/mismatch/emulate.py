@@ -5,6 +5,10 @@ force is linear: along a ridge of moduli and permeabilities it is curved. So the
 that are spread over draws of the posterior, a Gaussian process learns the force from all runs so far, and the
 posterior is drawn anew with it. That is repeated until fresh runs agree with what the emulator says of them.
 Where it says that it is unsure the posterior is taken to be zero: the next wave comes nearer.
+
+The forward model has an error, which is not the same all along a ridge. Where it matters the full model runs
+at a few of the draws. The mean of the errors there is added to the force, and how they differ from it, as a
+sample of a covariance, is part of the likelihood.
 """
 
 from __future__ import annotations
@@ -33,12 +37,14 @@ Learn = Callable[[Design], Surrogate]  # a surrogate of a design's force, with i
 class EmulationSettings:
     """Settings of an emulation.
 
+    checks : runs of the full model beside that at the fit, where the forward model's error matters
     points, waves : runs of a wave, and how many waves at most
     first : of the prior's width on either side of the fit's run, from where the first points are drawn
     sure : sd of the emulator, RMS over bins, over the noise of a bin, up to which it is believed
     enough : RMS error of the emulator at fresh runs, over the noise of a bin, with which it is done
     """
 
+    checks: int = 3
     points: int = 30
     waves: int = 4
     first: float = 0.5
@@ -62,11 +68,12 @@ class Emulated:
 
 
 def emulate(
-    found: JointFit, forces: Forces, learn: Learn, noise_n: float, seed: int,
+    found: JointFit, forces: Forces, full: Forces, learn: Learn, noise_n: float, seed: int,
     settings: EmulationSettings | None = None,
 ) -> Emulated | str:  # fmt: skip
     """Returns the posterior of a set about its fit; the message of a run where all of the first wave fail.
 
+    forces, full : of the forward model, and of the full model in whose place it is
     noise_n : sd of a bin's mean
     """
     settings, rng = settings or EmulationSettings(), np.random.default_rng([seed, 11])
@@ -75,6 +82,10 @@ def emulate(
     vector = np.clip(about.vector(found.fit.theta), *about.bounds)
     near = replace(found.fit, log_posterior=within(about, vector, settings.first))
     drawn, error_n = resample(near, None, seed, BEFORE), None
+    off_n = found.off_n
+    if off_n.any():
+        points = _spread(space, drawn.draws[:, : space.dim], found.run.theta[None], settings.checks, rng)
+        off_n, about = _with_errors(about, found.off_n, forces(points), full(points))
     design = _none(space, about.surrogate.edges_s)
     emulated: Emulated | None = None
     for wave in range(settings.waves):
@@ -82,10 +93,11 @@ def emulate(
         if wave == 0:
             points = np.concatenate([found.run.theta[None], points[1:]])
         answers = forces(points)
+        made = [answer + off_n for answer in answers if not isinstance(answer, str)]
         ran = [i for i, answer in enumerate(answers) if not isinstance(answer, str)]
         if not ran:
             return str(answers[0]) if emulated is None else emulated
-        fresh = _design(design, points[ran], np.array([answers[i] for i in ran]))
+        fresh = _design(design, points[ran], np.array(made))
         if emulated is not None:
             said = innermost(emulated.fit.log_posterior.surrogate).predict_mean(points[ran])
             error_n = float(np.sqrt(np.mean((said - fresh.force_n[-len(ran) :]) ** 2)))
@@ -99,6 +111,23 @@ def emulate(
             break
     assert emulated is not None
     return emulated
+
+
+def _with_errors(
+    about: LogPosterior, known_n: Array, forward: Sequence[Array | str], full: Sequence[Array | str]
+) -> tuple[Array, LogPosterior]:
+    """The forward model's mean error (m,) over some places, and the posterior that allows for the rest of it.
+
+    known_n (m,) : at the first place; forward, full : forces at the others
+    """
+    more = [b - a for a, b in zip(forward, full, strict=True)
+            if not isinstance(a, str) and not isinstance(b, str)]  # fmt: skip
+    if not more or about.model_error is None:
+        return known_n, about
+    errors_n = np.array([known_n, *more])
+    mean_n = errors_n.mean(axis=0)
+    apart_n = (errors_n - mean_n) / np.sqrt(len(errors_n) - 1)
+    return mean_n, replace(about, model_error=replace(about.model_error, measured_n=apart_n))
 
 
 def _posterior(about: LogPosterior, emulator: Surrogate, unsure_n: float) -> LogPosterior:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -115,9 +115,15 @@ class JointBench:
         """A run with derivatives of a set at values, or why it failed."""
         return self._run(names, theta, slopes=True)
 
-    def local(self, names: Sequence[str], run: FullRun) -> LogPosterior:
-        """The posterior of a set about a run of it."""
-        return self._posterior(self._seen(names, (), run))
+    def local(self, names: Sequence[str], run: FullRun, off_n: Array | None = None) -> LogPosterior:
+        """The posterior of a set about a run of it, to which the error of the reduced model was added.
+
+        That error changes from place to place by as much as it is, so it counts as known to one sd of itself.
+        """
+        about = self._posterior(self._seen(names, (), run))
+        if off_n is None or about.model_error is None:
+            return about
+        return replace(about, model_error=replace(about.model_error, measured_n=off_n[None]))
 
     def _run(self, names: Sequence[str], theta: Mapping[str, float], slopes: bool) -> FullRun | str:
         mechanisms, space = self.solved(names), self.space(names)
@@ -194,7 +200,8 @@ class JointBench:
         start = dict(task.start)
         start["E_c"] = max(start["E_c"], start["E_s"] / 1.9)  # a stiffer subcutis is ruled out
         off_n = np.array(task.off_n) if task.off_n else None
-        found = fit_jointly(task.names, start, self.skin, self.local, TrustSettings(runs=task.runs), off_n)
+        local, settings = partial(self.local, off_n=off_n), TrustSettings(runs=task.runs)
+        found = fit_jointly(task.names, start, self.skin, local, settings, off_n)
         return {"message": found} if isinstance(found, str) else as_json(found)
 
     def _promised(self, task: Promise) -> float:
@@ -232,8 +239,9 @@ class JointBench:
     def _fitted(self, said: Mapping[str, Any]) -> JointFit:
         """A fit from what `as_json` made of it."""
         run = FullRun(*(np.array(said["run"][name]) for name in ("theta", "force_n", "slopes_n")))
-        fitted = restored(said["fit"], self.local(said["fit"]["names"], run))
-        return JointFit(fitted, run, said["runs"], said["settled"], np.array(said["off_n"]))
+        off_n = np.array(said["off_n"])
+        about = self.local(said["fit"]["names"], run, off_n if off_n.any() else None)
+        return JointFit(restored(said["fit"], about), run, said["runs"], said["settled"], off_n)
 
 
 def as_json(found: JointFit) -> dict[str, Any]:

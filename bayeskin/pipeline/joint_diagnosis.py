@@ -22,7 +22,15 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.hypotheses import Family, Judgement, hypotheses_of, judge_family
 from bayeskin.mismatch.joint_fit import JointFit, within
-from bayeskin.mismatch.joint_search import Ask, JointSearch, Probe, Weigh, noise_of, search_jointly
+from bayeskin.mismatch.joint_search import (
+    Ask,
+    FullProbe,
+    JointSearch,
+    Probe,
+    Weigh,
+    noise_of,
+    search_jointly,
+)
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import Made, Search
@@ -145,14 +153,13 @@ def _emulated(bench: JointBench, ask: Ask, found: JointFit, seed: int) -> Emulat
     """A set's posterior from reduced runs where it is; about the fit's run where none of them finishes."""
     names, space = found.fit.names, bench.space(found.fit.names)
 
-    def forces(points: Array) -> list[Array | str]:
-        answers = ask([
-            Probe(names, dict(zip(space.names, map(float, row), strict=True))) for row in points
-        ])  # fmt: skip
-        return [one if isinstance(one, str) else np.asarray(one) + found.off_n for one in answers]
+    def asked_at(kind: type[Probe | FullProbe], points: Array) -> list[Any]:
+        return ask([kind(names, dict(zip(space.names, map(float, row), strict=True))) for row in points])
 
-    learn = partial(_learnt, seed=seed)
-    emulated = emulate(found, forces, learn, noise_of(bench.binned), seed)
+    emulated = emulate(
+        found, partial(asked_at, Probe), partial(asked_at, FullProbe), partial(_learnt, seed=seed),
+        noise_of(bench.binned), seed,
+    )  # fmt: skip
     if isinstance(emulated, str):
         return Emulated(found.fit, _drawn(found.fit, seed), 0, None, False)
     return emulated
