@@ -64,7 +64,7 @@ class SearchSettings:
     promised: float = 1.0
     astray: float = 10.0
     near: float = 0.5
-    alike: int = 2
+    alike: int = 3
     others: int = 16
     tried: int = 2
     gain: float = 1.0
@@ -248,7 +248,8 @@ class _Searcher:
         """Fits sets with one mechanism more, and those that gain most from other skins and without others.
 
         Where they gain much the set at hand is fitted again from their skins, and they from that of the best:
-        maybe they have found a better skin, and no mechanism.
+        maybe they have found a better skin, and no mechanism. Then they are checked by the full model, since
+        the reduced model may be far off with one of them.
         """
         sets = self._beside(current)
         if self._gains(current):
@@ -261,6 +262,10 @@ class _Searcher:
             ]))  # fmt: skip
             for one in hopeful[:1]:
                 self._from_other_skins(one)
+            self._check([
+                now for one in hopeful
+                if self._solved(one.fit.names) and not self._is_checked(now := self.found.fits[one.fit.names])
+            ])  # fmt: skip
             self._leaner(self.found.best)
 
     def _exchange(self, current: JointFit) -> None:
@@ -439,7 +444,7 @@ class _Searcher:
             Climb(with_one(names, name, self._known), ran.get(name, theta), settings.first,
                   () if name in starts else off_n) for name in worse
         ])  # fmt: skip
-        self._finish(fits)
+        self._finish(fits, current)
         sets = [with_one(names, name, self._known) for name in chosen]
         for name, its in zip(chosen, sets, strict=True):
             fitted = self.found.fits.get(its)
@@ -503,17 +508,21 @@ class _Searcher:
         gained = self._gained(self.found.fits[names], current)
         self._tell(f"{', '.join(names)} from other skins: {gained:+.1f} nats")
 
-    def _finish(self, answers: Sequence[object]) -> None:
-        """Keeps fits, and goes on with those that are not settled: the best, and others not far behind."""
+    def _finish(self, answers: Sequence[object], since: JointFit | None = None) -> None:
+        """Keeps fits, and goes on with those that are not settled: the best, and others not far behind.
+
+        since : a fit on which they gain; those that have gained a good part of what the best has are not far
+        """
         fits = sorted((one for one in answers if isinstance(one, JointFit)), key=lambda one: -weight(one.fit))
         for one in fits:
             self.found.add(one)
-        settings = self._settings
+        settings, behind = self._settings, self._settings.behind
+        if since is not None and fits:
+            behind = max(behind, (1.0 - settings.near) * self._gained(fits[0], since))
         for again in self._ask([
             Climb(one.fit.names, one.fit.theta, settings.runs - settings.first, tuple(one.off_n.tolist()))
             for i, one in enumerate(fits)
-            if not one.settled
-            and (i < settings.best or self._gained(self.found.best, one) <= settings.behind)
+            if not one.settled and (i < settings.best or self._gained(self.found.best, one) <= behind)
         ]):  # fmt: skip
             self.found.add(again)
 
