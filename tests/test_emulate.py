@@ -140,7 +140,7 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
     recorded = dataclasses.replace(recorded, force_n=recorded.force_n + off(TRUTH))
     bench = solved.bench(monkeypatch, recorded)
     start = {**bench.noise, **TRUTH}
-    aside = off({**TRUTH, "E_s": 1.02 * TRUTH["E_s"]})  # where the fit was checked
+    aside = off({**TRUTH, "E_s": 1.05 * TRUTH["E_s"]})  # where the fit was checked
     local = functools.partial(bench.local, off_n=aside)
     found = fit_jointly((), start, bench.skin, local, None, aside)
     assert isinstance(found, JointFit)
@@ -162,9 +162,9 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
     assert allowed.measured_n is not None
     assert len(allowed.measured_n) == 1 + FEW.checks - fails
     np.testing.assert_allclose(allowed.measured_n.sum(axis=0), 0.0, atol=1e-9)
-    low, high = np.quantile(emulated.draws.draws, [0.01, 0.99], axis=0)
-    at = emulated.draws.names.index("E_s")
-    assert low[at] < TRUTH["E_s"] < high[at]
+    about = emulated.fit.log_posterior
+    behind = emulated.fit.value - float(about.log_prob(about.vector({**emulated.fit.theta, **TRUTH}))[0])
+    assert behind < 12.0
 
 
 def test_one_wave_alone_is_never_settled(fitted: tuple[JointBench, JointFit]) -> None:
