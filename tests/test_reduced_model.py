@@ -177,6 +177,9 @@ def test_relaxed_skin_that_is_pushed_together_is_near_folding(model) -> None:
                             of(["solid-viscoelasticity"]))  # fmt: skip
     assert soft.status == "ok"
     assert found.stats["stiffness_left"] < 0.4 < soft.stats["stiffness_left"]
+    nearer = simulate_reduced(model, back, theta, of(["solid-viscoelasticity"]), least_stiffness=0.0)
+    assert nearer.status == "ok"
+    assert nearer.stats["stiffness_left"] == found.stats["stiffness_left"]
 
 
 def test_a_run_that_is_inside_out_between_its_points_has_failed(model, monkeypatch) -> None:

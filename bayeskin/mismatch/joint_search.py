@@ -41,7 +41,8 @@ class SearchSettings:
     skins : runs of the base model over its prior, from which fits set out
     starts, best : fits of the base model from the nearest of these, and how many go on after their first runs
     first, runs : of a fit, before those far behind are given up, and after
-    behind : nats of weight behind the likeliest set, from which on a fit is given up and needs no check
+    behind : nats of weight behind the likeliest set, from which on a fit is given up
+    close : nats behind it, up to which a set is checked by the full model
     probes : runs of each part of a mechanism that the model solves, and how far off neutral, of the prior
     shortlist, promised : mechanisms that are fitted beside a set, and nats that each must promise
     astray : nats of weight gained, from which on a set may have led the smaller one to another skin
@@ -58,6 +59,7 @@ class SearchSettings:
     first: int = 4
     runs: int = 9
     behind: float = 12.0
+    close: float = 6.0
     probes: int = 3
     off: float = 0.25
     shortlist: int = 4
@@ -284,12 +286,16 @@ class _Searcher:
             self._check(unchecked)
 
     def _unchecked(self) -> list[JointFit]:
-        """The sets to check: likely ones, parts of the likeliest, and this one if it has moved since."""
+        """The sets to check: likely ones, parts of the likeliest with the same tissue, and this if it moved."""
         order = self.found.likeliest(len(self.found.fits))
         best = order[0]
         near = [one for one in order[: self._settings.compared]
-                if self._gained(best, one) <= self._settings.behind]  # fmt: skip
-        parts = [one for one in order if set(one.fit.names) < set(best.fit.names)]
+                if self._gained(best, one) <= self._settings.close]  # fmt: skip
+        solved = self._solved(best.fit.names)
+        parts = [
+            one for one in order
+            if set(one.fit.names) < set(best.fit.names) and self._solved(one.fit.names) == solved
+        ]  # fmt: skip
         found = {one.fit.names: one for one in (*near, *parts) if one.fit.names not in self.found.checks}
         return list(found.values() if self._is_checked(best) else {best.fit.names: best, **found}.values())
 

@@ -21,6 +21,7 @@ from bayeskin.mechanisms.mechanism import observed
 from bayeskin.mismatch.corrected import FullRun
 from bayeskin.pipeline import joint_bench
 from bayeskin.pipeline.joint_bench import JointBench, Source
+from bayeskin.reduced.region import LEAST_STIFFNESS
 from bayeskin.types import (
     Array,
     BinnedForce,
@@ -79,9 +80,10 @@ def _relaxing(tau_s: Array, time_s: Array) -> Array:
 
 def simulate(
     model: object, motion: PadMotion, theta: Mapping[str, float], mechanisms: Sequence[Mechanism],
-    gradients: Mapping[str, float] | None = None, least_stiffness: float = 1.0,
+    gradients: Mapping[str, float] | None = None, *, least_stiffness: float,
 ) -> Simulation:  # fmt: skip
     """Has the signature of `simulate_reduced`."""
+    assert least_stiffness < LEAST_STIFFNESS
     slopes = []
     for name, by in (gradients or {}).items():
         ends = {**theta, name: theta[name] + 1e-5 * by * np.array([-1.0, 1.0])}
