@@ -177,6 +177,11 @@ def test_sets_are_compared_by_forces_that_runs_of_the_full_model_correct(
 def test_where_the_reduced_model_is_exact_a_check_changes_nothing(asked: Make) -> None:
     found = asked(F0=-0.03).search()
     assert all(not fit.off_n.any() for fit in found.fits.values())
+    for fit in found.fits.values():  # no error is allowed for that was not found
+        error = fit.fit.log_posterior.model_error
+        assert error is not None
+        assert error.measured_n is None
+        assert len(fit.fit.latent) == 1 + error.columns
     assert found.checks[("force-offset",)].off < 1e-9
 
 

@@ -259,7 +259,7 @@ class _Searcher:
             starts = [(current, one.fit.theta) for one in hopeful]
             starts += [(one, {**one.fit.theta, **self._skin(hopeful[0])}) for one in hopeful[1:]]
             self._finish(self._ask([
-                Climb(one.fit.names, theta, self._settings.first, tuple(one.off_n.tolist()))
+                Climb(one.fit.names, theta, self._settings.first, _added(one))
                 for one, theta in starts
             ]))  # fmt: skip
             for one in hopeful[:1]:
@@ -286,7 +286,7 @@ class _Searcher:
             self._check(unchecked)
 
     def _unchecked(self) -> list[JointFit]:
-        """The sets to check: likely ones, parts of the likeliest with the same tissue, and this if it moved."""
+        """The sets to check: likely ones, parts of the likeliest of the same tissue, and this if it moved."""
         order = self.found.likeliest(len(self.found.fits))
         best = order[0]
         near = [one for one in order[: self._settings.compared]
@@ -406,7 +406,7 @@ class _Searcher:
         """
         names, settings = current.fit.names, self._settings
         self._expanded.add(names)
-        off_n = tuple(current.off_n.tolist())  # of the same tissue
+        off_n = _added(current)  # of the same tissue
         others = [
             name for name in self._known
             if name not in names and with_one(names, name, self._known) not in self.found.fits
@@ -505,7 +505,7 @@ class _Searcher:
         """Fits a set from other skins, with its mechanisms as they are."""
         settings = self._settings
         skins = self._nearest(current.fit.names, self._skins[: settings.others], current.fit.theta)
-        off_n = tuple(current.off_n.tolist())
+        off_n = _added(current)
         self._finish(self._ask([
             Climb(current.fit.names, {**current.fit.theta, **skin}, settings.first, off_n)
             for skin in skins[: settings.tried]
@@ -526,7 +526,7 @@ class _Searcher:
         if since is not None and fits:
             behind = max(behind, (1.0 - settings.near) * self._gained(fits[0], since))
         for again in self._ask([
-            Climb(one.fit.names, one.fit.theta, settings.runs - settings.first, tuple(one.off_n.tolist()))
+            Climb(one.fit.names, one.fit.theta, settings.runs - settings.first, _added(one))
             for i, one in enumerate(fits)
             if not one.settled and (i < settings.best or self._gained(self.found.best, one) <= behind)
         ]):  # fmt: skip
@@ -545,6 +545,11 @@ class _Searcher:
 def noise_of(binned: BinnedForce) -> float:
     """Returns the sd [N] of the noise in a bin's mean, RMS over bins."""
     return float(np.sqrt(np.nanmean(binned.variance_n2)))
+
+
+def _added(one: JointFit) -> tuple[float, ...]:
+    """What a fit has added to the force, as tasks have it."""
+    return tuple(one.off_n.tolist()) if one.off_n.any() else ()
 
 
 def _better(one: object, current: JointFit) -> bool:
