@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -114,6 +115,24 @@ def test_a_fit_reaches_the_maximum_of_the_skin_itself(bench: JointBench) -> None
     np.testing.assert_allclose(found.fit.mean_n, found.fit.log_posterior.binned.force_n, atol=0.05)
     at_run = [found.fit.theta[name] for name in found.fit.log_posterior.surrogate.space.names]
     np.testing.assert_allclose(found.run.theta[:5], at_run[:5], rtol=1e-6)
+
+
+def test_what_is_added_to_the_force_is_part_of_each_run(bench: JointBench) -> None:
+    """A recording by the reduced model and more is fitted as the recording by the reduced model alone."""
+    plain = fit_jointly(SET, start(bench), bench.skin, bench.local)
+    off_n = 5e-3 * np.sin(np.arange(len(bench.binned.force_n)) / 7.0)
+    other = copy.copy(bench)
+    other.binned = dataclasses.replace(bench.binned, force_n=bench.binned.force_n + off_n)
+    found = fit_jointly(SET, start(bench), other.skin, other.local, None, off_n)
+    assert isinstance(plain, JointFit)
+    assert isinstance(found, JointFit)
+    assert found.fit.value == pytest.approx(plain.fit.value, abs=0.2)
+    assert found.fit.theta["F0"] == pytest.approx(plain.fit.theta["F0"], abs=2e-4)
+    alone = bench.skin(SET, found.fit.theta)
+    assert isinstance(alone, FullRun)
+    np.testing.assert_allclose(found.run.force_n, alone.force_n + off_n, atol=1e-6)
+    np.testing.assert_array_equal(found.off_n, off_n)
+    assert not plain.off_n.any()
 
 
 class Unsteady:
