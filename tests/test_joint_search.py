@@ -13,18 +13,9 @@ from toys import solved
 from toys.solved import BASE, KNOWN
 
 from bayeskin.errors import InputError
-from bayeskin.mismatch.joint_search import (
-    Climb,
-    FullProbe,
-    Join,
-    JointSearch,
-    Probe,
-    Promise,
-    SearchSettings,
-    Task,
-    search_jointly,
-)
+from bayeskin.mismatch.joint_search import JointSearch, SearchSettings, search_jointly
 from bayeskin.mismatch.search import weight
+from bayeskin.mismatch.tasks import Climb, FullProbe, Join, Probe, Promise, Task
 from bayeskin.pipeline.joint_bench import JointBench
 from bayeskin.types import Array, ParameterSpace
 

@@ -28,10 +28,10 @@ from bayeskin.mismatch.fit import (
 )
 from bayeskin.mismatch.full_fit import change
 from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, within
-from bayeskin.mismatch.joint_search import Ask, Climb, FullProbe, Join, Probe, Promise, Task, Weigh
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.refuted import refuted
 from bayeskin.mismatch.tangent import Tangent
+from bayeskin.mismatch.tasks import Ask, Climb, FullProbe, Join, Probe, Promise, Task, Weigh
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline.folder import read_lines, sha256_of
 from bayeskin.pipeline.model import model_error

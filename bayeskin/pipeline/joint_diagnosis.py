@@ -22,18 +22,11 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.hypotheses import Family, Judgement, hypotheses_of, judge_family
 from bayeskin.mismatch.joint_fit import JointFit, within
-from bayeskin.mismatch.joint_search import (
-    Ask,
-    FullProbe,
-    JointSearch,
-    Probe,
-    Weigh,
-    noise_of,
-    search_jointly,
-)
+from bayeskin.mismatch.joint_search import JointSearch, noise_of, search_jointly
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import Made, Search
+from bayeskin.mismatch.tasks import Ask, FullProbe, Probe, Weigh
 from bayeskin.pipeline.diagnosis_outputs import Found, Shown, candidates, draw, unexplained, window
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import write_json

@@ -1,0 +1,65 @@
+"""What a search asks of the processes that run the models: tasks, which travel by value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from bayeskin.mismatch.corrected import FullRun
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Asks for the force of a set at values, by the forward model alone: (m,) or why it failed."""
+
+    names: tuple[str, ...]
+    theta: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class FullProbe:
+    """Asks for the force of a set at values by the full model: (m,) or why it failed."""
+
+    names: tuple[str, ...]
+    theta: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Climb:
+    """Asks for the fit of a set from values, in so many runs at most; off_n (m,) is added to their force."""
+
+    names: tuple[str, ...]
+    start: Mapping[str, float]
+    runs: int
+    off_n: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Promise:
+    """Asks how many nats a mechanism with a shortcut for the force promises beside a fit, about its run."""
+
+    names: tuple[str, ...]
+    theta: Mapping[str, float]
+    run: FullRun
+    name: str
+
+
+@dataclass(frozen=True)
+class Join:
+    """Asks for the fit of a set with one such mechanism more, first searched for on the tangent of a run."""
+
+    promise: Promise
+    runs: int
+    off_n: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Weigh:
+    """Asks for the log evidences of a fit, as JSON has it, alone and with something smooth beside it."""
+
+    fit: Mapping[str, Any]
+
+
+Task = Probe | FullProbe | Climb | Promise | Join | Weigh
+Ask = Callable[[Sequence[Task]], list[object]]  # answers in the order of the tasks
