@@ -21,7 +21,7 @@ import numpy as np
 from bayeskin.inference import LogPosterior
 from bayeskin.mismatch.fit import Fit, fit_near
 from bayeskin.mismatch.joint_fit import JointFit, within
-from bayeskin.mismatch.resample import LEGS, Resampled, resample
+from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.wrapper import Wrapper, innermost
 from bayeskin.types import Array, Design, ParameterSpace, Surrogate
 
@@ -81,7 +81,7 @@ def emulate(
     space = innermost(about.surrogate).space
     vector = np.clip(about.vector(found.fit.theta), *about.bounds)
     near = replace(found.fit, log_posterior=within(about, vector, settings.first))
-    drawn, error_n = resample(near, None, seed, BEFORE), None
+    drawn, error_n = resample(near, None, seed, BEFORE, 0), None
     off_n = found.off_n
     if off_n.any():
         points = _spread(space, drawn.draws[:, : space.dim], found.run.theta[None], settings.checks, rng)
@@ -105,7 +105,8 @@ def emulate(
         local = _posterior(about, learn(design), settings.sure * noise_n)
         best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
         done = error_n is not None and error_n <= settings.enough * noise_n
-        drawn = resample(best, None, seed, LEGS if done or wave == settings.waves - 1 else BEFORE)
+        last = done or wave == settings.waves - 1
+        drawn = resample(best, None, seed) if last else resample(best, None, seed, BEFORE, 0)
         emulated = Emulated(best, drawn, len(design.theta), error_n, done)
         if done:
             break

@@ -55,14 +55,16 @@ class Resampled:
         }
 
 
-def resample(found: Fit, shear: Shear | None, seed: int, legs: Sequence[int] = LEGS) -> Resampled:
-    """Draws of the posterior about `found`; `shear` as for `fit`.
+def resample(
+    found: Fit, shear: Shear | None, seed: int, legs: Sequence[int] = LEGS, modes: int = MODES
+) -> Resampled:  # fmt: skip
+    """Draws of the posterior about `found` and so many other modes; `shear` as for `fit`.
 
     They end after the first of `legs` by which they have settled.
     """
     log_posterior = found.log_posterior
     rng = np.random.default_rng([seed, 7])
-    starts = _starts(found, shear, seed, rng)
+    starts = _starts(found, shear, seed, rng, modes)
     walkers = max(FEWEST_WALKERS, 2 * log_posterior.dim + 2)
     coordinates = MoveCoordinates(shear, *log_posterior.bounds)
     samplers = [
@@ -101,13 +103,17 @@ def _assessed(
     return Resampled(log_posterior.names, kept, rhat, effective, state.verdict.trusted)
 
 
-def _starts(found: Fit, shear: Shear | None, seed: int, rng: np.random.Generator) -> Callable[[int], Array]:
+def _starts(
+    found: Fit, shear: Shear | None, seed: int, rng: np.random.Generator, modes: int
+) -> Callable[[int], Array]:  # fmt: skip
     """A function that draws so many walkers (n, D) about the modes."""
     log_posterior = found.log_posterior
     low, high = log_posterior.bounds
     best = low + found.unit * (high - low)
     whole = skins(log_posterior.surrogate)[-1]
-    others = likely(log_posterior, other_skins(best, log_posterior, shear, seed, whole), MODES)
+    others = (
+        likely(log_posterior, other_skins(best, log_posterior, shear, seed, whole), modes) if modes else []
+    )
     tops = [gauss_newton(log_posterior, start, shear, sum(FIRST_ROUNDS)) for start in others]
     centres = np.array([best, *(top.vector for top in tops)])
     masses = np.array([found.log_evidence, *(evidence(log_posterior, top)[0] for top in tops)])
