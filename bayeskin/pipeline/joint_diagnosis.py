@@ -28,7 +28,7 @@ from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import Made, Search
 from bayeskin.mismatch.tasks import Ask, FullProbe, Probe, Weigh
 from bayeskin.pipeline.diagnosis_outputs import Found, Shown, candidates, draw, unexplained, window
-from bayeskin.pipeline.engine import Run, Stage
+from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
 from bayeskin.pipeline.folder import write_json
 from bayeskin.pipeline.joint_bench import JointBench, Source, as_json, asked, searches_file
 from bayeskin.pipeline.model import reduced_files
@@ -62,6 +62,8 @@ def _work(run: Run) -> Mapping[str, Any]:
         answers = ask([Weigh(as_json(found.fits[names])) for names in weighed])
         evidences = {names: said for names, said in zip(weighed, answers, strict=True)
                      if isinstance(said, tuple)}  # fmt: skip
+        if not evidences:
+            raise CannotGoOn(f"no set of mechanisms could be weighed: {answers[0]}")
         family = Family([one for names, said in evidences.items() for one in hypotheses_of(names, *said)])
         judged = judge_family(family, bench.known)
         best = max(evidences, key=lambda names: family.probability_of_set(names))
@@ -251,6 +253,9 @@ def in_words(answer: Mapping[str, Any]) -> str:
             f"cell: RMSE {1e3 * full['rmse']:.1f} mN. The reduced model is off by "
             f"{1e3 * full['reduced_off_by']:.2f} mN there."
         )
+    after = answer["fit"]["after"]
+    if not (after["emulator"]["settled"] and after["sampled"]["settled"]):
+        lines.append("The intervals are rough: the runs or the draws that they rest on did not settle.")
     best = ", ".join(f"{one['name']} {one['delta_score']:+.1f}" for one in answer["candidates"][:5])
     if best:
         lines.append(f"log evidence that single mechanisms gain: {best}")
