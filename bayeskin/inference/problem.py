@@ -230,13 +230,10 @@ class LogPosterior:
         if self.model_error is None:
             return ()
         motion = self.model_error.motion
-        measured = repr(self.model_error.measured_n)
-        return (
-            f"{self.model_error.amplitude:.5g}",
-            repr(motion.time_s),
-            repr(motion.displacement_m),
-            measured,
-        )
+        more = self.model_error.measured_n
+        measured = () if more is None else (repr(more.tolist()),)
+        said = f"{self.model_error.amplitude:.5g}", repr(motion.time_s), repr(motion.displacement_m)
+        return (*said, *measured)
 
     def _probe(self) -> tuple[str, ...]:
         # Provenance may miss what changed (a patched file): the prediction itself does not. Five digits,

@@ -386,7 +386,7 @@ def hopeful(found: Fit) -> float:
 def _other_starts(
     vector: Array, log_posterior: LogPosterior, shear: Shear | None, seed: int, count: int
 ) -> list[Array]:
-    """So many of the most probable `other_skins` of each kind."""
+    """Returns so many of the most probable `other_skins` of each kind."""
     kinds = skins(log_posterior.surrogate)
     drawn = [other_skins(vector, log_posterior, shear, seed, skin) for skin in kinds]
     return [start for trials in drawn for start in likely(log_posterior, trials, count)]

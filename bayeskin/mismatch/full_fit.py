@@ -57,7 +57,7 @@ def fit_full(
     log_posterior: LogPosterior, start: Mapping[str, float], full: Full, exact: Sequence[str], rounds: int,
     seed: int, given: Sequence[FullRun] = (), several: bool = True, at_least: float = -np.inf,
 ) -> tuple[FullFit, CorrectedSurrogate] | str:  # fmt: skip
-    """From `start` (all parameters), at most so many runs; the message of the first, where that fails.
+    """Returns a fit from `start` (all parameters) in so many runs at most; why the first failed, if so.
 
     With the fit comes the surrogate of the force about it.
 
@@ -120,7 +120,7 @@ def at_run(found: Fit, full: FullFit) -> Fit:
 
 
 def _excess(local: LogPosterior, theta: Mapping[str, float], force_n: Array) -> float:
-    """By how much nats are inflated where more than noise is left of the force (m,) at a point, 1 at least.
+    """Returns the factor, 1 at least, on nats where more than noise is left of the force (m,).
 
     The mean squared score of the innovations, which is what a sandwich of informations has in its middle
     (Godambe 1960, Ann. Math. Stat. 31:1208).
@@ -133,7 +133,7 @@ def _excess(local: LogPosterior, theta: Mapping[str, float], force_n: Array) -> 
 
 
 def change(space: ParameterSpace, theta: Array) -> Array:
-    """Of each parameter (d,), by one coordinate of the box."""
+    """Returns the change of each parameter (d,) along one coordinate of the box."""
     unit, h = space.box.to_unit(theta), 1e-6
     return np.asarray((space.box.from_unit(unit + h) - space.box.from_unit(unit - h)) / (2.0 * h))
 

@@ -8,10 +8,10 @@ a few runs. The sets that gain most are fitted from other skins, too, since a mi
 skin astray; then each mechanism of the best is left out in turn. Where nothing more is gained, each mechanism
 of the best is exchanged: left out, and every other one tried beside the rest.
 
-At the end a run of the full model at the fit of each likely set says by how much the forward model is off
-there. Where that is too much the set is fitted again, with the difference added to the force; so the sets are
-compared by forces that are as exact as the noise asks for. A set's weight is its evidence times the prior of
-its mechanisms.
+A run of the full model at a set's fit says by how much the forward model is off there. Where that is too much
+the set is fitted again, with the difference added to the force. Sets that gain much are checked in this way
+before the search goes on from one, and all likely sets at the end, so that they are compared by forces as
+exact as the noise asks for. A set's weight is its evidence times the prior of its mechanisms.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ class _Searcher:
         if self._gains(current):
             hopeful = self._hopeful(sets, current)
             starts = [(current, one.fit.theta) for one in hopeful]
-            starts += [(one, {**one.fit.theta, **self._skin(hopeful[0])}) for one in hopeful[1:]]
+            starts += [(one, {**one.fit.theta, **self._base_values(hopeful[0])}) for one in hopeful[1:]]
             self._finish(self._ask([
                 Climb(one.fit.names, theta, self._settings.first, _added(one))
                 for one, theta in starts
@@ -255,7 +255,7 @@ class _Searcher:
         for one in sets:
             groups.setdefault(self._solved(one.fit.names), []).append(one)
         first = [members[0] for members in groups.values()]
-        full = self._ask([FullProbe(names, self._skin_of(one))
+        full = self._ask([FullProbe(names, self._solved_values(one))
                           for names, one in zip(groups, first, strict=True)])  # fmt: skip
         again: list[Climb] = []
         for one, members, full_n in zip(first, groups.values(), full, strict=True):
@@ -282,11 +282,11 @@ class _Searcher:
             if off > self._settings.exact * noise_of(self._binned):
                 tasks.append(Climb(one.fit.names, one.fit.theta, self._settings.runs, tuple(off_n.tolist())))
                 self._tell(
-                    f"{said}: the reduced model is off by {1e3 * off:.1f} mN; fitted again beside that"
+                    f"{said}: the reduced model is off by {1e3 * off:.1f} mN; it is fitted with that added"
                 )
         return tasks
 
-    def _skin(self, one: JointFit) -> dict[str, float]:
+    def _base_values(self, one: JointFit) -> dict[str, float]:
         """The base model's parameters of a fit."""
         return {name: one.fit.theta[name] for name in self._base.names}
 
@@ -294,8 +294,8 @@ class _Searcher:
         """Those of a set that the forward model solves."""
         return tuple(name for name in sorted(names) if self._known[name].act.bind is not None)
 
-    def _skin_of(self, one: JointFit) -> dict[str, float]:
-        """Values of what the forward model solves, at a fit's run."""
+    def _solved_values(self, one: JointFit) -> dict[str, float]:
+        """The parameters that the forward model solves, at a fit's run."""
         names = innermost(one.fit.log_posterior.surrogate).space.names
         return dict(zip(names, map(float, one.run.theta), strict=True))
 
@@ -364,7 +364,7 @@ class _Searcher:
             Probe(with_one(names, name, self._known), {**theta, **values}) for name, values in probes
         ]
         answers = self._ask(
-            [*tasks, *(Promise(names, current.fit.theta, current.run, name) for name in quick)]
+            [*tasks, *(Promise(names, current.fit.theta, current.run, name, off_n) for name in quick)]
         )
         promised: dict[str, float] = {}
         tested: dict[str, float] = {}
@@ -387,7 +387,7 @@ class _Searcher:
         self._tell("promised: " + ", ".join(f"{name} {promised[name]:.0f} nats" for name in order[:5]))
         fits = self._ask([
             Climb(with_one(names, name, self._known), starts[name], settings.first) if name in starts
-            else Join(Promise(names, current.fit.theta, current.run, name), settings.first, off_n)
+            else Join(Promise(names, current.fit.theta, current.run, name, off_n), settings.first)
             for name in chosen
         ])  # fmt: skip
         worse = [name for name, one in zip(chosen, fits, strict=True) if not _better(one, current)]
@@ -493,7 +493,7 @@ def noise_of(binned: BinnedForce) -> float:
 
 
 def _added(one: JointFit) -> tuple[float, ...]:
-    """What a fit has added to the force, as tasks have it."""
+    """Returns the force that a fit has added to its runs, as tasks have it; empty for none."""
     return tuple(one.off_n.tolist()) if one.off_n.any() else ()
 
 

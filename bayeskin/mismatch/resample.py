@@ -46,7 +46,7 @@ class Resampled:
 
     @cached_property
     def summary(self) -> dict[str, dict[str, Any]]:
-        """Of each parameter mean, sd and the ends of the 90 % interval."""
+        """Mean, sd and the ends of the 90 % interval of each parameter."""
         low, high = np.quantile(self.draws, [0.05, 0.95], axis=0)
         rows = zip(self.names, self.draws.mean(axis=0), self.draws.std(axis=0), low, high, strict=True)
         return {
@@ -94,7 +94,7 @@ def resample(
 def _assessed(
     samplers: Sequence[emcee.EnsembleSampler], log_posterior: LogPosterior, forgotten: int
 ) -> Resampled:
-    """What ensembles have drawn after their first steps, of which so many are forgotten at least."""
+    """Returns the draws of ensembles after their first steps, of which so many are forgotten at least."""
     chains = np.stack([sampler.get_chain() for sampler in samplers])
     densities = np.stack([sampler.get_log_prob() for sampler in samplers])
     state = assess(chains, densities, log_posterior.names, LIMITS, forgotten)

@@ -1,4 +1,4 @@
-"""What a search asks of the processes that run the models: tasks, which travel by value."""
+"""The tasks that a search gives to the processes that run the models; they travel by value."""
 
 from __future__ import annotations
 
@@ -37,12 +37,16 @@ class Climb:
 
 @dataclass(frozen=True)
 class Promise:
-    """Asks how many nats a mechanism with a shortcut for the force promises beside a fit, about its run."""
+    """Asks how many nats a mechanism with a shortcut for the force promises beside a fit, about its run.
+
+    off_n (m,) : part of the run's force that was added to it
+    """
 
     names: tuple[str, ...]
     theta: Mapping[str, float]
     run: FullRun
     name: str
+    off_n: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -51,7 +55,6 @@ class Join:
 
     promise: Promise
     runs: int
-    off_n: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a diagnosis by the reduced model works on: a recording, the model of its device, and tasks on them."""
+"""The recording, the reduced model of its device, and tasks on them, of a diagnosis by that model."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ TRUST = 0.15  # of the prior's width about a run, within which a mechanism is se
 
 @dataclass(frozen=True)
 class Source:
-    """What a bench is opened from.
+    """The files and settings that a bench is opened from.
 
     recording : folder of a run's stage `recording`; model : file of the reduced model; base : priors of the
     base model; noise : bounds of the noise's parameters that the configuration states
@@ -120,10 +120,7 @@ class JointBench:
 
         That error changes from place to place by as much as it is, so it counts as known to one sd of itself.
         """
-        about = self._posterior(self._seen(names, (), run))
-        if off_n is None or about.model_error is None:
-            return about
-        return replace(about, model_error=replace(about.model_error, measured_n=off_n[None]))
+        return _with_error(self._posterior(self._seen(names, (), run)), off_n)
 
     def _run(self, names: Sequence[str], theta: Mapping[str, float], slopes: bool) -> FullRun | str:
         mechanisms, space = self.solved(names), self.space(names)
@@ -193,7 +190,7 @@ class JointBench:
             beside = task.promise
             names = with_one(beside.names, beside.name, self.known)
             start = {**self._neutral, **beside.theta, **self._searched(beside)}
-            return self._climbed(Climb(names, start, task.runs, task.off_n))
+            return self._climbed(Climb(names, start, task.runs, beside.off_n))
         return self._climbed(task)
 
     def _climbed(self, task: Climb) -> dict[str, Any]:
@@ -220,10 +217,11 @@ class JointBench:
 
     def _beside(self, task: Promise) -> tuple[LogPosterior, list[str]]:
         new = [name for name in with_one(task.names, task.name, self.known) if name not in task.names]
-        return self._posterior(self._seen(task.names, new, task.run)), new
+        about = self._posterior(self._seen(task.names, new, task.run))
+        return _with_error(about, np.array(task.off_n) if task.off_n else None), new
 
     def answered(self, task: Task, said: Mapping[str, Any]) -> object:
-        """What a search makes of an answer."""
+        """Returns an answer as a search reads it: a fit, nats, a force, evidences, or why there is none."""
         if "message" in said:
             return said["message"]
         if isinstance(task, Probe | FullProbe):
@@ -242,6 +240,13 @@ class JointBench:
         off_n = np.array(said["off_n"])
         about = self.local(said["fit"]["names"], run, off_n if off_n.any() else None)
         return JointFit(restored(said["fit"], about), run, said["runs"], said["settled"], off_n)
+
+
+def _with_error(about: LogPosterior, off_n: Array | None) -> LogPosterior:
+    """Returns the posterior with an error (m,) of the reduced model among those that it allows for."""
+    if off_n is None or about.model_error is None:
+        return about
+    return replace(about, model_error=replace(about.model_error, measured_n=off_n[None]))
 
 
 def as_json(found: JointFit) -> dict[str, Any]:
@@ -305,7 +310,7 @@ def asked(bench: JointBench, file: Path, workers: int) -> Iterator[Ask]:
 
 
 def searches_file(run_folder: Path, bench: JointBench) -> Path:
-    """Where answers to a bench's tasks are kept, by what they are of."""
+    """Returns the file in which answers to a bench's tasks are kept, by all that they depend on."""
     identity = [
         bayeskin.__version__, bench.source.seed, repr(bench.source.base), bench.source.noise,
         bench.model.hash, asdict(bench.binned), asdict(bench.motion),

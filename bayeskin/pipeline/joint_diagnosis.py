@@ -1,4 +1,4 @@
-"""What the model leaves out of a recording of any protocol and device, by the reduced model."""
+"""Diagnosis of a recording of any protocol and device by the reduced model."""
 
 from __future__ import annotations
 
@@ -216,7 +216,7 @@ def _shown(fit: Fit, located: Located, drawn: Resampled) -> Shown:
 
 
 def _checked(bench: JointBench, found: JointSearch, names: tuple[str, ...]) -> dict[str, Any]:
-    """What a run of the full model says of a set's fit."""
+    """Returns how far the reduced model and the recording are from a full run at a set's fit."""
     check, fit = found.checks.get(names), found.fits[names].fit
     if check is None or isinstance(check.full_n, str):
         return {"message": "no run was made" if check is None else check.full_n}

@@ -116,7 +116,7 @@ def own_files(run: Run) -> list[Path]:
 
 
 def _beside(run: Run, forward: str) -> str:
-    """Where a forward model is, from wherever it is called."""
+    """Returns the place of a forward model, as it is called from anywhere."""
     files = own_files(run)
     return f"{files[0]}:{forward.rpartition(':')[2]}" if files else forward
 

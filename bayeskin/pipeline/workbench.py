@@ -1,4 +1,4 @@
-"""What a diagnosis works on: a recording, surrogate and mechanisms, and the posteriors of sets of these."""
+"""The recording, surrogate and mechanisms of a diagnosis, and the posteriors of sets of mechanisms."""
 
 from __future__ import annotations
 
@@ -140,8 +140,10 @@ def opened(source: Path, reporter: Reporter, device: Path | None = None) -> Run:
 
 
 def calm_bins(folder: Path) -> tuple[BinnedForce, Jumps, PadMotion]:
-    """What the stage `recording` left in its folder: bins, whose noise is what is quick of it, what the
-    samples allow the force to jump by, and the protocol."""
+    """Returns bins with their quick noise alone, the jumps that the samples allow, and the protocol.
+
+    All are of the stage `recording`, from its folder.
+    """
     samples = storage.load(folder / "recording.h5", Recording)
     binned = storage.load(folder / "binned.h5", BinnedForce)
     quick = bin_recording(samples, binned.phases, binned.edges_s, analyse(samples, binned.phases, QUICK_S))
@@ -150,7 +152,7 @@ def calm_bins(folder: Path) -> tuple[BinnedForce, Jumps, PadMotion]:
 
 
 def workbench(run: Run) -> Workbench:
-    """Of a run whose stages up to `train` are done."""
+    """Returns the workbench of a run whose stages up to `train` are done."""
     binned, jumps, motion = calm_bins(run.folder / "recording")
     effects = effects_of(run) if run.config.model.observation == "reaction" else []
     learnt = {effect.mechanisms[0] for effect in effects if len(effect.mechanisms) == 1}
