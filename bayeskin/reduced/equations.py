@@ -16,10 +16,10 @@ from bayeskin.model.tissue import Bind, SurfaceTerm, TissueLaw
 from bayeskin.reduced import kernels
 from bayeskin.reduced.calls import address
 from bayeskin.reduced.operators import LinearParts, PointFields
+from bayeskin.reduced.tangents import Tangent, Tangents
 from bayeskin.types import Array, PadMotion
 
 SOLVER_TOLERANCE = 1e-5  # of the amplitude of displacements, and of the nominal force
-MOST_LONGER = 4.0  # times, a stage than that which a tangent was made for
 SurfaceUnit = Callable[[Problem], sp.csr_matrix]
 
 
@@ -108,6 +108,10 @@ def _flat(arrays: Sequence[Array]) -> Array:
     return np.concatenate([np.zeros(0), *(np.ravel(array) for array in arrays)])
 
 
+def _single(array: Array) -> np.ndarray:
+    return np.ascontiguousarray(array, dtype=np.float32)
+
+
 def packed(laws: Sequence[TissueLaw], points: int) -> kernels.Laws:
     """Laws as the compiled driver is given them."""
     par, widths = [len(law.par) for law in laws], [law.data.shape[1] for law in laws]
@@ -123,26 +127,6 @@ def packed(laws: Sequence[TissueLaw], points: int) -> kernels.Laws:
         np.array(widths, dtype=np.int64), points * starts(widths),
         np.array(memory, dtype=np.int64), points * starts(memory),
     )  # fmt: skip
-
-
-class Tangent:
-    """The inverse of the last tangent, with the force's row and the pads' column; corrected as solves go.
-
-    length_s : of the stage that it was made for, or None where there is none yet
-    """
-
-    def __init__(self, size: int) -> None:
-        self.inverse, self.force_row = np.zeros((size, size)), np.zeros(size)
-        self.by_pads = np.zeros(size + 1)
-        self.length_s: float | None = None
-
-    def serves(self, length_s: float) -> bool:
-        """Says whether it tells how far a stage of some length is from its solution.
-
-        A far longer stage drains what a short one does not, so its corrections of a short one are too small.
-        """
-        made_for_s = self.length_s
-        return made_for_s is not None and 1.0 / MOST_LONGER <= length_s / made_for_s <= MOST_LONGER
 
 
 class ReducedEquations:
@@ -168,12 +152,13 @@ class ReducedEquations:
         at, solid = space.at, run.solid
         self.units = units
         self.system = kernels.System(
-            at.gradient, at.pressure, at.slope, at.weight, solid.mu, solid.lam, solid.mobility,
-            solid.storage, np.tensordot(run.solid_by, units[0], 1), space.exact.coupling,
+            _single(at.gradient), _single(at.pressure), _single(at.slope), at.weight, solid.mu, solid.lam,
+            solid.mobility, solid.storage, np.tensordot(run.solid_by, units[0], 1), space.exact.coupling,
             np.tensordot(run.flow_by, units[1], 1),
         )  # fmt: skip
         self.packed = packed(run.laws, len(at.weight))
         self.tangent = Tangent(k + m - 2)
+        self._tangents = Tangents()
         self.spent = np.zeros(3, np.int64)  # iterations, residuals, tangents
         self.zero_n = 0.0
         self._nominal_n = nominal_force(solid, at.cutis, space.lengths, self.drive.largest_m)
@@ -232,7 +217,8 @@ class ReducedEquations:
             return None
         last = sources[-1][1]
         past = self._history(sources, length_s, time_s)
-        if not self.tangent.serves(length_s):
+        place = self._place(time_s, length_s)
+        if not self._tangents.take(place, self.tangent):
             self._renew(past, last.x)
 
         def first(pads_m: float) -> Solved | None:
@@ -245,12 +231,17 @@ class ReducedEquations:
         solved = self._series.solve(time_s, past.elapsed_s, last.lost, expected_m, first, again)
         if solved is None:
             return None
+        self._tangents.keep(place, self.tangent)
         ((x, force_n), lost), room = solved, self.room
         assert room is not None
         state = State(time_s, x, room.volume, room.at_pressure, (room.memory,), lost)
         history = State(last.time_s, last.x, past.volume, past.pressure, last.memory, last.lost)
         residual = np.array([0.0, 0.5 * (force_n + self.zero_n)])
         return Stage(state, length_s, past.elapsed_s, history, sources, residual)
+
+    def _place(self, time_s: float, length_s: float) -> tuple[float, float]:
+        """How far the pads are open in a stage, and its length: near ones have near tangents."""
+        return float(self.drive.motion.at(time_s)) / self.drive.largest_m, float(np.log(length_s))
 
     def _history(
         self, sources: tuple[tuple[float, State], ...], length_s: float, time_s: float
@@ -290,22 +281,18 @@ class ReducedEquations:
         """Makes the tangent anew for a stage, at the unknowns x."""
         t = self.tangent
         kernels.renew(self.system, self.packed, past, x, self.make_room(), t.inverse, t.force_row, t.by_pads)
-        t.length_s = past.length_s
         self.spent[2] += 1
 
     def _solve(self, past: kernels.History, guess: Array, pads_m: float) -> Solved | None:
         """The unknowns with the pads at `pads_m`, and the force beyond that at the start; None if none."""
-        t, room, x, tangents = self.tangent, self.make_room(), guess.copy(), self.spent[2]
+        t, room, x = self.tangent, self.make_room(), guess.copy()
         x[0], x[1] = pads_m, 0.0
         status, force_n = kernels.solve(
             self.system, self.packed, past, x, SOLVER_TOLERANCE, self._nominal_n, room, t.inverse,
             t.force_row, t.by_pads, self.spent,
         )  # fmt: skip
         if status != kernels.CONVERGED:
-            t.length_s = None
             return None
-        if self.spent[2] > tangents:
-            t.length_s = past.length_s
         self.room, self.past = room, past
         return x, float(force_n) - self.zero_n
 

@@ -31,7 +31,8 @@ class System(NamedTuple):
     """Modes and weights at n points, the base law's constants there, and what the points leave out.
 
     gradient (n, 9, k) : displacement gradients of the k = 2 + modes fields
-    pressure (n, m), slope (n, 3, m) : pressure modes and their gradients
+    pressure (n, m), slope (n, 3, m) : pressure modes and their gradients; all in single precision, which is
+        what a mode is known to
     weight (n,) [m^3]; mu, lam, mobility, storage (n,) : of the base law
     solid (k, k), coupling (k, m), flow (m, m) : added to the residual; flow is a rate
     """
@@ -241,33 +242,41 @@ def tangent(system, laws, past, room):
 
 @compiled
 def _assembled(system, past, stress_f, stress_p, content_f, content_p, flux_f, flux_g):
-    """The tangent from the laws' derivatives at the points."""
+    """The tangent from the laws' derivatives at the points, to the precision of the modes."""
     n, k, m = system.weight.shape[0], system.gradient.shape[2], system.pressure.shape[1]
-    solid, column, row = np.empty((n, 9, k)), np.empty((n, k)), np.empty((n, k))
-    turned, flow = np.empty((n, 3, k)), np.empty((n, 3, m))
-    stored = np.empty((n, m))
+    solid, column = np.zeros((9 * n, k), np.float32), np.zeros((n, k), np.float32)
+    row, turned = np.zeros((n, k), np.float32), np.zeros((3 * n, k), np.float32)
+    stored, flow = np.empty((n, m), np.float32), np.zeros((3 * n, m), np.float32)
     for q in range(n):
-        w, b = system.weight[q], system.gradient[q]
-        solid[q] = np.dot(w * stress_f[q], b)
-        turned[q] = np.dot(w * flux_f[q], b)
-        flow[q] = np.dot(w * flux_g[q], system.slope[q])
-        for c in range(k):
-            up = down = 0.0
+        w = system.weight[q]
+        for j in range(9):
+            one = system.gradient[q, j]
             for i in range(9):
-                up += stress_p[q, i] * b[i, c]
-                down += content_f[q, i] * b[i, c]
-            column[q, c], row[q, c] = w * up, w * down
+                _add_multiple(solid[9 * q + i], w * stress_f[q, i, j], one)
+            for i in range(3):
+                _add_multiple(turned[3 * q + i], w * flux_f[q, i, j], one)
+            _add_multiple(column[q], w * stress_p[q, j], one)
+            _add_multiple(row[q], w * content_f[q, j], one)
+        for j in range(3):
+            for i in range(3):
+                _add_multiple(flow[3 * q + i], w * flux_g[q, i, j], system.slope[q, j])
         for c in range(m):
             stored[q, c] = w * content_p[q] * system.pressure[q, c]
     gradient, slope = system.gradient.reshape(9 * n, k), system.slope.reshape(3 * n, m)
     out = np.empty((k + m, k + m))
-    out[:k, :k] = np.dot(gradient.T, solid.reshape(9 * n, k)) + system.solid
-    out[:k, k:] = np.dot(column.T, system.pressure) + system.coupling
-    out[k:, :k] = system.coupling.T
-    out[k:, :k] -= np.dot(system.pressure.T, row) + np.dot(slope.T, turned.reshape(3 * n, k))
+    out[:k, :k] = system.solid + np.dot(gradient.T, solid)
+    out[:k, k:] = system.coupling + np.dot(column.T, system.pressure)
+    out[k:, :k] = system.coupling.T - (np.dot(system.pressure.T, row) + np.dot(slope.T, turned))
     out[k:, k:] = past.length_s * system.flow
-    out[k:, k:] -= np.dot(system.pressure.T, stored) + np.dot(slope.T, flow.reshape(3 * n, m))
+    out[k:, k:] -= np.dot(system.pressure.T, stored) + np.dot(slope.T, flow)
     return out
+
+
+@compiled
+def _add_multiple(to, factor, values):
+    one = np.float32(factor)
+    for c in range(len(values)):
+        to[c] += one * values[c]
 
 
 @compiled
@@ -339,14 +348,14 @@ def solve(system, laws, past, x, tolerance, nominal_n, room, inverse, force_row,
             if damping < SMALLEST_DAMPING:
                 return INSIDE_OUT, 0.0
         if damping == 1.0:
-            _update(inverse, step, after[2:] - right[2:])
+            update(inverse, step, after[2:] - right[2:])
         free[:] = moved[2:]
         right[:] = after
     return SLOW, 0.0
 
 
 @compiled
-def _update(inverse, step, change):
+def update(inverse, step, change):
     """Broyden's rank-one correction of an inverse (his good method), in place."""
     answer = np.dot(inverse, change)
     row = np.dot(step, inverse)

@@ -1,13 +1,12 @@
 """Derivatives of a reduced run's force by any of its parameters: tangent sensitivities, all at once.
 
-Differentiating a solved stage R(x, history; theta) = 0 gives K dx = -dR/dtheta - dR/dhistory dhistory with
-the stage's own tangent K, whose inverse is at hand. The right-hand side is found by differences of what the
-laws answer at the points, one parameter a step further, at fixed kinematics; once dx is known, a second
-difference tells how J and the laws' memories change (`slopes.differentiate`). Steps in time are held.
+Differentiating a solved stage R(x, history; theta) = 0 gives K dx + dR/dtheta + dR/dhistory dhistory = 0. The
+left side is the difference of two residuals: with unknowns, parameter and history all a step further, and as
+they are. It is driven to zero from the derivatives of the stages before, by steps of the inverse that served
+the stage's own solve (`slopes.differentiate`); no tangent is made for it. Steps in time are held.
 
 A length of the tissue moves the nodes, and with them kinematics, weights and all that is integrated exactly.
-Its right-hand side is the difference of two residuals at the same unknowns, of the moved space and of the
-run's own.
+Its other residual is that of the moved space.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ import numpy as np
 from bayeskin.errors import InputError
 from bayeskin.geometry import LENGTHS
 from bayeskin.model.lagrangian import Stage, State, Step
+from bayeskin.model.newton import extrapolate
 from bayeskin.model.series import Memories, lost_slopes, memory_slopes, on_the_way, yielding
 from bayeskin.model.tissue import Bind
 from bayeskin.reduced import kernels, slopes
@@ -27,6 +27,10 @@ from bayeskin.reduced.equations import Bound, ReducedEquations, ReducedSpace, bo
 from bayeskin.types import Array, PadMotion
 
 STEP = 1e-6  # of a parameter's change: truncation 1e-6, rounding 1e-10
+PASSES_BY_LENGTH = 5
+# Derivatives below these are solved for to the accuracy of a stage's own solve, and no further: of the modes'
+# coefficients, which are of order one, and of the force, of its scale.
+LEAST_DISPLACEMENT, LEAST_FORCE = 0.1, 0.01
 REMEMBERED = 8  # states whose derivatives are kept; a step asks for three at most
 
 
@@ -74,6 +78,8 @@ class ReducedGradients:
         self._start = self._at_rest(changes.get("p_init", 0.0))
         self._known: dict[int, _Known] = {}
         self._zero_n = np.zeros(len(changes))
+        least = np.array([LEAST_DISPLACEMENT, LEAST_FORCE * equations.nominal_force()])
+        self._scale = np.repeat(least[:, None], len(self._varied.mu), axis=1)
         self.force_n: list[Array] = [np.zeros(len(changes))]
 
     def _at_rest(self, change: float) -> _Known:
@@ -112,28 +118,35 @@ class ReducedGradients:
         )  # fmt: skip
         past, room = eq.past_of(stage), eq.make_room()
         x, t = stage.state.x.copy(), eq.tangent
-        residual, pads_by = np.empty(len(x)), self._pads_by(stage.state.time_s, last.lost)
+        residual = np.empty(len(x))
         kernels.residual(eq.system, eq.packed, past, x, room, residual)
-        out = slopes.Slopes(*(np.empty_like(values) for values in last.slopes))
-        force = slopes.differentiate(
-            eq.system, eq.packed, past, x, room, self._varied, before, pads_by, t.inverse, t.force_row,
+        out = slopes.Slopes(self._ahead(stage), *(np.empty_like(values) for values in last.slopes[1:]))
+        out.x[:, 0], out.x[:, 1] = self._pads_by(stage.state.time_s, last.lost), 0.0
+        by_length = {i: out.x[i].copy() for i in self._moved}
+        force, tangents = slopes.differentiate(
+            eq.system, eq.packed, past, x, room, self._varied, before, self._scale, t.inverse, t.force_row,
             t.by_pads, out,
         )  # fmt: skip
-        for i in self._moved:
-            force[i] = self._by_length(i, past, x, residual, room, before, pads_by[i], out)
-        t.length_s = stage.length_s
-        eq.spent += (0, 1, 1)
+        for i, guess in by_length.items():
+            out.x[i] = guess
+            force[i] = self._by_length(i, past, x, residual, room, before, out)
+        eq.spent += (0, 1, tangents)
         if self._in_series:
             return self._less_lost(stage, last.lost, out, force)
         return _Known(stage.state, out, last.lost), force
 
+    def _ahead(self, stage: Stage) -> Array:
+        """A guess of the derivatives (r, k + m) at a stage's end, from those of the states that it knows."""
+        known = [(state.time_s, self._of(state).slopes.x) for _, state in stage.sources]
+        return extrapolate(known, stage.state.time_s)
+
     def _by_length(
         self, i: int, past: kernels.History, x: Array, residual: Array, room: kernels.Room,
-        before: slopes.Slopes, pads_by: float, out: slopes.Slopes,
+        before: slopes.Slopes, out: slopes.Slopes,
     ) -> float:  # fmt: skip
-        """Fills row i of `out`, the derivatives by a length, and returns the force's.
+        """Fills row i of `out`, the derivatives by a length from a guess of x's, and returns the force's.
 
-        residual, room : at the unknowns x; the tangent there is the last one made
+        residual, room : at the unknowns x
         """
         eq, moved, t = self._equations, self._moved[i], self._equations.tangent
         further, other = np.empty(len(x)), eq.make_room()
@@ -142,15 +155,15 @@ class ReducedGradients:
             past.memory + STEP * before.memory[i], past.displacement + STEP * before.x[i], past.length_s,
             past.elapsed_s, past.time_s,
         )  # fmt: skip
-        kernels.residual(moved.system, moved.packed, older, x, other, further)
-        right = (further - residual) / STEP
-        out.x[i, :2] = pads_by, 0.0
-        out.x[i, 2:] = -t.inverse @ (right[2:] + pads_by * t.by_pads[:-1])
-        kernels.residual(moved.system, moved.packed, older, x + STEP * out.x[i], other, further)
+        for _ in range(PASSES_BY_LENGTH):
+            kernels.residual(moved.system, moved.packed, older, x + STEP * out.x[i], other, further)
+            left = (further - residual) / STEP
+            step = -t.inverse @ left[2:]
+            out.x[i, 2:] += step
         out.volume[i] = (other.volume - room.volume) / STEP
         out.pressure[i] = (other.at_pressure - room.at_pressure) / STEP
         out.memory[i] = (other.memory - room.memory) / STEP
-        return float(2.0 * right[1] + t.force_row @ out.x[i, 2:] + pads_by * t.by_pads[-1])
+        return float(2.0 * left[1] + t.force_row @ step)
 
     def _pads_by(self, time_s: float, lost: Memories) -> Array:
         """Derivatives of the pads' displacement [m], with what was lost before; and their travel."""

@@ -8,8 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from bayeskin.model.assembly import compiled
-from bayeskin.reduced.kernels import History, Laws, Room, System, answer, renew
+from bayeskin.reduced.kernels import SLOW_CONTRACTION, History, Laws, Room, System, answer, renew, update
 from bayeskin.types import Array
+
+ENOUGH = 1e-3  # of the largest derivatives so far: steps below it end the solve
+MOST_PASSES = 12
 
 
 class Varied(NamedTuple):
@@ -42,24 +45,74 @@ class Slopes(NamedTuple):
 
 
 @compiled
-def differentiate(system, laws, past, x, room, varied, before, pads_by, inverse, force_row, by_pads, out):
-    """Fills `out`, the derivatives of a solved stage's end, and returns those of the force [N], (r,).
+def differentiate(system, laws, past, x, room, varied, before, scale, inverse, force_row, by_pads, out):
+    """Solves for `out`, derivatives of a solved stage's end; its x is a guess in which the pads' are right.
 
     room : as `solve` left it at x; before : derivatives of the history (x those of x*)
-    pads_by (r,) : of the pads' displacement
+    scale (2, r) : largest derivatives of the run so far, of displacements and of the force; kept up to date
+    inverse, force_row, by_pads : of a tangent near x, corrected by the steps and made anew where it contracts
+        badly
 
-    The tangent at x is made anew and left in inverse, force_row and by_pads.
+    Returns the derivatives of the force [N], (r,), corrected to first order by the last step, and the number
+    of tangents made.
     """
+    k, r = system.gradient.shape[2], len(out.x)
+    exact = _exact(system, past, x, varied, before)
+    step, change = np.zeros((r, out.x.shape[1] - 2)), np.empty((r, out.x.shape[1] - 2))
+    left, force = _left(system, laws, past, room, varied, before, exact, out), np.empty(r)
+    worst, tangents = np.inf, 0
+    for _ in range(MOST_PASSES):
+        worst_before, worst = worst, 0.0
+        for i in range(r):
+            step[i] = -np.dot(inverse, left[i, 2:])
+            more = np.dot(force_row, step[i])
+            force[i] = 2.0 * left[i, 1] + more
+            far = np.abs(step[i, : k - 2]).max()
+            scale[0, i] = max(scale[0, i], np.abs(out.x[i, :k]).max(), far)
+            scale[1, i] = max(scale[1, i], abs(force[i]))
+            if far > 0.0:
+                worst = max(worst, far / scale[0, i], abs(more) / scale[1, i])
+        if worst < ENOUGH:
+            break
+        if worst > SLOW_CONTRACTION * worst_before:
+            tangents += 1
+            renew(system, laws, past, x, room, inverse, force_row, by_pads)
+            worst = np.inf
+            for i in range(r):
+                step[i] = -np.dot(inverse, left[i, 2:])
+        out.x[:, 2:] += step
+        change[:] = left[:, 2:]
+        left = _left(system, laws, past, room, varied, before, exact, out)
+        change[:] = left[:, 2:] - change
+        for i in range(r):
+            update(inverse, step[i], change[i])
+    return force, tangents
+
+
+@compiled
+def _left(system, laws, past, room, varied, before, exact, out):
+    """Derivatives (r, k + m) of the residual by those in `out.x`; fills its other fields."""
     n, k, m = system.weight.shape[0], system.gradient.shape[2], system.pressure.shape[1]
-    r = len(pads_by)
-    step = varied.step
-    renew(system, laws, past, x, room, inverse, force_row, by_pads)
+    r, step = len(out.x), varied.step
+    gradient, slope = system.gradient.reshape(9 * n, k), system.slope.reshape(3 * n, m)
+    solid, fluid = out.x[:, :k].copy(), out.x[:, k:].copy()
+    single, single_fluid = solid.astype(np.float32), fluid.astype(np.float32)
+    deformed = np.dot(single, gradient.T)
+    pressed, sloped = np.dot(single_fluid, system.pressure.T), np.dot(single_fluid, slope.T)
     other = Room(
-        room.deformation.copy(), room.at_pressure.copy(), room.at_slope.copy(), np.empty((n, 3, 3)),
+        np.empty((n, 3, 3)), np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3)),
         np.empty(n), np.empty((n, 3)), np.empty(n), np.empty(len(room.memory)),
     )  # fmt: skip
-    stress, content, flux = np.empty((r, 9 * n)), np.empty((r, n)), np.empty((r, 3 * n))
+    stress = np.empty((r, 9 * n), np.float32)
+    content, flux = np.empty((r, n), np.float32), np.empty((r, 3 * n), np.float32)
     for i in range(r):
+        for q in range(n):
+            other.at_pressure[q] = room.at_pressure[q] + step * pressed[i, q]
+            for a in range(3):
+                other.at_slope[q, a] = room.at_slope[q, a] + step * sloped[i, 3 * q + a]
+                for b in range(3):
+                    moved = step * deformed[i, 9 * q + 3 * a + b]
+                    other.deformation[q, a, b] = room.deformation[q, a, b] + moved
         _answer_varied(system, laws, past, varied, before, i, other)
         for q in range(n):
             w = system.weight[q] / step
@@ -68,31 +121,14 @@ def differentiate(system, laws, past, x, room, varied, before, pads_by, inverse,
                 flux[i, 3 * q + a] = w * (other.flux[q, a] - room.flux[q, a])
                 for b in range(3):
                     stress[i, 9 * q + 3 * a + b] = w * (other.stress[q, a, b] - room.stress[q, a, b])
-    gradient, slope = system.gradient.reshape(9 * n, k), system.slope.reshape(3 * n, m)
-    right = np.empty((r, k + m))
-    right[:, :k] = np.dot(stress, gradient)
-    right[:, k:] = -(np.dot(content, system.pressure) + np.dot(flux, slope))
-    _add_exact(system, past, x, varied, before, right)
-    free = right[:, 2:] + np.outer(pads_by, by_pads[:-1])
-    out.x[:, 0] = pads_by
-    out.x[:, 1] = 0.0
-    out.x[:, 2:] = -np.dot(free, inverse.T)
-    force = 2.0 * right[:, 1] + np.dot(out.x[:, 2:].copy(), force_row) + pads_by * by_pads[-1]
-    deformed = np.dot(out.x[:, :k].copy(), gradient.T)
-    pressed, sloped = np.dot(out.x[:, k:].copy(), system.pressure.T), np.dot(out.x[:, k:].copy(), slope.T)
-    for i in range(r):
-        for q in range(n):
-            other.at_pressure[q] = room.at_pressure[q] + step * pressed[i, q]
-            for a in range(3):
-                other.at_slope[q, a] = room.at_slope[q, a] + step * sloped[i, 3 * q + a]
-                for b in range(3):
-                    change = step * deformed[i, 9 * q + 3 * a + b]
-                    other.deformation[q, a, b] = room.deformation[q, a, b] + change
-        _answer_varied(system, laws, past, varied, before, i, other)
+            out.pressure[i, q] = pressed[i, q]
         out.volume[i] = (other.volume - room.volume) / step
         out.memory[i] = (other.memory - room.memory) / step
-        out.pressure[i] = pressed[i]
-    return force
+    left = exact.copy()
+    left[:, :k] += np.dot(stress, gradient) + np.dot(solid, system.solid.T) + np.dot(fluid, system.coupling.T)
+    left[:, k:] += np.dot(solid, system.coupling) + past.length_s * np.dot(fluid, system.flow.T)
+    left[:, k:] -= np.dot(content, system.pressure) + np.dot(flux, slope)
+    return left
 
 
 @compiled
@@ -115,16 +151,18 @@ def _answer_varied(system, laws, past, varied, before, i, other):
 
 
 @compiled
-def _add_exact(system, past, x, varied, before, right):
-    """Adds the derivatives of the exactly integrated parts to right (r, k + m)."""
+def _exact(system, past, x, varied, before):
+    """Derivatives (r, k + m) of the exactly integrated parts at fixed x."""
     k = system.gradient.shape[2]
     force, fluid = x[:k].copy(), x[k:].copy()
+    out = np.zeros((varied.solid_by.shape[0], len(x)))
     for s in range(varied.solid_units.shape[0]):
         answer = np.dot(varied.solid_units[s], force)
-        for i in range(right.shape[0]):
-            right[i, :k] += varied.solid_by[i, s] * answer
+        for i in range(out.shape[0]):
+            out[i, :k] += varied.solid_by[i, s] * answer
     for t in range(varied.flow_units.shape[0]):
         answer = np.dot(varied.flow_units[t], fluid)
-        for i in range(right.shape[0]):
-            right[i, k:] += past.length_s * varied.flow_by[i, t] * answer
-    right[:, k:] -= np.dot(before.x[:, :k].copy(), system.coupling)
+        for i in range(out.shape[0]):
+            out[i, k:] += past.length_s * varied.flow_by[i, t] * answer
+    out[:, k:] -= np.dot(before.x[:, :k].copy(), system.coupling)
+    return out
