@@ -294,6 +294,9 @@ def renew(system, laws, past, x, room, inverse, force_row, by_pads):
     for i in range(len(scale)):
         for j in range(len(scale)):
             free[i, j] *= scale[i] * scale[j]
+    if not np.all(np.isfinite(free)):  # a law beyond all measure: the solve fails at its next step
+        inverse[:] = np.nan
+        return
     inverse[:] = np.linalg.inv(free)
     for i in range(len(scale)):
         for j in range(len(scale)):
