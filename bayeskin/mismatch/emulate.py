@@ -28,8 +28,9 @@ from bayeskin.types import Array, Design, ParameterSpace, Surrogate
 MOST = 1500  # draws, among which a wave's points are chosen
 BEFORE = (120,)  # steps of the ensembles whose draws a further wave begins with
 
-# The skin's force (m,) with the set at points (n, d), or why a run failed.
-Forces = Callable[[Array], Sequence[Array | str]]
+# The skin's force (m,) with the set at points (n, d) by the forward model, and at the first few by the full
+# model in whose place that is; or why a run failed.
+Forces = Callable[[Array, int], tuple[Sequence[Array | str], Sequence[Array | str]]]
 Learn = Callable[[Design], Surrogate]  # a surrogate of a design's force, with its error
 
 
@@ -68,12 +69,11 @@ class Emulated:
 
 
 def emulate(
-    found: JointFit, forces: Forces, full: Forces, learn: Learn, noise_n: float, seed: int,
+    found: JointFit, forces: Forces, learn: Learn, noise_n: float, seed: int,
     settings: EmulationSettings | None = None,
 ) -> Emulated | str:  # fmt: skip
     """Returns the posterior of a set about its fit; the message of a run where all of the first wave fail.
 
-    forces, full : of the forward model, and of the full model in whose place it is
     noise_n : sd of a bin's mean
     """
     settings, rng = settings or EmulationSettings(), np.random.default_rng([seed, 11])
@@ -83,16 +83,14 @@ def emulate(
     near = replace(found.fit, log_posterior=within(about, vector, settings.first))
     drawn, error_n = resample(near, None, seed, BEFORE, 0), None
     off_n = found.off_n
-    if off_n.any():
-        points = _spread(space, drawn.draws[:, : space.dim], found.run.theta[None], settings.checks, rng)
-        off_n, about = _with_errors(about, found.off_n, forces(points), full(points))
     design = _none(space, about.surrogate.edges_s)
     emulated: Emulated | None = None
     for wave in range(settings.waves):
         points = _spread(space, drawn.draws[:, : space.dim], design.theta, settings.points, rng)
         if wave == 0:
-            points = np.concatenate([found.run.theta[None], points[1:]])
-        answers = forces(points)
+            points = np.concatenate([points[:-1], found.run.theta[None]])
+        answers, full = forces(points, settings.checks if wave == 0 and off_n.any() else 0)
+        off_n, about = _with_errors(about, off_n, answers, full)
         made = [answer + off_n for answer in answers if not isinstance(answer, str)]
         ran = [i for i, answer in enumerate(answers) if not isinstance(answer, str)]
         if not ran:
@@ -119,9 +117,9 @@ def _with_errors(
 ) -> tuple[Array, LogPosterior]:
     """The forward model's mean error (m,) over some places, and the posterior that allows for the rest of it.
 
-    known_n (m,) : at the first place; forward, full : forces at the others
+    known_n (m,) : at the first place; forward, full : forces at others, of the latter at the first of these
     """
-    more = [b - a for a, b in zip(forward, full, strict=True)
+    more = [b - a for a, b in zip(forward, full, strict=False)
             if not isinstance(a, str) and not isinstance(b, str)]  # fmt: skip
     if not more or about.model_error is None:
         return known_n, about

@@ -50,6 +50,7 @@ class SearchSettings:
     gain : nats of weight, less is no reason to go on; most : mechanisms of a set
     compared : sets that are checked by the full model; checks : rounds of them
     exact : error of the forward model, RMS over bins, over that of the noise, that needs no correction
+    alike_by : of the prior's width: fits whose runs differ by less share a check, and have one maximum
     """
 
     skins: int = 32
@@ -73,6 +74,7 @@ class SearchSettings:
     compared: int = 6
     checks: int = 4
     exact: float = 0.3
+    alike_by: float = 0.1
 
 
 Tell = Callable[[str], None]
@@ -181,7 +183,7 @@ class _Searcher:
         these would pass for further mechanisms."""
         for _ in range(self._settings.checks):
             best = self.found.best
-            if not self._solved(best.fit.names) or self._is_checked(best):
+            if not self._solved(best.fit.names) or self._is_checked_nearby(best):
                 break
             self._check([best])
         return self.found.best
@@ -211,7 +213,8 @@ class _Searcher:
                 self._from_other_skins(one)
             self._check([
                 now for one in hopeful
-                if self._solved(one.fit.names) and not self._is_checked(now := self.found.fits[one.fit.names])
+                if self._solved(one.fit.names)
+                and not self._is_checked_nearby(now := self.found.fits[one.fit.names])
             ])  # fmt: skip
             self._leaner(self.found.best)
 
@@ -241,13 +244,24 @@ class _Searcher:
             one for one in order
             if set(one.fit.names) < set(best.fit.names) and self._solved(one.fit.names) == solved
         ]  # fmt: skip
-        found = {one.fit.names: one for one in (*near, *parts) if one.fit.names not in self.found.checks}
-        return list(found.values() if self._is_checked(best) else {best.fit.names: best, **found}.values())
+        found = {one.fit.names: one for one in (*near, *parts) if not self._is_checked_nearby(one)}
+        check = self.found.checks.get(best.fit.names)
+        is_checked = check is not None and np.array_equal(check.theta, best.run.theta)
+        return list(found.values() if is_checked else {best.fit.names: best, **found}.values())
 
-    def _is_checked(self, one: JointFit) -> bool:
-        """Returns whether the full model was run where a fit is."""
-        check = self.found.checks.get(one.fit.names)
-        return check is not None and np.array_equal(check.theta, one.run.theta)
+    def _is_checked_nearby(self, one: JointFit) -> bool:
+        """Returns whether the full model was run near a fit, with the same mechanisms of the tissue."""
+        solved = self._solved(one.fit.names)
+        return any(
+            self._solved(names) == solved and self._is_alike(one, check.theta)
+            for names, check in self.found.checks.items()
+        )
+
+    def _is_alike(self, one: JointFit, theta: Array) -> bool:
+        """Returns whether a fit's run is near other values of the parameters that the model solves."""
+        space = innermost(one.fit.log_posterior.surrogate).space
+        apart = space.to_unit(one.run.theta) - space.to_unit(theta)
+        return bool(np.abs(apart).max() <= self._settings.alike_by)
 
     def _check(self, sets: Sequence[JointFit]) -> None:
         """Runs the full model at fits, and fits those again at which the reduced model is too far off."""
@@ -473,9 +487,15 @@ class _Searcher:
         for again in self._ask([
             Climb(one.fit.names, one.fit.theta, settings.runs - settings.first, _added(one))
             for i, one in enumerate(fits)
-            if not one.settled and (i < settings.best or self._gained(self.found.best, one) <= behind)
+            if not one.settled and not self._is_known(one)
+            and (i < settings.best or self._gained(self.found.best, one) <= behind)
         ]):  # fmt: skip
             self.found.add(again)
+
+    def _is_known(self, one: JointFit) -> bool:
+        """Returns whether another fit of the same set is near and likelier: both climb to one maximum."""
+        best = self.found.fits.get(one.fit.names)
+        return best is not None and best is not one and self._is_alike(one, best.run.theta)
 
     def _leaner(self, current: JointFit) -> None:
         """Fits the sets with one mechanism fewer that were not fitted yet."""

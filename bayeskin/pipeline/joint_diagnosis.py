@@ -26,7 +26,7 @@ from bayeskin.mismatch.joint_search import JointSearch, noise_of, search_jointly
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import Made, Search
-from bayeskin.mismatch.tasks import Ask, FullProbe, Probe, Weigh
+from bayeskin.mismatch.tasks import Ask, FullProbe, Probe, Task, Weigh
 from bayeskin.pipeline.diagnosis_outputs import Found, Shown, candidates, draw, unexplained, window
 from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
 from bayeskin.pipeline.folder import write_json
@@ -148,13 +148,14 @@ def _emulated(bench: JointBench, ask: Ask, found: JointFit, seed: int) -> Emulat
     """A set's posterior from reduced runs where it is; about the fit's run where none of them finishes."""
     names, space = found.fit.names, bench.space(found.fit.names)
 
-    def asked_at(kind: type[Probe | FullProbe], points: Array) -> list[Any]:
-        return ask([kind(names, dict(zip(space.names, map(float, row), strict=True))) for row in points])
+    def forces(points: Array, count: int) -> tuple[list[Any], list[Any]]:
+        values = [dict(zip(space.names, map(float, row), strict=True)) for row in points]
+        tasks: list[Task] = [FullProbe(names, one) for one in values[:count]]
+        answers: list[Any] = ask([*tasks, *(Probe(names, one) for one in values)])
+        return answers[count:], answers[:count]
 
-    emulated = emulate(
-        found, partial(asked_at, Probe), partial(asked_at, FullProbe), partial(_learnt, seed=seed),
-        noise_of(bench.binned), seed,
-    )  # fmt: skip
+    learn = partial(_learnt, seed=seed)
+    emulated = emulate(found, forces, learn, noise_of(bench.binned), seed)
     if isinstance(emulated, str):
         return Emulated(found.fit, _drawn(found.fit, seed), 0, None, False)
     return emulated
