@@ -178,7 +178,7 @@ def test_relaxed_skin_that_is_pushed_together_is_near_folding(model) -> None:
     assert soft.status == "ok"
     assert found.stats["stiffness_left"] < 0.4 < soft.stats["stiffness_left"]
     nearer = simulate_reduced(model, back, theta, of(["solid-viscoelasticity"]), least_stiffness=0.0)
-    assert nearer.status == "ok"
+    assert nearer.status == "ok", nearer.message
     assert nearer.stats["stiffness_left"] == found.stats["stiffness_left"]
 
 

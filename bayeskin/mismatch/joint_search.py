@@ -244,7 +244,10 @@ class _Searcher:
             one for one in order
             if set(one.fit.names) < set(best.fit.names) and self._solved(one.fit.names) == solved
         ]  # fmt: skip
-        found = {one.fit.names: one for one in (*near, *parts) if not self._is_checked_nearby(one)}
+        found = {
+            one.fit.names: one for one in (*near, *parts)
+            if one.fit.names not in self.found.checks and not self._is_checked_nearby(one)
+        }  # fmt: skip
         check = self.found.checks.get(best.fit.names)
         is_checked = check is not None and np.array_equal(check.theta, best.run.theta)
         return list(found.values() if is_checked else {best.fit.names: best, **found}.values())

@@ -108,10 +108,6 @@ def _flat(arrays: Sequence[Array]) -> Array:
     return np.concatenate([np.zeros(0), *(np.ravel(array) for array in arrays)])
 
 
-def _single(array: Array) -> np.ndarray:
-    return np.ascontiguousarray(array, dtype=np.float32)
-
-
 def packed(laws: Sequence[TissueLaw], points: int) -> kernels.Laws:
     """Laws as the compiled driver is given them."""
     par, widths = [len(law.par) for law in laws], [law.data.shape[1] for law in laws]
@@ -152,8 +148,8 @@ class ReducedEquations:
         at, solid = space.at, run.solid
         self.units = units
         self.system = kernels.System(
-            _single(at.gradient), _single(at.pressure), _single(at.slope), at.weight, solid.mu, solid.lam,
-            solid.mobility, solid.storage, np.tensordot(run.solid_by, units[0], 1), space.exact.coupling,
+            at.gradient, at.pressure, at.slope, at.weight, solid.mu, solid.lam, solid.mobility,
+            solid.storage, np.tensordot(run.solid_by, units[0], 1), space.exact.coupling,
             np.tensordot(run.flow_by, units[1], 1),
         )  # fmt: skip
         self.packed = packed(run.laws, len(at.weight))

@@ -23,7 +23,7 @@ from bayeskin.reduced.library import Library
 from bayeskin.reduced.operators import Basis, Rule, fields_at, linear_parts, whole_linear_parts
 from bayeskin.types import Array
 
-MOST_SPACES = 8  # kept
+MOST_SPACES = 32  # kept
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,8 @@ class Basis:
 class PointFields:
     """Gradients and values of the fields of a basis at n quadrature points, with their weights.
 
-    gradient (n, 9, k), slope (n, 3, m), pressure (n, m), weight (n,); cutis (n,) bool; points_m (3, n)
+    gradient (n, 9, k), slope (n, 3, m), pressure (n, m) : in single precision, to which modes are known
+    weight (n,); cutis (n,) bool; points_m (3, n)
     """
 
     gradient: Array
@@ -93,16 +94,16 @@ class LinearParts:
 def linear_parts(at: PointFields) -> LinearParts:
     """Integrates the base law's linear part at rest at weighted points."""
     shear, bulk, flow = [], [], []
-    divergence = at.gradient[:, 0] + at.gradient[:, 4] + at.gradient[:, 8]
+    divergence, weight = at.gradient[:, 0] + at.gradient[:, 4] + at.gradient[:, 8], _single(at.weight)
     for layer in (at.cutis, ~at.cutis):
-        b, w, g, trace = at.gradient[layer], at.weight[layer], at.slope[layer], divergence[layer]
+        b, w, g, trace = at.gradient[layer], weight[layer], at.slope[layer], divergence[layer]
         (n, _, k), m = b.shape, g.shape[2]
         both = b + b.reshape(n, 3, 3, k).transpose(0, 2, 1, 3).reshape(n, 9, k)
         shear.append(b.reshape(n * 9, k).T @ (both * w[:, None, None]).reshape(n * 9, k))
         bulk.append(trace.T @ (trace * w[:, None]))
         flow.append(g.reshape(n * 3, m).T @ (g * w[:, None, None]).reshape(n * 3, m))
-    coupling = -(divergence * at.weight[:, None]).T @ at.pressure
-    return LinearParts(np.array(shear), np.array(bulk), np.array(flow), coupling)
+    coupling = -(divergence * weight[:, None]).T @ at.pressure
+    return LinearParts(*(np.array(part, dtype=float) for part in (shear, bulk, flow, coupling)))
 
 
 def point_fields(problem: Problem, basis: Basis, cells: np.ndarray | slice = slice(None)) -> PointFields:
@@ -111,18 +112,22 @@ def point_fields(problem: Problem, basis: Basis, cells: np.ndarray | slice = sli
     fields, nodes_u, nodes_p = basis.fields, s.nodes_u[cells], s.nodes_p[cells]
     (e, q), sites = s.weight[cells].shape, problem.sites
     numbers = (np.arange(len(s.weight))[cells, None] * q + np.arange(q)).ravel()
-    nodal = fields.T.reshape(-1, 3, len(fields))[nodes_u]  # (e, a, 3, k)
-    gradient = np.einsum("eqja,eaik->eqijk", s.grad_u[cells], nodal, optimize=True)
-    corners = basis.pressure.T[nodes_p]  # (e, b, m)
-    slope = np.einsum("eqjb,ebm->eqjm", s.grad_p[cells], corners, optimize=True)
+    nodal = _single(fields.T).reshape(-1, 3, len(fields))[nodes_u]  # (e, a, 3, k)
+    gradient = np.einsum("eqja,eaik->eqijk", _single(s.grad_u[cells]), nodal, optimize=True)
+    corners = _single(basis.pressure.T)[nodes_p]  # (e, b, m)
+    slope = np.einsum("eqjb,ebm->eqjm", _single(s.grad_p[cells]), corners, optimize=True)
     return PointFields(
-        gradient=np.ascontiguousarray(gradient.reshape(e * q, 9, -1)),
-        slope=np.ascontiguousarray(slope.reshape(e * q, 3, -1)),
-        pressure=np.ascontiguousarray(np.einsum("qb,ebm->eqm", s.value_p, corners).reshape(e * q, -1)),
+        gradient=gradient.reshape(e * q, 9, -1),
+        slope=slope.reshape(e * q, 3, -1),
+        pressure=np.einsum("qb,ebm->eqm", _single(s.value_p), corners, optimize=True).reshape(e * q, -1),
         weight=s.weight[cells].ravel(),
         cutis=sites.cutis[numbers],
         points_m=np.ascontiguousarray(sites.points_m[:, numbers]),
     )
+
+
+def _single(values: Array) -> np.ndarray:
+    return np.asarray(values, dtype=np.float32)
 
 
 def fields_at(problem: Problem, basis: Basis, rule: Rule) -> PointFields:

@@ -30,7 +30,7 @@ STEP = 1e-6  # of a parameter's change: truncation 1e-6, rounding 1e-10
 PASSES_BY_LENGTH = 5
 # Derivatives below these are solved for to the accuracy of a stage's own solve, and no further: of the modes'
 # coefficients, which are of order one, and of the force, of its scale.
-LEAST_DISPLACEMENT, LEAST_FORCE = 0.1, 0.01
+LEAST_DISPLACEMENT, LEAST_FORCE = 0.03, 0.003
 REMEMBERED = 8  # states whose derivatives are kept; a step asks for three at most
 
 
