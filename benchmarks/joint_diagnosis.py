@@ -1,12 +1,14 @@
-"""What a diagnosis by the reduced model makes of recordings of the development sets, whose keys are known.
+"""What diagnoses by the reduced model make of recordings whose keys are known, beside the stored verdicts.
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/joint_diagnosis.py --folder F [development/009 ...]
 
-Shipped surrogates know the protocol of these recordings. Here a configuration of each, with
-`coarse = "reduced"`, has the reduced model solve all mechanisms of a set together. Prints what was concealed
-and how large it is (in noise floors), what is named, the probability that nothing is missing, how many of the
-skin's and the effect's parameters lie in their 90 % intervals, RMS residuals before and after, by how much
-the reduced model is off at the end, and seconds. A second start with the same folder goes on.
+The verdicts that stand beside these recordings come from effects learnt one by one. Here a configuration of
+each recording, with `coarse = "reduced"`, has the reduced model solve all mechanisms of a set together. What
+it says is kept in `benchmarks/results/joint`, so that a second start goes on; `--part 1/2` takes every second
+recording, for two processes side by side. Prints a row for each recording: what was concealed and how large
+it is (in noise floors), what is named, the probability that nothing is missing, how many of the skin's and
+the effect's parameters lie in their 90 % intervals, RMS residuals before and after, by how much the reduced
+model is off at the end, and seconds. Then both scoreboards of the same recordings.
 """
 
 from __future__ import annotations
@@ -14,40 +16,77 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rows
 
 from bayeskin.pipeline.diagnosis import diagnose
+from bayeskin.proof.score import score
 
 DATA = Path(__file__).parent.parent / "data"
+KEPT = Path(__file__).parent / "results" / "joint"
 CONFIG = """name = "{name}"
 [recording]
 file = "{name}.h5"
 [design]
 coarse = "reduced"
-workers = 2
+workers = {workers}
 """
-CASES = ("001", "002", "004", "009", "016", "018", "022", "026", "041", "054")
 HEADER = (
     "recording", "concealed", "size [floors]", "named (probability)", "nothing", "skin inside",
     "effect inside", "RMS residual [mN]", "reduced model off by [mN]", "seconds",
 )  # fmt: skip
+SHARES = {
+    "false alarms": ("false_alarms",),
+    "clear effects named": ("named", "clear"),
+    "clear effects named, up to look-alikes": ("named_up_to_look_alikes", "clear"),
+    "smaller effects named, up to look-alikes": ("named_up_to_look_alikes", "below"),
+    "names that are there": ("named_mechanisms_there",),
+    "unknown where clear effects are outside": ("unknown_outside", "clear"),
+    "clear effects' parameters in 90 % intervals": ("effect_in_interval", "clear"),
+    "skin's parameters beside them in 90 % intervals": ("base_in_interval", "clear"),
+    "skin's parameters where nothing is concealed": ("base_in_interval_nothing",),
+}
 
 
-def row(case: str, folder: Path) -> list[str]:
-    """The table's row of one recording, such as "development/009"."""
+def answered(case: str, folder: Path, workers: int) -> dict[str, Any]:
+    """What is said of one recording, such as "development/009"; from where it is kept, if it is."""
     which, number = case.split("/")
-    name = f"{which}-{number}"
+    kept, name = KEPT / which / f"{number}.json", f"{which}-{number}"
+    if kept.exists():
+        return dict(json.loads(kept.read_text()))
     config = folder / f"{name}.toml"
     if not config.exists():
         shutil.copy(DATA / which / "recordings" / f"{number}.h5", folder / f"{name}.h5")
-        config.write_text(CONFIG.format(name=name))
+        config.write_text(CONFIG.format(name=name, workers=workers))
     said = diagnose(config, rows.Log())
-    key: dict[str, Any] = json.loads((DATA / which / "seals" / f"{number}.json").read_text())
-    values, fit = said["fit"]["after"]["theta"], said["fit"]
-    full = said["full_model"]
+    said = {key: value for key, value in said.items() if key not in ("text", "folder", "figures")}
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    kept.write_text(json.dumps(said) + "\n")
+    return said
+
+
+def key_of(case: str) -> dict[str, Any]:
+    """What is concealed in a recording."""
+    which, number = case.split("/")
+    return dict(json.loads((DATA / which / "seals" / f"{number}.json").read_text()))
+
+
+def stored(case: str) -> dict[str, Any]:
+    """The verdict that stands beside a recording."""
+    which, number = case.split("/")
+    return dict(json.loads((DATA / which / "verdicts" / f"{number}.json").read_text())["answer"])
+
+
+def row(case: str, said: Mapping[str, Any]) -> list[str]:
+    """The table's row of one recording."""
+    key = key_of(case)
+    if "fit" not in said:
+        return [case, key["label"], f"{key['size']:.1f}", f"failed: {said['message']}", *[""] * 6]
+    values, fit, full = said["fit"]["after"]["theta"], said["fit"], said["full_model"]
     named = [f"{one['name']} ({one['probability']:.2f})" for one in said["mechanisms"]]
     return [
         case, key["label"], f"{key['size']:.1f}",
@@ -58,27 +97,69 @@ def row(case: str, folder: Path) -> list[str]:
     ]  # fmt: skip
 
 
-def _inside(truth: dict[str, float], values: dict[str, Any]) -> str:
+def _inside(truth: Mapping[str, float], values: Mapping[str, Any]) -> str:
     """How many of the true values lie in their 90 % intervals, of those that were fitted."""
     known = {name: value for name, value in truth.items() if name in values and name != "p_init"}
     ends = {name: values[name]["interval90"] for name in known}
     return f"{sum(ends[n][0] <= v <= ends[n][1] for n, v in known.items())} of {len(known)}"
 
 
+def scoreboard(said: Mapping[str, Mapping[str, Any]]) -> str:
+    """Both scoreboards of recordings, side by side; times are those by the reduced model."""
+    keys = {case: key_of(case) for case in said}
+    judged = {case: one if "verdict" in one else {"verdict": "failed"} for case, one in said.items()}
+    boards = score(keys, {case: stored(case) for case in said}), score(keys, judged)
+    table = [[what, *(_share(board, path) for board in boards)] for what, path in SHARES.items()]
+    seconds = [one["seconds"] for one in said.values() if "seconds" in one]
+    if seconds:
+        table.append(
+            ["seconds, median and 95 %", "", "{:.0f}, {:.0f}".format(*np.quantile(seconds, (0.5, 0.95)))]
+        )
+    header = [f"{len(said)} recordings", "effects learnt one by one", "all solved together"]
+    return rows.markdown(header, table)
+
+
+def _share(board: Mapping[str, Any], path: tuple[str, ...]) -> str:
+    found: Any = board
+    for key in path:
+        found = found[key]
+    if not found["of"]:
+        return "none"
+    return f"{found['hits']} of {found['of']} ({found['low']:.2f} to {found['high']:.2f})"
+
+
+def cases_of(sets: list[str], part: str) -> list[str]:
+    """Recordings of sets, every n-th of them from the k-th on for "k/n"."""
+    number, count = (int(one) for one in part.split("/"))
+    found = [
+        f"{one}/{path.stem}" for one in sets for path in sorted((DATA / one / "recordings").glob("*.h5"))
+    ]
+    return found[number - 1 :: count]
+
+
 def main() -> None:
-    """Prints the table."""
+    """Prints the table and the scoreboards."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--folder", type=Path, required=True, help="where diagnoses stay")
-    parser.add_argument("cases", nargs="*", default=[f"development/{number}" for number in CASES])
+    parser.add_argument("--folder", type=Path, required=True, help="where runs stay")
+    parser.add_argument("--sets", nargs="+", default=["development"], help="whose recordings are diagnosed")
+    parser.add_argument("--part", default="1/1", help="k/n: every n-th recording, from the k-th on")
+    parser.add_argument("--workers", type=int, default=2, help="processes of a diagnosis")
+    parser.add_argument("--kept", action="store_true", help="only what is kept, nothing new")
+    parser.add_argument("cases", nargs="*", help="such as development/009, instead of whole sets")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
-    table = list[list[str]]()
-    for case in options.cases:
-        table.append(row(case, options.folder))
+    cases = options.cases or cases_of(options.sets, options.part)
+    if options.kept:
+        cases = [case for case in cases if (KEPT / f"{case}.json").exists()]
+    said, table = dict[str, dict[str, Any]](), list[list[str]]()
+    for case in cases:
+        said[case] = answered(case, options.folder, options.workers)
+        table.append(row(case, said[case]))
         rows.say(" | ".join(table[-1]))
     print(rows.markdown(HEADER, table))
+    print(scoreboard(said))
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ class EmulationSettings:
     """Settings of an emulation.
 
     checks : runs of the full model beside that at the fit, where the forward model's error matters
-    points, waves : runs of a wave, and how many waves at most
+    points, more, waves : runs of the first wave, of each further one, and how many waves at most
     first : of the prior's width on either side of the fit's run, from where the first points are drawn
     sure : sd of the emulator, RMS over bins, over the noise of a bin, up to which it is believed
     enough : RMS error of the emulator at fresh runs, over the noise of a bin, with which it is done
@@ -47,7 +47,8 @@ class EmulationSettings:
 
     checks: int = 3
     points: int = 30
-    waves: int = 4
+    more: int = 20
+    waves: int = 5
     first: float = 0.5
     sure: float = 2.0
     enough: float = 0.2
@@ -86,7 +87,8 @@ def emulate(
     design = _none(space, about.surrogate.edges_s)
     emulated: Emulated | None = None
     for wave in range(settings.waves):
-        points = _spread(space, drawn.draws[:, : space.dim], design.theta, settings.points, rng)
+        count = settings.more if wave else settings.points
+        points = _spread(space, drawn.draws[:, : space.dim], design.theta, count, rng)
         if wave == 0:
             points = np.concatenate([points[:-1], found.run.theta[None]])
         answers, full = forces(points, settings.checks if wave == 0 and off_n.any() else 0)

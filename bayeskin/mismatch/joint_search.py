@@ -47,6 +47,7 @@ class SearchSettings:
     astray : nats of weight gained, from which on a set may have led the smaller one to another skin
     near, alike : share of the best gain from which on sets are fitted from other skins; how many at most
     others, tried : skins that a set is run with, and how many of them it is fitted from
+    left : RMS residual over the noise's, from which on that is done
     gain : nats of weight, less is no reason to go on; most : mechanisms of a set
     compared : sets that are checked by the full model; checks : rounds of them
     exact : error of the forward model, RMS over bins, over that of the noise, that needs no correction
@@ -69,6 +70,7 @@ class SearchSettings:
     alike: int = 3
     others: int = 16
     tried: int = 2
+    left: float = 1.1
     gain: float = 1.0
     most: int = 6
     compared: int = 6
@@ -209,8 +211,10 @@ class _Searcher:
                 Climb(one.fit.names, theta, self._settings.first, _added(one))
                 for one, theta in starts
             ]))  # fmt: skip
-            for one in hopeful[:1]:
-                self._from_other_skins(one)
+            best = self.found.fits[hopeful[0].fit.names] if hopeful else current
+            left_n = self._rms(self._binned.force_n - best.fit.force_n)
+            if left_n > self._settings.left * noise_of(self._binned):
+                self._from_other_skins(best)
             self._check([
                 now for one in hopeful
                 if self._solved(one.fit.names)
