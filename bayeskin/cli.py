@@ -258,9 +258,7 @@ def run(config: Path, scheduler: str | None, as_json: bool) -> None:
 
 @cli.command(short_help="What the model leaves out: where, which physics.")
 @click.argument("source", type=click.Path(path_type=Path))
-@click.option(
-    "--device", type=click.Path(path_type=Path), metavar="FILE", help="The device that made a recording."
-)
+@a_device
 @as_json
 def diagnose(source: Path, device: Path | None, as_json: bool) -> None:
     """What the model leaves out of a recording: where, which physics, how much better.
@@ -286,26 +284,29 @@ def diagnose(source: Path, device: Path | None, as_json: bool) -> None:
     _answer(document, as_json)
 
 
-@cli.command()
+@cli.command(short_help="Which further test would tell look-alikes apart.")
 @click.argument("source", type=click.Path(path_type=Path))
+@a_device
 @as_json
-def experiment(source: Path, as_json: bool) -> None:
-    """Which further test would tell look-alikes apart.
+def experiment(source: Path, device: Path | None, as_json: bool) -> None:
+    """Which further test would tell look-alikes apart, and the one to run next.
 
     SOURCE as for `bayeskin diagnose`, which is run first where that is not done; the reaction only, since no
     other protocol has the article's observation. The set that explains the recording best and those with
-    look-alikes in its place are taken as equally probable; draws of their posteriors are run on nine
-    protocols, variations of the recording's own, and the expected information about which is true is
-    computed from the forces.
+    look-alikes in its place are taken as equally probable. The reduced model of the device runs draws of
+    their posteriors in other tests, and the expected information about which is true, in bits, is computed
+    from the forces. First come nine variations of the recording's own test, then changes of those that tell
+    most, within the displacements and speeds that the reduced model knows.
 
     \b
     Example:
       bayeskin experiment runs/healthy-skin.toml
+      bayeskin experiment first.h5 --device device.toml
     """
     from bayeskin.pipeline import experiment
 
     with Terminal() as terminal:
-        document = experiment.choose(source, terminal)
+        document = experiment.choose(source, terminal, device)
     _answer(document, as_json)
 
 

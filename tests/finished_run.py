@@ -169,10 +169,11 @@ def summaries() -> dict[str, dict[str, Any]]:
             "sets": [["device-friction"], ["viscous-drag"]],
             "experiments": [
                 {"protocol": "quarter speed", "sentence": "The same at a quarter of the speed.",
-                 "gain_nats": 0.66, "standard_error": 0.01, "named": 0.97, "possible_nats": 0.693,
-                 "failed": 0},
-                {"protocol": "no holds", "sentence": "Cycles without holds.", "gain_nats": None,
-                 "standard_error": None, "named": None, "possible_nats": 0.693, "failed": 12},
+                 "seconds": 187.0, "gain_bits": 0.95, "standard_error": 0.01, "named": 0.97,
+                 "possible_bits": 1.0, "failed": 0},
+                {"protocol": "no holds", "sentence": "Cycles without holds.", "seconds": 85.0,
+                 "gain_bits": None, "standard_error": None, "named": None, "possible_bits": 1.0,
+                 "failed": 12},
             ],
         },
     }  # fmt: skip

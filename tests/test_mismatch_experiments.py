@@ -3,33 +3,36 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 import toy
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.stats import norm
 from toy_inference import NOISE, SCALE, TRUTH, ToySurrogate, empty_recording
 
 from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior
-from bayeskin.mechanisms import Mechanism
+from bayeskin.mechanisms import Mechanism, bin_means, observed
 from bayeskin.mechanisms.mechanism import Instrument, Place, added
 from bayeskin.mechanisms.viscous_drag import speed_of
-from bayeskin.mismatch.experiments import DRAWS, Experiment, compete, noise_of, ranked, weigh
+from bayeskin.mismatch.experiments import DRAWS, Experiment, compete, noise_of, ranked, search, weigh
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.information import expected_gain
 from bayeskin.mismatch.observed import ObservedSurrogate
-from bayeskin.mismatch.protocols import own, phases_of, protocols
+from bayeskin.mismatch.protocols import Limits, changed, own, phases_of, variations
+from bayeskin.mismatch.tasks import Ask, OtherTest, Task
 from bayeskin.pipeline import diagnosis, experiment
 from bayeskin.pipeline.engine import Silent
 from bayeskin.pipeline.folder import Record, write_record
+from bayeskin.reduced.cases import Protocols
 from bayeskin.report import figure_experiments
-from bayeskin.types import PadMotion, Parameter, Simulation
-from bayeskin.workers import Lost
+from bayeskin.types import PadMotion, Parameter
 
 OWN_SPEED = 9e-4  # m/s, the toy's
 DRAG = 4e-3 / OWN_SPEED
@@ -126,7 +129,7 @@ def test_too_few_draws_are_refused() -> None:
 def test_protocols_vary_the_recordings_own_motion() -> None:
     amplitude, speed, hold = own(toy.MOTION)
     assert (amplitude, speed, hold) == pytest.approx((9e-3, OWN_SPEED, 30.0))
-    listed = {one.name: one for one in protocols(toy.MOTION)}
+    listed = {one.name: one for one in variations(toy.MOTION, LIMITS)}
     assert len(listed) == 9
     for one in listed.values():
         assert np.all(np.diff(one.motion.time_s) > 0.0)
@@ -141,14 +144,24 @@ def test_protocols_vary_the_recordings_own_motion() -> None:
         own(PadMotion(np.array([0.0, 1.0]), np.zeros(2)))
 
 
-def toy_run(motion: PadMotion, theta: Mapping[str, float], laws: Sequence[Any]) -> Simulation:
-    """The toy on any motion; it knows no parameters of mechanisms."""
-    assert list(theta) == list(toy.SPACE.names)
-    assert not laws
+LIMITS = Limits(10e-3, (1e-4, 5e-3), 1800.0)
+
+
+def toy_run(task: OtherTest) -> np.ndarray:
+    """The toy with its instrument in any test."""
+    motion = PadMotion(np.array(task.time_s), np.array(task.displacement_m))
     time_s = np.unique(np.concatenate([np.linspace(0.0, motion.time_s[-1], 400), motion.time_s]))
-    force = SCALE * toy.toy_force(np.array([list(theta.values())]), time_s, motion)[0]
-    corner = np.isin(time_s, motion.time_s)
-    return Simulation(theta, time_s, motion.at(time_s), force, corner, "ok", "", {}, "toy")
+    force = (
+        SCALE * toy.toy_force(np.array([[task.theta[name] for name in toy.SPACE.names]]), time_s, motion)[0]
+    )
+    rows = {name: np.array([value]) for name, value in task.theta.items()}
+    beyond = [KNOWN[name] for name in task.names]
+    seen = observed(beyond, rows, motion, lambda t: np.interp(t, time_s, force)[None])
+    return bin_means(seen, motion, np.array(task.edges_s), beyond)[0]
+
+
+def asked(tasks: Sequence[Task]) -> list[object]:
+    return [toy_run(task) for task in tasks if isinstance(task, OtherTest)]
 
 
 def fitted(name: str, **values: float) -> Fit:
@@ -166,46 +179,74 @@ def fitted(name: str, **values: float) -> Fit:
     )
 
 
-def judged(fits: Sequence[Fit], run: Any) -> list[Experiment]:
-    return ranked([weigh(one, fits, KNOWN, run, 0) for one in protocols(toy.MOTION)])
+def judged(fits: Sequence[Fit], ask: Ask = asked) -> list[Experiment]:
+    return ranked([weigh(one, fits, KNOWN, ask, 0) for one in variations(toy.MOTION, LIMITS)])
 
 
 def test_friction_is_told_from_drag_by_another_speed_and_not_by_a_repeat() -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    table = judged(fits, toy_run)
-    by_name = {one.protocol: one for one in table}
-    assert table[0].protocol in ("quarter speed", "five times faster")
-    assert by_name["five times faster"].gain_nats > 0.5
-    assert by_name["quarter speed"].gain_nats > 0.3
-    assert by_name["same again"].gain_nats < 0.05
-    assert by_name["half displacement"].gain_nats < 0.05
-    assert all(one.possible_nats == pytest.approx(np.log(2.0)) for one in table)
-    assert [one.gain_nats for one in table] == sorted((one.gain_nats for one in table), reverse=True)
+    table = judged(fits)
+    by_name = {one.protocol.name: one for one in table}
+    assert table[0].protocol.name in ("quarter speed", "five times faster")
+    assert by_name["five times faster"].gain_bits > 0.5
+    assert by_name["quarter speed"].gain_bits > 0.3
+    assert by_name["same again"].gain_bits < 0.05
+    assert by_name["half displacement"].gain_bits < 0.05
+    assert all(one.possible_bits == pytest.approx(1.0) for one in table)
+    assert [one.gain_bits for one in table] == sorted((one.gain_bits for one in table), reverse=True)
 
 
 def test_the_figure_shows_every_protocol_that_could_be_judged() -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    table = judged(fits, toy_run)
-    figure = figure_experiments((*table, dataclasses.replace(table[0], protocol="failed", gain_nats=np.nan)))
+    table = judged(fits)
+    figure = figure_experiments((*table, dataclasses.replace(table[0], gain_bits=np.nan)))
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == [
-        one.protocol for one in reversed(table)
+        one.protocol.name for one in reversed(table)
     ]
     assert "five times faster" in figure.get_suptitle().lower() or "quarter" in figure.get_suptitle().lower()
     assert "None" in figure_experiments(()).get_suptitle()
 
 
 def test_failed_runs_are_counted_and_leave_a_row() -> None:
-    def failing(motion: PadMotion, theta: Mapping[str, float], laws: Sequence[Any]) -> Simulation:
-        run = toy_run(motion, theta, laws)
-        return Simulation(
-            theta, run.time_s, run.displacement_m, run.force_n, run.corner, "failed", "", {}, "toy"
-        )
+    def failing(tasks: Sequence[Task]) -> list[object]:
+        return ["near folding" if i % DRAWS > 2 else force for i, force in enumerate(asked(tasks))]
 
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
     table = judged(fits, failing)
-    assert all(np.isnan(one.gain_nats) and one.failed == 24 for one in table)
+    assert all(np.isnan(one.gain_bits) and one.failed == 2 * (DRAWS - 3) for one in table)
     with pytest.raises(InputError, match="two at least"):
-        judged(fits[:1], toy_run)
+        judged(fits[:1])
+
+
+def test_changes_of_the_most_telling_tests_are_judged_and_tell_more() -> None:
+    """Drag and friction of one speed differ by speed alone; here no test to begin with has another."""
+    fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
+    others = ("quarter speed", "five times faster")
+    first = [one for one in variations(toy.MOTION, LIMITS) if one.name not in others]
+    found = search(lambda one: weigh(one, fits, KNOWN, asked, 0), first, LIMITS, 1)
+    listed = [one for one in found if one.protocol in first]
+    assert found[0].protocol not in first
+    assert found[0].gain_bits > listed[0].gain_bits + 0.1
+    again = search(lambda one: weigh(one, fits, KNOWN, asked, 0), first, LIMITS, 1)
+    assert [one.protocol for one in again] == [one.protocol for one in found]
+    sure = search(lambda one: Experiment(one, 1.0, 0.0, 1.0, 1.0, 0), first, LIMITS, 1)
+    assert len(sure) == len(first)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.floats(60.0, 3000.0))
+def test_changed_tests_stay_within_the_limits_of_the_device(seed: int, longest_s: float) -> None:
+    rng, limits = np.random.default_rng(seed), Limits(8e-3, (2e-4, 2e-3), longest_s)
+    one = variations(toy.MOTION, limits)[seed % 9]
+    for _ in range(4):
+        one = changed(one, limits, "changed", rng)
+        speed = np.abs(np.diff(one.motion.displacement_m) / np.diff(one.motion.time_s))
+        assert one.motion.displacement_m.max() <= limits.largest_m * (1.0 + 1e-9)
+        assert np.all(speed[speed > 0.0] <= 2e-3 * (1.0 + 1e-6))
+        assert np.all(speed[speed > 0.0] >= 2e-4 * (1.0 - 1e-6))
+        ramps_s = sum(2.0 * cycle.reach_m / cycle.speed_m_s for cycle in one.cycles)
+        assert one.motion.time_s[-1] <= max(longest_s, 5.0 + ramps_s) * (1.0 + 1e-9)
+        assert one.sentence.endswith(".")
 
 
 def test_sets_with_look_alikes_in_the_place_of_the_likeliest_compete() -> None:
@@ -235,41 +276,6 @@ def test_noise_of_a_test_to_come_is_that_of_the_fit() -> None:
     np.testing.assert_allclose(near, NOISE["sd_hold"] ** 2 * np.exp(-1.0 / NOISE["tau_noise"]) + 0.2e-6)
 
 
-def test_protocols_judged_before_an_interruption_are_not_judged_again(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    made: list[str] = []
-    listed = {one.name: one for one in protocols(toy.MOTION)}
-
-    def serially(judge: Any, items: Sequence[str], workers: int) -> Iterator[tuple[int, Any]]:
-        for place, name in enumerate(items):
-            if len(made) == 4:
-                made.append("interrupted")
-                raise KeyboardInterrupt
-            made.append(name)
-            yield place, weigh(listed[name], fits, KNOWN, toy_run, 0)
-
-    monkeypatch.setattr(experiment, "run_parallel", serially)
-    bench = SimpleNamespace(motion=toy.MOTION, run=SimpleNamespace(config=SimpleNamespace(seed=0)))
-    asked = (tmp_path / "x.toml", [{"names": list(one.names)} for one in fits], bench, tmp_path, Silent())
-    with pytest.raises(KeyboardInterrupt):
-        experiment._weighed(*asked)
-    file = next(tmp_path.glob("*.jsonl"))
-    file.write_text(file.read_text() + '{"protocol": "torn')
-    found = ranked(experiment._weighed(*asked))
-    assert sorted(made) == sorted([*listed, "interrupted"])
-    experiment._weighed(*asked)  # all lines are whole: nothing is left to judge
-    assert len(made) == len(listed) + 1
-    assert [one.protocol for one in found] == [one.protocol for one in judged(fits, toy_run)]
-    words = experiment._in_words(
-        {"sets": [["rub"], ["drag"]], "experiments": [experiment._row(one) for one in found]}
-    )
-    assert words.splitlines()[0] == "taken as equally probable: rub; or drag"
-    assert found[0].sentence in words.splitlines()[1]
-    assert "nothing competes" in experiment._in_words({"sets": [["rub"]], "experiments": []})
-
-
 @dataclasses.dataclass(frozen=True)
 class Asked:
     """What `choose` sees of a run that has been diagnosed."""
@@ -291,10 +297,15 @@ def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
     run = SimpleNamespace(
         config=config, folder=tmp_path / "x", at=lambda *parts: tmp_path.joinpath("x", *parts)
     )
-    bench = SimpleNamespace(motion=toy.MOTION, run=run, known=KNOWN)
+    trained = SimpleNamespace(protocols=Protocols())
+    bench = SimpleNamespace(
+        motion=toy.MOTION, known=KNOWN, model=SimpleNamespace(trained=trained), source=SimpleNamespace(seed=0)
+    )
     monkeypatch.setattr(experiment, "opened", lambda *_: run)
+    monkeypatch.setattr(experiment, "bench_of", lambda _: bench)
     monkeypatch.setattr(experiment, "workbench", lambda _: bench)
-    monkeypatch.setattr(experiment, "stored", lambda one: {"names": list(one.names)})
+    monkeypatch.setattr(experiment, "searches_file", lambda *_: tmp_path / "searches")
+    monkeypatch.setattr(experiment, "asked", lambda *_: nullcontext(asked))
     monkeypatch.setattr(experiment, "caption", lambda _: "x")
     monkeypatch.setattr(diagnosis, "diagnose", lambda *_: {"best_set": ["rub"]})
     return Asked(tmp_path / "x.toml", tmp_path / "x" / "experiment")
@@ -321,26 +332,31 @@ def test_without_a_diagnosis_its_answer_is_given_and_without_its_fits_one_line(
     assert experiment.choose(diagnosed.source, Silent()) == failed
 
 
-def test_protocols_whose_processes_are_lost_are_said_to_be_unjudged(
+def test_the_test_to_run_next_is_written_for_the_machine(
+    diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
+    monkeypatch.setattr(diagnosis, "fits_of", lambda _: fits)
+    answer = experiment.choose(diagnosed.source, Silent())
+    best = answer["experiments"][0]
+    words = answer["text"].splitlines()
+    assert words[0] == "taken as equally probable: rub; or drag"
+    assert best["sentence"] in words[1]
+    assert words[-1].startswith(f"Run next: {best['protocol']}.")
+    corners = np.loadtxt(diagnosed.folder / "next.csv", delimiter=",", skiprows=1)
+    assert corners[-1, 0] == pytest.approx(best["seconds"], abs=1e-3)
+    assert corners[:, 1].max() == pytest.approx(1e3 * max(c["reach_m"] for c in best["cycles"]), abs=1e-3)
+
+
+def test_tests_whose_processes_are_lost_are_said_to_be_unjudged(
     diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
     monkeypatch.setattr(diagnosis, "fits_of", lambda _: fits)
     monkeypatch.setattr(
-        experiment, "run_parallel", lambda judge, names, _: ((i, Lost("killed")) for i in range(len(names)))
+        experiment, "asked", lambda *_: nullcontext(lambda tasks: ["the process was lost"] * len(tasks))
     )
     answer = experiment.choose(diagnosed.source, Silent())
     assert (answer["ok"], len(answer["experiments"])) == (False, 9)
-    assert "nothing competes" not in answer["text"]
     assert answer["text"].count("could not be judged") == 9
-    asked: list[str] = []
-
-    def now(judge: Any, names: Sequence[str], workers: int) -> Iterator[tuple[int, Any]]:
-        asked.extend(names)
-        listed = {one.name: one for one in protocols(toy.MOTION)}
-        for place, name in enumerate(names):
-            yield place, weigh(listed[name], fits, KNOWN, toy_run, 0)
-
-    monkeypatch.setattr(experiment, "run_parallel", now)
-    assert experiment.choose(diagnosed.source, Silent())["ok"]
-    assert len(asked) == 9  # what was lost is judged anew
+    assert "None of these tests" in answer["text"]

@@ -208,7 +208,7 @@ def test_what_is_left_and_which_test_would_tell_stand_in_the_mismatch(whole: str
         "0.7 of it follows u^3 while loading",
         "u^2 while loading",
         "Taken as equally probable: device-friction; or viscous-drag.",
-        "quarter speed The same at a quarter of the speed. 95.2 % 1.44 % 97 %",
+        "quarter speed The same at a quarter of the speed. 187 s 0.95 0.01 97 %",
     ):
         assert re.sub(r"\s", "", said) in re.sub(r"\s", "", text), said
     assert "Nothing beyond noise" in diagnosed_as(

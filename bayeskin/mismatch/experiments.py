@@ -1,56 +1,54 @@
 """Which further test would tell competing sets of mechanisms apart: each simulated with the posterior.
 
 Of every set, a few posterior draws are run on each protocol, and the expected information gain about which
-set is true is computed from the forces (`information`). The noise of the test to come is
-the fitted noise of the most probable set, what it leaves unexplained with it.
+set is true is computed from the forces (`information`). The noise of the test to come is the fitted noise of
+the most probable set, what it leaves unexplained with it. After the variations of the recording's own test,
+the most telling protocols are changed at random, and so on from what tells more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 
 from bayeskin.errors import InputError
 from bayeskin.inference.noise_model import KINDS, noise_chain, noise_covariance
-from bayeskin.mechanisms import Mechanism, bin_means, laws, observed, solved
-from bayeskin.mechanisms.mechanism import ForceOfTime
-from bayeskin.mismatch import protocols as tests
+from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.information import FEWEST, expected_gain
+from bayeskin.mismatch.protocols import Limits, Protocol, changed, phases_of
 from bayeskin.mismatch.search import weight
-from bayeskin.types import Array, BinnedForce, PadMotion, Simulation
+from bayeskin.mismatch.tasks import Ask, OtherTest
+from bayeskin.types import Array, BinnedForce, PadMotion
 
 DRAWS = 12  # of each hypothesis
+BIT = float(np.log(2.0))  # nats
+PARENTS, CHANGES, ROUNDS = 2, 4, 3  # protocols that are changed, how many changes of them, how often
+ENOUGH = 0.02  # of what is to be had: less is no reason to go on
 MOST_BINS = 800  # of a protocol; longer ones have wider bins
 MOST_SETS = 4  # that compete
-
-
-class FullModel(Protocol):
-    """One full run: `bayeskin.model.simulate.simulate` with its specification already given."""
-
-    def __call__(self, motion: PadMotion, theta: Mapping[str, float], laws: Sequence[Any]) -> Simulation: ...
 
 
 @dataclass(frozen=True)
 class Experiment:
     """A further test and what it is expected to tell.
 
-    gain_nats, standard_error: expected information about which set is true, of `possible_nats` that are to
+    gain_bits, standard_error: expected information about which set is true, of `possible_bits` that are to
     be had; named: the probability that the true set is expected to have afterwards; failed: runs that did
     not converge. With too many failed for an estimate the first three are NaN.
     """
 
-    protocol: str
-    sentence: str
-    motion: PadMotion
-    gain_nats: float
+    protocol: Protocol
+    gain_bits: float
     standard_error: float
     named: float
-    possible_nats: float
+    possible_bits: float
     failed: int
+
+
+Judge = Callable[[Protocol], Experiment]
 
 
 def compete(found: Sequence[Fit], names: Sequence[str], known: Mapping[str, Mechanism]) -> list[Fit]:
@@ -74,35 +72,63 @@ def compete(found: Sequence[Fit], names: Sequence[str], known: Mapping[str, Mech
     return [best, *sorted(by_names.values(), key=weight, reverse=True)[: MOST_SETS - 1]]
 
 
+def search(judge: Judge, first: Sequence[Protocol], limits: Limits, seed: int) -> list[Experiment]:
+    """Judges protocols, then changes of the most telling ones within limits; the most informative first.
+
+    Ends where a round of changes tells no more than was told before, or all that is to be told is.
+    """
+    rng = np.random.default_rng(seed)
+    found = ranked([judge(one) for one in first])
+    for turn in range(ROUNDS):
+        best = found[0]
+        if np.isnan(best.gain_bits) or best.gain_bits > (1.0 - ENOUGH) * best.possible_bits:
+            break
+        parents = [one.protocol for one in found[:PARENTS]]
+        new = [
+            changed(parents[i % len(parents)], limits, f"proposal {CHANGES * turn + i + 1}", rng)
+            for i in range(CHANGES)
+        ]
+        found = ranked([*found, *(judge(one) for one in new)])
+        if found[0].gain_bits < best.gain_bits + ENOUGH * best.possible_bits:
+            break
+    return found
+
+
 def weigh(
-    protocol: tests.Protocol,
-    fits: Sequence[Fit],
-    known: Mapping[str, Mechanism],
-    simulate: FullModel,
-    seed: int,
+    protocol: Protocol, fits: Sequence[Fit], known: Mapping[str, Mechanism], ask: Ask, seed: int
 ) -> Experiment:
     """What a protocol is expected to tell about which of the sets is true, all as probable before.
 
     fits : one for each hypothesis, by whose `names` mechanisms of `known` are on, the likeliest first
-    simulate : called DRAWS times a hypothesis
+    ask : answers `DRAWS` tasks of another test for each hypothesis
     Raises InputError for fewer than two hypotheses.
     """
     if len(fits) < 2:
         raise InputError("hypotheses", f"{len(fits)}", "two at least, each with its fit")
-    edges_s = _edges(protocol.motion, fits[0])
-    forces = [_forces(one, known, protocol.motion, edges_s, simulate, seed + i) for i, one in enumerate(fits)]
-    failed = sum(DRAWS - len(rows) for rows in forces)
+    motion, edges_s = protocol.motion, _edges(protocol.motion, fits[0])
+    tasks = [
+        OtherTest(
+            one.names, theta, tuple(motion.time_s.tolist()), tuple(motion.displacement_m.tolist()),
+            tuple(edges_s.tolist()),
+        )
+        for i, one in enumerate(fits) for theta in _drawn(one, known, seed + i)
+    ]  # fmt: skip
+    answers = ask(tasks)
+    forces = [
+        np.array([force for force in answers[DRAWS * i : DRAWS * (i + 1)] if not isinstance(force, str)])
+        for i in range(len(fits))
+    ]
     gain = (np.nan, np.nan, np.nan)
     if min(len(rows) for rows in forces) >= FEWEST:
-        of = expected_gain(forces, noise_of(fits[0], protocol.motion, edges_s), np.ones(len(fits)), seed)
-        gain = (of.nats, of.standard_error, of.named)
-    possible = float(np.log(len(fits)))
-    return Experiment(protocol.name, protocol.sentence, protocol.motion, *gain, possible, failed)
+        of = expected_gain(forces, noise_of(fits[0], motion, edges_s), np.ones(len(fits)), seed)
+        gain = (of.nats / BIT, of.standard_error / BIT, of.named)
+    failed = sum(DRAWS - len(rows) for rows in forces)
+    return Experiment(protocol, *gain, float(np.log(len(fits))) / BIT, failed)
 
 
 def ranked(found: Sequence[Experiment]) -> list[Experiment]:
     """The most informative first; those that could not be judged last."""
-    return sorted(found, key=lambda one: (np.isnan(one.gain_nats), -one.gain_nats))
+    return sorted(found, key=lambda one: (np.isnan(one.gain_bits), -one.gain_bits))
 
 
 def _edges(motion: PadMotion, found: Fit) -> Array:
@@ -112,39 +138,14 @@ def _edges(motion: PadMotion, found: Fit) -> Array:
     return np.asarray(width_s * np.arange(int(end_s / width_s + 1e-6) + 1, dtype=float))
 
 
-def _forces(
-    found: Fit,
-    known: Mapping[str, Mechanism],
-    motion: PadMotion,
-    edges_s: Array,
-    simulate: FullModel,
-    seed: int,
-) -> Array:
-    """Bin means (draws, m) at posterior draws, those of failed runs left out."""
-    log_posterior = found.log_posterior
-    added = [known[name] for name in found.names]
-    within = solved(added)
-    beyond = [mechanism for mechanism in added if mechanism not in within]
-    own = {p.name for mechanism in added for p in mechanism.parameters}
-    along = {p.name for mechanism in within for p in mechanism.parameters}
-    rows = []
-    for draw in found.draws(DRAWS, seed)[:, : log_posterior.surrogate.space.dim]:
-        theta = _neutral(added) | dict(zip(log_posterior.surrogate.space.names, draw.tolist(), strict=True))
-        inside = {name: value for name, value in theta.items() if name not in own or name in along}
-        run = simulate(motion, inside, laws(added))
-        if run.status == "ok":
-            values = {name: np.array([value]) for name, value in theta.items()}
-            force = observed(beyond, values, motion, _force_of(run))
-            rows.append(bin_means(force, motion, edges_s, beyond)[0])
-    return np.array(rows).reshape(len(rows), len(edges_s) - 1)
-
-
-def _force_of(run: Simulation) -> ForceOfTime:
-    return lambda time_s: np.atleast_2d(run.at(time_s))
-
-
-def _neutral(mechanisms: Sequence[Mechanism]) -> dict[str, float]:
-    return {name: value for one in mechanisms for name, value in one.neutral.items()}
+def _drawn(found: Fit, known: Mapping[str, Mechanism], seed: int) -> list[dict[str, float]]:
+    """Values of all parameters of a set's force at posterior draws."""
+    names = found.log_posterior.surrogate.space.names
+    neutral = {name: value for one in found.names for name, value in known[one].neutral.items()}
+    return [
+        neutral | dict(zip(names, draw.tolist(), strict=True))
+        for draw in found.draws(DRAWS, seed)[:, : len(names)]
+    ]
 
 
 def noise_of(found: Fit, motion: PadMotion, edges_s: Array) -> Array:
@@ -161,7 +162,7 @@ def noise_of(found: Fit, motion: PadMotion, edges_s: Array) -> Array:
         kind: float(np.median(chain.variance_n2[chain.kind == i])) / wider
         for i, kind in enumerate(chain.kinds)
     }
-    phases = tests.phases_of(motion)
+    phases = phases_of(motion)
     middle = 0.5 * (edges_s[1:] + edges_s[:-1])
     phase = np.searchsorted([p.end_s for p in phases[:-1]], middle, side="right")
     of_bins = [phases[i].kind for i in phase]

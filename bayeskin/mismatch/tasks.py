@@ -64,5 +64,19 @@ class Weigh:
     fit: Mapping[str, Any]
 
 
-Task = Probe | FullProbe | Climb | Promise | Join | Weigh
+@dataclass(frozen=True)
+class OtherTest:
+    """Asks for the force that is reported of a set at values in another test: (m,) or why it failed.
+
+    time_s, displacement_m : corners of the pads' motion; edges_s (m + 1,)
+    """
+
+    names: tuple[str, ...]
+    theta: Mapping[str, float]
+    time_s: tuple[float, ...]
+    displacement_m: tuple[float, ...]
+    edges_s: tuple[float, ...]
+
+
+Task = Probe | FullProbe | Climb | Promise | Join | Weigh | OtherTest
 Ask = Callable[[Sequence[Task]], list[object]]  # answers in the order of the tasks

@@ -1,82 +1,80 @@
 """Which further test would tell the explanations of a mismatch apart, after it has been diagnosed.
 
-Runs are those of the coarsest bricks, which are quick (a mesh of one's own stays): what matters is by how
-much explanations differ, and a mesh changes them nearly alike.
+The reduced model of the device runs them. It knows the protocols that it was trained for, which are taken as
+what the device can do.
 """
 
 from __future__ import annotations
 
-import json
+import csv
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import bayeskin
 from bayeskin import report
 from bayeskin.errors import InputError
-from bayeskin.mismatch.experiments import DRAWS, Experiment, compete, ranked, weigh
-from bayeskin.mismatch.fit import restored, stored
-from bayeskin.mismatch.protocols import protocols
-from bayeskin.model.simulate import ModelSpec, simulate
+from bayeskin.mismatch.experiments import Experiment, compete, search, weigh
+from bayeskin.mismatch.fit import Fit
+from bayeskin.mismatch.protocols import Limits, Protocol, variations
+from bayeskin.mismatch.tasks import Ask
 from bayeskin.pipeline import diagnosis
-from bayeskin.pipeline.engine import Reporter, Run, Silent
+from bayeskin.pipeline.engine import Reporter, Run
 from bayeskin.pipeline.folder import (
     Record,
     current_record,
     locked,
     output_hashes,
     plain,
-    read_lines,
     read_record,
-    sha256_of,
     write_json,
     write_record,
 )
+from bayeskin.pipeline.joint_bench import JointBench, asked, searches_file
+from bayeskin.pipeline.joint_diagnosis import bench_of, searched
 from bayeskin.pipeline.provenance import caption
-from bayeskin.pipeline.workbench import Workbench, opened, workbench
-from bayeskin.types import PadMotion, Simulation
-from bayeskin.workers import Lost, run_parallel
+from bayeskin.pipeline.workbench import opened, workbench
 
 FOLDER = "experiment"
+LONGEST_S = 1800.0  # of a test: an arm can hardly be still for longer
+WORKERS = 2
 
 
-def choose(source: Path, reporter: Reporter) -> dict[str, Any]:
+def choose(source: Path, reporter: Reporter, device: Path | None = None) -> dict[str, Any]:
     """The answer of `bayeskin experiment` on a configuration's run, or on a recording by itself.
+
+    device : file of the device that a recording by itself was made with
 
     Diagnoses first, where that is not done, and answers as `diagnose` where that fails. Outputs go to the
     run's folder `experiment`. Raises InputError for bad input, among it the article's observation, which no
-    other protocol has.
+    other protocol has, and a device without a reduced model.
     """
-    run = opened(source, reporter)
+    run = opened(source, reporter, device)
     observation = run.config.model.observation
     if observation != "reaction":
         raise InputError(source, f"model.observation {observation!r}", "'reaction'")
-    if diagnosis.by_reduced_model(run.config):
-        why = "a diagnosis by the reduced model, which proposes no experiment yet"
-        expected = "a protocol that a shipped surrogate knows, or a design by the full model"
-        raise InputError(source, why, expected)
-    diagnosed = diagnosis.diagnose(source, reporter)
+    diagnosed = diagnosis.diagnose(source, reporter, device)
     if "best_set" not in diagnosed:
         return diagnosed
     where = run.folder / FOLDER
     with locked(run.folder):
         started, of = time.monotonic(), _diagnosis(run)
         where.mkdir(parents=True, exist_ok=True)
-        bench = workbench(run)
-        fits = compete(diagnosis.fits_of(bench), diagnosed["best_set"], bench.known)
-        answer: dict[str, Any] = {"sets": [list(one.names) for one in fits], "experiments": [], "ok": True}
-        if len(fits) > 1:
-            found = ranked(_weighed(source, [stored(one) for one in fits], bench, where, reporter))
-            answer["ok"] = any(np.isfinite(one.gain_nats) for one in found)
-            answer["experiments"] = [_row(one) for one in found]
-            figure = report.figure_experiments(found)
-            made = report.save_figure(figure, where / "experiments", caption(run))
+        bench = bench_of(run)
+        with asked(bench, searches_file(run.folder, bench), WORKERS) as ask:
+            fits = compete(_fits(run, bench, ask), diagnosed["best_set"], bench.known)
+            found = _searched(fits, bench, ask, reporter) if len(fits) > 1 else []
+        answer: dict[str, Any] = {
+            "sets": [list(one.names) for one in fits], "experiments": [_row(one) for one in found],
+            "ok": not found or any(np.isfinite(one.gain_bits) for one in found),
+        }  # fmt: skip
+        if found:
+            made = report.save_figure(report.figure_experiments(found), where / "experiments", caption(run))
             answer["figures"] = [path.name for path in made]
+            _write_corners(found[0].protocol, where / "next.csv")
         write_json(where / "experiment.json", answer)
         seconds = time.monotonic() - started
         write_record(where, Record(of, True, seconds, output_hashes(where), plain(answer)))
@@ -93,52 +91,44 @@ def _diagnosis(run: Run) -> str:
     return "" if record is None else record.sha256
 
 
-def _weighed(
-    source: Path, fits: Sequence[Mapping[str, Any]], bench: Workbench, folder: Path, reporter: Reporter
-) -> list[Experiment]:
-    """Each protocol judged in one of two processes; those judged before an interruption are not again.
+def _fits(run: Run, bench: JointBench, ask: Ask) -> list[Fit]:
+    """All fits that a diagnosis made."""
+    if diagnosis.by_reduced_model(run.config):
+        return [one.fit for one in searched(run, bench, ask).fits.values()]
+    return list(diagnosis.fits_of(workbench(run)))
 
-    One whose process was lost has no gain, and is judged anew the next time.
-    """
-    listed = {one.name: one for one in protocols(bench.motion)}
-    of = [bayeskin.__version__, bench.run.config.seed, list(map(dict, fits))]
-    file = folder / f"weighed-{sha256_of(of)[:12]}.jsonl"
-    done = {
-        row["protocol"]: Experiment(**row, motion=listed[row["protocol"]].motion) for row in read_lines(file)
-    }
-    todo = [name for name in listed if name not in done]
-    for place, one in run_parallel(partial(_weigh_apart, source, fits), todo, 2):
-        if isinstance(one, Lost):
-            lost = listed[todo[place]]
-            reporter.log(f"{lost.name}: {one.reason}")
-            done[lost.name] = Experiment(
-                lost.name, lost.sentence, lost.motion, *3 * (np.nan,), np.log(len(fits)), DRAWS * len(fits)
-            )
-            continue
-        done[one.protocol] = one
-        with open(file, "a", encoding="utf-8") as handle:
-            handle.write(json.dumps(_row(one)) + "\n")
-        told = f"{one.protocol}: {one.gain_nats:.2f} of {one.possible_nats:.2f} nats"
-        reporter.progress("experiments", len(done) / len(listed), told)
-    return list(done.values())
+
+def _searched(fits: Sequence[Fit], bench: JointBench, ask: Ask, reporter: Reporter) -> list[Experiment]:
+    """Protocols judged, the most telling first."""
+    trained = bench.model.trained.protocols
+    limits = Limits(trained.largest_m, trained.speeds_m_s, LONGEST_S)
+    first = variations(bench.motion, limits)
+
+    def judge(protocol: Protocol) -> Experiment:
+        one = weigh(protocol, fits, bench.known, ask, bench.source.seed)
+        reporter.log(f"{protocol.name}: {one.gain_bits:.2f} of {one.possible_bits:.2f} bits")
+        return one
+
+    return search(judge, first, limits, bench.source.seed)
+
+
+def _write_corners(protocol: Protocol, path: Path) -> None:
+    """Writes a test's corners as a table that a machine can be given."""
+    with open(path, "w", encoding="utf-8", newline="") as handle:
+        writer = csv.writer(handle)
+        writer.writerow(["time_s", "displacement_mm"])
+        for time_s, at_m in zip(protocol.motion.time_s, protocol.motion.displacement_m, strict=True):
+            writer.writerow([f"{time_s:.3f}", f"{1e3 * at_m:.4f}"])
 
 
 def _row(one: Experiment) -> dict[str, Any]:
-    return {name: value for name, value in asdict(one).items() if name != "motion"}
-
-
-def _weigh_apart(source: Path, fits: Sequence[Mapping[str, Any]], name: str) -> Experiment:
-    """In a process of its own: mechanisms have no copies."""
-    bench = workbench(opened(source, Silent()))
-    found = [restored(one, bench.posterior(None, one["names"])) for one in fits]
-    protocol = next(one for one in protocols(bench.motion) if one.name == name)
-    return weigh(protocol, found, bench.known, partial(_coarse, bench.spec), bench.run.config.seed)
-
-
-def _coarse(
-    spec: ModelSpec, motion: PadMotion, theta: Mapping[str, float], laws: Sequence[Any]
-) -> Simulation:
-    return simulate(spec.coarsest, motion, theta, laws=laws)
+    return {
+        "protocol": one.protocol.name, "sentence": one.protocol.sentence,
+        "seconds": float(one.protocol.motion.time_s[-1]),
+        "cycles": [asdict(cycle) for cycle in one.protocol.cycles], "gain_bits": one.gain_bits,
+        "standard_error": one.standard_error, "named": one.named, "possible_bits": one.possible_bits,
+        "failed": one.failed,
+    }  # fmt: skip
 
 
 def _in_words(answer: Mapping[str, Any]) -> str:
@@ -146,7 +136,13 @@ def _in_words(answer: Mapping[str, Any]) -> str:
         return "nothing competes: no look-alike was tried in the place of what explains the recording best"
     lines = ["taken as equally probable: " + "; or ".join(", ".join(one) for one in answer["sets"])]
     for one in answer["experiments"]:
-        share = one["gain_nats"] / one["possible_nats"]
-        told = f"{100 * share:.0f} % of what is to be known" if np.isfinite(share) else "could not be judged"
-        lines.append(f"  {one['protocol']}: {told}. {one['sentence']}")
+        told = "could not be judged"
+        if np.isfinite(one["gain_bits"]):
+            told = f"{one['gain_bits']:.2f} of {one['possible_bits']:.2f} bits"
+        lines.append(f"  {one['protocol']}, {one['seconds']:.0f} s: {told}. {one['sentence']}")
+    best = answer["experiments"][0]
+    if best["gain_bits"] > 0.0:
+        lines.append(f"Run next: {best['protocol']}. Its corners are in {FOLDER}/next.csv.")
+    else:
+        lines.append("None of these tests is shown to tell them apart.")
     return "\n".join(lines)

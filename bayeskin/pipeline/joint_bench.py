@@ -14,7 +14,7 @@ import numpy as np
 
 import bayeskin
 from bayeskin.inference import LogPosterior
-from bayeskin.mechanisms import Mechanism, catalogue, with_one
+from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed, with_one
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.mismatch.corrected import FullRun
 from bayeskin.mismatch.discrepancy import discrepancy
@@ -31,7 +31,7 @@ from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, wi
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.refuted import refuted
 from bayeskin.mismatch.tangent import Tangent
-from bayeskin.mismatch.tasks import Ask, Climb, FullProbe, Join, Probe, Promise, Task, Weigh
+from bayeskin.mismatch.tasks import Ask, Climb, FullProbe, Join, OtherTest, Probe, Promise, Task, Weigh
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline.folder import read_lines, sha256_of
 from bayeskin.pipeline.model import model_error
@@ -40,7 +40,7 @@ from bayeskin.pipeline.workbench import calm_bins
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.simulate import simulate_reduced
-from bayeskin.types import Array, ParameterSpace, Surrogate
+from bayeskin.types import Array, PadMotion, ParameterSpace, Surrogate
 from bayeskin.workers import Lost, standing
 
 FOLDING = 0.15  # of the stiffness at rest: nearer to folding the reduced model is of no use; runs of the full
@@ -111,6 +111,18 @@ class JointBench:
         seen = self._seen(names, (), FullRun(at, force_n, np.zeros((len(force_n), len(at)))))
         return seen.predict_mean(np.array([theta[name] for name in seen.space.names]))[0]
 
+    def elsewhere(self, task: OtherTest) -> Array | str:
+        """Force (m,) that the instrument reports of a set in another test, or why the run failed."""
+        motion = PadMotion(np.array(task.time_s), np.array(task.displacement_m))
+        values = {name: task.theta[name] for name in self.space(task.names).names}
+        found = simulate_reduced(self.model, motion, values, self.solved(task.names), least_stiffness=FOLDING)
+        if found.status != "ok":
+            return found.message
+        beyond = [self.known[name] for name in sorted(task.names) if self.known[name].act.bind is None]
+        rows = {name: np.array([value]) for name, value in task.theta.items()}
+        force = observed(beyond, rows, motion, lambda time_s: np.atleast_2d(found.at(time_s)))
+        return bin_means(force, motion, np.array(task.edges_s), beyond)[0]
+
     def skin(self, names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
         """A run with derivatives of a set at values, or why it failed."""
         return self._run(names, theta, slopes=True)
@@ -177,9 +189,8 @@ class JointBench:
 
     def done(self, task: Task) -> dict[str, Any]:
         """The answer to a task, as JSON has it."""
-        if isinstance(task, Probe | FullProbe):
-            run = self.force if isinstance(task, Probe) else self.full
-            force = run(task.names, task.theta)
+        if isinstance(task, Probe | FullProbe | OtherTest):
+            force = self._force_of(task)
             return {"message": force} if isinstance(force, str) else {"force_n": force.tolist()}
         if isinstance(task, Promise):
             return {"nats": self._promised(task)}
@@ -192,6 +203,12 @@ class JointBench:
             start = {**self._neutral, **beside.theta, **self._searched(beside)}
             return self._climbed(Climb(names, start, task.runs, beside.off_n))
         return self._climbed(task)
+
+    def _force_of(self, task: Probe | FullProbe | OtherTest) -> Array | str:
+        if isinstance(task, OtherTest):
+            return self.elsewhere(task)
+        run = self.force if isinstance(task, Probe) else self.full
+        return run(task.names, task.theta)
 
     def _climbed(self, task: Climb) -> dict[str, Any]:
         start = dict(task.start)
@@ -224,7 +241,7 @@ class JointBench:
         """Returns an answer as a search reads it: a fit, nats, a force, evidences, or why there is none."""
         if "message" in said:
             return said["message"]
-        if isinstance(task, Probe | FullProbe):
+        if isinstance(task, Probe | FullProbe | OtherTest):
             return np.array(said["force_n"])
         if isinstance(task, Promise):
             return said["nats"]

@@ -33,6 +33,7 @@ from bayeskin.pipeline.folder import write_json
 from bayeskin.pipeline.joint_bench import JointBench, Source, as_json, asked, searches_file
 from bayeskin.pipeline.model import reduced_files
 from bayeskin.pipeline.provenance import caption
+from bayeskin.pipeline.reducing import reduced_file
 from bayeskin.pipeline.taking_up import Remainder
 from bayeskin.reduced.region import protocol_outside
 from bayeskin.surrogates import train
@@ -45,19 +46,31 @@ KNOWN = "pads that open, by what and as fast as the reduced model was trained on
 NAME = "diagnose"
 
 
-def _work(run: Run) -> Mapping[str, Any]:
-    started, seed = time.monotonic(), run.config.seed
-    (model,) = reduced_files(run)
+def bench_of(run: Run) -> JointBench:
+    """Returns the bench of a run whose stage `recording` is done.
+
+    Raises InputError for a device without a reduced model, and for a protocol that this does not know.
+    """
+    model = reduced_file(run.config.geometry(run.config_path).geometry, [run.config_path])
     stated = tuple((name, bounds) for name, bounds in run.config.noise if bounds is not None)
-    source = Source(
-        run.folder / "recording", model, seed, parameter_space(run.config, run.config_path), stated
-    )
-    bench = JointBench(source)
+    base = parameter_space(run.config, run.config_path)
+    bench = JointBench(Source(run.folder / "recording", model, run.config.seed, base, stated))
     if beyond := protocol_outside(bench.model.trained.protocols, bench.motion):
         raise InputError(run.config_path, f"a protocol that {model.name} does not know: {beyond[0]}", KNOWN)
+    return bench
+
+
+def searched(run: Run, bench: JointBench, ask: Ask) -> JointSearch:
+    """Returns the search of a run; after a diagnosis all its answers are kept."""
     tell = partial(_tell, run)
+    return search_jointly(ask, bench.binned, bench.base, bench.known, bench.noise, run.config.seed, tell)
+
+
+def _work(run: Run) -> Mapping[str, Any]:
+    started, seed = time.monotonic(), run.config.seed
+    bench = bench_of(run)
     with asked(bench, searches_file(run.folder, bench), run.config.design.workers) as ask:
-        found = search_jointly(ask, bench.binned, bench.base, bench.known, bench.noise, seed, tell)
+        found = searched(run, bench, ask)
         weighed = [one.fit.names for one in found.likeliest(WEIGHED)]
         answers = ask([Weigh(as_json(found.fits[names])) for names in weighed])
         evidences = {names: said for names, said in zip(weighed, answers, strict=True)

@@ -50,19 +50,24 @@ class _Discrepancy(Protocol):
     def features(self) -> Sequence[str]: ...
 
 
-class _Experiment(Protocol):
+class _Test(Protocol):
     @property
-    def protocol(self) -> str: ...
+    def name(self) -> str: ...
     @property
     def motion(self) -> PadMotion: ...
+
+
+class _Experiment(Protocol):
     @property
-    def gain_nats(self) -> float: ...
+    def protocol(self) -> _Test: ...
+    @property
+    def gain_bits(self) -> float: ...
     @property
     def standard_error(self) -> float: ...
     @property
     def named(self) -> float: ...
     @property
-    def possible_nats(self) -> float: ...
+    def possible_bits(self) -> float: ...
 
 
 @styled
@@ -151,38 +156,41 @@ def _unbroken(bins: NDArray[np.int64]) -> list[slice]:
 @styled
 def figure_experiments(table: Sequence[_Experiment]) -> Figure:
     """Expected information of each protocol, the most telling at the top, with a sketch of its motion."""
-    rows = [one for one in reversed(table) if np.isfinite(one.gain_nats)]
+    rows = [one for one in reversed(table) if np.isfinite(one.gain_bits)]
     figure = new_figure(PAGE_IN, 1.1 + 0.3 * max(len(rows), 3))
     sketch, ax = figure.subplots(1, 2, sharey=True, width_ratios=(1, 2.2))
     place = np.arange(len(rows))
-    gain = np.array([one.gain_nats for one in rows])
+    gain = np.array([one.gain_bits for one in rows])
     ax.barh(place, gain, color=[MODEL if i == len(rows) - 1 else FAINT for i in place], height=0.55)
     ax.errorbar(
         gain, place, xerr=[one.standard_error for one in rows], fmt="none", ecolor=INK, elinewidth=0.8
     )
-    reach = max((float(one.motion.displacement_m.max()) for one in rows), default=1.0)
+    reach = max((float(one.protocol.motion.displacement_m.max()) for one in rows), default=1.0)
     for y, one in zip(place, rows, strict=True):
-        end_s = float(one.motion.time_s[-1])
+        end_s = float(one.protocol.motion.time_s[-1])
         sketch.plot(
-            one.motion.time_s / end_s, y - 0.28 + 0.56 * one.motion.displacement_m / reach, color=INK, lw=0.8
+            one.protocol.motion.time_s / end_s,
+            y - 0.28 + 0.56 * one.protocol.motion.displacement_m / reach,
+            color=INK,
+            lw=0.8,
         )
         sketch.text(1.03, y, f"{end_s:.0f} s", va="center", color=GREY, fontsize=6.5)
         ax.text(
             1.0, y, f"{100 * one.named:.0f} %", va="center", ha="right", color=GREY, fontsize=6.5,
             transform=ax.get_yaxis_transform(),
         )  # fmt: skip
-    possible = table[0].possible_nats if table else 0.0
+    possible = table[0].possible_bits if table else 0.0
     ax.axvline(possible, color=ACCENT, lw=0.8, ls=(0, (4, 2)))
     ax.text(possible, len(rows) - 0.45, "certainty ", color=ACCENT, ha="right", va="bottom", fontsize=6.5)
-    ax.set(xlabel="expected information about which is true [nats]", xlim=(0.0, 1.15 * possible or 1.0))
+    ax.set(xlabel="expected information about which is true [bits]", xlim=(0.0, 1.15 * possible or 1.0))
     ax.set_ylim(-0.6, max(len(rows), 1) - 0.1)
     ax.tick_params(left=False)
-    sketch.set_yticks(place, [one.protocol for one in rows])
+    sketch.set_yticks(place, [one.protocol.name for one in rows])
     sketch.set(xlim=(-0.02, 1.3), xticks=[], xlabel="displacement over the test")
     sketch.spines[["left", "bottom"]].set_visible(False)
     sketch.tick_params(left=False)
     finding = (
-        f"“{rows[-1].protocol[0].upper()}{rows[-1].protocol[1:]}” tells most about what is missing"
+        f"“{rows[-1].protocol.name[0].upper()}{rows[-1].protocol.name[1:]}” tells most about what is missing"
         if len(rows) and gain[-1] > 0.0
         else "None of these tests is shown to tell what is missing"
     )

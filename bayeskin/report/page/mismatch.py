@@ -162,14 +162,17 @@ def _experiments(facts: RunFacts) -> list[Block]:
             (
                 one["protocol"],
                 one["sentence"],
-                Cell(percent(_share(one["gain_nats"], one)), one["gain_nats"]),
-                Cell(percent(_share(one["standard_error"], one)), one["standard_error"]),
+                cell(one["seconds"], "s"),
+                Cell(number(one["gain_bits"]), one["gain_bits"]),
+                Cell(number(one["standard_error"]), one["standard_error"]),
                 Cell(percent(one["named"]), one["named"]),
             )
         )
         for one in asked["experiments"]
     ]
-    head = ("protocol", "what is done", "tells, of all there is to know", "±", "the true one is then named")
+    possible = asked["experiments"][0]["possible_bits"]
+    told = f"tells, of {number(possible)} bits"
+    head = ("protocol", "what is done", "takes", told, "±", "the true one is then named")
     sets = "; or ".join(", ".join(names) for names in asked["sets"])
     return [
         title,
@@ -177,10 +180,6 @@ def _experiments(facts: RunFacts) -> list[Block]:
         Table("Further tests, the most informative first", head, rows),
         *pictures(facts, "experiment"),
     ]
-
-
-def _share(nats: float | None, one: Mapping[str, Any]) -> float | None:
-    return None if nats is None else nats / one["possible_nats"]
 
 
 def _windows(when: str, windows: Sequence[Mapping[str, Any]]) -> Table:
