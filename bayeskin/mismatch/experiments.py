@@ -29,6 +29,7 @@ PARENTS, CHANGES, ROUNDS = 2, 4, 3  # protocols that are changed, how many chang
 ENOUGH = 0.02  # of what is to be had: less is no reason to go on
 MOST_BINS = 800  # of a protocol; longer ones have wider bins
 MOST_SETS = 4  # that compete
+OPEN = 12.0  # nats of weight behind the best set, from which on the recording has ruled a set out
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ Judge = Callable[[Protocol], Experiment]
 
 def compete(found: Sequence[Fit], names: Sequence[str], known: Mapping[str, Mechanism]) -> list[Fit]:
     """The set of these names, and the likeliest of those tried that have, in the place of some of its
-    mechanisms, look-alikes: one for each choice of mechanisms that differs from it.
+    mechanisms, look-alikes, and are not far behind: one for each choice of mechanisms that differs from it.
 
     Raises InputError where no fit is of the set.
     """
@@ -66,7 +67,8 @@ def compete(found: Sequence[Fit], names: Sequence[str], known: Mapping[str, Mech
     def alike(other: Fit) -> bool:
         gone, new = set(best.names) - set(other.names), set(other.names) - set(best.names)
         groups = {name for one in gone for name in known[one].group}
-        return bool(gone) and len(gone) == len(new) and new <= groups and bool(np.isfinite(weight(other)))
+        is_open = weight(other) > weight(best) - OPEN
+        return bool(gone) and len(gone) == len(new) and new <= groups and is_open
 
     by_names = {other.names: other for other in found if alike(other)}
     return [best, *sorted(by_names.values(), key=weight, reverse=True)[: MOST_SETS - 1]]
@@ -127,8 +129,13 @@ def weigh(
 
 
 def ranked(found: Sequence[Experiment]) -> list[Experiment]:
-    """The most informative first; those that could not be judged last."""
-    return sorted(found, key=lambda one: (np.isnan(one.gain_bits), -one.gain_bits))
+    """The most informative first, of those that tell equally much the shortest; unjudged ones last."""
+
+    def place(one: Experiment) -> tuple[bool, float, float]:
+        share = one.gain_bits / one.possible_bits
+        return bool(np.isnan(share)), -round(share, 2), float(one.protocol.motion.time_s[-1])
+
+    return sorted(found, key=place)
 
 
 def _edges(motion: PadMotion, found: Fit) -> Array:

@@ -27,7 +27,7 @@ from bayeskin.inference.gauss_newton import promise
 from bayeskin.mechanisms import Mechanism, with_one, without_one
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.mismatch.joint_fit import JointFit
-from bayeskin.mismatch.search import weight
+from bayeskin.mismatch.search import PRIOR, weight
 from bayeskin.mismatch.tasks import Ask, Climb, FullProbe, Join, Probe, Promise, Task
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array, BinnedForce, ParameterSpace
@@ -43,11 +43,12 @@ class SearchSettings:
     behind : nats of weight behind the likeliest set, from which on a fit is given up
     close : nats behind it, up to which a set is checked by the full model
     probes : runs of each part of a mechanism that the model solves, and how far off neutral, of the prior
-    shortlist, promised : mechanisms that are fitted beside a set, and nats that each must promise
+    shortlist, promised : mechanisms that are fitted beside a set, and nats that each must promise, which a
+        skin led astray makes too few; where nothing but noise is left, each must promise to be likely
     astray : nats of weight gained, from which on a set may have led the smaller one to another skin
     near, alike : share of the best gain from which on sets are fitted from other skins; how many at most
     others, tried : skins that a set is run with, and how many of them it is fitted from
-    left : RMS residual over the noise's, from which on that is done
+    left : RMS residual over the noise's, from which on that is done, and more than noise is left
     gain : nats of weight, less is no reason to go on; most : mechanisms of a set
     compared : sets that are checked by the full model; checks : rounds of them
     exact : error of the forward model, RMS over bins, over that of the noise, that needs no correction
@@ -79,6 +80,7 @@ class SearchSettings:
     alike_by: float = 0.1
 
 
+RARITY = float(np.log((1.0 - PRIOR) / PRIOR))  # nats that a mechanism must explain to be as likely as none
 Tell = Callable[[str], None]
 
 
@@ -212,8 +214,7 @@ class _Searcher:
                 for one, theta in starts
             ]))  # fmt: skip
             best = self.found.fits[hopeful[0].fit.names] if hopeful else current
-            left_n = self._rms(self._binned.force_n - best.fit.force_n)
-            if left_n > self._settings.left * noise_of(self._binned):
+            if self._leaves_more_than_noise(best):
                 self._from_other_skins(best)
             self._check([
                 now for one in hopeful
@@ -324,6 +325,10 @@ class _Searcher:
         """RMS over the bins that were recorded."""
         return float(np.sqrt(np.mean(np.square(force_n[np.isfinite(self._binned.force_n)]))))
 
+    def _leaves_more_than_noise(self, one: JointFit) -> bool:
+        left_n = self._rms(self._binned.force_n - one.fit.force_n)
+        return left_n > self._settings.left * noise_of(self._binned)
+
     def _gained(self, one: JointFit, before: JointFit) -> float:
         return weight(one.fit) - weight(before.fit)
 
@@ -404,7 +409,8 @@ class _Searcher:
             if isinstance(nats, float):
                 promised[name] = nats
         order = sorted(promised, key=lambda name: -promised[name])
-        chosen = [name for name in order if promised[name] > settings.promised][: settings.shortlist]
+        least = settings.promised if self._leaves_more_than_noise(current) else settings.gain + RARITY
+        chosen = [name for name in order if promised[name] > least][: settings.shortlist]
         self._tell("promised: " + ", ".join(f"{name} {promised[name]:.0f} nats" for name in order[:5]))
         fits = self._ask([
             Climb(with_one(names, name, self._known), starts[name], settings.first) if name in starts
