@@ -26,7 +26,7 @@ from bayeskin.mismatch.wrapper import Wrapper, innermost
 from bayeskin.types import Array, Design, ParameterSpace, Surrogate
 
 MOST = 1500  # draws, among which a wave's points are chosen
-BEFORE = (120,)  # steps of the ensembles whose draws a further wave begins with
+BEFORE = (60,)  # steps of the ensembles whose draws a further wave begins with
 
 # The skin's force (m,) with the set at points (n, d) by the forward model, and at the first few by the full
 # model in whose place that is; or why a run failed.
@@ -42,7 +42,8 @@ class EmulationSettings:
     points, more, waves : runs of the first wave, of each further one, and how many waves at most
     first : of the prior's width on either side of the fit's run, from where the first points are drawn
     sure : sd of the emulator, RMS over bins, over the noise of a bin, up to which it is believed
-    enough : RMS error of the emulator at fresh runs, over the noise of a bin, with which it is done
+    enough : RMS error of the emulator at the median of fresh runs, over the noise of a bin, with which it is
+        done
     """
 
     checks: int = 3
@@ -58,7 +59,7 @@ class EmulationSettings:
 class Emulated:
     """The most probable point by the emulator, draws of the posterior, runs made, the emulator's RMS error.
 
-    error_n : of the last emulator but one, at the runs that followed it [N]; None where none did
+    error_n : of the last emulator but one, at the median of the runs that followed it [N]; None for one wave
     settled : whether that is small beside the noise
     """
 
@@ -100,7 +101,10 @@ def emulate(
         fresh = _design(design, points[ran], np.array(made))
         if emulated is not None:
             said = innermost(emulated.fit.log_posterior.surrogate).predict_mean(points[ran])
-            error_n = float(np.sqrt(np.mean((said - fresh.force_n[-len(ran) :]) ** 2)))
+            each_n = np.sqrt(np.mean((said - fresh.force_n[-len(ran) :]) ** 2, axis=1))
+            error_n = float(
+                np.median(each_n)
+            )  # it knows itself where it is unsure, and most errors are there
         design = fresh
         local = _posterior(about, learn(design), settings.sure * noise_n)
         best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
