@@ -14,6 +14,7 @@ from toys.solved import TRUTH, Exact
 from bayeskin.mismatch.emulate import EmulationSettings, Forces, emulate
 from bayeskin.mismatch.fit import fit_near
 from bayeskin.mismatch.joint_fit import JointFit, fit_jointly, within
+from bayeskin.mismatch.joint_search import from_equal_permeabilities
 from bayeskin.mismatch.resample import resample
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.pipeline.joint_bench import JointBench
@@ -55,7 +56,7 @@ def learnt(design: Design) -> Surrogate:
 def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[JointBench, JointFit]) -> None:
     bench, found = fitted
     asked: list[int] = []
-    emulated = emulate(found, by_the_toy(bench, found.fit.names, asked), learnt, solved.NOISE_N, 1, FEW)
+    emulated = emulate([found], by_the_toy(bench, found.fit.names, asked), learnt, solved.NOISE_N, 1, FEW)
     assert not isinstance(emulated, str)
     assert emulated.settled
     assert emulated.error_n is not None
@@ -68,10 +69,42 @@ def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[JointBench, JointFit]
     assert sum(inside) >= len(inside) - 1
 
 
+def test_the_first_points_are_about_all_maxima(
+    fitted: tuple[JointBench, JointFit], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, found = fitted
+    further = from_equal_permeabilities(found, bench.base)
+    theta = found.fit.theta
+    assert further.names == found.fit.names
+    assert further.start["k_c"] == further.start["k_s"]
+    assert further.start["k_c"] ** 2 == pytest.approx(theta["k_c"] * theta["k_s"])
+    assert all(further.start[name] == theta[name] for name in theta if name not in ("k_c", "k_s"))
+    softer = {name: 0.7 * TRUTH[name] for name in ("E_c", "E_s")}
+    recorded = solved.recorded(3)
+    elsewhere = solved.bench(monkeypatch, dataclasses.replace(recorded, force_n=0.7 * recorded.force_n))
+    start = {**elsewhere.noise, **TRUTH, **softer, "F0": 0.0}
+    other = fit_jointly(found.fit.names, start, elsewhere.skin, elsewhere.local)
+    assert isinstance(other, JointFit)
+    run, waves = by_the_toy(bench, found.fit.names, []), list[Array]()
+
+    def forces(points: Array, full: int) -> tuple[Answers, Answers]:
+        waves.append(points)
+        return run(points, full)
+
+    emulated = emulate([found, other], forces, learnt, solved.NOISE_N, 1, FEW)
+    assert not isinstance(emulated, str)
+    np.testing.assert_array_equal(waves[0][-2:], [found.run.theta, other.run.theta])
+    unit = bench.space(found.fit.names).to_unit
+    at, first, second = unit(waves[0][:-2]), unit(found.run.theta), unit(other.run.theta)
+    assert np.linalg.norm(first - second) > 0.05
+    nearer = np.linalg.norm(at - second, axis=1) < np.linalg.norm(at - first, axis=1)
+    assert 0.2 < nearer.mean() < 0.8
+
+
 @pytest.mark.slow
 def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[JointBench, JointFit]) -> None:
     bench, found = fitted
-    emulated = emulate(found, by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
+    emulated = emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
     assert not isinstance(emulated, str)
     about = found.fit.log_posterior
     exact = Exact(innermost(about.surrogate).space)
@@ -94,7 +127,7 @@ def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[JointBench, Joint
 def test_the_same_seed_gives_the_same_draws(fitted: tuple[JointBench, JointFit]) -> None:
     bench, found = fitted
     made = [
-        emulate(found, by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
+        emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
         for _ in range(2)
     ]
     assert not isinstance(made[0], str)
@@ -114,10 +147,10 @@ def test_runs_that_fail_are_done_without_and_are_the_answer_where_all_do(
     def none(points: Array, full: int) -> tuple[Answers, Answers]:
         return ["near folding"] * len(points), []
 
-    emulated = emulate(found, some, learnt, solved.NOISE_N, 1, dataclasses.replace(FEW, waves=2))
+    emulated = emulate([found], some, learnt, solved.NOISE_N, 1, dataclasses.replace(FEW, waves=2))
     assert not isinstance(emulated, str)
     assert emulated.runs == 24 + 16
-    assert emulate(found, none, learnt, solved.NOISE_N, 1, FEW) == "near folding"
+    assert emulate([found], none, learnt, solved.NOISE_N, 1, FEW) == "near folding"
 
 
 MIDDLE = 0.5 * (solved.EDGES_S[1:] + solved.EDGES_S[:-1])
@@ -151,7 +184,7 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
                 for force, row in zip(forward[:count], points[:count], strict=True)]  # fmt: skip
         return forward, ["it folds", *full[1:]] if fails and count else full
 
-    emulated = emulate(found, forces, learnt, solved.NOISE_N, 1, FEW)
+    emulated = emulate([found], forces, learnt, solved.NOISE_N, 1, FEW)
     assert not isinstance(emulated, str)
     assert asked[0] == FEW.checks
     assert sum(asked) == FEW.checks
@@ -168,7 +201,7 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
 def test_one_wave_alone_is_never_settled(fitted: tuple[JointBench, JointFit]) -> None:
     bench, found = fitted
     one = dataclasses.replace(FEW, waves=1)
-    emulated = emulate(found, by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, one)
+    emulated = emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, one)
     assert not isinstance(emulated, str)
     assert emulated.error_n is None
     assert not emulated.settled

@@ -4,7 +4,8 @@ The force about one run (`tangent`) leads to the most probable skin, but a poste
 force is linear: along a ridge of moduli and permeabilities it is curved. So the forward model runs at points
 that are spread over draws of the posterior, a Gaussian process learns the force from all runs so far, and the
 posterior is drawn anew with it. That is repeated until fresh runs agree with what the emulator says of them.
-Where it says that it is unsure the posterior is taken to be zero: the next wave comes nearer.
+Where it says that it is unsure the posterior is taken to be zero: the next wave comes nearer. The first
+points are about all maxima that are known.
 
 The forward model has an error, which is not the same all along a ridge. Where it matters the full model runs
 at a few of the draws. The mean of the errors there is added to the force, and how they differ from it, as a
@@ -71,27 +72,27 @@ class Emulated:
 
 
 def emulate(
-    found: JointFit, forces: Forces, learn: Learn, noise_n: float, seed: int,
+    maxima: Sequence[JointFit], forces: Forces, learn: Learn, noise_n: float, seed: int,
     settings: EmulationSettings | None = None,
 ) -> Emulated | str:  # fmt: skip
-    """Returns the posterior of a set about its fit; the message of a run where all of the first wave fail.
+    """Returns the posterior of a set about its fits; the message of a run where all of the first wave fail.
 
+    maxima : fits of the set, the likeliest first, which has what is added to all runs
     noise_n : sd of a bin's mean
     """
     settings, rng = settings or EmulationSettings(), np.random.default_rng([seed, 11])
+    found = maxima[0]
     about, names = found.fit.log_posterior, found.fit.names
-    space = innermost(about.surrogate).space
-    vector = np.clip(about.vector(found.fit.theta), *about.bounds)
-    near = replace(found.fit, log_posterior=within(about, vector, settings.first))
-    drawn, error_n = resample(near, None, seed, BEFORE, 0), None
+    space, error_n = innermost(about.surrogate).space, None
+    draws = np.concatenate([_near(one, settings.first, seed) for one in maxima])
     off_n = found.off_n
     design = _none(space, about.surrogate.edges_s)
     emulated: Emulated | None = None
     for wave in range(settings.waves):
         count = settings.more if wave else settings.points
-        points = _spread(space, drawn.draws[:, : space.dim], design.theta, count, rng)
+        points = _spread(space, draws[:, : space.dim], design.theta, count, rng)
         if wave == 0:
-            points = np.concatenate([points[:-1], found.run.theta[None]])
+            points = np.concatenate([points[: -len(maxima)], [one.run.theta for one in maxima]])
         answers, full = forces(points, settings.checks if wave == 0 and off_n.any() else 0)
         off_n, about = _with_errors(about, off_n, answers, full)
         made = [answer + off_n for answer in answers if not isinstance(answer, str)]
@@ -111,11 +112,19 @@ def emulate(
         done = error_n is not None and error_n <= settings.enough * noise_n
         last = done or wave == settings.waves - 1
         drawn = resample(best, None, seed) if last else resample(best, None, seed, BEFORE, 0)
-        emulated = Emulated(best, drawn, len(design.theta), error_n, done)
+        draws, emulated = drawn.draws, Emulated(best, drawn, len(design.theta), error_n, done)
         if done:
             break
     assert emulated is not None
     return emulated
+
+
+def _near(one: JointFit, reach: float, seed: int) -> Array:
+    """Draws (n, D) of the posterior about a fit's run, up to so far from it, of the prior's width."""
+    about = one.fit.log_posterior
+    vector = np.clip(about.vector(one.fit.theta), *about.bounds)
+    near = replace(one.fit, log_posterior=within(about, vector, reach))
+    return resample(near, None, seed, BEFORE, 0).draws
 
 
 def _with_errors(

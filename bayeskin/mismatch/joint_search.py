@@ -140,6 +140,18 @@ def search_jointly(
     return searcher.found
 
 
+def from_equal_permeabilities(best: JointFit, base: ParameterSpace) -> Climb:
+    """Returns the climb of a set from a fit's values with the permeabilities of all layers equal.
+
+    Force hardly tells which layer drains: fits often have a second maximum there, beyond what a tangent sees.
+    """
+    names = [p.name for p in base.parameters if p.stress_power < 0]
+    middle = float(np.exp(np.mean([np.log(best.fit.theta[name]) for name in names])))
+    limits = {p.name: (p.lower, p.upper) for p in base.parameters}
+    equal = {name: float(np.clip(middle, *limits[name])) for name in names}
+    return Climb(best.fit.names, {**best.fit.theta, **equal}, SearchSettings().runs, _added(best))
+
+
 class _Searcher:
     def __init__(
         self, ask: Ask, binned: BinnedForce, base: ParameterSpace, known: Mapping[str, Mechanism],
