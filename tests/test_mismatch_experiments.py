@@ -21,7 +21,7 @@ from bayeskin.inference import LogPosterior
 from bayeskin.mechanisms import Mechanism, bin_means, observed
 from bayeskin.mechanisms.mechanism import Instrument, Place, added
 from bayeskin.mechanisms.viscous_drag import speed_of
-from bayeskin.mismatch.experiments import DRAWS, Experiment, compete, noise_of, ranked, search, weigh
+from bayeskin.mismatch.experiments import DRAWS, OPEN, Experiment, compete, noise_of, ranked, search, weigh
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.information import expected_gain
 from bayeskin.mismatch.observed import ObservedSurrogate
@@ -259,6 +259,8 @@ def test_sets_with_look_alikes_in_the_place_of_the_likeliest_compete() -> None:
     # A set that the search refused, since the surrogate is unsure of it, is no reference however likely.
     unsure = dataclasses.replace(alike, log_evidence=99.0)
     assert [one.names for one in compete([*found, unsure], ["rub"], KNOWN)] == [("rub",), ("drag",)]
+    ruled_out = dataclasses.replace(alike, log_evidence=9.0 - OPEN - 0.1)
+    assert [one.names for one in compete([none, ruled_out, likely], ["rub"], KNOWN)] == [("rub",)]
     impossible = dataclasses.replace(alike, log_evidence=-np.inf)
     assert [one.names for one in compete([none, impossible, likely], ["rub"], KNOWN)] == [("rub",)]
 

@@ -77,7 +77,7 @@ def emulate(
 ) -> Emulated | str:  # fmt: skip
     """Returns the posterior of a set about its fits; the message of a run where all of the first wave fail.
 
-    maxima : fits of the set, the likeliest first, which has what is added to all runs
+    maxima : fits of the set, the likeliest first; what was added to its runs is added to all
     noise_n : sd of a bin's mean
     """
     settings, rng = settings or EmulationSettings(), np.random.default_rng([seed, 11])
@@ -103,9 +103,7 @@ def emulate(
         if emulated is not None:
             said = innermost(emulated.fit.log_posterior.surrogate).predict_mean(points[ran])
             each_n = np.sqrt(np.mean((said - fresh.force_n[-len(ran) :]) ** 2, axis=1))
-            error_n = float(
-                np.median(each_n)
-            )  # it knows itself where it is unsure, and most errors are there
+            error_n = float(np.median(each_n))  # the largest are where the emulator says that it is unsure
         design = fresh
         local = _posterior(about, learn(design), settings.sure * noise_n)
         best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
@@ -132,7 +130,7 @@ def _with_errors(
 ) -> tuple[Array, LogPosterior]:
     """The forward model's mean error (m,) over some places, and the posterior that allows for the rest of it.
 
-    known_n (m,) : at the first place; forward, full : forces at others, of the latter at the first of these
+    known_n (m,) : at the first place; forward : forces at other places; full : at the first few of these
     """
     more = [b - a for a, b in zip(forward, full, strict=False)
             if not isinstance(a, str) and not isinstance(b, str)]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Which further test would tell competing sets of mechanisms apart: each simulated with the posterior.
+"""The choice of the further test that tells competing sets of mechanisms apart, each run with its posterior.
 
 Of every set, a few posterior draws are run on each protocol, and the expected information gain about which
 set is true is computed from the forces (`information`). The noise of the test to come is the fitted noise of
@@ -99,7 +99,7 @@ def search(judge: Judge, first: Sequence[Protocol], limits: Limits, seed: int) -
 def weigh(
     protocol: Protocol, fits: Sequence[Fit], known: Mapping[str, Mechanism], ask: Ask, seed: int
 ) -> Experiment:
-    """What a protocol is expected to tell about which of the sets is true, all as probable before.
+    """Returns what a protocol is expected to tell about which of the sets is true, all as probable before.
 
     fits : one for each hypothesis, by whose `names` mechanisms of `known` are on, the likeliest first
     ask : answers `DRAWS` tasks of another test for each hypothesis

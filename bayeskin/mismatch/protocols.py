@@ -71,7 +71,7 @@ class Protocol:
 
     @property
     def sentence(self) -> str:
-        """What to do."""
+        """The sentence that says what to do."""
         parts = [_said(cycle, len(list(equal))) for cycle, equal in groupby(self.cycles)]
         text = "; then ".join(parts)
         return f"{text[0].upper()}{text[1:]}."

@@ -1,4 +1,4 @@
-"""Which further test would tell the explanations of a mismatch apart, after it has been diagnosed.
+"""The choice of the further test that tells the explanations of a mismatch apart, after a diagnosis.
 
 The reduced model of the device runs them. It knows the protocols that it was trained for, which are taken as
 what the device can do.
@@ -82,7 +82,7 @@ def choose(source: Path, reporter: Reporter, device: Path | None = None) -> dict
 
 
 def answered(run: Run) -> Record | None:
-    """What was answered about the diagnosis that stands in the run's folder, if anything was asked of it."""
+    """Returns what was answered about the diagnosis in the run's folder, if anything was asked of it."""
     return current_record(run.folder / FOLDER, _diagnosis(run))
 
 

@@ -236,7 +236,7 @@ class ReducedEquations:
         return Stage(state, length_s, past.elapsed_s, history, sources, residual)
 
     def _place(self, time_s: float, length_s: float) -> tuple[float, float]:
-        """How far the pads are open in a stage, and its length: near ones have near tangents."""
+        """Returns how far the pads are open in a stage, and its length: near ones have near tangents."""
         return float(self.drive.motion.at(time_s)) / self.drive.largest_m, float(np.log(length_s))
 
     def _history(
