@@ -288,6 +288,7 @@ class ReducedEquations:
             t.force_row, t.by_pads, self.spent,
         )  # fmt: skip
         if status != kernels.CONVERGED:
+            self._tangents.forget()  # the next solve makes its own
             return None
         self.room, self.past = room, past
         return x, float(force_n) - self.zero_n

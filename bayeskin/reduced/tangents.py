@@ -40,6 +40,10 @@ class Tangents:
         into.set_to(nearest[1])
         return True
 
+    def forget(self) -> None:
+        """Drops all tangents."""
+        self._kept.clear()
+
     def keep(self, place: tuple[float, float], tangent: Tangent) -> None:
         """Keeps a copy under a place, instead of that at the same place, or of that which is oldest."""
         same = [i for i, kept in enumerate(self._kept) if _apart(kept[0], place) < SAME_PLACE]
