@@ -27,6 +27,8 @@ from bayeskin.reduced.equations import Bound, ReducedEquations, ReducedSpace, bo
 from bayeskin.types import Array, PadMotion
 
 STEP = 1e-6  # of a parameter's change: truncation 1e-6, rounding 1e-10
+# Either way for a length, whose moved fields are in single precision: truncation 1e-4, rounding 1e-4 to 1e-3.
+LENGTH_STEP = 1e-2
 PASSES_BY_LENGTH = 5
 # Derivatives below these are solved for to the accuracy of a stage's own solve, and no further: of the modes'
 # coefficients, which are of order one, and of the force, of its scale.
@@ -61,16 +63,15 @@ class ReducedGradients:
             raise InputError("gradients", unknown[0], f"among {', '.join(theta)}")
         self.names = tuple(changes)
         self._equations = equations
-        further = {name: {**theta, name: theta[name] + STEP * change} for name, change in changes.items()}
-        self._moved = {
-            self.names.index(name): ReducedEquations(space_at(values), values, binds, protocol)
-            for name, values in further.items()
-            if name in LENGTHS
-        }
-        runs = [
-            self._moved[i].run if i in self._moved else bound(equations.space, values, binds)
-            for i, values in enumerate(further.values())
-        ]
+        self._moved: dict[int, list[ReducedEquations]] = {}
+        runs = []
+        for i, (name, change) in enumerate(changes.items()):
+            if name in LENGTHS:
+                ends = [{**theta, name: theta[name] + way * LENGTH_STEP * change} for way in (1.0, -1.0)]
+                self._moved[i] = [ReducedEquations(space_at(end), end, binds, protocol) for end in ends]
+                runs.append(equations.run)  # in the space as it is, a length changes the history alone
+            else:
+                runs.append(bound(equations.space, {**theta, name: theta[name] + STEP * change}, binds))
         self._drives = [on_the_way(protocol, run.laws) for run in runs]
         self._in_series = bool(equations.drive.elements)
         self._varied = _varied(equations, [*runs, *([equations.run] if self._in_series else [])])
@@ -129,7 +130,7 @@ class ReducedGradients:
         )  # fmt: skip
         for i, guess in by_length.items():
             out.x[i] = guess
-            force[i] = self._by_length(i, past, x, residual, room, before, out)
+            force[i] = self._by_length(i, past, x, before, out)
         eq.spent += (0, 1, tangents)
         if self._in_series:
             return self._less_lost(stage, last.lost, out, force)
@@ -141,28 +142,31 @@ class ReducedGradients:
         return extrapolate(known, stage.state.time_s)
 
     def _by_length(
-        self, i: int, past: kernels.History, x: Array, residual: Array, room: kernels.Room,
-        before: slopes.Slopes, out: slopes.Slopes,
-    ) -> float:  # fmt: skip
-        """Fills row i of `out`, the derivatives by a length from a guess of x's, and returns the force's.
-
-        residual, room : at the unknowns x
-        """
-        eq, moved, t = self._equations, self._moved[i], self._equations.tangent
-        further, other = np.empty(len(x)), eq.make_room()
-        older = kernels.History(
-            past.volume + STEP * before.volume[i], past.pressure + STEP * before.pressure[i],
-            past.memory + STEP * before.memory[i], past.displacement + STEP * before.x[i], past.length_s,
-            past.elapsed_s, past.time_s,
-        )  # fmt: skip
+        self, i: int, past: kernels.History, x: Array, before: slopes.Slopes, out: slopes.Slopes
+    ) -> float:
+        """Fills row i of `out`, the derivatives by a length from a guess of x's, and returns the force's."""
+        t, ways = self._equations.tangent, (LENGTH_STEP, -LENGTH_STEP)
+        rooms = [equations.make_room() for equations in self._moved[i]]
+        residuals = np.empty((2, len(x)))
+        pasts = [
+            kernels.History(
+                past.volume + way * before.volume[i], past.pressure + way * before.pressure[i],
+                past.memory + way * before.memory[i], past.displacement + way * before.x[i], past.length_s,
+                past.elapsed_s, past.time_s,
+            )
+            for way in ways
+        ]  # fmt: skip
         for _ in range(PASSES_BY_LENGTH):
-            kernels.residual(moved.system, moved.packed, older, x + STEP * out.x[i], other, further)
-            left = (further - residual) / STEP
+            for n, moved in enumerate(self._moved[i]):
+                moved_x = x + ways[n] * out.x[i]
+                kernels.residual(moved.system, moved.packed, pasts[n], moved_x, rooms[n], residuals[n])
+            left = (residuals[0] - residuals[1]) / (2.0 * LENGTH_STEP)
             step = -t.inverse @ left[2:]
             out.x[i, 2:] += step
-        out.volume[i] = (other.volume - room.volume) / STEP
-        out.pressure[i] = (other.at_pressure - room.at_pressure) / STEP
-        out.memory[i] = (other.memory - room.memory) / STEP
+        up, down = rooms
+        out.volume[i] = (up.volume - down.volume) / (2.0 * LENGTH_STEP)
+        out.pressure[i] = (up.at_pressure - down.at_pressure) / (2.0 * LENGTH_STEP)
+        out.memory[i] = (up.memory - down.memory) / (2.0 * LENGTH_STEP)
         return float(2.0 * left[1] + t.force_row @ step)
 
     def _pads_by(self, time_s: float, lost: Memories) -> Array:
