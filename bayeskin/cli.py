@@ -29,7 +29,7 @@ a_device = click.option(
 
 
 class _Workflow(click.Group):
-    """Lists its commands in the order in which one comes to need them."""
+    """Lists its commands in the order in which a user needs them."""
 
     ORDER: ClassVar[dict[str, tuple[str, ...]]] = {
         "From a recording to an answer": ("doctor", "new", "import", "run", "diagnose", "report"),
@@ -52,7 +52,7 @@ class _Workflow(click.Group):
 )
 @click.version_option(bayeskin.__version__, prog_name="bayeskin")
 def cli() -> None:
-    """What living skin is made of, from an extensometer test, and how sure one can be.
+    """Infer the properties of living skin from an extensometer test, and say how sure they are.
 
     \b
     Start here:
@@ -147,7 +147,7 @@ def reduce_(source: Path | None, out: Path | None, scheduler: str | None, as_jso
     _answer(document, as_json)
 
 
-@cli.command(short_help="One run of the full model on a recording's displacement.")
+@cli.command(short_help="Run the full model once on a recording's displacement.")
 @click.argument("config", required=False, type=click.Path(path_type=Path))
 @click.option(
     "--recording", type=click.Path(path_type=Path), help="Recording whose displacement drives the run."
@@ -164,7 +164,7 @@ def reduce_(source: Path | None, out: Path | None, scheduler: str | None, as_jso
 @click.option("--at", "at_s", multiple=True, type=float, metavar="SECONDS", help="A time that it shows.")
 @as_json
 def simulate(as_json: bool, **options: Any) -> None:
-    """One run of the full model on a recording's displacement (default: the demo's).
+    """Run the full model once on a recording's displacement (default: the demo's).
 
     Parameters that are not set stand at the median of their prior, a mechanism's among them. The CSV has the
     columns time_s, displacement_m, force_n.
@@ -221,7 +221,7 @@ _stage_command("sobol", "Sobol' indices of the force over time.")
 @a_config
 @as_json
 def report(config: Path, as_json: bool) -> None:
-    """One HTML page of a run, from whatever stages are done.
+    """Write one HTML page of a run, from the stages that are done.
 
     Runs no stage: says plainly which are missing. The page is report.html in the run's folder; it needs no
     network and no file beside it, so it can be sent as it is.
@@ -238,12 +238,12 @@ def report(config: Path, as_json: bool) -> None:
     _answer(document, as_json)
 
 
-@cli.command(short_help="All stages of a configuration, skipping what is done.")
+@cli.command(short_help="Run all stages of a configuration that are not done yet.")
 @a_config
 @a_scheduler
 @as_json
 def run(config: Path, scheduler: str | None, as_json: bool) -> None:
-    """All stages of a configuration in order, skipping what is done and unchanged.
+    """Run all stages of a configuration in order; skip those that are done and unchanged.
 
     Outputs go to a folder beside CONFIG with the configuration's name; report.html in it is the answer to
     read. Interrupted at any moment, the same command goes on.
@@ -256,12 +256,12 @@ def run(config: Path, scheduler: str | None, as_json: bool) -> None:
     _run(config, None, scheduler, as_json)
 
 
-@cli.command(short_help="What the model leaves out: where, which physics.")
+@cli.command(short_help="Find the physics that the model leaves out, and where.")
 @click.argument("source", type=click.Path(path_type=Path))
 @a_device
 @as_json
 def diagnose(source: Path, device: Path | None, as_json: bool) -> None:
-    """What the model leaves out of a recording: where, which physics, how much better.
+    """Find the physics that the model leaves out of a recording, and where; show how the fit improves.
 
     SOURCE is a configuration, or a recording by itself. Where a shipped surrogate knows its protocol,
     mechanisms of the tissue are tried whose effects are shipped or were learnt by `bayeskin effects`, and
@@ -284,12 +284,12 @@ def diagnose(source: Path, device: Path | None, as_json: bool) -> None:
     _answer(document, as_json)
 
 
-@cli.command(short_help="Which further test would tell look-alikes apart.")
+@cli.command(short_help="Propose the further test that tells look-alikes apart.")
 @click.argument("source", type=click.Path(path_type=Path))
 @a_device
 @as_json
 def experiment(source: Path, device: Path | None, as_json: bool) -> None:
-    """Which further test would tell look-alikes apart, and the one to run next.
+    """Propose the further test that would best tell look-alike mechanisms apart.
 
     SOURCE as for `bayeskin diagnose`, which is run first where that is not done; the reaction only, since no
     other protocol has the article's observation. The set that explains the recording best and those with
@@ -310,13 +310,13 @@ def experiment(source: Path, device: Path | None, as_json: bool) -> None:
     _answer(document, as_json)
 
 
-@cli.command(short_help="What a diagnosis is worth, on concealed effects.")
+@cli.command(short_help="Measure how good diagnoses are, on concealed effects.")
 @click.argument("folder", required=False, type=click.Path(path_type=Path))
 @click.option("--at-most", type=click.IntRange(min=0), metavar="N", help="Diagnose N more, then score.")
 @click.option("--rediagnose", default=0, type=click.IntRange(min=0), metavar="N", help="Diagnose N again.")
 @as_json
 def prove(folder: Path | None, at_most: int | None, rediagnose: int, as_json: bool) -> None:
-    """What a diagnosis is worth: recordings with concealed effects diagnosed, then scored beside their keys.
+    """Measure how good diagnoses are, on recordings with concealed effects whose keys are known.
 
     FOLDER is a set that `bayeskin conceal` made; by default the one that is shipped. A recording that has a
     verdict is not diagnosed again, so the command can be interrupted; keys are opened when the verdicts are
@@ -362,13 +362,13 @@ def conceal(folder: Path, seed: int, count: int, only: tuple[str, ...], as_json:
     _answer(document, as_json)
 
 
-@cli.command(short_help="The full model as a UM-Bridge server for other tools.")
+@cli.command(short_help="Serve the full model to other tools by UM-Bridge.")
 @click.argument("config", required=False, type=click.Path(path_type=Path))
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen at.")
 @click.option("--port", default=4242, show_default=True, type=click.IntRange(0, 65535), help="0: a free one.")
 @as_json
 def serve(config: Path | None, host: str, port: int, as_json: bool) -> None:
-    """The forward model as a UM-Bridge model, for other tools of uncertainty quantification.
+    """Serve the forward model by UM-Bridge, for other tools of uncertainty quantification.
 
     Serves the model of CONFIG (default: the demo's) on its recording's protocol until Ctrl-C: one input
     vector of the parameters in SI units, one output vector of the mean force [N] in each of the recording's
@@ -390,10 +390,10 @@ def serve(config: Path | None, host: str, port: int, as_json: bool) -> None:
         server.serve_forever()
 
 
-@cli.command(short_help="Whether this installation works.")
+@cli.command(short_help="Check that this installation works.")
 @as_json
 def doctor(as_json: bool) -> None:
-    """Whether this installation works, in the folder that you are in.
+    """Check that this installation works in the current folder.
 
     Packages and their versions, the linear solver, threads, disk space, write access; then a short run of the
     full model and a surrogate's prediction against stored numbers, some five seconds (once, after the

@@ -1,4 +1,4 @@
-"""Where the full model is run: the prior box, points that fill it, and the part that data leave plausible.
+"""Points at which the full model is run: they fill the prior, or its part that data leave plausible.
 
 A design grows in waves. Wave 0 fills the prior box with a scrambled Sobol' sequence; each later wave
 fills what history matching against the recording has not ruled out, so that the surrogate is best
@@ -93,7 +93,7 @@ def first_wave(space: ParameterSpace, n: int, held_out: int, seed: int) -> Wave:
 
 
 def misfit_bounds(mean: Array, sd: Array, force_n: ArrayLike, weights: ArrayLike) -> tuple[Array, Array]:
-    """What the full model's RMS misfit [N] to the recording can be, at least and at most; each (n,).
+    """Returns the least and the largest RMS misfit [N] that the full model can have, each (n,).
 
     mean, sd (n, m): a surrogate's prediction; force_n (m,): the recording's bin means; weights (m,):
     weight of each bin, 0 where it is not fitted (a boolean mask will do). By the triangle inequality
@@ -113,7 +113,7 @@ def misfit_bounds(mean: Array, sd: Array, force_n: ArrayLike, weights: ArrayLike
 def plausible(
     mean: Array, sd: Array, force_n: ArrayLike, weights: ArrayLike, floor_n: float, factor: float = 1.5
 ) -> NDArray[np.bool_]:
-    """Which of n candidates can still be among the good fits, (n,); never empty.
+    """Returns which of n candidates can still be among the good fits, (n,); at least one is.
 
     History matching (Craig et al. 1997; Vernon et al. 2010) rules out a point whose misfit is many
     sd of noise and surrogate error. The skin model has a misfit to real recordings at every point,
@@ -246,7 +246,7 @@ class _Region:
 
 @dataclass(frozen=True)
 class _Survey:
-    """What history matching left: where to draw, the limit [N] to pass, and the size of what passes."""
+    """Result of history matching: where to draw, the limit [N] to pass, and the share that passes."""
 
     region: _Region
     best_n: float

@@ -50,7 +50,7 @@ def load_recording(path: Path | str, sheet: str | None = None) -> Recording:
 def simulate(
     recording: Recording, /, theta: Mapping[str, float] | None = None, **settings: Any
 ) -> Simulation:
-    """One run of the full model on a recording's displacement: some seconds.
+    """Returns one run of the full model on a recording's displacement: some seconds.
 
     theta : SI values by name; what is left out stands at the median of its prior
     settings : sections of a configuration, such as ``model={"refinement": 2}``
@@ -137,7 +137,7 @@ def check(recording: Recording, posterior: arviz.InferenceData, draws: int = 24)
 def diagnose(
     recording: Recording, posterior: arviz.InferenceData | None = None, folder: str | Path | None = None
 ) -> dict[str, Any]:
-    """What the model leaves out of a recording: the answer of ``bayeskin diagnose``.
+    """Returns the answer of ``bayeskin diagnose``: what the model leaves out of a recording.
 
     Surrogate, seed and noise are those that `posterior` was made with; the whole recording is fitted.
     Minutes, on two processes. `folder` keeps figures and what is needed to go on.

@@ -108,7 +108,7 @@ def reading(path: Path, expected: str) -> Iterator[h5py.File]:
 
 
 def in_a_line(error: Exception) -> str:
-    """What a library has to say of a file, in one line that is not too long."""
+    """Returns a library's message about a file in one line of limited length."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:200]
 
 
@@ -155,7 +155,7 @@ def checked(value: T, where: object) -> T:
 
 
 def _is(value: Any, kind: Any) -> bool:
-    """Whether a value read is what an annotation says; of arrays their kind of numbers, no shape."""
+    """Returns whether a value has the type of an annotation; of arrays, whose kind of numbers."""
     origin, parts = get_origin(kind) or kind, get_args(kind)
     if hasattr(origin, "__value__"):  # an alias by a name, which numpy's NDArray is from Python 3.12 on
         return _is(value, origin.__value__[parts])

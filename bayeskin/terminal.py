@@ -1,4 +1,4 @@
-"""How the command line speaks: progress and logs on stderr, one line of complaint, exit codes."""
+"""Output of the command line: progress and logs on stderr, one line for an error, exit codes."""
 
 from __future__ import annotations
 

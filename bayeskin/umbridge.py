@@ -32,7 +32,7 @@ Vectors = list[list[float]]
 
 
 class Model(Protocol):
-    """What a server offers. Each method raises InputError for what it cannot use."""
+    """Requests that a server answers. Each method raises InputError for input that it cannot use."""
 
     @property
     def name(self) -> str: ...

@@ -1,4 +1,4 @@
-"""How far a run is from that of an infinitely fine mesh and infinitely short steps.
+"""Discretisation error: how far a run is from the limit of fine meshes and short steps.
 
 In time, the root of the sum of squares of the steps' own estimates: two to five times the largest error that
 the study found. In space, what the study found on the same mesh. The study: docs/discretisation.md.
@@ -23,7 +23,7 @@ class MeshError(NamedTuple):
 
 
 def mesh_error(mesh_hash: str) -> MeshError | None:
-    """What the study found on the mesh of this hash; None for a mesh that was not in it."""
+    """Returns the study's result for the mesh with this hash; None for a mesh that was not in it."""
     found = _studied().get(mesh_hash)
     return None if found is None else MeshError(found["rms"], found["largest"])
 

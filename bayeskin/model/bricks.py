@@ -1,4 +1,4 @@
-"""Where the faces of the bricks lie: lines along x, y and z, graded toward the edges of pads and guard.
+"""Positions of the bricks' faces: lines along x, y and z, graded toward the edges of pads and guard.
 
 At these edges a clamped surface meets a free one and the stress is singular, so that is where bricks are
 small, and where a refinement divides them. The lines of the article's device are a pattern: each of its

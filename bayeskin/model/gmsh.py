@@ -93,7 +93,7 @@ def _cells(raw: meshio.Mesh, kind: str, corners: int) -> _Cells:
 
 
 def _carries(raw: meshio.Mesh, block: int, name: str) -> np.ndarray:
-    """Which cells of a block carry a name (n,); gmsh's older formats have one name a cell."""
+    """Returns which cells of a block carry a name (n,); older formats of gmsh have one name for each cell."""
     if name not in raw.cell_sets:
         return np.asarray(raw.cell_data["gmsh:physical"][block] == raw.field_data[name][0])
     carries = np.zeros(len(raw.cells[block].data), dtype=bool)

@@ -64,7 +64,7 @@ def logarithms(theta: Mapping[str, float]) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class _Varied:
-    """What a run is made of, where one parameter is EPSILON of its change further.
+    """Constants of a run in which one parameter is moved by EPSILON of its change.
 
     model : has the nodes where they are then; its own material and laws are the run's
     """

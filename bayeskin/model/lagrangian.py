@@ -125,7 +125,7 @@ class LagrangianModel:
             self._travel = (past[-1].x - past[-2].x) / way_m
 
     def _pad_of(self, state: State) -> float:
-        """Where the pads were then [m]."""
+        """Displacement of the pads at that time [m]."""
         return float(state.x[3 * self.problem.pads[0]])
 
     def initial_state(self, p_init: float) -> State:
@@ -247,7 +247,7 @@ class LagrangianModel:
 
     @cached_property
     def _drag(self) -> Array:
-        """What holds a body back as it falls (free,): the diagonal of the vector Laplacian, times mu."""
+        """Viscous resistance (free,) of a falling body: the diagonal of the vector Laplacian, times mu."""
         s = self.problem.space
         drag, per_cell = np.zeros((s.n_nodes, 3)), np.einsum("eq,eqia->ea", s.weight, s.grad_u**2)
         np.add.at(drag, s.nodes_u, (self.material.mu[:, None] * per_cell)[..., None])

@@ -35,7 +35,7 @@ ALLOWED_CONTRACTION, WANTED_CONTRACTION, MOST_GROWTH = 0.8, 0.25, 10.0
 
 @dataclass(frozen=True)
 class Equations:
-    """What one solve needs: functions of the whole vector x (dofs,), rows and columns free only.
+    """Functions that one solve needs: of the whole vector x (dofs,), with free rows and columns only.
 
     residual : x -> (free,) or None where a cell has turned inside out
     tangent : x -> free-free matrix and free-fixed matrix
@@ -151,7 +151,7 @@ class NewtonSolver:
         return None
 
     def relax(self, equations: Equations, x: Array, drag: Array) -> Array | None:
-        """Where x, whose fixed dofs are already right, comes to rest in a viscous medium; None if nowhere.
+        """Returns where x, with its fixed dofs right, comes to rest in a viscous medium; None if nowhere.
 
         drag : (free,) resistance of each unknown to motion, in units of its stiffness; none of the pressures,
         so that the energy of the step falls. Pseudo-transient continuation (Kelley & Keyes, SIAM J. Numer.
@@ -253,7 +253,7 @@ class NewtonSolver:
 
 
 def _shorter(after: Array, before: Array, allowed: float = 1.0) -> bool:
-    """Whether one tangent asks for a step after the last one that is at most `allowed` of it."""
+    """Returns whether the next step with the same tangent is at most `allowed` times the last one."""
     return float(np.linalg.norm(after)) <= allowed * float(np.linalg.norm(before))
 
 

@@ -125,7 +125,7 @@ def _simulation(
 
 
 def _told(error: Exception) -> str:
-    """What somebody's function raised and where, in one line."""
+    """Returns one line that says which error a user's function raised, and where."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     said, place = " ".join(str(error).split()), f"{Path(last.filename).name}, line {last.lineno}"
     return f"{type(error).__name__}: {said} ({place})"

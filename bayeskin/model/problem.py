@@ -21,7 +21,7 @@ PARAMETERS = ("E_c", "E_s", "k_c", "k_s", "p_init")
 
 @dataclass(frozen=True)
 class Constants:
-    """What the article fixes (its section "Initial parameters values"); SI."""
+    """Parameters that the article fixes (its section "Initial parameters values"); SI."""
 
     nu_c: float = 0.48
     nu_s: float = 0.3

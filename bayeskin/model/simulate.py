@@ -43,7 +43,7 @@ OnState = Callable[[float, Array, float], None]  # time_s, x (dofs,), force_n
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """Which model: of which device and tissue, what force is observed, on which mesh, to what tolerance.
+    """Choice of a model: its device and tissue, the force that is observed, the mesh and the tolerance.
 
     observation : "reaction" (what the load cell measures), "article" (its released code), or "own"
     mesh : "bricks" (our graded bricks) or the path of a gmsh file with the article's names

@@ -93,7 +93,7 @@ def taylor_hood(mesh: SkinMesh) -> TaylorHood:
 
 @dataclass(frozen=True)
 class Sparsity:
-    """Where each entry of each cell matrix goes: free rows only, columns split in free and fixed.
+    """Destination of each entry of each cell matrix: free rows only, columns split into free and fixed.
 
     free (f,), fixed (c,) : dof numbers; free_free (f, f), free_fixed (f, c) : patterns, their data (bytes)
     without meaning; position (e, nd, nd) : index into the concatenated data of both, or -1 for a fixed row.
@@ -117,7 +117,7 @@ class Sparsity:
         return blocks
 
     def places(self, matrix: sp.csr_matrix) -> tuple[np.ndarray, Array]:
-        """Where the entries of a matrix over all unknowns stand in the concatenated data, and their values.
+        """Returns the places of a matrix's entries in the concatenated data, and their values.
 
         Rows of fixed unknowns are left out; every other entry must couple unknowns of one cell.
         """

@@ -1,4 +1,4 @@
-"""What is seen of the quarter near the pads: its top and its two planes of symmetry, with the fields on them.
+"""Visible surface of the quarter near the pads: its top and two planes of symmetry, with their fields.
 
 Facets of the mesh are divided into small faces, on whose corners the fields are the finite elements' own.
 The fluid's velocity past the solid is ``v_l - v_s = -k / (mu_f porosity) grad p`` (Darcy), with the mean
@@ -138,7 +138,7 @@ def _divided_triangle(n: int) -> tuple[Array, np.ndarray]:
 
 
 def _near(problem: Problem, points: Array) -> np.ndarray:
-    """Which of the points (..., 3) lie near the pads (...,): not where the default bricks are longest."""
+    """Returns which of the points (..., 3) lie near the pads (...,), where the default bricks are short."""
     along, across, _ = brick_lines(1, problem.lengths)
     x, y, _ = unroll(np.moveaxis(points, -1, 0), problem.lengths.arm_radius_m)
     return np.asarray((x < along[-2]) & (y < across[-2]))

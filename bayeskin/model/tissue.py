@@ -1,4 +1,4 @@
-"""Where physics beyond the base model enters its equations.
+"""Places in the base model's equations at which further physics enters.
 
 A tissue law is bound to values of its parameters and to the points of a model before a run. It changes what
 the base law answers at the points, and its derivatives, in place; or it adds linear terms on surfaces; or it
@@ -23,7 +23,7 @@ SURFACE_QUADRATURE_DEGREE = 4
 
 
 class Rank(IntEnum):
-    """Which laws answer first: each acts on the elastic stress that those of lower rank left."""
+    """Order in which laws answer: each acts on the elastic stress that laws of lower rank left."""
 
     ELASTIC = 0
     AGEING = 1

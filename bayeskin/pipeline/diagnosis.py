@@ -1,4 +1,4 @@
-"""What the model leaves out of a recording: located, candidates tried, named, shown before and after."""
+"""Diagnosis of a recording: mismatches located, mechanisms tried and named, the fit before and after."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a load cell's noise correlates in time, when a slow force that is not noise lies under it.
+"""Correlation in time of a load cell's noise, where a slow force that is not noise lies under it.
 
 The noise is taken as white plus a first-order autoregression,
 

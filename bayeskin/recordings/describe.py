@@ -1,4 +1,4 @@
-"""What was found in a recording, in words for a reader and as plain values for a program."""
+"""Description of a recording, as text for a reader and as plain values for a program."""
 
 from __future__ import annotations
 

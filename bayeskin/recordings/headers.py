@@ -1,4 +1,4 @@
-"""What a column of a recording is, from its header: time, displacement or force, and in which unit."""
+"""Meaning of a recording's columns by their headers: time, displacement or force, and the unit."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def recognise(headers: Sequence[str]) -> list[Column]:
 
 
 def is_header(headers: Sequence[str]) -> bool:
-    """Whether a row announces at least two of the three quantities: then it is meant to be the header."""
+    """Returns whether a row names at least two of the three quantities: then it is taken as the header."""
     return len({column.quantity for column in recognise(headers)}) >= 2
 
 

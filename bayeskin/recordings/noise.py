@@ -1,4 +1,4 @@
-"""What a recording's noise is, phase by phase: its sd, its correlation, its spikes, its zero steps."""
+"""Noise of a recording, phase by phase: its sd, its correlation, its spikes, its zero steps."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def analyse(recording: Recording, phases: Sequence[Phase], window_s: float = WIN
 
 
 def jumps_of(recording: Recording, phases: Sequence[Phase]) -> Jumps:
-    """What the samples of a recording allow its force to jump by within phases. Raises as `phase_noise`."""
+    """Returns the jumps of force within phases that a recording's samples allow. Raises as `phase_noise`."""
     analysis, found = analyse(recording, phases), []
     for phase, local, (a, b) in zip(phases, analysis.local, pairwise(analysis.bounds), strict=True):
         time_s, force_n = recording.time_s[a:b], analysis.despiked.force_n[a:b]

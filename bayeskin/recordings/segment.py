@@ -36,7 +36,7 @@ class _Piece:
 
 
 def resolution_m(displacement_m: Array) -> float:
-    """How finely displacement was recorded [m]: the larger of its least step and its noise's sd."""
+    """Returns the resolution of the displacement [m]: the larger of its least step and its noise's sd."""
     levels = np.unique(displacement_m)
     step = float(np.min(np.diff(levels))) if len(levels) > 1 else 0.0
     second = np.diff(displacement_m, 2)
@@ -122,7 +122,7 @@ def _join(pieces: list[_Piece], time_s: Array, smooth: Array, still_m: float) ->
 
 
 def _apart(a: _Piece, b: _Piece, time_s: Array, smooth: Array, still_m: float) -> bool:
-    """Whether two neighbours are ramps of their own: long, far-reaching and of different speeds."""
+    """Returns whether two neighbours are separate ramps: long, far-reaching and of different speeds."""
     moved = np.array([abs(smooth[p.stop] - smooth[p.start]) for p in (a, b)])
     lasted = np.array([time_s[p.stop] - time_s[p.start] for p in (a, b)])
     speed = moved / lasted
@@ -156,7 +156,7 @@ def _near_half(time_s: Array, piece: _Piece, at_end: bool) -> tuple[int, int]:
 
 
 def _corner_s(time_s: Array, smooth: Array, before: _Piece, after: _Piece) -> float:
-    """Where the lines through both sides of a corner meet; the polyline's knot if they do not meet near."""
+    """Returns where the lines through both sides of a corner meet; its knot if that is not near."""
     slope_a, intercept_a = _line(time_s, smooth, *_near_half(time_s, before, at_end=True))
     slope_b, intercept_b = _line(time_s, smooth, *_near_half(time_s, after, at_end=False))
     knot = 0.5 * float(time_s[before.stop] + time_s[after.start])

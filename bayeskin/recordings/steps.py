@@ -81,7 +81,7 @@ def find_steps(time_s: Array, force_n: Array, sd_n: float, shape: NoiseShape, te
 
 
 def allowed_jumps(time_s: Array, force_n: Array, sd_n: Array, shape: NoiseShape) -> Jumps:
-    """What one phase's force without spikes (n,) allows of jumps within it, under noise of local sd_n (n,).
+    """Returns the jumps that one phase's force without spikes (n,) allows, with noise of local sd_n (n,).
 
     A jump beside a parabola, by generalised least squares over a second to either side, with a gap for a jump
     that takes some samples. Those seen half a second before and after count too, since a jump's time is not

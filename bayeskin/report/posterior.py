@@ -168,7 +168,7 @@ def _draw_key(axes: list[list[Axes]], has_map: bool) -> None:
 
 
 def _finding(parameters: Sequence[Parameter], draws: Array) -> str:
-    """What the recording says of each parameter, draws (s, d) in their order, as `identifiability` has it."""
+    """Returns what the recording says about each parameter, by draws (s, d) in their order."""
     said = identifiability(ParameterSpace(tuple(parameters)), draws).parameters
     kinds: dict[str, list[str]] = {"does not inform it": [], "informs it weakly": [], "informs it": []}
     for one in said:

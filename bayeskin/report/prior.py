@@ -1,4 +1,4 @@
-"""What the prior expects before it sees the recording."""
+"""Predictions of the prior before it sees the recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fit leaves, against the noise that the likelihood takes it for."""
+"""Residuals of a fit, compared with the noise that the likelihood assumes."""
 
 from __future__ import annotations
 

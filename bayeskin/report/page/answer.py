@@ -27,13 +27,13 @@ def answer(facts: RunFacts) -> Answer:
 
 
 def sentences(facts: RunFacts) -> dict[str, str]:
-    """What the data says of each parameter, its name taken off the front."""
+    """Returns the sentences about each parameter, without its name at the front."""
     lines = facts.said("sample").get("identifiability", [])
     return {name: text for name, _, text in (line.partition(": ") for line in lines)}
 
 
 def without_numbers(sentence: str) -> str:
-    """What the data says of a parameter, where its median and interval stand beside it."""
+    """Returns the sentence about a parameter whose median and interval stand beside it."""
     return re.sub(r": median [^;]*", "", sentence)
 
 
@@ -160,5 +160,5 @@ def _missing(facts: RunFacts) -> Verdict:
 
 
 def is_outside(said: Mapping[str, Any]) -> bool:
-    """Whether a mismatch of unknown cause is rather outside the catalogue than one of several in it."""
+    """Returns whether an unknown cause is more likely outside the catalogue than one of several in it."""
     return bool(said.get("unknown_probability", 1.0) > 0.5)

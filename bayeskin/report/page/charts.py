@@ -42,7 +42,7 @@ def history_chart(history: Mapping[str, Any], phases: Phases) -> Chart:
 
 
 def residual_chart(history: Mapping[str, Any], phases: Phases) -> Chart:
-    """What the predicted median leaves of each recorded bin, in mN, and the bands about it."""
+    """Chart of the difference between each recorded bin and the predicted median, in mN, with bands."""
     series, fitted = _series(history)
     median_n, left_mn = series["median_n"], 1e3 * (series["recorded_n"] - series["median_n"])
     names = ("low_90", "high_90", "low_50", "high_50")

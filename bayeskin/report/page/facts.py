@@ -1,4 +1,4 @@
-"""What a page is made from: a run, and what each of its stages said and drew."""
+"""Input of a page: a run, and the answers and figures of its stages."""
 
 from __future__ import annotations
 

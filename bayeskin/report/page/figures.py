@@ -1,4 +1,4 @@
-"""Which figure stands where on a page, what it is called, and what it shows in words."""
+"""Place of each figure on a page, its title, and a description of what it shows."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def _candidates(candidates: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def _unexplained(left: Mapping[str, Any] | None) -> list[Block]:
-    """What a process without a name describes of the residual: how much, in what, and in what form."""
+    """Section on the residual that a smooth process describes: its size, variable and form."""
     if left is None:
         return []
     if not left["noticeable"]:

@@ -1,4 +1,4 @@
-"""What a page is built of; the template turns each into HTML and computes nothing."""
+"""Parts of a page; the template turns each into HTML and computes nothing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Cell:
-    """What a cell of a table shows, and the number by which it is sorted (None: by its text)."""
+    """Text of a table's cell, and the number by which it is sorted (None: by its text)."""
 
     text: str
     order: float | None = None
@@ -83,7 +83,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Key:
-    """What a mark of a chart stands for: "dots", "line", "dashed" or "band", in its own colour or none."""
+    """Entry of a chart's legend: "dots", "line", "dashed" or "band", in its own colour or none."""
 
     text: str
     mark: str
@@ -114,7 +114,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Bar:
-    """Where in the prior's range a 90 % interval and its median lie, in percent of its width."""
+    """Position of a 90 % interval and its median in the prior's range, in percent of its width."""
 
     left: float
     width: float
@@ -147,7 +147,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a reader asks first: what it is made of, how sure that is, what is missing."""
+    """Answers to a reader's first questions: the skin's properties, how sure they are, what is missing."""
 
     made: Sequence[Made]
     made_of: Verdict

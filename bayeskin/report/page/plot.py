@@ -48,7 +48,7 @@ class Plot:
         )
 
     def numbers(self, marked: Sequence[Array], says: Sequence[str]) -> dict[str, Any]:
-        """What the cross-hair needs: where it stands at each time, its dots, and what is read there."""
+        """Data of the cross-hair: its position at each time, its dots, and the values that it shows."""
         dots = [[None if np.isnan(v) else round(float(v), 1) for v in self.y(values)] for values in marked]
         return {
             "x": np.round(self.x(self.time_s), 1).tolist(), "dots": dots, "says": list(says),

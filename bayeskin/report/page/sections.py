@@ -165,7 +165,7 @@ def posterior(facts: RunFacts) -> Section:
 
 
 def _taught(said: Mapping[str, Any]) -> list[Block]:
-    """What the test taught of each material parameter: in words, and by three measures."""
+    """Section on what the test taught about each material parameter: in words, and by three measures."""
     rows = []
     for name, one in said["profiles"].items():
         learned, unit = said["learned"][name], said["parameters"][name]["unit"]
@@ -186,7 +186,7 @@ def _taught(said: Mapping[str, Any]) -> list[Block]:
 
 
 def _lengths(said: Mapping[str, Any]) -> list[Block]:
-    """What uncertain lengths explain of the other parameters' posterior variances; nothing without any."""
+    """Table of the shares of posterior variances that uncertain lengths explain; nothing without any."""
     due = said.get("lengths")
     if not due:
         return []
