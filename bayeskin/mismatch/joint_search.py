@@ -76,7 +76,7 @@ class SearchSettings:
     most: int = 6
     compared: int = 6
     checks: int = 4
-    exact: float = 0.3
+    exact: float = 0.05
     alike_by: float = 0.1
 
 
