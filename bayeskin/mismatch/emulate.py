@@ -7,9 +7,10 @@ posterior is drawn anew with it. That is repeated until fresh runs agree with wh
 Where it says that it is unsure the posterior is taken to be zero: the next wave comes nearer. The first
 points are about all maxima that are known.
 
-The forward model has an error, which is not the same all along a ridge. Where it matters the full model runs
-at a few of the draws. The mean of the errors there is added to the force, and how they differ from it, as a
-sample of a covariance, is part of the likelihood.
+The forward model has an error, which is not the same all along a ridge, and often differs from one maximum to
+another by more than their forces do. Where it matters the full model runs at a few of the draws. Between the
+places where it ran the error is interpolated and added to the force. How far each error is from what the
+others say of it, as a sample of a covariance, is part of the likelihood.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from bayeskin.mismatch.wrapper import Wrapper, innermost
 from bayeskin.types import Array, Design, ParameterSpace, Surrogate
 
 MOST = 1500  # draws, among which a wave's points are chosen
+TOUCHING = 1e-3  # of the unit cube: places that are nearer are the same
 BEFORE = (60,)  # steps of the ensembles whose draws a further wave begins with
 
 # The skin's force (m,) with the set at points (n, d) by the forward model, and at the first few by the full
@@ -71,13 +73,51 @@ class Emulated:
     settled: bool
 
 
+@dataclass(frozen=True)
+class _Errors:
+    """Errors [N] (k, m) of the forward model at places (k, d) of the unit cube.
+
+    Between places they are averages, each weighted by the inverse square of its distance (Shepard 1968, Proc.
+    23rd ACM Nat. Conf., 517).
+    """
+
+    places: Array
+    errors_n: Array
+
+    def with_more(
+        self, places: Array, forward: Sequence[Array | str], full: Sequence[Array | str]
+    ) -> _Errors:
+        """Returns these and those at the first few of further places, where both models ran."""
+        more = [(place, b - a) for place, a, b in zip(places, forward, full, strict=False)
+                if not isinstance(a, str) and not isinstance(b, str)]  # fmt: skip
+        if not more:
+            return self
+        return _Errors(
+            np.concatenate([self.places, [place for place, _ in more]]),
+            np.concatenate([self.errors_n, [error for _, error in more]]),
+        )
+
+    def at(self, unit: Array) -> Array:
+        """Returns the errors (n, m) at points (n, d) of the unit cube."""
+        square = np.sum((unit[:, None] - self.places) ** 2, axis=2)
+        weight = 1.0 / (square + TOUCHING**2)
+        return np.asarray((weight / weight.sum(axis=1, keepdims=True)) @ self.errors_n)
+
+    def left(self) -> Array:
+        """Returns a sample (k, m) of what is unknown of them: each less what the others say, over root k."""
+        others = [_Errors(*(np.delete(one, i, axis=0) for one in (self.places, self.errors_n)))
+                  for i in range(len(self.places))]  # fmt: skip
+        said = [one.at(place[None])[0] for one, place in zip(others, self.places, strict=True)]
+        return np.asarray((self.errors_n - said) / np.sqrt(len(said)))
+
+
 def emulate(
     maxima: Sequence[JointFit], forces: Forces, learn: Learn, noise_n: float, seed: int,
     settings: EmulationSettings | None = None,
 ) -> Emulated | str:  # fmt: skip
     """Returns the posterior of a set about its fits; the message of a run where all of the first wave fail.
 
-    maxima : fits of the set, the likeliest first; what was added to its runs is added to all
+    maxima : fits of the set, the likeliest first, each with the forward model's error at its run
     noise_n : sd of a bin's mean
     """
     settings, rng = settings or EmulationSettings(), np.random.default_rng([seed, 11])
@@ -85,7 +125,9 @@ def emulate(
     about, names = found.fit.log_posterior, found.fit.names
     space, error_n = innermost(about.surrogate).space, None
     draws = np.concatenate([_near(one, settings.first, seed) for one in maxima])
-    off_n = found.off_n
+    errors = _Errors(
+        space.box.to_unit([one.run.theta for one in maxima]), np.array([one.off_n for one in maxima])
+    )
     design = _none(space, about.surrogate.edges_s)
     emulated: Emulated | None = None
     for wave in range(settings.waves):
@@ -93,13 +135,15 @@ def emulate(
         points = _spread(space, draws[:, : space.dim], design.theta, count, rng)
         if wave == 0:
             points = np.concatenate([points[: -len(maxima)], [one.run.theta for one in maxima]])
-        answers, full = forces(points, settings.checks if wave == 0 and off_n.any() else 0)
-        off_n, about = _with_errors(about, off_n, answers, full)
-        made = [answer + off_n for answer in answers if not isinstance(answer, str)]
+        answers, full = forces(points, settings.checks if wave == 0 and errors.errors_n.any() else 0)
+        errors = errors.with_more(space.box.to_unit(points), answers, full)
         ran = [i for i, answer in enumerate(answers) if not isinstance(answer, str)]
         if not ran:
             return str(answers[0]) if emulated is None else emulated
-        fresh = _design(design, points[ran], np.array(made))
+        if wave == 0:
+            about = _allowing(about, errors)
+        made = np.array([answers[i] for i in ran]) + errors.at(space.box.to_unit(points[ran]))
+        fresh = _design(design, points[ran], made)
         if emulated is not None:
             said = innermost(emulated.fit.log_posterior.surrogate).predict_mean(points[ran])
             each_n = np.sqrt(np.mean((said - fresh.force_n[-len(ran) :]) ** 2, axis=1))
@@ -125,21 +169,11 @@ def _near(one: JointFit, reach: float, seed: int) -> Array:
     return resample(near, None, seed, BEFORE, 0).draws
 
 
-def _with_errors(
-    about: LogPosterior, known_n: Array, forward: Sequence[Array | str], full: Sequence[Array | str]
-) -> tuple[Array, LogPosterior]:
-    """The forward model's mean error (m,) over some places, and the posterior that allows for the rest of it.
-
-    known_n (m,) : at the first place; forward : forces at other places; full : at the first few of these
-    """
-    more = [b - a for a, b in zip(forward, full, strict=False)
-            if not isinstance(a, str) and not isinstance(b, str)]  # fmt: skip
-    if not more or about.model_error is None:
-        return known_n, about
-    errors_n = np.array([known_n, *more])
-    mean_n = errors_n.mean(axis=0)
-    apart_n = (errors_n - mean_n) / np.sqrt(len(errors_n) - 1)
-    return mean_n, replace(about, model_error=replace(about.model_error, measured_n=apart_n))
+def _allowing(about: LogPosterior, errors: _Errors) -> LogPosterior:
+    """Returns the posterior that allows for what is not known of the forward model's error."""
+    if len(errors.places) < 2 or about.model_error is None:
+        return about
+    return replace(about, model_error=replace(about.model_error, measured_n=errors.left()))
 
 
 def _posterior(about: LogPosterior, emulator: Surrogate, unsure_n: float) -> LogPosterior:

@@ -100,10 +100,14 @@ class Check:
 
 @dataclass
 class JointSearch:
-    """All sets fitted, by their names sorted: of each the likeliest fit, and the last check of one."""
+    """All sets fitted, by their names sorted: of each the likeliest fit, and the last check of one.
+
+    other : another maximum of the likeliest set, less likely than that in `fits`; None where none is known
+    """
 
     fits: dict[tuple[str, ...], JointFit] = field(default_factory=dict)
     checks: dict[tuple[str, ...], Check] = field(default_factory=dict)
+    other: JointFit | None = None
 
     def add(self, found: object) -> None:
         """Keeps a fit where it is the likeliest of its set; answers of another kind are failures."""
@@ -137,19 +141,8 @@ def search_jointly(
     searcher = _Searcher(ask, binned, base, known, noise, seed, tell, settings or SearchSettings())
     searcher.base()
     searcher.search()
+    searcher.other_maximum()
     return searcher.found
-
-
-def from_equal_permeabilities(best: JointFit, base: ParameterSpace) -> Climb:
-    """Returns the climb of a set from a fit's values with the permeabilities of all layers equal.
-
-    Force hardly tells which layer drains: fits often have a second maximum there, beyond what a tangent sees.
-    """
-    names = [p.name for p in base.parameters if p.stress_power < 0]
-    middle = float(np.exp(np.mean([np.log(best.fit.theta[name]) for name in names])))
-    limits = {p.name: (p.lower, p.upper) for p in base.parameters}
-    equal = {name: float(np.clip(middle, *limits[name])) for name in names}
-    return Climb(best.fit.names, {**best.fit.theta, **equal}, SearchSettings().runs, _added(best))
 
 
 class _Searcher:
@@ -193,6 +186,34 @@ class _Searcher:
                 self._check_all()
             if not self._gains(current):
                 return
+
+    def other_maximum(self) -> None:
+        """Climbs from the likeliest fit with the permeabilities of all layers equal, to a second maximum.
+
+        Force hardly tells which layer drains, so there often is one, farther than a tangent sees. The forces
+        of both differ by so little that each needs a full run of its own.
+        """
+        best = self.found.best
+        names, limits = best.fit.names, {p.name: (p.lower, p.upper) for p in self._base.parameters}
+        flow = [p.name for p in self._base.parameters if p.stress_power < 0]
+        middle = float(np.exp(np.mean([np.log(best.fit.theta[name]) for name in flow])))
+        equal = {name: float(np.clip(middle, *limits[name])) for name in flow}
+        start = {**best.fit.theta, **equal}
+        (there,) = self._ask([Climb(names, start, self._settings.runs, _added(best))])
+        if not isinstance(there, JointFit) or self._is_alike(there, best.run.theta):
+            return
+        (full_n,) = self._ask([FullProbe(self._solved(names), self._solved_values(there))])
+        if isinstance(full_n, str):
+            return
+        off_n = np.asarray(full_n) - (there.run.force_n - there.off_n)
+        (there,) = self._ask([Climb(names, there.fit.theta, self._settings.runs, tuple(off_n.tolist()))])
+        if not isinstance(there, JointFit) or self._is_alike(there, best.run.theta):
+            return
+        self._tell(f"another maximum of the likeliest set: {self._gained(there, best):+.1f} nats")
+        self.found.other = min((there, best), key=lambda one: weight(one.fit))
+        if self.found.other is best:
+            self.found.fits[names] = there
+            self.found.checks[names] = Check(there.run.theta, np.asarray(full_n), 0.0)
 
     def _exact(self) -> JointFit:
         """The likeliest set, checked if it has mechanisms of the tissue: what the reduced model leaves out of

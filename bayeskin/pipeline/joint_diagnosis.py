@@ -22,7 +22,7 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.hypotheses import Family, Judgement, hypotheses_of, judge_family
 from bayeskin.mismatch.joint_fit import JointFit, within
-from bayeskin.mismatch.joint_search import JointSearch, from_equal_permeabilities, noise_of, search_jointly
+from bayeskin.mismatch.joint_search import JointSearch, noise_of, search_jointly
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import Made, Search
@@ -72,8 +72,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     with asked(bench, searches_file(run.folder, bench), run.config.design.workers) as ask:
         found = searched(run, bench, ask)
         weighed = [one.fit.names for one in found.likeliest(WEIGHED)]
-        further = from_equal_permeabilities(found.best, bench.base)
-        *answers, elsewhere = ask([*(Weigh(as_json(found.fits[names])) for names in weighed), further])
+        answers = ask([Weigh(as_json(found.fits[names])) for names in weighed])
         evidences = {names: said for names, said in zip(weighed, answers, strict=True)
                      if isinstance(said, tuple)}  # fmt: skip
         if not evidences:
@@ -82,8 +81,10 @@ def _work(run: Run) -> Mapping[str, Any]:
         judged = judge_family(family, bench.known)
         best = max(evidences, key=lambda names: family.probability_of_set(names))
         run.reporter.log("runs where the posterior is, and draws of it")
-        others = [one for one in [elsewhere] if isinstance(one, JointFit) and one.fit.names == best]
-        emulated = _emulated(bench, ask, found.fits[best], others, seed)
+        maxima = [found.fits[best]]
+        if found.other is not None and found.other.fit.names == best:
+            maxima.append(found.other)
+        emulated = _emulated(bench, ask, maxima, seed)
     base, chosen = found.fits[()].fit, emulated.fit
     before, after = (
         locate(fit, {**fit.theta, **_noise_of(fit, chosen.theta)}, seed) for fit in (base, chosen)
@@ -159,10 +160,9 @@ def _drawn(fit: Fit, seed: int) -> Resampled:
     return resample(replace(fit, log_posterior=near), None, seed)
 
 
-def _emulated(
-    bench: JointBench, ask: Ask, found: JointFit, others: Sequence[JointFit], seed: int
-) -> Emulated:
+def _emulated(bench: JointBench, ask: Ask, maxima: Sequence[JointFit], seed: int) -> Emulated:
     """A set's posterior from reduced runs where it is; about the fit's run where none of them finishes."""
+    found = maxima[0]
     names, space = found.fit.names, bench.space(found.fit.names)
 
     def forces(points: Array, count: int) -> tuple[list[Any], list[Any]]:
@@ -172,7 +172,7 @@ def _emulated(
         return answers[count:], answers[:count]
 
     learn = partial(_learnt, seed=seed)
-    emulated = emulate([found, *others], forces, learn, noise_of(bench.binned), seed)
+    emulated = emulate(maxima, forces, learn, noise_of(bench.binned), seed)
     if isinstance(emulated, str):
         return Emulated(found.fit, _drawn(found.fit, seed), 0, None, False)
     return emulated
