@@ -153,7 +153,10 @@ def emulate(
         best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
         done = error_n is not None and error_n <= settings.enough * noise_n
         last = done or wave == settings.waves - 1
-        drawn = resample(best, None, seed) if last else resample(best, None, seed, BEFORE, 0)
+        known = [one.fit.theta for one in maxima]
+        drawn = (
+            resample(best, None, seed, near=known) if last else resample(best, None, seed, BEFORE, 0, known)
+        )
         draws, emulated = drawn.draws, Emulated(best, drawn, len(design.theta), error_n, done)
         if done:
             break

@@ -7,7 +7,7 @@ taken by its share of the evidence, and move as those of a run do (`inference.mo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -21,7 +21,7 @@ from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.moves import mixed_moves
 from bayeskin.inference.straighten import Shear
-from bayeskin.mismatch.fit import FIRST_ROUNDS, Fit, evidence, likely, other_skins
+from bayeskin.mismatch.fit import APART, FIRST_ROUNDS, Fit, evidence, likely, other_skins
 from bayeskin.mismatch.wrapper import skins
 from bayeskin.types import Array
 
@@ -56,15 +56,18 @@ class Resampled:
 
 
 def resample(
-    found: Fit, shear: Shear | None, seed: int, legs: Sequence[int] = LEGS, modes: int = MODES
+    found: Fit, shear: Shear | None, seed: int, legs: Sequence[int] = LEGS, modes: int = MODES,
+    near: Sequence[Mapping[str, float]] = (),
 ) -> Resampled:  # fmt: skip
-    """Draws of the posterior about `found` and so many other modes; `shear` as for `fit`.
+    """Returns draws of the posterior about `found` and other modes; `shear` as for `fit`.
 
     They end after the first of `legs` by which they have settled.
+
+    modes : climbs to other modes from skins of the prior; near : values by name from which further ones start
     """
     log_posterior = found.log_posterior
     rng = np.random.default_rng([seed, 7])
-    starts = _starts(found, shear, seed, rng, modes)
+    starts = _starts(found, rng, _modes(found, shear, seed, modes, near))
     walkers = max(FEWEST_WALKERS, 2 * log_posterior.dim + 2)
     coordinates = MoveCoordinates(shear, *log_posterior.bounds)
     samplers = [
@@ -103,28 +106,47 @@ def _assessed(
     return Resampled(log_posterior.names, kept, rhat, effective, state.verdict.trusted)
 
 
-def _starts(
-    found: Fit, shear: Shear | None, seed: int, rng: np.random.Generator, modes: int
-) -> Callable[[int], Array]:  # fmt: skip
-    """A function that draws so many walkers (n, D) about the modes."""
+def _modes(
+    found: Fit, shear: Shear | None, seed: int, count: int, near: Sequence[Mapping[str, float]]
+) -> list[tuple[Array, float, Array]]:
+    """Vector (D,), log evidence and covariance (D, D) over the unit cube of each mode, that of `found` first.
+
+    Climbs that end nearer than `APART` to a mode that is known have found nothing new.
+    """
     log_posterior = found.log_posterior
     low, high = log_posterior.bounds
     best = low + found.unit * (high - low)
-    whole = skins(log_posterior.surrogate)[-1]
-    others = (
-        likely(log_posterior, other_skins(best, log_posterior, shear, seed, whole), modes) if modes else []
-    )
-    tops = [gauss_newton(log_posterior, start, shear, sum(FIRST_ROUNDS)) for start in others]
-    centres = np.array([best, *(top.vector for top in tops)])
-    masses = np.array([found.log_evidence, *(evidence(log_posterior, top)[0] for top in tops)])
+    skin = skins(log_posterior.surrogate)[-1]
+    starts = [np.clip(log_posterior.vector(theta), low, high) for theta in near]
+    if count:
+        starts += likely(log_posterior, other_skins(best, log_posterior, shear, seed, skin), count)
+    modes = [(best, found.log_evidence, found.covariance)]
+    for start in starts:
+        top = gauss_newton(log_posterior, start, shear, sum(FIRST_ROUNDS))
+        apart = [np.abs((top.vector - vector) / (high - low))[:skin].max() for vector, _, _ in modes]
+        if min(apart) > APART:
+            modes.append((top.vector, *evidence(log_posterior, top)))
+    return modes
+
+
+def _starts(
+    found: Fit, rng: np.random.Generator, modes: Sequence[tuple[Array, float, Array]]
+) -> Callable[[int], Array]:
+    """A function that draws so many walkers (n, D) about the modes, to each by its share of the evidence."""
+    log_posterior = found.log_posterior
+    low, high = log_posterior.bounds
+    masses = np.array([log_evidence for _, log_evidence, _ in modes])
     share = np.exp(masses - masses.max())
-    root = np.linalg.cholesky(found.covariance + 1e-12 * np.eye(len(low))) * (high - low)[:, None]
+    aside = 1e-12 * np.eye(len(low))
+    roots = np.array([np.linalg.cholesky(one + aside) * (high - low)[:, None] for _, _, one in modes])
+    centres = np.array([vector for vector, _, _ in modes])
 
     def draw(count: int) -> Array:
         out, near = np.empty((0, len(low))), NEAR
         while len(out) < count:
-            centre = centres[rng.choice(len(centres), count, p=share / share.sum())]
-            trial = centre + near * rng.standard_normal((count, len(low))) @ root.T
+            mode = rng.choice(len(modes), count, p=share / share.sum())
+            normal = rng.standard_normal((count, len(low)))
+            trial = centres[mode] + near * np.einsum("nij,nj->ni", roots[mode], normal)
             trial = low + np.abs(np.mod((trial - low) / (high - low) + 1.0, 2.0) - 1.0) * (high - low)
             out = np.concatenate([out, trial[np.isfinite(log_posterior.log_prob(trial))]])
             near *= NEARER  # where next to nothing is possible farther away
