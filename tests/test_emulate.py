@@ -14,7 +14,6 @@ from toys.solved import TRUTH, Exact
 from bayeskin.mismatch.emulate import EmulationSettings, Forces, emulate
 from bayeskin.mismatch.fit import fit_near
 from bayeskin.mismatch.joint_fit import JointFit, fit_jointly, within
-from bayeskin.mismatch.joint_search import from_equal_permeabilities
 from bayeskin.mismatch.resample import resample
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.pipeline.joint_bench import JointBench
@@ -73,12 +72,6 @@ def test_the_first_points_are_about_all_maxima(
     fitted: tuple[JointBench, JointFit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench, found = fitted
-    further = from_equal_permeabilities(found, bench.base)
-    theta = found.fit.theta
-    assert further.names == found.fit.names
-    assert further.start["k_c"] == further.start["k_s"]
-    assert further.start["k_c"] ** 2 == pytest.approx(theta["k_c"] * theta["k_s"])
-    assert all(further.start[name] == theta[name] for name in theta if name not in ("k_c", "k_s"))
     softer = {name: 0.7 * TRUTH[name] for name in ("E_c", "E_s")}
     recorded = solved.recorded(3)
     elsewhere = solved.bench(monkeypatch, dataclasses.replace(recorded, force_n=0.7 * recorded.force_n))
@@ -192,10 +185,10 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
     assert allowed is not None
     assert allowed.measured_n is not None
     assert len(allowed.measured_n) == 1 + FEW.checks - fails
-    np.testing.assert_allclose(allowed.measured_n.sum(axis=0), 0.0, atol=1e-9)
+    assert np.abs(allowed.measured_n).max() > 0.1 * np.abs(shape).max()
     about = emulated.fit.log_posterior
     behind = emulated.fit.value - float(about.log_prob(about.vector({**emulated.fit.theta, **TRUTH}))[0])
-    assert behind < 12.0
+    assert behind < 8.0
 
 
 def test_one_wave_alone_is_never_settled(fitted: tuple[JointBench, JointFit]) -> None:

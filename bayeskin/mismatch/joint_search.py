@@ -206,14 +206,17 @@ class _Searcher:
         if isinstance(full_n, str):
             return
         off_n = np.asarray(full_n) - (there.run.force_n - there.off_n)
-        (there,) = self._ask([Climb(names, there.fit.theta, self._settings.runs, tuple(off_n.tolist()))])
-        if not isinstance(there, JointFit) or self._is_alike(there, best.run.theta):
-            return
+        off = self._rms(off_n - there.off_n)
+        if off > self._settings.exact * noise_of(self._binned):
+            again = Climb(names, there.fit.theta, self._settings.runs, tuple(off_n.tolist()))
+            (there,) = self._ask([again])
+            if not isinstance(there, JointFit) or self._is_alike(there, best.run.theta):
+                return
         self._tell(f"another maximum of the likeliest set: {self._gained(there, best):+.1f} nats")
         self.found.other = min((there, best), key=lambda one: weight(one.fit))
         if self.found.other is best:
             self.found.fits[names] = there
-            self.found.checks[names] = Check(there.run.theta, np.asarray(full_n), 0.0)
+            self.found.checks[names] = Check(there.run.theta, np.asarray(full_n), off)
 
     def _exact(self) -> JointFit:
         """The likeliest set, checked if it has mechanisms of the tissue: what the reduced model leaves out of
