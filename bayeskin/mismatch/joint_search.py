@@ -199,7 +199,7 @@ class _Searcher:
         middle = float(np.exp(np.mean([np.log(best.fit.theta[name]) for name in flow])))
         equal = {name: float(np.clip(middle, *limits[name])) for name in flow}
         start = {**best.fit.theta, **equal}
-        (there,) = self._ask([Climb(names, start, self._settings.runs, _added(best))])
+        (there,) = self._ask([Climb(names, start, self._settings.runs, added(best))])
         if not isinstance(there, JointFit) or self._is_alike(there, best.run.theta):
             return
         (full_n,) = self._ask([FullProbe(self._solved(names), self._solved_values(there))])
@@ -246,7 +246,7 @@ class _Searcher:
             starts = [(current, one.fit.theta) for one in hopeful]
             starts += [(one, {**one.fit.theta, **self._base_values(hopeful[0])}) for one in hopeful[1:]]
             self._finish(self._ask([
-                Climb(one.fit.names, theta, self._settings.first, _added(one))
+                Climb(one.fit.names, theta, self._settings.first, added(one))
                 for one, theta in starts
             ]))  # fmt: skip
             best = self.found.fits[hopeful[0].fit.names] if hopeful else current
@@ -413,7 +413,7 @@ class _Searcher:
         """
         names, settings = current.fit.names, self._settings
         self._expanded.add(names)
-        off_n = _added(current)  # of the same tissue
+        off_n = added(current)  # of the same tissue
         others = [
             name for name in self._known
             if name not in names and with_one(names, name, self._known) not in self.found.fits
@@ -513,7 +513,7 @@ class _Searcher:
         """Fits a set from other skins, with its mechanisms as they are."""
         settings = self._settings
         skins = self._nearest(current.fit.names, self._skins[: settings.others], current.fit.theta)
-        off_n = _added(current)
+        off_n = added(current)
         self._finish(self._ask([
             Climb(current.fit.names, {**current.fit.theta, **skin}, settings.first, off_n)
             for skin in skins[: settings.tried]
@@ -534,7 +534,7 @@ class _Searcher:
         if since is not None and fits:
             behind = max(behind, (1.0 - settings.near) * self._gained(fits[0], since))
         for again in self._ask([
-            Climb(one.fit.names, one.fit.theta, settings.runs - settings.first, _added(one))
+            Climb(one.fit.names, one.fit.theta, settings.runs - settings.first, added(one))
             for i, one in enumerate(fits)
             if not one.settled and not self._is_known(one)
             and (i < settings.best or self._gained(self.found.best, one) <= behind)
@@ -561,7 +561,7 @@ def noise_of(binned: BinnedForce) -> float:
     return float(np.sqrt(np.nanmean(binned.variance_n2)))
 
 
-def _added(one: JointFit) -> tuple[float, ...]:
+def added(one: JointFit) -> tuple[float, ...]:
     """Returns the force that a fit has added to its runs, as tasks have it; empty for none."""
     return tuple(one.off_n.tolist()) if one.off_n.any() else ()
 

@@ -27,12 +27,16 @@ class FullProbe:
 
 @dataclass(frozen=True)
 class Climb:
-    """Asks for the fit of a set from values, in so many runs at most; off_n (m,) is added to their force."""
+    """Asks for the fit of a set from values, in so many runs at most.
+
+    off_n (m,) : added to the runs' force; until_s : end of what is fitted, None for the whole recording
+    """
 
     names: tuple[str, ...]
     start: Mapping[str, float]
     runs: int
     off_n: tuple[float, ...] = ()
+    until_s: float | None = None
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.mechanisms import with_one
 from bayeskin.mismatch.fit import Fit, much_left, restored, stored
 from bayeskin.mismatch.full_fit import FullFit
+from bayeskin.mismatch.held_out import end_of_second_hold
 from bayeskin.mismatch.locate import Located
 from bayeskin.mismatch.search import Build, Made, Search, search
 from bayeskin.mismatch.verdict import Diagnosis, judge, set_probability
@@ -74,7 +75,7 @@ def stages_of(config: Config) -> dict[str, Stage]:
 def _work(run: Run) -> Mapping[str, Any]:
     started = time.monotonic()
     bench = workbench(run)
-    split_s = _end_of_second_hold(bench.binned)
+    split_s = end_of_second_hold(bench.binned)
     beginning = (lambda: None) if split_s is None else _search_beside(run, bench, split_s)
     whole = _searched(bench, None, lambda: found.best if (found := beginning()) else None)
     whole.learnt = bench.learnt
@@ -249,12 +250,6 @@ def _made_in(bench: Workbench, build: Build) -> list[Made]:
         return [Made(restored(said, build(said["names"])), said["counts"]) for said in rows]
     except (KeyError, TypeError):
         raise InputError(file, "no fits of a search", "those that `diagnose` wrote, or no file") from None
-
-
-def _end_of_second_hold(binned: BinnedForce) -> float | None:
-    """Where the held-out part starts: the end of the second hold, if something follows it."""
-    holds = [phase for phase in binned.phases if phase.kind == "hold"]
-    return holds[1].end_s if len(holds) > 2 else None
 
 
 def _fit(

@@ -127,12 +127,16 @@ class JointBench:
         """A run with derivatives of a set at values, or why it failed."""
         return self._run(names, theta, slopes=True)
 
-    def local(self, names: Sequence[str], run: FullRun, off_n: Array | None = None) -> LogPosterior:
+    def local(
+        self, names: Sequence[str], run: FullRun, off_n: Array | None = None, until_s: float | None = None
+    ) -> LogPosterior:
         """The posterior of a set about a run of it, to which the error of the reduced model was added.
 
         That error changes from place to place by as much as it is, so it counts as known to one sd of itself.
+
+        until_s : end of what of the recording is known; None for all
         """
-        return _with_error(self._posterior(self._seen(names, (), run)), off_n)
+        return _with_error(self._posterior(self._seen(names, (), run), until_s), off_n)
 
     def _run(self, names: Sequence[str], theta: Mapping[str, float], slopes: bool) -> FullRun | str:
         mechanisms, space = self.solved(names), self.space(names)
@@ -175,11 +179,11 @@ class JointBench:
     def _solved_names(self, names: Sequence[str]) -> tuple[str, ...]:
         return tuple(m.name for m in self.solved(names))
 
-    def _posterior(self, seen: Surrogate) -> LogPosterior:
+    def _posterior(self, seen: Surrogate, until_s: float | None = None) -> LogPosterior:
         return LogPosterior(
             seen,
             self.binned,
-            None,
+            None if until_s is None else ((float(self.binned.edges_s[0]), until_s),),
             self._noise,
             ParameterSpace(seen.space.parameters, self.base.correlations),
             None,
@@ -214,7 +218,8 @@ class JointBench:
         start = dict(task.start)
         start["E_c"] = max(start["E_c"], start["E_s"] / 1.9)  # a stiffer subcutis is ruled out
         off_n = np.array(task.off_n) if task.off_n else None
-        local, settings = partial(self.local, off_n=off_n), TrustSettings(runs=task.runs)
+        local = partial(self.local, off_n=off_n, until_s=task.until_s)
+        settings = TrustSettings(runs=task.runs)
         found = fit_jointly(task.names, start, self.skin, local, settings, off_n)
         return {"message": found} if isinstance(found, str) else as_json(found)
 
@@ -247,15 +252,15 @@ class JointBench:
             return said["nats"]
         if isinstance(task, Weigh):
             return said["alone"], said["with_smooth"]
-        found = self._fitted(said)
+        found = self._fitted(said, task.until_s if isinstance(task, Climb) else None)
         against = refuted(found.fit, self.known, self.motion, self.jumps)
         return f"the recording's samples show nothing of {', '.join(against)}" if against else found
 
-    def _fitted(self, said: Mapping[str, Any]) -> JointFit:
+    def _fitted(self, said: Mapping[str, Any], until_s: float | None = None) -> JointFit:
         """A fit from what `as_json` made of it."""
         run = FullRun(*(np.array(said["run"][name]) for name in ("theta", "force_n", "slopes_n")))
         off_n = np.array(said["off_n"])
-        about = self.local(said["fit"]["names"], run, off_n if off_n.any() else None)
+        about = self.local(said["fit"]["names"], run, off_n if off_n.any() else None, until_s)
         return JointFit(restored(said["fit"], about), run, said["runs"], said["settled"], off_n)
 
 

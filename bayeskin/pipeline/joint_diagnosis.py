@@ -20,6 +20,7 @@ from bayeskin.mismatch.discrepancy import discrepancy
 from bayeskin.mismatch.emulate import Emulated, emulate
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
+from bayeskin.mismatch.held_out import end_of_second_hold, fit_beginning
 from bayeskin.mismatch.hypotheses import Family, Judgement, hypotheses_of, judge_family
 from bayeskin.mismatch.joint_fit import JointFit, within
 from bayeskin.mismatch.joint_search import JointSearch, noise_of, search_jointly
@@ -80,6 +81,8 @@ def _work(run: Run) -> Mapping[str, Any]:
         family = Family([one for names, said in evidences.items() for one in hypotheses_of(names, *said)])
         judged = judge_family(family, bench.known)
         best = max(evidences, key=lambda names: family.probability_of_set(names))
+        split_s = end_of_second_hold(bench.binned)
+        begun = fit_beginning(ask, [found.fits[names] for names in weighed], split_s)
         run.reporter.log("runs where the posterior is, and draws of it")
         maxima = [found.fits[best]]
         if found.other is not None and found.other.fit.names == best:
@@ -93,9 +96,12 @@ def _work(run: Run) -> Mapping[str, Any]:
     if best != ():
         drawn[()] = _drawn(base, seed)
     pictured = {
-        names: _shown(fit, windows, drawn[names])
-        for names, fit, windows in (((), base, before), (best, chosen, after))
-    }
+        names: _shown(fit, windows, drawn[names], fitted)
+        for names, fit, windows, fitted in (
+            ((), base, before, None if begun is None else begun.base),
+            (best, chosen, after, None if begun is None else begun.best),
+        )
+    }  # fmt: skip
     parts = contributions(best, chosen.theta, bench.reported, bench.known)
     remainder = None
     if judged.verdict == "unknown" or (judged.named and after.windows):
@@ -113,15 +119,16 @@ def _work(run: Run) -> Mapping[str, Any]:
         "candidates": candidates(tried, bench.known),
         "sets": [_set(names, found, said, family) for names, said in evidences.items()],
         "fit": {
-            "before": _fit(bench.binned, base, drawn[()], pictured[()]),
+            "before": _fit(bench.binned, base, drawn[()], pictured[()], split_s),
             "after": {
-                **_fit(bench.binned, chosen, drawn[best], pictured[best]),
+                **_fit(bench.binned, chosen, drawn[best], pictured[best], split_s),
                 "emulator": {
                     "runs": emulated.runs, "off_by": emulated.error_n, "settled": emulated.settled,
                 },
             },
         },
         "best_set": list(best),
+        "held_out_set": None if begun is None else list(begun.best.names),
         "full_model": _checked(bench, found, best),
         "seconds": time.monotonic() - started,
     }  # fmt: skip
@@ -129,7 +136,8 @@ def _work(run: Run) -> Mapping[str, Any]:
     figures = draw(
         run.folder / NAME, caption(run), bench.binned, bench.motion,
         Found(
-            pictured[()], pictured[best], None, bench.base.parameters, parts, remainder,
+            pictured[()], pictured[best], None if begun is None else split_s, bench.base.parameters, parts,
+            remainder,
         ),
         answer["candidates"],
     )  # fmt: skip
@@ -212,14 +220,19 @@ def _set(
     }  # fmt: skip
 
 
-def _fit(binned: BinnedForce, fit: Fit, drawn: Resampled, shown: Shown) -> dict[str, Any]:
-    usable = bins_in_windows(binned, None) >= 0
+def _fit(
+    binned: BinnedForce, fit: Fit, drawn: Resampled, shown: Shown, split_s: float | None
+) -> dict[str, Any]:
+    usable, held_out = bins_in_windows(binned, None) >= 0, None
+    if shown.held_out_n is not None and split_s is not None:
+        rest = bins_in_windows(binned, ((split_s, float(binned.edges_s[-1])),)) >= 0
+        held_out = _rms((binned.force_n - shown.held_out_n)[rest])
     return {
         "model": "reduced model",
         "rmse": _rms((binned.force_n - fit.force_n)[usable]),
         "rmse_of_mean": _rms((binned.force_n - fit.mean_n)[usable]),
         "rmse_by_phase": dict(inference.rmse(binned, fit.force_n).by_kind_n),
-        "rmse_held_out": None,
+        "rmse_held_out": held_out,
         "coverage90": inference.coverage(binned, *shown.band_n),
         "log_evidence": fit.log_evidence,
         "theta": drawn.summary,
@@ -227,10 +240,10 @@ def _fit(binned: BinnedForce, fit: Fit, drawn: Resampled, shown: Shown) -> dict[
     }
 
 
-def _shown(fit: Fit, located: Located, drawn: Resampled) -> Shown:
+def _shown(fit: Fit, located: Located, drawn: Resampled, begun: Fit | None) -> Shown:
     some = inference.evenly(drawn.draws, PREDICTIVE_DRAWS)
     band_n = inference.bands(fit.log_posterior, some, np.random.default_rng(1)).interval(0.9)
-    return Shown(fit.force_n, band_n, None, located, drawn.summary)
+    return Shown(fit.force_n, band_n, None if begun is None else begun.force_n, located, drawn.summary)
 
 
 def _checked(bench: JointBench, found: JointSearch, names: tuple[str, ...]) -> dict[str, Any]:
@@ -261,7 +274,9 @@ def in_words(answer: Mapping[str, Any]) -> str:
         f"and in {len(answer['remaining'])} with {', '.join(answer['best_set']) or 'no mechanism'}."
     )
     for when in ("before", "after"):
-        lines.append(f"{when}: RMSE {1e3 * answer['fit'][when]['rmse']:.1f} mN")
+        held = answer["fit"][when]["rmse_held_out"]
+        rest = "" if held is None else f", {1e3 * held:.1f} mN on what follows the second hold, not fitted"
+        lines.append(f"{when}: RMSE {1e3 * answer['fit'][when]['rmse']:.1f} mN{rest}")
     full = answer["full_model"]
     if "message" in full:
         lines.append(f"The full model fails at the best values: {full['message']}")

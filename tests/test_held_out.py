@@ -1,0 +1,63 @@
+"""Fits to the beginning of a recording know nothing of what follows, and predict it, on a skin in closed form."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from toys import solved
+from toys.solved import TRUTH
+
+from bayeskin.mismatch.held_out import Beginning, end_of_second_hold, fit_beginning
+from bayeskin.mismatch.joint_fit import JointFit, fit_jointly
+from bayeskin.mismatch.tasks import Task
+from bayeskin.pipeline.joint_bench import JointBench
+from bayeskin.types import Phase
+
+SPLIT_S = 50.0
+OFFSET = ("force-offset",)
+VALUES = {"F0": -0.03}
+
+
+def fitted(bench: JointBench, names: Sequence[str]) -> JointFit:
+    found = fit_jointly(names, {**bench.noise, **TRUTH, **VALUES}, bench.skin, bench.local)
+    assert isinstance(found, JointFit)
+    return found
+
+
+def begun(bench: JointBench, sets: Sequence[JointFit], split_s: float | None = SPLIT_S) -> Beginning | None:
+    def ask(tasks: Sequence[Task]) -> list[object]:
+        return [bench.answered(task, bench.done(task)) for task in tasks]
+
+    return fit_beginning(ask, sets, split_s)
+
+
+def test_what_follows_does_not_count_and_is_predicted(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded = solved.recorded(3, **VALUES)
+    later = recorded.time_s > SPLIT_S
+    bench = solved.bench(monkeypatch, recorded)
+    sets = [fitted(bench, names) for names in ((), OFFSET)]
+    found = begun(bench, sets)
+    assert found is not None
+    assert found.best.names == OFFSET
+    left_n = [(recorded.force_n - one.force_n)[later] for one in (found.base, found.best)]
+    before, after = (np.sqrt(np.mean(np.square(one))) for one in left_n)
+    assert after < 3.0 * solved.NOISE_N
+    assert after < 0.5 * before
+    force_n = np.where(later, recorded.force_n + 0.1, recorded.force_n)
+    other = solved.bench(monkeypatch, dataclasses.replace(recorded, force_n=force_n))
+    same = begun(other, sets)
+    assert same is not None
+    assert same.best.theta == pytest.approx(found.best.theta)
+    assert same.best.log_evidence == pytest.approx(found.best.log_evidence)
+
+
+def test_nothing_is_held_out_of_a_test_without_a_third_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded = solved.recorded(3)
+    bench = solved.bench(monkeypatch, recorded)
+    assert end_of_second_hold(recorded) is None
+    assert begun(bench, [fitted(bench, ())], None) is None
+    longer = (*recorded.phases, Phase("hold", 2, 66.0, 70.0))
+    assert end_of_second_hold(dataclasses.replace(recorded, phases=longer)) == SPLIT_S
