@@ -278,7 +278,7 @@ def test_priors_without_a_skin_that_can_be_are_refused(monkeypatch: pytest.Monke
 
 
 def test_a_second_maximum_is_sought_where_all_layers_drain_alike(asked: Make) -> None:
-    """It is checked by a run of the full model at its own values, and is the likelier one or kept beside it."""
+    """It has a run of the full model at its own values, and is the likelier one or kept beside it."""
     by_hand = asked(full=lambda values: exact(values) + 2e-3)
     found = by_hand.search()
     best = found.best
