@@ -1,4 +1,4 @@
-"""Fits to the beginning of a recording know nothing of what follows, and predict it (a skin in closed form)."""
+"""Fits to the beginning of a recording know nothing of what follows, and predict it; on a toy."""
 
 from __future__ import annotations
 
