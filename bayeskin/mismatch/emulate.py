@@ -28,7 +28,7 @@ from bayeskin.mismatch.wrapper import Wrapper, innermost
 from bayeskin.types import Array, Design, ParameterSpace, Surrogate
 
 MOST = 1500  # draws, among which a wave's points are chosen
-TOUCHING = 1e-3  # of the unit cube: places that are nearer are the same
+NEARBY = 0.1  # of the unit cube: within it errors hardly change, so that an emulator can learn them
 BEFORE = (60,)  # steps of the ensembles whose draws a further wave begins with
 
 # The skin's force (m,) with the set at points (n, d) by the forward model, and at the first few by the full
@@ -100,7 +100,7 @@ class _Errors:
     def at(self, unit: Array) -> Array:
         """Returns the errors (n, m) at points (n, d) of the unit cube."""
         square = np.sum((unit[:, None] - self.places) ** 2, axis=2)
-        weight = 1.0 / (square + TOUCHING**2)
+        weight = 1.0 / (square + NEARBY**2)
         return np.asarray((weight / weight.sum(axis=1, keepdims=True)) @ self.errors_n)
 
     def left(self) -> Array:
@@ -151,6 +151,9 @@ def emulate(
         design = fresh
         local = _posterior(about, learn(design), settings.sure * noise_n)
         best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
+        if not np.isfinite(best.value):  # it is sure nowhere yet
+            local = replace(local, sure_within_n=None)
+            best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
         done = error_n is not None and error_n <= settings.enough * noise_n
         last = done or wave == settings.waves - 1
         known = [one.fit.theta for one in maxima]
