@@ -145,7 +145,7 @@ def server(model: Model, host: str, port: int) -> ThreadingHTTPServer:
 
 class _Server(ThreadingHTTPServer):
     def server_bind(self) -> None:
-        """As any TCP server: HTTP's asks the network for the machine's name, which can take long."""
+        """Binds as any TCP server does; HTTP's asks the network for a name, which can take long."""
         TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 

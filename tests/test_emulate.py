@@ -198,3 +198,14 @@ def test_one_wave_alone_is_never_settled(fitted: tuple[JointBench, JointFit]) ->
     assert not isinstance(emulated, str)
     assert emulated.error_n is None
     assert not emulated.settled
+
+
+def test_an_emulator_that_is_sure_nowhere_is_believed_but_never_settled(
+    fitted: tuple[JointBench, JointFit],
+) -> None:
+    bench, found = fitted
+    never = dataclasses.replace(FEW, sure=1e-9, waves=2)
+    emulated = emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, never)
+    assert not isinstance(emulated, str)
+    assert np.isfinite(emulated.fit.value)
+    assert not emulated.settled

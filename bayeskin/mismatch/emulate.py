@@ -23,7 +23,7 @@ import numpy as np
 from bayeskin.inference import LogPosterior
 from bayeskin.mismatch.fit import Fit, fit_near
 from bayeskin.mismatch.joint_fit import JointFit, within
-from bayeskin.mismatch.resample import Resampled, resample
+from bayeskin.mismatch.resample import LEGS, MODES, Resampled, resample
 from bayeskin.mismatch.wrapper import Wrapper, innermost
 from bayeskin.types import Array, Design, ParameterSpace, Surrogate
 
@@ -151,15 +151,15 @@ def emulate(
         design = fresh
         local = _posterior(about, learn(design), settings.sure * noise_n)
         best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
-        if not np.isfinite(best.value):  # it is sure nowhere yet
+        if not np.isfinite(best.value):  # it is sure nowhere yet: for this wave it is believed
             local = replace(local, sure_within_n=None)
             best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
-        done = error_n is not None and error_n <= settings.enough * noise_n
+        sure = local.sure_within_n is not None
+        done = sure and error_n is not None and error_n <= settings.enough * noise_n
         last = done or wave == settings.waves - 1
         known = [one.fit.theta for one in maxima]
-        drawn = (
-            resample(best, None, seed, near=known) if last else resample(best, None, seed, BEFORE, 0, known)
-        )
+        legs, modes = (LEGS, MODES) if last else (BEFORE, 0)
+        drawn = resample(best, None, seed, legs, modes, known)
         draws, emulated = drawn.draws, Emulated(best, drawn, len(design.theta), error_n, done)
         if done:
             break

@@ -22,9 +22,8 @@ RUNS = 6  # of a fit, at most
 
 @dataclass(frozen=True)
 class Beginning:
-    """Fits of the base model and of the likeliest set to the recording up to `split_s`."""
+    """Fits of the base model and of the likeliest set to the beginning of a recording."""
 
-    split_s: float
     base: Fit
     best: Fit
 
@@ -45,4 +44,4 @@ def fit_beginning(ask: Ask, sets: Sequence[JointFit], split_s: float | None) -> 
     answers = ask([Climb(one.fit.names, one.fit.theta, RUNS, added(one), split_s) for one in sets])
     fits = [one.fit for one in answers if isinstance(one, JointFit)]
     base = next((one for one in fits if not one.names), None)
-    return None if base is None else Beginning(split_s, base, max(fits, key=weight))
+    return None if base is None else Beginning(base, max(fits, key=weight))

@@ -15,8 +15,8 @@ FILE = "discretisation.json"  # beside this file; written by benchmarks/discreti
 
 
 class MeshError(NamedTuple):
-    """Of the reaction's history over the first cycle, relative to its peak: RMS and largest, the worst of the
-    study's points."""
+    """Error of the reaction's history over the first cycle, relative to its peak: RMS and largest, the worst
+    of the study's points."""
 
     rms: float
     largest: float

@@ -87,7 +87,7 @@ class NewtonSolver:
         return free_fixed
 
     def _number_for(self, place: Array) -> int:
-        """Of the kept one at this place, else a free number, else of the one that has not served longest."""
+        """Returns the number of the factor at this place, else a free one, else the least recently used."""
         nearest = self._nearest(place)
         if nearest is not None and np.abs(self._places[nearest] - place).sum() < SAME_PLACE:
             return nearest
@@ -230,7 +230,7 @@ class NewtonSolver:
         return x, False
 
     def _newton_step(self, equations: Equations, right: Array) -> Array:
-        """By the tangent factorised or taken last, (free,) in units of the tolerance."""
+        """Returns Newton's step (free,) by the last tangent, in units of the tolerance."""
         return -self.back_substitute(right) * equations.weight
 
     def _damped(self, equations: Equations, x: Array, step: Array) -> Array | None:

@@ -78,7 +78,7 @@ class ModelSpec:
 
     @property
     def mesh_hash(self) -> str:
-        """By which `accuracy.mesh_error` knows the mesh."""
+        """Hash by which `accuracy.mesh_error` knows the mesh."""
         return _mesh(self.mesh, self.refinement, self.geometry).hash
 
     @property

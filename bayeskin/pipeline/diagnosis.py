@@ -62,7 +62,7 @@ def diagnose(source: Path, reporter: Reporter, device: Path | None = None) -> di
 
 
 def by_reduced_model(config: Config) -> bool:
-    """Whether the reduced model solves the mechanisms of a set together, in place of learnt effects."""
+    """Returns whether the reduced model solves the mechanisms of a set together."""
     return config.design.coarse == "reduced"
 
 
@@ -144,7 +144,7 @@ def _likeliest(
     whole: Search, before: TakenUp, after: TakenUp, rivals: Sequence[Fit],
     judged: Sequence[TakenUp | float | None],
 ) -> TakenUp:  # fmt: skip
-    """What follows the best set, which is the one of it and its rivals that the full model makes it.
+    """Returns what follows the likeliest, by the full model, of the best set and its rivals.
 
     One that the full model cannot run goes for none that it can run and that leaves much.
     """
@@ -170,7 +170,7 @@ def _base_and_best(found: Search) -> list[Fit]:
 
 
 def leaves_something(found: Diagnosis, after: Located) -> bool:
-    """Whether there is something to describe: the mismatch is unknown, or windows remain beside names."""
+    """Returns whether the mismatch is unknown, or windows remain beside named mechanisms."""
     return found.verdict == "unknown" or (found.verdict == "named" and bool(after.windows))
 
 
@@ -211,7 +211,7 @@ def _as_search(made: Sequence[Made]) -> Search:
 
 
 def _search_file(bench: Workbench, build: Build) -> Path:
-    """Where a search keeps its fits, by what they are of."""
+    """Returns the file in which a search keeps its fits, by all that they depend on."""
     identity = sha256_of(
         [bayeskin.__version__, bench.run.config.seed, build(()).identity, repr(build(()).noise_priors),
          [repr(mechanism.parameters) for mechanism in bench.known.values()],
@@ -243,7 +243,7 @@ def _searched(
 
 
 def _made_in(bench: Workbench, build: Build) -> list[Made]:
-    """What a search has made so far, in order."""
+    """Returns the fits that a search has made so far, in order."""
     file = _search_file(bench, build)
     rows = read_lines(file)
     try:

@@ -242,7 +242,7 @@ class ReducedEquations:
     def _history(
         self, sources: tuple[tuple[float, State], ...], length_s: float, time_s: float
     ) -> kernels.History:
-        """What a stage at a time knows of its sources, of which the last carries the memory."""
+        """Returns the history that a stage at a time has from its sources; the last carries the memory."""
         last, k = sources[-1][1], self.space.modes[0]
         return kernels.History(
             np.asarray(sum(w * s.volume for w, s in sources)),

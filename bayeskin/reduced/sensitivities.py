@@ -6,7 +6,7 @@ they are. It is driven to zero from the derivatives of the stages before, by ste
 the stage's own solve (`slopes.differentiate`); no tangent is made for it. Steps in time are held.
 
 A length of the tissue moves the nodes, and with them kinematics, weights and all that is integrated exactly.
-Its other residual is that of the moved space.
+Its residuals are those of two moved spaces, on either side.
 """
 
 from __future__ import annotations

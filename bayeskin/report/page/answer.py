@@ -22,7 +22,7 @@ _THREE = ("low_90", "median", "high_90")
 
 
 def answer(facts: RunFacts) -> Answer:
-    """Of a run, as far as it is finished."""
+    """Returns the answer of a run, as far as it is finished."""
     return Answer(_made(facts), _made_of(facts), _sure(facts), _missing(facts))
 
 
@@ -110,7 +110,7 @@ def _sure(facts: RunFacts) -> Verdict:
 
 
 def fits_of(fit: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """By model the fits without or with mechanisms, the last the best there is: the full model's, if any."""
+    """Returns fits by the model that they rest on; the last is the full model's, if there is one."""
     full = fit.get("full_model")
     return {fit.get("model", "surrogate"): fit, **({"full model": full} if full and "rmse" in full else {})}
 

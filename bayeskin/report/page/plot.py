@@ -19,7 +19,7 @@ Phases = Sequence[Mapping[str, Any]]
 
 
 class Plot:
-    """From seconds and values to the drawing's own units; each method gives a piece of SVG."""
+    """Scales of a drawing, from seconds and values to its own units; each method returns a piece of SVG."""
 
     def __init__(self, time_s: Array, values: Sequence[Array]) -> None:
         """`values`, each (m,), are all to be seen; NaN is not drawn."""
