@@ -40,7 +40,7 @@ def start(bench: JointBench) -> dict[str, float]:
 def tangent(bench: JointBench, space: ParameterSpace = BASE) -> tuple[Tangent, FullRun]:
     run = a_run(bench)
     assert run.slopes_n is not None
-    return Tangent(space, solved.EDGES_S, run.theta, run.force_n, run.slopes_n), run
+    return Tangent(space, solved.EDGES_S, (run,)), run
 
 
 @pytest.mark.parametrize("first", [BASE.parameters[0], PEAKED], ids=["flat", "peaked"])
@@ -61,34 +61,55 @@ def test_a_tangent_has_the_value_and_the_slopes_of_its_run(bench: JointBench, fi
         np.testing.assert_allclose(skin, run.slopes_n[:, i], rtol=0, atol=1e-4 * largest)
 
 
-def test_a_tangent_is_a_straight_line_in_moduli_and_in_the_box_of_all_others(bench: JointBench) -> None:
+def test_a_tangent_is_a_straight_line_in_the_box_of_what_is_no_modulus(bench: JointBench) -> None:
     near, run = tangent(bench)
     share = np.linspace(0.0, 1.0, 5)[:, None]
-    moduli = run.theta * np.array([3.0, 0.2, 1.0, 1.0, 1.0])
     others = run.theta * np.array([1.0, 1.0, 20.0, 0.1, 2.0])
     here, there = BASE.to_unit(run.theta), BASE.to_unit(others)
-    for line in (run.theta + share * (moduli - run.theta), BASE.from_unit(here + share * (there - here))):
-        mean = near.predict_mean(line)
-        np.testing.assert_allclose(mean, mean[0] + share * (mean[-1] - mean[0]), rtol=0, atol=1e-12)
-        assert np.abs(mean[-1] - mean[0]).max() > 0.01
+    mean = near.predict_mean(BASE.from_unit(here + share * (there - here)))
+    np.testing.assert_allclose(mean, mean[0] + share * (mean[-1] - mean[0]), rtol=0, atol=1e-12)
+    assert np.abs(mean[-1] - mean[0]).max() > 0.01
 
 
 @pytest.mark.parametrize("factor", [0.3, 4.0])
-def test_moduli_times_c_pull_c_times_as_hard_where_the_force_is_proportional_to_them(
+def test_moduli_times_c_and_permeabilities_over_c_pull_c_times_as_hard(
     bench: JointBench, factor: float
 ) -> None:
+    """Far from the run, too, if its slopes have it: by Euler, those of moduli and permeabilities add up."""
     run = a_run(bench)
-    width = np.log(BASE.upper[:2] / BASE.lower[:2])
-    slopes_n = np.zeros((len(run.force_n), BASE.dim))
-    slopes_n[:, :2] = np.outer(run.force_n, [0.7, 0.3]) * width  # by Euler: 70 % of it are the cutis's
-    near = Tangent(BASE, solved.EDGES_S, run.theta, run.force_n, slopes_n)
-    stiffer = run.theta * np.array([factor, factor, 1.0, 1.0, 1.0])
-    np.testing.assert_allclose(near.predict_mean(stiffer)[0], factor * run.force_n, rtol=1e-12, atol=1e-15)
+    assert run.slopes_n is not None
+    width = np.log(BASE.upper[:4] / BASE.lower[:4])
+    by_log = run.slopes_n[:, :4] / width
+    by_log[:, 1] = run.force_n + by_log[:, 2] + by_log[:, 3] - by_log[:, 0]
+    slopes_n = np.column_stack([by_log * width, run.slopes_n[:, 4:]])
+    near = Tangent(BASE, solved.EDGES_S, (FullRun(run.theta, run.force_n, slopes_n),))
+    aside = run.theta * np.array([1.5, 0.7, 2.0, 0.4, 1.0])
+    stiffer = aside * np.array([factor, factor, 1.0 / factor, 1.0 / factor, 1.0])
+    for here, there in ((run.theta, run.theta * (stiffer / aside)), (aside, stiffer)):
+        mean = near.predict_mean(np.array([here, there]))
+        np.testing.assert_allclose(mean[1], factor * mean[0], rtol=1e-12, atol=1e-15)
+
+
+def test_several_runs_are_all_met_with_their_slopes(bench: JointBench) -> None:
+    first = a_run(bench)
+    second = bench.skin((), {**start(bench), "E_c": 130e3, "k_s": 6e-14})
+    assert isinstance(second, FullRun)
+    near, step = Tangent(BASE, solved.EDGES_S, (first, second)), 1e-4
+    between = Tangent(BASE, solved.EDGES_S, (first,)).predict_mean(second.theta)[0]
+    assert np.abs(between - second.force_n).max() > 1e-3  # which one alone does not know
+    for run in (first, second):
+        assert run.slopes_n is not None
+        np.testing.assert_allclose(near.predict_mean(run.theta)[0], run.force_n, rtol=0, atol=1e-9)
+        unit = BASE.to_unit(run.theta)
+        for i in range(BASE.dim):
+            ends = BASE.from_unit(unit + step * np.outer([-1.0, 1.0], np.eye(BASE.dim)[i]))
+            back, ahead = near.predict_mean(ends)
+            np.testing.assert_allclose((ahead - back) / (2.0 * step), run.slopes_n[:, i], rtol=0, atol=2e-5)
 
 
 def highest(bench: JointBench) -> tuple[float, dict[str, float]]:
     """Log density and values of the highest top of the set's posterior by the skin itself, of many climbs."""
-    about = bench.local(SET, a_run(bench, SET))
+    about = bench.local(SET, [a_run(bench, SET)])
     seen: Any = about.surrogate  # what the instrument does, about the skin
     exact = dataclasses.replace(seen, inner=Exact(innermost(seen).space))
     whole = dataclasses.replace(about, surrogate=exact)
@@ -219,7 +240,7 @@ def test_no_more_runs_are_made_than_asked_for_and_more_are_never_worse(bench: Jo
 
 @pytest.mark.parametrize("reach", [0.0, 0.15])
 def test_a_trust_region_holds_what_the_model_solves_and_nothing_else(bench: JointBench, reach: float) -> None:
-    about = bench.local(SET, a_run(bench, SET))
+    about = bench.local(SET, [a_run(bench, SET)])
     space, (low, high) = about.surrogate.space, about.bounds
     assert [n for n, held in zip(space.names, solved_columns(about), strict=True) if not held] == ["F0"]
     vector = np.clip(about.vector({**start(bench), **TRUTH}), low, high)
@@ -241,7 +262,7 @@ def test_priors_that_go_together_do_so_in_a_fit_and_its_trust_region(
     base = ParameterSpace((PEAKED, other, *BASE.parameters[2:]), together)
     bench = solved.bench(monkeypatch, solved.recorded(0), base)
     for names in ((), ("force-offset",), SET):
-        about = bench.local(names, a_run(bench, names))
+        about = bench.local(names, [a_run(bench, names)])
         assert about.space.correlations == together
         vector = np.clip(about.vector({**start(bench), **TRUTH}), *about.bounds)
         assert within(about, vector, 0.1).space.correlations == together

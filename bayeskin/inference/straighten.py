@@ -31,13 +31,15 @@ _CHUNK = 256
 _MIN_SHARE = 0.02  # mean share of the amplitude that puts a parameter into the group
 _DEGREE = 5
 _NEWTON = 4  # steps onto the ridge
+_STEP = 1e-4  # of a logarithm, for differences
 
 
 @dataclass(frozen=True)
 class Shear(_FreezesArrays):
     """The map for x (n, D): `group` (D,) bool, log_weight (D,) of its members, -inf outside.
 
-    The polynomial has `powers` (t, D) and `coefficients` (t,) in (P x - centre) / scale.
+    The polynomial has `powers` (t, D) and `coefficients` (t,) in (P x - centre) / scale. With another `power` q
+    than 1 the amplitude is that of a sum of moduli to the power q, and the sum's logarithm is divided by q.
     """
 
     group: NDArray[np.bool_]
@@ -46,6 +48,7 @@ class Shear(_FreezesArrays):
     coefficients: Array
     centre: Array
     scale: Array
+    power: float = 1.0
 
     def straight(self, x: Array) -> Array:
         """P x (n, D) with c' in the place of the group's first parameter."""
@@ -72,7 +75,7 @@ class Shear(_FreezesArrays):
 
     def height(self, rest: Array) -> Array:
         """h (n,) at P x (n, D)."""
-        height = log_sum(rest[:, self.group] + self.log_weight[self.group])
+        height = log_sum(self.power * rest[:, self.group] + self.log_weight[self.group]) / self.power
         return height + self.coefficients @ self.polynomial(rest)
 
     def among(self, own: Sequence[str], names: Sequence[str]) -> Shear:
@@ -86,7 +89,7 @@ class Shear(_FreezesArrays):
 
         return Shear(
             spread(self.group, 0), spread(self.log_weight, -np.inf), spread(self.powers, 0),
-            self.coefficients, spread(self.centre, 0.0), spread(self.scale, 1.0),
+            self.coefficients, spread(self.centre, 0.0), spread(self.scale, 1.0), self.power,
         )  # fmt: skip
 
     @property
@@ -142,6 +145,27 @@ def find_shear(log_posterior: LogPosterior) -> Shear | None:
         0.5 * (low + high), 0.5 * (high - low),
     )  # fmt: skip
     return _corrected(log_posterior, plain, x, material)
+
+
+def shear_at(log_posterior: LogPosterior, x: Array, power: float) -> Shear | None:
+    """The shear by how the amplitude changes with each modulus at one point (D,), without a polynomial.
+
+    power : of the moduli, in which the amplitude is a sum
+    None where fewer than two moduli raise it.
+    """
+    parameters = log_posterior.surrogate.space.parameters
+    moduli = [i for i, p in enumerate(parameters) if p.stress_power == 1 and p.in_log and p.offset == 0.0]
+    step = _STEP * np.eye(len(x))[moduli]
+    ahead, back = (_amplitude(log_posterior, x + way * step) for way in (1.0, -1.0))
+    share = np.zeros(len(x))
+    share[moduli] = (ahead - back) / (2.0 * _STEP)  # the amplitude there is about one
+    group = share > _MIN_SHARE
+    if group.sum() < 2:
+        return None
+    with np.errstate(divide="ignore"):
+        log_weight = np.where(group, np.log(np.maximum(share, 0.0)) - power * x, -np.inf)
+    nothing = np.zeros((0, len(x)), dtype=np.int64), np.zeros(0), np.zeros(len(x)), np.ones(len(x))
+    return Shear(group, log_weight, *nothing, power)
 
 
 def _amplitude(log_posterior: LogPosterior, x: Array) -> Array:

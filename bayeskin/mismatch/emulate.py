@@ -43,7 +43,8 @@ class EmulationSettings:
 
     checks : runs of the full model beside that at the fit, where the forward model's error matters
     points, more, waves : runs of the first wave, of each further one, and how many waves at most
-    first : of the prior's width on either side of the fit's run, from where the first points are drawn
+    first : of the prior's width on either side of a fit's run, from where the first points are drawn
+    nearer : of that, from where the next ones are drawn, as long as the emulator is sure nowhere
     sure : sd of the emulator, RMS over bins, over the noise of a bin, up to which it is believed
     enough : RMS error of the emulator at the median of fresh runs, over the noise of a bin, with which it is
         done
@@ -52,8 +53,9 @@ class EmulationSettings:
     checks: int = 3
     points: int = 30
     more: int = 20
-    waves: int = 5
+    waves: int = 8
     first: float = 0.5
+    nearer: float = 0.5
     sure: float = 2.0
     enough: float = 0.2
 
@@ -124,7 +126,8 @@ def emulate(
     found = maxima[0]
     about, names = found.fit.log_posterior, found.fit.names
     space, error_n = innermost(about.surrogate).space, None
-    draws = np.concatenate([_near(one, settings.first, seed) for one in maxima])
+    reach = settings.first
+    draws = _near(maxima, reach, seed)
     errors = _Errors(
         space.box.to_unit([one.run.theta for one in maxima]), np.array([one.off_n for one in maxima])
     )
@@ -151,10 +154,14 @@ def emulate(
         design = fresh
         local = _posterior(about, learn(design), settings.sure * noise_n)
         best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
-        if not np.isfinite(best.value):  # it is sure nowhere yet: for this wave it is believed
+        sure = bool(np.isfinite(best.value))
+        if not sure and wave < settings.waves - 1:
+            reach *= settings.nearer
+            draws = _near(maxima, reach, seed)
+            continue
+        if not sure:  # there are no more waves: it is believed
             local = replace(local, sure_within_n=None)
             best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
-        sure = local.sure_within_n is not None
         done = sure and error_n is not None and error_n <= settings.enough * noise_n
         last = done or wave == settings.waves - 1
         known = [one.fit.theta for one in maxima]
@@ -167,12 +174,16 @@ def emulate(
     return emulated
 
 
-def _near(one: JointFit, reach: float, seed: int) -> Array:
-    """Draws (n, D) of the posterior about a fit's run, up to so far from it, of the prior's width."""
-    about = one.fit.log_posterior
-    vector = np.clip(about.vector(one.fit.theta), *about.bounds)
-    near = replace(one.fit, log_posterior=within(about, vector, reach))
-    return resample(near, None, seed, BEFORE, 0).draws
+def _near(maxima: Sequence[JointFit], reach: float, seed: int) -> Array:
+    """Draws (n, D) of the posterior about each fit's run, up to so far from it, of the prior's width."""
+
+    def near(one: JointFit) -> Array:
+        about = one.fit.log_posterior
+        vector = np.clip(about.vector(one.fit.theta), *about.bounds)
+        held = replace(one.fit, log_posterior=within(about, vector, reach))
+        return resample(held, None, seed, BEFORE, 0).draws
+
+    return np.concatenate([near(one) for one in maxima])
 
 
 def _allowing(about: LogPosterior, errors: _Errors) -> LogPosterior:

@@ -1,9 +1,9 @@
 """A set of mechanisms fitted by a forward model that solves all of them together.
 
 Each run of the model carries its derivatives, so the posterior is known about it (`tangent`); what acts on
-the force alone, and the noise, are exact there. A round maximises this posterior within a trust region of
-the parameters that the model solves, makes a run at the maximum, and goes on from it if the posterior has
-risen there by a part of what was promised.
+the force alone, and the noise, are exact there. A round maximises this posterior, as all runs so far tell it,
+within a trust region of the parameters that the model solves, makes a run at the maximum, and goes on from
+it if the posterior has risen there. A run that was no gain tells where not to go.
 
 Conn, Gould & Toint, Trust-Region Methods (2000), chapter 6.
 """
@@ -17,29 +17,34 @@ import numpy as np
 
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import Top, gauss_newton, with_less_noise
+from bayeskin.inference.straighten import shear_at
 from bayeskin.mismatch.corrected import FullRun
 from bayeskin.mismatch.fit import Fit, evidence
+from bayeskin.mismatch.tangent import POWER
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array
 
 
 @dataclass(frozen=True)
 class TrustSettings:
-    """Half width of the trust region, of the prior's width: at first, at most and at last.
+    """Half widths of the trust region, of the prior's width: at first, at most and at last.
 
     kept : share of the promised gain that a step has to reach for the region to stay as it is; more : from
         which on it grows; shrinks, grows : by what factors
+    moved : share of its half width, from which on a parameter has moved far: the region shrinks and grows
+        along those that have
     enough : nats still promised at which a fit is settled
     runs : at most
     climb, held : rounds of Gauss-Newton in a trust region, and with the model's parameters held
     """
 
-    first: float = 0.15
+    first: float = 0.2
     largest: float = 0.5
     smallest: float = 0.004
     kept: float = 0.3
     more: float = 0.8
     shrinks: float = 0.3
+    moved: float = 0.5
     grows: float = 2.0
     enough: float = 0.3
     runs: int = 9
@@ -49,7 +54,7 @@ class TrustSettings:
 
 # Names of a set and values by name to a run with derivatives, or why it failed.
 Skin = Callable[[Sequence[str], Mapping[str, float]], FullRun | str]
-Local = Callable[[Sequence[str], FullRun], LogPosterior]  # the posterior of a set about a run
+Local = Callable[[Sequence[str], Sequence[FullRun]], LogPosterior]  # the posterior of a set about runs
 
 
 @dataclass(frozen=True)
@@ -84,11 +89,15 @@ def fit_jointly(
     run = made_at(start)
     if isinstance(run, str):
         return run
-    about = local(names, run)
+    runs, about = [run], local(names, [run])
     vector, value = _at_run(about, np.clip(about.vector(start), *about.bounds), settings.held)
-    trust, settled, made = settings.first, False, 1
-    while made < settings.runs and trust >= settings.smallest:
-        ahead, promised = _highest(about, within(about, vector, trust), vector, settings.climb)
+    low, high = about.bounds
+    reach = np.where(solved_columns(about), settings.first, 1.0)
+    settled, made = False, 1
+    while made < settings.runs and reach.min() >= settings.smallest:
+        ahead, promised = _highest(about, in_box(about, vector, reach), vector, settings.climb)
+        moved = (np.abs(ahead - vector) / (high - low))[: len(reach)]
+        far = solved_columns(about) & (moved >= settings.moved * reach)
         promised -= value
         if promised < settings.enough:
             settled = True
@@ -97,17 +106,18 @@ def fit_jointly(
         there = made_at(about.named(about.from_sampling(ahead)))
         gained = -np.inf
         if not isinstance(there, str):
-            other = local(names, there)
-            moved, its_value = _at_run(other, ahead, settings.held)
+            runs.append(there)
+            about = local(names, runs)
+            ahead, its_value = _at_run(about, ahead, settings.held)
             gained = its_value - value
         if gained > 0.0 and not isinstance(there, str):
-            run, about, vector, value = there, other, moved, its_value
+            run, vector, value = there, ahead, its_value
         if gained < settings.kept * promised:
-            trust *= settings.shrinks
+            reach[far if far.any() else solved_columns(about)] *= settings.shrinks
         elif gained > settings.more * promised:
-            trust = min(settings.grows * trust, settings.largest)
+            reach[far] = np.minimum(settings.grows * reach[far], settings.largest)
     off_n = np.zeros_like(run.force_n) if off_n is None else off_n
-    return JointFit(_fit(names, about, vector), run, made, settled, off_n)
+    return JointFit(_fit(names, local(names, [run]), vector), run, made, settled, off_n)
 
 
 def _at_run(about: LogPosterior, vector: Array, rounds: int) -> tuple[Array, float]:
@@ -120,8 +130,8 @@ def _highest(about: LogPosterior, near: LogPosterior, vector: Array, rounds: int
 
     Climbs set out from the noise as it is and from little: noise that took up another run's misfit stays.
     """
-    starts = [vector, with_less_noise(about, vector)]
-    tops = [gauss_newton(near, np.clip(start, *near.bounds), None, rounds) for start in starts]
+    starts, ridge = [vector, with_less_noise(about, vector)], shear_at(about, vector, POWER)
+    tops = [gauss_newton(near, np.clip(start, *near.bounds), ridge, rounds) for start in starts]
     better = np.clip(max(tops, key=lambda top: top.value).vector, *about.bounds)
     return better, float(about.log_prob(better[None])[0])
 

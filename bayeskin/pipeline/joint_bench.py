@@ -108,7 +108,7 @@ class JointBench:
     def reported_of(self, names: Sequence[str], theta: Mapping[str, float], force_n: Array) -> Array:
         """A force (m,) of the skin as the instrument reports it, with a set at values."""
         at = np.array([theta[name] for name in self.space(names).names])
-        seen = self._seen(names, (), FullRun(at, force_n, np.zeros((len(force_n), len(at)))))
+        seen = self._seen(names, (), [FullRun(at, force_n, np.zeros((len(force_n), len(at))))])
         return seen.predict_mean(np.array([theta[name] for name in seen.space.names]))[0]
 
     def elsewhere(self, task: OtherTest) -> Array | str:
@@ -128,15 +128,16 @@ class JointBench:
         return self._run(names, theta, slopes=True)
 
     def local(
-        self, names: Sequence[str], run: FullRun, off_n: Array | None = None, until_s: float | None = None
-    ) -> LogPosterior:
-        """The posterior of a set about a run of it, to which the error of the reduced model was added.
+        self, names: Sequence[str], runs: Sequence[FullRun], off_n: Array | None = None,
+        until_s: float | None = None,
+    ) -> LogPosterior:  # fmt: skip
+        """The posterior of a set about runs of it, to which the error of the reduced model was added.
 
         That error changes from place to place by as much as it is, so it counts as known to one sd of itself.
 
         until_s : end of what of the recording is known; None for all
         """
-        return _with_error(self._posterior(self._seen(names, (), run), until_s), off_n)
+        return _with_error(self._posterior(self._seen(names, (), runs), until_s), off_n)
 
     def _run(self, names: Sequence[str], theta: Mapping[str, float], slopes: bool) -> FullRun | str:
         mechanisms, space = self.solved(names), self.space(names)
@@ -161,10 +162,9 @@ class JointBench:
         """Those of a set that the forward model solves, by their names' order."""
         return [self.known[name] for name in sorted(names) if self.known[name].act.bind is not None]
 
-    def _seen(self, names: Sequence[str], more: Sequence[str], run: FullRun) -> Surrogate:
-        """The reported force about a run of a set, with `more` mechanisms by what they do to a force."""
-        assert run.slopes_n is not None
-        skin = Tangent(self.space(names), self.binned.edges_s, run.theta, run.force_n, run.slopes_n)
+    def _seen(self, names: Sequence[str], more: Sequence[str], runs: Sequence[FullRun]) -> Surrogate:
+        """The reported force about runs of a set, with `more` mechanisms by what they do to a force."""
+        skin = Tangent(self.space(names), self.binned.edges_s, tuple(runs))
         beyond = tuple(
             self.known[name] for name in sorted({*names, *more})
             if name in more or self.known[name].act.bind is None
@@ -239,7 +239,7 @@ class JointBench:
 
     def _beside(self, task: Promise) -> tuple[LogPosterior, list[str]]:
         new = [name for name in with_one(task.names, task.name, self.known) if name not in task.names]
-        about = self._posterior(self._seen(task.names, new, task.run))
+        about = self._posterior(self._seen(task.names, new, [task.run]))
         return _with_error(about, np.array(task.off_n) if task.off_n else None), new
 
     def answered(self, task: Task, said: Mapping[str, Any]) -> object:
@@ -260,7 +260,7 @@ class JointBench:
         """A fit from what `as_json` made of it."""
         run = FullRun(*(np.array(said["run"][name]) for name in ("theta", "force_n", "slopes_n")))
         off_n = np.array(said["off_n"])
-        about = self.local(said["fit"]["names"], run, off_n if off_n.any() else None, until_s)
+        about = self.local(said["fit"]["names"], [run], off_n if off_n.any() else None, until_s)
         return JointFit(restored(said["fit"], about), run, said["runs"], said["settled"], off_n)
 
 
