@@ -38,8 +38,8 @@ _STEP = 1e-4  # of a logarithm, for differences
 class Shear(_FreezesArrays):
     """The map for x (n, D): `group` (D,) bool, log_weight (D,) of its members, -inf outside.
 
-    The polynomial has `powers` (t, D) and `coefficients` (t,) in (P x - centre) / scale. With another `power` q
-    than 1 the amplitude is that of a sum of moduli to the power q, and the sum's logarithm is divided by q.
+    The polynomial has `powers` (t, D) and `coefficients` (t,) in (P x - centre) / scale. With another `power`
+    q than 1 the amplitude is a sum of moduli to the power q, to the power 1 / q.
     """
 
     group: NDArray[np.bool_]

@@ -91,13 +91,13 @@ def fit_jointly(
         return run
     runs, about = [run], local(names, [run])
     vector, value = _at_run(about, np.clip(about.vector(start), *about.bounds), settings.held)
-    low, high = about.bounds
-    reach = np.where(solved_columns(about), settings.first, 1.0)
+    (low, high), solved = about.bounds, solved_columns(about)
+    reach = np.where(solved, settings.first, 1.0)
     settled, made = False, 1
     while made < settings.runs and reach.min() >= settings.smallest:
         ahead, promised = _highest(about, in_box(about, vector, reach), vector, settings.climb)
         moved = (np.abs(ahead - vector) / (high - low))[: len(reach)]
-        far = solved_columns(about) & (moved >= settings.moved * reach)
+        far = np.logical_and(solved, moved >= settings.moved * reach)
         promised -= value
         if promised < settings.enough:
             settled = True
@@ -113,7 +113,7 @@ def fit_jointly(
         if gained > 0.0 and not isinstance(there, str):
             run, vector, value = there, ahead, its_value
         if gained < settings.kept * promised:
-            reach[far if far.any() else solved_columns(about)] *= settings.shrinks
+            reach[far if far.any() else solved] *= settings.shrinks
         elif gained > settings.more * promised:
             reach[far] = np.minimum(settings.grows * reach[far], settings.largest)
     off_n = np.zeros_like(run.force_n) if off_n is None else off_n

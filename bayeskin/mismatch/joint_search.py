@@ -67,7 +67,7 @@ class SearchSettings:
     shortlist: int = 4
     promised: float = 1.0
     astray: float = 10.0
-    near: float = 0.5
+    near: float = 0.8
     alike: int = 3
     others: int = 16
     tried: int = 2
@@ -199,8 +199,8 @@ class _Searcher:
         middle = float(np.exp(np.mean([np.log(best.fit.theta[name]) for name in flow])))
         equal = {name: float(np.clip(middle, *limits[name])) for name in flow}
         start = {**best.fit.theta, **equal}
-        (there,) = self._ask([Climb(names, start, self._settings.runs, added(best))])
-        if not isinstance(there, JointFit) or self._is_alike(there, best.run.theta):
+        there = self._climbed_elsewhere(names, start, best)
+        if there is None:
             return
         (full_n,) = self._ask([FullProbe(self._solved(names), self._solved_values(there))])
         if isinstance(full_n, str):
@@ -209,14 +209,31 @@ class _Searcher:
         off = self._rms(off_n - there.off_n)
         if off > self._settings.exact * noise_of(self._binned):
             again = Climb(names, there.fit.theta, self._settings.runs, tuple(off_n.tolist()))
-            (there,) = self._ask([again])
-            if not isinstance(there, JointFit) or self._is_alike(there, best.run.theta):
+            (corrected,) = self._ask([again])
+            if not isinstance(corrected, JointFit) or self._is_alike(corrected, best.run.theta):
                 return
+            there = corrected
         self._tell(f"another maximum of the likeliest set: {self._gained(there, best):+.1f} nats")
         self.found.other = min((there, best), key=lambda one: weight(one.fit))
         if self.found.other is best:
             self.found.fits[names] = there
             self.found.checks[names] = Check(there.run.theta, np.asarray(full_n), off)
+
+    def _climbed_elsewhere(
+        self, names: tuple[str, ...], start: Mapping[str, float], best: JointFit
+    ) -> JointFit | None:
+        """A fit of the likeliest set that is elsewhere and not far behind; None where a climb finds none."""
+        settings, found = self._settings, None
+        for runs in (settings.first, settings.runs - settings.first):
+            (there,) = self._ask([Climb(names, start, runs, added(best))])
+            if not isinstance(there, JointFit) or self._is_alike(there, best.run.theta):
+                return None
+            if self._gained(best, there) > settings.behind:
+                return None
+            found, start = there, there.fit.theta
+            if there.settled:
+                break
+        return found
 
     def _exact(self) -> JointFit:
         """The likeliest set, checked if it has mechanisms of the tissue: what the reduced model leaves out of

@@ -3,12 +3,12 @@
 Moduli multiplied by c and permeabilities by 1/c give forces multiplied by c (`surrogates.similarity`), which
 holds here exactly. Beyond that, the force about one run is linear in a power of each modulus and in the
 coordinates of the prior's box for all other parameters. Layers do not share a load as springs side by side,
-whose force would be linear in their moduli: between layers alike and a cutis that is fifteen times as stiff as
-the subcutis the best power goes from a half to one, and 0.8 serves all.
+whose force would be linear in their moduli. The best power goes from a half, for layers alike, to one, for a
+cutis that is fifteen times as stiff as the subcutis; 0.8 serves all.
 
 Between runs the force is an average of what each of them says, weighted by the inverse square of its distance
-in the box, so that it has the value and the slopes of every run (Shepard 1968, Proc. 23rd ACM Nat. Conf., 517;
-with slopes: Franke & Nielson 1980, Int. J. Numer. Meth. Eng. 15:1691).
+in the box, so that it has the value and the slopes of every run (Shepard 1968, Proc. 23rd ACM Nat. Conf.,
+517; with slopes: Franke & Nielson 1980, Int. J. Numer. Meth. Eng. 15:1691).
 """
 
 from __future__ import annotations
