@@ -13,9 +13,10 @@ from toys import solved
 from toys.solved import BASE, TRUTH, Exact, a_run
 
 from bayeskin.inference.gauss_newton import gauss_newton
+from bayeskin.inference.straighten import shear_at
 from bayeskin.mismatch.corrected import FullRun
 from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, solved_columns, within
-from bayeskin.mismatch.tangent import Tangent
+from bayeskin.mismatch.tangent import POWER, Tangent
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.pipeline.joint_bench import JointBench
 from bayeskin.types import Correlation, ParameterSpace
@@ -208,6 +209,47 @@ def test_a_fit_takes_shorter_steps_where_long_ones_fail(bench: JointBench) -> No
     assert failed
     assert found.settled
     assert found.fit.value == pytest.approx(highest(bench)[0], abs=2.0 * TrustSettings().enough)
+
+
+@pytest.mark.parametrize("power", [1.0, POWER])
+def test_a_sum_of_powers_of_moduli_stays_on_the_ridge_that_a_shear_knows(
+    bench: JointBench, power: float
+) -> None:
+    about = bench.local(SET, [a_run(bench, SET)])
+    vector = about.vector({**start(bench), **TRUTH, "stiffness_rate": 0.0, "F0": 0.0})
+    ridge = shear_at(about, vector, power)
+    assert ridge is not None
+    np.testing.assert_array_equal(np.flatnonzero(ridge.group), [0, 1])
+    aside = np.zeros(about.dim)
+    aside[:2] = [0.3, -0.3]
+    there = ridge.back(ridge.straight(vector[None]) + np.array([0.0, -0.5, *np.zeros(about.dim - 2)]))[0]
+    assert there[1] < vector[1] - 0.1 < vector[0] + 0.05 < there[0]
+    share = np.exp(ridge.log_weight[:2] + power * vector[:2])
+    sums = [float(share @ np.exp(power * (point - vector)[:2])) for point in (vector, there)]
+    assert sums[1] == pytest.approx(sums[0], rel=1e-9)
+    force_n = about.predict_mean(about.from_sampling(np.array([vector, there, vector + aside])))
+    here, along, across = force_n @ about.binned.force_n
+    assert abs(along - here) < (0.03 if power == POWER else 0.15) * abs(across - here)
+
+
+def test_a_step_that_fails_shortens_the_next_along_what_moved_far(bench: JointBench) -> None:
+    last, failed = START["k_s"], 0
+
+    def skin(names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
+        """Runs as far as one permeability changes by a quarter since the last run."""
+        nonlocal last, failed
+        if abs(np.log(theta["k_s"] / last)) > np.log(1.25):
+            failed += 1
+            return "near folding"
+        last = theta["k_s"]
+        return bench.skin(names, theta)
+
+    found = fit_jointly(SET, start(bench), skin, bench.local, TrustSettings(runs=4))
+    assert isinstance(found, JointFit)
+    assert failed
+    stiffness = [2e-6 * theta["E_c"] + 4e-6 * theta["E_s"] for theta in (found.fit.theta, TRUTH, START)]
+    assert stiffness[0] == pytest.approx(stiffness[1], rel=0.05)  # moduli have gone all the way meanwhile
+    assert stiffness[2] != pytest.approx(stiffness[1], rel=0.1)
 
 
 def test_a_fit_does_not_go_on_from_a_run_that_is_worse(bench: JointBench) -> None:

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg.lapack import dpotri
 from scipy.optimize import minimize
 
 from bayeskin.mismatch.features import describe
@@ -184,8 +185,7 @@ def _unlikely(
     if squares is not None and masks is not None:
         kernels = _kernels(line[2:], squares, masks)
         covariance = covariance + rest.beyond(rest.beyond(kernels.sum(axis=0)).T)
-    root = np.linalg.cholesky(covariance)
-    inverse = cho_solve((root, True), np.eye(len(root)))
+    root, inverse = _inverted(covariance)
     weight = inverse @ rest.residual_n
     value = 0.5 * float(rest.residual_n @ weight) + float(np.sum(np.log(np.diag(root))))
     bend = inverse - np.outer(weight, weight)
@@ -197,3 +197,10 @@ def _unlikely(
     by_size = np.einsum("ij,pij->p", bend, kernels)
     by_length = np.einsum("ij,pij,pij->p", bend, kernels, squares) * 0.5 * np.exp(-2.0 * line[5:])
     return value, np.concatenate([slopes, by_size, by_length])
+
+
+def _inverted(covariance: Array) -> tuple[Array, Array]:
+    """Returns the Cholesky factor and the inverse; raises LinAlgError where it is not positive definite."""
+    root = np.linalg.cholesky(covariance)
+    lower, _ = dpotri(root, lower=1)
+    return root, np.tril(lower) + np.tril(lower, -1).T

@@ -41,6 +41,7 @@ from bayeskin.surrogates import train
 from bayeskin.types import Array, BinnedForce, Design, Surrogate
 
 WEIGHED = 6  # sets, the likeliest and that without mechanisms, whose hypotheses are compared
+POSSIBLE = 1e-6  # probability of a set, below which it is not fitted to the beginning
 PREDICTIVE_DRAWS = 300
 REACH = 0.5  # of the prior's width on either side of a run, within which its tangent is sampled
 KNOWN = "pads that open, by what and as fast as the reduced model was trained on"
@@ -82,7 +83,9 @@ def _work(run: Run) -> Mapping[str, Any]:
         judged = judge_family(family, bench.known)
         best = max(evidences, key=lambda names: family.probability_of_set(names))
         split_s = end_of_second_hold(bench.binned)
-        begun = fit_beginning(ask, [found.fits[names] for names in weighed], split_s)
+        possible = [names for names in evidences
+                    if not names or family.probability_of_set(names) > POSSIBLE]  # fmt: skip
+        begun = fit_beginning(ask, [found.fits[names] for names in possible], split_s)
         run.reporter.log("runs where the posterior is, and draws of it")
         maxima = [found.fits[best]]
         if found.other is not None and found.other.fit.names == best:
