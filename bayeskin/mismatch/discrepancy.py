@@ -203,4 +203,4 @@ def _inverted(covariance: Array) -> tuple[Array, Array]:
     """Returns the Cholesky factor and the inverse; raises LinAlgError where it is not positive definite."""
     root = np.linalg.cholesky(covariance)
     lower, _ = dpotri(root, lower=1)
-    return root, np.tril(lower) + np.tril(lower, -1).T
+    return np.asarray(root), np.asarray(np.tril(lower) + np.tril(lower, -1).T)
