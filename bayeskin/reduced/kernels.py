@@ -133,24 +133,24 @@ def residual(system, laws, past, x, room, out):
 @compiled
 def _kinematics(system, x, start, end, room):
     """Fills F, p and grad p at some points."""
-    k, m = system.gradient.shape[2], system.pressure.shape[1]
+    k = system.gradient.shape[2]
+    fields, pressures = x[:k], x[k:]
     for q in range(start, end):
         for i in range(3):
             for j in range(3):
-                total = 0.0
-                for c in range(k):
-                    total += system.gradient[q, 3 * i + j, c] * x[c]
-                room.deformation[q, i, j] = total
+                room.deformation[q, i, j] = _product(system.gradient[q, 3 * i + j], fields)
             room.deformation[q, i, i] += 1.0
-        total = 0.0
-        for c in range(m):
-            total += system.pressure[q, c] * x[k + c]
-        room.at_pressure[q] = total
+        room.at_pressure[q] = _product(system.pressure[q], pressures)
         for i in range(3):
-            total = 0.0
-            for c in range(m):
-                total += system.slope[q, i, c] * x[k + c]
-            room.at_slope[q, i] = total
+            room.at_slope[q, i] = _product(system.slope[q, i], pressures)
+
+
+@compiled
+def _product(one, other):
+    total = 0.0
+    for c in range(len(one)):
+        total += one[c] * other[c]
+    return total
 
 
 @compiled
@@ -200,21 +200,21 @@ def _project(system, start, end, room, out):
     """Adds what some points answer to the residual."""
     k, m = system.gradient.shape[2], system.pressure.shape[1]
     for q in range(start, end):
-        w = system.weight[q]
-        for i in range(3):
-            for j in range(3):
-                s = w * room.stress[q, i, j]
-                for c in range(k):
-                    out[c] += s * system.gradient[q, 3 * i + j, c]
-        content = w * room.content[q]
-        f0, f1, f2 = w * room.flux[q, 0], w * room.flux[q, 1], w * room.flux[q, 2]
+        w, g, slope = system.weight[q], system.gradient[q], system.slope[q]
+        stress, flux = room.stress[q], room.flux[q]
+        s0, s1, s2 = w * stress[0, 0], w * stress[0, 1], w * stress[0, 2]
+        s3, s4, s5 = w * stress[1, 0], w * stress[1, 1], w * stress[1, 2]
+        s6, s7, s8 = w * stress[2, 0], w * stress[2, 1], w * stress[2, 2]
+        for c in range(k):  # one pass for all nine: the sum is fetched and put back once
+            out[c] += (
+                s0 * g[0, c] + s1 * g[1, c] + s2 * g[2, c]
+                + s3 * g[3, c] + s4 * g[4, c] + s5 * g[5, c]
+                + s6 * g[6, c] + s7 * g[7, c] + s8 * g[8, c]
+            )  # fmt: skip
+        content, pressure = w * room.content[q], system.pressure[q]
+        f0, f1, f2 = w * flux[0], w * flux[1], w * flux[2]
         for c in range(m):
-            out[k + c] -= (
-                content * system.pressure[q, c]
-                + f0 * system.slope[q, 0, c]
-                + f1 * system.slope[q, 1, c]
-                + f2 * system.slope[q, 2, c]
-            )
+            out[k + c] -= content * pressure[c] + f0 * slope[0, c] + f1 * slope[1, c] + f2 * slope[2, c]
 
 
 @compiled
