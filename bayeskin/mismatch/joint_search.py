@@ -52,6 +52,8 @@ class SearchSettings:
     gain : nats of weight, less is no reason to go on; most : mechanisms of a set
     compared : sets that are checked by the full model; checks : rounds of them
     exact : error of the forward model, RMS over bins, over that of the noise, that needs no correction
+    shapes : of each part of a mechanism that the model solves, from which further maxima are sought
+    maxima : further ones that are kept
     alike_by : of the prior's width: fits whose runs differ by less share a check, and have one maximum
     """
 
@@ -77,6 +79,8 @@ class SearchSettings:
     compared: int = 6
     checks: int = 4
     exact: float = 0.05
+    shapes: int = 2
+    maxima: int = 2
     alike_by: float = 0.1
 
 
@@ -102,12 +106,12 @@ class Check:
 class JointSearch:
     """All sets fitted, by their names sorted: of each the likeliest fit, and the last check of one.
 
-    other : another maximum of the likeliest set, less likely than that in `fits`; None where none is known
+    others : further maxima of the likeliest set, less likely than that in `fits`
     """
 
     fits: dict[tuple[str, ...], JointFit] = field(default_factory=dict)
     checks: dict[tuple[str, ...], Check] = field(default_factory=dict)
-    other: JointFit | None = None
+    others: list[JointFit] = field(default_factory=list)
 
     def add(self, found: object) -> None:
         """Keeps a fit where it is the likeliest of its set; answers of another kind are failures."""
@@ -141,7 +145,7 @@ def search_jointly(
     searcher = _Searcher(ask, binned, base, known, noise, seed, tell, settings or SearchSettings())
     searcher.base()
     searcher.search()
-    searcher.other_maximum()
+    searcher.other_maxima()
     return searcher.found
 
 
@@ -187,53 +191,70 @@ class _Searcher:
             if not self._gains(current):
                 return
 
-    def other_maximum(self) -> None:
-        """Climbs from the likeliest fit with the permeabilities of all layers equal, to a second maximum.
+    def other_maxima(self) -> None:
+        """Climbs to further maxima of the likeliest set, from values that the force says little of.
 
-        Force hardly tells which layer drains, so there often is one, farther than a tangent sees. The forces
-        of both differ by so little that each needs a full run of its own.
+        The forces of two maxima differ by so little that each needs a full run of its own.
         """
         best = self.found.best
-        names, limits = best.fit.names, {p.name: (p.lower, p.upper) for p in self._base.parameters}
-        flow = [p.name for p in self._base.parameters if p.stress_power < 0]
-        middle = float(np.exp(np.mean([np.log(best.fit.theta[name]) for name in flow])))
-        equal = {name: float(np.clip(middle, *limits[name])) for name in flow}
-        start = {**best.fit.theta, **equal}
-        there = self._climbed_elsewhere(names, start, best)
-        if there is None:
-            return
-        (full_n,) = self._ask([FullProbe(self._solved(names), self._solved_values(there))])
-        if isinstance(full_n, str):
-            return
-        off_n = np.asarray(full_n) - (there.run.force_n - there.off_n)
-        off = self._rms(off_n - there.off_n)
-        if off > self._settings.exact * noise_of(self._binned):
-            again = Climb(names, there.fit.theta, self._settings.runs, tuple(off_n.tolist()))
-            (corrected,) = self._ask([again])
-            if not isinstance(corrected, JointFit) or self._is_alike(corrected, best.run.theta):
-                return
-            there = corrected
-        self._tell(f"another maximum of the likeliest set: {self._gained(there, best):+.1f} nats")
-        self.found.other = min((there, best), key=lambda one: weight(one.fit))
-        if self.found.other is best:
-            self.found.fits[names] = there
-            self.found.checks[names] = Check(there.run.theta, np.asarray(full_n), off)
+        names, there = best.fit.names, self._climbed_elsewhere(best)
+        full = self._ask([FullProbe(self._solved(names), self._solved_values(one)) for one in there])
+        for one, full_n in zip(there, full, strict=True):
+            if isinstance(full_n, str):
+                continue
+            off_n = np.asarray(full_n) - (one.run.force_n - one.off_n)
+            check, maximum = Check(one.run.theta, np.asarray(full_n), self._rms(off_n - one.off_n)), one
+            if check.off > self._settings.exact * noise_of(self._binned):
+                again = Climb(names, one.fit.theta, self._settings.runs, tuple(off_n.tolist()))
+                (corrected,) = self._ask([again])
+                if not isinstance(corrected, JointFit) or self._is_alike(corrected, best.run.theta):
+                    continue
+                maximum = corrected
+            self._tell(f"another maximum of the likeliest set: {self._gained(maximum, best):+.1f} nats")
+            likeliest = self.found.fits[names]
+            self.found.others.append(min((maximum, likeliest), key=lambda each: weight(each.fit)))
+            if self.found.others[-1] is likeliest:
+                self.found.fits[names], self.found.checks[names] = maximum, check
 
-    def _climbed_elsewhere(
-        self, names: tuple[str, ...], start: Mapping[str, float], best: JointFit
-    ) -> JointFit | None:
-        """A fit of the likeliest set that is elsewhere and not far behind; None where a climb finds none."""
-        settings, found = self._settings, None
-        for runs in (settings.first, settings.runs - settings.first):
-            (there,) = self._ask([Climb(names, start, runs, added(best))])
-            if not isinstance(there, JointFit) or self._is_alike(there, best.run.theta):
-                return None
-            if self._gained(best, there) > settings.behind:
-                return None
-            found, start = there, there.fit.theta
-            if there.settled:
-                break
-        return found
+    def _climbed_elsewhere(self, best: JointFit) -> list[JointFit]:
+        """Fits of the likeliest set that are elsewhere and not far behind, the likeliest first."""
+        settings, names = self._settings, best.fit.names
+        climbs = [Climb(names, start, settings.first, added(best)) for start in self._elsewhere(best)]
+        first = self._distinct(self._ask(climbs), best, settings.behind)
+        rest = settings.runs - settings.first
+        again = self._ask([Climb(names, one.fit.theta, rest, added(best)) for one in first
+                           if not one.settled])  # fmt: skip
+        ended = [*(one for one in first if one.settled), *again]
+        return self._distinct(ended, best, settings.close)[: settings.maxima]
+
+    def _distinct(self, answers: Sequence[object], best: JointFit, behind: float) -> list[JointFit]:
+        """Returns the fits among answers, the likeliest of each maximum, that is not the best's."""
+        fits = sorted((one for one in answers if isinstance(one, JointFit)), key=lambda one: -weight(one.fit))
+        kept = [best]
+        for one in fits:
+            apart = not any(self._is_alike(one, other.run.theta) for other in kept)
+            if apart and self._gained(best, one) <= behind:
+                kept.append(one)
+        return kept[1:]
+
+    def _elsewhere(self, best: JointFit) -> list[dict[str, float]]:
+        """Values with equal and with exchanged permeabilities, since a force hardly tells which layer drains;
+        and with other shapes of each mechanism that the model solves."""
+        theta = best.fit.theta
+        limits = {p.name: (p.lower, p.upper) for p in self._base.parameters}
+        flow = [p.name for p in self._base.parameters if p.stress_power < 0]
+        middle = float(np.exp(np.mean([np.log(theta[name]) for name in flow])))
+        others = [
+            dict.fromkeys(flow, middle),
+            {name: theta[other] for name, other in zip(flow, flow[::-1], strict=True)},
+        ]
+        others = [{name: float(np.clip(value, *limits[name])) for name, value in one.items()}
+                  for one in others]  # fmt: skip
+        for name in self._solved(best.fit.names):
+            mechanism = self._known[name]
+            for _, *shapes in mechanism.whole_or_parts:
+                others += _shapes_of(mechanism, shapes, self._settings.shapes) if shapes else []
+        return [{**theta, **values} for values in others]
 
     def _exact(self) -> JointFit:
         """The likeliest set, checked if it has mechanisms of the tissue: what the reduced model leaves out of
@@ -495,10 +516,7 @@ class _Searcher:
             if not shapes or strength in self._shapes:
                 rows.append({**off, **self._shapes.get(strength, {})})
                 continue
-            others = ParameterSpace(tuple(by_name[name] for name in shapes))
-            unit = qmc.Halton(others.dim, scramble=False).random(self._settings.probes + 1)[1:]
-            rows += [{**off, **dict(zip(others.names, map(float, row), strict=True))}
-                     for row in others.from_unit(unit)]  # fmt: skip
+            rows += [{**off, **values} for values in _shapes_of(mechanism, shapes, self._settings.probes)]
         return rows
 
     def _score(
@@ -571,6 +589,14 @@ class _Searcher:
             Climb(one, current.fit.theta, self._settings.first)
             for one in sorted(fewer) if one not in self.found.fits
         ]))  # fmt: skip
+
+
+def _shapes_of(mechanism: Mechanism, names: Sequence[str], count: int) -> list[dict[str, float]]:
+    """Values of some of a mechanism's parameters, spread over their priors."""
+    by_name = {p.name: p for p in mechanism.parameters}
+    space = ParameterSpace(tuple(by_name[name] for name in names))
+    unit = qmc.Halton(space.dim, scramble=False).random(count + 1)[1:]
+    return [dict(zip(space.names, map(float, row), strict=True)) for row in space.from_unit(unit)]
 
 
 def noise_of(binned: BinnedForce) -> float:

@@ -87,9 +87,7 @@ def _work(run: Run) -> Mapping[str, Any]:
                     if not names or family.probability_of_set(names) > POSSIBLE]  # fmt: skip
         begun = fit_beginning(ask, [found.fits[names] for names in possible], split_s)
         run.reporter.log("runs where the posterior is, and draws of it")
-        maxima = [found.fits[best]]
-        if found.other is not None and found.other.fit.names == best:
-            maxima.append(found.other)
+        maxima = [found.fits[best], *(one for one in found.others if one.fit.names == best)]
         emulated = _emulated(bench, ask, maxima, seed)
     base, chosen = found.fits[()].fit, emulated.fit
     before, after = (
