@@ -159,6 +159,15 @@ class ParameterSpace:
             missing = missing[~inside]
         return np.clip(self.from_line(line), self.lower, self.upper)
 
+    def scaled(self, power: int) -> NDArray[np.intp]:
+        """Columns of parameters that enter as a stress to a power: 1 for moduli, -1 for permeabilities.
+
+        Those with an offset, which do not scale, are not among them.
+        """
+        known = enumerate(self.parameters)
+        found = [i for i, p in known if p.stress_power == power and p.in_log and p.offset == 0.0]
+        return np.array(found, dtype=np.intp)
+
     def to_unit(self, theta: ArrayLike) -> Array:
         """Prior cumulative probability of each coordinate, shape (..., d); outside [0, 1] beyond the box.
 

@@ -1,4 +1,4 @@
-"""Which mechanisms a search names on a skin in closed form, and what its tasks are."""
+"""A search on a skin in closed form: the mechanisms that it names, and its tasks."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from bayeskin.errors import InputError
 from bayeskin.mismatch.joint_search import JointSearch, SearchSettings, search_jointly
 from bayeskin.mismatch.search import weight
 from bayeskin.mismatch.tasks import Climb, FullProbe, Join, Probe, Promise, Task
+from bayeskin.mismatch.wrapper import innermost
 from bayeskin.pipeline.joint_bench import JointBench
 from bayeskin.types import Array, ParameterSpace
 
@@ -55,7 +56,7 @@ class Asked:
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Asked]:
-    """What answers tasks on a recording of the toy with mechanisms of these values."""
+    """Answers tasks on a recording of the toy with mechanisms of these values."""
 
     def make(
         seed: int = 0, lost: Callable[[Task], bool] = lambda task: False, full: Full = exact, **values: float
@@ -129,7 +130,7 @@ def test_no_task_is_asked_twice_and_only_what_is_taken_is_fitted_from_other_skin
 
 
 def of_other_skins(task: Probe, found: JointSearch) -> bool:
-    """Whether a run is of another skin than that of a fit."""
+    """Returns whether a run is of another skin than that of a fit."""
     return all(task.theta["p_init"] != one.fit.theta["p_init"] for one in found.fits.values())
 
 
@@ -185,7 +186,7 @@ def test_a_check_in_which_the_full_model_fails_is_told(asked: Make) -> None:
 
 
 def test_a_mechanism_that_stood_in_for_others_is_exchanged(asked: Make) -> None:
-    """Of a set of two each is left out in turn, and the others are tried beside the rest."""
+    """Each of a set of two is left out in turn, and the others are tried beside the rest."""
     one = asked(stiffness_rate=9e-4, F0=-0.03)
     found = one.search()
     assert found.best.fit.names == ("force-offset", "stiffness-drift")
@@ -278,18 +279,28 @@ def test_priors_without_a_skin_that_can_be_are_refused(monkeypatch: pytest.Monke
 
 
 def test_further_maxima_are_sought_where_the_force_says_little(asked: Make) -> None:
-    """From layers that drain alike or in exchange, and from other times of a drift."""
+    """Fits set out from layers that drain alike and in exchange, and from other times of a drift."""
     one = asked(stiffness_rate=9e-4)
     best = one.search().best
     assert best.fit.names == ("stiffness-drift",)
-    theta = next(task.start for task in one.tasks if isinstance(task, Climb)
-                 and task.start["k_c"] == task.start["k_s"])  # fmt: skip
-    last = [task for task in one.tasks if isinstance(task, Climb) and task.names == best.fit.names
-            and task.start["E_c"] == theta["E_c"]]  # fmt: skip
-    starts = [task.start for task in last]
-    middle = theta["k_c"] ** 2
-    flows = {(start["k_c"], start["k_s"]) for start in starts}
-    own = min(flows, key=lambda pair: abs(np.log(pair[0] * pair[1] / middle)) - (pair[0] != pair[1]))
-    assert own[::-1] in flows
-    times = {start["stiffness_time"] for start in starts if (start["k_c"], start["k_s"]) in (own, own[::-1])}
-    assert len(times) == 1 + FEW.shapes
+    climbs = [task for task in one.tasks if isinstance(task, Climb)]
+    (first,) = (i for i, task in enumerate(climbs) if task.start["k_c"] == task.start["k_s"])
+    starts = [task.start for task in climbs[first : first + 2 + FEW.shapes]]
+    assert {task.names for task in climbs[first : first + 2 + FEW.shapes]} == {best.fit.names}
+    equal, exchanged, *shapes = starts
+    assert equal["k_c"] ** 2 == pytest.approx(exchanged["k_c"] * exchanged["k_s"])
+    for start in shapes:
+        assert (start["k_s"], start["k_c"]) == (exchanged["k_c"], exchanged["k_s"])
+    times = {start["stiffness_time"] for start in shapes}
+    assert len(times - {equal["stiffness_time"], exchanged["stiffness_time"]}) == FEW.shapes
+
+
+def test_maxima_are_all_distinct_and_the_likeliest_is_the_fit(asked: Make) -> None:
+    found = asked(full=lambda values: exact(values) + 2e-3, stiffness_rate=9e-4).search()
+    best = found.fits[("stiffness-drift",)]
+    space = innermost(best.fit.log_posterior.surrogate).space
+    places = [space.to_unit(one.run.theta) for one in (best, *found.others)]
+    for i, place in enumerate(places):
+        assert all(np.abs(place - other).max() > FEW.alike_by for other in places[:i])
+    assert all(weight(one.fit) <= weight(best.fit) for one in found.others)
+    assert 0 < len(found.others) <= FEW.maxima

@@ -148,13 +148,12 @@ def find_shear(log_posterior: LogPosterior) -> Shear | None:
 
 
 def shear_at(log_posterior: LogPosterior, x: Array, power: float) -> Shear | None:
-    """The shear by how the amplitude changes with each modulus at one point (D,), without a polynomial.
+    """Returns the shear by the amplitude's slopes along each modulus at a point (D,), without a polynomial.
 
     power : of the moduli, in which the amplitude is a sum
     None where fewer than two moduli raise it.
     """
-    parameters = log_posterior.surrogate.space.parameters
-    moduli = [i for i, p in enumerate(parameters) if p.stress_power == 1 and p.in_log and p.offset == 0.0]
+    moduli = log_posterior.surrogate.space.scaled(1)
     step = _STEP * np.eye(len(x))[moduli]
     ahead, back = (_amplitude(log_posterior, x + way * step) for way in (1.0, -1.0))
     share = np.zeros(len(x))

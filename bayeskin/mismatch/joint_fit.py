@@ -17,7 +17,7 @@ import numpy as np
 
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import Top, gauss_newton, with_less_noise
-from bayeskin.inference.straighten import shear_at
+from bayeskin.inference.straighten import Shear, shear_at
 from bayeskin.mismatch.corrected import FullRun
 from bayeskin.mismatch.fit import Fit, evidence
 from bayeskin.mismatch.tangent import POWER
@@ -95,7 +95,8 @@ def fit_jointly(
     reach = np.where(solved, settings.first, 1.0)
     settled, made = False, 1
     while made < settings.runs and reach.min() >= settings.smallest:
-        ahead, promised = _highest(about, in_box(about, vector, reach), vector, settings.climb)
+        ridge = shear_at(about, vector, POWER)
+        ahead, promised = _highest(about, in_box(about, vector, reach), vector, settings.climb, ridge)
         moved = (np.abs(ahead - vector) / (high - low))[: len(reach)]
         far = np.logical_and(solved, moved >= settings.moved * reach)
         promised -= value
@@ -125,12 +126,16 @@ def _at_run(about: LogPosterior, vector: Array, rounds: int) -> tuple[Array, flo
     return _highest(about, within(about, vector, 0.0), vector, rounds)
 
 
-def _highest(about: LogPosterior, near: LogPosterior, vector: Array, rounds: int) -> tuple[Array, float]:
+def _highest(
+    about: LogPosterior, near: LogPosterior, vector: Array, rounds: int, ridge: Shear | None = None
+) -> tuple[Array, float]:
     """Returns the most probable point (D,) of a part of the posterior, and its log density.
+
+    ridge : of the moduli, which steps may follow
 
     Climbs set out from the noise as it is and from little: noise that took up another run's misfit stays.
     """
-    starts, ridge = [vector, with_less_noise(about, vector)], shear_at(about, vector, POWER)
+    starts = [vector, with_less_noise(about, vector)]
     tops = [gauss_newton(near, np.clip(start, *near.bounds), ridge, rounds) for start in starts]
     better = np.clip(max(tops, key=lambda top: top.value).vector, *about.bounds)
     return better, float(about.log_prob(better[None])[0])

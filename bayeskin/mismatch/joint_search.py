@@ -199,47 +199,56 @@ class _Searcher:
         best = self.found.best
         names, there = best.fit.names, self._climbed_elsewhere(best)
         full = self._ask([FullProbe(self._solved(names), self._solved_values(one)) for one in there])
+        maxima, checks = [best], list[Check]()
         for one, full_n in zip(there, full, strict=True):
             if isinstance(full_n, str):
                 continue
-            off_n = np.asarray(full_n) - (one.run.force_n - one.off_n)
-            check, maximum = Check(one.run.theta, np.asarray(full_n), self._rms(off_n - one.off_n)), one
+            off_n = _error_at(one, full_n)
+            check, corrected = Check(one.run.theta, np.asarray(full_n), self._rms(off_n - one.off_n)), one
             if check.off > self._settings.exact * noise_of(self._binned):
                 again = Climb(names, one.fit.theta, self._settings.runs, tuple(off_n.tolist()))
-                (corrected,) = self._ask([again])
-                if not isinstance(corrected, JointFit) or self._is_alike(corrected, best.run.theta):
-                    continue
-                maximum = corrected
-            self._tell(f"another maximum of the likeliest set: {self._gained(maximum, best):+.1f} nats")
-            likeliest = self.found.fits[names]
-            self.found.others.append(min((maximum, likeliest), key=lambda each: weight(each.fit)))
-            if self.found.others[-1] is likeliest:
-                self.found.fits[names], self.found.checks[names] = maximum, check
+                (corrected,) = self._ask([again])  # type: ignore[assignment]
+            for maximum in self._distinct([corrected], maxima, self._settings.close):
+                self._tell(f"another maximum of the likeliest set: {self._gained(maximum, best):+.1f} nats")
+                maxima.append(maximum)
+                checks.append(check)
+        top = int(np.argmax([weight(one.fit) for one in maxima]))
+        self.found.others = [*maxima[:top], *maxima[top + 1 :]]
+        if top:
+            self.found.fits[names], self.found.checks[names] = maxima[top], checks[top - 1]
 
     def _climbed_elsewhere(self, best: JointFit) -> list[JointFit]:
-        """Fits of the likeliest set that are elsewhere and not far behind, the likeliest first."""
+        """Returns fits of the likeliest set that are elsewhere and not far behind, the likeliest first."""
         settings, names = self._settings, best.fit.names
         climbs = [Climb(names, start, settings.first, added(best)) for start in self._elsewhere(best)]
-        first = self._distinct(self._ask(climbs), best, settings.behind)
+        first = self._distinct(self._ask(climbs), [best], settings.behind)
         rest = settings.runs - settings.first
         again = self._ask([Climb(names, one.fit.theta, rest, added(best)) for one in first
                            if not one.settled])  # fmt: skip
         ended = [*(one for one in first if one.settled), *again]
-        return self._distinct(ended, best, settings.close)[: settings.maxima]
+        return self._distinct(ended, [best], settings.close)[: settings.maxima]
 
-    def _distinct(self, answers: Sequence[object], best: JointFit, behind: float) -> list[JointFit]:
-        """Returns the fits among answers, the likeliest of each maximum, that is not the best's."""
+    def _distinct(
+        self, answers: Sequence[object], known: Sequence[JointFit], behind: float
+    ) -> list[JointFit]:
+        """Returns the fits among answers that are no known maximum, the likeliest of each other one.
+
+        known : fits, the first of which no other is to be farther behind than so many nats
+        """
         fits = sorted((one for one in answers if isinstance(one, JointFit)), key=lambda one: -weight(one.fit))
-        kept = [best]
+        kept = list(known)
         for one in fits:
             apart = not any(self._is_alike(one, other.run.theta) for other in kept)
-            if apart and self._gained(best, one) <= behind:
+            if apart and self._gained(known[0], one) <= behind:
                 kept.append(one)
-        return kept[1:]
+        return kept[len(known) :]
 
     def _elsewhere(self, best: JointFit) -> list[dict[str, float]]:
-        """Values with equal and with exchanged permeabilities, since a force hardly tells which layer drains;
-        and with other shapes of each mechanism that the model solves."""
+        """Returns values from which further maxima may be reached.
+
+        Permeabilities are equal or exchanged, since a force hardly tells which layer drains; or a mechanism
+        that the model solves has another shape.
+        """
         theta = best.fit.theta
         limits = {p.name: (p.lower, p.upper) for p in self._base.parameters}
         flow = [p.name for p in self._base.parameters if p.stress_power < 0]
@@ -372,7 +381,7 @@ class _Searcher:
                 self.found.checks[one.fit.names] = Check(first.run.theta, full_n, np.inf)
                 self._tell(f"{said}: the full model fails there: {full_n}")
                 continue
-            off_n = np.asarray(full_n) - (first.run.force_n - first.off_n)
+            off_n = _error_at(first, full_n)
             off = self._rms(off_n - one.off_n)
             self.found.checks[one.fit.names] = Check(first.run.theta, np.asarray(full_n), off)
             if off > self._settings.exact * noise_of(self._binned):
@@ -592,7 +601,7 @@ class _Searcher:
 
 
 def _shapes_of(mechanism: Mechanism, names: Sequence[str], count: int) -> list[dict[str, float]]:
-    """Values of some of a mechanism's parameters, spread over their priors."""
+    """Returns so many values of some of a mechanism's parameters, spread over their priors."""
     by_name = {p.name: p for p in mechanism.parameters}
     space = ParameterSpace(tuple(by_name[name] for name in names))
     unit = qmc.Halton(space.dim, scramble=False).random(count + 1)[1:]
@@ -607,6 +616,11 @@ def noise_of(binned: BinnedForce) -> float:
 def added(one: JointFit) -> tuple[float, ...]:
     """Returns the force that a fit has added to its runs, as tasks have it; empty for none."""
     return tuple(one.off_n.tolist()) if one.off_n.any() else ()
+
+
+def _error_at(one: JointFit, full_n: object) -> Array:
+    """Returns by how much the forward model is off at a fit's run (m,), without what was added to it."""
+    return np.asarray(full_n) - (one.run.force_n - one.off_n)
 
 
 def _better(one: object, current: JointFit) -> bool:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -63,9 +62,9 @@ class Tangent(_FreezesArrays):
     def _about(self, run: FullRun, theta: Array, change: Array) -> Array:
         """The force (n, m) at theta (n, d) by one run, from which it is `change` (n, d) away in the box."""
         assert run.slopes_n is not None
-        if not len(self._moduli):
+        moduli, flow = self.space.scaled(1), self.space.scaled(-1)
+        if not len(moduli):
             return np.asarray(run.force_n + change @ run.slopes_n.T)
-        moduli, flow = self._moduli, self._permeabilities
         by_modulus = run.slopes_n[:, moduli] / self._log_widths(moduli)
         by_flow = run.slopes_n[:, flow] / self._log_widths(flow)
         share = np.maximum(run.force_n @ by_modulus, 0.0) + 1e-12
@@ -78,22 +77,6 @@ class Tangent(_FreezesArrays):
         unlike = run.force_n + by_flow.sum(axis=1) - by_modulus.sum(axis=1)  # none where the law is exact
         scaled = scale[:, None] * (run.force_n + change @ run.slopes_n.T)
         return np.asarray(scaled - np.outer(scale - 1.0, unlike))
-
-    @cached_property
-    def _moduli(self) -> NDArray[np.intp]:
-        """Columns of parameters that forces are multiplied with."""
-        return self._scaled(1)
-
-    @cached_property
-    def _permeabilities(self) -> NDArray[np.intp]:
-        """Columns of parameters that are divided by what moduli are multiplied with."""
-        return self._scaled(-1)
-
-    def _scaled(self, power: int) -> NDArray[np.intp]:
-        known = enumerate(self.space.parameters)
-        return np.array(
-            [i for i, p in known if p.stress_power == power and p.in_log and p.offset == 0.0], dtype=np.intp
-        )
 
     def _log_widths(self, columns: NDArray[np.intp]) -> Array:
         """Logarithms over which priors of parameters extend."""
