@@ -86,7 +86,10 @@ def predictive_draws(log_posterior: LogPosterior, theta: ArrayLike, rng: np.rand
     largest of the fitted kinds' sd.
     """
     theta = np.atleast_2d(np.asarray(theta, dtype=float))
-    fitted, chain = log_posterior.chain, _whole_chain(log_posterior.binned)
+    fitted, chain = (
+        log_posterior.chain,
+        _whole_chain(log_posterior.binned, log_posterior.noise_priors.by_kind),
+    )
     parts = [_predictive(log_posterior, fitted, chain, theta[a : a + _CHUNK], rng)
              for a in range(0, len(theta), _CHUNK)]  # fmt: skip
     return ForceDraws(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -135,7 +138,7 @@ def _root_mean(square: Array) -> float:
     return float(np.sqrt(square.mean())) if len(square) else float("nan")
 
 
-def _whole_chain(binned: BinnedForce) -> NoiseChain:
+def _whole_chain(binned: BinnedForce, by_kind: bool) -> NoiseChain:
     """All bins, those without a recorded force included, with no variance of their own there."""
     filled = BinnedForce(
         edges_s=binned.edges_s,
@@ -145,7 +148,7 @@ def _whole_chain(binned: BinnedForce) -> NoiseChain:
         phase=binned.phase,
         phases=binned.phases,
     )
-    return noise_chain(filled)
+    return noise_chain(filled, by_kind=by_kind)
 
 
 def _predictive(

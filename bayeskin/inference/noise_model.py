@@ -4,10 +4,10 @@ The noise of bin j is the sum of three:
 
     e_j = sd_j x_j + sqrt(v_j) w_j + sqrt(d_j) u_j ,
 
-noise with a memory, whose sd is sampled for each kind of phase and which forgets within `tau_noise` (x is an
-Ornstein-Uhlenbeck process at the bins' own times); noise that is quicker, whose variance v_j and correlation
-of neighbours c_j the binned data carry themselves (w is a Markov chain); and the surrogate's diagonal, white.
-x and w have unit variance, and both start anew in each fit window.
+noise with a memory, whose sd is sampled, for each kind of phase or for all together, and which forgets within
+`tau_noise` (x is an Ornstein-Uhlenbeck process at the bins' own times); noise that is quicker, whose variance
+v_j and correlation of neighbours c_j the binned data carry themselves (w is a Markov chain); and the
+surrogate's diagonal, white. x and w have unit variance, and both start anew in each fit window.
 
 A Kalman filter over (x, w) turns the noise into innovations, each divided by its sd (Kalman 1960, J. Basic
 Eng. 82:35): with Gaussian noise they are independent and standard normal, exactly, for bins of any width
@@ -38,17 +38,22 @@ from bayeskin.types import (
 )
 
 KINDS: tuple[PhaseKind, ...] = ("rest", "load", "hold", "unload")
+ALL = "noise"  # the kind of all phases that share one sd
 Windows = Sequence[tuple[float, float]]
 _SOURCE = "weakly informative: spans what load cells and living skin show"
 
 
 @dataclass(frozen=True)
 class NoisePriors:
-    """Bounds of the log-uniform priors on the noise: sd [N], correlation time [s], tail index."""
+    """Bounds of the log-uniform priors on the noise: sd [N], correlation time [s], tail index.
+
+    by_kind : whether each kind of phase has an sd of its own
+    """
 
     sd_n: tuple[float, float] = (1e-4, 0.3)
     tau_s: tuple[float, float] = (0.1, 10.0)
     nu: tuple[float, float] = (2.0, 100.0)
+    by_kind: bool = True
 
 
 @dataclass(frozen=True)
@@ -67,16 +72,19 @@ class NoiseChain(_FreezesArrays):
     gap_s: Array
     starts: NDArray[np.bool_]
     kind: NDArray[np.int64]
-    kinds: tuple[PhaseKind, ...]
+    kinds: tuple[str, ...]
 
 
-def noise_space(kinds: Sequence[PhaseKind], priors: NoisePriors | None = None) -> ParameterSpace:
-    """Parameters of the noise: one sd a phase kind, then `tau_noise` [s] and `nu_noise`, all log-uniform."""
+def noise_space(kinds: Sequence[str], priors: NoisePriors | None = None) -> ParameterSpace:
+    """Parameters of the noise, all log-uniform: one sd for each of `kinds`, then `tau_noise` [s] and `nu_noise`."""
     priors = priors or NoisePriors()
     sds = [
-        Parameter(f"sd_{kind}", "N", *priors.sd_n, "log-uniform", f"noise sd while pads {kind}", _SOURCE)
+        Parameter(
+            f"sd_{kind}", "N", *priors.sd_n, "log-uniform",
+            "noise sd" if kind == ALL else f"noise sd while pads {kind}", _SOURCE,
+        )
         for kind in kinds
-    ]
+    ]  # fmt: skip
     tau = Parameter("tau_noise", "s", *priors.tau_s, "log-uniform", "correlation time of the noise", _SOURCE)
     nu = Parameter("nu_noise", "1", *priors.nu, "log-uniform", "tail index of the noise", _SOURCE)
     return ParameterSpace((*sds, tau, nu))
@@ -103,13 +111,16 @@ def bins_in_windows(binned: BinnedForce, windows: Windows | None) -> NDArray[np.
     return inside
 
 
-def noise_chain(binned: BinnedForce, windows: Windows | None = None, omit: int | None = None) -> NoiseChain:
+def noise_chain(
+    binned: BinnedForce, windows: Windows | None = None, omit: int | None = None, by_kind: bool = True
+) -> NoiseChain:
     """The chain through the bins of `windows`, or all; `omit` leaves out one phase (index) as a gap.
 
+    by_kind : whether each kind of phase has an sd of its own
     Raises InputError when no bin is left or a variance is negative.
     """
     window = bins_in_windows(binned, windows)
-    kinds = _kinds(binned, np.flatnonzero(window >= 0))
+    kinds = _kinds(binned, np.flatnonzero(window >= 0)) if by_kind else (ALL,)
     keep = window >= 0 if omit is None else (window >= 0) & (binned.phase != omit)
     bins = np.flatnonzero(keep)
     if not len(bins):
@@ -121,7 +132,7 @@ def noise_chain(binned: BinnedForce, windows: Windows | None = None, omit: int |
     # A product of neighbours' correlations bridges omitted bins, as a Markov chain's does.
     neighbour = np.clip(np.nan_to_num(binned.correlation), -0.999, 0.999)
     bridge = np.array([0.0, *(np.prod(neighbour[a:b]) for a, b in pairwise(bins))])
-    of_kind = [kinds.index(binned.phases[p].kind) for p in binned.phase[bins]]
+    of_kind = [kinds.index(binned.phases[p].kind) if by_kind else 0 for p in binned.phase[bins]]
     return NoiseChain(
         bins=bins.astype(np.int64),
         force_n=binned.force_n[bins],

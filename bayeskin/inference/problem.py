@@ -65,7 +65,7 @@ class LogPosterior:
     @cached_property
     def chain(self) -> NoiseChain:
         """The fitted bins in order."""
-        return noise_chain(self.binned, self.fit_windows)
+        return noise_chain(self.binned, self.fit_windows, by_kind=self.noise_priors.by_kind)
 
     @cached_property
     def space(self) -> ParameterSpace:
@@ -183,7 +183,9 @@ class LogPosterior:
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         if len(self.blocks) == 1:
             return self._in_chunks([self.chain], theta)
-        others = [noise_chain(self.binned, self.fit_windows, omit=b) for b in self.blocks]
+        others = [
+            noise_chain(self.binned, self.fit_windows, b, self.noise_priors.by_kind) for b in self.blocks
+        ]
         each = self._in_chunks([self.chain, *others], theta)
         return each[:, :1] - each[:, 1:]
 

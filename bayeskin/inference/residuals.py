@@ -20,7 +20,7 @@ from scipy import stats
 from bayeskin.inference.gauss_newton import surrogate_error
 from bayeskin.inference.noise_model import innovations
 from bayeskin.inference.problem import LogPosterior
-from bayeskin.types import Array, PhaseKind, _FreezesArrays
+from bayeskin.types import Array, _FreezesArrays
 
 LAGS = 10
 FAMILY_WISE = 0.01  # probability that noise as assumed fails any of the tests
@@ -35,7 +35,7 @@ class KindCheck:
     NaN where there are too few bins.
     """
 
-    kind: PhaseKind
+    kind: str
     bins: int
     sd: float
     p_sd: float
@@ -129,7 +129,7 @@ def _ljung_box(correlation: Array, count: int) -> float:
     return float(stats.chi2.sf(count * (count + 2) * np.sum(correlation**2 / (count - lag)), len(lag)))
 
 
-def _checked(kind: PhaseKind, scores: Array, before: Array, after: Array) -> KindCheck:
+def _checked(kind: str, scores: Array, before: Array, after: Array) -> KindCheck:
     """`before` and `after` (p,): the pairs of neighbours among the kind's scores (k,)."""
     if len(after) < _FEWEST:
         return KindCheck(kind, len(scores), math.nan, math.nan, math.nan, math.nan)

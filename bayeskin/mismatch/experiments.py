@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayeskin.errors import InputError
-from bayeskin.inference.noise_model import KINDS, noise_chain, noise_covariance
+from bayeskin.inference.noise_model import noise_chain, noise_covariance
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.information import FEWEST, expected_gain
@@ -165,9 +165,10 @@ def noise_of(found: Fit, motion: PadMotion, edges_s: Array) -> Array:
     chain, binned = log_posterior.chain, log_posterior.binned
     wider = float(edges_s[1] - edges_s[0]) / float(np.median(np.diff(binned.edges_s)))
     sd = {kind: found.theta[f"sd_{kind}"] for kind in chain.kinds}
+    recorded = np.array([binned.phases[p].kind for p in binned.phase[chain.bins]])
     variance = {
-        kind: float(np.median(chain.variance_n2[chain.kind == i])) / wider
-        for i, kind in enumerate(chain.kinds)
+        str(kind): float(np.median(chain.variance_n2[recorded == kind])) / wider
+        for kind in np.unique(recorded)
     }
     phases = phases_of(motion)
     middle = 0.5 * (edges_s[1:] + edges_s[:-1])
@@ -179,7 +180,7 @@ def noise_of(found: Fit, motion: PadMotion, edges_s: Array) -> Array:
         np.array([variance.get(kind, max(variance.values())) for kind in of_bins]),
         np.full(len(middle) - 1, correlation), phase, phases,
     )  # fmt: skip
-    ahead = noise_chain(planned)
-    sds = [sd.get(kind, max(sd.values())) for kind in KINDS if kind in ahead.kinds]
+    ahead = noise_chain(planned, by_kind=log_posterior.noise_priors.by_kind)
+    sds = [sd.get(kind, max(sd.values())) for kind in ahead.kinds]
     noise = np.array([*sds, found.theta["tau_noise"], np.inf])
     return noise_covariance(ahead, noise, np.zeros(len(middle)))

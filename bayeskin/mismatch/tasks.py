@@ -63,7 +63,8 @@ class Join:
 
 @dataclass(frozen=True)
 class Weigh:
-    """Asks for the log evidences of a fit, as JSON has it, alone and with something smooth beside it."""
+    """Asks for the log evidences of a fit, as JSON has it, alone and with something smooth beside it, and for
+    the chance that noise leaves some window as far off as this fit leaves its farthest."""
 
     fit: Mapping[str, Any]
 

@@ -14,6 +14,7 @@ import numpy as np
 
 import bayeskin
 from bayeskin.inference import LogPosterior
+from bayeskin.inference.noise_model import ALL, noise_space
 from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed, with_one
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.mismatch.corrected import FullRun
@@ -28,6 +29,7 @@ from bayeskin.mismatch.fit import (
 )
 from bayeskin.mismatch.full_fit import change
 from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, within
+from bayeskin.mismatch.locate import locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.refuted import refuted
 from bayeskin.mismatch.tangent import Tangent
@@ -73,17 +75,14 @@ class JointBench:
         self.known: Mapping[str, Mechanism] = _trained(self.model)
         self.base = source.base
         self._seed = source.seed
-        self._noise = replace(instrument_noise(self.binned), **dict(source.noise))  # type: ignore[arg-type]
+        self._noise = replace(instrument_noise(self.binned), by_kind=False, **dict(source.noise))  # type: ignore[arg-type]
         self._neutral = {name: value for m in self.known.values() for name, value in m.neutral.items()}
 
     @property
     def noise(self) -> dict[str, float]:
         """Values of the noise's parameters to begin with: the middle of their priors."""
-        named = {}
-        for kind in sorted({phase.kind for phase in self.binned.phases}):
-            named[f"sd_{kind}"] = float(np.sqrt(np.prod(self._noise.sd_n)))
-        middle = (float(np.sqrt(np.prod(ends))) for ends in (self._noise.tau_s, self._noise.nu))
-        return {**named, **dict(zip(("tau_noise", "nu_noise"), middle, strict=True))}
+        space = noise_space([ALL], self._noise)
+        return dict(zip(space.names, map(float, space.from_unit(np.full(space.dim, 0.5))), strict=True))
 
     def space(self, names: Sequence[str]) -> ParameterSpace:
         """Parameters that the forward model solves for a set: the base's, then each mechanism's."""
@@ -199,8 +198,9 @@ class JointBench:
         if isinstance(task, Promise):
             return {"nats": self._promised(task)}
         if isinstance(task, Weigh):
-            left = discrepancy(self._fitted(task.fit).fit, self.motion)
-            return {"alone": left.without_log_evidence, "with_smooth": left.log_evidence}
+            fitted = self._fitted(task.fit).fit
+            left, chance = discrepancy(fitted, self.motion), locate(fitted, fitted.theta, self._seed).chance
+            return {"alone": left.without_log_evidence, "with_smooth": left.log_evidence, "chance": chance}
         if isinstance(task, Join):
             beside = task.promise
             names = with_one(beside.names, beside.name, self.known)
@@ -251,7 +251,7 @@ class JointBench:
         if isinstance(task, Promise):
             return said["nats"]
         if isinstance(task, Weigh):
-            return said["alone"], said["with_smooth"]
+            return said["alone"], said["with_smooth"], said["chance"]
         found = self._fitted(said, task.until_s if isinstance(task, Climb) else None)
         against = refuted(found.fit, self.known, self.motion, self.jumps)
         return f"the recording's samples show nothing of {', '.join(against)}" if against else found

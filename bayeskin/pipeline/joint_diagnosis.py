@@ -113,6 +113,7 @@ def _work(run: Run) -> Mapping[str, Any]:
         "verdict": judged.verdict,
         "nothing_probability": judged.nothing_probability,
         "smooth_probability": judged.smooth_probability,
+        "local_probability": judged.local_probability,
         "located": [window(one) for one in before.windows],
         "remaining": [window(one) for one in after.windows],
         "mechanisms": _mechanisms(judged, chosen, drawn[best].summary, bench.known, parts),
@@ -210,14 +211,15 @@ def _mechanisms(
 
 
 def _set(
-    names: tuple[str, ...], found: JointSearch, evidences: tuple[float, float], family: Family
+    names: tuple[str, ...], found: JointSearch, said: tuple[float, float, float], family: Family
 ) -> dict[str, Any]:
     one: JointFit = found.fits[names]
-    alone, with_smooth = evidences
+    alone, with_smooth, chance = said
     return {
         "mechanisms": list(names), "probability": family.probability_of_set(names),
         "log_evidence": one.fit.log_evidence, "log_evidence_alone": alone,
-        "log_evidence_with_smooth": with_smooth, "settled": one.settled, "runs": one.runs,
+        "log_evidence_with_smooth": with_smooth, "chance_of_windows": chance,
+        "settled": one.settled, "runs": one.runs,
     }  # fmt: skip
 
 
@@ -267,9 +269,11 @@ def in_words(answer: Mapping[str, Any]) -> str:
     lines += [f"  {one['name']} (probability {one['probability']:.2f}): {one['statement']}"
               for one in answer["mechanisms"]]  # fmt: skip
     lines.append(f"  nothing is missing: probability {answer['nothing_probability']:.2f}")
-    lines.append(
-        f"  something smooth that is not in the catalogue: probability {answer['smooth_probability']:.2f}"
-    )
+    for kind, where in (("smooth", ""), ("local", ", within one window")):
+        probability = answer[f"{kind}_probability"]
+        lines.append(
+            f"  something that is not in the catalogue, {kind}{where}: probability {probability:.2f}"
+        )
     lines.append(
         f"The model leaves the recording in {len(answer['located'])} windows, "
         f"and in {len(answer['remaining'])} with {', '.join(answer['best_set']) or 'no mechanism'}."
