@@ -269,11 +269,9 @@ def in_words(answer: Mapping[str, Any]) -> str:
     lines += [f"  {one['name']} (probability {one['probability']:.2f}): {one['statement']}"
               for one in answer["mechanisms"]]  # fmt: skip
     lines.append(f"  nothing is missing: probability {answer['nothing_probability']:.2f}")
-    for kind, where in (("smooth", ""), ("local", ", within one window")):
+    for kind in ("smooth", "local"):
         probability = answer[f"{kind}_probability"]
-        lines.append(
-            f"  something that is not in the catalogue, {kind}{where}: probability {probability:.2f}"
-        )
+        lines.append(f"  something {kind} that is not in the catalogue: probability {probability:.2f}")
     lines.append(
         f"The model leaves the recording in {len(answer['located'])} windows, "
         f"and in {len(answer['remaining'])} with {', '.join(answer['best_set']) or 'no mechanism'}."
