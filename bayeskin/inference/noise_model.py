@@ -76,7 +76,7 @@ class NoiseChain(_FreezesArrays):
 
 
 def noise_space(kinds: Sequence[str], priors: NoisePriors | None = None) -> ParameterSpace:
-    """Log-uniform parameters of the noise: one sd for each of `kinds`, then `tau_noise` [s] and `nu_noise`."""
+    """Log-uniform parameters of the noise: an sd for each of `kinds`, then `tau_noise` [s] and `nu_noise`."""
     priors = priors or NoisePriors()
     sds = [
         Parameter(
