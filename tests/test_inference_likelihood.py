@@ -20,6 +20,7 @@ from bayeskin.inference.noise_model import (
     innovations,
     noise_chain,
     noise_covariance,
+    noise_space,
 )
 from bayeskin.types import Array, BinnedForce, Prediction
 
@@ -85,6 +86,17 @@ def test_with_gaussian_tails_it_is_the_multivariate_normal(
         total = covariance(chain, noise[i], prediction.diagonal[i]) + factor @ factor.T
         exact = stats.multivariate_normal(prediction.mean[i, chain.bins], total).logpdf(chain.force_n)
         assert got[i] == pytest.approx(exact, rel=1e-8)
+
+
+def test_one_sd_for_all_phases_is_the_same_sd_for_each() -> None:
+    rng = np.random.default_rng(3)
+    binned, windows = irregular_recording(60, rng), [(2.0, 14.0), (15.0, 30.0)]
+    each, together = noise_chain(binned, windows), noise_chain(binned, windows, by_kind=False)
+    prediction, noise = prediction_of(60, 2, rng), noise_vectors(1, 8.0, rng)
+    repeated = np.column_stack([np.repeat(noise[:, :1], len(each.kinds), axis=1), noise[:, 1:]])
+    got = log_likelihood(together, prediction, noise)
+    assert got == pytest.approx(log_likelihood(each, prediction, repeated), rel=1e-12)
+    assert noise_space(together.kinds).names == ("sd_noise", "tau_noise", "nu_noise")
 
 
 def test_neighbours_covary_as_both_noises_say() -> None:
