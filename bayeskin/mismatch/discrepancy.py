@@ -1,8 +1,9 @@
 """A discrepancy that no mechanism explains: a Gaussian process over the coordinates that physics acts in.
 
-Three parts are added up, each with its own size s and length l of a squared-exponential kernel:
+Four parts are added up, each with its own size s and length l of a squared-exponential kernel:
 
     displacement   over displacement; half of it the same in every direction of motion, half its own
+    change         like displacement, but a change from each cycle to the next that stays in all later ones
     phase          over log(1 + time since the last corner); the same in all phases of a kind
     cycle          over the same time; its own in each phase of each cycle
 
@@ -29,9 +30,14 @@ from bayeskin.mismatch.fit import Fit, occam
 from bayeskin.mismatch.unexplained import Memory, Place, Unexplained, unexplained
 from bayeskin.types import Array, PadMotion
 
-PARTS = ("displacement", "phase", "cycle")
+PARTS = ("displacement", "change", "phase", "cycle")
 SMALLEST, LARGEST = 0.01, 10.0  # size s: of the noise's sd, of the residual's RMS
-LENGTHS = ((0.05, 2.0), (0.2, 3.0), (0.2, 3.0))  # of the displacement's range; of log(1 + t / 1 s)
+LENGTHS = (
+    (0.05, 2.0),
+    (0.05, 2.0),
+    (0.2, 3.0),
+    (0.2, 3.0),
+)  # of the displacement's range; of log(1 + t / 1 s)
 LITTLE = 0.1  # of the fitted noise with a memory, from which a climb beside a discrepancy begins
 STEP = 1e-3  # of a hyperparameter's range, for second derivatives
 NOTICEABLE = 5.0  # nats over no discrepancy; noise alone gains less in 99 of 100 recordings
@@ -102,8 +108,8 @@ def discrepancy(found: Fit, motion: PadMotion) -> Discrepancy:
         rest.bins, mean, sd, parts, beyond, rest.residual_n - beyond,
         float(np.sqrt(np.mean(mean**2))),
         {name: float(mean @ mean) * one / whole if whole > 0.0 else 0.0 for name, one in own.items()},
-        dict(zip(PARTS, np.exp(line[:3]).tolist(), strict=True)),
-        dict(zip(PARTS, np.exp(line[3:]).tolist(), strict=True)),
+        dict(zip(PARTS, np.exp(line[:4]).tolist(), strict=True)),
+        dict(zip(PARTS, np.exp(line[4:]).tolist(), strict=True)),
         rest.memory, gain,
         rest.log_evidence(np.sum(kernels, axis=0)) + top.share, alone.log_evidence() + noise_alone.share,
         features,
@@ -111,31 +117,34 @@ def discrepancy(found: Fit, motion: PadMotion) -> Discrepancy:
 
 
 def _squared_distances(at: Place) -> Array:
-    """(3, k, k), one for each part."""
+    """(4, k, k), one for each part."""
     reach = float(np.ptp(at.displacement_m)) or 1.0
     memory = np.log1p(at.since_s)
-    axes = (at.displacement_m / reach, memory, memory)
+    displacement = at.displacement_m / reach
+    axes = (displacement, displacement, memory, memory)
     return np.array([(axis[:, None] - axis) ** 2 for axis in axes])
 
 
 def _masks(at: Place) -> Array:
-    """(3, k, k): how much of each part two bins share whatever their distance."""
+    """(4, k, k): how much of each part two bins share whatever their distance."""
     same = [values[:, None] == values for values in (at.direction, at.kind, at.phase)]
-    return np.array([0.5 + 0.5 * same[0], same[1], same[2]], dtype=float)
+    moving, changes = 0.5 + 0.5 * same[0], np.maximum(at.cycle - 1.0, 0.0)
+    before_both = np.minimum(changes[:, None], changes) / max(changes.max(), 1.0)
+    return np.array([moving, before_both * moving, same[1], same[2]], dtype=float)
 
 
 def _kernels(line: Array, squares: Array, masks: Array) -> Array:
-    """(3, k, k) [N^2] at logarithms of three sizes and three lengths, (6,)."""
-    size, length = np.exp(line[:3, None, None]), np.exp(line[3:, None, None])
+    """(4, k, k) [N^2] at logarithms of four sizes and four lengths, (8,)."""
+    size, length = np.exp(line[:4, None, None]), np.exp(line[4:, None, None])
     return np.asarray(size**2 * masks * np.exp(-0.5 * squares / length**2))
 
 
 def _bounds(rest: Unexplained) -> Array:
-    """Returns bounds (8, 2) of logarithms: noise's size and memory, then the parts' sizes and lengths."""
+    """Returns bounds (10, 2) of logarithms: noise's size and memory, then the parts' sizes and lengths."""
     noise = float(np.sqrt(np.median(np.diag(rest.measured_n2))))
     rms = max(float(np.sqrt(np.mean(rest.beyond(rest.residual_n) ** 2))), noise)
     of_noise = [rest.memory.size_within, rest.memory.time_within]
-    return np.log([*of_noise, *[(SMALLEST * noise, LARGEST * rms)] * 3, *LENGTHS])
+    return np.log([*of_noise, *[(SMALLEST * noise, LARGEST * rms)] * 4, *LENGTHS])
 
 
 def _starts(rest: Unexplained, bounds: Array | None = None) -> list[Array]:
@@ -145,7 +154,7 @@ def _starts(rest: Unexplained, bounds: Array | None = None) -> list[Array]:
     if bounds is None:
         return noises
     rms = np.exp(bounds[2, 1]) / LARGEST
-    parts = np.concatenate([np.full(3, np.log(rms / np.sqrt(3.0))), np.log([0.3, 0.8, 0.8])])
+    parts = np.concatenate([np.full(4, np.log(rms / 2.0)), np.log([0.3, 0.3, 0.8, 0.8])])
     return [np.concatenate([noise, parts]) for noise in noises[1:]]
 
 
@@ -177,7 +186,7 @@ def _unlikely(
 ) -> tuple[float, Array]:
     """Minus the log evidence, up to a constant, at logarithms of hyperparameters, and its derivatives.
 
-    Size and time of the noise (2,), and with distances and masks those of parts after them (8,).
+    Size and time of the noise (2,), and with distances and masks those of parts after them (10,).
     """
     rest = rest.with_memory(line[:2])
     memory = rest.memory.covariance_n2
@@ -195,7 +204,7 @@ def _unlikely(
         return value, np.array(slopes)
     bend = rest.beyond(rest.beyond(bend).T)
     by_size = np.einsum("ij,pij->p", bend, kernels)
-    by_length = np.einsum("ij,pij,pij->p", bend, kernels, squares) * 0.5 * np.exp(-2.0 * line[5:])
+    by_length = np.einsum("ij,pij,pij->p", bend, kernels, squares) * 0.5 * np.exp(-2.0 * line[6:])
     return value, np.concatenate([slopes, by_size, by_length])
 
 
