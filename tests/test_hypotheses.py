@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bayeskin.mechanisms import catalogue
-from bayeskin.mismatch.hypotheses import Family, Judgement, hypotheses_of, judge_family
+from bayeskin.mismatch.hypotheses import Evidences, Family, Judgement, hypotheses_of, judge_family
 
 # Look-alikes of each other, one whose group is not all known, and some that are like nothing else.
 NAMES = (
@@ -30,8 +30,8 @@ def families(draw: st.DrawFn) -> Family:
     names = {tuple(sorted(one)) for one in draw(SETS)} | {()}
     near = st.floats(-4.0, 4.0)
     evidence = draw(st.sampled_from([EVIDENCES, near]))
-    return Family([one for own in sorted(names)
-                   for one in hypotheses_of(own, draw(evidence), draw(evidence), draw(CHANCES))])  # fmt: skip
+    said = [(own, Evidences(draw(evidence), draw(evidence), draw(CHANCES))) for own in sorted(names)]
+    return Family([one for own, its in said for one in hypotheses_of(own, its)])
 
 
 def unnamed(family: Family) -> float:
@@ -90,8 +90,9 @@ def test_a_constant_more_in_all_evidences_changes_nothing(family: Family, consta
 def test_each_mechanism_and_what_has_no_name_cost_the_same_prior(
     names: set[str], alone: float, smooth: float, chance: float
 ) -> None:
-    fewer = hypotheses_of(tuple(sorted(names)), alone, smooth, chance)
-    more = hypotheses_of((*sorted(names), "stiffness-drift"), alone, smooth, chance)
+    said = Evidences(alone, smooth, chance)
+    fewer = hypotheses_of(tuple(sorted(names)), said)
+    more = hypotheses_of((*sorted(names), "stiffness-drift"), said)
     for less, one in zip(fewer, more, strict=True):
         assert one.log_weight - less.log_weight == pytest.approx(ODDS, abs=1e-9)
     assert fewer[0].log_weight == pytest.approx(alone + len(names) * ODDS)
@@ -101,8 +102,10 @@ def test_each_mechanism_and_what_has_no_name_cost_the_same_prior(
 
 def of(**nats: float) -> Family:
     """Sets of one mechanism or none, by name with `_` for `-`, the base at 0, nothing smooth anywhere."""
-    rows = [hypotheses_of((), 0.0, -50.0, 1.0)]
-    rows += [hypotheses_of((name.replace("_", "-"),), value, -50.0, 1.0) for name, value in nats.items()]
+    rows = [hypotheses_of((), Evidences(0.0, -50.0, 1.0))]
+    rows += [
+        hypotheses_of((name.replace("_", "-"),), Evidences(value, -50.0, 1.0)) for name, value in nats.items()
+    ]
     return Family([one for row in rows for one in row])
 
 
@@ -113,9 +116,9 @@ def test_the_verdicts_by_hand() -> None:
     assert found.verdict == "named"
     assert found.named[0].probability == pytest.approx(np.exp(6.0) / (np.exp(6.0) + 19.0))
     assert judged(of(sensor_drift=5.0)).verdict == "nothing-missing"  # 148 / 167, below nine in ten
-    smooth = Family([*hypotheses_of((), 0.0, 3.5, 1.0)])  # e^3.5 is 33, to 19
+    smooth = Family([*hypotheses_of((), Evidences(0.0, 3.5, 1.0))])  # e^3.5 is 33, to 19
     assert (judged(smooth).verdict, judged(smooth).named) == ("unknown", ())
-    assert judged(Family(hypotheses_of((), 0.0, 2.5, 1.0))).verdict == "nothing-missing"
+    assert judged(Family(hypotheses_of((), Evidences(0.0, 2.5, 1.0)))).verdict == "nothing-missing"
 
 
 def test_of_look_alikes_that_share_the_chances_the_likeliest_is_named() -> None:
@@ -138,22 +141,26 @@ def test_a_mechanism_is_not_named_for_a_likelier_look_alike() -> None:
 def test_a_device_whose_model_knows_few_mechanisms_has_a_verdict() -> None:
     """Look-alikes that the model was not trained for have no probability."""
     few = {name: KNOWN[name] for name in ("device-friction", "friction-creep")}
-    family = Family([*hypotheses_of((), 0.0, 0.0, 1.0),
-                     *hypotheses_of(("device-friction", "friction-creep"), 30.0, 0.0, 1.0)])  # fmt: skip
-    assert [one.name for one in judge_family(family, few).named] == ["device-friction", "friction-creep"]
+    pair = ("device-friction", "friction-creep")
+    said = {(): Evidences(0.0, 0.0, 1.0), pair: Evidences(30.0, 0.0, 1.0)}
+    family = Family([one for names, its in said.items() for one in hypotheses_of(names, its)])
+    assert [one.name for one in judge_family(family, few).named] == list(pair)
 
 
 def test_a_window_that_noise_does_not_explain_speaks_for_something_local() -> None:
     """By hand: with p = 1e-4 the odds are at most 1 / (e 1e-4 9.21) = 399, to 19; with 0.01 they are 8."""
-    far = judged(Family(hypotheses_of((), 0.0, -50.0, 1e-4)))
+    far = judged(Family(hypotheses_of((), Evidences(0.0, -50.0, 1e-4))))
     assert far.verdict == "unknown"
     assert far.local_probability == pytest.approx(399.4 / (399.4 + 19.0), abs=1e-3)
-    assert judged(Family(hypotheses_of((), 0.0, -50.0, 0.01))).verdict == "nothing-missing"
-    usual = judged(Family(hypotheses_of((), 0.0, -50.0, 0.5)))
+    assert judged(Family(hypotheses_of((), Evidences(0.0, -50.0, 0.01)))).verdict == "nothing-missing"
+    usual = judged(Family(hypotheses_of((), Evidences(0.0, -50.0, 0.5))))
     assert usual.local_probability == pytest.approx(0.05)  # its prior
 
 
 @given(CHANCES, CHANCES)
 def test_the_less_noise_explains_a_window_the_likelier_is_something_local(one: float, other: float) -> None:
-    by = [judged(Family(hypotheses_of((), 0.0, 0.0, chance))).local_probability for chance in (one, other)]
+    by = [
+        judged(Family(hypotheses_of((), Evidences(0.0, 0.0, chance)))).local_probability
+        for chance in (one, other)
+    ]
     assert (by[0] - by[1]) * (other - one) >= 0.0

@@ -32,6 +32,18 @@ Unnamed = Literal["smooth", "local"]
 
 
 @dataclass(frozen=True)
+class Evidences:
+    """What speaks for a set: its log evidences alone and with something smooth beside it.
+
+    chance : that noise leaves some window as far off as the farthest that the set leaves
+    """
+
+    alone: float
+    with_smooth: float
+    chance: float
+
+
+@dataclass(frozen=True)
 class Hypothesis:
     """A set of mechanisms, what without a name is beside it, if anything, and the logarithm of its weight."""
 
@@ -61,19 +73,14 @@ class Judgement:
     local_probability: float
 
 
-def hypotheses_of(
-    names: tuple[str, ...], alone: float, with_smooth: float, chance: float
-) -> tuple[Hypothesis, ...]:
-    """Returns the hypotheses of a set, by its log evidences alone and with something smooth beside it.
-
-    chance : that noise leaves some window as far off as the farthest that the set leaves
-    """
+def hypotheses_of(names: tuple[str, ...], said: Evidences) -> tuple[Hypothesis, ...]:
+    """Returns the hypotheses of a set."""
     odds = float(np.log(PRIOR / (1.0 - PRIOR)))
     own = len(names) * odds
-    with_local = alone + _most_for(chance)
+    with_local = said.alone + _most_for(said.chance)
     return (
-        Hypothesis(names, None, alone + own),
-        Hypothesis(names, "smooth", with_smooth + own + odds),
+        Hypothesis(names, None, said.alone + own),
+        Hypothesis(names, "smooth", said.with_smooth + own + odds),
         Hypothesis(names, "local", with_local + own + odds),
     )
 
@@ -97,6 +104,10 @@ class Family:
     def probability_of_set(self, names: tuple[str, ...]) -> float:
         """Returns the probability that just these mechanisms act, something smooth beside them or not."""
         return self._share([one.names == names for one in self.hypotheses])
+
+    def likeliest(self, names: tuple[str, ...]) -> float:
+        """Returns the logarithm of the weight of a set's likeliest hypothesis."""
+        return max(one.log_weight for one in self.hypotheses if one.names == names)
 
     def unnamed(self, kind: Unnamed) -> float:
         """Returns the probability that something of this kind acts that has no name."""

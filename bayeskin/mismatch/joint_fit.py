@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import Top, gauss_newton, with_less_noise
 from bayeskin.inference.straighten import Shear, shear_at
 from bayeskin.mismatch.corrected import FullRun
-from bayeskin.mismatch.fit import Fit, evidence
+from bayeskin.mismatch.fit import Fit, evidence, stored
 from bayeskin.mismatch.tangent import POWER
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array
@@ -69,6 +70,19 @@ class JointFit:
     runs: int
     settled: bool
     off_n: Array
+
+
+def as_json(found: JointFit) -> dict[str, Any]:
+    """A joint fit, as a bench reads it."""
+    assert found.run.slopes_n is not None
+    run = {
+        "theta": found.run.theta.tolist(), "force_n": found.run.force_n.tolist(),
+        "slopes_n": found.run.slopes_n.tolist(),
+    }  # fmt: skip
+    return {
+        "fit": stored(found.fit), "run": run, "runs": found.runs, "settled": found.settled,
+        "off_n": found.off_n.tolist(),
+    }  # fmt: skip
 
 
 def fit_jointly(

@@ -8,6 +8,10 @@ a few runs. The sets that gain most are fitted from other skins, too, since a mi
 skin astray; then each mechanism of the best is left out in turn. Where nothing more is gained, each mechanism
 of the best is exchanged: left out, and every other one tried beside the rest.
 
+A mechanism that is not in the catalogue is imitated by several that are, each of which gains. So the search
+goes on from a larger set only if this is likelier than the smaller one with something smooth beside it that
+has no name, or with the same beside itself.
+
 A run of the full model at a set's fit says by how much the forward model is off there. Where that is too much
 the set is fitted again, with the difference added to the force. Sets that gain much are checked in this way
 before the search goes on from one, and all likely sets at the end, so that they are compared by forces as
@@ -16,7 +20,7 @@ exact as the noise asks for. A set's weight is its evidence times the prior of i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,9 +30,10 @@ from bayeskin.errors import InputError
 from bayeskin.inference.gauss_newton import promise
 from bayeskin.mechanisms import Mechanism, with_one, without_one
 from bayeskin.mechanisms.mechanism import Tissue
-from bayeskin.mismatch.joint_fit import JointFit
+from bayeskin.mismatch.hypotheses import Evidences, Family, hypotheses_of
+from bayeskin.mismatch.joint_fit import JointFit, as_json
 from bayeskin.mismatch.search import PRIOR, weight
-from bayeskin.mismatch.tasks import Ask, Climb, FullProbe, Join, Probe, Promise, Task
+from bayeskin.mismatch.tasks import Ask, Climb, FullProbe, Join, Probe, Promise, Task, Weigh
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array, BinnedForce, ParameterSpace
 
@@ -51,6 +56,7 @@ class SearchSettings:
     left : RMS residual over the noise's, from which on that is done, and more than noise is left
     gain : nats of weight, less is no reason to go on; most : mechanisms of a set
     compared : sets that are checked by the full model; checks : rounds of them
+    weighed : sets, the likeliest and that without mechanisms, whose hypotheses are compared
     exact : error of the forward model, RMS over bins, over that of the noise, that needs no correction
     shapes : of each part of a mechanism that the model solves, from which further maxima are sought
     maxima : further ones that are kept
@@ -78,6 +84,7 @@ class SearchSettings:
     most: int = 6
     compared: int = 6
     checks: int = 4
+    weighed: int = 6
     exact: float = 0.05
     shapes: int = 2
     maxima: int = 2
@@ -106,11 +113,13 @@ class Check:
 class JointSearch:
     """All sets fitted, by their names sorted: of each the likeliest fit, and the last check of one.
 
-    others : further maxima of the likeliest set, less likely than that in `fits`
+    evidences : of the sets whose hypotheses are compared
+    others : further maxima of the likeliest of these, less likely than that in `fits`
     """
 
     fits: dict[tuple[str, ...], JointFit] = field(default_factory=dict)
     checks: dict[tuple[str, ...], Check] = field(default_factory=dict)
+    evidences: dict[tuple[str, ...], Evidences] = field(default_factory=dict)
     others: list[JointFit] = field(default_factory=list)
 
     def add(self, found: object) -> None:
@@ -124,6 +133,16 @@ class JointSearch:
     def best(self) -> JointFit:
         """The set with the largest weight."""
         return max(self.fits.values(), key=lambda one: weight(one.fit))
+
+    @property
+    def family(self) -> Family:
+        """The hypotheses that are compared."""
+        return Family([one for names, said in self.evidences.items() for one in hypotheses_of(names, said)])
+
+    @property
+    def chosen(self) -> tuple[str, ...]:
+        """The likeliest of the sets that are compared, with or without something beside it."""
+        return max(self.evidences, key=self.family.probability_of_set)
 
     def likeliest(self, count: int) -> list[JointFit]:
         """Returns so many of the sets with the largest weights, that without mechanisms always among them."""
@@ -145,6 +164,7 @@ def search_jointly(
     searcher = _Searcher(ask, binned, base, known, noise, seed, tell, settings or SearchSettings())
     searcher.base()
     searcher.search()
+    searcher.weigh()
     searcher.other_maxima()
     return searcher.found
 
@@ -160,6 +180,7 @@ class _Searcher:
         self._neutral = {name: value for m in known.values() for name, value in m.neutral.items()}
         self._skins: list[dict[str, float]] = []
         self._expanded: set[tuple[str, ...]] = set()
+        self._weighed: dict[tuple[str, ...], JointFit] = {}  # fits that the evidences are of
         self._shapes: dict[str, Mapping[str, float]] = {}  # by the strength: values that promised most
 
     def base(self) -> None:
@@ -184,6 +205,9 @@ class _Searcher:
             current = self._exact()
             if current.fit.names not in self._expanded and len(current.fit.names) < self._settings.most:
                 self._forward(current)
+                if self._gains(current) and not self._beats_smooth(current.fit.names):
+                    self._check_all()
+                    return
             if not self._gains(current):
                 self._exchange(current)
             if not self._gains(current):
@@ -191,13 +215,55 @@ class _Searcher:
             if not self._gains(current):
                 return
 
+    def weigh(self) -> None:
+        """Weighs the hypotheses of the likeliest sets, and of those that the search stopped at.
+
+        Raises InputError where none can be.
+        """
+        before = list(self.found.evidences)
+        sets = [one.fit.names for one in self.found.likeliest(self._settings.weighed)]
+        why = self._weigh(dict.fromkeys([*sets, *before]))
+        if not self.found.evidences:
+            raise InputError("diagnosis", f"no set of mechanisms could be weighed: {why}", "a set that can")
+
+    def _weigh(self, sets: Iterable[tuple[str, ...]]) -> str:
+        """Weighs hypotheses of sets, those again whose fit is another now; returns why the last failed."""
+        new = [names for names in sets if self._weighed.get(names) is not self.found.fits[names]]
+        why = ""
+        for names, said in zip(new, self._ask([Weigh(as_json(self.found.fits[one])) for one in new]),
+                               strict=True):  # fmt: skip
+            self.found.evidences.pop(names, None)
+            self._weighed[names] = self.found.fits[names]
+            if isinstance(said, Evidences):
+                self.found.evidences[names] = said
+            else:
+                why = str(said)
+        return why
+
+    def _beats_smooth(self, names: tuple[str, ...]) -> bool:
+        """Returns whether the likeliest set is likelier than another with something smooth beside it."""
+        best = self.found.best.fit.names
+        self._weigh([names, best])
+        if not {names, best} <= set(self.found.evidences):
+            return True
+        family = self.found.family
+        gained = family.likeliest(best) - family.likeliest(names)
+        if gained < self._settings.gain:
+            said = ", ".join(names) or "no mechanism"
+            self._tell(
+                f"{said}, with something smooth that has no name, is as likely as {', '.join(best)}, "
+                f"alone or with the same: {-gained:+.1f} nats"
+            )
+        return gained >= self._settings.gain
+
     def other_maxima(self) -> None:
         """Climbs to further maxima of the likeliest set, from values that the force says little of.
 
         The forces of two maxima differ by so little that each needs a full run of its own.
         """
-        best = self.found.best
-        names, there = best.fit.names, self._climbed_elsewhere(best)
+        names = self.found.chosen
+        best = self.found.fits[names]
+        there = self._climbed_elsewhere(best)
         full = self._ask([FullProbe(self._solved(names), self._solved_values(one)) for one in there])
         maxima, checks = [best], list[Check]()
         for one, full_n in zip(there, full, strict=True):
@@ -216,6 +282,7 @@ class _Searcher:
         self.found.others = [*maxima[:top], *maxima[top + 1 :]]
         if top:
             self.found.fits[names], self.found.checks[names] = maxima[top], checks[top - 1]
+            self._weigh([names])
 
     def _climbed_elsewhere(self, best: JointFit) -> list[JointFit]:
         """Returns fits of the likeliest set that are elsewhere and not far behind, the likeliest first."""

@@ -25,10 +25,10 @@ from bayeskin.mismatch.fit import (
     promised,
     restored,
     soft_on_stiff,
-    stored,
 )
 from bayeskin.mismatch.full_fit import change
-from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, within
+from bayeskin.mismatch.hypotheses import Evidences
+from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, as_json, fit_jointly, within
 from bayeskin.mismatch.locate import locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.refuted import refuted
@@ -251,7 +251,7 @@ class JointBench:
         if isinstance(task, Promise):
             return said["nats"]
         if isinstance(task, Weigh):
-            return said["alone"], said["with_smooth"], said["chance"]
+            return Evidences(**said)
         found = self._fitted(said, task.until_s if isinstance(task, Climb) else None)
         against = refuted(found.fit, self.known, self.motion, self.jumps)
         return f"the recording's samples show nothing of {', '.join(against)}" if against else found
@@ -269,19 +269,6 @@ def _with_error(about: LogPosterior, off_n: Array | None) -> LogPosterior:
     if off_n is None or about.model_error is None:
         return about
     return replace(about, model_error=replace(about.model_error, measured_n=off_n[None]))
-
-
-def as_json(found: JointFit) -> dict[str, Any]:
-    """A joint fit, as `JointBench` reads it."""
-    assert found.run.slopes_n is not None
-    run = {
-        "theta": found.run.theta.tolist(), "force_n": found.run.force_n.tolist(),
-        "slopes_n": found.run.slopes_n.tolist(),
-    }  # fmt: skip
-    return {
-        "fit": stored(found.fit), "run": run, "runs": found.runs, "settled": found.settled,
-        "off_n": found.off_n.tolist(),
-    }  # fmt: skip
 
 
 def _trained(model: ReducedModel) -> dict[str, Mechanism]:

@@ -21,17 +21,17 @@ from bayeskin.mismatch.emulate import Emulated, emulate
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.held_out import end_of_second_hold, fit_beginning
-from bayeskin.mismatch.hypotheses import Family, Judgement, hypotheses_of, judge_family
+from bayeskin.mismatch.hypotheses import Evidences, Family, Judgement, judge_family
 from bayeskin.mismatch.joint_fit import JointFit, within
 from bayeskin.mismatch.joint_search import JointSearch, noise_of, search_jointly
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import Made, Search
-from bayeskin.mismatch.tasks import Ask, FullProbe, Probe, Task, Weigh
+from bayeskin.mismatch.tasks import Ask, FullProbe, Probe, Task
 from bayeskin.pipeline.diagnosis_outputs import Found, Shown, candidates, draw, unexplained, window
-from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
+from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import write_json
-from bayeskin.pipeline.joint_bench import JointBench, Source, as_json, asked, searches_file
+from bayeskin.pipeline.joint_bench import JointBench, Source, asked, searches_file
 from bayeskin.pipeline.model import reduced_files
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.reducing import reduced_file
@@ -40,7 +40,6 @@ from bayeskin.reduced.region import protocol_outside
 from bayeskin.surrogates import train
 from bayeskin.types import Array, BinnedForce, Design, Surrogate
 
-WEIGHED = 6  # sets, the likeliest and that without mechanisms, whose hypotheses are compared
 POSSIBLE = 1e-6  # probability of a set, below which it is not fitted to the beginning
 PREDICTIVE_DRAWS = 300
 REACH = 0.5  # of the prior's width on either side of a run, within which its tangent is sampled
@@ -73,22 +72,14 @@ def _work(run: Run) -> Mapping[str, Any]:
     bench = bench_of(run)
     with asked(bench, searches_file(run.folder, bench), run.config.design.workers) as ask:
         found = searched(run, bench, ask)
-        weighed = [one.fit.names for one in found.likeliest(WEIGHED)]
-        answers = ask([Weigh(as_json(found.fits[names])) for names in weighed])
-        evidences = {names: said for names, said in zip(weighed, answers, strict=True)
-                     if isinstance(said, tuple)}  # fmt: skip
-        if not evidences:
-            raise CannotGoOn(f"no set of mechanisms could be weighed: {answers[0]}")
-        family = Family([one for names, said in evidences.items() for one in hypotheses_of(names, *said)])
+        evidences, family, best = found.evidences, found.family, found.chosen
         judged = judge_family(family, bench.known)
-        best = max(evidences, key=lambda names: family.probability_of_set(names))
         split_s = end_of_second_hold(bench.binned)
         possible = [names for names in evidences
                     if not names or family.probability_of_set(names) > POSSIBLE]  # fmt: skip
         begun = fit_beginning(ask, [found.fits[names] for names in possible], split_s)
         run.reporter.log("runs where the posterior is, and draws of it")
-        maxima = [found.fits[best], *(one for one in found.others if one.fit.names == best)]
-        emulated = _emulated(bench, ask, maxima, seed)
+        emulated = _emulated(bench, ask, [found.fits[best], *found.others], seed)
     base, chosen = found.fits[()].fit, emulated.fit
     before, after = (
         locate(fit, {**fit.theta, **_noise_of(fit, chosen.theta)}, seed) for fit in (base, chosen)
@@ -210,15 +201,12 @@ def _mechanisms(
     return rows
 
 
-def _set(
-    names: tuple[str, ...], found: JointSearch, said: tuple[float, float, float], family: Family
-) -> dict[str, Any]:
+def _set(names: tuple[str, ...], found: JointSearch, said: Evidences, family: Family) -> dict[str, Any]:
     one: JointFit = found.fits[names]
-    alone, with_smooth, chance = said
     return {
         "mechanisms": list(names), "probability": family.probability_of_set(names),
-        "log_evidence": one.fit.log_evidence, "log_evidence_alone": alone,
-        "log_evidence_with_smooth": with_smooth, "chance_of_windows": chance,
+        "log_evidence": one.fit.log_evidence, "log_evidence_alone": said.alone,
+        "log_evidence_with_smooth": said.with_smooth, "chance_of_windows": said.chance,
         "settled": one.settled, "runs": one.runs,
     }  # fmt: skip
 
