@@ -21,7 +21,7 @@ KNOWN = {name: catalogue()[name] for name in NAMES}
 ODDS = np.log(0.05 / 0.95)
 SETS = st.lists(st.sets(st.sampled_from(NAMES), max_size=4), max_size=5, unique_by=tuple)
 EVIDENCES = st.floats(-800.0, 800.0)
-CHANCES = st.floats(0.0, 1.0) | st.floats(0.0, 1e-6)
+CHANCES = st.floats(0.0) | st.floats(0.0, 1e-6)
 
 
 @st.composite
@@ -30,12 +30,8 @@ def families(draw: st.DrawFn) -> Family:
     names = {tuple(sorted(one)) for one in draw(SETS)} | {()}
     near = st.floats(-4.0, 4.0)
     evidence = draw(st.sampled_from([EVIDENCES, near]))
-    said = [(own, Evidences(draw(evidence), draw(evidence), draw(CHANCES))) for own in sorted(names)]
+    said = [(own, Evidences(draw(evidence), draw(evidence))) for own in sorted(names)]
     return Family([one for own, its in said for one in hypotheses_of(own, its)])
-
-
-def unnamed(family: Family) -> float:
-    return family.unnamed("smooth") + family.unnamed("local")
 
 
 def judged(family: Family) -> Judgement:
@@ -46,7 +42,7 @@ def judged(family: Family) -> Judgement:
 def test_probabilities_of_sets_add_up_to_one(family: Family) -> None:
     sets = {one.names for one in family.hypotheses}
     assert sum(family.probability_of_set(names) for names in sets) == pytest.approx(1.0)
-    assert family.nothing + unnamed(family) + family.probability(NAMES) >= 1.0 - 1e-9
+    assert family.nothing + family.smooth + family.probability(NAMES) >= 1.0 - 1e-9
     assert family.probability_of_set(()) + family.probability(NAMES) == pytest.approx(1.0)
     assert family.nothing <= family.probability_of_set(()) + 1e-12
 
@@ -66,10 +62,8 @@ def test_a_mechanism_is_no_likelier_than_its_look_alikes_together(family: Family
 def test_a_verdict_is_one_of_three_that_exclude_each_other(family: Family) -> None:
     found = judged(family)
     assert (found.verdict == "named") == bool(found.named)
-    assert (found.verdict == "unknown") == (not found.named and unnamed(family) > 0.5)
-    assert (found.smooth_probability, found.local_probability) == (
-        family.unnamed("smooth"), family.unnamed("local"),
-    )  # fmt: skip
+    assert (found.verdict == "unknown") == (not found.named and family.smooth > 0.5)
+    assert found.smooth_probability == family.smooth
     assert found.nothing_probability == family.nothing
     names = [one.name for one in found.named]
     assert len(set(names)) == len(names)
@@ -82,29 +76,29 @@ def test_a_constant_more_in_all_evidences_changes_nothing(family: Family, consta
     moved = Family([replace(one, log_weight=one.log_weight + constant) for one in family.hypotheses])
     for names in {one.names for one in family.hypotheses}:
         assert moved.probability_of_set(names) == pytest.approx(family.probability_of_set(names), abs=1e-9)
-    assert unnamed(moved) == pytest.approx(unnamed(family), abs=1e-9)
+    assert moved.smooth == pytest.approx(family.smooth, abs=1e-9)
     assert moved.nothing == pytest.approx(family.nothing, abs=1e-9)
 
 
-@given(st.sets(st.sampled_from(NAMES[:-1])), EVIDENCES, EVIDENCES, CHANCES)
+@given(st.sets(st.sampled_from(NAMES[:-1])), EVIDENCES, EVIDENCES)
 def test_each_mechanism_and_what_has_no_name_cost_the_same_prior(
-    names: set[str], alone: float, smooth: float, chance: float
+    names: set[str], alone: float, smooth: float
 ) -> None:
-    said = Evidences(alone, smooth, chance)
+    said = Evidences(alone, smooth)
     fewer = hypotheses_of(tuple(sorted(names)), said)
     more = hypotheses_of((*sorted(names), "stiffness-drift"), said)
     for less, one in zip(fewer, more, strict=True):
         assert one.log_weight - less.log_weight == pytest.approx(ODDS, abs=1e-9)
     assert fewer[0].log_weight == pytest.approx(alone + len(names) * ODDS)
     assert fewer[1].log_weight - fewer[0].log_weight == pytest.approx(smooth - alone + ODDS, abs=1e-9)
-    assert [one.unnamed for one in fewer] == [None, "smooth", "local"]
+    assert [one.smooth for one in fewer] == [False, True]
 
 
 def of(**nats: float) -> Family:
     """Sets of one mechanism or none, by name with `_` for `-`, the base at 0, nothing smooth anywhere."""
-    rows = [hypotheses_of((), Evidences(0.0, -50.0, 1.0))]
+    rows = [hypotheses_of((), Evidences(0.0, -50.0))]
     rows += [
-        hypotheses_of((name.replace("_", "-"),), Evidences(value, -50.0, 1.0)) for name, value in nats.items()
+        hypotheses_of((name.replace("_", "-"),), Evidences(value, -50.0)) for name, value in nats.items()
     ]
     return Family([one for row in rows for one in row])
 
@@ -116,9 +110,9 @@ def test_the_verdicts_by_hand() -> None:
     assert found.verdict == "named"
     assert found.named[0].probability == pytest.approx(np.exp(6.0) / (np.exp(6.0) + 19.0))
     assert judged(of(sensor_drift=5.0)).verdict == "nothing-missing"  # 148 / 167, below nine in ten
-    smooth = Family([*hypotheses_of((), Evidences(0.0, 3.5, 1.0))])  # e^3.5 is 33, to 19
+    smooth = Family([*hypotheses_of((), Evidences(0.0, 3.5))])  # e^3.5 is 33, to 19
     assert (judged(smooth).verdict, judged(smooth).named) == ("unknown", ())
-    assert judged(Family(hypotheses_of((), Evidences(0.0, 2.5, 1.0)))).verdict == "nothing-missing"
+    assert judged(Family(hypotheses_of((), Evidences(0.0, 2.5)))).verdict == "nothing-missing"
 
 
 def test_of_look_alikes_that_share_the_chances_the_likeliest_is_named() -> None:
@@ -142,25 +136,6 @@ def test_a_device_whose_model_knows_few_mechanisms_has_a_verdict() -> None:
     """Look-alikes that the model was not trained for have no probability."""
     few = {name: KNOWN[name] for name in ("device-friction", "friction-creep")}
     pair = ("device-friction", "friction-creep")
-    said = {(): Evidences(0.0, 0.0, 1.0), pair: Evidences(30.0, 0.0, 1.0)}
+    said = {(): Evidences(0.0, 0.0), pair: Evidences(30.0, 0.0)}
     family = Family([one for names, its in said.items() for one in hypotheses_of(names, its)])
     assert [one.name for one in judge_family(family, few).named] == list(pair)
-
-
-def test_a_window_that_noise_does_not_explain_speaks_for_something_local() -> None:
-    """By hand: with p = 1e-4 the odds are at most 1 / (e 1e-4 9.21) = 399, to 19; with 0.01 they are 8."""
-    far = judged(Family(hypotheses_of((), Evidences(0.0, -50.0, 1e-4))))
-    assert far.verdict == "unknown"
-    assert far.local_probability == pytest.approx(399.4 / (399.4 + 19.0), abs=1e-3)
-    assert judged(Family(hypotheses_of((), Evidences(0.0, -50.0, 0.01)))).verdict == "nothing-missing"
-    usual = judged(Family(hypotheses_of((), Evidences(0.0, -50.0, 0.5))))
-    assert usual.local_probability == pytest.approx(0.05)  # its prior
-
-
-@given(CHANCES, CHANCES)
-def test_the_less_noise_explains_a_window_the_likelier_is_something_local(one: float, other: float) -> None:
-    by = [
-        judged(Family(hypotheses_of((), Evidences(0.0, 0.0, chance)))).local_probability
-        for chance in (one, other)
-    ]
-    assert (by[0] - by[1]) * (other - one) >= 0.0

@@ -15,7 +15,7 @@ from toys.solved import BASE, KNOWN
 from bayeskin.errors import InputError
 from bayeskin.mismatch.joint_search import JointSearch, SearchSettings, search_jointly
 from bayeskin.mismatch.search import weight
-from bayeskin.mismatch.tasks import Climb, FullProbe, Join, Probe, Promise, Task
+from bayeskin.mismatch.tasks import Climb, FullProbe, Join, Probe, Promise, Task, Weigh
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.pipeline.joint_bench import JointBench
 from bayeskin.types import Array, ParameterSpace
@@ -304,3 +304,24 @@ def test_maxima_are_all_distinct_and_the_likeliest_is_the_fit(asked: Make) -> No
         assert all(np.abs(place - other).max() > FEW.alike_by for other in places[:i])
     assert all(weight(one.fit) <= weight(best.fit) for one in found.others)
     assert 0 < len(found.others) <= FEW.maxima
+
+
+def test_what_has_no_name_is_not_imitated_by_ever_larger_sets(asked: Make) -> None:
+    """A friction: both force-offset and stiffness-drift gain on it, and together still more."""
+    one = asked(friction_n=8e-3)
+    found = one.search()
+    assert found.best.fit.names != ()
+    assert found.chosen == ()
+    assert found.family.smooth > 0.99
+    assert max(map(len, found.fits)) == 1
+    assert any("with something smooth that has no name, is as likely" in line for line in one.told)
+
+
+def test_the_sets_that_are_compared_are_weighed_at_their_last_fits(asked: Make) -> None:
+    one = asked(full=lambda values: exact(values) + 2e-3, stiffness_rate=9e-4, F0=-0.03)
+    found = one.search()
+    assert found.chosen == ("force-offset", "stiffness-drift")
+    weighed = {tuple(task.fit["fit"]["names"]): task.fit["fit"]["value"]
+               for task in one.tasks if isinstance(task, Weigh)}  # fmt: skip
+    assert set(weighed) == set(found.evidences)
+    assert weighed == {names: found.fits[names].fit.value for names in weighed}

@@ -1,18 +1,14 @@
 """One rule for the verdict: probabilities of hypotheses in one family.
 
-A hypothesis is a set of mechanisms, alone or with something beside it that has no name: something smooth (a
-Gaussian process, `discrepancy`), or something local, that acts within one window of the recording only. Each
-mechanism is there with the same prior probability, and so is each kind of what has no name. The evidence of a
-set, alone or with something smooth, is that of the force linear about the set's fit, with the measured noise
-(`Unexplained.log_evidence`). How much likelier something local makes the residual is not known, since nobody
-knows its form. But with p, the chance that noise alone leaves a window as far off (`locate`), it is at most
-1 / (-e p log p), whatever form it has of those whose p falls steadily (Sellke, Bayarri & Berger 2001, Am.
-Stat. 55:62). That is what it counts for. Probabilities are shares of all hypotheses that were weighed; sets
-that were never fitted count as nothing.
+A hypothesis is a set of mechanisms, with or without something smooth beside it that has no name (a Gaussian
+process, `discrepancy`). Each mechanism is there with the same prior probability, and so is what has no name.
+The evidence of both kinds is that of the force linear about the set's fit, with the measured noise
+(`Unexplained.log_evidence`). Probabilities are shares of all hypotheses that were weighed; sets that were
+never fitted count as nothing.
 
 A mechanism is named where it has nine chances in ten, or its look-alikes have them together and it is the
-likeliest of these. Where none is named the mismatch is unknown if something without a name is likelier than
-not; elsewhere nothing is missing.
+likeliest of these. Where none is named the mismatch is unknown if something smooth is likelier than not;
+elsewhere nothing is missing.
 """
 
 from __future__ import annotations
@@ -28,27 +24,22 @@ from bayeskin.mismatch.search import PRIOR
 
 PROBABLE = 0.9  # of a mechanism or its look-alikes, to be named
 LIKELIER_THAN_NOT = 0.5
-Unnamed = Literal["smooth", "local"]
 
 
 @dataclass(frozen=True)
 class Evidences:
-    """What speaks for a set: its log evidences alone and with something smooth beside it.
-
-    chance : that noise leaves some window as far off as the farthest that the set leaves
-    """
+    """Log evidences of a set: alone, and with something smooth beside it."""
 
     alone: float
     with_smooth: float
-    chance: float
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A set of mechanisms, what without a name is beside it, if anything, and the logarithm of its weight."""
+    """A set of mechanisms, with something smooth beside it or not; the logarithm of its weight."""
 
     names: tuple[str, ...]
-    unnamed: Unnamed | None
+    smooth: bool
     log_weight: float
 
 
@@ -64,31 +55,22 @@ class NamedMechanism:
 
 @dataclass(frozen=True)
 class Judgement:
-    """The verdict; probabilities that nothing is missing, and that something smooth or local has no name."""
+    """The verdict; probability that nothing is missing, and that something smooth without a name acts."""
 
     verdict: Literal["nothing-missing", "named", "unknown"]
     named: tuple[NamedMechanism, ...]
     nothing_probability: float
     smooth_probability: float
-    local_probability: float
 
 
-def hypotheses_of(names: tuple[str, ...], said: Evidences) -> tuple[Hypothesis, ...]:
-    """Returns the hypotheses of a set."""
+def hypotheses_of(names: tuple[str, ...], said: Evidences) -> tuple[Hypothesis, Hypothesis]:
+    """Returns both hypotheses of a set."""
     odds = float(np.log(PRIOR / (1.0 - PRIOR)))
     own = len(names) * odds
-    with_local = said.alone + _most_for(said.chance)
     return (
-        Hypothesis(names, None, said.alone + own),
-        Hypothesis(names, "smooth", said.with_smooth + own + odds),
-        Hypothesis(names, "local", with_local + own + odds),
+        Hypothesis(names, False, said.alone + own),
+        Hypothesis(names, True, said.with_smooth + own + odds),
     )
-
-
-def _most_for(chance: float) -> float:
-    """Returns the most nats that a chance under a hypothesis can speak for another one."""
-    chance = max(chance, np.finfo(float).tiny)
-    return 0.0 if chance > 1.0 / np.e else float(-1.0 - np.log(chance) - np.log(-np.log(chance)))
 
 
 @dataclass(frozen=True)
@@ -109,14 +91,15 @@ class Family:
         """Returns the logarithm of the weight of a set's likeliest hypothesis."""
         return max(one.log_weight for one in self.hypotheses if one.names == names)
 
-    def unnamed(self, kind: Unnamed) -> float:
-        """Returns the probability that something of this kind acts that has no name."""
-        return self._share([one.unnamed == kind for one in self.hypotheses])
+    @property
+    def smooth(self) -> float:
+        """Probability that something smooth without a name acts."""
+        return self._share([one.smooth for one in self.hypotheses])
 
     @property
     def nothing(self) -> float:
         """Probability that nothing is missing."""
-        return self._share([not one.names and not one.unnamed for one in self.hypotheses])
+        return self._share([not one.names and not one.smooth for one in self.hypotheses])
 
     def _share(self, among: Sequence[bool]) -> float:
         logs = np.array([one.log_weight for one in self.hypotheses])
@@ -127,7 +110,6 @@ class Family:
 def judge_family(family: Family, known: Mapping[str, Mechanism]) -> Judgement:
     """Returns the verdict."""
     alone = {name: family.probability([name]) for name in known}
-    smooth, local = family.unnamed("smooth"), family.unnamed("local")
     named: list[NamedMechanism] = []
     for name, probability in sorted(alone.items(), key=lambda item: -item[1]):
         likelier = [one.name for one in named]
@@ -139,5 +121,5 @@ def judge_family(family: Family, known: Mapping[str, Mechanism]) -> Judgement:
     if named:
         verdict: Literal["nothing-missing", "named", "unknown"] = "named"
     else:
-        verdict = "unknown" if smooth + local > LIKELIER_THAN_NOT else "nothing-missing"
-    return Judgement(verdict, tuple(named), family.nothing, smooth, local)
+        verdict = "unknown" if family.smooth > LIKELIER_THAN_NOT else "nothing-missing"
+    return Judgement(verdict, tuple(named), family.nothing, family.smooth)

@@ -63,8 +63,7 @@ class Join:
 
 @dataclass(frozen=True)
 class Weigh:
-    """Asks for the log evidences of a fit, as JSON has it, alone and with something smooth beside it, and for
-    the chance that noise leaves some window as far off as this fit leaves its farthest."""
+    """Asks for the log evidences of a fit, as JSON has it, alone and with something smooth beside it."""
 
     fit: Mapping[str, Any]
 

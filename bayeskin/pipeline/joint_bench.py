@@ -29,7 +29,6 @@ from bayeskin.mismatch.fit import (
 from bayeskin.mismatch.full_fit import change
 from bayeskin.mismatch.hypotheses import Evidences
 from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, as_json, fit_jointly, within
-from bayeskin.mismatch.locate import locate
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.refuted import refuted
 from bayeskin.mismatch.tangent import Tangent
@@ -198,9 +197,8 @@ class JointBench:
         if isinstance(task, Promise):
             return {"nats": self._promised(task)}
         if isinstance(task, Weigh):
-            fitted = self._fitted(task.fit).fit
-            left, chance = discrepancy(fitted, self.motion), locate(fitted, fitted.theta, self._seed).chance
-            return {"alone": left.without_log_evidence, "with_smooth": left.log_evidence, "chance": chance}
+            left = discrepancy(self._fitted(task.fit).fit, self.motion)
+            return asdict(Evidences(left.without_log_evidence, left.log_evidence))
         if isinstance(task, Join):
             beside = task.promise
             names = with_one(beside.names, beside.name, self.known)

@@ -104,7 +104,6 @@ def _work(run: Run) -> Mapping[str, Any]:
         "verdict": judged.verdict,
         "nothing_probability": judged.nothing_probability,
         "smooth_probability": judged.smooth_probability,
-        "local_probability": judged.local_probability,
         "located": [window(one) for one in before.windows],
         "remaining": [window(one) for one in after.windows],
         "mechanisms": _mechanisms(judged, chosen, drawn[best].summary, bench.known, parts),
@@ -206,7 +205,7 @@ def _set(names: tuple[str, ...], found: JointSearch, said: Evidences, family: Fa
     return {
         "mechanisms": list(names), "probability": family.probability_of_set(names),
         "log_evidence": one.fit.log_evidence, "log_evidence_alone": said.alone,
-        "log_evidence_with_smooth": said.with_smooth, "chance_of_windows": said.chance,
+        "log_evidence_with_smooth": said.with_smooth,
         "settled": one.settled, "runs": one.runs,
     }  # fmt: skip
 
@@ -257,9 +256,9 @@ def in_words(answer: Mapping[str, Any]) -> str:
     lines += [f"  {one['name']} (probability {one['probability']:.2f}): {one['statement']}"
               for one in answer["mechanisms"]]  # fmt: skip
     lines.append(f"  nothing is missing: probability {answer['nothing_probability']:.2f}")
-    for kind in ("smooth", "local"):
-        probability = answer[f"{kind}_probability"]
-        lines.append(f"  something {kind} that is not in the catalogue: probability {probability:.2f}")
+    lines.append(
+        f"  something smooth that is not in the catalogue: probability {answer['smooth_probability']:.2f}"
+    )
     lines.append(
         f"The model leaves the recording in {len(answer['located'])} windows, "
         f"and in {len(answer['remaining'])} with {', '.join(answer['best_set']) or 'no mechanism'}."

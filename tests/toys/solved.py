@@ -121,8 +121,11 @@ def means(values: Mapping[str, ArrayLike]) -> Array:
     ])  # fmt: skip
 
 
-def recorded(seed: int, **values: float) -> BinnedForce:
-    """Bins of the toy with mechanisms at work, of these values, and white noise."""
+def recorded(seed: int, friction_n: float = 0.0, **values: float) -> BinnedForce:
+    """Bins of the toy with mechanisms at work, of these values, and white noise.
+
+    friction_n : of the device, which no mechanism of the toy knows
+    """
     acting = [m for m in KNOWN.values() if {p.name for p in m.parameters} & set(values)]
     own = {name: value for m in acting for name, value in {**m.neutral, **values}.items()}
     skin = means({**TRUTH, **{name: own[name] for name in own if name.startswith("stiffness")}})
@@ -130,7 +133,8 @@ def recorded(seed: int, **values: float) -> BinnedForce:
     at = {name: np.array([value]) for name, value in own.items()}
     more = observed(acting, at, MOTION, lambda t: np.zeros((1, np.shape(t)[-1])))(middle)
     rng, count = np.random.default_rng(seed), len(middle)
-    force_n = skin[0] + more[0] + NOISE_N * rng.standard_normal(count)
+    moves = np.sign(MOTION.at(EDGES_S[1:]) - MOTION.at(EDGES_S[:-1]))
+    force_n = skin[0] + more[0] + friction_n * moves + NOISE_N * rng.standard_normal(count)
     phase = np.searchsorted([one.end_s for one in PHASES], middle)
     return BinnedForce(EDGES_S, force_n, np.full(count, NOISE_N**2), np.zeros(count - 1), phase, PHASES)
 
