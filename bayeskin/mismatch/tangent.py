@@ -29,14 +29,16 @@ POWER = 0.8  # of a modulus, which the force is linear in
 
 @dataclass(frozen=True)
 class Tangent(_FreezesArrays):
-    """Satisfies `types.Surrogate`, without an error of its own.
+    """Satisfies `types.Surrogate`.
 
     edges_s (m+1,) : of the bins whose means the runs' forces are; runs : one or more, each with slopes
+    errors_n (r, m) : of the runs, as their model says, of one sd each; None for none
     """
 
     space: ParameterSpace
     edges_s: Array
     runs: tuple[FullRun, ...]
+    errors_n: Array | None = None
 
     @property
     def provenance(self) -> Mapping[str, Any]:
@@ -45,7 +47,11 @@ class Tangent(_FreezesArrays):
     def predict(self, theta: ArrayLike) -> Prediction:
         """Force at theta (n, d) or (d,)."""
         mean = self.predict_mean(theta)
-        return Prediction(mean, np.zeros((*mean.shape, 1)), np.zeros(mean.shape))
+        errors_n = np.zeros((1, mean.shape[1]))
+        if self.errors_n is not None and len(self.errors_n):
+            errors_n = self.errors_n
+        factor = np.broadcast_to(errors_n.T, (len(mean), *errors_n.T.shape))
+        return Prediction(mean, factor, np.zeros(mean.shape))
 
     def predict_mean(self, theta: ArrayLike) -> Array:
         """The mean (n, m) of `predict` alone."""

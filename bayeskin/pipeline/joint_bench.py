@@ -26,7 +26,6 @@ from bayeskin.mismatch.fit import (
     restored,
     soft_on_stiff,
 )
-from bayeskin.mismatch.full_fit import change
 from bayeskin.mismatch.hypotheses import Evidences
 from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, as_json, fit_jointly, within
 from bayeskin.mismatch.observed import ObservedSurrogate
@@ -36,16 +35,12 @@ from bayeskin.mismatch.tasks import Ask, Climb, FullProbe, Join, OtherTest, Prob
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline.folder import read_lines, sha256_of
 from bayeskin.pipeline.model import model_error
-from bayeskin.pipeline.reported import FullForce, beside_neutral
+from bayeskin.pipeline.reported import FullForce
+from bayeskin.pipeline.skins import ReducedSkin, Skin, skin_of
 from bayeskin.pipeline.workbench import calm_bins
-from bayeskin.reduced.files import load_reduced
-from bayeskin.reduced.model import ReducedModel
-from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.types import Array, PadMotion, ParameterSpace, Surrogate
 from bayeskin.workers import Lost, standing
 
-FOLDING = 0.15  # of the stiffness at rest: nearer to folding the reduced model is of no use; runs of the full
-# model check what comes out
 TRUST = 0.15  # of the prior's width about a run, within which a mechanism is searched for on its tangent
 
 
@@ -53,25 +48,27 @@ TRUST = 0.15  # of the prior's width about a run, within which a mechanism is se
 class Source:
     """The files and settings that a bench is opened from.
 
-    recording : folder of a run's stage `recording`; model : file of the reduced model; base : priors of the
-    base model; noise : bounds of the noise's parameters that the configuration states
+    recording : folder of a run's stage `recording`; model : file of the skin's model; spec : the full model
+    that the configuration asks for; base : priors of the base model; noise : bounds of the noise's parameters
+    that the configuration states
     """
 
     recording: Path
     model: Path
+    spec: ModelSpec
     seed: int
     base: ParameterSpace
     noise: tuple[tuple[str, tuple[float, float]], ...] = ()
 
 
 class JointBench:
-    """A recording's bins and protocol, the reduced model, and posteriors of sets about its runs."""
+    """A recording's bins and protocol, the skin by a forward model, and posteriors of sets about its runs."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
         self.binned, self.jumps, self.motion = calm_bins(source.recording)
-        self.model: ReducedModel = load_reduced(source.model)
-        self.known: Mapping[str, Mechanism] = _trained(self.model)
+        self.forward: Skin = skin_of(source.model, source.spec, self.motion, self.binned.edges_s)
+        self.known: Mapping[str, Mechanism] = _known(self.forward)
         self.base = source.base
         self._seed = source.seed
         self._noise = replace(instrument_noise(self.binned), by_kind=False, **dict(source.noise))  # type: ignore[arg-type]
@@ -90,12 +87,14 @@ class JointBench:
 
     def force(self, names: Sequence[str], theta: Mapping[str, float]) -> Array | str:
         """Force (m,) of the skin with a set at values, or why the run failed."""
-        found = self._run(names, theta, slopes=False)
-        return found if isinstance(found, str) else found.force_n
+        run = self._run(names, theta, slopes=False)
+        return run if isinstance(run, str) else run.force_n
 
     def full(self, names: Sequence[str], theta: Mapping[str, float]) -> Array | str:
         """Force (m,) of the skin with a set at values by the full model, or why its run failed."""
-        return FullForce(self._spec, self.motion, self.binned.edges_s)((self._solved_names(names), theta))
+        return FullForce(self.forward.spec, self.motion, self.binned.edges_s)(
+            (self._solved_names(names), theta)
+        )
 
     def reported(self, case: tuple[Sequence[str], Mapping[str, float]]) -> Array | str:
         """Force (m,) as the instrument reports it, with a set at values."""
@@ -113,7 +112,8 @@ class JointBench:
         """Force (m,) that the instrument reports of a set in another test, or why the run failed."""
         motion = PadMotion(np.array(task.time_s), np.array(task.displacement_m))
         values = {name: task.theta[name] for name in self.space(task.names).names}
-        found = simulate_reduced(self.model, motion, values, self.solved(task.names), least_stiffness=FOLDING)
+        assert isinstance(self.forward, ReducedSkin)
+        found = self.forward.simulated(motion, values, self.solved(task.names))
         if found.status != "ok":
             return found.message
         beyond = [self.known[name] for name in sorted(task.names) if self.known[name].act.bind is None]
@@ -138,23 +138,9 @@ class JointBench:
         return _with_error(self._posterior(self._seen(names, (), runs), until_s), off_n)
 
     def _run(self, names: Sequence[str], theta: Mapping[str, float], slopes: bool) -> FullRun | str:
-        mechanisms, space = self.solved(names), self.space(names)
+        space = self.space(names)
         at = np.array([theta[name] for name in space.names])
-        by = dict(zip(space.names, map(float, change(space, at)), strict=True))
-        values = dict(zip(space.names, map(float, at), strict=True))
-        if slopes:
-            values |= beside_neutral(values, by, mechanisms)
-        found = simulate_reduced(
-            self.model, self.motion, values, mechanisms, by if slopes else None, least_stiffness=FOLDING
-        )
-        if found.status != "ok":
-            return found.message
-        force_n = found.bin_means(self.binned.edges_s)
-        if not slopes:
-            return FullRun(at, force_n, None)
-        slopes_n = found.gradient_bin_means(self.binned.edges_s)
-        aside = np.array([(values[name] - here) / by[name] for name, here in zip(by, at, strict=True)])
-        return FullRun(at, force_n - slopes_n @ aside, slopes_n)
+        return self.forward.run(space, at, self.solved(names), slopes)
 
     def solved(self, names: Sequence[str]) -> list[Mechanism]:
         """Those of a set that the forward model solves, by their names' order."""
@@ -162,17 +148,13 @@ class JointBench:
 
     def _seen(self, names: Sequence[str], more: Sequence[str], runs: Sequence[FullRun]) -> Surrogate:
         """The reported force about runs of a set, with `more` mechanisms by what they do to a force."""
-        skin = Tangent(self.space(names), self.binned.edges_s, tuple(runs))
+        errors_n = self.forward.errors(runs[0].theta)
+        skin = Tangent(self.space(names), self.binned.edges_s, tuple(runs), errors_n)
         beyond = tuple(
             self.known[name] for name in sorted({*names, *more})
             if name in more or self.known[name].act.bind is None
         )  # fmt: skip
         return ObservedSurrogate(skin, beyond, self.motion) if beyond else skin
-
-    @property
-    def _spec(self) -> ModelSpec:
-        """The full model, which the reduced one was made from."""
-        return ModelSpec(refinement=self.model.refinement, geometry=self.model.trained.geometry)
 
     def _solved_names(self, names: Sequence[str]) -> tuple[str, ...]:
         return tuple(m.name for m in self.solved(names))
@@ -186,7 +168,7 @@ class JointBench:
             ParameterSpace(seen.space.parameters, self.base.correlations),
             None,
             soft_on_stiff,
-            model_error(self._spec, self.motion, self.binned.edges_s),
+            model_error(self.forward.spec, self.motion, self.binned.edges_s),
         )
 
     def done(self, task: Task) -> dict[str, Any]:
@@ -214,7 +196,8 @@ class JointBench:
 
     def _climbed(self, task: Climb) -> dict[str, Any]:
         start = dict(task.start)
-        start["E_c"] = max(start["E_c"], start["E_s"] / 1.9)  # a stiffer subcutis is ruled out
+        if {"E_c", "E_s"} <= set(start):
+            start["E_c"] = max(start["E_c"], start["E_s"] / 1.9)  # a stiffer subcutis is ruled out
         off_n = np.array(task.off_n) if task.off_n else None
         local = partial(self.local, off_n=off_n, until_s=task.until_s)
         settings = TrustSettings(runs=task.runs)
@@ -269,12 +252,11 @@ def _with_error(about: LogPosterior, off_n: Array | None) -> LogPosterior:
     return replace(about, model_error=replace(about.model_error, measured_n=off_n[None]))
 
 
-def _trained(model: ReducedModel) -> dict[str, Mechanism]:
-    """Mechanisms of the catalogue that a reduced model can run, or that act on the force."""
+def _known(skin: Skin) -> dict[str, Mechanism]:
+    """Mechanisms of the catalogue that a skin can solve, or that act on the force."""
     known = {
-        name: m for name, m in catalogue().items()
-        if name in model.trained.mechanisms or not isinstance(m.act, Tissue)
-    }  # fmt: skip
+        name: m for name, m in catalogue().items() if name in skin.solves or not isinstance(m.act, Tissue)
+    }
     return {name: m for name, m in known.items() if set(m.needs) <= set(known)}
 
 
@@ -320,7 +302,7 @@ def searches_file(run_folder: Path, bench: JointBench) -> Path:
     """Returns the file in which answers to a bench's tasks are kept, by all that they depend on."""
     identity = [
         bayeskin.__version__, bench.source.seed, repr(bench.source.base), bench.source.noise,
-        bench.model.hash, asdict(bench.binned), asdict(bench.motion),
+        bench.forward.hash, asdict(bench.binned), asdict(bench.motion),
         [repr(m.parameters) for m in bench.known.values()],
     ]  # fmt: skip
     return run_folder / "searches" / f"{sha256_of(identity)[:16]}-joint.jsonl"

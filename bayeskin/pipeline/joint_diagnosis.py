@@ -32,9 +32,10 @@ from bayeskin.pipeline.diagnosis_outputs import Found, Shown, candidates, draw, 
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import write_json
 from bayeskin.pipeline.joint_bench import JointBench, Source, asked, searches_file
-from bayeskin.pipeline.model import reduced_files
+from bayeskin.pipeline.model import model_spec, reduced_files
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.reducing import reduced_file
+from bayeskin.pipeline.skins import ReducedSkin
 from bayeskin.pipeline.taking_up import Remainder
 from bayeskin.reduced.region import protocol_outside
 from bayeskin.surrogates import train
@@ -48,16 +49,22 @@ NAME = "diagnose"
 
 
 def bench_of(run: Run) -> JointBench:
-    """Returns the bench of a run whose stage `recording` is done.
+    """Returns the bench of a run whose stages before are done.
 
     Raises InputError for a device without a reduced model, and for a protocol that this does not know.
     """
-    model = reduced_file(run.config.geometry(run.config_path).geometry, [run.config_path])
+    spec = model_spec(run)
+    model = run.at("train", "surrogate.h5")
+    if spec.observation == "reaction":
+        model = reduced_file(spec.geometry, [run.config_path])
     stated = tuple((name, bounds) for name, bounds in run.config.noise if bounds is not None)
     base = parameter_space(run.config, run.config_path)
-    bench = JointBench(Source(run.folder / "recording", model, run.config.seed, base, stated))
-    if beyond := protocol_outside(bench.model.trained.protocols, bench.motion):
-        raise InputError(run.config_path, f"a protocol that {model.name} does not know: {beyond[0]}", KNOWN)
+    bench = JointBench(Source(run.folder / "recording", model, spec, run.config.seed, base, stated))
+    if isinstance(bench.forward, ReducedSkin):
+        beyond = protocol_outside(bench.forward.model.trained.protocols, bench.motion)
+        if beyond:
+            found = f"a protocol that {model.name} does not know: {beyond[0]}"
+            raise InputError(run.config_path, found, KNOWN)
     return bench
 
 

@@ -19,7 +19,8 @@ from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import observed
 from bayeskin.mismatch.corrected import FullRun
-from bayeskin.pipeline import joint_bench
+from bayeskin.model.simulate import ModelSpec
+from bayeskin.pipeline import joint_bench, skins
 from bayeskin.pipeline.joint_bench import JointBench, Source
 from bayeskin.reduced.region import LEAST_STIFFNESS
 from bayeskin.types import (
@@ -149,10 +150,10 @@ def bench(
         refinement=2, hash="toy",
     )  # fmt: skip
     patch.setattr(joint_bench, "calm_bins", lambda folder: (binned, NO_WORD, MOTION))
-    patch.setattr(joint_bench, "load_reduced", lambda file: model)
-    patch.setattr(joint_bench, "simulate_reduced", simulate)
+    patch.setattr(skins, "load_reduced", lambda file: model)
+    patch.setattr(skins, "simulate_reduced", simulate)
     patch.setattr(joint_bench, "FullForce", lambda spec, motion, edges_s: lambda case: full(case[1]))
-    return JointBench(Source(Path("recording"), Path("model"), 1, base))
+    return JointBench(Source(Path("recording"), Path("model"), ModelSpec(), 1, base))
 
 
 def a_run(bench: JointBench, names: Sequence[str] = (), **values: float) -> FullRun:
