@@ -114,7 +114,7 @@ class JointSearch:
     """All sets fitted, by their names sorted: of each the likeliest fit, and the last check of one.
 
     evidences : of the sets whose hypotheses are compared
-    others : further maxima of the likeliest of these, less likely than that in `fits`
+    others : further maxima of that which was the likeliest of these, less likely than its fit in `fits`
     """
 
     fits: dict[tuple[str, ...], JointFit] = field(default_factory=dict)
@@ -138,6 +138,10 @@ class JointSearch:
     def family(self) -> Family:
         """The hypotheses that are compared."""
         return Family([one for names, said in self.evidences.items() for one in hypotheses_of(names, said)])
+
+    def others_of(self, names: tuple[str, ...]) -> list[JointFit]:
+        """Returns further maxima of a set; none of one that became the likeliest by what they showed."""
+        return [one for one in self.others if one.fit.names == names]
 
     @property
     def chosen(self) -> tuple[str, ...]:

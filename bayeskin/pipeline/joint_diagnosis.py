@@ -86,7 +86,7 @@ def _work(run: Run) -> Mapping[str, Any]:
                     if not names or family.probability_of_set(names) > POSSIBLE]  # fmt: skip
         begun = fit_beginning(ask, [found.fits[names] for names in possible], split_s)
         run.reporter.log("runs where the posterior is, and draws of it")
-        emulated = _emulated(bench, ask, [found.fits[best], *found.others], seed)
+        emulated = _emulated(bench, ask, [found.fits[best], *found.others_of(best)], seed)
     base, chosen = found.fits[()].fit, emulated.fit
     before, after = (
         locate(fit, {**fit.theta, **_noise_of(fit, chosen.theta)}, seed) for fit in (base, chosen)
