@@ -35,7 +35,7 @@ def families(draw: st.DrawFn) -> Family:
 
 
 def judged(family: Family) -> Judgement:
-    return judge_family(family, KNOWN)
+    return judge_family(family, KNOWN, 1.0)
 
 
 @given(families())
@@ -127,8 +127,8 @@ def test_a_mechanism_is_not_named_for_a_likelier_look_alike() -> None:
     """Where the likelier of two is not said to look like the other."""
     pair = ("sensor-drift", "stiffness-drift")
     known = {**KNOWN, "sensor-drift": replace(KNOWN["sensor-drift"], group=pair)}
-    assert judge_family(of(sensor_drift=20.0, stiffness_drift=20.5), known).named == ()
-    (one,) = judge_family(of(sensor_drift=20.5, stiffness_drift=20.0), known).named
+    assert judge_family(of(sensor_drift=20.0, stiffness_drift=20.5), known, 1.0).named == ()
+    (one,) = judge_family(of(sensor_drift=20.5, stiffness_drift=20.0), known, 1.0).named
     assert (one.name, one.group) == ("sensor-drift", pair)
 
 
@@ -138,4 +138,17 @@ def test_a_device_whose_model_knows_few_mechanisms_has_a_verdict() -> None:
     pair = ("device-friction", "friction-creep")
     said = {(): Evidences(0.0, 0.0), pair: Evidences(30.0, 0.0)}
     family = Family([one for names, its in said.items() for one in hypotheses_of(names, its)])
-    assert [one.name for one in judge_family(family, few).named] == list(pair)
+    assert [one.name for one in judge_family(family, few, 1.0).named] == list(pair)
+
+
+def test_nothing_is_named_beside_something_smooth_that_is_most_of_the_misfit() -> None:
+    """A friction that a Gaussian process beside it cannot do without, and 782 nats that it explains itself."""
+    said = {(): Evidences(0.0, 782.0), ("device-friction",): Evidences(30.0, 830.0)}
+    family = Family([one for names, its in said.items() for one in hypotheses_of(names, its)])
+    assert family.probability(["device-friction"]) > 0.99
+    little = judge_family(family, KNOWN, 0.2)
+    assert (little.verdict, little.named) == ("unknown", ())
+    (one,) = judge_family(family, KNOWN, 0.8).named
+    assert one.name == "device-friction"
+    alone = Family(hypotheses_of(("device-friction",), Evidences(30.0, 20.0)))
+    assert judge_family(alone, KNOWN, 0.2).verdict == "named"  # nothing smooth: a small effect is one

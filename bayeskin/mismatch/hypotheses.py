@@ -7,7 +7,9 @@ The evidence of both kinds is that of the force linear about the set's fit, with
 never fitted count as nothing.
 
 A mechanism is named where it has nine chances in ten, or its look-alikes have them together and it is the
-likeliest of these. Where none is named the mismatch is unknown if something smooth is likelier than not;
+likeliest of these. But where something smooth is likelier than not, and the likeliest set explains less than
+half of the squared misfit, nothing is named: a Gaussian process is a poor model of what is missing, so that
+mechanisms which fill its gaps gain beside it, too. Where none is named the mismatch is unknown if something smooth is likelier than not;
 elsewhere nothing is missing.
 """
 
@@ -24,6 +26,7 @@ from bayeskin.mismatch.search import PRIOR
 
 PROBABLE = 0.9  # of a mechanism or its look-alikes, to be named
 LIKELIER_THAN_NOT = 0.5
+MOST_OF_IT = 0.5  # of the squared misfit, which names beside something smooth have to explain
 
 
 @dataclass(frozen=True)
@@ -107,8 +110,11 @@ class Family:
         return float(share[np.array(among)].sum() / share.sum())
 
 
-def judge_family(family: Family, known: Mapping[str, Mechanism]) -> Judgement:
-    """Returns the verdict."""
+def judge_family(family: Family, known: Mapping[str, Mechanism], explained: float) -> Judgement:
+    """Returns the verdict.
+
+    explained : share of the base model's squared misfit that the likeliest set explains
+    """
     alone = {name: family.probability([name]) for name in known}
     named: list[NamedMechanism] = []
     for name, probability in sorted(alone.items(), key=lambda item: -item[1]):
@@ -118,6 +124,8 @@ def judge_family(family: Family, known: Mapping[str, Mechanism]) -> Judgement:
         likeliest = probability >= max(alone[other] for other in group)
         if probability >= PROBABLE or (likeliest and together >= PROBABLE):
             named.append(NamedMechanism(name, probability, known[name].group, together))
+    if family.smooth > LIKELIER_THAN_NOT and explained < MOST_OF_IT:
+        named = []
     if named:
         verdict: Literal["nothing-missing", "named", "unknown"] = "named"
     else:

@@ -80,7 +80,8 @@ def _work(run: Run) -> Mapping[str, Any]:
     with asked(bench, searches_file(run.folder, bench), run.config.design.workers) as ask:
         found = searched(run, bench, ask)
         evidences, family, best = found.evidences, found.family, found.chosen
-        judged = judge_family(family, bench.known)
+        explained = _explained(bench.binned, found.fits[()].fit, found.fits[best].fit)
+        judged = judge_family(family, bench.known, explained)
         split_s = end_of_second_hold(bench.binned)
         possible = [names for names in evidences
                     if not names or family.probability_of_set(names) > POSSIBLE]  # fmt: skip
@@ -111,6 +112,7 @@ def _work(run: Run) -> Mapping[str, Any]:
         "verdict": judged.verdict,
         "nothing_probability": judged.nothing_probability,
         "smooth_probability": judged.smooth_probability,
+        "explained": explained,
         "located": [window(one) for one in before.windows],
         "remaining": [window(one) for one in after.windows],
         "mechanisms": _mechanisms(judged, chosen, drawn[best].summary, bench.known, parts),
@@ -141,6 +143,13 @@ def _work(run: Run) -> Mapping[str, Any]:
         answer["candidates"],
     )  # fmt: skip
     return {**answer, "figures": [figure.name for figure in figures]}
+
+
+def _explained(binned: BinnedForce, base: Fit, best: Fit) -> float:
+    """The share of the base fit's squared misfit that another fit does not have."""
+    usable = bins_in_windows(binned, None) >= 0
+    before, after = (_rms((binned.force_n - one.force_n)[usable]) for one in (base, best))
+    return 1.0 - after**2 / before**2
 
 
 def _tell(run: Run, text: str) -> None:
