@@ -142,7 +142,7 @@ def test_a_device_whose_model_knows_few_mechanisms_has_a_verdict() -> None:
 
 
 def test_nothing_is_named_beside_something_smooth_that_is_most_of_the_misfit() -> None:
-    """A friction that a Gaussian process beside it cannot do without, and 782 nats that it explains itself."""
+    """A friction that a Gaussian process gains by, which explains 782 nats by itself."""
     said = {(): Evidences(0.0, 782.0), ("device-friction",): Evidences(30.0, 830.0)}
     family = Family([one for names, its in said.items() for one in hypotheses_of(names, its)])
     assert family.probability(["device-friction"]) > 0.99
