@@ -1,0 +1,139 @@
+"""The skin of a diagnosis: its force by a forward model, with mechanisms of the tissue."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from bayeskin.mechanisms import Mechanism
+from bayeskin.mismatch.corrected import FullRun, slopes
+from bayeskin.mismatch.full_fit import change
+from bayeskin.model.simulate import ModelSpec
+from bayeskin.pipeline.folder import sha256_of
+from bayeskin.pipeline.reported import beside_neutral
+from bayeskin.reduced.files import load_reduced
+from bayeskin.reduced.model import ReducedModel
+from bayeskin.reduced.simulate import simulate_reduced
+from bayeskin.surrogates import load_surrogate
+from bayeskin.types import Array, PadMotion, ParameterSpace, Simulation, Surrogate
+
+FOLDING = 0.15  # of the stiffness at rest: nearer to folding the reduced model is of no use; runs of the full
+# model check what comes out
+
+
+class Skin(Protocol):
+    """A forward model; `solves` names mechanisms of the tissue that it solves, `hash` says which it is."""
+
+    @property
+    def solves(self) -> frozenset[str]: ...
+
+    @property
+    def hash(self) -> str: ...
+
+    @property
+    def spec(self) -> ModelSpec:
+        """The full model in whose place it is."""
+        ...
+
+    def run(
+        self, space: ParameterSpace, at: Array, mechanisms: Sequence[Mechanism], derive: bool
+    ) -> FullRun | str:
+        """Returns a run at parameters (d,) of a space, with derivatives or not; or why it failed."""
+        ...
+
+    def errors(self, at: Array) -> Array:
+        """Returns errors (r, m) [N] that the model says it has at parameters (d,), of one sd each."""
+        ...
+
+
+@dataclass(frozen=True)
+class ReducedSkin:
+    """The reduced model of a device, on a protocol."""
+
+    model: ReducedModel
+    motion: PadMotion
+    edges_s: Array
+
+    @property
+    def solves(self) -> frozenset[str]:
+        return frozenset(self.model.trained.mechanisms)
+
+    @property
+    def hash(self) -> str:
+        return self.model.hash
+
+    @property
+    def spec(self) -> ModelSpec:
+        """That which it was made from."""
+        return ModelSpec(refinement=self.model.refinement, geometry=self.model.trained.geometry)
+
+    def run(
+        self, space: ParameterSpace, at: Array, mechanisms: Sequence[Mechanism], derive: bool
+    ) -> FullRun | str:
+        """Derivatives at a value that is neutral are taken beside it, and the force is brought back."""
+        by = dict(zip(space.names, map(float, change(space, at)), strict=True))
+        values = dict(zip(space.names, map(float, at), strict=True))
+        if derive:
+            values |= beside_neutral(values, by, mechanisms)
+        made = self.simulated(self.motion, values, mechanisms, by if derive else None)
+        if made.status != "ok":
+            return made.message
+        force_n = made.bin_means(self.edges_s)
+        if not derive:
+            return FullRun(at, force_n, None)
+        slopes_n = made.gradient_bin_means(self.edges_s)
+        aside = np.array([(values[name] - here) / by[name] for name, here in zip(by, at, strict=True)])
+        return FullRun(at, force_n - slopes_n @ aside, slopes_n)
+
+    def simulated(
+        self, motion: PadMotion, values: Mapping[str, float], mechanisms: Sequence[Mechanism],
+        by: Mapping[str, float] | None = None,
+    ) -> Simulation:  # fmt: skip
+        """Returns a run on any protocol."""
+        return simulate_reduced(self.model, motion, values, mechanisms, by, least_stiffness=FOLDING)
+
+    def errors(self, at: Array) -> Array:
+        """It says nothing of its error: runs of the full model show it."""
+        return np.zeros((0, len(self.edges_s) - 1))
+
+
+@dataclass(frozen=True)
+class SurrogateSkin:
+    """A surrogate of a model that no reduced model stands for; it solves no mechanism of the tissue."""
+
+    surrogate: Surrogate
+    spec: ModelSpec
+
+    @property
+    def hash(self) -> str:
+        """Of the surrogate's training and of the model."""
+        return sha256_of([dict(self.surrogate.provenance), self.spec.hash])
+
+    @property
+    def solves(self) -> frozenset[str]:
+        return frozenset()
+
+    def run(
+        self, space: ParameterSpace, at: Array, mechanisms: Sequence[Mechanism], derive: bool
+    ) -> FullRun | str:
+        """The space is the surrogate's own."""
+        force_n = self.surrogate.predict_mean(at)[0]
+        return FullRun(at, force_n, slopes(self.surrogate, at) if derive else None)
+
+    def errors(self, at: Array) -> Array:
+        """Columns of its factor."""
+        return np.asarray(self.surrogate.predict(at).factor[0].T)
+
+
+def skin_of(file: Path, spec: ModelSpec, motion: PadMotion, edges_s: Array) -> Skin:
+    """Returns the skin by the model in a file: the reduced model of the reaction, else a surrogate of `spec`.
+
+    A reduced model stands for the full model that it was made from.
+    """
+    if spec.observation == "reaction":
+        return ReducedSkin(load_reduced(file), motion, edges_s)
+    return SurrogateSkin(load_surrogate(file), spec)
