@@ -146,9 +146,9 @@ def test_nothing_is_named_beside_something_smooth_that_is_most_of_the_misfit() -
     said = {(): Evidences(0.0, 782.0), ("device-friction",): Evidences(30.0, 830.0)}
     family = Family([one for names, its in said.items() for one in hypotheses_of(names, its)])
     assert family.probability(["device-friction"]) > 0.99
-    little = judge_family(family, KNOWN, 0.2)
+    little = judge_family(family, KNOWN, 0.8)
     assert (little.verdict, little.named) == ("unknown", ())
-    (one,) = judge_family(family, KNOWN, 0.8).named
+    (one,) = judge_family(family, KNOWN, 0.95).named
     assert one.name == "device-friction"
     alone = Family(hypotheses_of(("device-friction",), Evidences(30.0, 20.0)))
     assert judge_family(alone, KNOWN, 0.2).verdict == "named"  # nothing smooth: a small effect is one

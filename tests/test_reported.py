@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bayeskin.geometry import Geometry
 from bayeskin.model import ModelSpec, simulate
 from bayeskin.pipeline import reported
 from bayeskin.pipeline.reported import FullForce
@@ -31,6 +32,17 @@ def test_a_full_force_is_the_runs_bin_means_and_what_the_instrument_adds(full: F
     behind = full((("backlash", "force-offset"), {**THETA, "F0": 0.0, "gap": 2e-4, "frame_compliance": 0.0}))
     assert isinstance(behind, np.ndarray)
     assert behind[-1] < 0.99 * plain[-1]
+
+
+def test_a_length_of_the_tissue_is_one_of_the_runs_parameters(full: FullForce) -> None:
+    quick = replace(full, spec=ModelSpec(refinement=0))
+    thick = quick(((), {**THETA, "cutis_m": 2.4e-3}))
+    meshed = replace(quick, spec=ModelSpec(refinement=0, geometry=Geometry(cutis_m=2.4e-3)))(((), THETA))
+    assert isinstance(thick, np.ndarray)
+    np.testing.assert_allclose(thick, meshed, atol=5e-3 * np.abs(thick).max())
+    plain = quick(((), THETA))
+    assert isinstance(plain, np.ndarray)
+    assert thick[-1] > 1.05 * plain[-1]
 
 
 def test_slopes_are_those_of_the_skin_and_of_the_instrument(full: FullForce) -> None:

@@ -14,7 +14,7 @@ from toy_inference import ToySurrogate, empty_recording
 from toys.small_reduced import hollow
 
 from bayeskin import storage
-from bayeskin.config import config_of
+from bayeskin.config import config_of, parameter_space
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.inference import LogPosterior
@@ -154,6 +154,20 @@ def test_a_recording_of_a_stated_device_takes_that_device_s_reduced_model(tmp_pa
     assert run.config.geometry(run.config_path).geometry == thin
     own = hollow(tmp_path / "device-reduced.h5", thin)
     assert reduced_files(run) == [own]
+
+
+def test_an_uncertain_length_asks_for_the_reduced_model(tmp_path: Path) -> None:
+    recording(tmp_path)
+    tissue = "[tissue]\ncutis_mm = { mean = 2.0, sd = 0.2 }\n"
+    (tmp_path / "device.toml").write_text(tissue)
+    run = opened(tmp_path / "a test.h5", Silent(), tmp_path / "device.toml")
+    assert "cutis_m" in parameter_space(run.config).names
+    case = tmp_path / "case.toml"
+    case.write_text(f'[recording]\nfile = "a test.h5"\n{tissue}')
+    with pytest.raises(InputError, match=r"tissue\.cutis_mm: found a mean and an sd; expected a number"):
+        opened(case, Silent())
+    case.write_text(case.read_text() + '[design]\ncoarse = "reduced"\n')
+    assert opened(case, Silent()).config.geometry(case).sd_m == {"cutis_m": 0.2e-3}
 
 
 def test_a_device_stands_beside_no_configuration(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ never fitted count as nothing.
 
 A mechanism is named where it has nine chances in ten, or its look-alikes have them together and it is the
 likeliest of these. But where something smooth is likelier than not, and the likeliest set explains less than
-half of the squared misfit, nothing is named: a Gaussian process is a poor model of what is missing, so that
+nine tenths of the squared misfit, nothing is named: a Gaussian process is a poor model of what is missing, so that
 mechanisms which fill its gaps gain beside it, too. Where none is named the mismatch is unknown if something
 smooth is likelier than not; elsewhere nothing is missing.
 """
@@ -26,7 +26,7 @@ from bayeskin.mismatch.search import PRIOR
 
 PROBABLE = 0.9  # of a mechanism or its look-alikes, to be named
 LIKELIER_THAN_NOT = 0.5
-MOST_OF_IT = 0.5  # of the squared misfit, which names beside something smooth have to explain
+MOST_OF_IT = 0.9  # of the squared misfit, which names beside something smooth have to explain
 
 
 @dataclass(frozen=True)

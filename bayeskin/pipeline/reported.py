@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bayeskin.geometry import LENGTHS
 from bayeskin.mechanisms import Mechanism, bin_means, catalogue, laws, observed, solved
 from bayeskin.mechanisms.mechanism import ForceOfTime
 from bayeskin.model.problem import PARAMETERS
@@ -63,7 +64,7 @@ class FullForce:
         names, values = case
         mechanisms = [catalogue()[name] for name in names]
         along = {p.name for mechanism in solved(mechanisms) for p in mechanism.parameters}
-        theta = {name: value for name, value in values.items() if name in along or name in PARAMETERS}
+        theta = {name: value for name, value in values.items() if name in {*along, *PARAMETERS, *LENGTHS}}
         by = {name: change for name, change in changes.items() if name in theta}
         theta |= beside_neutral(theta, by, mechanisms)
         simulation = simulate(

@@ -109,8 +109,8 @@ def opened(source: Path, reporter: Reporter, device: Path | None = None) -> Run:
     """A configuration's run, or that of a recording by itself beside it, made with the device of a file.
 
     A recording by itself takes a shipped surrogate where one knows its protocol, else the reduced model of
-    its device. Raises InputError for bad input, and for a device beside a configuration, which states its
-    own.
+    its device. Raises InputError for bad input, for a device beside a configuration, which states its own,
+    and for an uncertain length in one whose design the reduced model does not make.
     """
     if source.suffix == ".toml":
         if device is not None:
@@ -118,7 +118,8 @@ def opened(source: Path, reporter: Reporter, device: Path | None = None) -> Run:
                 "--device", f"{device} beside a configuration", "the device in [device] and [tissue]"
             )
         run = open_run(source, reporter)
-        run.config.refuse_uncertain(source, "diagnose")
+        if run.config.design.coarse != "reduced":
+            run.config.refuse_uncertain(source, "diagnose")
         return run
     found = read_recording(source)
     sections: dict[str, Any] = {}
@@ -135,7 +136,6 @@ def opened(source: Path, reporter: Reporter, device: Path | None = None) -> Run:
         name=re.sub(r"[^A-Za-z0-9._-]", "-", f"run-{source.stem}"),
         recording=RecordingConfig(file=source.name), **sections,
     )  # fmt: skip
-    config.refuse_uncertain(device, "diagnose")
     return Run(config, source, source.resolve().with_name(f"{source.stem}-diagnosis"), reporter)
 
 
