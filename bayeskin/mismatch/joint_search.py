@@ -30,6 +30,7 @@ from bayeskin.errors import InputError
 from bayeskin.inference.gauss_newton import promise
 from bayeskin.mechanisms import Mechanism, with_one, without_one
 from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.mismatch.fit import soft_on_stiff
 from bayeskin.mismatch.hypotheses import Evidences, Family, hypotheses_of
 from bayeskin.mismatch.joint_fit import JointFit, as_json
 from bayeskin.mismatch.search import PRIOR, weight
@@ -190,10 +191,10 @@ class _Searcher:
     def base(self) -> None:
         """Fits the model without mechanisms. Raises InputError where no skin runs."""
         settings = self._settings
-        unit = qmc.Sobol(self._base.dim, rng=self._seed).random(settings.skins)
-        drawn = [dict(zip(self._base.names, map(float, row), strict=True))
-                 for row in self._base.from_unit(unit)]  # fmt: skip
-        self._skins = self._nearest((), [skin for skin in drawn if skin["E_s"] <= 2.0 * skin["E_c"]], {})
+        rows = self._base.from_unit(qmc.Sobol(self._base.dim, rng=self._seed).random(settings.skins))
+        rows = rows[~soft_on_stiff(self._base, rows)]
+        drawn = [dict(zip(self._base.names, map(float, row), strict=True)) for row in rows]
+        self._skins = self._nearest((), drawn, {})
         starts = [Climb((), {**self._noise, **skin}, settings.first)
                   for skin in self._skins[: settings.starts]]  # fmt: skip
         answers = self._ask(starts)
@@ -323,11 +324,11 @@ class _Searcher:
         theta = best.fit.theta
         limits = {p.name: (p.lower, p.upper) for p in self._base.parameters}
         flow = [p.name for p in self._base.parameters if p.stress_power < 0]
-        middle = float(np.exp(np.mean([np.log(theta[name]) for name in flow])))
-        others = [
-            dict.fromkeys(flow, middle),
-            {name: theta[other] for name, other in zip(flow, flow[::-1], strict=True)},
-        ]
+        others: list[dict[str, float]] = []
+        if flow:
+            middle = float(np.exp(np.mean([np.log(theta[name]) for name in flow])))
+            exchanged = {name: theta[other] for name, other in zip(flow, flow[::-1], strict=True)}
+            others = [dict.fromkeys(flow, middle), exchanged]
         others = [{name: float(np.clip(value, *limits[name])) for name, value in one.items()}
                   for one in others]  # fmt: skip
         for name in self._solved(best.fit.names):
