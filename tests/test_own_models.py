@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import signal
 import socket
@@ -29,6 +30,7 @@ from bayeskin.mechanisms import bin_means, catalogue, observed
 from bayeskin.model import ModelSpec
 from bayeskin.model.own import identity, simulate_own, simulate_server, simulate_with
 from bayeskin.pipeline import stages
+from bayeskin.pipeline.diagnosis import diagnose
 from bayeskin.pipeline.doctor import FULL_MODEL_N, THETA
 from bayeskin.pipeline.engine import Silent
 from bayeskin.pipeline.serve import Asked, ServedModel, open_server
@@ -125,6 +127,22 @@ def test_a_function_in_a_file_is_fitted_with_parameters_of_its_own(case: Path, u
     for name, value in TRUE.items():
         assert answer["theta"][name] == pytest.approx(value, rel=0.05), name
     assert answer["rmse_of_full_model"]["fitted_n"] < NOISE_N
+
+
+@pytest.mark.slow
+def test_a_diagnosis_solves_what_acts_on_the_force_beside_a_model_of_one_s_own(case: Path) -> None:
+    file = case.parent / "measured.h5"
+    measured = storage.load(file, Recording)
+    storage.save(file, dataclasses.replace(measured, force_n=measured.force_n - 0.03))
+    said = diagnose(case, Silent())
+    (one,) = said["mechanisms"]
+    assert one["name"] == "force-offset"
+    offset = one["parameters"]["F0"]
+    assert abs(offset["mean"] + 0.03) < 4.0 * offset["sd"] < 0.01
+    assert said["full_model"]["rmse"] < NOISE_N
+    for name, value in TRUE.items():
+        low, high = said["fit"]["after"]["theta"][name]["interval90"]
+        assert 0.9 * low < value < 1.1 * high, name
 
 
 def test_a_change_of_what_the_file_does_makes_the_runs_again_and_nothing_else(

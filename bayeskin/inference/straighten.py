@@ -154,6 +154,8 @@ def shear_at(log_posterior: LogPosterior, x: Array, power: float) -> Shear | Non
     None where fewer than two moduli raise it.
     """
     moduli = log_posterior.surrogate.space.scaled(1)
+    if len(moduli) < 2:
+        return None
     step = _STEP * np.eye(len(x))[moduli]
     ahead, back = (_amplitude(log_posterior, x + way * step) for way in (1.0, -1.0))
     share = np.zeros(len(x))

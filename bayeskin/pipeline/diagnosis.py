@@ -56,20 +56,21 @@ def diagnose(source: Path, reporter: Reporter, device: Path | None = None) -> di
     run = opened(source, reporter, device)
     outcome = run_stages(run, stages_of(run.config))[-1]
     answer = {**outcome.record.summary, "ok": outcome.ok, "folder": run.folder / STAGE.name}
-    said = joint_diagnosis.in_words if by_reduced_model(run.config) else in_words
+    said = in_words if by_effects(run.config) else joint_diagnosis.in_words
     text = said(answer) if outcome.record.done else f"{outcome.stage}: failed: {answer['message']}"
     return plain({**answer, "text": text})
 
 
-def by_reduced_model(config: Config) -> bool:
-    """Returns whether the reduced model solves the mechanisms of a set together."""
-    return config.design.coarse == "reduced"
+def by_effects(config: Config) -> bool:
+    """Returns whether surrogates of effects are added up, in the place of mechanisms solved together."""
+    return config.model.observation == "reaction" and config.design.coarse != "reduced"
 
 
 def stages_of(config: Config) -> dict[str, Stage]:
     """The stages of a diagnosis, in their order."""
-    own = (joint_diagnosis.STAGE,) if by_reduced_model(config) else (design.STAGE, training.STAGE, STAGE)
-    return {stage.name: stage for stage in (recording.STAGE, *own)}
+    own = {"diagnose": STAGE} if by_effects(config) else {"diagnose": joint_diagnosis.stage_of(config)}
+    before = {stage.name: stage for stage in (recording.STAGE, design.STAGE, training.STAGE)}
+    return {name: before[name] for name in own["diagnose"].needs} | own
 
 
 def _work(run: Run) -> Mapping[str, Any]:

@@ -94,9 +94,9 @@ def _diagnosis(run: Run) -> str:
 
 def _fits(run: Run, bench: JointBench, ask: Ask) -> list[Fit]:
     """All fits that a diagnosis made."""
-    if diagnosis.by_reduced_model(run.config):
-        return [one.fit for one in searched(run, bench, ask).fits.values()]
-    return list(diagnosis.fits_of(workbench(run)))
+    if diagnosis.by_effects(run.config):
+        return list(diagnosis.fits_of(workbench(run)))
+    return [one.fit for one in searched(run, bench, ask).fits.values()]
 
 
 def _searched(fits: Sequence[Fit], bench: JointBench, ask: Ask, reporter: Reporter) -> list[Experiment]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bayeskin import inference
-from bayeskin.config import parameter_space
+from bayeskin.config import Config, parameter_space
 from bayeskin.errors import InputError
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.mechanisms import Mechanism
@@ -310,3 +310,10 @@ STAGE = Stage(
     _work,
     reduced_files,
 )
+
+
+def stage_of(config: Config) -> Stage:
+    """Returns the stage; a model that no reduced one stands for needs a surrogate before it."""
+    if config.model.observation == "reaction":
+        return STAGE
+    return replace(STAGE, needs=("recording", "design", "train"))

@@ -64,7 +64,10 @@ class FullForce:
         names, values = case
         mechanisms = [catalogue()[name] for name in names]
         along = {p.name for mechanism in solved(mechanisms) for p in mechanism.parameters}
-        theta = {name: value for name, value in values.items() if name in {*along, *PARAMETERS, *LENGTHS}}
+        own = self.spec.forward is not None  # its parameters have names of its own
+        theta = {
+            name: value for name, value in values.items() if own or name in {*along, *PARAMETERS, *LENGTHS}
+        }
         by = {name: change for name, change in changes.items() if name in theta}
         theta |= beside_neutral(theta, by, mechanisms)
         simulation = simulate(
