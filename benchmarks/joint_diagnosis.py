@@ -4,11 +4,15 @@
 
 The verdicts that stand beside these recordings come from effects learnt one by one. Here a configuration of
 each recording, with `coarse = "reduced"`, has the reduced model solve all mechanisms of a set together. What
-it says is kept in `benchmarks/results/joint`, so that a second start goes on; `--part 1/2` takes every second
-recording, for two processes side by side. Prints a row for each recording: what was concealed and how large
-it is (in noise floors), what is named, the probability that nothing is missing, how many of the skin's and
-the effect's parameters lie in their 90 % intervals, RMS residuals before and after, by how much the reduced
-model is off at the end, and seconds. Then both scoreboards of the same recordings.
+it says of verdict and values is kept in `benchmarks/results/joint_diagnosis.jsonl`, with the commit that said
+it, so that a second start goes on; `--part 1/2` takes every second recording, for two processes side by side.
+Effects that were outside of the catalogue when a set was made, and are in it now, count as what they are for
+the reduced model, and as outside for the stored verdicts.
+
+Prints a row for each recording: what was concealed and how large it is (in noise floors), what is named, the
+probability that nothing is missing, how many of the skin's and the effect's parameters lie in their 90 %
+intervals, RMS residuals before and after, by how much the reduced model is off at the end, and seconds. Then
+both scoreboards of the same recordings.
 """
 
 from __future__ import annotations
@@ -16,6 +20,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,7 +32,12 @@ from bayeskin.pipeline.diagnosis import diagnose
 from bayeskin.proof.score import score
 
 DATA = Path(__file__).parent.parent / "data"
-KEPT = Path(__file__).parent / "results" / "joint"
+KEPT = Path(__file__).parent / "results" / "joint_diagnosis.jsonl"
+NOW_KNOWN = {
+    "bent-cell": "cell-nonlinearity", "breathing": "periodic-motion", "slow-amplifier": "amplifier-lag",
+    "poisson-cutis": "skeleton-compressibility", "poisson-subcutis-high": "skeleton-compressibility",
+    "poisson-subcutis-low": "skeleton-compressibility",
+}  # fmt: skip
 CONFIG = """name = "{name}"
 [recording]
 file = "{name}.h5"
@@ -55,24 +65,58 @@ SHARES = {
 def answered(case: str, folder: Path, workers: int) -> dict[str, Any]:
     """What is said of one recording, such as "development/009"; from where it is kept, if it is."""
     which, number = case.split("/")
-    kept, name = KEPT / which / f"{number}.json", f"{which}-{number}"
-    if kept.exists():
-        return dict(json.loads(kept.read_text()))
+    name = f"{which}-{number}"
+    if case in (known := kept()):
+        return known[case]
     config = folder / f"{name}.toml"
     if not config.exists():
         shutil.copy(DATA / which / "recordings" / f"{number}.h5", folder / f"{name}.h5")
         config.write_text(CONFIG.format(name=name, workers=workers))
-    said = diagnose(config, rows.Log())
-    said = {key: value for key, value in said.items() if key not in ("text", "folder", "figures")}
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    kept.write_text(json.dumps(said) + "\n")
+    said = essential(diagnose(config, rows.Log()))
+    with open(KEPT, "a", encoding="utf-8") as handle:  # one line at a time, from two processes
+        handle.write(json.dumps({"case": case, "commit": commit(), **said}) + "\n")
     return said
 
 
-def key_of(case: str) -> dict[str, Any]:
-    """What is concealed in a recording."""
+def kept() -> dict[str, dict[str, Any]]:
+    """What was said of recordings, the last of each."""
+    if not KEPT.exists():
+        return {}
+    lines = [json.loads(line) for line in KEPT.read_text(encoding="utf-8").splitlines()]
+    return {one["case"]: one for one in lines}
+
+
+def commit() -> str:
+    """The state that diagnoses."""
+    command = ["git", "-C", str(DATA), "rev-parse", "--short", "HEAD"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+
+def essential(said: Mapping[str, Any]) -> dict[str, Any]:
+    """What scores and the table need of an answer."""
+    if "fit" not in said:
+        return {"message": said["message"]}
+    fits = {
+        when: {
+            "rmse": one["rmse"], "rmse_held_out": one["rmse_held_out"],
+            "theta": {name: {key: its[key] for key in ("mean", "interval90")}
+                      for name, its in one["theta"].items()},
+        }
+        for when, one in said["fit"].items()
+    }  # fmt: skip
+    same = ("verdict", "nothing_probability", "smooth_probability", "explained", "mechanisms", "sets",
+            "best_set", "full_model", "seconds")  # fmt: skip
+    located = [{"t0": one["t0"], "t1": one["t1"]} for one in said["located"]]
+    return {**{name: said[name] for name in same}, "located": located, "fit": fits}
+
+
+def key_of(case: str, known: bool = False) -> dict[str, Any]:
+    """What is concealed in a recording; of what is `known` now its mechanism."""
     which, number = case.split("/")
-    return dict(json.loads((DATA / which / "seals" / f"{number}.json").read_text()))
+    key = dict(json.loads((DATA / which / "seals" / f"{number}.json").read_text()))
+    if known and (name := NOW_KNOWN.get(key["label"])):
+        key |= {"kind": "alone", "label": name, "mechanisms": [name], "sizes": {name: key["size_n"]}}
+    return key
 
 
 def stored(case: str) -> dict[str, Any]:
@@ -106,9 +150,9 @@ def _inside(truth: Mapping[str, float], values: Mapping[str, Any]) -> str:
 
 def scoreboard(said: Mapping[str, Mapping[str, Any]]) -> str:
     """Both scoreboards of recordings, side by side; times are those by the reduced model."""
-    keys = {case: key_of(case) for case in said}
+    keys, now = {case: key_of(case) for case in said}, {case: key_of(case, known=True) for case in said}
     judged = {case: one if "verdict" in one else {"verdict": "failed"} for case, one in said.items()}
-    boards = score(keys, {case: stored(case) for case in said}), score(keys, judged)
+    boards = score(keys, {case: stored(case) for case in said}), score(now, judged)
     table = [[what, *(_share(board, path) for board in boards)] for what, path in SHARES.items()]
     seconds = [one["seconds"] for one in said.values() if "seconds" in one]
     if seconds:
@@ -152,7 +196,7 @@ def main() -> None:
     options.folder.mkdir(parents=True, exist_ok=True)
     cases = options.cases or cases_of(options.sets, options.part)
     if options.kept:
-        cases = [case for case in cases if (KEPT / f"{case}.json").exists()]
+        cases = [case for case in cases if case in kept()]
     said, table = dict[str, dict[str, Any]](), list[list[str]]()
     for case in cases:
         said[case] = answered(case, options.folder, options.workers)
