@@ -230,6 +230,12 @@ class _Searcher:
         why = self._weigh(dict.fromkeys([*sets, *before]))
         if not self.found.evidences:
             raise InputError("diagnosis", f"no set of mechanisms could be weighed: {why}", "a set that can")
+        for _ in range(self._settings.checks):
+            names = self.found.chosen
+            if names in self.found.checks:
+                return
+            self._check([self.found.fits[names]])
+            self._weigh([names])
 
     def _weigh(self, sets: Iterable[tuple[str, ...]]) -> str:
         """Weighs hypotheses of sets, those again whose fit is another now; returns why the last failed."""

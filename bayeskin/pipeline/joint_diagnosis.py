@@ -27,7 +27,8 @@ from bayeskin.mismatch.joint_search import JointSearch, noise_of, search_jointly
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import Made, Search
-from bayeskin.mismatch.tasks import Ask, FullProbe, Probe, Task
+from bayeskin.mismatch.tasks import Ask, FullProbe, Polish, Probe, Task
+from bayeskin.mismatch.wrapper import innermost
 from bayeskin.pipeline.diagnosis_outputs import Found, Shown, candidates, draw, unexplained, window
 from bayeskin.pipeline.engine import Run, Stage
 from bayeskin.pipeline.folder import write_json
@@ -43,6 +44,7 @@ from bayeskin.types import Array, BinnedForce, Design, Surrogate
 
 POSSIBLE = 1e-6  # probability of a set, below which it is not fitted to the beginning
 PREDICTIVE_DRAWS = 300
+POLISHING_RUNS = 5  # of the full model with derivatives, at most
 REACH = 0.5  # of the prior's width on either side of a run, within which its tangent is sampled
 KNOWN = "pads that open, by what and as fast as the reduced model was trained on"
 NAME = "diagnose"
@@ -87,7 +89,8 @@ def _work(run: Run) -> Mapping[str, Any]:
                     if not names or family.probability_of_set(names) > POSSIBLE]  # fmt: skip
         begun = fit_beginning(ask, [found.fits[names] for names in possible], split_s)
         run.reporter.log("runs where the posterior is, and draws of it")
-        emulated = _emulated(bench, ask, [found.fits[best], *found.others_of(best)], seed)
+        maxima = [*_polished(run, ask, found.fits[best]), *found.others_of(best)]
+        emulated = _emulated(bench, ask, maxima, seed)
     base, chosen = found.fits[()].fit, emulated.fit
     before, after = (
         locate(fit, {**fit.theta, **_noise_of(fit, chosen.theta)}, seed) for fit in (base, chosen)
@@ -192,6 +195,27 @@ def _emulated(bench: JointBench, ask: Ask, maxima: Sequence[JointFit], seed: int
     if isinstance(emulated, str):
         return Emulated(found.fit, _drawn(found.fit, seed), 0, None, False)
     return emulated
+
+
+def _polished(run: Run, ask: Ask, found: JointFit) -> list[JointFit]:
+    """A fit, after that which the full model climbs to from it where the forward model is off there.
+
+    The error of the forward model changes along a ridge, so that a constant one leads to a point beside the
+    full model's maximum.
+    """
+    if not found.off_n.any():
+        return [found]
+    (full,) = ask([Polish(found.fit.names, found.fit.theta, POLISHING_RUNS)])
+    if not isinstance(full, JointFit):
+        return [found]
+    names = innermost(full.fit.log_posterior.surrogate).space.names
+    at = dict(zip(names, map(float, full.run.theta), strict=True))
+    (force_n,) = ask([Probe(full.fit.names, at)])
+    if isinstance(force_n, str):
+        return [found]
+    gained = full.fit.value - found.fit.value
+    run.reporter.log(f"the full model climbs by itself: {gained:+.1f} nats in {full.runs} runs")
+    return [replace(full, off_n=full.run.force_n - np.asarray(force_n)), found]
 
 
 def _learnt(design: Design, seed: int) -> Surrogate:

@@ -6,6 +6,7 @@ Two springs, each with a share that relaxes as its fluid flows; moduli and perme
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -140,6 +141,31 @@ def recorded(seed: int, friction_n: float = 0.0, **values: float) -> BinnedForce
     return BinnedForce(EDGES_S, force_n, np.full(count, NOISE_N**2), np.zeros(count - 1), phase, PHASES)
 
 
+@dataclass(frozen=True)
+class Full:
+    """Stands for `FullForce`, by a function of values."""
+
+    force: Callable[[Mapping[str, float]], Array | str]
+
+    def __call__(self, case: tuple[Sequence[str], Mapping[str, float]]) -> Array | str:
+        return self.force(case[1])
+
+    def with_slopes(
+        self, case: tuple[Sequence[str], Mapping[str, float]], changes: Mapping[str, float]
+    ) -> tuple[Array, Array] | str:
+        here, columns = self.force(case[1]), []
+        if isinstance(here, str):
+            return here
+        for name, change in changes.items():
+            ahead, back = (
+                self.force({**case[1], name: case[1][name] + way * change}) for way in (1e-4, -1e-4)
+            )
+            assert not isinstance(ahead, str)
+            assert not isinstance(back, str)
+            columns.append((ahead - back) / 2e-4)
+        return here, np.array(columns).T
+
+
 def bench(
     patch: pytest.MonkeyPatch, binned: BinnedForce, base: ParameterSpace = BASE,
     full: Callable[[Mapping[str, float]], Array | str] = lambda values: means(values)[0],
@@ -152,7 +178,7 @@ def bench(
     patch.setattr(joint_bench, "calm_bins", lambda folder: (binned, NO_WORD, MOTION))
     patch.setattr(skins, "load_reduced", lambda file: model)
     patch.setattr(skins, "simulate_reduced", simulate)
-    patch.setattr(joint_bench, "FullForce", lambda spec, motion, edges_s: lambda case: full(case[1]))
+    patch.setattr(joint_bench, "FullForce", lambda spec, motion, edges_s: Full(full))
     return JointBench(Source(Path("recording"), Path("model"), ModelSpec(), 1, base))
 
 
