@@ -279,15 +279,20 @@ def test_priors_without_a_skin_that_can_be_are_refused(monkeypatch: pytest.Monke
 
 
 def test_further_maxima_are_sought_where_the_force_says_little(asked: Make) -> None:
-    """Fits set out from layers that drain alike and in exchange, and from other times of a drift."""
+    """Fits set out from layers that drain alike, in exchange, at once or not at all; from other drifts."""
     one = asked(stiffness_rate=9e-4)
     best = one.search().best
     assert best.fit.names == ("stiffness-drift",)
     climbs = [task for task in one.tasks if isinstance(task, Climb)]
     (first,) = (i for i, task in enumerate(climbs) if task.start["k_c"] == task.start["k_s"])
-    starts = [task.start for task in climbs[first : first + 2 + FEW.shapes]]
-    assert {task.names for task in climbs[first : first + 2 + FEW.shapes]} == {best.fit.names}
-    equal, exchanged, *shapes = starts
+    tasks = climbs[first : first + 6 + FEW.shapes]
+    assert {task.names for task in tasks} == {best.fit.names}
+    equal, exchanged, *rest = (task.start for task in tasks)
+    ends, shapes = rest[:4], rest[4:]
+    drains = [(start["k_c"], start["k_s"]) for start in ends]
+    k_c, k_s = exchanged["k_s"], exchanged["k_c"]
+    few, many = 10**-15.5, 10**-11.5  # a tenth of the prior from its ends
+    np.testing.assert_allclose(drains, [(few, k_s), (k_c, few), (many, k_s), (k_c, many)], rtol=1e-6)
     assert equal["k_c"] ** 2 == pytest.approx(exchanged["k_c"] * exchanged["k_s"])
     for start in shapes:
         assert (start["k_s"], start["k_c"]) == (exchanged["k_c"], exchanged["k_s"])

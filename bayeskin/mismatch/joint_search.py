@@ -60,6 +60,7 @@ class SearchSettings:
     weighed : sets, the likeliest and that without mechanisms, whose hypotheses are compared
     exact : error of the forward model, RMS over bins, over that of the noise, that needs no correction
     shapes : of each part of a mechanism that the model solves, from which further maxima are sought
+    ends : of the prior's width, where a permeability sets out for these
     maxima : further ones that are kept
     alike_by : of the prior's width: fits whose runs differ by less share a check, and have one maximum
     """
@@ -88,7 +89,8 @@ class SearchSettings:
     weighed: int = 6
     exact: float = 0.05
     shapes: int = 2
-    maxima: int = 2
+    ends: tuple[float, float] = (0.1, 0.9)
+    maxima: int = 3
     alike_by: float = 0.1
 
 
@@ -324,17 +326,21 @@ class _Searcher:
     def _elsewhere(self, best: JointFit) -> list[dict[str, float]]:
         """Returns values from which further maxima may be reached.
 
-        Permeabilities are equal or exchanged, since a force hardly tells which layer drains; or a mechanism
-        that the model solves has another shape.
+        A force hardly tells which layer drains while it is watched, and of the other one whether that drains
+        at once or not at all. So permeabilities are equal or exchanged, or one of them is near an end of its
+        prior. Or a mechanism that the model solves has another shape.
         """
         theta = best.fit.theta
         limits = {p.name: (p.lower, p.upper) for p in self._base.parameters}
-        flow = [p.name for p in self._base.parameters if p.stress_power < 0]
+        flow = ParameterSpace(tuple(p for p in self._base.parameters if p.stress_power < 0))
         others: list[dict[str, float]] = []
-        if flow:
-            middle = float(np.exp(np.mean([np.log(theta[name]) for name in flow])))
-            exchanged = {name: theta[other] for name, other in zip(flow, flow[::-1], strict=True)}
-            others = [dict.fromkeys(flow, middle), exchanged]
+        if flow.dim:
+            middle = float(np.exp(np.mean([np.log(theta[name]) for name in flow.names])))
+            exchanged = {name: theta[other] for name, other in zip(flow.names, flow.names[::-1], strict=True)}
+            others = [dict.fromkeys(flow.names, middle), exchanged]
+            for share in self._settings.ends:
+                at_end = flow.from_unit(np.full(flow.dim, share))
+                others += [{name: float(value)} for name, value in zip(flow.names, at_end, strict=True)]
         others = [{name: float(np.clip(value, *limits[name])) for name, value in one.items()}
                   for one in others]  # fmt: skip
         for name in self._solved(best.fit.names):
