@@ -117,7 +117,7 @@ class JointSearch:
     """All sets fitted, by their names sorted: of each the likeliest fit, and the last check of one.
 
     evidences : of the sets whose hypotheses are compared
-    others : further maxima of that which was the likeliest of these, less likely than its fit in `fits`
+    others : further maxima of the likeliest of these, and of a part of it, less likely than those in `fits`
     """
 
     fits: dict[tuple[str, ...], JointFit] = field(default_factory=dict)
@@ -143,7 +143,7 @@ class JointSearch:
         return Family([one for names, said in self.evidences.items() for one in hypotheses_of(names, said)])
 
     def others_of(self, names: tuple[str, ...]) -> list[JointFit]:
-        """Returns further maxima of a set; none of one that became the likeliest by what they showed."""
+        """Returns further maxima of a set."""
         return [one for one in self.others if one.fit.names == names]
 
     @property
@@ -272,12 +272,24 @@ class _Searcher:
     def other_maxima(self) -> None:
         """Climbs to further maxima of the likeliest set, from values that the force says little of.
 
-        The forces of two maxima differ by so little that each needs a full run of its own.
+        Before it that is done for the likeliest of its parts, if this is not far behind: a mechanism may have
+        gained on a maximum that is not the highest.
         """
-        names = self.found.chosen
+        family, names = self.found.family, self.found.chosen
+        gap = {one: family.likeliest(names) - family.likeliest(one) for one in self.found.evidences}
+        parts = [one for one in gap if set(one) < set(names) and gap[one] < self._settings.behind]
+        if parts:
+            self._further_maxima(min(parts, key=lambda one: gap[one]))
+        self._further_maxima(self.found.chosen)
+
+    def _further_maxima(self, names: tuple[str, ...]) -> None:
+        """Keeps further maxima of a set; their forces differ by so little that each needs a full run."""
+        if self.found.others_of(names):
+            return
         best = self.found.fits[names]
         there = self._climbed_elsewhere(best)
         full = self._ask([FullProbe(self._solved(names), self._solved_values(one)) for one in there])
+        said = ", ".join(names) or "no mechanism"
         maxima, checks = [best], list[Check]()
         for one, full_n in zip(there, full, strict=True):
             if isinstance(full_n, str):
@@ -288,11 +300,11 @@ class _Searcher:
                 again = Climb(names, one.fit.theta, self._settings.runs, tuple(off_n.tolist()))
                 (corrected,) = self._ask([again])  # type: ignore[assignment]
             for maximum in self._distinct([corrected], maxima, self._settings.close):
-                self._tell(f"another maximum of the likeliest set: {self._gained(maximum, best):+.1f} nats")
+                self._tell(f"another maximum of {said}: {self._gained(maximum, best):+.1f} nats")
                 maxima.append(maximum)
                 checks.append(check)
         top = int(np.argmax([weight(one.fit) for one in maxima]))
-        self.found.others = [*maxima[:top], *maxima[top + 1 :]]
+        self.found.others += [*maxima[:top], *maxima[top + 1 :]]
         if top:
             self.found.fits[names], self.found.checks[names] = maxima[top], checks[top - 1]
             self._weigh([names])
