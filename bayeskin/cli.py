@@ -268,8 +268,8 @@ def diagnose(source: Path, device: Path | None, as_json: bool) -> None:
     selection and fit are repeated on the recording up to the end of the second hold and tested on what
     follows. That takes minutes, with many mechanisms most of an hour.
 
-    Elsewhere the reduced model of the device solves all mechanisms of a set together, on any protocol, in one
-    to three minutes. The exit code is 0 whatever the verdict.
+    Elsewhere the reduced model of the device solves all mechanisms of a set together, on any protocol, in two
+    to eight minutes. The exit code is 0 whatever the verdict.
 
     \b
     Example:

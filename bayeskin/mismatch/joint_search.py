@@ -61,6 +61,7 @@ class SearchSettings:
     exact : error of the forward model, RMS over bins, over that of the noise, that needs no correction
     shapes : of each part of a mechanism that the model solves, from which further maxima are sought
     ends : of the prior's width, where a permeability sets out for these
+    ratios : of a modulus to the first one, which are tried there
     maxima : further ones that are kept
     alike_by : of the prior's width: fits whose runs differ by less share a check, and have one maximum
     """
@@ -90,6 +91,7 @@ class SearchSettings:
     exact: float = 0.05
     shapes: int = 2
     ends: tuple[float, float] = (0.1, 0.9)
+    ratios: tuple[float, ...] = (0.05, 0.2, 0.6, 1.5)
     maxima: int = 3
     alike_by: float = 0.1
 
@@ -340,7 +342,8 @@ class _Searcher:
 
         A force hardly tells which layer drains while it is watched, and of the other one whether that drains
         at once or not at all. So permeabilities are equal or exchanged, or one of them is near an end of its
-        prior. Or a mechanism that the model solves has another shape.
+        prior, each with the moduli that suit the recording best. Or a mechanism that the model solves has
+        another shape.
         """
         theta = best.fit.theta
         limits = {p.name: (p.lower, p.upper) for p in self._base.parameters}
@@ -355,11 +358,22 @@ class _Searcher:
                 others += [{name: float(value)} for name, value in zip(flow.names, at_end, strict=True)]
         others = [{name: float(np.clip(value, *limits[name])) for name, value in one.items()}
                   for one in others]  # fmt: skip
+        others = [self._with_moduli({**theta, **one}, best) for one in others]
         for name in self._solved(best.fit.names):
             mechanism = self._known[name]
             for _, *shapes in mechanism.whole_or_parts:
                 others += _shapes_of(mechanism, shapes, self._settings.shapes) if shapes else []
         return [{**theta, **values} for values in others]
+
+    def _with_moduli(self, theta: Mapping[str, float], best: JointFit) -> dict[str, float]:
+        """Returns the base's parameters with the ratio of moduli and the stiffness whose force is nearest."""
+        skin = {name: theta[name] for name in self._base.names}
+        first, *rest = (p for p in self._base.parameters if p.stress_power > 0)
+        others = [
+            {**skin, p.name: float(np.clip(ratio * skin[first.name], p.lower, p.upper))}
+            for p in rest for ratio in self._settings.ratios
+        ]  # fmt: skip
+        return next(iter(self._nearest(best.fit.names, [skin, *others], theta)), skin)
 
     def _exact(self) -> JointFit:
         """The likeliest set, checked if it has mechanisms of the tissue: what the reduced model leaves out of
