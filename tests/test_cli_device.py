@@ -170,10 +170,9 @@ UNCERTAIN = "[tissue]\ncutis_mm = { mean = 2.0, sd = 0.2 }\n"
     [
         ("[tissue]\ncutis_mm = 4.0\n", "one that `bayeskin reduce` makes"),
         ("[device]\ngauge_mm = 0\n", "device.gauge_mm: found 0 mm: the pads overlap"),
-        (UNCERTAIN, "`bayeskin diagnose` takes no uncertain length"),
         (None, "device.toml: found no such file"),
     ],
-    ids=["no reduced model", "impossible", "uncertain", "absent"],
+    ids=["no reduced model", "impossible", "absent"],
 )
 def test_a_device_that_cannot_be_diagnosed_is_refused_in_one_line(
     bayeskin: Command, short: Path, tmp_path: Path, device: str | None, says: str

@@ -167,7 +167,7 @@ def remainder() -> Remainder:
 def test_what_is_left_is_said_with_its_size_parts_and_form(remainder: Remainder) -> None:
     said = json.loads(json.dumps(plain(unexplained(remainder)), allow_nan=False))
     assert said["size_n"] == pytest.approx(remainder.discrepancy.size_n)
-    assert set(said["share"]) == {"displacement", "phase", "cycle"}
+    assert set(said["share"]) == {"displacement", "change", "phase", "cycle"}
     assert said["noticeable"]
     assert said["gain_nats"] > 5.0
     assert "rises with time" in " ".join(said["features"])

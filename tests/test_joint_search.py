@@ -125,7 +125,11 @@ def test_no_task_is_asked_twice_and_only_what_is_taken_is_fitted_from_other_skin
     assert set(Counter(key(task) for task in one.tasks).values()) == {1}
     fitted = {names_of(task) for task in one.tasks if isinstance(task, Climb | Join)}
     assert fitted == set(found.fits)
-    skins = {task.names for task in one.tasks if isinstance(task, Probe) and of_other_skins(task, found)}
+    probes = [task for task in one.tasks if isinstance(task, Probe)]
+    alike = next(
+        i for i, task in enumerate(probes) if task.theta["k_c"] == task.theta["k_s"]
+    )  # further maxima
+    skins = {task.names for task in probes[:alike] if of_other_skins(task, found)}
     assert skins == {(), ("force-offset",)}  # both together leave nothing but noise
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from bayeskin.mismatch.tasks import Ask, OtherTest, Task
 from bayeskin.pipeline import diagnosis, experiment
 from bayeskin.pipeline.engine import Silent
 from bayeskin.pipeline.folder import Record, write_record
+from bayeskin.pipeline.skins import ReducedSkin
 from bayeskin.reduced.cases import Protocols
 from bayeskin.report import figure_experiments
 from bayeskin.types import PadMotion, Parameter
@@ -300,9 +302,9 @@ def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
         config=config, folder=tmp_path / "x", at=lambda *parts: tmp_path.joinpath("x", *parts)
     )
     trained = SimpleNamespace(protocols=Protocols())
-    bench = SimpleNamespace(
-        motion=toy.MOTION, known=KNOWN, model=SimpleNamespace(trained=trained), source=SimpleNamespace(seed=0)
-    )
+    model: Any = SimpleNamespace(trained=trained)
+    skin = ReducedSkin(model, toy.MOTION, np.zeros(2))
+    bench = SimpleNamespace(motion=toy.MOTION, known=KNOWN, forward=skin, source=SimpleNamespace(seed=0))
     monkeypatch.setattr(experiment, "opened", lambda *_: run)
     monkeypatch.setattr(experiment, "bench_of", lambda _: bench)
     monkeypatch.setattr(experiment, "workbench", lambda _: bench)

@@ -86,6 +86,8 @@ class ReducedSkin:
         if not derive:
             return FullRun(at, force_n, None)
         slopes_n = made.gradient_bin_means(self.edges_s)
+        if not np.all(np.isfinite(slopes_n)):
+            return "derivatives beyond all measure"
         aside = np.array([(values[name] - here) / by[name] for name, here in zip(by, at, strict=True)])
         return FullRun(at, force_n - slopes_n @ aside, slopes_n)
 
