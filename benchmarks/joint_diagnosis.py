@@ -11,8 +11,9 @@ the reduced model, and as outside for the stored verdicts.
 
 Prints a row for each recording: what was concealed and how large it is (in noise floors), what is named, the
 probability that nothing is missing, how many of the skin's and the effect's parameters lie in their 90 %
-intervals, RMS residuals before and after, by how much the reduced model is off at the end, and seconds. Then
-both scoreboards of the same recordings.
+intervals, RMS residuals before and after, by how much the reduced model is off at the end, seconds, which are
+those of the last start where a diagnosis was interrupted, and the commit. Then both scoreboards of the same
+recordings.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ workers = {workers}
 """
 HEADER = (
     "recording", "concealed", "size [floors]", "named (probability)", "nothing", "skin inside",
-    "effect inside", "RMS residual [mN]", "reduced model off by [mN]", "seconds",
+    "effect inside", "RMS residual [mN]", "reduced model off by [mN]", "seconds", "commit",
 )  # fmt: skip
 SHARES = {
     "false alarms": ("false_alarms",),
@@ -72,9 +73,9 @@ def answered(case: str, folder: Path, workers: int) -> dict[str, Any]:
     if not config.exists():
         shutil.copy(DATA / which / "recordings" / f"{number}.h5", folder / f"{name}.h5")
         config.write_text(CONFIG.format(name=name, workers=workers))
-    said = essential(diagnose(config, rows.Log()))
+    said = {"case": case, "commit": commit(), **essential(diagnose(config, rows.Log()))}
     with open(KEPT, "a", encoding="utf-8") as handle:  # one line at a time, from two processes
-        handle.write(json.dumps({"case": case, "commit": commit(), **said}) + "\n")
+        handle.write(json.dumps(said) + "\n")
     return said
 
 
@@ -87,7 +88,7 @@ def kept() -> dict[str, dict[str, Any]]:
 
 
 def commit() -> str:
-    """The state that diagnoses."""
+    """Returns the commit of the sources that diagnose."""
     command = ["git", "-C", str(DATA), "rev-parse", "--short", "HEAD"]
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
 
@@ -129,7 +130,14 @@ def row(case: str, said: Mapping[str, Any]) -> list[str]:
     """The table's row of one recording."""
     key = key_of(case)
     if "fit" not in said:
-        return [case, key["label"], f"{key['size']:.1f}", f"failed: {said['message']}", *[""] * 6]
+        return [
+            case,
+            key["label"],
+            f"{key['size']:.1f}",
+            f"failed: {said['message']}",
+            *[""] * 6,
+            said["commit"],
+        ]
     values, fit, full = said["fit"]["after"]["theta"], said["fit"], said["full_model"]
     named = [f"{one['name']} ({one['probability']:.2f})" for one in said["mechanisms"]]
     return [
@@ -138,6 +146,7 @@ def row(case: str, said: Mapping[str, Any]) -> list[str]:
         f"{said['nothing_probability']:.2f}", _inside(key["theta"], values), _inside(key["values"], values),
         f"{1e3 * fit['before']['rmse']:.1f} to {1e3 * fit['after']['rmse']:.1f}",
         full.get("message") or f"{1e3 * full['reduced_off_by']:.2f}", f"{said['seconds']:.0f}",
+        said["commit"],
     ]  # fmt: skip
 
 
@@ -196,7 +205,8 @@ def main() -> None:
     options.folder.mkdir(parents=True, exist_ok=True)
     cases = options.cases or cases_of(options.sets, options.part)
     if options.kept:
-        cases = [case for case in cases if case in kept()]
+        known = kept()
+        cases = [case for case in cases if case in known]
     said, table = dict[str, dict[str, Any]](), list[list[str]]()
     for case in cases:
         said[case] = answered(case, options.folder, options.workers)

@@ -31,7 +31,7 @@ from bayeskin.mismatch.tasks import Ask, OtherTest, Task
 from bayeskin.pipeline import diagnosis, experiment
 from bayeskin.pipeline.engine import Silent
 from bayeskin.pipeline.folder import Record, write_record
-from bayeskin.pipeline.skins import ReducedSkin
+from bayeskin.pipeline.forward import ReducedForward
 from bayeskin.reduced.cases import Protocols
 from bayeskin.report import figure_experiments
 from bayeskin.types import PadMotion, Parameter
@@ -303,7 +303,7 @@ def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
     )
     trained = SimpleNamespace(protocols=Protocols())
     model: Any = SimpleNamespace(trained=trained)
-    skin = ReducedSkin(model, toy.MOTION, np.zeros(2))
+    skin = ReducedForward(model, toy.MOTION, np.zeros(2))
     bench = SimpleNamespace(motion=toy.MOTION, known=KNOWN, forward=skin, source=SimpleNamespace(seed=0))
     monkeypatch.setattr(experiment, "opened", lambda *_: run)
     monkeypatch.setattr(experiment, "bench_of", lambda _: bench)

@@ -86,10 +86,8 @@ def predictive_draws(log_posterior: LogPosterior, theta: ArrayLike, rng: np.rand
     largest of the fitted kinds' sd.
     """
     theta = np.atleast_2d(np.asarray(theta, dtype=float))
-    fitted, chain = (
-        log_posterior.chain,
-        _whole_chain(log_posterior.binned, log_posterior.noise_priors.by_kind),
-    )
+    fitted = log_posterior.chain
+    chain = _whole_chain(log_posterior.binned, log_posterior.noise_priors.by_kind)
     parts = [_predictive(log_posterior, fitted, chain, theta[a : a + _CHUNK], rng)
              for a in range(0, len(theta), _CHUNK)]  # fmt: skip
     return ForceDraws(*(np.concatenate(column) for column in zip(*parts, strict=True)))

@@ -32,12 +32,9 @@ from bayeskin.types import Array, PadMotion
 
 PARTS = ("displacement", "change", "phase", "cycle")
 SMALLEST, LARGEST = 0.01, 10.0  # size s: of the noise's sd, of the residual's RMS
-LENGTHS = (
-    (0.05, 2.0),
-    (0.05, 2.0),
-    (0.2, 3.0),
-    (0.2, 3.0),
-)  # of the displacement's range; of log(1 + t / 1 s)
+# Length l: of the displacement's range, and of log(1 + t / 1 s).
+OVER_DISPLACEMENT, OVER_TIME = (0.05, 2.0), (0.2, 3.0)
+LENGTHS = (OVER_DISPLACEMENT, OVER_DISPLACEMENT, OVER_TIME, OVER_TIME)
 LITTLE = 0.1  # of the fitted noise with a memory, from which a climb beside a discrepancy begins
 STEP = 1e-3  # of a hyperparameter's range, for second derivatives
 NOTICEABLE = 5.0  # nats over no discrepancy; noise alone gains less in 99 of 100 recordings

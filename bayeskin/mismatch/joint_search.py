@@ -174,7 +174,8 @@ def search_jointly(
     searcher.base()
     searcher.search()
     searcher.weigh()
-    searcher.other_maxima()
+    if searcher.found.evidences:
+        searcher.other_maxima()
     return searcher.found
 
 
@@ -225,35 +226,28 @@ class _Searcher:
                 return
 
     def weigh(self) -> None:
-        """Weighs the hypotheses of the likeliest sets, and of those that the search stopped at.
-
-        Raises InputError where none can be.
-        """
+        """Weighs the hypotheses of the likeliest sets, and of those that the search stopped at."""
         before = list(self.found.evidences)
         sets = [one.fit.names for one in self.found.likeliest(self._settings.weighed)]
-        why = self._weigh(dict.fromkeys([*sets, *before]))
-        if not self.found.evidences:
-            raise InputError("diagnosis", f"no set of mechanisms could be weighed: {why}", "a set that can")
+        self._weigh(dict.fromkeys([*sets, *before]))
         for _ in range(self._settings.checks):
-            names = self.found.chosen
-            if names in self.found.checks:
+            if not self.found.evidences or self.found.chosen in self.found.checks:
                 return
+            names = self.found.chosen
             self._check([self.found.fits[names]])
             self._weigh([names])
 
-    def _weigh(self, sets: Iterable[tuple[str, ...]]) -> str:
-        """Weighs hypotheses of sets, those again whose fit is another now; returns why the last failed."""
+    def _weigh(self, sets: Iterable[tuple[str, ...]]) -> None:
+        """Weighs hypotheses of sets, those again whose fit is another now; one that fails has no evidence."""
         new = [names for names in sets if self._weighed.get(names) is not self.found.fits[names]]
-        why = ""
-        for names, said in zip(new, self._ask([Weigh(as_json(self.found.fits[one])) for one in new]),
-                               strict=True):  # fmt: skip
+        answers = self._ask([Weigh(as_json(self.found.fits[names])) for names in new])
+        for names, said in zip(new, answers, strict=True):
             self.found.evidences.pop(names, None)
             self._weighed[names] = self.found.fits[names]
             if isinstance(said, Evidences):
                 self.found.evidences[names] = said
             else:
-                why = str(said)
-        return why
+                self._tell(f"{', '.join(names) or 'no mechanism'} could not be weighed: {said}")
 
     def _beats_smooth(self, names: tuple[str, ...]) -> bool:
         """Returns whether the likeliest set is likelier than another with something smooth beside it."""

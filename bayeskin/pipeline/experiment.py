@@ -33,10 +33,10 @@ from bayeskin.pipeline.folder import (
     write_json,
     write_record,
 )
+from bayeskin.pipeline.forward import ReducedForward
 from bayeskin.pipeline.joint_bench import JointBench, asked, searches_file
 from bayeskin.pipeline.joint_diagnosis import bench_of, searched
 from bayeskin.pipeline.provenance import caption
-from bayeskin.pipeline.skins import ReducedSkin
 from bayeskin.pipeline.workbench import opened, workbench
 
 FOLDER = "experiment"
@@ -101,7 +101,7 @@ def _fits(run: Run, bench: JointBench, ask: Ask) -> list[Fit]:
 
 def _searched(fits: Sequence[Fit], bench: JointBench, ask: Ask, reporter: Reporter) -> list[Experiment]:
     """Protocols judged, the most telling first."""
-    assert isinstance(bench.forward, ReducedSkin)
+    assert isinstance(bench.forward, ReducedForward)
     trained = bench.forward.model.trained.protocols
     limits = Limits(trained.largest_m, trained.speeds_m_s, LONGEST_S)
     first = variations(bench.motion, limits)

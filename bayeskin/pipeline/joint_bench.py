@@ -46,9 +46,9 @@ from bayeskin.mismatch.tasks import (
 )
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline.folder import read_lines, sha256_of
+from bayeskin.pipeline.forward import ForwardModel, ReducedForward, forward_model
 from bayeskin.pipeline.model import model_error
 from bayeskin.pipeline.reported import FullForce
-from bayeskin.pipeline.skins import ReducedSkin, Skin, skin_of
 from bayeskin.pipeline.workbench import calm_bins
 from bayeskin.types import Array, PadMotion, ParameterSpace, Surrogate
 from bayeskin.workers import Lost, standing
@@ -61,7 +61,7 @@ TRUST = 0.15  # of the prior's width about a run, within which a mechanism is se
 class Source:
     """The files and settings that a bench is opened from.
 
-    recording : folder of a run's stage `recording`; model : file of the skin's model; spec : the full model
+    recording : folder of a run's stage `recording`; model : file of the forward model; spec : the full model
     that the configuration asks for; base : priors of the base model; noise : bounds of the noise's parameters
     that the configuration states
     """
@@ -75,12 +75,14 @@ class Source:
 
 
 class JointBench:
-    """A recording's bins and protocol, the skin by a forward model, and posteriors of sets about its runs."""
+    """A recording's bins and protocol, a forward model, and posteriors of sets about its runs."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
         self.binned, self.jumps, self.motion = calm_bins(source.recording)
-        self.forward: Skin = skin_of(source.model, source.spec, self.motion, self.binned.edges_s)
+        self.forward: ForwardModel = forward_model(
+            source.model, source.spec, self.motion, self.binned.edges_s
+        )
         self.known: Mapping[str, Mechanism] = _known(self.forward)
         self.base = source.base
         self._seed = source.seed
@@ -105,9 +107,7 @@ class JointBench:
 
     def full(self, names: Sequence[str], theta: Mapping[str, float]) -> Array | str:
         """Force (m,) of the skin with a set at values by the full model, or why its run failed."""
-        return FullForce(self.forward.spec, self.motion, self.binned.edges_s)(
-            (self._solved_names(names), theta)
-        )
+        return self._full((self._solved_names(names), theta))
 
     def reported(self, case: tuple[Sequence[str], Mapping[str, float]]) -> Array | str:
         """Force (m,) as the instrument reports it, with a set at values."""
@@ -125,7 +125,7 @@ class JointBench:
         """Force (m,) that the instrument reports of a set in another test, or why the run failed."""
         motion = PadMotion(np.array(task.time_s), np.array(task.displacement_m))
         values = {name: task.theta[name] for name in self.space(task.names).names}
-        assert isinstance(self.forward, ReducedSkin)
+        assert isinstance(self.forward, ReducedForward)
         found = self.forward.simulated(motion, values, self.solved(task.names))
         if found.status != "ok":
             return found.message
@@ -143,9 +143,8 @@ class JointBench:
         space = self.space(names)
         at = np.array([theta[name] for name in space.names])
         by = dict(zip(space.names, map(float, change(space, at)), strict=True))
-        run = FullForce(self.forward.spec, self.motion, self.binned.edges_s)
         values = dict(zip(space.names, map(float, at), strict=True))
-        found = run.with_slopes((self._solved_names(names), values), by)
+        found = self._full.with_slopes((self._solved_names(names), values), by)
         return found if isinstance(found, str) else FullRun(at, *found)
 
     def local(
@@ -178,6 +177,10 @@ class JointBench:
             if name in more or self.known[name].act.bind is None
         )  # fmt: skip
         return ObservedSurrogate(skin, beyond, self.motion) if beyond else skin
+
+    @property
+    def _full(self) -> FullForce:
+        return FullForce(self.forward.spec, self.motion, self.binned.edges_s)
 
     def _solved_names(self, names: Sequence[str]) -> tuple[str, ...]:
         return tuple(m.name for m in self.solved(names))
@@ -279,10 +282,10 @@ def _with_error(about: LogPosterior, off_n: Array | None) -> LogPosterior:
     return replace(about, model_error=replace(about.model_error, measured_n=off_n[None]))
 
 
-def _known(skin: Skin) -> dict[str, Mechanism]:
-    """Mechanisms of the catalogue that a skin can solve, or that act on the force."""
+def _known(forward: ForwardModel) -> dict[str, Mechanism]:
+    """Mechanisms of the catalogue that a forward model can solve, or that act on the force."""
     known = {
-        name: m for name, m in catalogue().items() if name in skin.solves or not isinstance(m.act, Tissue)
+        name: m for name, m in catalogue().items() if name in forward.solves or not isinstance(m.act, Tissue)
     }
     return {name: m for name, m in known.items() if set(m.needs) <= set(known)}
 

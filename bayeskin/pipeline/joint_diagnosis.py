@@ -30,13 +30,13 @@ from bayeskin.mismatch.search import Made, Search
 from bayeskin.mismatch.tasks import Ask, FullProbe, Polish, Probe, Task
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.pipeline.diagnosis_outputs import Found, Shown, candidates, draw, unexplained, window
-from bayeskin.pipeline.engine import Run, Stage
+from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
 from bayeskin.pipeline.folder import write_json
+from bayeskin.pipeline.forward import ReducedForward
 from bayeskin.pipeline.joint_bench import JointBench, Source, asked, searches_file
 from bayeskin.pipeline.model import model_spec, reduced_files
 from bayeskin.pipeline.provenance import caption
 from bayeskin.pipeline.reducing import reduced_file
-from bayeskin.pipeline.skins import ReducedSkin
 from bayeskin.pipeline.taking_up import Remainder
 from bayeskin.reduced.region import protocol_outside
 from bayeskin.surrogates import train
@@ -62,7 +62,7 @@ def bench_of(run: Run) -> JointBench:
     stated = tuple((name, bounds) for name, bounds in run.config.noise if bounds is not None)
     base = parameter_space(run.config, run.config_path)
     bench = JointBench(Source(run.folder / "recording", model, spec, run.config.seed, base, stated))
-    if isinstance(bench.forward, ReducedSkin):
+    if isinstance(bench.forward, ReducedForward):
         beyond = protocol_outside(bench.forward.model.trained.protocols, bench.motion)
         if beyond:
             found = f"a protocol that {model.name} does not know: {beyond[0]}"
@@ -81,6 +81,8 @@ def _work(run: Run) -> Mapping[str, Any]:
     bench = bench_of(run)
     with asked(bench, searches_file(run.folder, bench), run.config.design.workers) as ask:
         found = searched(run, bench, ask)
+        if not found.evidences:
+            raise CannotGoOn("no set of mechanisms could be weighed")
         evidences, family, best = found.evidences, found.family, found.chosen
         explained = _explained(bench.binned, found.fits[()].fit, found.fits[best].fit)
         judged = judge_family(family, bench.known, explained)
@@ -89,7 +91,7 @@ def _work(run: Run) -> Mapping[str, Any]:
                     if not names or family.probability_of_set(names) > POSSIBLE]  # fmt: skip
         begun = fit_beginning(ask, [found.fits[names] for names in possible], split_s)
         run.reporter.log("runs where the posterior is, and draws of it")
-        maxima = [*_polished(run, ask, found.fits[best]), *found.others_of(best)]
+        maxima = [*_polished(run, bench, ask, found.fits[best]), *found.others_of(best)]
         emulated = _emulated(bench, ask, maxima, seed)
     base, chosen = found.fits[()].fit, emulated.fit
     before, after = (
@@ -149,7 +151,7 @@ def _work(run: Run) -> Mapping[str, Any]:
 
 
 def _explained(binned: BinnedForce, base: Fit, best: Fit) -> float:
-    """The share of the base fit's squared misfit that another fit does not have."""
+    """Returns the share of the base fit's squared misfit that another fit explains."""
     usable = bins_in_windows(binned, None) >= 0
     before, after = (_rms((binned.force_n - one.force_n)[usable]) for one in (base, best))
     return 1.0 - after**2 / before**2
@@ -197,13 +199,13 @@ def _emulated(bench: JointBench, ask: Ask, maxima: Sequence[JointFit], seed: int
     return emulated
 
 
-def _polished(run: Run, ask: Ask, found: JointFit) -> list[JointFit]:
-    """A fit, after that which the full model climbs to from it where the forward model is off there.
+def _polished(run: Run, bench: JointBench, ask: Ask, found: JointFit) -> list[JointFit]:
+    """Returns a fit, after the one to which the full model climbs from it if the forward model is off there.
 
     The error of the forward model changes along a ridge, so that a constant one leads to a point beside the
-    full model's maximum.
+    full model's maximum. Only the model of the reaction has derivatives to climb by.
     """
-    if not found.off_n.any():
+    if not found.off_n.any() or bench.forward.spec.observation != "reaction":
         return [found]
     (full,) = ask([Polish(found.fit.names, found.fit.theta, POLISHING_RUNS)])
     if not isinstance(full, JointFit):

@@ -64,10 +64,9 @@ class FullForce:
         names, values = case
         mechanisms = [catalogue()[name] for name in names]
         along = {p.name for mechanism in solved(mechanisms) for p in mechanism.parameters}
-        own = self.spec.forward is not None  # its parameters have names of its own
-        theta = {
-            name: value for name, value in values.items() if own or name in {*along, *PARAMETERS, *LENGTHS}
-        }
+        theta = dict(values)
+        if self.spec.forward is None:  # a model of one's own has parameters of any name
+            theta = {name: value for name, value in values.items() if name in {*along, *PARAMETERS, *LENGTHS}}
         by = {name: change for name, change in changes.items() if name in theta}
         theta |= beside_neutral(theta, by, mechanisms)
         simulation = simulate(

@@ -21,7 +21,7 @@ from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import observed
 from bayeskin.mismatch.corrected import FullRun
 from bayeskin.model.simulate import ModelSpec
-from bayeskin.pipeline import joint_bench, skins
+from bayeskin.pipeline import forward, joint_bench
 from bayeskin.pipeline.joint_bench import JointBench, Source
 from bayeskin.reduced.region import LEAST_STIFFNESS
 from bayeskin.types import (
@@ -176,8 +176,8 @@ def bench(
         refinement=2, hash="toy",
     )  # fmt: skip
     patch.setattr(joint_bench, "calm_bins", lambda folder: (binned, NO_WORD, MOTION))
-    patch.setattr(skins, "load_reduced", lambda file: model)
-    patch.setattr(skins, "simulate_reduced", simulate)
+    patch.setattr(forward, "load_reduced", lambda file: model)
+    patch.setattr(forward, "simulate_reduced", simulate)
     patch.setattr(joint_bench, "FullForce", lambda spec, motion, edges_s: Full(full))
     return JointBench(Source(Path("recording"), Path("model"), ModelSpec(), 1, base))
 

@@ -1,4 +1,4 @@
-"""The skin of a diagnosis: its force by a forward model, with mechanisms of the tissue."""
+"""The forward models of a diagnosis: the force of a skin with mechanisms of the tissue."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ FOLDING = 0.15  # of the stiffness at rest: nearer to folding the reduced model 
 # model check what comes out
 
 
-class Skin(Protocol):
-    """A forward model; `solves` names mechanisms of the tissue that it solves, `hash` says which it is."""
+class ForwardModel(Protocol):
+    """Runs the skin; `solves` names the mechanisms of the tissue that it solves, `hash` identifies it."""
 
     @property
     def solves(self) -> frozenset[str]: ...
@@ -51,7 +51,7 @@ class Skin(Protocol):
 
 
 @dataclass(frozen=True)
-class ReducedSkin:
+class ReducedForward:
     """The reduced model of a device, on a protocol."""
 
     model: ReducedModel
@@ -68,7 +68,7 @@ class ReducedSkin:
 
     @property
     def spec(self) -> ModelSpec:
-        """That which it was made from."""
+        """The full model that it was made from."""
         return ModelSpec(refinement=self.model.refinement, geometry=self.model.trained.geometry)
 
     def run(
@@ -87,7 +87,7 @@ class ReducedSkin:
             return FullRun(at, force_n, None)
         slopes_n = made.gradient_bin_means(self.edges_s)
         if not np.all(np.isfinite(slopes_n)):
-            return "derivatives beyond all measure"
+            return "the derivatives of the run are not finite"
         aside = np.array([(values[name] - here) / by[name] for name, here in zip(by, at, strict=True)])
         return FullRun(at, force_n - slopes_n @ aside, slopes_n)
 
@@ -99,12 +99,12 @@ class ReducedSkin:
         return simulate_reduced(self.model, motion, values, mechanisms, by, least_stiffness=FOLDING)
 
     def errors(self, at: Array) -> Array:
-        """It says nothing of its error: runs of the full model show it."""
+        """Returns none: the reduced model does not state its error; runs of the full model show it."""
         return np.zeros((0, len(self.edges_s) - 1))
 
 
 @dataclass(frozen=True)
-class SurrogateSkin:
+class SurrogateForward:
     """A surrogate of a model that no reduced model stands for; it solves no mechanism of the tissue."""
 
     surrogate: Surrogate
@@ -112,7 +112,7 @@ class SurrogateSkin:
 
     @property
     def hash(self) -> str:
-        """Of the surrogate's training and of the model."""
+        """A hash of the surrogate's training and of the model that it stands for."""
         return sha256_of([dict(self.surrogate.provenance), self.spec.hash])
 
     @property
@@ -127,15 +127,15 @@ class SurrogateSkin:
         return FullRun(at, force_n, slopes(self.surrogate, at) if derive else None)
 
     def errors(self, at: Array) -> Array:
-        """Columns of its factor."""
+        """The columns of the factor of its error."""
         return np.asarray(self.surrogate.predict(at).factor[0].T)
 
 
-def skin_of(file: Path, spec: ModelSpec, motion: PadMotion, edges_s: Array) -> Skin:
-    """Returns the skin by the model in a file: the reduced model of the reaction, else a surrogate of `spec`.
+def forward_model(file: Path, spec: ModelSpec, motion: PadMotion, edges_s: Array) -> ForwardModel:
+    """Returns the forward model in a file: the reduced model for the reaction, else a surrogate of `spec`.
 
     A reduced model stands for the full model that it was made from.
     """
     if spec.observation == "reaction":
-        return ReducedSkin(load_reduced(file), motion, edges_s)
-    return SurrogateSkin(load_surrogate(file), spec)
+        return ReducedForward(load_reduced(file), motion, edges_s)
+    return SurrogateForward(load_surrogate(file), spec)
