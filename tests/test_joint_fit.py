@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -18,10 +17,9 @@ from bayeskin.inference.straighten import shear_at
 from bayeskin.mismatch.corrected import FullRun
 from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, solved_columns, within
 from bayeskin.mismatch.tangent import POWER, Tangent
-from bayeskin.mismatch.tasks import Climb, Polish
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.pipeline.joint_bench import JointBench
-from bayeskin.types import Array, Correlation, ParameterSpace
+from bayeskin.types import Correlation, ParameterSpace
 
 SET = ("force-offset", "stiffness-drift")
 START = {
@@ -310,22 +308,3 @@ def test_priors_that_go_together_do_so_in_a_fit_and_its_trust_region(
         assert about.space.correlations == together
         vector = np.clip(about.vector({**start(bench), **TRUTH}), *about.bounds)
         assert within(about, vector, 0.1).space.correlations == together
-
-
-def test_the_full_model_climbs_to_its_own_maximum(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its subcutis drains three times as fast as the forward model's with the same permeability."""
-
-    def full(values: Mapping[str, float]) -> Array:
-        return np.asarray(solved.means({**values, "k_s": 3.0 * values["k_s"]})[0])
-
-    bench = solved.bench(monkeypatch, solved.recorded(0), full=full)
-    tasks = (Climb((), {**bench.noise, **TRUTH}, 9), Polish((), {**bench.noise, **TRUTH}, 9))
-    quick, polished = (bench.answered(task, json.loads(json.dumps(bench.done(task)))) for task in tasks)
-    assert isinstance(quick, JointFit)
-    assert isinstance(polished, JointFit)
-    assert not polished.off_n.any()
-    at = dict(zip(BASE.names, map(float, polished.run.theta), strict=True))
-    np.testing.assert_allclose(polished.run.force_n, full(at), atol=1e-12)
-    assert polished.fit.value == pytest.approx(quick.fit.value, abs=0.5)
-    flows = [one.fit.theta["k_s"] * one.fit.theta["E_s"] for one in (quick, polished)]
-    assert flows[0] / flows[1] == pytest.approx(3.0, rel=0.3)

@@ -40,15 +40,6 @@ class Climb:
 
 
 @dataclass(frozen=True)
-class Polish:
-    """Asks for the fit of a set from values by the full model itself, in so many runs at most."""
-
-    names: tuple[str, ...]
-    start: Mapping[str, float]
-    runs: int
-
-
-@dataclass(frozen=True)
 class Promise:
     """Asks how many nats a mechanism with a shortcut for the force promises beside a fit, about its run.
 
@@ -91,5 +82,5 @@ class OtherTest:
     edges_s: tuple[float, ...]
 
 
-Task = Probe | FullProbe | Climb | Polish | Promise | Join | Weigh | OtherTest
+Task = Probe | FullProbe | Climb | Promise | Join | Weigh | OtherTest
 Ask = Callable[[Sequence[Task]], list[object]]  # answers in the order of the tasks

@@ -26,7 +26,6 @@ from bayeskin.mismatch.fit import (
     restored,
     soft_on_stiff,
 )
-from bayeskin.mismatch.full_fit import change
 from bayeskin.mismatch.hypotheses import Evidences
 from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, as_json, fit_jointly, within
 from bayeskin.mismatch.observed import ObservedSurrogate
@@ -38,7 +37,6 @@ from bayeskin.mismatch.tasks import (
     FullProbe,
     Join,
     OtherTest,
-    Polish,
     Probe,
     Promise,
     Task,
@@ -53,7 +51,6 @@ from bayeskin.pipeline.workbench import calm_bins
 from bayeskin.types import Array, PadMotion, ParameterSpace, Surrogate
 from bayeskin.workers import Lost, standing
 
-POLISHED = 0.1  # of the prior's width about a fit, within which the full model's first step stays
 TRUST = 0.15  # of the prior's width about a run, within which a mechanism is searched for on its tangent
 
 
@@ -138,15 +135,6 @@ class JointBench:
         """A run with derivatives of a set at values, or why it failed."""
         return self._run(names, theta, slopes=True)
 
-    def full_skin(self, names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
-        """A run of the full model with derivatives of a set at values, or why it failed."""
-        space = self.space(names)
-        at = np.array([theta[name] for name in space.names])
-        by = dict(zip(space.names, map(float, change(space, at)), strict=True))
-        values = dict(zip(space.names, map(float, at), strict=True))
-        found = self._full.with_slopes((self._solved_names(names), values), by)
-        return found if isinstance(found, str) else FullRun(at, *found)
-
     def local(
         self, names: Sequence[str], runs: Sequence[FullRun], off_n: Array | None = None,
         until_s: float | None = None,
@@ -212,10 +200,6 @@ class JointBench:
             names = with_one(beside.names, beside.name, self.known)
             start = {**self._neutral, **beside.theta, **self._searched(beside)}
             return self._climbed(Climb(names, start, task.runs, beside.off_n))
-        if isinstance(task, Polish):
-            settings = TrustSettings(runs=task.runs, first=POLISHED)
-            made = fit_jointly(task.names, task.start, self.full_skin, self.local, settings)
-            return {"message": made} if isinstance(made, str) else as_json(made)
         return self._climbed(task)
 
     def _force_of(self, task: Probe | FullProbe | OtherTest) -> Array | str:

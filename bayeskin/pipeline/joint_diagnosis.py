@@ -27,8 +27,7 @@ from bayeskin.mismatch.joint_search import JointSearch, noise_of, search_jointly
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
 from bayeskin.mismatch.search import Made, Search
-from bayeskin.mismatch.tasks import Ask, FullProbe, Polish, Probe, Task
-from bayeskin.mismatch.wrapper import innermost
+from bayeskin.mismatch.tasks import Ask, FullProbe, Probe, Task
 from bayeskin.pipeline.diagnosis_outputs import Found, Shown, candidates, draw, unexplained, window
 from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
 from bayeskin.pipeline.folder import write_json
@@ -44,7 +43,6 @@ from bayeskin.types import Array, BinnedForce, Design, Surrogate
 
 POSSIBLE = 1e-6  # probability of a set, below which it is not fitted to the beginning
 PREDICTIVE_DRAWS = 300
-POLISHING_RUNS = 5  # of the full model with derivatives, at most
 REACH = 0.5  # of the prior's width on either side of a run, within which its tangent is sampled
 KNOWN = "pads that open, by what and as fast as the reduced model was trained on"
 NAME = "diagnose"
@@ -91,7 +89,7 @@ def _work(run: Run) -> Mapping[str, Any]:
                     if not names or family.probability_of_set(names) > POSSIBLE]  # fmt: skip
         begun = fit_beginning(ask, [found.fits[names] for names in possible], split_s)
         run.reporter.log("runs where the posterior is, and draws of it")
-        maxima = [*_polished(run, bench, ask, found.fits[best]), *found.others_of(best)]
+        maxima = [found.fits[best], *found.others_of(best)]
         emulated = _emulated(bench, ask, maxima, seed)
     base, chosen = found.fits[()].fit, emulated.fit
     before, after = (
@@ -197,27 +195,6 @@ def _emulated(bench: JointBench, ask: Ask, maxima: Sequence[JointFit], seed: int
     if isinstance(emulated, str):
         return Emulated(found.fit, _drawn(found.fit, seed), 0, None, False)
     return emulated
-
-
-def _polished(run: Run, bench: JointBench, ask: Ask, found: JointFit) -> list[JointFit]:
-    """Returns a fit, after the one to which the full model climbs from it if the forward model is off there.
-
-    The error of the forward model changes along a ridge, so that a constant one leads to a point beside the
-    full model's maximum. Only the model of the reaction has derivatives to climb by.
-    """
-    if not found.off_n.any() or bench.forward.spec.observation != "reaction":
-        return [found]
-    (full,) = ask([Polish(found.fit.names, found.fit.theta, POLISHING_RUNS)])
-    if not isinstance(full, JointFit):
-        return [found]
-    names = innermost(full.fit.log_posterior.surrogate).space.names
-    at = dict(zip(names, map(float, full.run.theta), strict=True))
-    (force_n,) = ask([Probe(full.fit.names, at)])
-    if isinstance(force_n, str):
-        return [found]
-    gained = full.fit.value - found.fit.value
-    run.reporter.log(f"the full model climbs by itself: {gained:+.1f} nats in {full.runs} runs")
-    return [replace(full, off_n=full.run.force_n - np.asarray(force_n)), found]
 
 
 def _learnt(design: Design, seed: int) -> Surrogate:
