@@ -33,7 +33,7 @@ class _Workflow(click.Group):
 
     ORDER: ClassVar[dict[str, tuple[str, ...]]] = {
         "From a recording to an answer": ("doctor", "new", "import", "run", "diagnose", "report"),
-        "Single stages": ("reduce", "design", "train", "map", "sample", "sobol", "effects"),
+        "Single stages": ("reduce", "design", "train", "map", "sample", "sobol"),
         "Further": ("experiment", "simulate", "serve", "prove", "conceal"),
     }
 
@@ -205,13 +205,6 @@ def _stage_command(name: str, text: str, example: str = "runs/demo.toml") -> Non
 
 _stage_command("design", "Run the full model at the design's points, wave by wave.")
 _stage_command("train", "Train the surrogate on the design, validate it on held-out points.")
-_stage_command(
-    "effects",
-    "Learn what mechanisms do to the force, by full runs.\n\n"
-    "Of all that the full model solves, which takes hours. For the demo and the article's protocol some are\n"
-    "shipped; those learnt here go first.",
-    "runs/test.toml",
-)
 _stage_command("map", "Find the most probable point and check it by the full model.")
 _stage_command("sample", "Sample the posterior, check it at draws; bands on the force.")
 _stage_command("sobol", "Sobol' indices of the force over time.")
@@ -263,13 +256,11 @@ def run(config: Path, scheduler: str | None, as_json: bool) -> None:
 def diagnose(source: Path, device: Path | None, as_json: bool) -> None:
     """Find the physics that the model leaves out of a recording, and where; show how the fit improves.
 
-    SOURCE is a configuration, or a recording by itself. Where a shipped surrogate knows its protocol,
-    mechanisms of the tissue are tried whose effects are shipped or were learnt by `bayeskin effects`, and
-    selection and fit are repeated on the recording up to the end of the second hold and tested on what
-    follows. That takes minutes, with many mechanisms most of an hour.
-
-    Elsewhere the reduced model of the device solves all mechanisms of a set together, on any protocol, in two
-    to eight minutes. The exit code is 0 whatever the verdict.
+    SOURCE is a configuration, or a recording by itself, of any protocol. The reduced model of the device
+    solves all mechanisms of a set together, and the full model checks what comes out. The likeliest sets are
+    fitted once more to the recording up to the end of its second hold, and tested on what follows. That takes
+    two to eight minutes. For the article's observation and a model of your own a surrogate is trained first,
+    and mechanisms of the tissue are not tried. The exit code is 0 whatever the verdict.
 
     \b
     Example:

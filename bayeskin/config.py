@@ -163,22 +163,6 @@ class SurrogateConfig(Section):
     file: str | None = None
 
 
-class EffectsConfig(Section):
-    """Mechanisms that the full model solves (by default all) to learn, pairs of their parts; runs of each.
-
-    `coarse` of them on the coarsest bricks, with and without the mechanism; `points` and `held_out` of the
-    model itself, which correct those and test the correction; `plausible` more of it, and a third as many
-    held out, where the recording leaves the mechanism plausible.
-    """
-
-    mechanisms: list[str] = []
-    pairs: list[tuple[str, str]] = []
-    coarse: Runs = 400
-    points: Runs = 72
-    held_out: Runs = 20
-    plausible: Annotated[int, Field(ge=0, le=100_000)] = 0
-
-
 class FitConfig(Section):
     """The stretches of the recording that are fitted (default: all of it) and the bins of its means."""
 
@@ -259,7 +243,6 @@ class Config(Section):
     design: DesignConfig = DesignConfig()
     slurm: SlurmConfig | None = None
     surrogate: SurrogateConfig = SurrogateConfig()
-    effects: EffectsConfig = EffectsConfig()
     fit: FitConfig = FitConfig()
     noise: NoiseConfig = NoiseConfig()
     sample: SampleConfig = SampleConfig()
@@ -309,12 +292,6 @@ class Config(Section):
             found = f"another than the article's, with observation {self.model.observation!r}"
             raise InputError(f"{where}: {section}", found, "observation 'reaction' with it")
         return stated
-
-    def refuse_uncertain(self, where: object, command: str) -> None:
-        """Raises InputError, of `where`, for a length that is uncertain, which a command cannot have."""
-        for name in self.geometry(where).sd_m:
-            expected = f"a number: `bayeskin {command}` takes no uncertain length, `bayeskin run` does"
-            raise InputError(f"{where}: tissue.{name}m", "a mean and an sd", expected)
 
 
 def load_config(path: Path | str) -> Config:

@@ -110,22 +110,6 @@ def misfit_bounds(mean: Array, sd: Array, force_n: ArrayLike, weights: ArrayLike
     return misfit - SURROGATE_SDS * spread, misfit + SURROGATE_SDS * spread
 
 
-def plausible(
-    mean: Array, sd: Array, force_n: ArrayLike, weights: ArrayLike, floor_n: float, factor: float = 1.5
-) -> NDArray[np.bool_]:
-    """Returns which of n candidates can still be among the good fits, (n,); at least one is.
-
-    History matching (Craig et al. 1997; Vernon et al. 2010) rules out a point whose misfit is many
-    sd of noise and surrogate error. The skin model has a misfit to real recordings at every point,
-    so in those units it would rule out all. The yardstick here is therefore the best attainable
-    misfit: with (low, high) = `misfit_bounds`, keep ``low <= factor * max(min(high), floor_n)``,
-    that is, all that may be within `factor` of the best, where a misfit below the noise floor
-    `floor_n` [N] (RMS noise of the fitted bins) counts as the floor. Arguments as `misfit_bounds`.
-    """
-    low, high = misfit_bounds(mean, sd, force_n, weights)
-    return low <= factor * max(high.min(), floor_n)
-
-
 def next_wave(
     space: ParameterSpace,
     predict: Predict,
@@ -140,7 +124,15 @@ def next_wave(
 ) -> Wave:
     """`n` training and `held_out` test points that fill the plausible part of the box.
 
-    `predict` maps theta (n, d) to a Prediction of the bins of force_n (m,); the rest as `plausible`.
+    predict : maps theta (n, d) to a Prediction of the bins of force_n (m,); weights as in `misfit_bounds`
+
+    History matching (Craig et al. 1997; Vernon et al. 2010) rules out a point whose misfit is many sd of
+    noise and surrogate error. The skin model has a misfit to real recordings at every point, so in those
+    units it would rule out all. The yardstick here is therefore the best attainable misfit: with (low, high)
+    = `misfit_bounds`, points stay where ``low <= factor * max(min(high), floor_n)``, that is, all that may be
+    within `factor` of the best, where a misfit below the noise floor `floor_n` [N] (RMS noise of the fitted
+    bins) counts as the floor.
+
     Both sets are scrambled Sobol' sequences over a region round the plausible part, filtered and
     taken in the sequence's order, so they fill it; the test points' sequence is an independent one.
     Fewer are returned where the plausible part is too thin to find more. The record states the share

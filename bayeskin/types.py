@@ -490,15 +490,6 @@ class Surrogate(Protocol):
         ...
 
 
-@runtime_checkable
-class Correlated(Surrogate, Protocol):
-    """A surrogate that knows how far its own error goes."""
-
-    def correlation(self, theta: Array, at: Array) -> Array:
-        """Of the error along each column of the factor, at theta (n, d) with that at a point (d,): (n, r)."""
-        ...
-
-
 @dataclass(frozen=True)
 class Provenance:
     """What a result was made from; stands in every file that bayeskin writes."""

@@ -27,26 +27,15 @@ RUNS = {
 
 
 def fits(answer: Mapping[str, Any]) -> str:
-    """Errors before and after: the full model's where it was fitted, and the surrogate's."""
-    both = [answer["fit"][when] for when in ("before", "after")]
-    full = [one["full_model"] for one in both]
-    table = []
-    if all(one is not None and "rmse" in one for one in full):
-        table += [
-            ["full model, RMSE over the whole recording", *_mn(full, "rmse"), WHOLE_MN],
-            [f"its {' / '.join(KINDS)}", *(_by_phase(one) for one in full), ""],
-            ["without what is allowed for its mesh and the load cell", *_mn(full, "rmse_of_run"), ""],
-            ["full model selected and fitted up to the end of the second hold, RMSE on what follows",
-             *_mn(full, "rmse_held_out"), HELD_OUT_MN],
-        ]  # fmt: skip
-    aims = ("", "") if table else (WHOLE_MN, HELD_OUT_MN)
-    table += [
-        ["surrogate, RMSE over the whole recording", *_mn(both, "rmse"), aims[0]],
-        ["without what its own error takes up", *_mn(both, "rmse_of_mean"), ""],
+    """Errors before and after, and that of a full run at the best values."""
+    both, full = [answer["fit"][when] for when in ("before", "after")], answer["full_model"]
+    table = [
+        ["RMSE over the whole recording", *_mn(both, "rmse"), WHOLE_MN],
         [f"its {' / '.join(KINDS)}", *(_by_phase(one) for one in both), ""],
-        ["surrogate selected and fitted up to the end of the second hold, RMSE on what follows",
-         *_mn(both, "rmse_held_out"), aims[1]],
-        ["each phase by parameters fitted without it", *_mn(both, "rmse_left_out"), ""],
+        ["fitted up to the end of the second hold, RMSE on what follows", *_mn(both, "rmse_held_out"),
+         HELD_OUT_MN],
+        ["a run of the full model at the best values, RMSE", "",
+         full["message"] if "message" in full else f"{1e3 * full['rmse']:.1f} mN", ""],
         ["recorded bins in the 90 % band", *(f"{100 * one['coverage90']:.0f} %" for one in both), ""],
         ["windows in which they differ",
          *(str(len(answer[where])) for where in ("located", "remaining")), ""],
@@ -60,8 +49,8 @@ def named(answer: Mapping[str, Any]) -> str:
     verdict = (
         f"The verdict is `{answer['verdict']}`. Best set: {best}, which explains "
         f"{100 * answer['explained']:.1f} % of the squared residual; R-hat of its draws {_rhat(answer)}. "
-        "Something outside the catalogue: "
-        f"probability at most {answer['unknown_probability']:.2f}. {answer['seconds'] / 60.0:.0f} minutes."
+        "Something smooth that is not in the catalogue: "
+        f"probability {answer['smooth_probability']:.2f}. {answer['seconds'] / 60.0:.0f} minutes."
     )
     table = [
         [one["name"], f"{one['probability']:.2f}", *_mn([one], "contribution_n"), one["statement"]]

@@ -2,12 +2,12 @@
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/joint_diagnosis.py --folder F [development/009 ...]
 
-The verdicts that stand beside these recordings come from effects learnt one by one. Here a configuration of
-each recording, with `coarse = "reduced"`, has the reduced model solve all mechanisms of a set together. What
-it says of verdict and values is kept in `benchmarks/results/joint_diagnosis.jsonl`, with the commit that said
-it, so that a second start goes on; `--part 1/2` takes every second recording, for two processes side by side.
-Effects that were outside of the catalogue when a set was made, and are in it now, count as what they are for
-the reduced model, and as outside for the stored verdicts.
+The verdicts that stand beside these recordings are of the version that learnt effects one by one. Here the
+reduced model solves all mechanisms of a set together. What is said of verdict and values is kept in
+`benchmarks/results/joint_diagnosis.jsonl`, with the commit that said it, so that a second start goes on;
+`--part 1/2` takes every second recording, for two processes side by side. Effects that were outside of the
+catalogue when a set was made, and are in it now, count as what they are here, and as outside for the stored
+verdicts.
 
 Prints a row for each recording: what was concealed and how large it is (in noise floors), what is named, the
 probability that nothing is missing, how many of the skin's and the effect's parameters lie in their 90 %
@@ -43,7 +43,6 @@ CONFIG = """name = "{name}"
 [recording]
 file = "{name}.h5"
 [design]
-coarse = "reduced"
 workers = {workers}
 """
 HEADER = (

@@ -9,7 +9,6 @@ markers of the page.
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -180,20 +179,6 @@ def faint(boards: Mapping[str, Mapping[str, Any]], answers: Mapping[str, Mapping
     return rows.markdown(head, table)
 
 
-def unsure(board: Mapping[str, Any], answers: Mapping[str, Mapping[str, Any]]) -> str:
-    """Of which mechanisms the surrogate was not sure, on how many recordings with and without an effect."""
-    counts: dict[str, Counter[bool]] = {}
-    kinds = Counter(one["kind"] == "nothing" for one in board["each"])
-    for one in board["each"]:
-        for name in answers[one["number"]]["unsure"]:
-            counts.setdefault(name, Counter())[one["kind"] == "nothing"] += 1
-    table = [
-        [name, f"{count[False]} of {kinds[False]}", f"{count[True]} of {kinds[True]}"]
-        for name, count in sorted(counts.items(), key=lambda item: -item[1].total())
-    ]
-    return rows.markdown(("", "not sure of it, with an effect", "with nothing concealed"), table)
-
-
 def sizes(board: Mapping[str, Any]) -> str:
     """Of each mechanism how many are named right, and how large an effect has to be."""
     table = []
@@ -248,7 +233,6 @@ def main() -> None:
         seconds[folder.name] = {number: one["seconds"] for number, one in answers[folder.name].items()}
     proof = boards[PROOF.name]
     tables = {"proof": scores(proof, seconds[PROOF.name]), "each": each(proof)}
-    tables["unsure"] = unsure(proof, answers[PROOF.name])
     smaller(PROOF / "scoreboard.png", FIGURES / "proof.png")
     if NOTHING.name in boards:
         tables["nothing"] = nothing({name: boards[name] for name in (PROOF.name, NOTHING.name)})

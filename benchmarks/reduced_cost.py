@@ -19,8 +19,8 @@ from reduced_model import PROTOCOLS, Skin, held_out
 
 from bayeskin.design import default_space
 from bayeskin.mechanisms import catalogue
-from bayeskin.mismatch.full_fit import change
 from bayeskin.model.stepping import integrate
+from bayeskin.pipeline.forward import change
 from bayeskin.pipeline.reducing import SHIPPED
 from bayeskin.reduced import kernels
 from bayeskin.reduced.equations import ReducedEquations

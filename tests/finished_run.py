@@ -141,19 +141,19 @@ def summaries() -> dict[str, dict[str, Any]]:
             "verdict": "named",
             "located": [{"t0": 0.0, "t1": 9.5, "phase": "rest", "cycle": 0, "mean_residual": -0.0586,
                          "significance": 0.001}],
-            "remaining": [], "unknown_probability": 0.07,
+            "remaining": [], "smooth_probability": 0.07, "nothing_probability": 0.0,
+            "best_set": ["device-friction"], "full_model": {"rmse": 0.0213, "reduced_off_by": 0.0004},
             "mechanisms": [
                 {"name": "device-friction", "probability": 0.98, "group": ["device-friction", "viscous-drag"],
-                 "group_probability": 1.0, "explains_n": 0.03, "statement": "The slide rubs: 60 mN.",
+                 "group_probability": 1.0, "contribution_n": 0.03, "statement": "The slide rubs: 60 mN.",
                  "parameters": {"Fc": {"mean": 0.0601, "sd": 0.0007, "unit": "N"}}},
             ],
             "candidates": [{"name": "device-friction", "delta_score": 8596.9, "standard_error": 3918.4},
                            {"name": "backlash", "delta_score": -1.5, "standard_error": 0.2}],
             "fit": {
                 when: {"rmse": rmse, "rmse_by_phase": {"rest": rmse}, "rmse_held_out": None,
-                       "coverage90": 0.9, "rmse_left_out": rmse, "rmse_of_mean": rmse,
-                       "full_model": {"rmse": full, "rmse_by_phase": {"rest": full}, "rmse_held_out": None}}
-                for when, rmse, full in (("before", 0.08, 0.078), ("after", 0.0247, 0.0213))
+                       "coverage90": 0.9, "rmse_of_mean": rmse}
+                for when, rmse in (("before", 0.08), ("after", 0.0247))
             },
             "unexplained": {
                 "size_n": 0.0123, "share": {"displacement": 0.75, "phase": 0.25}, "gain_nats": 41.0,
@@ -187,7 +187,7 @@ def drawing(name: str) -> str:
 
 
 def facts(**changed: Any) -> RunFacts:
-    """A run whose stages are all done but `effects`."""
+    """A run whose stages are all done."""
     said = summaries()
     stages = {
         name: StageFacts(
@@ -198,7 +198,7 @@ def facts(**changed: Any) -> RunFacts:
     given: dict[str, Any] = {
         "name": "forearm", "config_path": "runs/forearm.toml", "config_text": 'name = "forearm"\n',
         "config_sha256": "c" * 64, "version": "0.1.0", "seed": 7, "observation": "reaction", "mesh": "bricks",
-        "parameters": PARAMETERS, "stages": {**stages, "effects": StageFacts("effects", "not run")},
+        "parameters": PARAMETERS, "stages": stages,
         "history": HISTORY, "indices": {"prior_gp": INDICES},
     }  # fmt: skip
     return RunFacts(**{**given, **changed})

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 import bayeskin
 from bayeskin import mechanisms
 from bayeskin.behaviour import sha256_of_behaviour
+from bayeskin.mechanisms.hashes import _law
 from bayeskin.pipeline import diagnosing_sources, diagnosis
 from bayeskin.pipeline.folder import sha256_of_input
 
@@ -286,3 +287,19 @@ def test_verdicts_hold_after_a_comment_and_not_after_a_constant(
     assert diagnosing_sources.diagnosing_sources() == before
     changed.write_text(source + "REMARK = 1\n")
     assert diagnosing_sources.diagnosing_sources() != before
+
+
+def test_an_entry_of_the_catalogue_is_no_part_of_a_law(tmp_path: Path) -> None:
+    """A sentence or a prior of a mechanism costs no reduced model; its kernel does."""
+    source = Path(mechanisms.__file__).with_name("solid_viscoelasticity.py").read_text()
+    file, seen = tmp_path / "law.py", []
+    for before, after in (
+        ("", ""),
+        ("pulls", "draws"),
+        ("0.2, 15.0", "0.3, 15.0"),
+        ("past[:] = 0.0", "past[:] = 1.0"),
+    ):
+        assert before in source
+        file.write_text(source.replace(before, after) if before else source)
+        seen.append(_law(file))
+    assert seen[0] == seen[1] == seen[2] != seen[3]

@@ -129,7 +129,7 @@ def test_new_writes_the_device_into_the_configuration(bayeskin: Command, tmp_pat
     assert parameter_space(config).names[-1] == "cutis_m"
     code, line = bayeskin("diagnose", tmp_path / "case.toml")
     assert code == 2
-    assert "`bayeskin diagnose` takes no uncertain length" in line
+    assert "found none for this device and tissue; expected one that `bayeskin reduce` makes" in line
     assert not (tmp_path / "case").exists()
 
 

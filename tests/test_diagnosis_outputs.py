@@ -6,14 +6,12 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 import toy
 from matplotlib.figure import Figure
-from test_mismatch import tried
 from toy_inference import NOISE, TRUTH, ToySurrogate, toy_problem
 
 from bayeskin import report
@@ -23,25 +21,18 @@ from bayeskin.mismatch.contributions import Contribution, contributions
 from bayeskin.mismatch.discrepancy import discrepancy
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
-from bayeskin.mismatch.full_fit import FullFit
 from bayeskin.mismatch.locate import Located, Window
 from bayeskin.mismatch.observed import ObservedSurrogate
-from bayeskin.mismatch.search import Search
-from bayeskin.mismatch.verdict import Diagnosis, Named
-from bayeskin.pipeline import diagnosis
+from bayeskin.pipeline.diagnosis import in_words
 from bayeskin.pipeline.diagnosis_outputs import (
     Found,
     Remainder,
     Shown,
     candidates,
     draw,
-    in_words,
-    mechanism,
-    shown,
     unexplained,
 )
 from bayeskin.pipeline.folder import plain
-from bayeskin.pipeline.taking_up import TakenUp
 
 CREEP_S = 20.0
 VALUES = {
@@ -120,35 +111,7 @@ def test_friction_takes_its_creep_along() -> None:
     np.testing.assert_allclose(friction.force_n, kept.force_n + creep.force_n, atol=1e-12)
 
 
-def test_a_named_mechanism_states_the_size_of_its_own_part() -> None:
-    named = Named("sensor-drift", 1.0, ("sensor-drift",), 1.0, 5e-3)
-    parts = parts_of("force-offset", "sensor-drift")
-    values = {"drift": {"mean": 1e-4, "sd": 1e-6, "interval90": [9.8e-5, 1.02e-4]}}
-    said = mechanism(named, catalogue()["sensor-drift"], parts, values, {"drift": 1e-4})
-    assert said["contribution_n"] == pytest.approx(1e-4 * np.sqrt(np.mean(BINNED.time_s**2)))
-    assert said["statement"] == catalogue()["sensor-drift"].statement({"drift": 1e-4})
-    assert said["parameters"] == {"drift": {**values["drift"], "unit": "N/s"}}
-
-
 # What is left
-
-
-@pytest.mark.parametrize(
-    ("verdict", "windows", "described"),
-    [
-        ("nothing-missing", (), False),
-        ("nothing-missing", (WINDOW,), False),
-        ("named", (), False),
-        ("named", (WINDOW,), True),
-        ("unknown", (), True),
-        ("unknown", (WINDOW,), True),
-    ],
-)
-def test_what_is_left_is_described_where_something_is(
-    verdict: Any, windows: tuple[Window, ...], described: bool
-) -> None:
-    after = located(np.zeros(len(BINNED.force_n)), *windows)
-    assert diagnosis.leaves_something(Diagnosis(verdict, (), 0.0, 0.05, True), after) == described
 
 
 def drifting() -> Fit:
@@ -177,47 +140,29 @@ def test_what_is_left_is_said_with_its_size_parts_and_form(remainder: Remainder)
     assert said["form"]["sentence"] == remainder.form.sentence
 
 
-def test_words_say_what_is_left_only_where_something_is(remainder: Remainder) -> None:
+def test_words_say_what_was_found_and_how_far_the_models_are_off() -> None:
     fits = {
-        "rmse": 1e-3,
-        "rmse_held_out": None,
-        "rmse_of_mean": 5e-3,
-        "rmse_left_out": 4e-3,
-        "full_model": {"rmse": 2.5e-3, "rmse_held_out": 3e-3, "fit_off_by": 4e-4, "runs": 2},
-        "sampled": {"settled": True, "rhat": 1.37, "effective": 150.0},
-    }
-    answer = {
-        "verdict": "unknown", "mechanisms": [], "located": [], "remaining": [], "candidates": [],
-        "fit": {"before": fits, "after": fits}, "folder": "x", "unexplained": None, "unsure": [],
-        "refuted": [],
-        "unknown_probability": 0.974,
+        "rmse": 1e-3, "rmse_held_out": 3e-3, "emulator": {"settled": True}, "sampled": {"settled": True},
     }  # fmt: skip
-    assert "outside this catalogue: probability at most 0.97" in in_words(answer)
-    assert "unexplained" not in in_words(answer)
-    assert "R-hat" not in in_words(answer)
-    faint = in_words(
-        {**answer, "verdict": "nothing-missing", "best_set": ["pre-stretch"], "set_probability": 0.9}
+    answer: dict[str, Any] = {
+        "verdict": "unknown", "mechanisms": [], "nothing_probability": 0.02, "smooth_probability": 0.974,
+        "located": [], "remaining": [], "best_set": [], "candidates": [], "folder": "x",
+        "fit": {"before": fits, "after": fits}, "full_model": {"rmse": 2.5e-3, "reduced_off_by": 4e-4},
+    }  # fmt: skip
+    words = in_words(answer)
+    assert "something smooth that is not in the catalogue: probability 0.97" in words
+    assert "before: RMSE 1.0 mN, 3.0 mN on what follows the second hold, not fitted" in words
+    assert "RMSE 2.5 mN. The reduced model is off by 0.40 mN there." in words
+    assert "rough" not in words
+    rough = {**answer, "fit": {"before": fits, "after": {**fits, "sampled": {"settled": False}}}}
+    assert "The intervals are rough" in in_words(rough)
+    assert "The full model fails at the best values: it folds" in in_words(
+        {**answer, "full_model": {"message": "it folds"}}
     )
+    faint = in_words({**answer, "verdict": "nothing-missing", "best_set": ["pre-stretch"]})
     assert "With pre-stretch it would fit better" in faint
-    assert "not to be relied on" in faint
-    for alike in ({"verdict": "nothing-missing", "best_set": []}, {"verdict": "unknown", "best_set": ["x"]}):
-        assert "would fit better" not in in_words({**answer, **alike, "set_probability": None})
-    believed = in_words({**answer, "best_set": ["pad-slip", "backlash"], "set_probability": 0.034})
-    assert "pad-slip, backlash: probability against something smooth without a name 0.03" in believed
-    rough = {**fits, "sampled": {**fits["sampled"], "settled": False}}
-    assert "R-hat of the draws 1.37" in in_words({**answer, "fit": {"before": rough, "after": fits}})
-    assert "each phase by a fit without it: RMSE 4.0 mN" in in_words(answer)
-    assert "without what the surrogate's own error takes up: 5.0 mN" in in_words(answer)
-    said = "full model: RMSE 2.5 mN, 3.0 mN on what follows the second hold, not fitted; the surrogate's fit"
-    assert f"{said} is off by 0.4 mN" in in_words(answer)
-    said = unexplained(remainder)
-    words = in_words({**answer, "unexplained": said})
-    assert f"left unexplained: {1e3 * said['size_n']:.1f} mN RMS" in words
-    assert said["form"]["sentence"] in words
-    assert all(feature in words for feature in said["features"])
-    nothing = in_words({**answer, "unexplained": {**said, "noticeable": False}})
-    assert "nothing beyond noise" in nothing
-    assert "mN RMS" not in nothing
+    for alike in ({"verdict": "nothing-missing"}, {"best_set": ["x"]}):
+        assert "would fit better" not in in_words({**answer, **alike})
 
 
 # Figures
@@ -240,21 +185,6 @@ def test_each_figure_is_written_where_it_has_something_to_show(
     assert {Path(name).stem for name in written[1]} == {
         "located", "candidates", "before_after", "residual_by_phase", "base_parameters"
     }  # fmt: skip
-
-
-def test_a_fit_is_drawn_by_the_full_model_where_there_is_a_run() -> None:
-    fit, begun, run = fitted("force-offset"), fitted(), np.full(len(BINNED.force_n), 0.25)
-    full = FullFit({}, 0.0, run, 0.0 * run, 1, 0.0)
-    taken = cast(TakenUp, SimpleNamespace(full=full, band_n=(run, run), located=None,
-                                          draws=SimpleNamespace(summary={})))  # fmt: skip
-    both = shown(fit, taken, begun, full)
-    assert both.force_n is run
-    assert both.held_out_n is run
-    failed = cast(TakenUp, SimpleNamespace(**{**vars(taken), "full": "did not converge"}))
-    neither = shown(fit, failed, begun, None)
-    np.testing.assert_array_equal(neither.force_n, fit.force_n)
-    np.testing.assert_array_equal(neither.held_out_n, begun.force_n)  # type: ignore[arg-type]
-    assert shown(fit, taken, None, None).held_out_n is None
 
 
 def test_before_and_after_have_their_band_and_what_was_not_fitted() -> None:
@@ -343,11 +273,11 @@ def test_contributions_have_a_row_each_and_rounding_does_not_fill_one() -> None:
 def test_what_a_pair_gains_is_no_candidate_s_alone() -> None:
     known = catalogue()
     sets: list[tuple[str, ...]] = [(), ("device-friction",), ("device-friction", "force-offset")]
-    search = Search({names: fitted(*names) for names in sets}, {("force-offset",): fitted("force-offset")})
-    assert [row["name"] for row in candidates(search, known)] == ["device-friction"]
+    fits = {names: fitted(*names) for names in sets}
+    assert [row["name"] for row in candidates(fits, known)] == ["device-friction"]
     needed = ("device-friction", "friction-creep")
-    search.fits[needed] = fitted(*needed)
-    assert {row["name"] for row in candidates(search, known)} == set(needed)
+    fits[needed] = fitted(*needed)
+    assert {row["name"] for row in candidates(fits, known)} == set(needed)
 
 
 def test_candidates_of_a_few_nats_are_read_off_beside_one_of_hundreds() -> None:
@@ -365,47 +295,3 @@ def test_candidates_of_a_few_nats_are_read_off_beside_one_of_hundreds() -> None:
     assert headline(figure).endswith("viscous-drag alone gains most")
     rows[1] |= {"delta_score": 750.0}
     assert headline(report.figure_candidates(rows)).endswith("most, 1 other as much within the error")
-
-
-def test_the_best_set_is_the_one_that_the_full_model_makes_it() -> None:
-    found = tried({(): 0.0, ("x",): 90.0, ("y",): 70.0})
-
-    def taken(weight: float | None) -> Any:
-        return SimpleNamespace(full_weight=weight, full=None)
-
-    before, after, rival = taken(5.0), taken(80.0), taken(95.0)
-    likeliest = diagnosis._likeliest(found, before, after, found.rivals(None), [rival])
-    assert likeliest is rival
-    assert found.best.names == ("y",)
-    found.full = {}
-    assert diagnosis._likeliest(found, before, after, found.rivals(None), [taken(None)]) is after
-    found.full = {}
-    assert diagnosis._likeliest(found, before, taken(1.0), found.rivals(None), [taken(2.0)]) is before
-    found.full = {}
-    none = taken(None)
-    assert diagnosis._likeliest(found, none, none, found.rivals(None), [none]) is none
-    assert found.best.names == ("x",)
-
-
-def test_a_set_that_the_full_model_cannot_run_goes_for_none_that_leaves_much() -> None:
-    found = tried({(): 0.0, ("x",): 90.0, ("y",): 70.0})
-
-    def taken(weight: float | None, left: str) -> Any:
-        fit = found.base
-        noise = [name for name in fit.log_posterior.names if name.startswith("sd_")]
-        end = fit.log_posterior.bounds[left == "much"]
-        widest = fit.log_posterior.named(fit.log_posterior.from_sampling(np.asarray(end)))
-        theta = {**fit.theta, **{name: widest[name] for name in noise}}
-        full = FullFit(theta, 0.0, fit.force_n, fit.force_n, 1, 0.0)
-        return SimpleNamespace(full_weight=weight, full="the skin folds" if weight is None else full)
-
-    rivals = [found.fits["y",]]
-    for before, rival, best in (("much", "much", "x"), ("much", "little", "y"), ("little", "much", "")):
-        found.full = {}
-        without, failed, other = taken(5.0, before), taken(None, ""), taken(70.0, rival)
-        after = diagnosis._likeliest(found, without, failed, rivals, [other])
-        assert after is {"x": failed, "y": other, "": without}[best]
-        assert "".join(found.best.names) == best
-    found.full = {}
-    runs = taken(60.0, "much")
-    assert diagnosis._likeliest(found, taken(5.0, "much"), runs, rivals, [taken(70.0, "much")]) is not runs

@@ -16,7 +16,7 @@ from bayeskin.mismatch.fit import fit_near
 from bayeskin.mismatch.joint_fit import JointFit, fit_jointly, within
 from bayeskin.mismatch.resample import resample
 from bayeskin.mismatch.wrapper import innermost
-from bayeskin.pipeline.joint_bench import JointBench
+from bayeskin.pipeline.workbench import Workbench
 from bayeskin.surrogates import train
 from bayeskin.types import Array, Design, Surrogate
 
@@ -25,7 +25,7 @@ FEW = EmulationSettings(points=30)
 
 
 @pytest.fixture(params=SETS, ids=["base", "offset"])
-def fitted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tuple[JointBench, JointFit]:
+def fitted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tuple[Workbench, JointFit]:
     names = request.param
     bench = solved.bench(monkeypatch, solved.recorded(3, **({"F0": -0.03} if names else {})))
     found = fit_jointly(names, {**bench.noise, **TRUTH, "F0": 0.0}, bench.skin, bench.local)
@@ -36,7 +36,7 @@ def fitted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> t
 Answers = Sequence[Array | str]
 
 
-def by_the_toy(bench: JointBench, names: tuple[str, ...], asked: list[int]) -> Forces:
+def by_the_toy(bench: Workbench, names: tuple[str, ...], asked: list[int]) -> Forces:
     """Runs of the toy, which counts them; it is exact, so no full model is asked for."""
 
     def forces(points: Array, full: int) -> tuple[Answers, Answers]:
@@ -52,7 +52,7 @@ def learnt(design: Design) -> Surrogate:
     return train(design, "gp", 1)[0]
 
 
-def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[JointBench, JointFit]) -> None:
+def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[Workbench, JointFit]) -> None:
     bench, found = fitted
     asked: list[int] = []
     emulated = emulate([found], by_the_toy(bench, found.fit.names, asked), learnt, solved.NOISE_N, 1, FEW)
@@ -69,7 +69,7 @@ def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[JointBench, JointFit]
 
 
 def test_the_first_points_are_about_all_maxima(
-    fitted: tuple[JointBench, JointFit], monkeypatch: pytest.MonkeyPatch
+    fitted: tuple[Workbench, JointFit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench, found = fitted
     softer = {name: 0.7 * TRUTH[name] for name in ("E_c", "E_s")}
@@ -95,7 +95,7 @@ def test_the_first_points_are_about_all_maxima(
 
 
 @pytest.mark.slow
-def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[JointBench, JointFit]) -> None:
+def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[Workbench, JointFit]) -> None:
     bench, found = fitted
     emulated = emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
     assert not isinstance(emulated, str)
@@ -117,7 +117,7 @@ def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[JointBench, Joint
     assert np.all(np.abs(np.log(sd / exact_sd)) < np.log(1.5))
 
 
-def test_the_same_seed_gives_the_same_draws(fitted: tuple[JointBench, JointFit]) -> None:
+def test_the_same_seed_gives_the_same_draws(fitted: tuple[Workbench, JointFit]) -> None:
     bench, found = fitted
     made = [
         emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
@@ -129,7 +129,7 @@ def test_the_same_seed_gives_the_same_draws(fitted: tuple[JointBench, JointFit])
 
 
 def test_runs_that_fail_are_done_without_and_are_the_answer_where_all_do(
-    fitted: tuple[JointBench, JointFit],
+    fitted: tuple[Workbench, JointFit],
 ) -> None:
     bench, found = fitted
     run = by_the_toy(bench, found.fit.names, [])
@@ -191,7 +191,7 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
     assert behind < 8.0
 
 
-def test_one_wave_alone_is_never_settled(fitted: tuple[JointBench, JointFit]) -> None:
+def test_one_wave_alone_is_never_settled(fitted: tuple[Workbench, JointFit]) -> None:
     bench, found = fitted
     one = dataclasses.replace(FEW, waves=1)
     emulated = emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, one)
@@ -201,7 +201,7 @@ def test_one_wave_alone_is_never_settled(fitted: tuple[JointBench, JointFit]) ->
 
 
 def test_an_emulator_that_is_sure_nowhere_is_believed_but_never_settled(
-    fitted: tuple[JointBench, JointFit],
+    fitted: tuple[Workbench, JointFit],
 ) -> None:
     bench, found = fitted
     never = dataclasses.replace(FEW, sure=1e-9, waves=2)

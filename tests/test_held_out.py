@@ -13,7 +13,7 @@ from toys.solved import TRUTH
 from bayeskin.mismatch.held_out import Beginning, end_of_second_hold, fit_beginning
 from bayeskin.mismatch.joint_fit import JointFit, fit_jointly
 from bayeskin.mismatch.tasks import Task
-from bayeskin.pipeline.joint_bench import JointBench
+from bayeskin.pipeline.workbench import Workbench
 from bayeskin.types import Phase
 
 SPLIT_S = 50.0
@@ -21,13 +21,13 @@ OFFSET = ("force-offset",)
 VALUES = {"F0": -0.03}
 
 
-def fitted(bench: JointBench, names: Sequence[str]) -> JointFit:
+def fitted(bench: Workbench, names: Sequence[str]) -> JointFit:
     found = fit_jointly(names, {**bench.noise, **TRUTH, **VALUES}, bench.skin, bench.local)
     assert isinstance(found, JointFit)
     return found
 
 
-def begun(bench: JointBench, sets: Sequence[JointFit], split_s: float | None = SPLIT_S) -> Beginning | None:
+def begun(bench: Workbench, sets: Sequence[JointFit], split_s: float | None = SPLIT_S) -> Beginning | None:
     def ask(tasks: Sequence[Task]) -> list[object]:
         return [bench.answered(task, bench.done(task)) for task in tasks]
 

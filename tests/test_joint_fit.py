@@ -14,11 +14,10 @@ from toys.solved import BASE, TRUTH, Exact, a_run
 
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.straighten import shear_at
-from bayeskin.mismatch.corrected import FullRun
 from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, solved_columns, within
-from bayeskin.mismatch.tangent import POWER, Tangent
+from bayeskin.mismatch.tangent import POWER, ModelRun, Tangent
 from bayeskin.mismatch.wrapper import innermost
-from bayeskin.pipeline.joint_bench import JointBench
+from bayeskin.pipeline.workbench import Workbench
 from bayeskin.types import Correlation, ParameterSpace
 
 SET = ("force-offset", "stiffness-drift")
@@ -30,22 +29,22 @@ PEAKED = dataclasses.replace(BASE.parameters[0], prior="log-normal", centre=150e
 
 
 @pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> JointBench:
+def bench(monkeypatch: pytest.MonkeyPatch) -> Workbench:
     return solved.bench(monkeypatch, solved.recorded(0, F0=-0.03, stiffness_rate=-8e-4))
 
 
-def start(bench: JointBench) -> dict[str, float]:
+def start(bench: Workbench) -> dict[str, float]:
     return {**bench.noise, **START}
 
 
-def tangent(bench: JointBench, space: ParameterSpace = BASE) -> tuple[Tangent, FullRun]:
+def tangent(bench: Workbench, space: ParameterSpace = BASE) -> tuple[Tangent, ModelRun]:
     run = a_run(bench)
     assert run.slopes_n is not None
     return Tangent(space, solved.EDGES_S, (run,)), run
 
 
 @pytest.mark.parametrize("first", [BASE.parameters[0], PEAKED], ids=["flat", "peaked"])
-def test_a_tangent_has_the_value_and_the_slopes_of_its_run(bench: JointBench, first) -> None:
+def test_a_tangent_has_the_value_and_the_slopes_of_its_run(bench: Workbench, first) -> None:
     space = ParameterSpace((first, *BASE.parameters[1:]))
     near, run = tangent(bench, space)
     found = near.predict(run.theta)
@@ -62,7 +61,7 @@ def test_a_tangent_has_the_value_and_the_slopes_of_its_run(bench: JointBench, fi
         np.testing.assert_allclose(skin, run.slopes_n[:, i], rtol=0, atol=1e-4 * largest)
 
 
-def test_a_tangent_is_a_straight_line_in_the_box_of_what_is_no_modulus(bench: JointBench) -> None:
+def test_a_tangent_is_a_straight_line_in_the_box_of_what_is_no_modulus(bench: Workbench) -> None:
     near, run = tangent(bench)
     share = np.linspace(0.0, 1.0, 5)[:, None]
     others = run.theta * np.array([1.0, 1.0, 20.0, 0.1, 2.0])
@@ -74,7 +73,7 @@ def test_a_tangent_is_a_straight_line_in_the_box_of_what_is_no_modulus(bench: Jo
 
 @pytest.mark.parametrize("factor", [0.3, 4.0])
 def test_moduli_times_c_and_permeabilities_over_c_pull_c_times_as_hard(
-    bench: JointBench, factor: float
+    bench: Workbench, factor: float
 ) -> None:
     """Far from the run, too, if its slopes have it: by Euler, those of moduli and permeabilities add up."""
     run = a_run(bench)
@@ -83,7 +82,7 @@ def test_moduli_times_c_and_permeabilities_over_c_pull_c_times_as_hard(
     by_log = run.slopes_n[:, :4] / width
     by_log[:, 1] = run.force_n + by_log[:, 2] + by_log[:, 3] - by_log[:, 0]
     slopes_n = np.column_stack([by_log * width, run.slopes_n[:, 4:]])
-    near = Tangent(BASE, solved.EDGES_S, (FullRun(run.theta, run.force_n, slopes_n),))
+    near = Tangent(BASE, solved.EDGES_S, (ModelRun(run.theta, run.force_n, slopes_n),))
     aside = run.theta * np.array([1.5, 0.7, 2.0, 0.4, 1.0])
     stiffer = aside * np.array([factor, factor, 1.0 / factor, 1.0 / factor, 1.0])
     for here, there in ((run.theta, run.theta * (stiffer / aside)), (aside, stiffer)):
@@ -91,10 +90,10 @@ def test_moduli_times_c_and_permeabilities_over_c_pull_c_times_as_hard(
         np.testing.assert_allclose(mean[1], factor * mean[0], rtol=1e-12, atol=1e-15)
 
 
-def test_several_runs_are_all_met_with_their_slopes(bench: JointBench) -> None:
+def test_several_runs_are_all_met_with_their_slopes(bench: Workbench) -> None:
     first = a_run(bench)
     second = bench.skin((), {**start(bench), "E_c": 130e3, "k_s": 6e-14})
-    assert isinstance(second, FullRun)
+    assert isinstance(second, ModelRun)
     near, step = Tangent(BASE, solved.EDGES_S, (first, second)), 1e-4
     between = Tangent(BASE, solved.EDGES_S, (first,)).predict_mean(second.theta)[0]
     assert np.abs(between - second.force_n).max() > 1e-3  # which one alone does not know
@@ -108,7 +107,7 @@ def test_several_runs_are_all_met_with_their_slopes(bench: JointBench) -> None:
             np.testing.assert_allclose((ahead - back) / (2.0 * step), run.slopes_n[:, i], rtol=0, atol=2e-5)
 
 
-def highest(bench: JointBench) -> tuple[float, dict[str, float]]:
+def highest(bench: Workbench) -> tuple[float, dict[str, float]]:
     """Log density and values of the highest top of the set's posterior by the skin itself, of many climbs."""
     about = bench.local(SET, [a_run(bench, SET)])
     seen: Any = about.surrogate  # what the instrument does, about the skin
@@ -122,7 +121,7 @@ def highest(bench: JointBench) -> tuple[float, dict[str, float]]:
     return top.value, whole.named(whole.from_sampling(top.vector))
 
 
-def test_a_fit_reaches_the_maximum_of_the_skin_itself(bench: JointBench) -> None:
+def test_a_fit_reaches_the_maximum_of_the_skin_itself(bench: Workbench) -> None:
     found = fit_jointly(SET, start(bench), bench.skin, bench.local)
     value, theta = highest(bench)
     assert isinstance(found, JointFit)
@@ -139,7 +138,7 @@ def test_a_fit_reaches_the_maximum_of_the_skin_itself(bench: JointBench) -> None
     np.testing.assert_allclose(found.run.theta[:5], at_run[:5], rtol=1e-6)
 
 
-def test_what_is_added_to_the_force_is_part_of_each_run(bench: JointBench) -> None:
+def test_what_is_added_to_the_force_is_part_of_each_run(bench: Workbench) -> None:
     """A recording by the reduced model and more is fitted as the recording by the reduced model alone."""
     plain = fit_jointly(SET, start(bench), bench.skin, bench.local)
     off_n = 5e-3 * np.sin(np.arange(len(bench.binned.force_n)) / 7.0)
@@ -151,7 +150,7 @@ def test_what_is_added_to_the_force_is_part_of_each_run(bench: JointBench) -> No
     assert found.fit.value == pytest.approx(plain.fit.value, abs=0.2)
     assert found.fit.theta["F0"] == pytest.approx(plain.fit.theta["F0"], abs=2e-4)
     alone = bench.skin(SET, found.fit.theta)
-    assert isinstance(alone, FullRun)
+    assert isinstance(alone, ModelRun)
     np.testing.assert_allclose(found.run.force_n, alone.force_n + off_n, atol=1e-6)
     np.testing.assert_array_equal(found.off_n, off_n)
     assert not plain.off_n.any()
@@ -160,16 +159,16 @@ def test_what_is_added_to_the_force_is_part_of_each_run(bench: JointBench) -> No
 class Unsteady:
     """Runs of a bench, some of which fail."""
 
-    def __init__(self, bench: JointBench, failing: Sequence[int]) -> None:
+    def __init__(self, bench: Workbench, failing: Sequence[int]) -> None:
         self.bench, self.failing, self.made = bench, failing, 0
 
-    def __call__(self, names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
+    def __call__(self, names: Sequence[str], theta: Mapping[str, float]) -> ModelRun | str:
         self.made += 1
         return "near folding" if self.made in self.failing else self.bench.skin(names, theta)
 
 
 @pytest.mark.parametrize("failing", [(2,), (3,), (2, 4)])
-def test_a_fit_goes_on_where_a_run_in_the_middle_fails(bench: JointBench, failing: tuple[int, ...]) -> None:
+def test_a_fit_goes_on_where_a_run_in_the_middle_fails(bench: Workbench, failing: tuple[int, ...]) -> None:
     skin = Unsteady(bench, failing)
     found = fit_jointly(SET, start(bench), skin, bench.local, TrustSettings(runs=14))
     assert isinstance(found, JointFit)
@@ -178,23 +177,23 @@ def test_a_fit_goes_on_where_a_run_in_the_middle_fails(bench: JointBench, failin
     assert found.fit.value == pytest.approx(highest(bench)[0], abs=2.0 * TrustSettings().enough)
 
 
-def test_a_fit_whose_first_run_fails_is_its_message(bench: JointBench) -> None:
+def test_a_fit_whose_first_run_fails_is_its_message(bench: Workbench) -> None:
     skin = Unsteady(bench, (1,))
     assert fit_jointly(SET, start(bench), skin, bench.local) == "near folding"
     assert skin.made == 1
 
 
-def test_a_fit_is_the_first_run_s_where_all_others_fail(bench: JointBench) -> None:
+def test_a_fit_is_the_first_run_s_where_all_others_fail(bench: Workbench) -> None:
     found = fit_jointly(SET, start(bench), Unsteady(bench, range(2, 99)), bench.local)
     assert isinstance(found, JointFit)
     assert not found.settled
     np.testing.assert_array_equal(found.run.theta[:5], [START[name] for name in BASE.names])
 
 
-def test_a_fit_takes_shorter_steps_where_long_ones_fail(bench: JointBench) -> None:
+def test_a_fit_takes_shorter_steps_where_long_ones_fail(bench: Workbench) -> None:
     last, failed = np.array([START["E_c"], START["E_s"]]), []
 
-    def skin(names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
+    def skin(names: Sequence[str], theta: Mapping[str, float]) -> ModelRun | str:
         """Runs as far as moduli change by a third since the last run."""
         nonlocal last
         moduli = np.array([theta["E_c"], theta["E_s"]])
@@ -213,7 +212,7 @@ def test_a_fit_takes_shorter_steps_where_long_ones_fail(bench: JointBench) -> No
 
 @pytest.mark.parametrize("power", [1.0, POWER])
 def test_a_sum_of_powers_of_moduli_stays_on_the_ridge_that_a_shear_knows(
-    bench: JointBench, power: float
+    bench: Workbench, power: float
 ) -> None:
     about = bench.local(SET, [a_run(bench, SET)])
     vector = about.vector({**start(bench), **TRUTH, "stiffness_rate": 0.0, "F0": 0.0})
@@ -232,10 +231,10 @@ def test_a_sum_of_powers_of_moduli_stays_on_the_ridge_that_a_shear_knows(
     assert abs(along - here) < (0.03 if power == POWER else 0.15) * abs(across - here)
 
 
-def test_a_step_that_fails_shortens_the_next_along_what_moved_far(bench: JointBench) -> None:
+def test_a_step_that_fails_shortens_the_next_along_what_moved_far(bench: Workbench) -> None:
     last, failed = START["k_s"], 0
 
-    def skin(names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
+    def skin(names: Sequence[str], theta: Mapping[str, float]) -> ModelRun | str:
         """Runs as far as one permeability changes by a quarter since the last run."""
         nonlocal last, failed
         if abs(np.log(theta["k_s"] / last)) > np.log(1.25):
@@ -252,13 +251,13 @@ def test_a_step_that_fails_shortens_the_next_along_what_moved_far(bench: JointBe
     assert stiffness[2] != pytest.approx(stiffness[1], rel=0.1)
 
 
-def test_a_fit_does_not_go_on_from_a_run_that_is_worse(bench: JointBench) -> None:
-    made: list[FullRun] = []
+def test_a_fit_does_not_go_on_from_a_run_that_is_worse(bench: Workbench) -> None:
+    made: list[ModelRun] = []
 
-    def skin(names: Sequence[str], theta: Mapping[str, float]) -> FullRun | str:
+    def skin(names: Sequence[str], theta: Mapping[str, float]) -> ModelRun | str:
         """Whose third run pulls ten times as hard as the second's slopes say."""
         run = bench.skin(names, theta)
-        assert isinstance(run, FullRun)
+        assert isinstance(run, ModelRun)
         made.append(dataclasses.replace(run, force_n=(10.0 if len(made) == 2 else 1.0) * run.force_n))
         return made[-1]
 
@@ -269,7 +268,7 @@ def test_a_fit_does_not_go_on_from_a_run_that_is_worse(bench: JointBench) -> Non
 
 
 @pytest.mark.parametrize("runs", [1, 2, 3, 5])
-def test_no_more_runs_are_made_than_asked_for_and_more_are_never_worse(bench: JointBench, runs: int) -> None:
+def test_no_more_runs_are_made_than_asked_for_and_more_are_never_worse(bench: Workbench, runs: int) -> None:
     values = []
     for most in (runs, runs + 1):
         skin = Unsteady(bench, ())
@@ -281,7 +280,7 @@ def test_no_more_runs_are_made_than_asked_for_and_more_are_never_worse(bench: Jo
 
 
 @pytest.mark.parametrize("reach", [0.0, 0.15])
-def test_a_trust_region_holds_what_the_model_solves_and_nothing_else(bench: JointBench, reach: float) -> None:
+def test_a_trust_region_holds_what_the_model_solves_and_nothing_else(bench: Workbench, reach: float) -> None:
     about = bench.local(SET, [a_run(bench, SET)])
     space, (low, high) = about.surrogate.space, about.bounds
     assert [n for n, held in zip(space.names, solved_columns(about), strict=True) if not held] == ["F0"]

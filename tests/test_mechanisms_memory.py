@@ -296,36 +296,3 @@ def test_a_shortcut_is_near_the_full_model(base, name):
     effect = np.sqrt(np.mean((found.at(times) - base.at(times)) ** 2))
     assert effect > 1e-3
     assert np.sqrt(np.mean((quick - found.at(times)) ** 2)) < 0.1 * effect
-
-
-def test_the_estimate_of_viscoelasticity_is_near_the_full_model(base):
-    mechanism = SOLVED["solid-viscoelasticity"]
-    found = simulate(ModelSpec(), SHORT, strong(mechanism.name), laws=laws([mechanism]))
-    columns = {key: np.array([value]) for key, value in STRONG.items()}
-    times = np.arange(0.0, 18.0, 0.2)
-    quick = mechanism.act.estimate(columns, SHORT, lambda t: np.atleast_2d(base.at(t)))(times)[0]
-    effect = np.sqrt(np.mean((found.at(times) - base.at(times)) ** 2))
-    assert effect > 1e-3
-    assert np.sqrt(np.mean((quick - found.at(times)) ** 2)) < 0.1 * effect
-
-
-def test_the_estimate_of_viscoelasticity_relaxes_a_held_stress_by_its_exponentials():
-    motion = PadMotion(np.array([0.0, 2.0, 30.0]), np.array([0.0, 1e-3, 1e-3]))
-    stretch = 1.0 + 0.5 * motion.at(np.array([2.0, 7.0, 25.0])) / 18e-3
-    values = {"g_1": [0.5, 0.0], "tau_1": [3.0, 1.0], "g_2": [1.5, 0.7], "tau_2": [40.0, 20.0]}
-
-    def force(time_s):
-        ramp = np.minimum(np.asarray(time_s) / 2.0, 1.0)
-        return np.atleast_2d(ramp * (1.0 + 0.5 * motion.at(time_s) / 18e-3))
-
-    act = SOLVED["solid-viscoelasticity"].act
-    columns = {name: np.array(value) for name, value in values.items()}
-    found = act.estimate(columns, motion, force)(np.array([2.0, 7.0, 25.0]))
-    since = np.array([0.0, 5.0, 23.0])
-    for row in range(2):
-        left = sum(
-            columns[g][row] * columns[tau][row] / 2.0
-            * (1.0 - np.exp(-2.0 / columns[tau][row])) * np.exp(-since / columns[tau][row])
-            for g, tau in (("g_1", "tau_1"), ("g_2", "tau_2"))
-        )  # fmt: skip
-        np.testing.assert_allclose(found[row], stretch * (1.0 + left), rtol=1e-9)

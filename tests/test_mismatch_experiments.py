@@ -258,9 +258,6 @@ def test_sets_with_look_alikes_in_the_place_of_the_likeliest_compete() -> None:
     none = dataclasses.replace(alike, names=(), log_evidence=3.0)
     found = [none, alike, both, likely]
     assert [one.names for one in compete(found, ["rub"], KNOWN)] == [("rub",), ("drag",)]
-    # A set that the search refused, since the surrogate is unsure of it, is no reference however likely.
-    unsure = dataclasses.replace(alike, log_evidence=99.0)
-    assert [one.names for one in compete([*found, unsure], ["rub"], KNOWN)] == [("rub",), ("drag",)]
     ruled_out = dataclasses.replace(alike, log_evidence=9.0 - OPEN - 0.1)
     assert [one.names for one in compete([none, ruled_out, likely], ["rub"], KNOWN)] == [("rub",)]
     impossible = dataclasses.replace(alike, log_evidence=-np.inf)
@@ -278,6 +275,11 @@ def test_noise_of_a_test_to_come_is_that_of_the_fit() -> None:
     hold = slice(20, 40)
     near = np.diag(covariance[hold, hold], 1)
     np.testing.assert_allclose(near, NOISE["sd_hold"] ** 2 * np.exp(-1.0 / NOISE["tau_noise"]) + 0.2e-6)
+
+
+def made(fits: Sequence[Fit]) -> Any:
+    """A search that has made these fits."""
+    return SimpleNamespace(fits={one.names: SimpleNamespace(fit=one) for one in fits})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -307,7 +309,6 @@ def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
     bench = SimpleNamespace(motion=toy.MOTION, known=KNOWN, forward=skin, source=SimpleNamespace(seed=0))
     monkeypatch.setattr(experiment, "opened", lambda *_: run)
     monkeypatch.setattr(experiment, "bench_of", lambda _: bench)
-    monkeypatch.setattr(experiment, "workbench", lambda _: bench)
     monkeypatch.setattr(experiment, "searches_file", lambda *_: tmp_path / "searches")
     monkeypatch.setattr(experiment, "asked", lambda *_: nullcontext(asked))
     monkeypatch.setattr(experiment, "caption", lambda _: "x")
@@ -318,7 +319,7 @@ def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
 def test_nothing_competes_with_the_only_set_that_was_tried(
     diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(diagnosis, "fits_of", lambda _: [fitted("rub", rubbing=4e-3)])
+    monkeypatch.setattr(experiment, "searched", lambda *_: made([fitted("rub", rubbing=4e-3)]))
     answer = experiment.choose(diagnosed.source, Silent())
     assert (answer["ok"], answer["sets"]) == (True, [["rub"]])
     assert "nothing competes" in answer["text"]
@@ -328,7 +329,7 @@ def test_nothing_competes_with_the_only_set_that_was_tried(
 def test_without_a_diagnosis_its_answer_is_given_and_without_its_fits_one_line(
     diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(diagnosis, "fits_of", lambda _: [])
+    monkeypatch.setattr(experiment, "searched", lambda *_: made([]))
     with pytest.raises(InputError, match="no fit of rub; expected those that `bayeskin diagnose` left"):
         experiment.choose(diagnosed.source, Silent())
     failed = {"ok": False, "message": "too few runs", "text": "design: failed: too few runs"}
@@ -340,7 +341,7 @@ def test_the_test_to_run_next_is_written_for_the_machine(
     diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    monkeypatch.setattr(diagnosis, "fits_of", lambda _: fits)
+    monkeypatch.setattr(experiment, "searched", lambda *_: made(fits))
     answer = experiment.choose(diagnosed.source, Silent())
     best = answer["experiments"][0]
     words = answer["text"].splitlines()
@@ -356,7 +357,7 @@ def test_tests_whose_processes_are_lost_are_said_to_be_unjudged(
     diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
-    monkeypatch.setattr(diagnosis, "fits_of", lambda _: fits)
+    monkeypatch.setattr(experiment, "searched", lambda *_: made(fits))
     monkeypatch.setattr(
         experiment, "asked", lambda *_: nullcontext(lambda tasks: ["the process was lost"] * len(tasks))
     )

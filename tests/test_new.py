@@ -19,11 +19,9 @@ from bayeskin.design import default_space
 from bayeskin.errors import InputError
 from bayeskin.inference import NoisePriors
 from bayeskin.pipeline import stages
-from bayeskin.pipeline.effects import effect_files
 from bayeskin.pipeline.engine import Silent, open_run
 from bayeskin.pipeline.new import new_config, new_demo
 from bayeskin.pipeline.shipping import shipped_files
-from bayeskin.pipeline.workbench import opened
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_manifest
 from bayeskin.types import Recording
@@ -167,8 +165,9 @@ def test_without_a_recording_it_is_the_demo(tmp_path: Path) -> None:
 def test_a_recording_with_the_name_of_a_shipped_surrogate_is_not_taken_for_it(tmp_path: Path) -> None:
     recording = tmp_path / "demo.h5"
     shutil.copy(shipped("data/demo.h5"), recording)
-    run = opened(recording, Silent())
-    assert run.config.surrogate.file == recording.name
+    case = tmp_path / "case.toml"
+    case.write_text('[recording]\nfile = "demo.h5"\n[surrogate]\nfile = "demo.h5"\n')
+    run = open_run(case, Silent())
     assert shipped_files(run).surrogate == shipped("surrogates/demo.h5")
 
 
@@ -178,31 +177,6 @@ def test_a_surrogate_that_is_nowhere_is_told_apart_from_a_broken_installation(tm
     case.write_text('[recording]\nfile = "a.h5"\n[surrogate]\nfile = "mine.h5"\n')
     with pytest.raises(InputError, match=r"surrogate.file: found no file .*mine.h5; expected .*: demo.h5, "):
         shipped_files(open_run(case, Silent()))
-
-
-def test_effects_that_come_with_a_surrogate_of_ones_own_are_tried_before_they_are_read(
-    tmp_path: Path,
-) -> None:
-    for name in ("a.h5", "mine.h5", "mine-design.h5"):
-        shutil.copy(shipped("data/demo.h5"), tmp_path / name)
-    (tmp_path / "mine-effects").mkdir()
-    (tmp_path / "mine-effects" / "bottom-adherence.h5").write_bytes(b"\x89HDF")
-    case = tmp_path / "case.toml"
-    case.write_text('[recording]\nfile = "a.h5"\n[surrogate]\nfile = "mine.h5"\n')
-    with pytest.raises(InputError, match=r"bottom-adherence.h5: found not readable as HDF5"):
-        shipped_files(open_run(case, Silent()))
-
-
-def test_learnt_effects_go_before_shipped_ones_part_by_part(demo: Path) -> None:
-    new_config(demo)
-    run = open_run(demo.with_suffix(".toml"), Silent())
-    known = effect_files(run)
-    learnt = run.folder / "effects"
-    learnt.mkdir(parents=True)
-    (learnt / "stage.json").write_text("{}")  # as an attempt leaves it that was stopped at once
-    assert effect_files(run) == known
-    shutil.copy(known[2], learnt)
-    assert effect_files(run) == [*known[:2], learnt / known[2].name, *known[3:]]
 
 
 def test_a_window_without_a_bin_is_refused_before_anything_is_run(own: Path) -> None:

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,9 @@ import bayeskin
 from bayeskin import report, storage
 from bayeskin.design import default_space
 from bayeskin.errors import InputError
-from bayeskin.mechanisms import catalogue
+from bayeskin.mechanisms import catalogue, observed
+from bayeskin.mechanisms.binned import BinnedForces
+from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.model.lagrangian import LagrangianModel
 from bayeskin.model.mesh import brick_mesh
 from bayeskin.model.problem import build_problem, material
@@ -77,7 +80,17 @@ class QuickSkin:
         return self.predict(theta).mean
 
 
-SKIN = Screen(Refit(QuickSkin()), (), catalogue())
+class QuickScreen(Screen):
+    """What the instrument makes of `QuickSkin`; mechanisms of the tissue do nothing."""
+
+    def force(self, names, theta, values):
+        mean_n = self.refit.force(theta)
+        seen = [self.known[name] for name in names if isinstance(self.known[name].act, Instrument)]
+        forces = BinnedForces(EDGES_S, MOTION, seen)
+        return mean_n + forces.change(partial(observed, seen, values, MOTION), mean_n)
+
+
+SKIN = QuickScreen(Refit(QuickSkin()), None, catalogue())
 
 
 def quick_run(case: Case, names, change: Change) -> Simulation:

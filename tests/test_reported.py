@@ -45,34 +45,6 @@ def test_a_length_of_the_tissue_is_one_of_the_runs_parameters(full: FullForce) -
     assert thick[-1] > 1.05 * plain[-1]
 
 
-def test_slopes_are_those_of_the_skin_and_of_the_instrument(full: FullForce) -> None:
-    names = ("slow-recovery", "device-friction", "force-offset")
-    theta = THETA | {"recovery_compliance": 1e-3, "recovery_time": 5.0, "F0": -0.03, "Fc": 0.02}
-    theta |= {"presliding": 2e-5, "friction_start": 0.0}
-    changes = {"E_c": 6e4, "recovery_compliance": 1e-3, "F0": 0.1, "Fc": 0.1}
-    quick = replace(full, spec=ModelSpec(refinement=0, tolerance=1e-4))
-    found = quick.with_slopes((names, theta), changes)
-    assert not isinstance(found, str)
-    force, slopes = found
-    np.testing.assert_allclose(force, quick((names, theta)), atol=1e-5)
-    for name, column in zip(changes, slopes.T, strict=True):
-        moved = quick((names, {**theta, name: theta[name] + 0.1 * changes[name]}))
-        assert isinstance(moved, np.ndarray)
-        np.testing.assert_allclose(column, (moved - force) / 0.1, atol=0.06 * np.abs(column).max())
-
-
-def test_slopes_at_a_neutral_value_are_those_beside_it(full: FullForce) -> None:
-    """Pads that were never opened: there is no opening in the run, which a fit at its bound asks about."""
-    quick = replace(full, spec=ModelSpec(refinement=0, tolerance=1e-4))
-    found = quick.with_slopes((("pre-stretch",), {**THETA, "opening": 0.0}), {"E_c": 6e4, "opening": 0.15})
-    assert not isinstance(found, str)
-    force, slopes = found
-    np.testing.assert_allclose(force, quick((("pre-stretch",), {**THETA, "opening": 0.0})), atol=5e-5)
-    moved = quick((("pre-stretch",), {**THETA, "opening": 0.015}))
-    assert isinstance(moved, np.ndarray)
-    np.testing.assert_allclose(slopes[:, 1], (moved - force) / 0.1, atol=0.1 * np.abs(slopes[:, 1]).max())
-
-
 def test_a_run_that_fails_gives_its_message(full: FullForce, monkeypatch: pytest.MonkeyPatch) -> None:
     failed = replace(simulate(ModelSpec(), MOTION, THETA), status="failed", message="did not converge")
     monkeypatch.setattr(reported, "simulate", lambda *args, **more: failed)

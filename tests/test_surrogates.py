@@ -23,8 +23,6 @@ from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.shipped import shipped
 from bayeskin.storage import contents_hash
 from bayeskin.surrogates import (
-    Effect,
-    WithEffects,
     load_manifest,
     load_surrogate,
     manifest_of,
@@ -38,7 +36,7 @@ from bayeskin.surrogates.hyperparameters import LatentFit, _Data, _likelihood, f
 from bayeskin.surrogates.kernels import KERNELS, kernel, squared_distances, trend_basis, trend_degree
 from bayeskin.surrogates.shapes import all_components, split
 from bayeskin.surrogates.similarity import Similarity
-from bayeskin.types import Design, Parameter, ParameterSpace, Surrogate
+from bayeskin.types import Design, ParameterSpace, Surrogate
 
 
 @cache
@@ -316,9 +314,6 @@ def test_gp_predicts_as_the_textbook_formulas(name):
     found = gp.predict(points)
     np.testing.assert_allclose(found[0][:, 0], target.mean() + target.std() * mean, rtol=1e-7)
     np.testing.assert_allclose(found[1][:, 0], target.var() * variance, rtol=1e-4)
-    apart = kernel(name, squared_distances(points @ map_.T, points[:1] @ map_.T))[0][:, 0]
-    covariance = process * (apart - both @ bordered @ both[0])
-    np.testing.assert_allclose(gp.covariance(points, points[0])[:, 0], target.var() * covariance, rtol=1e-4)
 
 
 @pytest.mark.parametrize("nugget", [1e-2, 1.0])
@@ -357,39 +352,6 @@ def test_latents_of_two_kernels_are_predicted_together_as_each_by_itself():
         alone = LatentGPs.assemble(unit, targets[:, j : j + 1], [fit]).predict(points)
         for found, expected in zip(together, alone, strict=True):
             np.testing.assert_allclose(found[:, j], expected[:, 0], rtol=1e-9)
-
-
-def test_errors_correlate_as_one_run_more_would_tell(trained):
-    """The more one row tells of another point, the nearer their errors' correlation is to one; at no distance
-    it is one but for what counts as noise."""
-    surrogate, at = trained[0], SPACE.from_unit(np.full(SPACE.dim, 0.5))
-    line = SPACE.from_unit(0.5 + np.linspace(0.0, 0.3, 4)[:, None] * np.eye(SPACE.dim)[0])
-    along = surrogate.correlation(line, at)
-    assert along.shape == (4, surrogate.predict(at).factor.shape[2])
-    assert np.all(np.abs(along) <= 1.0 + 1e-9)
-    assert np.all(along[0] > 0.0)
-    assert along[3, 0] < 0.7 * along[0, 0]
-    np.testing.assert_allclose(surrogate.correlation(at[None], line[2])[0], along[2], rtol=1e-6, atol=1e-9)
-
-
-def test_effects_add_their_strength_times_what_they_have_learnt(gp):
-    own = Parameter("g", "1", 0.0, 1.0, "uniform")
-    space = ParameterSpace((*SPACE.parameters, own))
-    more = replace(
-        DESIGN, space=space, theta=np.column_stack([DESIGN.theta, np.linspace(0.0, 1.0, len(DESIGN.theta))])
-    )
-    effect = Effect("g", ("toy",), {"g": 0.2}, ("g",), train(more, "gp", seed=0)[0])
-    both = WithEffects(gp[0], (effect,))
-    base, learnt = gp[0].predict(DESIGN.theta[:9]), effect.surrogate.predict(more.theta[:9])
-    s = (more.theta[:9, 5] - 0.2)[:, None]
-    assert s.min() < 0.0
-    found = both.predict(more.theta[:9])
-    np.testing.assert_allclose(found.mean, base.mean + s * learnt.mean, rtol=1e-12)
-    covariance = base.sd() ** 2 + s**2 * learnt.sd() ** 2
-    np.testing.assert_allclose(found.sd() ** 2, covariance, rtol=1e-9)
-    each = [gp[0].correlation(DESIGN.theta[:9], DESIGN.theta[0])]
-    each.append(effect.surrogate.correlation(more.theta[:9], more.theta[0]))
-    np.testing.assert_allclose(both.correlation(more.theta[:9], more.theta[0]), np.hstack(each), rtol=1e-12)
 
 
 def test_gp_leave_one_out_is_the_gp_without_the_row():
@@ -638,9 +600,5 @@ def test_a_surrogate_obeys_the_law_exactly():
 
 def test_the_mean_alone_is_that_of_the_whole_prediction(trained):
     theta = SPACE.box.from_unit(np.random.default_rng(3).uniform(size=(40, SPACE.dim)))
-    whole, times = trained[0], np.linspace(0.5, 2.0, 40)
-    for surrogate in (whole, WithEffects(whole, ())):
-        alone, mean = surrogate.predict_mean(theta), surrogate.predict(theta).mean
-        np.testing.assert_allclose(alone, mean, rtol=1e-9, atol=1e-10 * np.abs(mean).max())
-    alone, mean = whole.predict_mean(theta, times), whole.predict(theta, times).mean
+    alone, mean = trained[0].predict_mean(theta), trained[0].predict(theta).mean
     np.testing.assert_allclose(alone, mean, rtol=1e-9, atol=1e-10 * np.abs(mean).max())

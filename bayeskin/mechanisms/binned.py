@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -48,45 +46,3 @@ class BinnedForces:
         far, middle = near + side, self._middle
         slope = (mean_n[:, far] - mean_n[:, near]) / (middle[far] - middle[near])
         return np.asarray(mean_n[:, near] + slope * (self._corners - middle[near]))
-
-
-@dataclass(frozen=True)
-class BinnedEstimate:
-    """A mechanism's estimate of its effect, of bins' means: see `Mechanism.estimate`.
-
-    `own` names the parameters that are given; the mechanism's others are neutral.
-    """
-
-    mechanism: Mechanism
-    own: tuple[str, ...]
-    motion: PadMotion
-    edges_s: Array
-
-    def __call__(self, own: Array, mean_n: Array) -> Array:
-        """What the mechanism adds (n, m), at its own parameters (n, k), to a force without it (n, m)."""
-        estimate = self.mechanism.estimate
-        assert estimate is not None
-        neutral = {name: np.full(len(own), value) for name, value in self.mechanism.neutral.items()}
-        values = {**neutral, **dict(zip(self.own, own.T, strict=True))}
-        return self._forces.change(partial(estimate, values, self.motion), mean_n)
-
-    @cached_property
-    def _forces(self) -> BinnedForces:
-        return BinnedForces(self.edges_s, self.motion, [self.mechanism])
-
-
-def estimate_of(
-    mechanisms: Sequence[Mechanism], own: Sequence[str], motion: PadMotion, edges_s: Array
-) -> BinnedEstimate | None:
-    """None for a mechanism without an estimate, and for what two do beyond both."""
-    mechanism = mechanisms[0]
-    if len(mechanisms) > 1 or mechanism.estimate is None:
-        return None
-    return BinnedEstimate(mechanism, tuple(own), motion, edges_s)
-
-
-def estimates_by_name(
-    known: Mapping[str, Mechanism], motion: PadMotion
-) -> Callable[[Sequence[str], Sequence[str], Array], BinnedEstimate | None]:
-    """`estimate_of` by names of mechanisms, names of their own parameters, and edges of bins."""
-    return lambda names, own, edges_s: estimate_of([known[name] for name in names], own, motion, edges_s)

@@ -3,15 +3,6 @@
 The law of `fibres` with k2 = 0 and k1 = (ratio - 1) E_c / 4, so that Young's modulus along the lines is about
 `ratio` times E_c at small strain; the lines lie at an angle to x in the skin's plane. In one uniaxial test
 most of it looks like another E_c.
-
-Skin that is incompressible, pulled alike by a small strain, without shear, and narrows by the share y of it
-has, with r = ratio - 1 and the lines' angle a, the energy
-
-    W / E = (1 + y^2 + (1 - y)^2) / 3 + r (cos^2 a - y sin^2 a)^2 / 2 ;
-
-where that is least, the force is 2 W / E times the one without lines. Those that keep their length, at some
-55 degrees, add nothing to it. Skin that pads hold is not strained alike, so that they add a share of r at any
-angle (`estimate`).
 """
 
 from __future__ import annotations
@@ -21,12 +12,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from bayeskin.mechanisms.fibres import fibres
-from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Tissue, Values
+from bayeskin.mechanisms.mechanism import Mechanism, Tissue
 from bayeskin.model.problem import Sites
 from bayeskin.model.tissue import TissueLaw
-from bayeskin.types import PadMotion, Parameter
-
-AT_ANY_ANGLE = 0.2  # of the ratio's excess over 1
+from bayeskin.types import Parameter
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
@@ -45,16 +34,6 @@ def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
     return fibres(sites, direction, k1, 0.0, tension_only=False)
 
 
-def estimate(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """The force times what a sheet gains, and a share of the ratio."""
-    more = values["langer_ratio"] - 1.0
-    along, across = np.cos(values["langer_angle"]) ** 2, np.sin(values["langer_angle"]) ** 2
-    narrows = (2.0 / 3.0 + more * along * across) / (4.0 / 3.0 + more * across**2)
-    energy = (1.0 + narrows**2 + (1.0 - narrows) ** 2) / 3.0 + 0.5 * more * (along - narrows * across) ** 2
-    factor = 2.0 * energy + AT_ANY_ANGLE * more
-    return lambda time_s: factor[:, None] * force(time_s)
-
-
 MECHANISM = Mechanism(
     name="fibre-anisotropy",
     parameters=(
@@ -68,5 +47,5 @@ MECHANISM = Mechanism(
         "in one uniaxial test most of this looks like a stiffer cutis, and a pull across would tell."
     ),
     group=("fibre-anisotropy",),
-    act=Tissue(bind, estimate),
+    act=Tissue(bind),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import inspect
 import sys
@@ -14,12 +15,14 @@ from bayeskin.behaviour import sha256_of_behaviour
 from bayeskin.mechanisms import catalogue, mechanism
 
 PACKAGE = "bayeskin.mechanisms."
+ENTRY = "MECHANISM"
 
 
 def law_hashes(names: Iterable[str]) -> dict[str, str]:
     """Returns what the files behave like in which each mechanism's law is written, as a sha256 by its name.
 
-    These are the mechanism's own file and those of this package that it takes functions from.
+    These are the mechanism's own file and those of this package that it takes functions from. An entry of the
+    catalogue does not count: its sentences, priors and look-alikes are no part of a law.
     Raises KeyError for a name that is not in the catalogue.
     """
     known = catalogue()
@@ -29,7 +32,18 @@ def law_hashes(names: Iterable[str]) -> dict[str, str]:
 @cache
 def _hash(module: ModuleType) -> str:
     files = sorted(_files(module, set()))
-    return hashlib.sha256("\n".join(sha256_of_behaviour(f.read_bytes()) for f in files).encode()).hexdigest()
+    return hashlib.sha256("\n".join(sha256_of_behaviour(_law(f)) for f in files).encode()).hexdigest()
+
+
+def _law(file: Path) -> bytes:
+    """A file's source without its entry of the catalogue."""
+    source = file.read_bytes()
+    lines = source.splitlines(keepends=True)
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.Assign) and [getattr(one, "id", None) for one in node.targets] == [ENTRY]:
+            lines[node.lineno - 1 : node.end_lineno] = []
+            break
+    return b"".join(lines)
 
 
 def _files(module: ModuleType, seen: set[Path]) -> set[Path]:

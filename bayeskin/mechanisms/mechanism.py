@@ -63,13 +63,9 @@ class Instrument:
 
 @dataclass(frozen=True)
 class Tissue:
-    """What a tissue mechanism does to the full model.
-
-    estimate : of the force with it, from the force without, in closed form
-    """
+    """What a tissue mechanism does to the full model."""
 
     bind: Bind
-    estimate: Observe | None = None
 
 
 @dataclass(frozen=True)
@@ -92,14 +88,6 @@ class Mechanism:
     act: Instrument | Tissue
     parts: tuple[tuple[str, ...], ...] = ()
     needs: tuple[str, ...] = ()
-
-    @property
-    def estimate(self) -> Observe | None:
-        """Of the force with it from the force without, for what the full model solves: surrogates learn only
-        what it leaves."""
-        if isinstance(self.act, Tissue):
-            return self.act.estimate
-        return None if self.act.bind is None else self.act.observe
 
     @property
     def whole_or_parts(self) -> tuple[tuple[str, ...], ...]:

@@ -24,15 +24,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bayeskin.geometry import Geometry
 from bayeskin.mechanisms.elastic import elastic_stress, scale_elastic
-from bayeskin.mechanisms.lines import stretch_of, strict
-from bayeskin.mechanisms.mechanism import ForceOfTime, Mechanism, Tissue, Values
+from bayeskin.mechanisms.mechanism import Mechanism, Tissue
 from bayeskin.model.assembly import compiled, inverse_and_determinant
 from bayeskin.model.kernels import linearise_kernel, respond_kernel
 from bayeskin.model.problem import Sites
 from bayeskin.model.tissue import Rank, TissueLaw
-from bayeskin.types import Array, PadMotion, Parameter
+from bayeskin.types import Parameter
 from bayeskin.words import number
 
 STEPS_A_PHASE = 100
@@ -122,57 +120,6 @@ def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
     )
 
 
-def estimate(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """The force with branches on F / l, straight between the steps of a grid."""
-    steps = np.linspace(motion.time_s[:-1], motion.time_s[1:], STEPS_A_PHASE, endpoint=False).T.ravel()
-    grid_s = np.append(steps, motion.time_s[-1])
-    elapsed = np.diff(grid_s)
-    strength = np.stack([values["g_1"], values["g_2"]], axis=1)
-    tau_s = np.stack([values["tau_1"], values["tau_2"]], axis=1)
-    stress = np.broadcast_to(force(grid_s) / _stretch(motion, grid_s), (len(strength), len(grid_s)))
-    rate = np.ascontiguousarray(np.diff(stress, axis=1) / elapsed)
-    left = np.zeros((len(strength), len(grid_s), 2))
-    remember(rate, elapsed, strength, tau_s, left)
-
-    def reported(time_s: Array) -> Array:
-        times = np.ascontiguousarray(np.atleast_2d(time_s))
-        more = np.empty((len(strength), times.shape[1]))
-        recall(grid_s, rate, strength, tau_s, left, times, more)
-        return np.asarray(force(time_s) + _stretch(motion, time_s) * more)
-
-    return reported
-
-
-@compiled
-def remember(rate, elapsed, strength, tau_s, left):
-    """Fills left (n, k, b), the branches' share at each time, of stresses that change by rate (n, k - 1)."""
-    for i in range(rate.shape[0]):
-        for b in np.flatnonzero(strength[i]):
-            for k in range(rate.shape[1]):
-                keep = np.exp(-elapsed[k] / tau_s[i, b])
-                grown = strength[i, b] * tau_s[i, b] * rate[i, k] * (1.0 - keep)
-                left[i, k + 1, b] = keep * left[i, k, b] + grown
-
-
-@strict
-def recall(grid, rate, strength, tau_s, left, times, more):
-    """Fills more (n, t), the branches' sum at times (1 or n, t), from their shares `left` on a grid (k,)."""
-    for i in range(more.shape[0]):
-        row, k, acting = times[i if len(times) > 1 else 0], 0, np.flatnonzero(strength[i])
-        for j in range(more.shape[1]):
-            k = stretch_of(grid, k, row[j])
-            total = 0.0
-            for b in acting:
-                keep = np.exp(-(row[j] - grid[k]) / tau_s[i, b])
-                total += keep * left[i, k, b] + strength[i, b] * tau_s[i, b] * rate[i, k] * (1.0 - keep)
-            more[i, j] = total
-
-
-def _stretch(motion: PadMotion, time_s: Array) -> Array:
-    """Mean stretch of the skin between the article's pads: surrogates learn what an estimate leaves."""
-    return np.asarray(1.0 + 0.5 * motion.at(time_s) / Geometry().half_gauge_m)
-
-
 MECHANISM = Mechanism(
     name="solid-viscoelasticity",
     parameters=(
@@ -193,6 +140,6 @@ MECHANISM = Mechanism(
         "friction-creep",
         "skeleton-compressibility",
     ),
-    act=Tissue(bind, estimate),
+    act=Tissue(bind),
     parts=(("g_1", "tau_1"), ("g_2", "tau_2")),
 )

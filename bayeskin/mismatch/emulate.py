@@ -153,7 +153,7 @@ def emulate(
             error_n = float(np.median(each_n))  # the largest are where the emulator says that it is unsure
         design = fresh
         local = _posterior(about, learn(design), settings.sure * noise_n)
-        best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
+        best = fit_near(names, local, _likeliest(local, found.fit, design.theta))
         sure = bool(np.isfinite(best.value))
         if not sure and wave < settings.waves - 1:
             reach *= settings.nearer
@@ -161,12 +161,12 @@ def emulate(
             continue
         if not sure:  # there are no more waves: it is believed
             local = replace(local, sure_within_n=None)
-            best = fit_near(names, local, _likeliest(local, found.fit, design.theta), None)
+            best = fit_near(names, local, _likeliest(local, found.fit, design.theta))
         done = sure and error_n is not None and error_n <= settings.enough * noise_n
         last = done or wave == settings.waves - 1
         known = [one.fit.theta for one in maxima]
         legs, modes = (LEGS, MODES) if last else (BEFORE, 0)
-        drawn = resample(best, None, seed, legs, modes, known)
+        drawn = resample(best, seed, legs, modes, known)
         draws, emulated = drawn.draws, Emulated(best, drawn, len(design.theta), error_n, done)
         if done:
             break
@@ -181,7 +181,7 @@ def _near(maxima: Sequence[JointFit], reach: float, seed: int) -> Array:
         about = one.fit.log_posterior
         vector = np.clip(about.vector(one.fit.theta), *about.bounds)
         held = replace(one.fit, log_posterior=within(about, vector, reach))
-        return resample(held, None, seed, BEFORE, 0).draws
+        return resample(held, seed, BEFORE, 0).draws
 
     return np.concatenate([near(one) for one in maxima])
 

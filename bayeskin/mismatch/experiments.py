@@ -17,9 +17,9 @@ from bayeskin.errors import InputError
 from bayeskin.inference.noise_model import noise_chain, noise_covariance
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.fit import Fit
+from bayeskin.mismatch.hypotheses import weight
 from bayeskin.mismatch.information import FEWEST, expected_gain
 from bayeskin.mismatch.protocols import Limits, Protocol, changed, phases_of
-from bayeskin.mismatch.search import weight
 from bayeskin.mismatch.tasks import Ask, OtherTest
 from bayeskin.types import Array, BinnedForce, PadMotion
 

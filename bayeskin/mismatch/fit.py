@@ -27,31 +27,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bayeskin.errors import InputError
 from bayeskin.inference import LogPosterior, NoisePriors
 from bayeskin.inference.gauss_newton import Top, gauss_newton, promise, with_less_noise
-from bayeskin.inference.likelihood import log_likelihood
-from bayeskin.inference.straighten import Shear
-from bayeskin.mismatch.wrapper import Sure, skins
+from bayeskin.mismatch.wrapper import skins
 from bayeskin.types import Array, BinnedForce, ParameterSpace
 
 NOISE_SHARE = 3.0  # sd of the noise with a memory, at most, of the median sd of a bin's own mean
 QUICK_S, QUICK_TIMES = 1.0, 2.5  # that sd is at most so many times what noise quicker than this makes it
 FEWEST_TAILS = 50.0  # of the tail index: nearly normal, since spikes are gone from robust means of bins
 STIFFEST_BELOW = 2.0  # the subcutis over the cutis: on a stiffer one a cutis folds, and fat is the softer
-SURE = 0.03  # sd of the surrogate, RMS, at most, of the recorded force's range
 DRAWS = 96  # of the prior for each new parameter, from which climbs start
 RANKED = 32  # of these, for the order in which mechanisms are tried
 SKINS, SKIN_STARTS = 192, 4  # draws of what the skin is made of, and climbs from the best of them
 APART = 0.1  # of the prior's width, in some parameter: tops that are nearer are the same
-BASE_STARTS, STARTS = 10, 2
+STARTS = 2
 NEAREST = 8  # trials that are weighed for each that is climbed from
 REDRAWN = 1  # times that the parameters of a part are drawn anew, about the best so far
 FIRST_ROUNDS, FIRST_KEPT = (2, 4), 3  # of climbs: of every one, then of so many that are ahead
 ROUNDS = 25  # of the one that is then ahead
 FAR, NEAR, NEXT = 5.0, 1e-4, 1.6  # sd on either side of a top, of the prior's width, and from place to place
 EDGE = 1e-6  # of the unit cube: on a bound
-AT_BOUND = 0.999  # of the noise's range
 
 
 def without_swings(binned: BinnedForce, quick_n2: Array) -> BinnedForce:
@@ -89,11 +84,6 @@ def soft_on_stiff(space: ParameterSpace, theta: Array) -> NDArray[np.bool_]:
     if not {"E_c", "E_s"} <= set(names):
         return np.zeros(len(theta), dtype=bool)
     return np.asarray(theta[:, names.index("E_s")] > STIFFEST_BELOW * theta[:, names.index("E_c")])
-
-
-def surrogate_limit(binned: BinnedForce) -> float:
-    """RMS sd [N] of a surrogate beyond which it is not to be relied on for this recording."""
-    return SURE * float(np.nanmax(binned.force_n) - np.nanmin(binned.force_n))
 
 
 @dataclass(frozen=True)
@@ -135,19 +125,6 @@ class Fit:
         low, high = self.log_posterior.bounds
         return self.value + float(np.sum(np.log(high - low)))
 
-    @cached_property
-    def hope(self) -> float:
-        """Nats that the surrogate's own error costs by being free: a full model may give as many, at most."""
-        log_posterior = self.log_posterior
-        values = log_posterior.from_sampling(log_posterior.vector(self.theta))[None]
-        free, none = (
-            replace(log_posterior, surrogate=one).predict(values)
-            for one in (log_posterior.surrogate, Sure(log_posterior.surrogate))
-        )
-        chain, noise = log_posterior.chain, log_posterior.split(values)[1]
-        at_best = replace(chain, force_n=free.mean[0, chain.bins])
-        return float(log_likelihood(at_best, none, noise)[0] - log_likelihood(at_best, free, noise)[0])
-
     def draws(self, count: int, seed: int) -> Array:
         """SI values (count, D) from the Gaussian about the point, folded back at the priors' bounds."""
         rng = np.random.default_rng(seed)
@@ -170,13 +147,6 @@ def restored(plain: Mapping[str, Any], log_posterior: LogPosterior) -> Fit:
     covariance, latent = (np.asarray(plain[name], dtype=float) for name in ("covariance", "latent"))
     value, log_evidence = plain["value"], plain["log_evidence"]
     return Fit(tuple(plain["names"]), log_posterior, plain["theta"], value, log_evidence, covariance, latent)
-
-
-def much_left(log_posterior: LogPosterior, theta: Mapping[str, float]) -> bool:
-    """Returns whether the noise of some kind of phase is as large as it may be."""
-    low, high = log_posterior.bounds
-    unit = (log_posterior.vector(theta) - low) / (high - low)
-    return any(unit[i] > AT_BOUND for i, name in enumerate(log_posterior.names) if name.startswith("sd_"))
 
 
 def promised(
@@ -204,35 +174,19 @@ def _drawn(
     return trials
 
 
-def fit_base(log_posterior: LogPosterior, seed: int, shear: Shear | None) -> Fit:
-    """Without any mechanism: the best of climbs from the most probable of many draws of the prior.
-
-    Raises InputError where the prior holds no skin that can be.
-    """
-    low, high = log_posterior.bounds
-    trials = np.random.default_rng(seed).uniform(low, high, (8 * DRAWS, log_posterior.dim))
-    starts = likely(log_posterior, trials, BASE_STARTS)
-    if not starts:
-        expected = f"skins whose E_s can be at most {STIFFEST_BELOW:g} E_c, and which the surrogate knows"
-        raise InputError("priors", "none but skins that a diagnosis rules out", expected)
-    return _best((), log_posterior, starts, shear, seed)
-
-
 def fit(
     names: Sequence[str],
     log_posterior: LogPosterior,
     start: Mapping[str, float],
     neutral: Mapping[str, float],
     seed: int,
-    shear: Shear | None = None,
     parts: Sequence[Sequence[str]] = (),
 ) -> Fit:
     """The best of a few climbs from `start`, which has the values of a smaller set.
 
     What `start` does not have begins at its neutral value, and is searched for, one of `parts` (names of
     parameters) after the other; at last, with all others as found, the skin is, by itself and with the
-    mechanisms that are in it: one that changes much has led the smaller set to another skin. `shear`
-    straightens the ridges of this posterior, where it is known.
+    mechanisms that are in it: one that changes much has led the smaller set to another skin.
     """
     low, high = log_posterior.bounds
     starts = [np.clip(log_posterior.vector({**neutral, **start}), low, high)]
@@ -241,22 +195,20 @@ def fit(
     rounds = list(zip(parts, laters, strict=True))
     rounds += [(part, []) for part in parts] if len(parts) > 1 else []  # again, with the others found
     for part, later in rounds:
-        starts = [_searched(log_posterior, starts[0], part, later, neutral, rng, shear)]
-    return _best(names, log_posterior, starts, shear, seed)
+        starts = [_searched(log_posterior, starts[0], part, later, neutral, rng)]
+    return _best(names, log_posterior, starts, seed)
 
 
-def fit_near(
-    names: Sequence[str], log_posterior: LogPosterior, theta: Mapping[str, float], shear: Shear | None
-) -> Fit:
+def fit_near(names: Sequence[str], log_posterior: LogPosterior, theta: Mapping[str, float]) -> Fit:
     """The top that one climb from a point reaches."""
     low, high = log_posterior.bounds
-    top = gauss_newton(log_posterior, np.clip(log_posterior.vector(theta), low, high), shear, ROUNDS)
+    top = gauss_newton(log_posterior, np.clip(log_posterior.vector(theta), low, high), None, ROUNDS)
     return _fit_at(names, log_posterior, top)
 
 
 def _searched(
     log_posterior: LogPosterior, vector: Array, part: Sequence[str], later: Sequence[str],
-    neutral: Mapping[str, float], rng: np.random.Generator, shear: Shear | None,
+    neutral: Mapping[str, float], rng: np.random.Generator,
 ) -> Array:  # fmt: skip
     """The best point (D,) of climbs along the most promising draws of a part's parameters, and near them.
 
@@ -268,14 +220,14 @@ def _searched(
     without |= {name: neutral[name] for name in (*part, *later)}
     alone = np.clip(log_posterior.vector(without), low, high)
     trials = _drawn(alone, columns, DRAWS, low, high, rng)
-    top = _climbed(
-        log_posterior, [vector, *_promising(log_posterior, alone, trials, part, later, neutral)], shear
-    )[0]
+    top = _climbed(log_posterior, [vector, *_promising(log_posterior, alone, trials, part, later, neutral)])[
+        0
+    ]
     for _ in range(REDRAWN if len(columns) > 1 else 0):
         near = _about(top.vector, columns, low, high, len(trials), rng)
         trials[:, columns] = near[:, columns]
         starts = _promising(log_posterior, alone, trials, part, later, neutral)
-        top = _climbed(log_posterior, [top.vector, *starts], shear)[0]
+        top = _climbed(log_posterior, [top.vector, *starts])[0]
     return top.vector
 
 
@@ -339,24 +291,24 @@ def likely(log_posterior: LogPosterior, trials: Array, count: int) -> list[Array
     return list(found[:weighed][np.argsort(-values[:weighed])[:count]])
 
 
-def _climbed(log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None) -> list[Top]:
+def _climbed(log_posterior: LogPosterior, starts: Sequence[Array]) -> list[Top]:
     """Tops after a few rounds, of those that were ahead after the first of them; the best first."""
     tops: list[Top] = []
     for rounds in FIRST_ROUNDS:
-        tops = [gauss_newton(log_posterior, start, shear, rounds, quick=True) for start in starts]
+        tops = [gauss_newton(log_posterior, start, None, rounds, quick=True) for start in starts]
         tops = sorted(tops, key=lambda one: -one.value)[:FIRST_KEPT]
         starts = [top.vector for top in tops]
     return tops
 
 
 def _best(
-    names: Sequence[str], log_posterior: LogPosterior, starts: Sequence[Array], shear: Shear | None, seed: int
+    names: Sequence[str], log_posterior: LogPosterior, starts: Sequence[Array], seed: int
 ) -> Fit:  # fmt: skip
-    ahead = _climbed(log_posterior, starts, shear)[0]
-    others = _other_starts(ahead.vector, log_posterior, shear, seed, SKIN_STARTS)
+    ahead = _climbed(log_posterior, starts)[0]
+    others = _other_starts(ahead.vector, log_posterior, seed, SKIN_STARTS)
     quiet = with_less_noise(log_posterior, ahead.vector)
-    ahead = _climbed(log_posterior, [ahead.vector, quiet, *others], shear)[0]
-    return _fit_at(names, log_posterior, gauss_newton(log_posterior, ahead.vector, shear, ROUNDS))
+    ahead = _climbed(log_posterior, [ahead.vector, quiet, *others])[0]
+    return _fit_at(names, log_posterior, gauss_newton(log_posterior, ahead.vector, None, ROUNDS))
 
 
 def _fit_at(names: Sequence[str], log_posterior: LogPosterior, top: Top) -> Fit:
@@ -364,50 +316,19 @@ def _fit_at(names: Sequence[str], log_posterior: LogPosterior, top: Top) -> Fit:
     return Fit(tuple(names), log_posterior, theta, top.value, *evidence(log_posterior, top), top.latent)
 
 
-def other_tops(found: Fit, shear: Shear | None, seed: int, count: int) -> list[Fit]:
-    """Tops about other skins, the most hopeful first, each farther than `APART` from all before."""
-    log_posterior = found.log_posterior
-    low, high = log_posterior.bounds
-    skin = skins(log_posterior.surrogate)[-1]
-    starts = _other_starts(low + found.unit * (high - low), log_posterior, shear, seed, 2 * count)
-    tops = [gauss_newton(log_posterior, start, shear, sum(FIRST_ROUNDS), quick=True) for start in starts]
-    chosen = [found]
-    for one in sorted((_fit_at(found.names, log_posterior, top) for top in tops), key=hopeful, reverse=True):
-        if all(np.max(np.abs(one.unit - other.unit)[:skin]) > APART for other in chosen):
-            chosen.append(one)
-    return chosen[1 : count + 1]
-
-
-def hopeful(found: Fit) -> float:
-    """Log density of a fit, were its surrogate's error free of cost."""
-    return found.value + found.hope
-
-
-def _other_starts(
-    vector: Array, log_posterior: LogPosterior, shear: Shear | None, seed: int, count: int
-) -> list[Array]:
+def _other_starts(vector: Array, log_posterior: LogPosterior, seed: int, count: int) -> list[Array]:
     """Returns so many of the most probable `other_skins` of each kind."""
     kinds = skins(log_posterior.surrogate)
-    drawn = [other_skins(vector, log_posterior, shear, seed, skin) for skin in kinds]
+    drawn = [other_skins(vector, log_posterior, seed, skin) for skin in kinds]
     return [start for trials in drawn for start in likely(log_posterior, trials, count)]
 
 
-def other_skins(
-    vector: Array, log_posterior: LogPosterior, shear: Shear | None, seed: int, skin: int
-) -> Array:
+def other_skins(vector: Array, log_posterior: LogPosterior, seed: int, skin: int) -> Array:
     """Points (n, D) with the first `skin` parameters drawn anew, those of the base and maybe of tissue
     mechanisms, and stiffness such that the force fits best."""
     low, high = log_posterior.bounds
     trials = np.tile(np.clip(vector, low, high), (SKINS, 1))
     trials[:, :skin] = np.random.default_rng(seed).uniform(low[:skin], high[:skin], (len(trials), skin))
-    if shear is None:
-        return trials
-    bins, recorded = log_posterior.chain.bins, log_posterior.chain.force_n
-    for _ in range(3):  # the force is nearly of degree one in the moduli together
-        force = log_posterior.predict_mean(log_posterior.from_sampling(trials))[:, bins]
-        factor = (force @ recorded) / np.maximum(np.sum(force**2, axis=1), np.finfo(float).tiny)
-        trials[:, shear.group] += np.log(np.clip(factor, 1e-3, 1e3))[:, None]
-        trials = trials[np.all((trials >= low) & (trials <= high), axis=1)]
     return trials
 
 

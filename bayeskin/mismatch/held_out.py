@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from bayeskin.mismatch.fit import Fit
+from bayeskin.mismatch.hypotheses import weight
 from bayeskin.mismatch.joint_fit import JointFit
-from bayeskin.mismatch.joint_search import added
-from bayeskin.mismatch.search import weight
+from bayeskin.mismatch.search import added
 from bayeskin.mismatch.tasks import Ask, Climb
 from bayeskin.types import BinnedForce
 

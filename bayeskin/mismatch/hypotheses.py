@@ -22,8 +22,10 @@ from typing import Literal
 import numpy as np
 
 from bayeskin.mechanisms import Mechanism
-from bayeskin.mismatch.search import PRIOR
+from bayeskin.mismatch.fit import Fit
 
+PRIOR = 0.05  # of a mechanism to be at work, before the recording is seen
+ODDS = float(np.log(PRIOR / (1.0 - PRIOR)))
 PROBABLE = 0.9  # of a mechanism or its look-alikes, to be named
 LIKELIER_THAN_NOT = 0.5
 MOST_OF_IT = 0.9  # of the squared misfit, which names beside something smooth have to explain
@@ -66,13 +68,17 @@ class Judgement:
     smooth_probability: float
 
 
+def weight(found: Fit) -> float:
+    """Returns the logarithm of a set's weight: its evidence times the prior of its mechanisms."""
+    return found.log_evidence + len(found.names) * ODDS
+
+
 def hypotheses_of(names: tuple[str, ...], said: Evidences) -> tuple[Hypothesis, Hypothesis]:
     """Returns both hypotheses of a set."""
-    odds = float(np.log(PRIOR / (1.0 - PRIOR)))
-    own = len(names) * odds
+    own = len(names) * ODDS
     return (
         Hypothesis(names, False, said.alone + own),
-        Hypothesis(names, True, said.with_smooth + own + odds),
+        Hypothesis(names, True, said.with_smooth + own + ODDS),
     )
 
 

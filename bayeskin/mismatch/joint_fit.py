@@ -19,9 +19,8 @@ import numpy as np
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import Top, gauss_newton, with_less_noise
 from bayeskin.inference.straighten import Shear, shear_at
-from bayeskin.mismatch.corrected import FullRun
 from bayeskin.mismatch.fit import Fit, evidence, stored
-from bayeskin.mismatch.tangent import POWER
+from bayeskin.mismatch.tangent import POWER, ModelRun
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array
 
@@ -54,8 +53,8 @@ class TrustSettings:
 
 
 # Names of a set and values by name to a run with derivatives, or why it failed.
-Skin = Callable[[Sequence[str], Mapping[str, float]], FullRun | str]
-Local = Callable[[Sequence[str], Sequence[FullRun]], LogPosterior]  # the posterior of a set about runs
+Skin = Callable[[Sequence[str], Mapping[str, float]], ModelRun | str]
+Local = Callable[[Sequence[str], Sequence[ModelRun]], LogPosterior]  # the posterior of a set about runs
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class JointFit:
     """
 
     fit: Fit
-    run: FullRun
+    run: ModelRun
     runs: int
     settled: bool
     off_n: Array
@@ -96,7 +95,7 @@ def fit_jointly(
     """
     settings = settings or TrustSettings()
 
-    def made_at(theta: Mapping[str, float]) -> FullRun | str:
+    def made_at(theta: Mapping[str, float]) -> ModelRun | str:
         run = skin(names, theta)
         return run if isinstance(run, str) or off_n is None else replace(run, force_n=run.force_n + off_n)
 

@@ -20,7 +20,7 @@ from bayeskin.mechanisms import Mechanism, observed
 from bayeskin.mechanisms.binned import BinnedForces
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.wrapper import Wrapper
-from bayeskin.types import Array, Correlated, PadMotion, ParameterSpace, Prediction
+from bayeskin.types import Array, PadMotion, ParameterSpace, Prediction
 
 
 @dataclass(frozen=True)
@@ -51,12 +51,6 @@ class ObservedSurrogate(Wrapper):
         skin, values = self._split(theta)
         mean = mean_at_distinct(lambda these, _: self.inner.predict_mean(these), skin, skin)
         return mean + self._added(values, mean)
-
-    def correlation(self, theta: Array, at: Array) -> Array:
-        """Of the error along each column of the factor, at theta (n, d) with that at a point (d,): (n, r)."""
-        inner = self.inner.space.dim
-        assert isinstance(self.inner, Correlated)
-        return self.inner.correlation(theta[:, :inner], at[:inner])
 
     def _split(self, theta: ArrayLike) -> tuple[Array, dict[str, Array]]:
         """The skin's parameters (n, k), and the instrument's by name, (n,) each."""

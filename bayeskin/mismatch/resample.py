@@ -20,7 +20,6 @@ from bayeskin.inference.convergence import Limits, assess
 from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.moves import mixed_moves
-from bayeskin.inference.straighten import Shear
 from bayeskin.mismatch.fit import APART, FIRST_ROUNDS, Fit, evidence, likely, other_skins
 from bayeskin.mismatch.wrapper import skins
 from bayeskin.types import Array
@@ -56,10 +55,10 @@ class Resampled:
 
 
 def resample(
-    found: Fit, shear: Shear | None, seed: int, legs: Sequence[int] = LEGS, modes: int = MODES,
+    found: Fit, seed: int, legs: Sequence[int] = LEGS, modes: int = MODES,
     near: Sequence[Mapping[str, float]] = (),
 ) -> Resampled:  # fmt: skip
-    """Returns draws of the posterior about `found` and other modes; `shear` as for `fit`.
+    """Returns draws of the posterior about `found` and other modes.
 
     They end after the first of `legs` by which they have settled.
 
@@ -67,9 +66,9 @@ def resample(
     """
     log_posterior = found.log_posterior
     rng = np.random.default_rng([seed, 7])
-    starts = _starts(found, rng, _modes(found, shear, seed, modes, near))
+    starts = _starts(found, rng, _modes(found, seed, modes, near))
     walkers = max(FEWEST_WALKERS, 2 * log_posterior.dim + 2)
-    coordinates = MoveCoordinates(shear, *log_posterior.bounds)
+    coordinates = MoveCoordinates(None, *log_posterior.bounds)
     samplers = [
         emcee.EnsembleSampler(
             walkers, log_posterior.dim, log_posterior.log_prob, moves=mixed_moves(coordinates, walkers),
@@ -107,7 +106,7 @@ def _assessed(
 
 
 def _modes(
-    found: Fit, shear: Shear | None, seed: int, count: int, near: Sequence[Mapping[str, float]]
+    found: Fit, seed: int, count: int, near: Sequence[Mapping[str, float]]
 ) -> list[tuple[Array, float, Array]]:
     """Vector (D,), log evidence and covariance (D, D) over the unit cube of each mode, that of `found` first.
 
@@ -119,10 +118,10 @@ def _modes(
     skin = skins(log_posterior.surrogate)[-1]
     starts = [np.clip(log_posterior.vector(theta), low, high) for theta in near]
     if count:
-        starts += likely(log_posterior, other_skins(best, log_posterior, shear, seed, skin), count)
+        starts += likely(log_posterior, other_skins(best, log_posterior, seed, skin), count)
     modes = [(best, found.log_evidence, found.covariance)]
     for start in starts:
-        top = gauss_newton(log_posterior, start, shear, sum(FIRST_ROUNDS))
+        top = gauss_newton(log_posterior, start, None, sum(FIRST_ROUNDS))
         apart = [np.abs((top.vector - vector) / (high - low))[:skin].max() for vector, _, _ in modes]
         if min(apart) > APART:
             modes.append((top.vector, *evidence(log_posterior, top)))

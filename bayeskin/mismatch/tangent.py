@@ -20,11 +20,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayeskin.mismatch.corrected import FullRun
 from bayeskin.types import Array, ParameterSpace, Prediction, _FreezesArrays
 
 AT_A_RUN = 1e-12  # square of a distance in the box that is none
 POWER = 0.8  # of a modulus, which the force is linear in
+
+
+@dataclass(frozen=True)
+class ModelRun:
+    """A run of a forward model: theta (d,) in SI; force_n (m,), means over bins [N].
+
+    slopes_n (m, d) : derivatives by coordinates of the prior's box [N], None where it has none
+    """
+
+    theta: Array
+    force_n: Array
+    slopes_n: Array | None
 
 
 @dataclass(frozen=True)
@@ -37,7 +48,7 @@ class Tangent(_FreezesArrays):
 
     space: ParameterSpace
     edges_s: Array
-    runs: tuple[FullRun, ...]
+    runs: tuple[ModelRun, ...]
     errors_n: Array | None = None
 
     @property
@@ -65,7 +76,7 @@ class Tangent(_FreezesArrays):
             weight += near
         return np.asarray(found / weight)
 
-    def _about(self, run: FullRun, theta: Array, change: Array) -> Array:
+    def _about(self, run: ModelRun, theta: Array, change: Array) -> Array:
         """The force (n, m) at theta (n, d) by one run, from which it is `change` (n, d) away in the box."""
         assert run.slopes_n is not None
         moduli, flow = self.space.scaled(1), self.space.scaled(-1)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bayeskin.mismatch.corrected import FullRun
+from bayeskin.mismatch.tangent import ModelRun
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Promise:
 
     names: tuple[str, ...]
     theta: Mapping[str, float]
-    run: FullRun
+    run: ModelRun
     name: str
     off_n: tuple[float, ...] = ()
 

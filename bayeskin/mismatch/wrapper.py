@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from bayeskin.mechanisms import catalogue
@@ -38,15 +37,6 @@ class Wrapper:
     def predict_mean(self, theta: ArrayLike) -> Array:
         """The mean (n, m) of `predict` alone."""
         return self.inner.predict_mean(theta)
-
-
-class Sure(Wrapper):
-    """The mean of another, as if that had no error."""
-
-    def predict(self, theta: ArrayLike) -> Prediction:
-        """Force at theta (n, d) or (d,). Raises InputError outside the box."""
-        force = self.predict_mean(theta)
-        return Prediction(force, np.zeros((*force.shape, 1)), np.zeros(force.shape))
 
 
 def innermost(surrogate: Surrogate) -> Surrogate:

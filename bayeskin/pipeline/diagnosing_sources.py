@@ -11,7 +11,6 @@ from bayeskin import mechanisms
 from bayeskin.pipeline import diagnosis
 from bayeskin.pipeline.folder import sha256_of, sha256_of_input
 from bayeskin.shipped import shipped
-from bayeskin.surrogates import effects_beside
 
 WITHOUT_EFFECT = ("report", "scripting")  # figures; what the package offers to scripts that ask for it
 PACKAGE = Path(bayeskin.__file__).parent
@@ -21,13 +20,11 @@ def diagnosing_sources() -> str:
     """Returns the sha256 of what a diagnosis is made by: its sources' behaviour, and the bytes of data.
 
     The sources are the modules that a diagnosis imports and all mechanisms; the data are the model's tables
-    and the manifests of the shipped surrogates. A corrected comment or docstring changes nothing.
+    and the manifest of the shipped reduced model. A corrected comment or docstring changes nothing.
     """
     files = sorted({*imported(Path(diagnosis.__file__)), *Path(mechanisms.__file__).parent.glob("*.py")})
     files += sorted(PACKAGE.glob("model/*.json"))
-    surrogate = shipped("surrogates/healthy-skin-reaction.h5")
-    files += sorted(surrogate.parent.glob("healthy-skin-reaction*.json"))
-    files += sorted(effects_beside(surrogate).glob("*.json"))
+    files.append(shipped("surrogates/article-device-reduced.json"))
     return sha256_of([[path.name, sha256_of_input(path)] for path in files])
 
 

@@ -22,6 +22,7 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.protocols import Limits, Protocol, variations
 from bayeskin.mismatch.tasks import Ask
 from bayeskin.pipeline import diagnosis
+from bayeskin.pipeline.diagnosis import bench_of, opened, searched
 from bayeskin.pipeline.engine import Reporter, Run
 from bayeskin.pipeline.folder import (
     Record,
@@ -34,10 +35,8 @@ from bayeskin.pipeline.folder import (
     write_record,
 )
 from bayeskin.pipeline.forward import ReducedForward
-from bayeskin.pipeline.joint_bench import JointBench, asked, searches_file
-from bayeskin.pipeline.joint_diagnosis import bench_of, searched
 from bayeskin.pipeline.provenance import caption
-from bayeskin.pipeline.workbench import opened, workbench
+from bayeskin.pipeline.workbench import Workbench, asked, searches_file
 
 FOLDER = "experiment"
 LONGEST_S = 1800.0  # of a test: an arm can hardly be still for longer
@@ -66,7 +65,8 @@ def choose(source: Path, reporter: Reporter, device: Path | None = None) -> dict
         where.mkdir(parents=True, exist_ok=True)
         bench = bench_of(run)
         with asked(bench, searches_file(run.folder, bench), WORKERS) as ask:
-            fits = compete(_fits(run, bench, ask), diagnosed["best_set"], bench.known)
+            fitted = [one.fit for one in searched(run, bench, ask).fits.values()]
+            fits = compete(fitted, diagnosed["best_set"], bench.known)
             found = _searched(fits, bench, ask, reporter) if len(fits) > 1 else []
         answer: dict[str, Any] = {
             "sets": [list(one.names) for one in fits], "experiments": [_row(one) for one in found],
@@ -88,18 +88,11 @@ def answered(run: Run) -> Record | None:
 
 
 def _diagnosis(run: Run) -> str:
-    record = read_record(run.folder / diagnosis.STAGE.name)
+    record = read_record(run.folder / diagnosis.NAME)
     return "" if record is None else record.sha256
 
 
-def _fits(run: Run, bench: JointBench, ask: Ask) -> list[Fit]:
-    """All fits that a diagnosis made."""
-    if diagnosis.by_effects(run.config):
-        return list(diagnosis.fits_of(workbench(run)))
-    return [one.fit for one in searched(run, bench, ask).fits.values()]
-
-
-def _searched(fits: Sequence[Fit], bench: JointBench, ask: Ask, reporter: Reporter) -> list[Experiment]:
+def _searched(fits: Sequence[Fit], bench: Workbench, ask: Ask, reporter: Reporter) -> list[Experiment]:
     """Protocols judged, the most telling first."""
     assert isinstance(bench.forward, ReducedForward)
     trained = bench.forward.model.trained.protocols

@@ -10,8 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from bayeskin.mechanisms import Mechanism
-from bayeskin.mismatch.corrected import FullRun, slopes
-from bayeskin.mismatch.full_fit import change
+from bayeskin.mismatch.tangent import ModelRun
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.reported import beside_neutral
@@ -23,6 +22,7 @@ from bayeskin.types import Array, PadMotion, ParameterSpace, Simulation, Surroga
 
 FOLDING = 0.15  # of the stiffness at rest: nearer to folding the reduced model is of no use; runs of the full
 # model check what comes out
+STEP = 1e-4  # of the prior's box, for differences of a surrogate
 
 
 class ForwardModel(Protocol):
@@ -41,7 +41,7 @@ class ForwardModel(Protocol):
 
     def run(
         self, space: ParameterSpace, at: Array, mechanisms: Sequence[Mechanism], derive: bool
-    ) -> FullRun | str:
+    ) -> ModelRun | str:
         """Returns a run at parameters (d,) of a space, with derivatives or not; or why it failed."""
         ...
 
@@ -73,7 +73,7 @@ class ReducedForward:
 
     def run(
         self, space: ParameterSpace, at: Array, mechanisms: Sequence[Mechanism], derive: bool
-    ) -> FullRun | str:
+    ) -> ModelRun | str:
         """Derivatives at a value that is neutral are taken beside it, and the force is brought back."""
         by = dict(zip(space.names, map(float, change(space, at)), strict=True))
         values = dict(zip(space.names, map(float, at), strict=True))
@@ -84,12 +84,12 @@ class ReducedForward:
             return made.message
         force_n = made.bin_means(self.edges_s)
         if not derive:
-            return FullRun(at, force_n, None)
+            return ModelRun(at, force_n, None)
         slopes_n = made.gradient_bin_means(self.edges_s)
         if not np.all(np.isfinite(slopes_n)):
             return "the derivatives of the run are not finite"
         aside = np.array([(values[name] - here) / by[name] for name, here in zip(by, at, strict=True)])
-        return FullRun(at, force_n - slopes_n @ aside, slopes_n)
+        return ModelRun(at, force_n - slopes_n @ aside, slopes_n)
 
     def simulated(
         self, motion: PadMotion, values: Mapping[str, float], mechanisms: Sequence[Mechanism],
@@ -121,21 +121,40 @@ class SurrogateForward:
 
     def run(
         self, space: ParameterSpace, at: Array, mechanisms: Sequence[Mechanism], derive: bool
-    ) -> FullRun | str:
+    ) -> ModelRun | str:
         """The space is the surrogate's own."""
         force_n = self.surrogate.predict_mean(at)[0]
-        return FullRun(at, force_n, slopes(self.surrogate, at) if derive else None)
+        return ModelRun(at, force_n, slopes(self.surrogate, at) if derive else None)
 
     def errors(self, at: Array) -> Array:
         """The columns of the factor of its error."""
         return np.asarray(self.surrogate.predict(at).factor[0].T)
 
 
-def forward_model(file: Path, spec: ModelSpec, motion: PadMotion, edges_s: Array) -> ForwardModel:
-    """Returns the forward model in a file: the reduced model for the reaction, else a surrogate of `spec`.
+def stands_for(spec: ModelSpec) -> bool:
+    """Returns whether a device's reduced model stands for a full model: that of the reaction, on bricks."""
+    return (spec.observation, spec.mesh) == ("reaction", "bricks")
 
-    A reduced model stands for the full model that it was made from.
-    """
-    if spec.observation == "reaction":
+
+def forward_model(file: Path, spec: ModelSpec, motion: PadMotion, edges_s: Array) -> ForwardModel:
+    """Returns the model in a file: the reduced model where one stands for `spec`, else a surrogate."""
+    if stands_for(spec):
         return ReducedForward(load_reduced(file), motion, edges_s)
     return SurrogateForward(load_surrogate(file), spec)
+
+
+def change(space: ParameterSpace, theta: Array) -> Array:
+    """Returns the change of each parameter (d,) along one coordinate of the prior's box."""
+    unit, h = space.box.to_unit(theta), 1e-6
+    return np.asarray((space.box.from_unit(unit + h) - space.box.from_unit(unit - h)) / (2.0 * h))
+
+
+def slopes(surrogate: Surrogate, theta: Array) -> Array:
+    """Returns derivatives (m, d) of a surrogate's mean by coordinates of the box, by differences toward its
+    middle."""
+    box = surrogate.space.box
+    unit = box.to_unit(theta)
+    steps = np.diag(np.where(unit > 0.5, -STEP, STEP))
+    rows = np.vstack([theta, np.clip(box.from_unit(unit + steps), box.lower, box.upper)])
+    mean = surrogate.predict_mean(rows)
+    return np.asarray((mean[1:] - mean[0]).T / np.diag(steps))

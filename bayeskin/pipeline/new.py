@@ -63,13 +63,6 @@ _SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
         "draws": "0 for none; each is a full run",
         "rounds": "in which they may join the design, where the surrogate is off",
     }),
-    ("effects", "what `bayeskin effects` learns of mechanisms that the full model solves: hours of runs", {
-        "mechanisms": "all of them where none is named",
-        "coarse": "runs on 80 bricks for each part of one",
-        "points": "full runs for each",
-        "held_out": "full runs that test it",
-        "plausible": "more of them where the recording leaves the mechanism plausible",
-    }),
     ("sobol", "indices over the prior", {"samples": "more make their intervals narrower"}),
 )  # fmt: skip
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from bayeskin.model.problem import PARAMETERS
 from bayeskin.model.simulate import ModelSpec, simulate
 from bayeskin.types import Array, PadMotion, Simulation
 
-STEP = 1e-4  # of a change, for differences of what the instrument makes of a force
 BESIDE = 1e-4  # of a change, by which derivatives are taken beside a neutral value
 
 
@@ -54,37 +53,15 @@ class FullForce:
     edges_s: Array
 
     def __call__(self, case: tuple[Sequence[str], Mapping[str, float]]) -> Array | str:
-        found = self.with_slopes(case, {})
-        return found if isinstance(found, str) else found[0]
-
-    def with_slopes(
-        self, case: tuple[Sequence[str], Mapping[str, float]], changes: Mapping[str, float]
-    ) -> tuple[Array, Array] | str:
-        """Bin means (m,), and their derivatives (m, r) by these parameters, each for its change."""
         names, values = case
         mechanisms = [catalogue()[name] for name in names]
         along = {p.name for mechanism in solved(mechanisms) for p in mechanism.parameters}
         theta = dict(values)
         if self.spec.forward is None:  # a model of one's own has parameters of any name
             theta = {name: value for name, value in values.items() if name in {*along, *PARAMETERS, *LENGTHS}}
-        by = {name: change for name, change in changes.items() if name in theta}
-        theta |= beside_neutral(theta, by, mechanisms)
-        simulation = simulate(
-            self.spec, self.motion, theta, laws=laws(mechanisms), gradients=by, falls_too=False
-        )
+        simulation = simulate(self.spec, self.motion, theta, laws=laws(mechanisms), falls_too=False)
         if simulation.status != "ok":
             return simulation.message
-        slopes = dict(zip(simulation.gradient_names, simulation.gradient_n.T, strict=True))
-        runs = [replace(simulation, force_n=simulation.force_n + STEP * slopes.get(name, 0.0))
-                for name in changes]  # fmt: skip
-        columns = {name: np.full(1 + len(changes), value) for name, value in values.items()}
-        for row, (name, change) in enumerate(changes.items(), start=1):
-            columns[name][row] += STEP * change
-
-        def force(time_s: Array) -> Array:
-            times_s = np.broadcast_to(time_s, (1 + len(runs), np.shape(time_s)[-1]))
-            return np.stack([run.at(row) for run, row in zip([simulation, *runs], times_s, strict=True)])
-
         beyond = [mechanism for mechanism in mechanisms if mechanism.act.bind is None]
-        seen = bin_means(observed(beyond, columns, self.motion, force), self.motion, self.edges_s, beyond)
-        return seen[0], (seen[1:] - seen[0]).T / STEP
+        force = reported(simulation, mechanisms, values, self.motion)
+        return np.asarray(bin_means(force, self.motion, self.edges_s, beyond)[0])

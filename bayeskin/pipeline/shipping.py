@@ -18,7 +18,7 @@ from bayeskin.pipeline.folder import sha256_of
 from bayeskin.pipeline.model import model_spec, waves_model
 from bayeskin.probe import refuse_damaged
 from bayeskin.shipped import shipped
-from bayeskin.surrogates import effects_beside, effects_in, load_manifest
+from bayeskin.surrogates import load_manifest
 from bayeskin.types import BinnedForce, Design, PadMotion
 
 
@@ -53,8 +53,8 @@ def shipped_files(run: Run) -> ShippedFiles:
     for file in files.present[1:]:
         if not file.is_file():
             raise InputError(f"{run.config_path}: surrogate.file", f"no {file}", "its design beside it")
-    for file in (*files.present, *effects_in(effects_beside(path))) if brought else ():
-        refuse_damaged(file, "a surrogate that bayeskin wrote, and its design and effects")
+    for file in files.present if brought else ():
+        refuse_damaged(file, "a surrogate that bayeskin wrote, and its design")
     return files
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from bayeskin.config import Config
-from bayeskin.pipeline import design, diagnosis, effects, indices, maximum, posterior, recording, training
+from bayeskin.pipeline import design, diagnosis, indices, maximum, posterior, recording, training
 from bayeskin.pipeline.crew import made_by
 from bayeskin.pipeline.engine import Outcome, Reporter, Run, Stage, open_run, run_stages, standing
 from bayeskin.pipeline.folder import plain, read_record, write_json
@@ -73,13 +73,12 @@ def _summarise(run: Run) -> Mapping[str, Any]:
 REPORT = Stage(
     "report", "writes summary.json", tuple(stage.name for stage in BEFORE_REPORT), ("model",), _summarise
 )
-STAGES = {stage.name: stage for stage in (*BEFORE_REPORT, REPORT, effects.STAGE, diagnosis.STAGE)}
+STAGES = {stage.name: stage for stage in (*BEFORE_REPORT, REPORT, diagnosis.STAGE)}
 
 
 def stages_of(config: Config) -> Mapping[str, Stage]:
-    """Returns all stages of a configuration; the reduced model diagnoses where it makes the design."""
-    own = diagnosis.stages_of(config)
-    return {**STAGES, **{name: stage for name, stage in own.items() if name == "diagnose"}}
+    """Returns all stages of a configuration; what a diagnosis needs goes by its model."""
+    return {**STAGES, diagnosis.NAME: diagnosis.stage_of(config)}
 
 
 def run(
@@ -96,8 +95,6 @@ def run(
     """
     opened = open_run(config, reporter)
     stages = stages or stages_of(opened.config)
-    if last == "effects":
-        opened.config.refuse_uncertain(config, last)
     if scheduler is not None:
         opened = made_by(opened, scheduler)
     outcomes = run_stages(opened, stages, last or "report")
@@ -166,7 +163,6 @@ def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str
             ]
         ),
         "sobol": lambda: "\n".join(one["sentence"] for one in said.values()),
-        "effects": lambda: "\n".join(effects.in_words(name, one) for name, one in said.items()),
     }
     return f"{head}\n{lines[answer.stage]()}\noutputs in {folder / answer.stage}"
 

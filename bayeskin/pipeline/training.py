@@ -44,11 +44,6 @@ def corrected(
     return correct(surrogate, fine, focus(fine, binned, fitted_bins(run, binned)))
 
 
-def base_surrogate(run: Run) -> ShapeSurrogate:
-    """The surrogate of the base model that the stage left."""
-    return load_surrogate(run.at("train", "surrogate.h5"))
-
-
 def fine_design(run: Run, stage: str) -> Design | None:
     """The configuration's model at points of a coarser one's design, as a stage left it; None without."""
     return None if run.config.design.coarse is None else storage.load(run.at(stage, "fine.h5"), Design)

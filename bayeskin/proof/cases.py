@@ -3,7 +3,7 @@
 A set has all kinds in fixed shares, or `only` what is asked for, in equal numbers. Base parameters are drawn
 from the default box where the peak force is that of a skin test and the subcutis is not much stiffer than the
 cutis (on a stiff one a soft cutis folds), a mechanism's from their priors. Of many draws that one is taken
-whose size, by the shipped surrogates, is nearest to a target that is log-uniform over `SIZES`, or spread so
+whose size, by the shipped models, is nearest to a target that is log-uniform over `SIZES`, or spread so
 evenly in a set of what was asked for; where none comes near, the nearest.
 """
 
@@ -17,23 +17,17 @@ from typing import Literal
 import numpy as np
 
 from bayeskin.errors import InputError
-from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed
-from bayeskin.mechanisms.binned import estimates_by_name
-from bayeskin.mechanisms.mechanism import Instrument, Tissue
+from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed, solved
+from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.proof.noise import FLOORS_N
 from bayeskin.proof.outside import OUTSIDE
 from bayeskin.proof.protocol import EDGES_S, MOTION, SURROGATE
 from bayeskin.proof.remains import ALONE, Refit, rms
+from bayeskin.reduced.files import load_reduced
+from bayeskin.reduced.model import ReducedModel
+from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.shipped import shipped
-from bayeskin.surrogates import (
-    Effect,
-    effects_among,
-    effects_beside,
-    effects_in,
-    load_effect,
-    load_surrogate,
-    with_effects,
-)
+from bayeskin.surrogates import load_surrogate
 from bayeskin.types import Array, ParameterSpace
 
 # A seed draws from these alone, so that a set of the past can be made again whatever the catalogue has since.
@@ -50,8 +44,10 @@ PEAK_N = (0.1, 2.0)
 STIFFEST_BELOW = 2.0  # E_s over E_c, at most
 SIZES = (1.0, 30.0)  # of the noise floor
 NEAR = 0.2  # of a logarithm: how near to its target a size is near enough
+REDUCED = "surrogates/article-device-reduced.h5"
+FOLDING = 0.15  # of the stiffness at rest: runs that come nearer to folding are not used
 LEAST_SHARE = 0.25  # of a pair's size, that each of the two should have
-BATCH, BATCHES, FITTED = 64, 8, 3  # draws at a time, how often, and how many of each are fitted
+BATCH, BATCHES, FITTED = 16, 16, 3  # draws at a time, how often, and how many of each are fitted
 
 
 @dataclass(frozen=True)
@@ -163,48 +159,40 @@ def _pairs(rng: np.random.Generator, known: Mapping[str, Mechanism], count: int)
 
 @dataclass(frozen=True)
 class Screen:
-    """Predicts what a case's force will be, well enough to choose its size."""
+    """Predicts what a case's force will be, well enough to choose its size.
+
+    refit : the base model, by its surrogate; model : says how mechanisms change its force
+    """
 
     refit: Refit
-    effects: tuple[Effect, ...]
+    model: ReducedModel
     known: Mapping[str, Mechanism]
 
     def force(self, names: Sequence[str], theta: Array, values: Mapping[str, Array]) -> Array:
-        """Bin means (n, m) at theta (n, 5) with mechanisms at values (n,) each."""
-        whole = with_effects(self.refit.surrogate, effects_among(self.effects, names))  # type: ignore[arg-type]
-        columns = [*theta.T, *(values[name] for name in whole.space.names[theta.shape[1] :])]
-        force_n = Refit(whole).force(np.stack(columns, axis=1))
-        reported = [self.known[n] for n in names if isinstance(self.known[n].act, Instrument)]
-        if not reported:
-            return force_n
-        straight = _Straight(force_n)
-        seen = bin_means(observed(reported, values, MOTION, straight), MOTION, EDGES_S, reported)
-        return np.asarray(force_n + seen - bin_means(straight, MOTION, EDGES_S))
+        """Bin means (n, m) at theta (n, 5) with mechanisms at values (n,) each; NaN where no run finishes."""
+        changes = [self._change(names, one, {name: value[i] for name, value in values.items()})
+                   for i, one in enumerate(theta)]  # fmt: skip
+        return np.asarray(self.refit.force(theta) + np.array(changes))
 
-
-class _Straight:
-    """Force over time, straight from one bin's middle to the next; bin means (n, m)."""
-
-    def __init__(self, mean_n: Array) -> None:
-        self._mean_n = mean_n
-
-    def __call__(self, time_s: Array) -> Array:
-        rows = np.broadcast_to(time_s, (len(self._mean_n), np.shape(time_s)[-1]))
-        place = np.clip((rows - EDGES_S[0]) / (EDGES_S[1] - EDGES_S[0]) - 0.5, 0.0, len(EDGES_S) - 2.000001)
-        left = place.astype(int)
-        low, high = (np.take_along_axis(self._mean_n, left + one, axis=1) for one in (0, 1))
-        return np.asarray(low + (place - left) * (high - low))
+    def _change(self, names: Sequence[str], theta: Array, values: Mapping[str, float]) -> Array:
+        """What mechanisms add to the bin means (m,) of a skin."""
+        mechanisms = [self.known[name] for name in names]
+        skin, within = _named(self, theta), solved(mechanisms)
+        runs = [simulate_reduced(self.model, MOTION, {**skin, **values}, some, least_stiffness=FOLDING)
+                for some in (within, [])]  # fmt: skip
+        if any(run.status != "ok" for run in runs):
+            return np.full(len(EDGES_S) - 1, np.nan)
+        beyond = [one for one in mechanisms if one not in within]
+        rows = {name: np.array([value]) for name, value in values.items()}
+        seen = observed(beyond, rows, MOTION, lambda time_s: np.atleast_2d(runs[0].at(time_s)))
+        return np.asarray(bin_means(seen, MOTION, EDGES_S, beyond)[0] - runs[1].bin_means(EDGES_S))
 
 
 @cache
 def shipped_screen() -> Screen:
-    """With the surrogates that come with bayeskin; of the instrument's mechanisms the shortcut is enough."""
-    path = shipped(SURROGATE)
-    known = catalogue()
-    estimates = estimates_by_name(known, MOTION)
-    effects = (load_effect(one, estimates) for one in effects_in(effects_beside(path)))
-    tissue = (one for one in effects if all(isinstance(known[n].act, Tissue) for n in one.mechanisms))
-    return Screen(Refit(load_surrogate(path)), tuple(tissue), known)
+    """With the surrogate and the reduced model that come with bayeskin."""
+    model = load_reduced(shipped(REDUCED))
+    return Screen(Refit(load_surrogate(shipped(SURROGATE))), model, catalogue())
 
 
 def draw(plan: Plan, attempt: int, screen: Screen) -> Case:
@@ -236,8 +224,9 @@ def _sized(plan: Plan, rng: np.random.Generator, screen: Screen, floor_n: float,
         all_n = screen.force(plan.mechanisms, theta, values)
         size = rms(screen.refit.linear(all_n - base_n, theta)) / floor_n
         short = _one_sided(plan, screen, theta, values, all_n, size * floor_n)
-        short[(np.abs(all_n).max(axis=1) > PEAK_N[1]) | (all_n.max(axis=1) < PEAK_N[0])] = np.inf
-        for row in np.argsort(_far(size, target) + short)[:FITTED]:
+        usable = (np.abs(all_n).max(axis=1) < PEAK_N[1]) & (all_n.max(axis=1) > PEAK_N[0])  # not where NaN
+        short[~usable] = np.inf
+        for row in np.argsort(_far(size, target) + short)[: min(FITTED, usable.sum())]:
             fitted = rms(screen.refit.residual(all_n[row], theta[row], ALONE)) / floor_n
             far = _far(fitted, target) + short[row]
             if far < best:

@@ -1,19 +1,6 @@
 """Surrogates of the full model: trained on a design, honest about their error, stored without code."""
 
-from bayeskin.surrogates.effects import (
-    Effect,
-    Pair,
-    WithEffects,
-    composed,
-    effect_of,
-    effects_among,
-    train_effect,
-    with_effects,
-)
 from bayeskin.surrogates.files import (
-    effects_beside,
-    effects_in,
-    load_effect,
     load_manifest,
     load_surrogate,
     manifest_of,
@@ -26,8 +13,6 @@ from bayeskin.surrogates.two_fidelities import correct
 from bayeskin.surrogates.validate import Validation, validate
 
 __all__ = [
-    "Effect", "Pair", "ShapeSurrogate", "Similarity", "Validation", "WithEffects", "composed", "correct",
-    "effect_of", "effects_among", "effects_beside", "effects_in", "load_effect",
-    "load_manifest", "load_surrogate", "manifest_of", "save_surrogate", "train",
-    "train_effect", "validate", "with_effects",
+    "ShapeSurrogate", "Similarity", "Validation", "correct", "load_manifest", "load_surrogate", "manifest_of",
+    "save_surrogate", "train", "validate",
 ]  # fmt: skip

@@ -158,15 +158,6 @@ class LatentChaos(_FreezesArrays):
         basis = legendre_basis(unit, self.indices)
         return np.stack([basis[:, fit.terms] @ fit.coefficients for fit in self._solved], axis=1)
 
-    def covariance(self, unit: Array, at: Array) -> Array:
-        """Of each latent's error at unit (k, d) with that at one point (d,), by its coefficients: (k, q)."""
-        basis = legendre_basis(np.vstack([unit, at[None]]), self.indices)
-        found = np.empty((len(unit), self.targets.shape[1]))
-        for j, fit in enumerate(self._solved):
-            rows = basis[:, fit.terms] @ fit.root
-            found[:, j] = self._variance(j, rows[:-1] @ rows[-1]) - self._variance(j, np.zeros(1))
-        return found
-
     def leave_one_out(self) -> tuple[Array, Array]:
         """Mean and variance of each row given all others, (n, q) each; terms kept."""
         residual = np.stack([fit.residual for fit in self._solved], axis=1)

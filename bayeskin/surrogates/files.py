@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,13 @@ import numpy as np
 from bayeskin import __version__, storage
 from bayeskin.errors import InputError
 from bayeskin.surrogates.chaos import LatentChaos
-from bayeskin.surrogates.effects import Effect, Estimate, effect_of
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.shapes import ShapeTransform
 from bayeskin.surrogates.sound import refuse_unsound
 from bayeskin.surrogates.surrogate import Latents, ShapeSurrogate
 from bayeskin.surrogates.two_fidelities import CorrectedLatents
 from bayeskin.surrogates.validate import Validation
-from bayeskin.types import Array, ParameterSpace, frozen_array
+from bayeskin.types import ParameterSpace, frozen_array
 
 FORMAT = "bayeskin surrogate"
 # 2: inputs are those of `Similarity`; 3: latents may have a correction; 4: active inputs; 5: a correction may
@@ -124,35 +123,6 @@ def _loaded(path: Path) -> tuple[ShapeSurrogate, dict[str, Any]]:
         if not isinstance(manifest, dict) or not isinstance(surrogate.provenance, dict):
             raise InputError("manifest or provenance", "JSON of another kind", "a table of names and values")
         return surrogate, manifest
-
-
-def effects_beside(surrogate: Path) -> Path:
-    """The folder of effects that belongs to a surrogate's file."""
-    return surrogate.with_name(f"{surrogate.stem}-effects")
-
-
-def effects_in(folder: Path) -> list[Path]:
-    """Files of effects in a folder, without their designs; [] where there is none."""
-    return sorted(path for path in folder.glob("*.h5") if not path.stem.endswith("-design"))
-
-
-def load_effect(
-    path: Path,
-    estimates: Callable[[Sequence[str], Sequence[str], Array], Estimate | None],
-    model_hash: str | None = None,
-) -> Effect:
-    """An effect from its file; `estimates` by names of mechanisms, names of their own parameters, and bins.
-
-    Raises InputError as `load_surrogate` does, where the effect was learnt beside another estimate, and where
-    it is of another model than the one asked for.
-    """
-    surrogate, manifest = _loaded(path)
-    if model_hash is not None and manifest.get("model_hash") != model_hash:
-        raise InputError(path, "an effect of another model", "one of this configuration's model")
-    about = manifest.get("effect")
-    if not isinstance(about, dict) or not {"part", "mechanisms", "neutral", "own"} <= set(about):
-        raise InputError(f"{path}: manifest: effect", f"{about!r:.60}", "what `bayeskin effects` writes")
-    return effect_of(about, surrogate, estimates(about["mechanisms"], about["own"], surrogate.edges_s))
 
 
 def _refuse_unfit(path: Path, handle: h5py.File) -> None:

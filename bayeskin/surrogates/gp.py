@@ -268,20 +268,6 @@ class LatentGPs(_FreezesArrays):
             spread=spread[:, None],
         )
 
-    def covariance(self, unit: Array, at: Array) -> Array:
-        """Of each latent's error at unit (k, d) with that at one point (d,), without the nugget: (k, q)."""
-        points = np.vstack([unit, at[None]])
-        basis, found = trend_basis(points, self.degree), np.empty((len(unit), len(self.kernels)))
-        for j, given in enumerate(self._conditioned):
-            mapped = (points - 0.5) @ self.linear_maps[j].T
-            rows = kernel(self.kernels[j], squared_distances(mapped, given.mapped))[0]
-            explained = rows @ given.whitener.T
-            trend = (basis - rows @ given.trend_weights) @ given.trend_root.T
-            prior = kernel(self.kernels[j], squared_distances(mapped[:-1], mapped[-1:]))[0][:, 0]
-            spread = (self.inflation[j] * given.deviation) ** 2 * given.variance
-            found[:, j] = spread * (prior - explained[:-1] @ explained[-1] + trend[:-1] @ trend[-1])
-        return found
-
     def leave_one_out(self) -> tuple[Array, Array]:
         """Mean and variance of each row given all others, (n, q) each; hyperparameters kept."""
         mean, variance = np.empty_like(self.targets), np.empty_like(self.targets)

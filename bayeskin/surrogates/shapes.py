@@ -43,20 +43,20 @@ class ShapeTransform(_FreezesArrays):
         amplitude, shapes = split(force_n)
         return np.column_stack([amplitude, (shapes - self.mean) @ self.components.T])
 
-    def decode(self, latent: Array, sd: Array, times: Array | float = 1.0) -> Prediction:
-        """`times` (n,) the force of latent vectors with independent errors, mean and sd (n, 1 + K) each.
+    def decode(self, latent: Array, sd: Array) -> Prediction:
+        """The force of latent vectors with independent errors, mean and sd (n, 1 + K) each.
 
         Delta method: d force = force da + exp(a) components dz.
         """
-        scale = (times * np.exp(latent[:, 0]))[:, None]
-        mean = self.decode_mean(latent, times)
+        scale = np.exp(latent[:, 0])[:, None]
+        mean = self.decode_mean(latent)
         columns = np.empty((*latent.shape, len(self.mean)))
         _fill(mean, self.components, sd, scale * sd, columns)
         return Prediction(mean, columns.transpose(0, 2, 1), scale**2 * self.truncation)
 
-    def decode_mean(self, latent: Array, times: Array | float = 1.0) -> Array:
+    def decode_mean(self, latent: Array) -> Array:
         """The mean (n, m) of `decode` alone."""
-        scale = (times * np.exp(latent[:, 0]))[:, None]
+        scale = np.exp(latent[:, 0])[:, None]
         mean = np.asarray((scale * latent[:, 1:]) @ self.components)
         mean += scale * self.mean
         return mean

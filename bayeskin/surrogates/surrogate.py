@@ -32,10 +32,6 @@ class Latents(Protocol):
         """The mean (n, q) of `predict` alone."""
         ...
 
-    def covariance(self, unit: Array, at: Array) -> Array:
-        """Of each latent's error at inputs (n, k) with that at one point (k,): (n, q)."""
-        ...
-
     def leave_one_out(self) -> tuple[Array, Array]:
         """Mean and variance (n, q) of each training row given the others."""
         ...
@@ -64,37 +60,31 @@ class ShapeSurrogate(_FreezesArrays):
         """What the latents see of theta (n, d), (n, k)."""
         return self.similarity.inputs(theta)[:, self.active]
 
-    def predict(self, theta: ArrayLike, times: Array | float = 1.0) -> Prediction:
-        """`times` (n,) the force at theta (n, d) or (d,), with its uncertainty.
+    def predict(self, theta: ArrayLike) -> Prediction:
+        """The force at theta (n, d) or (d,), with its uncertainty.
 
         Raises InputError that names the first parameter outside the box.
         """
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
         mean, variance = self.latents.predict(self.inputs(theta))
-        return self._decode(theta, mean, variance, times)
+        return self._decode(theta, mean, variance)
 
-    def predict_mean(self, theta: ArrayLike, times: Array | float = 1.0) -> Array:
+    def predict_mean(self, theta: ArrayLike) -> Array:
         """The mean (n, m) of `predict` alone."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
         latent = self.latents.predict_mean(self.inputs(theta))
         latent[:, 0] += self.similarity.log_scale(theta)
-        return self.transform.decode_mean(latent, times)
-
-    def correlation(self, theta: Array, at: Array) -> Array:
-        """Of the error along each column of the factor, at theta (n, d) with that at a point (d,): (n, r)."""
-        unit = self.inputs(np.vstack([theta, at[None]]))
-        variance = self.latents.predict(unit)[1]
-        return self.latents.covariance(unit[:-1], unit[-1]) / np.sqrt(variance[:-1] * variance[-1])
+        return self.transform.decode_mean(latent)
 
     def leave_one_out(self, theta: Array) -> Prediction:
         """Force at the training rows, theta (n, d), as the others predict it; hyperparameters kept."""
         return self._decode(theta, *self.latents.leave_one_out())
 
-    def _decode(self, theta: Array, mean: Array, variance: Array, times: Array | float = 1.0) -> Prediction:
+    def _decode(self, theta: Array, mean: Array, variance: Array) -> Prediction:
         mean[:, 0] += self.similarity.log_scale(theta)
-        return self.transform.decode(mean, np.sqrt(variance), times)
+        return self.transform.decode(mean, np.sqrt(variance))
 
 
 def refuse_outside(space: ParameterSpace, theta: Array) -> None:

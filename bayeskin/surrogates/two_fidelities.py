@@ -52,12 +52,6 @@ class CorrectedLatents:
         mean[:, : coarse.shape[1]] += coarse
         return mean
 
-    def covariance(self, unit: Array, at: Array) -> Array:
-        """Of each latent's error at unit (n, dim) with that at one point (dim,): (n, q)."""
-        found, coarse = self.correction.covariance(unit, at), self.coarse.covariance(unit, at)
-        found[:, : coarse.shape[1]] += coarse
-        return found
-
     def leave_one_out(self) -> tuple[Array, Array]:
         """Mean and variance (n, q) at each fine run, its correction as the other fine runs predict it."""
         return self._added(self.inputs, *self.correction.leave_one_out())

@@ -19,10 +19,10 @@ from bayeskin.design import default_space
 from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import observed
-from bayeskin.mismatch.corrected import FullRun
+from bayeskin.mismatch.tangent import ModelRun
 from bayeskin.model.simulate import ModelSpec
-from bayeskin.pipeline import forward, joint_bench
-from bayeskin.pipeline.joint_bench import JointBench, Source
+from bayeskin.pipeline import forward, workbench
+from bayeskin.pipeline.workbench import Source, Workbench
 from bayeskin.reduced.region import LEAST_STIFFNESS
 from bayeskin.types import (
     Array,
@@ -169,22 +169,22 @@ class Full:
 def bench(
     patch: pytest.MonkeyPatch, binned: BinnedForce, base: ParameterSpace = BASE,
     full: Callable[[Mapping[str, float]], Array | str] = lambda values: means(values)[0],
-) -> JointBench:  # fmt: skip
+) -> Workbench:  # fmt: skip
     """A diagnosis's bench whose reduced model is the toy, and whose full model is a function of values."""
     model: Any = SimpleNamespace(
         trained=SimpleNamespace(geometry=Geometry(), mechanisms={"stiffness-drift": None}),
         refinement=2, hash="toy",
     )  # fmt: skip
-    patch.setattr(joint_bench, "calm_bins", lambda folder: (binned, NO_WORD, MOTION))
+    patch.setattr(workbench, "calm_bins", lambda folder: (binned, NO_WORD, MOTION))
     patch.setattr(forward, "load_reduced", lambda file: model)
     patch.setattr(forward, "simulate_reduced", simulate)
-    patch.setattr(joint_bench, "FullForce", lambda spec, motion, edges_s: Full(full))
-    return JointBench(Source(Path("recording"), Path("model"), ModelSpec(), 1, base))
+    patch.setattr(workbench, "FullForce", lambda spec, motion, edges_s: Full(full))
+    return Workbench(Source(Path("recording"), Path("model"), ModelSpec(), 1, base))
 
 
-def a_run(bench: JointBench, names: Sequence[str] = (), **values: float) -> FullRun:
+def a_run(bench: Workbench, names: Sequence[str] = (), **values: float) -> ModelRun:
     """With derivatives, at the truth but for these values."""
     neutral = {name: value for one in names for name, value in KNOWN[one].neutral.items()}
     run = bench.skin(names, {**neutral, **TRUTH, **values})
-    assert isinstance(run, FullRun)
+    assert isinstance(run, ModelRun)
     return run

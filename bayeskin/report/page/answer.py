@@ -109,33 +109,18 @@ def _sure(facts: RunFacts) -> Verdict:
     return Verdict("trusted" if trusted else "not trusted", "good" if trusted else "doubt", lines)
 
 
-def fits_of(fit: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """Returns fits by the model that they rest on; the last is the full model's, if there is one."""
-    full = fit.get("full_model")
-    return {fit.get("model", "surrogate"): fit, **({"full model": full} if full and "rmse" in full else {})}
-
-
-def _beyond_the_catalogue(said: Mapping[str, Any]) -> list[str]:
-    """Nothing of a diagnosis that did not ask."""
-    chance = said.get("unknown_probability")
-    if chance is None:
-        return []
-    return [f"Something outside the catalogue: probability {number(chance)} at most."]
-
-
 def _missing(facts: RunFacts) -> Verdict:
     said = facts.said("diagnose")
     if not said:
         standing = facts.stage("diagnose").standing
         why = [f"Nobody has looked yet: the stage diagnose is {standing}."]
         return Verdict("not known yet", "none", why, f"bayeskin diagnose {facts.config_path}")
-    fit = said["fit"]
-    fits = [fits_of(fit[when]) for when in ("before", "after")]
-    last = all("full model" in one for one in fits)
-    both = [quantity(one["full model" if last else next(iter(one))]["rmse"], "N") for one in fits]
+    both = [quantity(said["fit"][when]["rmse"], "N") for when in ("before", "after")]
+    chance = number(said["smooth_probability"])
+    beyond = f"Something smooth that is not in the catalogue: probability {chance}."
     if said["verdict"] == "nothing-missing":
         within = f"The recording stays within what the model allows ({both[0]} RMSE)."
-        lines = [within, *_beyond_the_catalogue(said)]
+        lines = [within, beyond]
         if faint := faint_in_words(said):
             return Verdict("nothing that could be named", "doubt", [faint, *lines])
         return Verdict("nothing", "good", lines)
@@ -144,21 +129,9 @@ def _missing(facts: RunFacts) -> Verdict:
     left = len(said["remaining"])
     if left:
         lines.append(f"{left} window{'s' * (left != 1)} of the recording remain unexplained.")
-    lines += _beyond_the_catalogue(said)
+    lines.append(beyond)
     if said["verdict"] == "named":
         return Verdict("named", "doubt", lines)
-    if (share := said.get("set_probability")) is not None:
-        among = ", ".join(said["best_set"])
-        lines.append(f"Of the catalogue {among} fits best, with a probability of {number(share)} against "
-                     "something smooth without a name.")  # fmt: skip
-    word = (
-        "something that has no name here"
-        if is_outside(said)
-        else "something that several causes would explain"
-    )
-    return Verdict(word, "doubt", lines)
-
-
-def is_outside(said: Mapping[str, Any]) -> bool:
-    """Returns whether an unknown cause is more likely outside the catalogue than one of several in it."""
-    return bool(said.get("unknown_probability", 1.0) > 0.5)
+    if said["best_set"]:
+        lines.append(f"Of the catalogue {', '.join(said['best_set'])} fits best.")
+    return Verdict("something that has no name here", "doubt", lines)

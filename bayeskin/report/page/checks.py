@@ -25,7 +25,7 @@ def checks(facts: RunFacts) -> Section:
     blocks: list[Block] = []
     for title, found in parts:
         blocks += [Heading(title), *found]
-    return Section("checks", "Checks", [*blocks, *pictures(facts, "effects")])
+    return Section("checks", "Checks", blocks)
 
 
 def _convergence(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayeskin.report.mismatch import faint_in_words
-from bayeskin.report.page.answer import fits_of, is_outside
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
 from bayeskin.report.page.numbers import number, percent, quantity
@@ -16,22 +15,19 @@ from bayeskin.report.page.sections import absent, cell
 _VERDICTS = {
     "nothing-missing": "The model leaves nothing out that the recording shows.",
     "named": "The recording shows physics that the model leaves out, and it has been named.",
+    "unknown": "The model leaves something out that no mechanism of the catalogue explains.",
 }
-_OUTSIDE = "The model leaves something out that no mechanism of the catalogue explains."
-_SEVERAL = (
-    "The model leaves something out that several mechanisms of the catalogue would explain, none surely."
-)
 
 
 def mismatch(facts: RunFacts) -> Section:
     said = facts.said("diagnose")
     blocks: list[Block] = list(absent(facts, "diagnose"))
     if said:
-        verdict = _VERDICTS.get(said["verdict"], _OUTSIDE if is_outside(said) else _SEVERAL)
+        verdict = _VERDICTS[said["verdict"]]
         blocks.append(Text([f"{verdict} {faint}" if (faint := faint_in_words(said)) else verdict]))
         if said["mechanisms"]:
             blocks.append(_mechanisms(said["mechanisms"]))
-        blocks.append(_fits(said["fit"]))
+        blocks += [_fits(said["fit"]), Text([_checked(said["full_model"])])]
         blocks += pictures(facts, "diagnose")
         if said["mechanisms"]:
             blocks.append(Folded("Parameters of the mechanisms", [_parameters(said["mechanisms"])]))
@@ -54,13 +50,13 @@ def _mechanisms(found: Sequence[Mapping[str, Any]]) -> Table:
                 one["name"],
                 one["statement"],
                 Cell(number(one["probability"]), one["probability"]),
-                cell(one.get("explains_n"), "N"),
+                cell(one["contribution_n"], "N"),
                 ", ".join(name for name in one["group"] if name != one["name"]) or "none",
             )
         )
         for one in found
     ]
-    head = ("mechanism", "what it does here", "probability", "explains", "look-alikes")
+    head = ("mechanism", "what it does here", "probability", "moves the force by", "look-alikes")
     return Table("Mechanisms that were named", head, rows)
 
 
@@ -75,29 +71,32 @@ def _parameters(found: Sequence[Mapping[str, Any]]) -> Table:
 
 def _fits(fit: Mapping[str, Mapping[str, Any]]) -> Table:
     kinds = list(fit["before"]["rmse_by_phase"])
-    last = {
-        when: [*fits_of(fit[when]).values()][-1] for when in fit
-    }  # of whose posterior phases are left out
     rows = [
         row(
             (
-                f"{when}, {name}",
+                when,
                 cell(one["rmse"], "N"),
                 cell(one["rmse_held_out"], "N"),
                 *(cell(one["rmse_by_phase"].get(kind), "N") for kind in kinds),
-                cell(fit[when].get("rmse_left_out") if one is last[when] else None, "N"),
-                Cell(percent(fit[when]["coverage90"]), fit[when]["coverage90"]),
+                Cell(percent(one["coverage90"]), one["coverage90"]),
             )
         )
-        for when in ("before", "after")
-        for name, one in fits_of(fit[when]).items()
+        for when, one in fit.items()
     ]
-    head = ("fit", "whole recording", "held out", *kinds, "phases left out", "90 % band holds")
-    return Table(
-        "RMSE without and with the mechanisms; held out: after the second hold, not fitted; "
-        "left out: each phase by a fit without it",
-        head,
-        rows,
+    head = ("fit", "whole recording", "held out", *kinds, "90 % band holds")
+    title = (
+        "RMSE without and with the mechanisms; held out: after the second hold, by a fit to what is before it"
+    )
+    return Table(title, head, rows)
+
+
+def _checked(full: Mapping[str, Any]) -> str:
+    """What a run of the full model at the best values shows."""
+    if "message" in full:
+        return f"The full model fails at the best values: {full['message']}"
+    return (
+        f"A run of the full model at the best values leaves {quantity(full['rmse'], 'N')} RMSE; the reduced "
+        f"model is off by {quantity(full['reduced_off_by'], 'N')} there."
     )
 
 

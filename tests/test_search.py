@@ -13,11 +13,11 @@ from toys import solved
 from toys.solved import BASE, KNOWN
 
 from bayeskin.errors import InputError
-from bayeskin.mismatch.joint_search import JointSearch, SearchSettings, search_jointly
-from bayeskin.mismatch.search import weight
+from bayeskin.mismatch.hypotheses import weight
+from bayeskin.mismatch.search import Search, SearchSettings, search
 from bayeskin.mismatch.tasks import Climb, FullProbe, Join, Probe, Promise, Task, Weigh
 from bayeskin.mismatch.wrapper import innermost
-from bayeskin.pipeline.joint_bench import JointBench
+from bayeskin.pipeline.workbench import Workbench
 from bayeskin.types import Array, ParameterSpace
 
 Full = Callable[[Mapping[str, float]], Array | str]
@@ -34,7 +34,7 @@ FEW = SearchSettings(skins=8, others=4, tried=1)
 class Asked:
     """Answers tasks as processes do, through JSON, and keeps them."""
 
-    def __init__(self, bench: JointBench, lost: Callable[[Task], bool] = lambda task: False) -> None:
+    def __init__(self, bench: Workbench, lost: Callable[[Task], bool] = lambda task: False) -> None:
         self.bench, self.lost = bench, lost
         self.tasks: list[Task] = []
         self.told: list[str] = []
@@ -47,11 +47,9 @@ class Asked:
         said = {"message": "the worker ended"} if self.lost(task) else self.bench.done(task)
         return self.bench.answered(task, json.loads(json.dumps(said)))
 
-    def search(self, seed: int = 1, settings: SearchSettings = FEW) -> JointSearch:
+    def search(self, seed: int = 1, settings: SearchSettings = FEW) -> Search:
         bench = self.bench
-        return search_jointly(
-            self, bench.binned, bench.base, KNOWN, bench.noise, seed, self.told.append, settings
-        )
+        return search(self, bench.binned, bench.base, KNOWN, bench.noise, seed, self.told.append, settings)
 
 
 @pytest.fixture
@@ -204,7 +202,7 @@ def test_the_same_seed_gives_the_same_search(asked: Make) -> None:
     assert _as_values(other.search(4)) != _as_values(first.search(3))
 
 
-def _as_values(found: JointSearch) -> dict[tuple[str, ...], tuple[float, dict[str, float]]]:
+def _as_values(found: Search) -> dict[tuple[str, ...], tuple[float, dict[str, float]]]:
     return {names: (one.fit.value, dict(one.fit.theta)) for names, one in found.fits.items()}
 
 

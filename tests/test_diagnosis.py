@@ -74,7 +74,7 @@ def test_a_solid_that_relaxes_is_named_on_any_protocol_and_a_second_call_makes_n
     written = json.loads((folder / "diagnose" / "diagnosis.json").read_text())
     assert written["verdict"] == "named"
 
-    (answers,) = (folder / "searches").glob("*-joint.jsonl")
+    (answers,) = (folder / "searches").glob("*.jsonl")
     before = answers.read_bytes()
     shutil.rmtree(folder / "diagnose")
     again = diagnose(recording, Silent())

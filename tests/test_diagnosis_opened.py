@@ -1,0 +1,71 @@
+"""What a diagnosis of a recording by itself, or of a configuration, works on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toys.small_reduced import hollow
+
+from bayeskin import storage
+from bayeskin.config import parameter_space
+from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
+from bayeskin.pipeline.diagnosis import STAGE, opened, stage_of
+from bayeskin.pipeline.engine import Silent
+from bayeskin.shipped import shipped
+from bayeskin.types import Recording
+
+
+def recording(path: Path) -> Path:
+    """Two ramps and holds, which no shipped surrogate knows."""
+    time_s = np.arange(0.0, 60.0, 0.1)
+    u_m = np.interp(time_s, [0.0, 5.0, 9.0, 30.0, 34.0, 60.0], [0.0, 0.0, 3e-3, 3e-3, 6e-3, 6e-3])
+    noise_n = 1e-3 * np.random.default_rng(1).standard_normal(len(time_s))
+    storage.save(path / "a test.h5", Recording(time_s, u_m, 30.0 * u_m + noise_n, "own", "0" * 64))
+    return path / "a test.h5"
+
+
+def test_a_recording_by_itself_takes_the_article_s_reduced_model(tmp_path: Path) -> None:
+    run = opened(recording(tmp_path), Silent())
+    assert stage_of(run.config) is STAGE
+    assert run.config.geometry(run.config_path).geometry == Geometry()
+    assert run.folder == tmp_path / "a test-diagnosis"
+    assert list(STAGE.files(run)) == [shipped("surrogates/article-device-reduced.h5")]
+
+
+def test_a_recording_of_a_stated_device_takes_that_device_s_reduced_model(tmp_path: Path) -> None:
+    thin = Geometry(cutis_m=1.5e-3)
+    (tmp_path / "device.toml").write_text("[tissue]\ncutis_mm = 1.5\n")
+    run = opened(recording(tmp_path), Silent(), tmp_path / "device.toml")
+    assert run.config.geometry(run.config_path).geometry == thin
+    own = hollow(tmp_path / "device-reduced.h5", thin)
+    assert list(STAGE.files(run)) == [own]
+
+
+def test_an_uncertain_length_is_a_parameter(tmp_path: Path) -> None:
+    recording(tmp_path)
+    tissue = "[tissue]\ncutis_mm = { mean = 2.0, sd = 0.2 }\n"
+    (tmp_path / "device.toml").write_text(tissue)
+    run = opened(tmp_path / "a test.h5", Silent(), tmp_path / "device.toml")
+    assert "cutis_m" in parameter_space(run.config).names
+    case = tmp_path / "case.toml"
+    case.write_text(f'[recording]\nfile = "a test.h5"\n{tissue}')
+    assert opened(case, Silent()).config.geometry(case).sd_m == {"cutis_m": 0.2e-3}
+
+
+@pytest.mark.parametrize("model", ['observation = "article"\nmesh = "own.msh"', 'mesh = "own.msh"'])
+def test_a_model_that_no_reduced_one_stands_for_needs_a_surrogate(tmp_path: Path, model: str) -> None:
+    recording(tmp_path)
+    (tmp_path / "own.msh").write_text("")
+    case = tmp_path / "case.toml"
+    case.write_text(f'[recording]\nfile = "a test.h5"\n[model]\n{model}\n')
+    run = opened(case, Silent())
+    assert stage_of(run.config).needs == ("recording", "design", "train")
+    assert list(stage_of(run.config).files(run)) == []
+
+
+def test_a_device_stands_beside_no_configuration(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--device: found device\.toml beside a configuration"):
+        opened(tmp_path / "case.toml", Silent(), Path("device.toml"))
