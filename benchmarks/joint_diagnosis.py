@@ -13,7 +13,7 @@ Prints a row for each recording: what was concealed and how large it is (in nois
 probability that nothing is missing, how many of the skin's and the effect's parameters lie in their 90 %
 intervals, RMS residuals before and after, by how much the reduced model is off at the end, seconds, which are
 those of the last start where a diagnosis was interrupted, and the commit. Then both scoreboards of the same
-recordings.
+recordings, and what other thresholds of the verdict would have made of the kept evidences.
 """
 
 from __future__ import annotations
@@ -25,10 +25,13 @@ import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import rows
 
+from bayeskin.mechanisms import catalogue
+from bayeskin.mismatch import hypotheses
 from bayeskin.pipeline.diagnosis import diagnose
 from bayeskin.proof.score import score
 
@@ -60,6 +63,20 @@ SHARES = {
     "skin's parameters beside them in 90 % intervals": ("base_in_interval", "clear"),
     "skin's parameters where nothing is concealed": ("base_in_interval_nothing",),
 }
+RULES: dict[str, dict[str, float]] = {
+    "as it is": {"PROBABLE": hypotheses.PROBABLE},
+    "named whatever the set explains": {"MOST_OF_IT": 0.0},
+    "only if it explains 0.8": {"MOST_OF_IT": 0.8},
+    "only if it explains 0.95": {"MOST_OF_IT": 0.95},
+    "named from 0.8 on": {"PROBABLE": 0.8},
+    "named from 0.95 on": {"PROBABLE": 0.95},
+    "a prior of 0.01": {"ODDS": float(np.log(0.01 / 0.99))},
+    "a prior of 0.2": {"ODDS": float(np.log(0.2 / 0.8))},
+}  # a prior before the recording is seen, of each mechanism and of what has no name
+WEIGHED = (
+    "false alarms", "clear effects named, up to look-alikes", "smaller effects named, up to look-alikes",
+    "names that are there", "unknown where clear effects are outside",
+)  # fmt: skip
 
 
 def answered(case: str, folder: Path, workers: int) -> dict[str, Any]:
@@ -171,6 +188,32 @@ def scoreboard(said: Mapping[str, Mapping[str, Any]]) -> str:
     return rows.markdown(header, table)
 
 
+def ablation(said: Mapping[str, Mapping[str, Any]]) -> str:
+    """What becomes of the same evidences by other thresholds of `bayeskin.mismatch.hypotheses`."""
+    keys = {case: key_of(case, known=True) for case in said}
+    judged = {case: one for case, one in said.items() if "verdict" in one}
+    table = []
+    for what, changed in RULES.items():
+        with mock.patch.multiple(hypotheses, **changed):
+            board = score(keys, {case: _judged_anew(one) for case, one in judged.items()})
+        table.append([what, *(_share(board, SHARES[name]).split(" (")[0] for name in WEIGHED)])
+    return rows.markdown((f"{len(judged)} recordings", *WEIGHED), table)
+
+
+def _judged_anew(said: Mapping[str, Any]) -> dict[str, Any]:
+    """An answer with the verdict that follows from its evidences."""
+    weighed = {tuple(one["mechanisms"]): one for one in said["sets"]}
+    family = hypotheses.Family([
+        one for names, its in weighed.items()
+        for one in hypotheses.hypotheses_of(
+            names, hypotheses.Evidences(its["log_evidence_alone"], its["log_evidence_with_smooth"])
+        )
+    ])  # fmt: skip
+    found = hypotheses.judge_family(family, catalogue(), said["explained"])
+    named = [{"name": one.name, "probability": one.probability} for one in found.named]
+    return {**said, "verdict": found.verdict, "mechanisms": named}
+
+
 def _share(board: Mapping[str, Any], path: tuple[str, ...]) -> str:
     found: Any = board
     for key in path:
@@ -213,6 +256,7 @@ def main() -> None:
         rows.say(" | ".join(table[-1]))
     print(rows.markdown(HEADER, table))
     print(scoreboard(said))
+    print(ablation(said))
 
 
 if __name__ == "__main__":

@@ -92,26 +92,6 @@ def test_correcting_again_replaces_the_correction(coarse, fine):
     np.testing.assert_allclose(once.predict(theta).mean, twice.predict(theta).mean)
 
 
-def test_errors_of_both_parts_correlate_from_point_to_point(coarse, fine):
-    """At no distance the covariance is the variance that is predicted, but for each part's nugget; the
-    correction's own components have no other part."""
-    latents = correct(train(coarse, "gp")[0], fine)[0].latents
-    points = np.array([[0.5] * latents.inputs.shape[1], [0.45] * latents.inputs.shape[1]])
-    variance = latents.predict(points)[1]
-    found = latents.covariance(points, points[0])
-    own = nuggets(latents.correction)
-    own[: latents.coarse.targets.shape[1]] += nuggets(latents.coarse)
-    np.testing.assert_allclose(found[0], variance[0] - own, rtol=1e-6)
-    assert np.all(found[1] <= np.sqrt((variance - own).prod(axis=0)) * (1.0 + 1e-9))
-    assert np.all(found[1, :2] > 0.5 * found[0, :2])
-
-
-def nuggets(gps) -> np.ndarray:
-    """In the units of each latent, (q,)."""
-    spreads = np.array([one.deviation**2 * one.variance for one in gps._conditioned])
-    return spreads * gps.nuggets * gps.inflation**2
-
-
 @pytest.mark.parametrize("kind", ["gp", "chaos"])
 def test_a_corrected_surrogate_is_read_back_as_it_was(tmp_path, coarse, fine, kind):
     corrected = correct(train(coarse, kind)[0], fine)[0]

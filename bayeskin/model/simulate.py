@@ -6,7 +6,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -70,11 +70,6 @@ class ModelSpec:
         if self.observation != "reaction" and self.geometry != Geometry():
             found = f"another than the article's, with observation {self.observation!r}"
             raise InputError("geometry", found, "observation 'reaction', or the article's device and tissue")
-
-    @property
-    def coarsest(self) -> ModelSpec:
-        """The same on the 80 coarsest bricks, several times quicker; on a mesh of one's own, itself."""
-        return replace(self, refinement=0) if self.mesh == "bricks" else self
 
     @property
     def mesh_hash(self) -> str:

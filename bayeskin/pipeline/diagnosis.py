@@ -60,6 +60,7 @@ def diagnose(source: Path, reporter: Reporter, device: Path | None = None) -> di
     input, among it a device without a reduced model.
     """
     run = opened(source, reporter, device)
+    _files(run)  # a device without a reduced model is refused before anything is written
     outcome = run_stages(run, stages_of(run.config))[-1]
     answer = {**outcome.record.summary, "ok": outcome.ok, "folder": run.folder / NAME}
     text = in_words(answer) if outcome.record.done else f"{outcome.stage}: failed: {answer['message']}"
