@@ -5,9 +5,9 @@
 The verdicts that stand beside these recordings are of the version that learnt effects one by one. Here the
 reduced model solves all mechanisms of a set together. What is said of verdict and values is kept in
 `benchmarks/results/joint_diagnosis.jsonl`, with the commit that said it, so that a second start goes on;
-`--part 1/2` takes every second recording, for two processes side by side. Effects that were outside of the
-catalogue when a set was made, and are in it now, count as what they are here, and as outside for the stored
-verdicts.
+`--part 1/2` takes every second recording, for two processes side by side. Verdicts are what the present rule
+makes of kept evidences. Effects that were outside of the catalogue when a set was made, and are in it now,
+count as what they are here, and as outside for the stored verdicts.
 
 Prints a row for each recording: what was concealed and how large it is (in noise floors), what is named, the
 probability that nothing is missing, how many of the skin's and the effect's parameters lie in their 90 %
@@ -195,13 +195,15 @@ def ablation(said: Mapping[str, Mapping[str, Any]]) -> str:
     table = []
     for what, changed in RULES.items():
         with mock.patch.multiple(hypotheses, **changed):
-            board = score(keys, {case: _judged_anew(one) for case, one in judged.items()})
+            board = score(keys, {case: by_present_rule(one) for case, one in judged.items()})
         table.append([what, *(_share(board, SHARES[name]).split(" (")[0] for name in WEIGHED)])
     return rows.markdown((f"{len(judged)} recordings", *WEIGHED), table)
 
 
-def _judged_anew(said: Mapping[str, Any]) -> dict[str, Any]:
-    """An answer with the verdict that follows from its evidences."""
+def by_present_rule(said: Mapping[str, Any]) -> dict[str, Any]:
+    """An answer with the verdict that follows from its evidences; one of a failure as it is."""
+    if "sets" not in said:
+        return dict(said)
     weighed = {tuple(one["mechanisms"]): one for one in said["sets"]}
     family = hypotheses.Family([
         one for names, its in weighed.items()
@@ -210,7 +212,12 @@ def _judged_anew(said: Mapping[str, Any]) -> dict[str, Any]:
         )
     ])  # fmt: skip
     found = hypotheses.judge_family(family, catalogue(), said["explained"])
-    named = [{"name": one.name, "probability": one.probability} for one in found.named]
+    values = said["fit"]["after"]["theta"]
+    named = [
+        {"name": one.name, "probability": one.probability,
+         "parameters": {p.name: values[p.name] for p in catalogue()[one.name].parameters if p.name in values}}
+        for one in found.named
+    ]  # fmt: skip
     return {**said, "verdict": found.verdict, "mechanisms": named}
 
 
@@ -251,7 +258,7 @@ def main() -> None:
         cases = [case for case in cases if case in known]
     said, table = dict[str, dict[str, Any]](), list[list[str]]()
     for case in cases:
-        said[case] = answered(case, options.folder, options.workers)
+        said[case] = by_present_rule(answered(case, options.folder, options.workers))
         table.append(row(case, said[case]))
         rows.say(" | ".join(table[-1]))
     print(rows.markdown(HEADER, table))

@@ -152,22 +152,25 @@ def test_the_fit_and_its_check_by_the_full_model_are_said() -> None:
 
 
 @pytest.mark.parametrize(
-    ("verdict", "word", "sentence"),
+    ("verdict", "smooth", "word", "sentence"),
     [
-        ("unknown", "something that has no name here", "that no mechanism of the catalogue explains"),
-        ("nothing-missing", "nothing that could be named", "leaves nothing out"),
+        ("unknown", 0.9, "something that has no name here", "no mechanism is likely enough to be named"),
+        ("unknown", 0.1, "something that several causes would explain", "no mechanism is likely enough to be named"),
+        ("nothing-missing", 0.1, "nothing that could be named", "leaves nothing out"),
     ],
 )
 def test_what_is_missing_is_said_alike_in_a_word_and_a_sentence(
-    verdict: str, word: str, sentence: str
+    verdict: str, smooth: float, word: str, sentence: str
 ) -> None:
-    text = diagnosed_as({"verdict": verdict, "best_set": ["pad-slip", "backlash"]})
+    text = diagnosed_as(
+        {"verdict": verdict, "best_set": ["pad-slip", "backlash"], "smooth_probability": smooth}
+    )
     assert f"What is missing? {word}" in text
     assert ("Of the catalogue pad-slip, backlash fits best" in text) == (verdict == "unknown")
     faint = text.count("With pad-slip, backlash it would fit better")
     assert faint == (2 if verdict == "nothing-missing" else 0)
     assert sentence in text
-    assert "Something smooth that is not in the catalogue: probability 0.07." in text
+    assert f"Something smooth that is not in the catalogue: probability {smooth}." in text
 
 
 def test_nothing_is_missing_where_no_set_fits_better() -> None:

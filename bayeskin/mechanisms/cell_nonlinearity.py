@@ -3,8 +3,8 @@
 Within 1 N the curve rises throughout, whatever c. The range is chosen for this test: a calibrated cell is far
 straighter, ISO 376:2011 lets one of its widest class be off its curve by 0.2 %.
 
-It is a look-alike of fibres that stiffen with stretch (`strain-stiffening`), since both act alike in each
-cycle and at each speed. Weights hung on the cell tell the two apart.
+It is a look-alike of fibres (`strain-stiffening`, `fibre-anisotropy`), since they, too, change how the force
+rises with displacement, alike in each cycle and at each speed. Weights hung on the cell tell them apart.
 """
 
 from __future__ import annotations
@@ -38,6 +38,6 @@ MECHANISM = Mechanism(
         f"The load cell's curve bends: it reads {number(100 * abs(v['cell_bend']), 2)} % too "
         f"{'much' if v['cell_bend'] > 0 else 'little'} at 1 N, and at other forces a share in proportion."
     ),
-    group=("cell-nonlinearity", "strain-stiffening"),
+    group=("cell-nonlinearity", "strain-stiffening", "fibre-anisotropy"),
     act=Instrument(Place.CELL, observe, adds=False),
 )

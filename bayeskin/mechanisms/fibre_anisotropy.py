@@ -46,6 +46,6 @@ MECHANISM = Mechanism(
         f"{np.degrees(v['langer_angle']):.0f} degrees to the pull; "
         "in one uniaxial test most of this looks like a stiffer cutis, and a pull across would tell."
     ),
-    group=("fibre-anisotropy",),
+    group=("fibre-anisotropy", "cell-nonlinearity"),
     act=Tissue(bind),
 )

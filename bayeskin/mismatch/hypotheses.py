@@ -9,8 +9,8 @@ never fitted count as nothing.
 A mechanism is named where it has nine chances in ten, or its look-alikes have them together and it is the
 likeliest of these. But where something smooth is likelier than not, and the likeliest set explains less than
 nine tenths of the squared misfit, nothing is named: a Gaussian process is a poor model of what is missing,
-and mechanisms that fill its gaps gain beside it, too. Where none is named the mismatch is unknown if
-something smooth is likelier than not; elsewhere nothing is missing.
+and mechanisms that fill its gaps gain beside it, too. Where none is named the mismatch is unknown, unless it
+is likelier than not that nothing is missing.
 """
 
 from __future__ import annotations
@@ -135,5 +135,5 @@ def judge_family(family: Family, known: Mapping[str, Mechanism], explained: floa
     if named:
         verdict: Literal["nothing-missing", "named", "unknown"] = "named"
     else:
-        verdict = "unknown" if family.smooth > LIKELIER_THAN_NOT else "nothing-missing"
+        verdict = "nothing-missing" if family.nothing > LIKELIER_THAN_NOT else "unknown"
     return Judgement(verdict, tuple(named), family.nothing, family.smooth)

@@ -134,4 +134,6 @@ def _missing(facts: RunFacts) -> Verdict:
         return Verdict("named", "doubt", lines)
     if said["best_set"]:
         lines.append(f"Of the catalogue {', '.join(said['best_set'])} fits best.")
-    return Verdict("something that has no name here", "doubt", lines)
+    several = said["smooth_probability"] < 0.5
+    word = "something that several causes would explain" if several else "something that has no name here"
+    return Verdict(word, "doubt", lines)

@@ -15,7 +15,7 @@ from bayeskin.report.page.sections import absent, cell
 _VERDICTS = {
     "nothing-missing": "The model leaves nothing out that the recording shows.",
     "named": "The recording shows physics that the model leaves out, and it has been named.",
-    "unknown": "The model leaves something out that no mechanism of the catalogue explains.",
+    "unknown": "The model leaves something out, and no mechanism is likely enough to be named.",
 }
 
 
