@@ -154,8 +154,8 @@ def test_the_fit_and_its_check_by_the_full_model_are_said() -> None:
 @pytest.mark.parametrize(
     ("verdict", "smooth", "word", "sentence"),
     [
-        ("unknown", 0.9, "something that has no name here", "no mechanism is likely enough to be named"),
-        ("unknown", 0.1, "something that several causes would explain", "no mechanism is likely enough to be named"),
+        ("unknown", 0.9, "something that has no name here", "no mechanism is likely enough"),
+        ("unknown", 0.1, "something that several causes would explain", "no mechanism is likely enough"),
         ("nothing-missing", 0.1, "nothing that could be named", "leaves nothing out"),
     ],
 )
