@@ -169,8 +169,8 @@ def figure_candidates(candidates: Sequence[Mapping[str, Any]]) -> Figure:
     state_finding(
         figure,
         finding,
-        "All other parameters free again for each. Lines: standard error over phases. Not shown: what "
-        "the recording's samples refute, and mechanisms of whose best fit the surrogate is unsure.",
+        "All other parameters are free again for each. Lines: standard error over phases. Mechanisms that "
+        "promised too little to be fitted, and those that the recording's samples refute, are not shown.",
     )
     return figure
 
