@@ -41,6 +41,7 @@ NOW_KNOWN = {
     "bent-cell": "cell-nonlinearity", "breathing": "periodic-motion", "slow-amplifier": "amplifier-lag",
     "poisson-cutis": "skeleton-compressibility", "poisson-subcutis-high": "skeleton-compressibility",
     "poisson-subcutis-low": "skeleton-compressibility",
+    "plastic-set": "plastic-set",  # which was made of the displacement; in the catalogue it is of the tissue
 }  # fmt: skip
 CONFIG = """name = "{name}"
 [recording]

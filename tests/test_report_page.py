@@ -199,7 +199,7 @@ def test_what_is_left_and_which_test_would_tell_stand_in_the_mismatch(whole: str
         "quarter speed The same at a quarter of the speed. 187 s 0.95 0.01 97 %",
     ):
         assert re.sub(r"\s", "", said) in re.sub(r"\s", "", text), said
-    assert "Nothing beyond noise" in diagnosed_as(
+    assert "Nothing beyond the noise" in diagnosed_as(
         {"unexplained": {**summaries()["diagnose"]["unexplained"], "noticeable": False}}
     )
     nothing = diagnosed_as({"unexplained": None})

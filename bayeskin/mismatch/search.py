@@ -52,6 +52,7 @@ class SearchSettings:
         skin led astray makes too few; where nothing but noise is left, each must promise to be likely
     astray : nats of weight gained, from which on a set may have led the smaller one to another skin
     near, alike : share of the best gain from which on sets are fitted from other skins; how many at most
+    again : shares of the strength of a finished run, with which fits begin that fail otherwise
     others, tried : skins that a set is run with, and how many of them it is fitted from
     left : RMS residual over the noise's, from which on that is done, and more than noise is left
     gain : nats of weight, less is no reason to go on; most : mechanisms of a set
@@ -79,6 +80,7 @@ class SearchSettings:
     astray: float = 10.0
     near: float = 0.8
     alike: int = 3
+    again: tuple[float, ...] = (1.0, 0.2)
     others: int = 16
     tried: int = 2
     left: float = 1.1
@@ -559,7 +561,7 @@ class _Searcher:
         """Fits the sets with one mechanism more that promise most, as far as they are new, and returns these.
 
         One that fails, or ends below the fit without the mechanism, begins again there, with the values of a
-        run that was finished.
+        run that was finished, and then with a weaker mechanism.
         """
         names, settings = current.fit.names, self._settings
         self._expanded.add(names)
@@ -590,7 +592,7 @@ class _Searcher:
             if gain > tested.get(strength, -1.0):
                 tested[strength], self._shapes[strength] = gain, values
             if gain > promised.get(name, 0.0):
-                promised[name], starts[name], ran[name] = gain, start, {**theta, **values}
+                promised[name], starts[name], ran[name] = gain, start, values
         for name, nats in zip(quick, answers[len(probes) :], strict=True):
             if isinstance(nats, float):
                 promised[name] = nats
@@ -603,11 +605,17 @@ class _Searcher:
             else Join(Promise(names, current.fit.theta, current.run, name, off_n), settings.first)
             for name in chosen
         ])  # fmt: skip
-        worse = [name for name, one in zip(chosen, fits, strict=True) if not _better(one, current)]
-        fits += self._ask([
-            Climb(with_one(names, name, self._known), ran.get(name, theta), settings.first,
-                  () if name in starts else off_n) for name in worse
-        ])  # fmt: skip
+        better = {name: _better(one, current) for name, one in zip(chosen, fits, strict=True)}
+        for share in settings.again:
+            worse = [name for name in chosen if not better[name]]
+            more = self._ask([
+                Climb(with_one(names, name, self._known),
+                      {**theta, **self._weaker(name, ran.get(name, {}), share)}, settings.first,
+                      () if name in starts else off_n)
+                for name in worse
+            ])  # fmt: skip
+            better |= {name: _better(one, current) for name, one in zip(worse, more, strict=True)}
+            fits += more
         self._finish(fits, current)
         sets = [with_one(names, name, self._known) for name in chosen]
         for name, its in zip(chosen, sets, strict=True):
@@ -630,6 +638,14 @@ class _Searcher:
                 continue
             rows += [{**off, **values} for values in _shapes_of(mechanism, shapes, self._settings.probes)]
         return rows
+
+    def _weaker(self, name: str, values: Mapping[str, float], share: float) -> dict[str, float]:
+        """Values of a mechanism that are so near to neutral, of the way that its strength is from there."""
+        found = dict(values)
+        for strength in list(values)[:1]:
+            neutral = self._known[name].neutral[strength]
+            found[strength] = neutral + share * (values[strength] - neutral)
+        return found
 
     def _score(
         self, current: JointFit, name: str, values: Mapping[str, float], force_n: Array

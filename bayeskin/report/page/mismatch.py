@@ -120,7 +120,10 @@ def _unexplained(left: Mapping[str, Any] | None) -> list[Block]:
     if left is None:
         return []
     if not left["noticeable"]:
-        return [Heading("What is left"), Text(["Nothing beyond noise and the surrogate's error."])]
+        return [
+            Heading("What is left"),
+            Text(["Nothing beyond the noise and what the models are allowed to be off by."]),
+        ]
     form = left["form"]
     rows = [
         row(
