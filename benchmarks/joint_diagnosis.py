@@ -162,7 +162,7 @@ def row(case: str, said: Mapping[str, Any]) -> list[str]:
         ", ".join(named) or said["verdict"],
         f"{said['nothing_probability']:.2f}", _inside(key["theta"], values), _inside(key["values"], values),
         f"{1e3 * fit['before']['rmse']:.1f} to {1e3 * fit['after']['rmse']:.1f}",
-        full.get("message") or f"{1e3 * full['reduced_off_by']:.2f}", f"{said['seconds']:.0f}",
+        full.get("message") or f"{1e3 * full['fit_off_by']:.2f}", f"{said['seconds']:.0f}",
         said["commit"],
     ]  # fmt: skip
 

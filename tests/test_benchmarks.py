@@ -340,7 +340,7 @@ def test_the_page_of_the_recording_says_what_the_diagnosis_says(benchmark):
     answer = {
         "verdict": "named", "best_set": ["pad-slip"], "explained": 0.98, "smooth_probability": 0.4,
         "seconds": 600.0, "mechanisms": [named], "located": [{}] * 3, "remaining": [{}], "fit": fits,
-        "full_model": {"rmse": 0.011, "reduced_off_by": 1e-3},
+        "full_model": {"rmse": 0.011, "fit_off_by": 1e-3},
     }  # fmt: skip
     whole = page.fits(answer)
     assert "| 70.0 mN | 9.5 mN | 12 mN |" in whole

@@ -62,7 +62,7 @@ def test_a_solid_that_relaxes_is_named_on_any_protocol_and_a_second_call_makes_n
     assert said["fit"]["before"]["rmse"] > 2.0 * said["fit"]["after"]["rmse"]
     assert said["fit"]["after"]["rmse"] < NOISE_N
     checked = said["full_model"]
-    assert checked["reduced_off_by"] < 0.3 * NOISE_N
+    assert checked["fit_off_by"] < 0.3 * NOISE_N
     assert checked["rmse"] < NOISE_N
     assert "solid-viscoelasticity (probability" in said["text"]
 

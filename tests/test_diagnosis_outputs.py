@@ -147,12 +147,12 @@ def test_words_say_what_was_found_and_how_far_the_models_are_off() -> None:
     answer: dict[str, Any] = {
         "verdict": "unknown", "mechanisms": [], "nothing_probability": 0.02, "smooth_probability": 0.974,
         "located": [], "remaining": [], "best_set": [], "candidates": [], "folder": "x",
-        "fit": {"before": fits, "after": fits}, "full_model": {"rmse": 2.5e-3, "reduced_off_by": 4e-4},
+        "fit": {"before": fits, "after": fits}, "full_model": {"rmse": 2.5e-3, "fit_off_by": 4e-4},
     }  # fmt: skip
     words = in_words(answer)
     assert "something smooth that is not in the catalogue: probability 0.97" in words
     assert "before: RMSE 1.0 mN, 3.0 mN on what follows the second hold, not fitted" in words
-    assert "RMSE 2.5 mN. The reduced model is off by 0.40 mN there." in words
+    assert "RMSE 2.5 mN. The model that was fitted is off by 0.40 mN there." in words
     assert "rough" not in words
     rough = {**answer, "fit": {"before": fits, "after": {**fits, "sampled": {"settled": False}}}}
     assert "The intervals are rough" in in_words(rough)

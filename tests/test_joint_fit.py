@@ -5,10 +5,14 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import toy
+from toy_inference import TRUTH as SKIN
+from toy_inference import ToySurrogate, toy_problem
 from toys import solved
 from toys.solved import BASE, TRUTH, Exact, a_run
 
@@ -16,8 +20,12 @@ from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.straighten import shear_at
 from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, solved_columns, within
 from bayeskin.mismatch.tangent import POWER, ModelRun, Tangent
+from bayeskin.mismatch.tasks import Climb
 from bayeskin.mismatch.wrapper import innermost
-from bayeskin.pipeline.workbench import Workbench
+from bayeskin.model import ModelSpec
+from bayeskin.pipeline import workbench
+from bayeskin.pipeline.forward import SurrogateForward
+from bayeskin.pipeline.workbench import Source, Workbench
 from bayeskin.types import Correlation, ParameterSpace
 
 SET = ("force-offset", "stiffness-drift")
@@ -307,3 +315,24 @@ def test_priors_that_go_together_do_so_in_a_fit_and_its_trust_region(
         assert about.space.correlations == together
         vector = np.clip(about.vector({**start(bench), **TRUTH}), *about.bounds)
         assert within(about, vector, 0.1).space.correlations == together
+
+
+def test_what_lies_in_series_goes_by_its_shortcut_where_a_surrogate_is_the_skin(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    skin: Any = ToySurrogate()
+    binned = toy_problem().binned
+    monkeypatch.setattr(workbench, "calm_bins", lambda folder: (binned, solved.NO_WORD, toy.MOTION))
+    monkeypatch.setattr(workbench, "forward_model", lambda *_: SurrogateForward(skin, ModelSpec()))
+    bench = Workbench(Source(Path("recording"), Path("model"), ModelSpec(), 1, skin.space))
+    assert "slow-recovery" in bench.known
+    names = ("slow-recovery",)
+    assert bench.space(names).names == skin.space.names
+    values = {"recovery_compliance": 1e-3, "recovery_time": 20.0}
+    task = Climb(names, {**bench.noise, **SKIN, **values}, 4)
+    found = bench.answered(task, bench.done(task))
+    assert isinstance(found, JointFit)
+    assert set(values) <= set(found.fit.theta)
+    plain = bench.reported((names, {**found.fit.theta, "recovery_compliance": 0.0}))
+    slower = bench.reported((names, {**found.fit.theta, **values}))
+    assert np.abs(np.asarray(slower) - np.asarray(plain)).max() > 1e-3

@@ -146,7 +146,7 @@ def diagnosed_as(changed: dict[str, object]) -> str:
 def test_the_fit_and_its_check_by_the_full_model_are_said() -> None:
     text = diagnosed_as({})
     assert "RMSE 80 mN without, 24.7 mN with" in text
-    assert "leaves 21.3 mN RMSE; the reduced model is off by 0.4 mN there" in text
+    assert "leaves 21.3 mN RMSE; the model that was fitted is off by 0.4 mN there" in text
     failed = diagnosed_as({"full_model": {"message": "the skin folds"}})
     assert "The full model fails at the best values: the skin folds" in failed
 

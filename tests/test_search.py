@@ -48,8 +48,9 @@ class Asked:
         return self.bench.answered(task, json.loads(json.dumps(said)))
 
     def search(self, seed: int = 1, settings: SearchSettings = FEW) -> Search:
-        bench = self.bench
-        return search(self, bench.binned, bench.base, KNOWN, bench.noise, seed, self.told.append, settings)
+        bench, tell = self.bench, self.told.append
+        solves = bench.forward.solves
+        return search(self, bench.binned, bench.base, KNOWN, solves, bench.noise, seed, tell, settings)
 
 
 @pytest.fixture

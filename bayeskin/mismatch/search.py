@@ -20,7 +20,7 @@ exact as the noise asks for. A set's weight is its evidence times the prior of i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -164,14 +164,16 @@ class Search:
 
 def search(
     ask: Ask, binned: BinnedForce, base: ParameterSpace, known: Mapping[str, Mechanism],
-    noise: Mapping[str, float], seed: int, tell: Tell, settings: SearchSettings | None = None,
+    solves: Collection[str], noise: Mapping[str, float], seed: int, tell: Tell,
+    settings: SearchSettings | None = None,
 ) -> Search:  # fmt: skip
     """Returns the fits of all sets that a search comes by.
 
-    base : the base model's priors; noise : values of the noise's parameters to begin with
+    base : the base model's priors; solves : names of known mechanisms that the forward model solves
+    noise : values of the noise's parameters to begin with
     Raises InputError where the model runs with no skin of these priors.
     """
-    searcher = _Searcher(ask, binned, base, known, noise, seed, tell, settings or SearchSettings())
+    searcher = _Searcher(ask, binned, base, known, solves, noise, seed, tell, settings or SearchSettings())
     searcher.base()
     searcher.search()
     searcher.weigh()
@@ -183,11 +185,12 @@ def search(
 class _Searcher:
     def __init__(
         self, ask: Ask, binned: BinnedForce, base: ParameterSpace, known: Mapping[str, Mechanism],
-        noise: Mapping[str, float], seed: int, tell: Tell, settings: SearchSettings,
+        solves: Collection[str], noise: Mapping[str, float], seed: int, tell: Tell, settings: SearchSettings,
     ) -> None:  # fmt: skip
         self.found = Search()
         self._ask, self._binned, self._base, self._known = ask, binned, base, known
         self._noise, self._seed, self._tell, self._settings = noise, seed, tell, settings
+        self._solves = frozenset(solves)
         self._neutral = {name: value for m in known.values() for name, value in m.neutral.items()}
         self._skins: list[dict[str, float]] = []
         self._expanded: set[tuple[str, ...]] = set()
@@ -491,9 +494,7 @@ class _Searcher:
             self.found.checks[one.fit.names] = Check(first.run.theta, np.asarray(full_n), off)
             if off > self._settings.exact * noise_of(self._binned):
                 tasks.append(Climb(one.fit.names, one.fit.theta, self._settings.runs, tuple(off_n.tolist())))
-                self._tell(
-                    f"{said}: the reduced model is off by {1e3 * off:.1f} mN; it is fitted with that added"
-                )
+                self._tell(f"{said}: a full run differs by {1e3 * off:.1f} mN; it is fitted with that added")
         return tasks
 
     def _base_values(self, one: JointFit) -> dict[str, float]:
@@ -502,7 +503,7 @@ class _Searcher:
 
     def _solved(self, names: Sequence[str]) -> tuple[str, ...]:
         """Those of a set that the forward model solves."""
-        return tuple(name for name in sorted(names) if self._known[name].act.bind is not None)
+        return tuple(name for name in sorted(names) if name in self._solves)
 
     def _solved_values(self, one: JointFit) -> dict[str, float]:
         """The parameters that the forward model solves, at a fit's run."""

@@ -113,7 +113,8 @@ def bench_of(run: Run) -> Workbench:
 def searched(run: Run, bench: Workbench, ask: Ask) -> Search:
     """Returns the search of a run; after a diagnosis all its answers are kept."""
     tell = partial(_tell, run)
-    return search(ask, bench.binned, bench.base, bench.known, bench.noise, run.config.seed, tell)
+    known, solves = bench.known, bench.forward.solves
+    return search(ask, bench.binned, bench.base, known, solves, bench.noise, run.config.seed, tell)
 
 
 def _work(run: Run) -> Mapping[str, Any]:
@@ -271,7 +272,6 @@ def _fit(
         rest = bins_in_windows(binned, ((split_s, float(binned.edges_s[-1])),)) >= 0
         held_out = _rms((binned.force_n - shown.held_out_n)[rest])
     return {
-        "model": "reduced model",
         "rmse": _rms((binned.force_n - fit.force_n)[usable]),
         "rmse_of_mean": _rms((binned.force_n - fit.mean_n)[usable]),
         "rmse_by_phase": dict(inference.rmse(binned, fit.force_n).by_kind_n),
@@ -296,7 +296,7 @@ def _checked(bench: Workbench, found: Search, names: tuple[str, ...]) -> dict[st
         return {"message": "no run was made" if check is None else check.full_n}
     full_n = bench.reported_of(names, fit.theta, check.full_n)
     usable = bins_in_windows(bench.binned, None) >= 0
-    return {"reduced_off_by": check.off, "rmse": _rms((bench.binned.force_n - full_n)[usable])}
+    return {"fit_off_by": check.off, "rmse": _rms((bench.binned.force_n - full_n)[usable])}
 
 
 def _rms(values: Array) -> float:
@@ -328,8 +328,8 @@ def in_words(answer: Mapping[str, Any]) -> str:
     else:
         lines.append(
             f"A run of the full model at the best values, without what is allowed for its mesh and the load "
-            f"cell: RMSE {1e3 * full['rmse']:.1f} mN. The reduced model is off by "
-            f"{1e3 * full['reduced_off_by']:.2f} mN there."
+            f"cell: RMSE {1e3 * full['rmse']:.1f} mN. The model that was fitted is off "
+            f"by {1e3 * full['fit_off_by']:.2f} mN there."
         )
     after = answer["fit"]["after"]
     if not (after["emulator"]["settled"] and after["sampled"]["settled"]):

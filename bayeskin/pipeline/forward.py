@@ -9,7 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
-from bayeskin.mechanisms import Mechanism
+from bayeskin.mechanisms import Mechanism, catalogue
+from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.tangent import ModelRun
 from bayeskin.model.simulate import ModelSpec
 from bayeskin.pipeline.folder import sha256_of
@@ -26,7 +27,7 @@ STEP = 1e-4  # of the prior's box, for differences of a surrogate
 
 
 class ForwardModel(Protocol):
-    """Runs the skin; `solves` names the mechanisms of the tissue that it solves, `hash` identifies it."""
+    """Runs the skin; `solves` names the mechanisms that it solves, `hash` identifies it."""
 
     @property
     def solves(self) -> frozenset[str]: ...
@@ -60,7 +61,9 @@ class ReducedForward:
 
     @property
     def solves(self) -> frozenset[str]:
-        return frozenset(self.model.trained.mechanisms)
+        """Those of the tissue that it was trained for, and those that lie in series with the skin."""
+        in_series = (m.name for m in catalogue().values() if isinstance(m.act, Instrument) and m.act.bind)
+        return frozenset({*self.model.trained.mechanisms, *in_series})
 
     @property
     def hash(self) -> str:
@@ -105,7 +108,7 @@ class ReducedForward:
 
 @dataclass(frozen=True)
 class SurrogateForward:
-    """A surrogate of a model that no reduced model stands for; it solves no mechanism of the tissue."""
+    """A surrogate of a model that no reduced model stands for; it solves no mechanism."""
 
     surrogate: Surrogate
     spec: ModelSpec

@@ -128,7 +128,7 @@ class Workbench:
         found = self.forward.simulated(motion, values, self.solved(task.names))
         if found.status != "ok":
             return found.message
-        beyond = [self.known[name] for name in sorted(task.names) if self.known[name].act.bind is None]
+        beyond = [self.known[name] for name in sorted(task.names) if name not in self.forward.solves]
         rows = {name: np.array([value]) for name, value in task.theta.items()}
         force = observed(beyond, rows, motion, lambda time_s: np.atleast_2d(found.at(time_s)))
         return bin_means(force, motion, np.array(task.edges_s), beyond)[0]
@@ -156,7 +156,7 @@ class Workbench:
 
     def solved(self, names: Sequence[str]) -> list[Mechanism]:
         """Those of a set that the forward model solves, by their names' order."""
-        return [self.known[name] for name in sorted(names) if self.known[name].act.bind is not None]
+        return [self.known[name] for name in sorted(names) if name in self.forward.solves]
 
     def _seen(self, names: Sequence[str], more: Sequence[str], runs: Sequence[ModelRun]) -> Surrogate:
         """The reported force about runs of a set, with `more` mechanisms by what they do to a force."""
@@ -164,7 +164,7 @@ class Workbench:
         skin = Tangent(self.space(names), self.binned.edges_s, tuple(runs), errors_n)
         beyond = tuple(
             self.known[name] for name in sorted({*names, *more})
-            if name in more or self.known[name].act.bind is None
+            if name in more or name not in self.forward.solves
         )  # fmt: skip
         return ObservedSurrogate(skin, beyond, self.motion) if beyond else skin
 

@@ -150,21 +150,6 @@ class Full:
     def __call__(self, case: tuple[Sequence[str], Mapping[str, float]]) -> Array | str:
         return self.force(case[1])
 
-    def with_slopes(
-        self, case: tuple[Sequence[str], Mapping[str, float]], changes: Mapping[str, float]
-    ) -> tuple[Array, Array] | str:
-        here, columns = self.force(case[1]), []
-        if isinstance(here, str):
-            return here
-        for name, change in changes.items():
-            ahead, back = (
-                self.force({**case[1], name: case[1][name] + way * change}) for way in (1e-4, -1e-4)
-            )
-            assert not isinstance(ahead, str)
-            assert not isinstance(back, str)
-            columns.append((ahead - back) / 2e-4)
-        return here, np.array(columns).T
-
 
 def bench(
     patch: pytest.MonkeyPatch, binned: BinnedForce, base: ParameterSpace = BASE,

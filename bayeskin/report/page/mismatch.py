@@ -95,8 +95,8 @@ def _checked(full: Mapping[str, Any]) -> str:
     if "message" in full:
         return f"The full model fails at the best values: {full['message']}"
     return (
-        f"A run of the full model at the best values leaves {quantity(full['rmse'], 'N')} RMSE; the reduced "
-        f"model is off by {quantity(full['reduced_off_by'], 'N')} there."
+        f"A run of the full model at the best values leaves {quantity(full['rmse'], 'N')} RMSE; the "
+        f"model that was fitted is off by {quantity(full['fit_off_by'], 'N')} there."
     )
 
 
