@@ -14,7 +14,7 @@ from toys.solved import BASE, KNOWN
 
 from bayeskin.errors import InputError
 from bayeskin.mismatch.hypotheses import weight
-from bayeskin.mismatch.search import Search, SearchSettings, search
+from bayeskin.mismatch.search import Search, SearchSettings, _Searcher, search
 from bayeskin.mismatch.tasks import Climb, FullProbe, Join, Probe, Promise, Task, Weigh
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.pipeline.workbench import Workbench
@@ -311,6 +311,25 @@ def test_maxima_are_all_distinct_and_the_likeliest_is_the_fit(asked: Make) -> No
         assert all(np.abs(place - other).max() > FEW.alike_by for other in places[:i])
     assert all(weight(one.fit) <= weight(best.fit) for one in found.others)
     assert 0 < len(found.others) <= FEW.maxima
+
+
+def test_larger_sets_are_fitted_anew_from_a_new_maximum_of_a_part(asked: Make) -> None:
+    one = asked(stiffness_rate=-9e-4, F0=-0.03)
+    found, bench = one.search(), one.bench
+    part, both = ("stiffness-drift",), ("force-offset", "stiffness-drift")
+    assert {part, both} <= set(found.evidences)
+    right = found.fits[both]
+    found.fits[both] = replace(right, fit=replace(right.fit, log_evidence=right.fit.log_evidence - 50.0))
+    searcher = _Searcher(
+        one, bench.binned, bench.base, KNOWN, bench.forward.solves, bench.noise, 1, one.told.append, FEW
+    )
+    searcher.found = found
+    searcher._fit_larger(found.fits[part])
+    assert weight(found.fits[both].fit) > weight(right.fit) - 20.0
+    assert both not in found.checks
+    searcher.weigh()
+    assert found.chosen == both
+    assert both in found.checks
 
 
 def test_what_has_no_name_is_not_imitated_by_ever_larger_sets(asked: Make) -> None:

@@ -307,7 +307,20 @@ class _Searcher:
         self.found.others += [*maxima[:top], *maxima[top + 1 :]]
         if top:
             self.found.fits[names], self.found.checks[names] = maxima[top], checks[top - 1]
-            self._weigh([names])
+            self._fit_larger(maxima[top])
+            self.weigh()
+
+    def _fit_larger(self, best: JointFit) -> None:
+        """Fits the compared sets that contain one anew from its new maximum; all are to be compared there."""
+        larger = [names for names in self.found.evidences if set(best.fit.names) < set(names)]
+        starts = [{**self.found.fits[names].fit.theta, **best.fit.theta} for names in larger]
+        runs, off_n = self._settings.runs, added(best)
+        climbs = [Climb(names, start, runs, off_n) for names, start in zip(larger, starts, strict=True)]
+        for names, answer in zip(larger, self._ask(climbs), strict=True):
+            before = self.found.fits[names]
+            self.found.add(answer)
+            if self.found.fits[names] is not before:
+                self.found.checks.pop(names, None)
 
     def _climbed_elsewhere(self, best: JointFit) -> list[JointFit]:
         """Returns fits of the likeliest set that are elsewhere and not far behind, the likeliest first."""
