@@ -21,7 +21,7 @@ PAGE = ROOT / "docs" / "mismatch.md"
 WHOLE_MN, HELD_OUT_MN = "12 mN", "18 mN"  # this project's aims on this recording
 KINDS = ("rest", "load", "hold", "unload")
 RUNS = {
-    "healthy-skin": ("located", "before_after", "contributions", "candidates"),
+    "healthy-skin": ("located", "before_after", "candidates"),
     "healthy-skin-article": ("before_after",),
 }
 
