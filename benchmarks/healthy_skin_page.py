@@ -22,7 +22,7 @@ WHOLE_MN, HELD_OUT_MN = "12 mN", "18 mN"  # this project's aims on this recordin
 KINDS = ("rest", "load", "hold", "unload")
 RUNS = {
     "healthy-skin": ("located", "before_after", "candidates"),
-    "healthy-skin-article": ("before_after",),
+    "healthy-skin-article": ("before_after", "contributions"),
 }
 
 

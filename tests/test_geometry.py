@@ -90,8 +90,6 @@ def test_a_configuration_has_the_same_sections(tmp_path: Path):
     config = load_config(path)
     (tmp_path / "device.toml").write_text(DEVICE)
     assert config.geometry() == load_device(tmp_path / "device.toml")
-    with pytest.raises(InputError, match=r"tissue\.cutis_mm: found a mean and an sd; expected a number"):
-        config.refuse_uncertain(path, "diagnose")
     path.write_text('[recording]\nfile = "a.h5"\n')
     plain = load_config(path)
     path.write_text('[recording]\nfile = "a.h5"\n[device]\nforce_on = "pad and guard"\n')

@@ -52,7 +52,7 @@ BELOW = {
     "sensitivity": BASE,
     "shapley": BASE,
     "mismatch": BASE | {"model", "mechanisms", "inference"},
-    "proof": BASE | SIBLINGS | {"mechanisms", "runner"},  # and nothing that diagnoses imports it
+    "proof": BASE | SIBLINGS | {"mechanisms", "reduced", "runner"},  # and nothing that diagnoses imports it
     "report": BASE | {"recordings", "inference", "sensitivity", "shapley"},
     "pipeline": BASE
     | SIBLINGS
