@@ -259,8 +259,9 @@ def diagnose(source: Path, device: Path | None, as_json: bool) -> None:
     SOURCE is a configuration, or a recording by itself, of any protocol. The reduced model of the device
     solves all mechanisms of a set together, and the full model checks what comes out. The likeliest sets are
     fitted once more to the recording up to the end of its second hold, and tested on what follows. That takes
-    two to eight minutes. For the article's observation and a model of your own a surrogate is trained first,
-    and mechanisms of the tissue are not tried. The exit code is 0 whatever the verdict.
+    two to ten minutes, and longer where many mechanisms act. For the article's observation and a model of
+    your own a surrogate is trained first, and mechanisms of the tissue are not tried. The exit code is 0
+    whatever the verdict.
 
     \b
     Example:

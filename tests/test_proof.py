@@ -11,6 +11,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -20,9 +21,10 @@ import bayeskin
 from bayeskin import report, storage
 from bayeskin.design import default_space
 from bayeskin.errors import InputError
-from bayeskin.mechanisms import catalogue, observed
+from bayeskin.mechanisms import catalogue, laws, observed
 from bayeskin.mechanisms.binned import BinnedForces
 from bayeskin.mechanisms.mechanism import Instrument
+from bayeskin.model import ModelSpec, simulate
 from bayeskin.model.lagrangian import LagrangianModel
 from bayeskin.model.mesh import brick_mesh
 from bayeskin.model.problem import build_problem, material
@@ -315,6 +317,27 @@ def test_a_run_that_fails_is_drawn_anew() -> None:
     assert one.key["attempt"] == 1
     assert one.key["theta"] == tried[-1].theta != tried[0].theta
     assert one.key["size"] < 1e-6
+
+
+def test_the_screen_adds_what_mechanisms_change_and_marks_a_run_that_fails() -> None:
+    """By the shipped reduced model, beside the full one."""
+    screen = shipped_screen()
+    theta = np.array([THETA[name] for name in screen.refit.surrogate.space.names])[None]
+    alone_n = screen.refit.force(theta)
+    shifted_n = screen.force(["force-offset"], theta, {"F0": np.array([-0.03])})
+    np.testing.assert_allclose(shifted_n, alone_n - 0.03, atol=1e-5)
+    relaxing = {"g_1": 0.5, "tau_1": 5.0, "g_2": 0.0, "tau_2": 60.0}
+    more_n = screen.force(["solid-viscoelasticity"], theta, {n: np.array([v]) for n, v in relaxing.items()})
+    law = laws([catalogue()["solid-viscoelasticity"]])
+    relaxes, plain = (
+        simulate(ModelSpec(refinement=1), MOTION, values, laws=some).bin_means(EDGES_S)
+        for values, some in (({**THETA, **relaxing}, law), (THETA, []))
+    )
+    change_n = relaxes - plain
+    np.testing.assert_allclose(more_n - alone_n, [change_n], atol=0.02 * np.ptp(change_n))
+    failed = Simulation({}, *np.zeros((3, 1)), np.ones(1, dtype=bool), "failed", "the skin folds", {}, "")
+    with mock.patch("bayeskin.proof.cases.simulate_reduced", return_value=failed):
+        assert np.isnan(screen.force(["force-offset"], theta, {"F0": np.array([-0.03])})).all()
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""What mechanisms do to a force of which only means over bins are known."""
+"""Mechanisms act here on a force of which only means over bins are known."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class BinnedForces:
         return lambda time_s: interpolated(self._times, force, time_s)
 
     def change(self, act: Callable[[ForceOfTime], ForceOfTime], mean_n: Array) -> Array:
-        """What `act` adds to the bins' means (n, m) of a force."""
+        """Returns what `act` adds to the bins' means (n, m) of a force."""
         force = self.through(mean_n)
         return self.bins.means(act(force)) - self.bins.means(force)
 

@@ -1,4 +1,4 @@
-"""What a mechanism is: physics that the base model leaves out, off at its neutral value.
+"""A mechanism is physics that the base model leaves out, off at its neutral value.
 
 Tissue mechanisms change the model's equations (`bayeskin.model.tissue`). Instrument mechanisms act on the
 force that comes out of the skin, sample by sample of a posterior: each takes a force as a function of time
@@ -27,7 +27,10 @@ SETTLING = np.array([3.0, 12.0])  # time constants after a corner at which bins 
 
 
 class Place(IntEnum):
-    """Where in the instrument a mechanism acts, from the skin outward; it sees what those before it made."""
+    """The place in the instrument where a mechanism acts, from the skin outward.
+
+    A mechanism sees what those before it made.
+    """
 
     PADS = 0
     ARM = 1  # under the pads; what these lose goes by the force without its swings
@@ -39,7 +42,7 @@ class Place(IntEnum):
 
 @dataclass(frozen=True)
 class Instrument:
-    """What an instrument mechanism does to a force.
+    """The action of an instrument mechanism on a force.
 
     bind : set where it changes the displacement that the skin sees: the full model solves it along, and
         `observe` is its shortcut for the force of a surrogate
@@ -63,7 +66,7 @@ class Instrument:
 
 @dataclass(frozen=True)
 class Tissue:
-    """What a tissue mechanism does to the full model."""
+    """The action of a tissue mechanism on the full model."""
 
     bind: Bind
 
@@ -121,7 +124,7 @@ def solved(mechanisms: Iterable[Mechanism]) -> list[Mechanism]:
 
 
 def laws(mechanisms: Iterable[Mechanism]) -> list[Bind]:
-    """What `simulate` is given for `mechanisms`."""
+    """Returns the laws that `simulate` is given for `mechanisms`."""
     return [m.act.bind for m in mechanisms if m.act.bind is not None]
 
 
@@ -151,7 +154,7 @@ class Bins:
         self._first = np.searchsorted(cuts, edges_s)
 
     def means(self, force: ForceOfTime) -> Array:
-        """Of a force, (n, m)."""
+        """Returns the means of a force over the bins, (n, m)."""
         found = np.ascontiguousarray(force(self._time_s)).reshape(-1, len(self._width), GAUSS_POINTS)
         integral = np.empty((len(found), len(self._lasts_s)))
         bin_integrals(found, self._weight, self._width, self._first, integral)

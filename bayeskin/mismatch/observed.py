@@ -32,7 +32,7 @@ class ObservedSurrogate(Wrapper):
 
     @cached_property
     def space(self) -> ParameterSpace:
-        """Of the skin, then of each mechanism."""
+        """The parameters of the skin, then those of each mechanism."""
         more = tuple(p for mechanism in self.mechanisms for p in mechanism.parameters)
         return ParameterSpace((*self.inner.space.parameters, *more))
 
@@ -59,7 +59,7 @@ class ObservedSurrogate(Wrapper):
         return theta[:, :inner], dict(zip(self.space.names[inner:], theta[:, inner:].T, strict=True))
 
     def _added(self, values: Mapping[str, Array], mean_n: Array) -> Array:
-        """What the mechanisms add to the bins' means (n, m)."""
+        """Returns what the mechanisms add to the bins' means (n, m)."""
         if all(isinstance(m.act, Instrument) and m.act.adds for m in self.mechanisms):
             seen = observed(
                 self.mechanisms, values, self.motion, lambda t: np.zeros((len(mean_n), np.shape(t)[-1]))

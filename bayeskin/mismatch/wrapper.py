@@ -40,14 +40,14 @@ class Wrapper:
 
 
 def innermost(surrogate: Surrogate) -> Surrogate:
-    """That of the skin, and of what changes it: the one that is about no other."""
+    """Returns the surrogate of the skin and of what changes it: the one that is about no other."""
     while isinstance(surrogate, Wrapper):
         surrogate = surrogate.inner
     return surrogate
 
 
 def skins(surrogate: Surrogate) -> tuple[int, ...]:
-    """How many of the first parameters are the skin's: its own, and those with mechanisms of the tissue."""
+    """Returns how many of the first parameters are the skin's, without and with mechanisms of the tissue."""
     names = innermost(surrogate).space.names
     of_mechanisms = {p.name for mechanism in catalogue().values() for p in mechanism.parameters}
     return tuple(sorted({sum(name not in of_mechanisms for name in names), len(names)}))

@@ -40,7 +40,7 @@ def imported(module: Path) -> set[Path]:
 
 
 def _imports(file: Path) -> Iterator[Path]:
-    """What one file imports of the package, with the packages that these modules lie in."""
+    """Yields what one file imports of the package, with the packages that these modules lie in."""
     for node in ast.walk(ast.parse(file.read_bytes())):
         names: list[str] = []
         if isinstance(node, ast.Import):

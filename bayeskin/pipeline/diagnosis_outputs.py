@@ -1,4 +1,4 @@
-"""What is said and drawn of a diagnosis: entries of its JSON, figures, lines of text."""
+"""The outputs of a diagnosis: entries of its JSON, and figures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from bayeskin.types import Array, BinnedForce, PadMotion, Parameter
 
 @dataclass(frozen=True)
 class Remainder:
-    """What a set leaves over: a discrepancy, and the form that is proposed for it."""
+    """The rest that a set leaves: a discrepancy, and the form that is proposed for it."""
 
     discrepancy: Discrepancy
     form: Form
@@ -45,7 +45,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Found:
-    """What is drawn of a mismatch: fits without and with the best set, what that has of the force.
+    """The contents of the figures: fits without and with the best set, what that has of the force.
 
     split_s : until when what is `held_out_n` was fitted; base : parameters of the model without mechanisms;
     remainder : None where the verdict leaves nothing to describe
@@ -87,7 +87,7 @@ def candidates(fits: Mapping[tuple[str, ...], Fit], known: Mapping[str, Mechanis
 
 
 def _score_error(base: Fit, one: Fit) -> float:
-    """Of a difference of log likelihoods, from its scatter over the phases."""
+    """Returns the standard error of a difference of log likelihoods, from its scatter over the phases."""
     differences = _blocks(one) - _blocks(base)
     return float(np.sqrt(len(differences)) * differences.std(ddof=1)) if len(differences) > 1 else 0.0
 

@@ -132,7 +132,7 @@ def _reduced_for(motion: PadMotion, geometry: Geometry, out: Path) -> Path | Non
 
 
 def _way(surrogate: Path | None, reduced: Path | None) -> tuple[str, list[str]]:
-    """How a run comes by its surrogate, in words and as a section."""
+    """Returns how a run comes by its surrogate, in words and as a section."""
     if surrogate is not None:
         return f"the shipped surrogate {surrogate.name}", _surrogate(surrogate.name)
     if reduced is not None:

@@ -63,7 +63,7 @@ def _shipped_folder() -> Path:
 
 
 def _shipped_manifests() -> dict[Path, Mapping[str, Any]]:
-    """What the manifests of the shipped surrogates say, by their files; a reduced model's is none of them."""
+    """Returns the manifests of the shipped surrogates by their files; a reduced model's is none of them."""
     files = sorted(_shipped_folder().glob("*.json"))
     said = {path: json.loads(path.read_text(encoding="utf-8")) for path in files}
     return {path: manifest for path, manifest in said.items() if "motion_sha256" in manifest}
@@ -84,7 +84,7 @@ def shipped_for(motion: PadMotion, geometry: Geometry = Geometry()) -> Path | No
 
 
 def origin(run: Run, motion: PadMotion, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What a manifest must say beside the surrogate's own facts, so that it is used where it belongs."""
+    """Returns what a manifest says beside the surrogate's own facts, so that it is used where it belongs."""
     model = run.config.model
     return {
         "observation": model.observation,
