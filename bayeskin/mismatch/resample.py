@@ -8,8 +8,9 @@ taken by its share of the evidence, and move as those of a run do (`inference.mo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import emcee
@@ -81,16 +82,19 @@ def resample(
         for _ in samplers
     ]
     made = 0
-    for steps in legs:
-        states = [
-            sampler.run_mcmc(state, steps - made, skip_initial_state_check=True)
-            for sampler, state in zip(samplers, states, strict=True)
-        ]
-        made = steps
-        drawn = _assessed(samplers, log_posterior, int(FORGOTTEN * steps))
-        if drawn.settled:
-            break
+    with ThreadPoolExecutor(ENSEMBLES) as pool:  # the likelihood frees the interpreter
+        for steps in legs:
+            more = partial(_moved_on, steps=steps - made)
+            states = list(pool.map(more, samplers, states))
+            made = steps
+            drawn = _assessed(samplers, log_posterior, int(FORGOTTEN * steps))
+            if drawn.settled:
+                break
     return drawn
+
+
+def _moved_on(sampler: emcee.EnsembleSampler, state: emcee.State, steps: int) -> emcee.State:
+    return sampler.run_mcmc(state, steps, skip_initial_state_check=True)
 
 
 def _assessed(

@@ -32,7 +32,7 @@ LENGTH_STEP = 1e-2
 PASSES_BY_LENGTH = 5
 # Derivatives below these are solved for to the accuracy of a stage's own solve, and no further: of the modes'
 # coefficients, which are of order one, and of the force, of its scale.
-LEAST_DISPLACEMENT, LEAST_FORCE = 0.03, 0.003
+LEAST_DISPLACEMENT, LEAST_FORCE = 0.01, 0.001
 REMEMBERED = 8  # states whose derivatives are kept; a step asks for three at most
 
 

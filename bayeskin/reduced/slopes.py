@@ -57,45 +57,50 @@ def differentiate(system, laws, past, x, room, varied, before, scale, inverse, f
     of tangents made.
     """
     k, r = system.gradient.shape[2], len(out.x)
-    exact = _exact(system, past, x, varied, before)
-    step, change = np.zeros((r, out.x.shape[1] - 2)), np.empty((r, out.x.shape[1] - 2))
-    left, force = _left(system, laws, past, room, varied, before, exact, out), np.empty(r)
-    worst, tangents = np.inf, 0
+    exact, force = _exact(system, past, x, varied, before), np.empty(r)
+    rows, worst, tangents = np.arange(r), np.inf, 0
+    left = _left(system, laws, past, room, varied, before, exact, rows, out)
     for _ in range(MOST_PASSES):
+        step, going = np.zeros((len(rows), len(x) - 2)), np.full(len(rows), False)
         worst_before, worst = worst, 0.0
-        for i in range(r):
-            step[i] = -np.dot(inverse, left[i, 2:])
-            more = np.dot(force_row, step[i])
-            force[i] = 2.0 * left[i, 1] + more
-            far = np.abs(step[i, : k - 2]).max()
+        for a in range(len(rows)):
+            i = rows[a]
+            step[a] = -np.dot(inverse, left[a, 2:])
+            more = np.dot(force_row, step[a])
+            force[i] = 2.0 * left[a, 1] + more
+            far = np.abs(step[a, : k - 2]).max()
             scale[0, i] = max(scale[0, i], np.abs(out.x[i, :k]).max(), far)
             scale[1, i] = max(scale[1, i], abs(force[i]))
             if far > 0.0:
-                worst = max(worst, far / scale[0, i], abs(more) / scale[1, i])
-        if worst < ENOUGH:
+                now = max(far / scale[0, i], abs(more) / scale[1, i])
+                going[a] = not now < ENOUGH
+                worst = max(worst, now)
+        rows, left, step = rows[going], left[going], step[going]
+        if len(rows) == 0:
             break
         if worst > SLOW_CONTRACTION * worst_before:
             tangents += 1
             renew(system, laws, past, x, room, inverse, force_row, by_pads)
             worst = np.inf
-            for i in range(r):
-                step[i] = -np.dot(inverse, left[i, 2:])
-        out.x[:, 2:] += step
-        change[:] = left[:, 2:]
-        left = _left(system, laws, past, room, varied, before, exact, out)
-        change[:] = left[:, 2:] - change
-        for i in range(r):
-            update(inverse, step[i], change[i])
+            for a in range(len(rows)):
+                step[a] = -np.dot(inverse, left[a, 2:])
+        for a in range(len(rows)):
+            out.x[rows[a], 2:] += step[a]
+        nearer = _left(system, laws, past, room, varied, before, exact, rows, out)
+        for a in range(len(rows)):
+            update(inverse, step[a], nearer[a, 2:] - left[a, 2:])
+        left = nearer
     return force, tangents
 
 
 @compiled
-def _left(system, laws, past, room, varied, before, exact, out):
-    """Derivatives (r, k + m) of the residual by those in `out.x`; fills its other fields."""
+def _left(system, laws, past, room, varied, before, exact, rows, out):
+    """Derivatives (a, k + m) of the residual by some of the parameters, the a rows of `out.x`; fills the
+    other fields of these rows."""
     n, k, m = system.weight.shape[0], system.gradient.shape[2], system.pressure.shape[1]
-    r, step = len(out.x), varied.step
+    r, step = len(rows), varied.step
     gradient, slope = system.gradient.reshape(9 * n, k), system.slope.reshape(3 * n, m)
-    solid, fluid = out.x[:, :k].copy(), out.x[:, k:].copy()
+    solid, fluid = out.x[rows, :k].copy(), out.x[rows, k:].copy()
     single, single_fluid = solid.astype(np.float32), fluid.astype(np.float32)
     deformed = np.dot(single, gradient.T)
     pressed, sloped = np.dot(single_fluid, system.pressure.T), np.dot(single_fluid, slope.T)
@@ -105,26 +110,27 @@ def _left(system, laws, past, room, varied, before, exact, out):
     )  # fmt: skip
     stress = np.empty((r, 9 * n), np.float32)
     content, flux = np.empty((r, n), np.float32), np.empty((r, 3 * n), np.float32)
-    for i in range(r):
+    for one in range(r):
+        i = rows[one]
         for q in range(n):
-            other.at_pressure[q] = room.at_pressure[q] + step * pressed[i, q]
+            other.at_pressure[q] = room.at_pressure[q] + step * pressed[one, q]
             for a in range(3):
-                other.at_slope[q, a] = room.at_slope[q, a] + step * sloped[i, 3 * q + a]
+                other.at_slope[q, a] = room.at_slope[q, a] + step * sloped[one, 3 * q + a]
                 for b in range(3):
-                    moved = step * deformed[i, 9 * q + 3 * a + b]
+                    moved = step * deformed[one, 9 * q + 3 * a + b]
                     other.deformation[q, a, b] = room.deformation[q, a, b] + moved
         _answer_varied(system, laws, past, varied, before, i, other)
         for q in range(n):
             w = system.weight[q] / step
-            content[i, q] = w * (other.content[q] - room.content[q])
+            content[one, q] = w * (other.content[q] - room.content[q])
             for a in range(3):
-                flux[i, 3 * q + a] = w * (other.flux[q, a] - room.flux[q, a])
+                flux[one, 3 * q + a] = w * (other.flux[q, a] - room.flux[q, a])
                 for b in range(3):
-                    stress[i, 9 * q + 3 * a + b] = w * (other.stress[q, a, b] - room.stress[q, a, b])
-            out.pressure[i, q] = pressed[i, q]
+                    stress[one, 9 * q + 3 * a + b] = w * (other.stress[q, a, b] - room.stress[q, a, b])
+            out.pressure[i, q] = pressed[one, q]
         out.volume[i] = (other.volume - room.volume) / step
         out.memory[i] = (other.memory - room.memory) / step
-    left = exact.copy()
+    left = exact[rows]
     left[:, :k] += np.dot(stress, gradient) + np.dot(solid, system.solid.T) + np.dot(fluid, system.coupling.T)
     left[:, k:] += np.dot(solid, system.coupling) + past.length_s * np.dot(fluid, system.flow.T)
     left[:, k:] -= np.dot(content, system.pressure) + np.dot(flux, slope)
