@@ -83,7 +83,7 @@ def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
       bayeskin import Healthy_skin.xlsx -o runs/healthy-skin.h5
       bayeskin import series.xlsx --sheet "Test 3" -o runs/test-3.h5
     """
-    from bayeskin.pipeline import single
+    from bayeskin.workflow import single
 
     _answer(single.import_recording(file, out, sheet), as_json)
 
@@ -109,7 +109,7 @@ def new(recording: Path | None, out: Path | None, device: Path | None, as_json: 
       bayeskin new test.xlsx -o runs/test.toml --device device.toml
       bayeskin new runs/test.h5 && bayeskin run runs/test.toml
     """
-    from bayeskin.pipeline.new import new_config, new_demo
+    from bayeskin.workflow.new import new_config, new_demo
 
     if recording is None and device is not None:
         raise InputError(f"--device {device}", "no RECORDING", "one: the demo is of the article's device")
@@ -140,7 +140,7 @@ def reduce_(source: Path | None, out: Path | None, scheduler: str | None, as_jso
       bayeskin reduce device.toml
       bayeskin reduce device.toml -o device-reduced.h5 --scheduler tcp://10.0.0.5:8786
     """
-    from bayeskin.pipeline.reducing import reduce
+    from bayeskin.workflow.reducing import reduce
 
     with Terminal() as terminal:
         document = reduce(source, out, terminal, scheduler)
@@ -185,7 +185,7 @@ def simulate(as_json: bool, **options: Any) -> None:
       bayeskin simulate --reduced -o force.csv --mechanism solid-viscoelasticity --json
       bayeskin simulate -o force.csv --device device.toml
     """
-    from bayeskin.pipeline import single
+    from bayeskin.workflow import single
 
     with Terminal() as terminal:
         document = single.simulate_once(reporter=terminal, **options)
@@ -224,7 +224,7 @@ def report(config: Path, as_json: bool) -> None:
       bayeskin report runs/demo.toml
       bayeskin report runs/demo.toml --json > answer.json
     """
-    from bayeskin.pipeline import stages
+    from bayeskin.workflow import stages
 
     with Terminal() as terminal:
         document = stages.report(config, terminal)
@@ -269,7 +269,7 @@ def diagnose(source: Path, device: Path | None, as_json: bool) -> None:
       bayeskin diagnose runs/healthy-skin.h5 --json
       bayeskin diagnose first.h5 --device device.toml
     """
-    from bayeskin.pipeline import diagnosis
+    from bayeskin.workflow import diagnosis
 
     with Terminal() as terminal:
         document = diagnosis.diagnose(source, terminal, device)
@@ -295,7 +295,7 @@ def experiment(source: Path, device: Path | None, as_json: bool) -> None:
       bayeskin experiment runs/healthy-skin.toml
       bayeskin experiment first.h5 --device device.toml
     """
-    from bayeskin.pipeline import experiment
+    from bayeskin.workflow import experiment
 
     with Terminal() as terminal:
         document = experiment.choose(source, terminal, device)
@@ -320,7 +320,7 @@ def prove(folder: Path | None, at_most: int | None, rediagnose: int, as_json: bo
       bayeskin prove --rediagnose 2
       bayeskin prove sets/one --at-most 4
     """
-    from bayeskin.pipeline import proof
+    from bayeskin.workflow import proof
 
     with Terminal() as terminal:
         document = proof.prove(folder, terminal, rediagnose, at_most)
@@ -347,7 +347,7 @@ def conceal(folder: Path, seed: int, count: int, only: tuple[str, ...], as_json:
       bayeskin conceal sets/none --seed 8 --count 80 --only nothing
       bayeskin conceal sets/sizes --seed 9 --count 16 --only pad-slip --only force-offset
     """
-    from bayeskin.pipeline import proof
+    from bayeskin.workflow import proof
 
     with Terminal() as terminal:
         document = proof.conceal(folder, seed, count, terminal, only)
@@ -372,7 +372,7 @@ def serve(config: Path | None, host: str, port: int, as_json: bool) -> None:
       bayeskin serve runs/demo.toml --port 4242
       bayeskin serve runs/demo.toml --port 0 --json
     """
-    from bayeskin.pipeline.serve import open_server
+    from bayeskin.workflow.serve import open_server
 
     with Terminal() as terminal:
         server, document = open_server(config, host, port, terminal)
@@ -396,13 +396,13 @@ def doctor(as_json: bool) -> None:
       bayeskin doctor
       bayeskin doctor --json
     """
-    from bayeskin.pipeline.doctor import examine
+    from bayeskin.workflow.doctor import examine
 
     _answer(examine(Path.cwd()), as_json)
 
 
 def _run(config: Path, last: str | None, scheduler: str | None, as_json: bool) -> None:
-    from bayeskin.pipeline import stages
+    from bayeskin.workflow import stages
 
     with Terminal() as terminal:
         document = stages.run(config, last, terminal, scheduler=scheduler)

@@ -25,9 +25,9 @@ from numpy.typing import ArrayLike
 from bayeskin import storage
 from bayeskin.design import Wave
 from bayeskin.errors import InputError, Unavailable
+from bayeskin.execution.local import Lost, Map, local
 from bayeskin.journal import Journal, Run
 from bayeskin.types import Array, Design, ParameterSpace, Simulation
-from bayeskin.workers import Lost, Map, local
 
 Simulate = Callable[[Mapping[str, float]], Simulation]
 Progress = Callable[[int, int, int], None]

@@ -21,20 +21,20 @@ import numpy as np
 from bayeskin import inference, storage
 from bayeskin.config import FEWEST_CHECKED, config_of, parameter_space, to_toml
 from bayeskin.errors import InputError
+from bayeskin.finite_element import simulate as run_model
 from bayeskin.inference import LogPosterior, Weighed
-from bayeskin.model import simulate as run_model
-from bayeskin.pipeline import diagnosis
-from bayeskin.pipeline.calibration import log_posterior_of
-from bayeskin.pipeline.engine import Run, Silent
-from bayeskin.pipeline.folder import plain
-from bayeskin.pipeline.model import model_spec
-from bayeskin.pipeline.posterior import PREDICTIVE_DRAWS, chains_folder, provenance_of, settings_of
-from bayeskin.pipeline.recording import pad_motion, prepared
-from bayeskin.pipeline.shipping import check_fits, shipped_files, shipped_for
+from bayeskin.json_files import plain
 from bayeskin.recordings import read_recording, segment
 from bayeskin.runner import load_design
 from bayeskin.surrogates import load_surrogate
 from bayeskin.types import BinnedForce, PadMotion, Recording, Simulation
+from bayeskin.workflow import diagnosis
+from bayeskin.workflow.calibration import log_posterior_of
+from bayeskin.workflow.engine import Run, Silent
+from bayeskin.workflow.model import model_spec
+from bayeskin.workflow.posterior import PREDICTIVE_DRAWS, chains_folder, provenance_of, settings_of
+from bayeskin.workflow.recording import pad_motion, prepared
+from bayeskin.workflow.shipping import check_fits, shipped_files, shipped_for
 
 if TYPE_CHECKING:
     import arviz

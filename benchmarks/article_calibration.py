@@ -27,7 +27,7 @@ import numpy as np
 import rows
 from scipy.optimize import differential_evolution
 
-from bayeskin.model import ModelSpec, simulate
+from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.recordings import motion_of, read_recording
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_surrogate

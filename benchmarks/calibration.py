@@ -32,17 +32,17 @@ from matplotlib.figure import Figure
 from scipy.stats import binom, chi2
 
 from bayeskin import inference
+from bayeskin.execution.local import Lost, run_parallel
+from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.inference import Limits, LogPosterior, SampleSettings
 from bayeskin.inference.noise_model import draw_noise
-from bayeskin.model import ModelSpec, simulate
-from bayeskin.pipeline.recording import pad_motion
 from bayeskin.recordings import bin_recording, read_recording, segment, uniform_edges
 from bayeskin.report import save_figure
 from bayeskin.report.style import GREY, MODEL, PAGE_IN, new_figure, state_finding, styled, symbol
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_manifest, load_surrogate
 from bayeskin.types import Array
-from bayeskin.workers import Lost, run_parallel
+from bayeskin.workflow.recording import pad_motion
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 WINDOW_S = ((5.0, 45.0),)

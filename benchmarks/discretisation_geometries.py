@@ -18,9 +18,9 @@ import numpy as np
 import rows
 from discretisation_tables import Error, error
 
+from bayeskin.finite_element import ModelSpec, simulate
+from bayeskin.finite_element.simulate import problem_of
 from bayeskin.geometry import Geometry, Guard
-from bayeskin.model import ModelSpec, simulate
-from bayeskin.model.simulate import problem_of
 from bayeskin.types import PadMotion, Simulation
 
 REFERENCE = 2

@@ -19,7 +19,7 @@ histories every 0.1 s, RMS and largest, over the reference's peak.
 `--first-cycle` takes the first cycle only of every protocol. A stopped study goes on: finished runs are rows
 of benchmarks/results/discretisation.csv, their histories lie beside it. Writes the tables between the markers
 of docs/discretisation.md, docs/figures/discretisation.{png,svg}, and the meshes' errors into
-bayeskin/model/discretisation.json, from which `bayeskin simulate` states them.
+bayeskin/finite_element/discretisation.json, from which `bayeskin simulate` states them.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ from discretisation_tables import (
 
 from bayeskin import storage
 from bayeskin.errors import InputError
-from bayeskin.model import accuracy, lagrangian, simulate, stepping
-from bayeskin.model.problem import Problem, material
-from bayeskin.model.simulate import ModelSpec, problem_of
+from bayeskin.finite_element import accuracy, lagrangian, simulate, stepping
+from bayeskin.finite_element.problem import Problem, material
+from bayeskin.finite_element.simulate import ModelSpec, problem_of
 from bayeskin.recordings import idealised_motion, segment
 from bayeskin.report import save_figure
 from bayeskin.types import Array, PadMotion, Recording, Simulation

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import rows
 
-from bayeskin.model import ModelSpec
-from bayeskin.model.stepping import STEPS_PER_PHASE
+from bayeskin.finite_element import ModelSpec
+from bayeskin.finite_element.stepping import STEPS_PER_PHASE
 from bayeskin.types import Simulation
 
 SPACE_TOLERANCE = 3e-4

@@ -43,12 +43,12 @@ import numpy as np
 import rows
 import scipy.sparse as sp
 
-from bayeskin.model import assembly, linear, newton, poroelastic, simulate
-from bayeskin.model.gradients import ForceGradients, logarithms
-from bayeskin.model.linear import SOLVER_NAME, Factorisations
-from bayeskin.model.simulate import ModelSpec, problem_of
+from bayeskin.execution.local import Lost, run_parallel
+from bayeskin.finite_element import assembly, linear, newton, poroelastic, simulate
+from bayeskin.finite_element.gradients import ForceGradients, logarithms
+from bayeskin.finite_element.linear import SOLVER_NAME, Factorisations
+from bayeskin.finite_element.simulate import ModelSpec, problem_of
 from bayeskin.types import Array, PadMotion
-from bayeskin.workers import Lost, run_parallel
 
 ARTICLE_CPU_S = 3600.0  # stated, for 694 steps; see above
 STAGES = ("evaluation", "law", "residual", "tangent", "analysis", "factorisation", "solve", "rest")

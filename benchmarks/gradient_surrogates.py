@@ -30,7 +30,8 @@ import rows
 from matplotlib.figure import Figure
 
 from bayeskin.design import default_space, first_wave
-from bayeskin.model import ModelSpec, simulate
+from bayeskin.execution.local import Lost, run_parallel
+from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.report import save_figure
 from bayeskin.report.style import PAGE_IN, new_figure, plain_log, state_finding, styled
@@ -48,7 +49,6 @@ from bayeskin.surrogates.shapes import ShapeTransform, split
 from bayeskin.surrogates.similarity import Similarity
 from bayeskin.surrogates.train import fit_latents
 from bayeskin.types import Array
-from bayeskin.workers import Lost, run_parallel
 
 FOLDER = rows.RESULTS / "gradient_surrogates"
 FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "gradient_surrogates"

@@ -15,10 +15,10 @@ from unittest import mock
 
 import numpy as np
 
+from bayeskin.finite_element import mesh as mesh_module
+from bayeskin.finite_element.bricks import brick_lines
+from bayeskin.finite_element.simulate import ModelSpec, _mesh, problem_of
 from bayeskin.geometry import Geometry
-from bayeskin.model import mesh as mesh_module
-from bayeskin.model.bricks import brick_lines
-from bayeskin.model.simulate import ModelSpec, _mesh, problem_of
 from bayeskin.proof.protocol import MOTION
 from bayeskin.types import Array, PadMotion
 

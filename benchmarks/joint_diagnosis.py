@@ -32,8 +32,8 @@ import rows
 
 from bayeskin.mechanisms import catalogue
 from bayeskin.mismatch import hypotheses
-from bayeskin.pipeline.diagnosis import diagnose
 from bayeskin.proof.score import score
+from bayeskin.workflow.diagnosis import diagnose
 
 DATA = Path(__file__).parent.parent / "data"
 KEPT = Path(__file__).parent / "results" / "joint_diagnosis.jsonl"

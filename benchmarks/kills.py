@@ -27,8 +27,8 @@ import h5py
 import numpy as np
 
 from bayeskin import storage
-from bayeskin.pipeline.folder import current_record, read_record
 from bayeskin.types import Recording
+from bayeskin.workflow.folder import current_record, read_record
 
 STAGES = ("design", "train", "sample", "diagnose")
 KILLS_A_ROUND = 5  # then the stage is let to its end, and begun anew

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 import openpyxl
 
-from bayeskin.model import ModelSpec, simulate
-from bayeskin.model.gradients import logarithms
+from bayeskin.finite_element import ModelSpec, simulate
+from bayeskin.finite_element.gradients import logarithms
 from bayeskin.types import Array, PadMotion
 
 NAMES = ("E_c", "E_s", "k_c", "k_s")

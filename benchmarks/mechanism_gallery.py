@@ -20,9 +20,9 @@ import healthy_skin
 import numpy as np
 import rows
 
+from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.mechanisms import Mechanism, catalogue, laws, observed, solved
 from bayeskin.mechanisms.mechanism import Instrument
-from bayeskin.model import ModelSpec, simulate
 from bayeskin.report import save_figure
 from bayeskin.report.style import ACCENT, FAINT, MODEL, PAGE_IN, new_figure, state_finding, styled
 from bayeskin.types import Array, PadMotion

@@ -23,12 +23,12 @@ import numpy as np
 import rows
 
 from bayeskin.design import default_space, sobol_points
+from bayeskin.execution.local import Lost, run_parallel
+from bayeskin.finite_element import simulate
+from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.inference.model_error import RELAXATION_S, errors, shapes
 from bayeskin.mismatch.fit import STIFFEST_BELOW
-from bayeskin.model import simulate
-from bayeskin.model.simulate import ModelSpec
 from bayeskin.types import Array
-from bayeskin.workers import Lost, run_parallel
 
 SEED = 21
 BIN_S = 0.5

@@ -18,11 +18,11 @@ import numpy as np
 import rows
 from demo_gallery import FIGURES, smaller
 
-from bayeskin.pipeline.engine import Silent
-from bayeskin.pipeline.proof import prove
 from bayeskin.proof import seals
 from bayeskin.proof.score import CLEAR, share, share_of_parts
 from bayeskin.report import half_in_words
+from bayeskin.workflow.engine import Silent
+from bayeskin.workflow.proof import prove
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "mismatch.md"

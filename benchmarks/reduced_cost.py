@@ -18,10 +18,9 @@ import rows
 from reduced_model import PROTOCOLS, Skin, held_out
 
 from bayeskin.design import default_space
+from bayeskin.finite_element.stepping import integrate
+from bayeskin.forward.interface import change
 from bayeskin.mechanisms import catalogue
-from bayeskin.model.stepping import integrate
-from bayeskin.pipeline.forward import change
-from bayeskin.pipeline.reducing import SHIPPED
 from bayeskin.reduced import kernels
 from bayeskin.reduced.equations import ReducedEquations
 from bayeskin.reduced.files import load_reduced
@@ -31,6 +30,7 @@ from bayeskin.reduced.runs import binds_of, tissue_of
 from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.shipped import shipped
 from bayeskin.types import ParameterSpace
+from bayeskin.workflow.reducing import SHIPPED
 
 SHARES = (0.5, 1.0)  # of the modes
 POINTS = (0.25, 0.5, 1.0)  # of the points

@@ -19,14 +19,14 @@ import h5py
 import rows
 from reduced_model import PROTOCOLS, RESULTS, compared, held_out
 
+from bayeskin.execution.local import local
 from bayeskin.mechanisms import catalogue
-from bayeskin.pipeline.reducing import SHIPPED
 from bayeskin.reduced.enrichment import EnrichmentSettings, enrich
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.shipped import shipped
-from bayeskin.workers import local
+from bayeskin.workflow.reducing import SHIPPED
 
 HEADER = (
     "skin", "mechanisms", "before [% of peak]", "after, as full runs join [% of peak]", "full runs",

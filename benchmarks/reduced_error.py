@@ -22,9 +22,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from reduced_model import Row, compared, keep_full_run
 
+from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.geometry import LENGTHS
-from bayeskin.model.simulate import ModelSpec
-from bayeskin.pipeline.reducing import SHIPPED, trained_for
 from bayeskin.reduced import simulate as reduced_runs
 from bayeskin.reduced.cases import BASE, SETS, THICKNESS_RANGE, Case
 from bayeskin.reduced.files import load_reduced
@@ -34,6 +33,7 @@ from bayeskin.reduced.runs import FullRuns
 from bayeskin.report.style import INK, PAGE_IN, new_figure, state_finding, styled
 from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, ParameterSpace
+from bayeskin.workflow.reducing import SHIPPED, trained_for
 
 RESULTS = Path(__file__).with_name("results") / "reduced_fresh.h5"
 SEED = 20261128  # of no training case

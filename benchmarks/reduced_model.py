@@ -21,16 +21,16 @@ import h5py
 import numpy as np
 
 from bayeskin.design import default_space
+from bayeskin.finite_element.simulate import ModelSpec, simulate
 from bayeskin.mechanisms import catalogue, laws
 from bayeskin.mechanisms.mechanism import Tissue
-from bayeskin.model.simulate import ModelSpec, simulate
-from bayeskin.pipeline.reducing import SHIPPED
 from bayeskin.proof.protocol import MOTION
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, ParameterSpace
+from bayeskin.workflow.reducing import SHIPPED
 
 RESULTS = Path(__file__).with_name("results") / "reduced_held_out.h5"
 SEED = 20261127

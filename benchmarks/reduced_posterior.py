@@ -21,9 +21,9 @@ import numpy as np
 import rows
 
 from bayeskin.config import load_config
-from bayeskin.pipeline.single import import_recording
-from bayeskin.pipeline.stages import run
 from bayeskin.types import Array
+from bayeskin.workflow.single import import_recording
+from bayeskin.workflow.stages import run
 
 CONFIG = """name = "{name}"
 seed = 1

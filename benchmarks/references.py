@@ -18,12 +18,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bayeskin.model import ModelSpec, simulate
-from bayeskin.pipeline.reducing import SHIPPED
+from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.shipped import shipped
 from bayeskin.types import Array, PadMotion, Simulation
+from bayeskin.workflow.reducing import SHIPPED
 
 POINTS = {
     "A": {"E_c": 60e3, "E_s": 20e3, "k_c": 1e-14, "k_s": 5e-13, "p_init": 700.0},

@@ -30,8 +30,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from bayeskin.design import default_space
-from bayeskin.model import simulate
-from bayeskin.model.simulate import ModelSpec
+from bayeskin.execution.local import Lost, run_parallel
+from bayeskin.finite_element import simulate
+from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.report import save_figure
 from bayeskin.report.style import (
     ACCENT,
@@ -44,7 +45,6 @@ from bayeskin.report.style import (
     styled,
 )
 from bayeskin.types import PadMotion, ParameterSpace
-from bayeskin.workers import Lost, run_parallel
 
 SEED = 20
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"

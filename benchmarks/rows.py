@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import bayeskin.model
-from bayeskin.behaviour import sha256_of_behaviour
-from bayeskin.pipeline.engine import Silent
+import bayeskin.finite_element
+from bayeskin.hashing import sha256_of_behaviour
+from bayeskin.workflow.engine import Silent
 
 RESULTS = Path(__file__).parent / "results"
 Row = dict[str, str]
@@ -88,7 +88,7 @@ def digest(inputs: Mapping[str, Any]) -> str:
 
 
 def _code_digest() -> str:
-    folder = Path(bayeskin.model.__file__).parent
+    folder = Path(bayeskin.finite_element.__file__).parent
     whole = "".join(sha256_of_behaviour(path.read_bytes()) for path in sorted(folder.glob("*.py")))
     return hashlib.sha256(whole.encode()).hexdigest()[:12]
 
@@ -101,7 +101,8 @@ def warn_of_mixed_code(rows: Sequence[Row]) -> None:
     """Says so when the rows of one table come from more than one state of the model's source."""
     found = sorted({row["code"] for row in rows})
     if len(found) > 1:
-        say(f"warning: rows from {len(found)} states of bayeskin/model ({', '.join(found)}) in one table")
+        states = ", ".join(found)
+        say(f"warning: rows from {len(found)} states of bayeskin/finite_element ({states}) in one table")
 
 
 class Log(Silent):

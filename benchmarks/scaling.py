@@ -28,12 +28,12 @@ import healthy_skin
 import numpy as np
 import rows
 
-from bayeskin import cluster
 from bayeskin.design import Wave, default_space, first_wave
 from bayeskin.errors import InputError
-from bayeskin.model import ModelSpec, simulate
+from bayeskin.execution import cluster
+from bayeskin.execution.local import Map, local
+from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.runner import run_design
-from bayeskin.workers import Map, local
 
 SEED = 5
 SPEC = ModelSpec()

@@ -22,10 +22,10 @@ import rows
 from matplotlib.figure import Figure
 
 from bayeskin.inference import load_inference_data
-from bayeskin.pipeline import stages
 from bayeskin.report import save_figure
 from bayeskin.report.style import INK, PAGE_IN, new_figure, panel_title, state_finding, styled
 from bayeskin.types import Array
+from bayeskin.workflow import stages
 
 FOLDER = rows.RESULTS / "two_fidelities"
 FIGURE = Path(__file__).parents[1] / "docs" / "figures" / "two_fidelities"

@@ -25,10 +25,10 @@ import rows
 from scipy.signal import lfilter
 
 from bayeskin import storage
-from bayeskin.model import ModelSpec, simulate
-from bayeskin.pipeline.new import new_config
-from bayeskin.pipeline.stages import BEFORE_REPORT, run
+from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.types import Array, PadMotion, Recording
+from bayeskin.workflow.new import new_config
+from bayeskin.workflow.stages import BEFORE_REPORT, run
 
 TRUTH = {"E_c": 300e3, "E_s": 20e3, "k_c": 3e-14, "k_s": 2e-13, "p_init": 300.0}
 SPREAD = 0.3  # sd of the logarithms of a seed's skin about it

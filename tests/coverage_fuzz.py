@@ -17,8 +17,8 @@ from pathlib import Path
 import atheris
 
 with atheris.instrument_imports(include=["bayeskin", "meshio", "openpyxl"]):
-    import bayeskin.pipeline.serve
     import bayeskin.scripting
+    import bayeskin.workflow.serve
 
     assert bayeskin
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import skfem
 
-from bayeskin.model.lagrangian import LagrangianModel, State
-from bayeskin.model.mesh import SkinMesh, roll
-from bayeskin.model.problem import Material, Problem
-from bayeskin.model.series import Drive, SeriesSolver
-from bayeskin.model.space import TaylorHood, sparsity, taylor_hood
-from bayeskin.model.stepping import advance
+from bayeskin.finite_element.lagrangian import LagrangianModel, State
+from bayeskin.finite_element.mesh import SkinMesh, roll
+from bayeskin.finite_element.problem import Material, Problem
+from bayeskin.finite_element.series import Drive, SeriesSolver
+from bayeskin.finite_element.space import TaylorHood, sparsity, taylor_hood
+from bayeskin.finite_element.stepping import advance
 from bayeskin.types import Array, PadMotion
 
 STILL = PadMotion(np.array([0.0, 1.0]), np.zeros(2))

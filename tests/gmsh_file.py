@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import skfem
 
+from bayeskin.finite_element.gmsh import GMSH_LAYERS, GMSH_NAMES
+from bayeskin.finite_element.mesh import SkinMesh, layered_mesh
 from bayeskin.geometry import Geometry
-from bayeskin.model.gmsh import GMSH_LAYERS, GMSH_NAMES
-from bayeskin.model.mesh import SkinMesh, layered_mesh
 
 NUMBER = {name: n for n, name in enumerate((*GMSH_NAMES, *GMSH_LAYERS, "everything"), start=1)}
 

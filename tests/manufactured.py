@@ -13,8 +13,8 @@ import numpy as np
 import skfem
 from driven import Load, Point, corner_points, elements
 
-from bayeskin.model.lagrangian import State
-from bayeskin.model.space import QUADRATURE_DEGREE, TaylorHood
+from bayeskin.finite_element.lagrangian import State
+from bayeskin.finite_element.space import QUADRATURE_DEGREE, TaylorHood
 from bayeskin.types import Array
 
 COMPLEX_STEP = 1e-30

@@ -17,9 +17,9 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.stats import binom, multivariate_normal
 
 from bayeskin import storage
+from bayeskin.finite_element import ModelSpec
+from bayeskin.finite_element.problem import build_problem
 from bayeskin.inference import NoisePriors
-from bayeskin.model import ModelSpec
-from bayeskin.model.problem import build_problem
 from bayeskin.proof import score, seals
 from bayeskin.proof.curves import curve
 from bayeskin.recordings import read_recording
@@ -56,7 +56,7 @@ def test_halved_bricks_have_every_line_and_the_middles(benchmark):
 
 def test_face_stress_at_rest_is_minus_the_pressure_times_the_pads_area(benchmark):
     skin, study = benchmark("healthy_skin"), benchmark("discretisation_study")
-    mesh = importlib.import_module("bayeskin.model.mesh").brick_mesh()
+    mesh = importlib.import_module("bayeskin.finite_element.mesh").brick_mesh()
     problem = build_problem(mesh)
     x = np.zeros(problem.space.dofs)
     x[3 * problem.space.n_nodes :] = 700.0
@@ -66,7 +66,7 @@ def test_face_stress_at_rest_is_minus_the_pressure_times_the_pads_area(benchmark
 
 def test_face_stress_of_a_uniform_strain_is_the_laws(benchmark):
     skin, study = benchmark("healthy_skin"), benchmark("discretisation_study")
-    mesh = importlib.import_module("bayeskin.model.mesh").brick_mesh()
+    mesh = importlib.import_module("bayeskin.finite_element.mesh").brick_mesh()
     problem = build_problem(mesh)
     f = np.array([[1.2, 0.1, 0.05], [0.0, 0.95, 0.0], [0.02, 0.0, 1.05]])
     x = np.zeros(problem.space.dofs)

@@ -23,14 +23,14 @@ from toy import MOTION, SPACE, toy_force
 
 from bayeskin import cli, report, storage
 from bayeskin.design import first_wave
-from bayeskin.model.simulate import ModelSpec, OnState, problem_of
-from bayeskin.pipeline import single, stages
-from bayeskin.pipeline.engine import CannotGoOn, Run, Stage
-from bayeskin.pipeline.field_outputs import FieldOutputs
-from bayeskin.pipeline.shipping import motion_sha256
+from bayeskin.finite_element.simulate import ModelSpec, OnState, problem_of
 from bayeskin.recordings import idealised_motion, read_recording, segment
 from bayeskin.surrogates import manifest_of, save_surrogate, train
 from bayeskin.types import Design, PadMotion, Recording, Simulation
+from bayeskin.workflow import single, stages
+from bayeskin.workflow.engine import CannotGoOn, Run, Stage
+from bayeskin.workflow.field_outputs import FieldOutputs
+from bayeskin.workflow.shipping import motion_sha256
 
 THETA = np.array([[200e3, 30e3, 1e-14, 1e-13, 300.0]])
 
@@ -204,7 +204,7 @@ def test_with_mechanisms_no_two_times_are_the_same(
 def test_a_reader_that_leaves_early_does_not_hide_what_was_found(monkeypatch: pytest.MonkeyPatch) -> None:
     code = (
         "import sys; from bayeskin import cli\n"
-        "import bayeskin.pipeline.new as new\n"
+        "import bayeskin.workflow.new as new\n"
         "new.new_demo = lambda out: {'ok': False, 'text': 'x' * 10 ** 6}\n"
         "cli.main(['new'])\n"
     )
@@ -492,7 +492,7 @@ def test_the_exit_code_says_whether_the_answer_can_be_relied_on(
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 def test_a_command_that_is_interrupted_says_how_to_go_on(measured: Path, tmp_path: Path, ending: int) -> None:
     code = (
-        "import sys, time; from bayeskin import cli; from bayeskin.pipeline import single\n"
+        "import sys, time; from bayeskin import cli; from bayeskin.workflow import single\n"
         "def slow(*_): print('at work', flush=True); time.sleep(60)\n"
         "single.import_recording = slow; cli.main(['import', *sys.argv[1:]])"
     )

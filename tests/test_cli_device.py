@@ -12,8 +12,8 @@ from gmsh_file import coarse_tetrahedra, gmsh_text
 
 from bayeskin import cli, storage
 from bayeskin.config import load_config, parameter_space
+from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.geometry import Geometry
-from bayeskin.model import ModelSpec, simulate
 from bayeskin.recordings import idealised_motion, read_recording, segment
 from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, Recording, Simulation

@@ -16,11 +16,11 @@ from test_runner import SHORT, assert_same_rows, run
 from toy import toy_simulate
 from toy_runs import COARSE_S
 
-from bayeskin.cluster import on_scheduler, on_slurm
 from bayeskin.errors import InputError
+from bayeskin.execution.cluster import on_scheduler, on_slurm
+from bayeskin.execution.local import Lost, local
 from bayeskin.runner import load_design, run_design
 from bayeskin.types import Design
-from bayeskin.workers import Lost, local
 
 distributed = pytest.importorskip("distributed")
 dask = pytest.importorskip("dask")
@@ -104,7 +104,7 @@ def test_a_run_that_comes_back_twice_is_one_row(tmp_path: Path, expected: Design
 
 
 def test_an_address_where_nobody_answers_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bayeskin.cluster.CONNECT_S", 1)
+    monkeypatch.setattr("bayeskin.execution.cluster.CONNECT_S", 1)
     with pytest.raises(InputError, match="9: found no answer"), on_scheduler("tcp://127.0.0.1:9"):
         pass
     with pytest.raises(InputError, match="the address of a Dask scheduler"), on_scheduler("nowhere://x"):

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from bayeskin import storage
+from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.mechanisms import catalogue, laws
-from bayeskin.model import ModelSpec, simulate
-from bayeskin.pipeline.diagnosis import diagnose
-from bayeskin.pipeline.engine import Silent
 from bayeskin.types import PadMotion, Recording
+from bayeskin.workflow.diagnosis import diagnose
+from bayeskin.workflow.engine import Silent
 
 THETA = {"E_c": 300e3, "E_s": 20e3, "k_c": 3e-14, "k_s": 2e-13, "p_init": 300.0}
 CONCEALED = {"g_1": 0.3, "tau_1": 3.0, "g_2": 0.0, "tau_2": 60.0}

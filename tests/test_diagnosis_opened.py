@@ -12,10 +12,10 @@ from bayeskin import storage
 from bayeskin.config import parameter_space
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
-from bayeskin.pipeline.diagnosis import STAGE, opened, stage_of
-from bayeskin.pipeline.engine import Silent
 from bayeskin.shipped import shipped
 from bayeskin.types import Recording
+from bayeskin.workflow.diagnosis import STAGE, opened, stage_of
+from bayeskin.workflow.engine import Silent
 
 
 def recording(path: Path) -> Path:

@@ -16,6 +16,7 @@ from toy_inference import NOISE, TRUTH, ToySurrogate, toy_problem
 
 from bayeskin import report
 from bayeskin.inference import LogPosterior
+from bayeskin.json_files import plain
 from bayeskin.mechanisms import catalogue
 from bayeskin.mismatch.contributions import Contribution, contributions
 from bayeskin.mismatch.discrepancy import discrepancy
@@ -23,8 +24,8 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.locate import Located, Window
 from bayeskin.mismatch.observed import ObservedSurrogate
-from bayeskin.pipeline.diagnosis import in_words
-from bayeskin.pipeline.diagnosis_outputs import (
+from bayeskin.workflow.diagnosis import in_words
+from bayeskin.workflow.diagnosis_outputs import (
     Found,
     Remainder,
     Shown,
@@ -32,7 +33,6 @@ from bayeskin.pipeline.diagnosis_outputs import (
     draw,
     unexplained,
 )
-from bayeskin.pipeline.folder import plain
 
 CREEP_S = 20.0
 VALUES = {

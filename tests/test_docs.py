@@ -117,6 +117,6 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     reference = (tmp_path / "reference.html").read_text()
-    for name in ("bayeskin.model.simulate.simulate", "bayeskin.runner.run_design", "bayeskin.types.Design"):
-        assert f'id="{name}"' in reference
+    for name in ("finite_element.simulate.simulate", "runner.run_design", "types.Design"):
+        assert f'id="bayeskin.{name}"' in reference
     assert "bayeskin serve [OPTIONS] [CONFIG]" in (tmp_path / "commands.html").read_text()

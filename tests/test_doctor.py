@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from bayeskin import cli
-from bayeskin.pipeline import doctor
+from bayeskin.workflow import doctor
 
 TESTS = ("_full_model", "_surrogate")
 
@@ -82,7 +82,7 @@ def test_a_part_that_cannot_be_imported_is_a_finding_and_no_crash(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(metadata, "requires", lambda name: [])
-    monkeypatch.setitem(sys.modules, "bayeskin.model", None)
+    monkeypatch.setitem(sys.modules, "bayeskin.finite_element", None)
     said = doctor.examine(tmp_path)
     assert list(broken(said)) == ["linear solver"]
     assert "ModuleNotFoundError" in broken(said)["linear solver"]

@@ -13,12 +13,12 @@ from toys.solved import TRUTH, Exact
 
 from bayeskin.mismatch.emulate import EmulationSettings, Forces, emulate
 from bayeskin.mismatch.fit import fit_near
-from bayeskin.mismatch.joint_fit import JointFit, fit_jointly, within
 from bayeskin.mismatch.resample import resample
+from bayeskin.mismatch.trust_region import JointFit, fit_jointly, within
 from bayeskin.mismatch.wrapper import innermost
-from bayeskin.pipeline.workbench import Workbench
 from bayeskin.surrogates import train
 from bayeskin.types import Array, Design, Surrogate
+from bayeskin.workflow.workbench import Workbench
 
 SETS = ((), ("force-offset",))
 FEW = EmulationSettings(points=30)

@@ -26,9 +26,10 @@ from toy import MOTION
 
 from bayeskin import storage
 from bayeskin.errors import InputError
-from bayeskin.pipeline.folder import read_lines, read_record
+from bayeskin.json_files import read_lines
 from bayeskin.runner import load_design
 from bayeskin.types import Recording
+from bayeskin.workflow.folder import read_record
 
 ROOT = Path(__file__).parents[1]
 MAIN = "from bayeskin.cli import main; main()"

@@ -33,19 +33,19 @@ from bayeskin import probe, storage
 from bayeskin.config import load_config
 from bayeskin.device import load_device
 from bayeskin.errors import InputError
+from bayeskin.external.umbridge import Refused, _understood
+from bayeskin.finite_element.gmsh import read_gmsh
+from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.geometry import Geometry
 from bayeskin.inference import chains, draws_of, inference_data, load_inference_data, save_inference_data
 from bayeskin.journal import Journal, Run
-from bayeskin.model.gmsh import read_gmsh
-from bayeskin.model.simulate import ModelSpec
-from bayeskin.pipeline import folder
-from bayeskin.pipeline.serve import Asked, ServedModel
 from bayeskin.recordings import phase_noise, read_recording, segment
 from bayeskin.runner import load_waves
 from bayeskin.storage import contents_hash
 from bayeskin.surrogates import load_manifest, manifest_of, save_surrogate, train
 from bayeskin.types import Design, Recording
-from bayeskin.umbridge import Refused, _understood
+from bayeskin.workflow import folder
+from bayeskin.workflow.serve import Asked, ServedModel
 
 ROOT = Path(__file__).parents[1]
 TOKENS = [

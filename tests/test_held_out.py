@@ -11,10 +11,10 @@ from toys import solved
 from toys.solved import TRUTH
 
 from bayeskin.mismatch.held_out import Beginning, end_of_second_hold, fit_beginning
-from bayeskin.mismatch.joint_fit import JointFit, fit_jointly
 from bayeskin.mismatch.tasks import Task
-from bayeskin.pipeline.workbench import Workbench
+from bayeskin.mismatch.trust_region import JointFit, fit_jointly
 from bayeskin.types import Phase
+from bayeskin.workflow.workbench import Workbench
 
 SPLIT_S = 50.0
 OFFSET = ("force-offset",)

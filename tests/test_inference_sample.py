@@ -22,7 +22,7 @@ from bayeskin.inference.convergence import assess, autocorrelation_steps, split_
 from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.inference.moves import SnookerMove, SubspaceMove, TriesMove, mixed_moves
 from bayeskin.inference.proposal import Mixture, Product
-from bayeskin.inference.straighten import Shear, find_shear
+from bayeskin.inference.reparametrisation import Shear, find_shear
 from bayeskin.types import Array
 
 LINE_START = {"a": 0.2, "b": -0.3, "sd_hold": 0.05002, "tau_noise": 0.0010005, "nu_noise": 1.0005e6}

@@ -16,17 +16,18 @@ from toy_inference import ToySurrogate, toy_problem
 from toys import solved
 from toys.solved import BASE, TRUTH, Exact, a_run
 
+from bayeskin.finite_element import ModelSpec
+from bayeskin.forward.interface import ModelRun
+from bayeskin.forward.surrogate import SurrogateForward
 from bayeskin.inference.gauss_newton import gauss_newton
-from bayeskin.inference.straighten import shear_at
-from bayeskin.mismatch.joint_fit import JointFit, TrustSettings, fit_jointly, solved_columns, within
-from bayeskin.mismatch.tangent import POWER, ModelRun, Tangent
+from bayeskin.inference.reparametrisation import shear_at
+from bayeskin.mismatch.tangent import POWER, Tangent
 from bayeskin.mismatch.tasks import Climb
+from bayeskin.mismatch.trust_region import JointFit, TrustSettings, fit_jointly, solved_columns, within
 from bayeskin.mismatch.wrapper import innermost
-from bayeskin.model import ModelSpec
-from bayeskin.pipeline import workbench
-from bayeskin.pipeline.forward import SurrogateForward
-from bayeskin.pipeline.workbench import Source, Workbench
 from bayeskin.types import Correlation, ParameterSpace
+from bayeskin.workflow import workbench
+from bayeskin.workflow.workbench import Source, Workbench
 
 SET = ("force-offset", "stiffness-drift")
 START = {

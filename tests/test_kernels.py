@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numba.typed import List
 
+from bayeskin.finite_element import ModelSpec, simulate
+from bayeskin.finite_element.kernels import LINEARISE, RESPOND
+from bayeskin.finite_element.mesh import brick_mesh
+from bayeskin.finite_element.problem import Sites, build_problem
 from bayeskin.mechanisms import catalogue, laws
-from bayeskin.model import ModelSpec, simulate
-from bayeskin.model.kernels import LINEARISE, RESPOND
-from bayeskin.model.mesh import brick_mesh
-from bayeskin.model.problem import Sites, build_problem
 from bayeskin.proof.outside import OUTSIDE
 from bayeskin.types import PadMotion
 

@@ -15,46 +15,46 @@ BASE = {
     "types",
     "storage",
     "shipped",
-    "workers",
-    "umbridge",
+    "execution",
     "probe",
-    "words",
-    "distinct",
-    "off_limits",
+    "number_format",
+    "access_guard",
     "polynomials",
-    "behaviour",
+    "hashing",
+    "json_files",
 }
-SIBLINGS = {"recordings", "model", "design", "surrogates"}
+SIBLINGS = {"recordings", "finite_element", "design", "surrogates"}
 BELOW = {
     "errors": set(),
-    "behaviour": set(),
+    "json_files": {"errors"},
+    "hashing": {"json_files"},
     "geometry": {"errors"},
     "types": {"errors"},
     "polynomials": {"types"},
     "storage": {"types", "errors"},
     "shipped": {"errors"},
-    "off_limits": set(),
-    "workers": {"errors", "off_limits"},
-    "umbridge": {"errors"},
+    "access_guard": set(),
+    "execution": {"errors", "access_guard"},
     "probe": {"errors"},
-    "words": set(),
-    "distinct": {"types"},
-    "cluster": {"errors", "workers"},
+    "number_format": set(),
     **dict.fromkeys(SIBLINGS, BASE),
+    "finite_element": BASE | {"external"},
     "journal": BASE,
     "sections": {"errors", "probe"},
     "device": {"errors", "geometry", "sections", "types"},
     "config": BASE | {"design", "device", "sections"},
-    "mechanisms": BASE | {"model"},
-    "reduced": BASE | {"model", "mechanisms"},
+    "external": {"errors", "hashing", "types"},
+    "mechanisms": BASE | {"finite_element"},
+    "reduced": BASE | {"finite_element", "mechanisms"},
+    "forward": BASE | {"finite_element", "mechanisms", "reduced", "surrogates"},
     "runner": BASE | SIBLINGS | {"journal"},
-    "inference": BASE,  # a Surrogate is all that these two know of a model
+    "inference": BASE,  # a Surrogate is all that it knows of a model
     "sensitivity": BASE,
-    "shapley": BASE,
-    "mismatch": BASE | {"model", "mechanisms", "inference"},
+    "mismatch": BASE | {"finite_element", "mechanisms", "inference", "forward"},
+    "experiments": BASE | {"mechanisms", "inference", "mismatch"},
     "proof": BASE | SIBLINGS | {"mechanisms", "reduced", "runner"},  # and nothing that diagnoses imports it
-    "report": BASE | {"recordings", "inference", "sensitivity", "shapley"},
-    "pipeline": BASE
+    "report": BASE | {"recordings", "inference", "sensitivity"},
+    "workflow": BASE
     | SIBLINGS
     | {
         "mechanisms",
@@ -63,18 +63,19 @@ BELOW = {
         "sections",
         "device",
         "runner",
-        "cluster",
         "mismatch",
+        "experiments",
+        "external",
+        "forward",
         "inference",
         "sensitivity",
-        "shapley",
         "report",
     },
 }
-BELOW["pipeline"] |= {"proof"}
-BELOW["scripting"] = BELOW["pipeline"] | {"pipeline"}
+BELOW["workflow"] |= {"proof"}
+BELOW["scripting"] = BELOW["workflow"] | {"workflow"}
 BELOW["terminal"] = {"errors"}
-BELOW["cli"] = BELOW["pipeline"] | {"pipeline", "terminal"}
+BELOW["cli"] = BELOW["workflow"] | {"workflow", "terminal"}
 
 
 def imported(source: str, module: tuple[str, ...], is_package: bool) -> Iterator[str]:
@@ -99,7 +100,7 @@ def wrong_arrows(source: str, module: tuple[str, ...], is_package: bool = False)
     return set(imported(source, module, is_package)) - BELOW[module[0]] - {module[0]}
 
 
-PROVES = {("pipeline", "proof"), ("cli",)}  # all that may know of the proof, itself apart
+PROVES = {("workflow", "proof"), ("cli",)}  # all that may know of the proof, itself apart
 
 
 SOURCES = sorted(p for p in PACKAGE.rglob("*.py") if p != PACKAGE / "__init__.py")
@@ -131,12 +132,16 @@ def test_an_upward_arrow_is_seen_however_it_is_written(
 ) -> None:
     (tmp_path / "runner.py").touch()
     monkeypatch.setattr(f"{__name__}.PACKAGE", tmp_path)
-    assert wrong_arrows(source, ("model", "mesh")) == {"runner"}
+    assert wrong_arrows(source, ("finite_element", "mesh")) == {"runner"}
     assert wrong_arrows(source, ("cli", "x")) == set()
 
 
 def test_a_sideways_arrow_is_seen() -> None:
-    assert wrong_arrows("from bayeskin.model import mesh", ("surrogates", "gp")) == {"model"}
-    assert wrong_arrows("from bayeskin.model import mesh", ("inference", "sample")) == {"model"}
+    assert wrong_arrows("from bayeskin.finite_element import mesh", ("surrogates", "gp")) == {
+        "finite_element"
+    }
+    assert wrong_arrows("from bayeskin.finite_element import mesh", ("inference", "sample")) == {
+        "finite_element"
+    }
     assert wrong_arrows("from .pca import fit", ("surrogates", "gp")) == set()
     assert wrong_arrows("from .pca import fit", ("surrogates",), is_package=True) == set()

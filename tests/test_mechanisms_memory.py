@@ -16,17 +16,17 @@ from test_mechanisms_tissue import IN_SERIES, SOLVED, STRONG, THETA, skin, stron
 from test_model_consolidation import EDGE_M, Point, block, by_layer, corner_points, march
 from test_model_physics import LAM, MU, drained_bar
 
+from bayeskin.finite_element import ModelSpec, simulate
+from bayeskin.finite_element.lagrangian import LagrangianModel, State
+from bayeskin.finite_element.mesh import brick_mesh
+from bayeskin.finite_element.problem import build_problem
+from bayeskin.finite_element.space import taylor_hood
+from bayeskin.finite_element.stepping import advance
 from bayeskin.mechanisms import laws, observed
 from bayeskin.mechanisms.backlash import trailing
 from bayeskin.mechanisms.preconditioning import damaged
 from bayeskin.mechanisms.series import mean_beyond
 from bayeskin.mechanisms.slow_recovery import KelvinVoigt
-from bayeskin.model import ModelSpec, simulate
-from bayeskin.model.lagrangian import LagrangianModel, State
-from bayeskin.model.mesh import brick_mesh
-from bayeskin.model.problem import build_problem
-from bayeskin.model.space import taylor_hood
-from bayeskin.model.stepping import advance
 from bayeskin.types import PadMotion
 
 SHORT = PadMotion(np.array([0.0, 6.0, 12.0, 18.0]), 1e-3 * np.array([0.0, 6.0, 6.0, 0.0]))

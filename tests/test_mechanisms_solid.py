@@ -12,12 +12,12 @@ from test_mechanisms_tissue import ONE, SOLVED, THETA, strong
 from test_model_physics import LAM, MU
 
 from bayeskin.errors import InputError
+from bayeskin.finite_element import ModelSpec, poroelastic, simulate
+from bayeskin.finite_element.problem import material
 from bayeskin.mechanisms import laws
 from bayeskin.mechanisms.fibres import fibres
 from bayeskin.mechanisms.plastic_set import setting
 from bayeskin.mechanisms.stiffness_drift import LEAST, drifting
-from bayeskin.model import ModelSpec, poroelastic, simulate
-from bayeskin.model.problem import material
 from bayeskin.proof.protocol import MOTION
 from bayeskin.types import PadMotion
 

@@ -8,17 +8,17 @@ from scipy.optimize import brentq
 from test_model_physics import LAM, MU, drained_bar
 
 from bayeskin.errors import InputError
+from bayeskin.finite_element import ModelSpec, simulate
+from bayeskin.finite_element.lagrangian import LagrangianModel
+from bayeskin.finite_element.mesh import brick_mesh
+from bayeskin.finite_element.problem import Sites, build_problem, material
+from bayeskin.finite_element.stepping import advance
+from bayeskin.finite_element.tissue import TissueLaw
 from bayeskin.mechanisms import catalogue, laws
 from bayeskin.mechanisms.bottom_adherence import springs
 from bayeskin.mechanisms.fibres import fibres
 from bayeskin.mechanisms.fluid_leakage import open_surface
 from bayeskin.mechanisms.mechanism import Tissue
-from bayeskin.model import ModelSpec, simulate
-from bayeskin.model.lagrangian import LagrangianModel
-from bayeskin.model.mesh import brick_mesh
-from bayeskin.model.problem import Sites, build_problem, material
-from bayeskin.model.stepping import advance
-from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import PadMotion
 
 ALL = catalogue()

@@ -18,23 +18,23 @@ from scipy.stats import norm
 from toy_inference import NOISE, SCALE, TRUTH, ToySurrogate, empty_recording
 
 from bayeskin.errors import InputError
+from bayeskin.experiments.choice import DRAWS, OPEN, Experiment, compete, noise_of, ranked, search, weigh
+from bayeskin.experiments.information import expected_gain
+from bayeskin.experiments.protocols import Limits, changed, own, phases_of, variations
+from bayeskin.forward.reduced import ReducedForward
 from bayeskin.inference import LogPosterior
 from bayeskin.mechanisms import Mechanism, bin_means, observed
 from bayeskin.mechanisms.mechanism import Instrument, Place, added
 from bayeskin.mechanisms.viscous_drag import speed_of
-from bayeskin.mismatch.experiments import DRAWS, OPEN, Experiment, compete, noise_of, ranked, search, weigh
 from bayeskin.mismatch.fit import Fit
-from bayeskin.mismatch.information import expected_gain
 from bayeskin.mismatch.observed import ObservedSurrogate
-from bayeskin.mismatch.protocols import Limits, changed, own, phases_of, variations
 from bayeskin.mismatch.tasks import Ask, OtherTest, Task
-from bayeskin.pipeline import diagnosis, experiment
-from bayeskin.pipeline.engine import Silent
-from bayeskin.pipeline.folder import Record, write_record
-from bayeskin.pipeline.forward import ReducedForward
 from bayeskin.reduced.cases import Protocols
 from bayeskin.report import figure_experiments
 from bayeskin.types import PadMotion, Parameter
+from bayeskin.workflow import diagnosis, experiment
+from bayeskin.workflow.engine import Silent
+from bayeskin.workflow.folder import Record, write_record
 
 OWN_SPEED = 9e-4  # m/s, the toy's
 DRAG = 4e-3 / OWN_SPEED

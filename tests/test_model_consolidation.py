@@ -11,8 +11,8 @@ import skfem
 from consolidation import Mandel, compression_stress, cryer_centre
 from driven import Point, block, by_layer, corner_points, driven, march
 
-from bayeskin.model.mesh import SkinMesh
-from bayeskin.model.space import taylor_hood
+from bayeskin.finite_element.mesh import SkinMesh
+from bayeskin.finite_element.space import taylor_hood
 
 EDGE_M = 10e-3
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from skin_test import supplement
 
+from bayeskin.finite_element.fields import FieldWriter, StatesAt, fields_of
+from bayeskin.finite_element.gmsh import read_gmsh
+from bayeskin.finite_element.mesh import layered_mesh
+from bayeskin.finite_element.problem import build_problem, material
+from bayeskin.finite_element.simulate import ModelSpec, problem_of, simulate
+from bayeskin.finite_element.surface import PARTS, _divided_triangle, seen_surface, surface_state
 from bayeskin.geometry import Geometry
-from bayeskin.model.fields import FieldWriter, StatesAt, fields_of
-from bayeskin.model.gmsh import read_gmsh
-from bayeskin.model.mesh import layered_mesh
-from bayeskin.model.problem import build_problem, material
-from bayeskin.model.simulate import ModelSpec, problem_of, simulate
-from bayeskin.model.surface import PARTS, _divided_triangle, seen_surface, surface_state
 from bayeskin.types import PadMotion
 
 THETA = {"E_c": 6e4, "E_s": 2e4, "k_c": 1e-14, "k_s": 5e-13, "p_init": 0.0}

@@ -9,14 +9,14 @@ import pytest
 import skfem
 
 from bayeskin.errors import InputError
+from bayeskin.finite_element import ModelSpec, simulate
+from bayeskin.finite_element.bricks import brick_lines
+from bayeskin.finite_element.gradients import logarithms
+from bayeskin.finite_element.lagrangian import LagrangianModel
+from bayeskin.finite_element.mesh import brick_mesh
+from bayeskin.finite_element.problem import build_problem, material
+from bayeskin.finite_element.stepping import integrate
 from bayeskin.geometry import Geometry, Guard
-from bayeskin.model import ModelSpec, simulate
-from bayeskin.model.bricks import brick_lines
-from bayeskin.model.gradients import logarithms
-from bayeskin.model.lagrangian import LagrangianModel
-from bayeskin.model.mesh import brick_mesh
-from bayeskin.model.problem import build_problem, material
-from bayeskin.model.stepping import integrate
 from bayeskin.types import PadMotion
 
 THETA = {"E_c": 6e4, "E_s": 2e4, "k_c": 1e-14, "k_s": 5e-13, "p_init": 700.0}

@@ -10,9 +10,9 @@ from gmsh_file import coarse_tetrahedra, gmsh_text
 from skin_test import supplement
 
 from bayeskin.errors import InputError
+from bayeskin.finite_element.gmsh import read_gmsh
+from bayeskin.finite_element.mesh import BOUNDARIES
 from bayeskin.geometry import Geometry, Guard
-from bayeskin.model.gmsh import read_gmsh
-from bayeskin.model.mesh import BOUNDARIES
 
 FLAT = Geometry(arm_radius_m=None)
 BARE = Geometry(guard=None, arm_radius_m=None)

@@ -10,15 +10,15 @@ import pytest
 from toys.same_steps import on_steps_of, start_at_zero
 
 from bayeskin.errors import InputError
+from bayeskin.finite_element import ModelSpec, lagrangian, series, simulate
+from bayeskin.finite_element.directional import TangentAction
+from bayeskin.finite_element.gradients import ForceGradients, logarithms
+from bayeskin.finite_element.lagrangian import Evaluated, LagrangianModel, Stage, State, Step
+from bayeskin.finite_element.problem import Material, material
+from bayeskin.finite_element.simulate import problem_of
+from bayeskin.finite_element.stepping import integrate
+from bayeskin.finite_element.tissue import Bind
 from bayeskin.mechanisms import catalogue, laws
-from bayeskin.model import ModelSpec, lagrangian, series, simulate
-from bayeskin.model.directional import TangentAction
-from bayeskin.model.gradients import ForceGradients, logarithms
-from bayeskin.model.lagrangian import Evaluated, LagrangianModel, Stage, State, Step
-from bayeskin.model.problem import Material, material
-from bayeskin.model.simulate import problem_of
-from bayeskin.model.stepping import integrate
-from bayeskin.model.tissue import Bind
 from bayeskin.types import PadMotion
 
 THETA = {"E_c": 6e4, "E_s": 2e4, "k_c": 1e-14, "k_s": 5e-13, "p_init": 700.0}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from bayeskin.model.linear import _Pardiso, _SuperLU, pypardiso
+from bayeskin.finite_element.linear import _Pardiso, _SuperLU, pypardiso
 
 SOLVERS = [
     pytest.param(

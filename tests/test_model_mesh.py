@@ -7,11 +7,11 @@ import pytest
 from skin_test import supplement
 
 from bayeskin.errors import InputError
-from bayeskin.model import ModelSpec, simulate
-from bayeskin.model.bricks import brick_lines
-from bayeskin.model.gmsh import read_gmsh
-from bayeskin.model.mesh import brick_mesh, roll, unroll
-from bayeskin.model.problem import build_problem
+from bayeskin.finite_element import ModelSpec, simulate
+from bayeskin.finite_element.bricks import brick_lines
+from bayeskin.finite_element.gmsh import read_gmsh
+from bayeskin.finite_element.mesh import brick_mesh, roll, unroll
+from bayeskin.finite_element.problem import build_problem
 from bayeskin.types import PadMotion
 
 STILL = PadMotion(np.array([0.0, 1.0]), np.zeros(2))

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from bayeskin.model import stepping
-from bayeskin.model.lagrangian import LagrangianModel
-from bayeskin.model.mesh import layered_mesh
-from bayeskin.model.newton import Equations, NewtonSolver
-from bayeskin.model.problem import build_problem, material
-from bayeskin.model.stepping import integrate
+from bayeskin.finite_element import stepping
+from bayeskin.finite_element.lagrangian import LagrangianModel
+from bayeskin.finite_element.mesh import layered_mesh
+from bayeskin.finite_element.newton import Equations, NewtonSolver
+from bayeskin.finite_element.problem import build_problem, material
+from bayeskin.finite_element.stepping import integrate
 from bayeskin.types import PadMotion
 
 

@@ -11,12 +11,12 @@ from driven import corner_points
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from bayeskin.model.lagrangian import LagrangianModel, State
-from bayeskin.model.mesh import SkinMesh
-from bayeskin.model.problem import Material, Problem
-from bayeskin.model.simulate import ModelSpec, simulate
-from bayeskin.model.space import sparsity, taylor_hood
-from bayeskin.model.stepping import GAMMA, advance
+from bayeskin.finite_element.lagrangian import LagrangianModel, State
+from bayeskin.finite_element.mesh import SkinMesh
+from bayeskin.finite_element.problem import Material, Problem
+from bayeskin.finite_element.simulate import ModelSpec, simulate
+from bayeskin.finite_element.space import sparsity, taylor_hood
+from bayeskin.finite_element.stepping import GAMMA, advance
 from bayeskin.types import PadMotion
 
 STILL = PadMotion(np.array([0.0, 1.0]), np.zeros(2))

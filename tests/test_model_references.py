@@ -13,11 +13,11 @@ import openpyxl
 import pytest
 from skin_test import supplement
 
+from bayeskin.finite_element import ModelSpec, article, simulate
+from bayeskin.finite_element.article import ArticleModel
+from bayeskin.finite_element.gmsh import read_gmsh
+from bayeskin.finite_element.problem import build_problem, material
 from bayeskin.geometry import Geometry
-from bayeskin.model import ModelSpec, article, simulate
-from bayeskin.model.article import ArticleModel
-from bayeskin.model.gmsh import read_gmsh
-from bayeskin.model.problem import build_problem, material
 from bayeskin.types import PadMotion
 
 POINTS = {

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayeskin.mechanisms.backlash import Play
-from bayeskin.mechanisms.slow_recovery import KelvinVoigt
-from bayeskin.model.series import (
+from bayeskin.finite_element.series import (
     REST_S,
     SERIES_TOLERANCE,
     Drive,
@@ -18,7 +16,9 @@ from bayeskin.model.series import (
     total,
     yielding,
 )
-from bayeskin.model.tissue import TissueLaw
+from bayeskin.finite_element.tissue import TissueLaw
+from bayeskin.mechanisms.backlash import Play
+from bayeskin.mechanisms.slow_recovery import KelvinVoigt
 from bayeskin.types import PadMotion
 
 STIFFNESS, COMPLIANCE = 60.0, 5e-3  # N/m by the drive's displacement, m/N

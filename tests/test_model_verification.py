@@ -14,11 +14,11 @@ from driven import DrivenModel, Point, TightModel, block, by_layer, corner_point
 from manufactured import Manufactured, errors, exact_state, strong_load, weak_load
 from scipy.spatial.transform import Rotation
 
-from bayeskin.model.lagrangian import SOLVER_TOLERANCE, LagrangianModel
-from bayeskin.model.mesh import brick_mesh
-from bayeskin.model.problem import build_problem, material
-from bayeskin.model.space import taylor_hood
-from bayeskin.model.stepping import integrate
+from bayeskin.finite_element.lagrangian import SOLVER_TOLERANCE, LagrangianModel
+from bayeskin.finite_element.mesh import brick_mesh
+from bayeskin.finite_element.problem import build_problem, material
+from bayeskin.finite_element.space import taylor_hood
+from bayeskin.finite_element.stepping import integrate
 from bayeskin.types import PadMotion
 
 EDGE_M = 10e-3

@@ -18,13 +18,13 @@ from bayeskin.config import Config, DesignConfig, RecordingConfig, load_config, 
 from bayeskin.design import default_space
 from bayeskin.errors import InputError
 from bayeskin.inference import NoisePriors
-from bayeskin.pipeline import stages
-from bayeskin.pipeline.engine import Silent, open_run
-from bayeskin.pipeline.new import new_config, new_demo
-from bayeskin.pipeline.shipping import shipped_files
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_manifest
 from bayeskin.types import Recording
+from bayeskin.workflow import stages
+from bayeskin.workflow.engine import Silent, open_run
+from bayeskin.workflow.new import new_config, new_demo
+from bayeskin.workflow.shipping import shipped_files
 
 REDUCED = DesignConfig.model_validate({"coarse": "reduced"})
 

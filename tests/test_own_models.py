@@ -26,18 +26,18 @@ from toy import MOTION
 from bayeskin import cli, report, storage
 from bayeskin.design import Wave
 from bayeskin.errors import InputError, Unavailable
+from bayeskin.execution.local import local
+from bayeskin.external.model import identity, simulate_own, simulate_server, simulate_with
+from bayeskin.external.umbridge import Client, server
+from bayeskin.finite_element import ModelSpec
 from bayeskin.mechanisms import bin_means, catalogue, observed
-from bayeskin.model import ModelSpec
-from bayeskin.model.own import identity, simulate_own, simulate_server, simulate_with
-from bayeskin.pipeline import stages
-from bayeskin.pipeline.diagnosis import diagnose
-from bayeskin.pipeline.doctor import FULL_MODEL_N, THETA
-from bayeskin.pipeline.engine import Silent
-from bayeskin.pipeline.serve import Asked, ServedModel, open_server
 from bayeskin.runner import load_design, run_design
 from bayeskin.types import PadMotion, Parameter, ParameterSpace, Recording
-from bayeskin.umbridge import Client, server
-from bayeskin.workers import local
+from bayeskin.workflow import stages
+from bayeskin.workflow.diagnosis import diagnose
+from bayeskin.workflow.doctor import FULL_MODEL_N, THETA
+from bayeskin.workflow.engine import Silent
+from bayeskin.workflow.serve import Asked, ServedModel, open_server
 
 CONFIG = """
 [recording]

@@ -15,8 +15,8 @@ import pytest
 
 from bayeskin.errors import InputError
 from bayeskin.inference import Bands, Verdict
-from bayeskin.pipeline import folder
-from bayeskin.pipeline.engine import (
+from bayeskin.workflow import folder
+from bayeskin.workflow.engine import (
     STANDINGS,
     CannotGoOn,
     Run,
@@ -26,7 +26,7 @@ from bayeskin.pipeline.engine import (
     run_stages,
     standing,
 )
-from bayeskin.pipeline.posterior import with_surrogate_error
+from bayeskin.workflow.posterior import with_surrogate_error
 
 CONFIG = 'seed = {seed}\n[recording]\nfile = "input.txt"\n'
 
@@ -155,7 +155,7 @@ def test_how_stages_stand_is_told_without_running_them(tmp_path: Path) -> None:
 
 def test_a_folder_serves_one_process_and_is_free_when_that_is_killed(tmp_path: Path) -> None:
     code = (
-        "import sys, time, pathlib; from bayeskin.pipeline import folder\n"
+        "import sys, time, pathlib; from bayeskin.workflow import folder\n"
         "with folder.locked(pathlib.Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
     )
     holder = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE)

@@ -21,19 +21,14 @@ import bayeskin
 from bayeskin import report, storage
 from bayeskin.design import default_space
 from bayeskin.errors import InputError
+from bayeskin.execution.local import local, run_parallel
+from bayeskin.finite_element import ModelSpec, simulate
+from bayeskin.finite_element.lagrangian import LagrangianModel
+from bayeskin.finite_element.mesh import brick_mesh
+from bayeskin.finite_element.problem import build_problem, material
 from bayeskin.mechanisms import catalogue, laws, observed
 from bayeskin.mechanisms.binned import BinnedForces
 from bayeskin.mechanisms.mechanism import Instrument
-from bayeskin.model import ModelSpec, simulate
-from bayeskin.model.lagrangian import LagrangianModel
-from bayeskin.model.mesh import brick_mesh
-from bayeskin.model.problem import build_problem, material
-from bayeskin.pipeline import proof as pipeline
-from bayeskin.pipeline.diagnosing_sources import imported
-from bayeskin.pipeline.engine import Silent
-from bayeskin.pipeline.folder import locked
-from bayeskin.pipeline.recording import pad_motion
-from bayeskin.pipeline.shipping import motion_sha256
 from bayeskin.proof import closed, conceal, score, seals
 from bayeskin.proof.cases import CONCEALED, Case, Plan, Screen, draw, plans, shipped_screen
 from bayeskin.proof.conceal import Concealed, concealed, full_run
@@ -41,7 +36,7 @@ from bayeskin.proof.curves import curve
 from bayeskin.proof.noise import floor_after, noise
 from bayeskin.proof.outside import OUTSIDE, Change
 from bayeskin.proof.protocol import EDGES_S, HELD_OUT_FROM_S, KINDS, MOTION, SURROGATE, kind_at, samples_s
-from bayeskin.proof.remains import Refit, rms, windows
+from bayeskin.proof.refit_residual import Refit, rms, windows
 from bayeskin.proof.score import (
     CLEAR,
     group_of,
@@ -57,7 +52,12 @@ from bayeskin.report import half_in_words
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_manifest, load_surrogate
 from bayeskin.types import PadMotion, Prediction, Recording, Simulation
-from bayeskin.workers import local, run_parallel
+from bayeskin.workflow import proof as pipeline
+from bayeskin.workflow.diagnosing_sources import imported
+from bayeskin.workflow.engine import Silent
+from bayeskin.workflow.folder import locked
+from bayeskin.workflow.recording import pad_motion
+from bayeskin.workflow.shipping import motion_sha256
 
 SEED, COUNT = 5, 4
 PACKAGE = Path(bayeskin.__file__).parent
@@ -531,7 +531,7 @@ def test_a_scoring_by_another_scorer_is_recorded(
 def test_a_verdict_is_of_all_modules_that_a_diagnosis_loads_and_of_no_others() -> None:
     package = Path(bayeskin.__file__).parent
     script = (
-        "import sys\nfrom bayeskin.pipeline import diagnosis\n"
+        "import sys\nfrom bayeskin.workflow import diagnosis\n"
         "print(*(m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'bayeskin'), sep='\\n')"
     )
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
@@ -551,7 +551,7 @@ def test_a_diagnosis_in_a_process_that_refuses_the_seals_goes_through(made: Path
         "        raise PermissionError(arguments[0])\n"
         "sys.addaudithook(refuse)\n"
         "from pathlib import Path\n"
-        "from bayeskin.pipeline import diagnosis\n"
+        "from bayeskin.workflow import diagnosis\n"
         "from bayeskin.recordings import read_recording, segment\n"
         f"assert len(segment(read_recording(Path({str(seals.recording_path(made, '001'))!r})))) == 14\n"
         "assert not [name for name in sys.modules if name.startswith('bayeskin.proof')]\n"
@@ -563,7 +563,7 @@ def test_a_diagnosis_in_a_process_that_refuses_the_seals_goes_through(made: Path
 
 
 def test_what_diagnoses_mentions_neither_proof_nor_seals() -> None:
-    for path in [*(PACKAGE / "mismatch").rglob("*.py"), *(PACKAGE / "pipeline").glob("diagnosis*.py")]:
+    for path in [*(PACKAGE / "mismatch").rglob("*.py"), *(PACKAGE / "workflow").glob("diagnosis*.py")]:
         tree = ast.parse(path.read_text())
         words = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
         words |= {

@@ -13,8 +13,8 @@ import pytest
 from bayeskin import cli
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
-from bayeskin.pipeline.reducing import SHIPPED, default_path, reduced_file
 from bayeskin.shipped import shipped
+from bayeskin.workflow.reducing import SHIPPED, default_path, reduced_file
 
 DEVICE = "[device]\ngauge_mm = 30\n"
 NEAR = "[tissue]\ncutis_mm = 2.3\nsubcutis_mm = 6\narm_radius_mm = 44\n"

@@ -16,14 +16,16 @@ from toys.small_reduced import hollow
 
 from bayeskin import cli, report, storage
 from bayeskin.config import load_config
+from bayeskin.finite_element.simulate import ModelSpec
+from bayeskin.forward import design_model
+from bayeskin.forward.design_model import FullModel, ReducedOrFull
 from bayeskin.geometry import Geometry
-from bayeskin.model.simulate import ModelSpec
-from bayeskin.pipeline import maximum, model, reducing, stages
-from bayeskin.pipeline.engine import Silent, open_run, standing
-from bayeskin.pipeline.model import FullModel, ReducedOrFull, full_model, waves_model
-from bayeskin.pipeline.new import new_config
-from bayeskin.pipeline.reducing import find_reduced
 from bayeskin.types import BinnedForce, Design, PadMotion, Recording, Simulation
+from bayeskin.workflow import maximum, model, reducing, stages
+from bayeskin.workflow.engine import Silent, open_run, standing
+from bayeskin.workflow.model import full_model, waves_model
+from bayeskin.workflow.new import new_config
+from bayeskin.workflow.reducing import find_reduced
 
 TRUE = {"E_c": 200e3, "E_s": 30e3, "k_c": 1e-14, "k_s": 1e-13, "p_init": 300.0}
 STIFF = {**TRUE, "E_c": 3e6}
@@ -120,7 +122,7 @@ def test_the_full_model_runs_where_the_reduced_one_was_not_trained(
     assert (found.status, found.model_hash) == ("ok", waves.hash)
     assert found.message == "run by the full model: E_c is 3e+06, trained 10000 to 2e+06"
     inside = replace(right, stats={"inside": 1.0}, force_n=2.0 * right.force_n)
-    monkeypatch.setattr(model, "simulate_reduced", lambda *arguments, **more: inside)
+    monkeypatch.setattr(design_model, "simulate_reduced", lambda *arguments, **more: inside)
     found = waves(MOTION, TRUE)
     np.testing.assert_array_equal(found.force_n, inside.force_n)
     assert (found.model_hash, found.message) == (waves.hash, "")

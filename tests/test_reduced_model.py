@@ -15,12 +15,12 @@ from toys.small_reduced import NAMES, SETTINGS, built, one_by_one, unheard
 
 from bayeskin import storage
 from bayeskin.errors import InputError
+from bayeskin.finite_element import series
+from bayeskin.finite_element.lagrangian import Step
+from bayeskin.finite_element.simulate import ModelSpec, simulate
+from bayeskin.finite_element.stepping import integrate
 from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import Mechanism, catalogue, laws
-from bayeskin.model import series
-from bayeskin.model.lagrangian import Step
-from bayeskin.model.simulate import ModelSpec, simulate
-from bayeskin.model.stepping import integrate
 from bayeskin.reduced import equations as equations_module
 from bayeskin.reduced import simulate as simulate_module
 from bayeskin.reduced.cases import BASE, Case

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from scipy.optimize import nnls
 
 from bayeskin.design import default_space
+from bayeskin.finite_element.mesh import brick_mesh
+from bayeskin.finite_element.problem import build_problem
 from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import catalogue
-from bayeskin.model.mesh import brick_mesh
-from bayeskin.model.problem import build_problem
 from bayeskin.reduced.basis import inner_products, pod, weighted_modes
 from bayeskin.reduced.cases import BASE, SETS, Protocols, Trained, random_motion
 from bayeskin.reduced.cubature import CubatureSettings, _tested, choose_points

@@ -9,9 +9,9 @@ import pytest
 from toys.same_steps import on_steps_of, run
 from toys.snapshots import binds_of, full_model, snapshot_basis
 
+from bayeskin.finite_element.mesh import brick_mesh
+from bayeskin.finite_element.problem import build_problem
 from bayeskin.geometry import Geometry
-from bayeskin.model.mesh import brick_mesh
-from bayeskin.model.problem import build_problem
 from bayeskin.reduced.basis import inner_products
 from bayeskin.reduced.build import whole_space
 from bayeskin.reduced.cases import Case

@@ -13,8 +13,6 @@ from typing import Any
 import pytest
 from finished_run import HISTORY, INDICES, drawing, facts, summaries
 
-from bayeskin.pipeline import folder, page, stages
-from bayeskin.pipeline.engine import CannotGoOn, Run, Silent, Stage
 from bayeskin.report.page import RunFacts, StageFacts, render_page
 from bayeskin.report.page.answer import answer
 from bayeskin.report.page.charts import history_chart, indices_chart, residual_chart
@@ -22,6 +20,8 @@ from bayeskin.report.page.figures import _KNOWN
 from bayeskin.report.page.numbers import interval, number, quantity
 from bayeskin.report.page.prose import prose
 from bayeskin.report.page.svg import inline_svg
+from bayeskin.workflow import folder, page, stages
+from bayeskin.workflow.engine import CannotGoOn, Run, Silent, Stage
 
 VOID = {"meta", "br", "img", "link", "input", "hr", "source"}
 SECTIONS = ["answer", "recording", "fit", "posterior", "sobol", "mismatch", "checks", "provenance"]

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bayeskin.finite_element import ModelSpec, simulate
+from bayeskin.forward import observed
+from bayeskin.forward.observed import FullForce
 from bayeskin.geometry import Geometry
-from bayeskin.model import ModelSpec, simulate
-from bayeskin.pipeline import reported
-from bayeskin.pipeline.reported import FullForce
 from bayeskin.types import PadMotion
 
 MOTION = PadMotion(np.array([0.0, 1.0, 4.0, 8.0]), 1e-3 * np.array([0.0, 0.0, 2.0, 2.0]))
@@ -47,5 +47,5 @@ def test_a_length_of_the_tissue_is_one_of_the_runs_parameters(full: FullForce) -
 
 def test_a_run_that_fails_gives_its_message(full: FullForce, monkeypatch: pytest.MonkeyPatch) -> None:
     failed = replace(simulate(ModelSpec(), MOTION, THETA), status="failed", message="did not converge")
-    monkeypatch.setattr(reported, "simulate", lambda *args, **more: failed)
+    monkeypatch.setattr(observed, "simulate", lambda *args, **more: failed)
     assert full(((), THETA)) == "did not converge"

@@ -18,14 +18,14 @@ from toy import MOTION, SPACE, toy_force
 
 from bayeskin import report, storage
 from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data
-from bayeskin.pipeline import design, maximum, model, stages
-from bayeskin.pipeline.calibration import refined_posterior
-from bayeskin.pipeline.checking import checked_posterior, with_full_model
-from bayeskin.pipeline.engine import Silent, open_run
-from bayeskin.pipeline.indices import nearby
 from bayeskin.report.page.prose import prose
 from bayeskin.runner import load_design
 from bayeskin.types import Design, PadMotion, Recording, Simulation
+from bayeskin.workflow import design, maximum, model, stages
+from bayeskin.workflow.calibration import refined_posterior
+from bayeskin.workflow.checking import checked_posterior, with_full_model
+from bayeskin.workflow.engine import Silent, open_run
+from bayeskin.workflow.indices import nearby
 
 TRUE = {"E_c": 200e3, "E_s": 30e3, "k_c": 1e-14, "k_s": 1e-13, "p_init": 300.0}
 CONFIG = """

@@ -18,13 +18,14 @@ import toy_runs
 from toy import SPACE, toy_bin_means, toy_simulate
 from toy_runs import COARSE_S, WAVE
 
-from bayeskin import runner, storage, workers
+from bayeskin import runner, storage
 from bayeskin.design import Wave, first_wave
 from bayeskin.errors import InputError
+from bayeskin.execution import local as workers
+from bayeskin.execution.local import local
 from bayeskin.journal import Journal, Run
 from bayeskin.runner import add_points, load_design, load_waves, run_design
 from bayeskin.types import Design
-from bayeskin.workers import local
 
 HERE = Path(__file__).parent
 SHORT = replace(WAVE, theta=WAVE.theta[:4], held_out=WAVE.held_out[:4])

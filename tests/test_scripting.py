@@ -18,8 +18,8 @@ import bayeskin as bk
 from bayeskin.config import config_of, load_config, to_toml
 from bayeskin.errors import InputError
 from bayeskin.inference import draws_of
-from bayeskin.pipeline import diagnosis
 from bayeskin.types import Recording
+from bayeskin.workflow import diagnosis
 
 mpl.use("Agg")
 ROOT = Path(__file__).parents[1]
@@ -124,8 +124,8 @@ def test_a_script_that_diagnoses_needs_no_guard(tmp_path: Path) -> None:
     (tmp_path / "unguarded.py").write_text(
         "import math, sys\n"
         "import bayeskin as bk\n"
-        "from bayeskin.pipeline import diagnosis\n"
-        "from bayeskin.workers import run_parallel\n"
+        "from bayeskin.workflow import diagnosis\n"
+        "from bayeskin.execution.local import run_parallel\n"
         "print('once')\n"
         "diagnosis.diagnose = lambda source, reporter: dict(run_parallel(math.sqrt, [4.0], 1))\n"
         f"print(bk.diagnose(bk.load_recording({str(ROOT / 'data' / 'demo.h5')!r})))\n"

@@ -17,8 +17,8 @@ from bayeskin.mismatch.hypotheses import weight
 from bayeskin.mismatch.search import Search, SearchSettings, _Searcher, search
 from bayeskin.mismatch.tasks import Climb, FullProbe, Join, Probe, Promise, Task, Weigh
 from bayeskin.mismatch.wrapper import innermost
-from bayeskin.pipeline.workbench import Workbench
 from bayeskin.types import Array, ParameterSpace
+from bayeskin.workflow.workbench import Workbench
 
 Full = Callable[[Mapping[str, float]], Array | str]
 

@@ -7,7 +7,7 @@ import pytest
 from toy import SPACE
 
 from bayeskin.errors import InputError
-from bayeskin.sensitivity import (
+from bayeskin.sensitivity.sobol import (
     error_draws,
     pick_freeze,
     projection,

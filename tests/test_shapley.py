@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_sensitivity import ONE_BIN, box, ishigami, ishigami_indices
 
-from bayeskin.shapley import shapley
+from bayeskin.sensitivity.shapley import shapley
 
 
 @pytest.mark.parametrize("rho", [-0.9, 0.0, 0.6])

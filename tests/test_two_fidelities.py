@@ -14,10 +14,10 @@ from toy import EDGES_S, MOTION, SPACE, toy_bin_means, toy_force
 from bayeskin import report, storage
 from bayeskin.design import fine_wave, first_wave, spread_out
 from bayeskin.errors import InputError
-from bayeskin.pipeline import maximum, model, stages
-from bayeskin.pipeline.engine import Silent
 from bayeskin.surrogates import Similarity, correct, load_surrogate, save_surrogate, train
 from bayeskin.types import Design, Recording
+from bayeskin.workflow import maximum, model, stages
+from bayeskin.workflow.engine import Silent
 
 
 def designed(refinement: int, theta: np.ndarray, held_out: np.ndarray) -> Design:

@@ -13,12 +13,12 @@ from toys.same_steps import Model, on_steps_of, start_at_zero
 from toys.snapshots import binds_of, full_model, snapshot_basis
 
 from bayeskin.errors import InputError
+from bayeskin.finite_element import lagrangian, series
+from bayeskin.finite_element.gradients import ForceGradients
+from bayeskin.finite_element.lagrangian import Step
+from bayeskin.finite_element.simulate import ModelSpec, problem_at, problem_of, simulate
+from bayeskin.finite_element.stepping import integrate
 from bayeskin.geometry import Geometry
-from bayeskin.model import lagrangian, series
-from bayeskin.model.gradients import ForceGradients
-from bayeskin.model.lagrangian import Step
-from bayeskin.model.simulate import ModelSpec, problem_at, problem_of, simulate
-from bayeskin.model.stepping import integrate
 from bayeskin.reduced import equations as equations_module
 from bayeskin.reduced.basis import inner_products
 from bayeskin.reduced.build import whole_space

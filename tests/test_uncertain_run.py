@@ -12,16 +12,16 @@ from bayeskin import cli, storage
 from bayeskin.config import load_config, parameter_space
 from bayeskin.design import default_space
 from bayeskin.errors import InputError
+from bayeskin.finite_element.simulate import ModelSpec, simulate
+from bayeskin.forward.design_model import FullModel
 from bayeskin.inference import due_to_lengths, identifiability
-from bayeskin.model.simulate import ModelSpec, simulate
-from bayeskin.pipeline import stages
-from bayeskin.pipeline.engine import Silent, open_run, standing
-from bayeskin.pipeline.model import FullModel
-from bayeskin.pipeline.new import new_config
 from bayeskin.report.style import axis_values, parameter_label
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import Similarity
 from bayeskin.types import PadMotion, Parameter, ParameterSpace, Recording
+from bayeskin.workflow import stages
+from bayeskin.workflow.engine import Silent, open_run, standing
+from bayeskin.workflow.new import new_config
 
 UNCERTAIN = "[tissue]\ncutis_mm = { mean = 2.0, sd = 0.2 }\narm_radius_mm = { mean = 48, sd = 8 }\n"
 TRUE = {"E_c": 120e3, "E_s": 20e3, "k_c": 3e-14, "k_s": 3e-13, "p_init": 300.0}

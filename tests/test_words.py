@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bayeskin.mechanisms import catalogue
+from bayeskin.number_format import number
 from bayeskin.types import ParameterSpace
-from bayeskin.words import number
 
 
 @pytest.mark.parametrize(

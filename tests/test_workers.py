@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from toys.busy import counted, dead_once, met, slept
 
-from bayeskin.workers import Lost, standing
+from bayeskin.execution.local import Lost, standing
 
 pytestmark = pytest.mark.skipif(
     not Path("/proc/self/stat").exists(), reason="looks processes up in /proc"

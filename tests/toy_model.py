@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from toy import SPACE, toy_force
 
-from bayeskin.model.simulate import ModelSpec
+from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.types import PadMotion, Simulation, frozen_array
 
 SCALE = 1e-3  # the toy is a thousand times too stiff for a skin test
@@ -59,7 +59,7 @@ def simulate(
 
 @dataclass(frozen=True)
 class ToyModel:
-    """Stands in the place of `bayeskin.pipeline.model.FullModel`."""
+    """Stands in the place of `bayeskin.workflow.model.FullModel`."""
 
     spec: ModelSpec
 

@@ -15,9 +15,9 @@ import numpy as np
 from toy import EDGES_S, SPACE, toy_simulate
 
 from bayeskin.design import Wave
+from bayeskin.execution.local import local
 from bayeskin.runner import add_points, run_design
 from bayeskin.types import Simulation
-from bayeskin.workers import local
 
 COARSE_S = EDGES_S[::10]
 WAVE = Wave(  # random, not Sobol': each worker imports this file, and SciPy's qmc takes a second

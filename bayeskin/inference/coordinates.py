@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from bayeskin.inference.straighten import Shear
+from bayeskin.inference.reparametrisation import Shear
 from bayeskin.types import Array, _FreezesArrays
 
 _EDGE = 1e-14  # nearest to a wall that a score is taken

@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
 from bayeskin.inference.noise_model import NoiseChain, innovations
 from bayeskin.inference.problem import LogPosterior
-from bayeskin.inference.straighten import Shear
+from bayeskin.inference.reparametrisation import Shear
 from bayeskin.types import Array, NDArray, Prediction
 
 STEP = 1e-4  # of the box, for differences

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 from scipy.stats import rankdata
 
+from bayeskin.number_format import at_edge
 from bayeskin.types import Array, Parameter, ParameterSpace
-from bayeskin.words import at_edge
 
 _NOTHING_NATS, _NOTHING_CONTRACTION = 0.03, 0.1  # below both, posterior and prior are the same
 _WEAK = 0.5  # contraction below which the data narrows little

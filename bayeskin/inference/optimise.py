@@ -17,7 +17,7 @@ from scipy.optimize import differential_evolution
 from bayeskin.errors import InputError
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.problem import LogPosterior
-from bayeskin.inference.straighten import Shear, find_shear
+from bayeskin.inference.reparametrisation import Shear, find_shear
 from bayeskin.types import Array
 
 _AGREE = 0.1  # nats: starts this close to the best found the same maximum, whatever stays flat around it

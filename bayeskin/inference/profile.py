@@ -16,7 +16,7 @@ import numpy as np
 
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.problem import LogPosterior
-from bayeskin.inference.straighten import Shear, find_shear
+from bayeskin.inference.reparametrisation import Shear, find_shear
 from bayeskin.types import Array, Parameter, ParameterSpace, _FreezesArrays
 
 DROP = 1.353  # nats below the top that 90 % of a chi-square of one degree of freedom lie within, halved

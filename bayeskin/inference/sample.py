@@ -20,7 +20,7 @@ from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.inference.moves import mixed_moves
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.proposal import Product
-from bayeskin.inference.straighten import find_shear
+from bayeskin.inference.reparametrisation import find_shear
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
 _FIRST_CHECK, _BETWEEN = 500, 250

@@ -11,11 +11,11 @@ from functools import partial
 import numpy as np
 import scipy.sparse as sp
 
+from bayeskin.finite_element.problem import Problem, Sites
+from bayeskin.finite_element.tissue import SurfaceTerm, TissueLaw, displacement_rows, surface_mass
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.problem import Problem, Sites
-from bayeskin.model.tissue import SurfaceTerm, TissueLaw, displacement_rows, surface_mass
+from bayeskin.number_format import number
 from bayeskin.types import Array, Parameter
-from bayeskin.words import number
 
 
 def tangential(point: Array, i: int, j: int) -> Array:

@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values
+from bayeskin.number_format import number
 from bayeskin.types import Array, PadMotion, Parameter
-from bayeskin.words import number
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:

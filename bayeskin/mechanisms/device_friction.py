@@ -20,8 +20,8 @@ import numpy as np
 
 from bayeskin.mechanisms.lines import stretch_of, strict
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
+from bayeskin.number_format import number
 from bayeskin.types import Array, PadMotion, Parameter
-from bayeskin.words import number
 
 
 def friction(

@@ -6,7 +6,7 @@ A chunk's stress is P = P_e - p J F^-T; what the fluid carries is no part of the
 
 from __future__ import annotations
 
-from bayeskin.model.assembly import compiled, inverse_and_determinant
+from bayeskin.finite_element.assembly import compiled, inverse_and_determinant
 
 
 @compiled

@@ -11,10 +11,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from bayeskin.finite_element.problem import Sites
+from bayeskin.finite_element.tissue import TissueLaw
 from bayeskin.mechanisms.fibres import fibres
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.problem import Sites
-from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Parameter
 
 

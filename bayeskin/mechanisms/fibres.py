@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayeskin.model.assembly import compiled
-from bayeskin.model.kernels import linearise_kernel, respond_kernel
-from bayeskin.model.problem import Sites
-from bayeskin.model.tissue import TissueLaw
+from bayeskin.finite_element.assembly import compiled
+from bayeskin.finite_element.kernels import linearise_kernel, respond_kernel
+from bayeskin.finite_element.problem import Sites
+from bayeskin.finite_element.tissue import TissueLaw
 from bayeskin.types import Array
 
 

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 import scipy.sparse as sp
 
+from bayeskin.finite_element.problem import Problem, Sites
+from bayeskin.finite_element.tissue import SurfaceTerm, TissueLaw, pressure_rows, surface_mass
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.problem import Problem, Sites
-from bayeskin.model.tissue import SurfaceTerm, TissueLaw, pressure_rows, surface_mass
+from bayeskin.number_format import number
 from bayeskin.types import Parameter
-from bayeskin.words import number
 
 
 def open_surface(problem: Problem) -> np.ndarray:

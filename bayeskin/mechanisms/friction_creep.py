@@ -9,8 +9,8 @@ import numpy as np
 
 from bayeskin.mechanisms.device_friction import friction
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
+from bayeskin.number_format import number
 from bayeskin.types import Array, PadMotion, Parameter
-from bayeskin.words import number
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:

@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType
 
-from bayeskin.behaviour import sha256_of_behaviour
+from bayeskin.hashing import sha256_of_behaviour
 from bayeskin.mechanisms import catalogue, mechanism
 
 PACKAGE = "bayeskin.mechanisms."
@@ -21,8 +21,10 @@ ENTRY = "MECHANISM"
 def law_hashes(names: Iterable[str]) -> dict[str, str]:
     """Returns what the files behave like in which each mechanism's law is written, as a sha256 by its name.
 
-    These are the mechanism's own file and those of this package that it takes functions from. An entry of the
-    catalogue does not count: its sentences, priors and look-alikes are no part of a law.
+    These are the mechanism's own file and the files of this package that it takes functions from. The entry
+    in the catalogue does not count, since sentences, priors and look-alikes are no part of a law. Imports do
+    not count either: functions of this package are hashed with their own files, and those of the full model
+    have a version (`PHYSICS_VERSION`).
     Raises KeyError for a name that is not in the catalogue.
     """
     known = catalogue()
@@ -36,14 +38,18 @@ def _hash(module: ModuleType) -> str:
 
 
 def _law(file: Path) -> bytes:
-    """A file's source without its entry of the catalogue."""
+    """Returns a file's source without its imports and without its entry in the catalogue."""
     source = file.read_bytes()
     lines = source.splitlines(keepends=True)
-    for node in ast.parse(source).body:
-        if isinstance(node, ast.Assign) and [getattr(one, "id", None) for one in node.targets] == [ENTRY]:
+    for node in reversed(ast.parse(source).body):
+        if isinstance(node, ast.Import | ast.ImportFrom) or _is_entry(node):
             lines[node.lineno - 1 : node.end_lineno] = []
-            break
     return b"".join(lines)
+
+
+def _is_entry(node: ast.stmt) -> bool:
+    """Returns whether a statement assigns the mechanism's entry in the catalogue."""
+    return isinstance(node, ast.Assign) and [getattr(t, "id", None) for t in node.targets] == [ENTRY]
 
 
 def _files(module: ModuleType, seen: set[Path]) -> set[Path]:

@@ -1,8 +1,8 @@
 """A mechanism is physics that the base model leaves out, off at its neutral value.
 
-Tissue mechanisms change the model's equations (`bayeskin.model.tissue`). Instrument mechanisms act on the
-force that comes out of the skin, sample by sample of a posterior: each takes a force as a function of time
-and gives the one that the load cell then reports.
+Tissue mechanisms change the model's equations (`bayeskin.finite_element.tissue`). Instrument mechanisms act
+on the force that comes out of the skin, sample by sample of a posterior: each takes a force as a function of
+time and gives the one that the load cell then reports.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from bayeskin.finite_element.tissue import Bind
 from bayeskin.mechanisms.lines import bin_integrals
-from bayeskin.model.tissue import Bind
 from bayeskin.types import Array, Jumps, PadMotion, Parameter
 
 Values = Mapping[str, Array]  # each parameter (n,), SI; those of all mechanisms that are on

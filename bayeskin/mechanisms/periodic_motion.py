@@ -19,8 +19,8 @@ from __future__ import annotations
 import numpy as np
 
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values
+from bayeskin.number_format import number
 from bayeskin.types import Array, PadMotion, Parameter
-from bayeskin.words import number
 
 SHORTEST_S, LONGEST_S = 0.6, 8.0  # period
 

@@ -22,11 +22,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from bayeskin.finite_element.assembly import compiled
+from bayeskin.finite_element.kernels import linearise_kernel, respond_kernel
+from bayeskin.finite_element.problem import Sites, material
+from bayeskin.finite_element.tissue import TissueLaw
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.assembly import compiled
-from bayeskin.model.kernels import linearise_kernel, respond_kernel
-from bayeskin.model.problem import Sites, material
-from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Array, Parameter
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
 from bayeskin.mechanisms.viscous_drag import speed_of
+from bayeskin.number_format import number
 from bayeskin.types import Array, PadMotion, Parameter
-from bayeskin.words import number
 
 SHORTEST_M, LONGEST_M = 1e-4, 1e-3  # period
 AT_REST_M_S = 2e-5  # slower than this is no motion

@@ -17,13 +17,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from bayeskin.finite_element.assembly import compiled, inverse_and_determinant
+from bayeskin.finite_element.kernels import linearise_kernel, respond_kernel
+from bayeskin.finite_element.problem import Sites, material
+from bayeskin.finite_element.tissue import TissueLaw
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.assembly import compiled, inverse_and_determinant
-from bayeskin.model.kernels import linearise_kernel, respond_kernel
-from bayeskin.model.problem import Sites, material
-from bayeskin.model.tissue import TissueLaw
+from bayeskin.number_format import number
 from bayeskin.types import Array, Parameter
-from bayeskin.words import number
 
 
 @compiled

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
+from bayeskin.number_format import number
 from bayeskin.types import PadMotion, Parameter
-from bayeskin.words import number
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:

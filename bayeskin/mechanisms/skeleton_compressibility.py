@@ -12,9 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from bayeskin.finite_element.problem import Constants, Sites
+from bayeskin.finite_element.tissue import TissueLaw
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.problem import Constants, Sites
-from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Parameter
 
 

@@ -19,12 +19,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from bayeskin.finite_element.problem import Sites
+from bayeskin.finite_element.tissue import SeriesElement, TissueLaw
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values
 from bayeskin.mechanisms.series import lost_in_series
-from bayeskin.model.problem import Sites
-from bayeskin.model.tissue import SeriesElement, TissueLaw
+from bayeskin.number_format import number
 from bayeskin.types import Array, PadMotion, Parameter
-from bayeskin.words import number
 
 
 class KelvinVoigt(SeriesElement):

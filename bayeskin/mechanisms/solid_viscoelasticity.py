@@ -24,14 +24,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from bayeskin.finite_element.assembly import compiled, inverse_and_determinant
+from bayeskin.finite_element.kernels import linearise_kernel, respond_kernel
+from bayeskin.finite_element.problem import Sites
+from bayeskin.finite_element.tissue import Rank, TissueLaw
 from bayeskin.mechanisms.elastic import elastic_stress, scale_elastic
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.assembly import compiled, inverse_and_determinant
-from bayeskin.model.kernels import linearise_kernel, respond_kernel
-from bayeskin.model.problem import Sites
-from bayeskin.model.tissue import Rank, TissueLaw
+from bayeskin.number_format import number
 from bayeskin.types import Parameter
-from bayeskin.words import number
 
 STEPS_A_PHASE = 100
 

@@ -10,11 +10,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from bayeskin.finite_element.assembly import inverse_and_determinant
+from bayeskin.finite_element.kernels import linearise_kernel, respond_kernel
+from bayeskin.finite_element.problem import Sites
+from bayeskin.finite_element.tissue import TissueLaw
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.assembly import inverse_and_determinant
-from bayeskin.model.kernels import linearise_kernel, respond_kernel
-from bayeskin.model.problem import Sites
-from bayeskin.model.tissue import TissueLaw
 from bayeskin.types import Parameter
 
 

@@ -18,12 +18,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from bayeskin.finite_element.problem import Sites
+from bayeskin.finite_element.tissue import TissueLaw
 from bayeskin.mechanisms.fibres import fibres
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
-from bayeskin.model.problem import Sites
-from bayeskin.model.tissue import TissueLaw
+from bayeskin.number_format import number
 from bayeskin.types import Parameter
-from bayeskin.words import number
 
 STRETCH = 1.25
 

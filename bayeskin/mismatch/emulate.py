@@ -22,8 +22,8 @@ import numpy as np
 
 from bayeskin.inference import LogPosterior
 from bayeskin.mismatch.fit import Fit, fit_near
-from bayeskin.mismatch.joint_fit import JointFit, within
 from bayeskin.mismatch.resample import LEGS, MODES, Resampled, resample
+from bayeskin.mismatch.trust_region import JointFit, within
 from bayeskin.mismatch.wrapper import Wrapper, innermost
 from bayeskin.types import Array, Design, ParameterSpace, Surrogate
 

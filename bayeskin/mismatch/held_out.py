@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.hypotheses import weight
-from bayeskin.mismatch.joint_fit import JointFit
 from bayeskin.mismatch.search import added
 from bayeskin.mismatch.tasks import Ask, Climb
+from bayeskin.mismatch.trust_region import JointFit
 from bayeskin.types import BinnedForce
 
 RUNS = 6  # of a fit, at most

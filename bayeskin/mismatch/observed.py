@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayeskin.distinct import at_distinct, mean_at_distinct
 from bayeskin.mechanisms import Mechanism, observed
 from bayeskin.mechanisms.binned import BinnedForces
 from bayeskin.mechanisms.mechanism import Instrument
+from bayeskin.mismatch.distinct import at_distinct, mean_at_distinct
 from bayeskin.mismatch.wrapper import Wrapper
 from bayeskin.types import Array, PadMotion, ParameterSpace, Prediction
 

@@ -32,8 +32,8 @@ from bayeskin.mechanisms import Mechanism, with_one, without_one
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.mismatch.fit import soft_on_stiff
 from bayeskin.mismatch.hypotheses import ODDS, Evidences, Family, hypotheses_of, weight
-from bayeskin.mismatch.joint_fit import JointFit, as_json
 from bayeskin.mismatch.tasks import Ask, Climb, FullProbe, Join, Probe, Promise, Task, Weigh
+from bayeskin.mismatch.trust_region import JointFit, as_json
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array, BinnedForce, ParameterSpace
 

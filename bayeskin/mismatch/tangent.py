@@ -20,22 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bayeskin.forward.interface import ModelRun
 from bayeskin.types import Array, ParameterSpace, Prediction, _FreezesArrays
 
 AT_A_RUN = 1e-12  # square of a distance in the box that is none
 POWER = 0.8  # of a modulus, which the force is linear in
-
-
-@dataclass(frozen=True)
-class ModelRun:
-    """A run of a forward model: theta (d,) in SI; force_n (m,), means over bins [N].
-
-    slopes_n (m, d) : derivatives by coordinates of the prior's box [N], None where it has none
-    """
-
-    theta: Array
-    force_n: Array
-    slopes_n: Array | None
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bayeskin.mismatch.tangent import ModelRun
+from bayeskin.forward.interface import ModelRun
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.proof.noise import FLOORS_N
 from bayeskin.proof.outside import OUTSIDE
 from bayeskin.proof.protocol import EDGES_S, MOTION, SURROGATE
-from bayeskin.proof.remains import ALONE, Refit, rms
+from bayeskin.proof.refit_residual import ALONE, Refit, rms
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.simulate import simulate_reduced

@@ -18,20 +18,20 @@ import numpy as np
 import bayeskin
 from bayeskin import storage
 from bayeskin.errors import InputError
+from bayeskin.execution.local import Lost, Map, local
+from bayeskin.finite_element.mesh import layered_mesh, unroll
+from bayeskin.finite_element.problem import Problem, build_problem, material
+from bayeskin.finite_element.simulate import simulate_on
 from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import bin_means, catalogue, laws, observed
 from bayeskin.mechanisms.mechanism import ForceOfTime
-from bayeskin.model.mesh import layered_mesh, unroll
-from bayeskin.model.problem import Problem, build_problem, material
-from bayeskin.model.simulate import simulate_on
 from bayeskin.proof import seals
 from bayeskin.proof.cases import Case, Plan, Screen, draw, plans, shipped_screen
 from bayeskin.proof.noise import noise
 from bayeskin.proof.outside import OUTSIDE, Change
 from bayeskin.proof.protocol import EDGES_S, MOTION, samples_s
-from bayeskin.proof.remains import rms, windows
+from bayeskin.proof.refit_residual import rms, windows
 from bayeskin.types import Array, Recording, Simulation
-from bayeskin.workers import Lost, Map, local
 
 # Lines of the bricks [mm]: more of them, and graded otherwise, than those of the shipped surrogates' model.
 _X_MM = (0.0, 9.0, 16.0, 18.0, 19.0, 22.0, 25.0, 26.0, 27.0, 28.0, 31.0, 34.0, 35.0, 37.0, 43.0, 58.0, 105.0)

@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
+from bayeskin.finite_element.assembly import inverse_and_determinant
+from bayeskin.finite_element.kernels import linearise_kernel, respond_kernel
+from bayeskin.finite_element.problem import Constants, Material, Sites, material
+from bayeskin.finite_element.tissue import Bind, TissueLaw
 from bayeskin.geometry import Geometry
 from bayeskin.mechanisms.elastic import elastic_stress, scale_elastic
 from bayeskin.mechanisms.mechanism import ForceOfTime
 from bayeskin.mechanisms.stiffness_drift import Piece, drifting
-from bayeskin.model.assembly import inverse_and_determinant
-from bayeskin.model.kernels import linearise_kernel, respond_kernel
-from bayeskin.model.problem import Constants, Material, Sites, material
-from bayeskin.model.tissue import Bind, TissueLaw
 from bayeskin.proof.protocol import MOTION
 from bayeskin.types import Array, PadMotion
 

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from bayeskin import storage
+from bayeskin.access_guard import off_limits
 from bayeskin.errors import InputError
-from bayeskin.off_limits import off_limits
 
 RECORDINGS, SEALS, VERDICTS = "recordings", "seals", "verdicts"
 INDEX, SCORINGS, SET = "index.json", "scorings.json", "set.json"

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from bayeskin.number_format import number
 from bayeskin.recordings.noise import PhaseNoise
 from bayeskin.recordings.segment import resolution_m
 from bayeskin.types import Phase, Recording
-from bayeskin.words import number
 
 _HEADINGS = (
     "phase",

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from bayeskin.model.problem import Problem
+from bayeskin.finite_element.problem import Problem
 from bayeskin.types import Array
 
 SUBCUTIS_WEIGHT = 0.3  # of its share in the displacements' inner product

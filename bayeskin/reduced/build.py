@@ -13,8 +13,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from bayeskin.errors import InputError
-from bayeskin.model.problem import Problem
-from bayeskin.model.simulate import ModelSpec, problem_of
+from bayeskin.execution.local import Lost, Map
+from bayeskin.finite_element.problem import Problem
+from bayeskin.finite_element.simulate import ModelSpec, problem_of
 from bayeskin.reduced.basis import Inner, pod
 from bayeskin.reduced.cases import BASE, SETS, Case, Trained
 from bayeskin.reduced.cubature import CubatureSettings, Taken, choose_points, take, with_volumes
@@ -25,7 +26,6 @@ from bayeskin.reduced.operators import Basis, LinearParts, Rule, point_fields
 from bayeskin.reduced.runs import FullRuns, Progress, binds_of, tissue_of
 from bayeskin.reduced.shadow import Shadow
 from bayeskin.types import Array
-from bayeskin.workers import Lost, Map
 
 ROUNDS = (4, 10, 20, 40)  # reduced runs after which a cubature is trained anew, for those that follow
 

@@ -1,8 +1,8 @@
 """Law kernels called by the address of their machine code from compiled code.
 
-The kernels of a mechanism all have one of two signatures (`bayeskin.model.kernels`). So one compiled driver
-calls those of any set of mechanisms, whose addresses are among its arguments, and no set needs a compilation
-of its own.
+The kernels of a mechanism all have one of two signatures (`bayeskin.finite_element.kernels`). So one compiled
+driver calls those of any set of mechanisms, whose addresses are among its arguments, and no set needs a
+compilation of its own.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -13,7 +13,7 @@ from typing import Any
 from numba import types
 from numba.extending import intrinsic
 
-from bayeskin.model.kernels import LINEARISE, RESPOND
+from bayeskin.finite_element.kernels import LINEARISE, RESPOND
 
 
 def address(kernel: Any) -> int:

@@ -16,6 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from bayeskin.errors import InputError
+from bayeskin.execution.local import Map
 from bayeskin.mechanisms import catalogue
 from bayeskin.reduced.basis import Inner, pod
 from bayeskin.reduced.build import BuildSettings, Teacher
@@ -27,7 +28,6 @@ from bayeskin.reduced.runs import FullRuns, Progress, tissue_of
 from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.reduced.training import TrainingRun
 from bayeskin.types import Array, PadMotion, ParameterSpace
-from bayeskin.workers import Map
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The equations of one reduced run, as `bayeskin.model.stepping` integrates them."""
+"""The equations of one reduced run, as `bayeskin.finite_element.stepping` integrates them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
+from bayeskin.finite_element.lagrangian import Stage, State, Step
+from bayeskin.finite_element.problem import Material, Problem, Sites, material, nominal_force
+from bayeskin.finite_element.series import SeriesSolver, Solved, on_the_way
+from bayeskin.finite_element.tissue import Bind, SurfaceTerm, TissueLaw
 from bayeskin.geometry import Geometry
-from bayeskin.model.lagrangian import Stage, State, Step
-from bayeskin.model.problem import Material, Problem, Sites, material, nominal_force
-from bayeskin.model.series import SeriesSolver, Solved, on_the_way
-from bayeskin.model.tissue import Bind, SurfaceTerm, TissueLaw
 from bayeskin.reduced import kernels
 from bayeskin.reduced.calls import address
 from bayeskin.reduced.operators import LinearParts, PointFields

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayeskin.model.lagrangian import LagrangianModel, Stage, State
+from bayeskin.finite_element.lagrangian import LagrangianModel, Stage, State
 from bayeskin.reduced.operators import Basis
 from bayeskin.types import Array
 

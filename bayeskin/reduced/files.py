@@ -14,10 +14,10 @@ import numpy as np
 
 from bayeskin import __version__, storage
 from bayeskin.errors import InputError
+from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.geometry import Geometry, Guard
 from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.hashes import law_hashes
-from bayeskin.model.simulate import ModelSpec
 from bayeskin.reduced.cases import Protocols, Trained
 from bayeskin.reduced.library import Library, Modes
 from bayeskin.reduced.model import Cubatures, ReducedModel

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayeskin.model import poroelastic
-from bayeskin.model.assembly import compiled
+from bayeskin.finite_element import poroelastic
+from bayeskin.finite_element.assembly import compiled
 from bayeskin.reduced.calls import call_linearise, call_respond
 from bayeskin.types import Array
 

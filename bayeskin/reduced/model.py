@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy.linalg
 
+from bayeskin.finite_element.mesh import brick_mesh
+from bayeskin.finite_element.problem import Problem, moved_problem
+from bayeskin.finite_element.simulate import problem_of
 from bayeskin.geometry import Geometry
-from bayeskin.model.mesh import brick_mesh
-from bayeskin.model.problem import Problem, moved_problem
-from bayeskin.model.simulate import problem_of
 from bayeskin.reduced.basis import Inner, inner_products
 from bayeskin.reduced.cases import Trained
 from bayeskin.reduced.equations import ReducedSpace, SurfaceUnit

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from bayeskin.model.problem import Problem
+from bayeskin.finite_element.problem import Problem
 from bayeskin.types import Array
 
 CELLS_AT_ONCE = 64

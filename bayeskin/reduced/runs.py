@@ -16,18 +16,18 @@ import h5py
 
 from bayeskin import storage
 from bayeskin.errors import InputError
+from bayeskin.execution.local import Lost, Map
+from bayeskin.finite_element.mesh import brick_mesh
+from bayeskin.finite_element.problem import build_problem
+from bayeskin.finite_element.simulate import ModelSpec, problem_of
+from bayeskin.finite_element.tissue import Bind
 from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import catalogue
 from bayeskin.mechanisms.hashes import law_hashes
 from bayeskin.mechanisms.mechanism import Tissue
-from bayeskin.model.mesh import brick_mesh
-from bayeskin.model.problem import build_problem
-from bayeskin.model.simulate import ModelSpec, problem_of
-from bayeskin.model.tissue import Bind
 from bayeskin.reduced.cases import Case
 from bayeskin.reduced.model import inner_of
 from bayeskin.reduced.training import TrainingRun, training_run
-from bayeskin.workers import Lost, Map
 
 Progress = Callable[[str, float], None]
 RUN_ARRAYS = ("displacement", "pressure", "time_s", "force_n")

@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayeskin.errors import InputError
+from bayeskin.finite_element.lagrangian import Stage, State, Step
+from bayeskin.finite_element.newton import extrapolate
+from bayeskin.finite_element.series import Memories, lost_slopes, memory_slopes, on_the_way, yielding
+from bayeskin.finite_element.tissue import Bind
 from bayeskin.geometry import LENGTHS
-from bayeskin.model.lagrangian import Stage, State, Step
-from bayeskin.model.newton import extrapolate
-from bayeskin.model.series import Memories, lost_slopes, memory_slopes, on_the_way, yielding
-from bayeskin.model.tissue import Bind
 from bayeskin.reduced import kernels, slopes
 from bayeskin.reduced.equations import Bound, ReducedEquations, ReducedSpace, bound
 from bayeskin.types import Array, PadMotion

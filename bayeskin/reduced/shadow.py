@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayeskin.model.lagrangian import Stage, State
-from bayeskin.model.tissue import Bind
+from bayeskin.finite_element.lagrangian import Stage, State
+from bayeskin.finite_element.tissue import Bind
 from bayeskin.reduced import kernels
 from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
 from bayeskin.types import Array, PadMotion

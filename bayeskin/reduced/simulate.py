@@ -8,13 +8,13 @@ from functools import partial
 
 import numpy as np
 
+from bayeskin.finite_element.lagrangian import LagrangianModel, Step
+from bayeskin.finite_element.problem import material
+from bayeskin.finite_element.simulate import OnState
+from bayeskin.finite_element.stepping import integrate
 from bayeskin.geometry import Geometry, moved
 from bayeskin.mechanisms import Mechanism, solved
 from bayeskin.mechanisms.mechanism import Tissue
-from bayeskin.model.lagrangian import LagrangianModel, Step
-from bayeskin.model.problem import material
-from bayeskin.model.simulate import OnState
-from bayeskin.model.stepping import integrate
 from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
 from bayeskin.reduced.error import DualWeightedResidual
 from bayeskin.reduced.model import ReducedModel

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayeskin.model.assembly import compiled
+from bayeskin.finite_element.assembly import compiled
 from bayeskin.reduced.kernels import SLOW_CONTRACTION, History, Laws, Room, System, answer, renew, update
 from bayeskin.types import Array
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayeskin.model.lagrangian import LagrangianModel, Step
-from bayeskin.model.problem import Problem, material
-from bayeskin.model.stepping import integrate
-from bayeskin.model.tissue import Bind
+from bayeskin.finite_element.lagrangian import LagrangianModel, Step
+from bayeskin.finite_element.problem import Problem, material
+from bayeskin.finite_element.stepping import integrate
+from bayeskin.finite_element.tissue import Bind
 from bayeskin.reduced.basis import Inner, weighted_modes
 from bayeskin.reduced.cases import Case
 from bayeskin.types import Array

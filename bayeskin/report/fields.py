@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from bayeskin.errors import InputError
+from bayeskin.number_format import number
 from bayeskin.report.style import GREY, INK, PAGE_IN, new_figure, plain_log, state_finding, styled
 from bayeskin.types import Array
-from bayeskin.words import number
 
 # Grey stands for nothing: a white surface would vanish on the page.
 _SEQUENTIAL = LinearSegmentedColormap.from_list("grey-blue", ["#E6E6E6", "#86B8D9", "#0072B2", "#08284F"])

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 
+from bayeskin.number_format import number
 from bayeskin.report.style import (
     GREY,
     INK,
@@ -30,7 +31,6 @@ from bayeskin.report.timeline import (
     shade_phases,
 )
 from bayeskin.types import Array, BinnedForce
-from bayeskin.words import number
 
 Mask = NDArray[np.bool_]
 

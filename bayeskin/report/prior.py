@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from bayeskin.number_format import number
 from bayeskin.report.style import (
     GREY,
     MODEL,
@@ -20,7 +21,6 @@ from bayeskin.report.style import (
 )
 from bayeskin.report.timeline import LEVELS, draw_bands, phase_legend, shade_phases
 from bayeskin.types import Array, BinnedForce
-from bayeskin.words import number
 
 
 @styled

@@ -7,6 +7,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from bayeskin.number_format import number
 from bayeskin.report.style import (
     INK,
     PAGE_IN,
@@ -19,7 +20,6 @@ from bayeskin.report.style import (
 )
 from bayeskin.report.timeline import phase_legend, shade_phases
 from bayeskin.types import Array, BinnedForce, Recording
-from bayeskin.words import number
 
 _MANY = 4000  # samples beyond which a line goes into an SVG as pixels
 

@@ -21,8 +21,8 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import ArrayLike
 
 from bayeskin.geometry import LENGTHS
+from bayeskin.number_format import at_edge
 from bayeskin.types import Array, Parameter
-from bayeskin.words import at_edge
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
+from bayeskin.number_format import number
 from bayeskin.report.style import (
     ACCENT,
     GREY,
@@ -23,7 +24,6 @@ from bayeskin.report.style import (
 )
 from bayeskin.report.timeline import phase_legend, shade_phases
 from bayeskin.types import Array, BinnedForce, Prediction
-from bayeskin.words import number
 
 _NOMINAL = np.array([0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99])
 

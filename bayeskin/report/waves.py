@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
+from bayeskin.number_format import number
 from bayeskin.report.style import (
     ACCENT,
     GREY,
@@ -22,7 +23,6 @@ from bayeskin.report.style import (
 )
 from bayeskin.report.triangle import label_edges, triangle
 from bayeskin.types import Array, Design, Parameter
-from bayeskin.words import number
 
 
 @styled

@@ -13,9 +13,9 @@ import numpy as np
 from bayeskin import __version__, storage
 from bayeskin.errors import InputError
 from bayeskin.surrogates.chaos import LatentChaos
+from bayeskin.surrogates.consistency import refuse_unsound
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.shapes import ShapeTransform
-from bayeskin.surrogates.sound import refuse_unsound
 from bayeskin.surrogates.surrogate import Latents, ShapeSurrogate
 from bayeskin.surrogates.two_fidelities import CorrectedLatents
 from bayeskin.surrogates.validate import Validation

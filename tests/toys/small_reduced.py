@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from bayeskin.design import default_space
+from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import catalogue
-from bayeskin.model.simulate import ModelSpec
 from bayeskin.reduced.build import BuildSettings, base_model, with_mechanisms
 from bayeskin.reduced.cases import Protocols, Trained
 from bayeskin.reduced.files import save_reduced

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import scipy.sparse as sp
 
+from bayeskin.finite_element.lagrangian import LagrangianModel
+from bayeskin.finite_element.problem import Problem, material
+from bayeskin.finite_element.tissue import Bind
 from bayeskin.mechanisms import catalogue, laws
-from bayeskin.model.lagrangian import LagrangianModel
-from bayeskin.model.problem import Problem, material
-from bayeskin.model.tissue import Bind
 from bayeskin.reduced.basis import Inner, pod
 from bayeskin.reduced.cases import Case
 from bayeskin.reduced.library import Modes, scaled_basis

@@ -16,13 +16,12 @@ import pytest
 from numpy.typing import ArrayLike
 
 from bayeskin.design import default_space
+from bayeskin.finite_element.simulate import ModelSpec
+from bayeskin.forward import opened, reduced
+from bayeskin.forward.interface import ModelRun
 from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import observed
-from bayeskin.mismatch.tangent import ModelRun
-from bayeskin.model.simulate import ModelSpec
-from bayeskin.pipeline import forward, workbench
-from bayeskin.pipeline.workbench import Source, Workbench
 from bayeskin.reduced.region import LEAST_STIFFNESS
 from bayeskin.types import (
     Array,
@@ -35,6 +34,8 @@ from bayeskin.types import (
     Simulation,
     frozen_array,
 )
+from bayeskin.workflow import workbench
+from bayeskin.workflow.workbench import Source, Workbench
 
 MOTION = PadMotion(
     np.array([0.0, 4.0, 8.0, 25.0, 29.0, 50.0, 58.0, 66.0]),
@@ -161,8 +162,8 @@ def bench(
         refinement=2, hash="toy",
     )  # fmt: skip
     patch.setattr(workbench, "calm_bins", lambda folder: (binned, NO_WORD, MOTION))
-    patch.setattr(forward, "load_reduced", lambda file: model)
-    patch.setattr(forward, "simulate_reduced", simulate)
+    patch.setattr(opened, "load_reduced", lambda file: model)
+    patch.setattr(reduced, "simulate_reduced", simulate)
     patch.setattr(workbench, "FullForce", lambda spec, motion, edges_s: Full(full))
     return Workbench(Source(Path("recording"), Path("model"), ModelSpec(), 1, base))
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bayeskin.number_format import number
 from bayeskin.report.page.parts import Chart, Key
 from bayeskin.report.page.plot import Phases, Plot, moments
 from bayeskin.report.style import parameter_colors
-from bayeskin.sensitivity import SobolResult
+from bayeskin.sensitivity.sobol import SobolResult
 from bayeskin.types import Array
-from bayeskin.words import number
 
 _BANDS = Key("50 and 90 % bands", "band")
 

@@ -1,0 +1,1 @@
+"""One function over many items, in processes of this machine or on a cluster."""

@@ -1,0 +1,96 @@
+"""The map of `bayeskin.execution.local` on other machines: a Dask cluster by its address, or SLURM jobs.
+
+Needs the extra `bayeskin[cluster]`. A worker that dies costs its own item, which is run again elsewhere. The
+scheduler gives up whatever stood in a worker's queue as often as it allows workers to die (its
+`allowed-failures`), be it the cause or not: what it has given up is run once more, one by one after all
+others, and then only the cause is lost. Workers should have one thread each (``dask worker --nthreads 1``):
+the full model uses a core.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from bayeskin.errors import InputError
+from bayeskin.execution.local import Lost, Map
+
+CONNECT_S = 10
+HIDDEN = {"dashboard": False}  # jobs must reach the scheduler; nobody else needs its pages
+
+
+@contextmanager
+def on_scheduler(address: str) -> Iterator[Map]:
+    """A map over the workers of the Dask scheduler at an address, such as tcp://10.0.0.1:8786.
+
+    Raises InputError where nobody answers.
+    """
+    distributed = extra("distributed")
+    if not re.fullmatch(r"(\w+://)?[^\s/]+:\d+", address):  # its client would wait, and end in a traceback
+        raise InputError(f"scheduler {address}", "no host and port", "the address of a Dask scheduler")
+    try:
+        client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        found = f"no answer ({type(error).__name__})"
+        raise InputError(f"scheduler {address}", found, "the address of a Dask scheduler") from None
+    with client:
+        yield _over(client)
+
+
+@contextmanager
+def on_slurm(jobs: int, settings: Mapping[str, Any]) -> Iterator[Map]:
+    """A map over `jobs` SLURM jobs, each a worker of one thread; settings as dask_jobqueue.SLURMCluster's.
+
+    Raises InputError for settings that it does not take.
+    """
+    distributed, queue = extra("distributed"), extra("dask_jobqueue")
+    try:
+        cluster = queue.SLURMCluster(cores=1, processes=1, scheduler_options=HIDDEN, **settings)
+    except (TypeError, ValueError) as error:
+        raise InputError("slurm", str(error), "settings of dask_jobqueue.SLURMCluster") from None
+    with cluster, distributed.Client(cluster, set_as_default=False) as client:
+        cluster.scale(jobs=jobs)
+        yield _over(client)
+
+
+def _over(client: Any) -> Map:
+    distributed = extra("distributed")
+
+    def over(function: Callable[[Any], Any], items: Sequence[Any]) -> Generator[tuple[int, Any], None, None]:
+        futures = {client.submit(function, item, pure=False): index for index, item in enumerate(items)}
+        given_up: list[int] = []
+        try:
+            for future in distributed.as_completed(list(futures), loop=client.loop):
+                result = _result(future, distributed)
+                if isinstance(result, Lost):
+                    given_up.append(futures[future])
+                else:
+                    yield futures[future], result
+        finally:
+            client.cancel(list(futures))
+        for index in given_up:
+            alone = client.submit(function, items[index], pure=False)
+            try:
+                yield index, _result(alone, distributed)
+            finally:
+                client.cancel([alone])
+
+    return over
+
+
+def _result(future: Any, distributed: Any) -> Any:
+    try:
+        return future.result()
+    except distributed.KilledWorker as killed:
+        return Lost(f"the worker process ended each time; last: {killed.last_worker}")
+
+
+def extra(name: str) -> Any:
+    import importlib
+
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise InputError("cluster", f"no {name} installed", "pip install '.[cluster]'") from None

@@ -1,0 +1,253 @@
+"""The article's own formulation, reproduced because its numbers rest on it; it is not a reaction.
+
+Its released script differs from the total-Lagrangian model in four ways:
+
+- after each step the mesh's corners move with the increment, and all gradients of the next step are
+  taken on that moved, straight-edged mesh, while the displacement stays total: the "F" in its
+  stress is I + du/dx on the start of the step, where a total-Lagrangian F is I + du/dX;
+- momentum balances the Cauchy stress of that F, t_eff - p I, and fluid mass the small-strain rate
+  div(du)/dt + S dp/dt - div((k/mu_f) grad p), both integrated over the start-of-step mesh;
+- force is the integral of t_xx - p over the pad's top face, whose normal is z, and is not doubled;
+- backward Euler on every 50th sample of the recording.
+
+Where the subcutis is soft beside the cutis (E_s below some 0.03 E_c), this updating is unstable: the force
+swings from step to step at a steady speed of the pads, and soon no step converges. Such a run has failed.
+
+Source: the script released with the article, physics unchanged (design: observation `article`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy.sparse as sp
+import skfem
+
+from bayeskin.finite_element import article_law, assembly
+from bayeskin.finite_element.newton import EXTRAPOLATION_POINTS, Equations, NewtonSolver, extrapolate
+from bayeskin.finite_element.problem import Material, Problem
+from bayeskin.types import Array
+
+SOLVER_TOLERANCE = 1e-4  # of the largest displacement and pressure, before the last correction
+FACE_QUADRATURE_DEGREE = 6
+SMALLEST_STRESS = 1e-3  # of the shear modulus, below which no force is told from rounding
+SWING = 0.05  # of the largest force so far, to and fro at a steady speed: no relaxation does that
+
+
+@dataclass(frozen=True)
+class PadFace:
+    """Quadrature on the pad's triangles: cells (f,), reference points and gradients, weights.
+
+    gradients (f, q, a, 3) of the cell's quadratic shape functions on the reference tetrahedron;
+    value_p (f, q, 4); corners (f, 3) node numbers; weight (q,) summing to 1/2.
+    """
+
+    cells: np.ndarray
+    gradients: Array
+    value_p: Array
+    corners: np.ndarray
+    weight: Array
+
+
+@dataclass
+class ArticleModel:
+    """The article's equations on one mesh and material; the state is x (dofs,) and the moved corners."""
+
+    problem: Problem
+    material: Material
+    solver: NewtonSolver = field(default_factory=lambda: NewtonSolver(symmetric=False))
+
+    def __post_init__(self) -> None:
+        space, mesh = self.problem.space, self.problem.mesh.geometry
+        quadratic = skfem.ElementTetP2()
+        points, self._weight = skfem.quadrature.get_quadrature(quadratic.refdom, 4)
+        self._ref_u = _reference_gradients(quadratic, points)
+        self._ref_p = _reference_gradients(skfem.ElementTetP1(), points)
+        self._face = _pad_face(mesh, self.problem.mesh.facets["pad"])
+        self._cells = np.ascontiguousarray(mesh.t.T)
+        shape = space.weight.shape
+        self._chunks = assembly.chunks(shape)
+        self._data = np.empty(self.problem.pattern.size)  # overwritten by each tangent
+        # displacement nodes 0..corners-1 are the mesh's vertices in scikit-fem's numbering
+        assert np.array_equal(space.nodes_u[:, :4], self._cells)
+
+    def step(
+        self, x: Array, corners: Array, dt: float, pad_displacement_m: float, guess: Array | None
+    ) -> tuple[Array, float] | None:
+        """New x (dofs,) and the force [N] after a step dt [s] that starts at x on `corners` (n, 3).
+
+        Without a guess (the pads' speed has just changed) the step begins from the linear response.
+        """
+        jacobian = corners[self._cells[:, 1:]] - corners[self._cells[:, :1]]  # (e, 3 edges, 3)
+        inverse = np.linalg.inv(jacobian)  # rows: coordinates; columns: edges
+        volume = np.linalg.det(jacobian)
+        grad_u, grad_p = (
+            np.ascontiguousarray(np.einsum("qaj,eij->eqia", on_cell, inverse, optimize=True))
+            for on_cell in (self._ref_u, self._ref_p)
+        )
+        weight = np.abs(volume)[:, None] * self._weight
+        equations = self._equations(x, grad_u, grad_p, weight, dt)
+        target = self.problem.prescribe(x if guess is None else guess, pad_displacement_m)
+        start: Array | None = target
+        if guess is None:
+            start = self.solver.respond(equations, x, target, self.problem.pattern.fixed)
+        new = None if start is None else self.solver.solve(equations, start)
+        if new is None:
+            return None
+        return new, self._force(new, corners, inverse)
+
+    def move(self, corners: Array, old: Array, new: Array) -> Array:
+        """Corners (n, 3) after the increment from old to new x."""
+        n = len(corners)
+        return corners + (new - old)[: 3 * n].reshape(n, 3)
+
+    def _equations(self, old: Array, grad_u: Array, grad_p: Array, weight: Array, dt: float) -> Equations:
+        s, m, pattern = self.problem.space, self.material, self.problem.pattern
+
+        def evaluate(x: Array, chunk: assembly.Chunk) -> None:
+            c, at = chunk.cells, chunk.at
+            assembly.evaluate(
+                x, s.n_nodes, s.nodes_u[c], s.nodes_p[c], grad_u[c], grad_p[c], s.value_p,
+                at.deformation, at.pressure, at.gradient,
+            )  # fmt: skip
+
+        divergence_old, pressure_old = np.empty(weight.shape), np.empty(weight.shape)
+        for chunk in self._chunks:
+            evaluate(old, chunk)
+            divergence_old[chunk.cells] = np.trace(chunk.at.deformation, axis1=2, axis2=3)
+            pressure_old[chunk.cells] = chunk.at.pressure
+
+        def residual(x: Array) -> Array | None:
+            out = np.zeros(s.dofs)
+            for chunk in self._chunks:
+                c, at, found = chunk.cells, chunk.at, chunk.found
+                evaluate(x, chunk)
+                smallest = article_law.respond(
+                    at.deformation, at.pressure, at.gradient, m.mu[c], m.lam[c], m.mobility[c], m.storage[c],
+                    dt, divergence_old[c], pressure_old[c], found.stress, found.content, found.flux,
+                )  # fmt: skip
+                if not smallest > 0.0:
+                    return None
+                assembly.residual(
+                    s.n_nodes, s.nodes_u[c], s.nodes_p[c], grad_u[c], grad_p[c], s.value_p, weight[c],
+                    found.stress, found.content, found.flux, out,
+                )  # fmt: skip
+            return out[pattern.free] if np.isfinite(out).all() else None
+
+        def tangent(x: Array) -> tuple[sp.csr_matrix, sp.csr_matrix]:
+            data = self._data
+            data[:] = 0.0
+            for chunk in self._chunks:
+                c, at, by = chunk.cells, chunk.at, chunk.by
+                evaluate(x, chunk)
+                article_law.linearise(
+                    at.deformation, m.mu[c], m.lam[c], m.mobility[c], m.storage[c], dt,
+                    by.stress_f, by.stress_p, by.content_f, by.content_p, by.flux_g,
+                )  # fmt: skip
+                assembly.tangent(
+                    grad_u[c], grad_p[c], s.value_p, weight[c], by.stress_f, by.stress_p, by.content_f,
+                    by.content_p, by.flux_f, by.flux_g, pattern.position[c], data,
+                )  # fmt: skip
+            return pattern.matrices(data)
+
+        n = 3 * s.n_nodes
+        size_u = max(float(np.abs(old[:n]).max()), 1e-4)
+        size_p = max(float(np.abs(old[n:]).max()), 1e-3 * float(m.mu.min()))
+        size = np.where(np.arange(s.dofs) < n, size_u, size_p)
+        scale = np.where(np.arange(s.dofs) < n, 1.0, float(m.mu.max()) / self.problem.lengths.cutis_m)
+        return Equations(
+            pattern.free,
+            residual,
+            tangent,
+            1.0 / (SOLVER_TOLERANCE * size[pattern.free]),
+            scale[pattern.free],
+            np.array([np.log2(dt), float(np.abs(old[self.problem.pattern.fixed]).max()) / size_u]),
+        )
+
+    def _force(self, x: Array, corners: Array, inverse: Array) -> float:
+        """Integral of t_xx - p over the pad's face [N], gradients on the start-of-step mesh."""
+        s, m, face = self.problem.space, self.material, self._face
+        u = x[: 3 * s.n_nodes].reshape(-1, 3)
+        local_u = u[s.nodes_u[face.cells]]
+        local_p = x[3 * s.n_nodes + s.nodes_p[face.cells]]
+        gradients = np.einsum("fqaj,fij->fqai", face.gradients, inverse[face.cells])
+        f = np.eye(3) + np.einsum("fai,fqaj->fqij", local_u, gradients)
+        j = np.linalg.det(f)
+        mu, lam = m.mu[face.cells][:, None], m.lam[face.cells][:, None]
+        t_xx = (mu * (np.einsum("fqj,fqj->fq", f[:, :, 0], f[:, :, 0]) - 1.0) + lam * np.log(j)) / j
+        pressure = np.einsum("fqb,fb->fq", face.value_p, local_p)
+        a, b, c = (corners[face.corners[:, k]] for k in range(3))
+        twice_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        return float(np.einsum("f,q,fq->", twice_area, face.weight, t_xx - pressure))
+
+
+def run(
+    model: ArticleModel,
+    time_s: Array,
+    displacement_m: Array,
+    p_init: float,
+    on_step: Callable[[float, Array, float], None],
+) -> str:
+    """Backward Euler over the given samples (n,); calls `on_step(time_s, x, force_n)` for each.
+
+    Returns "" or, for a run that failed, one line with the step, the time and a remedy.
+    """
+    space = model.problem.space
+    x = np.zeros(space.dofs)
+    x[3 * space.n_nodes :] = p_init
+    corners = model.problem.mesh.geometry.p.T.copy()
+    past, old_speed = [(0.0, x)], np.nan  # states since the pads' speed last changed
+    forces = [0.0]  # at those states
+    largest = SMALLEST_STRESS * float(model.material.mu.max()) * model.problem.lengths.quarter_pad_m2
+    for n in range(1, len(time_s)):
+        dt = float(time_s[n] - time_s[n - 1])
+        speed = (displacement_m[n] - displacement_m[n - 1]) / dt
+        if not abs(speed - old_speed) < 0.2 * abs(speed) + 1e-5:
+            past, forces = past[-1:], forces[-1:]
+        pad = 0.5 * float(displacement_m[n])
+        guess = extrapolate(past, float(time_s[n])) if len(past) > 1 else None
+        found = model.step(x, corners, dt, pad, guess)
+        if found is None and guess is not None:
+            found = model.step(x, corners, dt, pad, None)
+        if found is None:
+            return (
+                f"step {n} at t = {time_s[n]:.2f} s did not converge; the article's formulation has "
+                "fixed steps: try stiffer or more permeable parameters"
+            )
+        new, force = found
+        corners = model.move(corners, x, new)
+        largest, forces = max(largest, abs(force)), [*forces, force][-3:]
+        turns = np.diff(forces)
+        if len(turns) == 2 and turns[0] * turns[1] < 0 and np.abs(turns).min() > SWING * largest:
+            return (
+                f"the force swings by {np.abs(turns).min():.2g} N a step at t = {time_s[n]:.2f} s, at a "
+                "steady speed of the pads: the article's updated mesh is unstable; try a stiffer subcutis"
+            )
+        x, old_speed = new, speed
+        past = [*past, (float(time_s[n]), x)][-EXTRAPOLATION_POINTS:]
+        on_step(float(time_s[n]), x, force)
+    return ""
+
+
+def _reference_gradients(element: skfem.Element, points: Array) -> Array:
+    """Gradients of the shape functions on the reference cell, (q, a, 3)."""
+    count = 10 if isinstance(element, skfem.ElementTetP2) else 4
+    return np.ascontiguousarray(
+        np.stack([element.lbasis(points, a)[1] for a in range(count)]).transpose(2, 0, 1)
+    )
+
+
+def _pad_face(mesh: skfem.MeshTet, facets: np.ndarray) -> PadFace:
+    triangle, weight = skfem.quadrature.get_quadrature(skfem.ElementTriP1().refdom, FACE_QUADRATURE_DEGREE)
+    barycentric = np.stack([1.0 - triangle.sum(axis=0), *triangle])  # (3, q)
+    corners, cells = mesh.facets[:, facets].T, mesh.f2t[0, facets]
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
+    gradients, values = [], []
+    for nodes, cell in zip(corners, cells, strict=True):
+        local = [int(np.flatnonzero(mesh.t[:, cell] == node)[0]) for node in nodes]
+        points = vertices[local].T @ barycentric
+        gradients.append(_reference_gradients(skfem.ElementTetP2(), points))
+        values.append(np.stack([skfem.ElementTetP1().lbasis(points, b)[0] for b in range(4)]).T)
+    return PadFace(cells, np.stack(gradients), np.stack(values), corners, weight)

@@ -1,0 +1,161 @@
+"""A mesh of one's own from gmsh: with the article's names for boundaries and layers, flat, in metres.
+
+It is compared with the device and the tissue that it is said to be a mesh of, before it is rolled.
+"""
+
+from __future__ import annotations
+
+import io
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+
+import meshio
+import numpy as np
+import skfem
+
+from bayeskin.errors import InputError
+from bayeskin.finite_element.mesh import SkinMesh, roll
+from bayeskin.geometry import Geometry
+from bayeskin.types import Array
+
+GMSH_NAMES = {
+    "right_patch": "pad",
+    "u_right": "guard",
+    "left": "symmetry_x",
+    "back": "symmetry_y",
+    "bottom": "bottom",
+}
+GMSH_LAYERS = {"bottom_layer": "subcutis", "top_layer": "cutis"}
+LONGEST_M = 2.0  # no mesh of skin is longer
+PLAN_TOLERANCE_M, DEPTH_TOLERANCE_M = 0.5e-3, 0.1e-3  # along x and y, and along z
+
+
+def read_gmsh(path: Path | str, geometry: Geometry = Geometry()) -> SkinMesh:
+    """A flat gmsh file with the article's names for boundaries and layers, rolled after loading.
+
+    Raises InputError if the file is absent or unreadable, holds no tetrahedra or some of no layer, lacks a
+    name, is in millimetres, or is a mesh of other lengths than those of `geometry`.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(path, "no such file", "a gmsh mesh")
+    try:
+        with redirect_stderr(io.StringIO()), redirect_stdout(io.StringIO()):  # meshio complains at length
+            return _assembled(path, meshio.read(path, file_format="gmsh"), geometry)
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:  # a damaged file: meshio and the indices raise of every kind
+        raise InputError(path, f"not readable as gmsh ({type(error).__name__})", "a gmsh 4.1 mesh") from None
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """Cells of one kind (n, corners), and by name which of them carry it (n,); one may carry several."""
+
+    corners: np.ndarray
+    named: dict[str, np.ndarray]
+
+
+def _assembled(path: Path, raw: meshio.Mesh, geometry: Geometry) -> SkinMesh:
+    names = {gmsh: name for gmsh, name in GMSH_NAMES.items() if name != "guard" or geometry.guard is not None}
+    missing = [n for n in (*names, *GMSH_LAYERS) if n not in raw.field_data]
+    if missing:
+        raise InputError(path, f"no boundary or layer named {', '.join(missing)}", "the article's names")
+    solid, surface = _cells(raw, "tetra", 4), _cells(raw, "triangle", 3)
+    if not len(solid.corners):
+        raise InputError(path, "no tetrahedra", "a volume mesh")
+    used, compact = np.unique(solid.corners, return_inverse=True)
+    points = np.ascontiguousarray(raw.points[used].T)
+    flat = skfem.MeshTet(points, np.ascontiguousarray(compact.reshape(solid.corners.shape).T))
+    _check_units(path, points)
+    _check_layers(path, points, flat.t, solid, geometry)
+    _check_guard(path, surface, geometry)
+    number = np.full(len(raw.points), -1)
+    number[used] = np.arange(len(used))
+    facets = {"guard": np.empty(0, int)}
+    for gmsh_name, name in names.items():
+        nodes = number[surface.corners[surface.named[gmsh_name]]]
+        if not len(nodes):
+            raise InputError(path, f"boundary {gmsh_name} without triangles", "at least one")
+        _check_boundary(f"{path}: {gmsh_name}", points[:, nodes.ravel()], name, geometry)
+        facets[name] = _facet_indices(flat, nodes)
+    rolled = skfem.MeshTet(roll(flat.p, geometry.arm_radius_m), flat.t)
+    return SkinMesh(rolled, facets, solid.named["top_layer"], path.name, geometry)
+
+
+def _cells(raw: meshio.Mesh, kind: str, corners: int) -> _Cells:
+    blocks = [k for k, block in enumerate(raw.cells) if block.type == kind]
+    if not blocks:
+        return _Cells(np.empty((0, corners), int), {name: np.empty(0, bool) for name in raw.field_data})
+    named = {name: np.concatenate([_carries(raw, k, name) for k in blocks]) for name in raw.field_data}
+    return _Cells(np.concatenate([raw.cells[k].data for k in blocks]), named)
+
+
+def _carries(raw: meshio.Mesh, block: int, name: str) -> np.ndarray:
+    """Returns which cells of a block carry a name (n,); older formats of gmsh have one name for each cell."""
+    if name not in raw.cell_sets:
+        return np.asarray(raw.cell_data["gmsh:physical"][block] == raw.field_data[name][0])
+    carries = np.zeros(len(raw.cells[block].data), dtype=bool)
+    carries[raw.cell_sets[name][block]] = True
+    return carries
+
+
+def _check_units(path: Path, points: Array) -> None:
+    longest_m = float(np.ptp(points, axis=1).max())
+    if longest_m > LONGEST_M:
+        expected = "coordinates in metres (in gmsh: Mesh.ScalingFactor = 0.001 before it is saved)"
+        raise InputError(path, f"a length of {longest_m:g}: millimetres, by their looks", expected)
+
+
+def _check_layers(path: Path, points: Array, cells: np.ndarray, solid: _Cells, geometry: Geometry) -> None:
+    """Raises InputError unless each cell is of one layer, and each layer as thick as it is said to be."""
+    layers = [solid.named[name] for name in GMSH_LAYERS]
+    stray = int(np.sum(layers[0] == layers[1]))
+    if stray:
+        found = f"{stray} tetrahedra of no layer, or of both"
+        raise InputError(path, found, f"each in one of {', '.join(GMSH_LAYERS)}")
+    depths = (0.0, geometry.subcutis_m), (geometry.subcutis_m, geometry.thickness_m)
+    for name, inside, depth in zip(GMSH_LAYERS, layers, depths, strict=True):
+        if not inside.any():
+            raise InputError(path, f"layer {name} without tetrahedra", "at least one")
+        _check_extent(f"{path}: {name}", points[2, cells[:, inside]], "z", depth, DEPTH_TOLERANCE_M)
+
+
+def _check_guard(path: Path, surface: _Cells, geometry: Geometry) -> None:
+    """Raises InputError for a guard that the device lacks, or that is the pad, too."""
+    guard = surface.named.get("u_right", np.empty(0, bool))
+    if geometry.guard is None and guard.any():
+        raise InputError(f"{path}: u_right", "a guard", "none, as this device has none")
+    if geometry.guard is not None and (guard & surface.named["right_patch"]).any():
+        raise InputError(f"{path}: u_right", "triangles that are right_patch, too", "pad and guard apart")
+
+
+def _check_boundary(where: str, points: Array, name: str, geometry: Geometry) -> None:
+    """Raises InputError unless the corners (3, n) of a boundary lie where the geometry has it."""
+    top = (geometry.thickness_m,) * 2
+    expected: dict[str, list[tuple[str, tuple[float, ...]]]] = {
+        "pad": [("x", geometry.along_m[:2]), ("y", (0.0, geometry.across_m[0])), ("z", top)],
+        "guard": [("x", geometry.along_m[::3]), ("y", (0.0, geometry.across_m[-1])), ("z", top)],
+        "symmetry_x": [("x", (0.0, 0.0))],
+        "symmetry_y": [("y", (0.0, 0.0))],
+        "bottom": [("z", (0.0, 0.0))],
+    }
+    for axis, extent in expected[name]:
+        tolerance_m = DEPTH_TOLERANCE_M if axis == "z" else PLAN_TOLERANCE_M
+        _check_extent(where, points["xyz".index(axis)], axis, extent, tolerance_m)
+
+
+def _check_extent(
+    where: str, found_m: Array, axis: str, expected_m: tuple[float, ...], tolerance_m: float
+) -> None:
+    ends = float(found_m.min()), float(found_m.max())
+    if not np.allclose(ends, expected_m, rtol=0.0, atol=tolerance_m):
+        found, expected = (f"{axis} {1e3 * a:.4g} to {1e3 * b:.4g} mm" for a, b in (ends, expected_m))
+        raise InputError(where, found, f"{expected}, as the device and the tissue have it")
+
+
+def _facet_indices(mesh: skfem.Mesh, nodes: np.ndarray) -> np.ndarray:
+    """Indices of the facets with the corner nodes given, (n, 3)."""
+    keys = {tuple(sorted(f)): i for i, f in enumerate(mesh.facets.T.tolist())}
+    return np.unique([keys[tuple(sorted(n))] for n in nodes.tolist()])

@@ -1,0 +1,187 @@
+"""Time integration of the total-Lagrangian model: second order, adaptive, landing on every corner.
+
+At a corner of the protocol the pressure's rate jumps, so each phase starts with a step of Alexander's
+two-stage singly diagonally implicit Runge-Kutta method (SIAM J. Numer. Anal. 14, 1977; gamma = 1 -
+1/sqrt(2), stiffly accurate, L-stable), which needs no history. The variable-step backward differentiation
+formula of second order (Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, section III.5)
+goes on with half of the solves. Either is one solve of J - J* ... = h* div(...) with its own history J*, p*
+and length h*. The local error of the fluid mass, filtered through the tangent (Hosea & Shampine 1996), gives
+an error of the force in newtons, which steers the step.
+
+A soft cutis on a stiff subcutis folds, and snaps from one equilibrium to another. A step that fails at the
+smallest length is taken as such a fall (`NewtonSolver.relax`), and the phase starts anew after it. On fine
+meshes wrinkles may follow each other without end; a run whose falls become too dear is given up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from bayeskin.finite_element.lagrangian import Stage, State, Step
+from bayeskin.finite_element.newton import EXTRAPOLATION_POINTS, extrapolate, extrapolation_weights
+from bayeskin.types import Array, PadMotion
+
+GAMMA = 1.0 - np.sqrt(0.5)
+FIRST_STEP_S = 1.0
+SHORTEST_STEP = 1e-3  # of the phase; what asks for less is a fall, or has failed
+GROWTH, SHRINK = 2.0, 0.25  # zero-stable while steps grow less than 2.41-fold
+MOST_CRAWLS = 3000  # of a run: steps of its falls, some 150 each
+STEPS_PER_PHASE = 5  # fewer, longer ones cost as much: their guesses are worse, their tangents further apart
+
+
+class Solver(Protocol):
+    """The solver of a model; counts : of its work, "crawls" and "falls" among them."""
+
+    @property
+    def counts(self) -> Mapping[str, int]: ...
+
+
+class Equations(Protocol):
+    """The model, full or reduced, that step control integrates: `LagrangianModel` describes each member."""
+
+    @property
+    def starts_s(self) -> float: ...
+
+    @property
+    def motion(self) -> PadMotion: ...
+
+    @property
+    def solver(self) -> Solver: ...
+
+    def initial_state(self, p_init: float) -> State: ...
+
+    def nominal_force(self) -> float: ...
+
+    def remember_travel(self, past: list[State]) -> None: ...
+
+    def solve_stage(
+        self,
+        time_s: float,
+        length_s: float,
+        sources: tuple[tuple[float, State], ...],
+        guess: Array,
+        jump: bool,
+        fall: bool = False,
+    ) -> Stage | None: ...
+
+    def finish(self, stages: tuple[Stage, ...], mass: Array) -> Step: ...
+
+
+def advance(model: Equations, past: list[State], h: float) -> Step | None:
+    """One step of length h [s] from the last of `past`, the states of this phase up to now."""
+    if len(past) < EXTRAPOLATION_POINTS:
+        return _runge_kutta(model, past, h)
+    return _backward_difference(model, past, h)
+
+
+def _runge_kutta(model: Equations, past: list[State], h: float) -> Step | None:
+    first = GAMMA * h
+    state = past[-1]
+    t1, t2 = state.time_s + first, state.time_s + h
+    one = model.solve_stage(t1, first, ((1.0, state),), _guess(past, t1), len(past) == 1)
+    if one is None:
+        return None
+    ahead = (1.0 - GAMMA) / GAMMA
+    sources = ((1.0 - ahead, state), (ahead, one.state))
+    two = model.solve_stage(t2, first, sources, _guess([*past, one.state], t2), False)
+    if two is None:
+        return None
+    mass = (two.state.volume - two.history.volume) - (one.state.volume - state.volume)
+    return model.finish((one, two), mass)
+
+
+def _backward_difference(model: Equations, past: list[State], h: float) -> Step | None:
+    older, old, state = past[-3:]
+    before, earlier = state.time_s - old.time_s, old.time_s - older.time_s
+    ratio = h / before
+    spread = 1.0 + 2.0 * ratio
+    sources = ((-(ratio**2) / spread, old), ((1.0 + ratio) ** 2 / spread, state))
+    time_s = state.time_s + h
+    stage = model.solve_stage(time_s, h * (1.0 + ratio) / spread, sources, _guess(past, time_s), False)
+    if stage is None:
+        return None
+    # both the quadratic extrapolation and the formula err by a multiple of the third derivative
+    corrector = (1.0 + ratio) ** 2 * h**3 / (6.0 * ratio * spread)
+    predictor = h * (h + before) * (h + before + earlier) / 6.0
+    weights = extrapolation_weights([s.time_s for s in past[-3:]], time_s)
+    extrapolated = sum(w * s.volume for w, s in zip(weights, past[-3:], strict=True))
+    mass = (stage.state.volume - extrapolated) * corrector / (corrector + predictor)
+    return model.finish((stage,), mass)
+
+
+def _fall(model: Equations, state: State, h: float) -> Step | None:
+    """A step across a fold of the equilibria, of backward Euler, which extrapolates no jump.
+
+    As error of the fluid mass all that moves is taken, since nothing tells which part of it is right.
+    """
+    sources = ((1.0, state),)
+    stage = model.solve_stage(state.time_s + h, h, sources, state.x, jump=False, fall=True)
+    return None if stage is None else model.finish((stage,), stage.state.volume - state.volume)
+
+
+def _guess(past: list[State], time_s: float) -> Array:
+    return extrapolate([(state.time_s, state.x) for state in past], time_s)
+
+
+def integrate(
+    model: Equations,
+    p_init: float,
+    tolerance: float,
+    on_step: Callable[[Step], None],
+    falls_too: bool = True,
+) -> str:
+    """Runs the whole motion; calls `on_step` for the start and for each accepted step.
+
+    tolerance : estimated local error of the force a step, relative to the nominal force.
+    falls_too : whether a skin that folds is followed to where it comes to rest; else the run has failed.
+    Returns "" or, for a run that failed, one line with the step, the time and a remedy.
+    """
+    state = model.initial_state(p_init)
+    on_step(Step(state, 0.0, 0.0, corner=True))
+    allowed_n, count = tolerance * model.nominal_force(), 0
+    for start, end in zip(model.motion.time_s[:-1], model.motion.time_s[1:], strict=True):
+        past, h = [state], min(FIRST_STEP_S, 0.5 * (end - start))
+        longest, shortest = (end - start) / STEPS_PER_PHASE, SHORTEST_STEP * (end - start)
+        while state.time_s < end - 1e-9:
+            spent, at_s = model.solver.counts, state.time_s - model.starts_s
+            if spent["crawls"] > MOST_CRAWLS:
+                return (
+                    f"step {count + 1} at t = {at_s:.3f} s: the skin has folded and snapped "
+                    f"{spent['falls']} times; try layers less unlike in stiffness, or a coarser mesh"
+                )
+            h = _landing(max(h, shortest), end - state.time_s, longest)
+            step = advance(model, past, h)
+            falls = step is None and h <= shortest
+            if falls and not falls_too:
+                return (
+                    f"step {count + 1} at t = {at_s:.3f} s: the skin folds, or does not converge; "
+                    "try layers less unlike in stiffness, or a coarser mesh"
+                )
+            if falls:
+                step = _fall(model, state, h)
+                if step is None:
+                    return (
+                        f"step {count + 1} at t = {at_s:.3f} s did not converge down to "
+                        f"{shortest:.2g} s; try a finer mesh or parameters nearer to a skin's"
+                    )
+            excess = step.error_n / allowed_n if step else np.inf
+            if step is None or (excess > 1.0 and h > shortest):
+                h *= 0.5 if step is None else max(SHRINK, 0.9 / np.sqrt(excess))
+                past = past if step else [state]
+                continue
+            state, count = step.state, count + 1
+            past = [state] if falls else [*past, state][-EXTRAPOLATION_POINTS:]
+            on_step(replace(step, corner=abs(state.time_s - end) < 1e-9))
+            h *= min(GROWTH, 0.9 / np.sqrt(max(excess, 1e-6)))
+        model.remember_travel(past)
+    return ""
+
+
+def _landing(h: float, left: float, longest: float) -> float:
+    """The next step: at most `longest`, and equal last steps rather than a sliver at the corner."""
+    h = min(h, longest)
+    return left / np.ceil(left / h - 1e-9) if left < 2.0 * h else h

@@ -1,0 +1,59 @@
+"""Values as JSON knows them, and JSON files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from bayeskin.errors import InputError
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Writes JSON whole or not at all; what is not a number in JSON (NaN, infinity) becomes null."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON knows it: arrays become lists, numpy numbers become Python's, NaN becomes null."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def read_lines(file: Path) -> list[dict[str, Any]]:
+    """JSON lines of a file, [] without one; a torn last line is cut off, so that more can follow.
+
+    Raises InputError for a line that is no mapping in JSON.
+    """
+    if not file.is_file():
+        return []
+    contents = file.read_bytes()
+    end = contents.rfind(b"\n") + 1
+    if end != len(contents):
+        os.truncate(file, end)
+    rows = []
+    for number, line in enumerate(contents[:end].splitlines(), start=1):
+        try:
+            rows.append(json.loads(line))
+        except ValueError:
+            rows.append(None)
+        if not isinstance(rows[-1], dict):
+            raise InputError(
+                f"{file}, line {number}", "no JSON mapping", "one; without the file all begins anew"
+            )
+    return rows

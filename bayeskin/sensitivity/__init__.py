@@ -1,0 +1,1 @@
+"""Global sensitivity of the force history: Sobol' indices and Shapley effects."""

@@ -1,0 +1,206 @@
+"""Runs stages in order: what is done and unchanged is skipped, what was interrupted goes on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import bayeskin
+from bayeskin.config import WHO_RUNS, Config, load_config
+from bayeskin.device import DeviceConfig, TissueConfig
+from bayeskin.errors import InputError
+from bayeskin.hashing import sha256_of, sha256_of_input
+from bayeskin.json_files import plain
+from bayeskin.workflow import folder
+from bayeskin.workflow.folder import Record
+
+STANDINGS = ("done", "not run", "not finished", "failed", "out of date")
+
+
+class Reporter(Protocol):
+    """Who is told how a run goes on."""
+
+    def log(self, message: str) -> None: ...
+
+    def progress(self, label: str, share: float, note: str = "") -> None: ...
+
+
+class Silent:
+    """A Reporter that tells nobody."""
+
+    def log(self, message: str) -> None: ...
+
+    def progress(self, label: str, share: float, note: str = "") -> None: ...
+
+
+class CannotGoOn(Exception):
+    """A stage whose computation failed: why, and what to do. The engine makes an Outcome of it."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A configuration and the folder of its outputs."""
+
+    config: Config
+    config_path: Path
+    folder: Path
+    reporter: Reporter
+
+    def at(self, stage: str, file: str) -> Path:
+        """Path of a stage's output."""
+        return self.folder / stage / file
+
+    def beside(self, file: str) -> Path:
+        """Path of a file that the configuration names; raises InputError when there is none."""
+        path = self.config_path.resolve().parent / file
+        if not path.is_file():
+            raise InputError(self.config_path, f"no file {path}", "the files that the configuration names")
+        return path
+
+    def summary(self, stage: str) -> Mapping[str, Any]:
+        """What a stage that is done said of itself."""
+        record = folder.read_record(self.folder / stage)
+        return record.summary if record is not None else {}
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage: the sections of the configuration, the files and the earlier stages that it reads.
+
+    `work` writes its outputs into the stage's folder and returns its summary.
+    """
+
+    name: str
+    does: str
+    needs: tuple[str, ...]
+    sections: tuple[str, ...]
+    work: Callable[[Run], Mapping[str, Any]]
+    files: Callable[[Run], Iterable[Path]] = field(default=lambda run: ())
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a stage ended: its record, and whether it had been done before.
+
+    ``record.done`` is False when the computation failed; ``record.summary["message"]`` then says why.
+    """
+
+    stage: str
+    skipped: bool
+    record: Record
+
+    @property
+    def ok(self) -> bool:
+        """Whether the stage was done and says of itself that its answer can be relied on."""
+        return self.record.done and bool(self.record.summary.get("ok", True))
+
+
+def open_run(config_path: Path, reporter: Reporter, folder: Path | None = None) -> Run:
+    """A run from its configuration; its folder lies beside the configuration unless given.
+
+    Raises InputError for a configuration that is wrong.
+    """
+    config = load_config(config_path)
+    return Run(config, config_path, folder or config_path.resolve().parent / config.name, reporter)
+
+
+def run_stages(run: Run, stages: Mapping[str, Stage], last: str | None = None) -> list[Outcome]:
+    """Runs the stages that `last` needs, in order, and itself; all of them when `last` is None.
+
+    Ends with the stage that failed, if one does. An interruption leaves each stage's folder such that the
+    same call goes on from there. Raises InputError for bad input, or when another process works in the
+    run's folder.
+    """
+    wanted = _needed(stages, last)
+    outcomes: list[Outcome] = []
+    with folder.locked(run.folder):
+        for name, stage in stages.items():
+            if name in wanted:
+                outcomes.append(_run_stage(run, stage))
+                if not outcomes[-1].record.done:
+                    break
+    return outcomes
+
+
+def standing(run: Run, stages: Mapping[str, Stage]) -> dict[str, tuple[str, Record | None]]:
+    """How each stage stands, without running any: one of the words of `STANDINGS`, and its record.
+
+    A stage that is done was made from this configuration, its files and earlier stages that are done, by
+    this version, and its outputs are as it left them.
+    """
+    found: dict[str, tuple[str, Record | None]] = {}
+    for name, stage in stages.items():
+        record, inputs = folder.read_record(run.folder / name), _inputs_sha256(run, stage)
+        current = all(found[need][0] == "done" for need in stage.needs)
+        if record is None:
+            found[name] = "not run", None
+        elif record.inputs_sha256 != inputs or not current:
+            found[name] = "out of date", record
+        elif folder.current_record(run.folder / name, inputs) is not None:
+            found[name] = "done", record
+        elif record.done:
+            found[name] = "out of date", record
+        else:
+            found[name] = "failed" if "message" in record.summary else "not finished", record
+    return found
+
+
+def _needed(stages: Mapping[str, Stage], last: str | None) -> set[str]:
+    if last is None:
+        return set(stages)
+    return {last}.union(*(_needed(stages, name) for name in stages[last].needs))
+
+
+def _inputs_sha256(run: Run, stage: Stage) -> str:
+    records = {name: folder.read_record(run.folder / name) for name in stage.needs}
+    config = run.config.model_dump(mode="json", exclude=WHO_RUNS)
+    sections = stage.sections
+    if "parameters" in sections:  # of a model on this device and tissue; records are older than both sections
+        usual = {"device": DeviceConfig(), "tissue": TissueConfig()}
+        sections += tuple(name for name, value in usual.items() if getattr(run.config, name) != value)
+    return sha256_of(
+        {
+            "version": bayeskin.__version__,
+            "config": {section: config[section] for section in sections},
+            "files": [sha256_of_input(path) for path in stage.files(run)],
+            "stages": {name: record.sha256 for name, record in records.items() if record is not None},
+        }
+    )
+
+
+def _run_stage(run: Run, stage: Stage) -> Outcome:
+    inputs, where = _inputs_sha256(run, stage), run.folder / stage.name
+    record = folder.current_record(where, inputs)
+    if record is not None:
+        run.reporter.log(f"{stage.name}: done before, unchanged")
+        return Outcome(stage.name, True, record)
+    run.reporter.log(f"{stage.name}: {stage.does}")
+    spent, started = folder.begin(where, inputs), time.perf_counter()
+    summary: Mapping[str, Any] = {}
+    done = False
+    try:
+        summary = stage.work(run)
+        done = True
+    except CannotGoOn as failure:
+        summary = {"ok": False, "message": str(failure)}
+        run.reporter.log(f"{stage.name}: failed: {failure}")
+    finally:
+        record = Record(
+            inputs_sha256=inputs,
+            done=done,
+            seconds=spent + time.perf_counter() - started,
+            outputs=folder.output_hashes(where) if done else {},
+            summary=plain(summary),
+            provenance=_provenance(run),
+        )
+        folder.write_record(where, record)
+    run.reporter.log(f"{stage.name}: {record.seconds:.1f} s")
+    return Outcome(stage.name, False, record)
+
+
+def _provenance(run: Run) -> dict[str, Any]:
+    config = run.config
+    return {"version": bayeskin.__version__, "config_sha256": config.sha256, "seed": config.seed}

@@ -1,0 +1,79 @@
+"""The report of a run: one HTML file of whatever stages are done, made afresh each time."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import bayeskin
+from bayeskin import storage
+from bayeskin.config import parameter_space
+from bayeskin.report.page import RunFacts, StageFacts, render_page
+from bayeskin.sensitivity.sobol import SobolResult
+from bayeskin.workflow import experiment
+from bayeskin.workflow.engine import Run, Stage, standing
+from bayeskin.workflow.folder import Record
+
+FILE = "report.html"
+
+
+def write_page(run: Run, stages: Mapping[str, Stage]) -> Path:
+    """Writes the page into the run's folder, whole or not at all, and returns its path.
+
+    A stage that is not done, or was made from something else than now, is named and left out.
+    """
+    path = run.folder / FILE
+    storage.write_bytes(path, render_page(facts_of(run, stages)).encode())
+    return path
+
+
+def facts_of(run: Run, stages: Mapping[str, Stage]) -> RunFacts:
+    """All that the page says, from the stages' records."""
+    config = run.config
+    space = parameter_space(config, run.config_path)
+    stands = standing(run, stages)
+    if stands.get("diagnose", ("", None))[0] == "done" and (asked := experiment.answered(run)) is not None:
+        stands[experiment.FOLDER] = "done", asked
+    found = {name: _facts(run, name, *one) for name, one in stands.items() if name != "report"}
+    return RunFacts(
+        name=config.name,
+        config_path=str(run.config_path),
+        config_text=run.config_path.read_text(encoding="utf-8-sig"),
+        config_sha256=config.sha256,
+        version=bayeskin.__version__,
+        seed=config.seed,
+        observation=config.model.observation,
+        mesh=config.model.forward or Path(config.model.mesh).name,
+        parameters={p.name: p.description for p in space.parameters},
+        stages=found,
+        history=_history(run) if "sample" in found and found["sample"].done else None,
+        indices=_indices(run, found["sobol"]) if "sobol" in found else {},
+    )
+
+
+def _facts(run: Run, name: str, stands: str, record: Record | None) -> StageFacts:
+    if record is None:
+        return StageFacts(name, stands)
+    if stands == "failed":
+        return StageFacts(name, stands, record.seconds, record.summary)
+    if stands != "done":
+        return StageFacts(name, stands)
+    drawn = {
+        file.removesuffix(".svg"): run.at(name, file) for file in record.outputs if file.endswith(".svg")
+    }
+    figures = {figure: path.read_text(encoding="utf-8") for figure, path in drawn.items()}
+    return StageFacts(name, stands, record.seconds, record.summary, figures)
+
+
+def _history(run: Run) -> dict[str, Any] | None:
+    """The stage `sample`'s bands; None of a run that was sampled before the stage wrote any."""
+    file = run.at("sample", "bands.json")
+    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+
+
+def _indices(run: Run, stage: StageFacts) -> dict[str, SobolResult]:
+    """Sobol' indices over time, of those sets that the stage `sobol` has a file of."""
+    files = {name: run.at("sobol", f"{name}.h5") for name in stage.summary if stage.done}
+    return {name: storage.load(file, SobolResult) for name, file in files.items() if file.is_file()}

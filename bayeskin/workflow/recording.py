@@ -1,0 +1,90 @@
+"""First stage: the recording as it is fitted, the motion that drives the model, the noise by phase."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bayeskin import report, storage
+from bayeskin.errors import InputError
+from bayeskin.inference.noise_model import bins_in_windows
+from bayeskin.recordings import (
+    NoiseAnalysis,
+    analyse,
+    bin_recording,
+    covered_s,
+    describe_json,
+    idealised_motion,
+    motion_of,
+    read_recording,
+    recorded_motion,
+    segment,
+    summarise,
+    uniform_edges,
+)
+from bayeskin.types import BinnedForce, PadMotion, Phase, Recording
+from bayeskin.workflow.engine import Run, Stage
+from bayeskin.workflow.provenance import caption
+
+
+def pad_motion(
+    observation: str, recording: Recording, phases: Sequence[Phase], protocol: str = "recorded"
+) -> PadMotion:
+    """The displacement that drives the model; the article's script takes every 50th sample, as it stands."""
+    if observation == "article":
+        return motion_of(recording)
+    if protocol == "idealised":
+        return idealised_motion(recording, phases)
+    return recorded_motion(recording, phases)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A recording as it is fitted."""
+
+    phases: Sequence[Phase]
+    analysis: NoiseAnalysis
+    motion: PadMotion
+    binned: BinnedForce
+
+
+def prepared(run: Run, recording: Recording) -> Prepared:
+    """Phases, noise, protocol and bins of a recording as the configuration asks for them."""
+    phases = segment(recording)
+    analysis = analyse(recording, phases)
+    motion = pad_motion(run.config.model.observation, recording, phases, run.config.recording.protocol)
+    edges_s = uniform_edges(covered_s(recording, motion), run.config.fit.bin_width_s)
+    return Prepared(phases, analysis, motion, bin_recording(recording, phases, edges_s, analysis))
+
+
+def _work(run: Run) -> Mapping[str, Any]:
+    recording = read_recording(run.beside(run.config.recording.file))
+    made = prepared(run, recording)
+    _refuse_empty_windows(run, made.binned)
+    storage.save(run.at("recording", "recording.h5"), recording)
+    storage.save(run.at("recording", "motion.h5"), made.motion)
+    storage.save(run.at("recording", "binned.h5"), made.binned)
+    figure = report.figure_recording(recording, made.binned)
+    report.save_figure(figure, run.at("recording", "recording"), caption(run))
+    return describe_json(recording, made.phases, summarise(made.analysis, made.phases))
+
+
+def _refuse_empty_windows(run: Run, binned: BinnedForce) -> None:
+    """Raises InputError for a window to fit that holds no bin: later stages would find out after hours."""
+    windows = run.config.fit.windows_s or ()
+    held = set(bins_in_windows(binned, windows or None).tolist())
+    for index, (start, end) in enumerate(windows):
+        if index not in held:
+            where = f"{run.config_path}: fit.windows_s"
+            first, last = binned.edges_s[[0, -1]]
+            expected = f"windows that hold a bin of the recording's, {first:g} to {last:g} s"
+            raise InputError(where, f"[{start:g}, {end:g}]", expected)
+
+
+def _files(run: Run) -> Iterable[Path]:
+    return [run.beside(run.config.recording.file)]
+
+
+STAGE = Stage("recording", "reads the recording", (), ("recording", "model", "fit"), _work, _files)

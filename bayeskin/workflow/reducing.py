@@ -1,0 +1,161 @@
+"""The reduced model of a device: building it, and finding the one that fits a geometry."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+from bayeskin.config import load_config
+from bayeskin.design import default_space
+from bayeskin.device import load_device, stated_geometry
+from bayeskin.errors import InputError
+from bayeskin.execution.cluster import on_scheduler
+from bayeskin.execution.local import Map, local
+from bayeskin.geometry import Geometry
+from bayeskin.json_files import plain
+from bayeskin.mechanisms import catalogue
+from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.reduced.build import BuildSettings, base_model, with_mechanisms
+from bayeskin.reduced.cases import Trained
+from bayeskin.reduced.files import load_reduced, save_reduced, trained_geometry
+from bayeskin.reduced.model import ReducedModel
+from bayeskin.reduced.region import other_geometry
+from bayeskin.reduced.runs import FullRuns
+from bayeskin.sections import read_toml
+from bayeskin.shipped import shipped
+from bayeskin.types import ParameterSpace
+from bayeskin.workflow.engine import Reporter
+from bayeskin.workflow.folder import locked
+
+SHIPPED = "surrogates/article-device-reduced.h5"
+REFINEMENT = 1  # of the bricks that reduced models stand for
+WORKERS = 2
+EXPECTED = "a configuration, or a file with [device] and [tissue]"
+
+
+def reduce(
+    source: Path | None, out: Path | None, reporter: Reporter, scheduler: str | None = None
+) -> dict[str, Any]:
+    """Builds the reduced model of a device, the base model first and then all mechanisms of the tissue.
+
+    source : a configuration, or a file with the sections `device` and `tissue`; None is the article's device
+    out : HDF5 file to write; by default beside the source, with "-reduced" after its name
+    scheduler : address of a Dask scheduler that makes the training runs; else processes of this machine
+
+    Training runs are kept in a folder beside `out` until the model is finished, so the same command goes on.
+    Raises InputError for bad input, with nothing written; an `out` that is finished stays as it is.
+    """
+    geometry = _geometry(source)
+    path = out or default_path(source)
+    if path.suffix != ".h5":
+        raise InputError(f"-o {path}", f"ending {path.suffix!r}", "ending .h5")
+    trained = trained_for(geometry)
+    finished = _finished(path, trained)
+    if finished:
+        return _answer(path, load_reduced(path), 0.0, "done before, unchanged")
+    folder, started = path.with_name(f"{path.stem}-training"), time.perf_counter()
+    settings = BuildSettings()
+    with locked(folder):
+        if scheduler is None:
+            _build(path, trained, settings, folder, local(WORKERS), reporter)
+        else:
+            with on_scheduler(scheduler) as over:
+                _build(path, trained, settings, folder, over, reporter)
+    shutil.rmtree(folder)
+    return _answer(path, load_reduced(path), time.perf_counter() - started, "built")
+
+
+def _build(
+    path: Path, trained: Trained, settings: BuildSettings, folder: Path, run_all: Map, reporter: Reporter
+) -> None:
+    """Builds the base model and keeps it, so that it can be used meanwhile; then the whole one."""
+    full = FullRuns(trained.geometry, REFINEMENT, folder)
+
+    def progress(what: str, share: float) -> None:
+        reporter.progress(what, share)
+
+    if not path.is_file():
+        reporter.log(f"the base model learns from {settings.base_runs} full runs")
+        save_reduced(path, base_model(trained, full, settings, run_all, progress), _manifest(settings))
+        reporter.log(f"{path}: the base model can be used; {len(trained.mechanisms)} mechanisms follow")
+    whole = with_mechanisms(load_reduced(path), trained, full, settings, run_all, progress)
+    save_reduced(path, whole, _manifest(settings))
+
+
+def _manifest(settings: BuildSettings) -> dict[str, Any]:
+    return {"settings": asdict(settings), "made_by": "bayeskin reduce"}
+
+
+def trained_for(geometry: Geometry) -> Trained:
+    """Returns the region that the reduced model of a device is trained for: all priors of the catalogue."""
+    tissue = {
+        name: ParameterSpace(m.parameters) for name, m in catalogue().items() if isinstance(m.act, Tissue)
+    }
+    return Trained(geometry, default_space(), tissue)
+
+
+def _geometry(source: Path | None) -> Geometry:
+    if source is None:
+        return Geometry()
+    if not source.is_file():
+        raise InputError(source, "no such file", EXPECTED)
+    if "recording" not in read_toml(source, EXPECTED):
+        return load_device(source).geometry
+    config = load_config(source)
+    return stated_geometry(config.device, config.tissue, source).geometry
+
+
+def default_path(source: Path | None) -> Path:
+    """Returns where a source's reduced model is looked for, and written by default."""
+    return (
+        Path("article-device-reduced.h5") if source is None else source.with_name(f"{source.stem}-reduced.h5")
+    )
+
+
+def _finished(path: Path, trained: Trained) -> bool:
+    """Returns whether a file holds the whole model already. Raises InputError for one of another device."""
+    if not path.is_file():
+        return False
+    there = load_reduced(path)
+    if there.trained.geometry != trained.geometry:
+        raise InputError(f"-o {path}", "a reduced model of another geometry", "a name that is free")
+    return set(there.trained.mechanisms) == set(trained.mechanisms)
+
+
+def find_reduced(geometry: Geometry, beside: Sequence[Path]) -> Path | None:
+    """Returns the file of a reduced model that fits a geometry, or None where there is none.
+
+    It is one named as `default_path` names it, beside the files given, or the shipped one; where several fit,
+    the first that was made for this very geometry. Raises InputError for such a file that cannot be read.
+    """
+    own = [path for source in beside for path in sorted(source.resolve().parent.glob("*-reduced.h5"))]
+    known = [(trained_geometry(path), path) for path in (*own, shipped(SHIPPED))]
+    fitting = [(trained != geometry, path) for trained, path in known
+               if trained is not None and not other_geometry(trained, geometry)]  # fmt: skip
+    return min(fitting, key=itemgetter(0))[1] if fitting else None
+
+
+def reduced_file(geometry: Geometry, beside: Sequence[Path]) -> Path:
+    """Returns the file that `find_reduced` finds. Raises InputError where it finds none."""
+    found = find_reduced(geometry, beside)
+    if found is None:
+        expected = "one that `bayeskin reduce` makes of its file, once"
+        raise InputError("reduced model", "none for this device and tissue", expected)
+    return found
+
+
+def _answer(path: Path, model: ReducedModel, seconds: float, done: str) -> dict[str, Any]:
+    base, (u, p) = model.cubatures, (model.library.base.displacement, model.library.base.pressure)
+    text = (
+        f"{path}: {done}; {len(u)} displacement and {len(p) + 1} pressure modes of the base model at "
+        f"{len(base.base.points)} points, {len(model.library.beyond)} mechanisms"
+    )
+    return plain({
+        "ok": True, "out": path, "seconds": seconds, "mechanisms": sorted(model.library.beyond),
+        "modes": [len(u), len(p) + 1], "points": len(base.base.points), "text": text,
+    })  # fmt: skip

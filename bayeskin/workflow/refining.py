@@ -1,0 +1,102 @@
+"""A design that further full runs join, and the surrogate that is trained again with them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from bayeskin import storage
+from bayeskin.design import Wave
+from bayeskin.forward.design_model import ForceModel
+from bayeskin.runner import load_design
+from bayeskin.surrogates import load_manifest, load_surrogate, manifest_of, save_surrogate
+from bayeskin.types import Array, BinnedForce, Design, PadMotion, Simulation, Surrogate
+from bayeskin.workflow.design import rows_of, run_wave, runs_file
+from bayeskin.workflow.engine import Run
+from bayeskin.workflow.model import full_model, waves_model
+from bayeskin.workflow.training import corrected, fine_design, trained
+
+
+class Refining:
+    """The designs that the stage `stage` left with runs that join them; the last surrogate trained."""
+
+    def __init__(self, run: Run, binned: BinnedForce, stage: str, surrogate: str) -> None:
+        self.run, self.binned = run, binned
+        self.design = storage.load(run.at(stage, "design.h5"), Design)
+        self.fine = fine_design(run, stage)
+        self.surrogate = load_surrogate(run.at(surrogate, "surrogate.h5"))
+        self.manifest = load_manifest(run.at(surrogate, "surrogate.h5"))
+
+    def retrain(self, theta: Mapping[str, float], simulation: Simulation) -> Surrogate:
+        """With one run of the configuration's model."""
+        self.run.reporter.log("map: the surrogate was off there; the point joins the design")
+        return self.learn(_as_design(self.design, theta, simulation))
+
+    def learn(self, runs: Design) -> Surrogate:
+        """With runs of the configuration's model, those that failed left out."""
+        waves = runs
+        if self.fine is not None:
+            waves = runs_at(self.run, "coarse model", runs, waves_model(self.run))
+        self.design = _joined(self.design, waves)
+        self.surrogate, validation = trained(self.run, self.design, self.binned)
+        if self.fine is not None:
+            self.fine = _joined(self.fine, runs)
+            self.surrogate, validation = corrected(self.run, self.surrogate, self.fine, self.binned)
+        self.manifest = {**self.manifest, **manifest_of(self.surrogate, validation)}
+        return self.surrogate
+
+    def save(self, stage: str) -> None:
+        """Surrogate and designs into a stage's folder."""
+        save_surrogate(self.run.at(stage, "surrogate.h5"), self.surrogate, self.manifest)
+        storage.save(self.run.at(stage, "design.h5"), self.design)
+        if self.fine is not None:
+            storage.save(self.run.at(stage, "fine.h5"), self.fine)
+
+
+def full_runs(run: Run, label: str, points: Design) -> Design:
+    """Returns the points of a design as the configuration's model runs them."""
+    return runs_at(run, label, points, full_model(run))
+
+
+def runs_at(run: Run, label: str, points: Design, model: ForceModel) -> Design:
+    """Returns the points of a design as a model runs them: kept, so that no run is made twice."""
+    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    training = np.zeros(len(points.theta), bool)
+    wave = Wave(points.space, points.theta, training, 0, run.config.seed, {"rule": label})
+    file = runs_file(run, model, motion, points.edges_s, points.space)
+    run_wave(run, label, file, wave, points.edges_s, model, motion)
+    return rows_of(load_design(file), [wave])
+
+
+def points_like(design: Design, theta: Array) -> Design:
+    """Points (n, d) not yet run, in a design's space and bins."""
+    n, bins = len(theta), len(design.edges_s) - 1
+    return dataclasses.replace(
+        design, theta=theta, force_n=np.full((n, bins), np.nan), wave=np.zeros(n, dtype=np.int64),
+        held_out=np.zeros(n, bool), ok=np.zeros(n, bool), messages=("",) * n, seconds=np.full(n, np.nan),
+    )  # fmt: skip
+
+
+def _as_design(like: Design, theta: Mapping[str, float], simulation: Simulation) -> Design:
+    point = points_like(like, np.array([[theta[name] for name in like.space.names]]))
+    return dataclasses.replace(
+        point, force_n=simulation.bin_means(like.edges_s)[None], ok=np.array([True]),
+        messages=(simulation.message,), seconds=np.array([simulation.stats["seconds"]]),
+    )  # fmt: skip
+
+
+def _joined(design: Design, runs: Design) -> Design:
+    """The design with further training rows, a wave of their own."""
+    number = np.full(len(runs.theta), design.wave.max() + 1)
+    return dataclasses.replace(
+        design,
+        theta=np.concatenate([design.theta, runs.theta]),
+        force_n=np.concatenate([design.force_n, runs.force_n]),
+        wave=np.concatenate([design.wave, number]),
+        held_out=np.concatenate([design.held_out, runs.held_out]),
+        ok=np.concatenate([design.ok, runs.ok]),
+        messages=(*design.messages, *runs.messages),
+        seconds=np.concatenate([design.seconds, runs.seconds]),
+    )

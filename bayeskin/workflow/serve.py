@@ -1,0 +1,183 @@
+"""The forward model as a UM-Bridge model: parameters in, the force over a protocol out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from http.server import ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayeskin.config import parameter_space
+from bayeskin.errors import InputError
+from bayeskin.external.model import check_own
+from bayeskin.external.umbridge import Refused, Vectors, server
+from bayeskin.finite_element.simulate import ModelSpec, simulate
+from bayeskin.forward.observed import reported
+from bayeskin.mechanisms import Mechanism, bin_means, catalogue, laws, solved
+from bayeskin.recordings import covered_s, read_recording, segment, uniform_edges
+from bayeskin.shipped import shipped
+from bayeskin.types import Array, PadMotion, Parameter
+from bayeskin.workflow.engine import Reporter, Run, open_run
+from bayeskin.workflow.model import model_spec
+from bayeskin.workflow.recording import pad_motion
+
+NAME = "bayeskin"
+KEYS = ("protocol", "edges_s", "times_s", "mechanisms")
+MOST_TIMES = 1_000_000
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One configuration of the model: what drives it, where its force is wanted, what is added to it.
+
+    edges_s (m+1,) : bins whose mean forces are the output; times_s (t,) : times, in their place
+    """
+
+    motion: PadMotion
+    edges_s: Array
+    times_s: Array | None
+    mechanisms: tuple[Mechanism, ...]
+
+    @property
+    def outputs(self) -> int:
+        return len(self.edges_s) - 1 if self.times_s is None else len(self.times_s)
+
+
+@dataclass(frozen=True)
+class ServedModel:
+    """The model of a configuration, as `bayeskin.external.umbridge.Model`.
+
+    A client may send ``protocol`` (``time_s`` [s] and ``displacement_m`` [m] of its corners, of
+    the displacement between the pads), ``edges_s`` or ``times_s`` [s], and names of ``mechanisms``, whose
+    parameters follow the base model's in the one input vector. What it leaves out is the served one's.
+    """
+
+    spec: ModelSpec
+    parameters: tuple[Parameter, ...]
+    usual: Asked
+    name: str = NAME
+
+    def input_sizes(self, config: Mapping[str, Any]) -> list[int]:
+        return [len(self._names(self._asked(config)))]
+
+    def output_sizes(self, config: Mapping[str, Any]) -> list[int]:
+        return [self._asked(config).outputs]
+
+    def evaluate(self, inputs: Vectors, config: Mapping[str, Any]) -> Vectors:
+        """One run. Raises Refused for a run that fails, with its message."""
+        asked = self._asked(config)
+        values = dict(zip(self._names(asked), inputs[0], strict=True))
+        within = {p.name for mechanism in solved(asked.mechanisms) for p in mechanism.parameters}
+        theta = {n: v for n, v in values.items() if n in within or n in self._names(self.usual)}
+        run = simulate(self.spec, asked.motion, theta, laws=laws(asked.mechanisms))
+        if run.status != "ok":
+            raise Refused(run.message)
+        force = reported(run, asked.mechanisms, values, asked.motion)
+        if asked.times_s is not None:
+            return [np.atleast_2d(force(asked.times_s))[0].tolist()]
+        if not asked.mechanisms:  # a design's own means
+            return [run.bin_means(asked.edges_s).tolist()]
+        return [bin_means(force, asked.motion, asked.edges_s, asked.mechanisms)[0].tolist()]
+
+    def _names(self, asked: Asked) -> list[str]:
+        more = [p.name for mechanism in asked.mechanisms for p in mechanism.parameters]
+        names = [*(p.name for p in self.parameters), *more]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise InputError("config: mechanisms", f"{twice[0]} twice", "parameters of other names")
+        return names
+
+    def _asked(self, config: Mapping[str, Any]) -> Asked:
+        for key in config:
+            if key not in KEYS:
+                raise InputError(f"config: {key}", "an unknown key", f"one of {', '.join(KEYS)}")
+        motion, edges_s = self.usual.motion, self.usual.edges_s
+        if "protocol" in config:
+            motion = _protocol(config["protocol"])
+            width_s = float(edges_s[1] - edges_s[0])
+            edges_s = uniform_edges(float(motion.time_s[-1]), width_s)
+        if "edges_s" in config:
+            edges_s = _times("edges_s", config["edges_s"], motion)
+        times_s = _times("times_s", config["times_s"], motion) if "times_s" in config else None
+        if times_s is None and len(edges_s) < 2:
+            raise InputError("config: edges_s", f"{len(edges_s)} edges", "two or more")
+        return Asked(motion, edges_s, times_s, _mechanisms(config.get("mechanisms", [])))
+
+
+def open_server(
+    config: Path | None, host: str, port: int, reporter: Reporter
+) -> tuple[ThreadingHTTPServer, dict[str, Any]]:
+    """A server of a configuration's model (default: the demo's) that listens, and what it offers.
+
+    Raises InputError for bad input, or an address that cannot be had.
+    """
+    run = open_run(config or shipped("runs/demo.toml"), reporter)
+    model = _served(run)
+    listening = server(model, host, port)
+    address = f"http://{host}:{listening.server_address[1]}"
+    names = [p.name for p in model.parameters]
+    text = (
+        f"{NAME} at {address}: {', '.join(names)} in, mean forces over {model.usual.outputs} bins out; "
+        "Ctrl-C ends it"
+    )
+    offered = {"url": address, "model": NAME, "inputs": names, "outputs": model.usual.outputs}
+    return listening, {"ok": True, **offered, "text": text}
+
+
+def _served(run: Run) -> ServedModel:
+    spec, space = model_spec(run), parameter_space(run.config, run.config_path)
+    if spec.forward is not None:
+        check_own(spec.forward)
+    recording = read_recording(run.beside(run.config.recording.file))
+    motion = pad_motion(spec.observation, recording, segment(recording), run.config.recording.protocol)
+    edges_s = uniform_edges(covered_s(recording, motion), run.config.fit.bin_width_s)
+    return ServedModel(spec, space.parameters, Asked(motion, edges_s, None, ()))
+
+
+def _protocol(given: Any) -> PadMotion:
+    keys = {"time_s", "displacement_m"}
+    if not isinstance(given, dict) or set(given) != keys:
+        raise InputError("config: protocol", f"{given!r:.60}", "lists time_s and displacement_m")
+    time_s, displacement_m = (_numbers(f"protocol.{key}", given[key]) for key in ("time_s", "displacement_m"))
+    if len(time_s) != len(displacement_m) or len(time_s) < 2:
+        found = f"{len(time_s)} times, {len(displacement_m)} displacements"
+        raise InputError("config: protocol", found, "as many of both, two or more")
+    if time_s[0] != 0.0 or not np.all(np.diff(time_s) > 0):
+        raise InputError("config: protocol.time_s", f"{time_s[0]:g} first", "times that increase from 0")
+    return PadMotion(time_s, displacement_m)
+
+
+def _times(key: str, given: Any, motion: PadMotion) -> Array:
+    """Increasing times within a protocol."""
+    times_s, end_s = _numbers(key, given), float(motion.time_s[-1])
+    if not len(times_s) or not np.all(np.diff(times_s) > 0):
+        raise InputError(f"config: {key}", f"{len(times_s)} times that do not increase", "increasing times")
+    if times_s[0] < 0.0 or times_s[-1] > end_s * (1.0 + 1e-9):
+        found = f"{times_s[0]:g} to {times_s[-1]:g} s"
+        raise InputError(f"config: {key}", found, f"times within the protocol's 0 to {end_s:g} s")
+    return times_s
+
+
+def _numbers(key: str, given: Any) -> Array:
+    numbers = isinstance(given, list) and all(
+        isinstance(value, int | float) and not isinstance(value, bool) for value in given
+    )
+    found = np.array(given, dtype=float) if numbers and len(given) <= MOST_TIMES else np.array([np.nan])
+    if not np.isfinite(found).all():
+        raise InputError(f"config: {key}", f"{given!r:.60}", f"a list of at most {MOST_TIMES} finite numbers")
+    return found
+
+
+def _mechanisms(given: Any) -> tuple[Mechanism, ...]:
+    if given == []:
+        return ()
+    known = catalogue()
+    if not isinstance(given, list) or len({str(name) for name in given}) != len(given):
+        raise InputError("config: mechanisms", f"{given!r:.60}", "a list of names, each once")
+    for name in given:
+        if not isinstance(name, str) or name not in known:
+            raise InputError("config: mechanisms", repr(name), f"some of {', '.join(known)}")
+    return tuple(known[name] for name in given)

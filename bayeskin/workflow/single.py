@@ -1,0 +1,302 @@
+"""Commands that need no run's folder: import a recording, run the full model once."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bayeskin import storage
+from bayeskin.config import Config, load_config, parameter_space
+from bayeskin.device import load_device_file
+from bayeskin.errors import InputError
+from bayeskin.finite_element.accuracy import mesh_error
+from bayeskin.finite_element.problem import Problem
+from bayeskin.finite_element.simulate import ModelSpec, OnState, problem_at, simulate
+from bayeskin.forward.observed import reported
+from bayeskin.geometry import LENGTHS, Geometry
+from bayeskin.json_files import plain
+from bayeskin.mechanisms import Mechanism, catalogue, laws, solved
+from bayeskin.number_format import number
+from bayeskin.recordings import describe, describe_json, phase_noise, read_recording, segment
+from bayeskin.reduced.files import load_reduced
+from bayeskin.reduced.simulate import simulate_reduced
+from bayeskin.shipped import shipped
+from bayeskin.types import PadMotion, Parameter, ParameterSpace, Simulation
+from bayeskin.workflow.engine import Reporter, Run
+from bayeskin.workflow.field_outputs import FieldOutputs, moments_of
+from bayeskin.workflow.model import model_spec
+from bayeskin.workflow.provenance import caption
+from bayeskin.workflow.recording import pad_motion
+from bayeskin.workflow.reducing import reduced_file
+
+REPORTED_EVERY_S = 0.1  # with mechanisms, whose force changes within a step of the model
+
+
+def import_recording(file: Path, out: Path, sheet: str | None = None) -> dict[str, Any]:
+    """Reads `file`, writes it to `out` in bayeskin's HDF5, and says what is in it.
+
+    Raises InputError, with nothing written, when it is no recording of a test.
+    """
+    _check_suffix(out, (".h5",))
+    recording = read_recording(file, sheet=sheet)
+    phases = segment(recording)
+    noise = phase_noise(recording, phases)
+    storage.save(out, recording)
+    text = f"{describe(recording, phases, noise)}\n\nwritten to {out}"
+    return plain({"ok": True, "out": out, **describe_json(recording, phases, noise), "text": text})
+
+
+def simulate_once(
+    reporter: Reporter,
+    out: Path,
+    config: Path | None = None,
+    device: Path | None = None,
+    recording: Path | None = None,
+    settings: Sequence[str] = (),
+    mechanisms: Sequence[str] = (),
+    mesh: str | None = None,
+    observation: str | None = None,
+    reduced: bool = False,
+    fields: Path | None = None,
+    figures: Path | None = None,
+    at_s: Sequence[float] = (),
+) -> dict[str, Any]:
+    """Runs the model once on a recording's displacement, into `out` (.csv or .h5); its fields into folders.
+
+    What is not given is the configuration's, or the demo's; the sections of the file `device` go before its
+    own. Parameters that `settings` ("NAME=VALUE", SI) leave out stand at the median of their prior, uncertain
+    lengths of the tissue at their mean; those of the `mechanisms` named are among them. The
+    figure shows the fields at the times `at_s`, or at four moments of the protocol. With `reduced` the
+    device's reduced model runs in the full one's place. A run that fails is told, and nothing is written.
+    Raises InputError for bad input.
+    """
+    _check_suffix(out, (".csv", ".h5"))
+    _check_folders(fields, figures, at_s)
+    config_path = config or shipped("runs/demo.toml")
+    run = Run(_with_device(load_config(config_path), device), config_path, Path(), reporter)
+    added = _mechanisms(mechanisms)
+    spec = model_spec(run, mesh, observation)
+    if spec.forward is not None and (fields or figures or added):
+        raise InputError("simulate", f"the model {spec.forward}", "no fields, figures or mechanisms with it")
+    base = parameter_space(run.config, config_path)
+    more = tuple(p for mechanism in added for p in mechanism.parameters)
+    values = _values(ParameterSpace((*base.parameters, *more)), spec.geometry, settings)
+    for parameter in more:
+        _refuse_senseless(parameter, values[parameter.name])
+    theta = {name: values[name] for name in base.names}
+    along = {p.name: values[p.name] for mechanism in solved(added) for p in mechanism.parameters}
+    source = read_recording(recording or run.beside(run.config.recording.file))
+    phases = segment(source)
+    motion = pad_motion(spec.observation, source, phases, run.config.recording.protocol)
+    moments = moments_of(phases, motion, at_s)
+    reporter.log(f"simulating {motion.time_s[-1]:.1f} s, {spec.forward or _on_mesh(spec)}")
+    outputs = None
+    if fields or figures:
+        if spec.observation == "article":
+            found = "model.observation 'article', whose stresses are not those of the fields"
+            raise InputError("--fields, --figures", found, "'reaction'")
+        problem = problem_at(spec, theta)
+        _refuse_other_stresses(added, theta | along, problem)
+        outputs = FieldOutputs(problem, theta, motion, moments, fields, figures)
+    on_state = outputs.on_state if outputs else None
+    if reduced:
+        simulation = _reduced_run(spec, (device, config), motion, theta | along, added, on_state)
+    else:
+        simulation = simulate(
+            spec, motion, theta | along, lambda share: reporter.progress("simulation", share), on_state,
+            laws=laws(added),
+        )  # fmt: skip
+    files: list[Path] = []
+    if simulation.status == "ok":
+        simulation = _reported(simulation, added, values, motion)
+        write_simulation(out, simulation)
+        files = [out, *(outputs.write(caption(run)) if outputs else ())]
+    return _answer(simulation, spec, files, reduced)
+
+
+def _reduced_run(
+    spec: ModelSpec, sources: Sequence[Path | None], motion: PadMotion, theta: Mapping[str, float],
+    mechanisms: Sequence[Mechanism], on_state: OnState | None,
+) -> Simulation:  # fmt: skip
+    """A run of the reduced model that fits, with its estimated error.
+
+    Raises InputError where there is none for this device, mesh or observation.
+    """
+    if (spec.observation, spec.mesh, spec.refinement) != ("reaction", "bricks", 1):
+        found = f"observation {spec.observation!r} on {spec.mesh!r}, refinement {spec.refinement}"
+        raise InputError("--reduced", found, "observation 'reaction' on 'bricks', refinement 1")
+    model = load_reduced(reduced_file(spec.geometry, [source for source in sources if source is not None]))
+    return simulate_reduced(
+        model, motion, theta, mechanisms, geometry=spec.geometry, estimate=True, on_state=on_state
+    )
+
+
+def _with_device(config: Config, device: Path | None) -> Config:
+    """The configuration with the sections of a device's file."""
+    if device is None:
+        return config
+    stated = load_device_file(device)
+    return config.model_copy(update={"device": stated.device, "tissue": stated.tissue})
+
+
+def _on_mesh(spec: ModelSpec) -> str:
+    """The full model in words."""
+    return f"{spec.observation} on {Path(spec.mesh).name}"
+
+
+def write_simulation(out: Path, simulation: Simulation) -> None:
+    """As CSV with the columns time_s, displacement_m, force_n, or as HDF5, by suffix; whole or not at all."""
+    if out.suffix == ".h5":
+        storage.save(out, simulation)
+        return
+    columns, text = ("time_s", "displacement_m", "force_n"), io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*(getattr(simulation, name).tolist() for name in columns), strict=True))
+    storage.write_bytes(out, text.getvalue().encode())
+
+
+def _mechanisms(names: Sequence[str]) -> list[Mechanism]:
+    known = catalogue()
+    for name in names:
+        if name not in known:
+            raise InputError(f"--mechanism {name}", "an unknown mechanism", f"one of {', '.join(known)}")
+    return [known[name] for name in dict.fromkeys(names)]
+
+
+def _refuse_other_stresses(
+    mechanisms: Sequence[Mechanism], values: Mapping[str, float], problem: Problem
+) -> None:
+    """Fields are those of the base law: a mechanism that changes it at a point has others."""
+    for mechanism in mechanisms:
+        bind = mechanism.act.bind
+        if bind is not None and bind(values, problem.sites).respond is not None:
+            expected = "none that changes the tissue's stress or flow: fields are of the base law"
+            raise InputError("--fields, --figures", f"--mechanism {mechanism.name}", expected)
+
+
+def _refuse_senseless(parameter: Parameter, value: float) -> None:
+    positive = parameter.in_log and parameter.offset == 0.0
+    least = "positive number" if positive else "number of at least 0" if parameter.in_log else "number"
+    below = parameter.in_log and (value < 0.0 or (positive and value == 0.0))
+    if not np.isfinite(value) or below:
+        expected = f"a finite {least}"
+        raise InputError(f"--set {parameter.name}", f"{value:g}", expected)
+
+
+def _reported(
+    simulation: Simulation, mechanisms: Sequence[Mechanism], values: Mapping[str, float], motion: PadMotion
+) -> Simulation:
+    """The same run as an instrument with `mechanisms` reports it, at more times than the model's steps."""
+    if not mechanisms:
+        return simulation
+    time_s = motion.times(REPORTED_EVERY_S, simulation.time_s)
+    force_n = reported(simulation, mechanisms, values, motion)(time_s)[0]
+    return replace(
+        simulation,
+        theta=dict(values),
+        time_s=time_s,
+        displacement_m=motion.at(time_s),
+        force_n=force_n,
+        stats={**simulation.stats, "peak_force_n": float(np.abs(force_n).max())},
+        corner=np.isin(time_s, simulation.time_s[simulation.corner]),
+    )
+
+
+def _values(space: ParameterSpace, geometry: Geometry, settings: Sequence[str]) -> dict[str, float]:
+    theta = dict(zip(space.names, space.from_unit([0.5] * space.dim).tolist(), strict=True))
+    theta |= {name: getattr(geometry, name) for name in LENGTHS if name in theta}
+    for setting in settings:
+        name, equals, value = setting.partition("=")
+        if not equals or name not in theta:
+            raise InputError(f"--set {setting}", repr(name), f"NAME=VALUE with one of {', '.join(theta)}")
+        try:
+            theta[name] = float(value)
+        except ValueError:
+            raise InputError(f"--set {setting}", repr(value), "a number in SI units") from None
+    return theta
+
+
+def _answer(simulation: Simulation, spec: ModelSpec, files: Sequence[Path], reduced: bool) -> dict[str, Any]:
+    """Returns what a run says of itself; `files` are those that it wrote, the force first."""
+    ok, stats = simulation.status == "ok", simulation.stats
+    text = f"failed: {simulation.message}"
+    if ok:
+        own = spec.forward is not None
+        unknowns = stats.get("modes") if reduced else stats.get("dofs")
+        steps = "one run" if own else f"{stats['steps']:.0f} steps of {unknowns:.0f} unknowns"
+        text = (
+            f"{steps} in {stats['seconds']:.1f} s, peak force {number(stats['peak_force_n'], 4)} N, "
+            f"written to {', '.join(map(str, files))}"
+        )
+        lines = _reduced_accuracy(simulation) if reduced else _accuracy(simulation, spec)
+        text += "".join(f"\n{line}" for line in lines)
+    answer = {"ok": ok, "status": simulation.status, "message": simulation.message, "theta": simulation.theta}
+    model = {"observation": spec.observation, "mesh": spec.mesh, "model_hash": simulation.model_hash}
+    written = {
+        "out": files[0] if files else None,
+        "fields": next((file for file in files if file.suffix == ".xdmf"), None),
+        "figures": [file for file in files if file.suffix in (".png", ".svg")],
+        "files": files,
+    }
+    told = _told_of_reduced(simulation) if reduced else {}
+    return plain({**answer, **model, "stats": stats, **told, **written, "text": text})
+
+
+def _told_of_reduced(simulation: Simulation) -> dict[str, Any]:
+    """What a program asks of a reduced run first."""
+    stats = simulation.stats
+    return {
+        "seconds": stats["seconds"],
+        "error_estimate_n": stats.get("error_estimate_n"),
+        "inside": stats["inside"] == 1.0,
+    }
+
+
+def _reduced_accuracy(simulation: Simulation) -> list[str]:
+    """The estimated error of a reduced run beside the full model on the same mesh."""
+    stats = simulation.stats
+    error_n = stats["error_estimate_n"]
+    share = 100 * error_n / stats["peak_force_n"] if stats["peak_force_n"] > 0.0 else 0.0
+    return [
+        f"estimated error beside the full model: {number(1e3 * error_n, 2)} mN, {number(share, 2)} % of peak",
+        f"{stats['seconds_of_run']:.2f} s of these the run itself, the rest its preparation and the estimate",
+    ]
+
+
+def _accuracy(simulation: Simulation, spec: ModelSpec) -> list[str]:
+    """The estimated error of a reaction; the article's force has none: it does not converge."""
+    if spec.observation == "own":
+        return ["no estimated error: a model of your own"]
+    if spec.observation == "article":
+        return ["no estimated error: the article's force depends on its mesh and converges on none"]
+    peak_n = simulation.stats["peak_force_n"]
+    time_share = simulation.stats["time_error_n"] / peak_n if peak_n > 0.0 else 0.0
+    found = mesh_error(spec.mesh_hash)
+    mesh = "unknown, the mesh is not in the study" if found is None else f"{number(100 * found.rms, 2)} % RMS"
+    falls = simulation.stats["falls"]
+    snapped = [f"the skin folded: it snapped to another equilibrium {falls:.0f} times"] if falls else []
+    return [
+        *snapped,
+        f"estimated error, of the peak: time steps {number(100 * time_share, 2)} %, mesh {mesh}",
+    ]
+
+
+def _check_suffix(out: Path, suffixes: tuple[str, ...]) -> None:
+    if out.suffix not in suffixes:
+        raise InputError(f"-o {out}", f"ending {out.suffix!r}", f"ending {' or '.join(suffixes)}")
+
+
+def _check_folders(fields: Path | None, figures: Path | None, at_s: Sequence[float]) -> None:
+    for option, folder in (("--fields", fields), ("--figures", figures)):
+        above = [path for path in (folder, *folder.parents) if path.exists()] if folder else []
+        if above and not above[0].is_dir():
+            raise InputError(f"{option} {folder}", f"{above[0]} is a file", "a folder")
+    if at_s and figures is None:
+        raise InputError(f"--at {at_s[0]:g}", "no --figures", "--figures DIR with it")

@@ -1,0 +1,119 @@
+"""Third stage: the surrogate, with its error on held-out runs after each wave."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayeskin import report, storage
+from bayeskin.config import parameter_space
+from bayeskin.surrogates import (
+    ShapeSurrogate,
+    Validation,
+    correct,
+    load_manifest,
+    load_surrogate,
+    manifest_of,
+    save_surrogate,
+    train,
+)
+from bayeskin.types import Array, BinnedForce, Design, PadMotion
+from bayeskin.workflow.design import enough, fitted_bins, focus
+from bayeskin.workflow.engine import Run, Stage
+from bayeskin.workflow.provenance import caption
+from bayeskin.workflow.shipping import origin, shipped_files
+
+PRIOR_DRAWS = 256
+
+
+def trained(run: Run, design: Design, binned: BinnedForce) -> tuple[ShapeSurrogate, Validation]:
+    """The configuration's surrogate of a design, best near the recording."""
+    config = run.config
+    weights = focus(design, binned, fitted_bins(run, binned))
+    return train(enough(design), config.surrogate.kind, config.seed, weights)
+
+
+def corrected(
+    run: Run, surrogate: ShapeSurrogate, fine: Design, binned: BinnedForce
+) -> tuple[ShapeSurrogate, Validation]:
+    """A coarser model's surrogate, corrected by runs of the configuration's model."""
+    return correct(surrogate, fine, focus(fine, binned, fitted_bins(run, binned)))
+
+
+def fine_design(run: Run, stage: str) -> Design | None:
+    """The configuration's model at points of a coarser one's design, as a stage left it; None without."""
+    return None if run.config.design.coarse is None else storage.load(run.at(stage, "fine.h5"), Design)
+
+
+def _work(run: Run) -> Mapping[str, Any]:
+    design, fine = storage.load(run.at("design", "design.h5"), Design), fine_design(run, "design")
+    binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
+    motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
+    uncorrected = None
+    if run.config.surrogate.file is not None:
+        ready = shipped_files(run).surrogate
+        surrogate, manifest = load_surrogate(ready), load_manifest(ready)
+    else:
+        surrogate, validation = trained(run, design, binned)
+        if fine is not None:
+            uncorrected = surrogate
+            surrogate, validation = corrected(run, uncorrected, fine, binned)
+        records = json.loads(run.at("design", "waves.json").read_text())
+        manifest = {**manifest_of(surrogate, validation), **origin(run, motion, records)}
+    save_surrogate(run.at("train", "surrogate.h5"), surrogate, manifest)
+    _draw(run, design, fine, binned, surrogate, uncorrected)
+    return {name: value for name, value in manifest.items() if name not in ("waves", "parameters")}
+
+
+def _draw(
+    run: Run, design: Design, fine: Design | None, binned: BinnedForce, surrogate: ShapeSurrogate,
+    uncorrected: ShapeSurrogate | None,
+) -> None:  # fmt: skip
+    held_out = design if fine is None else fine
+    testing = held_out.testing
+    truth, prediction = held_out.force_n[testing], surrogate.predict(held_out.theta[testing])
+    noise_sd_n = np.sqrt(binned.variance_n2)
+    scale = np.sqrt(np.mean(truth**2, axis=1))
+    means = [*_former(run, design, binned, held_out, uncorrected), prediction.mean]
+    errors = np.array([np.sqrt(np.mean((mean - truth) ** 2, axis=1)) / scale for mean in means])
+    figure = report.figure_validation(
+        design.edges_s, truth, prediction, noise_sd_n, errors, corrected=fine is not None
+    )
+    report.save_figure(figure, run.at("train", "validation"), caption(run))
+    space = parameter_space(run.config, run.config_path)
+    theta = space.draw(np.random.default_rng([run.config.seed, 3]), PRIOR_DRAWS)
+    drawn = surrogate.predict_mean(theta)
+    figure = report.figure_prior_predictive(binned, drawn)
+    report.save_figure(figure, run.at("train", "prior_predictive"), caption(run))
+
+
+def _former(
+    run: Run, design: Design, binned: BinnedForce, held_out: Design, uncorrected: ShapeSurrogate | None
+) -> list[Array]:
+    """What surrogates trained on the waves up to each but the last predict at held-out points, (n, m) each.
+
+    With a fine model's held-out points, the last is of the uncorrected surrogate, of all waves. NaN where
+    the surrogate was trained elsewhere.
+    """
+    waves = np.unique(design.wave[design.ok])
+    theta, before = held_out.theta[held_out.testing], waves[:-1]
+    if run.config.surrogate.file is not None:
+        count = len(before) if held_out is design else len(waves)
+        return [np.full((len(theta), design.force_n.shape[1]), np.nan)] * count
+    parts = [dataclasses.replace(design, ok=design.ok & (design.wave <= wave)) for wave in before]
+    found = [trained(run, part, binned)[0].predict_mean(theta) for part in parts]
+    return found if uncorrected is None else [*found, uncorrected.predict_mean(theta)]
+
+
+STAGE = Stage(
+    "train",
+    "trains the surrogate",
+    ("recording", "design"),
+    ("seed", "parameters", "surrogate", "fit", "model", "design"),
+    _work,
+    lambda run: shipped_files(run).present if run.config.surrogate.file is not None else (),
+)
