@@ -13,8 +13,12 @@ from toys import solved
 from toys.solved import BASE, KNOWN
 
 from bayeskin.errors import InputError
+from bayeskin.mismatch.further_maxima import fit_larger_sets
 from bayeskin.mismatch.hypotheses import weight
-from bayeskin.mismatch.search import Search, SearchSettings, _Searcher, search
+from bayeskin.mismatch.search import Searcher, search
+from bayeskin.mismatch.search_context import SearchContext
+from bayeskin.mismatch.search_record import SearchRecord, SearchResult
+from bayeskin.mismatch.search_settings import SearchSettings
 from bayeskin.mismatch.tasks import Climb, FullProbe, Join, Probe, Promise, Task, Weigh
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array, ParameterSpace
@@ -47,7 +51,7 @@ class Asked:
         said = {"message": "the worker ended"} if self.lost(task) else self.bench.done(task)
         return self.bench.answered(task, json.loads(json.dumps(said)))
 
-    def search(self, seed: int = 1, settings: SearchSettings = FEW) -> Search:
+    def search(self, seed: int = 1, settings: SearchSettings = FEW) -> SearchResult:
         bench, tell = self.bench, self.told.append
         solves = bench.forward.solves
         return search(self, bench.binned, bench.base, KNOWN, solves, bench.noise, seed, tell, settings)
@@ -203,7 +207,7 @@ def test_the_same_seed_gives_the_same_search(asked: Make) -> None:
     assert _as_values(other.search(4)) != _as_values(first.search(3))
 
 
-def _as_values(found: Search) -> dict[tuple[str, ...], tuple[float, dict[str, float]]]:
+def _as_values(found: SearchResult) -> dict[tuple[str, ...], tuple[float, dict[str, float]]]:
     return {names: (one.fit.value, dict(one.fit.theta)) for names, one in found.fits.items()}
 
 
@@ -319,17 +323,18 @@ def test_larger_sets_are_fitted_anew_from_a_new_maximum_of_a_part(asked: Make) -
     part, both = ("stiffness-drift",), ("force-offset", "stiffness-drift")
     assert {part, both} <= set(found.evidences)
     right = found.fits[both]
-    found.fits[both] = replace(right, fit=replace(right.fit, log_evidence=right.fit.log_evidence - 50.0))
-    searcher = _Searcher(
-        one, bench.binned, bench.base, KNOWN, bench.forward.solves, bench.noise, 1, one.told.append, FEW
-    )
-    searcher.found = found
-    searcher._fit_larger(found.fits[part])
-    assert weight(found.fits[both].fit) > weight(right.fit) - 20.0
-    assert both not in found.checks
-    searcher.weigh()
-    assert found.chosen == both
-    assert both in found.checks
+    worse = replace(right, fit=replace(right.fit, log_evidence=right.fit.log_evidence - 50.0))
+    record = SearchRecord({**found.fits, both: worse}, dict(found.checks), dict(found.evidences))
+    context = SearchContext(
+        one, bench.binned, bench.base, KNOWN, bench.forward.solves, bench.noise, 1, one.told.append, FEW,
+        record,
+    )  # fmt: skip
+    fit_larger_sets(context, found.fits[part])
+    assert weight(record.fits[both].fit) > weight(right.fit) - 20.0
+    assert both not in record.checks
+    Searcher(context).weigh_likely_sets()
+    assert record.chosen == both
+    assert both in record.checks
 
 
 def test_what_has_no_name_is_not_imitated_by_ever_larger_sets(asked: Make) -> None:
@@ -341,7 +346,7 @@ def test_what_has_no_name_is_not_imitated_by_ever_larger_sets(asked: Make) -> No
     assert found.family.smooth > 0.99
     tried = [task for task in one.tasks if isinstance(task, Probe | Promise)]
     assert max(len(names_of(task)) for task in tried) == 1
-    assert any("with something smooth that has no name, is as likely" in line for line in one.told)
+    assert any("with an unnamed smooth discrepancy, is as likely" in line for line in one.told)
 
 
 def test_the_sets_that_are_compared_are_weighed_at_their_last_fits(asked: Make) -> None:

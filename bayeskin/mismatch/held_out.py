@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.hypotheses import weight
-from bayeskin.mismatch.search import added
+from bayeskin.mismatch.search_context import correction
 from bayeskin.mismatch.tasks import Ask, Climb
 from bayeskin.mismatch.trust_region import JointFit
 from bayeskin.types import BinnedForce
@@ -41,7 +41,7 @@ def fit_beginning(ask: Ask, sets: Sequence[JointFit], split_s: float | None) -> 
     """
     if split_s is None:
         return None
-    answers = ask([Climb(one.fit.names, one.fit.theta, RUNS, added(one), split_s) for one in sets])
+    answers = ask([Climb(one.fit.names, one.fit.theta, RUNS, correction(one), split_s) for one in sets])
     fits = [one.fit for one in answers if isinstance(one, JointFit)]
     base = next((one for one in fits if not one.names), None)
     return None if base is None else Beginning(base, max(fits, key=weight))

@@ -29,7 +29,9 @@ from bayeskin.mismatch.held_out import end_of_second_hold, fit_beginning
 from bayeskin.mismatch.hypotheses import Evidences, Family, Judgement, judge_family
 from bayeskin.mismatch.locate import Located, locate
 from bayeskin.mismatch.resample import Resampled, resample
-from bayeskin.mismatch.search import Search, noise_of, search
+from bayeskin.mismatch.search import search
+from bayeskin.mismatch.search_context import noise_of
+from bayeskin.mismatch.search_record import SearchResult
 from bayeskin.mismatch.tasks import Ask, FullProbe, Probe, Task
 from bayeskin.mismatch.trust_region import JointFit, within
 from bayeskin.recordings import read_recording
@@ -110,7 +112,7 @@ def bench_of(run: Run) -> Workbench:
     return bench
 
 
-def searched(run: Run, bench: Workbench, ask: Ask) -> Search:
+def searched(run: Run, bench: Workbench, ask: Ask) -> SearchResult:
     """Returns the search of a run; after a diagnosis all its answers are kept."""
     tell = partial(_tell, run)
     known, solves = bench.known, bench.forward.solves
@@ -254,7 +256,7 @@ def _mechanisms(
     return rows
 
 
-def _set(names: tuple[str, ...], found: Search, said: Evidences, family: Family) -> dict[str, Any]:
+def _set(names: tuple[str, ...], found: SearchResult, said: Evidences, family: Family) -> dict[str, Any]:
     one: JointFit = found.fits[names]
     return {
         "mechanisms": list(names), "probability": family.probability_of_set(names),
@@ -289,7 +291,7 @@ def _shown(fit: Fit, located: Located, drawn: Resampled, begun: Fit | None) -> S
     return Shown(fit.force_n, band_n, None if begun is None else begun.force_n, located, drawn.summary)
 
 
-def _checked(bench: Workbench, found: Search, names: tuple[str, ...]) -> dict[str, Any]:
+def _checked(bench: Workbench, found: SearchResult, names: tuple[str, ...]) -> dict[str, Any]:
     """Returns how far the reduced model and the recording are from a full run at a set's fit."""
     check, fit = found.checks.get(names), found.fits[names].fit
     if check is None or isinstance(check.full_n, str):

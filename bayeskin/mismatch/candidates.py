@@ -1,0 +1,180 @@
+"""Candidate mechanisms beside a set: score tests of all of them, and fits of the most promising ones.
+
+A mechanism that acts on the force alone is tested on the tangent of the set's last run, and its values are
+searched for there. A mechanism that the forward model solves is tested by a few runs off its neutral value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy.stats import qmc
+
+from bayeskin.inference.gauss_newton import promise
+from bayeskin.mechanisms import Mechanism, with_one
+from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.mismatch.search_context import SearchContext, correction, gained
+from bayeskin.mismatch.search_record import Names
+from bayeskin.mismatch.search_settings import RARITY
+from bayeskin.mismatch.tasks import Climb, Join, Probe, Promise, Task
+from bayeskin.mismatch.trust_region import JointFit
+from bayeskin.mismatch.wrapper import innermost
+from bayeskin.types import Array, ParameterSpace
+
+Values = Mapping[str, float]
+
+
+class Candidates:
+    """Finds the mechanisms that are worth fitting beside a set.
+
+    It remembers the shape of each mechanism that promised most, and the sets that it was asked about.
+    """
+
+    def __init__(self, context: SearchContext) -> None:
+        self._context = context
+        self._shapes: dict[str, Values] = {}  # by the name of the strength
+        self.expanded: set[Names] = set()
+
+    def fit_beside(self, current: JointFit) -> list[Names]:
+        """Fits the most promising of the new sets with one mechanism more; returns these sets.
+
+        A fit that fails, or that ends below the fit without the mechanism, starts again there: with the
+        values of a run that finished, and then with a weaker mechanism.
+        """
+        context, names, settings = self._context, current.fit.names, self._context.settings
+        self.expanded.add(names)
+        off_n = correction(current)  # it holds for the same mechanisms of the tissue
+        promised, starts, finished = self._score_tests(current)
+        order = sorted(promised, key=lambda name: -promised[name])
+        least = settings.gain + RARITY
+        if context.leaves_more_than_noise(current):
+            least = settings.promised
+        chosen = [name for name in order if promised[name] > least][: settings.shortlist]
+        context.tell("promised: " + ", ".join(f"{name} {promised[name]:.0f} nats" for name in order[:5]))
+        sets = {name: with_one(names, name, context.known) for name in chosen}
+        fits = context.ask([
+            Climb(sets[name], starts[name], settings.first) if name in starts
+            else Join(Promise(names, current.fit.theta, current.run, name, off_n), settings.first)
+            for name in chosen
+        ])  # fmt: skip
+        better = {name: _is_better(fit, current) for name, fit in zip(chosen, fits, strict=True)}
+        theta = {**context.neutral, **current.fit.theta}
+        for share in settings.again:
+            worse = [name for name in chosen if not better[name]]
+            more = context.ask([
+                Climb(sets[name], {**theta, **self._weaker(name, finished.get(name, {}), share)},
+                      settings.first, () if name in starts else off_n)
+                for name in worse
+            ])  # fmt: skip
+            better |= {name: _is_better(fit, current) for name, fit in zip(worse, more, strict=True)}
+            fits += more
+        context.keep(fits, current)
+        for name, with_name in sets.items():
+            fit = context.record.fits.get(with_name)
+            gain = "no fit" if fit is None else f"{gained(fit, current):+.1f} nats"
+            context.tell(f"{', '.join((*names, name))}: {gain}")
+        return list(sets.values())
+
+    def _score_tests(
+        self, current: JointFit
+    ) -> tuple[dict[str, float], dict[str, Values], dict[str, Values]]:
+        """Returns, by mechanism: the gain that its score test promises [nats]; where a fit would start, and
+        values with which the model runs, of the mechanisms that the model solves."""
+        context, names = self._context, current.fit.names
+        others = [
+            name for name in context.known
+            if name not in names and with_one(names, name, context.known) not in context.record.fits
+        ]  # fmt: skip
+        solved = [name for name in others if isinstance(context.known[name].act, Tissue)]
+        quick = [name for name in others if name not in solved]
+        probes = [(name, values) for name in solved for values in self._probes(context.known[name])]
+        theta = {**context.neutral, **current.fit.theta}
+        tasks: list[Task] = [
+            Probe(with_one(names, name, context.known), {**theta, **values}) for name, values in probes
+        ]
+        off_n = correction(current)
+        tasks += [Promise(names, current.fit.theta, current.run, name, off_n) for name in quick]
+        answers = context.ask(tasks)
+        promised: dict[str, float] = {}
+        tested: dict[str, float] = {}
+        starts: dict[str, Values] = {}
+        finished: dict[str, Values] = {}
+        for (name, values), force_n in zip(probes, answers, strict=False):
+            if isinstance(force_n, str):
+                continue
+            gain, start = self._score(current, name, values, np.asarray(force_n) + current.off_n)
+            strength = next(iter(values))
+            if gain > tested.get(strength, -1.0):
+                tested[strength], self._shapes[strength] = gain, values
+            if gain > promised.get(name, 0.0):
+                promised[name], starts[name], finished[name] = gain, start, values
+        for name, nats in zip(quick, answers[len(probes) :], strict=True):
+            if isinstance(nats, float):
+                promised[name] = nats
+        return promised, starts, finished
+
+    def _probes(self, mechanism: Mechanism) -> list[dict[str, float]]:
+        """Returns values of each part of a mechanism, off neutral, at which the model runs.
+
+        The first time they have several shapes, later the shape that promised most.
+        """
+        settings = self._context.settings
+        by_name, rows = {p.name: p for p in mechanism.parameters}, []
+        for strength, *shapes in mechanism.whole_or_parts:
+            space = ParameterSpace((by_name[strength],))
+            neutral = float(space.to_unit([mechanism.neutral[strength]])[0])
+            side = 1.0 if neutral <= 0.5 else -1.0
+            off = {strength: float(space.from_unit([neutral + side * settings.off])[0])}
+            if not shapes or strength in self._shapes:
+                rows.append({**off, **self._shapes.get(strength, {})})
+                continue
+            rows += [{**off, **values} for values in shapes_of(mechanism, shapes, settings.probes)]
+        return rows
+
+    def _weaker(self, name: str, values: Values, share: float) -> dict[str, float]:
+        """Returns values of a mechanism whose strength is only a share of its distance from neutral."""
+        weaker = dict(values)
+        for strength in list(values)[:1]:
+            neutral = self._context.known[name].neutral[strength]
+            weaker[strength] = neutral + share * (values[strength] - neutral)
+        return weaker
+
+    def _score(
+        self, current: JointFit, name: str, values: Values, force_n: Array
+    ) -> tuple[float, dict[str, float]]:
+        """Returns the gain [nats] that a mechanism promises along the change of force that a run shows, and
+        the point at which it would be reached.
+
+        The change of the skin's force counts as a change of the reported force.
+        """
+        about, mechanism = current.fit.log_posterior, self._context.known[name]
+        low, high = about.bounds
+        vector = np.clip(about.vector(current.fit.theta), low, high)
+        skin = innermost(about.surrogate)
+        skin_n = skin.predict_mean(np.array([current.fit.theta[p] for p in skin.space.names]))
+        mean = about.predict_mean(about.from_sampling(vector)) + (force_n - skin_n)
+        free = np.full(len(vector), True)
+        ((_, gain, multiple, moved),) = promise(about, vector, vector[None], free, 1, mean)
+        strength = next(iter(values))
+        parameter = next(p for p in mechanism.parameters if p.name == strength)
+        neutral = mechanism.neutral[strength]
+        wanted = neutral + multiple * (values[strength] - neutral)
+        inside = float(np.clip(wanted, parameter.lower, parameter.upper))
+        if (inside - neutral) * (wanted - neutral) <= 0.0:  # its prior does not allow this direction
+            return 0.0, {}
+        named = about.named(about.from_sampling(np.clip(moved, low, high)))
+        return gain, {**self._context.neutral, **named, **values, strength: inside}
+
+
+def shapes_of(mechanism: Mechanism, names: Sequence[str], count: int) -> list[dict[str, float]]:
+    """Returns `count` values of some of a mechanism's parameters, spread over their priors."""
+    by_name = {p.name: p for p in mechanism.parameters}
+    space = ParameterSpace(tuple(by_name[name] for name in names))
+    unit = qmc.Halton(space.dim, scramble=False).random(count + 1)[1:]
+    return [dict(zip(space.names, map(float, row), strict=True)) for row in space.from_unit(unit)]
+
+
+def _is_better(answer: object, current: JointFit) -> bool:
+    """Returns whether an answer is a fit that is not below another fit."""
+    return isinstance(answer, JointFit) and answer.fit.log_likelihood >= current.fit.log_likelihood

@@ -1,0 +1,117 @@
+"""Checks of fits by runs of the full model, and fits again where the forward model is too far off.
+
+The forward model has an error, which differs from one set of mechanisms to another. A full run at a fit shows
+it. The difference is then added to the force of the forward model, and the set is fitted again. So the sets
+that compete at the end are compared by forces that are as exact as the noise requires.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bayeskin.mismatch.search_context import SearchContext, gained, noise_of, title
+from bayeskin.mismatch.search_record import Check, Names
+from bayeskin.mismatch.tasks import Climb, FullProbe
+from bayeskin.mismatch.trust_region import JointFit
+from bayeskin.types import Array
+
+
+def checked_best(context: SearchContext) -> JointFit:
+    """Returns the likeliest set after a check, if it contains mechanisms of the tissue.
+
+    Without the check, an error of the forward model with these mechanisms could pass for further mechanisms.
+    """
+    for _ in range(context.settings.checks):
+        best = context.record.best
+        if not context.solved(best.fit.names) or is_checked_nearby(context, best):
+            break
+        check(context, [best])
+    return context.record.best
+
+
+def check_likely_sets(context: SearchContext) -> None:
+    """Checks the likely sets until no unchecked set is likely."""
+    for _ in range(context.settings.checks):
+        if not (unchecked := _unchecked(context)):
+            return
+        check(context, unchecked)
+
+
+def check(context: SearchContext, fits: Sequence[JointFit]) -> None:
+    """Runs the full model at fits, and fits the sets again for which the forward model is too far off."""
+    groups: dict[Names, list[JointFit]] = {}
+    for fit in fits:
+        groups.setdefault(context.solved(fit.fit.names), []).append(fit)
+    firsts = [members[0] for members in groups.values()]
+    forces = context.ask([FullProbe(names, context.solved_values(first))
+                          for names, first in zip(groups, firsts, strict=True)])  # fmt: skip
+    again: list[Climb] = []
+    for first, members, full_n in zip(firsts, groups.values(), forces, strict=True):
+        again += _record_checks(context, first, members, full_n)
+    for task, answer in zip(again, context.ask(again), strict=True):
+        if isinstance(answer, JointFit):
+            context.record.fits[task.names] = answer
+
+
+def is_checked_nearby(context: SearchContext, fit: JointFit) -> bool:
+    """Returns whether the full model was run near a fit, with the same mechanisms of the tissue."""
+    solved = context.solved(fit.fit.names)
+    return any(
+        context.solved(names) == solved and context.is_alike(fit, checked.theta)
+        for names, checked in context.record.checks.items()
+    )
+
+
+def forward_error(fit: JointFit, full_n: object) -> Array:
+    """Returns the error (m,) [N] of the forward model at a fit's run, without the fit's own correction."""
+    return np.asarray(full_n) - (fit.run.force_n - fit.off_n)
+
+
+def _unchecked(context: SearchContext) -> list[JointFit]:
+    """Returns the fits to check.
+
+    These are likely sets, parts of the likeliest set that have the same mechanisms of the tissue, and the
+    likeliest set itself if it has moved since its check.
+    """
+    record, settings = context.record, context.settings
+    order = record.likeliest(len(record.fits))
+    best = order[0]
+    likely = [fit for fit in order[: settings.compared] if gained(best, fit) <= settings.close]
+    solved = context.solved(best.fit.names)
+    parts = [
+        fit for fit in order
+        if set(fit.fit.names) < set(best.fit.names) and context.solved(fit.fit.names) == solved
+    ]  # fmt: skip
+    unchecked = {
+        fit.fit.names: fit for fit in (*likely, *parts)
+        if fit.fit.names not in record.checks and not is_checked_nearby(context, fit)
+    }  # fmt: skip
+    last = record.checks.get(best.fit.names)
+    best_is_checked = last is not None and np.array_equal(last.theta, best.run.theta)
+    return list(unchecked.values() if best_is_checked else {best.fit.names: best, **unchecked}.values())
+
+
+def _record_checks(
+    context: SearchContext, first: JointFit, members: Sequence[JointFit], full_n: object
+) -> list[Climb]:
+    """Records what a full run at the first of some fits shows of all of them; returns the fits to repeat.
+
+    All have the same mechanisms of the tissue, so the error of the forward model is taken to be the same.
+    """
+    tasks = []
+    for fit in members:
+        names = fit.fit.names
+        if isinstance(full_n, str):
+            context.record.checks[names] = Check(first.run.theta, full_n, np.inf)
+            context.tell(f"{title(names)}: the full model fails there: {full_n}")
+            continue
+        error_n = forward_error(first, full_n)
+        off = context.rms(error_n - fit.off_n)
+        context.record.checks[names] = Check(first.run.theta, np.asarray(full_n), off)
+        if off > context.settings.exact * noise_of(context.binned):
+            tasks.append(Climb(names, fit.fit.theta, context.settings.runs, tuple(error_n.tolist())))
+            difference = f"the full model differs by {1e3 * off:.1f} mN"
+            context.tell(f"{title(names)}: {difference}; the set is fitted again with that correction")
+    return tasks

@@ -1,0 +1,146 @@
+"""Further maxima of the posterior of the most probable set, from values that the force says little about.
+
+A posterior often has several maxima whose forces hardly differ. A force hardly tells which layer drains while
+it is observed, and of the other layer whether it drains at once or not at all. Intervals that ignore the
+further maxima are too narrow, and a mechanism may have gained only because the smaller set was not at its
+highest maximum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from bayeskin.mismatch.candidates import shapes_of
+from bayeskin.mismatch.full_checks import forward_error
+from bayeskin.mismatch.hypotheses import weight
+from bayeskin.mismatch.search_context import SearchContext, correction, gained, noise_of, title
+from bayeskin.mismatch.search_record import Check, Names
+from bayeskin.mismatch.tasks import Climb, FullProbe
+from bayeskin.mismatch.tissue_starts import nearest_tissues
+from bayeskin.mismatch.trust_region import JointFit
+from bayeskin.types import ParameterSpace
+
+
+def find_further_maxima(context: SearchContext, weigh: Callable[[], None]) -> None:
+    """Records further maxima of the most probable set, after those of the likeliest of its parts.
+
+    weigh : compares the hypotheses again, after a fit of theirs has changed
+    """
+    record = context.record
+    family, names = record.family, record.chosen
+    behind = {part: family.likeliest(names) - family.likeliest(part) for part in record.evidences}
+    parts = [part for part in behind if set(part) < set(names) and behind[part] < context.settings.behind]
+    if parts:
+        _record_maxima(context, min(parts, key=lambda part: behind[part]), weigh)
+    _record_maxima(context, record.chosen, weigh)
+
+
+def _record_maxima(context: SearchContext, names: Names, weigh: Callable[[], None]) -> None:
+    """Records further maxima of a set; their forces differ by so little that each needs a full run."""
+    record, settings = context.record, context.settings
+    if record.others_of(names):
+        return
+    best = record.fits[names]
+    fits = _fits_elsewhere(context, best)
+    forces = context.ask([FullProbe(context.solved(names), context.solved_values(fit)) for fit in fits])
+    maxima, checks = [best], list[Check]()
+    for fit, full_n in zip(fits, forces, strict=True):
+        if isinstance(full_n, str):
+            continue
+        error_n = forward_error(fit, full_n)
+        check = Check(fit.run.theta, np.asarray(full_n), context.rms(error_n - fit.off_n))
+        corrected: object = fit
+        if check.off > settings.exact * noise_of(context.binned):
+            (corrected,) = context.ask([Climb(names, fit.fit.theta, settings.runs, tuple(error_n.tolist()))])
+        for maximum in _distinct(context, [corrected], maxima, settings.close):
+            context.tell(f"another maximum of {title(names)}: {gained(maximum, best):+.1f} nats")
+            maxima.append(maximum)
+            checks.append(check)
+    highest = int(np.argmax([weight(fit.fit) for fit in maxima]))
+    record.others += [*maxima[:highest], *maxima[highest + 1 :]]
+    if highest:
+        record.fits[names], record.checks[names] = maxima[highest], checks[highest - 1]
+        fit_larger_sets(context, maxima[highest])
+        weigh()
+
+
+def fit_larger_sets(context: SearchContext, best: JointFit) -> None:
+    """Fits the compared sets that contain a set again, from its new maximum."""
+    record = context.record
+    larger = [names for names in record.evidences if set(best.fit.names) < set(names)]
+    starts = [{**record.fits[names].fit.theta, **best.fit.theta} for names in larger]
+    runs, off_n = context.settings.runs, correction(best)
+    climbs = [Climb(names, start, runs, off_n) for names, start in zip(larger, starts, strict=True)]
+    for names, answer in zip(larger, context.ask(climbs), strict=True):
+        before = record.fits[names]
+        record.add(answer)
+        if record.fits[names] is not before:
+            record.checks.pop(names, None)
+
+
+def _fits_elsewhere(context: SearchContext, best: JointFit) -> list[JointFit]:
+    """Returns fits of a set that ended elsewhere and not far behind, the likeliest first."""
+    settings, names, off_n = context.settings, best.fit.names, correction(best)
+    climbs = [Climb(names, start, settings.first, off_n) for start in _starts_elsewhere(context, best)]
+    first = _distinct(context, context.ask(climbs), [best], settings.behind)
+    left = settings.runs - settings.first
+    continued = context.ask([Climb(names, fit.fit.theta, left, off_n) for fit in first if not fit.settled])
+    ended = [*(fit for fit in first if fit.settled), *continued]
+    return _distinct(context, ended, [best], settings.close)[: settings.maxima]
+
+
+def _distinct(
+    context: SearchContext, answers: Sequence[object], known: Sequence[JointFit], behind: float
+) -> list[JointFit]:
+    """Returns the fits among answers that are at no known maximum, the likeliest of each new maximum.
+
+    behind : largest difference in weight [nats] from the first of the known fits
+    """
+    fits = sorted((a for a in answers if isinstance(a, JointFit)), key=lambda fit: -weight(fit.fit))
+    kept = list(known)
+    for fit in fits:
+        apart = not any(context.is_alike(fit, other.run.theta) for other in kept)
+        if apart and gained(known[0], fit) <= behind:
+            kept.append(fit)
+    return kept[len(known) :]
+
+
+def _starts_elsewhere(context: SearchContext, best: JointFit) -> list[dict[str, float]]:
+    """Returns values from which further maxima may be reached.
+
+    Permeabilities are equal, or exchanged, or one of them is near an end of its prior; the moduli are those
+    that suit the recording best. Or a mechanism that the model solves has another shape.
+    """
+    theta, settings = best.fit.theta, context.settings
+    limits = {p.name: (p.lower, p.upper) for p in context.base.parameters}
+    flow = ParameterSpace(tuple(p for p in context.base.parameters if p.stress_power < 0))
+    changes: list[dict[str, float]] = []
+    if flow.dim:
+        middle = float(np.exp(np.mean([np.log(theta[name]) for name in flow.names])))
+        exchanged = {name: theta[other] for name, other in zip(flow.names, flow.names[::-1], strict=True)}
+        changes = [dict.fromkeys(flow.names, middle), exchanged]
+        for share in settings.ends:
+            at_end = flow.from_unit(np.full(flow.dim, share))
+            changes += [{name: float(value)} for name, value in zip(flow.names, at_end, strict=True)]
+    changes = [{name: float(np.clip(value, *limits[name])) for name, value in change.items()}
+               for change in changes]  # fmt: skip
+    changes = [_with_best_moduli(context, {**theta, **change}, best) for change in changes]
+    for name in context.solved(best.fit.names):
+        mechanism = context.known[name]
+        for _, *shapes in mechanism.whole_or_parts:
+            changes += shapes_of(mechanism, shapes, settings.shapes) if shapes else []
+    return [{**theta, **change} for change in changes]
+
+
+def _with_best_moduli(context: SearchContext, theta: Mapping[str, float], best: JointFit) -> dict[str, float]:
+    """Returns the base parameters with the ratio of moduli, and the stiffness, whose force is nearest."""
+    tissue = {name: theta[name] for name in context.base.names}
+    first, *others = (p for p in context.base.parameters if p.stress_power > 0)
+    tissues = [
+        {**tissue, p.name: float(np.clip(ratio * tissue[first.name], p.lower, p.upper))}
+        for p in others for ratio in context.settings.ratios
+    ]  # fmt: skip
+    nearest = nearest_tissues(context, best.fit.names, [tissue, *tissues], theta)
+    return next(iter(nearest), tissue)

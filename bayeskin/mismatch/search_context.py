@@ -1,0 +1,118 @@
+"""The recording, the models and the record that all parts of a search work with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bayeskin.mechanisms import Mechanism
+from bayeskin.mismatch.hypotheses import weight
+from bayeskin.mismatch.search_record import Names, SearchRecord
+from bayeskin.mismatch.search_settings import SearchSettings
+from bayeskin.mismatch.tasks import Ask, Climb
+from bayeskin.mismatch.trust_region import JointFit
+from bayeskin.mismatch.wrapper import innermost
+from bayeskin.types import Array, BinnedForce, ParameterSpace
+
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class SearchContext:
+    """The inputs of a search, its record, and the comparisons that every part of it makes.
+
+    ask : answers tasks by running the models; tell : takes a line of progress
+    base : priors of the base model; known : mechanisms by name; solves : names of those that the forward
+        model solves; noise : values of the noise parameters to start from
+    """
+
+    ask: Ask
+    binned: BinnedForce
+    base: ParameterSpace
+    known: Mapping[str, Mechanism]
+    solves: Collection[str]
+    noise: Mapping[str, float]
+    seed: int
+    tell: Tell
+    settings: SearchSettings
+    record: SearchRecord = field(default_factory=SearchRecord)
+
+    @property
+    def neutral(self) -> dict[str, float]:
+        """Returns the neutral values of all mechanisms' parameters."""
+        return {name: value for m in self.known.values() for name, value in m.neutral.items()}
+
+    def solved(self, names: Sequence[str]) -> Names:
+        """Returns the mechanisms of a set that the forward model solves."""
+        return tuple(name for name in sorted(names) if name in self.solves)
+
+    def solved_values(self, fit: JointFit) -> dict[str, float]:
+        """Returns the values of the parameters that the forward model solves, at a fit's run."""
+        names = innermost(fit.fit.log_posterior.surrogate).space.names
+        return dict(zip(names, map(float, fit.run.theta), strict=True))
+
+    def base_values(self, fit: JointFit) -> dict[str, float]:
+        """Returns the base model's parameters of a fit."""
+        return {name: fit.fit.theta[name] for name in self.base.names}
+
+    def rms(self, force_n: Array) -> float:
+        """Returns the RMS [N] of a force (m,) over the bins that were recorded."""
+        return float(np.sqrt(np.mean(np.square(force_n[np.isfinite(self.binned.force_n)]))))
+
+    def leaves_more_than_noise(self, fit: JointFit) -> bool:
+        """Returns whether the residual of a fit is larger than the noise explains."""
+        residual_n = self.rms(self.binned.force_n - fit.fit.force_n)
+        return residual_n > self.settings.left * noise_of(self.binned)
+
+    def is_alike(self, fit: JointFit, theta: Array) -> bool:
+        """Returns whether a fit's run is near other values (d,) of the parameters that the model solves."""
+        space = innermost(fit.fit.log_posterior.surrogate).space
+        apart = space.to_unit(fit.run.theta) - space.to_unit(theta)
+        return bool(np.abs(apart).max() <= self.settings.alike_by)
+
+    def keep(self, answers: Sequence[object], since: JointFit | None = None) -> None:
+        """Records fits, and continues those that have not settled: the best, and others not far behind.
+
+        since : a fit that they gain on; a fit that gains a good part of what the best one gains is not far
+            behind
+        """
+        fits = sorted((a for a in answers if isinstance(a, JointFit)), key=lambda fit: -weight(fit.fit))
+        for fit in fits:
+            self.record.add(fit)
+        settings, behind = self.settings, self.settings.behind
+        if since is not None and fits:
+            behind = max(behind, (1.0 - settings.near) * gained(fits[0], since))
+        for continued in self.ask([
+            Climb(fit.fit.names, fit.fit.theta, settings.runs - settings.first, correction(fit))
+            for i, fit in enumerate(fits)
+            if not fit.settled and not self._is_recorded(fit)
+            and (i < settings.best or gained(self.record.best, fit) <= behind)
+        ]):  # fmt: skip
+            self.record.add(continued)
+
+    def _is_recorded(self, fit: JointFit) -> bool:
+        """Returns whether a likelier fit of the same set is near, so that both lead to one maximum."""
+        best = self.record.fits.get(fit.fit.names)
+        return best is not None and best is not fit and self.is_alike(fit, best.run.theta)
+
+
+def gained(fit: JointFit, before: JointFit) -> float:
+    """Returns the gain in weight [nats] of one fit over another."""
+    return weight(fit.fit) - weight(before.fit)
+
+
+def noise_of(binned: BinnedForce) -> float:
+    """Returns the sd [N] of the noise in a bin's mean, RMS over bins."""
+    return float(np.sqrt(np.nanmean(binned.variance_n2)))
+
+
+def correction(fit: JointFit) -> tuple[float, ...]:
+    """Returns the force that a fit has added to its runs, in the form that tasks take; empty for none."""
+    return tuple(fit.off_n.tolist()) if fit.off_n.any() else ()
+
+
+def title(names: Sequence[str]) -> str:
+    """Returns a set's name for a line of progress."""
+    return ", ".join(names) or "no mechanism"

@@ -1,0 +1,107 @@
+"""The sets of mechanisms that a search has fitted, with the checks of these fits and the evidences.
+
+While a search runs it keeps a `SearchRecord`, which changes. It returns a `SearchResult`, which does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+
+from bayeskin.mismatch.hypotheses import Evidences, Family, hypotheses_of, weight
+from bayeskin.mismatch.trust_region import JointFit
+from bayeskin.types import Array
+
+Names = tuple[str, ...]  # the sorted names of a set's mechanisms
+
+
+@dataclass(frozen=True)
+class Check:
+    """A run of the full model that checks a fit.
+
+    theta : values of the parameters that the forward model solves, at this run
+    full_n : force (m,) of the skin by the full model [N], or the message of a run that failed
+    off : difference between full model and forward model, beyond the correction that the fit has, RMS over
+        bins [N]; infinite where the run failed
+    """
+
+    theta: Array
+    full_n: Array | str
+    off: float
+
+
+class _Sets:
+    """What follows from the fits and the evidences of sets."""
+
+    fits: Mapping[Names, JointFit]
+    evidences: Mapping[Names, Evidences]
+    others: Sequence[JointFit]
+
+    @property
+    def best(self) -> JointFit:
+        """Returns the fit of the set with the largest weight."""
+        return max(self.fits.values(), key=lambda fit: weight(fit.fit))
+
+    @property
+    def family(self) -> Family:
+        """Returns the hypotheses that are compared."""
+        return Family(
+            [h for names, evidences in self.evidences.items() for h in hypotheses_of(names, evidences)]
+        )
+
+    @property
+    def chosen(self) -> Names:
+        """Returns the most probable of the compared sets, with or without a discrepancy beside it."""
+        return max(self.evidences, key=self.family.probability_of_set)
+
+    def others_of(self, names: Names) -> list[JointFit]:
+        """Returns the further maxima of a set."""
+        return [fit for fit in self.others if fit.fit.names == names]
+
+    def likeliest(self, count: int) -> list[JointFit]:
+        """Returns the `count` fits with the largest weights, and always the fit without mechanisms."""
+        order = sorted(self.fits.values(), key=lambda fit: -weight(fit.fit))
+        with_mechanisms = [fit for fit in order if fit.fit.names]
+        return sorted([*with_mechanisms[: count - 1], self.fits[()]], key=lambda fit: -weight(fit.fit))
+
+
+@dataclass(frozen=True)
+class SearchResult(_Sets):
+    """The result of a search.
+
+    fits : of each set, the fit with the largest weight; checks : of each set, its last check
+    evidences : of the sets whose hypotheses are compared
+    others : further maxima of the most probable set and of a part of it, less likely than those in `fits`
+    """
+
+    fits: Mapping[Names, JointFit]
+    checks: Mapping[Names, Check]
+    evidences: Mapping[Names, Evidences]
+    others: tuple[JointFit, ...]
+
+
+@dataclass
+class SearchRecord(_Sets):
+    """The record that a search keeps while it runs; the fields are those of `SearchResult`."""
+
+    fits: dict[Names, JointFit] = field(default_factory=dict)
+    checks: dict[Names, Check] = field(default_factory=dict)
+    evidences: dict[Names, Evidences] = field(default_factory=dict)
+    others: list[JointFit] = field(default_factory=list)
+
+    def add(self, answer: object) -> None:
+        """Keeps a fit if it is the likeliest of its set; an answer that is no fit is ignored."""
+        if isinstance(answer, JointFit) and np.isfinite(answer.fit.value):
+            names = answer.fit.names
+            if names not in self.fits or weight(answer.fit) > weight(self.fits[names].fit):
+                self.fits[names] = answer
+
+    def result(self) -> SearchResult:
+        """Returns the record as it stands, frozen."""
+        fits, checks, evidences = (
+            MappingProxyType(dict(values)) for values in (self.fits, self.checks, self.evidences)
+        )
+        return SearchResult(fits, checks, evidences, tuple(self.others))  # type: ignore[arg-type]

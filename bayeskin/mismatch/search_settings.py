@@ -1,0 +1,81 @@
+"""The numeric settings of a search for mechanisms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from bayeskin.mismatch.hypotheses import ODDS
+
+RARITY = -ODDS  # gain in log-likelihood with which a mechanism is as probable as its absence
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """Settings of a search. Weights and gains are in nats.
+
+    Starting points of the base model
+    skins : number of tissues, spread over the prior, that the model runs with at first
+    starts, best : number of base fits from the nearest of these, and how many are continued
+
+    Effort of a fit
+    first, runs : largest number of model runs before fits that are far behind are given up, and in all
+    behind : difference in weight from the best set at which a fit is given up
+    again : shares of a mechanism's strength with which a fit starts again after it failed
+
+    Candidate mechanisms
+    probes, off : runs for each part of a mechanism that the model solves, and their distance from the neutral
+        value, as a share of the prior
+    shortlist, promised : largest number of mechanisms that are fitted beside a set, and the gain that the
+        score test must promise each, which is too low while the tissue's parameters are biased by a missing
+        mechanism
+    gain : smallest gain in weight for which the search continues; most : largest number of mechanisms
+
+    Other tissues
+    astray : gain in weight from which a set may have biased the tissue of the smaller set
+    near, alike : share of the best gain from which sets are fitted from other tissues, and their largest
+        number
+    others, tried : number of tissues that a set runs with, and of those that it is fitted from
+    left : RMS residual over that of the noise, from which more than noise is left
+
+    Checks by the full model
+    close : difference in weight from the best set up to which a set is checked
+    compared, checks : largest number of sets that are checked in a round, and of rounds
+    weighed : number of sets whose hypotheses are compared
+    exact : error of the forward model that needs no correction, RMS over bins, over that of the noise
+
+    Further maxima
+    shapes : number of shapes of each part of a mechanism from which further maxima are sought
+    ends, ratios : positions of a permeability in its prior, and ratios of the moduli, that fits start from
+    maxima : largest number of further maxima that are kept
+    alike_by : largest difference between two runs that count as the same maximum, as a share of the prior
+    """
+
+    skins: int = 32
+    starts: int = 4
+    best: int = 2
+    first: int = 4
+    runs: int = 9
+    behind: float = 12.0
+    again: tuple[float, ...] = (1.0, 0.2)
+    probes: int = 3
+    off: float = 0.25
+    shortlist: int = 4
+    promised: float = 1.0
+    gain: float = 1.0
+    most: int = 6
+    astray: float = 10.0
+    near: float = 0.8
+    alike: int = 3
+    others: int = 16
+    tried: int = 2
+    left: float = 1.1
+    close: float = 6.0
+    compared: int = 6
+    checks: int = 4
+    weighed: int = 6
+    exact: float = 0.05
+    shapes: int = 2
+    ends: tuple[float, float] = (0.1, 0.9)
+    ratios: tuple[float, ...] = (0.05, 0.2, 0.6, 1.5)
+    maxima: int = 3
+    alike_by: float = 0.1

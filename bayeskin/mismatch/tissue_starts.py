@@ -1,0 +1,48 @@
+"""Tissues from which fits start: those whose force is nearest to the recorded one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from bayeskin.mismatch.search_context import SearchContext
+from bayeskin.mismatch.search_record import Names
+from bayeskin.mismatch.tasks import Probe
+
+
+def nearest_tissues(
+    context: SearchContext, names: Names, tissues: Sequence[Mapping[str, float]], values: Mapping[str, float]
+) -> list[dict[str, float]]:
+    """Returns tissues, scaled to the stiffness that suits them best, the nearest to the recorded force first.
+
+    The force of a tissue whose moduli are all c times as large, and whose permeabilities are 1/c times as
+    large, is c times as large. A tissue with which the model does not run is left out.
+
+    names, values : the set of mechanisms that the model runs with, and the values of its parameters
+    """
+    usable = np.isfinite(context.binned.force_n)
+    recorded, rows = context.binned.force_n[usable], []
+    answers = context.ask([Probe(names, {**values, **tissue}) for tissue in tissues])
+    powers = {p.name: p.stress_power for p in context.base.parameters if p.stress_power}
+    for tissue, force_n in zip(tissues, answers, strict=True):
+        if isinstance(force_n, str):
+            continue
+        force = np.asarray(force_n)[usable]
+        lowest, highest = _allowed_factors(context, tissue, powers)
+        factor = float(np.clip(force @ recorded / (force @ force), lowest, highest))
+        scaled = {name: value * factor ** powers.get(name, 0) for name, value in tissue.items()}
+        rows.append((float(np.sum((recorded - factor * force) ** 2)), scaled))
+    return [tissue for _, tissue in sorted(rows, key=lambda row: row[0])]
+
+
+def _allowed_factors(
+    context: SearchContext, tissue: Mapping[str, float], powers: Mapping[str, int]
+) -> tuple[float, float]:
+    """Returns the factors between which all scaled parameters stay within their priors."""
+    lowest, highest = 0.0, np.inf
+    for p in context.base.parameters:
+        if power := powers.get(p.name, 0):
+            ends = sorted((end / tissue[p.name]) ** (1.0 / power) for end in (p.lower, p.upper))
+            lowest, highest = max(lowest, ends[0] * 1.001), min(highest, ends[1] / 1.001)
+    return min(lowest, 1.0), max(highest, 1.0)
