@@ -1,4 +1,8 @@
-"""bayeskin: what living skin is made of, how sure one can be, and what the model leaves out."""
+"""Bayesian inference of the material parameters of living skin from extensometer tests.
+
+The package estimates the parameters with their uncertainty, and finds the physics that the model leaves out.
+The functions in `__all__` are for scripts; the command line is in `bayeskin.cli`.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,10 @@ __all__ = ["calibrate", "check", "diagnose", "load_recording", "simulate"]
 
 
 def __getattr__(name: str) -> Any:
-    """The functions of `scripting`, loaded when one is asked for: a worker process needs none of them."""
+    """Returns a function of `bayeskin.scripting`, which is imported only when it is asked for.
+
+    Worker processes import this package too, and need none of these functions.
+    """
     if name in __all__:
         from bayeskin import scripting
 

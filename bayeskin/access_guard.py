@@ -1,4 +1,8 @@
-"""Folders in which this process and those that it starts open no file for a while."""
+"""Forbids this process, and the processes that it starts, to open files in given folders for a while.
+
+While recordings with concealed effects are diagnosed, the folder with the answers is closed in this way, so
+that a diagnosis cannot read them. The guard is an audit hook of Python.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +15,16 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-_VARIABLE = "BAYESKIN_OFF_LIMITS"  # what a process that is started inherits
-_FOLDERS: list[str] = []  # at the moment
+_VARIABLE = "BAYESKIN_OFF_LIMITS"  # the closed folders as JSON, for processes that are started
+_FOLDERS: list[str] = []  # the folders that are closed at present
 
 
 @contextmanager
 def off_limits(folder: Path) -> Iterator[None]:
-    """While it lasts, no file in a folder can be opened, nor its names be listed: that is a PermissionError.
+    """Forbids access to a folder while the context lasts.
 
-    It holds in this process, in those that it forks, and in workers that call `keep_out`.
+    Opening a file in the folder, or listing its names, raises PermissionError. The ban holds in this process,
+    in processes that it forks, and in worker processes that call `keep_out`.
     """
     _set_hook()
     closed = os.path.realpath(folder)
@@ -37,7 +42,10 @@ def off_limits(folder: Path) -> Iterator[None]:
 
 
 def keep_out() -> None:
-    """Makes a process that was started meanwhile open none either, for the rest of its life."""
+    """Applies the bans of the parent process in a worker process, for the rest of the worker's life.
+
+    The worker reads the closed folders from an environment variable that it inherits from its parent.
+    """
     if folders := os.environ.get(_VARIABLE):
         _set_hook()
         _FOLDERS.extend(json.loads(folders))
@@ -45,13 +53,15 @@ def keep_out() -> None:
 
 @cache
 def _set_hook() -> None:
-    sys.addaudithook(_refuse)  # for good: Python takes none back
+    """Installs the audit hook once per process."""
+    sys.addaudithook(_refuse)  # for the life of the process: Python cannot remove an audit hook
 
 
 def _refuse(event: str, arguments: tuple[Any, ...]) -> None:
+    """Raises PermissionError where an audit event opens or lists something in a closed folder."""
     if _FOLDERS and event in ("open", "os.listdir", "os.scandir"):
         name = arguments[0]
         if isinstance(name, str | bytes | os.PathLike):
             path = os.path.realpath(os.fsdecode(name))
-            if any(path == one or path.startswith(one + os.sep) for one in _FOLDERS):
+            if any(path == folder or path.startswith(folder + os.sep) for folder in _FOLDERS):
                 raise PermissionError(f"{path} is off limits")

@@ -1,4 +1,8 @@
-"""The command line: parse, call, exit code. 0 done, 1 the answer is not to be trusted, 2 wrong input."""
+"""The command line: each command parses its options, calls a function and prints the answer.
+
+Exit code 0 means done, 1 that the answer failed or cannot be trusted, 2 that the input is wrong, and 130 that
+the command was interrupted.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,8 @@ import bayeskin
 from bayeskin.errors import InputError
 from bayeskin.terminal import NOT_TRUSTED, Terminal, exit_code
 
-# Its matrices are small: threads of linear algebra would cost more than they give. Read when numpy loads.
+# The matrices are small, so several threads of linear algebra would slow the program down. The linear algebra
+# libraries read these variables when numpy is imported, so they are set before.
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
@@ -29,7 +34,7 @@ a_device = click.option(
 
 
 class _Workflow(click.Group):
-    """Lists its commands in the order in which a user needs them."""
+    """A group of commands that lists them in the order in which a user needs them."""
 
     ORDER: ClassVar[dict[str, tuple[str, ...]]] = {
         "From a recording to an answer": ("doctor", "new", "import", "run", "diagnose", "report"),
@@ -38,13 +43,15 @@ class _Workflow(click.Group):
     }
 
     def list_commands(self, ctx: click.Context) -> list[str]:
+        """Returns the names of all commands in that order."""
         return [name for names in self.ORDER.values() for name in names]
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Writes the commands with their short help, section by section."""
         for title, names in self.ORDER.items():
             with formatter.section(title):
-                shown = [(name, self.commands[name].get_short_help_str(formatter.width)) for name in names]
-                formatter.write_dl(shown)
+                rows = [(name, self.commands[name].get_short_help_str(formatter.width)) for name in names]
+                formatter.write_dl(rows)
 
 
 @click.group(
@@ -52,17 +59,17 @@ class _Workflow(click.Group):
 )
 @click.version_option(bayeskin.__version__, prog_name="bayeskin")
 def cli() -> None:
-    """Infer the properties of living skin from an extensometer test, and say how sure they are.
+    """Infer the properties of living skin from an extensometer test, and say how certain they are.
 
     \b
     Start here:
-      bayeskin doctor                          does it work here
-      bayeskin new && bayeskin run demo.toml   everything, on the demo
-      bayeskin new test.xlsx -o test.toml      a configuration for your own
-      bayeskin run test.toml
+      bayeskin doctor                          check the installation
+      bayeskin new && bayeskin run demo.toml   run all stages on the demo
+      bayeskin new test.xlsx -o test.toml      write your own configuration
+      bayeskin run test.toml                   run all stages on it
 
     \b
-    Your shell completes commands and options after (zsh: zsh_source)
+    This line makes your shell complete commands and options (zsh: zsh_source):
       eval "$(_BAYESKIN_COMPLETE=bash_source bayeskin)"
     """
 
@@ -75,8 +82,8 @@ def cli() -> None:
 def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
     """Read a recording (xlsx, csv, tsv, h5) and write it in SI units as HDF5.
 
-    Finds the columns and their units and says what it took for what, and which phases, noise, spikes and
-    steps it sees.
+    The command finds the columns and their units, and reports how it interpreted them. It also reports the
+    phases, the noise, the spikes and the steps that it detects.
 
     \b
     Example:
@@ -96,12 +103,13 @@ def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
 @a_device
 @as_json
 def new(recording: Path | None, out: Path | None, device: Path | None, as_json: bool) -> None:
-    """Write a commented configuration for a recording of your own; without RECORDING the demo, to try.
+    """Write a commented configuration for your own recording; without RECORDING, write the demo's.
 
-    Reads the recording, says what it found, and takes a shipped surrogate where one knows its protocol, else
-    a design of full runs. Never writes over a file. The demo's recording comes with its configuration. With
-    --device its sections [device] and [tissue] are written into the configuration; without, they are the
-    article's.
+    The command reads the recording and reports what it contains. The configuration uses a shipped surrogate
+    if one was trained on the recording's protocol, and a design of model runs otherwise. Existing files are
+    never overwritten. The demo's recording is written beside its configuration. With --device, the sections
+    [device] and [tissue] of that file are written into the configuration; without it, the article's device
+    and tissue are used.
 
     \b
     Example:
@@ -131,9 +139,9 @@ a_scheduler = click.option(
 def reduce_(source: Path | None, out: Path | None, scheduler: str | None, as_json: bool) -> None:
     """Build the reduced model of a device: once, for all protocols.
 
-    SOURCE is a configuration, or a file with the sections [device] and [tissue]; without it the article's
-    device. The base model comes first, and can be used while the mechanisms follow. Training
-    runs of the full model are kept, so that the command can be interrupted and goes on.
+    SOURCE is a configuration, or a file with the sections [device] and [tissue]; the default is the article's
+    device. The base model is built first, and can be used while the mechanisms are added. Training runs of
+    the full model are stored, so that the command can be interrupted and started again.
 
     \b
     Example:
@@ -166,16 +174,17 @@ def reduce_(source: Path | None, out: Path | None, scheduler: str | None, as_jso
 def simulate(as_json: bool, **options: Any) -> None:
     """Run the full model once on a recording's displacement (default: the demo's).
 
-    Parameters that are not set stand at the median of their prior, a mechanism's among them. The CSV has the
-    columns time_s, displacement_m, force_n.
+    Parameters that are not set have the median of their prior; this includes the parameters of mechanisms.
+    The CSV file has the columns time_s, displacement_m, force_n.
 
-    With --reduced the device's reduced model runs instead, many times faster, and says how large its error
-    is: the one that `bayeskin reduce` made beside CONFIG or the device's file, or the shipped one of the
-    article's device. Where the run leaves what it was trained for, it says so, and exits with 1.
+    With --reduced, the reduced model of the device runs instead. It is many times faster, and the command
+    reports an estimate of its error. The command uses the reduced model that `bayeskin reduce` wrote beside
+    CONFIG or the device's file, or the shipped model of the article's device. If the run leaves the range
+    that the model was trained for, the command says so and exits with code 1.
 
-    The figure (fields.png, fields.svg) shows displacement, pressure and fluid velocity near the pads at the
-    times given by --at, which can be repeated, or at four moments: the end of the first loading, the middle
-    of its hold, the end of its unloading, and the middle of the last phase.
+    The figure (fields.png, fields.svg) shows displacement, pressure and fluid velocity near the pads. It
+    shows them at the times given by --at, which can be repeated. The default is four moments: the end of the
+    first loading, the middle of its hold, the end of its unloading, and the middle of the last phase.
 
     \b
     Example:
@@ -193,6 +202,8 @@ def simulate(as_json: bool, **options: Any) -> None:
 
 
 def _stage_command(name: str, text: str, example: str = "runs/demo.toml") -> None:
+    """Adds the command of a single stage; `text` and `example` appear in its help."""
+
     @cli.command(name, help=f"{text}\n\nWhat it needs of earlier stages is done first.\n\n"
                             f"\b\nExample:\n  bayeskin {name} {example}\n"
                             f"  bayeskin {name} {example} --json")  # fmt: skip
@@ -214,10 +225,10 @@ _stage_command("sobol", "Sobol' indices of the force over time.")
 @a_config
 @as_json
 def report(config: Path, as_json: bool) -> None:
-    """Write one HTML page of a run, from the stages that are done.
+    """Write one HTML page about a run, from the stages that are done.
 
-    Runs no stage: says plainly which are missing. The page is report.html in the run's folder; it needs no
-    network and no file beside it, so it can be sent as it is.
+    The command runs no stage, and lists the stages that are missing. The page is report.html in the run's
+    folder. It needs no network and no other file, so it can be sent as a single file.
 
     \b
     Example:
@@ -238,8 +249,8 @@ def report(config: Path, as_json: bool) -> None:
 def run(config: Path, scheduler: str | None, as_json: bool) -> None:
     """Run all stages of a configuration in order; skip those that are done and unchanged.
 
-    Outputs go to a folder beside CONFIG with the configuration's name; report.html in it is the answer to
-    read. Interrupted at any moment, the same command goes on.
+    Outputs are written to a folder beside CONFIG that has the configuration's name. Read report.html in this
+    folder for the result. If the command is interrupted, the same command continues the run.
 
     \b
     Example:
@@ -257,11 +268,11 @@ def diagnose(source: Path, device: Path | None, as_json: bool) -> None:
     """Find the physics that the model leaves out of a recording, and where; show how the fit improves.
 
     SOURCE is a configuration, or a recording by itself, of any protocol. The reduced model of the device
-    solves all mechanisms of a set together, and the full model checks what comes out. The likeliest sets are
-    fitted once more to the recording up to the end of its second hold, and tested on what follows. That takes
-    two to ten minutes, and longer where many mechanisms act. For the article's observation and a model of
-    your own a surrogate is trained first, and mechanisms of the tissue are not tried. The exit code is 0
-    whatever the verdict.
+    solves all mechanisms of a set together, and the full model checks the result. The likeliest sets are
+    fitted again to the recording up to the end of its second hold, and tested on the rest of it. This takes
+    two to ten minutes, and longer if many mechanisms act. For the article's observation, and for a forward
+    model of your own, a surrogate is trained first, and mechanisms of the tissue are not tried. The exit code
+    is 0 for every verdict.
 
     \b
     Example:
@@ -283,12 +294,13 @@ def diagnose(source: Path, device: Path | None, as_json: bool) -> None:
 def experiment(source: Path, device: Path | None, as_json: bool) -> None:
     """Propose the further test that would best tell look-alike mechanisms apart.
 
-    SOURCE as for `bayeskin diagnose`, which is run first where that is not done; the reaction only, since no
-    other protocol has the article's observation. The set that explains the recording best and those with
-    look-alikes in its place are taken as equally probable. The reduced model of the device runs draws of
-    their posteriors in other tests, and the expected information about which is true, in bits, is computed
-    from the forces. First come nine variations of the recording's own test, then changes of those that tell
-    most, within the displacements and speeds that the reduced model knows.
+    SOURCE is the same as for `bayeskin diagnose`, which runs first if the diagnosis is not done. The command
+    works for the reaction only, because no other protocol has the article's observation. The set that
+    explains the recording best, and the sets with look-alikes in its place, are taken as equally probable.
+    The reduced model of the device runs draws of their posteriors in other tests. The forces give the
+    expected information, in bits, about which set is true. The command first tries nine variations of the
+    recording's own test, and then changes of the most informative ones. All tests stay within the
+    displacements and speeds that the reduced model was trained for.
 
     \b
     Example:
@@ -310,10 +322,11 @@ def experiment(source: Path, device: Path | None, as_json: bool) -> None:
 def prove(folder: Path | None, at_most: int | None, rediagnose: int, as_json: bool) -> None:
     """Measure how good diagnoses are, on recordings with concealed effects whose keys are known.
 
-    FOLDER is a set that `bayeskin conceal` made; by default the one that is shipped. A recording that has a
-    verdict is not diagnosed again, so the command can be interrupted; keys are opened when the verdicts are
-    written. With --at-most, what is judged by then is scored. With --rediagnose, N of the recordings are
-    diagnosed afresh, elsewhere; the exit code is 1 if one has another verdict than the same sources gave.
+    FOLDER is a set that `bayeskin conceal` made; the default is the shipped set. A recording that has a
+    verdict is not diagnosed again, so the command can be interrupted. The keys are opened only after the
+    verdicts are written. With --at-most, the recordings that are judged by then are scored. With
+    --rediagnose, N of the recordings are diagnosed again, in a temporary folder. The exit code is 1 if one of
+    these gets another verdict than the same sources gave before.
 
     \b
     Example:
@@ -336,10 +349,11 @@ def prove(folder: Path | None, at_most: int | None, rediagnose: int, as_json: bo
 def conceal(folder: Path, seed: int, count: int, only: tuple[str, ...], as_json: bool) -> None:
     """Make a set for `bayeskin prove`: recordings by the full model, with the effects' keys under seal.
 
-    A set has recordings without any effect, with each mechanism, with pairs, and with effects that no
-    mechanism is. With --only, which can be repeated, it has what is named, in equal numbers, and sizes from
-    one to thirty noise floors: how large must an effect be to be found? A recording that is finished is not
-    made again. One takes about half a minute, two are made at once.
+    A set has recordings without any effect, with each mechanism, with pairs of mechanisms, and with effects
+    that are outside the catalogue of mechanisms. With --only, which can be repeated, the set has only the
+    named effects, in equal numbers. Their sizes then range from one to thirty noise floors, to show how large
+    an effect must be to be detected. A finished recording is not made again. Each recording takes about half
+    a minute, and two are made at once.
 
     \b
     Example:
@@ -362,10 +376,11 @@ def conceal(folder: Path, seed: int, count: int, only: tuple[str, ...], as_json:
 def serve(config: Path | None, host: str, port: int, as_json: bool) -> None:
     """Serve the forward model by UM-Bridge, for other tools of uncertainty quantification.
 
-    Serves the model of CONFIG (default: the demo's) on its recording's protocol until Ctrl-C: one input
-    vector of the parameters in SI units, one output vector of the mean force [N] in each of the recording's
-    bins. A request's config can ask for another protocol, other bins or times, and mechanisms. Only this
-    machine can reach it; with --host others can, and nothing asks who they are.
+    The server offers the model of CONFIG (default: the demo's) on the protocol of its recording until Ctrl-C.
+    The input is one vector of the parameters in SI units. The output is one vector of the mean force [N] in
+    each bin of the recording. A request's config can ask for another protocol, for other bins or times, and
+    for mechanisms. By default, only this machine can reach the server. With --host, other machines can reach
+    it, and no password protects it.
 
     \b
     Example:
@@ -387,9 +402,10 @@ def serve(config: Path | None, host: str, port: int, as_json: bool) -> None:
 def doctor(as_json: bool) -> None:
     """Check that this installation works in the current folder.
 
-    Packages and their versions, the linear solver, threads, disk space, write access; then a short run of the
-    full model and a surrogate's prediction against stored numbers, some five seconds (once, after the
-    installation, half a minute, because parts are compiled). Exit code 1 if something is broken.
+    The command checks the packages and their versions, the linear solver, the threads, the disk space and the
+    write access. Then it compares a short run of the full model and a prediction of a surrogate with stored
+    numbers. This takes about five seconds; the first time after the installation it takes half a minute,
+    because parts are compiled. The exit code is 1 if something is broken.
 
     \b
     Example:
@@ -402,6 +418,7 @@ def doctor(as_json: bool) -> None:
 
 
 def _run(config: Path, last: str | None, scheduler: str | None, as_json: bool) -> None:
+    """Runs a configuration up to the stage `last` (None: all stages) and prints the answer."""
     from bayeskin.workflow import stages
 
     with Terminal() as terminal:
@@ -410,17 +427,18 @@ def _run(config: Path, last: str | None, scheduler: str | None, as_json: bool) -
 
 
 def _answer(document: Mapping[str, Any], as_json: bool) -> None:
-    """Prints a command's answer; exits with 1 when it says of itself that it failed."""
+    """Prints the answer of a command as JSON or text; exits with code 1 where its ``ok`` is False."""
     try:
         click.echo(json.dumps(document, indent=2, allow_nan=False) if as_json else document["text"])
         sys.stdout.flush()
-    except BrokenPipeError:  # the reader left, as `head` does
+    except BrokenPipeError:  # the reading program ended early, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     if not document["ok"]:
         raise click.exceptions.Exit(NOT_TRUSTED)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point of the `bayeskin` command."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a scheduler's end is an interruption too
+    """Runs the `bayeskin` command with the given arguments (default: those of the process) and exits."""
+    # Job schedulers end a job by SIGTERM, which is treated as Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(exit_code(lambda: cli.main(arguments, prog_name="bayeskin", standalone_mode=False)))

@@ -1,7 +1,7 @@
-"""The configuration of a run: TOML in, checked values out, one line on what is wrong.
+"""The configuration of a run: reads a TOML file into checked values, and reports an error in one line.
 
-Every key has a default except ``recording.file``. Units stand in the names (``bin_width_s``); bounds
-of a parameter are in its own SI unit, as in `bayeskin.design.default_space`.
+Every key has a default except ``recording.file``. Units are part of the names (``bin_width_s``). The bounds
+of a parameter are in the SI unit of the parameter, as in `bayeskin.design.default_space`.
 """
 
 from __future__ import annotations
@@ -31,48 +31,57 @@ from bayeskin.sections import Section, checked, one_of, read_toml
 from bayeskin.types import Correlation, Parameter, ParameterSpace
 
 EXPECTED = "a TOML configuration, as `bayeskin new RECORDING` writes one"
-FEWEST_CHECKED = 8  # draws: of fewer, weights say next to nothing
-# Upper bounds refuse slips of the pen, which would take all memory; no computation comes near them.
+FEWEST_CHECKED = 8  # importance weights of fewer draws carry almost no information
+# The upper bounds catch typing errors, which would exhaust the memory. No real computation comes near them.
 Positive = Annotated[int, Field(gt=0, le=10**9)]
-Runs = Annotated[int, Field(gt=0, le=100_000)]  # of the full model
+Runs = Annotated[int, Field(gt=0, le=100_000)]  # runs of the full model
 Refinement = Annotated[int, Field(ge=0, le=6)]
 
 
-WHO_RUNS: Any = {"design": {"workers", "scheduler"}, "slurm": True}  # no result depends on it
+# These keys say where runs are made, so no result depends on them.
+WHO_RUNS: Any = {"design": {"workers", "scheduler"}, "slurm": True}
 
 
 class RecordingConfig(Section):
-    """The recording, and whether the model follows its displacement closely or its corners, rounded."""
+    """The recording, and how the protocol of the model follows its displacement.
+
+    With "idealised", the protocol goes straight between the recording's corners, whose times and
+    displacements are rounded. With "recorded", it follows the measured displacement closely.
+    """
 
     file: str
     protocol: Literal["recorded", "idealised"] = "idealised"
 
 
 class ModelConfig(Section):
-    """The force that the model reports, on which mesh (the generator's bricks or a gmsh file), how finely.
+    """The force that the model reports, its mesh (the generator's bricks or a gmsh file) and its refinement.
 
-    `forward`: a model of one's own instead, "FILE.py:FUNCTION" (beside the configuration),
-    "PACKAGE.MODULE:FUNCTION" or the URL of a UM-Bridge server; its observation is "own".
+    `forward` names a forward model of the user's own, which then replaces the full model. It is
+    "FILE.py:FUNCTION" (beside the configuration), "PACKAGE.MODULE:FUNCTION" or the URL of a UM-Bridge server.
+    The observation of such a model is "own".
     """
 
     observation: Literal["reaction", "article", "own"] = "reaction"
     mesh: str = "bricks"
-    refinement: Refinement = 1  # of the bricks, toward the pads' edges; 0: 80 of them
+    refinement: Refinement = 1  # of the bricks, towards the edges of the pads; 0 gives 80 bricks
     forward: str | None = None
 
     @model_validator(mode="before")
     @classmethod
-    def _a_forward_model_is_ones_own(cls, given: Any) -> Any:
+    def _forward_model_implies_observation_own(cls, given: Any) -> Any:
+        """Sets the observation "own" where a forward model of the user's own is given."""
         return {"observation": "own", **given} if isinstance(given, dict) and "forward" in given else given
 
     @model_validator(mode="after")
-    def _own_needs_its_forward_model(self) -> ModelConfig:
+    def _observation_own_needs_a_forward_model(self) -> ModelConfig:
+        """Refuses the observation "own" without a forward model, and another observation with it."""
         if (self.observation == "own") != (self.forward is not None):
             raise ValueError(f"observation: found {self.observation!r}; expected 'own' with model.forward")
         return self
 
     @model_validator(mode="after")
     def _article_needs_its_mesh(self) -> ModelConfig:
+        """Refuses the article's observation on the generator's bricks."""
         if self.observation == "article" and self.mesh == "bricks":
             raise ValueError(
                 "mesh: found 'bricks'; expected the article's gmsh file with observation 'article'"
@@ -81,12 +90,14 @@ class ModelConfig(Section):
 
 
 class PriorConfig(Section):
-    """Values that replace the default prior of one parameter; what is not given stays as it was.
+    """Values that replace the default prior of one parameter; values that are not given keep their default.
 
-    `mean` and `sd` belong to a normal prior, `median` and `factor` (of one sd) to a log-normal one; both are
-    cut to the bounds. `correlations` are with normal priors of other parameters, by their names, stated once.
+    `mean` and `sd` belong to a normal prior. `median` and `factor` (the factor of one sd) belong to a
+    log-normal prior. Both priors are truncated at the bounds. `correlations` maps names of other parameters
+    with normal priors to correlations; each pair is stated once.
 
-    With `model.forward` these are all the parameters there are: each has bounds, and may have a unit.
+    With `model.forward`, the parameters of the configuration are the only parameters. Each of them has
+    bounds, and may have a unit.
     """
 
     lower: float | None = None
@@ -101,18 +112,22 @@ class PriorConfig(Section):
     unit: str | None = None
 
     @model_validator(mode="after")
-    def _a_normal_prior_has_its_two_numbers(self) -> PriorConfig:
+    def _normal_prior_has_its_two_numbers(self) -> PriorConfig:
+        """Refuses a normal or log-normal prior without its two numbers, and these numbers without it."""
         given = {name for name in ("mean", "sd", "median", "factor") if getattr(self, name) is not None}
-        wanted = {"normal": {"mean", "sd"}, "log-normal": {"median", "factor"}}.get(self.prior or "", set())
-        if given != wanted:
+        needed = {"normal": {"mean", "sd"}, "log-normal": {"median", "factor"}}.get(self.prior or "", set())
+        if given != needed:
             found = ", ".join(sorted(given)) or "none of its numbers"
-            expected = f"{' and '.join(sorted(wanted))}" if wanted else "these with a normal prior only"
+            expected = f"{' and '.join(sorted(needed))}" if needed else "these with a normal prior only"
             raise ValueError(f"prior: found {found}; expected {expected}")
         return self
 
     @property
     def centre_and_spread(self) -> tuple[float, float]:
-        """Returns the centre and spread of the prior on its line; those of a uniform prior say nothing."""
+        """Returns centre and spread of the prior on its line: the value itself or its logarithm.
+
+        For a uniform prior, both numbers are placeholders without meaning.
+        """
         if self.mean is not None and self.sd is not None:
             return self.mean, self.sd
         if self.median is not None and self.factor is not None:
@@ -121,13 +136,13 @@ class PriorConfig(Section):
 
 
 class DesignConfig(Section):
-    """Full runs: training points of each wave, held-out points of each wave, worker processes.
+    """Runs of the model: training points and held-out points of each wave, and worker processes.
 
-    With `coarse` the waves run a quicker model, and the model itself at `fine_points` and `fine_held_out` of
-    their points, to correct what the quicker one gave: coarser bricks, of a refinement below the model's, or
-    "reduced", the reduced model of the device, whose waves from the third on are drawn from the posterior by
-    the surrogate of the waves before. `scheduler`, the address of a Dask scheduler, has the runs
-    made there.
+    With `coarse`, the waves run a quicker model. The configuration's model then runs at `fine_points` and
+    `fine_held_out` of their points, to correct the surrogate of the quicker model. The quicker model is
+    either the bricks at a refinement below the model's, or "reduced", the reduced model of the device. With
+    "reduced", the waves from the third on are drawn from the posterior that the surrogate of the earlier
+    waves gives. If `scheduler`, the address of a Dask scheduler, is set, the runs are made there.
     """
 
     points: Annotated[list[Runs], Field(min_length=1, max_length=100)] = [128, 96, 64]
@@ -140,14 +155,15 @@ class DesignConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _a_reduced_model_needs_less_correction(cls, given: Any) -> Any:
+    def _defaults_of_a_reduced_model(cls, given: Any) -> Any:
+        """Sets the defaults for a reduced model, which needs fewer full runs as a correction."""
         reduced = isinstance(given, dict) and given.get("coarse") == "reduced"
         usual = {"points": [128, 96, 64, 64], "fine_points": 8, "fine_held_out": 4}
         return {**usual, **given} if reduced else given
 
 
 class SlurmConfig(Section):
-    """Full runs as jobs of SLURM through dask-jobqueue: how many, and what it is told of each."""
+    """Runs of the full model as SLURM jobs through dask-jobqueue: the number of jobs, and their requests."""
 
     jobs: Annotated[int, Field(gt=0, le=100_000)]
     queue: str | None = None
@@ -157,20 +173,21 @@ class SlurmConfig(Section):
 
 
 class SurrogateConfig(Section):
-    """Kind of surrogate, or a shipped one that spares the design."""
+    """The kind of surrogate, or the file of a shipped surrogate, with which no design is needed."""
 
     kind: Literal["auto", "gp", "chaos"] = "auto"
     file: str | None = None
 
 
 class FitConfig(Section):
-    """The stretches of the recording that are fitted (default: all of it) and the bins of its means."""
+    """The windows of the recording that are fitted (default: all of it), and the width of the bins."""
 
     windows_s: list[tuple[float, float]] | None = None
     bin_width_s: Annotated[float, Field(gt=0)] = 0.5
 
     @model_validator(mode="after")
-    def _windows_have_an_inside(self) -> FitConfig:
+    def _windows_start_before_they_end(self) -> FitConfig:
+        """Refuses an empty list of windows, and a window that does not start before it ends."""
         if self.windows_s is not None and not self.windows_s:
             raise ValueError("windows_s: found an empty list; expected at least one [start, end]")
         for start, end in self.windows_s or ():
@@ -187,7 +204,8 @@ class NoiseConfig(Section):
     nu: tuple[float, float] | None = None
 
     @model_validator(mode="after")
-    def _bounds_are_the_right_way_up(self) -> NoiseConfig:
+    def _lower_bounds_lie_below_upper(self) -> NoiseConfig:
+        """Refuses bounds that are not ascending or not positive."""
         for name, bounds in self:
             if bounds is not None and not 0 < bounds[0] < bounds[1]:
                 found = f"[{bounds[0]:g}, {bounds[1]:g}]"
@@ -196,42 +214,43 @@ class NoiseConfig(Section):
 
 
 class SampleConfig(Section):
-    """Independent ensembles of walkers, and when to stop."""
+    """The number of independent ensembles and of walkers, and the criteria for stopping the sampler."""
 
     ensembles: Annotated[int, Field(ge=2, le=1000)] = 4
     walkers: Annotated[int, Field(ge=4, le=100_000)] = 40
     effective_samples: Positive = 5000
-    max_steps: Annotated[int, Field(ge=500)] = 20000  # the first 300 only lead to the posterior
+    max_steps: Annotated[int, Field(ge=500)] = 20000  # the first 300 steps only lead to the posterior
 
 
 class CheckConfig(Section):
-    """Posterior draws that the full model runs again, and how often they may join the design."""
+    """How many posterior draws the full model runs as a check, and how often they may join the design."""
 
     draws: Annotated[int, Field(ge=0, le=100_000)] = 24
     rounds: Annotated[int, Field(ge=0, le=1000)] = 2
 
     @model_validator(mode="after")
-    def _one_or_two_say_nothing(self) -> CheckConfig:
+    def _very_few_draws_are_refused(self) -> CheckConfig:
+        """Refuses numbers of draws whose importance weights carry almost no information."""
         if 0 < self.draws < FEWEST_CHECKED:
             raise ValueError(f"draws: found {self.draws}; expected 0 for none, or at least {FEWEST_CHECKED}")
         return self
 
 
 class MapConfig(Section):
-    """Starts of the search for the most probable point, and evaluations that each may spend."""
+    """How many starts the search for the most probable point has, and the evaluations of each start."""
 
     starts: Annotated[int, Field(gt=0, le=100_000)] = 8
     evaluations: Positive = 20000
 
 
 class SobolConfig(Section):
-    """Samples a matrix of the pick-freeze estimate on the Gaussian process."""
+    """How many samples each matrix of the pick-freeze estimate has, on the Gaussian process."""
 
     samples: Annotated[int, Field(gt=0, le=2**20)] = 2048
 
 
 class Config(Section):
-    """A whole run. `load_config` makes it from a file."""
+    """The configuration of a whole run, which `load_config` reads from a file."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
     recording: RecordingConfig
@@ -251,7 +270,9 @@ class Config(Section):
     sobol: SobolConfig = SobolConfig()
 
     @model_validator(mode="after")
-    def _coarse_is_coarser(self) -> Config:
+    def _coarse_model_is_coarser(self) -> Config:
+        """Refuses a coarse model that is not coarser, and keys that do not go with a forward model of the
+        user."""
         coarse, model = self.design.coarse, self.model
         below = 0 if coarse == "reduced" else coarse
         if below is not None and (model.mesh != "bricks" or below >= model.refinement):
@@ -268,23 +289,25 @@ class Config(Section):
 
     @property
     def sha256(self) -> str:
-        """Hash of all that can change a result; who makes the runs cannot."""
+        """Returns the hash of all keys that can change a result, without the keys that say where runs are
+        made."""
         plain = self.model_dump(mode="json", exclude=WHO_RUNS)
-        for name, usual in (("device", DeviceConfig()), ("tissue", TissueConfig())):
-            if getattr(self, name) == usual:  # hashes are older than these sections
+        for name, default in (("device", DeviceConfig()), ("tissue", TissueConfig())):
+            if getattr(self, name) == default:  # keeps hashes from before these sections existed
                 del plain[name]
         return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
     def geometry(self, where: object = "configuration") -> StatedGeometry:
-        """Device and tissue of the sections. Raises InputError, of `where`, for what cannot be.
+        """Returns device and tissue as the sections `device` and `tissue` state them.
 
-        An uncertain length moves nodes, so it needs the generator's bricks.
+        An uncertain length moves the nodes of the mesh, so it needs the generator's bricks. Raises
+        InputError, which names `where`, for lengths that are impossible or do not go with the model.
         """
         stated = stated_geometry(self.device, self.tissue, where)
         if stated.sd_m and (self.model.observation, self.model.mesh) != ("reaction", "bricks"):
             name, model = next(iter(stated.sd_m)), self.model
-            own = model.observation if model.observation != "reaction" else model.mesh
-            found = f"a mean and an sd, with {own!r} in [model]"
+            conflict = model.observation if model.observation != "reaction" else model.mesh
+            found = f"a mean and an sd, with {conflict!r} in [model]"
             expected = "a number, or observation 'reaction' on mesh 'bricks'"
             raise InputError(f"{where}: tissue.{name}m", found, expected)
         if self.model.observation != "reaction" and stated != StatedGeometry(Geometry()):
@@ -297,8 +320,8 @@ class Config(Section):
 def load_config(path: Path | str) -> Config:
     """Reads and checks a configuration; ``name`` defaults to the file's name without its suffix.
 
-    Raises InputError for a file that is absent or not TOML, an unknown key, a value of the wrong kind
-    or range, bounds upside down.
+    Raises InputError for a file that is absent or is not TOML, an unknown key, a value of the wrong type or
+    range, and a lower bound above the upper.
     """
     path = Path(path)
     plain = read_toml(path, EXPECTED)
@@ -307,7 +330,7 @@ def load_config(path: Path | str) -> Config:
 
 
 def config_of(plain: Mapping[str, Any], where: Path | str) -> Config:
-    """Checks a configuration's sections. Raises InputError as `load_config`, saying that it is of `where`."""
+    """Checks the sections of a configuration. Raises InputError as `load_config`, which names `where`."""
     config = checked(Config, plain, where, EXPECTED)
     parameter_space(config, where)
     config.geometry(where)
@@ -315,12 +338,13 @@ def config_of(plain: Mapping[str, Any], where: Path | str) -> Config:
 
 
 def to_toml(config: Config) -> str:
-    """A configuration as a file that `load_config` reads back to the same; all keys, defaults too."""
+    """Returns a configuration as TOML text with all keys, from which `load_config` reads the same values."""
     return "\n".join(_table(config.model_dump(mode="json", exclude_none=True))) + "\n"
 
 
 def _table(plain: Mapping[str, Any], name: str = "") -> list[str]:
-    # A scalar or a list of scalars is written alike in JSON and TOML.
+    # JSON and TOML write a scalar, and a list of scalars, in the same way.
+    """Returns the lines of a TOML table and of the tables in it."""
     lines = [f"{key} = {json.dumps(value)}" for key, value in plain.items() if not isinstance(value, dict)]
     for key, value in plain.items():
         if isinstance(value, dict):
@@ -330,25 +354,31 @@ def _table(plain: Mapping[str, Any], name: str = "") -> list[str]:
 
 
 def parameter_space(config: Config, where: object = "configuration") -> ParameterSpace:
-    """The prior box: the defaults with the configuration's changes, or that of a forward model of one's own.
+    """Returns the prior of a configuration: the default parameters with the configuration's changes.
 
-    Uncertain lengths of the tissue follow the defaults. Raises InputError for an unknown parameter, bounds
-    upside down, a log prior that reaches zero, lengths that cannot be, or correlations that cannot be.
+    With a forward model of the user's own, these are the parameters of the configuration. Uncertain lengths
+    of the tissue follow after the default parameters. Raises InputError for an unknown parameter, a lower
+    bound above the upper, a logarithmic prior that reaches zero, impossible lengths, or impossible
+    correlations.
     """
-    space = _own_space(config, where) if config.model.forward is not None else _changed_space(config, where)
-    stated = tuple(
-        Correlation(one, other, value)
-        for one, given in config.parameters.items()
-        for other, value in given.correlations.items()
+    space = (
+        _space_of_forward_model(config, where)
+        if config.model.forward is not None
+        else _space_of_full_model(config, where)
+    )
+    correlations = tuple(
+        Correlation(name, partner, value)
+        for name, prior in config.parameters.items()
+        for partner, value in prior.correlations.items()
     )
     try:
-        return replace(space, correlations=stated)
+        return replace(space, correlations=correlations)
     except InputError as error:
         raise InputError(f"{where}: {error.where}", error.found, error.expected) from None
 
 
-def _changed_space(config: Config, where: object) -> ParameterSpace:
-    """The default one and uncertain lengths, with the configuration's changes."""
+def _space_of_full_model(config: Config, where: object) -> ParameterSpace:
+    """Returns the default parameters and the uncertain lengths, with the configuration's changes."""
     stated = config.geometry(where)
     default = ParameterSpace((*default_space().parameters, *length_parameters(stated)))
     unknown = sorted(set(config.parameters) - set(default.names))
@@ -363,7 +393,7 @@ def _changed_space(config: Config, where: object) -> ParameterSpace:
 
 
 def _check_lengths(space: ParameterSpace, geometry: Geometry, where: object) -> None:
-    """Raises InputError for bounds of lengths between which some cannot be meshed."""
+    """Raises InputError where some lengths between the bounds cannot be meshed."""
     lengths = [p for p in space.parameters if p.name in LENGTHS]
     low = {p.name: p.lower / (1.0 + ROOM) for p in lengths}
     high = {p.name: p.upper / (1.0 - ROOM) for p in lengths}
@@ -377,22 +407,27 @@ def _check_lengths(space: ParameterSpace, geometry: Geometry, where: object) -> 
             raise InputError(f"{where}: parameters.{p.name}", found, error.expected) from None
 
 
-def _own_space(config: Config, where: object) -> ParameterSpace:
-    """Those of the table, or the default ones; without the law by which the full model's forces scale."""
+def _space_of_forward_model(config: Config, where: object) -> ParameterSpace:
+    """Returns the parameters of a forward model of the user's own, by default those of the full model.
+
+    The parameters do not have the law by which the force of the full model scales with stiffness and
+    permeability.
+    """
     if not config.parameters:
         return ParameterSpace(tuple(replace(p, stress_power=0) for p in default_space().parameters))
-    own = []
-    for name, given in config.parameters.items():
+    parameters = []
+    for name, prior in config.parameters.items():
         for key in ("lower", "upper"):
-            if getattr(given, key) is None:
+            if getattr(prior, key) is None:
                 at = f"{where}: parameters.{name}.{key}"
                 raise InputError(at, "nothing", "a bound, with model.forward")
-        blank = Parameter(name, given.unit or "", 0.0, 0.0, "uniform")
-        own.append(_overridden(blank, given, where))
-    return ParameterSpace(tuple(own))
+        blank = Parameter(name, prior.unit or "", 0.0, 0.0, "uniform")
+        parameters.append(_overridden(blank, prior, where))
+    return ParameterSpace(tuple(parameters))
 
 
 def _overridden(default: Parameter, change: PriorConfig | None, where: object) -> Parameter:
+    """Returns a parameter with the changes of a configuration. Raises InputError for invalid changes."""
     if change is None:
         return default
     if change.unit not in (None, default.unit):

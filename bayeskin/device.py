@@ -1,6 +1,7 @@
-"""The sections `device` and `tissue` of a configuration, and the file of its own that holds only these.
+"""Reads the sections `device` and `tissue`, from a configuration or from a file that holds only these two.
 
-Lengths in them are millimetres. Those of the tissue may be uncertain, a mean and a standard deviation.
+All lengths in them are in millimetres. A length of the tissue may be uncertain: it then has a mean and a
+standard deviation.
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ from bayeskin.sections import Section, checked, read_toml
 from bayeskin.types import Parameter
 
 EXPECTED = "the sections [device] and [tissue] in TOML"
-LARGEST_SD = 1 / 3  # of the mean: a normal prior that reaches zero is of no thickness
-REACH = 3.0  # sd on either side of the mean, to which the prior of a length reaches
-ROOM = 1e-3  # of a length, between its bounds and lengths that cannot be: derivatives take small steps
+LARGEST_SD = 1 / 3  # as a share of the mean, so that a normal prior stays away from zero
+REACH = 3.0  # the prior of a length extends so many sd to either side of the mean
+# Relative distance of a length's bounds from impossible lengths, because derivatives take small steps.
+ROOM = 1e-3
 _MEANING = {
     "cutis_m": "thickness of the cutis",
     "subcutis_m": "thickness of the subcutis",
@@ -40,18 +42,19 @@ _KEYS = {
 
 
 class Uncertain(Section):
-    """A length that is known to a standard deviation only, with a normal prior."""
+    """An uncertain length with a mean and a standard deviation, which stands for a normal prior."""
 
     mean: float
     sd: Annotated[float, Field(gt=0)]
 
 
 def _length_form(given: Any) -> str:
-    """Which form a length has, by the name of its tag."""
+    """Returns the tag of the form in which a length is given: a number or an uncertain length."""
     return "<uncertain>" if isinstance(given, Uncertain | Mapping) else "<number>"
 
 
 def _radius_form(given: Any) -> str:
+    """Returns the tag of the form in which the arm's radius is given: "flat", or a form of a length."""
     return "<flat>" if isinstance(given, str) else _length_form(given)
 
 
@@ -63,18 +66,22 @@ Radius = Annotated[_Number | _Uncertain | _Flat, Discriminator(_radius_form)]
 
 
 class GuardConfig(Section):
-    """The U around each pad: its gap to the pad, and its width, as `bayeskin.geometry.Guard` has them."""
+    """The guard around each pad: its gap to the pad, and its width, as in `bayeskin.geometry.Guard`."""
 
     gap: float
     width: float
 
 
 def _guard_form(given: Any) -> str:
+    """Returns the tag of the form in which the guard is given: a guard, or none."""
     return "<guard>" if isinstance(given, GuardConfig | Mapping) else "<none>"
 
 
 class DeviceConfig(Section):
-    """Lengths of the extensometer [mm]: between the pads, of a pad along and across the pull, its guard."""
+    """The extensometer's lengths [mm]: the gauge, a pad along and across the pull, and its guard.
+
+    The gauge is the distance between the pads. `force_on` says which parts the load cell holds.
+    """
 
     gauge_mm: float = 36.0
     pad_mm: tuple[float, float] = (8.0, 8.0)
@@ -86,7 +93,7 @@ class DeviceConfig(Section):
 
 
 class TissueConfig(Section):
-    """Thickness of the layers and radius of the arm below them [mm]."""
+    """The thickness of the layers and the radius of the arm below them [mm]."""
 
     cutis_mm: Length = 2.0
     subcutis_mm: Length = 8.0
@@ -94,7 +101,7 @@ class TissueConfig(Section):
 
 
 class DeviceFile(Section):
-    """A file that states a device, and the tissue that it is on."""
+    """The content of a file that states a device and the tissue that it is used on."""
 
     device: DeviceConfig = DeviceConfig()
     tissue: TissueConfig = TissueConfig()
@@ -102,9 +109,10 @@ class DeviceFile(Section):
 
 @dataclass(frozen=True)
 class StatedGeometry:
-    """A geometry with the standard deviations of what is uncertain.
+    """A geometry, and the standard deviations of its uncertain lengths.
 
-    geometry : at the means; sd_m : by the name of its field, those that are uncertain only [m]
+    geometry : the lengths, with the mean of each uncertain length
+    sd_m : the standard deviation [m] of each uncertain length, by the name of its field in the geometry
     """
 
     geometry: Geometry
@@ -112,25 +120,28 @@ class StatedGeometry:
 
 
 def load_device(path: Path | str) -> StatedGeometry:
-    """Reads a file with the sections `device` and `tissue`, of which what is missing is the article's.
+    """Reads a file with the sections `device` and `tissue`; missing keys have the values of the article.
 
-    Raises InputError for a file that is absent or not TOML, an unknown key, a value of the wrong kind, or
-    lengths that cannot be.
+    Raises InputError for a file that is absent or is not TOML, an unknown key, a value of the wrong type, or
+    impossible lengths.
     """
     file = load_device_file(path)
     return stated_geometry(file.device, file.tissue, path)
 
 
 def load_device_file(path: Path | str) -> DeviceFile:
-    """The file's sections as they stand there. Raises InputError as `load_device`."""
+    """Returns the sections of the file as they are written there. Raises InputError as `load_device`."""
     file = checked(DeviceFile, read_toml(Path(path), EXPECTED), path, EXPECTED)
     stated_geometry(file.device, file.tissue, path)
     return file
 
 
 def stated_geometry(device: DeviceConfig, tissue: TissueConfig, where: object) -> StatedGeometry:
-    """The geometry in metres of two sections. Raises InputError, of `where`, for lengths that cannot be."""
-    guard, radius = device.guard_mm, _mean(tissue.arm_radius_mm)
+    """Returns the geometry [m] that both sections state.
+
+    Raises InputError, which names `where`, for impossible lengths.
+    """
+    guard, radius = device.guard_mm, _mean_of(tissue.arm_radius_mm)
     try:
         geometry = Geometry(
             gauge_m=_metres(device.gauge_mm),
@@ -138,8 +149,8 @@ def stated_geometry(device: DeviceConfig, tissue: TissueConfig, where: object) -
             pad_width_m=_metres(device.pad_mm[1]),
             guard=Guard(_metres(guard.gap), _metres(guard.width)) if guard else None,
             force_on=device.force_on,
-            cutis_m=_metres(_mean(tissue.cutis_mm)),
-            subcutis_m=_metres(_mean(tissue.subcutis_mm)),
+            cutis_m=_metres(_mean_of(tissue.cutis_mm)),
+            subcutis_m=_metres(_mean_of(tissue.subcutis_mm)),
             arm_radius_m=None if radius == "flat" else _metres(radius),
         )
     except InputError as error:
@@ -155,52 +166,57 @@ def stated_geometry(device: DeviceConfig, tissue: TissueConfig, where: object) -
 
 
 def length_parameters(stated: StatedGeometry) -> tuple[Parameter, ...]:
-    """The parameters of a geometry's uncertain lengths [m]: normal priors, cut to what can be meshed."""
-    found: dict[str, Parameter] = {}
+    """Returns the parameters of a geometry's uncertain lengths [m].
+
+    Their normal priors are truncated to lengths that can be meshed.
+    """
+    parameters: dict[str, Parameter] = {}
     for name, sd in stated.sd_m.items():
         mean = getattr(stated.geometry, name)
         low, high = (1e-3 * bound for bound in BOUNDS_MM[name])
         if name == "arm_radius_m":
-            thickest = {layer: p.upper for layer, p in found.items()}
+            thickest = {layer: p.upper for layer, p in parameters.items()}
             flat = replace(stated.geometry, arm_radius_m=None)
             low = max(low, moved(flat, thickest).least_radius_m)
         lower, upper = max(mean - REACH * sd, low * (1.0 + ROOM)), min(mean + REACH * sd, high * (1.0 - ROOM))
-        found[name] = Parameter(
+        parameters[name] = Parameter(
             name, "m", lower, upper, "normal", _MEANING[name], "[tissue] of the configuration",
             centre=mean, spread=sd,
         )  # fmt: skip
-    return tuple(found.values())
+    return tuple(parameters.values())
 
 
 def device_lines(device: DeviceConfig, tissue: TissueConfig) -> list[str]:
-    """Both sections as lines of TOML, every key with its value and a comment."""
+    """Returns both sections as lines of TOML: every key with its value and a comment."""
     guard = device.guard_mm
     pad = ", ".join(f"{length:g}" for length in device.pad_mm)
-    shown_guard = f"{{ gap = {guard.gap:g}, width = {guard.width:g} }}" if guard else "false"
+    guard_text = f"{{ gap = {guard.gap:g}, width = {guard.width:g} }}" if guard else "false"
     return [
         "[device]  # lengths in mm",
         f"gauge_mm = {device.gauge_mm:g}  # between the pads' inner edges",
         f"pad_mm = [{pad}]  # along the pull, across it",
-        f"guard_mm = {shown_guard}  # from the pad, of the guard; or false: none",
+        f"guard_mm = {guard_text}  # from the pad, of the guard; or false: none",
         f'force_on = "{device.force_on}"  # what the load cell holds; or "pad and guard"',
         "",
         "[tissue]  # lengths in mm",
-        f"cutis_mm = {_shown(tissue.cutis_mm)}",
-        f"subcutis_mm = {_shown(tissue.subcutis_mm)}",
-        f'arm_radius_mm = {_shown(tissue.arm_radius_mm)}  # below the skin; or "flat"',
+        f"cutis_mm = {_length_as_toml(tissue.cutis_mm)}",
+        f"subcutis_mm = {_length_as_toml(tissue.subcutis_mm)}",
+        f'arm_radius_mm = {_length_as_toml(tissue.arm_radius_mm)}  # below the skin; or "flat"',
     ]
 
 
-def _shown(value: Any) -> str:
+def _length_as_toml(value: Any) -> str:
+    """Returns a length as TOML."""
     if isinstance(value, Uncertain):
         return f"{{ mean = {value.mean:g}, sd = {value.sd:g} }}"
     return '"flat"' if value == "flat" else f"{value:g}"
 
 
-def _mean(value: Any) -> Any:
+def _mean_of(value: Any) -> Any:
+    """Returns the mean of an uncertain length, and any other value unchanged."""
     return value.mean if isinstance(value, Uncertain) else value
 
 
 def _metres(length_mm: float) -> float:
-    """Metres, without the rounding error of the product."""
+    """Returns a length in metres, without the rounding error of the product."""
     return round(1e-3 * length_mm, 15)

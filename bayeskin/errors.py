@@ -1,20 +1,20 @@
-"""Errors that are the user's to mend, told apart from those that are ours."""
+"""Errors that the user can correct, which are kept apart from errors in the program."""
 
 from __future__ import annotations
 
 
 class InputError(ValueError):
-    """Bad input: one line that says where it is, what was found and what was expected.
+    """Wrong input, described in one line: where it is, what was found and what was expected.
 
-    The command line prints the line and exits with code 2; nothing has been written.
+    The command line prints this line and exits with code 2. Nothing has been written then.
 
     Parameters
     ----------
-    where : file, field or row at fault, e.g. ``"runs/a.toml: design.points"``
-    found : what stands there
-    expected : what should stand there
+    where : the file, field or row with the error, e.g. ``"runs/a.toml: design.points"``
+    found : what was found there
+    expected : what was expected there
 
-    Line breaks in these become spaces.
+    Line breaks in these texts become spaces.
     """
 
     def __init__(self, where: object, found: object, expected: object) -> None:
@@ -25,4 +25,7 @@ class InputError(ValueError):
 
 
 class Unavailable(InputError):
-    """Something that a run needs cannot be had now, which says nothing about the run: nothing is stored."""
+    """Something that a run needs, such as a server, is not available at present.
+
+    The error says nothing about the run itself, so no result is stored.
+    """

@@ -1,8 +1,9 @@
-"""Finished runs on their way into a design file: one line each, on disk before the next, and a lock.
+"""Stores finished runs on disk, one line each, until they are part of a design file.
 
-A line is ``<crc32 of the text, hex> <its length> <JSON text>``. A process killed while it writes leaves
-at most one line that is not whole; such a line is passed over, and its point is run again. JSON
-keeps every float64 exactly (shortest decimal that reads back the same).
+A line is ``<crc32 of the text, hex> <its length> <JSON text>``. It is on disk before the next run is stored.
+A process that is killed while it writes leaves at most one incomplete line. Such a line is skipped, and its
+point is run again. JSON stores every float64 exactly, as the shortest decimal number that reads back the
+same. A lock keeps other processes out.
 """
 
 from __future__ import annotations
@@ -22,7 +23,14 @@ from bayeskin.types import Array
 
 
 class Run(NamedTuple):
-    """One finished run: theta (d,), bin means [N] (m,) or NaN where it failed, why, and its duration."""
+    """One finished run.
+
+    theta : the parameters (d,)
+    force_n : the bin means [N] (m,), or NaN where the run failed
+    ok : whether the run succeeded
+    message : why it failed
+    seconds : its duration
+    """
 
     theta: Array
     force_n: Array
@@ -32,11 +40,11 @@ class Run(NamedTuple):
 
 
 class Journal:
-    """Append-only file of `Run`, held by one process at a time. A context manager.
+    """An append-only file of `Run` that one process at a time may hold. It is a context manager.
 
-    `runs` maps the bytes of theta to the run. `identity` stands in each line: results of another
-    model, box or bins are refused. The file is gone when nothing is left in it.
-    Raises InputError when another process holds it, or when it belongs to another design.
+    `runs` maps the bytes of theta to the run. Each line contains `identity`, so that results of another
+    model, box or bins are refused. The file is removed when it holds no run any more. Raises InputError when
+    another process holds the file, or when the file belongs to another design.
     """
 
     def __init__(self, path: Path, identity: str, bins: int) -> None:
@@ -58,37 +66,38 @@ class Journal:
         self._file.close()
 
     def append(self, run: Run) -> None:
-        """Adds one run; it is on disk on return."""
+        """Adds one run, which is safely on disk when the method returns."""
         self._file.write(_line(run, self.identity))
         self._file.flush()
         os.fsync(self._file.fileno())
         self.runs[run.theta.tobytes()] = run
 
     def forget(self, keys: set[bytes]) -> None:
-        """Drops runs that are safe elsewhere, all at once; the last use of an open journal."""
+        """Removes runs that are stored elsewhere, all at once. It must be the last use of an open journal."""
         self.runs = {key: run for key, run in self.runs.items() if key not in keys}
         if not self.runs:
             self._file.truncate(0)
             return
-        rest = self.path.with_name(f".{self.path.name}.partial")
-        with open(rest, "wb") as out:
+        partial = self.path.with_name(f".{self.path.name}.partial")
+        with open(partial, "wb") as out:
             out.writelines(_line(run, self.identity) for run in self.runs.values())
             out.flush()
             os.fsync(out.fileno())
-        os.replace(rest, self.path)
+        os.replace(partial, self.path)
 
     def _read(self) -> dict[bytes, Run]:
+        """Returns the runs of the file by the bytes of theta, and completes an incomplete last line."""
         self._file.seek(0)
         text = self._file.read()
         if text and not text.endswith(b"\n"):
-            self._file.write(b"\n")  # closes a torn line, so that the next one starts afresh
+            self._file.write(b"\n")  # ends an incomplete line, so that the next run starts a new line
         runs = {}
         for number, line in enumerate(text.splitlines(), start=1):
-            whole = _whole(line)
-            if whole is None:
+            content = _text_of_whole_line(line)
+            if content is None:
                 continue
             try:
-                design, run = self._run(json.loads(whole))
+                design, run = self._run(json.loads(content))
             except (KeyError, TypeError, ValueError, RecursionError):
                 expected = "one that bayeskin wrote; without the file all runs are made anew"
                 raise InputError(f"{self.path}, line {number}", "what is no run", expected) from None
@@ -102,7 +111,7 @@ class Journal:
         return runs
 
     def _run(self, plain: Mapping[str, Any]) -> tuple[Any, Run]:
-        """What a line is of, and its run."""
+        """Returns the identity of the design that a line belongs to, and its run."""
         force_n = [np.nan] * self.bins if plain["force_n"] is None else plain["force_n"]
         return plain["design"], Run(
             np.array(plain["theta"], dtype=float), np.array(force_n, dtype=float), plain["ok"],
@@ -111,6 +120,7 @@ class Journal:
 
 
 def _line(run: Run, identity: str) -> bytes:
+    """Returns a run as a line of the file."""
     plain = {
         "design": identity,
         "theta": run.theta.tolist(),
@@ -123,8 +133,8 @@ def _line(run: Run, identity: str) -> bytes:
     return b"%08x %d %s\n" % (zlib.crc32(text), len(text), text)
 
 
-def _whole(line: bytes) -> bytes | None:
-    """The content of a whole line, None for a torn or damaged one."""
+def _text_of_whole_line(line: bytes) -> bytes | None:
+    """Returns the JSON text of a complete line, and None for an incomplete or damaged line."""
     head, _, rest = line.partition(b" ")
     length, _, text = rest.partition(b" ")
     if length != b"%d" % len(text) or head != b"%08x" % zlib.crc32(text):
@@ -133,7 +143,7 @@ def _whole(line: bytes) -> bytes | None:
 
 
 def _open_locked(path: Path) -> IO[bytes]:
-    """Opens for appending under an exclusive lock, which the system drops when the process dies."""
+    """Opens a file for appending under an exclusive lock, which the system releases when the process ends."""
     while True:
         handle = open(path, "a+b")  # noqa: SIM115 - the journal closes it
         try:
@@ -143,7 +153,7 @@ def _open_locked(path: Path) -> IO[bytes]:
             raise InputError(
                 path, "a design that another process is running", "one process at a time"
             ) from None
-        # The former holder may have removed or replaced the file between our open and our lock.
+        # Another process may have removed or replaced the file after it was opened and before it was locked.
         if path.exists() and os.path.samestat(os.fstat(handle.fileno()), os.stat(path)):
             return handle
         handle.close()

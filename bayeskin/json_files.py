@@ -1,4 +1,4 @@
-"""Values as JSON knows them, and JSON files that are written whole or not at all."""
+"""Converts values to JSON, and writes JSON files completely or not at all."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bayeskin.errors import InputError
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Writes JSON whole or not at all; what is not a number in JSON (NaN, infinity) becomes null."""
+    """Writes a value as JSON, completely or not at all; NaN and infinity become null."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         partial.write_text(json.dumps(plain(value), indent=2, allow_nan=False) + "\n")
@@ -23,7 +23,10 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON knows it: arrays become lists, numpy numbers become Python's, NaN becomes null."""
+    """Returns a value that JSON can hold.
+
+    Arrays become lists, numpy numbers become Python's, paths become text, and NaN and infinity become None.
+    """
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if hasattr(value, "tolist"):
@@ -36,9 +39,10 @@ def plain(value: Any) -> Any:
 
 
 def read_lines(file: Path) -> list[dict[str, Any]]:
-    """JSON lines of a file, [] without one; a torn last line is cut off, so that more can follow.
+    """Returns the JSON lines of a file, and [] where there is no file.
 
-    Raises InputError for a line that is no mapping in JSON.
+    An incomplete last line is cut off, so that further lines can be added. Raises InputError for a line that
+    is not a mapping in JSON.
     """
     if not file.is_file():
         return []

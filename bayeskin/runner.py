@@ -1,9 +1,9 @@
-"""Runs a design through the full model, here or on a cluster, into one HDF5 file, whatever interrupts it.
+"""Runs a design through the full model, on this machine or a cluster, into one HDF5 file.
 
-While a wave runs, each finished run goes into a journal beside the file (`bayeskin.journal`); when
-all are there, a new file with all rows is written, replaces the old one, and the journal goes. So the
-file is whole at every moment, and a process killed at any moment loses only the runs in progress.
-Rows stand in the order of the points, whoever finished first.
+While a wave runs, each finished run goes into a journal beside the file (`bayeskin.journal`). When all runs
+are there, a new file with all rows is written and replaces the old one, and the journal is removed. The file
+is thus complete at every moment, and a process that is killed at any moment loses only the runs in progress.
+The rows have the order of the points, in whatever order the runs finished.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ Progress = Callable[[int, int, int], None]
 
 
 class _Outcome(NamedTuple):
-    """What a worker sends back; `force_n` is None when the run failed.
+    """The result that a worker sends back; `force_n` is None where the run failed.
 
-    `unavailable`: where, found and expected of what the run needs and could not be had.
+    unavailable : `where`, `found` and `expected` of an `Unavailable` error, where something that the run
+        needs was not available
     """
 
     force_n: Array | None
@@ -55,20 +56,24 @@ def run_design(
     run_all: Map | None = None,
     progress: Progress | None = None,
 ) -> Design:
-    """Runs the points of `wave` that are in no file yet and returns the design with all its waves.
+    """Runs the points of `wave` that are in no file yet, and returns the design with all its waves.
 
-    run_all maps over the points (`workers.local`, two processes by default, or `cluster`); the file is the
-    same whichever it was. simulate maps ``{name: value}`` to a Simulation; it must be picklable, and its
-    results carry `model_hash`. edges_s (m+1,): the bins whose mean force is kept. A point is known by its
-    bytes, so a repeated one is not run again. A run that fails, raises, or kills its worker `ATTEMPTS`
-    times becomes a row with ``ok`` False and a message. Called again after an interruption of any
-    kind, it goes on. progress(done, total, failed) counts this wave's points. Ctrl-C ends the workers,
-    keeps what is finished and raises KeyboardInterrupt.
+    edges_s : the edges (m+1,) of the bins whose mean force is stored
+    simulate : maps ``{name: value}`` to a Simulation; it must be picklable, and its results carry
+        `model_hash`
+    run_all : maps a function over the points (`execution.local.local`, by default with two processes, or a
+        cluster); the file is the same for each of them
+    progress : called as progress(done, total, failed) with the counts of this wave's points
 
-    Raises InputError, with nothing written, when the file holds another parameter space, model or
-    bins, when a point lies outside the box, when another process runs the same file, or when
-    `simulate` is of another model; Unavailable when something that runs need cannot be had, such as a server,
-    which says nothing of their points, so none of them is stored.
+    A point is identified by its bytes, so a repeated point is not run again. A run that fails, raises an
+    error, or kills its worker `ATTEMPTS` times becomes a row with ``ok`` False and a message. A call after an
+    interruption of any kind continues the wave. Ctrl-C ends the workers, keeps the finished runs and raises
+    KeyboardInterrupt.
+
+    Raises InputError, with nothing written, when the file holds another parameter space, model or bins, when
+    a point lies outside the box, when another process runs the same file, or when `simulate` belongs to
+    another model. Raises Unavailable when something that the runs need is not available, such as a server.
+    This says nothing about the points, so none of these runs is stored.
     """
     path, edges = Path(path), np.asarray(edges_s, dtype=float)
     points = _distinct(wave)
@@ -80,12 +85,12 @@ def run_design(
             _check_same(path, before, wave.space, edges, model_hash)
         known = _rows_ok(before) | {key: run.ok for key, run in journal.runs.items()}
         todo = [row for key, row in points.items() if key not in known]
-        report = _reporter(progress, len(points), [known[key] for key in points if key in known])
+        report = _progress_reporter(progress, len(points), [known[key] for key in points if key in known])
         report(None)
         task = partial(_bin_means_of, simulate, wave.space.names, edges)
         with closing((run_all or local(2))(task, todo)) as results:
             for index, outcome in results:
-                if todo[index].tobytes() in journal.runs:  # a cluster may have run it twice
+                if todo[index].tobytes() in journal.runs:  # a cluster may have run the point twice
                     continue
                 run = _as_run(path, todo[index], outcome, bins, model_hash)
                 journal.append(run)
@@ -107,10 +112,10 @@ def add_points(
     run_all: Map | None = None,
     progress: Progress | None = None,
 ) -> Design:
-    """Adds training points (n, d) that no rule drew, such as a MAP estimate, as the next wave.
+    """Adds training points (n, d) that no rule has drawn, such as a MAP estimate, as the next wave.
 
-    `reason` goes into the wave's record. Resumes as `run_design` does. Raises InputError as
-    `run_design` and `load_design` do.
+    `reason` goes into the wave's record. The call resumes after an interruption as `run_design` does. Raises
+    InputError as `run_design` and `load_design` do.
     """
     design = load_design(path)
     theta = np.atleast_2d(np.asarray(theta, dtype=float))
@@ -121,9 +126,9 @@ def add_points(
 
 
 def load_design(path: Path | str) -> Design:
-    """The finished waves in a design file.
+    """Returns the finished waves of a design file.
 
-    Raises InputError when there is no such file, or its arrays do not belong together.
+    Raises InputError where there is no such file, or where its arrays do not fit each other.
     """
     design = storage.load(path, Design)
     rows, bins = len(np.atleast_1d(design.ok)), design.edges_s.size - 1
@@ -142,14 +147,20 @@ def load_design(path: Path | str) -> Design:
 
 
 def load_waves(path: Path | str) -> tuple[dict[str, Any], ...]:
-    """How the points of each wave were chosen, oldest first. Raises InputError as `load_design`."""
+    """Returns how the points of each wave were chosen, oldest wave first.
+
+    Raises InputError as `load_design`.
+    """
     load_design(path)
     with storage.reading(Path(path), "a bayeskin Design file") as handle:
         return tuple(map(dict, json.loads(handle.attrs.get("waves", "[]"))))
 
 
 def _bin_means_of(simulate: Simulate, names: tuple[str, ...], edges: Array, theta: Array) -> _Outcome:
-    """One run, in a worker: bin means [N] (m,) or the reason why there are none. Raises nothing."""
+    """Returns the bin means [N] (m,) of one run, or the reason why it has none.
+
+    This function runs in a worker. It raises no error.
+    """
     start = time.perf_counter()
     force_n, message, model_hash, unavailable = None, "", "", None
     try:
@@ -167,7 +178,7 @@ def _bin_means_of(simulate: Simulate, names: tuple[str, ...], edges: Array, thet
 
 
 def _checked_means(run: Simulation, edges: Array) -> tuple[Array | None, str]:
-    """Bin means [N] (m,), refused where the run does not cover the bins or is not finite."""
+    """Returns the bin means [N] (m,) and a message; no means where the run is too short or not finite."""
     slack = 1e-9 * (edges[-1] - edges[0])
     if run.time_s[0] > edges[0] + slack or run.time_s[-1] < edges[-1] - slack:
         covered = f"{run.time_s[0]:g}..{run.time_s[-1]:g} s"
@@ -178,6 +189,7 @@ def _checked_means(run: Simulation, edges: Array) -> tuple[Array | None, str]:
 
 
 def _as_run(path: Path, theta: Array, outcome: _Outcome | Lost, bins: int, model_hash: str) -> Run:
+    """Returns the outcome of a worker as a run. Raises Unavailable, and InputError for another model."""
     if isinstance(outcome, Lost):
         return Run(theta, np.full(bins, np.nan), False, outcome.reason, math.nan)
     if outcome.unavailable is not None:
@@ -189,11 +201,17 @@ def _as_run(path: Path, theta: Array, outcome: _Outcome | Lost, bins: int, model
     return Run(theta, force_n, ok, outcome.message, outcome.seconds)
 
 
-def _reporter(progress: Progress | None, total: int, known: list[bool]) -> Callable[[Run | None], None]:
-    """Turns finished runs into calls of `progress`; `known` says of earlier ones whether they are ok."""
+def _progress_reporter(
+    progress: Progress | None, total: int, known: list[bool]
+) -> Callable[[Run | None], None]:
+    """Returns a function that turns finished runs into calls of `progress`.
+
+    `known` says for each earlier run whether it is ok.
+    """
     states = list(known)
 
     def report(run: Run | None) -> None:
+        """Counts a finished run (None: no new run) and reports the progress."""
         if run is not None:
             states.append(run.ok)
         if progress is not None:
@@ -203,14 +221,17 @@ def _reporter(progress: Progress | None, total: int, known: list[bool]) -> Calla
 
 
 def _rows_ok(design: Design | None) -> dict[bytes, bool]:
-    """Whether each stored point's run was ok, by the bytes of theta."""
+    """Returns whether the run of each stored point is ok, by the bytes of theta."""
     if design is None:
         return {}
     return {row.tobytes(): bool(ok) for row, ok in zip(design.theta, design.ok, strict=True)}
 
 
 def _distinct(wave: Wave) -> dict[bytes, Array]:
-    """The wave's points by their bytes, repeats once, in order."""
+    """Returns the wave's points by their bytes, in order, each point once.
+
+    Raises InputError for arrays of the wrong shape and for a point outside the prior box.
+    """
     theta = wave.theta
     if theta.ndim != 2 or theta.shape[1] != wave.space.dim or len(theta) != len(wave.held_out):
         raise InputError("points of a design", f"shape {theta.shape}", f"(n, {wave.space.dim})")
@@ -224,30 +245,34 @@ def _distinct(wave: Wave) -> dict[bytes, Array]:
 
 
 def _identity(space: ParameterSpace, edges: Array, model_hash: str) -> str:
-    """Hash of all that results depend on beside theta; wording of a description is not part of it."""
+    """Returns the hash of all that results depend on besides theta.
+
+    The wording of a parameter's description is not part of it.
+    """
     parts = [_box(space), edges.tobytes().hex(), model_hash]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
 def _box(space: ParameterSpace) -> list[list[Any]]:
+    """Returns the parameters with their units, bounds and priors as plain values."""
     return [[p.name, p.unit, float(p.lower), float(p.upper), p.prior, p.offset] for p in space.parameters]
 
 
 def _check_same(path: Path, design: Design, space: ParameterSpace, edges: Array, model_hash: str) -> None:
-    """Raises InputError unless the file's design can be extended by runs of this one."""
+    """Raises InputError unless runs of this model, space and bins can extend the file's design."""
     if design.model_hash != model_hash:
         raise InputError(path, f"a design of model {design.model_hash}", f"model {model_hash}")
     if _box(design.space) != _box(space):
         raise InputError(path, f"parameters {_box(design.space)}", f"{_box(space)}")
     if not np.array_equal(design.edges_s, edges):
-        found, wanted = len(design.edges_s) - 1, len(edges) - 1
+        bins, expected_bins = len(design.edges_s) - 1, len(edges) - 1
         raise InputError(
-            path, f"{found} time bins to {design.edges_s[-1]:g} s", f"{wanted} bins to {edges[-1]:g} s"
+            path, f"{bins} time bins to {design.edges_s[-1]:g} s", f"{expected_bins} bins to {edges[-1]:g} s"
         )
 
 
 def _extended(before: Design | None, wave: Wave, edges: Array, model_hash: str, fresh: list[Run]) -> Design:
-    """The design with `fresh` runs of `wave` as its last rows."""
+    """Returns the design with the `fresh` runs of `wave` as its last rows."""
     held_out = dict(zip((t.tobytes() for t in wave.theta[::-1]), wave.held_out[::-1], strict=True))
     new = Design(
         space=wave.space,
@@ -275,12 +300,12 @@ def _extended(before: Design | None, wave: Wave, edges: Array, model_hash: str, 
 
 
 def _write(path: Path, design: Design, waves: list[dict[str, Any]]) -> None:
-    """Replaces the file by one with all rows and the waves' records, at once."""
+    """Replaces the file, in one step, by a file with all rows and the records of the waves."""
     storage.save(path, design, {"waves": json.dumps(waves)})
 
 
 def _remove_stale(path: Path) -> None:
-    """Removes what a process killed while it wrote may have left; only the journal's holder may."""
+    """Removes partial files that a killed process may have left; only the journal's holder may do this."""
     for stale in path.parent.glob(f".{escape(path.name)}.*.partial"):
         stale.unlink(missing_ok=True)
     path.with_name(f".{path.name}.journal.partial").unlink(missing_ok=True)

@@ -1,7 +1,7 @@
-"""bayeskin from a script: ``import bayeskin as bk``. Each function is a thin call of what a run does.
+"""Functions for scripts, after ``import bayeskin as bk``; each of them calls what the commands call.
 
-Settings have the names and checks of a configuration's sections (README); InputError in one line where
-they are wrong.
+Settings have the names of a configuration's sections (README) and are checked in the same way. Wrong settings
+raise InputError with one line of text.
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ FILE, CONFIG = "recording.h5", "calibration.toml"
 
 
 def load_recording(path: Path | str, sheet: str | None = None) -> Recording:
-    """A recording (xlsx, csv, tsv, h5) in SI units. Raises InputError where it is none."""
+    """Returns a recording (xlsx, csv, tsv, h5) in SI units. Raises InputError for any other file."""
     return read_recording(path, sheet=sheet)
 
 
 def simulate(
     recording: Recording, /, theta: Mapping[str, float] | None = None, **settings: Any
 ) -> Simulation:
-    """Returns one run of the full model on a recording's displacement: some seconds.
+    """Returns one run of the full model on a recording's displacement, which takes some seconds.
 
-    theta : SI values by name; what is left out stands at the median of its prior
+    theta : SI values by parameter name; a missing parameter has the median of its prior
     settings : sections of a configuration, such as ``model={"refinement": 2}``
 
     Raises InputError for wrong settings or values.
     """
-    with _opened(recording, settings) as run:
+    with _run_on(recording, settings) as run:
         space = parameter_space(run.config)
         unknown = set(theta or {}) - set(space.names)
         if unknown:
@@ -76,16 +76,16 @@ def calibrate(
     folder: str | Path | None = None,
     **settings: Any,
 ) -> arviz.InferenceData:
-    """Posterior of a recording under a surrogate, with its verdict in the attributes.
+    """Returns the posterior of a recording under a surrogate, with its verdict in the attributes.
 
-    No full model is run: `check` does so at draws of the result, and `bayeskin run` at the most probable
-    point too.
+    This function does not run the full model. `check` runs it at draws of the result, and `bayeskin run` also
+    runs it at the most probable point.
 
     Parameters
     ----------
-    surrogate : a shipped one's name, such as "demo.h5", or a file with its design beside it; by default the
-        shipped one that knows the recording's protocol
-    folder : where chains are kept, so that a call with the same arguments goes on from there
+    surrogate : the name of a shipped surrogate, such as "demo.h5", or a file with its design beside it; by
+        default the shipped surrogate that was trained on the recording's protocol
+    folder : where chains are stored, so that a call with the same arguments continues them
     settings : ``seed`` and sections of a configuration, such as ``fit={"windows_s": [[0, 75]]}``,
         ``parameters={"E_c": {"upper": 1e6}}``, ``sample={"effective_samples": 1000}``
 
@@ -94,63 +94,69 @@ def calibrate(
     InferenceData : posterior, predictions, prior, data and the log-likelihood by phase, so that `az.plot_*`,
         `az.loo` (which leaves out one phase at a time) and `az.compare` work
     """
-    with _opened(recording, _with_surrogate(recording, settings, surrogate), folder) as run:
-        work = _workpiece(run, recording)
-        log_posterior, config = work.log_posterior, run.config
+    with _run_on(recording, _with_surrogate(recording, settings, surrogate), folder) as run:
+        inputs = _calibration_inputs(run, recording)
+        log_posterior, config = inputs.log_posterior, run.config
         best = inference.find_map(log_posterior, config.seed, config.map.starts, config.map.evaluations).theta
         chains = chains_folder(run, log_posterior)
         posterior = inference.sample(
             log_posterior, chains, config.seed, best, settings_of(config), threads=config.design.workers
         )
-        origin = provenance_of(run, log_posterior, recording.sha256)
+        provenance = provenance_of(run, log_posterior, recording.sha256)
         rng = np.random.default_rng([config.seed, 1])
-        idata = inference.to_inference_data(log_posterior, posterior, origin, rng, PREDICTIVE_DRAWS)
+        idata = inference.to_inference_data(log_posterior, posterior, provenance, rng, PREDICTIVE_DRAWS)
         idata.attrs["map"] = json.dumps(dict(best))
         return idata
 
 
 def check(recording: Recording, posterior: arviz.InferenceData, draws: int = 24) -> Weighed:
-    """Runs the full model at evenly taken draws of a posterior of `calibrate`, and weighs them by it.
+    """Runs the full model at regularly chosen draws of a posterior of `calibrate`, and returns their weights.
 
-    Raises InputError for fewer than 8 draws, of which weights say next to nothing, and for a posterior by
-    another surrogate than the file's that it names, as `bayeskin run` makes where it trains on.
+    Raises InputError for fewer than 8 draws, because their weights carry almost no information. Raises
+    InputError also for a posterior under another surrogate than that in the file that it names. `bayeskin
+    run` makes such posteriors where it trains the surrogate further.
     """
     if draws < FEWEST_CHECKED:
         raise InputError("draws", draws, f"at least {FEWEST_CHECKED}")
     settings = _settings_of(recording, posterior)
-    with _opened(recording, settings) as run:
-        work = _workpiece(run, recording)
-        log_posterior, flat = work.log_posterior, inference.draws_of(posterior)[1]
+    with _run_on(recording, settings) as run:
+        inputs = _calibration_inputs(run, recording)
+        log_posterior, flat = inputs.log_posterior, inference.draws_of(posterior)[1]
         if json.loads(posterior.attrs["provenance"]).get("identity") != log_posterior.identity:
-            other = f"one by another surrogate than that of {run.config.surrogate.file}"
-            raise InputError("posterior", other, "one of bk.calibrate; `bayeskin run` has checked its own")
-        few = inference.evenly(flat, draws)
-        spec, names, edges = model_spec(run), log_posterior.surrogate.space.names, work.binned.edges_s
-        force = np.full((len(few), len(edges) - 1), np.nan)
-        for row, point in enumerate(log_posterior.split(few)[0]):
-            found = run_model(spec, work.motion, dict(zip(names, map(float, point), strict=True)))
-            if found.status == "ok":
-                force[row] = found.bin_means(edges)
-        return inference.weigh(log_posterior, few, force)
+            found = f"one by another surrogate than that of {run.config.surrogate.file}"
+            raise InputError("posterior", found, "one of bk.calibrate; `bayeskin run` has checked its own")
+        chosen = inference.evenly(flat, draws)
+        spec, names, edges = model_spec(run), log_posterior.surrogate.space.names, inputs.binned.edges_s
+        force = np.full((len(chosen), len(edges) - 1), np.nan)
+        for row, point in enumerate(log_posterior.split(chosen)[0]):
+            simulation = run_model(spec, inputs.motion, dict(zip(names, map(float, point), strict=True)))
+            if simulation.status == "ok":
+                force[row] = simulation.bin_means(edges)
+        return inference.weigh(log_posterior, chosen, force)
 
 
 def diagnose(
     recording: Recording, posterior: arviz.InferenceData | None = None, folder: str | Path | None = None
 ) -> dict[str, Any]:
-    """Returns the answer of ``bayeskin diagnose``: what the model leaves out of a recording.
+    """Returns the answer of ``bayeskin diagnose``: the physics that the model leaves out of a recording.
 
-    Surrogate, seed and noise are those that `posterior` was made with; the whole recording is fitted.
-    Minutes, on two processes. `folder` keeps figures and what is needed to go on.
+    Surrogate, seed and noise are those of `posterior`. The whole recording is fitted, which takes minutes on
+    two processes. `folder` keeps the figures and the files that a later call needs to continue.
     """
     settings = {} if posterior is None else _settings_of(recording, posterior)
-    with _opened(recording, _with_surrogate(recording, settings, None), folder) as run, _apart_from_script():
+    with (
+        _run_on(recording, _with_surrogate(recording, settings, None), folder) as run,
+        _without_caller_script(),
+    ):
         return diagnosis.diagnose(run.config_path, Silent())
 
 
 @contextmanager
-def _apart_from_script() -> Iterator[None]:
-    """Processes started inside do not run the caller's script again, so that it needs no guard: they need
-    nothing of it."""
+def _without_caller_script() -> Iterator[None]:
+    """Keeps processes that are started inside the context from running the caller's script again.
+
+    These processes need nothing of the script, so the script needs no guard by ``__name__``.
+    """
     script = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -160,43 +166,51 @@ def _apart_from_script() -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class _Workpiece:
+class _CalibrationInputs:
+    """The bins, the protocol and the log-posterior of a run."""
+
     binned: BinnedForce
     motion: PadMotion
     log_posterior: LogPosterior
 
 
-def _workpiece(run: Run, recording: Recording) -> _Workpiece:
-    """Bins, protocol and posterior of a run whose surrogate is there."""
-    made = prepared(run, recording)
+def _calibration_inputs(run: Run, recording: Recording) -> _CalibrationInputs:
+    """Returns bins, protocol and log-posterior of a run whose surrogate exists already."""
+    fitted = prepared(run, recording)
     files = shipped_files(run)
-    check_fits(run, files, load_design(files.design), made.binned, made.motion)
-    log_posterior = log_posterior_of(run, load_surrogate(files.surrogate), made.binned, made.motion)
-    return _Workpiece(made.binned, made.motion, log_posterior)
+    check_fits(run, files, load_design(files.design), fitted.binned, fitted.motion)
+    log_posterior = log_posterior_of(run, load_surrogate(files.surrogate), fitted.binned, fitted.motion)
+    return _CalibrationInputs(fitted.binned, fitted.motion, log_posterior)
 
 
 def _with_surrogate(
     recording: Recording, settings: Mapping[str, Any], surrogate: str | Path | None
 ) -> dict[str, Any]:
-    """The settings with a surrogate that knows the recording's protocol."""
-    recording = _recording(recording)
+    """Returns the settings with a surrogate that was trained on the recording's protocol.
+
+    Raises InputError where the settings name no surrogate and no shipped one was trained on this protocol.
+    """
+    recording = _checked_recording(recording)
     if surrogate is None and settings.get("surrogate", {}).get("file") is not None:
         return dict(settings)
     if surrogate is None:
-        found = shipped_for(pad_motion("reaction", recording, segment(recording), "idealised"))
-        if found is None:
+        fitting = shipped_for(pad_motion("reaction", recording, segment(recording), "idealised"))
+        if fitting is None:
             raise InputError(
                 f"calibrate {recording.name}", "a protocol that no shipped surrogate was trained on",
                 "surrogate=FILE of `bayeskin train`, or a configuration and `bayeskin run`",
             )  # fmt: skip
-        surrogate = found.name
-    own = Path(surrogate)
-    return {**settings, "surrogate": {"file": str(own.resolve()) if own.is_file() else str(surrogate)}}
+        surrogate = fitting.name
+    file = Path(surrogate)
+    return {**settings, "surrogate": {"file": str(file.resolve()) if file.is_file() else str(surrogate)}}
 
 
 def _settings_of(recording: Recording, posterior: arviz.InferenceData) -> dict[str, Any]:
-    """The configuration that a posterior was made with; refused for another recording than its own."""
-    recording = _recording(recording)
+    """Returns the configuration that a posterior was made with.
+
+    Raises InputError for a posterior of another recording, and for a posterior whose surrogate has no file.
+    """
+    recording = _checked_recording(recording)
     if "recording_sha256" not in posterior.attrs:
         raise InputError("posterior", "an InferenceData without provenance", "one made by bayeskin")
     if posterior.attrs["recording_sha256"] != recording.sha256:
@@ -210,23 +224,24 @@ def _settings_of(recording: Recording, posterior: arviz.InferenceData) -> dict[s
     return settings
 
 
-def _recording(given: object) -> Recording:
+def _checked_recording(given: object) -> Recording:
+    """Returns the recording. Raises InputError for an object of another type."""
     if not isinstance(given, Recording):
         raise InputError("recording", f"{type(given).__name__} {given!r:.60}", "one of bk.load_recording")
     return given
 
 
 @contextmanager
-def _opened(
+def _run_on(
     recording: Recording, settings: Mapping[str, Any], folder: str | Path | None = None
 ) -> Iterator[Run]:
-    """A run on a recording, its files in `folder` or in one that is gone afterwards."""
-    with tempfile.TemporaryDirectory() as passing:
-        recording = _recording(recording)
-        where = Path(folder or passing)
-        where.mkdir(parents=True, exist_ok=True)
-        storage.save(where / FILE, recording)
-        own = {**settings.get("recording", {}), "file": FILE}
-        config = config_of(plain({"name": "calibration", **settings, "recording": own}), "settings")
-        (where / CONFIG).write_text(to_toml(config), encoding="utf-8")
-        yield Run(config, where / CONFIG, where / config.name, Silent())
+    """Yields a run on a recording, with its files in `folder`, or in a temporary folder without one."""
+    with tempfile.TemporaryDirectory() as temporary:
+        recording = _checked_recording(recording)
+        place = Path(folder or temporary)
+        place.mkdir(parents=True, exist_ok=True)
+        storage.save(place / FILE, recording)
+        section = {**settings.get("recording", {}), "file": FILE}
+        config = config_of(plain({"name": "calibration", **settings, "recording": section}), "settings")
+        (place / CONFIG).write_text(to_toml(config), encoding="utf-8")
+        yield Run(config, place / CONFIG, place / config.name, Silent())

@@ -1,4 +1,4 @@
-"""Checked sections of a TOML file: how it is read, and one line on what is wrong with it."""
+"""Reads and checks the sections of a TOML file, and reports the first error in one line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TOO_DEEP = "tables or lists nested too deeply"
 
 
 class Section(BaseModel):
-    """A table of known keys, frozen."""
+    """A frozen table that has only known keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
@@ -27,7 +27,7 @@ Checked = TypeVar("Checked", bound=Section)
 
 
 def read_toml(path: Path, expected: str) -> dict[str, Any]:
-    """The tables of a file. Raises InputError for a file that is absent, not text or not TOML."""
+    """Returns the tables of a file. Raises InputError for a file that is absent, not text or not TOML."""
     data = bytes_of(path, expected, MOST_BYTES)
     try:
         return tomllib.loads(data.decode("utf-8-sig"))
@@ -35,26 +35,26 @@ def read_toml(path: Path, expected: str) -> dict[str, Any]:
         raise InputError(path, "bytes that are not text in UTF-8", expected) from None
     except RecursionError:
         raise InputError(path, TOO_DEEP, expected) from None
-    except ValueError as error:  # of TOML, or of a number with thousands of digits
+    except ValueError as error:  # from the TOML reader, or for a number with thousands of digits
         raise InputError(path, str(error), expected) from None
 
 
 def checked(kind: type[Checked], plain: Mapping[str, Any], where: Path | str, expected: str) -> Checked:
-    """The tables as a checked value. Raises InputError for the first thing in them that is wrong."""
+    """Returns the tables as a checked value. Raises InputError for the first error in them."""
     try:
         return kind.model_validate_json(json.dumps(plain, default=str))
     except ValidationError as error:
         raise _input_error(where, error, kind) from None
     except RecursionError:
         raise InputError(where, TOO_DEEP, expected) from None
-    except ValueError as error:  # of a number with thousands of digits
+    except ValueError as error:  # for a number with thousands of digits
         raise InputError(where, str(error), expected) from None
 
 
 def _input_error(path: Path | str, error: ValidationError, root: type[Section]) -> InputError:
-    """The first complaint of pydantic as the project's one line."""
+    """Returns pydantic's first complaint as an InputError, whose text is one line."""
     first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"] if not str(part).startswith("<"))  # a form's name
+    key = ".".join(str(part) for part in first["loc"] if not str(part).startswith("<"))  # no tags
     kind, given = first["type"], first["input"]
     if kind == "extra_forbidden":
         return InputError(f"{path}: {key}", "an unknown key", one_of(_keys_beside(root, first["loc"])))
@@ -62,30 +62,31 @@ def _input_error(path: Path | str, error: ValidationError, root: type[Section]) 
         return InputError(f"{path}: {key}", "nothing", "one entry more")
     if kind == "missing":
         return InputError(f"{path}: {key}", "nothing", "this key: it has no default")
-    if kind == "value_error":  # ours, "key: found X; expected Y"
-        own, _, rest = str(first["ctx"]["error"]).partition(": found ")
+    if kind == "value_error":  # raised by this package: "key: found X; expected Y"
+        inner, _, rest = str(first["ctx"]["error"]).partition(": found ")
         found, _, expected = rest.partition("; expected ")
-        where = f"{key}.{own}" if key else own
+        where = f"{key}.{inner}" if key else inner
         return InputError(f"{path}: {where}", found, expected)
     expected = first["msg"].removeprefix("Input should be ").removeprefix("Value should be ")
     if kind in ("model_type", "model_attributes_type", "dict_type"):
         expected = "a table"
     elif kind == "too_long":
         expected = f"at most {first['ctx']['max_length']} entries"
-    shown = "a table" if isinstance(given, Mapping) else json.dumps(given, default=str)
-    return InputError(f"{path}: {key}", shown, expected[0].lower() + expected[1:])
+    given_text = "a table" if isinstance(given, Mapping) else json.dumps(given, default=str)
+    return InputError(f"{path}: {key}", given_text, expected[0].lower() + expected[1:])
 
 
 def _keys_beside(root: type[Section], location: tuple[Any, ...]) -> tuple[str, ...]:
-    """Names of the keys allowed in the table that `location` points into."""
+    """Returns the names of the keys that are allowed in the table that `location` points into."""
     section: type[BaseModel] = root
-    for part in location[:-1]:  # others are a parameter's name, or that of a form that a value has
+    for part in location[:-1]:  # other parts name a parameter or the form of a value
         if part in section.model_fields:
             section = next(_models_in(section.model_fields[part].annotation))
     return tuple(section.model_fields)
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yields the pydantic models that an annotation contains."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for part in get_args(annotation):
@@ -93,5 +94,5 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def one_of(names: tuple[str, ...]) -> str:
-    """The names that are allowed, as a complaint states them."""
+    """Returns the allowed names, as an error message lists them."""
     return "one of " + ", ".join(names)

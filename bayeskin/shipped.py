@@ -1,4 +1,4 @@
-"""Where the files that come with bayeskin lie: at the root of a checkout, inside an installed wheel."""
+"""Locates the files that come with bayeskin: at the root of a checkout, or inside an installed wheel."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ _ROOTS = (_PACKAGE / "_shipped", _PACKAGE.parent)
 
 
 def shipped(name: str) -> Path:
-    """Path of a shipped file such as ``"surrogates/demo.h5"``; raises InputError when there is none."""
+    """Returns the path of a shipped file such as ``"surrogates/demo.h5"``.
+
+    Raises InputError where there is no such file.
+    """
     for root in _ROOTS:
         if (root / name).is_file():
             return root / name

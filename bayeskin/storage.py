@@ -1,4 +1,4 @@
-"""Any of the project's dataclasses to and from HDF5: arrays, numbers and text, nothing executed."""
+"""Stores the project's dataclasses in HDF5 and reads them again: arrays, numbers and text, but no code."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ _STORED = {
 
 
 def save(path: Path | str, value: Any, attributes: Mapping[str, str] | None = None) -> None:
-    """Writes a dataclass of `bayeskin.types` to `path`, with `attributes` at its root, whole or not at all.
+    """Writes a dataclass of `bayeskin.types` to `path`, with `attributes` at the root of the file.
 
-    Raises InputError where it cannot be written.
+    The file is written completely or not at all. Raises InputError where it cannot be written.
     """
 
     def fill(handle: h5py.File) -> None:
+        """Fills the file with the attributes and the dataclass."""
         handle.attrs["format"] = FORMAT
         handle.attrs["format_version"] = FORMAT_VERSION
         handle.attrs.update(attributes or {})
@@ -44,11 +45,11 @@ def save(path: Path | str, value: Any, attributes: Mapping[str, str] | None = No
 
 
 def write_hdf5(path: Path, fill: Callable[[h5py.File], None]) -> None:
-    """Writes an HDF5 file that `fill` fills, whole or not at all.
+    """Writes an HDF5 file that `fill` fills, completely or not at all.
 
-    The file appears under its name only when it is complete and on disk, so that an interruption leaves the
-    earlier file as it was. It is made in memory: libhdf5 ends the process on a disk that is full.
-    Raises InputError where it cannot be written.
+    The file gets its name only when it is complete and on disk, so an interruption leaves an earlier file
+    unchanged. It is built in memory, because libhdf5 ends the process when a disk is full. Raises InputError
+    where the file cannot be written.
     """
     with h5py.File(path.name, "w", driver="core", backing_store=False) as handle:
         fill(handle)
@@ -58,9 +59,9 @@ def write_hdf5(path: Path, fill: Callable[[h5py.File], None]) -> None:
 
 
 def write_bytes(path: Path, contents: bytes) -> None:
-    """Writes a file whole or not at all; an earlier one stays until then.
+    """Writes a file completely or not at all; an earlier file stays until the new one is complete.
 
-    Raises InputError where it cannot be written.
+    Raises InputError where the file cannot be written.
     """
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -81,7 +82,7 @@ def write_bytes(path: Path, contents: bytes) -> None:
 def load(path: Path | str, cls: type[T]) -> T:
     """Reads the dataclass `cls` that `save` wrote.
 
-    Raises InputError if the file is absent, is not HDF5, is not bayeskin's, or holds another type.
+    Raises InputError if the file is absent, is not HDF5, is not a file of bayeskin, or holds another type.
     """
     path, expected = Path(path), f"a bayeskin {cls.__name__} file"
     with reading(path, expected) as handle:
@@ -92,7 +93,10 @@ def load(path: Path | str, cls: type[T]) -> T:
 
 @contextmanager
 def reading(path: Path, expected: str) -> Iterator[h5py.File]:
-    """An HDF5 file, open. Whatever goes wrong meanwhile is its fault: raises InputError that names it."""
+    """Yields an open HDF5 file.
+
+    All errors inside the context are taken as errors in this file: each becomes an InputError that names it.
+    """
     if not path.is_file():
         raise InputError(path, "no such file", expected)
     try:
@@ -102,9 +106,9 @@ def reading(path: Path, expected: str) -> Iterator[h5py.File]:
         if error.where.startswith(str(path)):
             raise
         raise InputError(f"{path}: {error.where}", error.found, error.expected) from None
-    except Exception as error:  # libhdf5, json and numpy raise of every kind on a damaged file
-        what = "not readable as HDF5" if isinstance(error, OSError) else "contents that cannot be read"
-        raise InputError(path, f"{what} ({in_a_line(error)})", expected) from None
+    except Exception as error:  # libhdf5, json and numpy raise many types of error for a damaged file
+        fault = "not readable as HDF5" if isinstance(error, OSError) else "contents that cannot be read"
+        raise InputError(path, f"{fault} ({in_a_line(error)})", expected) from None
 
 
 def in_a_line(error: Exception) -> str:
@@ -120,13 +124,14 @@ def write(group: h5py.Group, value: Any) -> None:
 
 
 def read(group: h5py.Group, cls: type[T], where: object = "") -> T:
-    """Reads a dataclass from an open HDF5 group; a field that came later has its default.
+    """Reads a dataclass from an open HDF5 group.
 
-    Raises InputError when the group holds another type, or a field of another kind than the type says.
+    A field that was added in a later version has its default. Raises InputError when the group holds another
+    type, or when a field has a value of another type than the dataclass states.
     """
-    found = group.attrs.get("type")
-    if found != cls.__name__:
-        raise InputError(where or group.name, f"type {found!r}", f"type {cls.__name__!r}")
+    stored_type = group.attrs.get("type")
+    if stored_type != cls.__name__:
+        raise InputError(where or group.name, f"type {stored_type!r}", f"type {cls.__name__!r}")
     values = {}
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         if field.name not in group and field.name not in group.attrs:
@@ -138,9 +143,9 @@ def read(group: h5py.Group, cls: type[T], where: object = "") -> T:
 
 
 def checked(value: T, where: object) -> T:
-    """A dataclass made of what somebody's file says.
+    """Returns a dataclass that was made from a file's content, after a check of its fields.
 
-    Raises InputError unless each field is what its annotation says, but for the shapes of arrays.
+    Raises InputError unless each field has the type of its annotation. The shapes of arrays are not checked.
     """
     kinds = get_type_hints(type(value))
     for field in dataclasses.fields(value):  # type: ignore[arg-type]
@@ -155,26 +160,27 @@ def checked(value: T, where: object) -> T:
 
 
 def _is(value: Any, kind: Any) -> bool:
-    """Returns whether a value has the type of an annotation; of arrays, whose kind of numbers."""
+    """Returns whether a value has the type of an annotation; for arrays, the type of their numbers counts."""
     origin, parts = get_origin(kind) or kind, get_args(kind)
-    if hasattr(origin, "__value__"):  # an alias by a name, which numpy's NDArray is from Python 3.12 on
+    if hasattr(origin, "__value__"):  # a named alias, as numpy's NDArray from Python 3.12 on
         return _is(value, origin.__value__[parts])
     if origin is Literal:
         return isinstance(value, str) and value in parts
     if origin is np.ndarray:
-        wanted = get_args(parts[1])[0]
-        return isinstance(value, np.ndarray) and np.can_cast(value.dtype, wanted, "same_kind")
+        needed = get_args(parts[1])[0]
+        return isinstance(value, np.ndarray) and np.can_cast(value.dtype, needed, "same_kind")
     if origin is tuple:
         return isinstance(value, tuple) and all(_is(part, parts[0]) for part in value)
-    if hasattr(origin, "_fields"):  # a named tuple, which JSON makes a list
-        wanted = get_type_hints(origin).values()
-        return isinstance(value, list | tuple) and len(value) == len(wanted) and all(map(_is, value, wanted))
+    if hasattr(origin, "_fields"):  # a named tuple, which becomes a list in JSON
+        needed = get_type_hints(origin).values()
+        return isinstance(value, list | tuple) and len(value) == len(needed) and all(map(_is, value, needed))
     if origin in (int, float):
         return isinstance(value, int | origin) and not isinstance(value, bool)
     return isinstance(value, origin)
 
 
 def _write_field(group: h5py.Group, name: str, value: Any) -> None:
+    """Writes one field into a group, as a dataset, a group or an attribute."""
     if isinstance(value, np.ndarray):
         compress = {"compression": "gzip", "shuffle": True} if value.size > 256 else {}
         group.create_dataset(name, data=value, **compress)
@@ -196,6 +202,7 @@ def _write_field(group: h5py.Group, name: str, value: Any) -> None:
 
 
 def _read_field(group: h5py.Group, name: str) -> Any:
+    """Reads one field that `_write_field` wrote."""
     if name in group.attrs:
         value = group.attrs[name]
         return value.item() if isinstance(value, np.generic) else value
@@ -211,14 +218,15 @@ def _read_field(group: h5py.Group, name: str) -> Any:
 
 
 def _read_dataclass(group: h5py.Group, name: str) -> Any:
-    found = group.attrs.get("type")
-    if found not in _STORED:
-        raise InputError(group.name, f"type {found!r}", "a type that bayeskin stores")
-    return read(group, _STORED[found], name)
+    """Reads a dataclass whose type the group itself states. Raises InputError for an unknown type."""
+    stored_type = group.attrs.get("type")
+    if stored_type not in _STORED:
+        raise InputError(group.name, f"type {stored_type!r}", "a type that bayeskin stores")
+    return read(group, _STORED[stored_type], name)
 
 
 def contents_hash(handle: h5py.File) -> str:
-    """SHA-256 over every dataset and attribute below the root, in the order of their names."""
+    """Returns the SHA-256 of all datasets and attributes below the root, in the order of their names."""
     digest = hashlib.sha256()
     names: list[str] = []
     handle.visit(names.append)

@@ -1,4 +1,4 @@
-"""Output of the command line: progress and logs on stderr, one line for an error, exit codes."""
+"""The output of the command line: progress and messages on stderr, errors in one line, and exit codes."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from bayeskin.errors import InputError
 DONE, NOT_TRUSTED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 
-class _Left(ProgressColumn):
-    """The time until the end, at the pace since the beginning; nothing until there is a pace."""
+class _TimeLeft(ProgressColumn):
+    """The time until the end, at the average pace so far; the column is empty until there is a pace."""
 
     def render(self, task: Task) -> Text:
+        """Returns the time left of a task as text."""
         gained, told_s = task.completed - task.fields["first"], task.fields["told_s"]
         if gained <= 0 or task.elapsed is None:
             return Text()
@@ -29,7 +30,7 @@ class _Left(ProgressColumn):
 
 
 class Terminal:
-    """Tells a person on stderr how a run goes on; bars only where somebody can see them move."""
+    """Shows on stderr how a run progresses, with moving bars where stderr is an interactive terminal."""
 
     def __init__(self, console: Console | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         self.console = console or Console(stderr=True, highlight=False)
@@ -37,7 +38,7 @@ class Terminal:
             TextColumn("{task.description}"),
             BarColumn(16),
             TimeElapsedColumn(),
-            _Left(),
+            _TimeLeft(),
             TextColumn("{task.fields[note]}"),
         )
         self.bars = Progress(
@@ -54,22 +55,25 @@ class Terminal:
         self.bars.stop()
 
     def log(self, message: str) -> None:
+        """Prints a message."""
         self.console.print(message, markup=False, soft_wrap=True)
 
     def progress(self, label: str, share: float, note: str = "") -> None:
-        """The share of something that is done; one that falls begins another round of it."""
+        """Shows the share of a task that is done; a share that falls starts a new bar for the same task."""
         task = self.tasks.get(label)
         if task is None or share < task.completed:
             if task is not None:
                 self.bars.remove_task(task.id)
-            name = self.bars.add_task(label, total=1.0, first=share, told_s=0.0, note=note)
-            task = self.tasks[label] = next(one for one in self.bars.tasks if one.id == name)
+            task_id = self.bars.add_task(label, total=1.0, first=share, told_s=0.0, note=note)
+            task = self.tasks[label] = next(
+                candidate for candidate in self.bars.tasks if candidate.id == task_id
+            )
         told_s = task.elapsed or 0.0
         self.bars.update(task.id, completed=share, told_s=told_s, note=note, visible=share < 1.0)
 
 
 def exit_code(call: Callable[[], Any]) -> int:
-    """Calls, and says what it came to; what went wrong is told in one line on stderr."""
+    """Calls a function and returns the exit code; an error is printed in one line on stderr."""
     try:
         return int(call() or DONE)
     except click.exceptions.NoArgsIsHelpError as error:
@@ -86,5 +90,6 @@ def exit_code(call: Callable[[], Any]) -> int:
 
 
 def complain(message: str, code: int) -> int:
+    """Prints an error message in one line on stderr, and returns `code`."""
     click.echo(f"bayeskin: {' '.join(message.split())}", err=True)
     return code

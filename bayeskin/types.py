@@ -1,7 +1,7 @@
-"""The values that flow through bayeskin: frozen, in SI units, with the unit in the name.
+"""The data types that the parts of bayeskin exchange: frozen, in SI units, with the unit in the name.
 
-Arrays in these types are read-only; a change makes a new object (`dataclasses.replace`).
-``n`` counts samples or parameter points, ``d`` parameters, ``m`` time bins, ``k`` corners.
+Arrays in these types are read-only; `dataclasses.replace` makes a changed copy. In shapes, ``n`` counts
+samples or parameter points, ``d`` parameters, ``m`` time bins, and ``k`` corners.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Observation = Literal["reaction", "article", "own"]
 
 
 def frozen_array(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
-    """A read-only copy of `values`."""
+    """Returns a read-only copy of `values`."""
     array = np.array(values, dtype=dtype)
     array.setflags(write=False)
     return array
@@ -41,13 +41,13 @@ class _FreezesArrays:
 
 @dataclass(frozen=True)
 class Parameter:
-    """One sampled parameter: its symbol, SI unit, prior and where the prior comes from.
+    """One sampled parameter: its symbol, its SI unit, its prior, and the source of the prior.
 
-    stress_power : with all parameters multiplied by c**stress_power, the force is multiplied by c
-        (1 for a modulus, -1 for a permeability, whose viscosity is fixed; 0: stays as it is)
+    stress_power : if all parameters are multiplied by c**stress_power, the force is multiplied by c (1 for a
+        modulus; -1 for a permeability, whose viscosity is fixed; a parameter with 0 stays unchanged)
     offset : a log-uniform prior is uniform in log(value + offset), so that it may reach down to 0
-    centre, spread : of a normal prior its mean and sd; of a log-normal one its median and the sd of the
-        logarithm; both are cut to the bounds
+    centre, spread : the mean and sd of a normal prior; the median and the sd of the logarithm of a log-normal
+        prior; both priors are truncated at the bounds
     """
 
     name: str
@@ -64,16 +64,17 @@ class Parameter:
 
     @property
     def in_log(self) -> bool:
+        """Returns whether the prior is a distribution of the logarithm."""
         return self.prior.startswith("log")
 
     @property
     def peaked(self) -> bool:
-        """Whether some values within the bounds are likelier than others."""
+        """Returns whether some values within the bounds are likelier than others."""
         return self.prior.endswith("normal")
 
 
 class Correlation(NamedTuple):
-    """Of the normal priors of two parameters, by their names, on their lines."""
+    """The correlation of the normal priors of two parameters, given by their names, on their lines."""
 
     one: str
     other: str
@@ -82,11 +83,12 @@ class Correlation(NamedTuple):
 
 @dataclass(frozen=True)
 class ParameterSpace:
-    """An ordered box of priors; the only place where theta meets the unit cube.
+    """An ordered list of parameters with their priors; only this class maps theta to the unit cube and back.
 
-    `theta` is always in SI units, shape ``(..., d)``, columns in the order of `names`. Priors are independent
-    but for normal and log-normal ones with `correlations`: a multivariate normal, cut to the bounds.
-    Raises InputError for a name that stands twice, and for correlations that no multivariate normal has.
+    `theta` is always in SI units, shape ``(..., d)``, with columns in the order of `names`. Priors are
+    independent, except normal and log-normal priors with `correlations`. These are a multivariate normal
+    distribution that is truncated at the bounds. Raises InputError for a name that occurs twice, and for
+    correlations that no multivariate normal distribution has.
     """
 
     parameters: tuple[Parameter, ...]
@@ -99,51 +101,61 @@ class ParameterSpace:
                 "parameters", f"{twice} twice", "names that differ, also from those of mechanisms"
             )
         peaked, pairs = [p.name for p in self.parameters if p.peaked], set[frozenset[str]]()
-        for one, other, value in self.correlations:
-            for name in (one, other):
+        for first, second, value in self.correlations:
+            for name in (first, second):
                 if name not in peaked:
                     found = f"{name}, whose prior is not normal" if name in self.names else repr(name)
                     raise InputError("correlations", found, "two parameters with normal or log-normal priors")
-            if one == other or not abs(value) < 1.0:
-                where = f"correlations: {one} and {other}"
+            if first == second or not abs(value) < 1.0:
+                where = f"correlations: {first} and {second}"
                 raise InputError(where, f"{value:g}", "two different parameters and a value between -1 and 1")
-            if {one, other} in pairs:
-                raise InputError(f"correlations: {one} and {other}", "two values", "one")
-            pairs.add(frozenset((one, other)))
+            if {first, second} in pairs:
+                raise InputError(f"correlations: {first} and {second}", "two values", "one")
+            pairs.add(frozenset((first, second)))
         if self.correlations and not np.linalg.eigvalsh(self._correlation).min() > 1e-9:
-            stated = ", ".join(f"{one} and {other} {value:g}" for one, other, value in self.correlations)
+            stated = ", ".join(
+                f"{first} and {second} {value:g}" for first, second, value in self.correlations
+            )
             raise InputError("correlations", stated, "correlations that can hold together")
 
     @cached_property
     def names(self) -> tuple[str, ...]:
+        """Returns the names of the parameters, in order."""
         return tuple(p.name for p in self.parameters)
 
     @property
     def dim(self) -> int:
+        """Returns the number of parameters."""
         return len(self.parameters)
 
     @cached_property
     def lower(self) -> Array:
+        """Returns the lower bounds, (d,) in SI."""
         return frozen_array([p.lower for p in self.parameters])
 
     @cached_property
     def upper(self) -> Array:
+        """Returns the upper bounds, (d,) in SI."""
         return frozen_array([p.upper for p in self.parameters])
 
     @cached_property
     def is_log(self) -> NDArray[np.bool_]:
+        """Returns which priors are distributions of the logarithm, (d,)."""
         return np.array([p.in_log for p in self.parameters])
 
     @cached_property
     def box(self) -> ParameterSpace:
-        """The same bounds with nothing likelier than anything else on the line."""
+        """Returns the space with the same bounds and with priors that are uniform on the line."""
         flat: dict[bool, Literal["uniform", "log-uniform"]] = {False: "uniform", True: "log-uniform"}
         return ParameterSpace(
             tuple(replace(p, prior=flat[p.in_log]) if p.peaked else p for p in self.parameters)
         )
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:
-        """Draws of the prior, (count, d); correlated ones by rejection of what lies beyond the bounds."""
+        """Returns draws of the prior, (count, d).
+
+        Correlated draws beyond the bounds are rejected and drawn again.
+        """
         theta = self.from_unit(rng.uniform(size=(count, self.dim)))
         if not self.correlations:
             return np.clip(theta, self.lower, self.upper)
@@ -160,18 +172,20 @@ class ParameterSpace:
         return np.clip(self.from_line(line), self.lower, self.upper)
 
     def scaled(self, power: int) -> NDArray[np.intp]:
-        """Columns of parameters that enter as a stress to a power: 1 for moduli, -1 for permeabilities.
+        """Returns the columns of parameters that enter as a stress to a power.
 
-        Those with an offset, which do not scale, are not among them.
+        The power is 1 for moduli and -1 for permeabilities. Parameters with an offset do not scale in this
+        way, so they are left out.
         """
-        known = enumerate(self.parameters)
-        found = [i for i, p in known if p.stress_power == power and p.in_log and p.offset == 0.0]
-        return np.array(found, dtype=np.intp)
+        numbered = enumerate(self.parameters)
+        columns = [i for i, p in numbered if p.stress_power == power and p.in_log and p.offset == 0.0]
+        return np.array(columns, dtype=np.intp)
 
     def to_unit(self, theta: ArrayLike) -> Array:
-        """Prior cumulative probability of each coordinate, shape (..., d); outside [0, 1] beyond the box.
+        """Returns the prior cumulative probability of each coordinate, (..., d).
 
-        Each coordinate by itself, correlated or not, as in `from_unit`.
+        The result leaves [0, 1] outside the box. Each coordinate is treated by itself, without its
+        correlations, as in `from_unit`.
         """
         low, high = self._line
         line = self.to_line(theta)
@@ -181,7 +195,7 @@ class ParameterSpace:
         return unit
 
     def from_unit(self, unit: ArrayLike) -> Array:
-        """Inverse of `to_unit`, shape (..., d)."""
+        """Returns theta for points of the unit cube, (..., d); this is the inverse of `to_unit`."""
         low, high = self._line
         unit = np.asarray(unit, dtype=float)
         line = np.asarray(low + unit * (high - low))
@@ -191,9 +205,9 @@ class ParameterSpace:
         return self.from_line(line)
 
     def log_density(self, line: ArrayLike) -> Array:
-        """Log prior density (...,) on the line, at points (..., d) within the bounds.
+        """Returns the log prior density (...,) on the line, at points (..., d) within the bounds.
 
-        With correlations up to a constant.
+        With correlations, the density is not normalised: the result lacks a constant.
         """
         line = np.asarray(line, dtype=float)
         low, high = self._line
@@ -203,47 +217,53 @@ class ParameterSpace:
             z = (line[..., j] - centre) / spread
             out += -0.5 * z**2 - np.log(spread * abs(share) * np.sqrt(2.0 * np.pi))
         if self.correlations:
-            centre, spread = np.array([own[:2] for own in self._normals.values()]).T
+            centre, spread = np.array([normal[:2] for normal in self._normals.values()]).T
             z = (line[..., list(self._normals)] - centre) / spread
             out -= 0.5 * np.einsum("...i,ij,...j->...", z, self._shared_precision, z)
         return out
 
     def log_density_slopes(self, line: Array) -> tuple[Array, Array]:
-        """Gradient (d,) of `log_density` at a point (d,) on the line, and its curvature (d, d), downward."""
+        """Returns gradient (d,) and negative Hessian (d, d) of `log_density` at a point (d,) on the line."""
         gradient, curvature = np.zeros(self.dim), np.zeros((self.dim, self.dim))
         if self._normals:
             columns = list(self._normals)
-            centre, spread = np.array([own[:2] for own in self._normals.values()]).T
+            centre, spread = np.array([normal[:2] for normal in self._normals.values()]).T
             precision = np.linalg.inv(self._correlation) / np.outer(spread, spread)
             curvature[np.ix_(columns, columns)] = precision
             gradient[columns] = precision @ (centre - np.asarray(line)[columns])
         return gradient, curvature
 
     def to_line(self, theta: ArrayLike) -> Array:
-        """Coordinates (..., d) in which each prior is uniform or normal: the value, or its logarithm."""
+        """Returns coordinates (..., d) on the line, in which each prior is uniform or normal.
+
+        The coordinate is the value, or its logarithm where the prior is a distribution of the logarithm.
+        """
         theta = np.asarray(theta, dtype=float)
         return np.where(self.is_log, np.log(np.where(self.is_log, theta + self._offset, 1.0)), theta)
 
     def from_line(self, line: ArrayLike) -> Array:
-        """Inverse of `to_line`, (..., d)."""
+        """Returns theta for points on the line, (..., d); this is the inverse of `to_line`."""
         line = np.asarray(line, dtype=float)
         return np.where(self.is_log, np.exp(np.where(self.is_log, line, 0.0)) - self._offset, line)
 
     def contains(self, theta: ArrayLike) -> NDArray[np.bool_]:
-        """Whether each point lies in the closed box, shape (...,)."""
+        """Returns whether each point lies in the closed box, (...,)."""
         theta = np.asarray(theta, dtype=float)
         return np.all((theta >= self.lower) & (theta <= self.upper), axis=-1)
 
     @cached_property
     def _line(self) -> tuple[Array, Array]:
+        """Returns the lower and upper bounds on the line, (d,) each."""
         return self.to_line(self.lower), self.to_line(self.upper)
 
     @cached_property
     def _normals(self) -> dict[int, tuple[float, float, float, float, float]]:
-        """By column of a normal prior: centre and spread on the line, side, mass below the bounds, within.
+        """Returns numbers of each normal prior by its column.
 
-        Where the lower bound is above the centre, side is -1, the mass is that above it, and that within is
-        negative: far out, what is below cannot be told from one.
+        The numbers are centre and spread on the line, the side, the probability below the lower bound, and
+        the probability between the bounds. Where the lower bound lies above the centre, the side is -1. The
+        first number is then the probability above the lower bound, and the second is negative. The numbers
+        stay accurate far from the centre, where the probability below a bound is one after rounding.
         """
         low, high = self._line
         out = {}
@@ -257,79 +277,85 @@ class ParameterSpace:
 
     @cached_property
     def _correlation(self) -> Array:
-        """Of the normal priors, in the order of `_normals`."""
+        """Returns the correlation matrix of the normal priors, in the order of `_normals`."""
         place = {self.names[j]: k for k, j in enumerate(self._normals)}
         matrix = np.eye(len(place))
-        for one, other, value in self.correlations:
-            matrix[place[one], place[other]] = matrix[place[other], place[one]] = value
+        for first, second, value in self.correlations:
+            matrix[place[first], place[second]] = matrix[place[second], place[first]] = value
         return matrix
 
     @cached_property
     def _shared_precision(self) -> Array:
-        """What correlations add to the precision of normal priors that have none."""
+        """Returns what the correlations add to the precision matrix of the standardised normal priors."""
         return np.asarray(np.linalg.inv(self._correlation) - np.eye(len(self._correlation)))
 
     @cached_property
     def _offset(self) -> Array:
+        """Returns the offsets of the parameters, (d,)."""
         return np.array([p.offset for p in self.parameters])
 
 
 @dataclass(frozen=True)
 class Phase(_FreezesArrays):
-    """A stretch of the protocol in which the pads rest, load, hold or unload."""
+    """A phase of the protocol, in which the pads rest, load, hold or unload."""
 
     kind: PhaseKind
-    cycle: int  # 1 for the first loading; the rest before it belongs to cycle 0
+    cycle: int  # 1 for the first loading; the rest phase before it belongs to cycle 0
     start_s: float
     end_s: float
 
 
 @dataclass(frozen=True)
 class PadMotion(_FreezesArrays):
-    """Protocol: the LVDT displacement over time as a piecewise-linear curve through its corners.
+    """The protocol: the LVDT displacement over time, as straight lines between corners.
 
-    `displacement_m` is the *full* LVDT reading; each pad of the symmetric model moves half of it.
-    Both arrays have shape (k,); `time_s` increases strictly and starts at 0.
+    `displacement_m` is the *full* LVDT reading; each pad of the symmetric model moves by half of it. Both
+    arrays have shape (k,). `time_s` increases strictly and starts at 0.
     """
 
     time_s: Array
     displacement_m: Array
 
     def at(self, time_s: ArrayLike) -> Array:
-        """LVDT displacement [m] at the times given, same shape."""
+        """Returns the LVDT displacement [m] at given times, same shape."""
         return np.interp(np.asarray(time_s, dtype=float), self.time_s, self.displacement_m)
 
     def times(self, step_s: float, beside_s: ArrayLike | None = None) -> Array:
-        """Times (n,) [s] every `step_s` and at the corners, or `beside_s`; a microsecond apart at least."""
-        kept = self.time_s if beside_s is None else np.asarray(beside_s, dtype=float)
+        """Returns times (n,) [s] every `step_s`, and at the corners or at `beside_s`.
+
+        Regular times closer than a microsecond to one of these are left out.
+        """
+        fixed = self.time_s if beside_s is None else np.asarray(beside_s, dtype=float)
         every = np.arange(0.0, self.time_s[-1], step_s)
-        after = np.searchsorted(kept, every)
+        after = np.searchsorted(fixed, every)
         nearest = np.minimum(
-            np.abs(every - kept[np.maximum(after - 1, 0)]),
-            np.abs(every - kept[np.minimum(after, len(kept) - 1)]),
+            np.abs(every - fixed[np.maximum(after - 1, 0)]),
+            np.abs(every - fixed[np.minimum(after, len(fixed) - 1)]),
         )
-        return np.union1d(kept, every[nearest > 1e-6])  # rounding makes two of one
+        return np.union1d(fixed, every[nearest > 1e-6])  # rounding could make two times out of one
 
 
 @dataclass(frozen=True)
 class Recording(_FreezesArrays):
-    """A recording as measured, in SI, nothing smoothed, nothing set to zero. Arrays (n,)."""
+    """A recording as measured, in SI units, without smoothing and without a zero correction; arrays (n,)."""
 
     time_s: Array
     displacement_m: Array
     force_n: Array
     name: str
-    sha256: str  # of the source file's bytes
-    notes: tuple[str, ...] = ()  # what the importer took for what
+    sha256: str  # hash of the source file's bytes
+    notes: tuple[str, ...] = ()  # how the importer interpreted columns and units
 
 
 @dataclass(frozen=True)
 class BinnedForce(_FreezesArrays):
-    """Robust bin means of a recording's force, with what each mean's noise is known to be.
+    """Robust bin means of a recording's force, with the noise of each mean.
 
-    edges_s (m+1,); force_n (m,) robust means; variance_n2 (m,) variance of each mean, the
-    correlation of samples within the bin included; correlation (m-1,) of neighbouring bins' noise;
-    phase (m,) index into `phases` of the phase that covers most of the bin.
+    edges_s : the edges of the bins, (m+1,)
+    force_n : robust means, (m,)
+    variance_n2 : the variance of each mean, (m,), which includes the correlation of samples within the bin
+    correlation : the correlation of the noise of neighbouring bins, (m-1,)
+    phase : for each bin the index in `phases` of the phase that covers most of it, (m,)
     """
 
     edges_s: Array
@@ -341,15 +367,16 @@ class BinnedForce(_FreezesArrays):
 
     @property
     def time_s(self) -> Array:
-        """Bin centres, (m,)."""
+        """Returns the bin centres, (m,)."""
         return 0.5 * (self.edges_s[1:] + self.edges_s[:-1])
 
 
 @dataclass(frozen=True)
 class Jumps(_FreezesArrays):
-    """What a recording's samples allow its force to jump by.
+    """The range of force jumps that a recording's samples allow.
 
-    lowest_n, highest_n (n,) : from where to where, at time_s (n,); infinite where the samples do not say
+    lowest_n, highest_n : the smallest and the largest jump at time_s, (n,) each; infinite where the samples
+        do not limit it
     """
 
     time_s: Array
@@ -357,12 +384,12 @@ class Jumps(_FreezesArrays):
     highest_n: Array
 
     def refute(self, time_s: Array, size_n: Array) -> NDArray[np.bool_]:
-        """Whether the samples speak against jumps of size_n (k,) [N] at time_s (k,)."""
+        """Returns whether the samples contradict jumps of size_n (k,) [N] at time_s (k,)."""
         at = np.clip(np.searchsorted(self.time_s, time_s), 0, len(self.time_s) - 1)
         return np.asarray((size_n < self.lowest_n[at]) | (size_n > self.highest_n[at]))
 
     def until(self, end_s: float) -> Jumps:
-        """What the samples up to a time allow."""
+        """Returns the range of jumps that the samples up to a given time allow."""
         known = self.time_s <= end_s
         return replace(
             self,
@@ -373,12 +400,16 @@ class Jumps(_FreezesArrays):
 
 @dataclass(frozen=True)
 class Simulation(_FreezesArrays):
-    """One full run. A failed run is a value too: `status` is not "ok" and `message` says what to do.
+    """One run of the full model.
 
-    time_s, displacement_m, force_n (n,): accepted steps, corners of the protocol among them.
-    `displacement_m` is the LVDT displacement. `corner` (n,) is True at the protocol's corners,
-    where the slope of the force jumps. `stats` holds counts and seconds (floats). gradient_n (n, r):
-    derivatives of the force by the parameters `gradient_names` that were asked for, each for its change.
+    A failed run is a value too: its `status` is not "ok", and its `message` says what to do.
+
+    time_s, displacement_m, force_n : the accepted time steps with the corners of the protocol, (n,) each;
+        `displacement_m` is the LVDT displacement
+    corner : True at the protocol's corners, where the slope of the force jumps, (n,)
+    stats : counts and seconds, as floats
+    gradient_n : derivatives of the force by the parameters `gradient_names`, (n, r); each is multiplied by
+        the change that was requested for its parameter
     """
 
     theta: Mapping[str, float]
@@ -394,7 +425,10 @@ class Simulation(_FreezesArrays):
     gradient_n: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def at(self, time_s: ArrayLike) -> Array:
-        """Force [N] between steps: monotone cubic (PCHIP) inside each phase, continuous at corners."""
+        """Returns the force [N] at given times.
+
+        Between time steps, it is a monotone cubic (PCHIP) inside each phase. It is continuous at corners.
+        """
         from scipy.interpolate import PchipInterpolator
 
         query = np.asarray(time_s, dtype=float)
@@ -408,23 +442,29 @@ class Simulation(_FreezesArrays):
         return out
 
     def bin_means(self, edges_s: ArrayLike) -> Array:
-        """Mean force [N] over each bin, (m,): composite trapezoid on eleven points a bin."""
+        """Returns the mean force [N] over each bin, (m,), by the trapezoidal rule on eleven points."""
         edges = np.asarray(edges_s, dtype=float)
         fine = edges[:-1, None] + np.linspace(0.0, 1.0, 11) * np.diff(edges)[:, None]
         return np.asarray(np.trapezoid(self.at(fine), dx=0.1, axis=1))
 
     def gradient_bin_means(self, edges_s: ArrayLike) -> Array:
-        """Mean of each column of `gradient_n` over each bin [N], (m, r)."""
+        """Returns the mean of each column of `gradient_n` over each bin [N], (m, r)."""
         columns = [replace(self, force_n=column).bin_means(edges_s) for column in self.gradient_n.T]
         return np.stack(columns, axis=1)
 
 
 @dataclass(frozen=True)
 class Design(_FreezesArrays):
-    """Points, and the force that the full model gave at them (bin means; NaN row where it failed).
+    """Parameter points, and the full model's force at each of them.
 
-    theta (n, d); force_n (n, m); edges_s (m+1,); wave (n,) 0, 1, ...; held_out (n,) bool;
-    ok (n,) bool; messages (n,) of failed runs; seconds (n,) of each run.
+    theta : the points, (n, d)
+    force_n : bin means of the force, (n, m); a row of NaN where the run failed
+    edges_s : the edges of the bins, (m+1,)
+    wave : the wave of each point, (n,): 0, 1, ...
+    held_out : which points are held out, (n,) bool
+    ok : which runs succeeded, (n,) bool
+    messages : the messages of failed runs, (n,)
+    seconds : the duration of each run, (n,)
     """
 
     space: ParameterSpace
@@ -441,22 +481,25 @@ class Design(_FreezesArrays):
 
     @property
     def training(self) -> NDArray[np.bool_]:
-        """Rows that a surrogate may learn from, (n,)."""
+        """Returns the rows that a surrogate may be trained on, (n,)."""
         return self.ok & ~self.held_out
 
     @property
     def testing(self) -> NDArray[np.bool_]:
-        """Rows that no surrogate may learn from, (n,)."""
+        """Returns the rows that no surrogate may be trained on, (n,)."""
         return self.ok & self.held_out
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Force at n points with its own uncertainty, as a low-rank Gaussian.
+    """The force at n points with its uncertainty, as a low-rank Gaussian.
 
-    mean (n, m) [N]; factor (n, m, r) [N]; diagonal (n, m) [N^2].
-    Covariance at point i: ``factor[i] @ factor[i].T + diag(diagonal[i])``. A factor whose bins lie next to
-    each other in memory, the transposed view of an (n, r, m) array, is used without a copy.
+    mean : (n, m) [N]
+    factor : (n, m, r) [N]
+    diagonal : (n, m) [N^2]
+
+    The covariance at point i is ``factor[i] @ factor[i].T + diag(diagonal[i])``. A factor whose bins are
+    adjacent in memory, which is the transposed view of an (n, r, m) array, is used without a copy.
     """
 
     mean: Array
@@ -464,35 +507,41 @@ class Prediction:
     diagonal: Array
 
     def sd(self) -> Array:
-        """Standard deviation of each bin, (n, m) [N]."""
+        """Returns the standard deviation of each bin, (n, m) [N]."""
         return np.sqrt(np.einsum("nmr,nmr->nm", self.factor, self.factor) + self.diagonal)
 
 
 @runtime_checkable
 class Surrogate(Protocol):
-    """All that inference and sensitivity know of a model: a box, bins, and predictions in them."""
+    """All that inference and sensitivity analysis need of a model: its box, its bins and its predictions."""
 
     @property
-    def space(self) -> ParameterSpace: ...
+    def space(self) -> ParameterSpace:
+        """Returns the parameters with their bounds."""
+        ...
 
     @property
-    def edges_s(self) -> Array: ...
+    def edges_s(self) -> Array:
+        """Returns the edges of the bins, (m+1,)."""
+        ...
 
     @property
-    def provenance(self) -> Mapping[str, Any]: ...
+    def provenance(self) -> Mapping[str, Any]:
+        """Returns the origin of the surrogate, as plain values."""
+        ...
 
     def predict(self, theta: ArrayLike) -> Prediction:
-        """Force at theta (n, d), vectorised. Raises InputError outside the box."""
+        """Returns the force at theta (n, d), vectorised. Raises InputError outside the box."""
         ...
 
     def predict_mean(self, theta: ArrayLike) -> Array:
-        """The mean (n, m) of `predict` alone, which may be had for less."""
+        """Returns only the mean (n, m) of `predict`, which may be faster."""
         ...
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a result was made from; stands in every file that bayeskin writes."""
+    """The origin of a result, which is part of every file that bayeskin writes."""
 
     version: str
     config_sha256: str = ""

@@ -59,9 +59,9 @@ def fitted(*names: str) -> Fit:
 def parts_of(*names: str) -> list[Contribution]:
     """By the toy itself."""
 
-    def force(case: tuple[Sequence[str], Mapping[str, float]]) -> np.ndarray:
-        log_posterior = build(case[0])
-        values = log_posterior.from_sampling(log_posterior.vector(case[1]))
+    def force(names: Sequence[str], theta: Mapping[str, float]) -> np.ndarray:
+        log_posterior = build(names)
+        values = log_posterior.from_sampling(log_posterior.vector(theta))
         return np.asarray(log_posterior.predict(values).mean[0])
 
     return contributions(names, fitted(*names).theta, force, catalogue())

@@ -11,6 +11,7 @@ import pytest
 from toys import solved
 from toys.solved import TRUTH, Exact
 
+from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.emulate import EmulationSettings, Forces, emulate
 from bayeskin.mismatch.fit import fit_near
 from bayeskin.mismatch.resample import resample
@@ -18,17 +19,18 @@ from bayeskin.mismatch.trust_region import JointFit, fit_jointly, within
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.surrogates import train
 from bayeskin.types import Array, Design, Surrogate
-from bayeskin.workflow.workbench import Workbench
 
 SETS = ((), ("force-offset",))
 FEW = EmulationSettings(points=30)
 
 
 @pytest.fixture(params=SETS, ids=["base", "offset"])
-def fitted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> tuple[Workbench, JointFit]:
+def fitted(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> tuple[DiagnosisContext, JointFit]:
     names = request.param
     bench = solved.bench(monkeypatch, solved.recorded(3, **({"F0": -0.03} if names else {})))
-    found = fit_jointly(names, {**bench.noise, **TRUTH, "F0": 0.0}, bench.skin, bench.local)
+    found = fit_jointly(names, {**bench.noise, **TRUTH, "F0": 0.0}, bench.run, bench.posterior)
     assert isinstance(found, JointFit)
     return bench, found
 
@@ -36,7 +38,7 @@ def fitted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> t
 Answers = Sequence[Array | str]
 
 
-def by_the_toy(bench: Workbench, names: tuple[str, ...], asked: list[int]) -> Forces:
+def by_the_toy(bench: DiagnosisContext, names: tuple[str, ...], asked: list[int]) -> Forces:
     """Runs of the toy, which counts them; it is exact, so no full model is asked for."""
 
     def forces(points: Array, full: int) -> tuple[Answers, Answers]:
@@ -52,7 +54,7 @@ def learnt(design: Design) -> Surrogate:
     return train(design, "gp", 1)[0]
 
 
-def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[Workbench, JointFit]) -> None:
+def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[DiagnosisContext, JointFit]) -> None:
     bench, found = fitted
     asked: list[int] = []
     emulated = emulate([found], by_the_toy(bench, found.fit.names, asked), learnt, solved.NOISE_N, 1, FEW)
@@ -69,14 +71,14 @@ def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[Workbench, JointFit])
 
 
 def test_the_first_points_are_about_all_maxima(
-    fitted: tuple[Workbench, JointFit], monkeypatch: pytest.MonkeyPatch
+    fitted: tuple[DiagnosisContext, JointFit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench, found = fitted
     softer = {name: 0.7 * TRUTH[name] for name in ("E_c", "E_s")}
     recorded = solved.recorded(3)
     elsewhere = solved.bench(monkeypatch, dataclasses.replace(recorded, force_n=0.7 * recorded.force_n))
     start = {**elsewhere.noise, **TRUTH, **softer, "F0": 0.0}
-    other = fit_jointly(found.fit.names, start, elsewhere.skin, elsewhere.local)
+    other = fit_jointly(found.fit.names, start, elsewhere.run, elsewhere.posterior)
     assert isinstance(other, JointFit)
     run, waves = by_the_toy(bench, found.fit.names, []), list[Array]()
 
@@ -95,7 +97,7 @@ def test_the_first_points_are_about_all_maxima(
 
 
 @pytest.mark.slow
-def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[Workbench, JointFit]) -> None:
+def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[DiagnosisContext, JointFit]) -> None:
     bench, found = fitted
     emulated = emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
     assert not isinstance(emulated, str)
@@ -117,7 +119,7 @@ def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[Workbench, JointF
     assert np.all(np.abs(np.log(sd / exact_sd)) < np.log(1.5))
 
 
-def test_the_same_seed_gives_the_same_draws(fitted: tuple[Workbench, JointFit]) -> None:
+def test_the_same_seed_gives_the_same_draws(fitted: tuple[DiagnosisContext, JointFit]) -> None:
     bench, found = fitted
     made = [
         emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
@@ -129,7 +131,7 @@ def test_the_same_seed_gives_the_same_draws(fitted: tuple[Workbench, JointFit]) 
 
 
 def test_runs_that_fail_are_done_without_and_are_the_answer_where_all_do(
-    fitted: tuple[Workbench, JointFit],
+    fitted: tuple[DiagnosisContext, JointFit],
 ) -> None:
     bench, found = fitted
     run = by_the_toy(bench, found.fit.names, [])
@@ -164,8 +166,8 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
     bench = solved.bench(monkeypatch, recorded)
     start = {**bench.noise, **TRUTH}
     aside = off({**TRUTH, "E_s": 1.05 * TRUTH["E_s"]})  # where the fit was checked
-    local = functools.partial(bench.local, off_n=aside)
-    found = fit_jointly((), start, bench.skin, local, None, aside)
+    local = functools.partial(bench.posterior, correction_n=aside)
+    found = fit_jointly((), start, bench.run, local, None, aside)
     assert isinstance(found, JointFit)
     run = by_the_toy(bench, (), [])
     asked: list[int] = []
@@ -191,7 +193,7 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
     assert behind < 8.0
 
 
-def test_one_wave_alone_is_never_settled(fitted: tuple[Workbench, JointFit]) -> None:
+def test_one_wave_alone_is_never_settled(fitted: tuple[DiagnosisContext, JointFit]) -> None:
     bench, found = fitted
     one = dataclasses.replace(FEW, waves=1)
     emulated = emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, one)
@@ -201,7 +203,7 @@ def test_one_wave_alone_is_never_settled(fitted: tuple[Workbench, JointFit]) -> 
 
 
 def test_an_emulator_that_is_sure_nowhere_is_believed_but_never_settled(
-    fitted: tuple[Workbench, JointFit],
+    fitted: tuple[DiagnosisContext, JointFit],
 ) -> None:
     bench, found = fitted
     never = dataclasses.replace(FEW, sure=1e-9, waves=2)

@@ -10,26 +10,29 @@ import pytest
 from toys import solved
 from toys.solved import TRUTH
 
+from bayeskin.mismatch.answers import answer, read_answer
+from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.held_out import Beginning, end_of_second_hold, fit_beginning
 from bayeskin.mismatch.tasks import Task
 from bayeskin.mismatch.trust_region import JointFit, fit_jointly
 from bayeskin.types import Phase
-from bayeskin.workflow.workbench import Workbench
 
 SPLIT_S = 50.0
 OFFSET = ("force-offset",)
 VALUES = {"F0": -0.03}
 
 
-def fitted(bench: Workbench, names: Sequence[str]) -> JointFit:
-    found = fit_jointly(names, {**bench.noise, **TRUTH, **VALUES}, bench.skin, bench.local)
+def fitted(bench: DiagnosisContext, names: Sequence[str]) -> JointFit:
+    found = fit_jointly(names, {**bench.noise, **TRUTH, **VALUES}, bench.run, bench.posterior)
     assert isinstance(found, JointFit)
     return found
 
 
-def begun(bench: Workbench, sets: Sequence[JointFit], split_s: float | None = SPLIT_S) -> Beginning | None:
+def begun(
+    bench: DiagnosisContext, sets: Sequence[JointFit], split_s: float | None = SPLIT_S
+) -> Beginning | None:
     def ask(tasks: Sequence[Task]) -> list[object]:
-        return [bench.answered(task, bench.done(task)) for task in tasks]
+        return [read_answer(bench, task, answer(bench, task)) for task in tasks]
 
     return fit_beginning(ask, sets, split_s)
 

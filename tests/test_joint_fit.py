@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,13 +19,13 @@ from bayeskin.forward.interface import ModelRun
 from bayeskin.forward.surrogate import SurrogateForward
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.reparametrisation import shear_at
+from bayeskin.mismatch.answers import answer, read_answer
+from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.tangent import POWER, Tangent
 from bayeskin.mismatch.tasks import Climb
 from bayeskin.mismatch.trust_region import JointFit, TrustSettings, fit_jointly, solved_columns, within
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Correlation, ParameterSpace
-from bayeskin.workflow import workbench
-from bayeskin.workflow.workbench import Source, Workbench
 
 SET = ("force-offset", "stiffness-drift")
 START = {
@@ -38,22 +36,22 @@ PEAKED = dataclasses.replace(BASE.parameters[0], prior="log-normal", centre=150e
 
 
 @pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> Workbench:
+def bench(monkeypatch: pytest.MonkeyPatch) -> DiagnosisContext:
     return solved.bench(monkeypatch, solved.recorded(0, F0=-0.03, stiffness_rate=-8e-4))
 
 
-def start(bench: Workbench) -> dict[str, float]:
+def start(bench: DiagnosisContext) -> dict[str, float]:
     return {**bench.noise, **START}
 
 
-def tangent(bench: Workbench, space: ParameterSpace = BASE) -> tuple[Tangent, ModelRun]:
+def tangent(bench: DiagnosisContext, space: ParameterSpace = BASE) -> tuple[Tangent, ModelRun]:
     run = a_run(bench)
     assert run.slopes_n is not None
     return Tangent(space, solved.EDGES_S, (run,)), run
 
 
 @pytest.mark.parametrize("first", [BASE.parameters[0], PEAKED], ids=["flat", "peaked"])
-def test_a_tangent_has_the_value_and_the_slopes_of_its_run(bench: Workbench, first) -> None:
+def test_a_tangent_has_the_value_and_the_slopes_of_its_run(bench: DiagnosisContext, first) -> None:
     space = ParameterSpace((first, *BASE.parameters[1:]))
     near, run = tangent(bench, space)
     found = near.predict(run.theta)
@@ -70,7 +68,7 @@ def test_a_tangent_has_the_value_and_the_slopes_of_its_run(bench: Workbench, fir
         np.testing.assert_allclose(skin, run.slopes_n[:, i], rtol=0, atol=1e-4 * largest)
 
 
-def test_a_tangent_is_a_straight_line_in_the_box_of_what_is_no_modulus(bench: Workbench) -> None:
+def test_a_tangent_is_a_straight_line_in_the_box_of_what_is_no_modulus(bench: DiagnosisContext) -> None:
     near, run = tangent(bench)
     share = np.linspace(0.0, 1.0, 5)[:, None]
     others = run.theta * np.array([1.0, 1.0, 20.0, 0.1, 2.0])
@@ -82,7 +80,7 @@ def test_a_tangent_is_a_straight_line_in_the_box_of_what_is_no_modulus(bench: Wo
 
 @pytest.mark.parametrize("factor", [0.3, 4.0])
 def test_moduli_times_c_and_permeabilities_over_c_pull_c_times_as_hard(
-    bench: Workbench, factor: float
+    bench: DiagnosisContext, factor: float
 ) -> None:
     """Far from the run, too, if its slopes have it: by Euler, those of moduli and permeabilities add up."""
     run = a_run(bench)
@@ -99,9 +97,9 @@ def test_moduli_times_c_and_permeabilities_over_c_pull_c_times_as_hard(
         np.testing.assert_allclose(mean[1], factor * mean[0], rtol=1e-12, atol=1e-15)
 
 
-def test_several_runs_are_all_met_with_their_slopes(bench: Workbench) -> None:
+def test_several_runs_are_all_met_with_their_slopes(bench: DiagnosisContext) -> None:
     first = a_run(bench)
-    second = bench.skin((), {**start(bench), "E_c": 130e3, "k_s": 6e-14})
+    second = bench.run((), {**start(bench), "E_c": 130e3, "k_s": 6e-14})
     assert isinstance(second, ModelRun)
     near, step = Tangent(BASE, solved.EDGES_S, (first, second)), 1e-4
     between = Tangent(BASE, solved.EDGES_S, (first,)).predict_mean(second.theta)[0]
@@ -116,9 +114,9 @@ def test_several_runs_are_all_met_with_their_slopes(bench: Workbench) -> None:
             np.testing.assert_allclose((ahead - back) / (2.0 * step), run.slopes_n[:, i], rtol=0, atol=2e-5)
 
 
-def highest(bench: Workbench) -> tuple[float, dict[str, float]]:
+def highest(bench: DiagnosisContext) -> tuple[float, dict[str, float]]:
     """Log density and values of the highest top of the set's posterior by the skin itself, of many climbs."""
-    about = bench.local(SET, [a_run(bench, SET)])
+    about = bench.posterior(SET, [a_run(bench, SET)])
     seen: Any = about.surrogate  # what the instrument does, about the skin
     exact = dataclasses.replace(seen, inner=Exact(innermost(seen).space))
     whole = dataclasses.replace(about, surrogate=exact)
@@ -130,8 +128,8 @@ def highest(bench: Workbench) -> tuple[float, dict[str, float]]:
     return top.value, whole.named(whole.from_sampling(top.vector))
 
 
-def test_a_fit_reaches_the_maximum_of_the_skin_itself(bench: Workbench) -> None:
-    found = fit_jointly(SET, start(bench), bench.skin, bench.local)
+def test_a_fit_reaches_the_maximum_of_the_skin_itself(bench: DiagnosisContext) -> None:
+    found = fit_jointly(SET, start(bench), bench.run, bench.posterior)
     value, theta = highest(bench)
     assert isinstance(found, JointFit)
     assert found.settled
@@ -147,18 +145,18 @@ def test_a_fit_reaches_the_maximum_of_the_skin_itself(bench: Workbench) -> None:
     np.testing.assert_allclose(found.run.theta[:5], at_run[:5], rtol=1e-6)
 
 
-def test_what_is_added_to_the_force_is_part_of_each_run(bench: Workbench) -> None:
+def test_what_is_added_to_the_force_is_part_of_each_run(bench: DiagnosisContext) -> None:
     """A recording by the reduced model and more is fitted as the recording by the reduced model alone."""
-    plain = fit_jointly(SET, start(bench), bench.skin, bench.local)
+    plain = fit_jointly(SET, start(bench), bench.run, bench.posterior)
     off_n = 5e-3 * np.sin(np.arange(len(bench.binned.force_n)) / 7.0)
-    other = copy.copy(bench)
-    other.binned = dataclasses.replace(bench.binned, force_n=bench.binned.force_n + off_n)
-    found = fit_jointly(SET, start(bench), other.skin, other.local, None, off_n)
+    binned = dataclasses.replace(bench.binned, force_n=bench.binned.force_n + off_n)
+    other = dataclasses.replace(bench, binned=binned)
+    found = fit_jointly(SET, start(bench), other.run, other.posterior, None, off_n)
     assert isinstance(plain, JointFit)
     assert isinstance(found, JointFit)
     assert found.fit.value == pytest.approx(plain.fit.value, abs=0.2)
     assert found.fit.theta["F0"] == pytest.approx(plain.fit.theta["F0"], abs=2e-4)
-    alone = bench.skin(SET, found.fit.theta)
+    alone = bench.run(SET, found.fit.theta)
     assert isinstance(alone, ModelRun)
     np.testing.assert_allclose(found.run.force_n, alone.force_n + off_n, atol=1e-6)
     np.testing.assert_array_equal(found.off_n, off_n)
@@ -168,38 +166,40 @@ def test_what_is_added_to_the_force_is_part_of_each_run(bench: Workbench) -> Non
 class Unsteady:
     """Runs of a bench, some of which fail."""
 
-    def __init__(self, bench: Workbench, failing: Sequence[int]) -> None:
+    def __init__(self, bench: DiagnosisContext, failing: Sequence[int]) -> None:
         self.bench, self.failing, self.made = bench, failing, 0
 
     def __call__(self, names: Sequence[str], theta: Mapping[str, float]) -> ModelRun | str:
         self.made += 1
-        return "near folding" if self.made in self.failing else self.bench.skin(names, theta)
+        return "near folding" if self.made in self.failing else self.bench.run(names, theta)
 
 
 @pytest.mark.parametrize("failing", [(2,), (3,), (2, 4)])
-def test_a_fit_goes_on_where_a_run_in_the_middle_fails(bench: Workbench, failing: tuple[int, ...]) -> None:
+def test_a_fit_goes_on_where_a_run_in_the_middle_fails(
+    bench: DiagnosisContext, failing: tuple[int, ...]
+) -> None:
     skin = Unsteady(bench, failing)
-    found = fit_jointly(SET, start(bench), skin, bench.local, TrustSettings(runs=14))
+    found = fit_jointly(SET, start(bench), skin, bench.posterior, TrustSettings(runs=14))
     assert isinstance(found, JointFit)
     assert found.runs == skin.made > max(failing)
     assert found.settled
     assert found.fit.value == pytest.approx(highest(bench)[0], abs=2.0 * TrustSettings().enough)
 
 
-def test_a_fit_whose_first_run_fails_is_its_message(bench: Workbench) -> None:
+def test_a_fit_whose_first_run_fails_is_its_message(bench: DiagnosisContext) -> None:
     skin = Unsteady(bench, (1,))
-    assert fit_jointly(SET, start(bench), skin, bench.local) == "near folding"
+    assert fit_jointly(SET, start(bench), skin, bench.posterior) == "near folding"
     assert skin.made == 1
 
 
-def test_a_fit_is_the_first_run_s_where_all_others_fail(bench: Workbench) -> None:
-    found = fit_jointly(SET, start(bench), Unsteady(bench, range(2, 99)), bench.local)
+def test_a_fit_is_the_first_run_s_where_all_others_fail(bench: DiagnosisContext) -> None:
+    found = fit_jointly(SET, start(bench), Unsteady(bench, range(2, 99)), bench.posterior)
     assert isinstance(found, JointFit)
     assert not found.settled
     np.testing.assert_array_equal(found.run.theta[:5], [START[name] for name in BASE.names])
 
 
-def test_a_fit_takes_shorter_steps_where_long_ones_fail(bench: Workbench) -> None:
+def test_a_fit_takes_shorter_steps_where_long_ones_fail(bench: DiagnosisContext) -> None:
     last, failed = np.array([START["E_c"], START["E_s"]]), []
 
     def skin(names: Sequence[str], theta: Mapping[str, float]) -> ModelRun | str:
@@ -210,9 +210,9 @@ def test_a_fit_takes_shorter_steps_where_long_ones_fail(bench: Workbench) -> Non
             failed.append(moduli)
             return "near folding"
         last = moduli
-        return bench.skin(names, theta)
+        return bench.run(names, theta)
 
-    found = fit_jointly(SET, start(bench), skin, bench.local, TrustSettings(runs=30))
+    found = fit_jointly(SET, start(bench), skin, bench.posterior, TrustSettings(runs=30))
     assert isinstance(found, JointFit)
     assert failed
     assert found.settled
@@ -221,9 +221,9 @@ def test_a_fit_takes_shorter_steps_where_long_ones_fail(bench: Workbench) -> Non
 
 @pytest.mark.parametrize("power", [1.0, POWER])
 def test_a_sum_of_powers_of_moduli_stays_on_the_ridge_that_a_shear_knows(
-    bench: Workbench, power: float
+    bench: DiagnosisContext, power: float
 ) -> None:
-    about = bench.local(SET, [a_run(bench, SET)])
+    about = bench.posterior(SET, [a_run(bench, SET)])
     vector = about.vector({**start(bench), **TRUTH, "stiffness_rate": 0.0, "F0": 0.0})
     ridge = shear_at(about, vector, power)
     assert ridge is not None
@@ -240,7 +240,7 @@ def test_a_sum_of_powers_of_moduli_stays_on_the_ridge_that_a_shear_knows(
     assert abs(along - here) < (0.03 if power == POWER else 0.15) * abs(across - here)
 
 
-def test_a_step_that_fails_shortens_the_next_along_what_moved_far(bench: Workbench) -> None:
+def test_a_step_that_fails_shortens_the_next_along_what_moved_far(bench: DiagnosisContext) -> None:
     last, failed = START["k_s"], 0
 
     def skin(names: Sequence[str], theta: Mapping[str, float]) -> ModelRun | str:
@@ -250,9 +250,9 @@ def test_a_step_that_fails_shortens_the_next_along_what_moved_far(bench: Workben
             failed += 1
             return "near folding"
         last = theta["k_s"]
-        return bench.skin(names, theta)
+        return bench.run(names, theta)
 
-    found = fit_jointly(SET, start(bench), skin, bench.local, TrustSettings(runs=4))
+    found = fit_jointly(SET, start(bench), skin, bench.posterior, TrustSettings(runs=4))
     assert isinstance(found, JointFit)
     assert failed
     stiffness = [2e-6 * theta["E_c"] + 4e-6 * theta["E_s"] for theta in (found.fit.theta, TRUTH, START)]
@@ -260,28 +260,30 @@ def test_a_step_that_fails_shortens_the_next_along_what_moved_far(bench: Workben
     assert stiffness[2] != pytest.approx(stiffness[1], rel=0.1)
 
 
-def test_a_fit_does_not_go_on_from_a_run_that_is_worse(bench: Workbench) -> None:
+def test_a_fit_does_not_go_on_from_a_run_that_is_worse(bench: DiagnosisContext) -> None:
     made: list[ModelRun] = []
 
     def skin(names: Sequence[str], theta: Mapping[str, float]) -> ModelRun | str:
         """Whose third run pulls ten times as hard as the second's slopes say."""
-        run = bench.skin(names, theta)
+        run = bench.run(names, theta)
         assert isinstance(run, ModelRun)
         made.append(dataclasses.replace(run, force_n=(10.0 if len(made) == 2 else 1.0) * run.force_n))
         return made[-1]
 
-    found = fit_jointly(SET, start(bench), skin, bench.local, TrustSettings(runs=3))
+    found = fit_jointly(SET, start(bench), skin, bench.posterior, TrustSettings(runs=3))
     assert isinstance(found, JointFit)
     assert len(made) == found.runs == 3
     assert found.run is made[1]
 
 
 @pytest.mark.parametrize("runs", [1, 2, 3, 5])
-def test_no_more_runs_are_made_than_asked_for_and_more_are_never_worse(bench: Workbench, runs: int) -> None:
+def test_no_more_runs_are_made_than_asked_for_and_more_are_never_worse(
+    bench: DiagnosisContext, runs: int
+) -> None:
     values = []
     for most in (runs, runs + 1):
         skin = Unsteady(bench, ())
-        found = fit_jointly(SET, start(bench), skin, bench.local, TrustSettings(runs=most))
+        found = fit_jointly(SET, start(bench), skin, bench.posterior, TrustSettings(runs=most))
         assert isinstance(found, JointFit)
         assert skin.made == found.runs <= most
         values.append(found.fit.value)
@@ -289,8 +291,10 @@ def test_no_more_runs_are_made_than_asked_for_and_more_are_never_worse(bench: Wo
 
 
 @pytest.mark.parametrize("reach", [0.0, 0.15])
-def test_a_trust_region_holds_what_the_model_solves_and_nothing_else(bench: Workbench, reach: float) -> None:
-    about = bench.local(SET, [a_run(bench, SET)])
+def test_a_trust_region_holds_what_the_model_solves_and_nothing_else(
+    bench: DiagnosisContext, reach: float
+) -> None:
+    about = bench.posterior(SET, [a_run(bench, SET)])
     space, (low, high) = about.surrogate.space, about.bounds
     assert [n for n, held in zip(space.names, solved_columns(about), strict=True) if not held] == ["F0"]
     vector = np.clip(about.vector({**start(bench), **TRUTH}), low, high)
@@ -312,28 +316,25 @@ def test_priors_that_go_together_do_so_in_a_fit_and_its_trust_region(
     base = ParameterSpace((PEAKED, other, *BASE.parameters[2:]), together)
     bench = solved.bench(monkeypatch, solved.recorded(0), base)
     for names in ((), ("force-offset",), SET):
-        about = bench.local(names, [a_run(bench, names)])
+        about = bench.posterior(names, [a_run(bench, names)])
         assert about.space.correlations == together
         vector = np.clip(about.vector({**start(bench), **TRUTH}), *about.bounds)
         assert within(about, vector, 0.1).space.correlations == together
 
 
-def test_what_lies_in_series_goes_by_its_shortcut_where_a_surrogate_is_the_skin(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_lies_in_series_goes_by_its_shortcut_where_a_surrogate_is_the_skin() -> None:
     skin: Any = ToySurrogate()
     binned = toy_problem().binned
-    monkeypatch.setattr(workbench, "calm_bins", lambda folder: (binned, solved.NO_WORD, toy.MOTION))
-    monkeypatch.setattr(workbench, "forward_model", lambda *_: SurrogateForward(skin, ModelSpec()))
-    bench = Workbench(Source(Path("recording"), Path("model"), ModelSpec(), 1, skin.space))
+    forward = SurrogateForward(skin, ModelSpec())
+    bench = DiagnosisContext(binned, solved.NO_WORD, toy.MOTION, forward, skin.space, 1)
     assert "slow-recovery" in bench.known
     names = ("slow-recovery",)
     assert bench.space(names).names == skin.space.names
     values = {"recovery_compliance": 1e-3, "recovery_time": 20.0}
     task = Climb(names, {**bench.noise, **SKIN, **values}, 4)
-    found = bench.answered(task, bench.done(task))
+    found = read_answer(bench, task, answer(bench, task))
     assert isinstance(found, JointFit)
     assert set(values) <= set(found.fit.theta)
-    plain = bench.reported((names, {**found.fit.theta, "recovery_compliance": 0.0}))
-    slower = bench.reported((names, {**found.fit.theta, **values}))
+    plain = bench.reported(names, {**found.fit.theta, "recovery_compliance": 0.0})
+    slower = bench.reported(names, {**found.fit.theta, **values})
     assert np.abs(np.asarray(slower) - np.asarray(plain)).max() > 1e-3

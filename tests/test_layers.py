@@ -46,7 +46,7 @@ BELOW = {
     "external": {"errors", "hashing", "types"},
     "mechanisms": BASE | {"finite_element"},
     "reduced": BASE | {"finite_element", "mechanisms"},
-    "forward": BASE | {"finite_element", "mechanisms", "reduced", "surrogates"},
+    "forward": BASE | {"finite_element", "mechanisms", "reduced", "surrogates", "inference"},
     "runner": BASE | SIBLINGS | {"journal"},
     "inference": BASE,  # a Surrogate is all that it knows of a model
     "sensitivity": BASE,

@@ -15,6 +15,7 @@ from toy_inference import NOISE, TRUTH, ToySurrogate, toy_problem
 
 from bayeskin.finite_element.accuracy import mesh_error
 from bayeskin.finite_element.simulate import ModelSpec
+from bayeskin.forward.posterior import UNKNOWN_MESH, model_error
 from bayeskin.inference.model_error import (
     BEND,
     CALIBRATION,
@@ -24,7 +25,6 @@ from bayeskin.inference.model_error import (
     relaxing,
 )
 from bayeskin.inference.noise_model import noise_covariance
-from bayeskin.workflow.model import UNKNOWN_MESH, model_error
 
 
 def test_the_mesh_s_error_is_a_factor_and_a_bend_of_the_force_and_what_relaxes() -> None:

@@ -13,6 +13,8 @@ from toys import solved
 from toys.solved import BASE, KNOWN
 
 from bayeskin.errors import InputError
+from bayeskin.mismatch.answers import answer, read_answer
+from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.further_maxima import fit_larger_sets
 from bayeskin.mismatch.hypotheses import weight
 from bayeskin.mismatch.search import Searcher, search
@@ -22,7 +24,6 @@ from bayeskin.mismatch.search_settings import SearchSettings
 from bayeskin.mismatch.tasks import Climb, FullProbe, Join, Probe, Promise, Task, Weigh
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array, ParameterSpace
-from bayeskin.workflow.workbench import Workbench
 
 Full = Callable[[Mapping[str, float]], Array | str]
 
@@ -38,7 +39,7 @@ FEW = SearchSettings(skins=8, others=4, tried=1)
 class Asked:
     """Answers tasks as processes do, through JSON, and keeps them."""
 
-    def __init__(self, bench: Workbench, lost: Callable[[Task], bool] = lambda task: False) -> None:
+    def __init__(self, bench: DiagnosisContext, lost: Callable[[Task], bool] = lambda task: False) -> None:
         self.bench, self.lost = bench, lost
         self.tasks: list[Task] = []
         self.told: list[str] = []
@@ -48,8 +49,8 @@ class Asked:
 
     def answer(self, task: Task) -> object:
         self.tasks.append(task)
-        said = {"message": "the worker ended"} if self.lost(task) else self.bench.done(task)
-        return self.bench.answered(task, json.loads(json.dumps(said)))
+        said = {"message": "the worker ended"} if self.lost(task) else answer(self.bench, task)
+        return read_answer(self.bench, task, json.loads(json.dumps(said)))
 
     def search(self, seed: int = 1, settings: SearchSettings = FEW) -> SearchResult:
         bench, tell = self.bench, self.told.append
@@ -152,7 +153,8 @@ def test_sets_are_compared_by_forces_that_runs_of_the_full_model_correct(
 ) -> None:
     """The recording is the full model's; what the reduced one leaves out of it is no mismatch."""
     one = asked(full=more, **values)
-    one.bench.binned = replace(one.bench.binned, force_n=one.bench.binned.force_n + SHAPE)
+    binned = replace(one.bench.binned, force_n=one.bench.binned.force_n + SHAPE)
+    one.bench = replace(one.bench, binned=binned)
     found = one.search()
     best = found.best
     assert best.fit.names == tuple(sorted({"F0": "force-offset", "stiffness_rate": "stiffness-drift"}[name]

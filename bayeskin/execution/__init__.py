@@ -1,1 +1,1 @@
-"""One function over many items, in processes of this machine or on a cluster."""
+"""Executors: they apply one function to many items, in processes of this machine or on a cluster."""

@@ -1,10 +1,10 @@
-"""The map of `bayeskin.execution.local` on other machines: a Dask cluster by its address, or SLURM jobs.
+"""Runs the map of `bayeskin.execution.local` on other machines: on a Dask cluster, or in SLURM jobs.
 
-Needs the extra `bayeskin[cluster]`. A worker that dies costs its own item, which is run again elsewhere. The
-scheduler gives up whatever stood in a worker's queue as often as it allows workers to die (its
-`allowed-failures`), be it the cause or not: what it has given up is run once more, one by one after all
-others, and then only the cause is lost. Workers should have one thread each (``dask worker --nthreads 1``):
-the full model uses a core.
+It needs the extra `bayeskin[cluster]`. When a worker dies, its item is run again on another worker. The
+scheduler also counts the failure against all other items in that worker's queue, although they are not the
+cause. It gives up an item after as many failures as it allows (`allowed-failures`). Items that it has given
+up are run once more, one by one after all others, so that only the item that is the cause is lost. Workers
+should have one thread each (``dask worker --nthreads 1``), since the full model uses one core.
 """
 
 from __future__ import annotations
@@ -18,32 +18,33 @@ from bayeskin.errors import InputError
 from bayeskin.execution.local import Lost, Map
 
 CONNECT_S = 10
-HIDDEN = {"dashboard": False}  # jobs must reach the scheduler; nobody else needs its pages
+HIDDEN = {"dashboard": False}  # jobs must reach the scheduler, but nobody needs the pages of its dashboard
 
 
 @contextmanager
 def on_scheduler(address: str) -> Iterator[Map]:
-    """A map over the workers of the Dask scheduler at an address, such as tcp://10.0.0.1:8786.
+    """Yields a map over the workers of the Dask scheduler at an address, such as tcp://10.0.0.1:8786.
 
-    Raises InputError where nobody answers.
+    Raises InputError where no scheduler answers.
     """
     distributed = extra("distributed")
-    if not re.fullmatch(r"(\w+://)?[^\s/]+:\d+", address):  # its client would wait, and end in a traceback
+    if not re.fullmatch(r"(\w+://)?[^\s/]+:\d+", address):  # Dask's client would wait and then fail
         raise InputError(f"scheduler {address}", "no host and port", "the address of a Dask scheduler")
     try:
         client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
-        found = f"no answer ({type(error).__name__})"
-        raise InputError(f"scheduler {address}", found, "the address of a Dask scheduler") from None
+        problem = f"no answer ({type(error).__name__})"
+        raise InputError(f"scheduler {address}", problem, "the address of a Dask scheduler") from None
     with client:
-        yield _over(client)
+        yield _map_over(client)
 
 
 @contextmanager
 def on_slurm(jobs: int, settings: Mapping[str, Any]) -> Iterator[Map]:
-    """A map over `jobs` SLURM jobs, each a worker of one thread; settings as dask_jobqueue.SLURMCluster's.
+    """Yields a map over `jobs` SLURM jobs, each of which is a worker with one thread.
 
-    Raises InputError for settings that it does not take.
+    settings : arguments of dask_jobqueue.SLURMCluster
+    Raises InputError for settings that SLURMCluster does not accept.
     """
     distributed, queue = extra("distributed"), extra("dask_jobqueue")
     try:
@@ -52,10 +53,10 @@ def on_slurm(jobs: int, settings: Mapping[str, Any]) -> Iterator[Map]:
         raise InputError("slurm", str(error), "settings of dask_jobqueue.SLURMCluster") from None
     with cluster, distributed.Client(cluster, set_as_default=False) as client:
         cluster.scale(jobs=jobs)
-        yield _over(client)
+        yield _map_over(client)
 
 
-def _over(client: Any) -> Map:
+def _map_over(client: Any) -> Map:
     distributed = extra("distributed")
 
     def over(function: Callable[[Any], Any], items: Sequence[Any]) -> Generator[tuple[int, Any], None, None]:
@@ -88,6 +89,7 @@ def _result(future: Any, distributed: Any) -> Any:
 
 
 def extra(name: str) -> Any:
+    """Returns an optional package. Raises InputError where it is not installed."""
     import importlib
 
     try:

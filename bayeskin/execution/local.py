@@ -1,4 +1,4 @@
-"""One function over many items in local processes, any of which may die without taking the rest along."""
+"""Applies one function to many items in local processes. A process that dies does not stop the others."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 from bayeskin.access_guard import keep_out
 from bayeskin.errors import InputError
 
-ATTEMPTS = 3  # an item that has cost so many workers is given up
+ATTEMPTS = 3  # an item that has ended this many workers is given up
 ONE_THREAD = {
     name: "1"
     for name in (
@@ -35,13 +35,13 @@ Map = Callable[[Callable[[Any], Any], Sequence[Any]], Results]
 
 
 def local(workers: int) -> Map:
-    """`run_parallel` over so many processes of this machine."""
+    """Returns a map that runs `run_parallel` with this number of processes on this machine."""
     return lambda function, items: run_parallel(function, items, workers)
 
 
 @dataclass(frozen=True)
 class Lost:
-    """Stands for the result of an item whose worker process died `ATTEMPTS` times."""
+    """Takes the place of the result of an item whose worker process died `ATTEMPTS` times."""
 
     reason: str
 
@@ -56,24 +56,25 @@ class _Worker:
 
 @contextmanager
 def standing(function: Callable[[Any], Any], workers: int) -> Iterator[Callable[[Sequence[Any]], Results]]:
-    """Yields what `run_parallel` does for one function, with workers that stay from one call to the next.
+    """Yields a function that does the same as `run_parallel`, but whose workers stay for later calls.
 
-    What the function keeps in its process, it keeps for later items.
+    Data that `function` keeps in its process are available for later items too.
     """
     crew: list[_Worker] = []
     try:
         yield lambda items: _run(function, items, workers, crew)
     finally:
         for worker in crew:
-            _end(worker)
+            _stop(worker)
 
 
 def run_parallel(function: Callable[[Any], Any], items: Sequence[Any], workers: int) -> Results:
-    """Yields ``(index, function(items[index]))`` as results come; `Lost` for an item that kills its worker.
+    """Yields ``(index, function(items[index]))`` in the order in which results arrive.
 
-    `function` must be importable by a fresh interpreter (picklable) and raise nothing; it runs with
-    one thread for linear algebra. A dead worker is replaced and its item run again, `ATTEMPTS` times
-    in all. Closing the iterator ends the workers, as does the death of this process.
+    A dead worker is replaced and its item is run again, `ATTEMPTS` times in total. The result of an item that
+    always kills its worker is `Lost`. A fresh interpreter must be able to import `function` (it is pickled),
+    and `function` must not raise exceptions. It runs with one thread for linear algebra. The workers end when
+    the iterator is closed or when this process dies.
     Raises InputError when workers die before they are ready.
     """
     with standing(function, workers) as run_all:
@@ -82,7 +83,7 @@ def run_parallel(function: Callable[[Any], Any], items: Sequence[Any], workers: 
 
 def _run(function: Callable[[Any], Any], items: Sequence[Any], workers: int, crew: list[_Worker]) -> Results:
     todo, attempts, false_starts = deque(range(len(items))), Counter[int](), 0
-    _hand_out(crew, items, todo, attempts)
+    _give_items(crew, items, todo, attempts)
     try:
         while todo or any(worker.item is not None for worker in crew):
             busy = sum(worker.item is not None for worker in crew)
@@ -90,37 +91,37 @@ def _run(function: Callable[[Any], Any], items: Sequence[Any], workers: int, cre
                 crew.append(_start(function))
             for pipe in wait([worker.pipe for worker in crew]):
                 worker = next(w for w in crew if w.pipe is pipe)
-                done, result = worker.item, None
+                index, result = worker.item, None
                 try:
                     result = worker.pipe.recv()
                     false_starts, worker.ready, worker.item = 0, True, None
                 except (EOFError, OSError):
                     crew.remove(worker)
-                    reason = _bury(worker)
+                    reason = _ending_of(worker)
                     if not worker.ready:
                         false_starts += 1
                         _check_start(false_starts, reason)
-                    elif done is not None and attempts[done] < ATTEMPTS:
-                        todo.appendleft(done)
-                        done = None
+                    elif index is not None and attempts[index] < ATTEMPTS:
+                        todo.appendleft(index)
+                        index = None
                     else:
                         result = Lost(f"the worker process ended {ATTEMPTS} times; last: {reason}")
-                _hand_out(crew, items, todo, attempts)
-                if done is not None:
-                    yield done, result
+                _give_items(crew, items, todo, attempts)
+                if index is not None:
+                    yield index, result
     finally:
-        for worker in [worker for worker in crew if worker.item is not None]:  # what it does is not wanted
+        for worker in [worker for worker in crew if worker.item is not None]:  # nobody waits for its result
             crew.remove(worker)
-            _end(worker)
+            _stop(worker)
 
 
-def _hand_out(crew: list[_Worker], items: Sequence[Any], todo: deque[int], attempts: Counter[int]) -> None:
-    """Gives each idle worker an item, as long as there are any."""
+def _give_items(crew: list[_Worker], items: Sequence[Any], todo: deque[int], attempts: Counter[int]) -> None:
+    """Gives an item to each idle worker, as long as items are left."""
     for worker in crew:
         if todo and worker.ready and worker.item is None:
             worker.item = todo.popleft()
             attempts[worker.item] += 1
-            with suppress(OSError):  # it has just died: the end of its pipe will say so
+            with suppress(OSError):  # the worker has just died; the loop notices the closed pipe
                 worker.pipe.send(items[worker.item])
 
 
@@ -135,17 +136,17 @@ def _check_start(false_starts: int, reason: str) -> None:
 
 
 def _start(function: Callable[[Any], Any]) -> _Worker:
-    """Starts a worker by spawn: a fork would copy the parent's threads' locks and its libraries' state."""
+    """Starts a worker by spawn, since a fork would copy locks of threads and the state of libraries."""
     context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(theirs, function), daemon=True)
-    with _environment(ONE_THREAD):  # read by the libraries when the child loads them
+    parent_end, child_end = context.Pipe()
+    process = context.Process(target=_work, args=(child_end, function), daemon=True)
+    with _environment(ONE_THREAD):  # the libraries read these values when the child loads them
         process.start()
-    theirs.close()  # or the end of the child would not close the pipe
-    return _Worker(process, ours)
+    child_end.close()  # otherwise the pipe would stay open after the child ends
+    return _Worker(process, parent_end)
 
 
-def _end(worker: _Worker) -> None:
+def _stop(worker: _Worker) -> None:
     worker.process.terminate()
     worker.process.join(timeout=5.0)
     if worker.process.exitcode is None:
@@ -154,10 +155,10 @@ def _end(worker: _Worker) -> None:
     worker.pipe.close()
 
 
-def _bury(worker: _Worker) -> str:
-    """Reaps a worker whose pipe has closed; returns how it ended, in words."""
-    worker.process.join(timeout=5.0)  # first let it end by itself, or the cause would be our own signal
-    _end(worker)
+def _ending_of(worker: _Worker) -> str:
+    """Removes a worker whose pipe has closed and returns a message that says how it ended."""
+    worker.process.join(timeout=5.0)  # else our own signal would hide the cause
+    _stop(worker)
     exitcode = worker.process.exitcode
     if exitcode == -signal.SIGKILL:
         return "killed by signal 9, as the system does when memory runs out"
@@ -179,18 +180,21 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
 
 
 def _work(pipe: Connection, function: Callable[[Any], Any]) -> None:
-    """The life of a worker: ready, then one item after another until the parent closes the pipe."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent decides
+    """Runs in the worker: reports that it is ready, then processes items until the parent closes the pipe."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, but the parent decides
     threading.Thread(target=_end_with_parent, daemon=True).start()
     keep_out()
     pipe.send(None)
-    with suppress(EOFError, OSError):  # the parent is gone
+    with suppress(EOFError, OSError):  # the parent has ended
         while True:
             pipe.send(function(pipe.recv()))
 
 
 def _end_with_parent() -> None:
-    """A parent killed outright cannot end its workers; they must not go on beside those of a new start."""
+    """Ends this worker when its parent ends.
+
+    A parent that is killed cannot end its workers. They must not run on beside the workers of a new start.
+    """
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

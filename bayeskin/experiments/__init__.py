@@ -1,1 +1,1 @@
-"""The choice of a further test: protocols within a device's limits, and what each is expected to tell."""
+"""Chooses a further test: makes protocols within a device's limits and estimates what each would tell."""

@@ -1,9 +1,9 @@
-"""The choice of the further test that tells competing sets of mechanisms apart, each run with its posterior.
+"""Chooses the further test that best distinguishes between competing sets of mechanisms.
 
-Of every set, a few posterior draws are run on each protocol, and the expected information gain about which
-set is true is computed from the forces (`information`). The noise of the test to come is the fitted noise of
-the most probable set, what it leaves unexplained with it. After the variations of the recording's own test,
-the most telling protocols are changed at random, and so on from what tells more.
+For every set, a few posterior draws are simulated with each protocol. The forces give the expected
+information gain about which set is true (`information`). The noise of the future test is the fitted noise of
+the most probable set, which includes what this set leaves unexplained. The search first judges variations of
+the recorded test. It then changes the most informative protocols at random, and continues from the best ones.
 """
 
 from __future__ import annotations
@@ -23,22 +23,25 @@ from bayeskin.mismatch.hypotheses import weight
 from bayeskin.mismatch.tasks import Ask, OtherTest
 from bayeskin.types import Array, BinnedForce, PadMotion
 
-DRAWS = 12  # of each hypothesis
+DRAWS = 12  # number of posterior draws of each hypothesis
 BIT = float(np.log(2.0))  # nats
-PARENTS, CHANGES, ROUNDS = 2, 4, 3  # protocols that are changed, how many changes of them, how often
-ENOUGH = 0.02  # of what is to be had: less is no reason to go on
-MOST_BINS = 800  # of a protocol; longer ones have wider bins
-MOST_SETS = 4  # that compete
-OPEN = 12.0  # nats of weight behind the best set, from which on the recording has ruled a set out
+# In each of `ROUNDS` rounds, the best `PARENTS` protocols give `CHANGES` changed protocols.
+PARENTS, CHANGES, ROUNDS = 2, 4, 3
+ENOUGH = 0.02  # the search stops if a round can add or has added less than this share of the possible gain
+MOST_BINS = 800  # largest number of bins of a protocol; longer protocols have wider bins
+MOST_SETS = 4  # largest number of competing sets
+OPEN = 12.0  # the recording has ruled out a set whose log weight is this many nats below the best set's
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A further test and what it is expected to tell.
+    """A further test and the information that it is expected to give.
 
-    gain_bits, standard_error: expected information about which set is true, of `possible_bits` that are to
-    be had; named: the probability that the true set is expected to have afterwards; failed: runs that did
-    not converge. With too many failed for an estimate the first three are NaN.
+    gain_bits, standard_error : expected information about which set is true, and its standard error [bits]
+    named : probability that the true set is expected to have after the test
+    possible_bits : the information that would determine the true set with certainty [bits]
+    failed : number of runs that did not converge. If too many runs fail for an estimate, `gain_bits`,
+        `standard_error` and `named` are NaN.
     """
 
     protocol: Protocol
@@ -53,67 +56,76 @@ Judge = Callable[[Protocol], Experiment]
 
 
 def compete(found: Sequence[Fit], names: Sequence[str], known: Mapping[str, Mechanism]) -> list[Fit]:
-    """The set of these names, and the likeliest of those tried that have, in the place of some of its
-    mechanisms, look-alikes, and are not far behind: one for each choice of mechanisms that differs from it.
+    """Returns the best fit of the set with these names, followed by the most probable competing sets.
 
-    Raises InputError where no fit is of the set.
+    A competing set was tried, has look-alikes in place of some mechanisms of the set, and its log weight is
+    less than `OPEN` below the best fit's. Each competing choice of mechanisms appears once. At most
+    `MOST_SETS` fits are returned.
+
+    Raises InputError if no fit has exactly these names.
     """
-    own = [one for one in found if one.names == tuple(names)]
-    if not own:
+    fits_of_set = [fit for fit in found if fit.names == tuple(names)]
+    if not fits_of_set:
         expected = "those that `bayeskin diagnose` left: remove the run's folder `diagnose` to make them anew"
         raise InputError("searches", f"no fit of {', '.join(names) or 'the base model'}", expected)
-    best = max(own, key=weight)
+    best = max(fits_of_set, key=weight)
 
     def alike(other: Fit) -> bool:
-        gone, new = set(best.names) - set(other.names), set(other.names) - set(best.names)
-        groups = {name for one in gone for name in known[one].group}
+        removed, added = set(best.names) - set(other.names), set(other.names) - set(best.names)
+        groups = {name for mechanism in removed for name in known[mechanism].group}
         is_open = weight(other) > weight(best) - OPEN
-        return bool(gone) and len(gone) == len(new) and new <= groups and is_open
+        return bool(removed) and len(removed) == len(added) and added <= groups and is_open
 
     by_names = {other.names: other for other in found if alike(other)}
     return [best, *sorted(by_names.values(), key=weight, reverse=True)[: MOST_SETS - 1]]
 
 
 def search(judge: Judge, first: Sequence[Protocol], limits: Limits, seed: int) -> list[Experiment]:
-    """Judges protocols, then changes of the most telling ones within limits; the most informative first.
+    """Returns the judged protocols, the most informative first.
 
-    Ends where a round of changes tells no more than was told before, or all that is to be told is.
+    The search judges the protocols in `first`, then random changes of the most informative ones within the
+    limits. It ends if a round brings hardly more information, if the best protocol already gives almost all
+    of it, and after `ROUNDS` rounds at the latest.
     """
     rng = np.random.default_rng(seed)
-    found = ranked([judge(one) for one in first])
+    experiments = ranked([judge(protocol) for protocol in first])
     for turn in range(ROUNDS):
-        best = found[0]
+        best = experiments[0]
         if np.isnan(best.gain_bits) or best.gain_bits > (1.0 - ENOUGH) * best.possible_bits:
             break
-        parents = [one.protocol for one in found[:PARENTS]]
+        parents = [experiment.protocol for experiment in experiments[:PARENTS]]
         new = [
             changed(parents[i % len(parents)], limits, f"proposal {CHANGES * turn + i + 1}", rng)
             for i in range(CHANGES)
         ]
-        found = ranked([*found, *(judge(one) for one in new)])
-        if found[0].gain_bits < best.gain_bits + ENOUGH * best.possible_bits:
+        experiments = ranked([*experiments, *(judge(protocol) for protocol in new)])
+        if experiments[0].gain_bits < best.gain_bits + ENOUGH * best.possible_bits:
             break
-    return found
+    return experiments
 
 
 def weigh(
     protocol: Protocol, fits: Sequence[Fit], known: Mapping[str, Mechanism], ask: Ask, seed: int
 ) -> Experiment:
-    """Returns what a protocol is expected to tell about which of the sets is true, all as probable before.
+    """Returns the information that a protocol is expected to give about which of the sets is true.
 
-    fits : one for each hypothesis, by whose `names` mechanisms of `known` are on, the likeliest first
-    ask : answers `DRAWS` tasks of another test for each hypothesis
+    All sets have the same probability before the test.
+
+    fits : the fit of each hypothesis, the most probable one first. Its `names` are the mechanisms of `known`
+        that are active.
+    ask : answers the tasks; each hypothesis has `DRAWS` tasks that simulate the test
+
     Raises InputError for fewer than two hypotheses.
     """
     if len(fits) < 2:
         raise InputError("hypotheses", f"{len(fits)}", "two at least, each with its fit")
-    motion, edges_s = protocol.motion, _edges(protocol.motion, fits[0])
+    motion, edges_s = protocol.motion, _bin_edges(protocol.motion, fits[0])
     tasks = [
         OtherTest(
-            one.names, theta, tuple(motion.time_s.tolist()), tuple(motion.displacement_m.tolist()),
+            fit.names, theta, tuple(motion.time_s.tolist()), tuple(motion.displacement_m.tolist()),
             tuple(edges_s.tolist()),
         )
-        for i, one in enumerate(fits) for theta in _drawn(one, known, seed + i)
+        for i, fit in enumerate(fits) for theta in _posterior_draws(fit, known, seed + i)
     ]  # fmt: skip
     answers = ask(tasks)
     forces = [
@@ -122,14 +134,18 @@ def weigh(
     ]
     gain = (np.nan, np.nan, np.nan)
     if min(len(rows) for rows in forces) >= FEWEST:
-        of = expected_gain(forces, noise_of(fits[0], motion, edges_s), np.ones(len(fits)), seed)
-        gain = (of.nats / BIT, of.standard_error / BIT, of.named)
+        expected = expected_gain(forces, noise_of(fits[0], motion, edges_s), np.ones(len(fits)), seed)
+        gain = (expected.nats / BIT, expected.standard_error / BIT, expected.named)
     failed = sum(DRAWS - len(rows) for rows in forces)
     return Experiment(protocol, *gain, float(np.log(len(fits))) / BIT, failed)
 
 
 def ranked(found: Sequence[Experiment]) -> list[Experiment]:
-    """The most informative first, of those that tell equally much the shortest; unjudged ones last."""
+    """Returns the experiments in order, the most informative first.
+
+    Among experiments with nearly the same information, the shortest test comes first. Experiments without an
+    estimate come last.
+    """
 
     def place(one: Experiment) -> tuple[bool, float, float]:
         share = one.gain_bits / one.possible_bits
@@ -138,17 +154,17 @@ def ranked(found: Sequence[Experiment]) -> list[Experiment]:
     return sorted(found, key=place)
 
 
-def _edges(motion: PadMotion, found: Fit) -> Array:
-    """Edges (m+1,) of equal bins, as wide as the recording's or wider."""
+def _bin_edges(motion: PadMotion, found: Fit) -> Array:
+    """Returns the edges (m+1,) of equal bins that are as wide as the recording's bins or wider."""
     end_s = float(motion.time_s[-1])
     width_s = max(float(np.median(np.diff(found.log_posterior.binned.edges_s))), end_s / MOST_BINS)
     return np.asarray(width_s * np.arange(int(end_s / width_s + 1e-6) + 1, dtype=float))
 
 
-def _drawn(found: Fit, known: Mapping[str, Mechanism], seed: int) -> list[dict[str, float]]:
-    """Values of all parameters of a set's force at posterior draws."""
+def _posterior_draws(found: Fit, known: Mapping[str, Mechanism], seed: int) -> list[dict[str, float]]:
+    """Returns posterior draws of all parameters that determine the force of a set of mechanisms."""
     names = found.log_posterior.surrogate.space.names
-    neutral = {name: value for one in found.names for name, value in known[one].neutral.items()}
+    neutral = {name: value for mechanism in found.names for name, value in known[mechanism].neutral.items()}
     return [
         neutral | dict(zip(names, draw.tolist(), strict=True))
         for draw in found.draws(DRAWS, seed)[:, : len(names)]
@@ -156,10 +172,11 @@ def _drawn(found: Fit, known: Mapping[str, Mechanism], seed: int) -> list[dict[s
 
 
 def noise_of(found: Fit, motion: PadMotion, edges_s: Array) -> Array:
-    """Covariance (m, m) [N^2] of the noise expected in another test, from a fit.
+    """Returns the covariance (m, m) [N^2] of the noise that is expected in another test, from a fit.
 
-    The fitted sds and correlation time, and the usual measured variance of each kind of phase, which goes
-    as 1 / width of the bins. A kind that was not recorded is as the noisiest.
+    The noise has the fitted sds and correlation time. It also has the median measured variance of each kind
+    of phase, which is proportional to 1 / width of the bins. A kind of phase that was not recorded has the
+    noise of the noisiest kind.
     """
     log_posterior = found.log_posterior
     chain, binned = log_posterior.chain, log_posterior.binned
@@ -180,7 +197,7 @@ def noise_of(found: Fit, motion: PadMotion, edges_s: Array) -> Array:
         np.array([variance.get(kind, max(variance.values())) for kind in of_bins]),
         np.full(len(middle) - 1, correlation), phase, phases,
     )  # fmt: skip
-    ahead = noise_chain(planned, by_kind=log_posterior.noise_priors.by_kind)
-    sds = [sd.get(kind, max(sd.values())) for kind in ahead.kinds]
+    future = noise_chain(planned, by_kind=log_posterior.noise_priors.by_kind)
+    sds = [sd.get(kind, max(sd.values())) for kind in future.kinds]
     noise = np.array([*sds, found.theta["tau_noise"], np.inf])
-    return noise_covariance(ahead, noise, np.zeros(len(middle)))
+    return noise_covariance(future, noise, np.zeros(len(middle)))

@@ -1,24 +1,28 @@
-"""How much an experiment is expected to say about which of several hypotheses is true.
+"""Estimates the information that an experiment is expected to give about which hypothesis is true.
 
-With hypotheses h of probability p(h), and the force y of an experiment,
+For hypotheses h with probability p(h), and the force y of an experiment, the expected information gain is
 
     gain = sum_h p(h) E[ log p(h | y) - log p(h) | h ] .
 
-The expectation is over simulated forces: a posterior draw of the hypothesis, with noise added. p(h | y) needs
-each hypothesis' density of y, which a dozen draws of hundreds of bins cannot give: with noise small beside
-the spread of draws, a sum over them sees only the nearest (the bias of nested Monte Carlo: Rainforth et al.
-2018, ICML). So bins are whitened by the noise and projected on what tells the hypotheses apart, linear
-discriminants of the draws (Fisher 1936), and on the direction of largest spread; there the noise is known and
-each hypothesis is taken as Gaussian, its spread drawn toward that of all (Friedman 1989, JASA 84:165), its
-mean's uncertainty included. Posteriors near a Laplace approximation are close to Gaussian in a few
-projections.
+The expectation is over simulated forces. Each simulated force is a posterior draw of the hypothesis plus
+noise. p(h | y) needs the density of y under each hypothesis. A dozen draws of hundreds of bins cannot give
+this density directly. If the noise is small compared with the spread of the draws, a sum over the draws
+depends only on the nearest draw (the bias of nested Monte Carlo: Rainforth et al. 2018, ICML).
 
-A draw is judged by densities and projections made without it. For any approximation q(h | y) made from other
-draws, E log q(h | y) / p(h) is at most the true gain (Barber & Agakov 2003, NIPS; Foster et al. 2019,
-NeurIPS), so too few draws or a poor projection make the estimate too low, never too high. It is 0 at least.
-Densities from a dozen draws are at times sure and wrong, which one draw pays for with tens of nats. So q is a
-mixture with the prior, which bounds that (as weights are bounded: Hesterberg 1995, Technometrics 37:185); the
-prior's share is what serves the other half of the draws best.
+Therefore the bins are whitened by the noise and projected on a few directions. These are the linear
+discriminants of the draws (Fisher 1936), which separate the hypotheses, and the direction of largest spread.
+In these directions the noise is known, and each hypothesis is modelled as Gaussian. Its covariance is shrunk
+towards the pooled covariance of all hypotheses (Friedman 1989, JASA 84:165), and the uncertainty of its mean
+is included. Posteriors near a Laplace approximation are close to Gaussian in a few projections.
+
+Each draw is judged by densities and projections that are computed without it. For any approximation q(h | y)
+from other draws, E log q(h | y) / p(h) is at most the true gain (Barber & Agakov 2003, NIPS; Foster et al.
+2019, NeurIPS). Too few draws or a poor projection therefore make the estimate too low, never too high. The
+estimate is at least 0.
+
+Densities from a dozen draws are sometimes confident and wrong, and a single such draw costs tens of nats. For
+this reason q is a mixture with the prior, which bounds the loss (as weights are bounded: Hesterberg 1995,
+Technometrics 37:185). Each half of the draws uses the share of the prior that is best for the other half.
 """
 
 from __future__ import annotations
@@ -34,18 +38,20 @@ from scipy.special import logsumexp
 from bayeskin.errors import InputError
 from bayeskin.types import Array
 
-FEWEST = 4  # draws of a hypothesis
-REPLICATES = 64  # of the noise, a draw
-SPREAD = 1  # directions of largest spread, beside the discriminants
-NEGLIGIBLE = 1e-9  # singular value of whitened draws, of the largest; gain
-DOUBTS = (1e-4, 0.01, 0.03, 0.1, 0.3, 1.0)  # shares of the prior in q
+FEWEST = 4  # least number of draws of a hypothesis
+REPLICATES = 64  # number of noise realisations for each draw
+SPREAD = 1  # number of directions of largest spread, in addition to the discriminants
+# Singular values of the whitened draws below this share of the largest are negligible, and gains [nats] below
+# this value too.
+NEGLIGIBLE = 1e-9
+DOUBTS = (1e-4, 0.01, 0.03, 0.1, 0.3, 1.0)  # shares of the prior in q that are tried
 
 
 @dataclass(frozen=True)
 class Gain:
-    """Expected gain [nats] and its Monte-Carlo standard error over draws.
+    """Expected information gain [nats] and its Monte Carlo standard error over the draws [nats].
 
-    named: the probability that the true hypothesis is expected to have after the experiment.
+    `named` is the probability that the true hypothesis is expected to have after the experiment.
     """
 
     nats: float
@@ -56,83 +62,88 @@ class Gain:
 def expected_gain(
     forces_n: Sequence[Array], noise_n2: ArrayLike, probabilities: ArrayLike, seed: int
 ) -> Gain:
-    """Of an experiment, about which hypothesis is true.
+    """Returns the expected gain of an experiment about which hypothesis is true.
 
-    forces_n : for each hypothesis (draws, m), its force without noise at posterior draws, at least 4
-    noise_n2 : (m, m) covariance of the noise
-    probabilities : (hypotheses,), any positive scale
-    Raises InputError for too few draws or hypotheses, or shapes that do not belong together.
+    forces_n : for each hypothesis the force without noise (draws, m) [N] at posterior draws, at least 4 draws
+    noise_n2 : (m, m) covariance of the noise [N^2]
+    probabilities : (hypotheses,) positive prior probabilities on any scale
+
+    Raises InputError for too few draws or hypotheses, or for shapes that do not match.
     """
     noise, prior = np.asarray(noise_n2, dtype=float), np.asarray(probabilities, dtype=float)
     _refuse(forces_n, noise, prior)
     log_prior = np.log(prior / prior.sum())
-    white = _compressed(forces_n, np.linalg.cholesky(noise))
+    white = _whitened_draws(forces_n, np.linalg.cholesky(noise))
     rng = np.random.default_rng(seed)
     of_truth = [np.empty((len(draws), REPLICATES)) for draws in white]  # log p(h | y), where h is true
     for h, draws in enumerate(white):
         for i, draw in enumerate(draws):
-            others = [np.delete(one, i, axis=0) if g == h else one for g, one in enumerate(white)]
-            axes = _axes(others, np.exp(log_prior))
+            others = [np.delete(rows, i, axis=0) if g == h else rows for g, rows in enumerate(white)]
+            axes = _projection_axes(others, np.exp(log_prior))
             seen = (draw + rng.standard_normal((REPLICATES, len(draw)))) @ axes
             of_truth[h][i] = _log_posterior(seen, others, axes, log_prior)[h]
     nats, error2, named = 0.0, 0.0, 0.0
     for log_post, start, share in zip(
-        _doubted(of_truth, log_prior), log_prior, np.exp(log_prior), strict=True
+        _mixed_with_prior(of_truth, log_prior), log_prior, np.exp(log_prior), strict=True
     ):
         each = log_post.mean(axis=1) - start
         nats += share * float(each.mean())
         error2 += share**2 * float(each.var(ddof=1)) / len(each)
         named += share * float(np.exp(log_post).mean())
-    if nats <= NEGLIGIBLE:  # the approximation is no better than what is known already
+    if nats <= NEGLIGIBLE:  # the approximation is no better than the prior
         nats, named = 0.0, float(np.sum(np.exp(2.0 * log_prior)))
     return Gain(nats, float(np.sqrt(error2)), named)
 
 
-def _doubted(of_truth: Sequence[Array], log_prior: Array) -> list[Array]:
-    """log q(h | y) of log p(h | y), (draws, replicates) each.
+def _mixed_with_prior(of_truth: Sequence[Array], log_prior: Array) -> list[Array]:
+    """Returns log q(h | y) from log p(h | y), arrays (draws, replicates) for each hypothesis.
 
-    Every second draw's has the share of the prior that makes the mean of the others largest.
+    Every second draw belongs to the same half. Each half uses the share of the prior that makes the mean of
+    log q over the other half largest.
     """
 
     def mixed(log_post: Array, start: float, doubt: float) -> Array:
         with np.errstate(divide="ignore"):
             return np.asarray(np.logaddexp(log_post + np.log1p(-doubt), start + np.log(doubt)))
 
-    found = [np.empty_like(one) for one in of_truth]
+    log_q = [np.empty_like(log_truth) for log_truth in of_truth]
     for half in (0, 1):
         means = [
             sum(
-                np.exp(start) * mixed(one[1 - half :: 2], start, doubt).mean()
-                for one, start in zip(of_truth, log_prior, strict=True)
+                np.exp(start) * mixed(log_truth[1 - half :: 2], start, doubt).mean()
+                for log_truth, start in zip(of_truth, log_prior, strict=True)
             )
             for doubt in DOUBTS
         ]
         best = DOUBTS[int(np.argmax(means))]
-        for one, start, into in zip(of_truth, log_prior, found, strict=True):
-            into[half::2] = mixed(one[half::2], start, best)
-    return found
+        for log_truth, start, mixture in zip(of_truth, log_prior, log_q, strict=True):
+            mixture[half::2] = mixed(log_truth[half::2], start, best)
+    return log_q
 
 
-def _compressed(forces_n: Sequence[Array], root: Array) -> list[Array]:
-    """Whitened draws (n, r) in an orthonormal basis of all that any two draws differ by; noise is I there."""
+def _whitened_draws(forces_n: Sequence[Array], root: Array) -> list[Array]:
+    """Returns the whitened draws (n, r) of each hypothesis; the covariance of the noise becomes I.
+
+    The coordinates belong to an orthonormal basis of the space of all differences between draws.
+    """
     rows = np.concatenate(list(forces_n))
     white = solve_triangular(root, (rows - rows.mean(axis=0)).T, lower=True).T
     left, size, _ = np.linalg.svd(white, full_matrices=False)
     kept = size > NEGLIGIBLE * max(size[0], 1e-300)
     kept[0] = True
     inside = left[:, kept] * size[kept]
-    return np.split(inside, np.cumsum([len(one) for one in forces_n])[:-1])
+    return np.split(inside, np.cumsum([len(draws) for draws in forces_n])[:-1])
 
 
-def _axes(draws: Sequence[Array], prior: Array) -> Array:
-    """Discriminants and directions of largest spread, orthonormal columns (r, q)."""
-    means = np.array([one.mean(axis=0) for one in draws])
+def _projection_axes(draws: Sequence[Array], prior: Array) -> Array:
+    """Returns the discriminants and the directions of largest spread as orthonormal columns (r, q)."""
+    means = np.array([rows.mean(axis=0) for rows in draws])
     within = sum(
-        p * np.cov(one.T, ddof=1).reshape(len(one.T), -1) for p, one in zip(prior, draws, strict=True)
+        p * np.cov(rows.T, ddof=1).reshape(len(rows.T), -1) for p, rows in zip(prior, draws, strict=True)
     )
-    within = np.eye(means.shape[1]) + np.asarray(within)  # the noise's and the draws' spread
+    within = np.eye(means.shape[1]) + np.asarray(within)  # covariance of the noise plus that of the draws
     apart = np.sqrt(prior)[:, None] * (means - prior @ means)
-    directions = np.linalg.solve(within, apart.T)  # spans Fisher's discriminants, one too many
+    directions = np.linalg.solve(within, apart.T)  # spans Fisher's discriminants; has one vector too many
     left, size, _ = np.linalg.svd(directions, full_matrices=False)
     left = left[:, : len(draws) - 1][:, size[: len(draws) - 1] > 0.0]
     spread = within - left @ (left.T @ within)
@@ -141,17 +152,17 @@ def _axes(draws: Sequence[Array], prior: Array) -> Array:
 
 
 def _log_posterior(seen: Array, draws: Sequence[Array], axes: Array, log_prior: Array) -> Array:
-    """log p(h | y) (h, s) of noisy forces (s, q) on the axes."""
+    """Returns log p(h | y), (h, s), for noisy forces (s, q) that are projected on the axes."""
     q = axes.shape[1]
-    projected = [one @ axes for one in draws]
-    own = [np.cov(one.T, ddof=1).reshape(q, q) for one in projected]
-    weight = np.array([len(one) - 1.0 for one in projected])
-    pooled = np.tensordot(weight / weight.sum(), np.array(own), axes=1)
+    projected = [rows @ axes for rows in draws]
+    covariances = [np.cov(rows.T, ddof=1).reshape(q, q) for rows in projected]
+    weight = np.array([len(rows) - 1.0 for rows in projected])
+    pooled = np.tensordot(weight / weight.sum(), np.array(covariances), axes=1)
     logs = []
-    for one, spread, n, prior in zip(projected, own, weight, log_prior, strict=True):
-        drawn = (n * spread + (q + 2.0) * pooled) / (n + q + 2.0)
-        root = np.linalg.cholesky(np.eye(q) + (1.0 + 1.0 / len(one)) * drawn)
-        z = solve_triangular(root, (seen - one.mean(axis=0)).T, lower=True)
+    for rows, spread, n, prior in zip(projected, covariances, weight, log_prior, strict=True):
+        shrunk = (n * spread + (q + 2.0) * pooled) / (n + q + 2.0)
+        root = np.linalg.cholesky(np.eye(q) + (1.0 + 1.0 / len(rows)) * shrunk)
+        z = solve_triangular(root, (seen - rows.mean(axis=0)).T, lower=True)
         logs.append(prior - 0.5 * np.sum(z**2, axis=0) - np.sum(np.log(np.diag(root))))
     joint = np.array(logs)
     return np.asarray(joint - logsumexp(joint, axis=0))

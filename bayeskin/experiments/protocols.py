@@ -1,4 +1,4 @@
-"""Further tests within a device's limits: variations of the recording's own, and changes of any of these."""
+"""Makes further tests within a device's limits: variations of the recorded test, and random changes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ import numpy as np
 from bayeskin.errors import InputError
 from bayeskin.types import Array, PadMotion, Phase, PhaseKind
 
-MOVING = 0.05  # of the fastest stretch's speed: slower than this the pads stand
-STILL_S = (10.0, 60.0)  # shortest and longest hold taken over from the recording
+# Pads are still if they are slower than this share of the largest speed. Still pads are at rest, not held, if
+# they are within this share of the travel from the lowest level.
+MOVING = 0.05
+STILL_S = (10.0, 60.0)  # shortest and longest hold that is taken from the recording
 LONG_S = 600.0
 BEFORE_S = 5.0  # rest at the start
-LEAST_REACH = 0.2  # of the largest displacement that a changed test opens the pads by
-CHANGE = 0.7  # sd of the logarithm of what is changed
-SHORT_S = 5.0  # added to holds and rests before they are changed by a factor, so that those of 0 s can grow
+LEAST_REACH = 0.2  # least displacement of a changed cycle, as a share of the device's largest displacement
+CHANGE = 0.7  # sd of the logarithm of the random factors
+SHORT_S = 5.0  # added to holds and rests before a factor changes them, so that a hold of 0 s can grow
 MOST_CYCLES = 5
 
 
@@ -32,7 +34,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Cycle:
-    """The pads open at a speed, are held, come back as fast, and rest."""
+    """A cycle: the pads open at a speed, are held, return at the same speed, and rest."""
 
     reach_m: float
     speed_m_s: float
@@ -44,26 +46,26 @@ class Cycle:
         return 2.0 * self.reach_m / self.speed_m_s + self.hold_s + self.rest_s
 
     def within(self, limits: Limits) -> Cycle:
-        """The nearest cycle that a device can do."""
+        """Returns the nearest cycle that a device can perform."""
         reach_m = float(np.clip(self.reach_m, 0.0, limits.largest_m))
         return replace(self, reach_m=reach_m, speed_m_s=float(np.clip(self.speed_m_s, *limits.speeds_m_s)))
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """A test of one cycle after the other, and its name."""
+    """A test that consists of consecutive cycles, with its name."""
 
     name: str
     cycles: tuple[Cycle, ...]
 
     @cached_property
     def motion(self) -> PadMotion:
-        """The pads' motion, after a short rest."""
+        """Returns the pads' motion, which begins with a short rest."""
         time_s, displacement_m = [0.0, BEFORE_S], [0.0, 0.0]
-        for one in self.cycles:
-            ramp_s = one.reach_m / one.speed_m_s
-            for lasts_s, level_m in ((ramp_s, one.reach_m), (one.hold_s, one.reach_m), (ramp_s, 0.0),
-                                     (one.rest_s, 0.0)):  # fmt: skip
+        for cycle in self.cycles:
+            ramp_s = cycle.reach_m / cycle.speed_m_s
+            for lasts_s, level_m in ((ramp_s, cycle.reach_m), (cycle.hold_s, cycle.reach_m), (ramp_s, 0.0),
+                                     (cycle.rest_s, 0.0)):  # fmt: skip
                 if lasts_s > 0.0:
                     time_s.append(time_s[-1] + lasts_s)
                     displacement_m.append(level_m)
@@ -71,23 +73,26 @@ class Protocol:
 
     @property
     def sentence(self) -> str:
-        """The sentence that says what to do."""
-        parts = [_said(cycle, len(list(equal))) for cycle, equal in groupby(self.cycles)]
+        """Returns the sentence that tells the user how to perform the test."""
+        parts = [_cycle_in_words(cycle, len(list(equal))) for cycle, equal in groupby(self.cycles)]
         text = "; then ".join(parts)
         return f"{text[0].upper()}{text[1:]}."
 
     def within(self, limits: Limits) -> Protocol:
-        """The nearest test that a device can do; waits are cut where it would take too long."""
-        cycles = [one.within(limits) for one in self.cycles]
-        waits_s = sum(one.hold_s + one.rest_s for one in cycles)
-        room_s = max(limits.longest_s - BEFORE_S - sum(one.seconds for one in cycles) + waits_s, 0.0)
-        share = min(1.0, room_s / waits_s) if waits_s else 1.0
+        """Returns the nearest test that a device can perform.
+
+        Holds and rests are shortened if the test would take too long.
+        """
+        cycles = [cycle.within(limits) for cycle in self.cycles]
+        waits_s = sum(cycle.hold_s + cycle.rest_s for cycle in cycles)
+        available_s = max(limits.longest_s - BEFORE_S - sum(cycle.seconds for cycle in cycles) + waits_s, 0.0)
+        share = min(1.0, available_s / waits_s) if waits_s else 1.0
         return Protocol(self.name, tuple(
-            replace(one, hold_s=share * one.hold_s, rest_s=share * one.rest_s) for one in cycles
+            replace(cycle, hold_s=share * cycle.hold_s, rest_s=share * cycle.rest_s) for cycle in cycles
         ))  # fmt: skip
 
 
-def _said(cycle: Cycle, times: int) -> str:
+def _cycle_in_words(cycle: Cycle, times: int) -> str:
     start = "one cycle" if times == 1 else f"{times} equal cycles"
     held = f"a hold of {cycle.hold_s:.0f} s" if cycle.hold_s >= 0.5 else "no hold"
     rest = (
@@ -99,7 +104,7 @@ def _said(cycle: Cycle, times: int) -> str:
 
 
 def variations(motion: PadMotion, limits: Limits) -> tuple[Protocol, ...]:
-    """Variations of amplitude, speed, holds and pauses of a recording's own motion, within limits.
+    """Returns variations of a recorded motion's amplitude, speed, holds and rests, within the limits.
 
     Raises InputError for pads that never move.
     """
@@ -121,12 +126,16 @@ def variations(motion: PadMotion, limits: Limits) -> tuple[Protocol, ...]:
 
 
 def changed(protocol: Protocol, limits: Limits, name: str, rng: np.random.Generator) -> Protocol:
-    """Returns a test near another: a cycle more or fewer, and one cycle or all with another shape."""
+    """Returns a random change of a test.
+
+    The new test may have one cycle more or less. In one cycle or in all cycles, the displacement, the speed,
+    the hold and the rest are multiplied by random factors.
+    """
     cycles = list(protocol.cycles)
-    more = int(rng.integers(-1, 2))
-    if more > 0 and len(cycles) < MOST_CYCLES:
+    added = int(rng.integers(-1, 2))
+    if added > 0 and len(cycles) < MOST_CYCLES:
         cycles.append(cycles[-1])
-    elif more < 0 and len(cycles) > 1:
+    elif added < 0 and len(cycles) > 1:
         cycles.pop()
     which = range(len(cycles)) if rng.random() < 0.5 else [int(rng.integers(len(cycles)))]
     factors = np.exp(CHANGE * rng.standard_normal(4))
@@ -145,7 +154,10 @@ def _scaled(cycle: Cycle, factors: Array, limits: Limits) -> Cycle:
 
 
 def own(motion: PadMotion) -> tuple[float, float, float]:
-    """Amplitude [m], speed [m/s] and usual hold [s] of a motion; holds between 10 and 60 s."""
+    """Returns the amplitude [m], the mean speed of the ramps [m/s] and the median hold [s] of a motion.
+
+    The hold is limited to the range from 10 to 60 s. Raises InputError for pads that never move.
+    """
     lasts = np.diff(motion.time_s)
     travel = np.diff(motion.displacement_m)
     speed = np.abs(travel) / lasts
@@ -153,19 +165,19 @@ def own(motion: PadMotion) -> tuple[float, float, float]:
     if amplitude <= 0.0:
         raise InputError("motion", "pads that never move", "at least one ramp")
     moving = speed > MOVING * speed.max()
-    usual = float(np.abs(travel[moving]).sum() / lasts[moving].sum())
+    mean_speed = float(np.abs(travel[moving]).sum() / lasts[moving].sum())
     level = 0.5 * (motion.displacement_m[1:] + motion.displacement_m[:-1]) - motion.displacement_m.min()
     held = ~moving & (level > MOVING * amplitude)
     runs = np.split(np.arange(len(lasts)), np.flatnonzero(np.diff(held)) + 1)
     holds = [float(lasts[run].sum()) for run in runs if held[run[0]]]
-    return amplitude, usual, float(np.clip(np.median(holds) if holds else 0.0, *STILL_S))
+    return amplitude, mean_speed, float(np.clip(np.median(holds) if holds else 0.0, *STILL_S))
 
 
 def phases_of(motion: PadMotion) -> tuple[Phase, ...]:
-    """Phases of a motion of straight stretches: rest at its lowest level, load, hold and unload."""
+    """Returns the phases of a piecewise-linear motion: rest near the lowest level, load, hold and unload."""
     travel = np.diff(motion.displacement_m)
     lowest, reach = float(motion.displacement_m.min()), float(np.ptp(motion.displacement_m))
-    found: list[Phase] = []
+    phases: list[Phase] = []
     cycle, turned = 0, True  # a loading after an unloading or a rest begins a cycle
     for i, step in enumerate(travel):
         kind: PhaseKind = "load" if step > 0.0 else "unload"
@@ -174,5 +186,5 @@ def phases_of(motion: PadMotion) -> tuple[Phase, ...]:
         if kind == "load" and turned:
             cycle, turned = cycle + 1, False
         turned = turned or kind in ("unload", "rest")
-        found.append(Phase(kind, cycle, float(motion.time_s[i]), float(motion.time_s[i + 1])))
-    return tuple(found)
+        phases.append(Phase(kind, cycle, float(motion.time_s[i]), float(motion.time_s[i + 1])))
+    return tuple(phases)

@@ -1,1 +1,1 @@
-"""Forward models from outside of the package: a Python function, or a server that speaks UM-Bridge."""
+"""Forward models from outside the package: a Python function, or a server that speaks UM-Bridge."""

@@ -1,9 +1,11 @@
-"""A forward model of one's own in the full model's place: a Python function, or a server of UM-Bridge.
+"""Runs the user's own forward model in place of the full model: a Python function or a UM-Bridge server.
 
-A function ``force(theta, time_s, displacement_m)`` gives the force [N] at the times of a displacement. It is
-named by where it stands, ``"FILE.py:FUNCTION"`` or ``"PACKAGE.MODULE:FUNCTION"``, so that worker processes
-can find it. A server (``"http://HOST:PORT"``) is sent the parameters in their order, and as configuration
-``{"protocol": {"time_s": [...], "displacement_m": [...]}, "times_s": [...]}``; it gives the force at these.
+A function ``force(theta, time_s, displacement_m)`` returns the force [N] at the times of a displacement. Its
+name is ``"FILE.py:FUNCTION"`` or ``"PACKAGE.MODULE:FUNCTION"``, so that worker processes can find it.
+
+A server (``"http://HOST:PORT"``) receives the parameters in their order and the configuration
+``{"protocol": {"time_s": [...], "displacement_m": [...]}, "times_s": [...]}``. It returns the force at
+`times_s`.
 """
 
 from __future__ import annotations
@@ -28,14 +30,14 @@ from bayeskin.external.umbridge import Client, Refused
 from bayeskin.hashing import sha256_of_behaviour
 from bayeskin.types import Array, PadMotion, Simulation, frozen_array
 
-STEP_S = 0.1  # between the times at which a force is asked for; bins are five times as wide
+STEP_S = 0.1  # between the times at which the force is requested; bins are five times as wide
 Force = Callable[[Mapping[str, float], Array, Array], ArrayLike]
 
 
 def identity(forward: str) -> str:
     """Returns a sha256 that changes with the behaviour of the function's file, or with the server's address.
 
-    Comments and docstrings of the file do not count. Raises InputError for a function that cannot be found.
+    Comments and docstrings of the file do not change it. Raises InputError where the function is not found.
     """
     code = "" if _is_url(forward) else sha256_of_behaviour(_source(forward).read_bytes())
     name = forward if _is_url(forward) else forward.rpartition(":")[2]
@@ -43,7 +45,10 @@ def identity(forward: str) -> str:
 
 
 def check_own(forward: str) -> None:
-    """Raises InputError where a function cannot be imported, Unavailable where a server does not answer."""
+    """Checks that the user's own model can be used.
+
+    Raises InputError where a function cannot be imported, and Unavailable where a server does not answer.
+    """
     if _is_url(forward):
         Client(forward).name()
     else:
@@ -51,9 +56,9 @@ def check_own(forward: str) -> None:
 
 
 def simulate_own(forward: str, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
-    """A run of the model that `forward` names.
+    """Returns a run of the model that `forward` names.
 
-    Raises InputError where it cannot be found, Unavailable where the server does not answer.
+    Raises InputError where the model cannot be found, and Unavailable where the server does not answer.
     """
     if _is_url(forward):
         return simulate_server(forward, motion, theta)
@@ -63,31 +68,34 @@ def simulate_own(forward: str, motion: PadMotion, theta: Mapping[str, float]) ->
 def simulate_with(
     force: Force, motion: PadMotion, theta: Mapping[str, float], model_hash: str = "own"
 ) -> Simulation:
-    """A run of any function ``force(theta, time_s, displacement_m)``, as the full model's runs look.
+    """Returns a run of a function ``force(theta, time_s, displacement_m)``, in the form of a full run.
 
-    A force that is not finite, or a function that raises, is a Simulation that failed. Raises InputError for
-    a result of another shape than that of time_s (n,).
+    The simulation has failed where the function raises an exception or the force is not finite. Raises
+    InputError where the result has another shape than time_s (n,).
     """
     started, time_s, message = time.perf_counter(), motion.times(STEP_S), ""
     try:
-        found = np.asarray(force(dict(theta), time_s, motion.at(time_s)), dtype=float)
+        force_n = np.asarray(force(dict(theta), time_s, motion.at(time_s)), dtype=float)
     except InputError:
         raise
-    except Exception as error:  # of somebody's function: it can be any
-        found, message = np.full(len(time_s), np.nan), _told(error)
-    return _simulation(motion, theta, time_s, found, model_hash, time.perf_counter() - started, message)
+    except Exception as error:  # the user's function can raise any exception
+        force_n, message = np.full(len(time_s), np.nan), _error_line(error)
+    return _simulation(motion, theta, time_s, force_n, model_hash, time.perf_counter() - started, message)
 
 
 def simulate_server(url: str, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
-    """A run of the model of a UM-Bridge server; one that the server refuses is a Simulation that failed."""
+    """Returns a run of the model of a UM-Bridge server; the run has failed where the server refuses it.
+
+    Raises InputError where the server has another number of inputs, and Unavailable where it does not answer.
+    """
     started, time_s, client = time.perf_counter(), motion.times(STEP_S), Client(url)
     config = {"protocol": {k: v.tolist() for k, v in vars(motion).items()}, "times_s": time_s.tolist()}
     try:
         name = client.name()
         sizes = client.sizes(name, "input", config)
         if sum(sizes) != len(theta):
-            found = f"a model of {sum(sizes)} inputs"
-            raise InputError(url, found, f"{len(theta)}: {', '.join(theta)}")
+            problem = f"a model of {sum(sizes)} inputs"
+            raise InputError(url, problem, f"{len(theta)}: {', '.join(theta)}")
         values = iter(theta.values())
         answer = client.evaluate(name, [[next(values) for _ in range(size)] for size in sizes], config)
         force_n, message = np.array(answer), ""
@@ -124,11 +132,11 @@ def _simulation(
     )
 
 
-def _told(error: Exception) -> str:
-    """Returns one line that says which error a user's function raised, and where."""
+def _error_line(error: Exception) -> str:
+    """Returns one line that says which error the user's function raised, and where."""
     last = traceback.extract_tb(error.__traceback__)[-1]
-    said, place = " ".join(str(error).split()), f"{Path(last.filename).name}, line {last.lineno}"
-    return f"{type(error).__name__}: {said} ({place})"
+    text, place = " ".join(str(error).split()), f"{Path(last.filename).name}, line {last.lineno}"
+    return f"{type(error).__name__}: {text} ({place})"
 
 
 def _is_url(forward: str) -> bool:
@@ -136,7 +144,7 @@ def _is_url(forward: str) -> bool:
 
 
 def _source(forward: str) -> Path:
-    """The file in which a function stands."""
+    """Returns the file in which a function is defined. Raises InputError where it cannot be found."""
     place, colon, function = forward.rpartition(":")
     if not colon or not function.isidentifier():
         expected = "FILE.py:FUNCTION, PACKAGE.MODULE:FUNCTION or http://HOST:PORT"
@@ -145,10 +153,10 @@ def _source(forward: str) -> Path:
         source = Path(place)
     else:
         try:
-            found = importlib.util.find_spec(place)
+            spec = importlib.util.find_spec(place)
         except (ImportError, ValueError):
-            found = None
-        source = Path(found.origin) if found is not None and found.origin else Path(place)
+            spec = None
+        source = Path(spec.origin) if spec is not None and spec.origin else Path(place)
     if not source.is_file():
         raise InputError(f"model.forward {forward}", f"no file {source}", "a Python file or module")
     return source
@@ -156,21 +164,24 @@ def _source(forward: str) -> Path:
 
 @lru_cache(maxsize=1)
 def _function(forward: str) -> Force:
-    """The function itself; its file is executed. Raises InputError where that fails, or there is none."""
+    """Returns the function, after its file is executed.
+
+    Raises InputError where the file cannot be imported or has no such function.
+    """
     source, (place, _, name) = _source(forward), forward.rpartition(":")
     try:
-        module = _executed(source) if place.endswith(".py") else importlib.import_module(place)
-    except Exception as error:  # of somebody's file: it can be any
-        found = f"{type(error).__name__}: {error}"
-        raise InputError(f"model.forward {source}", found, "a file that Python can import") from None
+        module = _module_of_file(source) if place.endswith(".py") else importlib.import_module(place)
+    except Exception as error:  # the user's file can raise any exception
+        problem = f"{type(error).__name__}: {error}"
+        raise InputError(f"model.forward {source}", problem, "a file that Python can import") from None
     function: Any = getattr(module, name, None)
     if not callable(function):
         raise InputError(f"model.forward {source}", f"no function {name}", "FILE.py:FUNCTION")
     return function  # type: ignore[no-any-return]
 
 
-def _executed(source: Path) -> ModuleType:
-    """A file as a module; it may import what lies beside it."""
+def _module_of_file(source: Path) -> ModuleType:
+    """Executes a file and returns it as a module. The file may import other files in its folder."""
     spec = importlib.util.spec_from_file_location(f"own_{source.stem}", source)
     assert spec is not None
     assert spec.loader is not None

@@ -1,10 +1,10 @@
-"""UM-Bridge, the protocol by which models and tools of uncertainty quantification talk: both ends of it.
+"""Client and server of UM-Bridge, a protocol that connects models with tools of uncertainty quantification.
 
 Seidelmann, L. et al. (2023), UM-Bridge: Uncertainty quantification and modeling bridge, JOSS 8(83), 4748.
-JSON over HTTP, version 1.0: a model takes vectors and a configuration, and gives vectors. The standard
-library is enough for it. The package `umbridge` has a server too, but one that listens to every network and
-opens shared memory by names that a client sends; this one does neither. Tests run both ends against that
-package.
+The protocol is JSON over HTTP, version 1.0: a model takes vectors and a configuration, and returns vectors.
+This module needs only the standard library. The package `umbridge` has a server too, but that server listens
+to every network and opens shared memory by names that a client sends; the server here does neither. The tests
+run client and server against that package.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from bayeskin.errors import InputError, Unavailable
 
 VERSION = 1.0
 CONNECT_S = 10.0
-MOST_BYTES = 64_000_000  # of a request; a protocol of a million corners takes half of it
+MOST_BYTES = 64_000_000  # largest size of a request; a protocol of a million corners takes half of it
 EXPECTED = "a server that speaks UM-Bridge"
 
 Vectors = list[list[float]]
 
 
 class Model(Protocol):
-    """Requests that a server answers. Each method raises InputError for input that it cannot use."""
+    """A model that a server offers. Each method raises InputError for input that it cannot use."""
 
     @property
     def name(self) -> str: ...
@@ -45,59 +45,61 @@ class Model(Protocol):
 
 
 class Refused(Exception):
-    """A server's answer to one evaluation: an error of the model, with its message."""
+    """Error with which a server answers an evaluation; it carries the message of the model."""
 
 
 @dataclass(frozen=True)
 class Client:
-    """A model behind a URL: ``http://HOST:PORT``, and ``#NAME`` where the server has several."""
+    """A model behind a URL: ``http://HOST:PORT``, with ``#NAME`` where the server has several models."""
 
     url: str
 
     def name(self) -> str:
-        """The model's name: the URL's, or the only one that the server has.
+        """Returns the name of the model: the name in the URL, or the only model of the server.
 
-        Raises InputError where it has another, or several, and Unavailable where nobody answers.
+        Raises InputError where the server does not have this model, or where the URL names none of several
+        models. Raises Unavailable where no server answers.
         """
-        models = self._ask("GET", "/Info", None).get("models")
-        asked = urlsplit(self.url).fragment
+        models = self._request("GET", "/Info", None).get("models")
+        wanted = urlsplit(self.url).fragment
         if not isinstance(models, list) or not models:
             raise InputError(self.url, "a server without models", EXPECTED)
-        if asked and asked not in models:
-            raise InputError(self.url, f"no model {asked!r}", f"one of {', '.join(map(str, models))}")
-        if not asked and len(models) > 1:
+        if wanted and wanted not in models:
+            raise InputError(self.url, f"no model {wanted!r}", f"one of {', '.join(map(str, models))}")
+        if not wanted and len(models) > 1:
             raise InputError(self.url, "several models", f"#NAME after the URL, one of {', '.join(models)}")
-        return asked or str(models[0])
+        return wanted or str(models[0])
 
     def sizes(self, name: str, which: str, config: Mapping[str, Any]) -> list[int]:
-        """Lengths of the model's vectors; `which` is "input" or "output"."""
-        said = self._ask("POST", f"/{which.capitalize()}Sizes", {"name": name, "config": config})
-        sizes = said.get(f"{which}Sizes")
+        """Returns the lengths of the model's vectors; `which` is "input" or "output"."""
+        answer = self._request("POST", f"/{which.capitalize()}Sizes", {"name": name, "config": config})
+        sizes = answer.get(f"{which}Sizes")
         if not isinstance(sizes, list) or not all(isinstance(size, int) for size in sizes):
             raise InputError(self.url, f"{which} sizes {sizes!r}", "a list of lengths")
         return sizes
 
     def evaluate(self, name: str, inputs: Vectors, config: Mapping[str, Any]) -> list[float]:
-        """All output vectors in a row. However long it takes: a model may need hours.
+        """Returns all output vectors as one list.
 
-        Raises Refused where the model fails, InputError where the answer has no numbers.
+        The call has no time limit, since a model may need hours. Raises Refused where the model fails, and
+        InputError where the answer has no numbers.
         """
-        said = self._ask("POST", "/Evaluate", {"name": name, "input": inputs, "config": config})
+        answer = self._request("POST", "/Evaluate", {"name": name, "input": inputs, "config": config})
         try:
-            return [float(value) for vector in said["output"] for value in vector]
+            return [float(value) for vector in answer["output"] for value in vector]
         except (KeyError, TypeError, ValueError):
             raise InputError(self.url, "an answer without numbers", "output vectors") from None
 
-    def _ask(self, method: str, path: str, content: Mapping[str, Any] | None) -> dict[str, Any]:
+    def _request(self, method: str, path: str, content: Mapping[str, Any] | None) -> dict[str, Any]:
         parts = _checked_url(self.url)
-        kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
-        connection = kind(parts.hostname or "", parts.port, timeout=CONNECT_S)
+        connect = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
+        connection = connect(parts.hostname or "", parts.port, timeout=CONNECT_S)
         body = None if content is None else json.dumps(content).encode()
         try:
             connection.connect()
             connection.sock.settimeout(None if path == "/Evaluate" else CONNECT_S)
-            head = {"Content-Type": "application/json"}
-            connection.request(method, parts.path.rstrip("/") + path, body, head)
+            headers = {"Content-Type": "application/json"}
+            connection.request(method, parts.path.rstrip("/") + path, body, headers)
             text = connection.getresponse().read()
         except (OSError, http.client.HTTPException) as error:
             raise Unavailable(self.url, f"no answer ({error or type(error).__name__})", EXPECTED) from None
@@ -111,7 +113,7 @@ def _checked_url(url: str) -> Any:
     try:
         parts = urlsplit(url)
         fits = parts.scheme in ("http", "https") and parts.hostname and (parts.port or True)
-    except ValueError:  # of a port that is no number
+    except ValueError:  # the port is not a number
         fits = False
     if not fits:
         raise InputError(url, "no address of a server", expected)
@@ -120,21 +122,21 @@ def _checked_url(url: str) -> Any:
 
 def _understood(url: str, text: bytes) -> dict[str, Any]:
     try:
-        said = json.loads(text)
+        answer = json.loads(text)
     except (ValueError, RecursionError):
-        said = None
-    if not isinstance(said, dict):
+        answer = None
+    if not isinstance(answer, dict):
         raise InputError(url, f"the answer {text[:40]!r}", EXPECTED)
-    if "error" in said:
-        error = said["error"]
+    if "error" in answer:
+        error = answer["error"]
         raise Refused(str(error.get("message", error)) if isinstance(error, dict) else str(error))
-    return said
+    return answer
 
 
 def server(model: Model, host: str, port: int) -> ThreadingHTTPServer:
-    """A server that listens already and answers from `serve_forever` on; one evaluation at a time.
+    """Returns a server that listens already. It answers once `serve_forever` is called.
 
-    Raises InputError where the address cannot be had.
+    It runs one evaluation at a time. Raises InputError where the address cannot be used.
     """
     handler = type("Handler", (_Handler,), {"model": model, "busy": threading.Lock()})
     try:
@@ -145,61 +147,61 @@ def server(model: Model, host: str, port: int) -> ThreadingHTTPServer:
 
 class _Server(ThreadingHTTPServer):
     def server_bind(self) -> None:
-        """Binds as any TCP server does; HTTP's asks the network for a name, which can take long."""
+        """Binds as a TCP server. An HTTP server would ask the network for a name, which can take long."""
         TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Nothing where a client has left before its answer: that is no fault of the server's."""
+        """Ignores a client that has left before its answer, since the server has made no error."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """The requests of the protocol that a model without derivatives answers."""
+    """Handles the requests of the protocol that a model without derivatives can answer."""
 
     model: Model
     busy: threading.Lock
-    timeout = 60  # of a client that sends nothing
+    timeout = 60  # seconds after which a client that sends nothing is dropped
 
     def do_GET(self) -> None:
         if self.path == "/Info":
-            self._say(200, {"protocolVersion": VERSION, "models": [self.model.name]})
+            self._send(200, {"protocolVersion": VERSION, "models": [self.model.name]})
         else:
             self._refuse(404, "UnsupportedFeature", f"no {self.path}")
 
     def do_POST(self) -> None:
         length = self.headers.get("Content-Length", "")
         if not (length.isdecimal() and len(length) < 20 and int(length) <= MOST_BYTES):
-            self.close_connection = True  # what follows cannot be told from the next request
+            self.close_connection = True  # the rest of this request could be mistaken for the next one
             self._refuse(400, "InvalidInput", f"Content-Length {length!r:.40}; expected at most {MOST_BYTES}")
             return
         body = self.rfile.read(int(length))
         try:
-            answer = self._answer(self.path, self._understood(body))
+            answer = self._answer(self.path, self._parsed(body))
         except (InputError, Refused) as error:
             self._refuse(400, "InvalidInput", str(error))
-        except Exception as error:  # of the model: the client is told, and the server stays
+        except Exception as error:  # the model failed: report it to the client and keep the server running
             self._refuse(500, "ModelError", f"{type(error).__name__}: {error}")
         else:
-            self._say(200, answer)
+            self._send(200, answer)
 
-    def _understood(self, body: bytes) -> dict[str, Any]:
+    def _parsed(self, body: bytes) -> dict[str, Any]:
         try:
-            asked = json.loads(body)
+            request = json.loads(body)
         except (ValueError, RecursionError):
-            asked = None
-        if not isinstance(asked, dict) or not isinstance(asked.get("config", {}), dict):
+            request = None
+        if not isinstance(request, dict) or not isinstance(request.get("config", {}), dict):
             raise Refused("the request is no JSON object with a config that is one")
-        if asked.get("name") != self.model.name:
-            raise Refused(f"no model {asked.get('name')!r:.60}; there is {self.model.name!r}")
-        return asked
+        if request.get("name") != self.model.name:
+            raise Refused(f"no model {request.get('name')!r:.60}; there is {self.model.name!r}")
+        return request
 
     def _answer(self, path: str, asked: Mapping[str, Any]) -> dict[str, Any]:
         config = asked.get("config", {})
         if path == "/ModelInfo":
-            without = dict.fromkeys(("Gradient", "ApplyJacobian", "ApplyHessian"), False)
-            return {"support": {"Evaluate": True, **without}}
+            unsupported = dict.fromkeys(("Gradient", "ApplyJacobian", "ApplyHessian"), False)
+            return {"support": {"Evaluate": True, **unsupported}}
         if path == "/InputSizes":
             return {"inputSizes": self.model.input_sizes(config)}
         if path == "/OutputSizes":
@@ -211,9 +213,9 @@ class _Handler(BaseHTTPRequestHandler):
         raise Refused(f"{path} is not supported")
 
     def _refuse(self, status: int, kind: str, message: str) -> None:
-        self._say(status, {"error": {"type": kind, "message": message}})
+        self._send(status, {"error": {"type": kind, "message": message}})
 
-    def _say(self, status: int, content: Mapping[str, Any]) -> None:
+    def _send(self, status: int, content: Mapping[str, Any]) -> None:
         body = json.dumps(content).encode()
         self.send_response(status)
         self.send_header("Content-Type", "application/json")
@@ -222,15 +224,15 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, *_: object) -> None:
-        """Nothing: each request of a sampler would be a line."""
+        """Writes no log, since each request of a sampler would be a line."""
 
 
 def _vectors(given: Any, sizes: Sequence[int]) -> Vectors:
-    """The input vectors, checked. Raises InputError unless they are finite numbers of the right count."""
+    """Returns the input vectors. Raises InputError unless they have these sizes and hold finite numbers."""
     fits = isinstance(given, list) and all(isinstance(vector, list) for vector in given)
     if not fits or [len(vector) for vector in given] != list(sizes):
-        found = [len(vector) for vector in given] if fits else type(given).__name__
-        raise InputError("input", f"vectors of lengths {found}", f"lengths {list(sizes)}")
+        lengths = [len(vector) for vector in given] if fits else type(given).__name__
+        raise InputError("input", f"vectors of lengths {lengths}", f"lengths {list(sizes)}")
     for value in (value for vector in given for value in vector):
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise InputError("input", repr(value), "finite numbers")

@@ -1,4 +1,8 @@
-"""The full finite-element model of the test: two-layer poro-hyperelastic skin under an extensometer."""
+"""The full finite-element model of an extensometer test on skin.
+
+The skin has two layers, cutis and subcutis. Each is a poro-hyperelastic solid. `simulate` runs the model that
+a `ModelSpec` describes.
+"""
 
 from bayeskin.finite_element.simulate import SOLVER_NAME, ModelSpec, simulate
 

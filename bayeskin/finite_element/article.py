@@ -1,19 +1,22 @@
-"""The article's own formulation, reproduced because its numbers rest on it; it is not a reaction.
+"""Reproduces the article's own formulation, because the article's numbers rest on it.
 
-Its released script differs from the total-Lagrangian model in four ways:
+The force of this formulation is not the reaction force on the pad. The script that was released with the
+article differs from the total-Lagrangian model in four ways:
 
-- after each step the mesh's corners move with the increment, and all gradients of the next step are
-  taken on that moved, straight-edged mesh, while the displacement stays total: the "F" in its
-  stress is I + du/dx on the start of the step, where a total-Lagrangian F is I + du/dX;
-- momentum balances the Cauchy stress of that F, t_eff - p I, and fluid mass the small-strain rate
-  div(du)/dt + S dp/dt - div((k/mu_f) grad p), both integrated over the start-of-step mesh;
-- force is the integral of t_xx - p over the pad's top face, whose normal is z, and is not doubled;
-- backward Euler on every 50th sample of the recording.
+- After each time step the mesh's corners move with the displacement increment. The next step takes all
+  gradients on this moved mesh, whose edges are straight, while the displacement stays total. So the "F" in
+  the stress is I + du/dx on the mesh at the start of the step, where a total-Lagrangian F is I + du/dX.
+- The momentum balance uses the Cauchy stress of this F, t_eff - p I. The fluid's mass balance uses the
+  small-strain rate div(du)/dt + S dp/dt - div((k/mu_f) grad p). Both are integrated over the mesh at the
+  start of the step.
+- The force is the integral of t_xx - p over the pad's top face, whose normal is z. It is not doubled.
+- Time integration is backward Euler on every 50th sample of the recording.
 
-Where the subcutis is soft beside the cutis (E_s below some 0.03 E_c), this updating is unstable: the force
-swings from step to step at a steady speed of the pads, and soon no step converges. Such a run has failed.
+This updating is unstable where the subcutis is soft compared with the cutis (E_s below about 0.03 E_c). The
+force then oscillates from step to step while the pads move at a steady speed, and soon no step converges. A
+run that does so counts as failed.
 
-Source: the script released with the article, physics unchanged (design: observation `article`).
+Source: the script released with the article, with its physics unchanged (observation `article`).
 """
 
 from __future__ import annotations
@@ -30,18 +33,22 @@ from bayeskin.finite_element.newton import EXTRAPOLATION_POINTS, Equations, Newt
 from bayeskin.finite_element.problem import Material, Problem
 from bayeskin.types import Array
 
-SOLVER_TOLERANCE = 1e-4  # of the largest displacement and pressure, before the last correction
+SOLVER_TOLERANCE = 1e-4  # relative to the largest displacement and pressure, before the last correction
 FACE_QUADRATURE_DEGREE = 6
-SMALLEST_STRESS = 1e-3  # of the shear modulus, below which no force is told from rounding
-SWING = 0.05  # of the largest force so far, to and fro at a steady speed: no relaxation does that
+SMALLEST_STRESS = 1e-3  # relative to the shear modulus; a force of smaller stresses is mere rounding error
+# relative to the largest force so far; at a steady speed no relaxation makes the force swing so much
+SWING = 0.05
 
 
 @dataclass(frozen=True)
 class PadFace:
-    """Quadrature on the pad's triangles: cells (f,), reference points and gradients, weights.
+    """Quadrature points on the f triangles of the pad, with q points on each triangle.
 
-    gradients (f, q, a, 3) of the cell's quadratic shape functions on the reference tetrahedron;
-    value_p (f, q, 4); corners (f, 3) node numbers; weight (q,) summing to 1/2.
+    cells (f,) : number of the tetrahedron that has the triangle as a face
+    gradients (f, q, a, 3) : gradients of the cell's quadratic shape functions on the reference tetrahedron
+    value_p (f, q, 4) : values of the cell's linear shape functions
+    corners (f, 3) : node numbers of the triangle's corners
+    weight (q,) : quadrature weights, which sum to 1/2
     """
 
     cells: np.ndarray
@@ -53,7 +60,10 @@ class PadFace:
 
 @dataclass
 class ArticleModel:
-    """The article's equations on one mesh and material; the state is x (dofs,) and the moved corners."""
+    """The article's equations for one mesh and material.
+
+    The state of a run is the vector of unknowns x (dofs,) and the coordinates of the moved corners (n, 3).
+    """
 
     problem: Problem
     material: Material
@@ -69,16 +79,20 @@ class ArticleModel:
         self._cells = np.ascontiguousarray(mesh.t.T)
         shape = space.weight.shape
         self._chunks = assembly.chunks(shape)
-        self._data = np.empty(self.problem.pattern.size)  # overwritten by each tangent
-        # displacement nodes 0..corners-1 are the mesh's vertices in scikit-fem's numbering
+        self._data = np.empty(self.problem.pattern.size)  # each tangent overwrites it
+        # `move` relies on scikit-fem's numbering: the first displacement nodes are the mesh's vertices
         assert np.array_equal(space.nodes_u[:, :4], self._cells)
 
     def step(
         self, x: Array, corners: Array, dt: float, pad_displacement_m: float, guess: Array | None
     ) -> tuple[Array, float] | None:
-        """New x (dofs,) and the force [N] after a step dt [s] that starts at x on `corners` (n, 3).
+        """Solves a backward Euler step of length dt [s].
 
-        Without a guess (the pads' speed has just changed) the step begins from the linear response.
+        x (dofs,), corners (n, 3) [m] : unknowns and mesh at the start of the step
+        pad_displacement_m : displacement of the pad at the end of the step
+        guess : starting point (dofs,) for the solver; None when the speed of the pads has just changed, so
+            that the solver starts from the linear response
+        Returns the new unknowns (dofs,) and the force [N], or None if the step does not converge.
         """
         jacobian = corners[self._cells[:, 1:]] - corners[self._cells[:, :1]]  # (e, 3 edges, 3)
         inverse = np.linalg.inv(jacobian)  # rows: coordinates; columns: edges
@@ -99,11 +113,12 @@ class ArticleModel:
         return new, self._force(new, corners, inverse)
 
     def move(self, corners: Array, old: Array, new: Array) -> Array:
-        """Corners (n, 3) after the increment from old to new x."""
+        """Returns the corners (n, 3) [m] after the increment from the old to the new unknowns (dofs,)."""
         n = len(corners)
         return corners + (new - old)[: 3 * n].reshape(n, 3)
 
     def _equations(self, old: Array, grad_u: Array, grad_p: Array, weight: Array, dt: float) -> Equations:
+        """Returns the equations of a step that starts at `old` (dofs,), with gradients on the mesh there."""
         s, m, pattern = self.problem.space, self.material, self.problem.pattern
 
         def evaluate(x: Array, chunk: assembly.Chunk) -> None:
@@ -122,17 +137,17 @@ class ArticleModel:
         def residual(x: Array) -> Array | None:
             out = np.zeros(s.dofs)
             for chunk in self._chunks:
-                c, at, found = chunk.cells, chunk.at, chunk.found
+                c, at, response = chunk.cells, chunk.at, chunk.found
                 evaluate(x, chunk)
                 smallest = article_law.respond(
                     at.deformation, at.pressure, at.gradient, m.mu[c], m.lam[c], m.mobility[c], m.storage[c],
-                    dt, divergence_old[c], pressure_old[c], found.stress, found.content, found.flux,
+                    dt, divergence_old[c], pressure_old[c], response.stress, response.content, response.flux,
                 )  # fmt: skip
                 if not smallest > 0.0:
                     return None
                 assembly.residual(
                     s.n_nodes, s.nodes_u[c], s.nodes_p[c], grad_u[c], grad_p[c], s.value_p, weight[c],
-                    found.stress, found.content, found.flux, out,
+                    response.stress, response.content, response.flux, out,
                 )  # fmt: skip
             return out[pattern.free] if np.isfinite(out).all() else None
 
@@ -167,7 +182,10 @@ class ArticleModel:
         )
 
     def _force(self, x: Array, corners: Array, inverse: Array) -> float:
-        """Integral of t_xx - p over the pad's face [N], gradients on the start-of-step mesh."""
+        """Returns the integral [N] of t_xx - p over the pad's face.
+
+        Gradients are taken on the mesh at the start of the step.
+        """
         s, m, face = self.problem.space, self.material, self._face
         u = x[: 3 * s.n_nodes].reshape(-1, 3)
         local_u = u[s.nodes_u[face.cells]]
@@ -190,16 +208,20 @@ def run(
     p_init: float,
     on_step: Callable[[float, Array, float], None],
 ) -> str:
-    """Backward Euler over the given samples (n,); calls `on_step(time_s, x, force_n)` for each.
+    """Runs backward Euler over the given samples (n,).
 
-    Returns "" or, for a run that failed, one line with the step, the time and a remedy.
+    The function calls `on_step(time_s, x, force_n)` after each step.
+
+    displacement_m : displacement of the LVDT; each pad moves half of it
+    p_init : initial interstitial pressure [Pa]
+    Returns an empty string, or for a run that failed one line with the step, the time and a remedy.
     """
     space = model.problem.space
     x = np.zeros(space.dofs)
     x[3 * space.n_nodes :] = p_init
     corners = model.problem.mesh.geometry.p.T.copy()
-    past, old_speed = [(0.0, x)], np.nan  # states since the pads' speed last changed
-    forces = [0.0]  # at those states
+    past, old_speed = [(0.0, x)], np.nan  # states since the speed of the pads last changed
+    forces = [0.0]  # the force at each of these states
     largest = SMALLEST_STRESS * float(model.material.mu.max()) * model.problem.lengths.quarter_pad_m2
     for n in range(1, len(time_s)):
         dt = float(time_s[n] - time_s[n - 1])
@@ -208,15 +230,15 @@ def run(
             past, forces = past[-1:], forces[-1:]
         pad = 0.5 * float(displacement_m[n])
         guess = extrapolate(past, float(time_s[n])) if len(past) > 1 else None
-        found = model.step(x, corners, dt, pad, guess)
-        if found is None and guess is not None:
-            found = model.step(x, corners, dt, pad, None)
-        if found is None:
+        solution = model.step(x, corners, dt, pad, guess)
+        if solution is None and guess is not None:
+            solution = model.step(x, corners, dt, pad, None)
+        if solution is None:
             return (
                 f"step {n} at t = {time_s[n]:.2f} s did not converge; the article's formulation has "
                 "fixed steps: try stiffer or more permeable parameters"
             )
-        new, force = found
+        new, force = solution
         corners = model.move(corners, x, new)
         largest, forces = max(largest, abs(force)), [*forces, force][-3:]
         turns = np.diff(forces)
@@ -232,7 +254,7 @@ def run(
 
 
 def _reference_gradients(element: skfem.Element, points: Array) -> Array:
-    """Gradients of the shape functions on the reference cell, (q, a, 3)."""
+    """Returns gradients (q, a, 3) of an element's shape functions at points (3, q) of the reference cell."""
     count = 10 if isinstance(element, skfem.ElementTetP2) else 4
     return np.ascontiguousarray(
         np.stack([element.lbasis(points, a)[1] for a in range(count)]).transpose(2, 0, 1)
@@ -240,6 +262,7 @@ def _reference_gradients(element: skfem.Element, points: Array) -> Array:
 
 
 def _pad_face(mesh: skfem.MeshTet, facets: np.ndarray) -> PadFace:
+    """Returns the quadrature points on the given facets of the mesh."""
     triangle, weight = skfem.quadrature.get_quadrature(skfem.ElementTriP1().refdom, FACE_QUADRATURE_DEGREE)
     barycentric = np.stack([1.0 - triangle.sum(axis=0), *triangle])  # (3, q)
     corners, cells = mesh.facets[:, facets].T, mesh.f2t[0, facets]

@@ -1,11 +1,12 @@
-"""Constitutive law of the article's formulation, on the mesh at the start of the step.
+"""The constitutive law of the article's formulation, on the mesh at the start of the time step.
 
-With "F" = I + grad u of the total displacement there, G = F^-1, and the small-strain fluid balance,
+Gradients are taken on that mesh. With "F" = I + grad u of the total displacement u, G = F^-1, and the
+small-strain fluid balance, the Cauchy stress t, the fluid content m and the flux Q are
 
     t = (mu (F F^T - I) + lambda ln(J) I) / J - p I
     m = div(u - u_old) + S (p - p_old) ,     Q = dt (k / mu_f) grad p
 
-(the article's equations 12, 13 and 26-29 as its script discretises them).
+These are the article's equations 12, 13 and 26-29, as its script discretises them.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -32,9 +33,12 @@ def respond(
     content,
     flux,
 ):
-    """Fills stress, content and flux; returns the smallest J (not positive: inside out).
+    """Fills stress, content and flux, and returns the smallest J = det F.
 
-    divergence_old, pressure_old (e, q) : tr F and p of the step's start on the same mesh
+    A J that is not positive means that a cell has turned inside out; the function then stops there.
+
+    mu, lam [Pa], mobility k/mu_f [m^2/(Pa s)] and storage S [1/Pa] are given for each cell (e,)
+    divergence_old, pressure_old (e, q) : tr F and p at the start of the step, on the same mesh
     """
     inverse = np.empty((3, 3))
     smallest = np.inf
@@ -70,7 +74,7 @@ def linearise(
     content_p,
     flux_g,
 ):
-    """Fills the derivatives of `respond`; what it does not fill is zero.
+    """Fills the derivatives of `respond`. The derivatives that it does not fill are zero.
 
     dt = -t_eff tr(G dF) + mu/J (dF F^T + F dF^T) + lambda/J tr(G dF) I - I dp
     """

@@ -1,11 +1,12 @@
-"""From unknowns to quadrature points and back: compiled, and ignorant of any constitutive law.
+"""Evaluates fields at quadrature points, and assembles the residual and its tangent from them.
 
-Down: F = I + grad u, p and grad p at the points. Up: with a law's stress P, fluid content m and flux Q
-there, the residual
+The functions are compiled and know no constitutive law. `evaluate` takes the unknowns to the quadrature
+points: it gives F = I + grad u, p and grad p there. `residual` takes a law's stress P, fluid content m and
+flux Q at the points back to the unknowns, with the test functions w and q:
 
     R_u = int P : grad w ,     R_p = - int ( q m + grad q . Q )
 
-and, with the law's derivatives, its tangent. Gradients are stored component by component, so that the
+`tangent` does the same with the law's derivatives. Gradients are stored component by component, so that the
 inner loops run over shape functions.
 """
 # mypy: disable-error-code="no-untyped-def"
@@ -21,25 +22,25 @@ import numpy as np
 
 from bayeskin.types import Array
 
-CHUNK = 256  # cells
+CHUNK = 256  # number of cells that are evaluated together
 FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
 SETTINGS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": FASTMATH}
 compiled = numba.njit(**SETTINGS)
 
 
 class AtPoints:
-    """Arrays (e, q, ...) at e cells' q quadrature points."""
+    """Base class of arrays (e, q, ...) at the q quadrature points of e cells."""
 
     @cached_property
     def flat(self) -> tuple[Array, ...]:
-        """Returns views (e q, ...) of the arrays, in their order, cell by cell."""
+        """Returns the arrays, in the order of the fields, as views (e q, ...) with points cell by cell."""
         arrays = (getattr(self, f.name) for f in fields(self))  # type: ignore[arg-type]
         return tuple(a.reshape(-1, *a.shape[2:]) for a in arrays)
 
 
 @dataclass(frozen=True)
 class Points(AtPoints):
-    """The place where a law acts: F (e, q, 3, 3), p (e, q), grad p (e, q, 3)."""
+    """The state in which a law is evaluated: F (e, q, 3, 3), p (e, q) and grad p (e, q, 3)."""
 
     deformation: Array
     pressure: Array
@@ -48,7 +49,7 @@ class Points(AtPoints):
 
 @dataclass(frozen=True)
 class Response(AtPoints):
-    """A law's answer: stress (e, q, 3, 3), fluid content (e, q), and flux (e, q, 3) over the step."""
+    """The response of a law: stress (e, q, 3, 3), fluid content (e, q), and flux (e, q, 3) over the step."""
 
     stress: Array
     content: Array
@@ -57,10 +58,11 @@ class Response(AtPoints):
 
 @dataclass(frozen=True)
 class Linearised(AtPoints):
-    """Derivatives of a `Response`; deformations and stresses as rows of nine.
+    """Derivatives of a `Response`. Deformations and stresses are written as rows of nine numbers.
 
-    stress_f (e, q, 9, 9), stress_p (e, q, 9), content_f (e, q, 9), content_p (e, q),
-    flux_f (e, q, 3, 9), flux_g (e, q, 3, 3) by the pressure's gradient
+    stress_f (e, q, 9, 9), content_f (e, q, 9), flux_f (e, q, 3, 9) : derivatives with respect to F
+    stress_p (e, q, 9), content_p (e, q) : derivatives with respect to p
+    flux_g (e, q, 3, 3) : derivative with respect to grad p
     """
 
     stress_f: Array
@@ -73,9 +75,11 @@ class Linearised(AtPoints):
 
 @dataclass(frozen=True)
 class Chunk:
-    """Some cells, few enough that what is computed of them stays in the cache, and room for it.
+    """A group of cells whose arrays are small enough for the processor's cache, and these arrays.
 
-    points : places of their quadrature points among all, cell by cell
+    cells : the cells of the group
+    points : the quadrature points of these cells, among all points in order of cells
+    at, found, by : storage for the state, the response and its derivatives
     """
 
     cells: slice
@@ -86,7 +90,10 @@ class Chunk:
 
 
 def chunks(shape: tuple[int, int]) -> list[Chunk]:
-    """Returns all (e, q) points, chunk by chunk, which share one room: each is done with before the next."""
+    """Returns the chunks that together contain all cells of a model with (e, q) points.
+
+    All chunks share the same arrays, so each chunk must be used up before the next is evaluated.
+    """
     size = min(CHUNK, shape[0]), shape[1]
     room = (
         Points(np.empty((*size, 3, 3)), np.empty(size), np.empty((*size, 3))),
@@ -101,12 +108,16 @@ def chunks(shape: tuple[int, int]) -> list[Chunk]:
 
 
 def _first(count: int, arrays: Any) -> Any:
+    """Returns the arrays of the first `count` cells, as views."""
     return type(arrays)(*(getattr(arrays, f.name)[:count] for f in fields(arrays)))
 
 
 @compiled
 def evaluate(x, n_nodes, nodes_u, nodes_p, grad_u, grad_p, value_p, deformation, pressure, gradient):
-    """Fills F, p and grad p at the points from the unknowns x (dofs,): 3 n_nodes displacements, pressures."""
+    """Fills F, p and grad p at the points from the unknowns x (dofs,).
+
+    x holds 3 n_nodes displacements, then the pressures.
+    """
     na, nb = nodes_u.shape[1], nodes_p.shape[1]
     u, p = np.empty((3, na)), np.empty(nb)
     for e in range(nodes_u.shape[0]):
@@ -135,7 +146,7 @@ def evaluate(x, n_nodes, nodes_u, nodes_p, grad_u, grad_p, value_p, deformation,
 
 @compiled
 def residual(n_nodes, nodes_u, nodes_p, grad_u, grad_p, value_p, weight, stress, content, flux, out):
-    """Adds the residual (dofs,) to `out`."""
+    """Adds the residual to `out` (dofs,)."""
     na, nb = nodes_u.shape[1], nodes_p.shape[1]
     force, fluid = np.empty((3, na)), np.empty(nb)
     for e in range(nodes_u.shape[0]):
@@ -177,9 +188,13 @@ def tangent(
     position,
     data,
 ):
-    """Adds the tangent to the sparse `data` at `position` (e, nd, nd), -1 where a row is not wanted."""
+    """Adds the tangent to the entries `data` of a sparse matrix.
+
+    position (e, nd, nd) : place in `data` of each entry of each cell's matrix; -1 for a row that is not
+        needed
+    """
     na, nb = grad_u.shape[3], grad_p.shape[3]
-    solid = np.empty((3, na, 3, na))  # component and node of the row, component and node of the column
+    solid = np.empty((3, na, 3, na))  # axes: component and node of the row, component and node of the column
     column = np.empty((3, na, nb))
     row = np.empty((nb, 3, na))
     fluid = np.empty((nb, nb))
@@ -255,13 +270,14 @@ def tangent(
 
 @compiled
 def _add(data, place, value):
+    """Adds a value at a place; a negative place means that the value is not needed."""
     if place >= 0:
         data[place] += value
 
 
 @compiled
 def inverse_and_determinant(f, inverse):
-    """Fills the inverse (3, 3) of F (3, 3); returns its determinant."""
+    """Fills the inverse (3, 3) of F (3, 3), and returns the determinant of F."""
     for i in range(3):
         i1, i2 = (i + 1) % 3, (i + 2) % 3
         for k in range(3):

@@ -1,8 +1,9 @@
-"""Positions of the bricks' faces: lines along x, y and z, graded toward the edges of pads and guard.
+"""Places the faces of the bricks: grid lines along x, y and z, graded toward the edges of pads and guard.
 
-At these edges a clamped surface meets a free one and the stress is singular, so that is where bricks are
-small, and where a refinement divides them. The lines of the article's device are a pattern: each of its
-stretches, such as the gauge or a layer of skin, is drawn over the same stretch of another device.
+At these edges a clamped surface meets a free one, and the stress is singular. The bricks are therefore small
+there, and a refinement divides them there. The lines of the article's device serve as a pattern. The pattern
+has sections, such as the gauge or a layer of skin. Each section is stretched to the length that it has on the
+device at hand.
 """
 
 from __future__ import annotations
@@ -16,13 +17,14 @@ from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.types import Array
 
-_TOWARD_EDGE = 0.25  # where a cell beside an edge is divided: a quarter of its width from it
+_TOWARD_EDGE = 0.25  # a cell beside an edge is divided at this share of its width from the edge
 
-# The pattern of each stretch: its length in the article's device, and its inner lines, from its start [mm].
-# Along x: half the gauge, pad, gap, guard, free skin beyond. Along y: half the pad, gap, guard, free skin.
-# Along z: subcutis, cutis. Free skin has coarse bricks: a soft cutis on a stiff subcutis would fold there,
-# and fine bricks try to. Bricks are smaller at the edges that carry what the load cell measures: those of the
-# article's pad are shielded by its guard, those of a bare pad, and of a guard that is measured, too, are not.
+# A stretch is one section of the pattern: its length on the article's device, and the positions of its inner
+# lines, measured from its start [mm]. The sections along x are half the gauge, pad, gap, guard, and the free
+# skin beyond. Along y they are half the pad, gap, guard, and free skin. Along z they are subcutis and cutis.
+# Free skin has coarse bricks, because with fine ones a soft cutis on a stiff subcutis tends to fold there.
+# Bricks are smaller at edges that carry much of the measured force. The guard shields the edges of the
+# article's pad. Nothing shields the edges of a pad without a guard, or of a guard that is also measured.
 Stretch = tuple[float, tuple[float, ...]]
 Pattern = tuple[tuple[Stretch, ...], ...]
 _COARSEST: Pattern = (
@@ -60,23 +62,27 @@ _COARSE_UNGUARDED: Pattern = (
 def brick_lines(
     refinement: int, geometry: Geometry = Geometry(), like: Geometry | None = None
 ) -> tuple[Array, ...]:
-    """Coordinates of the bricks' faces along x, y and z before rolling [m].
+    """Returns the coordinates [m] of the bricks' faces along x, y and z, before rolling.
 
-    refinement : 1 is the default, 0 coarser, each higher one has a further line on either side of every edge
-    like : as many lines as this geometry has, moved with the layers; its pads and guard must be the same
+    refinement : 1 is the default and 0 is coarser; each level above 1 adds a line on either side of every
+        edge
+    geometry : device and tissue
+    like : a geometry with the same pads and guard. The result then has the lines of this geometry, moved
+        along z to the layers of `geometry`
 
-    Raises InputError for another device than that of `like`.
+    Raises InputError if the pads or the guard differ from those of `like`.
     """
     if like is None:
         return tuple(1e-3 * np.array(axis) for axis in _lines_mm(refinement, geometry))
     if (like.along_m, like.across_m) != (geometry.along_m, geometry.across_m):
         raise InputError("geometry", "other pads or another guard", "the lengths of the device it is like")
     x, y, z = _lines_mm(refinement, like)
-    old, new = ([0.0, _mm(one.subcutis_m), _mm(one.thickness_m)] for one in (like, geometry))
+    old, new = ([0.0, _mm(tissue.subcutis_m), _mm(tissue.thickness_m)] for tissue in (like, geometry))
     return 1e-3 * np.array(x), 1e-3 * np.array(y), 1e-3 * np.interp(z, old, new)
 
 
 def _lines_mm(refinement: int, geometry: Geometry) -> list[tuple[float, ...]]:
+    """Returns the lines [mm] along x, y and z for a level of refinement."""
     length, width, thickness = geometry.box_m
     edges = [[_mm(x) for x in ends] for ends in (geometry.along_m, geometry.across_m, (thickness,))]
     stops = [
@@ -86,14 +92,14 @@ def _lines_mm(refinement: int, geometry: Geometry) -> list[tuple[float, ...]]:
     ]
     coarsest, coarse = _patterns(geometry)
     pattern = coarse if refinement else coarsest
-    lines = [_drawn(*axis) for axis in zip(stops, pattern, strict=True)]
+    lines = [_stretched(*axis) for axis in zip(stops, pattern, strict=True)]
     for _ in range(refinement - 1):
-        lines = [_divided(*axis) for axis in zip(lines, edges, strict=True)]
+        lines = [_divided_at_edges(*axis) for axis in zip(lines, edges, strict=True)]
     return lines
 
 
 def _patterns(geometry: Geometry) -> tuple[Pattern, Pattern]:
-    """Those of refinement 0 and 1."""
+    """Returns the patterns of refinements 0 and 1 for a geometry."""
     if geometry.guard is None:
         return _COARSEST_UNGUARDED, _COARSE_UNGUARDED
     if geometry.force_on == "pad and guard":
@@ -102,19 +108,20 @@ def _patterns(geometry: Geometry) -> tuple[Pattern, Pattern]:
 
 
 def _mm(length_m: float) -> float:
-    """Millimetres, without the rounding error of the product."""
+    """Returns a length in millimetres, without the rounding error of the product."""
     return round(1e3 * length_m, 12)
 
 
-def _drawn(stops: Sequence[float], stretches: Sequence[Stretch]) -> tuple[float, ...]:
-    """Lines of one axis: the pattern's stretches, each drawn between two stops."""
+def _stretched(stops: Sequence[float], stretches: Sequence[Stretch]) -> tuple[float, ...]:
+    """Returns the lines of one axis: each section of the pattern, stretched between two stops."""
     lines = [stops[0]]
     for (start, end), (length, inner) in zip(pairwise(stops), stretches, strict=True):
         lines += [*(start + (end - start) * line / length for line in inner), end]
     return tuple(lines)
 
 
-def _divided(lines: tuple[float, ...], edges: Sequence[float]) -> tuple[float, ...]:
+def _divided_at_edges(lines: tuple[float, ...], edges: Sequence[float]) -> tuple[float, ...]:
+    """Returns the lines of one axis with a further line on either side of each edge."""
     new = [a + _TOWARD_EDGE * (b - a) for a, b in pairwise(lines) if a in edges]
     new += [b - _TOWARD_EDGE * (b - a) for a, b in pairwise(lines) if b in edges]
     return tuple(sorted({*lines, *new}))

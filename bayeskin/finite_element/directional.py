@@ -1,14 +1,15 @@
-"""The base model's exact tangent, applied to several directions at once.
+"""Applies the base model's exact tangent to several directions at once.
 
-With G = F^-1, A = G dF and s = F^-T grad p, the base law's answers (`poroelastic`) change by
+The gradients of the force with respect to the parameters need this product (`gradients`). With G = F^-1,
+A = G dF and s = F^-T grad p, the responses of the base law (`poroelastic`) change by
 
     dP = mu dF + (mu - lambda ln J + p J) (A G)^T + [(lambda - p J) tr A - J dp] F^-T
          + dmu (F - F^-T) + dlambda ln J F^-T
     dm = dJ - dJ* + dJ S (p - p*) + J S (dp - dp*) ,  dJ = J tr A
     dQ = h J [ k/mu_f (tr A G s - A G s + G F^-T (d grad p - dF^T s)) + d(k/mu_f) G s ]
 
-F, J and G are found once for all directions, and what leads from unknowns to the points and back is a
-product of small dense matrices a cell. Three directions cost as much as two to three residuals.
+F, J and G are computed once for all directions. The maps from the unknowns to the quadrature points and back
+are products of small dense matrices for each cell. Three directions cost as much as two to three residuals.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -24,10 +25,12 @@ from bayeskin.types import Array
 
 
 class TangentAction:
-    """Derivatives of a solved stage's residual, J and p along r directions (of a model without laws).
+    """Gives the derivatives of a solved stage's residual, J and p along r directions.
+
+    The model must not have laws beyond the base law.
 
     rates : derivatives of mu, lam and mobility, (e, r) each
-    volume_old, pressure_old : of J* and p*, (e, q, r)
+    volume_old, pressure_old : derivatives of J* and p*, (e, q, r) each
     """
 
     def __init__(
@@ -48,7 +51,10 @@ class TangentAction:
         )  # fmt: skip
 
     def __call__(self, x: Array) -> Evaluated:
-        """Derivatives: residual (dofs, r), J and p (e, q, r); x (dofs, r) are those of the unknowns."""
+        """Returns the derivatives of the residual (dofs, r), and of J and p (e, q, r).
+
+        x (dofs, r) : derivatives of the unknowns
+        """
         n, r = 3 * self._space.n_nodes, x.shape[1]
         out, volume = np.zeros_like(x), np.empty_like(self._volume_old)
         pressure = np.empty_like(volume)
@@ -79,12 +85,13 @@ class TangentAction:
 
 
 def _cells(space: TaylorHood) -> list[slice]:
+    """Returns slices that divide the cells into chunks."""
     count = len(space.nodes_u)
     return [slice(a, min(a + assembly.CHUNK, count)) for a in range(0, count, assembly.CHUNK)]
 
 
 def _matrices(gradients: Array, c: slice) -> Array:
-    """Gradients (e, q, 3, a) of some cells as (e, 3 q, a)."""
+    """Returns the gradients (e, q, 3, a) of the cells `c` as matrices (e, 3 q, a)."""
     return gradients[c].reshape(c.stop - c.start, -1, gradients.shape[3])
 
 
@@ -110,8 +117,15 @@ def _respond(
     flux,
     volume,
 ):
-    """Turns dF into dP in `stress` (e, q, j, i, r), dp into dm in `content` (e, q, r), d grad p into dQ in
-    `flux` (e, q, 3, r), all times the quadrature weight; fills dJ in `volume` (e, q, r)."""
+    """Replaces the derivatives of the state by those of the response, in place.
+
+    stress (e, q, j, i, r) : dF before, dP after
+    content (e, q, r) : dp before, dm after
+    flux (e, q, 3, r) : d grad p before, dQ after
+    volume (e, q, r) : receives dJ
+
+    The function multiplies dP, dm and dQ by the quadrature weight.
+    """
     g, a, d = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     spatial, along, turned, back = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for e in range(pressure.shape[0]):
@@ -162,7 +176,7 @@ def _respond(
 
 @compiled
 def _add(nodes, values, sign, out):
-    """Adds what cells have at their nodes (e, a, n) to the nodes (m, n)."""
+    """Adds the values (e, a, n) at the cells' nodes, times `sign`, to `out` (m, n) for all nodes."""
     for e in range(nodes.shape[0]):
         for a in range(nodes.shape[1]):
             for k in range(values.shape[2]):

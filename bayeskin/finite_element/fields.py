@@ -1,12 +1,13 @@
-"""Fields of a run for ParaView: an XDMF series with its HDF5 data beside it.
+"""Writes the fields of a run for ParaView: a time series in XDMF, with its data in an HDF5 file beside it.
 
-Written on the corners and cells of the reference mesh (warp by `displacement` in ParaView):
+The fields belong to the corners and cells of the reference mesh. In ParaView, use "Warp By Vector" with
+`displacement` to see the deformed skin.
 
-- displacement [m] and pressure [Pa] at the corners;
-- porosity ``1 - (1 - porosity_0) / J`` (the solid's mass balance), effective stress
-  ``P_eff F^T / J`` and total stress ``effective - p I`` [Pa], and fluid velocity
-  ``v_l = -k / (mu_f porosity) grad p + v_s`` [m/s] (the article's Darcy law, with the fluid's
-  viscosity mu_f), as means over each cell.
+- Displacement [m] and pressure [Pa] are given at the corners.
+- The other fields are means over each cell: porosity ``1 - (1 - porosity_0) / J`` (from the solid's mass
+  balance), effective stress ``P_eff F^T / J`` and total stress ``effective - p I`` [Pa], and fluid velocity
+  ``v_l = -k / (mu_f porosity) grad p + v_s`` [m/s] (the article's Darcy law, with the fluid's viscosity
+  mu_f).
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ import skfem
 from bayeskin.finite_element.problem import Constants, Problem, material
 from bayeskin.types import Array
 
-SLACK_S = 1e-6  # by which a run's last time, found as a difference, may miss the protocol's end
+SLACK_S = 1e-6  # the last time of a run is a difference, and may miss the protocol's end by so much
 
 
 @dataclass(frozen=True)
 class Fields:
-    """Fields at one time. c corners, e cells.
+    """The fields at one time, at c corners and in e cells.
 
-    displacement (c, 3) [m], pressure (c,) [Pa], porosity (e,), effective_stress and total_stress
-    (e, 3, 3) Cauchy [Pa], fluid_velocity (e, 3) [m/s]
+    displacement (c, 3) [m], pressure (c,) [Pa], porosity (e,), effective_stress and total_stress (e, 3, 3),
+    both Cauchy stresses [Pa], fluid_velocity (e, 3) [m/s]
     """
 
     displacement: Array
@@ -46,7 +47,10 @@ class Fields:
 
 
 def fields_of(problem: Problem, theta: Mapping[str, float], x: Array, rate: Array) -> Fields:
-    """Fields from the unknowns x (dofs,) and their rate (dofs,) [per s]."""
+    """Returns the fields at the unknowns x (dofs,) with their rate (dofs,) [per s].
+
+    theta : parameters of the run
+    """
     s, c = problem.space, Constants()
     cells = material(theta, problem.mesh.cutis)
     u, v = (a[: 3 * s.n_nodes].reshape(-1, 3)[s.nodes_u] for a in (x, rate))
@@ -65,7 +69,7 @@ def fields_of(problem: Problem, theta: Mapping[str, float], x: Array, rate: Arra
     gradient = np.einsum("eqji,eqjb,eb->eqi", inverse, s.grad_p, p)
     weight = s.weight / s.weight.sum(axis=1, keepdims=True)
     darcy = -(cells.mobility[:, None] / porosity)[..., None] * gradient
-    corner_u = _at_corners(problem, x)
+    corner_u = _corner_displacement(problem, x)
     corner_p = np.zeros(len(corner_u))
     corner_p[_corner_numbers(problem)] = x[3 * s.n_nodes + s.nodes_p]
     return Fields(
@@ -75,23 +79,29 @@ def fields_of(problem: Problem, theta: Mapping[str, float], x: Array, rate: Arra
         effective_stress=np.einsum("eq,eqij->eij", weight, effective),
         total_stress=np.einsum("eq,eqij->eij", weight, total),
         fluid_velocity=np.einsum("eq,eqi->ei", weight, darcy)
-        + np.einsum("a,eai->ei", _in_the_mean(s.nodes_u.shape[1]), v),
+        + np.einsum("a,eai->ei", _node_weights(s.nodes_u.shape[1]), v),
     )
 
 
 @cache
-def _in_the_mean(nodes: int) -> Array:
-    """Weight (a,) of each displacement node in the mean over its cell, a tetrahedron of 10 or a brick of 27,
-    taken as evenly stretched."""
+def _node_weights(nodes: int) -> Array:
+    """Returns the weight (a,) of each displacement node in the mean over its cell.
+
+    The cell is a tetrahedron with 10 nodes or a brick with 27. The weights are exact for a cell that is a
+    uniformly stretched reference cell.
+    """
     element = {10: skfem.ElementTetP2, 27: skfem.ElementHex2}[nodes]()
     points, weight = skfem.quadrature.get_quadrature(element.refdom, 2 * element.maxdeg)
     return np.array([element.lbasis(points, i)[0] @ weight / weight.sum() for i in range(nodes)])
 
 
 class StatesAt:
-    """Keeps a run's unknowns at chosen times, linear between its steps; give `on_state` to `simulate`.
+    """Keeps a run's unknowns at chosen times. To use it, pass its method `on_state` to `simulate`.
 
-    states : unknowns (dofs,) at those of times_s (increasing) that the run has reached
+    Between two time steps the unknowns are interpolated linearly.
+
+    times_s : the chosen times [s], in increasing order
+    states : the unknowns (dofs,) at those of these times that the run has reached
     """
 
     def __init__(self, times_s: Sequence[float], problem: Problem, p_init_pa: float) -> None:
@@ -102,7 +112,7 @@ class StatesAt:
         self._before = 0.0, start
 
     def on_state(self, time_s: float, x: Array, force_n: float) -> None:
-        """Takes the next state of the run."""
+        """Receives the next state of the run."""
         before_s, before = self._before
         while len(self.states) < len(self.times_s) and self.times_s[len(self.states)] <= time_s + SLACK_S:
             span = time_s - before_s
@@ -112,7 +122,10 @@ class StatesAt:
 
 
 class FieldWriter:
-    """Collects a run's states and writes them as one XDMF series; give `on_state` to `simulate`."""
+    """Collects a run's states and writes them as one XDMF series.
+
+    To use it, pass its method `on_state` to `simulate`, and call `write` when the run has ended.
+    """
 
     def __init__(self, directory: Path | str, problem: Problem, theta: Mapping[str, float]) -> None:
         self.path = Path(directory) / "fields.xdmf"
@@ -124,7 +137,10 @@ class FieldWriter:
         self._states.append((time_s, x.copy()))
 
     def write(self) -> tuple[Path, Path]:
-        """Writes the series, whole or not at all; returns the paths of the XDMF and of the HDF5 file."""
+        """Writes the series and returns the paths of the XDMF file and of the HDF5 file.
+
+        If writing fails, no incomplete file is left.
+        """
         paths = self.path, self.path.with_suffix(".h5")
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=self.path.parent, prefix=".fields.") as partial:
@@ -134,12 +150,13 @@ class FieldWriter:
         return paths
 
     def _write_into(self, directory: Path) -> None:
+        """Writes both files into an existing folder."""
         mesh = self._problem.mesh.geometry
         kind = "hexahedron" if isinstance(mesh, skfem.MeshHex) else "tetra"
         corners = _corner_numbers(self._problem)
         order = list(_VTK_HEXAHEDRON) if kind == "hexahedron" else list(range(4))
         points = mesh.doflocs.T[: corners.max() + 1]
-        # meshio opens the HDF5 file by its bare name, so the folder must be the current one
+        # meshio opens the HDF5 file by its name alone, so the current folder must be the one of the file
         with contextlib.chdir(directory), meshio.xdmf.TimeSeriesWriter(self.path.name) as writer:
             writer.write_points_cells(points, [(kind, corners[:, order])])
             for (before_s, before), (time_s, x) in zip(
@@ -160,17 +177,20 @@ class FieldWriter:
                 )
 
 
-# scikit-fem's corner order of a brick, rearranged to VTK's
+# VTK's order of the corners of a brick, as numbers in scikit-fem's order
 _VTK_HEXAHEDRON = (0, 3, 6, 2, 1, 5, 7, 4)
 
 
 def _corner_numbers(problem: Problem) -> np.ndarray:
-    """Vertex numbers of each cell's corners in the order of `nodes_p`, (e, 4 or 8)."""
+    """Returns the vertex numbers (e, 4 or 8) of each cell's corners, in the order of `nodes_p`."""
     return problem.mesh.geometry.t.T
 
 
-def _at_corners(problem: Problem, x: Array) -> Array:
-    """Displacement (c, 3) at the vertices: the first shape functions of a cell belong to its corners."""
+def _corner_displacement(problem: Problem, x: Array) -> Array:
+    """Returns the displacement (c, 3) [m] at the corners.
+
+    It relies on the first shape functions of a cell being those of its corners.
+    """
     s, corners = problem.space, _corner_numbers(problem)
     out = np.zeros((corners.max() + 1, 3))
     out[corners] = x[: 3 * s.n_nodes].reshape(-1, 3)[s.nodes_u[:, : corners.shape[1]]]

@@ -1,6 +1,7 @@
-"""A mesh of one's own from gmsh: with the article's names for boundaries and layers, flat, in metres.
+"""Reads a user's mesh from a gmsh file.
 
-It is compared with the device and the tissue that it is said to be a mesh of, before it is rolled.
+The mesh must be flat, in metres, and have the article's names for boundaries and layers. Before the mesh is
+rolled onto the arm, it is compared with the lengths of the device and the tissue that it should represent.
 """
 
 from __future__ import annotations
@@ -27,37 +28,44 @@ GMSH_NAMES = {
     "bottom": "bottom",
 }
 GMSH_LAYERS = {"bottom_layer": "subcutis", "top_layer": "cutis"}
-LONGEST_M = 2.0  # no mesh of skin is longer
+LONGEST_M = 2.0  # a mesh of skin that is longer than this must be in another unit
 PLAN_TOLERANCE_M, DEPTH_TOLERANCE_M = 0.5e-3, 0.1e-3  # along x and y, and along z
 
 
 def read_gmsh(path: Path | str, geometry: Geometry = Geometry()) -> SkinMesh:
-    """A flat gmsh file with the article's names for boundaries and layers, rolled after loading.
+    """Returns the mesh of a flat gmsh file, rolled onto the arm.
 
-    Raises InputError if the file is absent or unreadable, holds no tetrahedra or some of no layer, lacks a
-    name, is in millimetres, or is a mesh of other lengths than those of `geometry`.
+    The file must use the article's names for boundaries and layers.
+
+    Raises InputError if the file is absent or unreadable, has no tetrahedra or some that belong to no layer,
+    lacks a name, is in millimetres, or if its lengths differ from those of `geometry`.
     """
     path = Path(path)
     if not path.is_file():
         raise InputError(path, "no such file", "a gmsh mesh")
     try:
-        with redirect_stderr(io.StringIO()), redirect_stdout(io.StringIO()):  # meshio complains at length
-            return _assembled(path, meshio.read(path, file_format="gmsh"), geometry)
+        with redirect_stderr(io.StringIO()), redirect_stdout(io.StringIO()):  # meshio prints long warnings
+            return _skin_mesh(path, meshio.read(path, file_format="gmsh"), geometry)
     except InputError:
         raise
-    except (Exception, SystemExit) as error:  # a damaged file: meshio and the indices raise of every kind
+    except (Exception, SystemExit) as error:  # a damaged file can raise almost any error
         raise InputError(path, f"not readable as gmsh ({type(error).__name__})", "a gmsh 4.1 mesh") from None
 
 
 @dataclass(frozen=True)
 class _Cells:
-    """Cells of one kind (n, corners), and by name which of them carry it (n,); one may carry several."""
+    """The cells of one kind, and the names that they carry. A cell may carry several names.
+
+    corners (n, corners) : node numbers of each cell's corners
+    named : for each name, which cells carry it (n,)
+    """
 
     corners: np.ndarray
     named: dict[str, np.ndarray]
 
 
-def _assembled(path: Path, raw: meshio.Mesh, geometry: Geometry) -> SkinMesh:
+def _skin_mesh(path: Path, raw: meshio.Mesh, geometry: Geometry) -> SkinMesh:
+    """Returns the rolled mesh. Raises InputError for a mesh that `read_gmsh` does not accept."""
     names = {gmsh: name for gmsh, name in GMSH_NAMES.items() if name != "guard" or geometry.guard is not None}
     missing = [n for n in (*names, *GMSH_LAYERS) if n not in raw.field_data]
     if missing:
@@ -85,6 +93,7 @@ def _assembled(path: Path, raw: meshio.Mesh, geometry: Geometry) -> SkinMesh:
 
 
 def _cells(raw: meshio.Mesh, kind: str, corners: int) -> _Cells:
+    """Returns all cells of one of meshio's kinds, with the names that they carry."""
     blocks = [k for k, block in enumerate(raw.cells) if block.type == kind]
     if not blocks:
         return _Cells(np.empty((0, corners), int), {name: np.empty(0, bool) for name in raw.field_data})
@@ -93,7 +102,10 @@ def _cells(raw: meshio.Mesh, kind: str, corners: int) -> _Cells:
 
 
 def _carries(raw: meshio.Mesh, block: int, name: str) -> np.ndarray:
-    """Returns which cells of a block carry a name (n,); older formats of gmsh have one name for each cell."""
+    """Returns which cells of a block carry a name (n,).
+
+    Older formats of gmsh have exactly one name for each cell.
+    """
     if name not in raw.cell_sets:
         return np.asarray(raw.cell_data["gmsh:physical"][block] == raw.field_data[name][0])
     carries = np.zeros(len(raw.cells[block].data), dtype=bool)
@@ -102,6 +114,7 @@ def _carries(raw: meshio.Mesh, block: int, name: str) -> np.ndarray:
 
 
 def _check_units(path: Path, points: Array) -> None:
+    """Raises InputError if the coordinates (3, n) look like millimetres."""
     longest_m = float(np.ptp(points, axis=1).max())
     if longest_m > LONGEST_M:
         expected = "coordinates in metres (in gmsh: Mesh.ScalingFactor = 0.001 before it is saved)"
@@ -109,12 +122,12 @@ def _check_units(path: Path, points: Array) -> None:
 
 
 def _check_layers(path: Path, points: Array, cells: np.ndarray, solid: _Cells, geometry: Geometry) -> None:
-    """Raises InputError unless each cell is of one layer, and each layer as thick as it is said to be."""
+    """Raises InputError unless each cell belongs to one layer, and each layer has the expected thickness."""
     layers = [solid.named[name] for name in GMSH_LAYERS]
     stray = int(np.sum(layers[0] == layers[1]))
     if stray:
-        found = f"{stray} tetrahedra of no layer, or of both"
-        raise InputError(path, found, f"each in one of {', '.join(GMSH_LAYERS)}")
+        message = f"{stray} tetrahedra of no layer, or of both"
+        raise InputError(path, message, f"each in one of {', '.join(GMSH_LAYERS)}")
     depths = (0.0, geometry.subcutis_m), (geometry.subcutis_m, geometry.thickness_m)
     for name, inside, depth in zip(GMSH_LAYERS, layers, depths, strict=True):
         if not inside.any():
@@ -123,7 +136,7 @@ def _check_layers(path: Path, points: Array, cells: np.ndarray, solid: _Cells, g
 
 
 def _check_guard(path: Path, surface: _Cells, geometry: Geometry) -> None:
-    """Raises InputError for a guard that the device lacks, or that is the pad, too."""
+    """Raises InputError if the device has no guard but the mesh does, or if guard and pad share triangles."""
     guard = surface.named.get("u_right", np.empty(0, bool))
     if geometry.guard is None and guard.any():
         raise InputError(f"{path}: u_right", "a guard", "none, as this device has none")
@@ -132,7 +145,7 @@ def _check_guard(path: Path, surface: _Cells, geometry: Geometry) -> None:
 
 
 def _check_boundary(where: str, points: Array, name: str, geometry: Geometry) -> None:
-    """Raises InputError unless the corners (3, n) of a boundary lie where the geometry has it."""
+    """Raises InputError unless the corners (3, n) of a boundary extend as far as in the geometry."""
     top = (geometry.thickness_m,) * 2
     expected: dict[str, list[tuple[str, tuple[float, ...]]]] = {
         "pad": [("x", geometry.along_m[:2]), ("y", (0.0, geometry.across_m[0])), ("z", top)],
@@ -149,13 +162,14 @@ def _check_boundary(where: str, points: Array, name: str, geometry: Geometry) ->
 def _check_extent(
     where: str, found_m: Array, axis: str, expected_m: tuple[float, ...], tolerance_m: float
 ) -> None:
+    """Raises InputError unless the coordinates along an axis extend over the expected interval."""
     ends = float(found_m.min()), float(found_m.max())
     if not np.allclose(ends, expected_m, rtol=0.0, atol=tolerance_m):
-        found, expected = (f"{axis} {1e3 * a:.4g} to {1e3 * b:.4g} mm" for a, b in (ends, expected_m))
-        raise InputError(where, found, f"{expected}, as the device and the tissue have it")
+        measured, expected = (f"{axis} {1e3 * a:.4g} to {1e3 * b:.4g} mm" for a, b in (ends, expected_m))
+        raise InputError(where, measured, f"{expected}, as the device and the tissue have it")
 
 
 def _facet_indices(mesh: skfem.Mesh, nodes: np.ndarray) -> np.ndarray:
-    """Indices of the facets with the corner nodes given, (n, 3)."""
+    """Returns the indices of the facets that have the given corner nodes (n, 3)."""
     keys = {tuple(sorted(f)): i for i, f in enumerate(mesh.facets.T.tolist())}
     return np.unique([keys[tuple(sorted(n))] for n in nodes.tolist()])

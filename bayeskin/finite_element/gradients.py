@@ -1,30 +1,35 @@
-"""Derivatives of the force history by any parameters, from the kept factorisations.
+"""Computes the derivatives of the force history with respect to any parameters, from the kept factorisations.
 
-Differentiating a solved stage R(x, J*, p*; theta) = 0 gives K dx = -dR/dtheta - dR/d(J*, p*) d(J*, p*),
-with the stage's own tangent K. For a guess v of dx the right-hand side less K v is the residual's derivative
+Each time step consists of stages. A solved stage satisfies R(x, J*, p*; theta) = 0. Its
+derivative is K dx = -dR/dtheta - dR/d(J*, p*) d(J*, p*), with the stage's own tangent K. For a guess v of dx,
+the right-hand side minus K v is a directional derivative of the residual,
 
     -r = [R(x + eps v, J* + eps dJ*, p* + eps dp*; theta + eps) - R(x, J*, p*; theta)] / eps
 
-so that no tangent is formed: of the base model r is found exactly and for all parameters at once
-(`directional`), with laws beyond it from two residuals a parameter, and with a length of the tissue among
-these too: there the residual further on is that of moved nodes, at the same unknowns.
+so that no tangent needs to be formed. For the base model, `directional` computes r exactly and for all
+parameters at once. With further laws, r is the difference of two residuals for each parameter. The same holds
+for all parameters if a length of the tissue is among them. For such a length the changed residual is the one
+on moved nodes, at the same unknowns.
 
-The guess combines the stages before as their unknowns best combine to those of this one, and is corrected by
-back-substitutions of r with the kept factorisation M nearest to the stage. Where residuals are differenced M
-is the stage's own, which costs less than a correction.
+The guess is a linear combination of the derivatives at earlier stages. Its weights are
+those with which the unknowns of these stages best approximate the unknowns of this stage. The guess is then
+corrected by back-substitution of r with the kept factorisation M that is nearest to the stage. Where
+residuals are differenced, M is the stage's own tangent, because factorising it costs less than a correction.
 
-The reaction's derivative is that of the same residual on the pad's rows. A correction would add g M^-1 r to
-it, with the reaction's derivative g by the unknowns; as M is symmetric, M^-1 g tells so before it is made.
-What is small enough is added and no correction made, so that the force's error is the product of the errors
-of v and of the factorisation.
+The derivative of the reaction is the same directional derivative on the pad's rows. A
+correction would add g M^-1 r to it, where g is the derivative of the reaction with respect to the unknowns.
+Since M is symmetric, M^-1 g gives this term before the correction is made. If the term is small enough, it is
+added and no correction is made. The error of the force is then the product of the errors of v and of the
+factorisation.
 
-What lies in series with the skin loses a displacement before it reaches the pads. Its derivatives ds follow
-(`series`) from those of the force with s held and the reaction of the stage's response y to the pads' travel
-alone; with the derivatives x' for s held, dx = x' - y ds.
+An element in series with the skin loses a displacement s before it reaches the pads.
+The derivative ds follows (`series`) from two quantities: the derivative of the force with s held, and the
+reaction of the stage's response y to the pads' travel alone. If x' are the derivatives with s held, then
+dx = x' - y ds.
 
-Forces scale with stresses: were the fluid incompressible, F(c E_c, c E_s, k_c / c, k_s / c) = c F. Of the
-base model's four derivatives three are therefore solved for and E_c's follows, to 3e-7 of the largest one
-(docs/verification.md).
+Forces scale with stresses. If the fluid were incompressible, F(c E_c, c E_s, k_c / c, k_s / c) = c F would
+hold. Only three of the base model's four derivatives are therefore solved for. The derivative with respect to
+E_c follows, to within 3e-7 of the largest derivative (docs/verification.md).
 """
 
 from __future__ import annotations
@@ -47,26 +52,30 @@ from bayeskin.finite_element.tissue import Bind, TissueLaw
 from bayeskin.geometry import LENGTHS
 from bayeskin.types import Array
 
-SCALING = {"E_c": 1.0, "E_s": 1.0, "k_c": -1.0, "k_s": -1.0}  # F = sum of these times dF/dlog, base model
-EPSILON = 1e-5  # of a parameter's change: truncation 1e-5, rounding 1e-9
-TOLERANCE = 1e-4  # of what a correction would add to the force, relative to the nominal force
-UNCORRECTED = 0.05  # times that for a bare guess, whose error adds up from stage to stage
+SCALING = {"E_c": 1.0, "E_s": 1.0, "k_c": -1.0, "k_s": -1.0}  # F = sum of these times dF/dlog (base model)
+EPSILON = 1e-5  # difference step, as a share of a parameter's change; error: truncation 1e-5, rounding 1e-9
+TOLERANCE = 1e-4  # largest force that a correction may still add, relative to the nominal force
+UNCORRECTED = 0.05  # factor on TOLERANCE for an uncorrected guess, whose error adds up from stage to stage
 MOST_CORRECTIONS = 12
 ANDERSON_DEPTH = 4
 GUESS_POINTS = 4
-DUALS = 10  # kept
+DUALS = 10  # largest number of kept dual solutions
 
 
 def logarithms(theta: Mapping[str, float]) -> dict[str, float]:
-    """The changes by which `simulate` gives derivatives by logarithms of the base's four and of lengths."""
+    """Returns the changes with which `simulate` gives derivatives with respect to logarithms.
+
+    They are the changes of the base model's four parameters and of the lengths in theta.
+    """
     return {name: theta[name] for name in (*SCALING, *LENGTHS) if name in theta}
 
 
 @dataclass(frozen=True)
 class _Varied:
-    """Constants of a run in which one parameter is moved by EPSILON of its change.
+    """The constants of a run in which one parameter differs by EPSILON times its change.
 
-    model : has the nodes where they are then; its own material and laws are the run's
+    model : the model with its nodes at the changed positions; its material and laws do not change
+    material, laws, drive : these at the changed parameter
     """
 
     model: LagrangianModel
@@ -77,8 +86,13 @@ class _Varied:
 
 @dataclass(frozen=True)
 class _Slopes:
-    """Derivatives of a `State` by r parameters: x (dofs, r), J and p (e, q, r), memories (e q, m, r), what
-    is lost in series (k, r). With such elements a last column of x is the response to the pads' travel."""
+    """The derivatives of a `State` with respect to r parameters.
+
+    x (dofs, r) : derivatives of the unknowns. If elements lie in series with the skin, a last column holds
+        the response to the pads' travel
+    volume, pressure (e, q, r) : derivatives of J and p
+    memory (e q, m, r), lost (k, r) : derivatives of the memories of each law, and of each element in series
+    """
 
     state: State
     x: Array
@@ -88,15 +102,17 @@ class _Slopes:
     lost: Memories
 
 
-_Evaluated = Union[Evaluated, "_Differences"]
+_Evaluated = Union[Evaluated, "_ResidualDifferences"]
 ProblemAt = Callable[[Mapping[str, float]], Problem]
 
 
 class ForceGradients:
-    """Follows a run, step by accepted step; `force_n` then holds the derivatives of each step's force.
+    """Follows a run and differentiates each accepted step. `force_n` collects the derivatives of the force.
 
-    changes : of each parameter, by name, what counts as one; derivatives are in newtons for that
-    problem_at : the model's problem with its nodes where parameters have them
+    theta : parameters of the run
+    changes : for each parameter, by name, the change to which the derivative in newtons refers
+    laws : the laws beyond the base model
+    problem_at : function that returns the model's problem, with its nodes moved as the parameters demand
     Raises InputError for a parameter that the run does not have.
     """
 
@@ -108,7 +124,7 @@ class ForceGradients:
         if unknown:
             raise InputError("gradients", unknown[0], f"among {', '.join(theta)}")
         self.names = tuple(changes)
-        self._model, self._follows = model, _follows(model, theta, changes)
+        self._model, self._follows = model, _scaling_rule(model, theta, changes)
         self._solved = tuple(name for name in changes if not (self._follows and name == "E_c"))
         self._by_differences = bool(model.laws) or not set(LENGTHS).isdisjoint(changes)
         self._varied = [
@@ -116,21 +132,25 @@ class ForceGradients:
         ]
         back = [{**theta, name: theta[name] - EPSILON * changes[name]} for name in self._solved]
         self._rates = _rates(
-            [one.material for one in self._varied],
+            [varied.material for varied in self._varied],
             [material(values, model.problem.mesh.cutis) for values in back],
         )
         self._in_series = bool(model.drive.elements)
         self._reach_m = 2.0 * model.drive.largest_m
         self._start = self._at_rest(theta["p_init"], changes.get("p_init", 0.0))
-        self._known: dict[int, _Slopes] = {}  # by identity of the state, which they keep alive
-        self._phase: list[_Slopes] = [self._start]  # ends of this phase's stages
+        self._known: dict[int, _Slopes] = {}  # by id of the state, which each entry keeps alive
+        self._phase: list[_Slopes] = [self._start]  # derivatives at the ends of this phase's stages
         self._travel: Array | None = None
-        self._duals: dict[int, tuple[Array, Array]] = {}  # by identity of the place, which they keep alive
-        self._zero_n = np.zeros(len(self._solved))  # of the force when the test starts
+        self._duals: dict[int, tuple[Array, Array]] = {}  # by id of the place, which each entry keeps alive
+        self._zero_n = np.zeros(len(self._solved))  # derivatives of the force when the test starts
         self.force_n: list[Array] = [np.zeros(len(changes))]
         self.corrections, self.seconds = 0, 0.0
 
     def _at_rest(self, p_init: float, change: float) -> _Slopes:
+        """Returns the derivatives of the state of rest.
+
+        change : change of p_init; 0 if the derivative with respect to p_init is not asked for
+        """
         model, r, n = self._model, len(self._solved), 3 * self._model.problem.space.n_nodes
         rest = model.initial_state(p_init)
         by_p_init = change * np.array([float(name == "p_init") for name in self._solved])
@@ -142,7 +162,7 @@ class ForceGradients:
         return _Slopes(rest, x, np.zeros(shape), np.zeros(shape) + by_p_init, memory, lost)
 
     def follow(self, step: Step) -> None:
-        """Differentiates an accepted step; appends the force's derivatives [N], (r,), to `force_n`."""
+        """Differentiates an accepted step, and appends the derivatives (r,) [N] of its force to `force_n`."""
         started = time.perf_counter()
         for stage in step.stages:
             slopes, force = self._differentiate(stage)
@@ -157,25 +177,35 @@ class ForceGradients:
         self.seconds += time.perf_counter() - started
 
     def _turn(self) -> None:
-        """At a corner: how the slopes went with the pads, to guess how they set out again."""
+        """Prepares for the next phase at a corner of the protocol.
+
+        It stores how the derivatives changed with the pads' travel, for the guess at the start of the next
+        phase.
+        """
         start, end = self._phase[-2:]
-        way_m = self._way_m(start.state, end.state)
+        way_m = self._travel_m(start.state, end.state)
         if abs(way_m) > 0.0:
             self._travel = (end.x - start.x) / way_m
         self._phase = [end]
 
-    def _way_m(self, start: State, end: State) -> float:
+    def _travel_m(self, start: State, end: State) -> float:
+        """Returns how far the pads travel between two states [m]."""
         drive = self._model.drive
         return drive.pads_m(end.time_s, 0.0) - drive.pads_m(start.time_s, 0.0)
 
-    def _of(self, state: State) -> _Slopes:
+    def _slopes_at(self, state: State) -> _Slopes:
+        """Returns the known derivatives of a state; a state that is not known is the state of rest."""
         return self._known.get(id(state), self._start)
 
     def _guess(self, state: State, equations: Equations) -> Array:
-        """The slopes of this phase's last stages, combined as their unknowns come nearest to the state's."""
+        """Returns a guess (dofs, r) of the derivatives at a state.
+
+        It combines the derivatives of this phase's last stages with the weights with which their unknowns
+        come nearest to those of the state.
+        """
         *before, last = self._phase[-GUESS_POINTS:]
         if not before:
-            travel = 0.0 if self._travel is None else self._travel * self._way_m(last.state, state)
+            travel = 0.0 if self._travel is None else self._travel * self._travel_m(last.state, state)
             return last.x + travel
 
         def weighted(x: Array) -> Array:
@@ -186,27 +216,32 @@ class ForceGradients:
         return last.x + sum(share * (old.x - last.x) for share, old in zip(shares, before, strict=True))
 
     def _differentiate(self, stage: Stage) -> tuple[_Slopes, Array]:
-        before = self._before(stage)
+        """Returns the derivatives of a stage's end, and of the force there (r,) [N]."""
+        before = self._history_slopes(stage)
         equations = self._model.equations(stage.length_s, stage.history, stage.elapsed_s)
         x = self._guess(stage.state, equations)
         x[self._model.problem.pattern.fixed] = 0.0
-        x[3 * self._model.problem.pads] = self._of_pads(stage.state.time_s, before)
-        x, found, force = self._solve(stage, equations, self._action(stage, before), x)
+        x[3 * self._model.problem.pads] = self._pad_slopes(stage.state.time_s, before)
+        x, slopes, force = self._solve(stage, equations, self._action(stage, before), x)
         if self._in_series:
-            return self._less_lost(stage, before, x, found, force)
-        return _Slopes(stage.state, x, found.volume, found.pressure, found.memory, before.lost), force
+            return self._subtract_lost(stage, before, x, slopes, force)
+        return _Slopes(stage.state, x, slopes.volume, slopes.pressure, slopes.memory, before.lost), force
 
-    def _before(self, stage: Stage) -> _Slopes:
-        """Derivatives of the stage's history."""
-        sources = [(weight, self._of(state)) for weight, state in stage.sources]
+    def _history_slopes(self, stage: Stage) -> _Slopes:
+        """Returns the derivatives of the stage's history."""
+        sources = [(weight, self._slopes_at(state)) for weight, state in stage.sources]
         volume = np.asarray(sum(weight * slopes.volume for weight, slopes in sources))
         pressure = np.asarray(sum(weight * slopes.pressure for weight, slopes in sources))
         return replace(sources[-1][1], volume=volume, pressure=pressure)
 
-    def _of_pads(self, time_s: float, before: _Slopes) -> Array:
-        """Derivatives of the pads' displacement [m], with what was lost before; and their travel."""
-        here = self._model.motion.at(time_s)
-        moved = np.array([(float(one.drive.motion.at(time_s)) - here) / EPSILON for one in self._varied])
+    def _pad_slopes(self, time_s: float, before: _Slopes) -> Array:
+        """Returns the derivatives of the pads' displacement [m].
+
+        The derivatives of the displacement lost in series are those before the stage. If elements lie in
+        series with the skin, the last entry moves the pads apart by `_reach_m`.
+        """
+        now_m = self._model.motion.at(time_s)
+        moved = np.array([(float(run.drive.motion.at(time_s)) - now_m) / EPSILON for run in self._varied])
         moved = moved - sum(lost[0] for lost in before.lost)
         return 0.5 * np.append(moved, [self._reach_m] * self._in_series)
 
@@ -217,26 +252,29 @@ class ForceGradients:
         action: Callable[[Array], _Evaluated],
         x: Array,
     ) -> tuple[Array, _Evaluated, Array]:
-        """From a guess x (dofs, r) whose fixed rows are right: x, what is `Evaluated` there, the force."""
+        """Corrects a guess x (dofs, r), whose fixed rows must already be right.
+
+        Returns the corrected x, the derivatives of all that is `Evaluated` there, and of the force (r,) [N].
+        """
         model, solver, free = self._model, self._model.solver, self._model.problem.pattern.free
         if self._by_differences:
             solver.renew(equations, stage.state.x)
         dual = self._dual(solver.toward(equations.place))
         weight, allowed_n = equations.weight[:, None], TOLERANCE * model.nominal_force()
-        tried: list[tuple[Array, Array]] = []  # unknowns and the corrections that they asked for
+        tried: list[tuple[Array, Array]] = []  # unknowns, and the correction computed at each
         for _ in range(MOST_CORRECTIONS):
-            found = action(x)
-            missing_n = -dual @ found.residual[free]
+            evaluated = action(x)
+            missing_n = -dual @ evaluated.residual[free]
             if np.abs(missing_n).max() <= (allowed_n if tried else UNCORRECTED * allowed_n):
                 break
-            correction = -solver.back_substitute(found.residual[free])
+            correction = -solver.back_substitute(evaluated.residual[free])
             tried = [*tried, (x[free] * weight, correction * weight)][-ANDERSON_DEPTH:]
-            x[free] += _accelerated(tried) / weight
+            x[free] += _anderson_step(tried) / weight
             self.corrections += 1
-        return x, found, 2.0 * found.residual[model.problem.measured_x].sum(axis=0) + missing_n
+        return x, evaluated, 2.0 * evaluated.residual[model.problem.measured_x].sum(axis=0) + missing_n
 
     def _dual(self, place: Array) -> Array:
-        """M^-1 g (free,) with the factorisation M that was made at `place`, solved for once."""
+        """Returns M^-1 g (free,) for the factorisation M made at `place`; the result is kept."""
         known = self._duals.get(id(place))
         if known is None:
             known = place, self._model.solver.back_substitute(self._model.pad_gradient)
@@ -244,38 +282,48 @@ class ForceGradients:
         return known[1]
 
     def _action(self, stage: Stage, before: _Slopes) -> Callable[[Array], _Evaluated]:
-        """Derivatives of all that is `Evaluated` at the stage's end, from those of the unknowns there."""
+        """Returns a function that takes the derivatives of the unknowns at the stage's end.
+
+        The function returns the derivatives of all that is `Evaluated` there.
+        """
         if self._by_differences:
-            return lambda x: _Differences(self._model, self._varied, stage, before, x)
+            return lambda x: _ResidualDifferences(self._model, self._varied, stage, before, x)
         return TangentAction(self._model, stage, self._rates, before.volume, before.pressure)
 
-    def _less_lost(
+    def _subtract_lost(
         self, stage: Stage, before: _Slopes, x: Array, found: _Evaluated, force: Array
     ) -> tuple[_Slopes, Array]:
-        """All derivatives once what lies in series with the skin has answered to the force's."""
+        """Returns all derivatives after the elements in series with the skin have responded to the force.
+
+        x, found, force : the derivatives with the lost displacement held, with the response to the pads'
+            travel as last column
+        """
         model, r = self._model, len(self._varied)
         travel, stiffness = x[:, r] / self._reach_m, float(force[r]) / self._reach_m
-        lost, more = before.lost, np.zeros(r)
+        lost, lost_change = before.lost, np.zeros(r)
         if model.drive.yields(stage.state.time_s):
-            more, lost = self._lost(stage, before, force[:r], stiffness)
+            lost_change, lost = self._lost(stage, before, force[:r], stiffness)
         columns = x.copy()
-        columns[:, :r] -= np.outer(travel, more)
+        columns[:, :r] -= np.outer(travel, lost_change)
 
         def less(values: Array) -> Array:
-            return np.asarray(values[..., :r] - values[..., r:] / self._reach_m * more)
+            return np.asarray(values[..., :r] - values[..., r:] / self._reach_m * lost_change)
 
-        memory = tuple(less(one) for one in found.memory)
+        memory = tuple(less(slope) for slope in found.memory)
         slopes = _Slopes(stage.state, columns, less(found.volume), less(found.pressure), memory, lost)
-        return slopes, force[:r] - stiffness * more
+        return slopes, force[:r] - stiffness * lost_change
 
     def _lost(self, stage: Stage, before: _Slopes, force: Array, stiffness: float) -> tuple[Array, Memories]:
-        """Derivatives (r,) of what is lost beyond those before, and of the elements' memories (k, r).
+        """Returns the change (r,) of the derivatives of the lost displacement during the stage.
 
-        force (r,), stiffness : the force's derivatives with the lost held, and by what is lost [N/m]
+        It also returns the derivatives (k, r) of the elements' memories.
+
+        force (r,) : derivatives of the force with the lost displacement held
+        stiffness : derivative of the force with respect to the pads' travel [N/m, LVDT]
         """
         model, elapsed_s, old = self._model, stage.elapsed_s, stage.history.lost
         force_n = model.problem.reaction(stage.residual) - model.zero_n
-        drives = [one.drive for one in self._varied]
+        drives = [varied.drive for varied in self._varied]
 
         def follow(slopes_n: Array) -> Memories:
             return memory_slopes(
@@ -293,7 +341,10 @@ def _varied(
     model: LagrangianModel, theta: Mapping[str, float], name: str, by: float, laws: Sequence[Bind],
     problem_at: ProblemAt,
 ) -> _Varied:  # fmt: skip
-    """Raises InputError for a change that makes of a run another one."""
+    """Returns the constants of the run with the parameter `name` increased by `by`.
+
+    Raises InputError if the change opens the pads before the test while in the run they were not opened.
+    """
     values = {**theta, name: theta[name] + by}
     if name in LENGTHS:
         model = LagrangianModel(problem_at(values), model.material, model.protocol, model.laws)
@@ -305,7 +356,10 @@ def _varied(
 
 
 def _rates(up: Sequence[Material], down: Sequence[Material]) -> tuple[Array, Array, Array]:
-    """Derivatives of mu, lam and mobility by r parameters, (e, r) each, from materials at both sides."""
+    """Returns the derivatives of mu, lam and mobility with respect to r parameters, (e, r) each.
+
+    up, down : the materials with each parameter increased and decreased, for central differences
+    """
 
     def rate(of: Callable[[Material], Array]) -> Array:
         pairs = zip(up, down, strict=True)
@@ -314,10 +368,15 @@ def _rates(up: Sequence[Material], down: Sequence[Material]) -> tuple[Array, Arr
     return rate(lambda m: m.mu), rate(lambda m: m.lam), rate(lambda m: m.mobility)
 
 
-def _follows(
+def _scaling_rule(
     model: LagrangianModel, theta: Mapping[str, float], changes: Mapping[str, float]
 ) -> Callable[[Array, float], Array] | None:
-    """All derivatives (r,) from the force and those without E_c's; of a base model asked for its four."""
+    """Returns a function that adds the derivative with respect to E_c by the scaling of the base model.
+
+    The function takes the other derivatives and the force, and returns all derivatives (r,). The result is
+    None if the scaling does not hold because there are further laws, or if not all four base parameters are
+    differentiated.
+    """
     if model.laws or not set(SCALING) <= set(changes):
         return None
     names = [name for name in changes if name != "E_c"]
@@ -326,11 +385,14 @@ def _follows(
     return lambda force, force_n: np.insert(force, place, scale * (force_n - share @ force))
 
 
-class _Differences:
-    """Derivatives by r parameters at a stage's end, by differences of the residual; `Evaluated`'s fields.
+class _ResidualDifferences:
+    """Derivatives at a stage's end with respect to r parameters, by differences of the residual.
 
-    `before` has those of the stage's history, x (dofs, r) those of its unknowns; a last column beyond r is
-    of the pads' travel, of which no history knows.
+    The fields have the names of those of `Evaluated`.
+
+    before : derivatives of the stage's history
+    x (dofs, r) : derivatives of the unknowns. A further column beyond r belongs to the pads' travel, on which
+        the history does not depend
     """
 
     def __init__(
@@ -338,16 +400,17 @@ class _Differences:
     ) -> None:
         self._base, self._columns = stage.state, []
         for r, column in enumerate(x.T):
-            at, old, to = model, stage.history, (model.material, model.laws)
+            column_model, history, changed = model, stage.history, (model.material, model.laws)
             if r < len(varied):
-                one, old = varied[r], _moved(old, before, r)
-                at, to = one.model, (one.material, one.laws)
+                constants, history = varied[r], _moved_history(history, before, r)
+                column_model, changed = constants.model, (constants.material, constants.laws)
             moved = self._base.x + EPSILON * column
-            found = at.residual(moved, stage.length_s, old, stage.elapsed_s, to)
-            if found is None:  # the cells were upright a moment ago, at the same unknowns to a millionth
+            evaluated = column_model.residual(moved, stage.length_s, history, stage.elapsed_s, changed)
+            # a cell has turned inside out, although the unknowns changed by only about a millionth
+            if evaluated is None:
                 at_s = self._base.time_s
                 raise FloatingPointError(f"no derivative at t = {at_s:.3f} s: a cell is all but flat")
-            self._columns.append(found)
+            self._columns.append(evaluated)
         self.residual = self._slope(lambda f: f.residual, stage.residual)
 
     @property
@@ -363,11 +426,12 @@ class _Differences:
         return tuple(self._slope(lambda f, k=k: f.memory[k], m) for k, m in enumerate(self._base.memory))  # type: ignore[misc]
 
     def _slope(self, of: Callable[[Evaluated], Array], at: Array) -> Array:
-        return np.stack([(of(found) - at) / EPSILON for found in self._columns], axis=-1)
+        """Returns the derivatives of a quantity `of` the evaluations, from its value `at` the stage's end."""
+        return np.stack([(of(evaluated) - at) / EPSILON for evaluated in self._columns], axis=-1)
 
 
-def _moved(history: State, before: _Slopes, r: int) -> State:
-    """A stage's history, EPSILON of parameter r's change further."""
+def _moved_history(history: State, before: _Slopes, r: int) -> State:
+    """Returns a stage's history with parameter r increased by EPSILON times its change."""
     memory = zip(history.memory, before.memory, strict=True)
     return State(
         history.time_s,
@@ -378,15 +442,20 @@ def _moved(history: State, before: _Slopes, r: int) -> State:
     )
 
 
-def _accelerated(tried: list[tuple[Array, Array]]) -> Array:
-    """Anderson's step from the last of `tried`, column by column (SIAM J. Numer. Anal. 49, 2011, 1715)."""
+def _anderson_step(tried: list[tuple[Array, Array]]) -> Array:
+    """Returns Anderson's step (SIAM J. Numer. Anal. 49, 2011, 1715) from the last of the tried points.
+
+    tried : unknowns and corrections (free, r) of the last iterations; each column is accelerated by itself
+    """
     correction = tried[-1][1]
     if len(tried) == 1:
         return correction
     moves = np.stack([after[0] - before[0] for before, after in pairwise(tried)], axis=2)
     turns = np.stack([after[1] - before[1] for before, after in pairwise(tried)], axis=2)
     gram = np.einsum("nrk,nrl->rkl", turns, turns)
-    size = np.trace(gram, axis1=1, axis2=2) + np.finfo(float).tiny  # 0 of what nothing depends on
+    size = (
+        np.trace(gram, axis1=1, axis2=2) + np.finfo(float).tiny
+    )  # the trace is 0 for a parameter without effect
     ridge = 1e-12 * size[:, None, None] * np.eye(gram.shape[1])
     gain = np.linalg.solve(gram + ridge, np.einsum("nrk,nr->rk", turns, correction)[:, :, None])[:, :, 0]
     return np.asarray(correction - np.einsum("nrk,rk->nr", moves + turns, gain))

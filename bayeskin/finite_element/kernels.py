@@ -1,21 +1,27 @@
-"""One signature for every tissue law, so that full and reduced models call the same compiled kernels.
+"""Defines the two signatures of the compiled kernels of all tissue laws.
 
-A kernel acts on n points, one after the other, of whatever model; all arrays are C-contiguous doubles:
+The full and the reduced models call the same kernels. A kernel evaluates a law at n points, one after the
+other. The points may belong to any model. All arrays are C-contiguous and hold doubles:
 
     respond(time_s, elapsed_s, par, data, deformation, pressure, gradient,
             before, after, stress, content, flux)
     linearise(time_s, elapsed_s, par, data, deformation, pressure, gradient,
               before, stress_f, stress_p, content_f, content_p, flux_f, flux_g)
 
-time_s : end of the solve since the test started [s], 0 before; elapsed_s : since `before` was kept
-par (k,), data (n, d) : constants of the run, and of each point
+time_s : time [s] at the end of the solve, since the start of the test; 0 before the start
+elapsed_s : time [s] since the memory `before` was stored
+par (k,), data (n, d) : constants of the run, and constants of each point
 deformation (n, 3, 3), pressure (n,), gradient (n, 3) : F, p [Pa] and grad p [Pa/m]
-before, after (n, m) : the law's memory at the start and at the end; `respond` fills all of `after`
-stress (n, 3, 3), content (n,), flux (n, 3) : what the base law and the laws before answered, to change
-stress_f (n, 9, 9), stress_p, content_f (n, 9), content_p (n,), flux_f (n, 3, 9), flux_g (n, 3, 3) : its
-derivatives by deformation (rows of nine), pressure and gradient, to change
+before, after (n, m) : the law's memory at the start and at the end of the solve; `respond` fills all of
+    `after`
+stress (n, 3, 3), content (n,), flux (n, 3) : the response of the base law and of the laws that were evaluated
+    before this one; the kernel changes it in place
+stress_f (n, 9, 9), stress_p, content_f (n, 9), content_p (n,), flux_f (n, 3, 9), flux_g (n, 3, 3) : the
+    derivatives of that response with respect to deformation (as rows of nine), pressure and gradient; the
+    kernel changes them in place
 
-They are compiled when their module is first imported, and loaded from numba's cache from then on.
+numba compiles a kernel when its module is imported for the first time, and loads it from its cache
+afterwards.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The total-Lagrangian model's equations: one implicit stage of a step in time, and what it needs.
+"""Defines the equations of the total-Lagrangian model and solves one implicit stage of a time step.
 
-A stage is one solve of J - J* ... = h* div(...) with a history J*, p* and a length h* that `stepping` gives
-it. What lies in series with the skin is solved along (`series`).
+A stage is one solve of J - J* ... = h* div(...). `stepping` chooses its history J*, p* and its length h*. If
+elements lie in series with the skin, the stage solves for them as well (`series`).
 """
 
 from __future__ import annotations
@@ -21,14 +21,17 @@ from bayeskin.finite_element.series import Drive, Memories, SeriesSolver, Solved
 from bayeskin.finite_element.tissue import SurfaceTerm, TissueLaw
 from bayeskin.types import Array, PadMotion
 
-SOLVER_TOLERANCE = 1e-4  # of the largest displacement and pressure, before the last correction
+SOLVER_TOLERANCE = 1e-4  # relative to the largest displacement and pressure, before the last correction
 
 
 @dataclass(frozen=True)
 class State:
-    """Everything that the next step needs: x (dofs,), J and p (e, q) at the quadrature points.
+    """The state at one time, with everything that the next step needs.
 
-    memory : (e q, m) of each law; lost : (k,) of each element in series with the skin
+    x (dofs,) : unknowns
+    volume, pressure (e, q) : J and p at the quadrature points
+    memory : memory (e q, m) of each law
+    lost : memory (k,) of each element in series with the skin
     """
 
     time_s: float
@@ -40,7 +43,7 @@ class State:
 
 
 class Evaluated(NamedTuple):
-    """The residual (dofs,) at some unknowns, with J and p (e, q) and each law's memory (e q, m) there."""
+    """The residual (dofs,) at given unknowns, with J and p (e, q) and each law's memory (e q, m) there."""
 
     residual: Array
     volume: Array
@@ -52,9 +55,12 @@ class Evaluated(NamedTuple):
 class Stage:
     """One solved implicit equation J - J* ... = h* div(...).
 
-    state : its end; length_s : h*; elapsed_s : since the last of `sources`; history : with J*, p*, which are
-    the weighted sum of `sources`; residual : (dofs,) at the end, zero to the solver's tolerance but for the
-    reactions
+    state : state at the end of the stage
+    length_s : h*
+    elapsed_s : time since the last of `sources`
+    history : state with J* and p*, which are weighted sums over `sources`
+    sources : pairs of a weight and an earlier state
+    residual (dofs,) : residual at the end; within the solver's tolerance it is zero except for the reactions
     """
 
     state: State
@@ -67,7 +73,10 @@ class Stage:
 
 @dataclass(frozen=True)
 class Step:
-    """One accepted step: end state, force there [N], estimated local error [N], and how it was solved."""
+    """One accepted step: its end state, the force there [N], the estimated local error [N], and its stages.
+
+    corner : True if the step ends at a corner of the protocol
+    """
 
     state: State
     force_n: float
@@ -78,10 +87,12 @@ class Step:
 
 @dataclass
 class LagrangianModel:
-    """The equations of one run: a problem, a material and a protocol; knows nothing of step control.
+    """The equations of one run with a problem, a material, a protocol and laws, without step control.
 
-    zero_n : the force when the test starts; what lies in series with the skin acts on the force beyond that
-    drive : what `laws` leave of the protocol on its way to the pads
+    zero_n : force at the start of the test; elements in series with the skin respond to the force beyond it
+    drive : the protocol after the laws that change it on its way to the pads
+    full_residual (dofs,) : residual at the last evaluation by the solver; after a solve it is the residual at
+        the solution
     """
 
     problem: Problem
@@ -100,24 +111,32 @@ class LagrangianModel:
         self.full_residual = np.zeros(self.problem.space.dofs)
         shape = self.problem.space.weight.shape
         self._chunks = assembly.chunks(shape)
-        self._data = np.empty(self.problem.pattern.size)  # overwritten by each tangent
-        # the reaction's derivative (free,) by the free unknowns, at the last tangent
+        self._data = np.empty(self.problem.pattern.size)  # each tangent overwrites it
+        # derivative (free,) of the reaction with respect to the free unknowns, at the last tangent
         self.pad_gradient = np.zeros(len(self.problem.pattern.free))
         self._measured = np.isin(self.problem.pattern.fixed, self.problem.measured_x).astype(float)
-        self._travel: Array | None = None  # change of the unknowns a metre of the pads' travel
+        self._travel: Array | None = None  # change of the unknowns for a metre of the pads' travel
 
     @property
     def motion(self) -> PadMotion:
-        """The protocol less what is lost whatever the force, from the opening of the pads on."""
+        """Returns the protocol from the opening of the pads on.
+
+        Displacement that is lost independently of the force is already subtracted.
+        """
         return self.drive.motion
 
     @property
     def starts_s(self) -> float:
-        """When the test starts [s]."""
+        """Returns the time at which the test starts [s]."""
         return self.drive.starts_s
 
     def remember_travel(self, past: list[State]) -> None:
-        """Keeps how the unknowns went with the pads, to guess how they set out again."""
+        """Stores how the unknowns change with the pads' travel.
+
+        The next phase starts with a guess from this.
+
+        past : states of the phase that ends
+        """
         if len(past) < 2:
             return
         way_m = self._pad_of(past[-1]) - self._pad_of(past[-2])
@@ -125,10 +144,11 @@ class LagrangianModel:
             self._travel = (past[-1].x - past[-2].x) / way_m
 
     def _pad_of(self, state: State) -> float:
-        """Displacement of the pads at that time [m]."""
+        """Returns the displacement of the pads in a state [m]."""
         return float(state.x[3 * self.problem.pads[0]])
 
     def initial_state(self, p_init: float) -> State:
+        """Returns the state of rest with the interstitial pressure p_init [Pa]."""
         space = self.problem.space
         x = np.zeros(space.dofs)
         x[3 * space.n_nodes :] = p_init
@@ -144,21 +164,24 @@ class LagrangianModel:
         elapsed_s: float | None = None,
         changed: tuple[Material, tuple[TissueLaw, ...]] | None = None,
     ) -> Evaluated | None:
-        """Residual with a history `old` (memory: `elapsed_s` earlier, else h); None if a cell is inside out.
+        """Returns the residual and what comes with it, or None if a cell is inside out.
 
-        `changed` takes the place of this model's material and laws.
+        x (dofs,) : unknowns
+        h : length of the stage [s]
+        old : history with J* and p*; its memory is `elapsed_s` old, or h if that is None
+        changed : material and laws to use instead of the model's own
         """
         s, (m, laws) = self.problem.space, changed or (self.material, self.laws)
         volume, pressure, out = np.empty(s.weight.shape), np.empty(s.weight.shape), np.zeros(s.dofs)
         elapsed_s = h if elapsed_s is None else elapsed_s
         memory = tuple(np.empty_like(before) for before in old.memory)
         for chunk in self._chunks:
-            c, at, found = chunk.cells, chunk.at, chunk.found
+            c, at, response = chunk.cells, chunk.at, chunk.found
             self._evaluate(x, chunk)
             pressure[c] = at.pressure
             smallest = poroelastic.respond(
                 at.deformation, at.pressure, at.gradient, m.mu[c], m.lam[c], m.mobility[c], m.storage[c], h,
-                old.volume[c], old.pressure[c], found.stress, found.content, found.flux, volume[c],
+                old.volume[c], old.pressure[c], response.stress, response.content, response.flux, volume[c],
             )  # fmt: skip
             if not smallest > 0.0:
                 return None
@@ -167,20 +190,24 @@ class LagrangianModel:
                     n = chunk.points
                     law.respond(
                         self._since_start(old, elapsed_s), elapsed_s, law.par, law.data[n], *at.flat,
-                        before[n], after[n], *found.flat,
+                        before[n], after[n], *response.flat,
                     )  # fmt: skip
             assembly.residual(
                 s.n_nodes, s.nodes_u[c], s.nodes_p[c], s.grad_u[c], s.grad_p[c], s.value_p, s.weight[c],
-                found.stress, found.content, found.flux, out,
+                response.stress, response.content, response.flux, out,
             )  # fmt: skip
-        for term in _surfaces(laws):
-            out += _factor(term, h) * (self.problem.linear(term.unit).matrix @ x)
+        for term in _surface_terms(laws):
+            out += _term_factor(term, h) * (self.problem.linear(term.unit).matrix @ x)
         return Evaluated(out, volume, pressure, memory) if np.isfinite(out).all() else None
 
     def tangent(
         self, x: Array, h: float, old: State, elapsed_s: float | None = None
     ) -> tuple[sp.csr_matrix, sp.csr_matrix]:
-        """Derivative of the residual's free rows by the free and by the fixed unknowns."""
+        """Returns the tangent: the derivatives of the residual's free rows.
+
+        The first matrix holds the derivatives with respect to the free unknowns, the second those with
+        respect to the fixed ones. The arguments are those of `residual`.
+        """
         s, m, data = self.problem.space, self.material, self._data
         elapsed_s = h if elapsed_s is None else elapsed_s
         data[:] = 0.0
@@ -203,14 +230,15 @@ class LagrangianModel:
                 s.grad_u[c], s.grad_p[c], s.value_p, s.weight[c], by.stress_f, by.stress_p, by.content_f,
                 by.content_p, by.flux_f, by.flux_g, self.problem.pattern.position[c], data,
             )  # fmt: skip
-        for term in _surfaces(self.laws):
+        for term in _surface_terms(self.laws):
             linear = self.problem.linear(term.unit)
-            np.add.at(data, linear.place, _factor(term, h) * linear.value)
+            np.add.at(data, linear.place, _term_factor(term, h) * linear.value)
         free_free, free_fixed = self.problem.pattern.matrices(data)
         self.pad_gradient = 2.0 * (free_fixed @ self._measured)
         return free_free, free_fixed
 
     def _evaluate(self, x: Array, chunk: assembly.Chunk) -> None:
+        """Fills F, p and grad p of a chunk from the unknowns."""
         s, c, at = self.problem.space, chunk.cells, chunk.at
         assembly.evaluate(
             x, s.n_nodes, s.nodes_u[c], s.nodes_p[c], s.grad_u[c], s.grad_p[c], s.value_p,
@@ -218,18 +246,20 @@ class LagrangianModel:
         )  # fmt: skip
 
     def _since_start(self, old: State, elapsed_s: float) -> float:
-        """Time of the test [s] when a solve ends that began at `old`; 0 before the test."""
+        """Returns the time of the test [s] when a solve ends that starts from `old`; 0 before the test."""
         return max(old.time_s + elapsed_s - self.starts_s, 0.0)
 
     def equations(self, h: float, old: State, elapsed_s: float | None = None) -> Equations:
+        """Returns the equations of one stage; the arguments are those of `residual`."""
         s, m, pattern = self.problem.space, self.material, self.problem.pattern
 
         def residual(x: Array) -> Array | None:
-            found = self.residual(x, h, old, elapsed_s)
-            if found is None:
+            evaluated = self.residual(x, h, old, elapsed_s)
+            if evaluated is None:
                 return None
-            self.full_residual, self._found = found.residual, found  # the last are at the solution
-            return found.residual[pattern.free]
+            # the solver's last evaluation is at the solution
+            self.full_residual, self._found = evaluated.residual, evaluated
+            return evaluated.residual[pattern.free]
 
         n = 3 * s.n_nodes
         size_u = np.abs(self.problem_scale(old.x[:n]))
@@ -247,20 +277,27 @@ class LagrangianModel:
 
     @cached_property
     def _drag(self) -> Array:
-        """Viscous resistance (free,) of a falling body: the diagonal of the vector Laplacian, times mu."""
+        """Returns the viscous resistance (free,) of a body that snaps from one equilibrium to another.
+
+        It is the diagonal of the vector Laplacian, times mu.
+        """
         s = self.problem.space
         drag, per_cell = np.zeros((s.n_nodes, 3)), np.einsum("eq,eqia->ea", s.weight, s.grad_u**2)
         np.add.at(drag, s.nodes_u, (self.material.mu[:, None] * per_cell)[..., None])
         return np.concatenate([drag.ravel(), np.zeros(s.n_corners)])[self.problem.pattern.free]
 
     def nominal_force(self) -> float:
-        """Scale of the force [N] over the protocol."""
+        """Returns a scale of the force [N] over the protocol."""
         return nominal_force(
             self.material, self.problem.mesh.cutis, self.problem.lengths, self.drive.largest_m
         )
 
     def problem_scale(self, u: Array) -> float:
-        """Largest displacement of the protocol [m], against which a correction is small."""
+        """Returns a scale of the displacements [m], with which the solver's corrections are compared.
+
+        It is the largest displacement of a pad in the protocol, or the largest component of u if that is
+        larger.
+        """
         return max(self.drive.largest_m, float(np.abs(u).max()))
 
     def solve_stage(
@@ -272,10 +309,14 @@ class LagrangianModel:
         jump: bool,
         fall: bool = False,
     ) -> Stage | None:
-        """Solves one implicit equation for time_s; `jump`: the guess knows nothing of the pads' motion.
+        """Solves one implicit equation for the state at time_s; returns None if there is no convergence.
 
-        The last source's unknowns are where the pads have been. `fall`: solved for where the guess comes to
-        rest, which may be far from it.
+        length_s : h*, the length of the stage
+        sources : weights and earlier states, whose weighted sums are J* and p*; the last gives the position
+            of the pads before the stage
+        guess : starting point (dofs,)
+        jump : True if the guess does not include the pads' motion during the stage
+        fall : True to follow the body from the guess to where it comes to rest, which may be far away
         """
         last = sources[-1][1]
         old = State(
@@ -313,7 +354,10 @@ class LagrangianModel:
         jump: bool = False,
         fall: bool = False,
     ) -> Solved | None:
-        """The unknowns with the pads at `pad_m`, and the force beyond that at the start; None if none."""
+        """Returns the unknowns and the force [N] with the pads at `pad_m`, or None without convergence.
+
+        The force is relative to the force at the start of the test.
+        """
         target = self.problem.prescribe(guess, pad_m)
         x = None
         if fall:
@@ -329,30 +373,34 @@ class LagrangianModel:
         return None if x is None else (x, self.problem.reaction(self.full_residual) - self.zero_n)
 
     def finish(self, stages: tuple[Stage, ...], mass: Array) -> Step:
-        """The step made of `stages`, with the local error `mass` (e, q) of the fluid mass."""
+        """Returns the step made of `stages`, with the error of its force.
+
+        mass (e, q) : local error of the fluid mass
+        """
         force, last = self.problem.reaction(self.full_residual), stages[-1]
         error = self.force_of_mass_error(last, mass)
         return Step(last.state, force, error, corner=False, stages=stages)
 
     def force_of_mass_error(self, stage: Stage, mass: Array) -> float:
-        """Change of the reaction [N] that an error of the fluid mass (e, q) makes, to first order."""
+        """Returns the change of the reaction [N] due to an error of the fluid mass (e, q), to first order."""
         s, free = self.problem.space, self.problem.pattern.free
         right = np.zeros(s.dofs)
         contribution = np.einsum("eq,qb->eb", s.weight * mass, s.value_p)
         np.subtract.at(right, 3 * s.n_nodes + s.nodes_p, contribution)
         moved = stage.state.x.copy()
         moved[free] += self.solver.back_substitute(right[free])
-        found = self.residual(moved, stage.length_s, stage.history, stage.elapsed_s)
-        if found is None:
+        evaluated = self.residual(moved, stage.length_s, stage.history, stage.elapsed_s)
+        if evaluated is None:
             return np.inf
         before = self.problem.reaction(self.full_residual)
-        return abs(self.problem.reaction(found.residual) - before)
+        return abs(self.problem.reaction(evaluated.residual) - before)
 
 
-def _surfaces(laws: Sequence[TissueLaw]) -> list[SurfaceTerm]:
+def _surface_terms(laws: Sequence[TissueLaw]) -> list[SurfaceTerm]:
+    """Returns the surface terms of all laws."""
     return [term for law in laws for term in law.surfaces]
 
 
-def _factor(term: SurfaceTerm, h: float) -> float:
-    """Factor of a term's unit matrix over a stage of length h."""
+def _term_factor(term: SurfaceTerm, h: float) -> float:
+    """Returns the factor of a surface term's unit matrix in a stage of length h [s]."""
     return term.value * (h if term.per_second else 1.0)

@@ -1,9 +1,10 @@
-"""A few sparse factorisations, kept and reused: MKL PARDISO where it is installed, else SuperLU.
+"""Keeps and reuses a few sparse factorisations, made by MKL PARDISO where it is installed, else by SuperLU.
 
-The factors only ever serve as an approximate inverse, which `newton` corrects by true residuals in
-double precision. So PARDISO factorises in single precision, in half the time and memory, and of a
-tangent that nearly is symmetric only the symmetric part, in half of the rest. Unknowns are scaled
-first, because displacements [m] and pressures [Pa] lie many decades apart.
+The factors serve only as an approximate inverse. `newton` corrects the result with true residuals in double
+precision. PARDISO can therefore factorise in single precision, which takes half the time and memory. Where
+the tangent is nearly symmetric, it factorises only the symmetric part, which halves time and memory again.
+The unknowns are scaled first, because displacements [m] and pressures [Pa] differ by many orders of
+magnitude.
 """
 
 from __future__ import annotations
@@ -23,56 +24,69 @@ from bayeskin.types import Array
 
 _library = next(iter(sorted(p for p in Path(sys.prefix, "lib").glob("libmkl_rt*") if p.is_file())), None)
 _unset = "PYPARDISO_MKL_RT" not in os.environ and _library is not None
-if _unset:  # where MKL's wheel puts it; else pypardiso looks through the whole environment
+if _unset:  # MKL's wheel installs the library here; otherwise pypardiso searches the whole environment
     os.environ["PYPARDISO_MKL_RT"] = str(_library)
 try:
     import pypardiso
-except (ImportError, OSError):  # no wheel for this processor, or no MKL beside it
+except (ImportError, OSError):  # there is no wheel for this processor, or MKL is missing
     pypardiso = None
-if _unset:  # a child may have another environment
+if _unset:  # a child process may run in another environment, and must not inherit this path
     del os.environ["PYPARDISO_MKL_RT"]
 
 SOLVER_NAME = "MKL PARDISO" if pypardiso is not None else "SuperLU"
 _STRUCTURALLY_SYMMETRIC, _SYMMETRIC_INDEFINITE = 1, -2
 _ANALYSE_AND_FACTORISE, _FACTORISE, _SOLVE, _RELEASE = 12, 22, 33, -1
-# by number in Intel's manual: own settings; METIS ordering; pivots perturbed below 1e-8; scaling and
-# matching; single precision; indices from 0
+# The keys are the numbers of PARDISO's parameters (iparm) in Intel's manual. In this order they choose
+# settings other than the defaults, METIS ordering, perturbation of pivots below 1e-8, scaling, matching,
+# counting of the factor's entries, single precision, and indices that start at 0.
 _SETTINGS = {1: 1, 2: 2, 10: 8, 11: 1, 13: 1, 18: -1, 28: 1, 35: 1}
-_PERTURBED_PIVOTS, _ENTRIES_OF_FACTOR = 14, 18  # the latter asked for by -1
-MOST, MEMORY_BYTES = 10, 480_000_000  # factorisations kept, and what they may take
+_PERTURBED_PIVOTS, _ENTRIES_OF_FACTOR = 14, 18  # the -1 above makes PARDISO report the latter
+MOST, MEMORY_BYTES = 10, 480_000_000  # largest number of kept factorisations, and of bytes that they take
 
 
 class Factorisations(Protocol):
-    """Numbered factorisations (from 0 on) of matrices that all share one sparsity pattern.
+    """Factorisations of matrices that all share one sparsity pattern. They are numbered from 0.
 
-    room : how many may be kept, by their memory; known after the first
+    room : number of factorisations that fit into the allowed memory, known after the first factorisation
     """
 
     @property
     def room(self) -> int: ...
 
-    def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None: ...
-
-    def solve(self, number: int, right: Array) -> Array:
-        """Solves with the matrix last given to `factorise` under this number; right (n,) or (n, r)."""
+    def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None:
+        """Factorises a matrix under a number; scale (n,) is the size of each unknown."""
         ...
 
-    def release(self) -> None: ...
+    def solve(self, number: int, right: Array) -> Array:
+        """Returns the solution for right-hand sides (n,) or (n, r).
+
+        The matrix is the one that was last factorised under this number.
+        """
+        ...
+
+    def release(self) -> None:
+        """Frees all factorisations."""
+        ...
 
 
 class _Pardiso:
-    """Calls MKL itself: pypardiso's own methods know double precision and one factorisation only."""
+    """Factorisations by MKL PARDISO.
+
+    The class calls MKL directly, because the methods of pypardiso allow only double precision and only one
+    factorisation.
+    """
 
     def __init__(self, symmetric: bool) -> None:
         self._symmetric = symmetric
         self._type = _SYMMETRIC_INDEFINITE if symmetric else _STRUCTURALLY_SYMMETRIC
-        self._pardiso = pypardiso.ps.libmkl["pardiso"]  # with argument types of our own
+        # a new function object, to which the argument types set by pypardiso do not apply
+        self._pardiso = pypardiso.ps.libmkl["pardiso"]
         self._handle = np.zeros(64, np.int64)
         self._settings = np.zeros(64, np.int32)
         for number, value in _SETTINGS.items():
             self._settings[number - 1] = value
-        self._scale: dict[int, Array] = {}  # of each factorisation
-        self._entries: dict[int, np.ndarray] = {}  # as MKL was given them, where it asks for them again
+        self._scale: dict[int, Array] = {}  # scale of each factorisation
+        self._entries: dict[int, np.ndarray] = {}  # entries of each matrix, where MKL needs them again
 
     @property
     def room(self) -> int:
@@ -87,10 +101,12 @@ class _Pardiso:
         _scaled_mean(self._indptr, self._indices, self._own, self._mirrored, matrix.data, scale, entries)
         self._scale[number], self._entries[number] = scale, entries
         self._call(number, _ANALYSE_AND_FACTORISE if first else _FACTORISE)  # the pattern is analysed once
-        if self._settings[_PERTURBED_PIVOTS - 1] == 0:  # else each solve is refined with the entries
+        # MKL needs the entries again only where it has perturbed pivots and therefore refines each solve
+        if self._settings[_PERTURBED_PIVOTS - 1] == 0:
             self._entries[number] = np.empty(0, np.float32)
 
     def _prepare(self, matrix: sp.csr_matrix) -> None:
+        """Stores the sparsity pattern, and for each stored entry the places of the two entries to average."""
         numbers = np.arange(matrix.nnz, dtype=np.int32)
         pattern = sp.csr_matrix((numbers, matrix.indices, matrix.indptr), shape=matrix.shape)
         self._own = self._mirrored = numbers
@@ -103,20 +119,21 @@ class _Pardiso:
 
     def solve(self, number: int, right: Array) -> Array:
         scale = self._scale[number]
-        scaled = np.ascontiguousarray(right.T) * scale  # column after column, as MKL has them
-        # each to size one, so that nothing underflows in single precision
+        scaled = np.ascontiguousarray(right.T) * scale  # MKL stores one column after the other
+        # each column is scaled to size one, so that no number underflows in single precision
         size = np.maximum(np.abs(scaled).max(axis=-1, keepdims=True), np.finfo(float).tiny)
         found = self._call(number, _SOLVE, (scaled / size).astype(np.float32))
         return np.asarray((found.astype(float) * (size * scale)).T)
 
     def release(self) -> None:
-        """Gives MKL's memory back; Python's collector knows nothing of it."""
+        """Frees the memory of MKL, which Python's garbage collector does not manage."""
         if self._scale:
             self._call(0, _RELEASE)
             self._scale.clear()
             self._entries.clear()
 
     def _call(self, number: int, phase: int, right: np.ndarray | None = None) -> np.ndarray:
+        """Runs a phase of PARDISO and returns the solution. Raises RuntimeError if MKL reports an error."""
         n = len(self._indptr) - 1
         right = np.zeros(n, np.float32) if right is None else right
         solution, error = np.zeros_like(right), ctypes.c_int32(0)
@@ -141,13 +158,18 @@ class _Pardiso:
 
 @numba.njit(cache=True)
 def _scaled_mean(indptr, indices, own, mirrored, data, scale, out):  # type: ignore[no-untyped-def]
-    """Fills the entries `out` of a CSR matrix with the means of two entries each of `data`, scaled."""
+    """Fills each entry of a CSR matrix, in `out`, with the scaled mean of two entries of `data`.
+
+    own, mirrored : places of the two entries in `data`
+    """
     for row in range(len(indptr) - 1):
         for k in range(indptr[row], indptr[row + 1]):
             out[k] = 0.5 * (data[own[k]] + data[mirrored[k]]) * scale[row] * scale[indices[k]]
 
 
 class _SuperLU:
+    """Factorisations by SuperLU, which scipy includes."""
+
     def __init__(self) -> None:
         self._stored: dict[int, tuple[spla.SuperLU, Array]] = {}
 
@@ -172,5 +194,8 @@ class _SuperLU:
 
 
 def factorisations(symmetric: bool) -> Factorisations:
-    """By the best solver at hand; of the symmetric part only, or of all of a matrix."""
+    """Returns a store of factorisations by the fastest installed solver.
+
+    symmetric : the matrices are nearly symmetric, so that PARDISO may factorise their symmetric part alone
+    """
     return _Pardiso(symmetric) if pypardiso is not None else _SuperLU()

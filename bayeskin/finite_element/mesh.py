@@ -1,7 +1,8 @@
-"""The quarter of the skin as a mesh: what a mesh is, and graded bricks of our own (`gmsh` reads files).
+"""Defines the mesh of a quarter of the skin, and makes meshes of graded bricks.
 
-Both are made flat, as `bayeskin.geometry` has it, and rolled onto an arm of radius R:
-``theta = y / (R + z)``, ``y' = (R + z) sin(theta)``, ``z' = (R + z) cos(theta)``.
+The module `gmsh` reads other meshes from files. A mesh is first flat, with the coordinates of
+`bayeskin.geometry`. It is then rolled onto an arm of radius R: ``theta = y / (R + z)``, ``y' = (R + z)
+sin(theta)``, ``z' = (R + z) cos(theta)``.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from bayeskin.finite_element.bricks import brick_lines
 from bayeskin.geometry import Geometry
 from bayeskin.types import Array
 
-TOP_TOLERANCE_M = 1e-6  # of what lies on the skin's outer face
+TOP_TOLERANCE_M = 1e-6  # points so near to the skin's outer face count as lying on it
 BOUNDARIES = ("pad", "guard", "symmetry_x", "symmetry_y", "bottom")
 
 
@@ -26,11 +27,12 @@ BOUNDARIES = ("pad", "guard", "symmetry_x", "symmetry_y", "bottom")
 class SkinMesh:
     """A rolled mesh with the facets of each boundary and the cells of the cutis.
 
-    geometry : scikit-fem mesh, coordinates in metres, already rolled
-    facets : indices of `geometry.facets` for each name in BOUNDARIES; none of a guard that is not there
+    geometry : scikit-fem mesh, already rolled, with coordinates in metres
+    facets : for each name in BOUNDARIES the indices of its facets in `geometry.facets`; a device without a
+        guard has no facets of that name
     cutis : (cells,) True in the cutis, False in the subcutis
-    name : for messages and records
-    lengths : device and tissue that it is a mesh of
+    name : name for messages and records
+    lengths : lengths of the device and the tissue that the mesh represents
     """
 
     geometry: skfem.Mesh
@@ -41,7 +43,10 @@ class SkinMesh:
 
     @property
     def hash(self) -> str:
-        """sha256 over cells, boundaries, layers, and coordinates to a nanometre (sines differ by machine)."""
+        """The sha256 of the cells, boundaries and layers, and of the coordinates.
+
+        Coordinates are rounded to a nanometre, because sines differ slightly from machine to machine.
+        """
         nanometres = np.round(1e9 * self.geometry.doflocs).astype(np.int64)
         whole = (self.geometry.t, self.cutis, *(self.facets[name] for name in BOUNDARIES))
         digest = hashlib.sha256()
@@ -50,7 +55,7 @@ class SkinMesh:
         return digest.hexdigest()
 
     def top(self) -> np.ndarray:
-        """Facets of the skin's outer face, under pads and guard, too."""
+        """Returns the facets of the skin's outer face, including those under pads and guard."""
         mesh = self.geometry
         outside = mesh.boundary_facets()
         corners = unroll(mesh.p[:, mesh.facets[:, outside]], self.lengths.arm_radius_m)
@@ -58,13 +63,19 @@ class SkinMesh:
         return outside[on_top.all(axis=0)]
 
     def facet_mapping(self) -> skfem.Mapping | None:
-        """With which scikit-fem's FacetBasis can place points on facets; None for its own."""
+        """Returns the mapping with which scikit-fem's FacetBasis can place points on facets.
+
+        It is None where scikit-fem's default mapping works.
+        """
         mesh = self.geometry
         return _BrickMapping(mesh, mesh.elem(), mesh.bndelem) if isinstance(mesh, skfem.MeshHex) else None
 
 
 class _BrickMapping(MappingIsoparametric):
-    """Inverts to 1e-10 of a brick: scikit-fem's own 1e-12 is below rounding in thin curved ones."""
+    """A mapping of bricks that is inverted to a tolerance of 1e-10 of a brick.
+
+    scikit-fem's default of 1e-12 is smaller than the rounding errors in thin curved bricks.
+    """
 
     def invF(
         self,
@@ -77,9 +88,9 @@ class _BrickMapping(MappingIsoparametric):
 
 
 def roll(points: Array, radius_m: float | None) -> Array:
-    """Flat coordinates (3, n) [m] onto an arm, (3, n) [m] (the article's script, after loading).
+    """Returns flat coordinates (3, n) [m] rolled onto an arm, (3, n) [m].
 
-    Without a radius they stay as they are.
+    The article's script does the same after loading a mesh. Without a radius the coordinates do not change.
     """
     if radius_m is None:
         return points
@@ -89,7 +100,7 @@ def roll(points: Array, radius_m: float | None) -> Array:
 
 
 def unroll(points: Array, radius_m: float | None) -> Array:
-    """The flat coordinates (3, ...) [m] of points (3, ...) on an arm: what `roll` made them from."""
+    """Returns the flat coordinates (3, ...) [m] of points (3, ...) [m] on an arm: the inverse of `roll`."""
     if radius_m is None:
         return points
     x, y, z = points
@@ -100,16 +111,18 @@ def unroll(points: Array, radius_m: float | None) -> Array:
 def brick_mesh(
     refinement: int = 1, geometry: Geometry = Geometry(), like: Geometry | None = None
 ) -> SkinMesh:
-    """Bricks graded toward the edges of pads and guard; 27-node cells, so the arm is curved.
+    """Returns a mesh of bricks that is graded toward the edges of pads and guard.
 
-    There a clamped surface meets a free one and the stress is singular, so that is where they are small and
-    where `refinement` divides them: 1 gives the article's device 448 bricks, 2 gives 1,540, each finer one
-    a further line on either side of every edge, a quarter of the cell's width from it.
+    The bricks have 27 nodes, so that they follow the curved arm. At the edges a clamped surface meets a free
+    one, and the stress is singular. Bricks are therefore small there, and `refinement` divides them there.
 
-    like : the same device on other skin, whose mesh this one is, cell by cell, with its nodes moved to this
-        skin's layers and arm
+    refinement : level of refinement. Level 1 gives the article's device 448 bricks, level 2 gives 1,540. Each
+        further level adds a line on either side of every edge, at a quarter of the cell's width from the edge
+    geometry : device and tissue
+    like : the same device on other skin. The result is then the mesh of `like`, cell by cell, with its nodes
+        moved to the layers and the arm of `geometry`
 
-    Raises InputError for another device than that of `like`.
+    Raises InputError if the device differs from that of `like`.
     """
     lines = brick_lines(refinement, geometry, like)
     return layered_mesh(lines, f"bricks, refinement {refinement}", geometry=geometry)
@@ -118,9 +131,10 @@ def brick_mesh(
 def layered_mesh(
     lines: Sequence[Array], name: str, tetrahedra: bool = False, geometry: Geometry = Geometry()
 ) -> SkinMesh:
-    """Curved bricks between `lines` along x, y, z before rolling [m], or straight tetrahedra cut from them.
+    """Returns a mesh of curved bricks, or of straight tetrahedra that are cut from them.
 
-    The edges of pads and guard, and where the layers meet, are among the lines.
+    lines : coordinates [m] of the bricks' faces along x, y and z before rolling; they must include the edges
+        of pads and guard, and the interface of the layers
     """
     flat = skfem.MeshHex.init_tensor(*lines)
     flat = flat.to_meshtet() if tetrahedra else flat
@@ -133,7 +147,7 @@ def layered_mesh(
 
 
 def _flat_boundaries(centre: Array, geometry: Geometry) -> dict[str, np.ndarray]:
-    """Facets of each boundary from the facet centres (3, facets) of the flat mesh [m]."""
+    """Returns the facets of each boundary. centre (3, facets) : centres [m] of the flat mesh's facets."""
     x, y, z = centre
     top = np.isclose(z, geometry.thickness_m)
     pad = _within(x, y, geometry.along_m[1], geometry.across_m[0])
@@ -153,4 +167,5 @@ def _flat_boundaries(centre: Array, geometry: Geometry) -> dict[str, np.ndarray]
 
 
 def _within(x: Array, y: Array, end_m: float, half_width_m: float) -> np.ndarray:
+    """Returns which points lie before `end_m` along x and within `half_width_m` along y."""
     return (x < end_m) & (y < half_width_m)

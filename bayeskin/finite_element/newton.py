@@ -1,13 +1,15 @@
-"""Nonlinear solves that keep factorised tangents: Newton when needed, Broyden in between.
+"""Solves the nonlinear equations of a time step by Newton's and Broyden's methods, with kept factorisations.
 
-A factorisation costs as much as some tens of residuals and back-substitutions, and the tangent
-changes slowly along the protocol, whose cycles come back to where it was before. So a few are kept, each
-under the place where it was made (`Equations.place`), and the nearest serves as approximate inverse,
-corrected by Broyden's rank-one updates (C. T. Kelley, Iterative Methods for Linear and Nonlinear
-Equations, SIAM 1995, section 7.3). When none contracts well, a new one is made.
+A factorisation of the tangent costs as much as some tens of residuals and back-substitutions. The tangent
+changes slowly along the protocol, and each cycle of the protocol returns to earlier states. The solver
+therefore keeps a few factorisations, each with the place where it was made (`Equations.place`). The nearest
+serves as approximate inverse, corrected by Broyden's rank-one updates (C. T. Kelley, Iterative Methods for
+Linear and Nonlinear Equations, SIAM 1995, section 7.3). If it does not contract well, the solver factorises a
+new tangent.
 
-Past a fold of the equilibria there is no solution near the last one, and Newton's method finds none. A body
-then moves on by itself, and `NewtonSolver.relax` follows it to where it comes to rest.
+Beyond a fold of the equilibria (a limit point) there is no solution near the last one, and Newton's method
+does not converge. The body then moves by itself to another equilibrium, and `NewtonSolver.relax` follows this
+motion until the body comes to rest.
 """
 
 from __future__ import annotations
@@ -24,24 +26,27 @@ from bayeskin.types import Array
 
 MAX_RENEWALS = 8
 MAX_BROYDEN = 25
-DEAR = 8.0  # iterations left from which a factorisation, worth some twenty-five but kept, is cheaper
+# The solver makes a new factorisation if more than so many iterations are left. A factorisation costs about
+# as much as twenty-five iterations, but later solves use it again.
+DEAR = 8.0
 SMALLEST_DAMPING = 1 / 64
-SAME_PLACE = 0.2  # a factorisation this near to a new one is replaced by it
+SAME_PLACE = 0.2  # a new factorisation replaces an old one that is nearer than this
 EXTRAPOLATION_POINTS = 3
 COUNTED = ("iterations", "residuals", "factorisations", "solves", "falls", "crawls")
-MOST_RELAXING, RELAXED = 400, 1e5  # steps of `relax`, and the length at which its drag is all but nothing
+MOST_RELAXING, RELAXED = 400, 1e5  # largest number of steps of `relax`; step length with negligible drag
 ALLOWED_CONTRACTION, WANTED_CONTRACTION, MOST_GROWTH = 0.8, 0.25, 10.0
 
 
 @dataclass(frozen=True)
 class Equations:
-    """Functions that one solve needs: of the whole vector x (dofs,), with free rows and columns only.
+    """The equations of one solve, as functions of the whole vector of unknowns x (dofs,).
 
-    residual : x -> (free,) or None where a cell has turned inside out
-    tangent : x -> free-free matrix and free-fixed matrix
-    weight : (free,) one over the tolerance of each unknown; a step is small where |weight step| < 1
-    scale : (free,) size of each unknown in the linear solves, so that the matrix is balanced
-    place : coordinates, each of order one, in which near equations have near tangents
+    free : numbers of the free dofs; the results have only free rows
+    residual : function of x that returns (free,), or None if a cell has turned inside out
+    tangent : function of x that returns the free-free matrix and the free-fixed matrix
+    weight : (free,) one over the tolerance of each unknown; a step is small if |weight step| < 1
+    scale : (free,) size of each unknown in the linear solves, which balances the matrix
+    place : coordinates of order one; equations with similar coordinates have similar tangents
     """
 
     free: np.ndarray
@@ -54,28 +59,28 @@ class Equations:
 
 @dataclass
 class NewtonSolver:
-    """Carries the factorised tangent from solve to solve, and counts what was spent."""
+    """Solves equations, keeps the factorised tangents from solve to solve, and counts the work."""
 
-    symmetric: bool = True  # the tangent nearly is, so its symmetric part is what is factorised
+    symmetric: bool = True  # the tangent is nearly symmetric, so that its symmetric part is factorised
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTED, 0))
     last_residual: float = np.nan
     _factors: Factorisations = field(init=False)
-    _places: dict[int, Array] = field(default_factory=dict)  # number of a kept factorisation: its place
-    _used: dict[int, int] = field(default_factory=dict)  # and when it last served
+    _places: dict[int, Array] = field(default_factory=dict)  # the place of each kept factorisation, by number
+    _used: dict[int, int] = field(default_factory=dict)  # the number of the solve that used it last
     _current: int = 0
 
     def __post_init__(self) -> None:
         self._factors = factorisations(self.symmetric)
 
     def release(self) -> None:
-        """Frees the factors."""
+        """Frees the memory of all factorisations."""
         self._factors.release()
         self._places.clear()
 
     def renew(self, equations: Equations, x: Array, drag: Array | None = None) -> sp.csr_matrix:
         """Factorises the tangent at x, with `drag` (free,) added to its diagonal.
 
-        Returns its free-fixed part, for prescribed increments.
+        Returns the free-fixed part of the tangent, which gives the effect of prescribed increments.
         """
         free_free, free_fixed = equations.tangent(x)
         if drag is not None:
@@ -87,7 +92,11 @@ class NewtonSolver:
         return free_fixed
 
     def _number_for(self, place: Array) -> int:
-        """Returns the number of the factor at this place, else a free one, else the least recently used."""
+        """Returns the number under which a new factorisation at this place is stored.
+
+        It is the number of a factorisation at nearly the same place, else an unused number, else the number
+        of the least recently used factorisation.
+        """
         nearest = self._nearest(place)
         if nearest is not None and np.abs(self._places[nearest] - place).sum() < SAME_PLACE:
             return nearest
@@ -96,12 +105,14 @@ class NewtonSolver:
         return min(self._places, key=lambda number: self._used[number])
 
     def _nearest(self, place: Array) -> int | None:
+        """Returns the number of the factorisation nearest to a place, or None if there is none."""
         return min(self._places, key=lambda n: float(np.abs(self._places[n] - place).sum()), default=None)
 
     def respond(self, equations: Equations, x: Array, target: Array, fixed: np.ndarray) -> Array | None:
-        """First guess when the fixed dofs jump from x to `target`: the linear response of the free ones.
+        """Returns the linear response of the free dofs when the fixed dofs jump from x to `target`.
 
-        Renews the tangent at x. None if x itself is inside out.
+        The result is a starting point for a solve. The method factorises the tangent at x. It returns None if
+        a cell is inside out at x.
         """
         free_fixed = self.renew(equations, x)
         right = self._residual(equations, x)
@@ -114,25 +125,33 @@ class NewtonSolver:
         return guess
 
     def toward(self, place: Array) -> Array:
-        """Takes the factorisation nearest to a place for the coming back-substitutions.
+        """Selects the factorisation nearest to a place for the next back-substitutions.
 
-        Returns where that was made: the same array as long as it is kept.
+        Returns the place where that factorisation was made. As long as the factorisation is kept, this is
+        always the same array object.
         """
         self._current = min(self._places, key=lambda n: float(np.abs(self._places[n] - place).sum()))
         return self._places[self._current]
 
     def back_substitute(self, right: Array) -> Array:
-        """Solves with the tangent factorised or taken last, (free,) or (free, r)."""
+        """Returns the solution for right-hand sides (free,) or (free, r).
+
+        The matrix is the tangent that was factorised or selected last.
+        """
         self.counts["solves"] += 1
         self._used[self._current] = self.counts["solves"]
         return self._factors.solve(self._current, right)
 
     def solve(self, equations: Equations, guess: Array) -> Array | None:
-        """The solution from a guess whose fixed dofs are already right; None if none was found."""
-        with np.errstate(over="ignore", invalid="ignore"):  # of steps that are then refused
-            return self._solved(equations, guess.copy())
+        """Returns the solution (dofs,), or None if the solver does not converge.
 
-    def _solved(self, equations: Equations, x: Array) -> Array | None:
+        guess : starting point (dofs,), with the fixed dofs at their prescribed values
+        """
+        with np.errstate(over="ignore", invalid="ignore"):  # steps that overflow are rejected
+            return self._solve_renewing(equations, guess.copy())
+
+    def _solve_renewing(self, equations: Equations, x: Array) -> Array | None:
+        """Iterates from x, and factorises a new tangent each time the iteration is slow."""
         nearest = self._nearest(equations.place)
         fresh = nearest is None
         if nearest is None:
@@ -151,12 +170,16 @@ class NewtonSolver:
         return None
 
     def relax(self, equations: Equations, x: Array, drag: Array) -> Array | None:
-        """Returns where x, with its fixed dofs right, comes to rest in a viscous medium; None if nowhere.
+        """Returns the unknowns (dofs,) at which a body comes to rest that starts at x in a viscous medium.
 
-        drag : (free,) resistance of each unknown to motion, in units of its stiffness; none of the pressures,
-        so that the energy of the step falls. Pseudo-transient continuation (Kelley & Keyes, SIAM J. Numer.
-        Anal. 35, 1998, 508): implicit Euler steps of one Newton iteration each, as long as that contracts.
-        They grow towards rest, and what is returned solves the equations without drag.
+        x : starting point (dofs,), with the fixed dofs at their prescribed values
+        drag : (free,) resistance of each unknown to motion, in units of its stiffness. It is zero for the
+            pressures, so that the energy of the step decreases
+
+        The method is pseudo-transient continuation (Kelley & Keyes, SIAM J. Numer. Anal. 35, 1998, 508). It
+        takes implicit Euler steps of one Newton iteration each, and halves a step in which the iteration does
+        not contract. The steps grow as the body comes to rest. The result solves the equations without drag.
+        It is None if the body does not come to rest, or if a cell is inside out at x.
         """
         right = self._residual(equations, x)
         if right is None:
@@ -164,7 +187,7 @@ class NewtonSolver:
         self.counts["falls"] += 1
         length, growth = 1.0, MOST_GROWTH
         for _ in range(MOST_RELAXING):
-            trial, after, moved, contraction = self._crawl(equations, x, right, drag / length)
+            trial, after, moved, contraction = self._relaxation_step(equations, x, right, drag / length)
             if after is None or not contraction < ALLOWED_CONTRACTION:
                 length, growth = 0.5 * length, 1.0
                 continue
@@ -175,11 +198,14 @@ class NewtonSolver:
             length, growth = length * float(np.clip(change, 0.5, growth)), MOST_GROWTH
         return None
 
-    def _crawl(
+    def _relaxation_step(
         self, equations: Equations, x: Array, right: Array, drag: Array
     ) -> tuple[Array, Array | None, float, float]:
-        """One step against drag: where to, the residual there, its size in units of the tolerance, and that
-        of a second iteration relative to it, 0 of a step within the tolerance, which may be mere rounding.
+        """Takes one step against the drag, and tests how a second iteration would contract.
+
+        Returns the new unknowns (dofs,), the residual there (None if a cell has turned inside out), the size
+        of the step in units of the tolerance, and the size of a second iteration relative to the step. The
+        last is 0 if the step is smaller than the tolerance, because it may then consist of rounding errors.
         """
         self.counts["crawls"] += 1
         self.renew(equations, x, drag)
@@ -189,8 +215,8 @@ class NewtonSolver:
         after, moved = self._residual(equations, trial), float(np.abs(step * equations.weight).max())
         if after is None or moved < 1.0:
             return trial, after, moved, 0.0
-        rest = self.back_substitute(after + drag * step)
-        sizes = [float(np.linalg.norm(move * equations.weight)) for move in (rest, step)]
+        second = self.back_substitute(after + drag * step)
+        sizes = [float(np.linalg.norm(move * equations.weight)) for move in (second, step)]
         return trial, after, moved, sizes[0] / sizes[1]
 
     def _residual(self, equations: Equations, x: Array) -> Array | None:
@@ -198,7 +224,11 @@ class NewtonSolver:
         return equations.residual(x)
 
     def _broyden(self, equations: Equations, x: Array, fresh: bool) -> tuple[Array | None, bool]:
-        """Steps with the kept tangent: (x, True) converged, (x, False) slow, (None, False) lost."""
+        """Iterates with the kept tangent and Broyden's updates.
+
+        fresh : the tangent was factorised at x
+        Returns (x, True) if the iteration converges, (x, False) if it is slow, and (None, False) if it fails.
+        """
         right = self._residual(equations, x)
         if right is None:
             return None, False
@@ -230,14 +260,16 @@ class NewtonSolver:
         return x, False
 
     def _newton_step(self, equations: Equations, right: Array) -> Array:
-        """Returns Newton's step (free,) by the last tangent, in units of the tolerance."""
+        """Returns the Newton step (free,) with the last tangent, in units of the tolerance."""
         return -self.back_substitute(right) * equations.weight
 
     def _damped(self, equations: Equations, x: Array, step: Array) -> Array | None:
-        """The first of x + step/2, /4, ... after which cells are upright and steps shorter, or None.
+        """Returns the first acceptable point among x + step/2, x + step/4, ..., or None.
 
-        The natural monotonicity test: P. Deuflhard, Newton Methods for Nonlinear Problems, Springer 2004,
-        section 3.3. step (free,) in units of the tolerance.
+        A point is acceptable if no cell is inside out and the next step is shorter. This is the natural
+        monotonicity test (P. Deuflhard, Newton Methods for Nonlinear Problems, Springer 2004, section 3.3).
+
+        step : (free,) in units of the tolerance
         """
         damping = 0.5
         while damping >= SMALLEST_DAMPING:
@@ -253,12 +285,15 @@ class NewtonSolver:
 
 
 def _shorter(after: Array, before: Array, allowed: float = 1.0) -> bool:
-    """Returns whether the next step with the same tangent is at most `allowed` times the last one."""
+    """Returns True if the next step with the same tangent is at most `allowed` times as long as the last."""
     return float(np.linalg.norm(after)) <= allowed * float(np.linalg.norm(before))
 
 
 def _updated_step(steps: list[Array], z: Array) -> Array:
-    """Next step from the history and the kept tangent's own, z (Kelley's matrix-free form of Broyden's)."""
+    """Returns the next step of Broyden's method, in Kelley's matrix-free form.
+
+    steps : all earlier steps with the kept tangent; z : the next step by the kept tangent alone
+    """
     for old, new in pairwise(steps):
         z = z + new * (old @ z) / (old @ old)
     last = steps[-1]
@@ -266,21 +301,27 @@ def _updated_step(steps: list[Array], z: Array) -> Array:
 
 
 def _iterations_left(size: float, before: list[float]) -> float:
-    """Until a step is below 1 at the mean contraction of the last two (Broyden's method goes by fits)."""
+    """Returns how many iterations are left until a step is smaller than 1.
+
+    It assumes the mean contraction of the last two iterations, because Broyden's method contracts unevenly.
+    """
     contraction = np.sqrt(size / before[-2])
     return float(np.log(size) / -np.log(contraction)) if contraction < 1.0 else np.inf
 
 
 def extrapolate(past: Sequence[tuple[float, Array]], time_s: float) -> Array:
-    """Unknowns (dofs,) at a later time by the polynomial through (at most) the last three (time, x)."""
+    """Returns the unknowns (dofs,) at a later time, extrapolated from the past pairs of time and unknowns.
+
+    The polynomial passes through the last three pairs, or through all if there are fewer.
+    """
     last = past[-EXTRAPOLATION_POINTS:]
     weights = extrapolation_weights([time for time, _ in last], time_s)
     return np.asarray(sum(weight * x for weight, (_, x) in zip(weights, last, strict=True)))
 
 
 def extrapolation_weights(times_s: Sequence[float], time_s: float) -> list[float]:
-    """Weights of values at `times_s` in their polynomial's value at another time (Lagrange)."""
+    """Returns the weights of the values at `times_s` in the Lagrange polynomial's value at another time."""
     return [
-        float(np.prod([(time_s - other) / (own - other) for other in times_s if other != own]))
-        for own in times_s
+        float(np.prod([(time_s - other_s) / (node_s - other_s) for other_s in times_s if other_s != node_s]))
+        for node_s in times_s
     ]

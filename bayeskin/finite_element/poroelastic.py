@@ -1,16 +1,17 @@
-"""The base model's constitutive law: neo-Hookean solid, Darcy flow, both on the reference configuration.
+"""The base model's constitutive law: a neo-Hookean solid with Darcy flow, on the reference configuration.
 
 With F, J = det F and C = F^T F, the first Piola-Kirchhoff stress is
 
     P = mu (F - F^-T) + lambda ln(J) F^-T - p J F^-T                       (Biot 1)
 
-and over a time step (or Runge-Kutta stage) of length h, from the stage's history J*, p*, fluid content
-and flux are
+A stage is a time step or a stage of a Runge-Kutta step. Over a stage of length h, with the stage's history
+J*, p*, the fluid content and the flux are
 
     m = J - J* + J S (p - p*) ,     Q = h (k / mu_f) J C^-1 Grad p
 
-Source: the article's equations 12-13 and 26-29, pulled back to the reference configuration. The tangent
-is symmetric up to the dependence of J C^-1 on u.
+The tangent is symmetric except for the dependence of J C^-1 on u.
+
+Source: the article's equations 12-13 and 26-29, pulled back to the reference configuration.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -38,7 +39,9 @@ def respond(
     flux,
     volume,
 ):
-    """Fills stress, content, flux and J (e, q); returns the smallest J (not positive: inside out).
+    """Fills stress, content, flux and J (e, q), and returns the smallest J.
+
+    A J that is not positive means that a cell has turned inside out; the function then stops there.
 
     mu, lam [Pa], mobility k/mu_f [m^2/(Pa s)] and storage S [1/Pa] are per cell (e,).
     """
@@ -85,7 +88,7 @@ def linearise(
     flux_f,
     flux_g,
 ):
-    """Fills the derivatives of `respond`. With G = F^-1:
+    """Fills the derivatives of `respond`. With G = F^-1 they are
 
     dP = mu dF + (mu - lambda ln J + p J) F^-T dF^T F^-T + (lambda - p J) tr(G dF) F^-T - J F^-T dp
     dQ = h k/mu_f J [ tr(G dF) G s - G dF G s - G (G dF)^T grad p + G F^-T d grad p ],  s = F^-T grad p
@@ -126,7 +129,7 @@ def linearise(
             for i in range(3):
                 for m in range(3):
                     for n in range(3):
-                        # G G^T entry (i, n) from d(F^-T), as flux_g over the conductance
+                        # flux_g holds the conductance times the entry (i, n) of G G^T, which d(F^-T) needs
                         flux_f[e, q, i, 3 * m + n] = (
                             conductance * (inverse[n, m] * along[i] - inverse[i, m] * along[n])
                             - flux_g[e, q, i, n] * spatial[m]

@@ -1,4 +1,4 @@
-"""The test as a boundary-value problem: which dofs are prescribed, which layer has which constants."""
+"""Describes the test as a boundary-value problem: its prescribed dofs, and the constants of each layer."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PARAMETERS = ("E_c", "E_s", "k_c", "k_s", "p_init")
 
 @dataclass(frozen=True)
 class Constants:
-    """Parameters that the article fixes (its section "Initial parameters values"); SI."""
+    """Parameters that the article fixes in its section "Initial parameters values", in SI units."""
 
     nu_c: float = 0.48
     nu_s: float = 0.3
@@ -34,7 +34,7 @@ class Constants:
 
 @dataclass(frozen=True)
 class Material:
-    """Constants of each cell (e,): Lame mu, lam [Pa], mobility k/mu_f [m^2/(Pa s)], storage [1/Pa]."""
+    """Constants of each cell (e,): Lame mu, lam [Pa], mobility k/mu_f [m^2/(Pa s)] and storage [1/Pa]."""
 
     mu: Array
     lam: Array
@@ -43,11 +43,13 @@ class Material:
 
 
 def material(theta: Mapping[str, float], cutis: np.ndarray, fixed: Constants | None = None) -> Material:
-    """Returns constants of cells or points from a run's parameters and the fixed ones.
+    """Returns the material constants of cells or points.
 
-    theta : E_c, E_s [Pa], k_c, k_s [m^2], and drained Poisson's ratios nu_c, nu_s in place of the fixed ones
-    cutis : (e,), which cells or points lie in the cutis
-    Raises InputError for a ratio of no stable solid.
+    theta : parameters of the run: E_c, E_s [Pa], k_c, k_s [m^2]. Drained Poisson's ratios nu_c, nu_s are
+        optional, and replace the fixed ones
+    cutis (e,) : True for cells or points in the cutis
+    fixed : the fixed parameters, by default the article's
+    Raises InputError for a Poisson's ratio that no stable solid has.
     """
     c = fixed or Constants()
     ratios = [theta.get(name, getattr(c, name)) for name in ("nu_c", "nu_s")]
@@ -70,9 +72,10 @@ def material(theta: Mapping[str, float], cutis: np.ndarray, fixed: Constants | N
 
 @dataclass(frozen=True, eq=False)
 class Sites:
-    """The n points at which laws act.
+    """The n points at which laws are evaluated.
 
-    cutis (n,) : True in the cutis; points_m (3, n) : coordinates on the rolled arm [m]
+    cutis (n,) : True in the cutis
+    points_m (3, n) : coordinates on the rolled arm [m]
     lengths : device and tissue
     """
 
@@ -81,14 +84,17 @@ class Sites:
     lengths: Geometry = Geometry()
 
     def table(self, *columns: Array | float) -> Array:
-        """Returns constants of the points side by side, (n, d), from columns (n,), (n, j) or one for all."""
+        """Returns constants of the points side by side, (n, d).
+
+        columns : arrays (n,) or (n, j), or a number that holds for all points
+        """
         n = len(self.cutis)
         parts = [c.reshape(n, -1) if np.ndim(c) else np.full((n, 1), c) for c in map(np.asarray, columns)]
         return np.ascontiguousarray(np.concatenate([np.empty((n, 0)), *parts], axis=1))
 
 
 class LinearTerm(NamedTuple):
-    """A matrix (dofs, dofs), and where its entries stand in the tangent, with their values."""
+    """A matrix (dofs, dofs), with the places of its entries in the data of the tangent, and their values."""
 
     matrix: sp.csr_matrix
     place: np.ndarray
@@ -97,10 +103,11 @@ class LinearTerm(NamedTuple):
 
 @dataclass(frozen=True)
 class Problem:
-    """A mesh with its space, prescribed dofs and sparsity; shared by every run on that mesh.
+    """A mesh with its function space, prescribed dofs and sparsity pattern. All runs on the mesh share it.
 
-    pad, pads : displacement nodes of the central pad; of pad and guard together
-    measured_x : x dofs of what the load cell holds, where the reaction is summed
+    pad : displacement nodes of the central pad
+    pads : displacement nodes of pad and guard together
+    measured_x : x dofs of the parts that the load cell holds, over which the reaction is summed
     """
 
     mesh: SkinMesh
@@ -112,13 +119,13 @@ class Problem:
 
     @cached_property
     def sites(self) -> Sites:
-        """Returns the quadrature points, cell by cell."""
+        """Returns the quadrature points, in order of cells."""
         points = self.space.quadrature_points
         cutis = np.repeat(self.mesh.cutis, points.shape[2])
         return Sites(cutis, np.ascontiguousarray(points.reshape(3, -1)), self.lengths)
 
     def linear(self, unit: Callable[[Problem], sp.csr_matrix]) -> LinearTerm:
-        """Returns the matrix that `unit` makes of this problem, made at the first call."""
+        """Returns the matrix that `unit` computes from this problem, computed at the first call and kept."""
         if unit not in self._linear:
             matrix = unit(self)
             self._linear[unit] = LinearTerm(matrix, *self.pattern.places(matrix))
@@ -126,29 +133,39 @@ class Problem:
 
     @property
     def lengths(self) -> Geometry:
-        """Device and tissue."""
+        """Returns the lengths of device and tissue."""
         return self.mesh.lengths
 
     @property
     def measured_x(self) -> np.ndarray:
+        """Returns the x dofs over which the reaction is summed."""
         return 3 * (self.pad if self.lengths.force_on == "pad" else self.pads)
 
     def prescribe(self, x: Array, pad_displacement_m: float) -> Array:
-        """A copy of x (dofs,) with every prescribed dof at its value: u_x of the pads, zero elsewhere."""
+        """Returns a copy of x (dofs,) in which every prescribed dof has its value.
+
+        The value is the pads' displacement [m] for u_x of the pads, and zero for all other prescribed dofs.
+        """
         out = x.copy()
         out[self.pattern.fixed] = 0.0
         out[3 * self.pads] = pad_displacement_m
         return out
 
     def reaction(self, residual: Array) -> float:
-        """Force on what the load cell holds [N]: nodal reactions along x, doubled for the y-symmetry."""
+        """Returns the force on the parts that the load cell holds [N].
+
+        It is the sum of the nodal reactions along x, doubled because of the symmetry about y = 0.
+        """
         return float(2.0 * residual[self.measured_x].sum())
 
 
 def nominal_force(solid: Material, cutis: np.ndarray, lengths: Geometry, moved_m: float) -> float:
-    """Returns a scale of the force [N]: both layers pulled from x = 0, as wide as the load cell holds.
+    """Returns a scale of the force [N].
 
-    cutis (e,) : which cells or points of the solid lie in the cutis; moved_m : how far a pad moves
+    It is the force that stretches both layers between x = 0 and the pad, over the measured width.
+
+    cutis (e,) : True for cells or points of the solid in the cutis
+    moved_m : displacement of a pad [m]
     """
     young = solid.mu * (3 * solid.lam + 2 * solid.mu)
     young = young / (solid.lam + solid.mu)
@@ -157,7 +174,11 @@ def nominal_force(solid: Material, cutis: np.ndarray, lengths: Geometry, moved_m
 
 
 def build_problem(mesh: SkinMesh) -> Problem:
-    """Space, prescribed dofs and sparsity of a mesh (design: pads move along x, bottom u_z = 0)."""
+    """Returns the boundary-value problem on a mesh.
+
+    The pads and the guard move along x only. The bottom has u_z = 0. Points on the planes of symmetry have no
+    normal displacement.
+    """
     space = taylor_hood(mesh)
     pad, guard = space.facet_nodes("pad"), space.facet_nodes("guard")
     pads = np.union1d(pad, guard)
@@ -175,5 +196,5 @@ def build_problem(mesh: SkinMesh) -> Problem:
 
 
 def moved_problem(problem: Problem, mesh: SkinMesh) -> Problem:
-    """The problem on a mesh with the same cells, whose nodes alone are elsewhere."""
+    """Returns the problem on a mesh with the same cells, whose nodes have moved."""
     return Problem(mesh, taylor_hood(mesh), problem.pattern, problem.pad, problem.pads)

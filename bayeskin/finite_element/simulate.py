@@ -1,4 +1,4 @@
-"""One full run: a specification, a motion and parameters in; a force history out."""
+"""Runs the full model: it computes a force history from a specification, a motion and parameters."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from bayeskin.finite_element.tissue import Bind
 from bayeskin.geometry import LENGTHS, Geometry, moved
 from bayeskin.types import Array, Observation, PadMotion, Simulation, frozen_array
 
-PHYSICS_VERSION = 2  # raised when a change of the code changes a force by more than its tolerance
+PHYSICS_VERSION = 2  # increase it when a change of the code changes a force by more than its tolerance
 ARTICLE_STEP_S = 0.5  # every 50th sample of a 100 Hz recording
 
 OnState = Callable[[float, Array, float], None]  # time_s, x (dofs,), force_n
@@ -43,16 +43,17 @@ OnState = Callable[[float, Array, float], None]  # time_s, x (dofs,), force_n
 
 @dataclass(frozen=True)
 class ModelSpec:
-    """Choice of a model: its device and tissue, the force that is observed, the mesh and the tolerance.
+    """Specification of a model: device and tissue, the observed force, the mesh and the tolerance.
 
-    observation : "reaction" (what the load cell measures), "article" (its released code), or "own"
-    mesh : "bricks" (our graded bricks) or the path of a gmsh file with the article's names
-    refinement : of the bricks, toward the edges of the pads; 1 gives 448 of them, 0 gives 80
-    tolerance : estimated local error of the reaction a step, relative to the nominal force; the
-        article's steps are its own
-    forward : with observation "own": where the model is that stands in this one's place, as
-        `bayeskin.external.model` says; mesh, refinement and tolerance are then nothing to it
-    geometry : device and tissue; the observations "article" and "own" know the article's only
+    observation : "reaction" (the force that the load cell measures), "article" (the force of the article's
+        released code), or "own" (the force of a user's own model)
+    mesh : "bricks" (bayeskin's graded bricks) or the path of a gmsh file with the article's names
+    refinement : refinement of the bricks toward the edges of the pads; 1 gives 448 bricks, 0 gives 80
+    tolerance : limit of the estimated local error of the reaction in a step, relative to the nominal force;
+        the observation "article" has fixed steps
+    forward : location of the user's own model, with observation "own", as `bayeskin.external.model`
+        describes; mesh, refinement and tolerance then have no effect
+    geometry : device and tissue; the observations "article" and "own" allow only the article's
     """
 
     observation: Observation = "reaction"
@@ -68,41 +69,42 @@ class ModelSpec:
         if self.observation == "article" and self.mesh == "bricks":
             raise InputError("model.mesh", "bricks", "the article's gmsh mesh for observation 'article'")
         if self.observation != "reaction" and self.geometry != Geometry():
-            found = f"another than the article's, with observation {self.observation!r}"
-            raise InputError("geometry", found, "observation 'reaction', or the article's device and tissue")
+            given = f"another than the article's, with observation {self.observation!r}"
+            raise InputError("geometry", given, "observation 'reaction', or the article's device and tissue")
 
     @property
     def mesh_hash(self) -> str:
-        """Hash by which `accuracy.mesh_error` knows the mesh."""
+        """Returns the hash of the mesh, which `accuracy.mesh_error` takes."""
         return _mesh(self.mesh, self.refinement, self.geometry).hash
 
     @property
     def hash(self) -> str:
-        """sha256 of all that the force depends on besides motion and parameters."""
+        """Returns the sha256 of all that the force depends on besides the motion and the parameters."""
         if self.forward is not None:
             return identity(self.forward)
         steps = ARTICLE_STEP_S if self.observation == "article" else self.tolerance
         known = [PHYSICS_VERSION, self.observation, self.mesh_hash, steps, asdict(Constants())]
-        if self.geometry != Geometry():  # hashes of the article's device are older than any other
+        if self.geometry != Geometry():  # older hashes of the article's device stay valid
             known.append(self.geometry.hash)
         return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
 
 
 @lru_cache(maxsize=2)
 def _mesh(mesh: str, refinement: int, geometry: Geometry) -> SkinMesh:
+    """Returns the mesh of a specification."""
     return brick_mesh(refinement, geometry) if mesh == "bricks" else read_gmsh(Path(mesh), geometry)
 
 
 @lru_cache(maxsize=2)
 def problem_of(mesh: str, refinement: int, geometry: Geometry = Geometry()) -> Problem:
-    """Builds the boundary-value problem of a mesh, once a process."""
+    """Returns the boundary-value problem of a mesh, which is built once in each process."""
     return build_problem(_mesh(mesh, refinement, geometry))
 
 
 def problem_at(spec: ModelSpec, theta: Mapping[str, float]) -> Problem:
-    """Returns the problem of a specification, its nodes moved to the tissue's lengths that are in theta.
+    """Returns the problem of a specification, with its nodes moved to the lengths of the tissue in theta.
 
-    Raises InputError for lengths that cannot be, and for a gmsh mesh, whose nodes stay where they are.
+    Raises InputError for impossible lengths, and for a gmsh mesh, whose nodes cannot be moved.
     """
     nominal, geometry = problem_of(spec.mesh, spec.refinement, spec.geometry), moved(spec.geometry, theta)
     if geometry == spec.geometry:
@@ -122,24 +124,26 @@ def simulate(
     laws: Sequence[Bind] = (),
     falls_too: bool = True,
 ) -> Simulation:
-    """Runs the full model over the whole motion.
+    """Runs the full model over the whole motion, and returns the force history.
 
-    theta : E_c, E_s [Pa], k_c, k_s [m^2], p_init [Pa], the parameters of `laws`, and lengths of the tissue
-        [m] in place of the specification's
-    on_progress : called with the fraction of the motion that is done
-    on_state : called with time [s], all unknowns (dofs,) and force [N] of each accepted step
-    gradients : also the force's derivatives by these parameters, each for the change that stands with it,
-        `reaction` only (`gradients.logarithms`: by the logarithms of the base's four and of lengths)
-    falls_too : whether a skin that folds is followed across the fold, which takes minutes; else it has failed
-    laws : physics beyond the base model, `reaction` only; with pads that were opened before the test the
-        force is relative to that at its start, where all is at rest
+    theta : E_c, E_s [Pa], k_c, k_s [m^2], p_init [Pa], the parameters of `laws`, and optionally lengths of
+        the tissue [m], which replace those of the specification
+    on_progress : function that is called with the completed fraction of the motion
+    on_state : function that is called with time [s], all unknowns (dofs,) and force [N] of each accepted step
+    gradients : parameters for which derivatives of the force are also computed, each with the change to which
+        the derivative refers; only for the observation "reaction". `gradients.logarithms` gives the changes
+        for derivatives with respect to the logarithms of the base model's four parameters and of lengths
+    laws : physics beyond the base model; only for the observation "reaction". If the pads were opened before
+        the test, the force is relative to the force at the start of the test, where everything is at rest
+    falls_too : True to follow a skin that folds across the fold, which takes minutes; otherwise such a run
+        fails
 
-    A run that does not converge is a Simulation with status "failed", its steps so far, and a
-    message with the step, the time and a remedy. Raises InputError for a parameter that is
-    missing, unknown, not finite, or not positive where it must be; of a model of one's own as `simulate_own`.
+    A run that does not converge returns a Simulation with status "failed", the steps so far, and a message
+    with the step, the time and a remedy. Raises InputError for a parameter that is missing, unknown, not
+    finite, or not positive where it must be. For the observation "own", `simulate_own` describes the errors.
     """
     if spec.forward is None:
-        _check(theta, bool(laws))
+        _check_parameters(theta, bool(laws))
     if gradients and spec.observation != "reaction":
         raise InputError("gradients", f"observation {spec.observation!r}", "observation 'reaction'")
     if laws and spec.observation != "reaction":
@@ -153,20 +157,21 @@ def simulate(
         solid = material(theta, problem.mesh.cutis)
         outcome = _run_reaction(
             problem, solid, spec.tolerance, laws, motion, theta, history,
-            partial(_slopes, spec, theta, gradients, laws) if gradients else None, falls_too,
+            partial(_gradients_of, spec, theta, gradients, laws) if gradients else None, falls_too,
         )  # fmt: skip
     else:
         outcome = (*_run_article(problem, motion, theta, history), None)
     return _simulation(problem, motion, theta, history, outcome, time.perf_counter() - started, spec.hash)
 
 
-def _slopes(
+def _gradients_of(
     spec: ModelSpec,
     theta: Mapping[str, float],
     changes: Mapping[str, float],
     laws: Sequence[Bind],
     model: LagrangianModel,
 ) -> ForceGradients:
+    """Returns the object that differentiates a run of the model."""
     return ForceGradients(model, theta, changes, laws, partial(problem_at, spec))
 
 
@@ -178,12 +183,13 @@ def simulate_on(
     theta: Mapping[str, float],
     laws: Sequence[Bind] = (),
 ) -> Simulation:
-    """The reaction on any mesh and with any constants of its cells, as `simulate` gives it.
+    """Runs the model on any mesh with any constants of its cells, and returns the history of the reaction.
 
-    solid : of each cell, in place of what theta makes of the article's constants; the rest as `simulate`.
-    The result's model_hash is the mesh's.
+    solid : constants of each cell, which replace those computed from theta
+
+    The other arguments and the errors are those of `simulate`. The result's model_hash is that of the mesh.
     """
-    _check(theta, bool(laws))
+    _check_parameters(theta, bool(laws))
     started = time.perf_counter()
     history = _History(motion, None, None)
     outcome = _run_reaction(problem, solid, tolerance, laws, motion, theta, history, None)
@@ -191,7 +197,7 @@ def simulate_on(
     return _simulation(problem, motion, theta, history, outcome, seconds, problem.mesh.hash)
 
 
-_Outcome = tuple[str, NewtonSolver, ForceGradients | None]  # message, empty for a run that finished
+_Outcome = tuple[str, NewtonSolver, ForceGradients | None]  # the message is empty for a run that finished
 
 
 def _simulation(
@@ -203,6 +209,7 @@ def _simulation(
     seconds: float,
     model_hash: str,
 ) -> Simulation:
+    """Frees the solver's memory and returns the result of a run."""
     message, solver, slopes = outcome
     solver.release()
     force = np.array(history.forces_n)
@@ -210,7 +217,7 @@ def _simulation(
         "seconds": seconds,
         "steps": float(len(force) - 1),
         "dofs": float(problem.space.dofs),
-        "time_error_n": float(np.linalg.norm(history.errors_n)),  # see `accuracy`
+        "time_error_n": float(np.linalg.norm(history.errors_n)),  # `accuracy` describes it
         "peak_force_n": float(np.abs(force).max()),
         "last_residual": float(solver.last_residual),
         **{name: float(count) for name, count in solver.counts.items()},
@@ -232,11 +239,12 @@ def _simulation(
 
 
 def _beyond_start(rows: Sequence[Array]) -> Array:
+    """Returns the rows relative to the first row, (n, r)."""
     return np.array(rows) - rows[0]
 
 
 class _History:
-    """Accepted steps so far, from the state of rest on; tells whoever listens of each."""
+    """The accepted steps so far, starting with the state of rest. It reports each step to the callbacks."""
 
     def __init__(
         self, motion: PadMotion, on_progress: Callable[[float], None] | None, on_state: OnState | None
@@ -245,6 +253,7 @@ class _History:
         self.times_s, self.forces_n, self.errors_n, self.corners = [0.0], [0.0], [0.0], [True]
 
     def add(self, time_s: float, x: Array, force_n: float, corner: bool, error_n: float = 0.0) -> None:
+        """Stores a step after the start, and calls the callbacks."""
         if time_s > 0.0:
             self.times_s.append(time_s)
             self.forces_n.append(force_n)
@@ -267,7 +276,7 @@ def _run_reaction(
     slopes_of: Callable[[LagrangianModel], ForceGradients] | None,
     falls_too: bool = True,
 ) -> _Outcome:
-    """Fills the history; returns a message, empty for a run that finished."""
+    """Runs the model for the observation "reaction", fills the history and returns the outcome."""
     bound = tuple(bind(theta, problem.sites) for bind in laws)
     model = LagrangianModel(problem, solid, motion, bound)
     slopes = slopes_of(model) if slopes_of is not None else None
@@ -293,6 +302,7 @@ def _run_reaction(
 def _run_article(
     problem: Problem, motion: PadMotion, theta: Mapping[str, float], history: _History
 ) -> tuple[str, NewtonSolver]:
+    """Runs the article's formulation and fills the history; returns the message and the solver."""
     model = article.ArticleModel(problem, material(theta, problem.mesh.cutis))
     samples = np.arange(0.0, motion.time_s[-1] + 1e-9, ARTICLE_STEP_S)
 
@@ -303,8 +313,11 @@ def _run_article(
     return message, model.solver
 
 
-def _check(theta: Mapping[str, float], more: bool) -> None:
-    """`more`: of laws, which alone know their parameters."""
+def _check_parameters(theta: Mapping[str, float], more: bool) -> None:
+    """Raises InputError for a parameter that is missing, unknown, not finite or wrongly not positive.
+
+    more : True if there are laws, whose parameters only the laws know, so that other names are allowed
+    """
     for name in PARAMETERS:
         if name not in theta:
             raise InputError("parameters", f"no {name}", f"all of {', '.join(PARAMETERS)}")

@@ -1,4 +1,4 @@
-"""Taylor-Hood space on a skin mesh: quadratic displacement, linear pressure, and their sparsity."""
+"""Builds the Taylor-Hood space on a skin mesh (quadratic displacement, linear pressure) and its sparsity."""
 
 from __future__ import annotations
 
@@ -19,15 +19,18 @@ QUADRATURE_DEGREE = 4
 
 @dataclass(frozen=True)
 class TaylorHood:
-    """Dof numbers, shape functions and gradients of one mesh, ready for the compiled kernels.
+    """Dof numbers, shape functions and their gradients on one mesh, as the compiled kernels need them.
 
-    A vector of unknowns x has shape (dofs,): three displacements a node [m] (node-major), then one
-    pressure a corner [Pa]. e cells, q quadrature points a cell, a and b shape functions.
+    A vector of unknowns x has shape (dofs,). It holds three displacements [m] for each node, node by node,
+    and then one pressure [Pa] for each corner. There are e cells with q quadrature points each, a shape
+    functions of the displacement and b of the pressure.
 
-    nodes_u (e, a), nodes_p (e, b) : numbers of nodes and of corners
-    grad_u (e, q, 3, a), grad_p (e, q, 3, b) : gradients [1/m]; value_p (q, b)
+    nodes_u (e, a), nodes_p (e, b) : numbers of the nodes and of the corners of each cell
+    grad_u (e, q, 3, a), grad_p (e, q, 3, b) : gradients of the shape functions [1/m]
+    value_p (q, b) : values of the pressure's shape functions
     weight (e, q) : quadrature weight times volume element [m^3]
     points_u (3, nodes), quadrature_points (3, e, q) : coordinates of displacement nodes and of points [m]
+    n_nodes, n_corners : number of displacement nodes, and of corners
     """
 
     mesh: SkinMesh
@@ -44,16 +47,17 @@ class TaylorHood:
 
     @property
     def dofs(self) -> int:
+        """Returns the number of unknowns."""
         return 3 * self.n_nodes + self.n_corners
 
     @cached_property
     def cell_dofs(self) -> np.ndarray:
-        """All dofs of each cell, (e, 3 a + b): displacements node by node, then pressures."""
+        """Returns all dofs of each cell, (e, 3 a + b): displacements node by node, then pressures."""
         u = (3 * self.nodes_u[:, :, None] + np.arange(3)).reshape(len(self.nodes_u), -1)
         return np.concatenate([u, 3 * self.n_nodes + self.nodes_p], axis=1)
 
     def facet_nodes(self, name: str) -> np.ndarray:
-        """Displacement nodes on a named boundary, sorted."""
+        """Returns the displacement nodes on a named boundary, sorted."""
         return np.unique(self._basis().get_dofs(self.mesh.facets[name]).all())
 
     def _basis(self) -> skfem.CellBasis:
@@ -61,13 +65,14 @@ class TaylorHood:
 
 
 def _element(mesh: SkinMesh) -> tuple[skfem.Element, skfem.Element]:
+    """Returns the elements of displacement and of pressure for a mesh of bricks or tetrahedra."""
     if isinstance(mesh.geometry, skfem.MeshHex2):
         return skfem.ElementHex2(), skfem.ElementHex1()
     return skfem.ElementTetP2(), skfem.ElementTetP1()
 
 
 def taylor_hood(mesh: SkinMesh) -> TaylorHood:
-    """Builds the space of a mesh, with quadrature of degree 4 (as the article's script)."""
+    """Builds the space of a mesh, with quadrature of degree 4, as in the article's script."""
     quadratic, linear = _element(mesh)
     basis = skfem.Basis(mesh.geometry, quadratic, intorder=QUADRATURE_DEGREE)
     corner = basis.with_element(linear)
@@ -93,10 +98,13 @@ def taylor_hood(mesh: SkinMesh) -> TaylorHood:
 
 @dataclass(frozen=True)
 class Sparsity:
-    """Destination of each entry of each cell matrix: free rows only, columns split into free and fixed.
+    """The sparsity pattern of the tangent, and the place of each entry of each cell's matrix in it.
 
-    free (f,), fixed (c,) : dof numbers; free_free (f, f), free_fixed (f, c) : patterns, their data (bytes)
-    without meaning; position (e, nd, nd) : index into the concatenated data of both, or -1 for a fixed row.
+    The tangent has rows only for free dofs. Its columns are split into those of free and of fixed dofs.
+
+    free (f,), fixed (c,) : dof numbers
+    free_free (f, f), free_fixed (f, c) : sparsity patterns; their data (bytes) have no meaning
+    position (e, nd, nd) : index into the concatenated data of both matrices, or -1 for a fixed row
     """
 
     free: np.ndarray
@@ -107,10 +115,14 @@ class Sparsity:
 
     @property
     def size(self) -> int:
+        """Returns the length of the concatenated data."""
         return self.free_free.nnz + self.free_fixed.nnz
 
     def matrices(self, data: Array) -> tuple[sp.csr_matrix, sp.csr_matrix]:
-        """Free-free and free-fixed tangents on concatenated data (size,); indices are shared, not checked."""
+        """Returns the free-free and the free-fixed matrix with the concatenated data (size,).
+
+        The matrices share their indices with the pattern, and scipy does not check them again.
+        """
         n = self.free_free.nnz
         blocks = copy(self.free_free), copy(self.free_fixed)
         blocks[0].data, blocks[1].data = data[:n], data[n:]
@@ -119,7 +131,7 @@ class Sparsity:
     def places(self, matrix: sp.csr_matrix) -> tuple[np.ndarray, Array]:
         """Returns the places of a matrix's entries in the concatenated data, and their values.
 
-        Rows of fixed unknowns are left out; every other entry must couple unknowns of one cell.
+        Rows of fixed unknowns are left out. Every other entry must couple two unknowns of one cell.
         """
         number = np.full(matrix.shape[0], -1)
         number[self.free] = np.arange(len(self.free))
@@ -143,7 +155,7 @@ class Sparsity:
 
 
 def sparsity(space: TaylorHood, fixed: np.ndarray) -> Sparsity:
-    """The pattern of the tangent when the dofs `fixed` are prescribed."""
+    """Returns the sparsity pattern of the tangent if the dofs `fixed` are prescribed."""
     is_fixed = np.zeros(space.dofs, dtype=bool)
     is_fixed[fixed] = True
     free, fixed = np.flatnonzero(~is_fixed), np.flatnonzero(is_fixed)
@@ -175,6 +187,7 @@ def sparsity(space: TaylorHood, fixed: np.ndarray) -> Sparsity:
 
 @numba.njit(cache=True)
 def _positions(cells, number, is_fixed, ptr, idx, ptr_fixed, idx_fixed, offset):  # type: ignore[no-untyped-def]
+    """Returns `Sparsity.position` (e, nd, nd); offset : number of entries of the free-free matrix."""
     out = np.full((cells.shape[0], cells.shape[1], cells.shape[1]), -1, np.int32)
     for e in range(cells.shape[0]):
         for i in range(cells.shape[1]):

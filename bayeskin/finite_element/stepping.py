@@ -1,16 +1,18 @@
-"""Time integration of the total-Lagrangian model: second order, adaptive, landing on every corner.
+"""Integrates the model in time: second order, with adaptive steps that end on every corner of the protocol.
 
-At a corner of the protocol the pressure's rate jumps, so each phase starts with a step of Alexander's
-two-stage singly diagonally implicit Runge-Kutta method (SIAM J. Numer. Anal. 14, 1977; gamma = 1 -
-1/sqrt(2), stiffly accurate, L-stable), which needs no history. The variable-step backward differentiation
-formula of second order (Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, section III.5)
-goes on with half of the solves. Either is one solve of J - J* ... = h* div(...) with its own history J*, p*
-and length h*. The local error of the fluid mass, filtered through the tangent (Hosea & Shampine 1996), gives
-an error of the force in newtons, which steers the step.
+The pressure's rate jumps at a corner of the protocol. Each phase therefore starts with steps of Alexander's
+two-stage singly diagonally implicit Runge-Kutta method (SIAM J. Numer. Anal. 14, 1977; gamma = 1 - 1/sqrt(2),
+stiffly accurate, L-stable), which needs no history. The phase continues with the variable-step backward
+differentiation formula of second order (Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I,
+section III.5), which needs half as many solves. Each stage of either method is one solve of J - J* ... = h*
+div(...) with its own history J*, p* and length h*. The local error of the fluid mass, filtered through the
+tangent (Hosea & Shampine 1996), gives an error of the force in newtons. This error controls the length of the
+steps.
 
-A soft cutis on a stiff subcutis folds, and snaps from one equilibrium to another. A step that fails at the
-smallest length is taken as such a fall (`NewtonSolver.relax`), and the phase starts anew after it. On fine
-meshes wrinkles may follow each other without end; a run whose falls become too dear is given up.
+A soft cutis on a stiff subcutis folds: it snaps from one equilibrium to another. A step that fails at the
+smallest length is treated as such a fall (`NewtonSolver.relax`), and the integration restarts after it. On
+fine meshes wrinkles may follow each other without end. A run whose falls take too many steps is therefore
+stopped.
 """
 
 from __future__ import annotations
@@ -27,21 +29,25 @@ from bayeskin.types import Array, PadMotion
 
 GAMMA = 1.0 - np.sqrt(0.5)
 FIRST_STEP_S = 1.0
-SHORTEST_STEP = 1e-3  # of the phase; what asks for less is a fall, or has failed
-GROWTH, SHRINK = 2.0, 0.25  # zero-stable while steps grow less than 2.41-fold
-MOST_CRAWLS = 3000  # of a run: steps of its falls, some 150 each
-STEPS_PER_PHASE = 5  # fewer, longer ones cost as much: their guesses are worse, their tangents further apart
+SHORTEST_STEP = 1e-3  # relative to the phase; a step that would have to be shorter is a fall, or fails
+GROWTH, SHRINK = 2.0, 0.25  # the method is zero-stable while steps grow less than 2.41-fold
+MOST_CRAWLS = 3000  # largest number of relaxation steps in a run; a fall takes about 150
+# Fewer and longer steps would cost as much, because their guesses are worse and their tangents differ more.
+STEPS_PER_PHASE = 5
 
 
 class Solver(Protocol):
-    """The solver of a model; counts : of its work, "crawls" and "falls" among them."""
+    """The solver of a model.
+
+    counts : counts of the work done, among them "crawls" and "falls"
+    """
 
     @property
     def counts(self) -> Mapping[str, int]: ...
 
 
 class Equations(Protocol):
-    """The model, full or reduced, that step control integrates: `LagrangianModel` describes each member."""
+    """The full or reduced model that is integrated in time. `LagrangianModel` describes each member."""
 
     @property
     def starts_s(self) -> float: ...
@@ -72,29 +78,34 @@ class Equations(Protocol):
 
 
 def advance(model: Equations, past: list[State], h: float) -> Step | None:
-    """One step of length h [s] from the last of `past`, the states of this phase up to now."""
+    """Returns the step of length h [s] from the last state in `past`, or None without convergence.
+
+    past : the last states of this phase
+    """
     if len(past) < EXTRAPOLATION_POINTS:
         return _runge_kutta(model, past, h)
     return _backward_difference(model, past, h)
 
 
 def _runge_kutta(model: Equations, past: list[State], h: float) -> Step | None:
-    first = GAMMA * h
+    """Returns a step of Alexander's two-stage Runge-Kutta method, or None if a stage does not converge."""
+    stage_length = GAMMA * h
     state = past[-1]
-    t1, t2 = state.time_s + first, state.time_s + h
-    one = model.solve_stage(t1, first, ((1.0, state),), _guess(past, t1), len(past) == 1)
-    if one is None:
+    t1, t2 = state.time_s + stage_length, state.time_s + h
+    stage1 = model.solve_stage(t1, stage_length, ((1.0, state),), _guess(past, t1), len(past) == 1)
+    if stage1 is None:
         return None
     ahead = (1.0 - GAMMA) / GAMMA
-    sources = ((1.0 - ahead, state), (ahead, one.state))
-    two = model.solve_stage(t2, first, sources, _guess([*past, one.state], t2), False)
-    if two is None:
+    sources = ((1.0 - ahead, state), (ahead, stage1.state))
+    stage2 = model.solve_stage(t2, stage_length, sources, _guess([*past, stage1.state], t2), False)
+    if stage2 is None:
         return None
-    mass = (two.state.volume - two.history.volume) - (one.state.volume - state.volume)
-    return model.finish((one, two), mass)
+    mass = (stage2.state.volume - stage2.history.volume) - (stage1.state.volume - state.volume)
+    return model.finish((stage1, stage2), mass)
 
 
 def _backward_difference(model: Equations, past: list[State], h: float) -> Step | None:
+    """Returns a step of the backward differentiation formula, or None if it does not converge."""
     older, old, state = past[-3:]
     before, earlier = state.time_s - old.time_s, old.time_s - older.time_s
     ratio = h / before
@@ -104,7 +115,7 @@ def _backward_difference(model: Equations, past: list[State], h: float) -> Step 
     stage = model.solve_stage(time_s, h * (1.0 + ratio) / spread, sources, _guess(past, time_s), False)
     if stage is None:
         return None
-    # both the quadratic extrapolation and the formula err by a multiple of the third derivative
+    # the errors of the quadratic extrapolation and of the formula are both multiples of the third derivative
     corrector = (1.0 + ratio) ** 2 * h**3 / (6.0 * ratio * spread)
     predictor = h * (h + before) * (h + before + earlier) / 6.0
     weights = extrapolation_weights([s.time_s for s in past[-3:]], time_s)
@@ -114,9 +125,10 @@ def _backward_difference(model: Equations, past: list[State], h: float) -> Step 
 
 
 def _fall(model: Equations, state: State, h: float) -> Step | None:
-    """A step across a fold of the equilibria, of backward Euler, which extrapolates no jump.
+    """Returns a step across a fold of the equilibria, or None if the body does not come to rest.
 
-    As error of the fluid mass all that moves is taken, since nothing tells which part of it is right.
+    The step is one of backward Euler, which does not extrapolate across the jump. Nothing tells how accurate
+    the change of volume is, so that all of it counts as error of the fluid mass.
     """
     sources = ((1.0, state),)
     stage = model.solve_stage(state.time_s + h, h, sources, state.x, jump=False, fall=True)
@@ -124,6 +136,7 @@ def _fall(model: Equations, state: State, h: float) -> Step | None:
 
 
 def _guess(past: list[State], time_s: float) -> Array:
+    """Returns the unknowns (dofs,) at a later time, extrapolated from past states."""
     return extrapolate([(state.time_s, state.x) for state in past], time_s)
 
 
@@ -134,11 +147,12 @@ def integrate(
     on_step: Callable[[Step], None],
     falls_too: bool = True,
 ) -> str:
-    """Runs the whole motion; calls `on_step` for the start and for each accepted step.
+    """Integrates over the whole motion, and calls `on_step` for the start and for each accepted step.
 
-    tolerance : estimated local error of the force a step, relative to the nominal force.
-    falls_too : whether a skin that folds is followed to where it comes to rest; else the run has failed.
-    Returns "" or, for a run that failed, one line with the step, the time and a remedy.
+    p_init : initial interstitial pressure [Pa]
+    tolerance : limit of the estimated local error of the force in a step, relative to the nominal force
+    falls_too : True to follow a skin that folds to where it comes to rest; otherwise such a run fails
+    Returns an empty string, or for a run that failed one line with the step, the time and a remedy.
     """
     state = model.initial_state(p_init)
     on_step(Step(state, 0.0, 0.0, corner=True))
@@ -153,7 +167,7 @@ def integrate(
                     f"step {count + 1} at t = {at_s:.3f} s: the skin has folded and snapped "
                     f"{spent['falls']} times; try layers less unlike in stiffness, or a coarser mesh"
                 )
-            h = _landing(max(h, shortest), end - state.time_s, longest)
+            h = _next_length(max(h, shortest), end - state.time_s, longest)
             step = advance(model, past, h)
             falls = step is None and h <= shortest
             if falls and not falls_too:
@@ -181,7 +195,10 @@ def integrate(
     return ""
 
 
-def _landing(h: float, left: float, longest: float) -> float:
-    """The next step: at most `longest`, and equal last steps rather than a sliver at the corner."""
+def _next_length(h: float, left: float, longest: float) -> float:
+    """Returns the length of the next step [s], at most `longest`.
+
+    Near the corner, `left` seconds away, it makes the last steps equal, so that no very short step remains.
+    """
     h = min(h, longest)
     return left / np.ceil(left / h - 1e-9) if left < 2.0 * h else h

@@ -1,9 +1,10 @@
-"""Visible surface of the quarter near the pads: its top and two planes of symmetry, with their fields.
+"""Computes the fields on the visible surface near the pads: the top and the two planes of symmetry.
 
-Facets of the mesh are divided into small faces, on whose corners the fields are the finite elements' own.
-The fluid's velocity past the solid is ``v_l - v_s = -k / (mu_f porosity) grad p`` (Darcy), with the mean
-porosity of a facet: at the pads' corners, where the strain is singular, a point's own falls below zero. The
-velocity lies in the faces: no fluid crosses the top or a plane of symmetry.
+The facets of the mesh are divided into small faces. At their corners the fields have the values of the
+finite-element solution. The velocity of the fluid relative to the solid is Darcy's,
+``v_l - v_s = -k / (mu_f porosity) grad p``, with the mean porosity of a facet. The porosity of a single point
+cannot be used, because it falls below zero at the pads' corners, where the strain is singular. The velocity
+lies in the faces, because no fluid crosses the top or a plane of symmetry.
 """
 
 from __future__ import annotations
@@ -19,17 +20,23 @@ from bayeskin.finite_element.mesh import unroll
 from bayeskin.finite_element.problem import Constants, Problem, material
 from bayeskin.types import Array
 
-DIVISIONS = {"brick": 6, "tetrahedron": 3}  # of the edges of a facet
+DIVISIONS = {"brick": 6, "tetrahedron": 3}  # number of parts into which each edge of a facet is divided
 PARTS = ("subcutis", "cutis", "top", "pad", "guard")
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Small faces of the seen facets near the pads. f faces, v points, g facets, k points a facet.
+    """The small faces of the visible facets near the pads.
 
-    faces (f, 3 or 4) numbers of points; part (f,) index into PARTS (a layer on the planes of symmetry);
-    plane (f,) 0 the top, 1 the plane y = 0, 2 the plane x = 0; point (g, k) numbers of each facet's points;
-    small (s, 3 or 4) small faces of one facet, by the facet's points; near (g, s) those that are seen
+    There are f small faces and v points, on g facets of k points each.
+
+    faces (f, 3 or 4) : numbers of the points of each small face
+    part (f,) : index into PARTS; on the planes of symmetry it is the index of a layer
+    plane (f,) : 0 for the top, 1 for the plane y = 0, 2 for the plane x = 0
+    point (g, k) : numbers of each facet's points
+    small (s, 3 or 4) : small faces of one facet, by the numbers of its points within the facet
+    near (g, s) : True for the small faces near the pads
+    quadratic, linear : finite-element bases of displacement and pressure at the points of the facets
     """
 
     faces: np.ndarray
@@ -44,9 +51,12 @@ class Surface:
 
 @dataclass(frozen=True)
 class SurfaceState:
-    """Fields at one time: deformed points (v, 3) [m], and means over the small faces (f,).
+    """The fields at one time. All but the first are means over the small faces.
 
-    displacement_m magnitude (f,), pressure_pa (f,), velocity_m_s (f, 3) of the fluid past the solid
+    points_m (v, 3) : deformed points
+    displacement_m (f,) : magnitude of the displacement
+    pressure_pa (f,) : pressure
+    velocity_m_s (f, 3) : velocity of the fluid relative to the solid
     """
 
     points_m: Array
@@ -56,7 +66,7 @@ class SurfaceState:
 
 
 def seen_surface(problem: Problem) -> Surface:
-    """The surface near the pads; each facet divided into small faces."""
+    """Returns the visible surface near the pads, with each facet divided into small faces."""
     mesh = problem.mesh.geometry
     bricks = isinstance(mesh, skfem.MeshHex)
     quadratic, linear = (
@@ -93,7 +103,7 @@ def seen_surface(problem: Problem) -> Surface:
 
 
 def surface_state(problem: Problem, theta: Mapping[str, float], surface: Surface, x: Array) -> SurfaceState:
-    """Fields on the surface from the unknowns x (dofs,)."""
+    """Returns the fields on the surface for the unknowns x (dofs,)."""
     n, c = 3 * problem.space.n_nodes, Constants()
     u = [surface.quadratic.interpolate(x[i:n:3]) for i in range(3)]
     p = surface.linear.interpolate(x[n:])
@@ -116,12 +126,12 @@ def surface_state(problem: Problem, theta: Mapping[str, float], surface: Surface
 
 
 def _face_means(surface: Surface, values: Array) -> Array:
-    """Means over the small faces (f, ...) from values at each facet's points (g, k, ...)."""
+    """Returns means over the small faces (f, ...) of values at the facets' points (g, k, ...)."""
     return values[:, surface.small].mean(axis=2)[surface.near]
 
 
 def _divided_square(n: int) -> tuple[Array, np.ndarray]:
-    """Points (2, (n+1)^2) of the unit square and the n^2 squares between them (n^2, 4)."""
+    """Returns points (2, (n+1)^2) in the unit square, and the n^2 squares between them (n^2, 4)."""
     ticks = np.linspace(0.0, 1.0, n + 1)
     number = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
     squares = np.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], axis=-1)
@@ -129,7 +139,7 @@ def _divided_square(n: int) -> tuple[Array, np.ndarray]:
 
 
 def _divided_triangle(n: int) -> tuple[Array, np.ndarray]:
-    """Points (2, (n+1)(n+2)/2) of the unit triangle and the n^2 triangles between them (n^2, 3)."""
+    """Returns points (2, (n+1)(n+2)/2) in the unit triangle, and the n^2 triangles between them (n^2, 3)."""
     number = {(i, j): k for k, (i, j) in enumerate((i, j) for i in range(n + 1) for j in range(n + 1 - i))}
     upright = [((i, j), (i + 1, j), (i, j + 1)) for i, j in number if i + j < n]
     hanging = [((i + 1, j), (i + 1, j + 1), (i, j + 1)) for i, j in number if i + j < n - 1]
@@ -138,14 +148,17 @@ def _divided_triangle(n: int) -> tuple[Array, np.ndarray]:
 
 
 def _near(problem: Problem, points: Array) -> np.ndarray:
-    """Returns which of the points (..., 3) lie near the pads (...,), where the default bricks are short."""
+    """Returns which of the points (..., 3) lie near the pads, (...,).
+
+    This is the region of all default bricks except the last along x and along y, which are long.
+    """
     along, across, _ = brick_lines(1, problem.lengths)
     x, y, _ = unroll(np.moveaxis(points, -1, 0), problem.lengths.arm_radius_m)
     return np.asarray((x < along[-2]) & (y < across[-2]))
 
 
 def _seen_facets(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Facets that reach near the pads, and the plane of each."""
+    """Returns the facets that have a corner near the pads, and the plane of each."""
     mesh, named = problem.mesh.geometry, problem.mesh.facets
     corners = mesh.doflocs[:, mesh.facets]  # (3, corners, facets)
     sets = (problem.mesh.top(), named["symmetry_y"], named["symmetry_x"])

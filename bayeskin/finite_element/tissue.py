@@ -1,8 +1,9 @@
-"""Places in the base model's equations at which further physics enters.
+"""Defines how further physics enters the equations of the base model.
 
-A tissue law is bound to values of its parameters and to the points of a model before a run. It changes what
-the base law answers at the points, and its derivatives, in place; or it adds linear terms on surfaces; or it
-lies in series with the skin, between the drive and the pads.
+Before a run, a tissue law is bound to values of its parameters and to the points of a model. A law can act in
+three ways. It changes the response of the base law at the points, and the derivatives of this response, in
+place. Or it adds linear terms on surfaces. Or it lies in series with the skin, between the drive and the
+pads.
 """
 
 from __future__ import annotations
@@ -23,27 +24,29 @@ SURFACE_QUADRATURE_DEGREE = 4
 
 
 class Rank(IntEnum):
-    """Order in which laws answer: each acts on the elastic stress that laws of lower rank left."""
+    """Order in which laws are evaluated: each acts on the elastic stress after the laws of lower rank."""
 
     ELASTIC = 0
     AGEING = 1
     VISCOUS = 2
 
 
-Kernel = Callable[..., None]  # compiled, of the signatures of `kernels`
+Kernel = Callable[..., None]  # compiled, with a signature of `kernels`
 
 
 @dataclass(frozen=True, eq=False)
 class TissueLaw:
-    """A law with the values of a run; by default it changes nothing.
+    """A law with the parameter values of a run. By default it changes nothing.
 
-    rank : when it answers, among others
-    remembers : numbers that it keeps at each point, 0 at the start
-    par (k,), data (n, d) : what its kernels are given, of the run and of each point (`Sites.table`)
-    respond, linearise : compiled kernels (`kernels`), or None where it leaves the points' response alone
+    rank : rank in the order of the laws
+    remembers : how many numbers the law keeps as its memory at each point; they are 0 at the start
+    par (k,), data (n, d) : constants of the run, and of each point (`Sites.table`), which the kernels receive
+    respond, linearise : compiled kernels (`kernels`), or None if the law does not change the response at the
+        points
     surfaces : terms that are added to the residual
-    opening_m : how far the pads were moved apart, and all was let come to rest, before the test [m, LVDT]
-    series : what lies between drive and skin, if anything
+    opening_m : distance by which the pads were moved apart before the test, after which everything came to
+        rest [m, LVDT]
+    series : element between drive and skin, or None
     """
 
     rank: Rank = Rank.ELASTIC
@@ -57,32 +60,34 @@ class TissueLaw:
     series: SeriesElement | None = None
 
 
-Bind = Callable[[Mapping[str, float], Sites], TissueLaw]  # of all parameters' values, SI
+Bind = Callable[[Mapping[str, float], Sites], TissueLaw]  # the mapping holds all parameters, in SI
 
 
 class SeriesElement:
-    """In series with the skin: the skin sees the drive's displacement less what is lost here.
+    """An element in series with the skin, which loses a part of the drive's displacement.
 
-    What is lost [m, LVDT] follows from the force [N] beyond that at the start of the test. Its memory (k,)
-    starts as zeros; the first number is the lost displacement.
+    The lost displacement [m, LVDT] depends on the force [N] relative to the start of the test. The element's
+    memory (k,) is zero at the start. Its first number is the lost displacement.
     """
 
     remembers: int = 2
 
     def moved(self, motion: PadMotion) -> PadMotion:
-        """The motion that is left when what depends on the motion alone is lost."""
+        """Returns the motion without the displacement whose loss depends on the motion alone."""
         return motion
 
     def follow(self, force_n: float, elapsed_s: float, before: Array) -> Array:
-        """The memory (k,) under a force, a time after `before`."""
+        """Returns the memory (k,) under a force, `elapsed_s` after the memory `before`."""
         return before
 
 
 @dataclass(frozen=True)
 class SurfaceTerm:
-    """``value * unit(problem) @ x`` in the residual, times the stage's length where it is a rate.
+    """The term ``value * unit(problem) @ x`` in the residual.
 
-    unit : a function of a module, so that its matrix (dofs, dofs) is made once a problem (`Problem.linear`)
+    unit : function that returns the matrix (dofs, dofs). It must be a function of a module, so that
+        `Problem.linear` computes its matrix once for each problem
+    per_second : True if the term is a rate, which is multiplied by the length of the stage
     """
 
     value: float
@@ -95,8 +100,10 @@ def surface_mass(
 ) -> sp.coo_matrix:
     """Returns integrals over `facets` of products of shape functions, (nodes, nodes) or (corners, corners).
 
-    displacement : of the quadratic ones, else of the linear ones
-    weight : of points (3, ...), 1 if None; the result's unit is the weight's times m^2
+    displacement : True for the quadratic shape functions of the displacement, False for the linear ones of
+        the pressure
+    weight : function of points (3, ...) by which the products are multiplied, 1 if None; the result has its
+        unit times m^2
     """
     mesh = problem.mesh.geometry
     bricks = isinstance(mesh, skfem.MeshHex)
@@ -112,11 +119,11 @@ def surface_mass(
 
 
 def pressure_rows(space: TaylorHood, mass: sp.coo_matrix) -> sp.csr_matrix:
-    """A matrix over corners as one over all unknowns."""
+    """Returns a matrix over corners as a matrix over all unknowns (dofs, dofs)."""
     start = 3 * space.n_nodes
     return sp.csr_matrix((mass.data, (start + mass.row, start + mass.col)), shape=(space.dofs, space.dofs))
 
 
 def displacement_rows(space: TaylorHood, mass: sp.coo_matrix, i: int, j: int) -> sp.csr_matrix:
-    """A matrix over nodes as one from displacements along j to forces along i."""
+    """Returns a matrix over nodes as a matrix (dofs, dofs) from displacements along j to forces along i."""
     return sp.csr_matrix((mass.data, (3 * mass.row + i, 3 * mass.col + j)), shape=(space.dofs, space.dofs))

@@ -1,4 +1,4 @@
-"""Models whose runs make a design: the full model, or the reduced one where it was trained."""
+"""Defines the models whose runs make a design: the full model, or the reduced model where it was trained."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from bayeskin.types import PadMotion, Simulation
 
 
 class ForceModel(Protocol):
-    """A model whose runs make a design. It is frozen and can be pickled, so that it travels to workers.
+    """A model whose runs make a design. It is frozen and can be pickled, so that worker processes can use it.
 
-    hash : sha256 of all that the force depends on besides motion and parameters, which each run carries
+    hash : sha256 of all that the force depends on besides motion and parameters; each run carries it
     """
 
     @property
@@ -28,7 +28,7 @@ class ForceModel(Protocol):
 
 @dataclass(frozen=True)
 class FullModel:
-    """Runs the model of a specification: the full model on any mesh, or a model of one's own."""
+    """Runs the model of a specification: the full model on any mesh, or the user's own model."""
 
     spec: ModelSpec
 
@@ -42,9 +42,11 @@ class FullModel:
 
 @dataclass(frozen=True)
 class ReducedOrFull:
-    """Runs the reduced model of a file, and the full model where that fails or was not trained.
+    """Runs the reduced model of a file, and the full model where the reduced model fails or was not trained.
 
-    The message of a run that the full model made says why. replaces : whether the full model runs there
+    The message of a run by the full model says why it was needed.
+
+    replaces : True to run the full model there; False to return the failed reduced run
     """
 
     file: Path

@@ -1,4 +1,4 @@
-"""The protocol of a forward model, and what a run of it returns."""
+"""Defines the interface of a forward model (a Python protocol) and the result of its run."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from bayeskin.types import Array, ParameterSpace
 
 @dataclass(frozen=True)
 class ModelRun:
-    """A run of a forward model: theta (d,) in SI; force_n (m,), means over bins [N].
+    """A run of a forward model.
 
-    slopes_n (m, d) : derivatives by coordinates of the prior's box [N], None where it has none
+    theta (d,) : parameters in SI units; force_n (m,) : means of the force over bins [N]
+    slopes_n (m, d) : derivatives of force_n by coordinates of the prior's box [N], or None
     """
 
     theta: Array
@@ -26,7 +27,7 @@ class ModelRun:
 
 
 class ForwardModel(Protocol):
-    """Runs the skin; `solves` names the mechanisms that it solves, `hash` identifies it."""
+    """Runs the test on the skin; `solves` names the mechanisms that it solves, `hash` identifies it."""
 
     @property
     def solves(self) -> frozenset[str]: ...
@@ -36,21 +37,24 @@ class ForwardModel(Protocol):
 
     @property
     def spec(self) -> ModelSpec:
-        """The full model in whose place it is."""
+        """Returns the specification of the full model that it replaces."""
         ...
 
     def run(
         self, space: ParameterSpace, at: Array, mechanisms: Sequence[Mechanism], derive: bool
     ) -> ModelRun | str:
-        """Returns a run at parameters (d,) of a space, with derivatives or not; or why it failed."""
+        """Returns a run at parameters `at` (d,) of a space, or the reason why it failed.
+
+        derive : True to compute derivatives as well
+        """
         ...
 
     def errors(self, at: Array) -> Array:
-        """Returns errors (r, m) [N] that the model says it has at parameters (d,), of one sd each."""
+        """Returns the errors (r, m) [N] that the model states at parameters (d,), each of one sd."""
         ...
 
 
 def change(space: ParameterSpace, theta: Array) -> Array:
-    """Returns the change of each parameter (d,) along one coordinate of the prior's box."""
+    """Returns the change of each parameter (d,) for a unit of its coordinate of the prior's box."""
     unit, h = space.box.to_unit(theta), 1e-6
     return np.asarray((space.box.from_unit(unit + h) - space.box.from_unit(unit - h)) / (2.0 * h))

@@ -1,4 +1,4 @@
-"""The full model with mechanisms, as the instrument reports its force."""
+"""Runs the full model with mechanisms and returns the force that the instrument reports."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bayeskin.mechanisms import Mechanism, bin_means, catalogue, laws, observed,
 from bayeskin.mechanisms.mechanism import ForceOfTime
 from bayeskin.types import Array, PadMotion, Simulation
 
-BESIDE = 1e-4  # of a change, by which derivatives are taken beside a neutral value
+BESIDE = 1e-4  # of a change; distance from a neutral value at which derivatives are computed
 
 
 def reported(
@@ -23,19 +23,25 @@ def reported(
     values: Mapping[str, float],
     motion: PadMotion,
 ) -> ForceOfTime:
-    """A run's force (1, t) after those of its mechanisms that the full model does not solve."""
+    """Returns the force (1, t) of a run, changed by those mechanisms that the full model does not solve.
+
+    The result is a function of times (t,).
+    """
     columns = {name: np.array([value]) for name, value in values.items()}
-    within = solved(mechanisms)
-    beyond = [mechanism for mechanism in mechanisms if mechanism not in within]
-    return observed(beyond, columns, motion, lambda t: np.atleast_2d(simulation.at(t)))
+    in_model = solved(mechanisms)
+    on_force = [mechanism for mechanism in mechanisms if mechanism not in in_model]
+    return observed(on_force, columns, motion, lambda t: np.atleast_2d(simulation.at(t)))
 
 
 def beside_neutral(
     theta: Mapping[str, float], by: Mapping[str, float], mechanisms: Sequence[Mechanism]
 ) -> dict[str, float]:
-    """Returns values beside those of `theta` that are neutral, by `BESIDE` of a change.
+    """Returns values at which to differentiate by those parameters of `theta` that are neutral.
 
-    At its neutral value a law may not be there at all, and has no derivative (pads never opened).
+    They differ from the neutral value by `BESIDE` of the parameter's change.
+
+    At its neutral value a law may be absent and then has no derivative, for example where the pads were never
+    opened.
     """
     neutral = {name: value for mechanism in mechanisms for name, value in mechanism.neutral.items()}
     return {name: theta[name] + BESIDE * by[name] for name in by if theta[name] == neutral.get(name)}
@@ -43,9 +49,11 @@ def beside_neutral(
 
 @dataclass(frozen=True)
 class FullForce:
-    """A function of (names of mechanisms, values by name): bin means (m,) of a full run with them.
+    """Returns the bin means (m,) of the force [N] of a full run with mechanisms.
 
-    Of a run that fails its message, of a skin that folds, too. Picklable, for `run_parallel`.
+    A call takes the names of mechanisms and the values of all parameters by name. It returns the error
+    message where the run fails, for example because the skin folds. Instances can be pickled, so that
+    `run_parallel` can send them to worker processes.
     """
 
     spec: ModelSpec
@@ -55,13 +63,13 @@ class FullForce:
     def __call__(self, case: tuple[Sequence[str], Mapping[str, float]]) -> Array | str:
         names, values = case
         mechanisms = [catalogue()[name] for name in names]
-        along = {p.name for mechanism in solved(mechanisms) for p in mechanism.parameters}
+        used = {p.name for mechanism in solved(mechanisms) for p in mechanism.parameters}
         theta = dict(values)
-        if self.spec.forward is None:  # a model of one's own has parameters of any name
-            theta = {name: value for name, value in values.items() if name in {*along, *PARAMETERS, *LENGTHS}}
+        if self.spec.forward is None:  # a user's own model may have parameters of any name
+            theta = {name: value for name, value in values.items() if name in {*used, *PARAMETERS, *LENGTHS}}
         simulation = simulate(self.spec, self.motion, theta, laws=laws(mechanisms), falls_too=False)
         if simulation.status != "ok":
             return simulation.message
-        beyond = [mechanism for mechanism in mechanisms if mechanism.act.bind is None]
+        on_force = [mechanism for mechanism in mechanisms if mechanism.act.bind is None]
         force = reported(simulation, mechanisms, values, self.motion)
-        return np.asarray(bin_means(force, self.motion, self.edges_s, beyond)[0])
+        return np.asarray(bin_means(force, self.motion, self.edges_s, on_force)[0])

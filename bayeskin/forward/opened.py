@@ -1,4 +1,4 @@
-"""The forward model in a file."""
+"""Opens the forward model that a file holds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from bayeskin.types import Array, PadMotion
 
 
 def forward_model(file: Path, spec: ModelSpec, motion: PadMotion, edges_s: Array) -> ForwardModel:
-    """Returns the model in a file: the reduced model where one stands for `spec`, else a surrogate."""
+    """Returns the model in a file: a reduced model where it can replace `spec`, otherwise a surrogate."""
     if stands_for(spec):
         return ReducedForward(load_reduced(file), motion, edges_s)
     return SurrogateForward(load_surrogate(file), spec)

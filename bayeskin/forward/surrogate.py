@@ -1,4 +1,4 @@
-"""A surrogate as a forward model, where no reduced model stands for the full one."""
+"""Uses a surrogate as a forward model, where no reduced model can replace the full model."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from bayeskin.hashing import sha256_of
 from bayeskin.mechanisms import Mechanism
 from bayeskin.types import Array, ParameterSpace, Surrogate
 
-STEP = 1e-4  # of the prior's box, for differences of a surrogate
+STEP = 1e-4  # of the width of the prior's box; step for finite differences of a surrogate
 
 
 @dataclass(frozen=True)
 class SurrogateForward:
-    """A surrogate of a model that no reduced model stands for; it solves no mechanism."""
+    """A surrogate of a model that no reduced model can replace. It solves no mechanism."""
 
     surrogate: Surrogate
     spec: ModelSpec
 
     @property
     def hash(self) -> str:
-        """A hash of the surrogate's training and of the model that it stands for."""
+        """Returns a hash of the surrogate's training and of the model that it replaces."""
         return sha256_of([dict(self.surrogate.provenance), self.spec.hash])
 
     @property
@@ -35,18 +35,20 @@ class SurrogateForward:
     def run(
         self, space: ParameterSpace, at: Array, mechanisms: Sequence[Mechanism], derive: bool
     ) -> ModelRun | str:
-        """The space is the surrogate's own."""
+        """Returns a run at parameters of the surrogate's own space, so `space` is not used."""
         force_n = self.surrogate.predict_mean(at)[0]
         return ModelRun(at, force_n, slopes(self.surrogate, at) if derive else None)
 
     def errors(self, at: Array) -> Array:
-        """The columns of the factor of its error."""
+        """Returns the columns of the factor of the surrogate's error covariance, as rows (r, m) [N]."""
         return np.asarray(self.surrogate.predict(at).factor[0].T)
 
 
 def slopes(surrogate: Surrogate, theta: Array) -> Array:
-    """Returns derivatives (m, d) of a surrogate's mean by coordinates of the box, by differences toward its
-    middle."""
+    """Returns derivatives (m, d) of a surrogate's mean by the coordinates of the box.
+
+    They are one-sided differences toward the middle of the box.
+    """
     box = surrogate.space.box
     unit = box.to_unit(theta)
     steps = np.diag(np.where(unit > 0.5, -STEP, STEP))

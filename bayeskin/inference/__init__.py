@@ -1,4 +1,8 @@
-"""Posterior inference: noise, likelihood, maximum, draws, checks. Sees a Surrogate, never a model."""
+"""Bayesian inference of parameters from a recording: noise, likelihood, maximum, posterior draws and checks.
+
+These modules know a model only through the `Surrogate` interface. Where a full run is needed, the caller
+passes a function for it, or the forces of the runs.
+"""
 
 from bayeskin.inference.bands import (
     Bands,

@@ -1,4 +1,4 @@
-"""The force that a posterior predicts, the parts of its uncertainty, and its distance from the recording."""
+"""Posterior predictive force, the parts of its uncertainty, and its distance from the recording."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ _CHUNK = 256
 
 @dataclass(frozen=True)
 class ForceDraws(_FreezesArrays):
-    """Posterior predictive on all bins, (s, m) each [N].
+    """Posterior predictive draws on all bins; each array is (s, m) [N].
 
-    mean_n the force without noise, the errors of surrogate and model in it as the recording shows them;
-    surrogate_sd_n what the surrogate says of its own error; noise_sd_n; force_n with noise.
+    mean_n is the force without noise; it includes the errors of surrogate and model that the recording
+    reveals. surrogate_sd_n is the sd that the surrogate states for its own error. noise_sd_n is the sd of
+    the noise. force_n is the force with noise.
     """
 
     mean_n: Array
@@ -44,10 +45,11 @@ class ForceDraws(_FreezesArrays):
 class Bands(_FreezesArrays):
     """Predictive bands over the bins, (m,) each [N], and the parts of their variance.
 
-    `sd_model_n` spread over the draws of the force without noise, which is what parameters and errors leave
-    open; `sd_noise_n` root of the mean variance of the noise (its Gaussian core, see `noise_model`);
-    `sd_surrogate_n` likewise of what the surrogate says of its own error, before the recording is known.
-    quantiles_n (5, m): 5, 25, 50, 75 and 95 % of the predicted force with noise.
+    `sd_model_n` is the sd of the force without noise over the draws; it contains the uncertainty of the
+    parameters and of the errors. `sd_noise_n` is the root of the mean variance of the noise (of its Gaussian
+    core, see `noise_model`). `sd_surrogate_n` is the root of the mean variance that the surrogate states for
+    its own error, before the recording is known. `quantiles_n` (5, m) are the 5, 25, 50, 75 and 95 %
+    quantiles of the predicted force with noise.
     """
 
     time_s: Array
@@ -62,7 +64,10 @@ class Bands(_FreezesArrays):
         return np.hypot(self.sd_model_n, self.sd_noise_n)
 
     def interval(self, level: float) -> tuple[Array, Array]:
-        """Lower and upper edge (m,) [N] of the 50 % (0.5) or 90 % (0.9) band."""
+        """Returns the lower and upper edge (m,) [N] of the 50 % (level 0.5) or 90 % (level 0.9) band.
+
+        Raises InputError for another level.
+        """
         if level not in (0.5, 0.9):
             raise InputError("level of the band", level, "0.5 or 0.9")
         low, high = (1, 3) if level == 0.5 else (0, 4)
@@ -71,7 +76,7 @@ class Bands(_FreezesArrays):
 
 @dataclass(frozen=True)
 class Rmse:
-    """Root mean square of recorded minus predicted force [N]: all bins, by phase kind, by window."""
+    """Root mean square of recorded minus predicted force [N]: over all bins, by kind of phase, by window."""
 
     whole_n: float
     by_kind_n: Mapping[str, float]
@@ -79,11 +84,11 @@ class Rmse:
 
 
 def predictive_draws(log_posterior: LogPosterior, theta: ArrayLike, rng: np.random.Generator) -> ForceDraws:
-    """One predicted recording for each draw theta (s, D) in SI, on all bins, fitted or not.
+    """Returns one predicted recording for each draw theta (s, D) in SI, on all bins, fitted or not.
 
-    The errors of surrogate and model are those of this device and this skin: they are drawn given what the
-    draw leaves of the fitted bins. The noise is drawn afresh. Phases of a kind that was not fitted take the
-    largest of the fitted kinds' sd.
+    The errors of surrogate and model belong to this device and this skin. They are therefore drawn given
+    the residuals of the draw in the fitted bins. The noise is drawn anew. Phases of a kind that was not
+    fitted take the largest noise sd of the fitted kinds.
     """
     theta = np.atleast_2d(np.asarray(theta, dtype=float))
     fitted = log_posterior.chain
@@ -94,12 +99,12 @@ def predictive_draws(log_posterior: LogPosterior, theta: ArrayLike, rng: np.rand
 
 
 def bands(log_posterior: LogPosterior, theta: ArrayLike, rng: np.random.Generator) -> Bands:
-    """Predictive bands from posterior draws theta (s, D) in SI; a thousand draws are plenty."""
+    """Returns predictive bands from posterior draws theta (s, D) in SI; a thousand draws are enough."""
     return bands_of(log_posterior.binned.time_s, predictive_draws(log_posterior, theta, rng))
 
 
 def bands_of(time_s: Array, draws: ForceDraws) -> Bands:
-    """The bands of draws that are there already."""
+    """Returns the bands of predictive draws that exist already; time_s (m,) are the bin centres [s]."""
     return Bands(
         time_s=time_s,
         mean_n=draws.mean_n.mean(axis=0),
@@ -111,16 +116,20 @@ def bands_of(time_s: Array, draws: ForceDraws) -> Bands:
 
 
 def coverage(binned: BinnedForce, low_n: Array, high_n: Array, windows: Windows | None = None) -> float:
-    """Share of recorded bins (in the windows, or all) that lie between two edges (m,) [N]."""
+    """Returns the share of recorded bins that lie between two edges (m,) [N]; NaN without a usable bin.
+
+    Only bins in `windows` count; without windows all bins count.
+    """
     inside = bins_in_windows(binned, windows) >= 0
     hit = (binned.force_n >= low_n) & (binned.force_n <= high_n)
     return float(hit[inside].mean()) if inside.any() else float("nan")
 
 
 def rmse(binned: BinnedForce, force_n: ArrayLike, windows: Windows | None = None) -> Rmse:
-    """Returns how far a predicted force (m,) [N] is from the recorded one; NaN for a window without bins.
+    """Returns the RMSE of a predicted force (m,) [N] against the recorded force.
 
-    `by_kind_n` is over the whole recording; `by_window_n` follows `windows`, one by one.
+    `by_kind_n` covers the whole recording. `by_window_n` has one value for each of `windows`; it is NaN for a
+    window without bins.
     """
     square = (binned.force_n - np.asarray(force_n, dtype=float)) ** 2
     usable = bins_in_windows(binned, None) >= 0
@@ -137,7 +146,10 @@ def _root_mean(square: Array) -> float:
 
 
 def _whole_chain(binned: BinnedForce, by_kind: bool) -> NoiseChain:
-    """All bins, those without a recorded force included, with no variance of their own there."""
+    """Returns a chain over all bins, including bins without a recorded force.
+
+    All forces are zero, because drawing noise does not need them. A variance that is not finite becomes zero.
+    """
     filled = BinnedForce(
         edges_s=binned.edges_s,
         force_n=np.zeros_like(binned.force_n),
@@ -156,19 +168,22 @@ def _predictive(
     sd = noise[:, : len(fitted.kinds)]
     columns = [sd[:, fitted.kinds.index(k)] if k in fitted.kinds else sd.max(axis=1) for k in chain.kinds]
     noise = np.column_stack([*columns, noise[:, -2:]])
-    own = log_posterior.surrogate.predict(log_posterior.split(theta)[0])
-    prediction = log_posterior.with_model_error(own)
-    latent = _errors(log_posterior, theta, prediction, rng)
+    surrogate_only = log_posterior.surrogate.predict(log_posterior.split(theta)[0])
+    prediction = log_posterior.with_model_error(surrogate_only)
+    latent = _draw_errors(log_posterior, theta, prediction, rng)
     mean = prediction.mean + np.einsum("nmr,nr->nm", prediction.factor, latent)
     force = mean + draw_noise(chain, noise, prediction.diagonal, rng)
     noise_sd = np.sqrt(noise[:, chain.kind] ** 2 + chain.variance_n2)
-    return mean, own.sd(), noise_sd, force
+    return mean, surrogate_only.sd(), noise_sd, force
 
 
-def _errors(
+def _draw_errors(
     log_posterior: LogPosterior, theta: Array, prediction: Prediction, rng: np.random.Generator
 ) -> Array:
-    """Draws (n, r) of the errors given the fitted bins, in sd of each column of the factor: one a theta."""
+    """Returns one draw of the errors given the fitted bins for each theta, (n, r).
+
+    The errors are in sd of each column of the prediction's factor.
+    """
     chain, noise = log_posterior.chain, log_posterior.split(theta)[1]
     normals = rng.standard_normal((len(theta), prediction.factor.shape[2]))
     out = np.empty_like(normals)

@@ -1,4 +1,7 @@
-"""Chains on disk: emcee's HDF5 form, replaced as a whole, and refused when it is another posterior's."""
+"""Stores chains on disk in emcee's HDF5 form.
+
+A file is always replaced as a whole. A chain that belongs to another posterior is refused.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +20,11 @@ from bayeskin.errors import InputError
 def save(
     path: Path, backend: emcee.backends.Backend, names: tuple[str, ...], identity: Mapping[str, str]
 ) -> None:
-    """Writes a chain so that `emcee.backends.HDFBackend(path)` reads it.
+    """Writes a chain so that `emcee.backends.HDFBackend(path)` can read it.
 
-    emcee itself appends in place at every step; a process killed while it does so leaves a file that
-    nothing opens. Here the earlier file stays until the new one is complete and on disk. Raises InputError
-    where it cannot be written.
+    emcee itself appends to the file at every step. A process that is killed during such a step leaves a file
+    that cannot be opened. Here the earlier file stays until the new one is complete and on disk. Raises
+    InputError where the file cannot be written.
     """
 
     def fill(handle: h5py.File) -> None:
@@ -42,27 +45,30 @@ def save(
 
 
 def load(path: Path, names: tuple[str, ...], identity: Mapping[str, str]) -> emcee.backends.Backend:
-    """The chain in `path` as an in-memory backend, its random state included.
+    """Returns the chain in `path` as an in-memory backend, including its random state.
 
     Raises InputError when the file is not readable, has other parameters, or differs in any entry of
-    `identity` (entries that `identity` lacks are not compared).
+    `identity`. Entries that `identity` lacks are not compared.
     """
     with storage.reading(path, "ensemble_N.h5 of `sample`") as handle:
-        found = json.loads(handle["mcmc"].attrs["bayeskin"])
-        its_names, its_identity = tuple(map(str, found["names"])), dict(found["identity"])
-        if its_names != names:
-            raise InputError(path, f"a chain of {', '.join(its_names)}", f"one of {', '.join(names)}")
+        stored = json.loads(handle["mcmc"].attrs["bayeskin"])
+        stored_names, stored_identity = tuple(map(str, stored["names"])), dict(stored["identity"])
+        if stored_names != names:
+            raise InputError(path, f"a chain of {', '.join(stored_names)}", f"one of {', '.join(names)}")
         for entry, value in identity.items():
-            if its_identity.get(entry) != value:
+            if stored_identity.get(entry) != value:
                 raise InputError(
-                    path, f"a chain with another {entry} ({its_identity.get(entry, 'none')!s:.12})",
+                    path, f"a chain with another {entry} ({stored_identity.get(entry, 'none')!s:.12})",
                     f"the same {entry} ({value[:12]}); sample into another folder",
                 )  # fmt: skip
         return _in_memory(emcee.backends.HDFBackend(str(path), read_only=True), len(names))
 
 
 def _in_memory(disk: emcee.backends.HDFBackend, count: int) -> emcee.backends.Backend:
-    """Raises InputError unless it holds steps of walkers in `count` parameters."""
+    """Returns a copy of a chain in memory.
+
+    Raises InputError unless the chain holds steps of walkers in `count` parameters.
+    """
     walkers, dim = (int(v) for v in disk.shape)
     memory = emcee.backends.Backend()
     memory.reset(walkers, dim)

@@ -1,4 +1,4 @@
-"""The surrogate against the full model where it matters: at the most probable point."""
+"""Compares the surrogate with the full model where it matters most: at the most probable point."""
 
 from __future__ import annotations
 
@@ -17,17 +17,20 @@ from bayeskin.types import Array, Prediction, Simulation, Surrogate, _FreezesArr
 FullRun = Callable[[Mapping[str, float]], Simulation]
 Retrain = Callable[[Mapping[str, float], Simulation], Surrogate]
 
-Z_LIMIT = 2.0  # an honest surrogate with one dominant error mode exceeds it at one point in twenty
-NOISE_SHARE = 0.1  # an error this small beside the noise changes no posterior, whatever sd is claimed
+# A surrogate with a correct sd and one dominant error mode exceeds this limit at one point in twenty.
+Z_LIMIT = 2.0
+# An error below this share of the noise does not change the posterior, whatever sd the surrogate claims.
+NOISE_SHARE = 0.1
 
 
 @dataclass(frozen=True)
 class MapCheck(_FreezesArrays):
-    """Surrogate minus full model at one point.
+    """Error of the surrogate at one point: its force minus that of the full model.
 
-    error_n (m,) [N]; rms_n, max_n over bins [N]; rms_z of the errors over their claimed sd;
-    mahalanobis: sqrt(e' C^-1 e / m) with the claimed covariance, correlations included (reported, not
-    judged: where C is nearly singular it measures rounding). NaN throughout when the full run failed.
+    error_n (m,) [N] is the error in each bin. rms_n and max_n [N] are its root mean square and its largest
+    magnitude over the bins. rms_z is the root mean square of the errors over their claimed sd. mahalanobis
+    is sqrt(e' C^-1 e / m) with the claimed covariance C, correlations included. It is reported but not
+    judged, because it measures rounding where C is nearly singular. All are NaN when the full run failed.
     """
 
     theta: Mapping[str, float]
@@ -43,7 +46,7 @@ class MapCheck(_FreezesArrays):
 
 @dataclass(frozen=True)
 class RefinedMap:
-    """The last maximum, the surrogate it was found with (in `log_posterior`), and every check made."""
+    """The last maximum, the surrogate that it belongs to (in `log_posterior`), and every check."""
 
     map: MapResult
     log_posterior: LogPosterior
@@ -61,12 +64,14 @@ def check_map(
     noise_sd_n: float = 0.0,
     fitted: NDArray[np.int64] | None = None,
 ) -> MapCheck:
-    """Runs the full model at `theta` (SI by name; entries the surrogate lacks are ignored) and compares.
+    """Runs the full model at `theta` (SI by name) and returns how far the surrogate is from it.
 
-    Passes when the errors do not matter, rms error at most a tenth of `noise_sd_n`, the noise sd of a bin
-    [N]; or when they are what the surrogate claims, rms_z <= 2, and at most the noise in the bins `fitted`
-    (all by default): a maximum with larger ones may be of the surrogate's uncertainty, not of the model. A
-    failed run is a check that does not pass.
+    Entries of `theta` that the surrogate lacks are ignored. The check passes in either of two cases:
+    - The errors do not matter: their rms is at most a tenth of `noise_sd_n`, the noise sd of a bin [N].
+    - The errors are as small as the surrogate claims (rms_z <= 2), and in the bins `fitted` (all by default)
+      they do not exceed the noise. A maximum with larger errors may come from the surrogate's uncertainty
+      and not from the model. The comparison with the noise is left out where `noise_sd_n` is 0.
+    A failed run gives a check that does not pass.
     """
     material = {name: float(theta[name]) for name in surrogate.space.names}
     simulation = full_run(material)
@@ -109,25 +114,29 @@ def refine_map(
     evaluations: int = 20000,
     max_rounds: int = 8,
 ) -> RefinedMap:
-    """Maximum, full run there, retraining with that run: until the check passes, or `max_rounds` checks.
+    """Finds the maximum, runs the full model there and retrains with that run, until a check passes.
 
-    `retrain(theta, simulation)` gives the surrogate whose training includes the run. It is not called
-    after a failed run, which teaches nothing: the loop ends there, not passed.
+    The loop ends after `max_rounds` checks at the latest. `retrain(theta, simulation)` returns the surrogate
+    whose training includes the run. It is not called after a failed run, which teaches nothing: the loop
+    ends there, and the result does not pass.
     """
     checks: list[MapCheck] = []
     while True:
-        found = find_map(log_posterior, seed, starts, evaluations)
-        noise_sd_n = _noise_sd_n(log_posterior, found.theta)
+        maximum = find_map(log_posterior, seed, starts, evaluations)
+        noise_sd_n = _noise_sd_n(log_posterior, maximum.theta)
         fitted = log_posterior.chain.bins
-        check = check_map(log_posterior.surrogate, full_run, found.theta, noise_sd_n, fitted)
+        check = check_map(log_posterior.surrogate, full_run, maximum.theta, noise_sd_n, fitted)
         checks.append(check)
         if check.passes or check.simulation.status != "ok" or len(checks) >= max_rounds:
-            return RefinedMap(found, log_posterior, tuple(checks))
+            return RefinedMap(maximum, log_posterior, tuple(checks))
         log_posterior = dataclasses.replace(log_posterior, surrogate=retrain(check.theta, check.simulation))
 
 
 def _noise_sd_n(log_posterior: LogPosterior, theta: Mapping[str, float]) -> float:
-    """Smallest noise sd of a phase kind [N], a bin's own variance included: the strictest yardstick."""
+    """Returns the smallest noise sd [N] among the kinds of phase, as the strictest limit.
+
+    The sd includes a bin's own variance.
+    """
     chain = log_posterior.chain
     sd = np.array([theta[f"sd_{kind}"] for kind in chain.kinds])[chain.kind]
     total = sd**2 + chain.variance_n2
@@ -135,14 +144,14 @@ def _noise_sd_n(log_posterior: LogPosterior, theta: Mapping[str, float]) -> floa
 
 
 def _rms_z(error: Array, sd: Array) -> float:
-    # A bin claimed to be exact counts as such to a millionth of the largest sd, so that rounding passes.
+    # Where a bin is claimed to be exact, an error of a millionth of the largest sd is allowed for rounding.
     floor = 1e-6 * float(sd.max()) or np.finfo(float).tiny
     with np.errstate(over="ignore"):
         return float(np.sqrt(np.mean((error / np.maximum(sd, floor)) ** 2)))
 
 
 def _mahalanobis(error: Array, prediction: Prediction) -> float:
-    """sqrt(e' C^-1 e / m) by the Woodbury identity; the diagonal is floored as in `_rms_z`."""
+    """Returns sqrt(e' C^-1 e / m) by the Woodbury identity; the diagonal has the floor of `_rms_z`."""
     floor = 1e-12 * float((prediction.sd()[0] ** 2).max()) or np.finfo(float).tiny
     diagonal = np.maximum(prediction.diagonal[0], floor)
     scaled = prediction.factor[0] / diagonal[:, None]

@@ -1,10 +1,10 @@
-"""Whether a posterior may be trusted: autocorrelation, effective samples, R-hat across ensembles.
+"""Judges whether a posterior can be trusted: autocorrelation, effective samples, R-hat across ensembles.
 
-Walkers of one ensemble are coupled, so none of them counts as a chain. Autocorrelation times are of the
-walkers' mean autocorrelation in each ensemble (Goodman & Weare 2010); R-hat compares ensembles, which
-share nothing but the target: each half of each ensemble's run, its walkers pooled and thinned by the
-autocorrelation time, is one chain of nearly independent draws (rank-normalised, bulk and folded; Vehtari
-et al. 2021, Bayesian Analysis 16:667).
+The walkers of one ensemble are coupled, so a single walker does not count as a chain. The autocorrelation
+time of an ensemble comes from the mean autocorrelation of its walkers (Goodman & Weare 2010). R-hat compares
+ensembles, which share nothing but the target density. Each half of each ensemble's run is one chain of nearly
+independent draws: its walkers are pooled and thinned by the autocorrelation time. R-hat is rank-normalised,
+and the larger of bulk and folded (Vehtari et al. 2021, Bayesian Analysis 16:667).
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from scipy.stats import rankdata
 
 from bayeskin.types import Array, _FreezesArrays
 
-_RESOLVED = 2000  # samples a series keeps for its autocorrelation time
-_BURN_IN_LENGTHS = 10  # autocorrelation times that the start is forgotten in
-_RARELY = 0.1  # a walker that moves less often than this share of its ensemble's median is stuck
-_BELOW = 5.0  # and so is one whose log density lies this many robust sd below its ensemble's
+_RESOLVED = 2000  # samples of a series from which its autocorrelation time is computed
+_BURN_IN_LENGTHS = 10  # autocorrelation times after which the start is forgotten
+_RARELY = 0.1  # a walker is stuck if it moves less often than this share of its ensemble's median
+_BELOW = 5.0  # a walker is also stuck if its log density is this many robust sd below its ensemble's median
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Below these no posterior is called trusted."""
+    """Criteria that a posterior must meet to be called trusted; `rhat` is the largest R-hat allowed."""
 
-    effective_samples: float = 5000.0  # in all, of the parameter that has fewest
-    lengths: float = 50.0  # autocorrelation times that each ensemble's run after burn-in spans
+    effective_samples: float = 5000.0  # the total of the parameter that has fewest
+    lengths: float = 50.0  # length of each ensemble's run after burn-in, in autocorrelation times
     rhat: float = 1.01
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether to trust, and each criterion with its number; failed ones first."""
+    """Says whether a posterior is trusted, and states each criterion with its number; failed ones first."""
 
     trusted: bool
     reasons: tuple[str, ...]
@@ -44,9 +44,9 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Convergence(_FreezesArrays):
-    """State of a run of E ensembles: tau_steps (E, D); ess, rhat (D,); acceptance (E,).
+    """Convergence of a run of E ensembles: tau_steps (E, D); ess, rhat (D,); acceptance (E,).
 
-    `stuck` lists (ensemble, walker). A parameter that does not move has NaN throughout.
+    `stuck` lists (ensemble, walker). A parameter that does not move has NaN in tau_steps, ess and rhat.
     """
 
     steps: int
@@ -60,7 +60,7 @@ class Convergence(_FreezesArrays):
     verdict: Verdict
 
     def progress(self, limits: Limits) -> float:
-        """Share of the way to the limits that is done, 0..1."""
+        """Returns the share of the way to the limits that is done, between 0 and 1."""
         kept = self.steps - self.burn_in
         parts = (_lowest(self.ess) / limits.effective_samples, kept / (limits.lengths * self._tau))
         return float(np.clip(np.nan_to_num(min(parts)), 0.0, 1.0))
@@ -73,12 +73,12 @@ class Convergence(_FreezesArrays):
 def assess(
     chains: Array, log_prob: Array, names: tuple[str, ...], limits: Limits, settled: int = 0
 ) -> Convergence:
-    """Convergence of chains (E, n, W, D) in sampling coordinates with log densities (E, n, W).
+    """Returns the convergence of chains (E, n, W, D) in sampling coordinates with log densities (E, n, W).
 
-    The first `settled` steps, after which nothing interferes with the chains, are burn-in whatever else is.
+    The first `settled` steps always count as burn-in. After them nothing interferes with the chains.
     """
     steps = chains.shape[1]
-    # The second half's time, since a start that is not yet forgotten would lengthen it.
+    # Only the second half is used, because a start that is not yet forgotten would lengthen the time.
     late = _highest(autocorrelation_steps(chains[:, steps // 2 :]))
     forgotten = math.ceil(_BURN_IN_LENGTHS * late) if np.isfinite(late) else steps
     burn_in = max(min(forgotten, steps // 2), settled)
@@ -90,16 +90,16 @@ def assess(
     thinned = kept[:, ::thin]
     rhat = np.array([split_rhat(thinned[..., j].reshape(len(chains), -1)) for j in range(chains.shape[3])])
     moved = np.any(np.diff(kept, axis=1) != 0.0, axis=3).mean(axis=1)
-    stuck = _stuck(moved, log_prob[:, burn_in:])
+    stuck = _stuck_walkers(moved, log_prob[:, burn_in:])
     verdict = _verdict(kept.shape[1], tau, ess, rhat, stuck, names, limits)
     return Convergence(steps, burn_in, thin, tau, ess, rhat, moved.mean(axis=1), stuck, verdict)
 
 
 def autocorrelation_steps(chains: Array) -> Array:
-    """Integrated autocorrelation time (E, D) [steps] of chains (E, n, W, D); NaN where nothing moves.
+    """Returns the integrated autocorrelation time (E, D) [steps] of chains (E, n, W, D).
 
-    Walkers that never move in a coordinate have no autocorrelation there and are left out; `_stuck` is what
-    reports those that move in none.
+    It is NaN where nothing moves. A walker that never moves in a coordinate has no autocorrelation there and
+    is left out. `_stuck_walkers` reports the walkers that move in no coordinate.
     """
     every = max(1, chains.shape[1] // _RESOLVED)
     times = np.full((len(chains), chains.shape[3]), np.nan)
@@ -112,7 +112,10 @@ def autocorrelation_steps(chains: Array) -> Array:
 
 
 def split_rhat(draws: Array) -> float:
-    """Rank-normalised split R-hat of draws (chains, n): the larger of bulk and folded; NaN if constant."""
+    """Returns the rank-normalised split R-hat of draws (chains, n): the larger of bulk and folded.
+
+    It is NaN where the draws are constant or fewer than four a chain.
+    """
     half = draws.shape[1] // 2
     if half < 2 or np.ptp(draws) == 0.0:
         return math.nan
@@ -133,7 +136,7 @@ def _rhat(draws: Array) -> float:
     return math.sqrt((n - 1) / n + between / within) if within > 0 else math.inf
 
 
-def _stuck(moved: Array, log_prob: Array) -> tuple[tuple[int, int], ...]:
+def _stuck_walkers(moved: Array, log_prob: Array) -> tuple[tuple[int, int], ...]:
     rarely = moved <= _RARELY * np.median(moved, axis=1, keepdims=True)
     level = np.median(log_prob, axis=1)
     centre = np.median(log_prob, axis=(1, 2))[:, None]
@@ -152,16 +155,16 @@ def _verdict(
         (
             lengths >= limits.lengths,
             f"{lengths:.0f} autocorrelation lengths a run of {kept} steps "
-            f"({_of(names, tau.max(axis=0), 'max')}, {longest:.0f} steps); {limits.lengths:.0f} needed",
+            f"({_extreme(names, tau.max(axis=0), 'max')}, {longest:.0f} steps); {limits.lengths:.0f} needed",
         ),
         (
             fewest >= limits.effective_samples,
-            f"{fewest:.0f} effective samples of {_of(names, ess, 'min')}; "
+            f"{fewest:.0f} effective samples of {_extreme(names, ess, 'min')}; "
             f"{limits.effective_samples:.0f} needed",
         ),
         (
             worst <= limits.rhat,
-            f"R-hat across {len(tau)} ensembles {worst:.4f} of {_of(names, rhat, 'max')}; "
+            f"R-hat across {len(tau)} ensembles {worst:.4f} of {_extreme(names, rhat, 'max')}; "
             f"at most {limits.rhat:g} allowed",
         ),
         (
@@ -177,7 +180,7 @@ def _verdict(
     return Verdict(all(bool(ok) for ok, _ in checks), tuple(text for _, text in checks))
 
 
-def _of(names: tuple[str, ...], values: Array, which: str) -> str:
+def _extreme(names: tuple[str, ...], values: Array, which: str) -> str:
     if np.isnan(values).any():
         return names[int(np.flatnonzero(np.isnan(values))[0])]
     return names[int(np.argmax(values) if which == "max" else np.argmin(values))]

@@ -1,4 +1,7 @@
-"""What the data taught: prior to posterior, one sentence a parameter, and the ridges between them."""
+"""Compares posterior with prior: what the data teach about each parameter, and which parameters form ridges.
+
+Each parameter gets a statement with numbers, and a sentence in plain words.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +16,26 @@ from scipy.stats import rankdata
 from bayeskin.number_format import at_edge
 from bayeskin.types import Array, Parameter, ParameterSpace
 
-_NOTHING_NATS, _NOTHING_CONTRACTION = 0.03, 0.1  # below both, posterior and prior are the same
-_WEAK = 0.5  # contraction below which the data narrows little
-_EDGE, _LEANS = 0.02, 0.06  # three times the mass that the prior has in its outermost 2 %
-_RIDGE = 0.8
-_VALLEY = 0.4  # of the lower of two peaks: a density between them below it parts them
-_SIDE = 0.05  # mass of a part that is worth a word
+_NOTHING_NATS, _NOTHING_CONTRACTION = 0.03, 0.1  # below both, the posterior counts as equal to the prior
+_WEAK = 0.5  # contraction below which the data narrow a parameter only a little
+# A posterior leans on a bound where the outermost 2 % of the prior hold three times their prior mass.
+_EDGE, _LEANS = 0.02, 0.06
+_RIDGE = 0.8  # rank correlation above which two parameters form a ridge
+# Two peaks are separate where the density between them falls below this share of the lower peak.
+_VALLEY = 0.4
+_SIDE = 0.05  # smallest share of the draws that counts as a part
 _CELLS = 200
 
 
 @dataclass(frozen=True)
 class Learned:
-    """One parameter: 1 - posterior over prior variance and Kullback-Leibler gain [nats], both in the
-    coordinate in which its prior is uniform; 5, 50 and 95 % quantiles in SI; all that in a statement, and in
-    a sentence without statistics."""
+    """What the posterior says about one parameter.
+
+    contraction : 1 - posterior variance / prior variance, in the coordinate in which the prior is uniform
+    gain_nats : Kullback-Leibler divergence of the posterior from the prior [nats]
+    quantiles : 5, 50 and 95 % quantiles in SI
+    statement, sentence : the result with these numbers, and in a sentence without statistics
+    """
 
     name: str
     contraction: float
@@ -38,7 +47,10 @@ class Learned:
 
 @dataclass(frozen=True)
 class Ridge:
-    """Two parameters that the data ties together, be it along a curve: the correlation of their ranks."""
+    """Two parameters that the data tie together, possibly along a curve.
+
+    `correlation` is the correlation of their ranks.
+    """
 
     first: str
     second: str
@@ -48,14 +60,14 @@ class Ridge:
 
 @dataclass(frozen=True)
 class Identifiability:
-    """All parameters in the order of their space, and the ridges, strongest first."""
+    """All parameters in the order of their space, and the ridges, the strongest first."""
 
     parameters: tuple[Learned, ...]
     ridges: tuple[Ridge, ...]
 
 
 def identifiability(space: ParameterSpace, draws: ArrayLike) -> Identifiability:
-    """What posterior draws (s, D) in SI say beyond the prior of `space`."""
+    """Returns what posterior draws (s, D) in SI say beyond the prior of `space`."""
     unit = space.to_unit(np.asarray(draws, dtype=float))
     learned = tuple(_learn(p, unit[:, j], space, j) for j, p in enumerate(space.parameters))
     with np.errstate(invalid="ignore"):
@@ -66,10 +78,12 @@ def identifiability(space: ParameterSpace, draws: ArrayLike) -> Identifiability:
 
 
 def parts(unit: ArrayLike) -> list[tuple[float, float]]:
-    """Separate ranges of the prior-uniform coordinate in which draws (s,) lie; one, unless valleys part them.
+    """Returns the separate ranges of the prior-uniform coordinate in which draws (s,) lie.
 
-    Valleys of a normal kernel's density, mirrored at the ends of the unit interval; the narrower of sd and
-    quartiles sets the kernel (Silverman 1986, eq. 3.31), which two far peaks would otherwise blur.
+    Each range spans the 5 to 95 % quantiles of its draws. There is a single range unless valleys of the
+    density separate the draws. The density is a normal kernel estimate, mirrored at the ends of the unit
+    interval. The width of the kernel follows from the smaller of sd and scaled interquartile range
+    (Silverman 1986, eq. 3.31), because two distant peaks would otherwise blur it.
     """
     unit = np.asarray(unit, dtype=float)
     quartiles = np.diff(np.quantile(unit, [0.25, 0.75]))[0] / 1.34
@@ -84,22 +98,23 @@ def parts(unit: ArrayLike) -> list[tuple[float, float]]:
             cuts.append(int(valley))
             start = int(valley)
     pieces = [unit[(unit >= edges[a]) & (unit <= edges[b])] for a, b in pairwise([*cuts, _CELLS])]
-    return [(float(low), float(high)) for low, high in (np.quantile(one, [0.05, 0.95]) for one in pieces)]
+    return [(float(low), float(high)) for low, high in (np.quantile(piece, [0.05, 0.95]) for piece in pieces)]
 
 
 def noise_remarks(found: Identifiability) -> tuple[str, ...]:
-    """What noise parameters at their bounds give away: a misfit that the likelihood takes for noise.
+    """Returns a remark where noise parameters lie at their bounds, since this points to a misfit.
 
-    Noise of a load cell is neither correlated over minutes nor of infinite variance.
+    The likelihood then takes the misfit for noise. The noise of a load cell is neither correlated over
+    minutes nor of infinite variance.
     """
     leaning = [
-        words
-        for name, side, words in (
+        remark
+        for name, side, remark in (
             ("tau_noise", "upper", "correlated for as long as its prior allows"),
             ("nu_noise", "lower", "with the heaviest tails that its prior allows"),
         )
-        for one in found.parameters
-        if one.name == name and f"leans on the prior's {side} bound" in one.statement
+        for parameter in found.parameters
+        if parameter.name == name and f"leans on the prior's {side} bound" in parameter.statement
     ]
     if not leaning:
         return ()
@@ -110,11 +125,12 @@ def noise_remarks(found: Identifiability) -> tuple[str, ...]:
 
 
 def information_gain_nats(unit: ArrayLike) -> float:
-    """KL divergence [nats] of draws (s,) of prior-uniform coordinates from the prior, at least 0.
+    """Returns the KL divergence [nats], at least 0, of draws (s,) from the prior.
 
-    Spacing estimate of the entropy (Vasicek 1976, J. R. Stat. Soc. B 38:54) with window sqrt(s), less its
-    value for evenly spread draws, so that a posterior equal to the prior gives 0. Spacings follow the
-    draws, so that narrow posteriors need no finer bins.
+    The draws are those of a coordinate in which the prior is uniform. The divergence comes from the spacing
+    estimate of the entropy (Vasicek 1976, J. R. Stat. Soc. B 38:54) with window sqrt(s). The estimate is
+    taken relative to that of evenly spread draws, so that a posterior equal to the prior gives 0. Spacings
+    follow the draws, so that narrow posteriors need no finer bins.
     """
     unit = np.sort(np.asarray(unit, dtype=float))
     return max(0.0, _spacing_entropy((np.arange(len(unit)) + 0.5) / len(unit)) - _spacing_entropy(unit))
@@ -160,9 +176,9 @@ def _statement(
     ranges = parts(unit)
     if len(ranges) > 1 and not p.peaked:
         box = ParameterSpace((p,))
-        ends = [factor * box.from_unit(np.array(one)[:, None])[:, 0] for one in ranges]
-        said = " and ".join(f"{a:.3g} to {b:.3g}{of_unit}" for a, b in ends)
-        leans.append(f"{len(ranges)} separate ranges fit: {said}")
+        ends = [factor * box.from_unit(np.array(limits)[:, None])[:, 0] for limits in ranges]
+        listed = " and ".join(f"{a:.3g} to {b:.3g}{of_unit}" for a, b in ends)
+        leans.append(f"{len(ranges)} separate ranges fit: {listed}")
     strength = "the data informs it" if contraction >= _WEAK else "the data informs it weakly"
     return "; ".join([f"{p.name}: {strength}: {numbers}", *leans])
 
@@ -170,19 +186,19 @@ def _statement(
 def _sentence(p: Parameter, contraction: float, gain: float, quantiles: tuple[float, float, float]) -> str:
     factor, name = at_edge(p.unit)
     unit = "" if name == "1" else f" {name}"
-    what = f"{p.description or 'parameter'} ({p.name})"
+    text = f"{p.description or 'parameter'} ({p.name})"
     if gain < _NOTHING_NATS and abs(contraction) < _NOTHING_CONTRACTION:
         return (
-            f"This test says nothing of the {what}: what is known of it is what was assumed, "
+            f"This test says nothing of the {text}: what is known of it is what was assumed, "
             f"{factor * p.lower:.3g} to {factor * p.upper:.3g}{unit}."
         )
     low, middle, high = (factor * value for value in quantiles)
     range_ = f"{low:.3g} to {high:.3g}{unit}"
     if contraction < _WEAK:
-        return f"This test narrows the {what} only a little: with 90 % probability it is {range_}."
+        return f"This test narrows the {text} only a little: with 90 % probability it is {range_}."
     times = 1.0 / np.sqrt(max(1.0 - contraction, 1e-12))
     return (
-        f"The {what} is about {middle:.3g}{unit}, with 90 % probability {range_}: {times:.2g} times narrower "
+        f"The {text} is about {middle:.3g}{unit}, with 90 % probability {range_}: {times:.2g} times narrower "
         f"than assumed before the test."
     )
 

@@ -1,11 +1,11 @@
-"""The surrogate's posterior held against the full model's: draws run again, and weighed.
+"""Compares the surrogate's posterior with the full model's: draws are run again and weighted.
 
-A draw theta of the posterior under the surrogate stands for the posterior under the full model with the
-weight p(y | theta, full model) / p(y | theta, surrogate), since both have one prior. Weights that are all
-alike say that the surrogate changes nothing; few that carry everything, that its posterior is elsewhere.
-From 200 draws on the largest are smoothed by a generalised Pareto tail, whose shape k-hat says whether
-their sums can be relied on (Vehtari et al. 2024, J. Mach. Learn. Res. 25:72); below, the effective number of
-draws and the largest weight have to do.
+A draw theta of the surrogate's posterior represents the full model's posterior with the weight
+p(y | theta, full model) / p(y | theta, surrogate), since both posteriors have the same prior. If all weights
+are alike, the surrogate does not change the posterior. If few draws carry all the weight, the surrogate's
+posterior lies elsewhere. From 200 draws on, the largest weights are smoothed by a generalised Pareto tail.
+Its shape k-hat says whether sums of the weights are reliable (Vehtari et al. 2024, J. Mach. Learn. Res.
+25:72). With fewer draws, only the effective number of draws and the largest weight can tell this.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ from bayeskin.inference.likelihood import log_likelihood
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
-SMOOTHED_FROM = 200  # draws
+SMOOTHED_FROM = 200  # number of draws from which on the weights are smoothed
 KHAT_LIMIT = 0.7
-EFFECTIVE_SHARE = 0.5  # of the draws, below which the surrogate's posterior is another one
+EFFECTIVE_SHARE = 0.5  # share of effective draws below which the surrogate's posterior counts as different
 
 
 @dataclass(frozen=True)
 class Weighed(_FreezesArrays):
-    """Draws theta (s, D) in SI with normalised weights (s,); a full run that failed weighs nothing.
+    """Draws theta (s, D) in SI with normalised weights (s,); a draw whose full run failed has weight zero.
 
-    log_ratio (s,): log-likelihood of the full model less that of the surrogate [nats], -inf where it
-    failed; effective: 1 / sum of squared weights; khat: NaN below 200 draws.
+    log_ratio (s,) : log-likelihood of the full model less that of the surrogate [nats], -inf for a failed run
+    effective : effective number of draws, 1 / sum of squared weights
+    khat : shape of the Pareto tail, NaN below 200 draws
     """
 
     space: ParameterSpace
@@ -44,9 +45,12 @@ class Weighed(_FreezesArrays):
 
 @dataclass(frozen=True)
 class Corrected:
-    """One parameter under the full model: 5, 50 and 95 % quantiles in SI. On its line (logarithms where the
-    prior is in them) the shift of the mean in sd of the surrogate's posterior, its standard error, and the sd
-    over that one."""
+    """One parameter under the full model; all but the quantiles are in logarithms where the prior is.
+
+    quantiles : 5, 50 and 95 % quantiles in SI
+    shift_sd, shift_error_sd : shift of the mean and its standard error, in sd of the surrogate's posterior
+    sd_ratio : sd under the full model over sd under the surrogate
+    """
 
     name: str
     quantiles: tuple[float, float, float]
@@ -56,9 +60,9 @@ class Corrected:
 
 
 def weigh(log_posterior: LogPosterior, theta: ArrayLike, force_n: ArrayLike) -> Weighed:
-    """Weights of posterior draws theta (s, D) in SI by the full model's bin means force_n (s, m) [N].
+    """Returns posterior draws theta (s, D) in SI with weights, from the full model's forces at them.
 
-    A row of NaN is a run that failed.
+    force_n (s, m) [N] are the bin means of these forces. A row of NaN stands for a run that failed.
     """
     theta, force = np.atleast_2d(np.asarray(theta, dtype=float)), np.atleast_2d(np.asarray(force_n, float))
     ok = np.isfinite(force).all(axis=1)
@@ -74,34 +78,36 @@ def weigh(log_posterior: LogPosterior, theta: ArrayLike, force_n: ArrayLike) -> 
 
 
 def corrected(weighed: Weighed, draws: ArrayLike) -> tuple[Corrected, ...]:
-    """The full model's posterior beside the surrogate's, whose draws (n, D) in SI are many more.
+    """Returns each parameter's posterior under the full model.
 
-    All draws are moved, on the line, by what the weights move the mean of the weighed ones, and stretched by
-    what they stretch their sd. So an error of sampling few draws cancels where the weights are nearly alike.
+    `draws` (n, D) in SI come from the surrogate's posterior and are many more than the weighted draws. The
+    weights shift the mean of the weighted draws and stretch their sd. All draws are shifted and stretched by
+    the same amount, in logarithms where the prior is. Thus the sampling error of few weighted draws cancels
+    where the weights are nearly alike.
     """
     space, w, tiny = weighed.space, weighed.weights, np.finfo(float).tiny
     line, few = space.to_line(draws), space.to_line(weighed.theta)
-    mean, moved = line.mean(axis=0), w @ few
-    shift = moved - few.mean(axis=0)
-    error = np.sqrt(((w - 1.0 / len(w)) ** 2) @ (few - moved) ** 2)
-    wide = np.maximum(line.std(axis=0), tiny)
-    ratio = np.sqrt(w @ (few - moved) ** 2 / np.maximum(few.var(axis=0), tiny))
+    mean, weighted_mean = line.mean(axis=0), w @ few
+    shift = weighted_mean - few.mean(axis=0)
+    error = np.sqrt(((w - 1.0 / len(w)) ** 2) @ (few - weighted_mean) ** 2)
+    sd = np.maximum(line.std(axis=0), tiny)
+    ratio = np.sqrt(w @ (few - weighted_mean) ** 2 / np.maximum(few.var(axis=0), tiny))
     quantiles = np.quantile(mean + shift + ratio * (line - mean), [0.05, 0.5, 0.95], axis=0)
     inside = np.clip(space.from_line(quantiles), space.lower, space.upper)
-    columns = zip(space.names, inside.T, shift / wide, error / wide, ratio, strict=True)
+    columns = zip(space.names, inside.T, shift / sd, error / sd, ratio, strict=True)
     return tuple(
-        Corrected(name, (float(low), float(middle), float(high)), float(by), float(unsure), float(times))
-        for name, (low, middle, high), by, unsure, times in columns
+        Corrected(name, (float(low), float(middle), float(high)), float(shifted), float(unsure), float(times))
+        for name, (low, middle, high), shifted, unsure, times in columns
     )
 
 
 def _weights(log_ratio: Array) -> tuple[Array, float]:
-    """Normalised weights (s,), smoothed from 200 on, and k-hat."""
+    """Returns normalised weights (s,), smoothed from 200 draws on, and k-hat."""
     if not np.isfinite(log_ratio).any():
         return np.zeros(len(log_ratio)), float("nan")
     relative, khat = log_ratio - log_ratio.max(), float("nan")
     if np.isfinite(relative).sum() >= SMOOTHED_FROM:
-        import arviz as az  # takes seconds, which only those who ask for it should wait
+        import arviz as az  # imported here, because the import takes seconds and is rarely needed
 
         smooth, shape = az.psislw(np.maximum(relative, -700.0))
         relative, khat = np.asarray(smooth), float(shape)
@@ -111,12 +117,12 @@ def _weights(log_ratio: Array) -> tuple[Array, float]:
 
 def _verdict(weights: Array, effective: float, khat: float, failed: int) -> Verdict:
     count = len(weights)
-    said = (
+    text = (
         f"full model at {count} posterior draws: {effective:.1f} effective, at least "
         f"{EFFECTIVE_SHARE * count:g} needed; largest weight {weights.max():.2g}"
     )
     good = effective >= EFFECTIVE_SHARE * count
     if np.isfinite(khat):
-        said += f"; Pareto k-hat {khat:.2f}, at most {KHAT_LIMIT:g} allowed"
+        text += f"; Pareto k-hat {khat:.2f}, at most {KHAT_LIMIT:g} allowed"
         good = good and khat <= KHAT_LIMIT
-    return Verdict(bool(good), (said + (f"; {failed} runs failed" if failed else ""),))
+    return Verdict(bool(good), (text + (f"; {failed} runs failed" if failed else ""),))

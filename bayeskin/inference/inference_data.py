@@ -1,4 +1,4 @@
-"""The posterior as an ArviZ InferenceData, and its NetCDF file."""
+"""Converts a posterior to an ArviZ InferenceData, and writes and reads its NetCDF file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _PRIOR_DRAWS = 2000
 _ENGINE = "h5netcdf"
-_MEMORY = "/dev/shm"  # Linux's folder in memory
+_MEMORY = "/dev/shm"  # folder in memory on Linux
 
 
 def to_inference_data(
@@ -36,14 +36,15 @@ def to_inference_data(
     rng: np.random.Generator,
     predictive: int = 1000,
 ) -> arviz.InferenceData:
-    """Posterior (SI; chain = ensemble), lp, log-likelihood by phase, predictions, prior, data, attributes.
+    """Returns the posterior in SI as an InferenceData, in which each ensemble is a chain.
 
-    `predictive` draws, evenly taken from all ensembles, go into posterior_predictive: `force` with noise,
-    its `mean` without, and the `surrogate_sd` [N] of the surrogate's own error. The log-likelihood is that of
+    It also holds lp, the log-likelihood by phase, predictions, prior draws, data and attributes. `predictive`
+    draws, taken evenly from all ensembles, go into posterior_predictive: `force` with noise, its `mean`
+    without noise, and `surrogate_sd` [N], the sd of the surrogate's own error. The log-likelihood is that of
     `LogPosterior.block_log_likelihood`, so that az.loo leaves out one phase at a time. Groups differ in
-    their number of draws, as ArviZ allows.
+    their number of draws, which ArviZ allows.
     """
-    import arviz as az  # takes seconds, which only those who ask for it should wait
+    import arviz as az  # imported here, because the import takes seconds and is rarely needed
 
     space, (ensembles, n, _) = posterior.space, posterior.draws.shape
     prior = space.draw(rng, _PRIOR_DRAWS)
@@ -69,28 +70,31 @@ def to_inference_data(
 
 
 def save_inference_data(path: Path | str, idata: arviz.InferenceData) -> None:
-    """Writes NetCDF (h5netcdf), whole or not at all; an earlier file stays until then.
+    """Writes a NetCDF file (h5netcdf), completely or not at all; an earlier file stays until then.
 
-    Made elsewhere first, in memory where the system has a place for that: libhdf5 ends the process on a disk
-    that is full. Raises InputError where it cannot be written.
+    The file is first made in another folder, in memory where the system has one, because libhdf5 ends the
+    process on a full disk. Raises InputError where the file cannot be written.
     """
     needed = 2 * sum(idata[group].nbytes for group in idata.groups())
     roomy = os.path.isdir(_MEMORY) and shutil.disk_usage(_MEMORY).free > needed
-    with tempfile.TemporaryDirectory(dir=_MEMORY if roomy else None) as elsewhere:
-        made = Path(elsewhere) / "posterior.nc"
-        idata.to_netcdf(str(made), engine=_ENGINE)
-        write_bytes(Path(path), made.read_bytes())
+    with tempfile.TemporaryDirectory(dir=_MEMORY if roomy else None) as folder:
+        temporary = Path(folder) / "posterior.nc"
+        idata.to_netcdf(str(temporary), engine=_ENGINE)
+        write_bytes(Path(path), temporary.read_bytes())
 
 
 def load_inference_data(path: Path | str) -> arviz.InferenceData:
-    """Reads what `save_inference_data` wrote. Raises InputError when absent or not NetCDF of ArviZ."""
+    """Returns the InferenceData that `save_inference_data` wrote.
+
+    Raises InputError when the file is absent or is not a NetCDF file of ArviZ.
+    """
     import arviz as az
 
     path, expected = Path(path), "a posterior in NetCDF"
     refuse_damaged(path, expected)
     try:
         idata = az.from_netcdf(str(path), engine=_ENGINE)
-    except Exception as error:  # h5netcdf and xarray raise of every kind on a damaged file
+    except Exception as error:  # h5netcdf and xarray raise many kinds of error on a damaged file
         raise InputError(path, f"not readable ({in_a_line(error)})", expected) from None
     if "posterior" not in idata.groups():
         raise InputError(path, f"groups {', '.join(idata.groups()) or 'none'}", "a group 'posterior'")
@@ -98,9 +102,9 @@ def load_inference_data(path: Path | str) -> arviz.InferenceData:
 
 
 def draws_of(idata: arviz.InferenceData) -> tuple[ParameterSpace, Array]:
-    """The priors and the draws (s, D) in SI that an InferenceData of `to_inference_data` holds.
+    """Returns the priors and the draws (s, D) in SI of an InferenceData that `to_inference_data` made.
 
-    Raises InputError for one of another origin, or whose parts do not belong together.
+    Raises InputError for an InferenceData of another origin, or where its parts do not belong together.
     """
     where, expected = "InferenceData", "one made by bayeskin"
     stored = idata.attrs.get("parameters")
@@ -108,12 +112,12 @@ def draws_of(idata: arviz.InferenceData) -> tuple[ParameterSpace, Array]:
         raise InputError(where, "no attribute 'parameters'", expected)
     try:
         tied = tuple(Correlation(*entry) for entry in json.loads(idata.attrs.get("correlations", "[]")))
-        given = tuple(checked(Parameter(**entry), where) for entry in json.loads(stored))
-        space = checked(ParameterSpace(given, tied), where)
+        parameters = tuple(checked(Parameter(**entry), where) for entry in json.loads(stored))
+        space = checked(ParameterSpace(parameters, tied), where)
         draws = np.stack([idata["posterior"][name].values.ravel() for name in space.names], axis=-1)
     except InputError:
         raise
-    except Exception as error:  # json, xarray and numpy raise of every kind on what somebody altered
+    except Exception as error:  # json, xarray and numpy raise many kinds of error on altered contents
         raise InputError(where, f"contents that cannot be read ({in_a_line(error)})", expected) from None
     if draws.dtype.kind != "f" or not np.isfinite(draws).all():
         raise InputError(f"{where}: posterior", "draws that are not finite numbers", expected)
@@ -124,11 +128,11 @@ def _predictive(
     log_posterior: LogPosterior, posterior: Posterior, wanted: int, rng: np.random.Generator
 ) -> dict[str, Array]:
     ensembles, n, dim = posterior.draws.shape
-    few = min(n, max(1, wanted // ensembles))
-    taken = posterior.draws[:, np.linspace(0, n - 1, few).astype(int)].reshape(-1, dim)
-    drawn = predictive_draws(log_posterior, taken, rng)
-    columns = {"force": drawn.force_n, "mean": drawn.mean_n, "surrogate_sd": drawn.surrogate_sd_n}
-    return {name: value.reshape(ensembles, few, -1) for name, value in columns.items()}
+    per_ensemble = min(n, max(1, wanted // ensembles))
+    theta = posterior.draws[:, np.linspace(0, n - 1, per_ensemble).astype(int)].reshape(-1, dim)
+    draws = predictive_draws(log_posterior, theta, rng)
+    columns = {"force": draws.force_n, "mean": draws.mean_n, "surrogate_sd": draws.surrogate_sd_n}
+    return {name: value.reshape(ensembles, per_ensemble, -1) for name, value in columns.items()}
 
 
 def _constant(log_posterior: LogPosterior) -> dict[str, Any]:
@@ -154,7 +158,7 @@ def _labels(log_posterior: LogPosterior) -> list[str]:
 
 
 def _attributes(posterior: Posterior, provenance: Provenance) -> dict[str, Any]:
-    """Texts and numbers only, which NetCDF holds; lists and mappings as JSON."""
+    """Returns attributes as texts and numbers, which NetCDF can hold; lists and mappings are JSON texts."""
     c = posterior.convergence
     by_name: Sequence[tuple[str, Array]] = (
         ("ess", c.ess), ("rhat", c.rhat), ("tau_steps", c.tau_steps.max(axis=0)),

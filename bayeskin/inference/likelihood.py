@@ -1,17 +1,19 @@
 """Log-likelihood of binned forces: correlated heavy-tailed noise and the surrogate's own error.
 
-Observed y = f + F z + e with f, F the surrogate's mean and factor, z ~ N(0, I_r), and e the noise of
-`noise_model`, the surrogate's diagonal in it. With the residual and the columns of F as innovations of that
-noise over their sd s_j, w and G, the innovations are eps(z) = w - G z, independent Student-t, and
+The observation is y = f + F z + e. Here f and F are the surrogate's mean and factor, z ~ N(0, I_r), and e is
+the noise of `noise_model`, which includes the surrogate's diagonal. The filter of that noise turns the
+residual and the columns of F into innovations; divided by their sd s_j, these are w and G. The innovations of
+the noise are then eps(z) = w - G z. They are independent Student-t, and
 
     p(y) = prod_j 1/s_j * int N(z; 0, I) prod_j t_nu(eps_j(z)) dz .
 
-N is the normal density within three sd; beyond, its logarithm falls by 50 (|z| - 3)^2 more, since a
-surrogate that were wrong by tens of its sd could explain any misfit by an error that it denies. The integral
-is Gaussian and exact for nu = inf within three sd. For finite nu it is Laplace's approximation about the
-mode, found by reweighted least squares and then Newton steps, whose curvature is kept while it serves
-(Tierney & Kadane 1986, JASA 81:82; Lange, Little & Taylor 1989, JASA 84:881). Float64 throughout; one thread;
-one call for any number of points.
+N is the normal density within three sd. Beyond three sd its logarithm falls by a further 50 (|z| - 3)^2 in
+each coordinate. Otherwise a surrogate that is wrong by tens of its sd could explain any misfit by an error
+that its own sd rules out. For nu = inf and a mode within three sd the integral is Gaussian and exact. For
+finite nu it is Laplace's approximation about the mode. The mode is found by reweighted least squares and then
+by Newton steps, which keep an earlier curvature as long as they converge quickly (Tierney & Kadane 1986, JASA
+81:82; Lange, Little & Taylor 1989, JASA 84:881). All computations are in float64 and in one thread, and one
+call serves any number of points.
 """
 
 from __future__ import annotations
@@ -24,24 +26,26 @@ import numpy as np
 from bayeskin.inference.noise_model import NoiseChain, filter_gains
 from bayeskin.types import Array, NDArray, Prediction
 
-_STEPS = 40  # bound on the mode search; five or six are usual
-FARTHEST, STIFF = 3.0, 100.0  # sd of the surrogate's error that z is normal to, and the stiffness beyond
-_REWEIGHTED = 2  # steps of reweighted least squares before Newton, which needs a start near the mode
-_SLOW = 0.1  # of the decrement before: more, and the curvature is summed anew
-_PATIENT = 8  # steps that may go too far: one often lands on the right side of three sd for the next
-_BACK = 0.3  # of a step that went too far after these
-_DECREMENT = 1e-8  # of the log density, at which the mode is found
+_STEPS = 40  # upper limit on the steps of the mode search; five or six are usual
+FARTHEST, STIFF = 3.0, 100.0  # number of sd within which z is normal, and the added stiffness beyond
+_REWEIGHTED = 2  # steps of reweighted least squares before Newton steps, which need a start near the mode
+_SLOW = 0.1  # share of the previous decrement above which the curvature is computed anew
+# This many first steps may go too far, because such a step often lands on the side of three sd that the next
+# step needs.
+_PATIENT = 8
+_BACK = 0.3  # factor on the distance from the best point, for a later step that goes too far
+_DECREMENT = 1e-8  # decrement of the log density below which the search for the mode ends
 # Sums may be reordered for SIMD; infinities and NaN keep their meaning.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
-# The helpers are put into `_kernel` before it is compiled: as functions of their own, the process that
-# compiles them and one that loads them from numba's cache would run differently reordered sums.
+# The helpers are inlined into `_kernel` before it is compiled. As separate functions, their sums would be
+# reordered differently in the process that compiles them and in one that loads them from numba's cache.
 
 
 def log_likelihood(chain: NoiseChain, prediction: Prediction, noise: Array) -> Array:
-    """Log density of the chain's forces, (n,), in nats (forces in N).
+    """Returns the log density (n,) of the chain's forces, in nats (forces in N).
 
-    `prediction` on all the recording's bins, at n points or at one for all rows of the noise; noise (n, q):
-    columns of `noise_space(chain.kinds)`, whose last is nu, inf allowed.
+    `prediction` covers all bins of the recording, at n points or at a single point for all rows of the noise.
+    noise (n, q) has the columns of `noise_space(chain.kinds)`; the last column is nu and may be inf.
     """
     return _kernel(
         np.ascontiguousarray(prediction.mean, dtype=np.float64),
@@ -89,7 +93,7 @@ def _whiten(
 ) -> float:  # fmt: skip
     """Fills `white` (k,) and the first r rows of `design`; returns the sum of the innovations' log sd.
 
-    The filter's states are kept as forces, what x and w are expected to add to a bin.
+    The filter's states are kept as forces: the contributions of x and w that are expected in a bin.
     """
     k, tau = len(bins), noise[-2]
     decay, gap_before = 0.0, -1.0
@@ -104,7 +108,7 @@ def _whiten(
     log_scale, product = 0.0, 1.0
     for j in range(k):
         product *= inverse[j]
-        if j % 8 == 7:  # one logarithm for eight factors
+        if j % 8 == 7:  # one logarithm of eight factors is faster than eight logarithms
             log_scale += math.log(product)
             product = 1.0
     log_scale += math.log(product)
@@ -126,7 +130,7 @@ def _whiten(
         one, one, one, one, keep, keep_quick, of_memory, of_quick, inverse, white, white, white, white
     )
     rank, last = len(factor), len(design)
-    whole = bins[k - 1] - bins[0] == k - 1  # no gap: no need to gather
+    whole = bins[k - 1] - bins[0] == k - 1  # without a gap the bins are one slice, which is faster to copy
     for a in range(0, last, 4):
         for b in range(4):
             row, target = factor[min(a + b, rank - 1)], work[4 + b]
@@ -150,7 +154,7 @@ def _innovations(
     keep: Array, keep_quick: Array, of_memory: Array, of_quick: Array, inverse: Array,
     first: Array, second: Array, third: Array, fourth: Array,
 ) -> None:  # fmt: skip
-    """Innovations of four columns (k,) at once, so that the processor need not wait for each."""
+    """Computes the innovations of four columns (k,) at once, so that the processor need not wait for each."""
     m1, m2, m3, m4 = 0.0, 0.0, 0.0, 0.0
     q1, q2, q3, q4 = 0.0, 0.0, 0.0, 0.0
     for j in range(len(one)):
@@ -165,9 +169,10 @@ def _innovations(
 
 @nb.njit(fastmath=_FAST, inline="always")
 def _marginal(white: Array, design: Array, rank: int, nu: float, work: Array) -> float:
-    """Log of the integral over z of N(z; 0, I) prod_j t_nu(white_j - design[:, j] z).
+    """Returns the log of the integral over z of N(z; 0, I) prod_j t_nu(white_j - design[:, j] z).
 
-    The curvature, which is what costs, is summed anew only where steps by a former one go too slowly.
+    The curvature takes most of the time. It is computed anew only where steps with an earlier curvature
+    converge too slowly.
     """
     gaussian = math.isinf(nu)
     z, best, gradient, change = np.zeros(len(design)), np.zeros(rank), np.empty(rank), np.empty(rank)
@@ -204,7 +209,7 @@ def _marginal(white: Array, design: Array, rank: int, nu: float, work: Array) ->
     else:
         z[:rank] = best
         value = _energy(white, design, rank, z, nu, eps)
-    if not gaussian:  # Laplace takes the curvature of the density, not of a bound or of a former point
+    if not gaussian:  # Laplace needs the density's own curvature, not that of a bound or of an earlier point
         _weights(eps, nu, _STEPS, True, pulled, bend)
         _gram(design, bend, gram)
         if not _factored(gram, z, curvature):
@@ -218,7 +223,7 @@ def _marginal(white: Array, design: Array, rank: int, nu: float, work: Array) ->
 
 @nb.njit(fastmath=_FAST, inline="always")
 def _solved(gram: Array, z: Array, gradient: Array, change: Array, lower: Array) -> tuple[bool, float]:
-    """Fills `change` with Newton's step; whether the curvature is positive, and the decrement."""
+    """Fills `change` with Newton's step; returns whether the curvature is positive, and the decrement."""
     if not _factored(gram, z, lower):
         return False, np.inf
     change[:] = gradient
@@ -234,7 +239,7 @@ def _log_norm(nu: float) -> float:
 
 @nb.njit(fastmath=_FAST, inline="always")
 def _energy(white: Array, design: Array, rank: int, z: Array, nu: float, eps: Array) -> float:
-    """Minus the log of the integrand, without constants; fills `eps` (k,)."""
+    """Returns minus the log of the integrand, without constants, and fills `eps` (k,)."""
     k = len(white)
     eps[:] = white
     square = 0.0
@@ -260,7 +265,10 @@ def _energy(white: Array, design: Array, rank: int, z: Array, nu: float, eps: Ar
 
 @nb.njit(fastmath=_FAST, inline="always")
 def _weights(eps: Array, nu: float, step: int, newton: bool, pulled: Array, bend: Array) -> None:
-    """Fills terms of the gradient, `pulled`, and of the curvature, `bend`, (k,); eps and 1 if Gaussian."""
+    """Fills the terms (k,) of the gradient, `pulled`, and of the curvature, `bend`.
+
+    They are eps and 1 in the first step and for Gaussian noise.
+    """
     if step == 0 or math.isinf(nu):
         pulled[:] = eps
         bend[:] = 1.0
@@ -274,7 +282,7 @@ def _weights(eps: Array, nu: float, step: int, newton: bool, pulled: Array, bend
 
 @nb.njit(fastmath=_FAST, inline="always")
 def _slope(design: Array, z: Array, pulled: Array, gradient: Array) -> None:
-    """gradient = G' pulled - z, and the spring's pull beyond three sd."""
+    """Fills `gradient` with G' pulled - z, and with the stiffer prior's pull beyond three sd."""
     for a in range(len(gradient)):
         row, total = design[a], 0.0
         for j in range(len(pulled)):
@@ -285,7 +293,7 @@ def _slope(design: Array, z: Array, pulled: Array, gradient: Array) -> None:
 
 @nb.njit(fastmath=_FAST, inline="always")
 def _gram(design: Array, bend: Array, gram: Array) -> None:
-    """Lower triangle of G' diag(bend) G, eight entries at once."""
+    """Fills the lower triangle of G' diag(bend) G, eight entries at once."""
     k = len(bend)
     for a in range(0, len(gram), 2):
         upper, under = design[a], design[a + 1]
@@ -310,7 +318,10 @@ def _gram(design: Array, bend: Array, gram: Array) -> None:
 
 @nb.njit(inline="always")
 def _factored(gram: Array, z: Array, lower: Array) -> bool:
-    """Fills `lower` with the Cholesky factor of the gram matrix and the prior's curvature; False if none."""
+    """Fills `lower` with the Cholesky factor of the gram matrix plus the prior's curvature.
+
+    Returns False where there is no such factor.
+    """
     for a in range(len(lower)):
         for b in range(a + 1):
             total = gram[a, b]

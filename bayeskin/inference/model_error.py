@@ -1,15 +1,16 @@
-"""The error of the full model itself: of its mesh, and of the calibration of the load cell.
+"""The error of the full model itself: the error of its mesh, and the calibration error of the load cell.
 
-A finer mesh changes the force, within a tenth of the change, by a factor; a cell's calibration is a factor,
-too. The rest of the change goes with displacement, and relaxes after each movement, because a mesh resolves
-the flow of the fluid to its own size only (`benchmarks/mesh_shapes.py`). All are errors of the force at every
-point of the parameter space. They are added up from shapes of one sd each,
+A finer mesh changes the force by a factor, to within a tenth of the change. The calibration error of a load
+cell is a factor, too. The remaining change by the mesh varies with displacement and relaxes after each
+movement, because a mesh resolves the flow of the fluid only down to its own size
+(`benchmarks/mesh_shapes.py`). All these errors affect the force at every point of the parameter space. They
+are a sum of shapes, which are, at one sd each,
 
-    a F(t) ,  b F(t) (2 d(t) / max d - 1)  and  c max |F| r_i(t) ,
+    a F(t) ,  b F(t) (2 d(t) / max d - 1)  and  c max |F| r_i(t) .
 
-F the predicted force, d the pads' displacement and r_i the answer of a spring and dashpot of relaxation time
-tau_i to d / max d. Without them a fit takes the mesh for skin: intervals of moduli come out as narrow as the
-noise alone lets them be.
+F is the predicted force, d the pads' displacement, and r_i the response of a spring and dashpot with
+relaxation time tau_i to d / max d. Without these errors a fit mistakes the mesh's error for a property of the
+skin: the intervals of the moduli become as narrow as the noise alone allows.
 """
 
 from __future__ import annotations
@@ -21,21 +22,18 @@ import numpy as np
 
 from bayeskin.types import Array, PadMotion, Prediction
 
-CALIBRATION = 0.01  # sd of a factor on the force: what a load cell of class 1 is off by (ISO 7500-1:2018)
-BEND = 3e-3  # b, of the force
-RELAXING = 1.5e-3  # c, of the largest force
-RELAXATION_S = (
-    3.0,
-    12.0,
-    50.0,
-)  # tau_i: an answer is told from one three times slower, hardly from one twice
+CALIBRATION = 0.01  # sd of a factor on the force: the error of a load cell of class 1 (ISO 7500-1:2018)
+BEND = 3e-3  # b, a share of the force
+RELAXING = 1.5e-3  # c, a share of the largest force
+# tau_i. A response can be told from another that is three times slower, but hardly from one twice as slow.
+RELAXATION_S = (3.0, 12.0, 50.0)
 
 
 @dataclass(frozen=True)
 class ModelError:
     """The errors of a force over the bins between edges_s (m+1,); `amplitude` is the sd of the factor, a.
 
-    measured_n (r, m) : further errors of one sd each, which runs near by have shown
+    measured_n (r, m) : further errors [N], at one sd each, which runs at nearby points have shown
     """
 
     motion: PadMotion
@@ -45,12 +43,12 @@ class ModelError:
 
     def beside(self, prediction: Prediction) -> Prediction:
         """Returns the prediction with these errors as further columns of its factor."""
-        rows = prediction.factor.transpose(0, 2, 1)  # as they lie in memory
-        more = errors(prediction.mean, *self._shapes) * self._sd[:, None]
+        rows = prediction.factor.transpose(0, 2, 1)  # the layout of the factor in memory
+        error_rows = errors(prediction.mean, *self._shapes) * self._sd[:, None]
         if self.measured_n is not None:
             measured = np.broadcast_to(self.measured_n, (len(rows), *self.measured_n.shape))
-            more = np.concatenate([more, measured], axis=1)
-        factor = np.concatenate([rows, more], axis=1).transpose(0, 2, 1)
+            error_rows = np.concatenate([error_rows, measured], axis=1)
+        factor = np.concatenate([rows, error_rows], axis=1).transpose(0, 2, 1)
         return Prediction(prediction.mean, factor, prediction.diagonal)
 
     @property
@@ -68,16 +66,16 @@ class ModelError:
 
 
 def shapes(motion: PadMotion, edges_s: Array) -> tuple[Array, Array]:
-    """Returns what multiplies the force in bins (2, m), and the relaxing answers (k, m)."""
+    """Returns the factors (2, m) that multiply the force in each bin, and the relaxing responses (k, m)."""
     middle = 0.5 * (edges_s[1:] + edges_s[:-1])
     share = motion.at(middle) / float(np.max(np.abs(motion.displacement_m)))
     return np.stack([np.ones(len(middle)), 2.0 * share - 1.0]), relaxing(motion, middle)
 
 
 def relaxing(motion: PadMotion, time_s: Array) -> Array:
-    """Returns the force (k, m) at given times of springs and dashpots in series, stretched by d / max d.
+    """Returns the force (k, m) of springs and dashpots in series at given times, stretched by d / max d.
 
-    Exact, as a protocol is straight between its corners.
+    It is exact, because a protocol is straight between its corners.
     """
     largest = float(np.max(np.abs(motion.displacement_m)))
     rate = np.diff(motion.displacement_m) / largest / np.diff(motion.time_s)
@@ -91,6 +89,6 @@ def relaxing(motion: PadMotion, time_s: Array) -> Array:
 
 
 def errors(mean_n: Array, multiplying: Array, added: Array) -> Array:
-    """Returns all shapes (n, 2 + k, m) of the error of forces (n, m), of the size of the force."""
+    """Returns all shapes (n, 2 + k, m) [N] of the error of forces (n, m) [N], not multiplied by their sd."""
     largest = np.max(np.abs(mean_n), axis=1)[:, None, None]
     return np.concatenate([mean_n[:, None, :] * multiplying, largest * added], axis=1)

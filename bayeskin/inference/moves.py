@@ -1,4 +1,4 @@
-"""The moves of an ensemble, in coordinates made for them: tries, differential evolution, stretch, snooker."""
+"""Moves of an ensemble, made in suitable coordinates: tries, differential evolution, stretch and snooker."""
 
 from __future__ import annotations
 
@@ -13,25 +13,27 @@ from bayeskin.inference.proposal import Mixture, Product
 from bayeskin.types import Array
 
 _CROSSOVER = (0.15, 0.3, 1.0)  # shares of the coordinates that a step moves
-_JUMP, _JITTER = 0.1, 1e-5  # share of steps of full length, from mode to mode; noise that fills space
-_TRIES = 5  # points that a walker chooses from
-_WALKERS_A_COORDINATE = 3  # or no tries
-_GAMMA = 1.7  # of about 2.38 / sqrt(2), optimal for the difference of two projected points
+# Share of steps of full length, which can lead from mode to mode; sd of the noise that lets steps fill space.
+_JUMP, _JITTER = 0.1, 1e-5
+_TRIES = 5  # points from which a walker chooses
+_WALKERS_A_COORDINATE = 3  # walkers for each coordinate below which no tries are made
+_GAMMA = 1.7  # about 2.38 / sqrt(2), which is optimal for the difference of two projected points
 
 
 class SnookerMove(emcee.moves.red_blue.RedBlueMove):
-    """Moves each walker along the line through another, by the projected difference of two more.
+    """Moves each walker along the line through another walker, by the projected difference of two others.
 
-    Source: ter Braak & Vrugt (2008), Statistics and Computing 18:435, equations 3 and 4. Not emcee's own
-    `DESnookerMove`, which in 3.1.6 divides by the root of the norm where the unit vector is meant and
-    halves the exponent of the acceptance ratio (emcee pull request 531): it leaves a unit Gaussian in
-    eight dimensions with variance 0.63.
+    Source: ter Braak & Vrugt (2008), Statistics and Computing 18:435, equations 3 and 4. This is not emcee's
+    own `DESnookerMove`. In emcee 3.1.6, that move divides by the root of the norm where the unit vector is
+    meant, and halves the exponent of the acceptance ratio (emcee pull request 531). It gives a unit Gaussian
+    in eight dimensions a variance of 0.63.
     """
 
     def get_proposal(self, walkers: Array, complement: list[Array], random: Any) -> tuple[Array, Array]:
-        """Proposals (n, d) for `walkers` (n, d) and the log of their Hastings factors (n,).
+        """Returns proposals (n, d) for `walkers` (n, d) and the log of their Hastings factors (n,).
 
-        A walker that stands where its anchor does, as one put back beside another can, has no line and stays.
+        A walker at the same point as its anchor has no line and stays. This can happen after a walker has
+        been moved to another one.
         """
         others = np.concatenate(complement)
         picks = random.random_sample((len(walkers), len(others))).argsort(axis=1)[:, :3]
@@ -49,15 +51,16 @@ class SnookerMove(emcee.moves.red_blue.RedBlueMove):
 
 
 class SubspaceMove(emcee.moves.red_blue.RedBlueMove):
-    """Differential evolution in a random few of the coordinates: y + gamma (a - b) there, a and b others.
+    """Moves each walker y by differential evolution, y + gamma (a - b), in a few random coordinates.
 
-    A step in all coordinates at once is accepted as rarely as its worst one; where parameters are nearly
-    independent a step in a few goes further. Source: Vrugt et al. (2009), International Journal of
-    Nonlinear Sciences and Numerical Simulation 10:273, equation 4, with fixed crossover rates.
+    a and b are two other walkers. A step in all coordinates at once is accepted as rarely as its worst
+    coordinate. Where parameters are nearly independent, a step in a few coordinates goes further. Source:
+    Vrugt et al. (2009), International Journal of Nonlinear Sciences and Numerical Simulation 10:273, equation
+    4, with fixed crossover rates.
     """
 
     def get_proposal(self, walkers: Array, complement: list[Array], random: Any) -> tuple[Array, Array]:
-        """Proposals (n, d) for `walkers` (n, d) and the log of their Hastings factors, which is 0 (n,)."""
+        """Returns proposals (n, d) for `walkers` (n, d), and the log (n,) of their Hastings factors, 0."""
         others = np.concatenate(complement)
         count, dim = walkers.shape
         picks = random.random_sample((count, len(others))).argsort(axis=1)[:, :2]
@@ -71,19 +74,19 @@ class SubspaceMove(emcee.moves.red_blue.RedBlueMove):
 
 
 class TriesMove(emcee.moves.Move):
-    """Moves each walker to one of several points of a distribution that does not depend on where it is.
+    """Moves each walker to one of several points of a distribution that does not depend on its position.
 
-    Such a step forgets that at once; of several tries one is more often worth it, and their densities cost
-    little more together than one. The distribution is `known`, or a t-distribution fitted to the other half's
-    walkers. Independent multiple-try Metropolis: Martino (2018), Digital Signal Processing 75:134, section
-    4.2.
+    Such a step forgets the position at once. Several tries are accepted more often than a single try, and
+    their densities together take little more time than one. The distribution is `known`, or a t-distribution
+    fitted to the walkers of the other half. Source: independent multiple-try Metropolis, Martino (2018),
+    Digital Signal Processing 75:134, section 4.2.
     """
 
     def __init__(self, coordinates: MoveCoordinates, known: Product | None = None) -> None:
         self.coordinates, self.known = coordinates, known
 
     def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, NDArray[np.bool_]]:
-        """One step of all walkers, and which of them moved, (walkers,)."""
+        """Makes one step of all walkers; returns the state and which walkers moved, (walkers,)."""
         count = len(state.coords)
         accepted = np.zeros(count, dtype=bool)
         if self.known is not None:
@@ -100,12 +103,12 @@ class TriesMove(emcee.moves.Move):
         self, own: NDArray[np.int64], proposal: Mixture | Product, model: Any, state: emcee.State,
         accepted: NDArray[np.bool_],
     ) -> None:  # fmt: skip
-        """Moves the walkers `own` in `state`, and notes which of them have moved."""
+        """Moves the walkers `own` in `state`, and marks in `accepted` which of them have moved."""
         y = self.coordinates.forward(state.coords[own])
-        tried = proposal.draw(len(own) * _TRIES, model.random)
-        points = self.coordinates.back(tried)
+        tries = proposal.draw(len(own) * _TRIES, model.random)
+        points = self.coordinates.back(tries)
         log_prob, _ = model.compute_log_prob_fn(points)
-        weight = log_prob + self.coordinates.log_volume(tried) - proposal.log_density(tried)
+        weight = log_prob + self.coordinates.log_volume(tries) - proposal.log_density(tries)
         weight = weight.reshape(len(own), _TRIES)
         stay = state.log_prob[own] + self.coordinates.log_volume(y) - proposal.log_density(y)
         top = np.maximum(weight.max(axis=1), stay)
@@ -114,29 +117,29 @@ class TriesMove(emcee.moves.Move):
         row, level = np.arange(len(own)), model.random.random_sample(len(own)) * total
         chosen = np.minimum((np.cumsum(weight, axis=1) < level[:, None]).sum(axis=1), _TRIES - 1)
         moves = model.random.random_sample(len(own)) * (total - weight[row, chosen] + stay) < total
-        to, picks = own[moves], (row * _TRIES + chosen)[moves]
-        state.coords[to], state.log_prob[to], accepted[to] = points[picks], log_prob[picks], True
+        movers, picks = own[moves], (row * _TRIES + chosen)[moves]
+        state.coords[movers], state.log_prob[movers], accepted[movers] = points[picks], log_prob[picks], True
 
 
 def mixed_moves(
     coordinates: MoveCoordinates, walkers: int, known: Product | None = None
 ) -> list[tuple[emcee.moves.Move, float]]:
-    """The moves with their shares, all made in `coordinates`; tries from the distribution that is `known`.
+    """Returns the moves with their shares, all made in `coordinates`.
 
-    Where none is, tries only where half of the walkers tell a distribution in so many coordinates; elsewhere
-    they miss.
+    Tries come from the distribution `known`. Without a known distribution, tries are made only if the walkers
+    are many enough: half of them must define a distribution in so many coordinates. Otherwise the tries miss.
     """
-    # Tries forget fastest where they are accepted; differential evolution goes on where they are not, and the
-    # others keep it from any one scale.
-    told = walkers >= _WALKERS_A_COORDINATE * len(coordinates.low)
-    tries = 0.8 if known is not None else 0.6 if told else 0.0
+    # Accepted tries forget the position fastest. Differential evolution makes progress where tries are
+    # rejected. Stretch and snooker moves keep it from depending on a single scale.
+    enough = walkers >= _WALKERS_A_COORDINATE * len(coordinates.low)
+    tries = 0.8 if known is not None else 0.6 if enough else 0.0
     kinds = ((SubspaceMove, 0.8), (emcee.moves.StretchMove, 0.1), (SnookerMove, 0.1))
-    moves = [(_local(kind)(coordinates), (1.0 - tries) * share) for kind, share in kinds]
+    moves = [(_in_move_coordinates(kind)(coordinates), (1.0 - tries) * share) for kind, share in kinds]
     return [(TriesMove(coordinates, known), tries), *moves] if tries else moves
 
 
-def _local(kind: type) -> type:
-    """A move of emcee's, made in other coordinates."""
+def _in_move_coordinates(kind: type) -> type:
+    """Returns the class of a move that is made in move coordinates instead of sampling coordinates."""
 
     class Local(kind):  # type: ignore[misc]
         def __init__(self, coordinates: MoveCoordinates) -> None:

@@ -1,19 +1,20 @@
-"""The model of a recording's noise: its parameters, its order in time, its draws.
+"""The noise model of a recording: its parameters, its correlation in time, and draws from it.
 
-The noise of bin j is the sum of three:
+The noise of bin j is the sum of three parts:
 
     e_j = sd_j x_j + sqrt(v_j) w_j + sqrt(d_j) u_j ,
 
-noise with a memory, whose sd is sampled, for each kind of phase or for all together, and which forgets within
-`tau_noise` (x is an Ornstein-Uhlenbeck process at the bins' own times); noise that is quicker, whose variance
-v_j and correlation of neighbours c_j the binned data carry themselves (w is a Markov chain); and the
-surrogate's diagonal, white. x and w have unit variance, and both start anew in each fit window.
+The first part is noise with a memory, which forgets within `tau_noise`; x is an Ornstein-Uhlenbeck process at
+the bins' own times. Its sd is sampled, for each kind of phase or for all together. The second part is quicker
+noise; w is a Markov chain. The binned data themselves state its variance v_j and the correlation c_j of
+neighbours. The third part is the surrogate's diagonal, which is white. x and w have unit variance, and both
+start anew in each fit window.
 
 A Kalman filter over (x, w) turns the noise into innovations, each divided by its sd (Kalman 1960, J. Basic
-Eng. 82:35): with Gaussian noise they are independent and standard normal, exactly, for bins of any width
-and with any gap. They are taken to be independent Student-t of `nu_noise` degrees of freedom and unit
-*scale*. sd_j is hence the sd of the Gaussian core: the sd itself as nu_noise grows, and finite meaning at
-nu_noise = 2.
+Eng. 82:35). With Gaussian noise they are exactly independent and standard normal, for bins of any width and
+with any gap. The model takes them as independent Student-t with `nu_noise` degrees of freedom and unit
+*scale*. Hence sd_j is the sd of the Gaussian core. It equals the sd of the noise as nu_noise grows, and it
+still has a finite meaning at nu_noise = 2.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from bayeskin.types import (
 )
 
 KINDS: tuple[PhaseKind, ...] = ("rest", "load", "hold", "unload")
-ALL = "noise"  # the kind of all phases that share one sd
+ALL = "noise"  # the kind of all phases where they share one sd
 Windows = Sequence[tuple[float, float]]
 _SOURCE = "weakly informative: spans what load cells and living skin show"
 
@@ -58,11 +59,12 @@ class NoisePriors:
 
 @dataclass(frozen=True)
 class NoiseChain(_FreezesArrays):
-    """The bins that enter a likelihood, in time order, with what does not depend on any parameter.
+    """The bins that enter a likelihood, in time order, with all values that do not depend on a parameter.
 
-    All (k,): `bins` index into the recording's bins; `force_n`; `variance_n2` of the quicker noise, v;
-    `correlation` of that with the bin before, c; `gap_s` time since the bin before; `starts` True where a
-    chain begins; `kind` index into `kinds`.
+    All arrays are (k,). `bins` are indices of the recording's bins, and `force_n` are their forces.
+    `variance_n2` is the variance v of the quicker noise, and `correlation` is its correlation c with the
+    previous bin. `gap_s` is the time since the previous bin. `starts` is True where a chain begins. `kind` is
+    an index into `kinds`.
     """
 
     bins: NDArray[np.int64]
@@ -76,7 +78,7 @@ class NoiseChain(_FreezesArrays):
 
 
 def noise_space(kinds: Sequence[str], priors: NoisePriors | None = None) -> ParameterSpace:
-    """Log-uniform parameters of the noise: an sd for each of `kinds`, then `tau_noise` [s] and `nu_noise`."""
+    """Returns log-uniform noise parameters: an sd [N] for each of `kinds`, `tau_noise` [s] and `nu_noise`."""
     priors = priors or NoisePriors()
     sds = [
         Parameter(
@@ -91,10 +93,10 @@ def noise_space(kinds: Sequence[str], priors: NoisePriors | None = None) -> Para
 
 
 def bins_in_windows(binned: BinnedForce, windows: Windows | None) -> NDArray[np.int64]:
-    """Window index (m,) of each bin that lies wholly in it and has a finite force, else -1.
+    """Returns for each bin (m,) the index of the window in which it lies completely, else -1.
 
-    Without windows all finite bins belong to window 0. Raises InputError on windows that are reversed,
-    overlap or are out of order.
+    Bins whose force or variance is not finite get -1, too. Without windows all finite bins belong to window
+    0. Raises InputError on windows that are reversed, overlap or are out of order.
     """
     usable = np.isfinite(binned.force_n) & np.isfinite(binned.variance_n2)
     if windows is None:
@@ -114,8 +116,9 @@ def bins_in_windows(binned: BinnedForce, windows: Windows | None) -> NDArray[np.
 def noise_chain(
     binned: BinnedForce, windows: Windows | None = None, omit: int | None = None, by_kind: bool = True
 ) -> NoiseChain:
-    """The chain through the bins of `windows`, or all; `omit` leaves out one phase (index) as a gap.
+    """Returns the chain through the bins of `windows`, or through all bins.
 
+    omit : index of a phase that is left out as a gap
     by_kind : whether each kind of phase has an sd of its own
     Raises InputError when no bin is left or a variance is negative.
     """
@@ -129,7 +132,7 @@ def noise_chain(
     if np.any(variance < 0):
         raise InputError("binned force", "a negative variance", "variances of at least 0")
     starts = np.concatenate([[True], np.diff(window[bins]) != 0])
-    # A product of neighbours' correlations bridges omitted bins, as a Markov chain's does.
+    # In a Markov chain, the correlation across omitted bins is the product of the neighbours' correlations.
     neighbour = np.clip(np.nan_to_num(binned.correlation), -0.999, 0.999)
     bridge = np.array([0.0, *(np.prod(neighbour[a:b]) for a, b in pairwise(bins))])
     of_kind = [kinds.index(binned.phases[p].kind) if by_kind else 0 for p in binned.phase[bins]]
@@ -138,7 +141,7 @@ def noise_chain(
         force_n=binned.force_n[bins],
         variance_n2=variance,
         correlation=np.where(starts, 0.0, bridge),
-        # Equal gaps are equal to the last bit then, and share one exponential.
+        # After rounding, equal gaps are equal to the last bit and share one exponential.
         gap_s=np.round(np.diff(binned.time_s[bins], prepend=binned.time_s[bins[0]]), 12),
         starts=starts,
         kind=np.array(of_kind, dtype=np.int64),
@@ -154,14 +157,14 @@ def _kinds(binned: BinnedForce, bins: NDArray[np.int64]) -> tuple[PhaseKind, ...
 def filter_gains(
     sd: Array, variance: Array, diagonal: Array, decay: Array, correlation: Array, starts: NDArray[np.bool_]
 ) -> tuple[Array, Array, Array]:
-    """Returns what the Kalman filter takes from each innovation [1/N], for x and for w, and its sd [N].
+    """Returns the Kalman gains [1/N] of x and of w at each innovation, and the innovation's sd [N].
 
-    All (k,): sd of the noise with a memory, variances of the quicker noise and of the surrogate's diagonal
-    [N^2], correlations of x and of w with the bin before.
+    All arrays are (k,): the sd of the noise with a memory [N], the variances of the quicker noise and of the
+    surrogate's diagonal [N^2], and the correlations of x (`decay`) and of w with the previous bin.
     """
     k = len(sd)
     of_memory, of_quick, scale = np.empty(k), np.empty(k), np.empty(k)
-    one, both, two = 1.0, 0.0, 1.0  # covariance of x and w
+    one, both, two = 1.0, 0.0, 1.0  # variance of x, covariance, variance of w
     for j in range(k):
         a, c = decay[j], correlation[j]
         if starts[j]:
@@ -184,7 +187,10 @@ def _filtered(
     sd: Array, variance: Array, decay: Array, correlation: Array, starts: NDArray[np.bool_],
     gains: tuple[Array, Array, Array], columns: Array, forwards: bool,
 ) -> Array:  # fmt: skip
-    """Innovations over their sd of columns (k, n) [N]; backwards, the columns that have these innovations."""
+    """Returns the innovations of columns (k, n) [N] over their sd.
+
+    If not `forwards`, the input is taken as such innovations; the result is the columns [N] that have them.
+    """
     k, n = columns.shape
     of_memory, of_quick, scale = gains
     out, x, w = np.empty((k, n)), np.zeros(n), np.zeros(n)
@@ -214,14 +220,14 @@ def _decay(chain: NoiseChain, noise: Array) -> Array:
 
 
 def innovations(chain: NoiseChain, noise: Array, diagonal: Array, columns: Array) -> Array:
-    """Returns the innovations, over their sd, of each of `columns` (k, n) [N].
+    """Returns the innovations of each of `columns` (k, n) [N] over their sd.
 
-    noise (q,): columns of `noise_space(chain.kinds)`; diagonal (k,) the surrogate's [N^2]
+    noise (q,) has the columns of `noise_space(chain.kinds)`; diagonal (k,) is the surrogate's [N^2].
     """
-    return _through(chain, noise, diagonal, columns, True)
+    return _run_filter(chain, noise, diagonal, columns, True)
 
 
-def _through(chain: NoiseChain, noise: Array, diagonal: Array, columns: Array, forwards: bool) -> Array:
+def _run_filter(chain: NoiseChain, noise: Array, diagonal: Array, columns: Array, forwards: bool) -> Array:
     sd, decay = noise[chain.kind], _decay(chain, noise)
     gains = _gains(sd, chain.variance_n2, diagonal, decay, chain.correlation, chain.starts)
     columns = np.ascontiguousarray(columns, dtype=float)
@@ -231,14 +237,14 @@ def _through(chain: NoiseChain, noise: Array, diagonal: Array, columns: Array, f
 
 
 def noise_covariance(chain: NoiseChain, noise: Array, diagonal: Array) -> Array:
-    """Returns the covariance (k, k) [N^2] of the noise's Gaussian core; arguments as in `innovations`."""
+    """Returns the covariance (k, k) [N^2] of the noise's Gaussian core, for arguments as in `innovations`."""
     sd, quick = noise[chain.kind], np.sqrt(chain.variance_n2)
     memory = sd[:, None] * _markov(chain, _decay(chain, noise)) * sd
     return np.asarray(memory + quick[:, None] * _markov(chain, chain.correlation) * quick + np.diag(diagonal))
 
 
 def _markov(chain: NoiseChain, with_the_one_before: Array) -> Array:
-    """Correlation (k, k) of a Markov chain."""
+    """Returns the correlation matrix (k, k) of a Markov chain."""
     step = np.where(chain.starts, 0.0, with_the_one_before)
     out = np.eye(len(step))
     for i in range(1, len(step)):
@@ -247,7 +253,7 @@ def _markov(chain: NoiseChain, with_the_one_before: Array) -> Array:
 
 
 def draw_noise(chain: NoiseChain, noise: Array, diagonal: Array, rng: np.random.Generator) -> Array:
-    """Returns noise [N] (n, k) drawn at n noise parameter vectors (n, q); diagonal (n, k) [N^2]."""
+    """Returns noise [N] (n, k) drawn at n noise parameter vectors (n, q); diagonal (n, k) is in N^2."""
     innovation = rng.standard_t(noise[:, -1:], size=diagonal.shape)
     rows = zip(noise, diagonal, innovation, strict=True)
-    return np.stack([_through(chain, one, d, t[:, None], False)[:, 0] for one, d, t in rows])
+    return np.stack([_run_filter(chain, q, d, t[:, None], False)[:, 0] for q, d, t in rows])

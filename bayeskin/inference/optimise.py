@@ -1,8 +1,8 @@
-"""The most probable point: three kinds of global search in turn, each polished locally.
+"""Finds the most probable point by three kinds of global search in turn, each followed by a local polish.
 
 Controlled random search (NLopt GN_CRS2_LM; Kaelo & Ali 2006, J. Optim. Theory Appl. 130:253), differential
 evolution (Storn & Price 1997, J. Glob. Optim. 11:341, by SciPy) and Gauss-Newton from draws of the prior
-(`gauss_newton`) share nothing but the density: where they end at one value, it is hardly a local one.
+(`gauss_newton`) share nothing but the density. Where they end at the same value, it is hardly a local one.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.reparametrisation import Shear, find_shear
 from bayeskin.types import Array
 
-_AGREE = 0.1  # nats: starts this close to the best found the same maximum, whatever stays flat around it
-# NLopt 2.11 has a class of its own above its errors; earlier ones raise Python's.
+# Starts within this many nats of the best have reached the same maximum, even where it is flat around.
+_AGREE = 0.1
+# NLopt 2.11 has its own base class of errors; earlier versions raise Python's errors.
 _ERRORS = (nlopt.RoundoffLimited, getattr(nlopt, "exception", RuntimeError), RuntimeError, MemoryError)
-_WORST = -1e30  # of a point without a density; NLopt asks for finite values
-_LEVELS = 3.0  # log amplitudes either side of the recorded force's that are searched
-_STEP = 1e-6  # of a unit coordinate, for central differences
-_STEEP = 1e4  # nats a box width outside the prior
-_CLIMBS = 16  # Gauss-Newton climbs from the prior that make one start
-_POPULATION = 10  # members of differential evolution, a parameter
+_WORST = -1e30  # value of a point without a density, because NLopt needs finite values
+_LEVELS = 3.0  # range of log amplitudes that is searched on either side of the recorded force's
+_STEP = 1e-6  # step of central differences in a unit coordinate
+_STEEP = 1e4  # nats that the density falls per box width outside the prior
+_CLIMBS = 16  # number of Gauss-Newton climbs from the prior that make one start
+_POPULATION = 10  # members of differential evolution for each parameter
 _STATUS = {
     nlopt.SUCCESS: "converged",
     nlopt.STOPVAL_REACHED: "converged",
@@ -41,9 +42,9 @@ _STATUS = {
 
 @dataclass(frozen=True)
 class StartResult:
-    """Where one start ended: SI values by name, log density, how the polish stopped, evaluations spent.
+    """End of one start: SI values by name, log density, how the polish stopped, and evaluations spent.
 
-    `search` names the global search before the polish; evaluations are those outside Gauss-Newton.
+    `search` names the global search before the polish. `evaluations` leaves out those inside Gauss-Newton.
     """
 
     theta: Mapping[str, float]
@@ -64,19 +65,19 @@ class MapResult:
 
     @property
     def by_search(self) -> dict[str, float]:
-        """Best log density that each kind of search ended at."""
+        """Returns the best log density at which each kind of search ended."""
         kinds = dict.fromkeys(start.search for start in self.starts)
         return {kind: max(s.value for s in self.starts if s.search == kind) for kind in kinds}
 
     @property
     def message(self) -> str:
-        """One sentence: whether to rely on the maximum, and the remedy if not."""
+        """Returns a sentence that says whether to rely on the maximum, and what to do if not."""
         reached = [kind for kind, value in self.by_search.items() if value >= self.value - _AGREE]
-        found = f"{round(self.agreement * len(self.starts))} of {len(self.starts)} starts reached it"
-        found += f", by {', '.join(reached)}"
+        summary = f"{round(self.agreement * len(self.starts))} of {len(self.starts)} starts reached it"
+        summary += f", by {', '.join(reached)}"
         if len(reached) > 1 or self.agreement >= 0.5:
-            return f"maximum of log posterior {self.value:.2f}: {found}"
-        return f"maximum of log posterior {self.value:.2f}: only {found}; allow more evaluations a start"
+            return f"maximum of log posterior {self.value:.2f}: {summary}"
+        return f"maximum of log posterior {self.value:.2f}: only {summary}; allow more evaluations a start"
 
 
 def find_map(
@@ -86,13 +87,14 @@ def find_map(
     evaluations: int = 20000,
     progress: Callable[[float, str], None] | None = None,
 ) -> MapResult:
-    """Maximum of the posterior density in sampling coordinates.
+    """Returns the maximum of the posterior density in sampling coordinates.
 
-    The starts take the kinds of `SEARCHES` in turn, each on at most half of `evaluations`, then Gauss-Newton,
-    L-BFGS and Sbplx from there, in straightened coordinates (`straighten`). Where the first of every kind end
-    at one value, no others are made. NLopt's failures become a start's
-    status. NLopt draws from its own generator, seeded for each start. Raises InputError when there is no
-    start to make.
+    The starts use the kinds of `SEARCHES` in turn. Each search spends at most half of `evaluations`. The
+    start then continues with Gauss-Newton, L-BFGS and Sbplx, in straightened coordinates
+    (`reparametrisation`).
+    Where the first starts of all kinds end at the same value, no further starts are made. A failure of NLopt
+    becomes the start's status. NLopt draws from its own generator, which is seeded for each start. Raises
+    InputError when there is no start to make.
     """
     if starts < 1 or evaluations < 4:
         raise InputError("map", f"{starts} starts, {evaluations} evaluations", "at least 1 start of 4")
@@ -116,9 +118,9 @@ def climb(
     evaluations: int = 4000,
     shear: Shear | None = None,
 ) -> StartResult:
-    """The local maximum near `start` (all parameters, SI; moved into the box if outside it).
+    """Returns the local maximum near `start` (all parameters, SI; moved into the box if outside it).
 
-    `shear`: the map that straightens this posterior, where it is known already.
+    shear : the map that straightens this posterior, where it is already known
     """
     space = _SearchSpace(log_posterior, shear)
     low, high = log_posterior.bounds
@@ -169,7 +171,7 @@ def _climbs(search: _Search, seed: int, evaluations: int) -> None:
 
 
 class _SearchSpace:
-    """The unit cube over straightened coordinates; beyond the prior box the density is continued."""
+    """The unit cube over straightened coordinates; the density is continued outside the prior box."""
 
     def __init__(self, log_posterior: LogPosterior, shear: Shear | None = None) -> None:
         self.log_posterior, self.shear = log_posterior, shear or find_shear(log_posterior)
@@ -182,7 +184,7 @@ class _SearchSpace:
             self.low[first], self.high[first] = -_LEVELS, _LEVELS
 
     def points(self, unit: Array) -> tuple[Array, Array]:
-        """Sampling coordinates (n, D) in the prior box, and how far out they were (n,), in box widths."""
+        """Returns sampling coordinates (n, D) moved into the prior box, and by how many box widths (n,)."""
         x = self.low + unit * (self.high - self.low)
         if self.shear is not None:
             x = self.shear.back(x)
@@ -191,18 +193,18 @@ class _SearchSpace:
         return inside, np.linalg.norm((x - inside) / (high - low), axis=1)
 
     def unit(self, x: Array) -> Array:
-        """Unit-cube coordinates (n, D) of sampling coordinates."""
+        """Returns the unit-cube coordinates (n, D) of sampling coordinates (n, D)."""
         straight = x if self.shear is None else self.shear.straight(x)
         return np.clip((straight - self.low) / (self.high - self.low), 0.0, 1.0)
 
     def values(self, unit: Array) -> Array:
-        """Log densities (n,); less a steep cone outside the prior box, finite throughout."""
+        """Returns log densities (n,), always finite; outside the prior box a steep cone is subtracted."""
         inside, outside = self.points(unit)
         return np.maximum(self.log_posterior.log_prob(inside) - _STEEP * outside, _WORST)
 
 
 class _Search:
-    """The objective on the unit cube, with the best point seen: NLopt drops it when it fails."""
+    """The objective on the unit cube; it keeps the best point so far, which NLopt drops when it fails."""
 
     def __init__(self, space: _SearchSpace) -> None:
         self.space = space
@@ -225,11 +227,11 @@ class _Search:
         return float(values[0])
 
     def offer(self, x: Array) -> None:
-        """One point (D,) in sampling coordinates that something else proposes."""
+        """Evaluates a point (D,) in sampling coordinates from another method, and keeps it if it is best."""
         self.offer_unit(self.space.unit(x[None]))
 
     def offer_unit(self, unit: Array) -> Array:
-        """Log densities (n,) at points (n, D) of the unit cube, the best of them kept."""
+        """Returns log densities (n,) at points (n, D) of the unit cube, and keeps the best point."""
         values = self.space.values(unit)
         self.evaluations += len(unit)
         best = int(np.argmax(values))

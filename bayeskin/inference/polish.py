@@ -1,9 +1,10 @@
-"""The maximum polished on the full model itself: Gauss-Newton, the force linearised at each full run.
+"""Polishes the maximum on the full model: Gauss-Newton steps, with the force linearised at each full run.
 
-The surrogate's error moves the most probable point; on a ridge, far. From a point of the surrogate's, each
-round runs the full model with its derivatives, maximises the posterior with the force linear about that run
-(material within a trust region, noise free), and takes the new point if the full model agrees that it is
-better. The posterior compared is the exact one: no surrogate, so no surrogate error in it.
+The surrogate's error shifts the most probable point, and on a ridge it shifts it far. The polish starts from
+a point of the surrogate's posterior. Each round runs the full model with its derivatives. It then maximises
+the posterior with the force linear about that run; the material parameters stay within a trust region, and
+the noise is free. The new point is accepted if the full model agrees that it is better. The compared
+posterior is exact, because it contains no surrogate and hence no surrogate error.
 """
 
 from __future__ import annotations
@@ -22,16 +23,19 @@ from bayeskin.types import Array, ParameterSpace, Prediction, Simulation
 
 FullRun = Callable[[Mapping[str, float]], Simulation]
 
-TRUST, SMALLEST_TRUST, RUN_ITSELF = 1.0, 0.02, 1e-9  # of a logarithm, either side
-ENOUGH = 0.05  # nats still to be gained: far below what tells two points apart
+# Half-widths of the trust region, in the logarithm of a parameter (or as a share of its prior's range): the
+# largest, the smallest, and one that holds the parameter at the run.
+TRUST, SMALLEST_TRUST, RUN_ITSELF = 1.0, 0.02, 1e-9
+ENOUGH = 0.05  # nats still to be gained below which the polish ends; far less than distinguishes two points
 
 
 @dataclass(frozen=True)
 class LinearForce:
-    """A `types.Surrogate` without error: the force linear about one full run.
+    """A `types.Surrogate` without error, whose force is linear about one full run.
 
-    theta (d,) of the run, force_n (m,), gradient_n (m, d) by logarithms. Linear in what the force is all but
-    proportional to (`Parameter.stress_power` 1), else in the logarithm.
+    theta (d,) are the run's parameters, force_n (m,) [N] is its force, and gradient_n (m, d) [N] is the
+    derivative by the parameters' logarithms. The force is linear in a parameter to which it is almost
+    proportional (`Parameter.stress_power` 1), and in the logarithm of other parameters.
     """
 
     space: ParameterSpace
@@ -43,16 +47,16 @@ class LinearForce:
 
     @property
     def moves(self) -> NDArray[np.bool_]:
-        """Whether each parameter has a derivative, (d,)."""
+        """Returns whether each parameter has a derivative, (d,)."""
         return np.any(self.gradient_n != 0.0, axis=0)
 
     def predict(self, theta: ArrayLike) -> Prediction:
-        """Force at theta (n, d)."""
+        """Returns the force at theta (n, d), with zero error."""
         mean = self.predict_mean(theta)
         return Prediction(mean, np.zeros((*mean.shape, 1)), np.zeros(mean.shape))
 
     def predict_mean(self, theta: ArrayLike) -> Array:
-        """Force (n, m) at theta (n, d)."""
+        """Returns the force (n, m) [N] at theta (n, d)."""
         ratio = np.atleast_2d(np.asarray(theta, dtype=float)) / self.theta
         moduli = np.array([p.stress_power == 1 for p in self.space.parameters])
         change = np.where(moduli, ratio - 1.0, np.log(np.where(self.moves & ~moduli, ratio, 1.0)))
@@ -61,8 +65,11 @@ class LinearForce:
 
 @dataclass(frozen=True)
 class Polished:
-    """theta: all parameters (SI) of the best full run; value: its exact log posterior; gained: on the start.
+    """Result of a polish.
 
+    theta : all parameters (SI) of the best full run
+    value : exact log posterior of this run
+    gained : nats gained over the start
     runs : (log posterior, full run) of every round, accepted or not
     """
 
@@ -79,9 +86,9 @@ def polish_map(
     start: Mapping[str, float],
     rounds: int = 6,
 ) -> Polished:
-    """Gauss-Newton from `start` (all parameters, SI) on runs of the full model that carry derivatives.
+    """Returns the maximum by Gauss-Newton from `start` (all parameters, SI), on full runs with derivatives.
 
-    A full run that fails ends the polish with the best point so far; the first one failing leaves the start.
+    A full run that fails ends the polish with the best point so far, which is `start` for the first run.
     """
     best, value, trust = dict(start), -np.inf, TRUST
     local: LogPosterior | None = None
@@ -91,12 +98,12 @@ def polish_map(
         run = full_run({name: trial[name] for name in log_posterior.surrogate.space.names})
         if run.status != "ok":
             return Polished(best, value, value - first, runs, f"a full run failed: {run.message}")
-        about = _linearised(log_posterior, run)
-        exact = _maximum(about, trial, RUN_ITSELF)  # the noise that suits the run best
+        linearised = _linearised(log_posterior, run)
+        exact = _maximum(linearised, trial, RUN_ITSELF)  # finds the most probable noise for this run
         runs.append((exact[1], run))
         if exact[1] > value:
             first = exact[1] if len(runs) == 1 else first
-            best, value, local = exact[0], exact[1], about
+            best, value, local = exact[0], exact[1], linearised
             trust = trust if len(runs) == 1 else min(2.0 * trust, TRUST)
         else:
             trust *= 0.25
@@ -109,7 +116,7 @@ def polish_map(
 
 
 def _linearised(log_posterior: LogPosterior, run: Simulation) -> LogPosterior:
-    """The posterior with the force linear about a run, in the same prior box."""
+    """Returns the posterior with the force linear about a run, in the same prior box."""
     space, edges = log_posterior.material or log_posterior.surrogate.space, log_posterior.surrogate.edges_s
     columns = dict(zip(run.gradient_names, run.gradient_bin_means(edges).T, strict=True))
     blank = np.zeros(len(edges) - 1)
@@ -122,9 +129,10 @@ def _linearised(log_posterior: LogPosterior, run: Simulation) -> LogPosterior:
 def _maximum(
     about: LogPosterior, centre: Mapping[str, float], trust: float
 ) -> tuple[dict[str, float], float]:
-    """Maximum within `trust` of the centre's material parameters, noise free.
+    """Returns the maximum within `trust` of the centre's material parameters, with the noise free.
 
-    A parameter without derivative, such as p_init, stays where it is: nothing here moves the force by it.
+    A parameter without a derivative, such as p_init, keeps its value, since the linear force does not depend
+    on it.
     """
     linear, narrowed = about.surrogate, []
     assert isinstance(linear, LinearForce)
@@ -136,8 +144,8 @@ def _maximum(
         else:
             low, high = middle - reach * (p.upper - p.lower), middle + reach * (p.upper - p.lower)
         narrowed.append(replace(p, lower=max(low, p.lower), upper=min(high, p.upper)))
-    found = climb(replace(about, material=replace(linear.space, parameters=tuple(narrowed))), centre)
-    return dict(found.theta), _density(about, found.theta)
+    maximum = climb(replace(about, material=replace(linear.space, parameters=tuple(narrowed))), centre)
+    return dict(maximum.theta), _density(about, maximum.theta)
 
 
 def _density(about: LogPosterior, theta: Mapping[str, float]) -> float:

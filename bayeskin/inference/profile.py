@@ -1,10 +1,10 @@
 """Profile likelihoods: how well the recording can be fitted with one parameter held, all others free.
 
-Where the profile is flat, no value of the parameter can be told from another by the fit, whatever the prior
-says (practical non-identifiability; Raue et al. 2009, Bioinformatics 25:1923). Noise parameters are free
-too. From the most probable point the held value moves to either end, each maximum from that of its
-neighbour by Gauss-Newton (`gauss_newton`), and from the likeliest and the nearest of the posterior's draws
-about the value, which know ridges that bend and tops that lie apart.
+Where the profile is flat, the fit cannot tell one value of the parameter from another, whatever the prior
+says (practical non-identifiability; Raue et al. 2009, Bioinformatics 25:1923). Noise parameters are free too.
+The held value moves from the most probable point to either end. Each maximum is found by Gauss-Newton
+(`gauss_newton`) from the maximum at the neighbouring value. Further climbs start from the likeliest and the
+nearest of the posterior draws about the value, because the draws follow curved ridges and separate maxima.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.reparametrisation import Shear, find_shear
 from bayeskin.types import Array, Parameter, ParameterSpace, _FreezesArrays
 
-DROP = 1.353  # nats below the top that 90 % of a chi-square of one degree of freedom lie within, halved
-_HELD = 1e-9  # width of what is left of a held parameter's prior, of its own
+DROP = 1.353  # nats below the top: half the 90 % quantile of chi-square with one degree of freedom
+_HELD = 1e-9  # half-width of a held parameter's prior, as a share of its value or of its prior's range
 _ROUNDS = 12
 
 
 @dataclass(frozen=True)
 class Profile(_FreezesArrays):
-    """One parameter: values (g,) in SI over its prior, and the log-likelihood (g,) less its largest.
+    """Profile of one parameter: values (g,) in SI over its prior, and log-likelihoods (g,) less the largest.
 
-    interval: 90 % by the likelihood ratio, SI; an end at the prior's bound is open.
+    interval : 90 % interval by the likelihood ratio, in SI; an end at the prior's bound is open
     """
 
     name: str
@@ -40,19 +40,20 @@ class Profile(_FreezesArrays):
 
     @property
     def flat(self) -> bool:
-        """Whether the fit excludes no value of the prior."""
+        """Returns whether the fit excludes no value of the prior."""
         return self.open_below and self.open_above
 
 
 def profiles(
     log_posterior: LogPosterior, best: Mapping[str, float], draws: Array, points: int = 15
 ) -> tuple[Profile, ...]:
-    """A profile for each material parameter, `points` values evenly over its prior and the best one.
+    """Returns a profile for each material parameter, at `points` values evenly over its prior and the best.
 
-    best : all parameters (SI) of the most probable point; draws : of the posterior (n, D), n from 0 on
+    best : all parameters (SI) of the most probable point
+    draws : posterior draws (n, D) in SI; n may be 0
     """
     material = log_posterior.material or log_posterior.surrogate.space
-    log_posterior = replace(log_posterior, material=material.box)  # the fit's own word, no prior in it
+    log_posterior = replace(log_posterior, material=material.box)  # without the prior, only the fit counts
     shear, names = find_shear(log_posterior), material.names
     known = log_posterior.to_sampling(draws)
     values = log_posterior.log_prob(known)
@@ -69,22 +70,23 @@ def _profile(
     line = np.sort(np.append(np.linspace(low, high, points), start[column]))
     middle = int(np.searchsorted(line, start[column]))
     last = len(line) - 1
-    value, found = np.full(len(line), -np.inf), np.tile(start, (len(line), 1))
-    value[middle], found[middle] = _held(log_posterior, start, shear, column)
-    for j, one in _likeliest_about(line, draws, column):
-        reached, point = _held(log_posterior, one, shear, column)
+    value, maxima = np.full(len(line), -np.inf), np.tile(start, (len(line), 1))
+    value[middle], maxima[middle] = _maximum_with_held(log_posterior, start, shear, column)
+    for j, draw in _likeliest_about(line, draws, column):
+        reached, point = _maximum_with_held(log_posterior, draw, shear, column)
         if reached > value[j]:
-            value[j], found[j] = reached, point
-    # Out to both ends, then across and back: what one direction missed, the other may find.
+            value[j], maxima[j] = reached, point
+    # The held value moves out to both ends, then across and back: a maximum that is missed in one direction
+    # may be found in the other.
     paths = ((middle, last), (middle, 0), (0, last), (last, 0))
     for first, end in paths:
         for i in range(first, end, 1 if end > first else -1):
             j = i + (1 if end > first else -1)
-            trial = found[i].copy()
+            trial = maxima[i].copy()
             trial[column] = line[j]
-            reached, point = _held(log_posterior, trial, shear, column)
+            reached, point = _maximum_with_held(log_posterior, trial, shear, column)
             if reached > value[j]:
-                value[j], found[j] = reached, point
+                value[j], maxima[j] = reached, point
     drop = value - value.max()
     inside = _crossings(line, drop)
     ends = np.tile(start, (len(line) + 2, 1))
@@ -96,7 +98,10 @@ def _profile(
 
 
 def _likeliest_about(line: Array, draws: Array, column: int) -> Iterator[tuple[int, Array]]:
-    """Of each value (g,) the first and the nearest of the draws (n, D) about it, moved onto it."""
+    """Yields for each value (g,) the likeliest and the nearest draw about it, moved onto the value.
+
+    The draws (n, D) are sorted, the likeliest first.
+    """
     away = np.abs(draws[:, column, None] - line)
     value = np.argmin(away, axis=1)
     for j in np.unique(value):
@@ -105,8 +110,10 @@ def _likeliest_about(line: Array, draws: Array, column: int) -> Iterator[tuple[i
             yield int(j), np.where(np.arange(draws.shape[1]) == column, line[j], draws[i])
 
 
-def _held(log_posterior: LogPosterior, at: Array, shear: Shear | None, column: int) -> tuple[float, Array]:
-    """Log-likelihood and point of the maximum near `at` (D,) that keeps one coordinate."""
+def _maximum_with_held(
+    log_posterior: LogPosterior, at: Array, shear: Shear | None, column: int
+) -> tuple[float, Array]:
+    """Returns log-likelihood and point of the maximum near `at` (D,), with the coordinate `column` held."""
     space = log_posterior.material or log_posterior.surrogate.space
     theta = log_posterior.from_sampling(at[None])[0, column]
     parameters = list(space.parameters)
@@ -124,7 +131,7 @@ def _narrowed(parameter: Parameter, value: float) -> Parameter:
 
 
 def _crossings(line: Array, drop: Array) -> tuple[float, float]:
-    """Where the profile last crosses `DROP`, on either side; the line's end where it does not."""
+    """Returns where the profile last crosses `DROP` on either side, or the line's end without a crossing."""
     within = np.flatnonzero(drop > -DROP)
     first, last = int(within[0]), int(within[-1])
 

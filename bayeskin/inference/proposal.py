@@ -1,8 +1,9 @@
-"""Distributions that moves propose points from: mixtures of t-distributions, fitted to draws.
+"""Distributions from which moves propose points: mixtures of t-distributions, fitted to draws.
 
 A posterior may be a thin, curved ridge or lie in several parts; a mixture follows it piece by piece. A poor
-fit costs speed, never correctness, since the acceptance of a point knows the density that it is drawn from.
-Expectation maximisation for t: McLachlan & Peel (1998), Lecture Notes in Computer Science 1451:658.
+fit costs speed, never correctness, since the acceptance of a point accounts for the density from which it is
+drawn. Source of expectation maximisation for t-distributions: McLachlan & Peel (1998), Lecture Notes in
+Computer Science 1451:658.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ from scipy.special import gammaln, logsumexp
 
 from bayeskin.types import Array, _FreezesArrays
 
-_FREEDOM = 5.0  # of the t-distributions: tails that reach where no draw has been yet
-_COMPONENTS, _ROUNDS = 24, 15  # at most; of expectation maximisation
-_PRIOR = 5.0  # draws a coordinate that the prior on a component's spread is worth
-_FIRST, _NARROW = 0.1, 0.005  # of the covariance of all draws: the spread at first, and a priori
+_FREEDOM = 5.0  # degrees of freedom of the t-distributions, whose tails reach where no draw has been yet
+_COMPONENTS, _ROUNDS = 24, 15  # largest number of components; rounds of expectation maximisation
+_PRIOR = 5.0  # weight of the prior on a component's spread, in draws for each coordinate
+_FIRST, _NARROW = 0.1, 0.005  # spread at the start and in the prior, as shares of the covariance of all draws
 
 
 @dataclass(frozen=True)
 class Mixture(_FreezesArrays):
-    """t-distributions with weights (k,), centres (k, d) and Cholesky factors (k, d, d) of their spreads."""
+    """Mixture of t-distributions: weights (k,), centres (k, d), Cholesky factors (k, d, d) of the spreads."""
 
     weights: Array
     centres: Array
@@ -31,27 +32,36 @@ class Mixture(_FreezesArrays):
 
     @classmethod
     def around(cls, points: Array) -> Mixture:
-        """One t-distribution with the mean and covariance of points (n, d), correlations shrunk where few."""
+        """Returns one t-distribution with the mean and covariance of points (n, d).
+
+        Correlations are shrunk where the points are few.
+        """
         count, dim = points.shape
         spread = np.cov(points.T)
-        own = np.diag(spread.diagonal())
-        spread = (count * spread + dim * own) / (count + dim) + 1e-10 * np.eye(dim)
+        variances = np.diag(spread.diagonal())
+        spread = (count * spread + dim * variances) / (count + dim) + 1e-10 * np.eye(dim)
         return cls(np.ones(1), points.mean(axis=0)[None], np.linalg.cholesky(spread)[None])
 
     @classmethod
     def of(cls, points: Array, rng: np.random.Generator) -> Mixture:
-        """Fitted to points (n, d); components begin at some of them, and go where few are left to them."""
+        """Returns a mixture fitted to points (n, d).
+
+        Components start at some of the points. A component is removed where few points are left to it.
+        """
         count, dim = points.shape
         spread = np.atleast_2d(np.cov(points.T)) + 1e-9 * np.eye(dim)
         start = rng.choice(count, min(_COMPONENTS, count // (2 * dim) + 1), replace=False)
         roots = np.repeat(np.linalg.cholesky(_FIRST * spread)[None], len(start), axis=0)
-        found = cls(np.full(len(start), 1.0 / len(start)), points[start], roots)
+        mixture = cls(np.full(len(start), 1.0 / len(start)), points[start], roots)
         for _ in range(_ROUNDS):
-            found = found._maximised(points, _PRIOR * dim, _NARROW * spread)
-        return found
+            mixture = mixture._maximised(points, _PRIOR * dim, _NARROW * spread)
+        return mixture
 
     def _maximised(self, points: Array, prior: float, narrow: Array) -> Mixture:
-        """One round of expectation maximisation, with a prior of so many draws on each spread."""
+        """Returns the mixture after one round of expectation maximisation.
+
+        prior : weight of the prior on each spread, in draws; narrow (d, d) : the spread of this prior
+        """
         dim = points.shape[1]
         squared = self._squared(points)
         log = self._log_densities(squared)
@@ -61,30 +71,30 @@ class Mixture(_FreezesArrays):
         share, size = share[:, kept], size[kept]
         pull = share * (_FREEDOM + dim) / (_FREEDOM + squared[:, kept])
         centres = (pull.T @ points) / pull.sum(axis=0)[:, None]
-        apart = [points - centre for centre in centres]
-        spreads = np.stack([(one * pull[:, k, None]).T @ one for k, one in enumerate(apart)])
+        differences = [points - centre for centre in centres]
+        spreads = np.stack([(away * pull[:, k, None]).T @ away for k, away in enumerate(differences)])
         spreads = (spreads + prior * narrow) / (size + prior)[:, None, None]
         return Mixture(size / size.sum(), centres, np.linalg.cholesky(spreads))
 
     def draw(self, count: int, random: np.random.RandomState) -> Array:
-        """Points (count, d)."""
-        which = random.choice(len(self.weights), count, p=self.weights)
+        """Returns points (count, d) drawn from the mixture."""
+        component = random.choice(len(self.weights), count, p=self.weights)
         size = np.sqrt(random.chisquare(_FREEDOM, (count, 1)) / _FREEDOM)
         normal = random.standard_normal((count, self.centres.shape[1])) / size
-        return np.asarray(self.centres[which] + np.einsum("nij,nj->ni", self.roots[which], normal))
+        return np.asarray(self.centres[component] + np.einsum("nij,nj->ni", self.roots[component], normal))
 
     def log_density(self, points: Array) -> Array:
-        """At points (n, d), (n,)."""
+        """Returns the log density (n,) at points (n, d)."""
         return np.asarray(logsumexp(self._log_densities(self._squared(points)), axis=1))
 
     def _squared(self, points: Array) -> Array:
-        """Squared distances (n, k) from the centres, in each component's own measure."""
+        """Returns squared distances (n, k) from the centres, in each component's own measure."""
         inverses = np.linalg.inv(self.roots)
-        away = [(points - centre) @ root.T for centre, root in zip(self.centres, inverses, strict=True)]
-        return np.stack([np.einsum("nd,nd->n", one, one) for one in away], axis=1)
+        scaled = [(points - centre) @ root.T for centre, root in zip(self.centres, inverses, strict=True)]
+        return np.stack([np.einsum("nd,nd->n", away, away) for away in scaled], axis=1)
 
     def _log_densities(self, squared: Array) -> Array:
-        """Returns log densities of the components times their weights (n, k)."""
+        """Returns the log (n, k) of the components' densities times their weights."""
         dim = self.centres.shape[1]
         sizes = np.log(np.diagonal(self.roots, axis1=1, axis2=2)).sum(axis=1)
         norm = (
@@ -96,9 +106,10 @@ class Mixture(_FreezesArrays):
 
 @dataclass(frozen=True)
 class Product:
-    """Independent mixtures, each of the coordinates in its `columns`.
+    """Independent mixtures, each for the block of coordinates in its `columns`.
 
-    Fewer draws tell mixtures of blocks that hardly depend on each other than one mixture of all of them.
+    Where blocks hardly depend on each other, their mixtures need fewer draws than one mixture of all
+    coordinates.
     """
 
     columns: tuple[slice, ...]
@@ -106,14 +117,14 @@ class Product:
 
     @classmethod
     def of(cls, points: Array, columns: Sequence[slice], rng: np.random.Generator) -> Product:
-        """Fitted to points (n, D)."""
+        """Returns mixtures fitted to the blocks of points (n, D)."""
         return cls(tuple(columns), tuple(Mixture.of(points[:, block], rng) for block in columns))
 
     def draw(self, count: int, random: np.random.RandomState) -> Array:
-        """Points (count, D)."""
+        """Returns points (count, D) drawn from the product."""
         return np.concatenate([mixture.draw(count, random) for mixture in self.mixtures], axis=1)
 
     def log_density(self, points: Array) -> Array:
-        """At points (n, D), (n,)."""
+        """Returns the log density (n,) at points (n, D)."""
         parts = zip(self.columns, self.mixtures, strict=True)
         return np.sum([mixture.log_density(points[:, block]) for block, mixture in parts], axis=0)

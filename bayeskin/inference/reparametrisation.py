@@ -1,14 +1,15 @@
 """Coordinates in which the ridge of the moduli is straight.
 
-A force fixes the sum of what several layers contribute, say a E_c + b E_s, to a few parts in a thousand
-and leaves their ratio open. In logarithms that ridge is a thin curve, which neither an ensemble of walkers
-nor an optimiser follows well. With x the sampling coordinates, G the parameters that the amplitude alpha
-of the force grows with, c the mean of x over G and P x what is left when c is taken from each of G,
+A force fixes the sum of the contributions of several layers, say a E_c + b E_s, to a few parts in a thousand
+and leaves their ratio open. In logarithms this ridge is a thin curve, which neither an ensemble of walkers
+nor an optimiser follows well. Let x be the sampling coordinates, G the parameters with which the amplitude
+alpha of the force grows, and c the mean of x over G. P x is x after c is subtracted from each member of G.
+The map
 
     c' = c + h(P x),     h(P x) = log sum_G a_j exp((P x)_j) + polynomial(P x),     P x' = P x,
 
-turns the ridge alpha = 1 into c' = 0. The map is a shear, since h does not depend on c: its inverse is
-explicit and its determinant constant whatever h is, so a poor fit of h costs speed, never correctness
+turns the ridge alpha = 1 into c' = 0. The map is a shear, since h does not depend on c. Its inverse is
+explicit and its determinant is constant, whatever h is. A poor fit of h costs speed, never correctness
 (a triangular transport map; Parno & Marzouk 2018, SIAM/ASA J. Uncertainty Quantification 6:645).
 """
 
@@ -26,20 +27,20 @@ from scipy.optimize import nnls
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.types import Array, NDArray, _FreezesArrays
 
-_POINTS = 2048  # of the prior, that the amplitude is learnt from
+_POINTS = 2048  # points of the prior from which the amplitude is learnt
 _CHUNK = 256
-_MIN_SHARE = 0.02  # mean share of the amplitude that puts a parameter into the group
+_MIN_SHARE = 0.02  # mean share of the amplitude from which on a parameter belongs to the group
 _DEGREE = 5
-_NEWTON = 4  # steps onto the ridge
-_STEP = 1e-4  # of a logarithm, for differences
+_NEWTON = 4  # Newton steps onto the ridge
+_STEP = 1e-4  # step of differences in a logarithm
 
 
 @dataclass(frozen=True)
 class Shear(_FreezesArrays):
-    """The map for x (n, D): `group` (D,) bool, log_weight (D,) of its members, -inf outside.
+    """The map for x (n, D): `group` (D,) bool marks G, and log_weight (D,) is log a_j in G, -inf outside.
 
-    The polynomial has `powers` (t, D) and `coefficients` (t,) in (P x - centre) / scale. With another `power`
-    q than 1 the amplitude is a sum of moduli to the power q, to the power 1 / q.
+    The polynomial has exponents `powers` (t, D) and `coefficients` (t,), in (P x - centre) / scale. If
+    `power` q differs from 1, the amplitude is a sum of moduli to the power q, raised to the power 1 / q.
     """
 
     group: NDArray[np.bool_]
@@ -51,35 +52,38 @@ class Shear(_FreezesArrays):
     power: float = 1.0
 
     def straight(self, x: Array) -> Array:
-        """P x (n, D) with c' in the place of the group's first parameter."""
+        """Returns P x (n, D) with c' in the place of the group's first parameter."""
         level, rest = self.split(x)
         out = rest.copy()
         out[:, self._first] = level + self.height(rest)
         return out
 
     def back(self, straight: Array) -> Array:
-        """x of what `straight` gives, (n, D)."""
+        """Returns x (n, D) from the result of `straight`."""
         rest = straight.copy()
         rest[:, self._first] = 0.0
         rest[:, self._first] = -rest[:, self.group].sum(axis=1)
         return self.join(straight[:, self._first] - self.height(rest), rest)
 
     def split(self, x: Array) -> tuple[Array, Array]:
-        """c (n,) and P x (n, D)."""
+        """Returns c (n,) and P x (n, D)."""
         level = x[:, self.group].mean(axis=1)
         return level, self.join(-level, x)
 
     def join(self, level: Array, rest: Array) -> Array:
-        """x of c (n,) and P x (n, D)."""
+        """Returns x (n, D) from c (n,) and P x (n, D)."""
         return rest + np.outer(level, self.group)
 
     def height(self, rest: Array) -> Array:
-        """h (n,) at P x (n, D)."""
+        """Returns h (n,) at P x (n, D)."""
         height = log_sum(self.power * rest[:, self.group] + self.log_weight[self.group]) / self.power
         return height + self.coefficients @ self.polynomial(rest)
 
     def among(self, own: Sequence[str], names: Sequence[str]) -> Shear:
-        """The same map for a space of more coordinates, by the names of both; it leaves the others alone."""
+        """Returns the same map for a space with more coordinates; the added coordinates stay as they were.
+
+        own, names : names of the coordinates of this map and of the larger space
+        """
         column = [own.index(name) if name in own else -1 for name in names]
 
         def spread(values: NDArray[Any], other: float) -> NDArray[Any]:
@@ -97,15 +101,15 @@ class Shear(_FreezesArrays):
         return int(np.argmax(self.group))
 
     def polynomial(self, rest: Array) -> Array:
-        """The polynomial's terms (t, n) at P x (n, D)."""
-        # Flat beyond the points it was fitted to, where a polynomial runs away.
+        """Returns the polynomial's terms (t, n) at P x (n, D)."""
+        # A polynomial grows quickly beyond the points to which it was fitted, so it is kept constant there.
         unit = np.clip((rest - self.centre) / self.scale, -1.0, 1.0)
         return _monomials(np.ascontiguousarray(unit.T), self.powers)
 
 
 @nb.njit(cache=True, nogil=True)
 def _monomials(unit: Array, powers: NDArray[np.int64]) -> Array:
-    """Products over columns of unit (D, n) raised to powers (t, D): (t, n)."""
+    """Returns products (t, n) over the D rows of unit (D, n), raised to powers (t, D)."""
     terms = np.ones((len(powers), unit.shape[1]))
     for t in range(len(powers)):
         for j in range(len(unit)):
@@ -116,16 +120,16 @@ def _monomials(unit: Array, powers: NDArray[np.int64]) -> Array:
 
 
 def log_sum(values: Array) -> Array:
-    """log sum exp over the last axis."""
+    """Returns log sum exp over the last axis."""
     top = values.max(axis=-1)
     return top + np.log(np.exp(values - top[..., None]).sum(axis=-1))
 
 
 def find_shear(log_posterior: LogPosterior) -> Shear | None:
-    """The shear that fits the surrogate's amplitude, or None when no two parameters share it.
+    """Returns the shear that fits the surrogate's amplitude, or None when no two parameters share it.
 
-    The amplitude is that of the recorded force in the predicted one, <y, f> / <y, y> over the fitted
-    bins. Same posterior, same shear: its points have a fixed seed of their own.
+    The amplitude is that of the recorded force y in the predicted force f, <y, f> / <y, y> over the fitted
+    bins. The same posterior always gives the same shear, because its points have a fixed seed.
     """
     material = log_posterior.surrogate.space.dim
     low, high = log_posterior.bounds
@@ -144,14 +148,14 @@ def find_shear(log_posterior: LogPosterior) -> Shear | None:
         group, log_weight, np.zeros((0, log_posterior.dim), dtype=np.int64), np.zeros(0),
         0.5 * (low + high), 0.5 * (high - low),
     )  # fmt: skip
-    return _corrected(log_posterior, plain, x, material)
+    return _with_polynomial(log_posterior, plain, x, material)
 
 
 def shear_at(log_posterior: LogPosterior, x: Array, power: float) -> Shear | None:
-    """Returns the shear by the amplitude's slopes along each modulus at a point (D,), without a polynomial.
+    """Returns the shear from the amplitude's slopes along each modulus at a point (D,), without a polynomial.
 
-    power : of the moduli, in which the amplitude is a sum
-    None where fewer than two moduli raise it.
+    It returns None where fewer than two moduli raise the amplitude.
+    power : the amplitude is a sum of the moduli to this power
     """
     moduli = log_posterior.surrogate.space.scaled(1)
     if len(moduli) < 2:
@@ -159,14 +163,14 @@ def shear_at(log_posterior: LogPosterior, x: Array, power: float) -> Shear | Non
     step = _STEP * np.eye(len(x))[moduli]
     ahead, back = (_amplitude(log_posterior, x + way * step) for way in (1.0, -1.0))
     share = np.zeros(len(x))
-    share[moduli] = (ahead - back) / (2.0 * _STEP)  # the amplitude there is about one
+    share[moduli] = (ahead - back) / (2.0 * _STEP)  # the amplitude at x is about one
     group = share > _MIN_SHARE
     if group.sum() < 2:
         return None
     with np.errstate(divide="ignore"):
         log_weight = np.where(group, np.log(np.maximum(share, 0.0)) - power * x, -np.inf)
-    nothing = np.zeros((0, len(x)), dtype=np.int64), np.zeros(0), np.zeros(len(x)), np.ones(len(x))
-    return Shear(group, log_weight, *nothing, power)
+    no_polynomial = np.zeros((0, len(x)), dtype=np.int64), np.zeros(0), np.zeros(len(x)), np.ones(len(x))
+    return Shear(group, log_weight, *no_polynomial, power)
 
 
 def _amplitude(log_posterior: LogPosterior, x: Array) -> Array:
@@ -182,7 +186,7 @@ def _amplitude(log_posterior: LogPosterior, x: Array) -> Array:
 
 
 def _weights(columns: Array, alpha: Array) -> Array:
-    """Non-negative a_j (D,) with alpha = sum a_j columns_j, in relative terms; 0 for small shares."""
+    """Returns non-negative a_j (D,) with alpha = sum a_j columns_j, fitted relatively; 0 for small shares."""
     usable = np.isfinite(alpha) & (alpha > 0)
     weight = np.zeros(columns.shape[1])
     if usable.sum() < 10 * len(weight):
@@ -194,7 +198,8 @@ def _weights(columns: Array, alpha: Array) -> Array:
         weight[:] = 0.0
         weight[candidate] = nnls(relative[:, candidate] / size[candidate], np.ones(len(relative)))[0]
         weight[candidate] /= size[candidate]
-        # A permeability's column is nearly always tiny, so a fit may give it some; drop and fit again.
+        # A permeability's column is nearly always tiny, so a fit may give it a weight. Such columns are
+        # dropped, and the others are fitted again.
         small = candidate & ((relative * weight).mean(axis=0) < _MIN_SHARE)
         if not small.any():
             break
@@ -202,20 +207,20 @@ def _weights(columns: Array, alpha: Array) -> Array:
     return weight
 
 
-def _corrected(log_posterior: LogPosterior, plain: Shear, x: Array, material: int) -> Shear:
-    """The polynomial that brings the points of the ridge to c' = 0."""
+def _with_polynomial(log_posterior: LogPosterior, plain: Shear, x: Array, material: int) -> Shear:
+    """Returns the shear with a polynomial that brings the points of the ridge to c' = 0."""
     low, high = log_posterior.bounds
     rest = plain.split(x)[1]
     on_ridge = plain.join(-plain.height(rest), rest)
     good = np.ones(len(x), dtype=bool)
-    for _ in range(_NEWTON):  # the amplitude is nearly of degree one in the moduli together
+    for _ in range(_NEWTON):  # the amplitude is nearly of degree one in all moduli together
         good &= np.all((on_ridge >= low) & (on_ridge <= high), axis=1)
         alpha = np.full(len(x), np.nan)
         if good.any():
             alpha[good] = _amplitude(log_posterior, on_ridge[good])
         good &= np.nan_to_num(alpha) > 0
         on_ridge[good] = plain.join(-np.log(alpha[good]), on_ridge[good])
-    # The sum of P x over the group is zero: one of its members says nothing that the others do not.
+    # The sum of P x over the group is zero, so one member of the group is redundant.
     axes = [j for j in range(material) if j != np.argmax(plain.group)]
     powers = _powers(axes, len(low))
     if good.sum() < 5 * len(powers):

@@ -1,11 +1,12 @@
-"""Whether what a fit leaves is the noise that the likelihood takes it for.
+"""Tests whether the residuals of a fit are the noise that the likelihood assumes.
 
-With the surrogate's error at its mode taken out, the innovations of `noise_model` at a good point are
-independent draws of the noise's own t law. They are brought to a standard normal by that law (z with
-Phi(z) = T_nu(eps)), so that tails of any weight leave the same scores, which are tested for
-- their law: Kolmogorov & Smirnov,
-- correlation over `LAGS` bins: Ljung & Box (1978), Biometrika 65:297, about the law's mean of zero,
-- in each kind of phase their sd, which is 1, and the correlation of neighbours, which is 0.
+The surrogate's most probable error is first subtracted. At a good point, the innovations of `noise_model` are
+then independent draws from the noise's t-distribution. This distribution transforms them to standard normal
+scores (z with Phi(z) = T_nu(eps)), so that the scores are the same for tails of any weight. The scores are
+tested for
+- their distribution: Kolmogorov & Smirnov,
+- their correlation over `LAGS` bins: Ljung & Box (1978), Biometrika 65:297, about the assumed mean of zero,
+- in each kind of phase their sd, which should be 1, and the correlation of neighbours, which should be 0.
 The parameters were fitted to the same bins, which makes the tests lenient, never strict.
 """
 
@@ -24,15 +25,15 @@ from bayeskin.types import Array, _FreezesArrays
 
 LAGS = 10
 FAMILY_WISE = 0.01  # probability that noise as assumed fails any of the tests
-_FEWEST = 8  # bins of a kind of phase that are tested by themselves
-_SMALLEST = 1e-300  # tail probability whose score is still a number: 37 sd
+_FEWEST = 8  # pairs of neighbouring bins from which on a kind of phase is tested by itself
+_SMALLEST = 1e-300  # smallest tail probability, whose score is still a finite number: 37 sd
 
 
 @dataclass(frozen=True)
 class KindCheck:
-    """Scores of one kind of phase: number of bins, sd, correlation of neighbours, and a p-value of each.
+    """Tests of the scores in one kind of phase: number of bins, sd, correlation of neighbours, and p-values.
 
-    NaN where there are too few bins.
+    The sd, the correlation and their p-values are NaN where there are too few bins.
     """
 
     kind: str
@@ -45,9 +46,10 @@ class KindCheck:
 
 @dataclass(frozen=True)
 class ResidualCheck(_FreezesArrays):
-    """What a fit leaves, in scores (k,) of the fitted bins: standard normal if the noise is as assumed.
+    """Residuals of a fit as scores (k,) of the fitted bins, standard normal if the noise is as assumed.
 
-    autocorrelation (l,) over 1 to l bins; p_law of Kolmogorov & Smirnov, p_correlation of Ljung & Box.
+    autocorrelation (l,) is over 1 to l bins. p_law is the p-value of Kolmogorov & Smirnov, and p_correlation
+    that of Ljung & Box.
     """
 
     scores: Array
@@ -58,7 +60,7 @@ class ResidualCheck(_FreezesArrays):
 
     @property
     def limit(self) -> float:
-        """The p-value below which a single test fails, so that all together hold `FAMILY_WISE`."""
+        """Returns the p-value below which a single test fails, so that all together keep `FAMILY_WISE`."""
         return FAMILY_WISE / (2 + 2 * len(self.kinds))
 
     @property
@@ -67,7 +69,7 @@ class ResidualCheck(_FreezesArrays):
 
     @property
     def sentence(self) -> str:
-        """The outcome in plain words."""
+        """Returns the outcome in plain words."""
         if not self.passes:
             return f"what the fit leaves is not the assumed noise: {'; '.join(self._failures())}"
         return (
@@ -83,43 +85,46 @@ class ResidualCheck(_FreezesArrays):
         if self.p_correlation < self.limit:
             lags, p = len(self.autocorrelation), self.p_correlation
             out.append(f"it is correlated otherwise (Ljung-Box over {lags} lags p = {p:.2g})")
-        for one in self.kinds:
-            when = f"while pads {one.kind}"
-            if one.p_sd < self.limit:
-                out.append(f"{when} its sd is {one.sd:.2g} of the assumed (p = {one.p_sd:.2g})")
-            if one.p_correlation < self.limit:
-                r, p = one.correlation, one.p_correlation
+        for check in self.kinds:
+            when = f"while pads {check.kind}"
+            if check.p_sd < self.limit:
+                out.append(f"{when} its sd is {check.sd:.2g} of the assumed (p = {check.p_sd:.2g})")
+            if check.p_correlation < self.limit:
+                r, p = check.correlation, check.p_correlation
                 out.append(f"{when} neighbours correlate by {r:+.2f} beyond the assumed (p = {p:.2g})")
         return out
 
 
 def check_residuals(log_posterior: LogPosterior, vector: Array) -> ResidualCheck:
-    """What is left of the fitted bins at sampling coordinates (D,), against the noise assumed there."""
+    """Returns tests of the residuals at sampling coordinates (D,) against the noise assumed there."""
     chain, theta = log_posterior.chain, log_posterior.from_sampling(vector)[None]
     prediction, noise = log_posterior.predict(theta), log_posterior.split(theta)[1][0]
     residual = chain.force_n - prediction.mean[0, chain.bins]
     columns = np.column_stack([residual, prediction.factor[0, chain.bins]])
     white = innovations(chain, noise, prediction.diagonal[0, chain.bins], columns)
-    left, factor, nu = white[:, 0], white[:, 1:], float(noise[-1])
-    scores = normal_scores(left - factor @ surrogate_error(left, factor, nu), nu)
+    whitened, factor, nu = white[:, 0], white[:, 1:], float(noise[-1])
+    scores = normal_scores(whitened - factor @ surrogate_error(whitened, factor, nu), nu)
     follows = ~chain.starts[1:] & (chain.kind[1:] == chain.kind[:-1])
     kinds = []
     for i, kind in enumerate(chain.kinds):
         later = 1 + np.flatnonzero(follows & (chain.kind[1:] == i))
-        kinds.append(_checked(kind, scores[chain.kind == i], scores[later - 1], scores[later]))
-    found = autocorrelation(scores, min(LAGS, len(scores) - 1))
+        kinds.append(_check_kind(kind, scores[chain.kind == i], scores[later - 1], scores[later]))
+    correlation = autocorrelation(scores, min(LAGS, len(scores) - 1))
     p_law = float(stats.kstest(scores, "norm").pvalue)
-    return ResidualCheck(scores, found, p_law, _ljung_box(found, len(scores)), tuple(kinds))
+    return ResidualCheck(scores, correlation, p_law, _ljung_box(correlation, len(scores)), tuple(kinds))
 
 
 def normal_scores(innovation: Array, nu: float) -> Array:
-    """Standard normal scores (k,) of draws (k,) of Student's t with `nu` degrees of freedom, inf allowed."""
+    """Returns standard normal scores (k,) of draws (k,) of Student's t with `nu` degrees of freedom.
+
+    nu may be inf.
+    """
     tail = np.maximum(stats.t.sf(np.abs(innovation), nu), _SMALLEST)
     return np.asarray(np.sign(innovation) * stats.norm.isf(tail))
 
 
 def autocorrelation(scores: Array, lags: int) -> Array:
-    """(lags,) of scores (k,) about zero."""
+    """Returns the autocorrelation (lags,) of scores (k,) about zero."""
     k = len(scores)
     return np.array([scores[lag:] @ scores[: k - lag] for lag in range(1, lags + 1)]) / (scores @ scores)
 
@@ -129,8 +134,11 @@ def _ljung_box(correlation: Array, count: int) -> float:
     return float(stats.chi2.sf(count * (count + 2) * np.sum(correlation**2 / (count - lag)), len(lag)))
 
 
-def _checked(kind: str, scores: Array, before: Array, after: Array) -> KindCheck:
-    """`before` and `after` (p,): the pairs of neighbours among the kind's scores (k,)."""
+def _check_kind(kind: str, scores: Array, before: Array, after: Array) -> KindCheck:
+    """Returns the tests of one kind of phase, from its scores (k,).
+
+    before, after (p,) : the pairs of neighbours among these scores
+    """
     if len(after) < _FEWEST:
         return KindCheck(kind, len(scores), math.nan, math.nan, math.nan, math.nan)
     square = float(scores @ scores)

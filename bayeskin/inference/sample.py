@@ -1,4 +1,7 @@
-"""Posterior draws from independent ensembles, which go on where they stopped and stop by themselves."""
+"""Draws from the posterior by independent ensembles.
+
+The ensembles continue after an interruption, and stop by themselves once their draws can be trusted.
+"""
 
 from __future__ import annotations
 
@@ -24,21 +27,22 @@ from bayeskin.inference.reparametrisation import find_shear
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
 _FIRST_CHECK, _BETWEEN = 500, 250
-# Steps at which draws so far teach what moves propose, and the power of the density that is drawn from until
-# then. Parts of the posterior are not yet apart at low powers, and what is learnt from 0.7 is wider than the
-# posterior: tails that a proposal lacks would hardly be visited. All before the last lesson is burn-in.
+# At these steps the proposals of the moves are fitted to the draws so far. Until then the draws come from the
+# given power of the density. At low powers, separate parts of the posterior are still connected. The last fit
+# is at the power 0.7, which makes the proposals wider than the posterior: tails that a proposal lacks would
+# hardly be visited. All steps before the last fit are burn-in.
 _LESSONS = {
     30: 0.1, 60: 0.1, 90: 0.2, 120: 0.2, 150: 0.35, 180: 0.35, 210: 0.5, 240: 0.5, 270: 0.7, 300: 0.7,
 }  # fmt: skip
-_LATE = 0.4  # of the steps so far, after which draws are taken
-_POINTS = 16000  # draws at most that a lesson takes
-_REFRESH = 100  # steps between two words of progress
+_LATE = 0.4  # share of the steps so far that such a fit leaves out
+_POINTS = 16000  # largest number of draws for such a fit
+_REFRESH = 100  # steps between two reports of progress
 Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)
 class SampleSettings:
-    """Independent ensembles, walkers in each, and when to stop."""
+    """Number of independent ensembles, number of walkers in each, and when to stop."""
 
     ensembles: int = 4
     walkers: int = 40
@@ -48,10 +52,10 @@ class SampleSettings:
 
 @dataclass(frozen=True)
 class Posterior(_FreezesArrays):
-    """Draws after burn-in, thinned by the autocorrelation time: each is worth about one sample.
+    """Draws after burn-in, thinned by the autocorrelation time, so that each is worth about one sample.
 
-    draws (E, n, D) in SI, columns of `space`, steps in order with an ensemble's walkers side by side;
-    log_prob (E, n). `convergence.verdict` says whether to trust them.
+    draws (E, n, D) are in SI with the columns of `space`. Steps are in order, with an ensemble's walkers side
+    by side. log_prob is (E, n). `convergence.verdict` says whether to trust the draws.
     """
 
     space: ParameterSpace
@@ -62,7 +66,7 @@ class Posterior(_FreezesArrays):
 
     @property
     def flat(self) -> Array:
-        """All draws, (E n, D)."""
+        """Returns all draws, (E n, D)."""
         return self.draws.reshape(-1, self.draws.shape[-1])
 
 
@@ -75,31 +79,32 @@ def sample(
     progress: Progress | None = None,
     threads: int = 1,
 ) -> Posterior:
-    """Runs ensembles from around `start` (the MAP, SI by name) until the verdict is trust, or to max_steps.
+    """Runs ensembles from around `start` (the MAP, SI by name) until they can be trusted, or to max_steps.
 
-    The first steps draw from powers of the posterior, from low to whole, and teach what moves propose: from
-    then on all ensembles propose from one distribution, so that R-hat compares what they made of it.
+    The first steps draw from powers of the posterior, from low powers to the full posterior. The proposals of
+    the moves are fitted to these draws. From then on all ensembles propose from one distribution, so that
+    R-hat compares what they have made of it.
 
-    `folder` keeps one file an ensemble, ``ensemble_0.h5`` ..., in emcee's own HDF5 form with its random
-    state, each replaced as a whole after every stretch. An interrupted run goes on from there and gives
-    the draws that an uninterrupted one gives, and so does any number of `threads`, over which the ensembles
-    are spread. Raises InputError for fewer than 500 steps, and when the files there belong to another
-    posterior, seed or number of walkers; they stay as they are.
+    `folder` keeps one file for each ensemble, ``ensemble_0.h5`` ..., in emcee's own HDF5 form with its random
+    state. Each file is replaced as a whole after every stretch of steps. An interrupted run continues from
+    these files and gives the same draws as an uninterrupted run. The draws do not depend on the number of
+    `threads`, over which the ensembles are spread. Raises InputError for fewer than 500 steps, and when the
+    files belong to another posterior, seed or number of walkers; these files are not changed.
     """
     settings = settings or SampleSettings()
-    _check(settings, log_posterior.dim)
+    _check_settings(settings, log_posterior.dim)
     files = _files(folder, settings.ensembles)
     identity = {**log_posterior.identity, "seed": str(seed), "walkers": str(settings.walkers)}
     backends = [store.load(f, log_posterior.names, identity) if f.exists() else None for f in files]
     runs = _ensembles(log_posterior, log_posterior.vector(start), seed, settings.walkers, backends)
     convergence: Convergence | None = None
     settled = 0
-    for goal, judged in _stops(settings.max_steps):
-        with closing(_advanced(runs, goal, threads)) as advanced:
+    for goal, judged in _checkpoints(settings.max_steps):
+        with closing(_advance_all(runs, goal, threads)) as advanced:
             for e, at in advanced:
                 if at < goal:
                     text = f"ensemble {e + 1} of {len(runs)}, step {at} of {goal}"
-                    _tell(progress, convergence, settings, text)
+                    _report_progress(progress, convergence, settings, text)
                 elif runs[e].changed:
                     store.save(files[e], runs[e].backend, log_posterior.names, identity)
                     runs[e].changed = False
@@ -107,22 +112,25 @@ def sample(
         log_prob = np.stack([r.backend.log_prob[:goal] for r in runs])
         if judged:
             convergence = assess(chains, log_prob, log_posterior.names, settings.limits, settled)
-            _tell(progress, convergence, settings, convergence.verdict.reasons[0])
+            _report_progress(progress, convergence, settings, convergence.verdict.reasons[0])
             if convergence.verdict.trusted:
                 break
         if goal in _LESSONS:
-            _teach(runs, chains[:, int(_LATE * goal) :], log_posterior, np.random.default_rng([seed, goal]))
+            _adapt_proposals(
+                runs, chains[:, int(_LATE * goal) :], log_posterior, np.random.default_rng([seed, goal])
+            )
             settled = goal
     assert convergence is not None
     return _posterior(log_posterior, chains, log_prob, convergence, seed)
 
 
-def _teach(
+def _adapt_proposals(
     runs: Sequence[_Ensemble], chains: Array, log_posterior: LogPosterior, rng: np.random.Generator
 ) -> None:
-    """Lets the ensembles propose from a distribution fitted to draws of them all, (E, n, W, D).
+    """Lets the ensembles propose from one distribution, fitted to the draws (E, n, W, D) of all ensembles.
 
-    Parameters of the model hardly depend on those of the noise.
+    The parameters of the model and of the noise have separate mixtures, since they hardly depend on each
+    other.
     """
     draws = chains[:, :: -(-chains[..., 0].size // _POINTS)].reshape(-1, log_posterior.dim)
     model = log_posterior.surrogate.space.dim
@@ -133,8 +141,11 @@ def _teach(
 
 
 def load_chains(folder: Path | str, log_posterior: LogPosterior, ensembles: int) -> Array:
-    """Whole chains (E, n, W, D) in SI of the first ensembles that `sample` left in `folder`, to their common
-    length. Raises InputError where one is not there or is another posterior's."""
+    """Returns whole chains (E, n, W, D) in SI of the first ensembles that `sample` left in `folder`.
+
+    They are cut to the length of the shortest chain. Raises InputError where a chain is missing or belongs to
+    another posterior.
+    """
     files = _files(folder, ensembles)
     parts = [store.load(f, log_posterior.names, log_posterior.identity).chain for f in files]
     steps = min(len(p) for p in parts)
@@ -146,13 +157,15 @@ def _files(folder: Path | str, ensembles: int) -> list[Path]:
 
 
 def evenly(draws: Array, count: int) -> Array:
-    """At most `count` of draws (n, D), evenly over all of them."""
+    """Returns at most `count` of draws (n, D), spread evenly over all of them."""
     return draws[np.linspace(0, len(draws) - 1, min(count, len(draws))).astype(int)]
 
 
-def _advanced(runs: Sequence[_Ensemble], goal: int, threads: int) -> Generator[tuple[int, int], None, None]:
-    """Brings all ensembles to step `goal`; yields which is at which step now and then, and at the goal."""
-    told: SimpleQueue[tuple[int, int]] = SimpleQueue()
+def _advance_all(
+    runs: Sequence[_Ensemble], goal: int, threads: int
+) -> Generator[tuple[int, int], None, None]:
+    """Brings all ensembles to step `goal`; yields (ensemble, step) now and then, and at the goal."""
+    updates: SimpleQueue[tuple[int, int]] = SimpleQueue()
     stop = Event()
 
     def advance(e: int) -> None:
@@ -160,19 +173,19 @@ def _advanced(runs: Sequence[_Ensemble], goal: int, threads: int) -> Generator[t
             for at in runs[e].advance(goal):
                 if stop.is_set():
                     return
-                told.put((e, at))
+                updates.put((e, at))
         finally:
-            told.put((e, goal))
+            updates.put((e, goal))
 
     with ThreadPoolExecutor(threads) as pool:
         futures = [pool.submit(advance, e) for e in range(len(runs))]
         try:
             for _ in runs:
-                while (step := told.get())[1] < goal:
+                while (step := updates.get())[1] < goal:
                     yield step
                 futures[step[0]].result()
                 yield step
-        finally:  # an interruption, or an error of one: the others end at their next word
+        finally:  # after an interruption or an error, the other ensembles end at their next report
             stop.set()
 
 
@@ -194,14 +207,14 @@ class _Ensemble:
         self.propose_from(None)
 
     def propose_from(self, known: Product | None) -> None:
-        """Gives the moves of further steps a distribution to propose from."""
+        """Sets the distribution from which the moves of further steps propose points."""
         self._moves = mixed_moves(self.coordinates, self.backend.nwalkers, known)
 
     def advance(self, goal: int) -> Iterator[int]:
-        """Steps to `goal`, if not there yet; yields the step now and then."""
-        begun = self.backend.iteration
+        """Runs the steps up to `goal` that are still to be done; yields the step now and then."""
+        first = self.backend.iteration
         power = next((power for at, power in _LESSONS.items() if at >= goal), 1.0)
-        if begun >= goal:
+        if first >= goal:
             return
         self.changed = True
         sampler = emcee.EnsembleSampler(
@@ -213,16 +226,16 @@ class _Ensemble:
             vectorize=True,
         )
         start = _scaled(self.state, power)
-        for state in sampler.sample(start, iterations=goal - begun, skip_initial_state_check=True):
+        for state in sampler.sample(start, iterations=goal - first, skip_initial_state_check=True):
             self.state = state
             if self.backend.iteration % _REFRESH == 0 and self.backend.iteration < goal:
                 yield self.backend.iteration
         self.state = _scaled(self.state, 1.0 / power)
-        self.backend.log_prob[begun:] *= 1.0 / power
+        self.backend.log_prob[first:] *= 1.0 / power
 
 
 def _scaled(state: emcee.State, factor: float) -> emcee.State:
-    """The walkers with `factor` times their log densities, where these are known."""
+    """Returns the walkers with `factor` times their log densities, where these are known."""
     log_prob = None if state.log_prob is None else factor * state.log_prob
     return emcee.State(state.coords, log_prob=log_prob, random_state=state.random_state)
 
@@ -234,20 +247,20 @@ def _ensembles(
     walkers: int,
     backends: Sequence[emcee.backends.Backend | None],
 ) -> list[_Ensemble]:
-    """Ensembles that go on from their chains, or start anew, each with a random stream of its own."""
+    """Returns ensembles that continue their chains or start anew, each with its own random stream."""
     coordinates = MoveCoordinates(find_shear(log_posterior), *log_posterior.bounds)
     runs = []
-    for e, (backend, own) in enumerate(
+    for e, (backend, stream) in enumerate(
         zip(backends, np.random.SeedSequence(seed).spawn(len(backends)), strict=True)
     ):
         if backend is None:
             backend = emcee.backends.Backend()
             backend.reset(walkers, log_posterior.dim)
-            rng = np.random.default_rng(own)
-            # Ensembles that all set out from one place could not disagree.
+            rng = np.random.default_rng(stream)
+            # Ensembles that all start from the same place could not disagree.
             centre = origin if e == 0 else 0.5 * (origin + rng.uniform(*log_posterior.bounds))
             coords = initial_walkers(log_posterior, centre, walkers, rng)
-            generator = np.random.RandomState(own.generate_state(8))  # emcee's kind
+            generator = np.random.RandomState(stream.generate_state(8))  # emcee uses this kind of generator
             state = emcee.State(coords, random_state=generator.get_state())
         else:
             state = backend.get_last_sample()
@@ -258,9 +271,9 @@ def _ensembles(
 def initial_walkers(
     log_posterior: LogPosterior, origin: Array, walkers: int, rng: np.random.Generator
 ) -> Array:
-    """Walkers (W, D) strewn between `origin` (sampling coordinates) and draws of the prior.
+    """Returns walkers (W, D) spread between `origin` (sampling coordinates) and draws of the prior.
 
-    Each lies a random share of the way, so that the ensemble spans both and is over-dispersed. Points
+    Each walker lies a random share of the way, so that the ensemble spans both and is over-dispersed. Points
     without a density are drawn again. Raises InputError when the density vanishes nearly everywhere.
     """
     low, high = log_posterior.bounds
@@ -276,10 +289,10 @@ def initial_walkers(
     )
 
 
-def _stops(max_steps: int) -> Iterator[tuple[int, bool]]:
-    """Steps at which the ensembles wait for each other, and whether convergence is judged there.
+def _checkpoints(max_steps: int) -> Iterator[tuple[int, bool]]:
+    """Yields the steps at which the ensembles wait for each other, and whether convergence is judged there.
 
-    Fixed by the step count alone, so that an interruption cannot move the point where a run stops.
+    They depend on the step count alone, so that an interruption cannot change the step at which a run stops.
     """
     check = 0
     while check < max_steps:
@@ -288,7 +301,7 @@ def _stops(max_steps: int) -> Iterator[tuple[int, bool]]:
         yield check, True
 
 
-def _check(settings: SampleSettings, dim: int) -> None:
+def _check_settings(settings: SampleSettings, dim: int) -> None:
     if settings.walkers < 2 * dim + 2:
         raise InputError(
             "sample.walkers",
@@ -304,7 +317,9 @@ def _check(settings: SampleSettings, dim: int) -> None:
         )  # fmt: skip
 
 
-def _tell(progress: Progress | None, state: Convergence | None, settings: SampleSettings, text: str) -> None:
+def _report_progress(
+    progress: Progress | None, state: Convergence | None, settings: SampleSettings, text: str
+) -> None:
     if progress:
         progress(state.progress(settings.limits) if state else 0.0, text)
 

@@ -1,7 +1,7 @@
-"""The catalogue of mechanisms: one file each, found by being there.
+"""The catalogue of mechanisms: effects that the base model leaves out, each in a file of its own.
 
-A module of this package with a `MECHANISM` is in the catalogue, and so is every entry point of the group
-"bayeskin.mechanisms" of any installed package.
+Every module of this package that defines `MECHANISM` adds this entry to the catalogue. So does every entry
+point of the group "bayeskin.mechanisms" of any installed package.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ ENTRY_POINTS = "bayeskin.mechanisms"
 
 
 def catalogue() -> dict[str, Mechanism]:
-    """All mechanisms by name, in the order of their names.
+    """Returns all mechanisms by name, in alphabetical order.
 
-    Raises InputError if two have the same name, or share a parameter's, or one needs what there is not, or
-    what needs another itself.
+    Raises InputError if two mechanisms or two parameters have the same name. It also raises InputError if a
+    mechanism needs one that is not in the catalogue, or one that itself needs another.
     """
     modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
     found = [module.MECHANISM for module in modules if hasattr(module, "MECHANISM")]

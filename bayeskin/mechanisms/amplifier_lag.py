@@ -1,17 +1,17 @@
-"""The load cell's amplifier is a low-pass filter of first order, as any that smooths a signal against noise.
+"""The load cell's amplifier smooths the noise of its signal, and acts as a first-order low-pass filter.
 
     tau dy/dt = F - y ,   y(0) = F(0)
 
-so that y lags by tau dF/dt on a ramp and comes up to it exponentially after each corner. The lag d = y - F
-of a force that goes straight over a time h, by the change D, is in closed form, with z = h / tau,
+On a ramp y lags by tau dF/dt. After each corner it approaches the new lag exponentially. If the force changes
+linearly by D over a time h, the lag d = y - F has a closed form, with z = h / tau,
 
     d_1 = d_0 + (e^-z - 1) (d_0 + D / z) ,
 
-whatever z is. The force is taken to be straight over `GRID_S` and between corners of the protocol; it may
-jump at these. Steps of the load cell's zero come before the filter, which smooths them too.
+for every z. The force is taken to be linear over `GRID_S` and between corners of the protocol, and may jump
+at corners. Steps of the load cell's zero come before the filter, which smooths them too.
 
-It is a look-alike of `clock-delay`: in bins of 0.5 s, of a force that rises to 0.45 N at 1 mm/s, the best
-delay leaves 0.07 mN RMS of the lag of 0.1 s, 1.2 mN of that of 0.5 s, and 10 mN of that of 2 s.
+It is a look-alike of `clock-delay`. For a force that rises to 0.45 N at 1 mm/s, in bins of 0.5 s, the best
+delay leaves 0.07 mN RMS of a lag with tau = 0.1 s, 1.2 mN of one with 0.5 s, and 10 mN of one with 2 s.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -28,12 +28,12 @@ from bayeskin.number_format import number
 from bayeskin.types import Array, PadMotion, Parameter
 
 GRID_S = 0.05
-BEFORE_S = 1e-6  # a corner, where a force may jump
-QUICKEST_S = 0.01  # a smaller time constant is as good as none
+BEFORE_S = 1e-6  # the grid has a time this long before each corner, where a force may jump
+QUICKEST_S = 0.01  # a smaller time constant acts as if there were none
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """Adds the lag."""
+    """Adds the lag of the amplifier to the force."""
     corners, tau = motion.time_s, np.ascontiguousarray(values["amplifier_time"])
     grid_s = motion.times(GRID_S, np.union1d(corners, corners[1:-1] - BEFORE_S))
     change = np.diff(np.broadcast_to(force(grid_s), (len(tau), len(grid_s))))
@@ -51,14 +51,17 @@ def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTim
 
 @numba.njit(inline="always")
 def _after(lag, elapsed, change, tau):
-    """The lag after a time over which the force goes straight, by a change."""
+    """Returns the lag after a time over which the force changes linearly by `change`."""
     z = elapsed / tau
     return lag + math.expm1(-z) * (lag + change / z)
 
 
 @strict
 def _follow(steps, change, tau, at_grid):
-    """Fills at_grid (n, k) with the lag after each step (k-1,), over which forces change (n, k-1)."""
+    """Fills at_grid (n, k) with the lag after each time step.
+
+    steps (k-1,) are the lengths of the time steps, and change (n, k-1) the changes of the forces over them.
+    """
     for i in range(at_grid.shape[0]):
         for k in range(len(steps)):
             at_grid[i, k + 1] = _after(at_grid[i, k], steps[k], change[i, k], tau[i])

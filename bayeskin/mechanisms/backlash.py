@@ -1,10 +1,11 @@
-"""Lost motion of the drive and compliance of the frame.
+"""Lost motion (backlash) of the drive and compliance of the frame.
 
-The skin sees p - c F: p trails the drive u as a nut with a gap g does, from the lower end of its play,
+The skin sees the displacement p - c F, where c is the compliance of the frame. The displacement p trails the
+drive's displacement u as a nut with a gap g does. It starts at the lower end of the play:
 
-    p(t) = max(u - g, min(u, p(t-))) ,   p(0) = 0 ,
+    p(t) = max(u - g, min(u, p(t-))) ,   p(0) = 0 .
 
-so that each reversal, the first motion among them, goes without effect over g; c is the frame's compliance.
+After each reversal, and at the first motion, the drive therefore moves over g without effect.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from bayeskin.types import Array, PadMotion, Parameter
 
 
 def trailing(motion: PadMotion, gap_m: float) -> PadMotion:
-    """The motion behind the gap, with its own corners."""
+    """Returns the motion behind the gap, with its own corners."""
     time_s, behind = [float(motion.time_s[0])], [float(motion.displacement_m[0])]
     for t0, t1, u0, u1 in zip(
         motion.time_s[:-1],
@@ -34,7 +35,7 @@ def trailing(motion: PadMotion, gap_m: float) -> PadMotion:
         p0 = behind[-1]
         p1 = max(u1 - gap_m, min(u1, p0))
         if p1 != p0:
-            taken_up = p0 + gap_m if u1 > u0 else p0  # where the drive meets the other side
+            taken_up = p0 + gap_m if u1 > u0 else p0  # the drive meets the other side of the gap here
             t = t0 + (taken_up - u0) / (u1 - u0) * (t1 - t0)
             if t0 + 1e-9 < t < t1 - 1e-9:
                 time_s.append(float(t))
@@ -45,7 +46,7 @@ def trailing(motion: PadMotion, gap_m: float) -> PadMotion:
 
 
 class Play(SeriesElement):
-    """A gap [m] and a compliance [m/N]; its memory is what the frame yields [m]."""
+    """A gap [m] and a compliance [m/N]. The memory is the displacement by which the frame yields [m]."""
 
     remembers = 1
 
@@ -60,12 +61,12 @@ class Play(SeriesElement):
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
-    """Returns the law of `gap` and `frame_compliance`."""
+    """Returns the tissue law for `gap` and `frame_compliance`."""
     return TissueLaw(series=Play(values["gap"], values["frame_compliance"]))
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """The shortcut of `series`."""
+    """Returns the reported force by the shortcut of `series`."""
     return lost_in_series(motion, force, gap_m=values["gap"], compliance=values["frame_compliance"])
 
 

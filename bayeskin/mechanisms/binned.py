@@ -1,4 +1,4 @@
-"""Mechanisms act here on a force of which only means over bins are known."""
+"""Applies mechanisms to a force of which only the means over bins are known."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from bayeskin.types import Array, PadMotion
 
 
 class BinnedForces:
-    """Forces over time, straight between the middles of bins and the corners of the protocol.
+    """Reconstructs forces over time from their bin means, and returns how mechanisms change these means.
 
-    At a corner inside a bin the force follows from the straight lines on either side, and they meet halfway.
-    bins : takes means over the same bins, of what `mechanisms` make of a force
+    A force is linear between the middles of bins and the corners of the protocol. At a corner, the lines on
+    both sides are extrapolated to it, and the force is the mean of the two values.
+    bins : computes means over the same bins of forces on which `mechanisms` have acted
     """
 
     def __init__(self, edges_s: Array, motion: PadMotion, mechanisms: Sequence[Mechanism]) -> None:
@@ -30,7 +31,7 @@ class BinnedForces:
         self._times = times[self._order]
 
     def through(self, mean_n: Array) -> ForceOfTime:
-        """The force of bins' means (n, m)."""
+        """Returns the force over time that is reconstructed from bin means (n, m)."""
         before, after = (self._extended(mean_n, side) for side in (-1, 1))
         force = np.concatenate([mean_n[:, self._kept], 0.5 * (before + after)], axis=1)[:, self._order]
         return lambda time_s: interpolated(self._times, force, time_s)
@@ -41,7 +42,10 @@ class BinnedForces:
         return self.bins.means(act(force)) - self.bins.means(force)
 
     def _extended(self, mean_n: Array, side: int) -> Array:
-        """Straight on from two middles at least a bin away on one side of each corner, (n, c)."""
+        """Returns the force (n, c) at each corner, extrapolated from one side: -1 before it, 1 after it.
+
+        The line goes through two bin middles that are at least a bin away from the corner.
+        """
         near = self._right + (1 if side > 0 else -2)
         far, middle = near + side, self._middle
         slope = (mean_n[:, far] - mean_n[:, near]) / (middle[far] - middle[near])

@@ -1,6 +1,7 @@
-"""The subcutis sticks to the muscle's fascia: springs along the bottom face against tangential motion.
+"""The subcutis sticks to the muscle's fascia: springs on the bottom face resist tangential motion.
 
-Traction -s (u - (u . n) n) on the bottom, n normal to it; 0 is free, 1e9 Pa/m stuck.
+The traction on the bottom face is -s (u - (u . n) n), where n is its normal and s the stiffness. The face is
+free at 0 and stuck at 1e9 Pa/m.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from bayeskin.types import Array, Parameter
 
 
 def tangential(point: Array, i: int, j: int) -> Array:
-    """Entry (i, j) of I - n (x) n at points (3, ...) of a face round the arm's axis."""
+    """Returns entry (i, j) of I - n (x) n at points (3, ...) of a face around the arm's axis."""
     radius = np.hypot(point[1], point[2])
     normal = [np.zeros_like(radius), point[1] / radius, point[2] / radius]
     return float(i == j) - normal[i] * normal[j]
@@ -40,7 +41,7 @@ def springs(problem: Problem) -> sp.csr_matrix:
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
-    """Returns the law of `adherence`."""
+    """Returns the tissue law for `adherence`."""
     return TissueLaw(surfaces=(SurfaceTerm(values["adherence"], springs),))
 
 

@@ -1,10 +1,11 @@
-"""The load cell's curve bends: F + c F^2, of the force that acts on it, before its zero is shifted.
+"""The load cell's curve bends: a force F reads as F + c F^2, before the cell's zero is shifted.
 
-Within 1 N the curve rises throughout, whatever c. The range is chosen for this test: a calibrated cell is far
-straighter, ISO 376:2011 lets one of its widest class be off its curve by 0.2 %.
+Within 1 N the curve rises throughout, for every c in the range. The range is chosen for this test. The curve
+of a calibrated cell is far straighter: ISO 376:2011 allows a deviation of 0.2 % in its widest class.
 
-It is a look-alike of fibres (`strain-stiffening`, `fibre-anisotropy`), since they, too, change how the force
-rises with displacement, alike in each cycle and at each speed. Weights hung on the cell tell them apart.
+It is a look-alike of the fibre mechanisms (`strain-stiffening`, `fibre-anisotropy`). They also change how the
+force rises with displacement, in the same way in each cycle and at each speed. Weights hung on the cell tell
+them apart.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from bayeskin.types import Array, PadMotion, Parameter
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """Adds c F^2."""
+    """Adds c F^2 to the force."""
 
     def bent(time_s: Array) -> Array:
         acting = force(time_s)

@@ -1,4 +1,4 @@
-"""Force and displacement are stamped by different clocks: F(t - d)."""
+"""Force and displacement have time stamps from different clocks: the reported force is F(t - d)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from bayeskin.types import PadMotion, Parameter
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """The force of d seconds before; before the recording's start, and after its end, that of the end."""
+    """Returns the force d seconds earlier.
+
+    Before the start of the recording it is the force at the start, and after its end the force at the end.
+    """
     end_s = motion.time_s[-1]
     return lambda time_s: force(np.clip(time_s - values["delay"][:, None], 0.0, end_s))
 

@@ -1,13 +1,16 @@
-"""Dry friction of the slide, with presliding: Dahl's model.
+"""Dry friction of the slide, with presliding, by Dahl's model.
 
-Along the displacement u of the drive, with sliding friction Fc and presliding length l,
+Let u be the displacement of the drive, Fc the sliding friction and l the presliding length. Then
 
-    dF/du = (Fc - F sgn(u')) / l     so that, moving on in one direction s from F(u0),
-    F = s Fc + (F(u0) - s Fc) exp(-|u - u0| / l)
+    dF/du = (Fc - F sgn(u')) / l ,
 
-Rate-independent: a hold keeps what the motion before it left. At t = 0 it is z0 Fc. Where the friction
-creeps (`friction-creep`), the same equation has the term - F / tau, and each straight stretch of the
-protocol its exponential in time.
+and in a motion from F(u0) in one direction s
+
+    F = s Fc + (F(u0) - s Fc) exp(-|u - u0| / l) .
+
+Friction does not depend on the speed: a hold keeps the friction that the motion before it left. At t = 0 the
+friction is z0 Fc. If the friction creeps (`friction-creep`), its equation in time has the additional term
+- F / tau. It then relaxes exponentially in time over each linear stretch of the protocol.
 
 Source: P. Dahl, A solid friction model, Aerospace Corp. TOR-158(3107-18), 1968.
 """
@@ -27,7 +30,11 @@ from bayeskin.types import Array, PadMotion, Parameter
 def friction(
     motion: PadMotion, time_s: Array, sliding_n: Array, length_m: Array, start: Array, per_s: Array
 ) -> Array:
-    """Friction (n, t) [N] at times (t,) or (n, t); parameters (n,), `per_s` = 1/tau, 0 without creep."""
+    """Returns the friction (n, t) [N] at times (t,) or (n, t).
+
+    sliding_n, length_m, start (n,) : sliding friction, presliding length, and friction at t = 0 over Fc
+    per_s (n,) : 1 / tau of the creep, 0 without creep
+    """
     speed = np.diff(motion.displacement_m) / np.diff(motion.time_s)
     rate = np.abs(speed) / length_m[:, None] + per_s[:, None]  # (n, k-1)
     ends = sliding_n[:, None] * speed / (length_m[:, None] * np.where(rate > 0.0, rate, 1.0))
@@ -43,7 +50,10 @@ def friction(
 
 @strict
 def _relax(corner_s, rate, ends, began, times, out):  # type: ignore[no-untyped-def]
-    """Fills out (n, t) from what each stretch (n, k-1) begins at and tends to, at times (1 or n, t)."""
+    """Fills out (n, t) with the friction at times (1 or n, t).
+
+    In each stretch (n, k-1) of the protocol the friction starts at `began` and tends to `ends`.
+    """
     for i in range(out.shape[0]):
         row, left = times[i if len(times) > 1 else 0], 0
         for j in range(out.shape[1]):
@@ -55,7 +65,7 @@ def _relax(corner_s, rate, ends, began, times, out):  # type: ignore[no-untyped-
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """Adds the friction, without creep."""
+    """Adds the friction, without creep, to the force."""
     sliding, length, start = (values[name] for name in ("Fc", "presliding", "friction_start"))
     return added(force, lambda t: friction(motion, t, sliding, length, start, np.zeros_like(sliding)))
 

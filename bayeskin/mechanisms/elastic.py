@@ -1,6 +1,7 @@
-"""The elastic stress that laws before left at the quadrature points, for laws that change or remember it.
+"""Extracts and scales the elastic stress at quadrature points, for laws that change or remember it.
 
-A chunk's stress is P = P_e - p J F^-T; what the fluid carries is no part of the solid's own.
+The stress of a chunk is P = P_e - p J F^-T. P_e is the elastic stress that earlier laws have left. The second
+term is carried by the fluid and is not part of the solid's stress.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -11,7 +12,7 @@ from bayeskin.finite_element.assembly import compiled, inverse_and_determinant
 
 @compiled
 def elastic_stress(f, p, stress, inverse, elastic):
-    """Fills F^-1 and P_e (3, 3) at one point, given F, the pressure and P there; returns J."""
+    """Fills F^-1 and P_e (3, 3) at one point from F, the pressure and P there, and returns J."""
     j = inverse_and_determinant(f, inverse)
     for i in range(3):
         for k in range(3):
@@ -21,9 +22,9 @@ def elastic_stress(f, p, stress, inverse, elastic):
 
 @compiled
 def scale_elastic(factor, p, j, inverse, stress_f):
-    """Multiplies dP_e/dF by a factor, given the derivative (9, 9) of the whole stress, in place.
+    """Multiplies dP_e/dF by a factor, in place, within the derivative (9, 9) of the total stress.
 
-    d(p J F^-T)/dF_mn = p J (F^-T F^-1_nm - F^-1_ni F^-1_km) is left as it is.
+    The fluid's term d(p J F^-T)/dF_mn = p J (F^-T F^-1_nm - F^-1_ni F^-1_km) does not change.
     """
     less = (factor - 1.0) * p * j
     for i in range(3):

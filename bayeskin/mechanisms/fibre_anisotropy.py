@@ -1,8 +1,8 @@
-"""The cutis is stiffer along the Langer lines, in pull and in push.
+"""The cutis is stiffer along the Langer lines, in tension and in compression.
 
-The law of `fibres` with k2 = 0 and k1 = (ratio - 1) E_c / 4, so that Young's modulus along the lines is about
-`ratio` times E_c at small strain; the lines lie at an angle to x in the skin's plane. In one uniaxial test
-most of it looks like another E_c.
+The law is that of `fibres` with k2 = 0 and k1 = (ratio - 1) E_c / 4. Young's modulus along the lines is then
+about `ratio` times E_c at small strain. The lines lie at an angle to x in the plane of the skin. In one
+uniaxial test most of the effect looks like a different E_c.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from bayeskin.types import Parameter
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
-    """Returns fibres in the cutis at `langer_angle` to x in the planes that are parallel to the surface."""
-    around = np.arctan2(sites.points_m[1], sites.points_m[2])  # the tangent there is (0, cos, -sin)
+    """Returns the law of fibres in the cutis, at `langer_angle` to x and parallel to the surface."""
+    around = np.arctan2(sites.points_m[1], sites.points_m[2])  # the tangent is (0, cos, -sin)
     angle = values["langer_angle"]
     direction = np.stack(
         [

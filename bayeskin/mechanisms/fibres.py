@@ -1,9 +1,10 @@
-"""Fibres in the solid: stress along given directions, shared by the mechanisms that have them.
+"""Fibres in the solid: they add stress along given directions. Several mechanisms share this law.
 
     W = k1 / (2 k2) (exp(k2 E^2) - 1) ,   E = kappa (I1 - 3) + (1 - 3 kappa) (I4 - 1) ,   I4 = |F a|^2
 
-(k2 = 0: W = k1 E^2 / 2). Dispersion kappa from 0, all fibres along a, to 1/3, none more than others. First
-Piola stress P = W' D with D = dE/dF = 2 kappa F + 2 (1 - 3 kappa) F a (x) a.
+For k2 = 0 the energy is W = k1 E^2 / 2. The dispersion kappa is 0 if all fibres lie along a, and 1/3 if no
+direction is preferred. The first Piola-Kirchhoff stress is P = W' D with
+D = dE/dF = 2 kappa F + 2 (1 - 3 kappa) F a (x) a.
 
 Source: Holzapfel, Gasser & Ogden, J. Elasticity 61 (2000), 1-48; with dispersion Gasser, Ogden & Holzapfel,
 J. R. Soc. Interface 3 (2006), 15-35.
@@ -23,7 +24,7 @@ from bayeskin.types import Array
 
 @compiled
 def _strain(f, a, kappa, gradient):
-    """E at F (3, 3) and direction a (3,); fills dE/dF (3, 3)."""
+    """Returns E at F (3, 3) and direction a (3,), and fills `gradient` (3, 3) with dE/dF."""
     trace = along = 0.0
     for i in range(3):
         stretched = f[i, 0] * a[0] + f[i, 1] * a[1] + f[i, 2] * a[2]
@@ -38,7 +39,7 @@ def _strain(f, a, kappa, gradient):
 def add_stress(
     time_s, elapsed_s, par, data, deformation, pressure, gradient, before, after, stress, content, flux
 ):  # fmt: skip
-    """Adds the fibres' stress."""
+    """Adds the stress of the fibres."""
     k2, kappa, everywhere = par[0], par[1], par[2] != 0.0
     slope = np.empty((3, 3))
     for n in range(len(pressure)):
@@ -58,7 +59,7 @@ def add_derivatives(
     time_s, elapsed_s, par, data, deformation, pressure, gradient,
     before, stress_f, stress_p, content_f, content_p, flux_f, flux_g,
 ):  # fmt: skip
-    """dP = W'' D (D : dF) + W' (2 kappa dF + 2 (1 - 3 kappa) dF a (x) a)."""
+    """Adds dP = W'' D (D : dF) + W' (2 kappa dF + 2 (1 - 3 kappa) dF a (x) a)."""
     k2, kappa, everywhere = par[0], par[1], par[2] != 0.0
     slope = np.empty((3, 3))
     for point in range(len(pressure)):
@@ -90,8 +91,9 @@ def fibres(
 ) -> TissueLaw:
     """Returns the law of fibres.
 
-    direction (n, 3) : of length one in the reference configuration, or (3,) for all points
-    k1 (n,) [Pa], or one for all; k2, kappa [-] : as above; tension_only : whether they go slack when pushed
+    direction (n, 3) : unit vectors in the reference configuration, or one vector (3,) for all points
+    k1 (n,) [Pa], or one number for all points; k2, kappa [-] : as in the equations above
+    tension_only : True if the fibres go slack in compression
     """
     along = np.broadcast_to(direction, (len(sites.cutis), 3))
     par = np.array([k2, kappa, 0.0 if tension_only else 1.0])

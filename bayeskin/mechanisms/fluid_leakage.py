@@ -1,4 +1,7 @@
-"""Fluid leaves through the surface beside the pads: outflow c p per area, by its interstitial pressure."""
+"""Fluid leaves through the surface beside the pads.
+
+The outflow per area is c p, where p is the interstitial pressure and c the conductance of the surface.
+"""
 
 from __future__ import annotations
 
@@ -15,18 +18,18 @@ from bayeskin.types import Parameter
 
 
 def open_surface(problem: Problem) -> np.ndarray:
-    """Facets of the top that no pad covers."""
+    """Returns the facets of the top that neither a pad nor a guard covers."""
     named = problem.mesh.facets
     return np.setdiff1d(problem.mesh.top(), np.concatenate([named["pad"], named["guard"]]))
 
 
 def outflow(problem: Problem) -> sp.csr_matrix:
-    """Returns the matrix (dofs, dofs) of a conductance of 1 m/(Pa s); its sign is that of `assembly`."""
+    """Returns the matrix (dofs, dofs) of a conductance of 1 m/(Pa s), with the sign of `assembly`."""
     return -pressure_rows(problem.space, surface_mass(problem, open_surface(problem), False))
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
-    """Returns the law of `leakage`."""
+    """Returns the tissue law for `leakage`."""
     return TissueLaw(surfaces=(SurfaceTerm(values["leakage"], outflow, per_second=True),))
 
 

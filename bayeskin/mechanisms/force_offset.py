@@ -1,4 +1,4 @@
-"""The load cell's zero is not the skin's zero: F + F0."""
+"""The load cell's zero is not the zero of the skin's force: the reported force is F + F0."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from bayeskin.types import PadMotion, Parameter
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """Adds F0 [N]."""
+    """Adds F0 [N] to the force."""
     return added(force, lambda time_s: values["F0"][:, None] * np.ones_like(time_s))
 
 

@@ -1,6 +1,6 @@
-"""The friction that a stop locks in relaxes: dF/dt = ... - F / tau in `device-friction`'s equation.
+"""The friction that a stop locks in relaxes: dF/dt = ... - F / tau in the equation of `device-friction`.
 
-Alone it has nothing to act on (`needs`).
+Without `device-friction` it has no effect (`needs`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from bayeskin.types import Array, PadMotion, Parameter
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """Adds what creep takes from the friction."""
+    """Adds the change that creep makes to the friction."""
     if "Fc" not in values:
         return force
     sliding, length, start = (values[name] for name in ("Fc", "presliding", "friction_start"))

@@ -1,4 +1,4 @@
-"""Hashes of what mechanisms do, by which stored results know whether they still hold."""
+"""Computes hashes of the mechanisms' laws, by which stored results know whether they are still valid."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ ENTRY = "MECHANISM"
 
 
 def law_hashes(names: Iterable[str]) -> dict[str, str]:
-    """Returns what the files behave like in which each mechanism's law is written, as a sha256 by its name.
+    """Returns, by mechanism name, the sha256 of the behaviour of the files that contain each law.
 
-    These are the mechanism's own file and the files of this package that it takes functions from. The entry
-    in the catalogue does not count, since sentences, priors and look-alikes are no part of a law. Imports do
-    not count either: functions of this package are hashed with their own files, and those of the full model
-    have a version (`PHYSICS_VERSION`).
+    These are the mechanism's own file and the files of this package from which it takes functions. The entry
+    in the catalogue does not count, because sentences, priors and look-alikes are not part of a law. Imports
+    do not count either: functions of this package are hashed with their own files, and functions of the full
+    model have a version (`PHYSICS_VERSION`).
     Raises KeyError for a name that is not in the catalogue.
     """
     known = catalogue()
@@ -53,7 +53,10 @@ def _is_entry(node: ast.stmt) -> bool:
 
 
 def _files(module: ModuleType, seen: set[Path]) -> set[Path]:
-    """The file of a module and, beside those `seen`, of what it takes from others of the package."""
+    """Returns `seen` with the file of a module and the files of this package from which it takes functions.
+
+    The file `mechanism.py` is left out.
+    """
     own = Path(inspect.getfile(module))
     if own not in seen:
         seen.add(own)

@@ -1,8 +1,8 @@
-"""A mechanism is physics that the base model leaves out, off at its neutral value.
+"""Defines a mechanism: physics that the base model leaves out, and that is off at its neutral value.
 
 Tissue mechanisms change the model's equations (`bayeskin.finite_element.tissue`). Instrument mechanisms act
-on the force that comes out of the skin, sample by sample of a posterior: each takes a force as a function of
-time and gives the one that the load cell then reports.
+on the force of the skin, for each sample of a posterior. Each takes a force as a function of time and returns
+the force that the load cell then reports.
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ from bayeskin.finite_element.tissue import Bind
 from bayeskin.mechanisms.lines import bin_integrals
 from bayeskin.types import Array, Jumps, PadMotion, Parameter
 
-Values = Mapping[str, Array]  # each parameter (n,), SI; those of all mechanisms that are on
-ForceOfTime = Callable[[Array], Array]  # times (t,) or (n, t) [s] to forces (n, t) [N]
+Values = Mapping[str, Array]  # (n,) of each parameter of all active mechanisms, SI
+ForceOfTime = Callable[[Array], Array]  # maps times (t,) or (n, t) [s] to forces (n, t) [N]
 Observe = Callable[[Values, PadMotion, ForceOfTime], ForceOfTime]
 Refuted = Callable[[Values, PadMotion, Jumps], NDArray[np.bool_]]
-GAUSS_POINTS = 4  # between neighbouring edges, corners and repeats
-SETTLING = np.array([3.0, 12.0])  # time constants after a corner at which bins are cut
+GAUSS_POINTS = 4  # in each interval between neighbouring bin edges, corners and repeats
+SETTLING = np.array([3.0, 12.0])  # bins are divided at these multiples of the time constant after a corner
 
 
 class Place(IntEnum):
-    """The place in the instrument where a mechanism acts, from the skin outward.
+    """The place in the instrument where a mechanism acts, in order from the skin outward.
 
-    A mechanism sees what those before it made.
+    A mechanism acts on the force that results from the mechanisms before it.
     """
 
     PADS = 0
-    ARM = 1  # under the pads; what these lose goes by the force without its swings
+    # The arm acts after the pads, so what the pads lose depends on the force without the swings of the arm.
+    ARM = 1
     DRIVE = 2
     CELL = 3
     AMPLIFIER = 4
@@ -44,14 +45,17 @@ class Place(IntEnum):
 class Instrument:
     """The action of an instrument mechanism on a force.
 
-    bind : set where it changes the displacement that the skin sees: the full model solves it along, and
-        `observe` is its shortcut for the force of a surrogate
-    adds : whether what it adds to a force does not depend on that force
-    refuted : which values the samples of a recording speak against, by what they allow of jumps; None where
-        they cannot
-    repeats_m, repeats_s : the shortest travel [m], or time [s], after which what it does comes again,
-        infinite where nothing does
-    settles_s : the shortest time constant [s] with which its response to a corner fades, infinite without any
+    place : where in the instrument it acts
+    observe : returns the force as a function of time after the mechanism has acted on it
+    bind : the law of a mechanism that changes the displacement of the skin, otherwise None. The full model
+        solves this law together with the skin; `observe` is then a shortcut for the force of a surrogate
+    adds : True if the force that it adds does not depend on the force on which it acts
+    refuted : returns which values contradict the samples of a recording, given the jumps that these samples
+        allow; None if samples cannot contradict the mechanism
+    repeats_m, repeats_s : the shortest travel [m], or time [s], after which its effect repeats; infinite if
+        it does not repeat
+    settles_s : the shortest time constant [s] with which its response to a corner decays; infinite if it has
+        no such response
     """
 
     place: Place
@@ -75,12 +79,14 @@ class Tissue:
 class Mechanism:
     """One entry of the catalogue.
 
-    parameters : SI, with priors; neutral : values of these that switch it off
-    statement : one plain sentence from the parameters' values, for a report
-    group : names of the look-alikes that one force channel cannot tell from it, its own among them
-    parts : names of parameters that act by themselves, the first of each part the one that switches it on;
-        () is one part of all
-    needs : names of mechanisms without which it does nothing
+    parameters : its parameters in SI units, with priors
+    neutral : values of these parameters that switch it off
+    statement : returns one plain sentence for a report, from the parameters' values
+    group : names of the look-alikes that one force channel cannot tell apart from it, including its own name
+    parts : groups of parameters, by name, that act without the others. The first parameter of each part
+        switches it on. () means that all parameters form one part
+    act : its action, on the force or on the full model
+    needs : names of mechanisms without which it has no effect
     """
 
     name: str
@@ -94,24 +100,27 @@ class Mechanism:
 
     @property
     def whole_or_parts(self) -> tuple[tuple[str, ...], ...]:
-        """`parts`, or the one part of all parameters."""
+        """Returns `parts`, or all parameters as one part."""
         return self.parts or (tuple(p.name for p in self.parameters),)
 
 
 def with_one(names: Iterable[str], name: str, known: Mapping[str, Mechanism]) -> tuple[str, ...]:
-    """A set with one mechanism more, and those that it needs."""
+    """Returns a set of names with one mechanism added, and with the mechanisms that it needs."""
     return tuple(sorted({*names, name, *known[name].needs}))
 
 
 def without_one(names: Iterable[str], name: str, known: Mapping[str, Mechanism]) -> tuple[str, ...]:
-    """A set with one mechanism fewer, and without those that need it."""
+    """Returns a set of names without one mechanism, and without the mechanisms that need it."""
     return tuple(other for other in names if other != name and name not in known[other].needs)
 
 
 def observed(
     mechanisms: Iterable[Mechanism], values: Values, motion: PadMotion, force: ForceOfTime
 ) -> ForceOfTime:
-    """The force that is reported when the instrument's among `mechanisms` act on it, in any order given."""
+    """Returns the reported force after the instrument mechanisms among `mechanisms` have acted on a force.
+
+    They act in the order of their places, then of their names, in whatever order they are given.
+    """
     acts = [(m.act.place, m.name, m.act) for m in mechanisms if isinstance(m.act, Instrument)]
     for _, _, act in sorted(acts, key=lambda one: one[:2]):
         force = act.observe(values, motion, force)
@@ -119,7 +128,7 @@ def observed(
 
 
 def solved(mechanisms: Iterable[Mechanism]) -> list[Mechanism]:
-    """Those that the full model solves; what is left acts on its force."""
+    """Returns the mechanisms that the full model solves. The other mechanisms act on its force."""
     return [m for m in mechanisms if m.act.bind is not None]
 
 
@@ -129,15 +138,15 @@ def laws(mechanisms: Iterable[Mechanism]) -> list[Bind]:
 
 
 def added(force: ForceOfTime, more: ForceOfTime) -> ForceOfTime:
-    """The sum of two forces."""
+    """Returns the sum of two forces as a function of time."""
     return lambda time_s: np.asarray(force(time_s) + more(time_s))
 
 
 class Bins:
-    """Means of forces over the bins between edges_s (m+1,), exact to high order between corners.
+    """Computes means of forces over the bins between edges_s (m+1,).
 
-    Of forces that `mechanisms` made, whatever repeats over the travel or time, or settles after a corner, is
-    followed too.
+    The quadrature is exact to high order between corners. It also resolves effects of `mechanisms` that
+    repeat over the travel or time, or that settle after a corner.
     """
 
     def __init__(self, motion: PadMotion, edges_s: Array, mechanisms: Iterable[Mechanism] = ()) -> None:
@@ -165,13 +174,18 @@ class Bins:
 def bin_means(
     force: ForceOfTime, motion: PadMotion, edges_s: Array, mechanisms: Iterable[Mechanism] = ()
 ) -> Array:
-    """Means (n, m), over the bins between edges_s (m+1,), of one force only, which `mechanisms` made."""
+    """Returns the means (n, m) of one force over the bins between edges_s (m+1,).
+
+    mechanisms : those that have acted on the force, so that the quadrature resolves their effects (`Bins`)
+    """
     return Bins(motion, edges_s, mechanisms).means(force)
 
 
 def _no_longer(cuts: Array, motion: PadMotion, travel_m: float, lasts_s: float) -> Array:
-    """Times between which the pads move by `travel_m` or less and `lasts_s` pass or less, those of `cuts`
-    among them."""
+    """Returns `cuts` with further times between them.
+
+    Between neighbouring times the pads move by at most `travel_m` [m], and at most `lasts_s` [s] pass.
+    """
     longest = np.maximum(np.abs(np.diff(motion.at(cuts))) / travel_m, np.diff(cuts) / lasts_s)
     parts = np.ceil(longest).astype(int).clip(1)
     pieces = zip(cuts[:-1], cuts[1:], parts, strict=True)

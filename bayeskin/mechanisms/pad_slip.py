@@ -1,8 +1,8 @@
-"""The adhesive creeps: beyond a threshold the pads slide on the skin, and stay where they slid.
+"""The adhesive creeps: beyond a threshold force the pads slide on the skin, and do not slide back.
 
     ds/dt = r sgn(F) max(|F| - F0, 0) ,   the skin sees u - s
 
-with F the force since the start of the test.
+where F is the force beyond that at the start of the test.
 """
 
 from __future__ import annotations
@@ -20,7 +20,10 @@ from bayeskin.types import Array, PadMotion, Parameter
 
 
 class Slip(SeriesElement):
-    """Slip at a rate [m/(N s)] beyond a threshold [N]; its memory is the slip [m] and the force [N]."""
+    """Slip at a rate [m/(N s)] beyond a threshold force [N].
+
+    The memory holds the slip [m] and the force [N].
+    """
 
     def __init__(self, rate: float, threshold_n: float) -> None:
         self._rate, self._threshold_n = rate, threshold_n
@@ -31,12 +34,12 @@ class Slip(SeriesElement):
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
-    """Returns the law of `slip_rate` and `slip_threshold`."""
+    """Returns the tissue law for `slip_rate` and `slip_threshold`."""
     return TissueLaw(series=Slip(values["slip_rate"], values["slip_threshold"]))
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """The shortcut of `series`."""
+    """Returns the reported force by the shortcut of `series`."""
     return lost_in_series(motion, force, rate=values["slip_rate"], threshold_n=values["slip_threshold"])
 
 

@@ -2,16 +2,17 @@
 
     F + (a + s F) sin(2 pi t / T + phi)
 
-A small displacement to and fro changes the force by the skin's stiffness, and that of soft tissue grows in
-proportion to its force, dF/du = A (F + B) (Fung, Am. J. Physiol. 213 (1967), 1532-1544): hence a part of the
-amplitude that is there without force and one that goes with it. An arm that turns or swells under the pads
-changes the pull by a share of itself, which is s too.
+A small displacement to and fro changes the force by the skin's stiffness. The stiffness of soft tissue grows
+linearly with its force, dF/du = A (F + B) (Fung, Am. J. Physiol. 213 (1967), 1532-1544). One part of the
+amplitude is therefore independent of the force, and the other part is proportional to it. An arm that turns
+or swells under the pads changes the pull by a share of the pull. The share s describes this too.
 
 At rest adults breathe 12 to 20 times a minute (Chourpiliadis & Bhardwaj, Physiology, Respiratory Rate,
 StatPearls 2022); hearts beat 50 to 90 times (Nanchen, Heart 104 (2018), 1048). Amplitudes are chosen for
-this test: 30 mN are a displacement of 0.6 mm at 50 mN/mm. The period is the same throughout, as in paced
-breathing; free breathing falls out of step after some breaths. Means over bins of a width h do not tell a
-period T from 1 / (1 / h - 1 / T): with 0.5 s a pulse of 0.8 s looks like a smaller swing of 1.3 s.
+this test: 30 mN correspond to a displacement of 0.6 mm at 50 mN/mm. The period is constant, as in paced
+breathing; free breathing falls out of step after some breaths. Means over bins of a width h cannot
+distinguish a period T from 1 / (1 / h - 1 / T): with h = 0.5 s, a pulse of 0.8 s looks like a smaller swing
+of 1.3 s.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Pl
 from bayeskin.number_format import number
 from bayeskin.types import Array, PadMotion, Parameter
 
-SHORTEST_S, LONGEST_S = 0.6, 8.0  # period
+SHORTEST_S, LONGEST_S = 0.6, 8.0  # bounds of the period
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """Adds the swing."""
+    """Adds the swing to the force."""
     amplitude, share, period, phase = (
         values[f"motion_{part}"][:, None] for part in ("amplitude", "share", "period", "phase")
     )

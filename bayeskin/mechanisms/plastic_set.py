@@ -1,18 +1,19 @@
-"""The tissue yields: beyond a stretch along the pull its rest length grows, and does not return.
+"""The tissue yields: beyond a threshold of stretch along the pull its rest length grows and does not return.
 
-With l = |F e_x| the stretch along x, l_max the largest up to now at the same point, a threshold y and the
-share s of the excess that stays,
+Let l = |F e_x| be the stretch along x, l_max its largest value so far at the same point, y the threshold, and
+s the share of the excess that stays. Then
 
     l_p = 1 + s max(l_max - y, 0) ,   F_p = diag(l_p, l_p^-1/2, l_p^-1/2) ,   W = W_e(F F_p^-1)
 
-with the base solid's energy W_e. As det F_p = 1, the stress differs from the base's by the first term only,
+with the energy W_e of the base solid. Because det F_p = 1, the stress differs from that of the base solid in
+the first term, mu F, only:
 
     P = P_base + mu F (C_p^-1 - I) ,   C_p^-1 = diag(l_p^-2, l_p, l_p) .
 
-Force still grows with stretch as long as s y < 1. Fibres of other mechanisms do not yield, and damage of
-`preconditioning` goes by the whole stretch.
+The force still grows with stretch as long as s y < 1. Fibres of other mechanisms do not yield, and the damage
+of `preconditioning` depends on the total stretch.
 
-Source: the split F = F_e F_p: Lee, J. Appl. Mech. 36 (1969), 1-6.
+Source: Lee, J. Appl. Mech. 36 (1969), 1-6, for the split F = F_e F_p.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -32,7 +33,7 @@ from bayeskin.types import Array, Parameter
 
 @compiled
 def stretch_along(f):
-    """|F e_x|"""
+    """Returns the stretch |F e_x| along the pull."""
     return np.sqrt(f[0, 0] * f[0, 0] + f[1, 0] * f[1, 0] + f[2, 0] * f[2, 0])
 
 
@@ -40,7 +41,10 @@ def stretch_along(f):
 def set_free(
     time_s, elapsed_s, par, data, deformation, pressure, gradient, before, after, stress, content, flux
 ):  # fmt: skip
-    """Adds mu F (C_p^-1 - I); `par` holds s and y, `data` mu, the memory l_max."""
+    """Adds mu F (C_p^-1 - I) to the stress.
+
+    `par` holds s and y, `data` holds mu, and the memory holds l_max.
+    """
     for n in range(len(pressure)):
         f, mu = deformation[n], data[n, 0]
         largest = max(stretch_along(f), before[n, 0])
@@ -58,7 +62,10 @@ def set_free_derivatives(
     time_s, elapsed_s, par, data, deformation, pressure, gradient,
     before, stress_f, stress_p, content_f, content_p, flux_f, flux_g,
 ):  # fmt: skip
-    """mu dF (C_p^-1 - I) and, while it yields, mu F dC_p^-1/dl_p s dl with dl = (F e_x) . (dF e_x) / l."""
+    """Adds mu dF (C_p^-1 - I) and, while the point yields, mu F dC_p^-1/dl_p s dl to the derivative.
+
+    Here dl = (F e_x) . (dF e_x) / l.
+    """
     for n in range(len(pressure)):
         f, mu = deformation[n], data[n, 0]
         stretch = stretch_along(f)
@@ -75,7 +82,7 @@ def set_free_derivatives(
 
 
 def setting(share: float, threshold: float, mu: Array) -> TissueLaw:
-    """Returns the law of a share that stays and a threshold of stretch [-]; mu (n, 1) [Pa]."""
+    """Returns the law for the share that stays [-] and the threshold of stretch [-]; mu (n, 1) is in Pa."""
     return TissueLaw(
         remembers=1,
         par=np.array([share, threshold]),
@@ -86,7 +93,7 @@ def setting(share: float, threshold: float, mu: Array) -> TissueLaw:
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
-    """Returns the law of `set_share` in both layers."""
+    """Returns the tissue law for `set_share` and `yield_stretch`, in both layers."""
     mu = sites.table(material(values, sites.cutis).mu)
     return setting(values["set_share"], values["yield_stretch"], mu)
 

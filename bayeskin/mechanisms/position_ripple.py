@@ -1,6 +1,6 @@
-"""Ripple of the screw or the gear, locked to the position, while the drive moves.
+"""The screw or the gear causes a ripple while the drive moves. Its phase is locked to the position.
 
-F + a sin(2 pi u / L + phi)   where du/dt is not 0
+The reported force is F + a sin(2 pi u / L + phi) where du/dt is not 0.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from bayeskin.mechanisms.viscous_drag import speed_of
 from bayeskin.number_format import number
 from bayeskin.types import Array, PadMotion, Parameter
 
-SHORTEST_M, LONGEST_M = 1e-4, 1e-3  # period
-AT_REST_M_S = 2e-5  # slower than this is no motion
+SHORTEST_M, LONGEST_M = 1e-4, 1e-3  # bounds of the period
+AT_REST_M_S = 2e-5  # a slower drive counts as at rest
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """Adds the ripple."""
+    """Adds the ripple to the force."""
     period, amplitude, phase = (
         values[f"ripple_{part}"][:, None] for part in ("period", "amplitude", "phase")
     )

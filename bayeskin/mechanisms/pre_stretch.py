@@ -1,9 +1,10 @@
 """The skin is under tension when the test starts.
 
-The pads were moved apart before and all came to rest, drained; the load cell was zeroed there.
+Before the test the pads were moved apart, and the tissue came to its drained equilibrium. The load cell was
+zeroed in this state.
 
-Range: tensions of 28 to 92 kPa in the upper arm, Flynn, Taberner & Nielsen, Biomech. Model. Mechanobiol. 10
-(2011), 27-38.
+Range: tensions of 28 to 92 kPa were measured in the upper arm (Flynn, Taberner & Nielsen, Biomech. Model.
+Mechanobiol. 10 (2011), 27-38).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from bayeskin.types import Parameter
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
-    """Returns the law of pads that were each opened by a share `opening` of the half gauge length."""
+    """Returns the law of pads that were each moved outward by a share `opening` of the half gauge length."""
     return TissueLaw(opening_m=2.0 * values["opening"] * sites.lengths.half_gauge_m)
 
 

@@ -1,13 +1,13 @@
-"""Damage by the largest strain energy so far: the first stretch is stiffer, later ones repeat.
+"""Damage by the largest strain energy so far: the first stretch is stiffer, and later stretches repeat.
 
-With W the base solid's stored energy and W_max its largest value up to now at the same point,
+Let W be the stored energy of the base solid, and W_max its largest value so far at the same point. Then
 
     P = (1 - D) dW/dF ,   D = d (1 - exp(-W_max / W_d)) .
 
-Stress grows with stretch all the same for d up to 0.6. Fibres of other mechanisms are not damaged.
+The stress still grows with stretch for d up to 0.6. Fibres of other mechanisms are not damaged.
 
-Source: Simo, Comput. Methods Appl. Mech. Eng. 60 (1987), 153-173 (damage by the largest energy); the
-effect in rubber: Mullins, Rubber Chem. Technol. 42 (1969), 339-362.
+Source: Simo, Comput. Methods Appl. Mech. Eng. 60 (1987), 153-173, for damage by the largest energy; Mullins,
+Rubber Chem. Technol. 42 (1969), 339-362, for the effect in rubber.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -28,7 +28,10 @@ from bayeskin.types import Array, Parameter
 
 @compiled
 def stored_energy(f, mu, lam, inverse, slope):
-    """W = mu / 2 (I1 - 3 - 2 ln J) + lambda / 2 ln^2 J at F (3, 3), and ln J; fills F^-1 and dW/dF."""
+    """Returns W and ln J at F (3, 3), and fills F^-1 and dW/dF.
+
+    W = mu / 2 (I1 - 3 - 2 ln J) + lambda / 2 ln^2 J
+    """
     log = np.log(inverse_and_determinant(f, inverse))
     spherical, square = lam * log - mu, 0.0
     for i in range(3):
@@ -42,7 +45,10 @@ def stored_energy(f, mu, lam, inverse, slope):
 def weaken(
     time_s, elapsed_s, par, data, deformation, pressure, gradient, before, after, stress, content, flux
 ):  # fmt: skip
-    """Takes D dW/dF off the stress; `par` holds d and W_d, `data` mu and lambda, the memory W_max."""
+    """Subtracts D dW/dF from the stress.
+
+    `par` holds d and W_d, `data` holds mu and lambda, and the memory holds W_max.
+    """
     most, scale = par[0], par[1]
     inverse, slope = np.empty((3, 3)), np.empty((3, 3))
     for n in range(len(pressure)):
@@ -60,7 +66,7 @@ def weaken_derivatives(
     time_s, elapsed_s, par, data, deformation, pressure, gradient,
     before, stress_f, stress_p, content_f, content_p, flux_f, flux_g,
 ):  # fmt: skip
-    """- D d2W/dF2 and, while W is the largest, - dD/dW dW/dF (x) dW/dF."""
+    """Adds - D d2W/dF2 and, while W is at its largest value, - dD/dW dW/dF (x) dW/dF to the derivative."""
     most, scale = par[0], par[1]
     inverse, slope = np.empty((3, 3)), np.empty((3, 3))
     for point in range(len(pressure)):
@@ -85,7 +91,7 @@ def weaken_derivatives(
 
 
 def damaged(most: float, scale_pa: float, lame: Array) -> TissueLaw:
-    """Returns the law of a largest damage [-] and its energy scale [Pa]; lame (n, 2): mu and lambda [Pa]."""
+    """Returns the law for a largest damage [-] and its energy scale [Pa]; lame (n, 2): mu and lambda [Pa]."""
     return TissueLaw(
         remembers=1,
         par=np.array([most, scale_pa]),
@@ -96,7 +102,7 @@ def damaged(most: float, scale_pa: float, lame: Array) -> TissueLaw:
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
-    """Returns the law of `damage` in both layers."""
+    """Returns the tissue law for `damage` and `damage_energy`, in both layers."""
     solid = material(values, sites.cutis)
     return damaged(values["damage"], values["damage_energy"], sites.table(solid.mu, solid.lam))
 

@@ -1,4 +1,4 @@
-"""The load cell drifts: F + r t. Cf. OIML R 60, which limits the creep of load cells."""
+"""The load cell drifts: the reported force is F + r t. OIML R 60 limits the creep of load cells."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from bayeskin.types import PadMotion, Parameter
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """Adds r t."""
+    """Adds r t to the force."""
     return added(force, lambda time_s: values["drift"][:, None] * time_s)
 
 

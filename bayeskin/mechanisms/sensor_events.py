@@ -1,9 +1,9 @@
-"""Steps of the load cell's zero at two moments: F + sum_i s_i H(t - t_i).
+"""The load cell's zero jumps at two moments: F + sum_i s_i H(t - t_i).
 
-Moments are counted as shares of the recording, so that one prior fits all.
+The moments are shares of the recording's duration, so that one prior suits all recordings.
 
-A step in the first or last fiftieth of a recording is not asked for: it would be an offset, or nothing.
-And a step is there from one sample to the next: where samples show none, something slower is at work.
+The prior excludes the first and the last fiftieth of a recording. A step there would be an offset, or have no
+effect. A step happens between one sample and the next. Where the samples show no step, a slower effect acts.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ EVENTS = (1, 2)
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """Adds the steps."""
+    """Adds the steps to the force."""
 
     def steps(time_s: Array) -> Array:
         share = time_s / motion.time_s[-1]
@@ -30,7 +30,10 @@ def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTim
 
 
 def refuted(values: Values, motion: PadMotion, jumps: Jumps) -> NDArray[np.bool_]:
-    """Of which values (n,) samples do not show the larger step; the smaller may stand for something slow."""
+    """Returns for which values (n,) the samples contradict the larger of the two steps.
+
+    The smaller step is not tested, because it may stand for a slow effect.
+    """
     sizes = np.array([values[f"event_{i}_step"] for i in EVENTS])
     moments = np.array([values[f"event_{i}_at"] for i in EVENTS]) * motion.time_s[-1]
     larger = np.argmax(np.abs(sizes), axis=0), np.arange(sizes.shape[1])

@@ -1,13 +1,13 @@
-"""What lies between drive and skin, on the force of a surrogate: a shortcut for what the full model solves.
+"""Changes the force of a surrogate for elements between drive and skin: a shortcut for the full model.
 
-The skin sees p - s: p trails the drive u behind a gap, s is what yields at once (compliance) or slowly
-(recovery, a Kelvin-Voigt element), and what has slipped.
-Its force is taken to follow the displacement at once,
+The skin sees the displacement p - s. The displacement p trails the drive's displacement u behind a gap. The
+lost displacement s is the sum of what yields at once (compliance), what yields slowly (recovery, a
+Kelvin-Voigt element) and what has slipped. The force is taken to follow the displacement at once,
 
     F[p - s](t) = F[u](t) + G(p(t) - s(t)) - G(u(t)) ,
 
-G the force over the displacement of the first loading, straight on below its start. Exact for skin without
-memory; the full model tells what else there is to it.
+where G is the force over the displacement of the first loading, extrapolated linearly beyond its ends. This
+is exact for skin without memory. The full model shows the effects that this shortcut leaves out.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -22,8 +22,8 @@ from bayeskin.mechanisms.mechanism import ForceOfTime, added
 from bayeskin.types import PadMotion
 
 STEPS_A_PHASE = 100
-GRID = 33  # displacements at which G is tabulated
-ITERATIONS = 8  # of a force and what it makes lost, which changes it by some tenths at most
+GRID = 33  # number of displacements at which G is tabulated
+ITERATIONS = 8  # of force and lost displacement; the latter changes the force by some tenths at most
 
 
 def lost_in_series(
@@ -36,8 +36,12 @@ def lost_in_series(
     recovery: ArrayLike = 0.0,
     recovery_s: ArrayLike = 1.0,
 ) -> ForceOfTime:
-    """The force behind a gap [m], a compliance [m/N], slip [m/(N s)] beyond a threshold, and a compliance
-    [m/N] that yields and returns over a time [s]; each (n,) or one for all."""
+    """Returns the reported force with elements between drive and skin; each argument is (n,) or one number.
+
+    gap_m : lost motion [m]; compliance [m/N] : of an element that yields at once
+    rate [m/(N s)], threshold_n [N] : of a slip, and the force beyond which it slips
+    recovery [m/N], recovery_s [s] : compliance and time constant of an element that yields and returns slowly
+    """
     given = np.broadcast_arrays(gap_m, compliance, rate, threshold_n, recovery, recovery_s)
     elements = [np.array(np.atleast_1d(one), dtype=float) for one in given]
     steps = np.linspace(motion.time_s[:-1], motion.time_s[1:], STEPS_A_PHASE, endpoint=False).T.ravel()
@@ -62,9 +66,9 @@ def lost_in_series(
 def _march(
     free, u, elapsed, table, low, width, gap, compliance, rate, threshold, recovery, recovery_s, reach, change
 ):  # fmt: skip
-    """Fills change (n, k) of the forces `free` (n, k) at drive displacements u (k,).
+    """Fills change (n, k) with the changes of the forces `free` (n, k), at displacements u (k,) of the drive.
 
-    Rows side by side, because each waits for its own last iteration.
+    The innermost loops run over rows, because each iteration of a row has to wait for the one before it.
     """
     n = free.shape[0]
     scale = (table.shape[1] - 1) / width
@@ -91,7 +95,7 @@ def _march(
                 lost = min(max(slid[i] + slow[i] + compliance[i] * now, -reach), reach)
                 added[i] = _interpolated(table, i, (behind[i] - lost - low) * scale) - rest[i]
                 moved |= added[i] != last
-            if not moved:  # to the last bit: no iteration changes them any more
+            if not moved:  # no force has changed in its last bit, so none would change any more
                 break
         for i in range(n):
             slip[i], yielded[i], before[i] = slid[i], slow[i], free[i, k] + added[i]
@@ -100,14 +104,14 @@ def _march(
 
 @numba.njit(inline="always")
 def _interpolated(table, i, place):
-    """Of row i of a table (n, g) at `place` in 0..g-1, straight on beyond it."""
+    """Returns row i of a table (n, g), interpolated at `place` in 0..g-1 and extrapolated linearly beyond."""
     left = min(max(int(place), 0), table.shape[1] - 2)
     return table[i, left] + (place - left) * (table[i, left + 1] - table[i, left])
 
 
 @strict
 def mean_beyond(before, now, threshold):
-    """Mean of sgn(F) max(|F| - threshold, 0) along a straight line between two forces."""
+    """Returns the mean of sgn(F) max(|F| - threshold, 0) while F goes linearly from `before` to `now`."""
     total = 0.0
     for sign in (1.0, -1.0):
         a, b = sign * before - threshold, sign * now - threshold

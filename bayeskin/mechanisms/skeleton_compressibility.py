@@ -1,11 +1,11 @@
-"""The drained solid is more compressible, or less, than the fixed Poisson ratios 0.48 and 0.3 say.
+"""The drained solid is more, or less, compressible than the fixed Poisson ratios 0.48 and 0.3 imply.
 
-Stretch then changes its volume, and fluid has to flow: the force relaxes in holds and is negative after
-unloading. All laws of the solid see the same ratios (`problem.material`),
+Stretch then changes its volume, and fluid has to flow. The force relaxes in holds and is negative after
+unloading. All laws of the solid use the same ratios (`problem.material`),
 
     lambda = E nu / ((1 + nu) (1 - 2 nu)) ,   mu = E / (2 (1 + nu)) .
 
-Source: skin loses volume under tension: Wahlsten et al., Biomech. Model. Mechanobiol. 18 (2019), 1079-1093.
+Source: skin loses volume under tension (Wahlsten et al., Biomech. Model. Mechanobiol. 18 (2019), 1079-1093).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bayeskin.types import Parameter
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
-    """Returns a law that adds nothing to the material, which has the ratios already."""
+    """Returns a law that changes nothing, because the material already has these ratios."""
     return TissueLaw()
 
 

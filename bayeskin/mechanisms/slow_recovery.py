@@ -2,15 +2,15 @@
 
     ds/dt = (c F - s) / tau ,   the skin sees u - s
 
-with the compliance c, one over the element's stiffness, so that 0 is off. Over a time in which F goes
-straight from F_0 to F_1, with z = h / tau and phi = (1 - e^-z) / z,
+The compliance c is the reciprocal of the element's stiffness, so that c = 0 switches it off. Over a time h in
+which F goes linearly from F_0 to F_1, with z = h / tau and phi = (1 - e^-z) / z,
 
     s_1 = e^-z s_0 + c [ (phi - e^-z) F_0 + (1 - phi) F_1 ] .
 
-It is tissue, but acts as the instrument's series elements do, between pads and skin.
+The element is tissue, but it acts like the series elements of the instrument, between pads and skin.
 
-Stiffness from 0.5 N/mm on; recovery over seconds to minutes: Wan Abas & Barbenel, J. Biomed. Eng. 4 (1982),
-33-38.
+Range: the stiffness is at least 0.5 N/mm; recovery takes seconds to minutes (Wan Abas & Barbenel, J. Biomed.
+Eng. 4 (1982), 33-38).
 """
 
 from __future__ import annotations
@@ -28,7 +28,10 @@ from bayeskin.types import Array, PadMotion, Parameter
 
 
 class KelvinVoigt(SeriesElement):
-    """An element of a compliance [m/N] and a time [s]; its memory is what is lost [m] and the force [N]."""
+    """An element with a compliance [m/N] and a time constant [s].
+
+    The memory holds the lost displacement [m] and the force [N].
+    """
 
     def __init__(self, compliance: float, time_s: float) -> None:
         self._compliance, self._time_s = compliance, time_s
@@ -41,12 +44,12 @@ class KelvinVoigt(SeriesElement):
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
-    """Returns the law of `recovery_compliance` and `recovery_time`."""
+    """Returns the tissue law for `recovery_compliance` and `recovery_time`."""
     return TissueLaw(series=KelvinVoigt(values["recovery_compliance"], values["recovery_time"]))
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """The shortcut of `series`."""
+    """Returns the reported force by the shortcut of `series`."""
     slow, time_s = values["recovery_compliance"], values["recovery_time"]
     return lost_in_series(motion, force, recovery=slow, recovery_s=time_s)
 

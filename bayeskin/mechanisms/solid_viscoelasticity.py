@@ -1,20 +1,20 @@
-"""The solid itself relaxes: generalised Maxwell branches on the elastic stress of both layers.
+"""The solid itself relaxes: generalised Maxwell branches act on the elastic stress of both layers.
 
-With S_e the elastic second Piola-Kirchhoff stress, at equilibrium, each branch b adds
+Let S_e be the elastic second Piola-Kirchhoff stress at equilibrium. Each branch b adds
 
     Q_b = g_b S_e - A_b ,   A_b' = (g_b S_e - A_b) / tau_b .
 
-Over a time h in which S_e goes straight from S_0 to S_1, with z = h / tau and phi = (1 - e^-z) / z, exactly
+Over a time h in which S_e goes linearly from S_0 to S_1, with z = h / tau and phi = (1 - e^-z) / z, exactly
 
     A_1 = e^-z A_0 + g [ (phi - e^-z) S_0 + (1 - phi) S_1 ] ,
 
-so that a step of the stretch relaxes by its exponential whatever the steps in time.
+so that the relaxation after a step of the stretch is exponential for time steps of any length.
 
-Of the force F without branches, all points stretched alike by l = 1 + u / 2 L between the pads, S goes as
-F / l, and what the branches add is near l times what they make of F / l (`estimate`).
+The effect on a force F without branches can be estimated. If all points between the pads are stretched alike,
+by l = 1 + u / 2 L, then S is proportional to F / l. The branches add about l times their response to F / l.
 
-Source: Simo, Comput. Methods Appl. Mech. Eng. 60 (1987), 153-173; recursion as Taylor, Pister & Goudreau,
-Int. J. Numer. Methods Eng. 2 (1970), 45-59.
+Source: Simo, Comput. Methods Appl. Mech. Eng. 60 (1987), 153-173; the recursion follows Taylor, Pister &
+Goudreau, Int. J. Numer. Methods Eng. 2 (1970), 45-59.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -38,7 +38,7 @@ STEPS_A_PHASE = 100
 
 @compiled
 def _decay(elapsed_s, tau_s):
-    """e^-z and phi over a time, z = h / tau."""
+    """Returns e^-z and phi over a time h, with z = h / tau."""
     z = elapsed_s / tau_s
     return np.exp(-z), -np.expm1(-z) / z
 
@@ -47,9 +47,12 @@ def _decay(elapsed_s, tau_s):
 def relax(
     time_s, elapsed_s, par, data, deformation, pressure, gradient, before, after, stress, content, flux
 ):  # fmt: skip
-    """Adds the branches' stress; `par` holds g and tau of each, the memory S_e and each A, row by row."""
+    """Adds the stress of the branches.
+
+    `par` holds g and tau of each branch. The memory holds S_e and then A of each branch, row by row.
+    """
     count = len(par) // 2
-    weight, over = np.empty((count, 3)), 0.0  # of A_0, S_0 and S_1 in A_1; sum of g
+    weight, over = np.empty((count, 3)), 0.0  # weights of A_0, S_0 and S_1 in A_1; sum of g
     for b in range(count):
         g = par[2 * b]
         keep, phi = _decay(elapsed_s, par[2 * b + 1])
@@ -85,9 +88,12 @@ def relax_derivatives(
     time_s, elapsed_s, par, data, deformation, pressure, gradient,
     before, stress_f, stress_p, content_f, content_p, flux_f, flux_g,
 ):  # fmt: skip
-    """dP = (1 + left) dP_e - dF C, `left` = sum of g_b phi_b, C the part of A_1 that the past has left."""
+    """Changes the derivative to dP = (1 + left) dP_e - dF C, where `left` is the sum of g_b phi_b.
+
+    C is the part of A_1 that follows from the past.
+    """
     count, left = len(par) // 2, 0.0
-    weight = np.empty((count, 2))  # of A_0 and S_0 in A_1
+    weight = np.empty((count, 2))  # weights of A_0 and S_0 in A_1
     for b in range(count):
         g = par[2 * b]
         keep, phi = _decay(elapsed_s, par[2 * b + 1])

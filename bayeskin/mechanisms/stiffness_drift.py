@@ -1,15 +1,16 @@
-"""All moduli change slowly with time, as tissue dries, warms or swells: P_e f(t), in both layers.
+"""All moduli change slowly with time, as the tissue dries, warms or swells: P_e f(t), in both layers.
 
     f = 1 + r T (1 - exp(-t / T))
 
-with t from the start of the test, a straight 1 + r t for T -> infinity. The factor is on the elastic stress
-of all that is elastic, fibres too; branches of a viscous solid then relax what is left. The kernels know
-factors of several such pieces too, each with its own start t_0 and its factor f_0 there.
+Here t is the time since the start of the test. For T -> infinity the factor is the straight line 1 + r t. The
+factor multiplies the stress of everything that is elastic, fibres included. Branches of a viscous solid then
+relax the result. The kernels also accept factors of several such pieces, each with its own start t_0 and its
+factor f_0 at that time.
 
-Moduli do not vanish: a rate below -1 / T, with which they would, is refused, and where the factor would fall
-below `LEAST` it stays there, for a rate near -1 / T after some four to five times T.
+Moduli do not vanish. A rate below -1 / T would make them vanish and is refused. If the factor would fall
+below `LEAST`, it stays at `LEAST`. For a rate near -1 / T this happens after four to five times T.
 
-Range: chosen for this test, a change of up to a third in its 347 s.
+Range: chosen for this test; the moduli change by up to a third in its 347 s.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -29,12 +30,12 @@ from bayeskin.mechanisms.mechanism import Mechanism, Tissue
 from bayeskin.types import Parameter
 
 LEAST = 0.01
-Piece = tuple[float, float, float, float]  # start t_0 [s], factor f_0 and its rate r [1/s] there, T [s]
+Piece = tuple[float, float, float, float]  # t_0 [s], factor f_0 and rate r [1/s] at t_0, T [s]
 
 
 @compiled
 def factor_at(time_s, par):
-    """The factor; `par` holds the pieces one after the other, in the order of their starts."""
+    """Returns the factor at a time; `par` holds the pieces in the order of their starts."""
     place = 0
     while place + 4 < len(par) and par[place + 4] <= time_s:
         place += 4
@@ -63,7 +64,7 @@ def factored_derivatives(
     time_s, elapsed_s, par, data, deformation, pressure, gradient,
     before, stress_f, stress_p, content_f, content_p, flux_f, flux_g,
 ):  # fmt: skip
-    """dP = f dP_e - d(p J F^-T)."""
+    """Changes the derivative to dP = f dP_e - d(p J F^-T)."""
     factor, inverse = factor_at(time_s, par), np.empty((3, 3))
     for n in range(len(pressure)):
         j = inverse_and_determinant(deformation[n], inverse)
@@ -71,7 +72,7 @@ def factored_derivatives(
 
 
 def drifting(sites: Sites, pieces: Sequence[Piece]) -> TissueLaw:
-    """Returns the law of a factor of the test's time, in pieces that are in the order of their starts."""
+    """Returns the law of a factor that depends on time, given in pieces in the order of their starts."""
     return TissueLaw(
         rank=Rank.AGEING,
         par=np.array(pieces, dtype=float).ravel(),
@@ -82,12 +83,12 @@ def drifting(sites: Sites, pieces: Sequence[Piece]) -> TissueLaw:
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
-    """Returns the law of `stiffness_rate`.
+    """Returns the tissue law for `stiffness_rate` and `stiffness_time`.
 
     Raises InputError for a rate with which the moduli would vanish.
     """
     rate, time_s = values["stiffness_rate"], values["stiffness_time"]
-    if 1.0 + rate * time_s < -LEAST:  # bounds of the prior may be passed by a difference quotient's step
+    if 1.0 + rate * time_s < -LEAST:  # a step of a finite difference may pass the prior's bounds
         expected = f"at least {-1.0 / time_s:g} 1/s with a time constant of {time_s:g} s: moduli would vanish"
         raise InputError("parameters: stiffness_rate", f"{rate:g}", expected)
     return drifting(sites, [(0.0, 1.0, rate, time_s)])

@@ -1,6 +1,6 @@
-"""Permeability that follows the volume: k = k0 exp(M (J - 1)) in both layers.
+"""The permeability changes with the volume: k = k0 exp(M (J - 1)) in both layers.
 
-Form: Lai & Mow, Biorheology 17 (1980), 111-123; J - 1 is of order 0.01 in this test.
+The form is from Lai & Mow, Biorheology 17 (1980), 111-123. J - 1 is of order 0.01 in this test.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -22,7 +22,7 @@ from bayeskin.types import Parameter
 def scale(
     time_s, elapsed_s, par, data, deformation, pressure, gradient, before, after, stress, content, flux
 ):  # fmt: skip
-    """Multiplies the flux by k / k0; `par` holds M."""
+    """Multiplies the flux by k / k0. `par` holds M."""
     inverse = np.empty((3, 3))
     for n in range(len(pressure)):
         j = inverse_and_determinant(deformation[n], inverse)
@@ -36,7 +36,7 @@ def scale_derivatives(
     time_s, elapsed_s, par, data, deformation, pressure, gradient,
     before, stress_f, stress_p, content_f, content_p, flux_f, flux_g,
 ):  # fmt: skip
-    """d(f Q) = f dQ + f M J tr(F^-1 dF) Q, with Q = dQ/dg g."""
+    """Changes the derivatives to d(f Q) = f dQ + f M J tr(F^-1 dF) Q, with f = k / k0 and Q = dQ/dg g."""
     exponent, inverse = par[0], np.empty((3, 3))
     for point in range(len(pressure)):
         j = inverse_and_determinant(deformation[point], inverse)
@@ -54,7 +54,7 @@ def scale_derivatives(
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
-    """Returns the law of `M_k`."""
+    """Returns the tissue law for `M_k`."""
     exponent = np.array([values["M_k"]])
     return TissueLaw(par=exponent, data=sites.table(), respond=scale, linearise=scale_derivatives)
 

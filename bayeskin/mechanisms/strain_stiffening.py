@@ -1,15 +1,15 @@
-"""Collagen recruits: fibres along x in the cutis that only pull, stiffer the further they are stretched.
+"""Collagen fibres are recruited: fibres along x in the cutis act in tension only and stiffen with stretch.
 
-The law is that of `fibres`; a dispersion of 1/3 makes it an isotropic Fung form. Its k1 follows from their
-second Piola-Kirchhoff stress S along x in a skin that is a quarter longer and, at the same volume, narrows
-and thins alike: with the stretch l = 1.25 and the dispersion kappa
+The law is that of `fibres`; a dispersion of 1/3 makes it an isotropic Fung form. Its k1 follows from the
+second Piola-Kirchhoff stress S of the fibres along x in a skin that is a quarter longer. At constant volume
+this skin narrows and thins equally. With the stretch l = 1.25 and the dispersion kappa,
 
     E = kappa (l^2 + 2 / l - 3) + (1 - 3 kappa) (l^2 - 1) ,   S = 2 (1 - 2 kappa) k1 E exp(k2 E^2) ,
 
-about what a test of a skin sees, so that k2 and kappa bend the curve and do not lift it.
+This is about the stretch of a skin in a test, so that k2 and kappa bend the curve without raising it.
 
-Range of S: k1 up to 1e6 Pa; slopes of 1 to 83 MPa in excised skin, taut: Annaidh et al., J. Mech. Behav.
-Biomed. Mater. 5 (2012), 139-148. A k2 above 50 locks at the strains beside the pads.
+Range of S: up to 1e6 Pa. Taut excised skin has slopes of 1 to 83 MPa (Annaidh et al., J. Mech. Behav.
+Biomed. Mater. 5 (2012), 139-148). Fibres with a k2 above 50 lock at the strains beside the pads.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ STRETCH = 1.25
 
 
 def first_modulus(values: Mapping[str, float]) -> float:
-    """Returns k1 [Pa] that the fibre stress S, k2 and the dispersion make."""
+    """Returns the k1 [Pa] that follows from the fibre stress S, k2 and the dispersion."""
     kappa = values["dispersion"]
     strain = kappa * (STRETCH**2 + 2.0 / STRETCH - 3.0) + (1.0 - 3.0 * kappa) * (STRETCH**2 - 1.0)
     slope = 2.0 * (1.0 - 2.0 * kappa) * strain * float(np.exp(values["k2"] * strain**2))
@@ -37,7 +37,7 @@ def first_modulus(values: Mapping[str, float]) -> float:
 
 
 def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
-    """Returns fibres along x in the cutis."""
+    """Returns the law of fibres along x in the cutis."""
     k1 = np.where(sites.cutis, first_modulus(values), 0.0)
     return fibres(sites, np.array([1.0, 0.0, 0.0]), k1, values["k2"], values["dispersion"])
 

@@ -1,4 +1,4 @@
-"""Drag of the drive proportional to its speed: F + c du/dt."""
+"""The drive has a drag proportional to its speed: the reported force is F + c du/dt."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from bayeskin.types import Array, PadMotion, Parameter
 
 
 def speed_of(motion: PadMotion, time_s: Array) -> Array:
-    """Speed of the LVDT [m/s] at times of any shape; at a corner that of the stretch which begins there."""
+    """Returns the speed of the LVDT [m/s] at times of any shape.
+
+    At a corner it is the speed of the stretch that begins there.
+    """
     speed = np.append(np.diff(motion.displacement_m) / np.diff(motion.time_s), 0.0)
     stretch = np.searchsorted(motion.time_s, time_s, side="right") - 1
     return np.asarray(np.where(stretch >= 0, speed[stretch], 0.0))
 
 
 def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTime:
-    """Adds c du/dt."""
+    """Adds c du/dt to the force."""
     return added(force, lambda time_s: values["drag"][:, None] * speed_of(motion, time_s))
 
 

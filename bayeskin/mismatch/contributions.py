@@ -29,17 +29,17 @@ class Contribution:
         return float(np.sqrt(np.mean(self.force_n**2)))
 
 
-Force = Callable[[tuple[Sequence[str], Mapping[str, float]]], Array | str]  # of a set at values: (m,)
+Force = Callable[[Sequence[str], Mapping[str, float]], Array | str]  # of a set at values: (m,)
 
 
 def contributions(
     names: Sequence[str], theta: Mapping[str, float], force: Force, known: Mapping[str, Mechanism]
 ) -> list[Contribution]:
     """Of each mechanism of a set at its values, the largest first; none where a force cannot be had."""
-    whole, parts = force((names, theta)), []
+    whole, parts = force(names, theta), []
     for name in names:
         rest = without_one(names, name, known)
-        without = force((rest, theta))
+        without = force(rest, theta)
         if not isinstance(whole, str) and not isinstance(without, str):
             along = tuple(other for other in names if other not in (name, *rest))
             parts.append(Contribution(name, along, whole - without))

@@ -1,6 +1,7 @@
-"""The proof: recordings in which an effect is concealed, and what a diagnosis of them is worth.
+"""Validates the diagnosis on simulated recordings in which effects are concealed.
 
-Nothing that diagnoses imports this package, and it imports nothing that diagnoses.
+The package makes these recordings with sealed keys, and scores the diagnoses of them against the keys. No
+module that diagnoses imports this package, and this package imports no module that diagnoses.
 """
 
 from bayeskin.proof.conceal import conceal

@@ -1,6 +1,7 @@
-"""Makes a set: each case in the full model, on another mesh and time grid than the surrogates', with noise.
+"""Makes a set of recordings: simulates each case with the full model and adds noise.
 
-A recording that is finished is not made again. Where the full model fails at a case, its plan is drawn anew.
+The mesh and the time steps differ from those of the surrogates. A recording that is finished is not made
+again. If the full model fails for a case, another case is drawn from its plan.
 """
 
 from __future__ import annotations
@@ -33,17 +34,17 @@ from bayeskin.proof.protocol import EDGES_S, MOTION, samples_s
 from bayeskin.proof.refit_residual import rms, windows
 from bayeskin.types import Array, Recording, Simulation
 
-# Lines of the bricks [mm]: more of them, and graded otherwise, than those of the shipped surrogates' model.
+# Grid lines of the bricks [mm]: more than in the model of the shipped surrogates, and graded differently.
 _X_MM = (0.0, 9.0, 16.0, 18.0, 19.0, 22.0, 25.0, 26.0, 27.0, 28.0, 31.0, 34.0, 35.0, 37.0, 43.0, 58.0, 105.0)
 _Y_MM = (0.0, 2.5, 4.0, 5.0, 6.5, 10.0, 12.0, 15.0, 24.0, 45.0, 84.0)
-_DEEP, _OUTER = 0.5, 0.65  # subcutis divided in the middle, cutis nearer to its surface
-TOLERANCE = 5e-4  # of a step; the surrogates' runs have twice that
+_DEEP, _OUTER = 0.5, 0.65  # the subcutis is divided in its middle, the cutis nearer to its surface
+TOLERANCE = 5e-4  # error tolerance of a time step; the surrogates' runs have twice this tolerance
 ATTEMPTS = 8
 LVDT_STEP_M, CELL_STEP_N = 1e-5, 2.0**-13
 
-TWO_AT_ONCE = local(2)  # processes, of which each needs some 1.5 GB
+TWO_AT_ONCE = local(2)  # two processes; each needs about 1.5 GB
 
-Run = Callable[[Case, Sequence[str], Change], Simulation]  # with the mechanisms named, and the change
+Run = Callable[[Case, Sequence[str], Change], Simulation]  # a run with the mechanisms named, and a change
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,12 @@ class Concealed:
     key: Mapping[str, Any]
 
 
-Made = Concealed | tuple[str, str, str]  # or where, what was found and expected instead
+Made = Concealed | tuple[str, str, str]  # or the texts of an InputError: where, found, expected
 
 
 @lru_cache(maxsize=3)
 def problem_of(tetrahedra: bool, geometry: Geometry) -> Problem:
-    """Builds the test on the proof's own mesh, for the article's device."""
+    """Builds the boundary-value problem of a test with the article's device, on the proof's own mesh."""
     bottom, height = 1e3 * geometry.subcutis_m, 1e3 * geometry.thickness_m
     z = (0.0, _DEEP * bottom, bottom, bottom + _OUTER * (height - bottom), height)
     lines = [1e-3 * np.array(axis) for axis in (_X_MM, _Y_MM, z)]
@@ -67,7 +68,7 @@ def problem_of(tetrahedra: bool, geometry: Geometry) -> Problem:
 
 
 def full_run(case: Case, names: Sequence[str], change: Change) -> Simulation:
-    """The full model with the mechanisms `names` and a change."""
+    """Runs the full model with the mechanisms `names` and a change."""
     known = catalogue()
     problem, lengths = problem_of(case.plan.tetrahedra, change.geometry), change.geometry
     corners = problem.mesh.geometry.p[:, problem.mesh.geometry.t]
@@ -75,13 +76,16 @@ def full_run(case: Case, names: Sequence[str], change: Change) -> Simulation:
     solid = change.solid(
         material(case.theta, problem.mesh.cutis, change.constants), height / lengths.subcutis_m
     )
-    along = {p.name: case.values[p.name] for name in names for p in known[name].parameters}
+    values = {p.name: case.values[p.name] for name in names for p in known[name].parameters}
     binds = [*laws([known[name] for name in names]), *change.laws]
-    return simulate_on(problem, solid, TOLERANCE, change.moved(MOTION), {**case.theta, **along}, binds)
+    return simulate_on(problem, solid, TOLERANCE, change.moved(MOTION), {**case.theta, **values}, binds)
 
 
 def made_of(plan: Plan) -> Made:
-    """`concealed` by the full model and the shipped surrogates, in a process of its own."""
+    """Returns `concealed` by the full model and the shipped surrogates, or the texts of an InputError.
+
+    A worker process calls this function.
+    """
     try:
         return concealed(plan, shipped_screen(), full_run)
     except InputError as error:
@@ -97,24 +101,26 @@ def conceal(
     make: Callable[[Plan], Made] = made_of,
     run_all: Map = TWO_AT_ONCE,
 ) -> int:
-    """Makes what is missing of a set of `count` recordings; returns how many it made.
+    """Makes the missing recordings of a set of `count`, and returns how many it made.
 
-    only : see `plans`; tell : called with the share that is done and a note; run_all maps `make` over plans.
-    Raises InputError for a set of another making, for what `plans` does not know, or where the full model
-    fails at every attempt.
+    only : see `plans`
+    tell : called with the share that is done and a note
+    run_all : maps `make` over plans
+    Raises InputError if the folder holds a set with other settings, if `plans` does not know a name, or if
+    the full model fails at every attempt.
     """
     wanted = plans(seed, count, only)
-    _agree(folder, seed, count, only)
+    _start_or_check(folder, seed, count, only)
     numbers = [f"{place + 1:03d}" for place in range(count)]
     missing = [place for place, number in enumerate(numbers) if not _finished(folder, number)]
     made = 0
     with closing(run_all(make, [wanted[place] for place in missing])) as results:
-        for index, one in results:
-            if isinstance(one, Lost):
-                raise InputError("proof", one.reason, "a worker process that lives")
-            if not isinstance(one, Concealed):
-                raise InputError(*one)
-            _write(folder, numbers[missing[index]], one)
+        for index, result in results:
+            if isinstance(result, Lost):
+                raise InputError("proof", result.reason, "a worker process that lives")
+            if not isinstance(result, Concealed):
+                raise InputError(*result)
+            _write(folder, numbers[missing[index]], result)
             made += 1
             done = count - len(missing) + made
             tell(done / count, f"{done} of {count}")
@@ -122,28 +128,32 @@ def conceal(
 
 
 def concealed(plan: Plan, screen: Screen, run: Run = full_run) -> Concealed:
-    """One plan's recording and key; drawn anew where the full model fails."""
+    """Returns the recording and the key of one plan.
+
+    If the full model fails, another case of the plan is drawn.
+    Raises InputError if it fails at every attempt.
+    """
     for attempt in range(ATTEMPTS):
         case = draw(plan, attempt, screen)
-        runs = _Runs(case, run)
+        runs = _FullRuns(case, run)
         if runs.ok:
-            return _recorded(case, runs, screen, attempt)
+            return _recording_and_key(case, runs, screen, attempt)
     raise InputError(
         f"proof: {plan.label}", f"{ATTEMPTS} runs of the full model that failed", "one that ends"
     )
 
 
-class _Runs:
-    """The full runs that a case needs, each made once: with and without what the model solves along."""
+class _FullRuns:
+    """The full runs that a case needs, each made once: with and without mechanisms that the model solves."""
 
     def __init__(self, case: Case, run: Run) -> None:
         known = catalogue()
         self._case, self._known = case, known
         self._change = OUTSIDE[case.plan.outside].change(case.strength) if case.plan.outside else Change()
         solved = [n for n in case.plan.mechanisms if known[n].act.bind is not None]
-        same = not solved and self._change.of_force_alone
+        runs_as_base = not solved and self._change.of_force_alone
         self._base = run(case, (), Change())
-        self._solved = self._base if same else run(case, solved, self._change)
+        self._solved = self._base if runs_as_base else run(case, solved, self._change)
 
     @property
     def ok(self) -> bool:
@@ -152,10 +162,13 @@ class _Runs:
     @property
     def seconds(self) -> float:
         different = [self._base] if self._solved is self._base else [self._base, self._solved]
-        return float(sum(one.stats.get("seconds", 0.0) for one in different))
+        return float(sum(simulation.stats.get("seconds", 0.0) for simulation in different))
 
     def force(self, names: Sequence[str], changed: bool) -> ForceOfTime:
-        """Noise-free, with the mechanisms `names` and, if `changed`, with what is outside."""
+        """Returns the force without noise, with the mechanisms `names`.
+
+        changed : whether it also has the effect outside the catalogue
+        """
         solved = [n for n in names if self._known[n].act.bind is not None]
         simulation = self._solved if solved or changed else self._base
         adding = [self._known[n] for n in names if n not in solved]
@@ -164,7 +177,7 @@ class _Runs:
         return self._change.reported(force) if changed else force
 
 
-def _recorded(case: Case, runs: _Runs, screen: Screen, attempt: int) -> Concealed:
+def _recording_and_key(case: Case, runs: _FullRuns, screen: Screen, attempt: int) -> Concealed:
     plan = case.plan
     force = runs.force(plan.mechanisms, bool(plan.outside))
     time_s = samples_s()
@@ -182,23 +195,23 @@ def _recorded(case: Case, runs: _Runs, screen: Screen, attempt: int) -> Conceale
     return Concealed(recording, _key(case, runs, screen, attempt, float(np.abs(force_n).max())))
 
 
-def _key(case: Case, runs: _Runs, screen: Screen, attempt: int, peak_n: float) -> dict[str, Any]:
-    """All that a score needs, and what remakes the case."""
+def _key(case: Case, runs: _FullRuns, screen: Screen, attempt: int, peak_n: float) -> dict[str, Any]:
+    """Returns everything that a score needs, and everything that is needed to make the case again."""
     plan, refit = case.plan, screen.refit
     theta = np.array([case.theta[name] for name in refit.surrogate.space.names])
 
     def means(names: Sequence[str], changed: bool) -> Array:
-        made_by = [screen.known[name] for name in names]
-        return bin_means(runs.force(names, changed), MOTION, EDGES_S, made_by)[0]
+        mechanisms = [screen.known[name] for name in names]
+        return bin_means(runs.force(names, changed), MOTION, EDGES_S, mechanisms)[0]
 
     whole, base = means(plan.mechanisms, bool(plan.outside)), means((), False)
     expected = refit.force(theta[None])[0]
 
-    def left(with_n: Array, without_n: Array) -> Array:
-        """Of an effect, when the base model is fitted again to its own force and the effect's."""
+    def remains(with_n: Array, without_n: Array) -> Array:
+        """Returns what remains of an effect after the base model is fitted to its force plus the effect."""
         return refit.residual(expected + with_n - without_n, theta)
 
-    remaining = left(whole, base)
+    remaining = remains(whole, base)
     size_n = float(rms(remaining))
     others = {name: [n for n in plan.mechanisms if n != name] for name in plan.mechanisms}
     return {
@@ -212,7 +225,7 @@ def _key(case: Case, runs: _Runs, screen: Screen, attempt: int, peak_n: float) -
         "floor_n": case.floor_n,
         "size_n": size_n,
         "size": size_n / case.floor_n,
-        "sizes": {name: float(rms(left(whole, means(rest, False)))) for name, rest in others.items()},
+        "sizes": {name: float(rms(remains(whole, means(kept, False)))) for name, kept in others.items()},
         "effect_n": float(rms(whole - base)),
         "target": case.target,
         "windows": windows(remaining, case.floor_n, EDGES_S),
@@ -227,22 +240,22 @@ def _key(case: Case, runs: _Runs, screen: Screen, attempt: int, peak_n: float) -
     }
 
 
-def _agree(folder: Path, seed: int, count: int, only: Sequence[str]) -> None:
-    """Raises InputError where the folder holds another set."""
+def _start_or_check(folder: Path, seed: int, count: int, only: Sequence[str]) -> None:
+    """Starts a set in a folder without one. Raises InputError if the folder holds another set."""
     path = folder / seals.SEALS / seals.SET
-    ours: dict[str, Any] = {"seed": seed, "count": count, **({"only": list(only)} if only else {})}
+    settings: dict[str, Any] = {"seed": seed, "count": count, **({"only": list(only)} if only else {})}
     if not path.is_file():
         if (folder / seals.INDEX).is_file() and seals.read_index(folder):
             raise InputError(folder, "a set without its seals", "a folder of its own for a new set")
         seals.write_json(folder / seals.INDEX, {"recordings": {}})
-        seals.write_json(path, ours)
-    elif (found := seals.read_json(path)) != ours:
-        raise InputError(folder, f"a set of another making than {ours}: {found}", "another folder")
+        seals.write_json(path, settings)
+    elif (stored := seals.read_json(path)) != settings:
+        raise InputError(folder, f"a set of another making than {settings}: {stored}", "another folder")
 
 
 def _finished(folder: Path, number: str) -> bool:
-    said = seals.read_index(folder).get(number)
-    return said is not None and said == _hashes(folder, number)
+    indexed = seals.read_index(folder).get(number)
+    return indexed is not None and indexed == _hashes(folder, number)
 
 
 def _hashes(folder: Path, number: str) -> dict[str, str]:

@@ -1,7 +1,8 @@
-"""Noise like that of a real load cell on skin: white, correlated, and one-sided spikes.
+"""Draws noise like that of a real load cell on skin: white noise, correlated noise and one-sided spikes.
 
-Its make-up follows the article's recording, in round numbers: quiet rests, in holds as much noise
-correlated over half a second as white, in ramps white noise of the drive; upward spikes, most in holds.
+Its composition follows the article's recording, in round numbers. Rests are quiet. Holds have as much noise
+that is correlated over half a second as white noise. Ramps have white noise of the drive. Spikes are upward,
+and most of them are in holds.
 """
 
 from __future__ import annotations
@@ -12,22 +13,27 @@ from scipy.signal import lfilter
 from bayeskin.proof.protocol import EDGES_S, KINDS, RATE_HZ, kind_at
 from bayeskin.types import Array
 
-WHITE = {"rest": 1.0, "hold": 1.8, "load": 8.0, "unload": 6.0}  # sd at 20 Hz, each relative to the others
+WHITE = {"rest": 1.0, "hold": 1.8, "load": 8.0, "unload": 6.0}  # sd at 20 Hz, relative to each other
 SLOW = {"rest": 0.1, "hold": 1.9, "load": 0.3, "unload": 0.3}
 SLOW_S = 0.55
 SPIKES_PER_S = {"rest": 0.02, "hold": 0.25, "load": 0.1, "unload": 0.01}
-SPIKE_LEAST, SPIKE_MORE = 6.0, 8.0  # of the floor: the smallest, and the mean of what comes on top
-FLOORS_N = (1.5e-3, 2.5e-3)  # between which a recording's floor is drawn
+SPIKE_LEAST, SPIKE_MORE = 6.0, 8.0  # in multiples of the floor: the least height, and the mean excess over it
+FLOORS_N = (1.5e-3, 2.5e-3)  # bounds between which a recording's floor is drawn
 
 
 def floor_after(floor_n: float, from_s: float) -> float:
-    """RMS of the noise of 0.5 s means [N] from a time on, where it is floor_n over the whole recording."""
+    """Returns the RMS of the noise of 0.5 s means [N] from a time on.
+
+    floor_n : this RMS over the whole recording [N]
+    """
     return floor_n * floor_unit(from_s) / floor_unit()
 
 
 def floor_unit(from_s: float = 0.0) -> float:
-    """RMS over the 0.5 s bins from a time on of the sd of their means, of noise with the sds of `WHITE` and
-    `SLOW`."""
+    """Returns the noise floor from a time on, for noise with the sds of `WHITE` and `SLOW`.
+
+    It is the RMS, over the 0.5 s bins, of the sd of their means.
+    """
     middle = 0.5 * (EDGES_S[1:] + EDGES_S[:-1])
     middle = middle[middle > from_s]
     count = round((EDGES_S[1] - EDGES_S[0]) * RATE_HZ)
@@ -38,7 +44,10 @@ def floor_unit(from_s: float = 0.0) -> float:
 
 
 def noise(rng: np.random.Generator, time_s: Array, floor_n: float) -> Array:
-    """Noise (n,) [N] at samples time_s (n,), spikes included, whose 0.5 s means have the RMS floor_n."""
+    """Returns noise (n,) [N] at samples time_s (n,), spikes included.
+
+    Without spikes, the 0.5 s means of the noise have the RMS floor_n.
+    """
     scale, n = floor_n / floor_unit(), len(time_s)
     keep = np.exp(-1.0 / (RATE_HZ * SLOW_S))
     start = round(20 * SLOW_S * RATE_HZ)

@@ -1,10 +1,10 @@
-"""Effects that no mechanism of the catalogue was when the sets were made, from the full model.
+"""Effects that were not in the catalogue of mechanisms when the sets were made, simulated by the full model.
 
-They are for the proof alone. Poisson's ratios, moduli that change evenly or within a minute, breathing, a
-bent cell, a slow amplifier and a plastic set are in the catalogue since, the last in another form.
+They serve the proof only. Some of them have entered the catalogue since: Poisson's ratios, moduli that change
+evenly or within a minute, breathing, a bent load cell, a slow amplifier and, in another form, a plastic set.
 
-Each has one strength, drawn log-uniformly between two bounds, and says what it changes: constants or layers
-of the skin, the arm, the solid's law over time or strain, the motion that the skin sees, or the force.
+Each effect has one strength, drawn log-uniformly between two bounds. An effect changes constants or layers of
+the skin, the arm, the solid's law over time or strain, the motion that the skin sees, or the force.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -29,7 +29,7 @@ from bayeskin.proof.protocol import MOTION
 from bayeskin.types import Array, PadMotion
 
 END_S = float(MOTION.time_s[-1])
-LOWEST_LAYER = 0.5  # of the subcutis' thickness
+LOWEST_LAYER = 0.5  # share of the subcutis' thickness
 
 
 def _as_it_is(value: Any) -> Any:
@@ -38,9 +38,13 @@ def _as_it_is(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Change:
-    """What the full model is run with instead.
+    """The changes with which the full model is run.
 
-    deep : factor on the moduli of the subcutis' lower half; reported : what becomes of the force
+    constants, geometry : replace those of the base model
+    deep : factor on the moduli of the subcutis' lower half
+    laws : tissue laws that are added
+    moved : returns the motion that the skin sees, from the protocol
+    reported : returns the force that is reported, from the force of the skin
     """
 
     constants: Constants = Constants()  # noqa: RUF009 - frozen
@@ -52,18 +56,21 @@ class Change:
 
     @property
     def of_force_alone(self) -> bool:
-        """Whether the full model runs as it is."""
+        """Returns whether only the reported force changes, so that the full model runs unchanged."""
         return replace(self, reported=_as_it_is) == Change()
 
     def solid(self, base: Material, depth: Array) -> Material:
-        """Constants of the cells (e,), whose middles lie at `depth`, as shares of the subcutis' height."""
+        """Returns the changed constants of the cells (e,).
+
+        depth (e,) : height of each cell's middle above the bottom, as a share of the subcutis' thickness
+        """
         factor = np.where(depth < LOWEST_LAYER, self.deep, 1.0)
         return replace(base, mu=factor * base.mu, lam=factor * base.lam)
 
 
 @dataclass(frozen=True)
 class Outside:
-    """One effect: what it is, the bounds of its strength, and the change that a strength makes."""
+    """One effect: its description, the bounds of its strength, and the change for a given strength."""
 
     sentence: str
     strengths: tuple[float, float]
@@ -74,7 +81,7 @@ class Outside:
 def softened(
     time_s, elapsed_s, par, data, deformation, pressure, gradient, before, after, stress, content, flux
 ):  # fmt: skip
-    """Divides the elastic part of the stress by 1 + a (tr C - 3); `par` holds the loss a."""
+    """Divides the elastic part of the stress by 1 + a (tr C - 3). `par` holds the loss a."""
     inverse, elastic = np.empty((3, 3)), np.empty((3, 3))
     for n in range(len(pressure)):
         f = deformation[n]
@@ -90,7 +97,10 @@ def softened_derivatives(
     time_s, elapsed_s, par, data, deformation, pressure, gradient,
     before, stress_f, stress_p, content_f, content_p, flux_f, flux_g,
 ):  # fmt: skip
-    """dP = (1 / b) dP_e - (2 a / b^2) (P_e (x) F) : dF, b = 1 + a (tr C - 3); `data` holds mu and lambda."""
+    """Changes the derivative to dP = (1 / b) dP_e - (2 a / b^2) (P_e (x) F) : dF.
+
+    Here b = 1 + a (tr C - 3). `data` holds mu and lambda.
+    """
     loss, inverse = par[0], np.empty((3, 3))
     for point in range(len(pressure)):
         f, mu, lam = deformation[point], data[point, 0], data[point, 1]
@@ -110,7 +120,7 @@ def softened_derivatives(
 
 
 def ageing(pieces: Sequence[Piece]) -> Change:
-    """Returns moduli that follow a factor of the time, in pieces (`stiffness_drift`)."""
+    """Returns a change: the moduli follow a factor of time, given in pieces (`stiffness_drift`)."""
 
     def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
         return drifting(sites, pieces)
@@ -119,7 +129,7 @@ def ageing(pieces: Sequence[Piece]) -> Change:
 
 
 def softening(loss: float) -> Change:
-    """Returns a solid that yields ever more easily the further it is stretched; loss a [-]."""
+    """Returns a change: the solid loses stiffness the further it is stretched. `loss` is a [-]."""
 
     def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
         solid = material(values, sites.cutis)
@@ -133,11 +143,11 @@ def softening(loss: float) -> Change:
     return Change(laws=(bind,))
 
 
-SETTING_S, LOOSENING_S = 15.0, 3.0  # a tissue that loosens while it is moved, and sets while it stands
+SETTING_S, LOOSENING_S = 15.0, 3.0  # time constants of a tissue that loosens while it moves
 
 
 def thixotropy(loss: float) -> Change:
-    """Returns moduli less a share that grows while the drive moves and vanishes while it stands."""
+    """Returns a change: the moduli lose a share that grows while the drive moves and vanishes at rest."""
     moving = np.diff(MOTION.displacement_m) != 0.0
     loose, pieces = 0.0, []
     for moves, start_s, lasts_s in zip(moving, MOTION.time_s[:-1], np.diff(MOTION.time_s), strict=True):
@@ -151,7 +161,10 @@ YIELD_M = 4e-3
 
 
 def plastic_set(share: float) -> Change:
-    """The skin keeps a share of the farthest displacement beyond a yield point, for good."""
+    """Returns a change: the skin keeps a share of the farthest displacement beyond a yield point.
+
+    The kept share does not return.
+    """
 
     def moved(motion: PadMotion) -> PadMotion:
         first = int(np.argmax(motion.displacement_m > YIELD_M))
@@ -165,7 +178,10 @@ def plastic_set(share: float) -> Change:
 
 
 def peeling(share: float) -> Change:
-    """From the third cycle on the pads' edges have come off: the skin sees a share less."""
+    """Returns a change: from the third cycle on, the pads' edges have come off.
+
+    The displacement that the skin sees is then smaller by a share.
+    """
     third = int(np.flatnonzero(np.diff(np.sign(np.diff(MOTION.displacement_m))) > 1)[1]) + 1
 
     def moved(motion: PadMotion) -> PadMotion:
@@ -176,7 +192,7 @@ def peeling(share: float) -> Change:
 
 
 def scaled(factor: Callable[[Array, Array], Array]) -> Change:
-    """The force times a factor of time and force."""
+    """Returns a change: the force is multiplied by a factor of time and force."""
 
     def reported(force: ForceOfTime) -> ForceOfTime:
         return lambda time_s: force(time_s) * factor(np.asarray(time_s), force(time_s))
@@ -189,7 +205,7 @@ TWITCHES_S, TWITCH_S = (120.0, 240.0), 4.0
 
 
 def twitching(size_n: float) -> Change:
-    """The muscle below pulls twice, for some seconds."""
+    """Returns a change: the muscle below the skin pulls twice, for some seconds each."""
 
     def pull(time_s: Array) -> Array:
         return size_n * np.sum([np.exp(-0.5 * ((time_s - at) / TWITCH_S) ** 2) for at in TWITCHES_S], axis=0)
@@ -201,7 +217,7 @@ GRID_S = 0.01
 
 
 def slow_amplifier(time_constant_s: float) -> Change:
-    """The force passes a low-pass of first order."""
+    """Returns a change: the force passes a first-order low-pass filter."""
     grid = np.arange(0.0, END_S + GRID_S, GRID_S)
     keep = float(np.exp(-GRID_S / time_constant_s))
 
@@ -220,7 +236,10 @@ FATIGUE_S = 60.0
 
 
 def _as_thick(cutis_m: float) -> Change:
-    """Another cutis [m], and so much more or less subcutis that both are as thick as the article's."""
+    """Returns a change: the cutis has another thickness [m].
+
+    Both layers together stay as thick as the article's.
+    """
     return Change(geometry=Geometry(cutis_m=cutis_m, subcutis_m=Geometry().thickness_m - cutis_m))
 
 

@@ -1,6 +1,6 @@
-"""The protocol of every concealed recording: that of the shipped surrogate `healthy-skin-reaction`.
+"""The protocol of every concealed recording, which is that of the shipped surrogate `healthy-skin-reaction`.
 
-Its corners are those of the article's recording, idealised: times rounded to 0.1 s and displacements to
+Its corners are those of the article's recording, idealised: times are rounded to 0.1 s and displacements to
 0.01 mm (Lavigne et al., "Poromechanical modelling of the time-dependent response of in vivo human skin
 during extension", supplement, data/Healthy_skin.xlsx).
 """
@@ -28,10 +28,10 @@ EDGES_S = uniform_edges(_CORNERS_S[-1])
 
 
 def samples_s() -> Array:
-    """Times of a recording's samples, (n,)."""
+    """Returns the times (n,) [s] of a recording's samples."""
     return np.asarray(np.arange(round(_CORNERS_S[-1] * RATE_HZ) + 1) / RATE_HZ)
 
 
 def kind_at(time_s: Array) -> np.ndarray:
-    """Index into `KINDS` of the phase at each time, same shape."""
+    """Returns the index into `KINDS` of the phase at each time, in the same shape."""
     return np.clip(np.searchsorted(MOTION.time_s, time_s, side="right") - 1, 0, len(KINDS) - 1)

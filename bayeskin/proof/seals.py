@@ -1,9 +1,9 @@
-"""A set's files: recordings in the open, keys under seal, and an index that shows if a key was changed.
+"""Reads and writes the files of a set: open recordings, sealed keys, and an index that reveals a changed key.
 
 FOLDER/index.json           sha256 of each recording and of its key
-FOLDER/recordings/001.h5    nothing in it tells what it conceals
-FOLDER/seals/001.json       the key; seals/set.json the seed
-FOLDER/verdicts/001.json    what a diagnosis said
+FOLDER/recordings/001.h5    a recording; nothing in the file tells which effect it conceals
+FOLDER/seals/001.json       its key; seals/set.json holds the seed
+FOLDER/verdicts/001.json    the verdict of a diagnosis
 FOLDER/scorings.json        each scoring of the whole set
 """
 
@@ -25,17 +25,17 @@ INDEX, SCORINGS, SET = "index.json", "scorings.json", "set.json"
 
 
 def sha256(path: Path) -> str:
-    """Of a file's bytes; empty where there is no such file."""
+    """Returns the hash of a file's bytes, or an empty text if there is no such file."""
     return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Whole or not at all. Raises InputError where it cannot be written."""
+    """Writes a file completely or not at all. Raises InputError if it cannot be written."""
     storage.write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: Path) -> Any:
-    """Raises InputError for a file that is absent or no JSON."""
+    """Returns the content of a JSON file. Raises InputError if the file is absent or is not JSON."""
     try:
         return json.loads(path.read_text())
     except OSError as error:
@@ -45,14 +45,17 @@ def read_json(path: Path) -> Any:
 
 
 def read_index(folder: Path) -> dict[str, dict[str, str]]:
-    """sha256 of recording and key by number ("001"); raises InputError where there is no set."""
-    said = read_json(folder / INDEX)
-    found = said.get("recordings") if isinstance(said, dict) else None
-    if not isinstance(found, dict) or not all(
-        isinstance(one, dict) and set(one) == {"recording_sha256", "key_sha256"} for one in found.values()
+    """Returns the sha256 of each recording and of its key, by number ("001").
+
+    Raises InputError if there is no set.
+    """
+    index = read_json(folder / INDEX)
+    hashes = index.get("recordings") if isinstance(index, dict) else None
+    if not isinstance(hashes, dict) or not all(
+        isinstance(pair, dict) and set(pair) == {"recording_sha256", "key_sha256"} for pair in hashes.values()
     ):
         raise InputError(folder / INDEX, "no index of a set", "hashes of recordings and keys, by number")
-    return dict(sorted(found.items()))
+    return dict(sorted(hashes.items()))
 
 
 def recording_path(folder: Path, number: str) -> Path:
@@ -60,12 +63,12 @@ def recording_path(folder: Path, number: str) -> Path:
 
 
 def read_keys(folder: Path) -> dict[str, Mapping[str, Any]]:
-    """The keys by number. Raises InputError for a recording or a key that is not what the index says."""
+    """Returns the keys by number. Raises InputError for a recording or a key that differs from the index."""
     keys = {}
-    for number, said in read_index(folder).items():
+    for number, hashes in read_index(folder).items():
         for path, expected in (
-            (recording_path(folder, number), said["recording_sha256"]),
-            (folder / SEALS / f"{number}.json", said["key_sha256"]),
+            (recording_path(folder, number), hashes["recording_sha256"]),
+            (folder / SEALS / f"{number}.json", hashes["key_sha256"]),
         ):
             if sha256(path) != expected:
                 raise InputError(path, "other contents than the index says", f"sha256 {expected[:12]}...")
@@ -74,5 +77,5 @@ def read_keys(folder: Path) -> dict[str, Mapping[str, Any]]:
 
 
 def closed(folder: Path) -> AbstractContextManager[None]:
-    """While it lasts, no process of this program can open a file under the set's seals (`off_limits`)."""
+    """Returns a context in which this program's processes cannot open the set's seals (`off_limits`)."""
     return off_limits(folder / SEALS)

@@ -1,4 +1,4 @@
-"""Recordings: read, cut into phases, their noise measured, binned, and turned into protocols."""
+"""Reads recordings, finds their phases, measures their noise, averages them in bins, and makes protocols."""
 
 from bayeskin.recordings.bins import bin_recording, covered_s, uniform_edges
 from bayeskin.recordings.describe import describe, describe_json

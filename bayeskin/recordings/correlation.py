@@ -1,13 +1,13 @@
-"""Correlation in time of a load cell's noise, where a slow force that is not noise lies under it.
+"""Estimates the correlation in time of a load cell's noise, which lies on top of a slowly varying force.
 
-The noise is taken as white plus a first-order autoregression,
+The model of the noise is white noise plus a first-order autoregression,
 
     gamma(h) = sd^2 [ w delta(h) + (1 - w) exp(-|h| / tau) ].
 
-Each window of a recording loses its best parabola, P = I - Q Q', which also takes some of the slow noise.
-So the averaged lagged products of the residuals are matched not to gamma but to what P leaves of it,
-tr(S_h P Gamma P), which is linear in the two amplitudes: they come from non-negative least squares, for
-each tau of a grid.
+The projection P = I - Q Q' subtracts the best-fitting parabola from each window of a recording. It also
+removes some of the slow noise. Therefore the averaged lagged products of the residuals are not matched to
+gamma, but to the part of gamma that P leaves, tr(S_h P Gamma P). This part is linear in the two amplitudes.
+Non-negative least squares gives the amplitudes for each tau of a grid.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from scipy.signal import correlate
 from bayeskin.types import Array, frozen_array
 
 _DEGREE = 2
-_GRID = 40  # correlation times tried, up to this share of a window:
-_LONGEST = 0.4
-_CHANCE = 9.0  # three standard deviations, squared
+_GRID = 40  # number of correlation times that are tried
+_LONGEST = 0.4  # longest correlation time that is tried, as a share of the window
+_CHANCE = 9.0  # square of three standard deviations
 
 
 @dataclass(frozen=True)
 class NoiseShape:
-    """Correlation of noise: the white share w of its variance, and the time tau [s] of the rest."""
+    """Correlation of noise: the white share w of the variance, and the time tau [s] of the other part."""
 
     white_share: float
     time_s: float
 
     def at(self, lag_s: ArrayLike) -> Array:
-        """Correlation at the lags [s] given, same shape."""
+        """Returns the correlation at the given lags [s], in the same shape."""
         lag = np.abs(np.asarray(lag_s, dtype=float))
         return self.white_share * (lag == 0) + (1 - self.white_share) * np.exp(-lag / self.time_s)
 
@@ -46,12 +46,12 @@ WHITE = NoiseShape(1.0, 1.0)
 
 
 def parabola_basis(size: int) -> Array:
-    """Orthonormal polynomials up to degree two on `size` samples, (size, 3)."""
+    """Returns orthonormal polynomials up to degree two on `size` samples, (size, 3)."""
     return np.linalg.qr(np.vander(np.linspace(-1, 1, size), _DEGREE + 1))[0]
 
 
 def residual_windows(values: Array, size: int) -> Array:
-    """Consecutive windows of values (n,) without their best parabola, (n // size, size)."""
+    """Returns consecutive windows of values (n,) without their best-fitting parabola, (n // size, size)."""
     count = len(values) // size
     offset = (len(values) - count * size) // 2
     windows = values[offset : offset + count * size].reshape(count, size)
@@ -60,14 +60,15 @@ def residual_windows(values: Array, size: int) -> Array:
 
 
 def lagged_products(windows: Array, kept: NDArray[np.bool_], lags: int) -> Array:
-    """Mean product of residuals at lags 0..lags-1, (lags,), over pairs of kept samples of windows (k, size).
+    """Returns the mean product (lags,) of residuals at lags 0..lags-1, over pairs of kept samples.
 
-    Windows with more than three times the usual variance are left out: no one event sets the correlation.
+    The windows and `kept` have shape (k, size). Windows with more than three times the median variance are
+    left out, so that no single event determines the correlation.
     """
     variance = np.mean(windows**2, axis=1)
-    usual = variance <= 3 * np.median(variance)
-    kept = kept[usual]
-    scaled = np.where(kept, windows[usual], 0.0)
+    typical = variance <= 3 * np.median(variance)
+    kept = kept[typical]
+    scaled = np.where(kept, windows[typical], 0.0)
     size = windows.shape[1]
     products = [np.sum(scaled[:, : size - h] * scaled[:, h:]) for h in range(lags)]
     pairs = [np.count_nonzero(kept[:, : size - h] & kept[:, h:]) for h in range(lags)]
@@ -75,29 +76,30 @@ def lagged_products(windows: Array, kept: NDArray[np.bool_], lags: int) -> Array
 
 
 def expected_products(correlation: Array, lags: int) -> Array:
-    """Mean of each diagonal of P Gamma P, (lags,), for a noise with correlation (size,)."""
+    """Returns the mean of each diagonal of P Gamma P, (lags,), for noise with a given correlation (size,)."""
     size = len(correlation)
     basis = parabola_basis(size)
-    carried = matmul_toeplitz(correlation, basis)
-    inner = basis @ (basis.T @ carried)
-    out = np.zeros(lags)
-    for q, g, i in zip(basis.T, carried.T, inner.T, strict=True):
+    correlated = matmul_toeplitz(correlation, basis)
+    inner = basis @ (basis.T @ correlated)
+    change = np.zeros(lags)
+    for q, g, i in zip(basis.T, correlated.T, inner.T, strict=True):
         cross = correlate(g, q)[size - 1 :] + correlate(q, g)[size - 1 :] - correlate(i, q)[size - 1 :]
-        out -= cross[:lags]
-    return correlation[:lags] + out / (size - np.arange(lags))
+        change -= cross[:lags]
+    return correlation[:lags] + change / (size - np.arange(lags))
 
 
 def fit_shape(correlogram: Array, samples: int, interval_s: float, size: int) -> NoiseShape:
-    """The noise whose expected products are nearest to those found.
+    """Returns the noise whose expected lagged products are nearest to the measured ones.
 
-    correlogram (lags,) are mean lagged products over that at lag 0, from `samples` samples in windows of
-    `size`. White unless a correlated part lowers the misfit by more than white noise would let it: the
-    estimates of white noise's correlations scatter with variance 1 / samples.
+    correlogram (lags,) contains the mean lagged products divided by the product at lag 0. They come from
+    `samples` samples in windows of `size`. The result is white noise unless a correlated part lowers the
+    misfit by more than chance allows under white noise. The estimated correlations of white noise scatter
+    with variance 1 / samples.
     """
     taus, dictionary = _dictionary(interval_s, size, len(correlogram))
     white = dictionary[0]
-    only = correlogram - white * float(white @ correlogram) / float(white @ white)
-    least, best = float(only @ only) - _CHANCE / samples, WHITE
+    remainder = correlogram - white * float(white @ correlogram) / float(white @ white)
+    least, best = float(remainder @ remainder) - _CHANCE / samples, WHITE
     for tau, slow in zip(taus, dictionary[1:], strict=True):
         amplitude, misfit = nnls(np.column_stack([white, slow]), correlogram)
         if misfit**2 < least:
@@ -107,7 +109,10 @@ def fit_shape(correlogram: Array, samples: int, interval_s: float, size: int) ->
 
 @lru_cache(maxsize=8)
 def _dictionary(interval_s: float, size: int, lags: int) -> tuple[Array, Array]:
-    """The correlation times tried (k,); the expected products of white noise and of each (k + 1, lags)."""
+    """Returns the correlation times that are tried, (k,), and the expected products (k + 1, lags).
+
+    The first row of the products belongs to white noise, the others belong to the correlation times.
+    """
     lag_s = interval_s * np.arange(size)
     taus = np.geomspace(interval_s, _LONGEST * size * interval_s, _GRID)
     correlations = [np.where(lag_s == 0, 1.0, 0.0), *(np.exp(-lag_s / tau) for tau in taus)]
@@ -116,12 +121,12 @@ def _dictionary(interval_s: float, size: int, lags: int) -> tuple[Array, Array]:
 
 
 def weighted_covariance(a: Array, b: Array, correlation: Array) -> float:
-    """Covariance of the sums a'x and b'x, weights (size,), for noise of unit variance."""
+    """Returns the covariance of the sums a'x and b'x for noise x of unit variance; weights a, b (size,)."""
     return float(a @ matmul_toeplitz(correlation[: len(a)], b))
 
 
 def effective_windows(shape: NoiseShape, interval_s: float, size: int) -> float:
-    """Degrees of freedom of one window's mean square: 2 / its relative variance."""
+    """Returns the degrees of freedom of one window's mean square: 2 divided by its relative variance."""
     rho = expected_products(shape.at(interval_s * np.arange(size)), size)
     weights = np.where(np.arange(size) == 0, 1.0, 2.0) * (1 - np.arange(size) / size)
     return float(size / np.sum(weights * (rho / rho[0]) ** 2))

@@ -1,4 +1,4 @@
-"""Description of a recording, as text for a reader and as plain values for a program."""
+"""Describes a recording, as text for a reader and as plain values for a program."""
 
 from __future__ import annotations
 
@@ -27,7 +27,11 @@ _WIDTHS = (7, 5, 9, 9, 16, 10, 9, 6, 5)
 
 
 def describe(recording: Recording, phases: Sequence[Phase], noise: Sequence[PhaseNoise]) -> str:
-    """Several lines: what was taken for what, sizes, one row a phase, and every step of the zero."""
+    """Returns the description of a recording as several lines of text.
+
+    The lines contain the notes on how the file was read, the ranges of displacement and force, one row for
+    each phase, and every step of the load cell's zero.
+    """
     facts = describe_json(recording, phases, noise)
     displacement, force = facts["displacement_m"], facts["force_n"]
     lines = [
@@ -52,7 +56,7 @@ def describe(recording: Recording, phases: Sequence[Phase], noise: Sequence[Phas
 def describe_json(
     recording: Recording, phases: Sequence[Phase], noise: Sequence[PhaseNoise]
 ) -> dict[str, Any]:
-    """The same as numbers, text, lists and mappings only, in SI."""
+    """Returns the content of `describe` in SI units, as numbers, text, lists and mappings only."""
     time_s, displacement_m, force_n = recording.time_s, recording.displacement_m, recording.force_n
     return {
         "name": recording.name,
@@ -68,7 +72,10 @@ def describe_json(
         },
         "force_n": {"min": float(force_n.min()), "max": float(force_n.max())},
         "cycles": max(phase.cycle for phase in phases),
-        "phases": [_phase_facts(recording, phase, own) for phase, own in zip(phases, noise, strict=True)],
+        "phases": [
+            _phase_facts(recording, phase, phase_noise)
+            for phase, phase_noise in zip(phases, noise, strict=True)
+        ],
     }
 
 

@@ -1,4 +1,4 @@
-"""Meaning of a recording's columns by their headers: time, displacement or force, and the unit."""
+"""Recognises the columns of a recording from their headers: time, displacement or force, and the unit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from bayeskin.errors import InputError
 
 QUANTITIES = ("time", "displacement", "force")
 
-# Factors to SI. Units are compared in lower case, so MN reads as mN: no skin test meets a meganewton.
+# These factors convert to SI. Units are compared in lower case, so MN is read as mN. No skin test reaches a
+# meganewton.
 UNITS: dict[str, dict[str, float]] = {
     "time": {"s": 1.0, "ms": 1e-3, "min": 60.0},
     "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6},
@@ -35,7 +36,7 @@ _WORDS = {
 
 @dataclass(frozen=True)
 class Column:
-    """One recognised column: where it stands, what it holds, its header and unit ("" if none is given)."""
+    """A recognised column: its index, quantity and header, and its unit ("" if the header gives none)."""
 
     index: int
     quantity: str
@@ -47,25 +48,26 @@ class Column:
         return self.unit == "" or self.unit in UNITS[self.quantity]
 
 
-def _fold(text: str) -> str:
-    """Lower case, accents removed, the two signs for micro made one."""
+def _without_accents(text: str) -> str:
+    """Returns the text in lower case, without accents, and with a single sign for micro."""
     plain = unicodedata.normalize("NFKD", text)
     return "".join(c for c in plain if not unicodedata.combining(c)).lower().strip()
 
 
 def parse_unit(text: str) -> str:
-    """The unit's one name ("mm" for "Millimètres"); the text itself where it is no unit known here."""
-    return _SPELLINGS.get(_fold(text).rstrip("."), text.strip())
+    """Returns the standard name of a unit ("mm" for "Millimètres"), or the text itself if it is unknown."""
+    return _SPELLINGS.get(_without_accents(text).rstrip("."), text.strip())
 
 
 def parse_header(index: int, header: str) -> Column | None:
-    """The column that a header announces, or None for a column that is not needed.
+    """Returns the column that a header describes, or None if the column is not needed.
 
-    The unit stands in brackets, or last after an underscore, blank, comma or slash (`time_s`, `Force N`).
+    The unit stands in brackets, or at the end after an underscore, blank, comma or slash (`time_s`,
+    `Force N`).
     """
     bracketed = re.search(r"[\[({<]([^\])}>]*)[\])}>]", header)
     name = header if bracketed is None else header[: bracketed.start()] + " " + header[bracketed.end() :]
-    words = [word for word in re.split(r"[^a-zμ]+", _fold(name)) if word]
+    words = [word for word in re.split(r"[^a-zμ]+", _without_accents(name)) if word]
     unit = parse_unit(bracketed.group(1)) if bracketed else ""
     if bracketed is None and len(words) > 1 and words[-1] in _SPELLINGS:
         unit = _SPELLINGS[words.pop()]
@@ -74,20 +76,21 @@ def parse_header(index: int, header: str) -> Column | None:
 
 
 def recognise(headers: Sequence[str]) -> list[Column]:
-    """All columns of a header row that could be time, displacement or force."""
-    found = (parse_header(index, header) for index, header in enumerate(headers))
-    return [column for column in found if column is not None]
+    """Returns all columns of a header row that could be time, displacement or force."""
+    columns = (parse_header(index, header) for index, header in enumerate(headers))
+    return [column for column in columns if column is not None]
 
 
 def is_header(headers: Sequence[str]) -> bool:
-    """Returns whether a row names at least two of the three quantities: then it is taken as the header."""
+    """Returns whether a row names at least two of the three quantities, which makes it the header."""
     return len({column.quantity for column in recognise(headers)}) >= 2
 
 
 def choose_columns(where: str, headers: Sequence[str]) -> dict[str, Column]:
-    """The one column of each quantity.
+    """Returns the column of each quantity.
 
-    A column whose unit is not one of its quantity ("Displacement rate (mm/s)") gives way to one whose is.
+    A column is ignored if its unit does not belong to its quantity ("Displacement rate (mm/s)") and another
+    column of this quantity has a suitable unit or none.
 
     Raises
     ------
@@ -100,12 +103,12 @@ def choose_columns(where: str, headers: Sequence[str]) -> dict[str, Column]:
         fitting = [c for c in named if c.has_unit_of_its_quantity]
         accepted = ", ".join(UNITS[quantity])
         if not named:
-            seen = ", ".join(repr(h.strip()) for h in headers if h.strip()) or "no header"
-            raise InputError(where, seen[:200], f"a {quantity} column in one of {accepted}")
+            listed = ", ".join(repr(h.strip()) for h in headers if h.strip()) or "no header"
+            raise InputError(where, listed[:200], f"a {quantity} column in one of {accepted}")
         if not fitting:
             raise InputError(where, f"column {named[0].header!r}", f"{quantity} in one of {accepted}")
         if len(fitting) > 1:
-            both = " and ".join(repr(c.header) for c in fitting)
-            raise InputError(where, f"{both}, each a {quantity} column", f"one {quantity} column")
+            candidates = " and ".join(repr(c.header) for c in fitting)
+            raise InputError(where, f"{candidates}, each a {quantity} column", f"one {quantity} column")
         chosen[quantity] = fitting[0]
     return chosen

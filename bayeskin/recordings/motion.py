@@ -1,4 +1,4 @@
-"""Protocols for the model from a recording's displacement: idealised, sampled, or followed closely."""
+"""Makes protocols for the model from a recording's displacement: idealised, sampled, or followed closely."""
 
 from __future__ import annotations
 
@@ -10,28 +10,29 @@ from bayeskin.recordings.polyline import simplify
 from bayeskin.recordings.segment import resolution_m
 from bayeskin.types import Array, PadMotion, Phase, Recording
 
-_ROUNDING_S = 0.1  # half width over which a drive rounds a corner: the extreme of a turning point lies within
-_CLEAR_S = 0.5  # left out at both ends of a still phase when its level is taken
+_ROUNDING_S = 0.1  # half width over which a drive rounds a corner; it contains a turning point's extreme
+_CLEAR_S = 0.5  # duration that is ignored at both ends of a still phase when its level is measured
 
 
 def corner_heights_m(recording: Recording, phases: Sequence[Phase]) -> Array:
-    """Displacement [m] (len(phases) + 1,) at the corners as the protocol meant it.
+    """Returns the displacement [m] (len(phases) + 1,) at the corners, as the protocol intended it.
 
-    The level of the still phase beside the corner, or between two moving ones the extreme reached.
+    Beside a still phase it is the level of that phase. Between a loading and an unloading it is the extreme
+    that the recording reaches. At all other corners it is the recorded displacement.
     """
     time_s, displacement_m = recording.time_s, recording.displacement_m
     heights = []
     for i in range(len(phases) + 1):
-        beside = [p for p in phases[max(i - 1, 0) : i + 1] if p.kind in ("rest", "hold")]
-        at = phases[i].start_s if i < len(phases) else phases[-1].end_s
-        if beside:
-            clear = min(_CLEAR_S, 0.2 * (beside[0].end_s - beside[0].start_s))
-            inside = (time_s >= beside[0].start_s + clear) & (time_s <= beside[0].end_s - clear)
+        still = [p for p in phases[max(i - 1, 0) : i + 1] if p.kind in ("rest", "hold")]
+        corner_s = phases[i].start_s if i < len(phases) else phases[-1].end_s
+        if still:
+            clear = min(_CLEAR_S, 0.2 * (still[0].end_s - still[0].start_s))
+            inside = (time_s >= still[0].start_s + clear) & (time_s <= still[0].end_s - clear)
             heights.append(float(np.median(displacement_m[inside])))
             continue
-        near = displacement_m[np.abs(time_s - at) <= _ROUNDING_S]
+        near = displacement_m[np.abs(time_s - corner_s) <= _ROUNDING_S]
         if i in (0, len(phases)) or phases[i - 1].kind == phases[i].kind:
-            heights.append(float(np.interp(at, time_s, displacement_m)))
+            heights.append(float(np.interp(corner_s, time_s, displacement_m)))
         else:
             heights.append(float(near.min() if phases[i].kind == "load" else near.max()))
     return np.array(heights)
@@ -40,9 +41,9 @@ def corner_heights_m(recording: Recording, phases: Sequence[Phase]) -> Array:
 def idealised_motion(
     recording: Recording, phases: Sequence[Phase], time_step_s: float = 0.1, height_step_m: float = 1e-5
 ) -> PadMotion:
-    """The protocol as straight lines between corners whose times and heights are rounded.
+    """Returns the protocol as straight lines between corners with rounded times and displacements.
 
-    The last corner is the recording's end, rounded up. Corners that rounding makes one are one.
+    The last corner is the recording's end, rounded up. Corners whose times become equal are merged.
     """
     times = [*(p.start_s for p in phases), phases[-1].end_s]
     ticks = np.rint(np.array(times) / time_step_s)
@@ -54,14 +55,15 @@ def idealised_motion(
 
 
 def motion_of(recording: Recording, every: int = 50) -> PadMotion:
-    """The recording's own displacement at every `every`-th sample (50: what the article's script used)."""
+    """Returns the recorded displacement at every `every`-th sample (the article's script used 50)."""
     return PadMotion(recording.time_s[::every], recording.displacement_m[::every])
 
 
 def recorded_motion(recording: Recording, phases: Sequence[Phase]) -> PadMotion:
-    """A polyline with knots at the corners that stays within twice the LVDT's resolution of every sample.
+    """Returns a polyline that stays within twice the LVDT's resolution of every sample.
 
-    At a corner, which the drive has rounded, it takes the displacement that was recorded there.
+    The polyline has knots at the corners. The drive rounds the corners, and the polyline takes the
+    displacement that was recorded there.
     """
     corners = np.array([p.start_s for p in phases[1:]])
     corners = corners[~np.isin(corners, recording.time_s)]

@@ -1,4 +1,4 @@
-"""Noise of a recording, phase by phase: its sd, its correlation, its spikes, its zero steps."""
+"""Measures the noise of a recording in each phase: sd, correlation, spikes, and steps of the zero."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from bayeskin.recordings.spikes import Despiked, despike
 from bayeskin.recordings.steps import Step, allowed_jumps, find_steps
 from bayeskin.types import Array, Jumps, Phase, PhaseKind, Recording, _FreezesArrays
 
-WINDOW_S = 2.5  # over which the force under the noise is a parabola
-_AFTER_BREAK_S = 1.0  # left out after a corner or step, where the force moves faster than that
+WINDOW_S = 2.5  # a parabola describes the force without noise over this time
+_AFTER_BREAK_S = 1.0  # time that is left out after a corner or step, where the force changes too fast
 _LAG_S = 1.0
 _LEAST_WINDOW = 20  # samples
 
@@ -33,10 +33,11 @@ _LEAST_WINDOW = 20  # samples
 class PhaseNoise(_FreezesArrays):
     """Noise of the force in one phase.
 
-    sd_n is that of the noise faster than about a second, spikes apart: a white part and one with
-    correlation time correlation_time_s (that one is pooled over all phases of the kind). A spike passes
-    spike_threshold_n from the running median; spikes_above of them are upward. step_times_s and
-    step_sizes_n (steps,) are shifts of the load cell's zero; their false-alarm rate is 1 % a recording.
+    `sd_n` is the sd of the noise that is faster than about a second, without spikes. It has a white part,
+    `white_sd_n`, and a correlated part, `correlated_sd_n`, with correlation time `correlation_time_s`. The
+    correlation time is pooled over all phases of the kind. A spike is farther than `spike_threshold_n` from
+    the running median. Of the `spikes`, `spikes_above` are upward. `step_times_s` and `step_sizes_n`
+    (steps,) describe shifts of the load cell's zero, with a false-alarm rate of 1 % per recording.
     """
 
     kind: PhaseKind
@@ -56,14 +57,14 @@ class PhaseNoise(_FreezesArrays):
 
 @dataclass(frozen=True)
 class LocalSd:
-    """The noise's sd along one phase: log sd (k,) at window centres time_s (k,), and the phase's own."""
+    """The noise's sd along one phase: log sd (k,) at window centres time_s (k,), and the sd of the phase."""
 
     time_s: Array
     log_sd: Array
     phase_sd_n: float
 
     def at(self, time_s: Array) -> Array:
-        """sd [N] at the times given, same shape."""
+        """Returns the sd [N] at the given times, in the same shape."""
         if not len(self.time_s):
             return np.full(np.shape(time_s), self.phase_sd_n)
         return np.exp(np.interp(time_s, self.time_s, self.log_sd))
@@ -71,18 +72,22 @@ class LocalSd:
 
 @dataclass(frozen=True)
 class NoiseAnalysis:
-    """A recording's force without spikes; its noise: correlation by kind of phase, sd by phase, steps."""
+    """A recording's force without spikes, and its noise.
+
+    `shapes` holds the correlation for each kind of phase, `local` the sd along each phase, and `steps` the
+    steps of the load cell's zero in each phase.
+    """
 
     despiked: Despiked
     shapes: Mapping[PhaseKind, NoiseShape]
     local: tuple[LocalSd, ...]
-    steps: tuple[tuple[Step, ...], ...]  # by phase
+    steps: tuple[tuple[Step, ...], ...]
     bounds: NDArray[np.int64]  # (phases + 1,) sample indices
 
 
 @dataclass(frozen=True)
 class _Windows:
-    """Residual windows (k, size) of one phase, which of their samples are no spikes, and their middles."""
+    """Residual windows (k, size) of one phase, their samples outside spikes, and their mean times (k,)."""
 
     residual: Array
     kept: NDArray[np.bool_]
@@ -90,22 +95,23 @@ class _Windows:
 
 
 def phase_noise(recording: Recording, phases: Sequence[Phase]) -> tuple[PhaseNoise, ...]:
-    """The noise of each phase, in the order of `phases`.
+    """Returns the noise of each phase, in the order of `phases`.
 
     Raises
     ------
-    InputError : no phase is long enough (about 30 samples) to tell noise from force.
+    InputError : no phase is long enough (about 30 samples) to distinguish noise from force, the samples are
+        too far apart, or the force never changes.
     """
     return summarise(analyse(recording, phases), phases)
 
 
 def summarise(analysis: NoiseAnalysis, phases: Sequence[Phase]) -> tuple[PhaseNoise, ...]:
-    """The noise of each phase from a recording's analysis."""
-    out = []
+    """Returns the noise of each phase from a recording's analysis."""
+    noises = []
     for i, (phase, (start, stop)) in enumerate(zip(phases, pairwise(analysis.bounds), strict=True)):
         shape, sd = analysis.shapes[phase.kind], analysis.local[i].phase_sd_n
         signs = analysis.despiked.events(start, stop)
-        out.append(
+        noises.append(
             PhaseNoise(
                 kind=phase.kind,
                 cycle=phase.cycle,
@@ -123,37 +129,42 @@ def summarise(analysis: NoiseAnalysis, phases: Sequence[Phase]) -> tuple[PhaseNo
                 step_sizes_n=np.array([s.size_n for s in analysis.steps[i]]),
             )
         )
-    return tuple(out)
+    return tuple(noises)
 
 
 def analyse(recording: Recording, phases: Sequence[Phase], window_s: float = WINDOW_S) -> NoiseAnalysis:
-    """Spikes, correlation, local sd and steps; the second round knows the steps that the first one found.
+    """Returns the spikes, the correlation and local sd of the noise, and the steps of a recording.
 
-    window_s : over which the force under the noise is a parabola, 20 samples at least; in a shorter one slow
-        swings of the force, which a long one takes for noise, are no noise either
+    If the first round finds steps, a second round treats them as breaks of the force.
 
-    Raises InputError for a force that never changes, and as `phase_noise`.
+    window_s : time over which a parabola describes the force without noise, at least 20 samples. With a long
+        window, slow variations of the force count as noise. With a shorter window they do not.
+
+    Raises InputError for a force that never changes, and in the cases of `phase_noise`.
     """
     if np.ptp(recording.force_n) == 0.0:
-        found = f"{recording.force_n[0]:g} N throughout"
-        raise InputError(f"{recording.name}: force", found, "a force that changes")
+        problem = f"{recording.force_n[0]:g} N throughout"
+        raise InputError(f"{recording.name}: force", problem, "a force that changes")
     time_s = recording.time_s
     bounds = np.searchsorted(time_s, [*(p.start_s for p in phases), np.inf])
     bounds[0] = 0
-    first = _round(recording, phases, bounds, np.empty(0, dtype=np.int64), window_s)
-    steps = _all_steps(time_s, first, phases)
-    indices = np.searchsorted(time_s, [step.time_s for found in steps for step in found])
-    last = _round(recording, phases, bounds, indices, window_s) if len(indices) else first
-    return NoiseAnalysis(last.despiked, last.shapes, last.local, steps, bounds)
+    first_round = _analyse_once(recording, phases, bounds, np.empty(0, dtype=np.int64), window_s)
+    steps = _all_steps(time_s, first_round, phases)
+    indices = np.searchsorted(time_s, [step.time_s for phase_steps in steps for step in phase_steps])
+    last_round = _analyse_once(recording, phases, bounds, indices, window_s) if len(indices) else first_round
+    return NoiseAnalysis(last_round.despiked, last_round.shapes, last_round.local, steps, bounds)
 
 
 def jumps_of(recording: Recording, phases: Sequence[Phase]) -> Jumps:
-    """Returns the jumps of force within phases that a recording's samples allow. Raises as `phase_noise`."""
-    analysis, found = analyse(recording, phases), []
+    """Returns the jumps of force within phases that a recording's samples allow.
+
+    Raises InputError in the cases of `phase_noise`.
+    """
+    analysis, by_phase = analyse(recording, phases), []
     for phase, local, (a, b) in zip(phases, analysis.local, pairwise(analysis.bounds), strict=True):
         time_s, force_n = recording.time_s[a:b], analysis.despiked.force_n[a:b]
-        found.append(allowed_jumps(time_s, force_n, local.at(time_s), analysis.shapes[phase.kind]))
-    columns = [np.concatenate([getattr(one, name) for one in found])
+        by_phase.append(allowed_jumps(time_s, force_n, local.at(time_s), analysis.shapes[phase.kind]))
+    columns = [np.concatenate([getattr(jumps, name) for jumps in by_phase])
                for name in ("time_s", "lowest_n", "highest_n")]  # fmt: skip
     return Jumps(*columns)
 
@@ -161,9 +172,10 @@ def jumps_of(recording: Recording, phases: Sequence[Phase]) -> Jumps:
 def _all_steps(
     time_s: Array, analysis: NoiseAnalysis, phases: Sequence[Phase]
 ) -> tuple[tuple[Step, ...], ...]:
-    """Steps of each phase; soon after a corner the force itself moves too fast to tell.
+    """Returns the steps of each phase.
 
-    A step raises the sd of the windows about it, so a phase counts as no noisier than its kind usually is.
+    The first second after a corner is left out, because the force itself changes too fast there. A step
+    raises the sd of the windows around it. The sd of a phase is therefore at most the median sd of its kind.
     """
     usual = {
         phase.kind: np.concatenate(
@@ -171,23 +183,28 @@ def _all_steps(
         )
         for phase in phases
     }
-    found = []
+    steps = []
     for phase, local, (a, b) in zip(phases, analysis.local, pairwise(analysis.bounds), strict=True):
         start = (
             a if a == 0 else int(np.searchsorted(time_s, time_s[min(a, len(time_s) - 1)] + _AFTER_BREAK_S))
         )
         inside = slice(start, max(start, b))
-        of_kind = usual[phase.kind]
-        sd_n = min(local.phase_sd_n, float(np.exp(np.median(of_kind)))) if len(of_kind) else local.phase_sd_n
+        log_sds = usual[phase.kind]
+        sd_n = min(local.phase_sd_n, float(np.exp(np.median(log_sds)))) if len(log_sds) else local.phase_sd_n
         shape, force_n = analysis.shapes[phase.kind], analysis.despiked.force_n
-        found.append(find_steps(time_s[inside], force_n[inside], sd_n, shape, len(time_s)))
-    return tuple(found)
+        steps.append(find_steps(time_s[inside], force_n[inside], sd_n, shape, len(time_s)))
+    return tuple(steps)
 
 
-def _round(
+def _analyse_once(
     recording: Recording, phases: Sequence[Phase], bounds: NDArray[np.int64], steps: NDArray[np.int64],
     window_s: float,
 ) -> NoiseAnalysis:  # fmt: skip
+    """Returns the analysis without a search for steps.
+
+    `bounds` (phases + 1,) are the sample indices of the phases. `steps` are sample indices that count as
+    breaks of the force.
+    """
     time_s = recording.time_s
     interval_s = float(np.median(np.diff(time_s)))
     breaks = np.unique(np.concatenate([bounds, steps]))
@@ -198,9 +215,9 @@ def _round(
         expected = f"at most {WINDOW_S / _LEAST_WINDOW:.2g} s, to know their noise"
         raise InputError(recording.name, f"samples {interval_s:.3g} s apart", expected)
     if size < _LEAST_WINDOW:
-        found = f"{longest} samples in the longest phase"
+        problem = f"{longest} samples in the longest phase"
         raise InputError(
-            recording.name, found, f"at least {round(_LEAST_WINDOW / 0.7) + 1}, to know its noise"
+            recording.name, problem, f"at least {round(_LEAST_WINDOW / 0.7) + 1}, to know its noise"
         )
     windows = [
         _phase_windows(time_s, despiked, breaks[(breaks >= a) & (breaks <= b)], size, interval_s)
@@ -214,7 +231,7 @@ def _round(
 def _phase_windows(
     time_s: Array, despiked: Despiked, breaks: NDArray[np.int64], size: int, interval_s: float
 ) -> _Windows:
-    """Residual windows between the breaks of one phase, none soon after a break of the force's slope."""
+    """Returns the residual windows between the breaks of one phase, without the time soon after a break."""
     residual, kept, middle = [np.empty((0, size))], [np.empty((0, size), dtype=bool)], [np.empty(0)]
     for a, b in pairwise(breaks):
         a = a if a == 0 else a + min(round(_AFTER_BREAK_S / interval_s), (b - a) // 5)
@@ -230,7 +247,10 @@ def _phase_windows(
 def _shapes_by_kind(
     phases: Sequence[Phase], windows: Sequence[_Windows], interval_s: float, size: int
 ) -> dict[PhaseKind, NoiseShape]:
-    """Correlation of each kind of phase, from all its windows; that of all together where it has none."""
+    """Returns the correlation of the noise for each kind of phase, from all windows of that kind.
+
+    A kind without windows gets the correlation that all windows together have.
+    """
     lags = min(round(_LAG_S / interval_s), size // 2) + 1
 
     def fit(chosen: Sequence[_Windows]) -> NoiseShape:
@@ -245,7 +265,7 @@ def _shapes_by_kind(
 
     kinds = {phase.kind for phase in phases}
     of_kind = {k: [w for w, p in zip(windows, phases, strict=True) if p.kind == k] for k in kinds}
-    return {k: fit(own if any(len(w.residual) for w in own) else windows) for k, own in of_kind.items()}
+    return {k: fit(ws if any(len(w.residual) for w in ws) else windows) for k, ws in of_kind.items()}
 
 
 def _local_sds(
@@ -255,18 +275,24 @@ def _local_sds(
     interval_s: float,
     size: int,
 ) -> tuple[LocalSd, ...]:
+    """Returns the sd along each phase; a phase without windows gets the median sd of the other phases."""
     local: list[LocalSd | None] = []
     for phase, w in zip(phases, windows, strict=True):
         correlation = shapes[phase.kind].at(interval_s * np.arange(size))
-        left = float(expected_products(correlation, 1)[0])  # share of the variance that a parabola leaves
-        variance = np.sum(w.residual**2 * w.kept, axis=1) / np.maximum(w.kept.sum(axis=1), 1) / left
-        local.append(_shrunk(w.middle_s, variance, effective_windows(shapes[phase.kind], interval_s, size)))
+        # Subtracting a parabola leaves this share of the variance.
+        share_left = float(expected_products(correlation, 1)[0])
+        variance = np.sum(w.residual**2 * w.kept, axis=1) / np.maximum(w.kept.sum(axis=1), 1) / share_left
+        local.append(_shrink(w.middle_s, variance, effective_windows(shapes[phase.kind], interval_s, size)))
     usual = float(np.median([sd.phase_sd_n for sd in local if sd is not None]))
     return tuple(sd or LocalSd(np.empty(0), np.empty(0), usual) for sd in local)
 
 
-def _shrunk(middle_s: Array, variance: Array, freedom: float) -> LocalSd | None:
-    """Window variances (k,) drawn towards their phase's as far as their scatter is what chance gives."""
+def _shrink(middle_s: Array, variance: Array, freedom: float) -> LocalSd | None:
+    """Returns the local sd from window variances (k,), which are shrunk towards the phase's variance.
+
+    The more of their scatter chance explains, the stronger is the shrinkage. The result is None if no
+    variance is positive. `freedom` is the number of degrees of freedom of a window.
+    """
     positive = variance > 0
     if not positive.any():
         return None

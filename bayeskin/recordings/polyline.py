@@ -1,4 +1,4 @@
-"""A curve of many samples as few straight pieces (Ramer 1972; Douglas & Peucker 1973)."""
+"""Simplifies a curve of many samples to few straight pieces (Ramer 1972; Douglas & Peucker 1973)."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from bayeskin.types import Array
 
 
 def simplify(x: Array, y: Array, tolerance: float, fixed: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Indices of samples whose polyline stays within `tolerance` of every sample, vertically.
+    """Returns the indices of samples whose polyline stays vertically within `tolerance` of every sample.
 
-    x, y (n,), x increasing; fixed (j,) indices that are kept, the first and last sample among them or not.
+    x, y : (n,), with x increasing
+    fixed : (j,) indices that are kept in any case. The first and the last sample are always kept, whether
+        `fixed` contains them or not.
     """
     keep = {0, len(x) - 1, *map(int, fixed)}
     ends = sorted(keep)
@@ -23,9 +25,9 @@ def simplify(x: Array, y: Array, tolerance: float, fixed: NDArray[np.int64]) -> 
         if b - a < 2:
             continue
         chord = y[a] + (y[b] - y[a]) / (x[b] - x[a]) * (x[a : b + 1] - x[a])
-        away = np.abs(y[a : b + 1] - chord)
-        far = int(np.argmax(away))
-        if away[far] > tolerance:
-            keep.add(a + far)
-            pieces += [(a, a + far), (a + far, b)]
+        distance = np.abs(y[a : b + 1] - chord)
+        farthest = int(np.argmax(distance))
+        if distance[farthest] > tolerance:
+            keep.add(a + farthest)
+            pieces += [(a, a + farthest), (a + farthest, b)]
     return np.array(sorted(keep))

@@ -1,4 +1,4 @@
-"""Recordings from the files that laboratories keep them in, refused in one line where they are unsound."""
+"""Reads recordings from the file formats of laboratories and refuses invalid files in a one-line message."""
 
 from __future__ import annotations
 
@@ -20,43 +20,45 @@ _TEXTS = {".csv", ".tsv", ".txt"}
 _STORED = {".h5", ".hdf5"}
 _MIN_SAMPLES = 100
 
-# What an extensometer test on living skin can be: (smallest, largest) duration, travel and peak force, in
-# SI. Wide on purpose: they only choose a unit that a header leaves out, where a single one fits.
+# These are the smallest and the largest plausible duration, travel and peak force of an extensometer test on
+# living skin, in SI. The ranges are wide on purpose. They only choose a unit that a header does not give, and
+# only if exactly one unit fits.
 _PLAUSIBLE = {"time": (5.0, 7200.0), "displacement": (5e-5, 0.1), "force": (0.01, 100.0)}
 _PLAUSIBLE_INTERVAL_S = (1e-6, 0.2)
-# Beyond these no skin test goes: the unit in the header is not the one of the numbers.
+# No skin test exceeds these values. Larger values mean that the header does not give the unit of the numbers.
 _LARGEST = {"displacement": (0.1, "m"), "force": (1e3, "N")}
 _SMALLEST_TRAVEL_M = 1e-5
 
 
 def read_recording(path: Path | str, *, sheet: str | None = None) -> Recording:
-    """Reads time, displacement and force from an xlsx, csv, tsv, txt or bayeskin h5 file.
+    """Reads time, displacement and force from an xlsx, xlsm, csv, tsv, txt or bayeskin h5 file.
 
-    Columns are found by their headers, in English or French, and units by the headers too (s, ms, min; m,
-    mm, um; N, mN); `notes` of the result says what was taken for what. Values become SI and are otherwise
-    as measured, but for a clock that does not start at zero, which is shifted to (and noted).
+    The headers, in English or French, identify the columns and their units (s, ms, min; m, mm, um; N, mN).
+    `notes` of the result records how each column was interpreted. Values are converted to SI and are
+    otherwise as measured. If time does not start at zero, it is shifted to zero, and a note says so.
 
     Parameters
     ----------
     path : the file
-    sheet : name of the sheet of a workbook in which several have the columns
+    sheet : name of the sheet, for a workbook in which several sheets have the columns
 
     Raises
     ------
-    InputError : the file cannot be read, or is no recording of a skin test; says where, what and why.
+    InputError : the file cannot be read, or is not a recording of a skin test; the message says where the
+        fault is, what was found and what was expected.
     """
     path = Path(path)
     refuse_endless(path, "a recording")
-    kind, known = path.suffix.lower(), _WORKBOOKS | _TEXTS | _STORED
-    if kind not in known:
-        raise InputError(path, f"ending {kind!r}", f"one of {', '.join(sorted(known))}")
+    kind, accepted = path.suffix.lower(), _WORKBOOKS | _TEXTS | _STORED
+    if kind not in accepted:
+        raise InputError(path, f"ending {kind!r}", f"one of {', '.join(sorted(accepted))}")
     if sheet is not None and kind not in _WORKBOOKS:
         raise InputError(f"{path}: sheet {sheet!r}", f"ending {kind!r}", "a workbook, .xlsx or .xlsm")
     if kind in _STORED:
         return _read_stored(path)
     data = bytes_of(path, "a recording")
     table = read_workbook(path, data, sheet) if kind in _WORKBOOKS else read_text(path, data)
-    with np.errstate(over="ignore"):  # absurd numbers become infinite, and are refused as such
+    with np.errstate(over="ignore"):  # absurdly large numbers become infinite and are refused then
         return _to_recording(path.stem, table, hashlib.sha256(data).hexdigest())
 
 
@@ -64,10 +66,10 @@ def _read_stored(path: Path) -> Recording:
     refuse_damaged(path, "a bayeskin Recording file")
     recording = storage.load(path, Recording)
     arrays = [recording.time_s, recording.displacement_m, recording.force_n]
-    sound = len({a.shape for a in arrays}) == 1 and all(a.ndim == 1 and a.dtype.kind == "f" for a in arrays)
-    if not sound:
+    valid = len({a.shape for a in arrays}) == 1 and all(a.ndim == 1 and a.dtype.kind == "f" for a in arrays)
+    if not valid:
         raise InputError(path, "arrays of other shapes or kinds", "three arrays of numbers of one length")
-    _refuse_unsound(str(path), 0, *arrays)
+    _refuse_invalid(str(path), 0, *arrays)
     return recording
 
 
@@ -81,21 +83,21 @@ def _to_recording(name: str, table: Table, sha256: str) -> Recording:
         values[quantity] = raw * UNITS[quantity][unit]
         stated = "" if column.unit else ", the unit that fits the numbers (the header gives none)"
         notes.append(f"column {column.header!r} taken as {quantity}, {unit}{stated}")
-    taken = {column.index for column in table.columns.values()}
-    ignored = [h.strip() for i, h in enumerate(table.headers) if i not in taken and h.strip()]
+    used = {column.index for column in table.columns.values()}
+    ignored = [h.strip() for i, h in enumerate(table.headers) if i not in used and h.strip()]
     if ignored:
         notes.append("columns ignored: " + ", ".join(map(repr, ignored)))
     time_s, displacement_m, force_n = values["time"], values["displacement"], values["force"]
-    _refuse_unsound(table.where, table.first_row, time_s, displacement_m, force_n)
+    _refuse_invalid(table.where, table.first_row, time_s, displacement_m, force_n)
     recording = Recording(time_s, displacement_m, force_n, name, sha256)
     remarks = (*notes, *_remarks_on_clock(time_s), *_remarks_on_sign(displacement_m, force_n))
     return replace(recording, time_s=time_s - time_s[0], notes=remarks)
 
 
 def _remarks_on_sign(displacement_m: Array, force_n: Array) -> list[str]:
-    with np.errstate(all="ignore"):  # forces that hardly change
-        together = np.corrcoef(displacement_m, force_n)[0, 1]
-    if not together < -0.5:
+    with np.errstate(all="ignore"):  # a force that hardly changes has no correlation
+        correlation = np.corrcoef(displacement_m, force_n)[0, 1]
+    if not correlation < -0.5:
         return []
     return ["the force falls where the displacement grows: is the sign of one of them reversed?"]
 
@@ -114,7 +116,10 @@ def _remarks_on_clock(time_s: Array) -> list[str]:
 
 
 def _guess_unit(table: Table, column: Column, raw: Array) -> str:
-    """The one unit under which the numbers can be a skin test's; raises InputError if none or several."""
+    """Returns the only unit with which the numbers can come from a skin test.
+
+    Raises InputError if no unit or several units fit.
+    """
     quantity = column.quantity
     size = float(np.ptp(raw) if quantity != "force" else np.max(np.abs(raw)))
     low, high = _PLAUSIBLE[quantity]
@@ -126,9 +131,9 @@ def _guess_unit(table: Table, column: Column, raw: Array) -> str:
     if len(fitting) == 1:
         return fitting[0]
     accepted = ", ".join(UNITS[quantity])
-    found = f"no unit, and numbers up to {size:g} that fit {' and '.join(fitting) or 'none'}"
+    problem = f"no unit, and numbers up to {size:g} that fit {' and '.join(fitting) or 'none'}"
     raise InputError(
-        f"{table.where}, column {column.header!r}", found, f"the unit in the header ({accepted})"
+        f"{table.where}, column {column.header!r}", problem, f"the unit in the header ({accepted})"
     )
 
 
@@ -139,8 +144,12 @@ def _refuse_infinite(where: str, first_row: int, what: str, values: Array) -> No
         raise InputError(place, f"{values[bad[0]]}", "a finite number")
 
 
-def _refuse_unsound(where: str, first_row: int, time_s: Array, displacement_m: Array, force_n: Array) -> None:
-    """Raises InputError unless the arrays (n,) can be a skin test: long enough, clock forward, sizes sane."""
+def _refuse_invalid(where: str, first_row: int, time_s: Array, displacement_m: Array, force_n: Array) -> None:
+    """Raises InputError unless the arrays (n,) can be a skin test.
+
+    The arrays must have enough samples, finite values, increasing times, plausible sizes, and a displacement
+    that changes.
+    """
     named = {"time": time_s, "displacement": displacement_m, "force": force_n}
     if len(time_s) < _MIN_SAMPLES:
         raise InputError(where, f"{len(time_s)} samples", f"at least {_MIN_SAMPLES}")
@@ -149,18 +158,18 @@ def _refuse_unsound(where: str, first_row: int, time_s: Array, displacement_m: A
     back = np.flatnonzero(np.diff(time_s) <= 0)
     if len(back):
         before, after = time_s[back[0]], time_s[back[0] + 1]
-        found = f"time {after:.6g} s after {before:.6g} s"
+        problem = f"time {after:.6g} s after {before:.6g} s"
         raise InputError(
-            f"{where}, row {first_row + back[0] + 1}", found, "times that increase from row to row"
+            f"{where}, row {first_row + back[0] + 1}", problem, "times that increase from row to row"
         )
     for name, (largest, unit) in _LARGEST.items():
         peak = int(np.argmax(np.abs(named[name])))
         value = abs(named[name][peak])
         if value > largest:
-            found = f"a {name} of {value:.4g} {unit}"
+            problem = f"a {name} of {value:.4g} {unit}"
             expected = f"at most {largest:g} {unit} (is the column in {'mm' if unit == 'm' else 'mN'}?)"
-            raise InputError(f"{where}, row {first_row + peak}", found, expected)
+            raise InputError(f"{where}, row {first_row + peak}", problem, expected)
     travel = float(np.ptp(displacement_m))
     if travel < _SMALLEST_TRAVEL_M:
-        found = f"a displacement that changes by {travel:.3g} m in all"
-        raise InputError(where, found, f"at least {_SMALLEST_TRAVEL_M:g} m (is its unit right?)")
+        problem = f"a displacement that changes by {travel:.3g} m in all"
+        raise InputError(where, problem, f"at least {_SMALLEST_TRAVEL_M:g} m (is its unit right?)")

@@ -1,8 +1,8 @@
-"""Phases of a test - rest, load, hold, unload - from the displacement alone.
+"""Finds the phases of a test (rest, load, hold, unload) from the displacement alone.
 
-A polyline through the displacement gives the pieces; each corner is then placed where straight lines
-fitted to both sides of it meet, so that neither the resolution of the LVDT nor the rounding of the
-corner by the drive moves it.
+A polyline through the displacement gives the pieces. Straight lines are then fitted to both sides of each
+corner, and the corner is placed where they meet. Therefore neither the resolution of the LVDT nor the
+rounding by the drive moves the corner.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from bayeskin.errors import InputError
 from bayeskin.recordings.polyline import simplify
 from bayeskin.types import Array, Phase, PhaseKind, Recording
 
-_STILL_SHARE = 0.03  # a piece that moves less than this share of the travel is still: drift, overshoot
-_REST_SHARE = 0.05  # still and this near to the lowest level: a rest, else a hold
-_SHORTEST_STILL_S = 0.2  # a turning point's dwell, shorter than this, is no phase
-_SPEED_CHANGE = 1.5  # loading that changes its speed by more has a corner there,
-_SHORTEST_RAMP_S = 0.5  # if both parts last at least this long
-_TRIM_S = 0.5  # left out of a line fit at the rounded end of a piece, but never more than a tenth of it
+_STILL_SHARE = 0.03  # a piece that moves less than this share of the travel is still (drift, overshoot)
+_REST_SHARE = 0.05  # a still piece closer to the lowest level than this share is a rest, else a hold
+_SHORTEST_STILL_S = 0.2  # a dwell at a turning point that is shorter than this is not a phase
+_SPEED_CHANGE = 1.5  # a ramp whose speed changes by a larger factor has a corner there
+_SHORTEST_RAMP_S = 0.5  # both parts of such a ramp must last at least this long
+_TRIM_S = 0.5  # duration that a line fit ignores at a piece's rounded end, at most a tenth of the piece
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """Samples start..stop of one direction: -1, 0 (still) or 1."""
+    """Samples start..stop that move in one direction: -1, 0 (still) or 1."""
 
     start: int
     stop: int
@@ -36,7 +36,7 @@ class _Piece:
 
 
 def resolution_m(displacement_m: Array) -> float:
-    """Returns the resolution of the displacement [m]: the larger of its least step and its noise's sd."""
+    """Returns the resolution of the displacement [m]: the larger of its smallest step and its noise's sd."""
     levels = np.unique(displacement_m)
     step = float(np.min(np.diff(levels))) if len(levels) > 1 else 0.0
     second = np.diff(displacement_m, 2)
@@ -46,16 +46,16 @@ def resolution_m(displacement_m: Array) -> float:
 
 
 def segment(recording: Recording) -> tuple[Phase, ...]:
-    """Phases that tile the recording, from the displacement alone.
+    """Returns the phases that together cover the recording, from the displacement alone.
 
-    Cycle 1 begins with the first loading; loading that follows an unloading or a rest begins the next
-    one, loading that follows a hold goes on with its own. A still phase within 5 % of the travel from the
-    lowest level is a rest, any other a hold. Turning points where the drive dwells for less than 0.2 s
-    have no phase of their own.
+    Cycle 1 begins with the first loading. A loading after an unloading or a rest begins the next cycle. A
+    loading after a hold or another loading continues its cycle. A still phase within 5 % of the travel from
+    the lowest level is a rest, and any other still phase is a hold. Turning points where the drive dwells for
+    less than 0.2 s have no phase of their own.
 
     Raises
     ------
-    InputError : the displacement shows one phase only.
+    InputError : the displacement has a single phase only, or moves little more than its noise.
     """
     time_s = recording.time_s
     smooth = median_filter(recording.displacement_m, 5, mode="nearest")
@@ -81,7 +81,10 @@ def segment(recording: Recording) -> tuple[Phase, ...]:
 
 
 def _fragments(time_s: Array, smooth: Array, knots: NDArray[np.int64], still_m: float) -> list[_Piece]:
-    """The polyline's pieces; one that moves little is still unless it moves about as fast as a ramp."""
+    """Returns the pieces of the polyline.
+
+    A piece that moves little is still, unless it moves at least half as fast as the slowest ramp.
+    """
     moved = np.abs(np.diff(smooth[knots]))
     speed = moved / np.diff(time_s[knots])
     ramps = speed[moved >= still_m]
@@ -91,29 +94,32 @@ def _fragments(time_s: Array, smooth: Array, knots: NDArray[np.int64], still_m: 
 
 
 def _merge(fragments: list[_Piece], time_s: Array, smooth: Array, still_m: float) -> list[_Piece]:
-    """Pieces of one direction made one; small returns (overshoot) become still, short dwells disappear."""
+    """Returns the pieces after neighbours of equal direction are joined.
+
+    Small movements (overshoot) become still, and short dwells disappear.
+    """
     pieces = [
         replace(piece, direction=0) if abs(smooth[piece.stop] - smooth[piece.start]) < still_m else piece
-        for piece in _join(fragments, time_s, smooth, still_m)
+        for piece in _join_equal(fragments, time_s, smooth, still_m)
     ]
-    pieces = _join(pieces, time_s, smooth, still_m)
+    pieces = _join_equal(pieces, time_s, smooth, still_m)
     kept = [
         piece
         for piece in pieces
         if piece.direction or time_s[piece.stop] - time_s[piece.start] >= _SHORTEST_STILL_S
     ]
-    return _join(kept, time_s, smooth, still_m)
+    return _join_equal(kept, time_s, smooth, still_m)
 
 
-def _join(pieces: list[_Piece], time_s: Array, smooth: Array, still_m: float) -> list[_Piece]:
-    """Neighbours of one direction made one, unless both are ramps and their speeds differ."""
+def _join_equal(pieces: list[_Piece], time_s: Array, smooth: Array, still_m: float) -> list[_Piece]:
+    """Joins neighbours of equal direction, unless both are ramps and their speeds differ."""
     joined: list[_Piece] = []
     for piece in pieces:
         last = joined[-1] if joined else None
         if (
             last is not None
             and last.direction == piece.direction
-            and not _apart(last, piece, time_s, smooth, still_m)
+            and not _are_separate_ramps(last, piece, time_s, smooth, still_m)
         ):
             joined[-1] = replace(piece, start=last.start)
         else:
@@ -121,8 +127,8 @@ def _join(pieces: list[_Piece], time_s: Array, smooth: Array, still_m: float) ->
     return joined
 
 
-def _apart(a: _Piece, b: _Piece, time_s: Array, smooth: Array, still_m: float) -> bool:
-    """Returns whether two neighbours are separate ramps: long, far-reaching and of different speeds."""
+def _are_separate_ramps(a: _Piece, b: _Piece, time_s: Array, smooth: Array, still_m: float) -> bool:
+    """Returns whether two neighbours are separate ramps: both long and far enough, with different speeds."""
     moved = np.array([abs(smooth[p.stop] - smooth[p.start]) for p in (a, b)])
     lasted = np.array([time_s[p.stop] - time_s[p.start] for p in (a, b)])
     speed = moved / lasted
@@ -131,8 +137,8 @@ def _apart(a: _Piece, b: _Piece, time_s: Array, smooth: Array, still_m: float) -
     return bool(speed.max() > _SPEED_CHANGE * speed.min())
 
 
-def _line(time_s: Array, smooth: Array, start: int, stop: int) -> tuple[float, float]:
-    """Slope and intercept of the least-squares line through samples start..stop."""
+def _fit_line(time_s: Array, smooth: Array, start: int, stop: int) -> tuple[float, float]:
+    """Returns the slope and intercept of the least-squares line through samples start..stop."""
     if stop - start < 2:
         stop = min(start + 2, len(time_s) - 1)
         start = max(0, stop - 2)
@@ -143,7 +149,7 @@ def _line(time_s: Array, smooth: Array, start: int, stop: int) -> tuple[float, f
 
 
 def _near_half(time_s: Array, piece: _Piece, at_end: bool) -> tuple[int, int]:
-    """The half of a piece that is nearest to a corner, without the corner's rounding."""
+    """Returns the first and last sample of the half of a piece next to a corner, without the rounded end."""
     length = time_s[piece.stop] - time_s[piece.start]
     trim = min(0.1 * length, _TRIM_S)
     near, far = trim, max(0.5 * length, trim)
@@ -156,15 +162,18 @@ def _near_half(time_s: Array, piece: _Piece, at_end: bool) -> tuple[int, int]:
 
 
 def _corner_s(time_s: Array, smooth: Array, before: _Piece, after: _Piece) -> float:
-    """Returns where the lines through both sides of a corner meet; its knot if that is not near."""
-    slope_a, intercept_a = _line(time_s, smooth, *_near_half(time_s, before, at_end=True))
-    slope_b, intercept_b = _line(time_s, smooth, *_near_half(time_s, after, at_end=False))
-    knot = 0.5 * float(time_s[before.stop] + time_s[after.start])
+    """Returns the time [s] at which the lines through both sides of a corner meet.
+
+    If the lines do not meet near the knot of the polyline, the time of the knot is returned.
+    """
+    slope_a, intercept_a = _fit_line(time_s, smooth, *_near_half(time_s, before, at_end=True))
+    slope_b, intercept_b = _fit_line(time_s, smooth, *_near_half(time_s, after, at_end=False))
+    knot_s = 0.5 * float(time_s[before.stop] + time_s[after.start])
     reach = 0.25 * min(time_s[before.stop] - time_s[before.start], time_s[after.stop] - time_s[after.start])
     if slope_a == slope_b:
-        return knot
-    meeting = (intercept_b - intercept_a) / (slope_a - slope_b)
-    return float(meeting) if abs(meeting - knot) <= max(reach, _SHORTEST_STILL_S) else knot
+        return knot_s
+    meeting_s = (intercept_b - intercept_a) / (slope_a - slope_b)
+    return float(meeting_s) if abs(meeting_s - knot_s) <= max(reach, _SHORTEST_STILL_S) else knot_s
 
 
 def _name_phases(pieces: list[_Piece], edges: list[float], smooth: Array) -> tuple[Phase, ...]:

@@ -1,10 +1,11 @@
-"""Spikes of the load cell: told from noise by a running median, counted, and taken out.
+"""Distinguishes spikes of the load cell from noise by a running median, counts them, and removes them.
 
-A spike is a short excursion: at least one sample further from the running median than a threshold that
-noise alone passes once in twenty recordings, with the samples beside it that are beyond two standard
-deviations on the same side. An excursion of half the median's window or longer moves the median and is
-no spike. The running median never crosses a break (a corner of the protocol, a step of the cell's zero),
-and is continued past a break by odd reflection, so that it follows any monotone force, however curved.
+A spike is a short excursion of the force. At least one of its samples is farther from the running median
+than a threshold, which noise alone exceeds in one of twenty recordings. The neighbouring samples that are
+more than two standard deviations away on the same side belong to the spike too. An excursion of half the
+median's window or longer moves the median and is not a spike. The running median never crosses a break (a
+corner of the protocol, a step of the load cell's zero). Odd reflection continues the force beyond a break.
+The median therefore follows any monotone force, however curved it is.
 """
 
 from __future__ import annotations
@@ -22,21 +23,24 @@ from bayeskin.types import Array, _FreezesArrays
 
 FAMILY_WISE = 0.05  # probability that noise alone shows any spike in a whole recording
 _WINDOW_S = 0.5
-_SCALE_S = 2.5  # noise differs from one moment of a hold to another: its sd is local over this
+_SCALE_S = 2.5  # the noise changes even within a hold, so its sd is estimated over blocks of this length
 _TAIL_SD = 2.0
-_PASSES = 3  # spikes crowd: each pass takes the median of what the last one left
-_FINEST = 1e-4
+_PASSES = 3  # spikes may be dense, so each pass takes the median of the force without the last pass's spikes
+_FINEST = 1e-4  # least noise sd, as a share of the force's range
 _HUBER = 2.5
-# E min(z^2, k^2) of a standard normal z: what makes the winsorised variance consistent.
+# This is E min(z^2, k^2) of a standard normal z. Dividing by it makes the winsorised variance consistent.
 _CONSISTENT = 1 - 2 * norm.sf(_HUBER) - 2 * _HUBER * norm.pdf(_HUBER) + 2 * _HUBER**2 * norm.sf(_HUBER)
 
 
 @dataclass(frozen=True)
 class Despiked(_FreezesArrays):
-    """A recording's force without its spikes, arrays (n,).
+    """A recording's force without its spikes; all arrays have shape (n,).
 
-    force_n with the running median in place of spikes; median_n the running median; sd_n the local sd about
-    it; spike +1 or -1 on samples of a spike, 0 elsewhere. A spike passes threshold_sd of those sds.
+    force_n : force [N] in which the running median replaces spikes
+    median_n : running median [N]
+    sd_n : local sd [N] of the noise about the running median
+    spike : +1 or -1 on the samples of a spike, 0 elsewhere
+    threshold_sd : a spike is farther than this many local sds from the running median
     """
 
     force_n: Array
@@ -46,51 +50,58 @@ class Despiked(_FreezesArrays):
     threshold_sd: float
 
     def events(self, start: int, stop: int) -> Array:
-        """Sign of each spike (a run of samples is one) that begins in samples start..stop, (events,)."""
+        """Returns the sign (events,) of each spike in samples start..stop.
+
+        Consecutive samples of the same sign are one spike.
+        """
         return np.concatenate(
             [np.full(label(self.spike[start:stop] == sign)[1], float(sign)) for sign in (-1, 1)]
         )
 
 
 def despike(time_s: Array, force_n: Array, breaks: Sequence[int]) -> Despiked:
-    """Finds and removes spikes in force_n (n,).
+    """Finds spikes in force_n (n,) and removes them.
 
-    `breaks` are sample indices, 0 and n among them, that the running median must not cross.
+    `breaks` are sample indices, including 0 and n, that the running median must not cross.
     """
     interval_s = float(np.median(np.diff(time_s)))
     half = max(2, round(0.5 * _WINDOW_S / interval_s))
     block = max(50, round(_SCALE_S / interval_s))
     threshold = float(norm.isf(0.5 * FAMILY_WISE / len(force_n)))
-    # A force has at least its rounding's noise, and no load cell is better than this share of its range.
+    # Rounding alone gives every force some noise, and no load cell is better than `_FINEST` of its range.
     least = max(_least_step(force_n) / np.sqrt(12.0), _FINEST * float(np.ptp(force_n)), 1e-12)
     median, sd, spike = np.empty_like(force_n), np.empty_like(force_n), np.zeros(len(force_n), dtype=np.int8)
     for a, b in pairwise(breaks):
-        x = force_n[a:b]
+        force = force_n[a:b]
         for _ in range(_PASSES):
-            left = np.where(spike[a:b] != 0, median[a:b], x) if spike[a:b].any() else x
-            median[a:b] = running_median(left, half)
-            residual = x - median[a:b]
+            cleaned = np.where(spike[a:b] != 0, median[a:b], force) if spike[a:b].any() else force
+            median[a:b] = running_median(cleaned, half)
+            residual = force - median[a:b]
             sd[a:b] = _local_sd(residual, spike[a:b] == 0, block, least)
             spike[a:b] = _excursions(residual / sd[a:b], threshold)
     return Despiked(np.where(spike != 0, median, force_n), median, sd, spike, threshold)
 
 
 def running_median(values: Array, half: int) -> Array:
-    """Median over 2 half + 1 samples, (n,); the ends continued by odd reflection about the end's level."""
+    """Returns the median (n,) over 2 half + 1 samples.
+
+    At both ends, odd reflection about the level of the end continues the values.
+    """
     half = min(half, (len(values) - 1) // 2)
     if half < 1:
         return values.copy()
-    ended = values.copy()
-    for end in (slice(None), slice(None, None, -1)):  # a spike may stand on the end: its level by robust line
+    anchored = values.copy()
+    # A spike may lie on the end itself, so a robust line gives the level of the end.
+    for end in (slice(None), slice(None, None, -1)):
         inward = values[end]
         if len(inward) >= 9:
-            ended[end][0] = 1.5 * np.median(inward[:5]) - 0.5 * np.median(inward[4:9])
-    padded = np.pad(ended, half, mode="reflect", reflect_type="odd")
+            anchored[end][0] = 1.5 * np.median(inward[:5]) - 0.5 * np.median(inward[4:9])
+    padded = np.pad(anchored, half, mode="reflect", reflect_type="odd")
     return median_filter(padded, 2 * half + 1)[half:-half]
 
 
 def huber_sd(residual: Array, start_sd: float) -> float:
-    """The sd of the Gaussian core of residual (n,): winsorised at 2.5 sd (Huber 1964, proposal 2)."""
+    """Returns the sd of the Gaussian core of residual (n,), winsorised at 2.5 sd (Huber 1964, proposal 2)."""
     sd = start_sd
     for _ in range(10):
         sd = float(np.sqrt(np.mean(np.clip(residual, -_HUBER * sd, _HUBER * sd) ** 2) / _CONSISTENT))
@@ -103,7 +114,10 @@ def _least_step(force_n: Array) -> float:
 
 
 def _local_sd(residual: Array, kept: NDArray[np.bool_], block: int, least: float) -> Array:
-    """The sd of residual block by block, (n,), begun from the quieter side: spikes are one-sided."""
+    """Returns the sd (n,) of the residual, block by block.
+
+    The estimate starts from the side with the smaller deviations, because spikes are one-sided.
+    """
     out = np.empty_like(residual)
     count = max(1, len(residual) // block)
     for part in np.array_split(np.arange(len(residual)), count):

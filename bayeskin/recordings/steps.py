@@ -1,9 +1,10 @@
-"""Steps of the load cell's zero: sudden lasting shifts of the force inside a phase.
+"""Finds steps of the load cell's zero: sudden, lasting shifts of the force inside a phase.
 
-The mean of half a second after each moment minus that of half a second before it, less what the slope on
-both sides accounts for, is a linear filter of the force. Its sd under the noise is known, but a load
-cell also wanders; that sd, or where it is larger the filter's own spread over the phase once the step is
-taken out, is one unit, and a step is what passes the level that noise passes once in a hundred recordings.
+The detector is a linear filter of the force. At each moment it takes the mean over the half second after the
+moment minus the mean over the half second before it. It then subtracts the part that the slope on both sides
+explains. The sd of the filter's output under the noise is known, but a load cell also drifts. The unit of
+significance is therefore this sd, or the spread of the filter's output over the phase without the step, if
+that is larger. A step is an output beyond a threshold that noise alone exceeds once in a hundred recordings.
 """
 
 from __future__ import annotations
@@ -21,16 +22,17 @@ from bayeskin.types import Array, Jumps
 FAMILY_WISE = 0.01  # probability that noise alone shows any step in a whole recording
 _WINDOW_S = 0.5
 _GAP_S = 0.05  # a step of the zero is not infinitely fast
-_MOST = 50  # in one phase
-_FINEST_S = 0.01  # between samples that are looked at for jumps
-_BESIDE_S = 1.0  # of a moment, in which a jump is looked for
-_BEYOND = 3.0  # sd by which a jump has to exceed what is seen, and
-_TIMES = 2.0  # how often that, to be refuted
+_MOST = 50  # largest number of steps in one phase
+_FINEST_S = 0.01  # approximate least time between the samples that are used to judge jumps
+_BESIDE_S = 1.0  # time on either side of a moment whose samples are used to judge a jump
+# The samples refute a jump that exceeds the estimated jump both by `_BEYOND` sd and by the factor `_TIMES`.
+_BEYOND = 3.0
+_TIMES = 2.0
 
 
 @dataclass(frozen=True)
 class Step:
-    """A step of the load cell's zero: when [s], by how much [N], and its size in sds of its estimate."""
+    """A step of the load cell's zero: its time [s], its size [N], and its size in sds of the estimate."""
 
     time_s: float
     size_n: float
@@ -38,20 +40,21 @@ class Step:
 
 
 def step_filter(interval_s: float) -> Array:
-    """Weights (odd size,) that give a step's size at their middle, and zero on any straight line."""
+    """Returns weights (odd size,) that give the size of a step in their middle, and 0 on a straight line."""
     window = max(3, round(_WINDOW_S / interval_s))
     gap = max(1, round(_GAP_S / interval_s))
     near = np.full(window, 1.0 / window)
-    reach = (window + 2 * gap + 1) / window  # distance of the near windows in units of that of near to far
+    reach = (window + 2 * gap + 1) / window  # near windows' distance over the distance from near to far
     right = np.concatenate([np.zeros(gap), (1 + 0.5 * reach) * near, -0.5 * reach * near])
     return np.concatenate([-right[::-1], [0.0], right])
 
 
 def find_steps(time_s: Array, force_n: Array, sd_n: float, shape: NoiseShape, tests: int) -> tuple[Step, ...]:
-    """Steps in one phase's force without spikes (n,), in time order.
+    """Returns the steps in one phase's force without spikes (n,), in time order.
 
-    sd_n and shape are the noise of an undisturbed phase, `tests` the samples of the whole recording, over
-    which the probability of a false step is kept. None is looked for within 1.05 s of the phase's ends.
+    `sd_n` and `shape` describe the noise of an undisturbed phase. `tests` is the number of samples of the
+    whole recording, to which the probability of a false step refers. The search leaves out 1.05 s at both
+    ends of the phase.
     """
     interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
     weights = step_filter(interval_s)
@@ -62,20 +65,20 @@ def find_steps(time_s: Array, force_n: Array, sd_n: float, shape: NoiseShape, te
     expected = sd_n * float(np.sqrt(weighted_covariance(weights, weights, correlation)))
     threshold = float(norm.isf(0.5 * FAMILY_WISE / tests))
     window = max(3, round(_WINDOW_S / interval_s))
-    left, steps = force_n.copy(), []
-    jump = np.convolve(left, weights[::-1], mode="valid")
-    free = np.ones(len(jump), dtype=bool)
+    corrected, steps = force_n.copy(), []
+    jump = np.convolve(corrected, weights[::-1], mode="valid")
+    available = np.ones(len(jump), dtype=bool)
     for _ in range(_MOST):
-        at = int(np.argmax(np.where(free, np.abs(jump), 0.0)))
-        first = _first_after(left, at + half, window)
+        peak = int(np.argmax(np.where(available, np.abs(jump), 0.0)))
+        first = _first_sample_after_step(corrected, peak + half, window)
         size = float(jump[np.clip(first - half, 0, len(jump) - 1)])
-        height = abs(float(jump[at]))
-        left[first:] -= size
-        jump = np.convolve(left, weights[::-1], mode="valid")
+        height = abs(float(jump[peak]))
+        corrected[first:] -= size
+        jump = np.convolve(corrected, weights[::-1], mode="valid")
         unit = max(expected, 1.4826 * float(np.median(np.abs(jump - np.median(jump)))))
-        if not free[at] or height <= threshold * unit:
+        if not available[peak] or height <= threshold * unit:
             break
-        free[max(0, at - window) : at + window + 1] = False
+        available[max(0, peak - window) : peak + window + 1] = False
         steps.append(Step(float(time_s[first]), size, height / unit))
     return tuple(sorted(steps, key=lambda step: step.time_s))
 
@@ -83,10 +86,11 @@ def find_steps(time_s: Array, force_n: Array, sd_n: float, shape: NoiseShape, te
 def allowed_jumps(time_s: Array, force_n: Array, sd_n: Array, shape: NoiseShape) -> Jumps:
     """Returns the jumps that one phase's force without spikes (n,) allows, with noise of local sd_n (n,).
 
-    A jump beside a parabola, by generalised least squares over a second to either side, with a gap for a jump
-    that takes some samples. Those seen half a second before and after count too, since a jump's time is not
-    known better. Near the phase's ends, where the force itself bends, none is judged. Of samples that lie
-    closer than `_FINEST_S` some are looked at.
+    Generalised least squares fits a parabola plus a jump over one second on either side. The fit leaves a
+    gap, because a jump may take some samples. The limits include the jumps estimated up to half a second
+    before and after, because the time of a jump is not known more precisely. Near the phase's ends the force
+    itself bends, so no jump is judged there. If the samples are closer than `_FINEST_S`, only some of them
+    are used.
     """
     interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
     every = max(1, int(_FINEST_S / interval_s))
@@ -96,7 +100,7 @@ def allowed_jumps(time_s: Array, force_n: Array, sd_n: Array, shape: NoiseShape)
     if len(force_n) > 4 * half:
         gap = max(1, round(_GAP_S / interval_s))
         weights, share = _jump_filter(half, gap, shape.at(interval_s * np.arange(2 * half)))
-        jump = np.convolve(force_n, weights[::-1], mode="valid")  # [i]: at sample i + half
+        jump = np.convolve(force_n, weights[::-1], mode="valid")  # element i is the jump at sample i + half
         unit = _BEYOND * share * sd_n[half : len(sd_n) - half + 1]
         low, high = np.minimum(jump - unit, _TIMES * jump), np.maximum(jump + unit, _TIMES * jump)
         reach = half // 2
@@ -107,18 +111,25 @@ def allowed_jumps(time_s: Array, force_n: Array, sd_n: Array, shape: NoiseShape)
 
 
 def _jump_filter(half: int, gap: int, correlation: Array) -> tuple[Array, float]:
-    """Weights (2 half,) that give the jump at the first sample of the second half, and the sd of what they
-    give, over the noise's; none lies on `gap` samples before and from there."""
+    """Returns weights (2 half,) that estimate a jump, and the sd of the estimate over the sd of the noise.
+
+    The jump lies at the first sample of the second half. The `gap` samples before it and the `gap` samples
+    from it on have zero weight.
+    """
     line = np.linspace(-1.0, 1.0, 2 * half)
-    between = np.eye(2 * half, 2 * gap, gap - half)  # a value of its own each: it tells nothing
+    # Each sample in the gap has a free value of its own, so it does not affect the estimate.
+    between = np.eye(2 * half, 2 * gap, gap - half)
     design = np.column_stack([line > 0.0, np.vander(line, 3), between])
     white = solve_toeplitz(correlation, design)
     covariance = np.linalg.inv(design.T @ white)
     return np.asarray(covariance[0] @ white.T), float(np.sqrt(covariance[0, 0]))
 
 
-def _first_after(values: Array, near: int, window: int) -> int:
-    """Index of the first sample after the step near `near`: least squares of a line plus one step."""
+def _first_sample_after_step(values: Array, near: int, window: int) -> int:
+    """Returns the index of the first sample after the step near `near`.
+
+    It is the least-squares fit of a line plus one step.
+    """
     start, stop = max(0, near - window), min(len(values), near + window)
     size = stop - start
     line = np.linalg.qr(np.vander(np.linspace(-1, 1, size), 2))[0]

@@ -1,4 +1,4 @@
-"""Rows of text or spreadsheet files, as they stand, to columns of numbers; every fault names its row."""
+"""Converts the rows of text and spreadsheet files to columns of numbers; every error names the row."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from bayeskin.errors import InputError
 from bayeskin.recordings.headers import UNITS, Column, choose_columns, is_header, parse_unit
 from bayeskin.types import Array
 
-_HEADER_WITHIN = 50  # rows searched for the header; laboratory exports put a preamble before it
-_CHUNK = 50_000  # rows held as text at a time
+_HEADER_WITHIN = 50  # number of rows searched for the header; laboratory exports put a preamble before it
+_CHUNK = 50_000  # number of rows that are in memory as text at a time
 MOST_UNPACKED = 2**30  # bytes of a workbook's parts; a sheet of a million rows with three columns has 10^8
 Row = Sequence[Any]
 Split = Callable[[Iterable[str]], Iterator[Row]]
@@ -27,9 +27,10 @@ Split = Callable[[Iterable[str]], Iterator[Row]]
 
 @dataclass(frozen=True)
 class Table:
-    """The three columns of a file as numbers in the file's own units, and where they came from.
+    """The three columns of a file as numbers in the file's own units, with their origin.
 
-    values maps time, displacement and force to arrays (n,); first_row is the file's number of row 0.
+    `values` maps time, displacement and force to arrays (n,). `first_row` is the row number in the file of
+    the first element of these arrays.
     """
 
     columns: dict[str, Column]
@@ -41,11 +42,11 @@ class Table:
 
 
 def read_text(path: Path, data: bytes) -> Table:
-    """Columns of a csv, tsv or txt file: delimiter, decimal sign and encoding found by looking.
+    """Returns the columns of a csv, tsv or txt file; detects its delimiter, decimal sign and encoding.
 
     Raises
     ------
-    InputError : no such header, a row with too many or too few cells, a cell that is no number.
+    InputError : there is no suitable header, a row has too many or too few cells, or a cell is not a number.
     """
     text, encoding = _decode(path, data)
     split = _choose_split(path, list(islice(_lines(text), _HEADER_WITHIN)))
@@ -59,11 +60,12 @@ def read_text(path: Path, data: bytes) -> Table:
 
 
 def read_workbook(path: Path, data: bytes, sheet: str | None) -> Table:
-    """Columns of the one sheet of an xlsx file that has them (or of `sheet`).
+    """Returns the columns of the only sheet of an xlsx file that has them, or those of `sheet`.
 
     Raises
     ------
-    InputError : unreadable file, no or several sheets with the columns, an empty or textual cell.
+    InputError : the file cannot be read, no sheet or several sheets have the columns, or a cell is empty or
+        contains text.
     """
     import openpyxl
 
@@ -78,16 +80,16 @@ def read_workbook(path: Path, data: bytes, sheet: str | None) -> Table:
             raise InputError(path, f"sheets {names}", f"a sheet {sheet!r}")
         wanted = [sheet] if sheet is not None else [n for n in names if _sheet_has_header(book[n])]
         if len(wanted) != 1:
-            found = f"the columns in {len(wanted)} of the sheets {names}"
-            raise InputError(path, found, "time, displacement and force in one sheet, or its name given")
+            problem = f"the columns in {len(wanted)} of the sheets {names}"
+            raise InputError(path, problem, "time, displacement and force in one sheet, or its name given")
         return _tabulate(f"{path}: sheet {wanted[0]!r}", book[wanted[0]].iter_rows(values_only=True))
     except InputError:
         raise
     except (zipfile.BadZipFile, OSError, EOFError) as error:
         raise InputError(path, f"a damaged file ({_one_line(error)})", "an xlsx workbook") from None
-    except Exception as error:  # openpyxl lets whatever its XML and zip layers raise through
-        found = f"a workbook that cannot be read ({type(error).__name__}: {_one_line(error)})"
-        raise InputError(path, found, "an xlsx workbook") from None
+    except Exception as error:  # openpyxl passes on any exception of its XML and zip layers
+        problem = f"a workbook that cannot be read ({type(error).__name__}: {_one_line(error)})"
+        raise InputError(path, problem, "an xlsx workbook") from None
 
 
 def _one_line(error: Exception) -> str:
@@ -104,7 +106,7 @@ def _texts(row: Row) -> list[str]:
 
 
 def _decode(path: Path, data: bytes) -> tuple[str, str]:
-    """Text, and the encoding that it was in: Unicode, or what a Western European Windows writes."""
+    """Returns the text and its encoding: Unicode, or the encoding of Western European Windows."""
     if not data.strip():
         raise InputError(path, "an empty file", "a header row and rows of numbers")
     utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
@@ -119,8 +121,8 @@ def _decode(path: Path, data: bytes) -> tuple[str, str]:
 
 
 def _lines(text: str) -> Iterator[str]:
-    """The lines one by one: ten million of them as a list would take a gigabyte."""
-    return (found[1] for found in re.finditer(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)", text))
+    """Returns an iterator over the lines, because a list of ten million lines would take a gigabyte."""
+    return (match[1] for match in re.finditer(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)", text))
 
 
 def _split_by(delimiter: str) -> Split:
@@ -128,13 +130,13 @@ def _split_by(delimiter: str) -> Split:
 
 
 def _split_by_blanks(lines: Iterable[str]) -> Iterator[Row]:
-    """Cells parted by blanks; a unit in brackets belongs to the word before it."""
+    """Splits lines into cells at blanks; a unit in brackets belongs to the word before it."""
     cell = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?|\S")
     return (cell.findall(line) for line in lines)
 
 
 def _choose_split(path: Path, lines: Sequence[str]) -> Split:
-    """The way of cutting lines into cells under which one of the first lines is a header."""
+    """Returns the function that splits lines into cells such that one of the first lines is a header."""
     for split in (*map(_split_by, ";\t,"), _split_by_blanks):
         try:
             if any(is_header(row) for row in split(lines)):
@@ -142,12 +144,12 @@ def _choose_split(path: Path, lines: Sequence[str]) -> Split:
         except csv.Error:
             continue
     first = next((line.strip() for line in lines if line.strip()), "")
-    found = f"no header (the first line is {first[:60]!r})"
-    raise InputError(path, found, "a header that names a time, a displacement and a force column")
+    problem = f"no header (the first line is {first[:60]!r})"
+    raise InputError(path, problem, "a header that names a time, a displacement and a force column")
 
 
 def _tabulate(where: str, rows: Iterable[Row]) -> Table:
-    """Header, then an optional row of units, then numbers to the end."""
+    """Returns the table of rows with a header, an optional row of units, and then numbers to the end."""
     numbered = enumerate(rows, start=1)
     header_row, headers = next(
         ((n, _texts(row)) for n, row in islice(numbered, _HEADER_WITHIN) if is_header(_texts(row))), (0, [])
@@ -173,7 +175,7 @@ def _blank(row: Row) -> bool:
 
 
 def _unit_row(columns: dict[str, Column], row: Row) -> dict[str, Column] | None:
-    """The columns with the units of a row such as ``s; mm; N`` filled in; None if the row is no such row."""
+    """Returns the columns with the units from a row such as ``s; mm; N``, or None if it is not such a row."""
     filled = {}
     for quantity, column in columns.items():
         cell = row[column.index] if column.index < len(row) else None
@@ -187,7 +189,7 @@ def _unit_row(columns: dict[str, Column], row: Row) -> dict[str, Column] | None:
 def _numbers(
     where: str, rows: Iterable[tuple[int, Row]], needed: list[int], headers: list[str]
 ) -> list[Array]:
-    """The needed columns as floats, one chunk of rows in memory as text at a time."""
+    """Returns the needed columns as floats; only one chunk of rows is in memory as text at a time."""
     filled = _until_blank(where, rows)
     parts = []
     while chunk := list(islice(filled, _CHUNK)):
@@ -197,7 +199,7 @@ def _numbers(
 
 
 def _until_blank(where: str, rows: Iterable[tuple[int, Row]]) -> Iterator[tuple[int, Row]]:
-    """The rows up to the first blank one, after which nothing but blank rows may come."""
+    """Yields the rows up to the first blank row; only blank rows may follow it."""
     blank = 0
     for number, row in rows:
         if _blank(row):
@@ -217,7 +219,7 @@ def _refuse_ragged(where: str, chunk: list[tuple[int, Row]], needed: list[int], 
 
 
 def _floats(where: str, chunk: list[tuple[int, Row]], index: int, header: str) -> Array:
-    """One column of a chunk; a comma is taken as the decimal sign unless points stand there too."""
+    """Returns one column of a chunk; a comma is the decimal sign unless the column contains points too."""
     cells = [row[index] for _, row in chunk]
     signs = {sign for sign in ",." if any(isinstance(c, str) and sign in c for c in cells)}
     if signs == {","}:
@@ -227,9 +229,9 @@ def _floats(where: str, chunk: list[tuple[int, Row]], index: int, header: str) -
             raise ValueError
         return np.array(cells, dtype=float)
     except (ValueError, TypeError, OverflowError):
-        fault = next(i for i, cell in enumerate(cells) if not _is_number(cell))
-        place = f"{where}, row {chunk[fault][0]}, column {header!r}"
-        raise InputError(place, _describe_cell(chunk[fault][1][index]), "a number") from None
+        bad = next(i for i, cell in enumerate(cells) if not _is_number(cell))
+        place = f"{where}, row {chunk[bad][0]}, column {header!r}"
+        raise InputError(place, _describe_cell(chunk[bad][1][index]), "a number") from None
 
 
 def _is_number(cell: Any) -> bool:

@@ -1,7 +1,7 @@
-"""Building a reduced model: full runs, then modes, then cubatures; the base model first, then mechanisms.
+"""Builds a reduced model: first full runs, then modes, then cubatures; the base model first, then mechanisms.
 
-The base model can be used by itself. Full runs and the reduced runs that train cubatures are independent of
-each other, and workers make them.
+The base model can be used by itself. The full runs are independent of each other, and so are the reduced
+runs that train a cubature. Worker processes therefore make them.
 """
 
 from __future__ import annotations
@@ -27,19 +27,21 @@ from bayeskin.reduced.runs import FullRuns, Progress, binds_of, tissue_of
 from bayeskin.reduced.shadow import Shadow
 from bayeskin.types import Array
 
-ROUNDS = (4, 10, 20, 40)  # reduced runs after which a cubature is trained anew, for those that follow
+ROUNDS = (4, 10, 20, 40)  # numbers of reduced runs after which the cubature is trained; the next runs use it
 
 
 @dataclass(frozen=True)
 class BuildSettings:
     """Sizes of a reduced model and of its training.
 
-    base_runs, runs : full runs of the base model, and of each mechanism
-    base, each : displacement and pressure modes of the base model, and of each mechanism beyond the base's
-    base_points, set_points : of the cubatures
-    base_shadows, set_shadows : reduced runs that train the cubatures
-    trusted : the largest share of the peak force that points left out in a run whose integrands are learnt
-    seed : of the training cases; those of the cubatures have others
+    base_runs, runs : number of full runs of the base model, and of each mechanism
+    base : numbers of displacement and pressure modes of the base model
+    each : numbers of displacement and pressure modes that each mechanism adds to the base's
+    base_points, set_points : number of cubature points of the base model, and of sets of mechanisms
+    base_shadows, set_shadows : number of reduced runs that train the cubature of each
+    trusted : largest force that the points may leave out in a reduced run, as a fraction of its peak force; a
+        cubature does not learn from runs that leave out more
+    seed : random seed of the full runs; the reduced runs that train cubatures use seed + 1
     """
 
     base_runs: int = 128
@@ -63,9 +65,9 @@ class BuildSettings:
 def base_model(
     trained: Trained, full: FullRuns, settings: BuildSettings, run_all: Map, progress: Progress
 ) -> ReducedModel:
-    """Returns the reduced model without mechanisms, from full runs that are made where they are not kept.
+    """Returns the reduced model without mechanisms; makes the full runs that are not in the folder yet.
 
-    Raises InputError where no full run finishes, or a worker is lost.
+    Raises InputError where no full run finishes, or where a worker is lost.
     """
     cases = settings.cases(trained, BASE)
     full.make(cases, run_all, progress)
@@ -83,18 +85,18 @@ def with_mechanisms(
     base: ReducedModel, trained: Trained, full: FullRuns, settings: BuildSettings, run_all: Map,
     progress: Progress,
 ) -> ReducedModel:  # fmt: skip
-    """Returns a base model with all mechanisms of a region, from full runs that are made where not kept.
+    """Returns a base model with all mechanisms of a region added; makes the full runs that are missing.
 
-    Raises InputError where no full run of a mechanism finishes, or a worker is lost.
+    Raises InputError where no full run of a mechanism finishes, or where a worker is lost.
     """
     cases = {kind: settings.cases(trained, kind) for kind in sorted(trained.mechanisms)}
-    full.make([case for turn in zip(*cases.values(), strict=True) for case in turn], run_all, progress)
-    inner, own = inner_of(base.problem()), base.library.base
+    full.make([case for row in zip(*cases.values(), strict=True) for case in row], run_all, progress)
+    inner, modes_of_base = inner_of(base.problem()), base.library.base
     beyond = {
-        kind: modes_beyond(own, weighted_modes_of(full, of_kind, inner), inner, settings.each)
-        for kind, of_kind in cases.items()
+        kind: modes_beyond(modes_of_base, weighted_modes_of(full, cases_of_kind, inner), inner, settings.each)
+        for kind, cases_of_kind in cases.items()
     }
-    library = Library(own, beyond)
+    library = Library(modes_of_base, beyond)
     teacher = Teacher(full, library, settings, "cubature of sets")
     shadows = [trained.case(SETS, index, settings.seed + 1) for index in range(settings.set_shadows)]
     rule = teacher.rule(shadows, settings.set_points, run_all, progress)
@@ -102,9 +104,9 @@ def with_mechanisms(
 
 
 def weighted_modes_of(full: FullRuns, cases: Sequence[Case], inner: Inner) -> Modes:
-    """Returns the modes of full runs, each times its singular value, without runs that ended early.
+    """Returns the modes of full runs, each times its singular value. Runs that ended early are left out.
 
-    Raises InputError where none has finished.
+    Raises InputError where no run has finished.
     """
     finished = [run for run in map(full.read, cases) if not run.message]
     if not finished:
@@ -120,11 +122,13 @@ def weighted_modes_of(full: FullRuns, cases: Sequence[Case], inner: Inner) -> Mo
 
 @dataclass(frozen=True)
 class Teacher:
-    """Trains a cubature on reduced runs that are followed on all points; picklable, for workers.
+    """Trains a cubature on reduced runs that are followed on all points of the mesh.
 
-    full : says the mesh; label : what progress is told of
-    known : the rule on whose points it runs, or None for all points
-    Given a case and the number of its random mixtures' stream, it returns what the run teaches.
+    full : full runs, whose mesh and geometry are used; label : name of this work in the progress report
+    known : cubature at whose points the reduced runs are solved, or None for all points
+
+    A call takes a case and the number of a random stream for the mixtures, and returns the integrands of the
+    case's run. Instances can be pickled, so that worker processes can use them.
     """
 
     full: FullRuns
@@ -141,34 +145,35 @@ class Teacher:
         return shadowed(problem, basis, case, self.known, self.settings.cubature, rng)
 
     def rule(self, cases: Sequence[Case], points: int, run_all: Map, progress: Progress) -> Rule:
-        """Returns a cubature of so many points, from runs on all points first, then on those of a first one.
+        """Returns a cubature of `points` points.
 
-        Raises InputError where no run stays near the full model, or a worker is lost.
+        The first runs are solved on all points, the later ones on the points of the cubature trained so far.
+        Raises InputError where no reduced run is accurate enough to learn from, or where a worker is lost.
         """
         problem = problem_of("bricks", self.full.refinement, self.full.geometry)
         at = point_fields(problem, self.library.basis((), inner_of(problem)))
-        taught, rule, done = list[Array](), None, 0
+        rows, rule, done = list[Array](), None, 0
         ends = [end for end in ROUNDS if end < len(cases)]
         for end in (*ends, len(cases)):
             items = [(case, done + number) for number, case in enumerate(cases[done:end])]
-            found: dict[int, Taken] = {}
-            for number, taken in run_all(replace(self, known=rule), items):
-                if isinstance(taken, Lost):
-                    raise InputError(self.label, taken.reason, "a worker that finishes a reduced run")
-                found[number] = taken
-                progress(self.label, (done + len(found)) / len(cases))
-            taught += [found[number].rows for number in sorted(found) if self._near(found[number])]
-            if not taught:
-                none = "no reduced run that stays near the full model"
-                raise InputError(self.label, none, "a point away from folds")
-            whole = with_volumes(np.concatenate(taught), at, self.settings.cubature)
-            rule = choose_points(whole, [points], self.settings.cubature)[points][0]
+            runs: dict[int, Taken] = {}
+            for number, run in run_all(replace(self, known=rule), items):
+                if isinstance(run, Lost):
+                    raise InputError(self.label, run.reason, "a worker that finishes a reduced run")
+                runs[number] = run
+                progress(self.label, (done + len(runs)) / len(cases))
+            rows += [runs[number].rows for number in sorted(runs) if self._is_near(runs[number])]
+            if not rows:
+                message = "no reduced run that stays near the full model"
+                raise InputError(self.label, message, "a point away from folds")
+            all_rows = with_volumes(np.concatenate(rows), at, self.settings.cubature)
+            rule = choose_points(all_rows, [points], self.settings.cubature)[points][0]
             done = end
         assert rule is not None
         return rule
 
-    def _near(self, taken: Taken) -> bool:
-        """Returns whether the points of a run left out so little that its integrands are worth learning."""
+    def _is_near(self, taken: Taken) -> bool:
+        """Returns whether the points of a run left out so little force that a cubature can learn from it."""
         return bool(len(taken.missing)) and float(np.abs(taken.missing).max()) < self.settings.trusted
 
 
@@ -176,18 +181,21 @@ def shadowed(
     problem: Problem, basis: Basis, case: Case, rule: Rule | None, settings: CubatureSettings,
     rng: np.random.Generator,
 ) -> Taken:  # fmt: skip
-    """Runs a case by the reduced model on the points of a rule, or on all, and follows it on all points."""
+    """Runs a case with the reduced model and returns its integrands at all points.
+
+    The run is solved at the points of `rule`, or at all points where `rule` is None.
+    """
     binds = binds_of(case.mechanisms)
-    whole = whole_space(problem, basis)
-    space = whole if rule is None else reduced_space(problem, basis, rule)
+    all_points = whole_space(problem, basis)
+    space = all_points if rule is None else reduced_space(problem, basis, rule)
     run = ReducedEquations(space, case.theta, binds, case.motion)
-    shadow = Shadow(whole, case.theta, binds, case.motion)
+    shadow = Shadow(all_points, case.theta, binds, case.motion)
     return take(run, shadow, case.theta["p_init"], settings, rng)
 
 
 def whole_space(problem: Problem, basis: Basis) -> ReducedSpace:
-    """Returns a basis at all points of a problem, which leave nothing out."""
+    """Returns a basis at all points of a problem. No exact part is added, since no point is left out."""
     at = point_fields(problem, basis)
     k, m = at.gradient.shape[2], at.pressure.shape[1]
-    nothing = LinearParts(np.zeros((2, k, k)), np.zeros((2, k, k)), np.zeros((2, m, m)), np.zeros((k, m)))
-    return ReducedSpace(problem.lengths, at, nothing, SurfacesOf(problem, basis))
+    no_parts = LinearParts(np.zeros((2, k, k)), np.zeros((2, k, k)), np.zeros((2, m, m)), np.zeros((k, m)))
+    return ReducedSpace(problem.lengths, at, no_parts, SurfacesOf(problem, basis))

@@ -1,8 +1,8 @@
-"""Law kernels called by the address of their machine code from compiled code.
+"""Calls the law kernels of mechanisms from compiled code, by the address of their machine code.
 
-The kernels of a mechanism all have one of two signatures (`bayeskin.finite_element.kernels`). So one compiled
-driver calls those of any set of mechanisms, whose addresses are among its arguments, and no set needs a
-compilation of its own.
+Every kernel of a mechanism has one of two signatures (`bayeskin.finite_element.kernels`). One compiled driver
+therefore calls the kernels of any set of mechanisms, whose addresses are among its arguments. No set needs
+its own compilation.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -17,7 +17,7 @@ from bayeskin.finite_element.kernels import LINEARISE, RESPOND
 
 
 def address(kernel: Any) -> int:
-    """Returns where the machine code of a law kernel lies, or 0 for None."""
+    """Returns the address of the machine code of a law kernel, or 0 for None."""
     if kernel is None:
         return 0
     (compilation,) = kernel.overloads.values()
@@ -25,7 +25,7 @@ def address(kernel: Any) -> int:
 
 
 def _call(context, builder, signature, args):
-    """Calls the function at the address args[0] with the rest of args, in numba's calling convention."""
+    """Calls the function at the address args[0] with the remaining args, in numba's calling convention."""
     arguments = signature.args[1:]
     pointer = context.call_conv.get_function_type(types.none, arguments).as_pointer()
     function = builder.inttoptr(args[0], pointer)
@@ -35,11 +35,11 @@ def _call(context, builder, signature, args):
 
 @intrinsic
 def call_respond(typing, at, time_s, elapsed_s, par, data, f, p, g, before, after, stress, content, flux):
-    """Calls the respond kernel at an address."""
+    """Calls the respond kernel at the address `at`."""
     return types.void(types.int64, *RESPOND.args), _call
 
 
 @intrinsic
 def call_linearise(typing, at, time_s, elapsed_s, par, data, f, p, g, before, sf, sp, cf, cp, ff, fg):
-    """Calls the linearise kernel at an address."""
+    """Calls the linearise kernel at the address `at`."""
     return types.void(types.int64, *LINEARISE.args), _call

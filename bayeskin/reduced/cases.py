@@ -1,7 +1,7 @@
-"""Training cases of a reduced model: skins of the prior, sets of mechanisms, geometries and short protocols.
+"""Draws the training cases of a reduced model: parameters from the prior, mechanisms, geometry and protocol.
 
-A reduced model knows no protocol. It learns from random ones with all that a protocol may do: unload fully,
-hold at zero, load slowly or fast.
+A reduced model is not tied to any protocol. It learns from short random protocols that contain all that a
+protocol may do: unload fully, hold at zero, load slowly or fast.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from bayeskin.types import PadMotion, ParameterSpace
 
 BASE = "base"  # the kind of runs without a mechanism
 SETS = "sets"  # the kind of runs with one to four mechanisms
-ACCOMPANIED = 0.5  # share of a mechanism's runs in which one or two others act as well
-MOVED = {BASE: 0.5}  # share of the runs on other layers and another arm
+ACCOMPANIED = 0.5  # fraction of a mechanism's runs in which one or two other mechanisms act as well
+MOVED = {BASE: 0.5}  # fraction of the runs with other thicknesses of the layers and another radius of the arm
 MOVED_OTHERWISE = 0.25
-THICKNESS_RANGE, RADIUS_RANGE = 0.4, 0.3  # shares by which layers and arm differ at most
+THICKNESS_RANGE, RADIUS_RANGE = 0.4, 0.3  # largest relative changes of layers and arm
 
 
 @dataclass(frozen=True)
 class Protocols:
-    """Bounds of the random protocols: the largest displacement [m], speeds [m/s] and holds [s].
+    """Bounds of the random protocols: largest displacement [m], range of speeds [m/s] and of holds [s].
 
-    returns, rests : shares of the protocols that unload fully, and that hold after unloading
+    returns, rests : fraction of the protocols that unload fully, and fraction that hold after unloading
     """
 
     largest_m: float = 10e-3
@@ -38,7 +38,7 @@ class Protocols:
 
 @dataclass(frozen=True)
 class Case:
-    """One training run: values of all parameters, names of mechanisms, geometry and protocol."""
+    """The input of one training run: values of all parameters, names of mechanisms, geometry and protocol."""
 
     theta: Mapping[str, float]
     mechanisms: tuple[str, ...]
@@ -50,7 +50,8 @@ class Case:
 class Trained:
     """The region that a reduced model is trained for: priors, geometry and protocols.
 
-    base : of the model without mechanisms; mechanisms : of each one's parameters, by its name
+    base : priors of the model without mechanisms
+    mechanisms : priors of each mechanism's parameters, by the name of the mechanism
     """
 
     geometry: Geometry
@@ -70,13 +71,13 @@ class Trained:
     def _names(self, kind: str, rng: np.random.Generator) -> tuple[str, ...]:
         if kind == BASE:
             return ()
-        own = () if kind == SETS else (kind,)
+        chosen = () if kind == SETS else (kind,)
         if kind == SETS:
             count = int(rng.integers(1, 5))
         else:
             count = int(rng.integers(1, 3)) if rng.uniform() < ACCOMPANIED else 0
-        others = sorted(set(self.mechanisms) - set(own))
-        return tuple(sorted([*own, *rng.choice(others, min(count, len(others)), replace=False).tolist()]))
+        others = sorted(set(self.mechanisms) - set(chosen))
+        return tuple(sorted([*chosen, *rng.choice(others, min(count, len(others)), replace=False).tolist()]))
 
     def _theta(self, names: Sequence[str], rng: np.random.Generator) -> dict[str, float]:
         theta = _drawn(self.base, rng)

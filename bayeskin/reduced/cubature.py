@@ -1,8 +1,9 @@
-"""Empirical cubature: few quadrature points with positive weights that integrate what reduced runs integrate.
+"""Trains an empirical cubature: a few quadrature points with positive weights that suffice for reduced runs.
 
-The rows are integrands over all points, of states that reduced runs went through, tested with random mixtures
-of the modes and with the force's own adjoint. The base law's linear part is left out of them, since it is
-integrated exactly. A sparse non-negative least-squares fit then chooses points and weights.
+Reduced runs pass through many states. At each state that is recorded, the integrand of the residual at all
+points is tested with random mixtures of the modes and with the adjoint of the force, which gives the rows of
+a least-squares problem. The linear part of the base law is left out, since it is integrated exactly. A sparse
+non-negative least-squares fit then chooses points and weights.
 
 Source: Hernandez, Caicedo & Ferrer, Comput. Methods Appl. Mech. Eng. 313 (2017), 687-722; non-negative least
 squares: Lawson & Hanson, Solving Least Squares Problems (1974), chapter 23.
@@ -28,13 +29,14 @@ from bayeskin.types import Array
 class CubatureSettings:
     """Settings of the training of a cubature.
 
-    every : steps between the states that are taken
-    mixtures : random test vectors a state
-    force : weight of the force's own rows beside a mixture's
-    pressure : size of a pressure coefficient a newton of the peak force; mode_m : of a displacement's [m]
-    volume : weight of the layers' volumes
-    most : largest norm of a row; states with larger ones are scaled down, so that none outweighs all others
-    batch : points added at once
+    every : number of steps from one recorded state to the next
+    mixtures : number of random test vectors for each state
+    force : weight of the rows of the force, relative to a row of a mixture
+    pressure : size of a pressure coefficient per newton of the peak force
+    mode_m : size of a displacement coefficient [m]
+    volume : weight of the rows for the volumes of the layers
+    most : largest norm of a row; states with larger rows are scaled down, so that no state outweighs the rest
+    batch : number of points that are added at once
     """
 
     every: int = 5
@@ -49,11 +51,11 @@ class CubatureSettings:
 
 @dataclass(frozen=True)
 class Taken:
-    """Integrands of one reduced run, to train or test a cubature.
+    """Integrands of one reduced run, to train or to test a cubature.
 
-    rows (r, n) : integrands times weights, over the peak force
-    missing (s,) : force on all points less that of the run, over its peak, at the states taken
-    message : empty, or why the run ended early
+    rows (r, n) : integrands times the weights of the points, relative to the peak force
+    missing (s,) : force from all points minus the force of the run, relative to its peak, at recorded states
+    message : empty, or the reason why the run ended early
     """
 
     rows: Array
@@ -63,26 +65,26 @@ class Taken:
 
 def take(run: ReducedEquations, shadow: Shadow, p_init: float, settings: CubatureSettings,
          rng: np.random.Generator, tolerance: float = 2e-3) -> Taken:  # fmt: skip
-    """Runs the reduced model and follows it on all points, whose integrands are taken at some states."""
+    """Runs the reduced model, follows it on all points and returns the integrands there at some states."""
     states: list[tuple[Array, Array, float]] = []
     forces, count = [0.0], [0]
 
     def on_step(step: Step) -> None:
         if abs(step.state.time_s - run.starts_s) < 1e-6:
             run.zero_n = step.force_n
-        followed = None
+        at_all_points = None
         for stage in step.stages:
-            followed = shadow.follow(stage, max(stage.state.time_s - run.starts_s, 0.0))
-            if followed is None:
+            at_all_points = shadow.follow(stage, max(stage.state.time_s - run.starts_s, 0.0))
+            if at_all_points is None:
                 raise FloatingPointError("a point that was not chosen is inside out")
-        if followed is None:
+        if at_all_points is None:
             return
         forces.append(step.force_n)
         count[0] += 1
         if step.corner or count[0] % settings.every == 0:
             dual = run.dual()
-            missing_n = 2.0 * float(dual @ followed.residual) - step.force_n
-            states.append((shadow.nonlinear_integrands(followed), dual, missing_n))
+            missing_n = 2.0 * float(dual @ at_all_points.residual) - step.force_n
+            states.append((shadow.nonlinear_integrands(at_all_points), dual, missing_n))
 
     try:
         message = integrate(run, p_init, tolerance, on_step, falls_too=False)
@@ -99,7 +101,10 @@ def _tested(
     integrand: Array, dual: Array, at: PointFields, peak_n: float, settings: CubatureSettings,
     rng: np.random.Generator,
 ) -> Array:  # fmt: skip
-    """Rows (mixtures + 2, n) of one state's integrand (n, k + m): mixtures, and the force by layer."""
+    """Returns the rows (mixtures + 2, n) of one state's integrand (n, k + m).
+
+    The first rows belong to the mixtures; the last two are the force of the cutis and of the subcutis.
+    """
     k = at.gradient.shape[2]
     mixture = rng.standard_normal((integrand.shape[1], settings.mixtures)) / np.sqrt(settings.mixtures)
     mixture[:2] = 0.0
@@ -112,7 +117,7 @@ def _tested(
 
 
 def with_volumes(rows: Array, at: PointFields, settings: CubatureSettings) -> Array:
-    """The rows, and one for the volume of each layer, so that the weights add up to it."""
+    """Returns the rows and one more for each layer, so that the weights in a layer add up to its volume."""
     share = at.weight / at.weight.sum() * settings.volume * np.sqrt(len(rows))
     return np.concatenate([rows, np.array([share * at.cutis, share * ~at.cutis], dtype=np.float32)])
 
@@ -120,30 +125,33 @@ def with_volumes(rows: Array, at: PointFields, settings: CubatureSettings) -> Ar
 def choose_points(
     rows: Array, counts: Sequence[int], settings: CubatureSettings
 ) -> dict[int, tuple[Rule, float]]:
-    """Returns cubatures of about `counts` points, increasing, for rows (r, n), and what each leaves."""
+    """Returns cubatures for rows (r, n), each with its relative residual, by the wanted number of points.
+
+    counts : wanted numbers of points, in increasing order; a cubature has about that many points
+    """
     right = rows.sum(axis=1, dtype=np.float64)
     norm = np.sqrt(np.einsum("ij,ij->j", rows, rows, dtype=np.float64))
     norm = np.maximum(norm, 1e-6 * norm.max())
     points, fit = np.zeros(0, np.int64), _NonNegative(right)
-    found: dict[int, tuple[Rule, float]] = {}
+    rules: dict[int, tuple[Rule, float]] = {}
     wanted = list(counts)
     while wanted:
         gain = (fit.left().astype(np.float32) @ rows) / norm
         gain[points] = -np.inf
-        more = min(settings.batch if len(points) > 20 else 2, max(1, wanted[0] - len(points)))
-        new = np.argpartition(-gain, more)[:more]
+        count = min(settings.batch if len(points) > 20 else 2, max(1, wanted[0] - len(points)))
+        new = np.argpartition(-gain, count)[:count]
         kept = fit.add(rows[:, new].astype(np.float64))
         points = np.concatenate([points, new])[kept]
         if len(points) >= wanted[0]:
-            left = float(np.linalg.norm(fit.left()) / np.linalg.norm(right))
-            found[wanted.pop(0)] = Rule(points.copy(), fit.factor.copy()), left
-    return found
+            remaining = float(np.linalg.norm(fit.left()) / np.linalg.norm(right))
+            rules[wanted.pop(0)] = Rule(points.copy(), fit.factor.copy()), remaining
+    return rules
 
 
 class _NonNegative:
-    """Non-negative least squares of columns that come one batch after another.
+    """Solves a non-negative least-squares problem whose columns are added batch by batch.
 
-    factor (c,) : of the columns kept so far, all positive
+    factor (c,) : factors of the columns that are kept so far, all positive
     """
 
     def __init__(self, right: Array) -> None:
@@ -157,10 +165,10 @@ class _NonNegative:
         return self._right - self._columns @ self.factor
 
     def add(self, new: Array) -> np.ndarray:
-        """Adds columns and solves again; returns the numbers of those that are kept, the new ones last."""
-        cross, own = self._columns.T @ new, new.T @ new
-        own[np.diag_indices_from(own)] *= 1.0 + 1e-12
-        self._gram = np.block([[self._gram, cross], [cross.T, own]])
+        """Adds columns and solves again; returns the indices of the kept columns, the new columns last."""
+        cross, among_new = self._columns.T @ new, new.T @ new
+        among_new[np.diag_indices_from(among_new)] *= 1.0 + 1e-12
+        self._gram = np.block([[self._gram, cross], [cross.T, among_new]])
         self._projected = np.concatenate([self._projected, new.T @ self._right])
         self._columns = np.concatenate([self._columns, new], axis=1)
         kept = self._solved(np.concatenate([self.factor, np.zeros(new.shape[1])]))
@@ -169,7 +177,7 @@ class _NonNegative:
         return kept
 
     def _solved(self, factor: Array) -> np.ndarray:
-        """Lawson and Hanson's inner loop from a feasible start."""
+        """Runs Lawson and Hanson's inner loop from feasible factors; returns indices of the kept columns."""
         kept = np.arange(len(factor))
         while True:
             factored = cho_factor(self._gram[np.ix_(kept, kept)], overwrite_a=True, check_finite=False)

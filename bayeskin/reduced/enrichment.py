@@ -1,9 +1,10 @@
-"""A reduced model for one recording: a few full runs near a point, on the recording's own protocol.
+"""Fits a reduced model to one recording, with a few full runs near a point and on the recording's protocol.
 
-Over all of the prior a set of mechanisms needs many modes; over the skins that a recording leaves plausible
-few will do. Full runs at and near a point, on the recording's protocol, give these modes, and reduced runs
-near by the cubature. Each further full run is first predicted, which measures the error. When that is below
-what is asked the model is done; else the run joins it. All full runs are kept.
+A set of mechanisms needs many modes over the whole prior, but few over the skins that a recording leaves
+plausible. Full runs at and near a point, on the recording's protocol, give these modes. Reduced runs near the
+point train the cubature. The model predicts each further full run before that run is added, which measures
+the error. The model is finished when the error is not above the wanted value; otherwise the run is added.
+All full runs are kept in a folder.
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ from bayeskin.types import Array, PadMotion, ParameterSpace
 class EnrichmentSettings:
     """Settings of the fit of a reduced model to a recording.
 
-    width : share of each prior within which full and reduced runs lie, around the point
-    first : full runs before the first prediction; most : full runs at most
-    kept : modes with singular values below this share of the largest are left out
-    modes : displacement and pressure modes at most
-    points, shadows : of the cubature, and reduced runs that train it; so few runs need many test vectors a
-        state, or the cubature is exact on these vectors alone
-    wanted : RMS error of a predicted run, as a share of its peak, at which the model is done
+    width : largest distance of a run's parameters from the point, in the unit coordinate of each prior
+    first : number of full runs before the first prediction; most : largest number of full runs
+    kept : modes with singular values below this fraction of the largest are left out
+    modes : largest numbers of displacement and pressure modes
+    points : number of cubature points; shadows : number of reduced runs that train the cubature. Since these
+        runs are few, each state needs many test vectors; else the cubature is exact on those vectors alone
+    wanted : RMS error of a predicted run at which the model is finished, as a fraction of its peak force
     """
 
     width: float = 0.05
@@ -59,7 +60,7 @@ class EnrichmentSettings:
 
 @dataclass(frozen=True)
 class Enriched:
-    """A reduced model around a point, and the RMS errors, over the peak, of the runs that it predicted."""
+    """A reduced model around a point, and the RMS errors of its predictions, relative to the peak force."""
 
     model: ReducedModel
     errors: tuple[float, ...]
@@ -67,7 +68,7 @@ class Enriched:
 
     @property
     def error(self) -> float:
-        """The last measured error, over the peak."""
+        """Returns the last measured error, relative to the peak force."""
         return self.errors[-1]
 
 
@@ -77,42 +78,42 @@ def enrich(
 ) -> Enriched:  # fmt: skip
     """Returns the reduced model of a set of mechanisms around a point, on one protocol.
 
-    folder : where full runs are kept, and found again
+    folder : where full runs are stored, and read again if they exist already
     Raises InputError where no full run finishes.
     """
     rng = np.random.default_rng([settings.seed, 7])
-    near = _Near(model, mechanisms, motion, settings.width)
-    cases = [near.case(theta, None), *(near.case(theta, rng) for _ in range(settings.most - 1))]
-    shadows = [near.case(theta, rng) for _ in range(settings.shadows)]
+    nearby = _NearbyCases(model, mechanisms, motion, settings.width)
+    cases = [nearby.case(theta, None), *(nearby.case(theta, rng) for _ in range(settings.most - 1))]
+    shadows = [nearby.case(theta, rng) for _ in range(settings.shadows)]
     full = FullRuns(model.trained.geometry, model.refinement, folder)
 
-    def made(some: Sequence[Case]) -> list[TrainingRun]:
-        full.make(some, run_all, progress)
-        return [full.read(case) for case in some]
+    def full_runs_of(wanted: Sequence[Case]) -> list[TrainingRun]:
+        full.make(wanted, run_all, progress)
+        return [full.read(case) for case in wanted]
 
-    runs = made(cases[: settings.first])
+    runs = full_runs_of(cases[: settings.first])
     errors: list[float] = []
     while True:
-        library = _library(near, runs, inner_of(model.problem()), settings)
+        library = _library(nearby, runs, inner_of(model.problem()), settings)
         teacher = Teacher(full, library, settings.build, "cubature near the point")
         rule = teacher.rule(shadows, settings.points, run_all, progress)
         fitted = replace(
-            model, trained=near.region(model.trained, theta), library=library,
+            model, trained=nearby.region(model.trained, theta), library=library,
             cubatures=Cubatures(rule, rule), hash=f"{model.hash}, enriched",
         )  # fmt: skip
-        ahead = cases[len(runs)] if len(runs) < len(cases) else None
-        if ahead is None:
+        next_case = cases[len(runs)] if len(runs) < len(cases) else None
+        if next_case is None:
             break
-        (run,) = made([ahead])
-        errors.append(_error(fitted, ahead, run))
+        (run,) = full_runs_of([next_case])
+        errors.append(_rms_error(fitted, next_case, run))
         if errors[-1] <= settings.wanted:
             break
         runs.append(run)
-    return Enriched(fitted, tuple(errors), len(runs) + (1 if ahead is not None else 0))
+    return Enriched(fitted, tuple(errors), len(runs) + (1 if next_case is not None else 0))
 
 
-class _Near:
-    """Cases around a point."""
+class _NearbyCases:
+    """Draws training cases around a point of the priors, on one protocol."""
 
     def __init__(
         self, model: ReducedModel, mechanisms: Sequence[str], motion: PadMotion, width: float
@@ -124,7 +125,7 @@ class _Near:
         self._geometry = model.trained.geometry
 
     def case(self, theta: Mapping[str, float], rng: np.random.Generator | None) -> Case:
-        """The point itself, or one drawn within the width of it on each prior."""
+        """Returns the case at the point itself, or with `rng` a random case within the width around it."""
         unit = self.space.to_unit([theta[name] for name in self.space.names])
         if rng is not None:
             unit = np.clip(unit + rng.uniform(-self._width, self._width, self.space.dim), 0.0, 1.0)
@@ -132,13 +133,13 @@ class _Near:
         return Case(values, self.mechanisms, self._geometry, self._motion)
 
     def region(self, trained: Trained, theta: Mapping[str, float]) -> Trained:
-        """The part of a trained region within twice the width of a point: where the model is trusted."""
+        """Returns a trained region narrowed to twice the width around a point, where the model is trusted."""
         known = catalogue()
         spaces = {name: ParameterSpace(known[name].parameters) for name in tissue_of(self.mechanisms)}
-        mechanisms = {name: self._part(space, theta) for name, space in spaces.items()}
-        return replace(trained, base=self._part(trained.base, theta), mechanisms=mechanisms)
+        mechanisms = {name: self._narrowed(space, theta) for name, space in spaces.items()}
+        return replace(trained, base=self._narrowed(trained.base, theta), mechanisms=mechanisms)
 
-    def _part(self, space: ParameterSpace, theta: Mapping[str, float]) -> ParameterSpace:
+    def _narrowed(self, space: ParameterSpace, theta: Mapping[str, float]) -> ParameterSpace:
         unit = space.to_unit([theta[name] for name in space.names])
         low = space.from_unit(np.clip(unit - 2.0 * self._width, 0.0, 1.0))
         high = space.from_unit(np.clip(unit + 2.0 * self._width, 0.0, 1.0))
@@ -148,32 +149,39 @@ class _Near:
         ))  # fmt: skip
 
 
-def _library(near: _Near, runs: Sequence[TrainingRun], inner: Inner, settings: EnrichmentSettings) -> Library:
-    """The modes of full runs, as those of the base model; the mechanisms have none beside them."""
+def _library(
+    near: _NearbyCases, runs: Sequence[TrainingRun], inner: Inner, settings: EnrichmentSettings
+) -> Library:
+    """Returns a library whose base modes are the modes of full runs; its mechanisms add no modes."""
     finished = [run for run in runs if not run.message]
     if not finished:
         raise InputError("enrichment", "no full run that finishes near this point", "a point away from folds")
     modes = Modes(
-        _largest([run.displacement for run in finished], inner.displacement, settings, 0),
-        _largest([run.pressure for run in finished], inner.pressure, settings, 1),
+        _largest_modes([run.displacement for run in finished], inner.displacement, settings, 0),
+        _largest_modes([run.pressure for run in finished], inner.pressure, settings, 1),
     )
     empty = Modes(np.zeros((0, modes.displacement.shape[1])), np.zeros((0, modes.pressure.shape[1])))
     return Library(modes, dict.fromkeys(tissue_of(near.mechanisms), empty))
 
 
-def _largest(rows: Sequence[Array], inner: sp.csr_matrix, settings: EnrichmentSettings, field: int) -> Array:
-    """The modes of weighted rows with the largest singular values; field : 0 displacement, 1 pressure."""
+def _largest_modes(
+    rows: Sequence[Array], inner: sp.csr_matrix, settings: EnrichmentSettings, field: int
+) -> Array:
+    """Returns the modes of weighted rows with the largest singular values.
+
+    field : 0 for displacement, 1 for pressure
+    """
     values, modes = pod(np.concatenate(rows).astype(float), inner)
     return modes[: min(settings.modes[field], int((values > settings.kept * values[0]).sum()))]
 
 
-def _error(model: ReducedModel, case: Case, run: TrainingRun) -> float:
-    """The RMS error of a reduced run beside the full one, over its peak; infinite where either fails."""
+def _rms_error(model: ReducedModel, case: Case, run: TrainingRun) -> float:
+    """Returns the RMS error of a reduced run over the full run's peak force; infinite where a run fails."""
     known = catalogue()
-    found = simulate_reduced(model, case.motion, case.theta, [known[name] for name in case.mechanisms])
-    if run.message or found.status != "ok":
+    prediction = simulate_reduced(model, case.motion, case.theta, [known[name] for name in case.mechanisms])
+    if run.message or prediction.status != "ok":
         return float("inf")
-    wrong_n = found.at(run.time_s) - run.force_n
+    error_n = prediction.at(run.time_s) - run.force_n
     weight = np.gradient(run.time_s)
-    rms_n = np.sqrt(np.average(np.square(wrong_n), weights=weight))
+    rms_n = np.sqrt(np.average(np.square(error_n), weights=weight))
     return float(rms_n / np.abs(run.force_n).max())

@@ -1,4 +1,7 @@
-"""The equations of one reduced run, as `bayeskin.finite_element.stepping` integrates them."""
+"""States the equations of one run of the reduced model.
+
+`bayeskin.finite_element.stepping` integrates them in time, as it integrates the full model.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +22,17 @@ from bayeskin.reduced.operators import LinearParts, PointFields
 from bayeskin.reduced.tangents import Tangent, Tangents
 from bayeskin.types import Array, PadMotion
 
-SOLVER_TOLERANCE = 1e-5  # of the amplitude of displacements, and of the nominal force
+SOLVER_TOLERANCE = 1e-5  # relative to the amplitude of displacements and to the nominal force
 SurfaceUnit = Callable[[Problem], sp.csr_matrix]
 
 
 @dataclass(frozen=True)
 class ReducedSpace:
-    """A basis at the points of a cubature, with what is integrated exactly.
+    """A basis at the points of a cubature, and the parts of the equations that are integrated exactly.
 
-    lengths : device and tissue; at : fields at the points
-    exact : linear parts of the base law less what the points make of them
-    surfaces : of unit surface terms, projected on all fields, (k + m, k + m)
+    lengths : geometry of device and tissue; at : fields of the basis at the points
+    exact : exact integrals of the base law's linear parts minus their sums over the points
+    surfaces : function that returns a unit surface term, projected on all fields, (k + m, k + m)
     """
 
     lengths: Geometry
@@ -39,20 +42,20 @@ class ReducedSpace:
 
     @property
     def modes(self) -> tuple[int, int]:
-        """Number of displacement fields, the pads' and the dual one among them, and of pressure modes."""
+        """Returns the number k of displacement fields (pads and dual included) and m of pressure modes."""
         return self.at.gradient.shape[2], self.at.pressure.shape[1]
 
     @property
     def sites(self) -> Sites:
-        """The points as laws see them."""
+        """Returns the points in the form that laws are given."""
         return Sites(self.at.cutis, self.at.points_m, self.lengths)
 
 
 @dataclass(frozen=True)
 class Bound:
-    """Constants and laws of a run at the points, for values of all parameters.
+    """Constants and laws of a run at the points, for given values of all parameters.
 
-    solid_by (s,), flow_by (t,) : coefficients of the exact parts' units (`exact_units`)
+    solid_by (s,), flow_by (t,) : coefficients of the matrices of the exact parts (`exact_units`)
     """
 
     solid: Material
@@ -62,24 +65,24 @@ class Bound:
 
     @property
     def par(self) -> Array:
-        """Constants of all laws, flat."""
+        """Returns the constants of all laws in one flat array."""
         return _flat([law.par for law in self.laws])
 
     @property
     def data(self) -> Array:
-        """Constants of all laws at the points, flat."""
+        """Returns the constants of all laws at the points in one flat array."""
         return _flat([law.data for law in self.laws])
 
 
 def bound(space: ReducedSpace, theta: Mapping[str, float], binds: Sequence[Bind]) -> Bound:
-    """Binds base law and mechanisms to values of their parameters."""
+    """Binds the base law and the laws of mechanisms to values of their parameters."""
     sites, cutis = space.sites, space.at.cutis
     solid = material(theta, cutis)
     laws = tuple(sorted((bind(theta, sites) for bind in binds), key=lambda law: law.rank))
-    first, other = int(np.argmax(cutis)), int(np.argmin(cutis))  # a point of each layer
+    in_cutis, in_subcutis = int(np.argmax(cutis)), int(np.argmin(cutis))  # the first point of each layer
 
     def of_layers(name: str) -> Array:
-        return np.array([getattr(solid, name)[first], getattr(solid, name)[other]])
+        return np.array([getattr(solid, name)[in_cutis], getattr(solid, name)[in_subcutis]])
 
     still, rates = surface_terms(laws)
     return Bound(
@@ -90,13 +93,13 @@ def bound(space: ReducedSpace, theta: Mapping[str, float], binds: Sequence[Bind]
 
 
 def surface_terms(laws: Sequence[TissueLaw]) -> tuple[list[SurfaceTerm], list[SurfaceTerm]]:
-    """The surface terms of laws: those of the displacement, and those that are rates of the fluid."""
+    """Returns two lists of the laws' surface terms: terms of the displacement, and rates of the fluid."""
     terms = [term for law in laws for term in law.surfaces]
     return [t for t in terms if not t.per_second], [t for t in terms if t.per_second]
 
 
 def exact_units(space: ReducedSpace, laws: Sequence[TissueLaw]) -> tuple[Array, Array]:
-    """The matrices (s, k, k) and (t, m, m) whose combinations are the exact parts."""
+    """Returns the matrices (s, k, k) and (t, m, m) whose linear combinations are the exact parts."""
     k, exact = space.modes[0], space.exact
     still, rates = surface_terms(laws)
     solid = [*exact.shear, *exact.bulk, *(space.surfaces(term.unit)[:k, :k] for term in still)]
@@ -109,7 +112,7 @@ def _flat(arrays: Sequence[Array]) -> Array:
 
 
 def packed(laws: Sequence[TissueLaw], points: int) -> kernels.Laws:
-    """Laws as the compiled driver is given them."""
+    """Returns laws in the form that the compiled driver takes; points : number of points."""
     par, widths = [len(law.par) for law in laws], [law.data.shape[1] for law in laws]
     memory = [law.remembers for law in laws]
 
@@ -126,10 +129,12 @@ def packed(laws: Sequence[TissueLaw], points: int) -> kernels.Laws:
 
 
 class ReducedEquations:
-    """The equations of one run: a reduced space, parameters, mechanisms and a protocol; no step control.
+    """The equations of one run: a reduced space, parameters, mechanisms and a protocol.
 
-    theta : values of all parameters; binds : of the mechanisms' laws
-    zero_n : the force when the test starts; what lies in series with the skin acts on the force beyond that
+    Step control is not part of them.
+
+    theta : values of all parameters; binds : functions that bind the mechanisms' laws
+    zero_n : force at the start of the test [N]; elements in series with the skin act on the force beyond it
     """
 
     def __init__(
@@ -165,25 +170,28 @@ class ReducedEquations:
 
     @property
     def solver(self) -> ReducedEquations:
-        """Carries the counts, as `stepping.integrate` asks of a model's solver."""
+        """Returns this object, since `stepping.integrate` reads the counts of a model from its solver."""
         return self
 
     def nominal_force(self) -> float:
-        """Scale of the force [N] over the protocol."""
+        """Returns the scale of the force [N] over the protocol."""
         return self._nominal_n
 
     @property
     def motion(self) -> PadMotion:
-        """The protocol less what is lost whatever the force, from the opening of the pads on."""
+        """Returns the protocol minus the displacement that is lost whatever the force is.
+
+        An opening of the pads before the test comes first.
+        """
         return self.drive.motion
 
     @property
     def starts_s(self) -> float:
-        """When the test starts [s]."""
+        """Returns the time at which the test starts [s]."""
         return self.drive.starts_s
 
     def initial_state(self, p_init: float) -> State:
-        """The skin at rest under a pressure [Pa]."""
+        """Returns the state of the skin at rest under a pressure [Pa]."""
         k, m = self.space.modes
         n = len(self.space.at.weight)
         x = np.zeros(k + m)
@@ -192,12 +200,12 @@ class ReducedEquations:
         return State(0.0, x, np.ones(n), np.full(n, float(p_init)), (memory,), self.drive.at_rest)
 
     def remember_travel(self, past: list[State]) -> None:
-        """Keeps how the unknowns went with the pads, to guess how they set out again."""
+        """Stores the change of the unknowns per metre of pad travel, to guess how the next phase begins."""
         if len(past) < 2:
             return
-        way_m = past[-1].x[0] - past[-2].x[0]
-        if abs(way_m) > 1e-3 * self.drive.largest_m:
-            self._travel = (past[-1].x - past[-2].x) / way_m
+        travel_m = past[-1].x[0] - past[-2].x[0]
+        if abs(travel_m) > 1e-3 * self.drive.largest_m:
+            self._travel = (past[-1].x - past[-2].x) / travel_m
 
     def solve_stage(
         self,
@@ -208,17 +216,20 @@ class ReducedEquations:
         jump: bool,
         fall: bool = False,
     ) -> Stage | None:
-        """Solves one implicit equation for time_s, as `LagrangianModel.solve_stage`; it follows no fall."""
+        """Solves one implicit stage that ends at time_s, as `LagrangianModel.solve_stage` does.
+
+        Returns None where no solution is found. The reduced model does not follow a fall.
+        """
         if fall:
             return None
         last = sources[-1][1]
         past = self._history(sources, length_s, time_s)
         place = self._place(time_s, length_s)
         if not self._tangents.take(place, self.tangent):
-            self._renew(past, last.x)
+            self._renew_tangent(past, last.x)
 
         def first(pads_m: float) -> Solved | None:
-            return self._solve(past, self._set_out(past, last, pads_m) if jump else guess, pads_m)
+            return self._solve(past, self._guess_by_travel(past, last, pads_m) if jump else guess, pads_m)
 
         def again(near: Array, pads_m: float) -> Solved | None:
             return self._solve(past, near, pads_m)
@@ -236,13 +247,16 @@ class ReducedEquations:
         return Stage(state, length_s, past.elapsed_s, history, sources, residual)
 
     def _place(self, time_s: float, length_s: float) -> tuple[float, float]:
-        """Returns how far the pads are open in a stage, and its length: near ones have near tangents."""
+        """Returns coordinates of a stage: the relative opening of the pads, and the logarithm of its length.
+
+        Stages that are near in these coordinates have similar tangents.
+        """
         return float(self.drive.motion.at(time_s)) / self.drive.largest_m, float(np.log(length_s))
 
     def _history(
         self, sources: tuple[tuple[float, State], ...], length_s: float, time_s: float
     ) -> kernels.History:
-        """Returns the history that a stage at a time has from its sources; the last carries the memory."""
+        """Returns the history of a stage that ends at a time; the last of its sources carries the memory."""
         last, k = sources[-1][1], self.space.modes[0]
         return kernels.History(
             np.asarray(sum(w * s.volume for w, s in sources)),
@@ -252,7 +266,7 @@ class ReducedEquations:
         )  # fmt: skip
 
     def past_of(self, stage: Stage) -> kernels.History:
-        """The history that a solved stage had."""
+        """Returns the history of a solved stage."""
         return self._history(stage.sources, stage.length_s, stage.state.time_s)
 
     def make_room(self) -> kernels.Room:
@@ -262,25 +276,31 @@ class ReducedEquations:
             np.empty((n, 3)), np.empty(n), np.empty(int(self.packed.memory_at[-1])),
         )  # fmt: skip
 
-    def _set_out(self, past: kernels.History, last: State, pads_m: float) -> Array:
-        """A guess where the pads set out from the last state: as they did before, or by the tangent."""
-        way_m = pads_m - last.x[0]
+    def _guess_by_travel(self, past: kernels.History, last: State, pads_m: float) -> Array:
+        """Returns a guess of the unknowns where the pads start to move from the last state.
+
+        It uses the stored change per pad travel, or the tangent where no change is stored yet.
+        """
+        travel_m = pads_m - last.x[0]
         if self._travel is not None:
-            return np.asarray(last.x + self._travel * way_m)
+            return np.asarray(last.x + self._travel * travel_m)
         right, x = np.empty(len(last.x)), last.x.copy()
         kernels.residual(self.system, self.packed, past, x, self.make_room(), right)
         self.spent[1] += 1
-        x[2:] -= self.tangent.inverse @ (right[2:] + self.tangent.by_pads[:-1] * way_m)
+        x[2:] -= self.tangent.inverse @ (right[2:] + self.tangent.by_pads[:-1] * travel_m)
         return x
 
-    def _renew(self, past: kernels.History, x: Array) -> None:
-        """Makes the tangent anew for a stage, at the unknowns x."""
+    def _renew_tangent(self, past: kernels.History, x: Array) -> None:
+        """Computes a new tangent for a stage, at the unknowns x."""
         t = self.tangent
         kernels.renew(self.system, self.packed, past, x, self.make_room(), t.inverse, t.force_row, t.by_pads)
         self.spent[2] += 1
 
     def _solve(self, past: kernels.History, guess: Array, pads_m: float) -> Solved | None:
-        """The unknowns with the pads at `pads_m`, and the force beyond that at the start; None if none."""
+        """Returns the unknowns with the pads at `pads_m`, and the force beyond that at the start of the test.
+
+        Returns None where the solve does not converge.
+        """
         t, room, x = self.tangent, self.make_room(), guess.copy()
         x[0], x[1] = pads_m, 0.0
         status, force_n = kernels.solve(
@@ -288,13 +308,16 @@ class ReducedEquations:
             t.force_row, t.by_pads, self.spent,
         )  # fmt: skip
         if status != kernels.CONVERGED:
-            self._tangents.forget()  # the next solve makes its own
+            self._tangents.forget()  # the next solve then computes a new tangent
             return None
         self.room, self.past = room, past
         return x, float(force_n) - self.zero_n
 
     def finish(self, stages: tuple[Stage, ...], mass: Array) -> Step:
-        """The step made of `stages`, with the local error that an error (n,) of the fluid mass makes."""
+        """Returns the step that consists of `stages`.
+
+        Its local error [N] is the change of the force that an error `mass` (n,) of the fluid mass causes.
+        """
         k = self.space.modes[0]
         at, t = self.space.at, self.tangent
         right = np.concatenate([np.zeros(k - 2), -(at.pressure.T @ (at.weight * mass))])
@@ -302,16 +325,19 @@ class ReducedEquations:
         return Step(stages[-1].state, 2.0 * float(stages[-1].residual[1]), error_n, False, stages)
 
     def solid_stiffness(self) -> Array:
-        """The tangent of the displacement modes (u, u) at the last solved stage, its symmetric part."""
+        """Returns the tangent stiffness (u, u) of the displacement modes at the last solved stage.
+
+        It is the symmetric part of the tangent.
+        """
         assert self.room is not None
         assert self.past is not None
         k = self.space.modes[0]
-        whole = kernels.tangent(self.system, self.packed, self.past, self.room)
-        solid = whole[2:k, 2:k]
+        tangent = kernels.tangent(self.system, self.packed, self.past, self.room)
+        solid = tangent[2:k, 2:k]
         return np.asarray(0.5 * (solid + solid.T))
 
     def dual(self) -> Array:
-        """The adjoint of half the force (k + m,) by the last tangent."""
+        """Returns the adjoint of half the force (k + m,), from the last tangent."""
         out = np.zeros(sum(self.space.modes))
         out[1] = 1.0
         out[2:] = -0.5 * (self.tangent.inverse.T @ self.tangent.force_row)

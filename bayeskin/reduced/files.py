@@ -1,4 +1,7 @@
-"""A reduced model to and from one HDF5 file, with its manifest inside and beside it: arrays and text."""
+"""Writes a reduced model to one HDF5 file and reads it again.
+
+The file holds arrays and text only. Its manifest is stored in the file and also beside it, as JSON.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +32,11 @@ EXPECTED = "a reduced model that `bayeskin reduce` wrote"
 
 
 def save_reduced(path: Path, model: ReducedModel, manifest: Mapping[str, Any]) -> None:
-    """Writes a reduced model and, beside it as ``.json``, its manifest; each whole or not at all.
+    """Writes a reduced model and, beside it as ``.json``, its manifest.
 
-    Modes beyond the base's are stored in half precision, each over its largest value.
-    Raises InputError where it cannot be written.
+    Each file is written whole or not at all. The base's modes are stored in single precision and the modes of
+    mechanisms in half precision. Each mode is divided by its largest value.
+    Raises InputError where a file cannot be written.
     """
     text = ""
 
@@ -48,12 +52,12 @@ def save_reduced(path: Path, model: ReducedModel, manifest: Mapping[str, Any]) -
         for name, space in model.trained.mechanisms.items():
             storage.write(handle.create_group(f"mechanisms/{name}"), space)
         digest = storage.contents_hash(handle)
-        said = {
+        full_manifest = {
             **manifest, "geometry": asdict(model.trained.geometry), "refinement": model.refinement,
             "protocols": asdict(model.trained.protocols), "full_model_hash": model.full_hash,
             "laws": law_hashes(model.trained.mechanisms), "arrays_sha256": digest,
         }  # fmt: skip
-        text = json.dumps(said, indent=2, sort_keys=True)
+        text = json.dumps(full_manifest, indent=2, sort_keys=True)
         handle.attrs.update(
             format=FORMAT, format_version=FORMAT_VERSION, version=__version__, arrays_sha256=digest,
             manifest=text,
@@ -65,11 +69,11 @@ def save_reduced(path: Path, model: ReducedModel, manifest: Mapping[str, Any]) -
 
 def _write_modes(group: h5py.Group, modes: Modes, kind: type) -> None:
     for name, values in asdict(modes).items():
-        size = np.abs(values).max(axis=1, initial=1e-300) if len(values) else np.zeros(0)
+        largest = np.abs(values).max(axis=1, initial=1e-300) if len(values) else np.zeros(0)
         group.create_dataset(
-            name, data=(values / size[:, None]).astype(kind), compression="gzip", shuffle=True
+            name, data=(values / largest[:, None]).astype(kind), compression="gzip", shuffle=True
         )
-        group[f"{name}_size"] = size
+        group[f"{name}_size"] = largest
 
 
 def _read_modes(group: h5py.Group) -> Modes:
@@ -80,9 +84,9 @@ def _read_modes(group: h5py.Group) -> Modes:
 
 
 def trained_geometry(path: Path) -> Geometry | None:
-    """Returns the geometry that the reduced model of a file was made for; None where it holds no such model.
+    """Returns the geometry of the reduced model in a file, or None where the file holds no reduced model.
 
-    Raises InputError for a file that is absent, or no HDF5.
+    Raises InputError for a file that is absent or is not HDF5.
     """
     with storage.reading(path, EXPECTED) as handle:
         if handle.attrs.get("format") != FORMAT:
@@ -92,10 +96,10 @@ def trained_geometry(path: Path) -> Geometry | None:
 
 @lru_cache(maxsize=4)
 def load_reduced(path: Path) -> ReducedModel:
-    """Reads what `save_reduced` wrote.
+    """Returns the reduced model that `save_reduced` wrote.
 
-    Raises InputError if the file is absent, truncated, foreign or altered, or if it was made from another
-    version of the full model or of a mechanism's law.
+    Raises InputError if the file is absent, truncated, altered or of another kind, or if the model was made
+    from another version of the full model or of a mechanism's law.
     """
     with storage.reading(path, EXPECTED) as handle:
         if handle.attrs.get("format") != FORMAT:
@@ -105,15 +109,15 @@ def load_reduced(path: Path) -> ReducedModel:
             raise InputError(path, f"format version {version}", f"format version {FORMAT_VERSION}")
         if storage.contents_hash(handle) != handle.attrs["arrays_sha256"]:
             raise InputError(path, "contents that differ from their stored hash", "an unaltered file")
-        said = json.loads(handle.attrs["manifest"])
+        manifest = json.loads(handle.attrs["manifest"])
         model = ReducedModel(
             trained=Trained(
-                _geometry(said["geometry"]), storage.read(handle["space"], ParameterSpace, path),
+                _geometry(manifest["geometry"]), storage.read(handle["space"], ParameterSpace, path),
                 {name: storage.read(group, ParameterSpace, path)
                  for name, group in handle.get("mechanisms", {}).items()},
-                Protocols(**{name: _tupled(value) for name, value in said["protocols"].items()}),
+                Protocols(**{name: _tupled(value) for name, value in manifest["protocols"].items()}),
             ),
-            refinement=int(said["refinement"]),
+            refinement=int(manifest["refinement"]),
             library=Library(
                 _read_modes(handle["base"]),
                 {name: _read_modes(group) for name, group in handle.get("beyond", {}).items()},
@@ -122,10 +126,10 @@ def load_reduced(path: Path) -> ReducedModel:
                 name: Rule(group["points"][()].astype(np.int64), frozen_array(group["factor"][()]))
                 for name, group in handle["cubatures"].items()
             }),
-            full_hash=str(said["full_model_hash"]),
+            full_hash=str(manifest["full_model_hash"]),
             hash=str(handle.attrs["arrays_sha256"]),
         )  # fmt: skip
-    _refuse_other_laws(path, model, said["laws"])
+    _check_versions(path, model, manifest["laws"])
     return model
 
 
@@ -138,7 +142,7 @@ def _geometry(said: Mapping[str, Any]) -> Geometry:
     return Geometry(**{**said, "guard": None if guard is None else Guard(**guard)})
 
 
-def _refuse_other_laws(path: Path, model: ReducedModel, laws: Mapping[str, str]) -> None:
+def _check_versions(path: Path, model: ReducedModel, laws: Mapping[str, str]) -> None:
     spec = ModelSpec(refinement=model.refinement, geometry=model.trained.geometry)
     remedy = "one of this version: make it anew with `bayeskin reduce`"
     if model.full_hash != spec.hash:

@@ -1,11 +1,13 @@
 """Compiled core of the reduced model: residual, tangent and the whole solve of a stage at weighted points.
 
-Unknowns are coefficients x = (d, 0, displacement modes, pressure modes): d is the pads' displacement, and the
-second entry, always zero, belongs to the dual field, whose row of the residual is half the measured force.
-Mechanisms' laws are called by address (`calls`), so Python is in no loop over points or iterations.
+The unknowns are the coefficients x = (d, 0, displacement modes, pressure modes), where d is the displacement
+of the pads. The second entry is always zero. It belongs to the dual field, whose row of the residual is half
+the measured force. The laws of mechanisms are called by address (`calls`), so no loop over points or
+iterations runs in Python.
 
-What the base law does to first order at rest is integrated exactly: `System.solid`, `coupling` and `flow`
-hold the difference between all points and the chosen ones, by which the sum over the latter is corrected.
+The part of the base law that is linear at rest is integrated exactly. `System.solid`, `coupling` and `flow`
+hold the difference between its integral over all points and its integral over the chosen points. This
+difference corrects the sum over the chosen points.
 """
 # mypy: disable-error-code="no-untyped-def"
 
@@ -22,19 +24,21 @@ from bayeskin.types import Array
 
 CONVERGED, INSIDE_OUT, SLOW, NOT_FINITE = range(4)
 MOST_ITERATIONS, MOST_RENEWALS = 60, 12
-SLOW_CONTRACTION = 0.6  # a larger one asks for a new tangent, which costs as much as twenty residuals
+SLOW_CONTRACTION = 0.6  # ratio of two steps above which a new tangent, as costly as twenty residuals, is made
 SMALLEST_DAMPING = 1e-3
-BLOCK = 16  # points whose modes stay in the first cache
+BLOCK = 16  # number of points whose modes fit into the first-level cache
 
 
 class System(NamedTuple):
-    """Modes and weights at n points, the base law's constants there, and what the points leave out.
+    """Modes and weights at n points, the base law's constants there, and the linear part that points miss.
 
-    gradient (n, 9, k) : displacement gradients of the k = 2 + modes fields
-    pressure (n, m), slope (n, 3, m) : pressure modes and their gradients; all in single precision, which is
-        what a mode is known to
-    weight (n,) [m^3]; mu, lam, mobility, storage (n,) : of the base law
-    solid (k, k), coupling (k, m), flow (m, m) : added to the residual; flow is a rate
+    gradient (n, 9, k) : gradients of the k displacement fields: the pads' field, the dual field and the modes
+    pressure (n, m), slope (n, 3, m) : pressure modes and their gradients
+    weight (n,) : weights of the points [m^3]; mu, lam, mobility, storage (n,) : constants of the base law
+    solid (k, k), coupling (k, m), flow (m, m) : matrices that add the missing part to the residual; flow is a
+        rate, multiplied by the length of the stage
+
+    gradient, pressure and slope are in single precision, which is the precision of the modes.
     """
 
     gradient: Array
@@ -51,10 +55,12 @@ class System(NamedTuple):
 
 
 class Laws(NamedTuple):
-    """The laws of mechanisms in the order in which they answer.
+    """The l laws of mechanisms, in the order in which they are evaluated.
 
-    respond, linearise (l,) : addresses, 0 for none; par, data : constants of all laws, flat; par_at, data_at,
-    memory_at (l + 1,) : where each law's begin; widths are a point's
+    respond, linearise (l,) : addresses of their kernels, 0 where a law has none
+    par, data : flat arrays of the constants of all laws, for the run and for the points
+    par_at, data_at, memory_at (l + 1,) : index at which the part of each law begins in its flat array
+    data_width, memory_width (l,) : how many constants and memory values each law has at a point
     """
 
     respond: np.ndarray
@@ -69,9 +75,12 @@ class Laws(NamedTuple):
 
 
 class History(NamedTuple):
-    """The past of a stage: J*, p* (n,), the laws' memory (flat), coefficients x* (k,), times.
+    """The history of a stage.
 
-    length_s : h*; elapsed_s : since the memory; time_s : at the stage's end since the test started
+    volume, pressure (n,) : J* and p*; memory : memory of all laws, flat
+    displacement (k,) : coefficients x* of the displacement
+    length_s : h*; elapsed_s : time since the memory was stored
+    time_s : time from the start of the test to the end of the stage
     """
 
     volume: Array
@@ -84,7 +93,7 @@ class History(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Arrays at n points that a solve fills: kinematics, the laws' answers, and the state at its end."""
+    """Arrays at n points that a solve fills: kinematics, response of the laws, and the state at the end."""
 
     deformation: Array
     at_pressure: Array
@@ -98,7 +107,10 @@ class Room(NamedTuple):
 
 @compiled
 def residual(system, laws, past, x, room, out):
-    """Fills out (k + m,) and the room; returns the smallest J (not positive: a point is inside out)."""
+    """Fills the residual `out` (k + m,) and the room, and returns the smallest J.
+
+    A point is inside out where J is not positive. The residual is then incomplete.
+    """
     n, k = system.weight.shape[0], system.gradient.shape[2]
     m = system.pressure.shape[1]
     out[:] = 0.0
@@ -132,7 +144,7 @@ def residual(system, laws, past, x, room, out):
 
 @compiled
 def _kinematics(system, x, start, end, room):
-    """Fills F, p and grad p at some points."""
+    """Fills F, p and grad p at the points from `start` to `end`."""
     k = system.gradient.shape[2]
     fields, pressures = x[:k], x[k:]
     for q in range(start, end):
@@ -155,7 +167,7 @@ def _product(one, other):
 
 @compiled
 def answer(system, laws, past, start, end, room):
-    """Fills stress, content, flux, J and memory at some points; returns the smallest J."""
+    """Fills stress, content, flux, J and memory at points `start` to `end`; returns the smallest J."""
     smallest = _base(system, past, start, end, room)
     if not smallest > 0.0:
         return smallest
@@ -172,7 +184,7 @@ def answer(system, laws, past, start, end, room):
 
 @compiled
 def _base(system, past, start, end, room):
-    """The base law's answer at some points; returns the smallest J."""
+    """Fills the response of the base law at the points from `start` to `end`; returns the smallest J."""
     e = end - start
     return poroelastic.respond(
         room.deformation[start:end].reshape(e, 1, 3, 3), room.at_pressure[start:end].reshape(e, 1),
@@ -186,7 +198,7 @@ def _base(system, past, start, end, room):
 
 @compiled
 def _of_law(laws, one, start, end, old, new):
-    """A law's memory before and after, constants at some points, and constants of the run."""
+    """Returns a law's memory before and after, its constants at some points, and its constants of the run."""
     width, at = laws.memory_width[one], laws.memory_at[one]
     before = old[at + start * width : at + end * width].reshape(end - start, width)
     after = new[at + start * width : at + end * width].reshape(end - start, width)
@@ -197,7 +209,7 @@ def _of_law(laws, one, start, end, old, new):
 
 @compiled
 def _project(system, start, end, room, out):
-    """Adds what some points answer to the residual."""
+    """Adds the response at the points from `start` to `end` to the residual."""
     k, m = system.gradient.shape[2], system.pressure.shape[1]
     for q in range(start, end):
         w, g, slope = system.weight[q], system.gradient[q], system.slope[q]
@@ -205,7 +217,7 @@ def _project(system, start, end, room, out):
         s0, s1, s2 = w * stress[0, 0], w * stress[0, 1], w * stress[0, 2]
         s3, s4, s5 = w * stress[1, 0], w * stress[1, 1], w * stress[1, 2]
         s6, s7, s8 = w * stress[2, 0], w * stress[2, 1], w * stress[2, 2]
-        for c in range(k):  # one pass for all nine: the sum is fetched and put back once
+        for c in range(k):  # all nine components in one pass, so that each sum is loaded and stored once
             out[c] += (
                 s0 * g[0, c] + s1 * g[1, c] + s2 * g[2, c]
                 + s3 * g[3, c] + s4 * g[4, c] + s5 * g[5, c]
@@ -219,7 +231,10 @@ def _project(system, start, end, room, out):
 
 @compiled
 def tangent(system, laws, past, room):
-    """Derivative of the residual by the unknowns, (k + m, k + m), whose F, p and grad p are in the room."""
+    """Returns the derivative (k + m, k + m) of the residual by the unknowns.
+
+    The room already holds F, p and grad p of these unknowns.
+    """
     n = system.weight.shape[0]
     stress_f, stress_p, content_f = np.empty((n, 9, 9)), np.empty((n, 9)), np.empty((n, 9))
     content_p, flux_f, flux_g = np.empty(n), np.empty((n, 3, 9)), np.empty((n, 3, 3))
@@ -242,7 +257,7 @@ def tangent(system, laws, past, room):
 
 @compiled
 def _assembled(system, past, stress_f, stress_p, content_f, content_p, flux_f, flux_g):
-    """The tangent from the laws' derivatives at the points, to the precision of the modes."""
+    """Returns the tangent from the laws' derivatives at the points, in the single precision of the modes."""
     n, k, m = system.weight.shape[0], system.gradient.shape[2], system.pressure.shape[1]
     solid, column = np.zeros((9 * n, k), np.float32), np.zeros((n, k), np.float32)
     row, turned = np.zeros((n, k), np.float32), np.zeros((3 * n, k), np.float32)
@@ -283,7 +298,7 @@ def _add_multiple(to, factor, values):
 def renew(system, laws, past, x, room, inverse, force_row, by_pads):
     """Fills the inverse of the free part of the tangent at x, the force's row and the pads' column.
 
-    The rows of the pads' and of the dual field are no equations of the solve: the free ones follow them.
+    The rows of the pads' field and of the dual field are not solved for. The free rows come after them.
     """
     _kinematics(system, x, 0, system.weight.shape[0], room)
     whole = tangent(system, laws, past, room)
@@ -294,7 +309,7 @@ def renew(system, laws, past, x, room, inverse, force_row, by_pads):
     for i in range(len(scale)):
         for j in range(len(scale)):
             free[i, j] *= scale[i] * scale[j]
-    if not np.all(np.isfinite(free)):  # a law beyond all measure: the solve fails at its next step
+    if not np.all(np.isfinite(free)):  # a law's values are not finite; the solve fails at its next step
         inverse[:] = np.nan
         return
     inverse[:] = np.linalg.inv(free)
@@ -308,11 +323,11 @@ def renew(system, laws, past, x, room, inverse, force_row, by_pads):
 
 @compiled
 def solve(system, laws, past, x, tolerance, nominal_n, room, inverse, force_row, by_pads, counts):
-    """Solves a stage from the guess x, whose first entry is the pads' displacement, in place.
+    """Solves a stage in place, from the guess x, whose first entry is the displacement of the pads.
 
-    inverse, force_row, by_pads : of the last tangent, renewed where they contract badly
-    counts (3,) : iterations, residuals and tangents, added up
-    Returns the status and the force [N], corrected to first order by the last step.
+    inverse, force_row, by_pads : parts of the last tangent (`renew`), renewed where convergence is slow
+    counts (3,) : counters of iterations, residuals and tangents, to which this solve is added
+    Returns the status and the force [N], which the last step corrects to first order.
     """
     free = x[2:]
     k = system.gradient.shape[2]
@@ -359,7 +374,7 @@ def solve(system, laws, past, x, tolerance, nominal_n, room, inverse, force_row,
 
 @compiled
 def update(inverse, step, change):
-    """Broyden's rank-one correction of an inverse (his good method), in place."""
+    """Corrects an inverse in place by Broyden's rank-one update (Broyden's good method)."""
     answer = np.dot(inverse, change)
     row = np.dot(step, inverse)
     along = np.dot(row, change)

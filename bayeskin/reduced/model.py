@@ -1,7 +1,8 @@
-"""A reduced model of one device: its modes, its cubatures and the region that it was trained for.
+"""Defines the reduced model of one device: its modes, its cubatures and the region that it was trained for.
 
-It runs with any set of the mechanisms that it was trained for, on any protocol and on layers and arms near
-its own. The spaces that it makes of its modes are kept, so only the first run of a set prepares anything.
+The model runs with any set of the mechanisms that it was trained for, on any protocol, and with layers and
+arms near its own. It keeps the spaces that it prepares from its modes, so only the first run of a set of
+mechanisms prepares anything.
 """
 
 from __future__ import annotations
@@ -23,18 +24,18 @@ from bayeskin.reduced.library import Library
 from bayeskin.reduced.operators import Basis, Rule, fields_at, linear_parts, whole_linear_parts
 from bayeskin.types import Array
 
-MOST_SPACES = 32  # kept
+MOST_SPACES = 32  # largest number of spaces that a model keeps
 
 
 @dataclass(frozen=True)
 class Cubatures:
-    """Rules for the base model, and for sets of mechanisms."""
+    """Cubatures for the base model and for sets of mechanisms."""
 
     base: Rule
     sets: Rule
 
     def of(self, mechanisms: Sequence[str]) -> Rule:
-        """The rule for a set of mechanisms."""
+        """Returns the cubature for a set of mechanisms; an empty set is the base model."""
         return self.sets if mechanisms else self.base
 
 
@@ -42,8 +43,8 @@ class Cubatures:
 class ReducedModel:
     """A reduced model as it is stored.
 
-    trained : region and geometry; refinement : of the bricks that it stands for
-    full_hash : of the full model that it was made from (`ModelSpec.hash`); hash : of its own arrays
+    trained : region and geometry of the training; refinement : refinement of the full model's brick mesh
+    full_hash : hash of the full model that it was made from (`ModelSpec.hash`); hash : hash of its arrays
     """
 
     trained: Trained
@@ -55,19 +56,19 @@ class ReducedModel:
     _spaces: dict[object, ReducedSpace] = field(init=False, repr=False, default_factory=dict)
 
     def problem(self, geometry: Geometry | None = None) -> Problem:
-        """The full model's problem: on the geometry trained for, or its mesh moved to another."""
-        own = self.trained.geometry
-        nominal = problem_of("bricks", self.refinement, own)
-        if geometry is None or geometry == own:
+        """Returns the full model's problem on the trained geometry, or with its mesh moved to another one."""
+        trained = self.trained.geometry
+        nominal = problem_of("bricks", self.refinement, trained)
+        if geometry is None or geometry == trained:
             return nominal
-        return moved_problem(nominal, brick_mesh(self.refinement, geometry, own))
+        return moved_problem(nominal, brick_mesh(self.refinement, geometry, trained))
 
     def basis(self, mechanisms: Sequence[str]) -> Basis:
-        """The fields of a set of mechanisms on the nodes of the mesh."""
+        """Returns the basis of a set of mechanisms, on the nodes of the mesh."""
         return self.library.basis(mechanisms, inner_of(self.problem()))
 
     def space(self, mechanisms: Sequence[str], geometry: Geometry | None = None) -> ReducedSpace:
-        """What a run with a set of mechanisms is solved in."""
+        """Returns the space in which a run with a set of mechanisms is solved."""
         key = tuple(mechanisms), geometry or self.trained.geometry
         if key not in self._spaces:
             while len(self._spaces) >= MOST_SPACES:
@@ -78,14 +79,14 @@ class ReducedModel:
 
 
 def reduced_space(problem: Problem, basis: Basis, rule: Rule) -> ReducedSpace:
-    """Returns a basis at the points of a rule, with the linear parts that the points leave out."""
-    few = fields_at(problem, basis, rule)
-    exact = whole_linear_parts(problem, basis) - linear_parts(few)
-    return ReducedSpace(problem.lengths, few, exact, SurfacesOf(problem, basis))
+    """Returns a basis at the points of a rule, with the linear parts that these points leave out."""
+    at_points = fields_at(problem, basis, rule)
+    exact = whole_linear_parts(problem, basis) - linear_parts(at_points)
+    return ReducedSpace(problem.lengths, at_points, exact, SurfacesOf(problem, basis))
 
 
 class SurfacesOf:
-    """Unit surface terms, projected on all fields of a basis at the first call."""
+    """Returns unit surface terms, projected on all fields of a basis. Each is computed at its first call."""
 
     def __init__(self, problem: Problem, basis: Basis) -> None:
         self._problem, self._basis = problem, basis
@@ -98,7 +99,7 @@ class SurfacesOf:
 
 
 def projected(problem: Problem, basis: Basis, unit: SurfaceUnit) -> Array:
-    """Returns a unit surface term's matrix on all fields of a basis, (k + m, k + m)."""
+    """Returns the matrix of a unit surface term, projected on all fields of a basis, (k + m, k + m)."""
     matrix, n = problem.linear(unit).matrix, 3 * problem.space.n_nodes
     u, p = basis.fields, basis.pressure
     return np.asarray(scipy.linalg.block_diag(u @ (matrix[:n, :n] @ u.T), p @ (matrix[n:, n:] @ p.T)))
@@ -108,7 +109,7 @@ _inner_products: dict[int, tuple[Problem, Inner]] = {}
 
 
 def inner_of(problem: Problem) -> Inner:
-    """Returns the inner products of a problem, made once."""
+    """Returns the inner products of a problem. They are computed once."""
     if id(problem) not in _inner_products:
         _inner_products[id(problem)] = problem, inner_products(problem)
     return _inner_products[id(problem)][1]

@@ -1,4 +1,4 @@
-"""What a basis becomes at the quadrature points of a mesh, and the exact linear parts of the base law."""
+"""Evaluates a basis at the quadrature points of a mesh and integrates the linear parts of the base law."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ CELLS_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Basis:
-    """Fields of a reduced model on the nodes of a mesh; the most important modes first.
+    """Fields of a reduced model on the nodes of a mesh; the most important modes come first.
 
-    moving, dual (3 nodes,) : one on all pads along x; one on what the load cell measures (`basis.Inner`)
-    displacement (u, 3 nodes) : modes [m]; pressure (p, corners) : modes [Pa], the first one constant
+    moving (3 nodes,) : field that is one along x on all nodes of the pads (`basis.Inner`)
+    dual (3 nodes,) : field that is one along x only on the nodes that the load cell measures
+    displacement (u, 3 nodes) : modes [m]; pressure (p, corners) : modes [Pa], of which the first is constant
     """
 
     moving: Array
@@ -27,11 +28,11 @@ class Basis:
 
     @property
     def fields(self) -> Array:
-        """All fields of the displacement (2 + u, 3 nodes)."""
+        """Returns all fields of the displacement (2 + u, 3 nodes): `moving`, `dual` and the modes."""
         return np.concatenate([[self.moving, self.dual], self.displacement])
 
     def nodal(self, x: Array) -> Array:
-        """The full model's unknowns (dofs,) for the coefficients (2 + u + p,) of a reduced state."""
+        """Returns the full model's unknowns (dofs,) for the coefficients (2 + u + p,) of a reduced state."""
         k = 2 + len(self.displacement)
         return np.concatenate([x[:k] @ self.fields, x[k:] @ self.pressure])
 
@@ -40,8 +41,11 @@ class Basis:
 class PointFields:
     """Gradients and values of the fields of a basis at n quadrature points, with their weights.
 
-    gradient (n, 9, k), slope (n, 3, m), pressure (n, m) : in single precision, to which modes are known
-    weight (n,); cutis (n,) bool; points_m (3, n)
+    gradient (n, 9, k) : gradients of the k displacement fields
+    slope (n, 3, m), pressure (n, m) : gradients and values of the m pressure modes
+    weight (n,) : weights of the points [m^3]; cutis (n,) : True in the cutis; points_m (3, n) : coordinates
+
+    gradient, slope and pressure are in single precision, which is the precision of the modes.
     """
 
     gradient: Array
@@ -52,7 +56,7 @@ class PointFields:
     points_m: Array
 
     def at(self, rule: Rule) -> PointFields:
-        """The fields at the points of a rule, with its weights."""
+        """Returns the fields at the points of a rule, with the weights of the rule."""
         i = rule.points
         return PointFields(
             self.gradient[i], self.slope[i], self.pressure[i], rule.weight(self.weight), self.cutis[i],
@@ -62,21 +66,22 @@ class PointFields:
 
 @dataclass(frozen=True)
 class Rule:
-    """A cubature: numbers of the chosen points, and factors (n,) on their own weights."""
+    """A cubature: indices (n,) of the chosen points, and factors (n,) that multiply their weights."""
 
     points: np.ndarray
     factor: Array
 
     def weight(self, weight: Array) -> Array:
-        """The chosen points' weights, of those of all points."""
+        """Returns the weights (n,) of the chosen points, from the weights of all points."""
         return np.asarray(self.factor * weight[self.points])
 
 
 @dataclass(frozen=True)
 class LinearParts:
-    """Matrices of the base law's linear part by layer (first axis: cutis, subcutis), and of what couples.
+    """Matrices of the base law's linear part, for each layer (first axis: cutis, subcutis).
 
-    shear, bulk (2, k, k) : by mu and lambda; flow (2, m, m) : by mobility; coupling (k, m) : - div u p
+    shear, bulk (2, k, k) : matrices for mu = 1 and for lambda = 1; flow (2, m, m) : matrix for mobility = 1
+    coupling (k, m) : integral of - div u p over both layers
     """
 
     shear: Array
@@ -92,14 +97,14 @@ class LinearParts:
 
 
 def linear_parts(at: PointFields) -> LinearParts:
-    """Integrates the base law's linear part at rest at weighted points."""
+    """Integrates the base law's linear part at rest, with weighted points."""
     shear, bulk, flow = [], [], []
     divergence, weight = at.gradient[:, 0] + at.gradient[:, 4] + at.gradient[:, 8], _single(at.weight)
     for layer in (at.cutis, ~at.cutis):
         b, w, g, trace = at.gradient[layer], weight[layer], at.slope[layer], divergence[layer]
         (n, _, k), m = b.shape, g.shape[2]
-        both = b + b.reshape(n, 3, 3, k).transpose(0, 2, 1, 3).reshape(n, 9, k)
-        shear.append(b.reshape(n * 9, k).T @ (both * w[:, None, None]).reshape(n * 9, k))
+        symmetric = b + b.reshape(n, 3, 3, k).transpose(0, 2, 1, 3).reshape(n, 9, k)
+        shear.append(b.reshape(n * 9, k).T @ (symmetric * w[:, None, None]).reshape(n * 9, k))
         bulk.append(trace.T @ (trace * w[:, None]))
         flow.append(g.reshape(n * 3, m).T @ (g * w[:, None, None]).reshape(n * 3, m))
     coupling = -(divergence * weight[:, None]).T @ at.pressure
@@ -107,7 +112,7 @@ def linear_parts(at: PointFields) -> LinearParts:
 
 
 def point_fields(problem: Problem, basis: Basis, cells: np.ndarray | slice = slice(None)) -> PointFields:
-    """Returns the fields of a basis at the quadrature points of some cells of a problem, cell by cell."""
+    """Returns the fields of a basis at the quadrature points of some cells of a problem, cell after cell."""
     s = problem.space
     fields, nodes_u, nodes_p = basis.fields, s.nodes_u[cells], s.nodes_p[cells]
     (e, q), sites = s.weight[cells].shape, problem.sites
@@ -131,7 +136,7 @@ def _single(values: Array) -> np.ndarray:
 
 
 def fields_at(problem: Problem, basis: Basis, rule: Rule) -> PointFields:
-    """Returns the fields of a basis at the points of a rule, with its weights."""
+    """Returns the fields of a basis at the points of a rule, with the weights of the rule."""
     q = problem.space.weight.shape[1]
     cells, place = np.unique(rule.points // q, return_inverse=True)
     local = Rule(place * q + rule.points % q, rule.factor)
@@ -139,7 +144,7 @@ def fields_at(problem: Problem, basis: Basis, rule: Rule) -> PointFields:
 
 
 def whole_linear_parts(problem: Problem, basis: Basis) -> LinearParts:
-    """Integrates the base law's linear part at rest at all points of a problem, some cells at a time."""
+    """Integrates the base law's linear part at rest, with all points of a problem, some cells at a time."""
     count = len(problem.space.weight)
     parts = [
         linear_parts(point_fields(problem, basis, slice(start, min(start + CELLS_AT_ONCE, count))))

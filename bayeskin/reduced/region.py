@@ -1,7 +1,7 @@
-"""The region in which a reduced model can be trusted: where it was trained, away from folds of the skin.
+"""Checks that a run stays where a reduced model can be trusted: in its trained region, away from folding.
 
-Relaxed skin that is pushed together folds: the smallest eigenvalue of its stiffness falls to zero. Near there
-a small error of the modes is a large one of the force.
+Relaxed skin that is pushed together folds: the smallest eigenvalue of its stiffness falls to zero. Near
+folding a small error of the modes is a large error of the force.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from bayeskin.geometry import Geometry
 from bayeskin.reduced.cases import RADIUS_RANGE, THICKNESS_RANGE, Protocols, Trained
 from bayeskin.types import Array, PadMotion, ParameterSpace
 
-LEAST_STIFFNESS = 0.4  # smallest eigenvalue of the stiffness over that at rest (docs/reduced.md)
-LOW = 0.3  # of the largest displacement: at corners below it the stiffness is looked at
-FASTER = 2.0  # than the fastest training protocol: faster ones leave the skin as undrained as it is
+LEAST_STIFFNESS = 0.4  # smallest eigenvalue of the stiffness, relative to rest (docs/reduced.md)
+LOW = 0.3  # of the largest displacement; the stiffness is checked at corners below it
+FASTER = 2.0  # largest allowed speed over the fastest in training; the skin is undrained at both
 
 
 def outside(
@@ -29,19 +29,19 @@ def outside(
     geometry: Geometry,
     motion: PadMotion,
 ) -> str:
-    """Returns one line that says where a run leaves the trained region; empty inside it."""
+    """Returns one line that says how a run leaves the trained region; the line is empty inside it."""
     unknown = [name for name in mechanisms if name not in trained.mechanisms]
     if unknown:
         return f"mechanism {unknown[0]} was not trained"
     spaces = [trained.base, *(trained.mechanisms[name] for name in mechanisms)]
-    lines = [line for space in spaces if (line := _beyond(space, theta))]
+    lines = [line for space in spaces if (line := _outside_prior(space, theta))]
     lines += protocol_outside(trained.protocols, motion)
     lines += other_geometry(trained.geometry, geometry)
     return "; ".join(lines)
 
 
 def protocol_outside(trained: Protocols, motion: PadMotion) -> list[str]:
-    """Returns how a protocol leaves those that a reduced model was trained on; empty where it does not."""
+    """Returns messages that say how a protocol leaves the trained range; an empty list inside it."""
     lines = []
     largest_m, lowest_m = float(motion.displacement_m.max()), float(motion.displacement_m.min())
     if largest_m > trained.largest_m * (1.0 + 1e-9):
@@ -56,7 +56,8 @@ def protocol_outside(trained: Protocols, motion: PadMotion) -> list[str]:
     return lines
 
 
-def _beyond(space: ParameterSpace, theta: Mapping[str, float]) -> str:
+def _outside_prior(space: ParameterSpace, theta: Mapping[str, float]) -> str:
+    """Returns a message about the first parameter that lies outside its trained range, or an empty string."""
     for parameter in space.parameters:
         value = theta[parameter.name]
         slack = 1e-9 * (parameter.upper - parameter.lower)
@@ -66,7 +67,7 @@ def _beyond(space: ParameterSpace, theta: Mapping[str, float]) -> str:
 
 
 def other_geometry(trained: Geometry, geometry: Geometry) -> list[str]:
-    """Returns how a geometry differs from the trained one by more than training runs did."""
+    """Returns messages that say where a geometry differs from the trained one by more than training runs."""
     lines = []
     same_tissue = replace(
         geometry,
@@ -79,20 +80,20 @@ def other_geometry(trained: Geometry, geometry: Geometry) -> list[str]:
     for name, share in (
         ("cutis_m", THICKNESS_RANGE), ("subcutis_m", THICKNESS_RANGE), ("arm_radius_m", RADIUS_RANGE)
     ):  # fmt: skip
-        one, other = getattr(trained, name), getattr(geometry, name)
-        if (one is None) != (other is None):
-            lines.append("the arm is flat" if other is None else "the arm is round")
-        elif one is not None and abs(other / one - 1.0) > share * (1.0 + 1e-9):
-            lines.append(f"{name.removesuffix('_m')} is {1e3 * other:.3g} mm, trained {1e3 * one:.3g} mm "
+        ref_m, given_m = getattr(trained, name), getattr(geometry, name)
+        if (ref_m is None) != (given_m is None):
+            lines.append("the arm is flat" if given_m is None else "the arm is round")
+        elif ref_m is not None and abs(given_m / ref_m - 1.0) > share * (1.0 + 1e-9):
+            lines.append(f"{name.removesuffix('_m')} is {1e3 * given_m:.3g} mm, trained {1e3 * ref_m:.3g} mm "
                          f"+- {100 * share:.0f} %")  # fmt: skip
     return lines
 
 
 class Stability:
-    """Looks at the stiffness of the skin where the pads have come back, for how near it is to folding.
+    """Checks the stiffness of the skin at corners where the pads are nearly closed again, to detect folding.
 
-    least : share of the stiffness at rest that has to be left
-    left : the smallest eigenvalue so far, over those at rest; 1 where there was nothing to look at
+    least : smallest allowed stiffness, relative to the stiffness at rest
+    left : smallest eigenvalue of the stiffness so far, relative to rest; 1 where nothing had to be checked
     """
 
     def __init__(self, largest_m: float, least: float) -> None:
@@ -101,7 +102,11 @@ class Stability:
         self.left = 1.0
 
     def look(self, step: Step, stiffness: Callable[[], Array]) -> None:
-        """Takes an accepted step; `stiffness` (u, u) is asked for at the first and where it may be small."""
+        """Checks an accepted step.
+
+        stiffness : function that returns the stiffness (u, u). It is called at the first step, where it gives
+            the stiffness at rest, and at corners where the pads are nearly closed again
+        """
         if self._rest is None:
             self._rest = stiffness()
         elif step.corner and abs(float(step.state.x[0])) <= self._low_m:
@@ -110,7 +115,7 @@ class Stability:
 
     @property
     def message(self) -> str:
-        """One line where the skin came near folding, else empty."""
+        """Returns one line where the skin came near folding, otherwise an empty string."""
         if self.left >= self._least:
             return ""
         return (

@@ -1,7 +1,8 @@
-"""Full runs that reduced models learn from: made by workers, kept in a folder, found again by their case.
+"""Makes the full runs that reduced models learn from, and keeps them in a folder.
 
-Each is kept as soon as it is finished, so that an interrupted building goes on, and under a name that says
-all that it depends on, so that none of another version of the laws is taken for it.
+Worker processes make the runs. Each run is stored as soon as it is finished, so that an interrupted building
+can be continued. The name of its file is a hash of all that the run depends on. A run of another version of
+the laws therefore has another name and is not used by mistake.
 """
 
 from __future__ import annotations
@@ -35,10 +36,13 @@ RUN_ARRAYS = ("displacement", "pressure", "time_s", "force_n")
 
 @dataclass(frozen=True)
 class FullRuns:
-    """The full runs of one device in one folder; picklable, for workers.
+    """The full runs of one device, stored in one folder.
 
-    geometry, refinement : of the mesh whose nodes the modes are on; a case's own geometry moves them
-    Given a case, it makes the run, keeps its modes and returns the message of a run that ended early.
+    geometry, refinement : of the mesh on whose nodes the modes are defined; a case with another geometry
+        moves the nodes
+
+    A call takes a case, makes its run and stores the modes. It returns the message of a run that ended early,
+    otherwise an empty string. Instances can be pickled, so that worker processes can use them.
     """
 
     geometry: Geometry
@@ -61,22 +65,22 @@ class FullRuns:
         return run.message
 
     def path(self, case: Case) -> Path:
-        """Returns the file of a case's run, whose name is the sha256 of all that the run depends on."""
+        """Returns the path of a case's run. The file name is the sha256 of all that the run depends on."""
         spec = ModelSpec(refinement=self.refinement, geometry=self.geometry)
-        said = [
+        depends_on = [
             spec.hash, law_hashes(case.mechanisms), sorted(case.theta.items()), case.geometry.hash,
             case.motion.time_s.tolist(), case.motion.displacement_m.tolist(),
         ]  # fmt: skip
-        return self.folder / f"{hashlib.sha256(json.dumps(said).encode()).hexdigest()}.h5"
+        return self.folder / f"{hashlib.sha256(json.dumps(depends_on).encode()).hexdigest()}.h5"
 
     def read(self, case: Case) -> TrainingRun:
-        """Returns the run of a case that was made. Raises InputError for a file that is damaged."""
+        """Returns the stored run of a case. Raises InputError for a file that is absent or damaged."""
         with storage.reading(self.path(case), "a training run") as handle:
             arrays = {name: handle[name][()] for name in RUN_ARRAYS}
             return TrainingRun(**arrays, message=str(handle.attrs["message"]))
 
     def make(self, wanted: Sequence[Case], run_all: Map, progress: Progress) -> None:
-        """Makes the runs that are not there yet. Raises InputError where a worker is lost."""
+        """Makes the runs that are not stored yet. Raises InputError where a worker is lost."""
         todo = [case for case in wanted if not self.path(case).is_file()]
         done = len(wanted) - len(todo)
         progress("full runs", done / max(len(wanted), 1))
@@ -89,12 +93,12 @@ class FullRuns:
 
 
 def binds_of(mechanisms: Sequence[str]) -> list[Bind]:
-    """Returns what binds the laws of the mechanisms that have one."""
+    """Returns the functions that bind the laws of those mechanisms that have a law."""
     known = catalogue()
     return [bind for name in mechanisms if (bind := known[name].act.bind) is not None]
 
 
 def tissue_of(mechanisms: Sequence[str]) -> list[str]:
-    """Returns those of the mechanisms that change the tissue, and so have modes of their own."""
+    """Returns the names of the tissue mechanisms among `mechanisms`; only these have modes of their own."""
     known = catalogue()
     return [name for name in mechanisms if isinstance(known[name].act, Tissue)]

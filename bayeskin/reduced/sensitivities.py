@@ -1,12 +1,13 @@
-"""Derivatives of a reduced run's force by any of its parameters: tangent sensitivities, all at once.
+"""Computes the derivatives of a reduced run's force by its parameters, all together: tangent sensitivities.
 
 Differentiating a solved stage R(x, history; theta) = 0 gives K dx + dR/dtheta + dR/dhistory dhistory = 0. The
-left side is the difference of two residuals: with unknowns, parameter and history all a step further, and as
-they are. It is driven to zero from the derivatives of the stages before, by steps of the inverse that served
-the stage's own solve (`slopes.differentiate`); no tangent is made for it. Steps in time are held.
+left side is computed as the difference of two residuals: the residual of the stage, and the residual after a
+small step of unknowns, parameter and history together. The solve starts from the derivatives at earlier
+stages and drives this difference to zero. It reuses the inverse tangent of the stage's own solve, and
+computes a new one only where that converges badly (`slopes.differentiate`). The time steps are held fixed.
 
-A length of the tissue moves the nodes, and with them kinematics, weights and all that is integrated exactly.
-Its residuals are those of two moved spaces, on either side.
+A length of the tissue moves the nodes. Kinematics, weights and all exactly integrated parts change with them.
+Its derivative therefore uses the residuals of two spaces, whose nodes are moved in opposite directions.
 """
 
 from __future__ import annotations
@@ -26,19 +27,20 @@ from bayeskin.reduced import kernels, slopes
 from bayeskin.reduced.equations import Bound, ReducedEquations, ReducedSpace, bound
 from bayeskin.types import Array, PadMotion
 
-STEP = 1e-6  # of a parameter's change: truncation 1e-6, rounding 1e-10
-# Either way for a length, whose moved fields are in single precision: truncation 1e-4, rounding 1e-4 to 1e-3.
+STEP = 1e-6  # of a parameter's change; truncation error 1e-6, rounding error 1e-10
+# A length changes by this step in both directions. The moved fields are in single precision, so the
+# truncation error is 1e-4 and the rounding error 1e-4 to 1e-3.
 LENGTH_STEP = 1e-2
 PASSES_BY_LENGTH = 5
-# Derivatives below these are solved for to the accuracy of a stage's own solve, and no further: of the modes'
-# coefficients, which are of order one, and of the force, of its scale.
+# Derivatives smaller than these are solved only as accurately as the stage itself. The first is a derivative
+# of the modes' coefficients, which are of order one; the second is relative to the scale of the force.
 LEAST_DISPLACEMENT, LEAST_FORCE = 0.01, 0.001
-REMEMBERED = 8  # states whose derivatives are kept; a step asks for three at most
+REMEMBERED = 8  # number of states whose derivatives are kept; a step needs at most three
 
 
 @dataclass(frozen=True)
-class _Known:
-    """Derivatives of a state, with those (k, r) of what is lost in series."""
+class _Derivatives:
+    """Derivatives of a state, and derivatives (k, r) of the memories of the elements in series."""
 
     state: State
     slopes: slopes.Slopes
@@ -46,10 +48,10 @@ class _Known:
 
 
 class ReducedGradients:
-    """Follows a reduced run step by accepted step; `force_n` then holds the derivatives of each step's force.
+    """Differentiates the accepted steps of a reduced run; `force_n` holds the derivatives at each step.
 
-    changes : of each parameter, by name, what counts as one; derivatives are in newtons for that
-    space_at : the run's space with its nodes where parameters have them
+    changes : change of each parameter, by its name; a derivative is the force in newtons for this change
+    space_at : function that returns the run's space for given parameters, whose lengths move the nodes
     Raises InputError for a parameter that the run does not have.
     """
 
@@ -69,7 +71,7 @@ class ReducedGradients:
             if name in LENGTHS:
                 ends = [{**theta, name: theta[name] + way * LENGTH_STEP * change} for way in (1.0, -1.0)]
                 self._moved[i] = [ReducedEquations(space_at(end), end, binds, protocol) for end in ends]
-                runs.append(equations.run)  # in the space as it is, a length changes the history alone
+                runs.append(equations.run)  # in the unmoved space a length changes only the history
             else:
                 runs.append(bound(equations.space, {**theta, name: theta[name] + STEP * change}, binds))
         self._drives = [on_the_way(protocol, run.laws) for run in runs]
@@ -77,13 +79,13 @@ class ReducedGradients:
         self._varied = _varied(equations, [*runs, *([equations.run] if self._in_series else [])])
         self._reach_m = equations.drive.largest_m
         self._start = self._at_rest(changes.get("p_init", 0.0))
-        self._known: dict[int, _Known] = {}
+        self._known: dict[int, _Derivatives] = {}
         self._zero_n = np.zeros(len(changes))
         least = np.array([LEAST_DISPLACEMENT, LEAST_FORCE * equations.nominal_force()])
         self._scale = np.repeat(least[:, None], len(self._varied.mu), axis=1)
         self.force_n: list[Array] = [np.zeros(len(changes))]
 
-    def _at_rest(self, change: float) -> _Known:
+    def _at_rest(self, change: float) -> _Derivatives:
         eq, (k, m) = self._equations, self._equations.space.modes
         r, n = len(self._varied.mu), len(eq.space.at.weight)
         by_p_init = change * np.array([float(name == "p_init") for name in self.names] + [0.0])[:r]
@@ -93,10 +95,10 @@ class ReducedGradients:
         pressure = np.zeros((r, n)) + by_p_init[:, None]
         memory = np.zeros((r, len(state.memory[0])))
         lost = tuple(np.zeros((*before.shape, len(self.names))) for before in state.lost)
-        return _Known(state, slopes.Slopes(x, np.zeros((r, n)), pressure, memory), lost)
+        return _Derivatives(state, slopes.Slopes(x, np.zeros((r, n)), pressure, memory), lost)
 
     def follow(self, step: Step) -> None:
-        """Differentiates an accepted step; appends the force's derivatives [N], (r,), to `force_n`."""
+        """Differentiates an accepted step and appends the derivatives (r,) of its force [N] to `force_n`."""
         for stage in step.stages:
             known, force = self._differentiate(stage)
             self._known[id(stage.state)] = known
@@ -105,12 +107,12 @@ class ReducedGradients:
         self.force_n.append(force)
         self._known = dict(list(self._known.items())[-REMEMBERED:])
 
-    def _of(self, state: State) -> _Known:
+    def _derivatives_of(self, state: State) -> _Derivatives:
         return self._known.get(id(state), self._start)
 
-    def _differentiate(self, stage: Stage) -> tuple[_Known, Array]:
+    def _differentiate(self, stage: Stage) -> tuple[_Derivatives, Array]:
         eq, k = self._equations, self._equations.space.modes[0]
-        sources = [(weight, self._of(state)) for weight, state in stage.sources]
+        sources = [(weight, self._derivatives_of(state)) for weight, state in stage.sources]
         last = sources[-1][1]
         before = slopes.Slopes(
             np.asarray(sum(w * s.slopes.x[:, :k] for w, s in sources)),
@@ -121,7 +123,7 @@ class ReducedGradients:
         x, t = stage.state.x.copy(), eq.tangent
         residual = np.empty(len(x))
         kernels.residual(eq.system, eq.packed, past, x, room, residual)
-        out = slopes.Slopes(self._ahead(stage), *(np.empty_like(values) for values in last.slopes[1:]))
+        out = slopes.Slopes(self._extrapolated(stage), *(np.empty_like(values) for values in last.slopes[1:]))
         out.x[:, 0], out.x[:, 1] = self._pads_by(stage.state.time_s, last.lost), 0.0
         by_length = {i: out.x[i].copy() for i in self._moved}
         force, tangents = slopes.differentiate(
@@ -133,18 +135,21 @@ class ReducedGradients:
             force[i] = self._by_length(i, past, x, before, out)
         eq.spent += (0, 1, tangents)
         if self._in_series:
-            return self._less_lost(stage, last.lost, out, force)
-        return _Known(stage.state, out, last.lost), force
+            return self._corrected_for_series(stage, last.lost, out, force)
+        return _Derivatives(stage.state, out, last.lost), force
 
-    def _ahead(self, stage: Stage) -> Array:
-        """A guess of the derivatives (r, k + m) at a stage's end, from those of the states that it knows."""
-        known = [(state.time_s, self._of(state).slopes.x) for _, state in stage.sources]
+    def _extrapolated(self, stage: Stage) -> Array:
+        """Returns a guess of the derivatives (r, k + m) at a stage's end, extrapolated from its sources."""
+        known = [(state.time_s, self._derivatives_of(state).slopes.x) for _, state in stage.sources]
         return extrapolate(known, stage.state.time_s)
 
     def _by_length(
         self, i: int, past: kernels.History, x: Array, before: slopes.Slopes, out: slopes.Slopes
     ) -> float:
-        """Fills row i of `out`, the derivatives by a length from a guess of x's, and returns the force's."""
+        """Fills row i of `out`, the derivatives by a length, and returns the derivative of the force [N].
+
+        Row i of ``out.x`` is a guess at the start.
+        """
         t, ways = self._equations.tangent, (LENGTH_STEP, -LENGTH_STEP)
         rooms = [equations.make_room() for equations in self._moved[i]]
         residuals = np.empty((2, len(x)))
@@ -160,29 +165,35 @@ class ReducedGradients:
             for n, moved in enumerate(self._moved[i]):
                 moved_x = x + ways[n] * out.x[i]
                 kernels.residual(moved.system, moved.packed, pasts[n], moved_x, rooms[n], residuals[n])
-            left = (residuals[0] - residuals[1]) / (2.0 * LENGTH_STEP)
-            step = -t.inverse @ left[2:]
+            derivative = (residuals[0] - residuals[1]) / (2.0 * LENGTH_STEP)
+            step = -t.inverse @ derivative[2:]
             out.x[i, 2:] += step
         up, down = rooms
         out.volume[i] = (up.volume - down.volume) / (2.0 * LENGTH_STEP)
         out.pressure[i] = (up.at_pressure - down.at_pressure) / (2.0 * LENGTH_STEP)
         out.memory[i] = (up.memory - down.memory) / (2.0 * LENGTH_STEP)
-        return float(2.0 * left[1] + t.force_row @ step)
+        return float(2.0 * derivative[1] + t.force_row @ step)
 
     def _pads_by(self, time_s: float, lost: Memories) -> Array:
-        """Derivatives of the pads' displacement [m], with what was lost before; and their travel."""
-        here = self._equations.drive.motion.at(time_s)
-        moved = np.array([(float(drive.motion.at(time_s)) - here) / STEP for drive in self._drives])
+        """Returns derivatives of the pads' displacement [m], with the losses in series as before the stage.
+
+        With elements in series a last entry follows: the derivative by the pads' travel itself.
+        """
+        nominal_m = self._equations.drive.motion.at(time_s)
+        moved = np.array([(float(drive.motion.at(time_s)) - nominal_m) / STEP for drive in self._drives])
         moved = moved - sum(memory[0] for memory in lost)
         return 0.5 * np.append(moved, [2.0 * self._reach_m] * self._in_series)
 
-    def _less_lost(
+    def _corrected_for_series(
         self, stage: Stage, held: Memories, out: slopes.Slopes, force: Array
-    ) -> tuple[_Known, Array]:
-        """All derivatives once what lies in series with the skin has answered to the force's."""
+    ) -> tuple[_Derivatives, Array]:
+        """Returns all derivatives, corrected for the response of the elements in series to the force.
+
+        held : derivatives of these elements' memories at the start of the stage
+        """
         eq, r = self._equations, len(self.names)
-        stiffness, own = float(force[r]) / (2.0 * self._reach_m), force[:r]
-        more, lost = np.zeros(r), held
+        stiffness, force_slopes = float(force[r]) / (2.0 * self._reach_m), force[:r]
+        more_lost, lost = np.zeros(r), held
         if eq.drive.yields(stage.state.time_s):
             force_n = 2.0 * float(stage.residual[1]) - eq.zero_n
             before = stage.history.lost
@@ -196,22 +207,22 @@ class ReducedGradients:
                 lambda f: eq.drive.follow(f, stage.elapsed_s, before), force_n, 1e-5 * eq.nominal_force()
             )
             held_m = np.asarray(sum((memory[0] for memory in held), np.zeros(r)))
-            more, lost = lost_slopes(own - self._zero_n, held_m, softness, stiffness, memories)
-            own = own - stiffness * more
-        travel = np.append(more, 0.0) / (2.0 * self._reach_m)
+            more_lost, lost = lost_slopes(force_slopes - self._zero_n, held_m, softness, stiffness, memories)
+            force_slopes = force_slopes - stiffness * more_lost
+        travel = np.append(more_lost, 0.0) / (2.0 * self._reach_m)
         for values in out:
             values -= np.outer(travel, values[r])
-            values[r] = 0.0  # the next stage's travel knows no history
-        return _Known(stage.state, out, lost), own
+            values[r] = 0.0  # the derivative by the next stage's travel has no history
+        return _Derivatives(stage.state, out, lost), force_slopes
 
 
 def _varied(equations: ReducedEquations, runs: Sequence[Bound]) -> slopes.Varied:
-    """Constants of runs that are each a step further in one parameter, as the kernels are given them."""
-    own, (solid_units, flow_units) = equations.run, equations.units
+    """Returns the constants of runs that each differ by a step in one parameter, as the kernels need them."""
+    unchanged, (solid_units, flow_units) = equations.run, equations.units
     return slopes.Varied(
         np.array([run.solid.mu for run in runs]), np.array([run.solid.lam for run in runs]),
         np.array([run.solid.mobility for run in runs]),
         np.array([run.par for run in runs]), np.array([run.data for run in runs]), solid_units, flow_units,
-        np.array([(run.solid_by - own.solid_by) / STEP for run in runs]),
-        np.array([(run.flow_by - own.flow_by) / STEP for run in runs]), STEP,
+        np.array([(run.solid_by - unchanged.solid_by) / STEP for run in runs]),
+        np.array([(run.flow_by - unchanged.flow_by) / STEP for run in runs]), STEP,
     )  # fmt: skip

@@ -1,4 +1,7 @@
-"""A reduced run followed on all points of the mesh: what the chosen points see, and what they leave out."""
+"""Follows a reduced run on all points of the mesh.
+
+The difference to the run shows what the chosen points of its cubature leave out.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +16,12 @@ from bayeskin.reduced import kernels
 from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
 from bayeskin.types import Array, PadMotion
 
-REMEMBERED = 8  # states whose followers are kept; a step asks for three at most
+REMEMBERED = 8  # number of states that are kept at all points; a step needs at most three
 
 
 @dataclass(frozen=True)
 class Followed:
-    """One stage on all points: the arrays there, the history, and the residual (k + m,) of all points."""
+    """One stage at all points: the arrays there, the history, and the residual (k + m,) of all points."""
 
     room: kernels.Room
     past: kernels.History
@@ -26,23 +29,26 @@ class Followed:
 
 
 class Shadow:
-    """Follows the stages of a reduced run on all points, at the unknowns that the run solved for."""
+    """Evaluates the stages of a reduced run at all points, with the unknowns that the run has solved for."""
 
     def __init__(
         self, whole: ReducedSpace, theta: Mapping[str, float], binds: Sequence[Bind], protocol: PadMotion
     ) -> None:
         self.equations = ReducedEquations(whole, theta, binds, protocol)
         self._start = self.equations.initial_state(theta["p_init"])
-        self._known: dict[int, tuple[State, State]] = {}  # by identity of the run's state, kept alive
+        self._known: dict[int, tuple[State, State]] = {}  # by id of the run's state, which is kept
 
     def follow(self, stage: Stage, time_s: float) -> Followed | None:
-        """The stage on all points, time_s after the test started; None where one is inside out."""
+        """Returns a stage at all points, or None where a point is inside out.
+
+        time_s : time from the start of the test to the end of the stage [s]
+        """
         eq, k = self.equations, self.equations.space.modes[0]
-        sources = [(weight, self._of(state), state) for weight, state in stage.sources]
+        sources = [(weight, self._at_all_points(state), state) for weight, state in stage.sources]
         past = kernels.History(
             np.asarray(sum(w * s.volume for w, s, _ in sources)),
             np.asarray(sum(w * s.pressure for w, s, _ in sources)), sources[-1][1].memory[0],
-            np.asarray(sum(w * own.x[:k] for w, _, own in sources)), stage.length_s, stage.elapsed_s, time_s,
+            np.asarray(sum(w * run.x[:k] for w, _, run in sources)), stage.length_s, stage.elapsed_s, time_s,
         )  # fmt: skip
         room, out = eq.make_room(), np.empty(len(stage.state.x))
         if not kernels.residual(eq.system, eq.packed, past, stage.state.x, room, out) > 0.0:
@@ -53,13 +59,15 @@ class Shadow:
             del self._known[old]
         return Followed(room, past, out)
 
-    def _of(self, state: State) -> State:
+    def _at_all_points(self, state: State) -> State:
         known = self._known.get(id(state))
         return self._start if known is None else known[1]
 
     def nonlinear_integrands(self, followed: Followed) -> Array:
-        """What each point adds to each row of the residual, over its weight, (n, k + m), without the base
-        law's linear part at rest, which is integrated exactly."""
+        """Returns the contribution of each point to each row of the residual, over its weight, (n, k + m).
+
+        The linear part of the base law at rest is subtracted, since it is integrated exactly.
+        """
         room, past, system = followed.room, followed.past, self.equations.system
         at = self.equations.space.at
         n, strain = len(at.weight), room.deformation - np.eye(3)

@@ -1,4 +1,4 @@
-"""One run of a reduced model: parameters, mechanisms and a protocol in; force history and its error out."""
+"""Runs a reduced model: parameters, mechanisms and a protocol in, the force history and its error out."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from bayeskin.reduced.region import LEAST_STIFFNESS, Stability, outside
 from bayeskin.reduced.sensitivities import ReducedGradients
 from bayeskin.types import PadMotion, Simulation, frozen_array
 
-TOLERANCE = 1e-3  # of a step's error in time, relative to the nominal force: the full model's default
-ESTIMATES = 12  # states at which the error is estimated, beside the corners
+TOLERANCE = 1e-3  # allowed error of a time step, relative to the nominal force; the default of the full model
+ESTIMATES = 12  # approximate number of states, besides the corners, at which the error is estimated
 INSIDE_OUT = "between the points of the cubature the mesh is inside out; run the full model"
-SAFETY = 3.0  # on what the residual tells of them: chosen on the skins of docs/reduced.md
+SAFETY = 3.0  # factor on the error that the residual gives; chosen on the skins of docs/reduced.md
 
 
 def simulate_reduced(
@@ -39,19 +39,23 @@ def simulate_reduced(
     on_state: OnState | None = None,
     least_stiffness: float = LEAST_STIFFNESS,
 ) -> Simulation:
-    """Runs a reduced model over the whole motion, with those of `mechanisms` that the full model solves.
+    """Runs a reduced model over the whole motion and returns the simulation.
 
-    theta : E_c, E_s [Pa], k_c, k_s [m^2], p_init [Pa], the mechanisms' parameters, and lengths of the tissue
-        [m] in place of the geometry's
-    gradients : also the force's derivatives by these parameters, each for the change that stands with it
-    geometry : the layers and the arm where they differ from the model's
-    estimate : whether the force's error is estimated, which takes longer than the run
-    on_state : called with time [s], the full model's unknowns (dofs,) and force [N] of each step of the test
-    least_stiffness : share of the stiffness at rest below which the skin counts as near folding
+    The run includes those of `mechanisms` that the full model solves.
 
-    A run that fails, or that leaves the trained region, is a Simulation with status "failed" and a message,
-    and so is one whose error is estimated and found to be without bound; `stats` has "error_estimate_n" [N]
-    of the RMS error where it was asked for.
+    theta : E_c, E_s [Pa], k_c, k_s [m^2], p_init [Pa], the parameters of the mechanisms, and lengths of the
+        tissue [m] that replace the geometry's
+    gradients : parameters by which the force is also differentiated, each with the change that its derivative
+        is for
+    geometry : layers and arm, where they differ from the model's
+    estimate : True to estimate the error of the force, which takes longer than the run
+    on_state : function that is called with time [s], unknowns of the full model (dofs,) and force [N] of each
+        step of the test
+    least_stiffness : stiffness, relative to rest, below which the skin counts as near folding
+
+    The simulation has status "failed" and a message where the run fails, where it leaves the trained region,
+    or where the estimated error is infinite. With `estimate`, its `stats` hold the estimated RMS error of the
+    force as "error_estimate_n" [N].
     """
     started = time.perf_counter()
     tissue = sorted(m.name for m in mechanisms if isinstance(m.act, Tissue))
@@ -87,12 +91,12 @@ def simulate_reduced(
         stats=stats,
         model_hash=model.hash,
         gradient_names=slopes.names if slopes else (),
-        gradient_n=_beyond_start(slopes, len(force_n)) if slopes else np.zeros((0, 0)),
+        gradient_n=_relative_to_start(slopes, len(force_n)) if slopes else np.zeros((0, 0)),
     )
 
 
 class _History:
-    """Accepted steps of the test, and all steps of the run."""
+    """Stores the accepted steps of the test, and all steps of the run."""
 
     def __init__(self) -> None:
         self.time_s, self.force_n, self.corner = [0.0], [0.0], [True]
@@ -100,7 +104,7 @@ class _History:
 
 
 class _Run:
-    """One reduced run with what follows it: derivatives, stability, and its error on the full mesh."""
+    """One reduced run with its derivatives, its check of stability, and its error on the full mesh."""
 
     def __init__(
         self, model: ReducedModel, motion: PadMotion, theta: Mapping[str, float],
@@ -119,7 +123,7 @@ class _Run:
         self._seconds = 0.0
 
     def integrate(self, history: _History) -> str:
-        """Fills the history; returns a message, empty for a run that finished and kept from folding."""
+        """Fills the history and returns a message, which is empty where the run finished without folding."""
         equations = self._equations
 
         def on_step(step: Step) -> None:
@@ -146,7 +150,7 @@ class _Run:
 
     @property
     def stats(self) -> dict[str, float]:
-        """Counts and sizes of the run; "inside" is 1 where it kept from folding."""
+        """Returns counts and sizes of the run; "inside" is 1 where the skin was not near folding."""
         space = self._equations.space
         counts = dict(zip(("iterations", "residuals", "tangents"), self._equations.spent, strict=True))
         return {
@@ -156,7 +160,7 @@ class _Run:
         }  # fmt: skip
 
     def show(self, history: _History, on_state: OnState) -> None:
-        """Shows each step of the test on the nodes of the full model's mesh."""
+        """Calls `on_state` for each step of the test, with the unknowns on the nodes of the full mesh."""
         basis, equations = self._model.basis(self._tissue), self._equations
         for step in history.steps:
             time_s = step.state.time_s - equations.starts_s
@@ -164,7 +168,7 @@ class _Run:
                 on_state(max(time_s, 0.0), basis.nodal(step.state.x), step.force_n - equations.zero_n)
 
     def estimated_error_n(self, history: _History) -> float:
-        """Estimates the RMS error of the force [N] from some states of the test."""
+        """Returns the estimated RMS error of the force [N], from some states of the test."""
         problem, starts_s = self._model.problem(self._geometry), self._equations.starts_s
         laws = tuple(bind(self._theta, problem.sites) for bind in self._binds)
         solid = material(self._theta, problem.mesh.cutis)
@@ -176,8 +180,8 @@ class _Run:
         errors = []
         for step in history.steps:
             for stage in step.stages:
-                looked_at = stage is step.stages[-1] and id(step) in wanted
-                error_n = residual.follow(stage, step.force_n if looked_at else None)
+                is_wanted = stage is step.stages[-1] and id(step) in wanted
+                error_n = residual.follow(stage, step.force_n if is_wanted else None)
                 if error_n is not None:
                     errors.append(error_n)
         full.solver.release()
@@ -190,6 +194,6 @@ def _space_at(
     return model.space(tissue, moved(geometry, theta))
 
 
-def _beyond_start(slopes: ReducedGradients, count: int) -> np.ndarray:
+def _relative_to_start(slopes: ReducedGradients, count: int) -> np.ndarray:
     rows = np.array(slopes.force_n[-count:])
     return rows - rows[0]

@@ -1,4 +1,4 @@
-"""Compiled derivatives of a solved stage of the reduced model, by all parameters at once."""
+"""Computes, in compiled code, the derivatives of a solved stage of the reduced model by all parameters."""
 # mypy: disable-error-code="no-untyped-def"
 
 from __future__ import annotations
@@ -11,16 +11,17 @@ from bayeskin.finite_element.assembly import compiled
 from bayeskin.reduced.kernels import SLOW_CONTRACTION, History, Laws, Room, System, answer, renew, update
 from bayeskin.types import Array
 
-ENOUGH = 1e-3  # of the largest derivatives so far: steps below it end the solve
+ENOUGH = 1e-3  # relative to the largest derivatives so far; the solve ends with a step below it
 MOST_PASSES = 12
 
 
 class Varied(NamedTuple):
-    """A run's constants where one of r parameters is a step further, and derivatives of its exact parts.
+    """Constants of a run after a step of one of r parameters, and derivatives of its exact parts.
 
-    mu, lam, mobility (r, n); par (r, .), data (r, .) : as in `System` and `Laws`, at the changed values
-    solid_units (s, k, k), flow_units (t, m, m) : what `System.solid` and `flow` are combinations of
-    solid_by (r, s), flow_by (r, t) : derivatives of the coefficients; step : the change, in units of one
+    mu, lam, mobility (r, n); par (r, .), data (r, .) : as in `System` and `Laws`, for the changed parameters
+    solid_units (s, k, k), flow_units (t, m, m) : matrices whose combinations are `System.solid` and `flow`
+    solid_by (r, s), flow_by (r, t) : derivatives of the coefficients of these matrices
+    step : size of the step, in units of each parameter's change
     """
 
     mu: Array
@@ -36,7 +37,7 @@ class Varied(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """Derivatives by r parameters of a state: x (r, k + m), J and p (r, n), memory (r, .)."""
+    """Derivatives of a state by r parameters: of x (r, k + m), J and p (r, n), and memory (r, .)."""
 
     x: Array
     volume: Array
@@ -46,15 +47,16 @@ class Slopes(NamedTuple):
 
 @compiled
 def differentiate(system, laws, past, x, room, varied, before, scale, inverse, force_row, by_pads, out):
-    """Solves for `out`, derivatives of a solved stage's end; its x is a guess in which the pads' are right.
+    """Solves for the derivatives `out` of the state at the end of a solved stage.
 
-    room : as `solve` left it at x; before : derivatives of the history (x those of x*)
-    scale (2, r) : largest derivatives of the run so far, of displacements and of the force; kept up to date
-    inverse, force_row, by_pads : of a tangent near x, corrected by the steps and made anew where it contracts
-        badly
+    room : arrays as the solve left them at x; before : derivatives of the history, whose x belongs to x*
+    scale (2, r) : largest derivatives of the run so far, of displacements and of the force; it is updated
+    inverse, force_row, by_pads : inverse, row and column of a tangent near x; each step corrects the inverse,
+        and all are computed again where the solve converges badly
+    out : its x is a guess at the start, in which the derivatives of the pads' displacement are exact
 
-    Returns the derivatives of the force [N], (r,), corrected to first order by the last step, and the number
-    of tangents made.
+    Returns the derivatives (r,) of the force [N], which the last step corrects to first order, and the number
+    of tangents that were computed.
     """
     k, r = system.gradient.shape[2], len(out.x)
     exact, force = _exact(system, past, x, varied, before), np.empty(r)
@@ -95,8 +97,10 @@ def differentiate(system, laws, past, x, room, varied, before, scale, inverse, f
 
 @compiled
 def _left(system, laws, past, room, varied, before, exact, rows, out):
-    """Derivatives (a, k + m) of the residual by some of the parameters, the a rows of `out.x`; fills the
-    other fields of these rows."""
+    """Returns derivatives (a, k + m) of the residual by the parameters `rows` (a,), given rows of `out.x`.
+
+    Fills the other fields of these rows of `out`.
+    """
     n, k, m = system.weight.shape[0], system.gradient.shape[2], system.pressure.shape[1]
     r, step = len(rows), varied.step
     gradient, slope = system.gradient.reshape(9 * n, k), system.slope.reshape(3 * n, m)
@@ -139,7 +143,7 @@ def _left(system, laws, past, room, varied, before, exact, rows, out):
 
 @compiled
 def _answer_varied(system, laws, past, varied, before, i, other):
-    """Fills `other` with the answers where parameter i and the history are a step further."""
+    """Fills `other` with the response of the laws after a step of parameter i and of the history."""
     step = varied.step
     changed = System(
         system.gradient, system.pressure, system.slope, system.weight, varied.mu[i], varied.lam[i],
@@ -158,7 +162,7 @@ def _answer_varied(system, laws, past, varied, before, i, other):
 
 @compiled
 def _exact(system, past, x, varied, before):
-    """Derivatives (r, k + m) of the exactly integrated parts at fixed x."""
+    """Returns the derivatives (r, k + m) of the exactly integrated parts at fixed x."""
     k = system.gradient.shape[2]
     force, fluid = x[:k].copy(), x[k:].copy()
     out = np.zeros((varied.solid_by.shape[0], len(x)))

@@ -1,39 +1,39 @@
-"""Tangents of stages that were solved, kept to serve again where a run comes back to.
+"""Keeps the tangents of solved stages, so that later stages of a run can use them again.
 
-A tangent costs as much as some twenty residuals and changes slowly along the protocol, whose cycles come back
-to where they were. So the inverse that served a stage, with the corrections that its solve made, is kept
-under the place of the stage, and the nearest one serves the next.
+A tangent costs as much as about twenty residuals. It changes slowly along the protocol, whose cycles return
+to earlier displacements. The inverse of a stage, with the corrections from its solve, is therefore kept under
+the place of the stage. A new stage takes the inverse of the nearest place.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-ROOM = 32  # tangents that are kept
-SAME_PLACE = 0.02  # one this near to a new one is replaced by it
-FAR = np.log(4.0)  # from which on one does not serve: what a short stage leaves undrained a long one drains
+ROOM = 32  # largest number of tangents that are kept
+SAME_PLACE = 0.02  # a kept tangent this near to a new one is replaced by it
+FAR = np.log(4.0)  # a tangent farther away is not used; a long stage drains more than a short one
 
 
 class Tangent:
-    """The inverse of a tangent, with the force's row and the pads' column; corrected as solves go."""
+    """The inverse of a tangent, with the row of the force and the column of the pads; solves correct it."""
 
     def __init__(self, size: int) -> None:
         self.inverse, self.force_row = np.zeros((size, size)), np.zeros(size)
         self.by_pads = np.zeros(size + 1)
 
     def set_to(self, other: Tangent) -> None:
-        """Takes the values of another one."""
+        """Copies the values of another tangent."""
         self.inverse[:], self.force_row[:], self.by_pads[:] = other.inverse, other.force_row, other.by_pads
 
 
 class Tangents:
-    """Tangents by the places where they last served."""
+    """Keeps tangents by the places of the stages that used them last."""
 
     def __init__(self) -> None:
-        self._kept: list[tuple[tuple[float, float], Tangent]] = []  # the one that served last at the end
+        self._kept: list[tuple[tuple[float, float], Tangent]] = []  # the most recent one is last
 
     def take(self, place: tuple[float, float], into: Tangent) -> bool:
-        """Sets a tangent to that of the nearest place; returns whether there is one that serves."""
+        """Copies the tangent of the nearest place to `into`; returns False where none is near enough."""
         nearest = min(self._kept, key=lambda kept: _apart(kept[0], place), default=None)
         if nearest is None or _apart(nearest[0], place) > FAR:
             return False
@@ -45,13 +45,16 @@ class Tangents:
         self._kept.clear()
 
     def keep(self, place: tuple[float, float], tangent: Tangent) -> None:
-        """Keeps a copy under a place, instead of that at the same place, or of that which is oldest."""
+        """Keeps a copy of a tangent under a place.
+
+        It replaces the tangent at the same place, or the oldest one where the storage is full.
+        """
         same = [i for i, kept in enumerate(self._kept) if _apart(kept[0], place) < SAME_PLACE]
         full = [0] if len(self._kept) == ROOM else []
         number = next(iter([*same, *full]), None)
-        room = Tangent(len(tangent.force_row)) if number is None else self._kept.pop(number)[1]
-        room.set_to(tangent)
-        self._kept.append((place, room))
+        copy = Tangent(len(tangent.force_row)) if number is None else self._kept.pop(number)[1]
+        copy.set_to(tangent)
+        self._kept.append((place, copy))
 
 
 def _apart(one: tuple[float, float], other: tuple[float, float]) -> float:

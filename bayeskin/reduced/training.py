@@ -1,4 +1,4 @@
-"""Training runs of the full model, kept as the few weighted modes that make up their states."""
+"""Makes training runs of the full model and compresses their states to a few weighted modes."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from bayeskin.reduced.basis import Inner, weighted_modes
 from bayeskin.reduced.cases import Case
 from bayeskin.types import Array
 
-DUAL_EVERY = 8  # steps between the adjoint solutions that are kept
-DUAL_SCALE_M = 5e-3  # displacement by which adjoint solutions are weighted beside states
-KEPT = 1e-5  # modes of a run with singular values below this share of the largest are left out
-MOST_MODES = 24  # of a run
+DUAL_EVERY = 8  # number of steps from one stored adjoint solution to the next
+DUAL_SCALE_M = 5e-3  # weight of adjoint solutions relative to states, as a displacement
+KEPT = 1e-5  # modes of a run with singular values below this fraction of the largest are left out
+MOST_MODES = 24  # largest number of modes of each kind from a run
 
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """One full run as weighted modes: its states and adjoint solutions are combinations of them.
+    """One full run as weighted modes, whose linear combinations are its states and adjoint solutions.
 
-    displacement (a, 3 nodes) [m], without the parts that move with the pads
-    pressure (b, corners), over the run's peak force [Pa/N], without their means
-    time_s, force_n (n,) : the steps and the force
-    message : empty, or why the run ended early
+    displacement (a, 3 nodes) : modes [m], without the part that moves with the pads
+    pressure (b, corners) : modes relative to the peak force of the run [Pa/N], without their means
+    time_s, force_n (n,) : times of the steps and the force there
+    message : empty, or the reason why the run ended early
     """
 
     displacement: Array
@@ -39,7 +39,7 @@ class TrainingRun:
 
 
 class _States:
-    """Collects the unknowns of each step of a run, and adjoint solutions of some."""
+    """Collects the unknowns at each step of a run, and the adjoint solutions at some steps."""
 
     def __init__(self, model: LagrangianModel) -> None:
         self.model = model
@@ -64,7 +64,7 @@ class _States:
             self.duals.append(self._dual(step))
 
     def _dual(self, step: Step) -> Array:
-        """The adjoint of half the force at the end of a step (dofs,)."""
+        """Returns the adjoint (dofs,) of half the force at the end of a step."""
         model, stage = self.model, step.stages[-1]
         equations = model.equations(stage.length_s, stage.history, stage.elapsed_s)
         model.solver.renew(equations, stage.state.x)
@@ -81,7 +81,11 @@ def training_run(
     binds: Sequence[Bind],
     tolerance: float = 1e-3,
 ) -> TrainingRun:
-    """Runs the full model of a case, whose mechanisms' laws are `binds`, and compresses its states."""
+    """Runs the full model of a case and returns the run with compressed states.
+
+    binds : functions that bind the laws of the case's mechanisms
+    tolerance : allowed local error of the force in a time step, relative to the nominal force
+    """
     laws = tuple(bind(case.theta, problem.sites) for bind in binds)
     model = LagrangianModel(problem, material(case.theta, problem.mesh.cutis), case.motion, laws)
     states = _States(model)
@@ -104,13 +108,16 @@ def training_run(
 def _weighted(
     unknowns: Sequence[Array], along: Array, inner: Inner, peak_n: float, scale: float
 ) -> tuple[Array, Array]:
-    """Returns weighted modes of displacements less `along` times the pads', and of pressures less means."""
+    """Returns weighted modes of displacements and of pressures.
+
+    The pads' displacement times `along` is subtracted from displacements, and the mean from each pressure.
+    """
     n, corners = inner.displacement.shape[0], inner.pressure.shape[0]
     states = np.array(unknowns).reshape(-1, n + corners)
     u = states[:, :n] - np.outer(states[:, inner.pad_dof], along)
     p = inner.without_mean(states[:, n:] / peak_n)
-    size = scale / np.sqrt(max(len(states), 1))
+    factor = scale / np.sqrt(max(len(states), 1))
     return (
-        weighted_modes(size * u, inner.displacement, KEPT, MOST_MODES),
-        weighted_modes(size * p, inner.pressure, KEPT, MOST_MODES),
+        weighted_modes(factor * u, inner.displacement, KEPT, MOST_MODES),
+        weighted_modes(factor * p, inner.pressure, KEPT, MOST_MODES),
     )

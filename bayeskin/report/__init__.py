@@ -1,4 +1,7 @@
-"""Figures of every result, as PNG and SVG."""
+"""Draws a figure of every result.
+
+Each `figure_...` function returns a matplotlib figure, and `save_figure` writes it as PNG and SVG.
+"""
 
 from bayeskin.report.check import figure_model_check
 from bayeskin.report.discrepancy import figure_discrepancy, figure_experiments

@@ -1,4 +1,8 @@
-"""The surrogate's posterior beside the full model's, by draws that the full model ran again."""
+"""Draws how the posterior changes when the full model replaces the surrogate.
+
+The full model runs some draws of the posterior again, and their weights turn the surrogate's posterior into
+that of the full model.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +27,11 @@ from bayeskin.report.style import (
 
 @styled
 def figure_model_check(weighed: Weighed, corrected: Sequence[Corrected]) -> Figure:
-    """Weights of the draws run again, and each parameter's posterior by them."""
+    """Returns a figure of the draws' weights and of each parameter's posterior with and without them.
+
+    weighed : the draws that the full model ran again, with their weights
+    corrected : each parameter's posterior under the full model
+    """
     figure = new_figure(PAGE_IN, 2.9)
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.7))
     count = len(weighed.weights)
@@ -35,20 +43,22 @@ def figure_model_check(weighed: Weighed, corrected: Sequence[Corrected]) -> Figu
     )  # fmt: skip
     left.set(xlabel="draw, heaviest first", ylabel="weight")
     panel_title(left, "a", "weights by the full model")
-    place = np.arange(len(corrected))
-    ratio = [one.sd_ratio for one in corrected]
-    shift = [one.shift_sd for one in corrected]
-    right.errorbar(place - 0.12, np.zeros(len(place)), yerr=1.0, fmt="o", color=MODEL, label="surrogate")
-    right.errorbar(place + 0.12, shift, yerr=ratio, fmt="o", color=ACCENT, label="full model")
-    error = [one.shift_error_sd for one in corrected]
-    right.errorbar(place + 0.12, shift, yerr=error, fmt="none", color=ACCENT, elinewidth=3.0, alpha=0.5)
+    position = np.arange(len(corrected))
+    ratio = [parameter.sd_ratio for parameter in corrected]
+    shift = [parameter.shift_sd for parameter in corrected]
+    right.errorbar(
+        position - 0.12, np.zeros(len(position)), yerr=1.0, fmt="o", color=MODEL, label="surrogate"
+    )
+    right.errorbar(position + 0.12, shift, yerr=ratio, fmt="o", color=ACCENT, label="full model")
+    error = [parameter.shift_error_sd for parameter in corrected]
+    right.errorbar(position + 0.12, shift, yerr=error, fmt="none", color=ACCENT, elinewidth=3.0, alpha=0.5)
     right.axhline(0.0, color=GREY, lw=0.8)
-    right.set_xticks(place, [symbol(one.name).replace(" ", "\n") for one in corrected])
+    right.set_xticks(position, [symbol(parameter.name).replace(" ", "\n") for parameter in corrected])
     right.set_ylabel("mean ± sd [sd of the surrogate's]")
     right.set_ylim(top=1.25 * right.get_ylim()[1])
     right.legend(loc="upper right", ncols=2)
     panel_title(right, "b", "what the weights do to the posterior")
-    largest = max(corrected, key=lambda one: abs(one.shift_sd))
+    largest = max(corrected, key=lambda parameter: abs(parameter.shift_sd))
     finding = (
         f"By {count} full runs {weighed.effective:.0f} draws remain effective; "
         f"{symbol(largest.name)} moves most, by {abs(largest.shift_sd):.2f} of its sd"

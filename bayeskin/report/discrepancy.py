@@ -1,4 +1,4 @@
-"""What a model leaves unexplained, and the further test that would say why."""
+"""Draws the force that a model leaves unexplained, and the further tests that would show its cause."""
 
 from __future__ import annotations
 
@@ -34,6 +34,8 @@ COLORS = {"load": ACCENT, "unload": MODEL, "hold": "#009E73", "rest": GREY}
 
 
 class _Discrepancy(Protocol):
+    """Lists what the figure needs of a `bayeskin.mismatch.discrepancy.Discrepancy`."""
+
     @property
     def bins(self) -> NDArray[np.int64]: ...
     @property
@@ -51,6 +53,8 @@ class _Discrepancy(Protocol):
 
 
 class _Test(Protocol):
+    """Lists what the figure needs of a `bayeskin.experiments.protocols.Protocol`."""
+
     @property
     def name(self) -> str: ...
     @property
@@ -58,6 +62,8 @@ class _Test(Protocol):
 
 
 class _Experiment(Protocol):
+    """Lists what the figure needs of a `bayeskin.experiments.choice.Experiment`."""
+
     @property
     def protocol(self) -> _Test: ...
     @property
@@ -72,7 +78,11 @@ class _Experiment(Protocol):
 
 @styled
 def figure_discrepancy(binned: BinnedForce, motion: PadMotion, found: _Discrepancy) -> Figure:
-    """The discrepancy over time, against displacement by direction, and against time since the corner."""
+    """Returns a figure of the discrepancy over time, over displacement by direction, and after a corner.
+
+    motion : motion of the pads in the recording
+    found : the discrepancy at a fit
+    """
     figure = new_figure(PAGE_IN, 4.6)
     grid = figure.add_gridspec(2, 2, height_ratios=(1.15, 1))
     over_time = figure.add_subplot(grid[0, :])
@@ -94,11 +104,11 @@ def figure_discrepancy(binned: BinnedForce, motion: PadMotion, found: _Discrepan
         if found.noticeable
         else "The model leaves nothing unexplained but noise"
     )
-    looks = "; ".join(found.features)
+    features = "; ".join(found.features)
     state_finding(
         figure, finding,
         "Dots: residual beyond what any change of the parameters takes up. Lines and bands: the discrepancy "
-        f"and its 90 % interval; in b and c later cycles are fainter. {looks[:1].upper()}{looks[1:]}.",
+        f"and its 90 % interval; in b and c later cycles are fainter. {features[:1].upper()}{features[1:]}.",
     )  # fmt: skip
     return figure
 
@@ -120,9 +130,9 @@ def _draw_over_time(ax: Axes, binned: BinnedForce, found: _Discrepancy) -> None:
 def _draw_phases(
     ax: Axes, binned: BinnedForce, motion: PadMotion, found: _Discrepancy, kinds: Sequence[PhaseKind]
 ) -> None:
-    """One line with its band for each phase of `kinds`, later cycles fainter."""
+    """Draws a line with its band for each phase of `kinds`. Later cycles are fainter."""
     last = max((phase.cycle for phase in binned.phases), default=1)
-    shown = set()
+    drawn_kinds = set()
     for index, phase in enumerate(binned.phases):
         part = np.flatnonzero(binned.phase[found.bins] == index)
         if phase.kind not in kinds or not len(part) or (phase.kind == "rest" and phase.cycle == 0):
@@ -135,8 +145,8 @@ def _draw_phases(
         ax.plot(x, 1e3 * found.beyond_n[part], ".", ms=1.5, color=color, alpha=0.35 * strength)
         ax.fill_between(x, mean - half, mean + half, color=color, alpha=0.18 * strength, lw=0)
         ax.plot(x, mean, color=color, alpha=strength, lw=1.1)
-        shown.add(phase.kind)
-    handles = [Line2D([], [], color=COLORS[kind], label=kind) for kind in kinds if kind in shown]
+        drawn_kinds.add(phase.kind)
+    handles = [Line2D([], [], color=COLORS[kind], label=kind) for kind in kinds if kind in drawn_kinds]
     if handles:
         ax.legend(
             handles=handles,
@@ -148,35 +158,44 @@ def _draw_phases(
 
 
 def _unbroken(bins: NDArray[np.int64]) -> list[slice]:
-    """Runs of neighbouring bins."""
+    """Returns a slice for each sequence of neighbouring bins."""
     cuts = [0, *(np.flatnonzero(np.diff(bins) != 1) + 1).tolist(), len(bins)]
     return [slice(a, b) for a, b in pairwise(cuts)]
 
 
 @styled
 def figure_experiments(table: Sequence[_Experiment]) -> Figure:
-    """Expected information of each protocol, the most telling at the top, with a sketch of its motion."""
-    rows = [one for one in reversed(table) if np.isfinite(one.gain_bits)]
+    """Returns a figure of each protocol's expected information [bits], with a sketch of its motion.
+
+    table : experiments, the most informative first, which stands at the top; those without a finite
+        estimate are not drawn
+    """
+    rows = [experiment for experiment in reversed(table) if np.isfinite(experiment.gain_bits)]
     figure = new_figure(PAGE_IN, 1.1 + 0.3 * max(len(rows), 3))
     sketch, ax = figure.subplots(1, 2, sharey=True, width_ratios=(1, 2.2))
-    place = np.arange(len(rows))
-    gain = np.array([one.gain_bits for one in rows])
-    ax.barh(place, gain, color=[MODEL if i == len(rows) - 1 else FAINT for i in place], height=0.55)
+    position = np.arange(len(rows))
+    gain = np.array([experiment.gain_bits for experiment in rows])
+    ax.barh(position, gain, color=[MODEL if i == len(rows) - 1 else FAINT for i in position], height=0.55)
     ax.errorbar(
-        gain, place, xerr=[one.standard_error for one in rows], fmt="none", ecolor=INK, elinewidth=0.8
+        gain,
+        position,
+        xerr=[experiment.standard_error for experiment in rows],
+        fmt="none",
+        ecolor=INK,
+        elinewidth=0.8,
     )
-    reach = max((float(one.protocol.motion.displacement_m.max()) for one in rows), default=1.0)
-    for y, one in zip(place, rows, strict=True):
-        end_s = float(one.protocol.motion.time_s[-1])
+    reach = max((float(experiment.protocol.motion.displacement_m.max()) for experiment in rows), default=1.0)
+    for y, experiment in zip(position, rows, strict=True):
+        end_s = float(experiment.protocol.motion.time_s[-1])
         sketch.plot(
-            one.protocol.motion.time_s / end_s,
-            y - 0.28 + 0.56 * one.protocol.motion.displacement_m / reach,
+            experiment.protocol.motion.time_s / end_s,
+            y - 0.28 + 0.56 * experiment.protocol.motion.displacement_m / reach,
             color=INK,
             lw=0.8,
         )
         sketch.text(1.03, y, f"{end_s:.0f} s", va="center", color=GREY, fontsize=6.5)
         ax.text(
-            1.0, y, f"{100 * one.named:.0f} %", va="center", ha="right", color=GREY, fontsize=6.5,
+            1.0, y, f"{100 * experiment.named:.0f} %", va="center", ha="right", color=GREY, fontsize=6.5,
             transform=ax.get_yaxis_transform(),
         )  # fmt: skip
     possible = table[0].possible_bits if table else 0.0
@@ -185,7 +204,7 @@ def figure_experiments(table: Sequence[_Experiment]) -> Figure:
     ax.set(xlabel="expected information about which is true [bits]", xlim=(0.0, 1.15 * possible or 1.0))
     ax.set_ylim(-0.6, max(len(rows), 1) - 0.1)
     ax.tick_params(left=False)
-    sketch.set_yticks(place, [one.protocol.name for one in rows])
+    sketch.set_yticks(position, [experiment.protocol.name for experiment in rows])
     sketch.set(xlim=(-0.02, 1.3), xticks=[], xlabel="displacement over the test")
     sketch.spines[["left", "bottom"]].set_visible(False)
     sketch.tick_params(left=False)

@@ -1,4 +1,4 @@
-"""Fields on the deformed surface of the quarter model: one row a time, one column a field."""
+"""Draws fields on the deformed surface of the quarter model, with a row per time and a column per field."""
 
 from __future__ import annotations
 
@@ -18,23 +18,24 @@ from bayeskin.number_format import number
 from bayeskin.report.style import GREY, INK, PAGE_IN, new_figure, plain_log, state_finding, styled
 from bayeskin.types import Array
 
-# Grey stands for nothing: a white surface would vanish on the page.
+# Grey stands for zero, because a white surface would be invisible on the page.
 _SEQUENTIAL = LinearSegmentedColormap.from_list("grey-blue", ["#E6E6E6", "#86B8D9", "#0072B2", "#08284F"])
 _DIVERGING = LinearSegmentedColormap.from_list(
     "blue-grey-red", ["#08284F", "#0072B2", "#86B8D9", "#E6E6E6", "#EDA377", "#D55E00", "#5C2000"]
 )
-_ELEVATION, _AZIMUTH = np.radians(38.0), np.radians(-112.0)  # the top and both planes of symmetry are seen
-_DECADES = 2.0  # of a vector's colour scale; below it neither colour nor arrow
+# From this direction the top and both planes of symmetry are visible.
+_ELEVATION, _AZIMUTH = np.radians(38.0), np.radians(-112.0)
+_DECADES = 2.0  # decades of a vector's colour scale; smaller vectors have its lowest colour and no arrow
 _LABEL_IN = 0.95
 _ARROW_MM, _SPACING_MM = 4.5, 5.5
 
 
 @dataclass(frozen=True)
 class SurfaceField:
-    """One column of the figure: values (t, f) of the small faces in `unit`.
+    """Holds one column of the figure: values (t, f) in `unit` of the surface's small faces at t times.
 
-    `signed` fields get a scale centred on zero. With directions (t, f, 3) the values are lengths of
-    vectors, whose scale is logarithmic and whose directions are drawn as arrows.
+    A `signed` field has a colour scale that is centred on zero. With directions (t, f, 3), the values are
+    lengths of vectors. Their colour scale is logarithmic, and arrows show their directions.
     """
 
     label: str
@@ -55,18 +56,24 @@ def figure_fields(
     finding: str,
     caption: str = "",
 ) -> Figure:
-    """Small multiples: one row a time, one column a field, one colour bar a column, one frame for all.
+    """Returns a figure with a row of panels for each time and a column with a colour bar for each field.
 
-    row_labels (t,); points_m (t, v, 3) deformed positions of the surface's points; faces (f, 3) or (f, 4)
-    numbers of points; part (f,) number of the part that a face belongs to: parts are outlined, those in
-    `strong` with a thick line. `finding` heads the figure, `caption` foots it.
-    Raises InputError if the shapes do not fit each other.
+    All panels show the same region.
+
+    row_labels (t,) : one for each time
+    points_m (t, v, 3) : deformed positions of the surface's points
+    faces (f, 3) or (f, 4) : numbers of the points of each face
+    part (f,) : number of the part to which each face belongs; the parts are outlined
+    strong : numbers of the parts that have a thick outline
+    finding, caption : texts above and below the panels
+
+    Raises InputError if the shapes do not match.
     """
     points, nodes, parts = np.asarray(points_m, dtype=float), np.asarray(faces, dtype=int), np.asarray(part)
     _check(row_labels, points, nodes, parts, columns)
     flat = 1e3 * points @ _view()  # (t, v, 3): right, up, toward the viewer
-    shown = flat[:, np.unique(nodes)]
-    low, high = shown.min(axis=(0, 1)), shown.max(axis=(0, 1))
+    visible = flat[:, np.unique(nodes)]
+    low, high = visible.min(axis=(0, 1)), visible.max(axis=(0, 1))
     panel_in = (PAGE_IN - _LABEL_IN) / max(len(columns), 3)
     height_in = len(row_labels) * (panel_in * (high - low)[1] / (high - low)[0] + 0.06)
     figure = new_figure(_LABEL_IN + panel_in * len(columns), height_in + 1.15)
@@ -100,6 +107,7 @@ def figure_fields(
 def _check(
     row_labels: Sequence[str], points: Array, faces: Array, part: Array, columns: Sequence[SurfaceField]
 ) -> None:
+    """Raises InputError if the shapes do not match."""
     if points.ndim != 3 or points.shape[0] != len(row_labels) or points.shape[2] != 3:
         raise InputError("points of the surface", f"shape {points.shape}", f"({len(row_labels)}, v, 3)")
     if faces.ndim != 2 or faces.shape[1] not in (3, 4) or faces.max(initial=0) >= points.shape[1]:
@@ -115,7 +123,10 @@ def _check(
 
 
 def _view() -> Array:
-    """Columns: the page's right and up, and the direction toward the viewer; a parallel projection."""
+    """Returns the matrix (3, 3) of a parallel projection.
+
+    Its columns are the directions to the right of the page, up the page, and toward the viewer.
+    """
     e, a = _ELEVATION, _AZIMUTH
     right = (-np.sin(a), np.cos(a), 0.0)
     up = (-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e))
@@ -124,6 +135,7 @@ def _view() -> Array:
 
 
 def _scale(field: SurfaceField) -> ScalarMappable:
+    """Returns the colour scale of a field."""
     values = field.values[np.isfinite(field.values)]
     reach = float(np.max(np.abs(values), initial=0.0)) or 1.0
     if field.signed:
@@ -134,7 +146,7 @@ def _scale(field: SurfaceField) -> ScalarMappable:
 
 
 def _paint(ax: Axes, flat_mm: Array, faces: Array, values: Array, scale: ScalarMappable) -> None:
-    order = np.argsort(flat_mm[faces, 2].mean(axis=1))  # the nearest last
+    order = np.argsort(flat_mm[faces, 2].mean(axis=1))  # the nearest faces are painted last
     colors = scale.to_rgba(values[order])
     patch = PolyCollection(
         list(flat_mm[faces[order], :2]), facecolors=colors, edgecolors=colors, linewidths=0.3
@@ -144,6 +156,7 @@ def _paint(ax: Axes, flat_mm: Array, faces: Array, values: Array, scale: ScalarM
 
 
 def _outline(ax: Axes, flat_mm: Array, faces: Array, part: Array, strong: Sequence[int]) -> None:
+    """Draws the outlines of the parts, with a thick line for those in `strong`."""
     edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     unique, first, inverse = np.unique(edges, axis=0, return_index=True, return_inverse=True)
     owner = np.repeat(part, faces.shape[1])
@@ -158,14 +171,14 @@ def _outline(ax: Axes, flat_mm: Array, faces: Array, part: Array, strong: Sequen
 
 
 def _broken_line(segments: Array) -> tuple[Array, Array]:
-    """Segments (s, 2, 2) as one line with gaps, which makes one path in an SVG."""
+    """Returns segments (s, 2, 2) as one line with gaps, which is a single path in an SVG."""
     gaps = np.full((len(segments), 1, 2), np.nan)
     x, y = np.concatenate([segments, gaps], axis=1).reshape(-1, 2).T
     return x, y
 
 
 def _arrows(ax: Axes, centres_mm: Array, field: SurfaceField, row: int, scale: ScalarMappable) -> None:
-    """Arrows of one length in space, spread over the page, where the colour scale reaches."""
+    """Draws arrows of equal length in space, spread over the page, for vectors within the colour scale."""
     assert field.directions is not None
     chosen: list[int] = []
     for k in np.flatnonzero(field.values[row] > (scale.norm.vmin or 0.0)):
@@ -176,7 +189,7 @@ def _arrows(ax: Axes, centres_mm: Array, field: SurfaceField, row: int, scale: S
         return
     vectors = field.directions[row, chosen]
     along = _ARROW_MM * (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)) @ _view()[:, :2]
-    seen = np.linalg.norm(along, axis=1) > 0.3 * _ARROW_MM  # what points at the viewer shows no direction
+    seen = np.linalg.norm(along, axis=1) > 0.3 * _ARROW_MM  # an arrow toward the viewer shows no direction
     ax.quiver(
         *centres_mm[chosen, :2][seen].T, *along[seen].T, angles="xy", scale_units="xy", scale=1.0,
         pivot="mid", units="xy", width=0.5, headwidth=4.0, headlength=4.5, headaxislength=4.0,
@@ -189,8 +202,8 @@ def _frame(ax: Axes, low: Array, high: Array, values: Array, unit: str) -> None:
     ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
     ax.set(xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
-    reach = f"{number(values.min(), 3)} to {number(values.max(), 3)} {unit}".replace("-", "−")
-    ax.text(1.0, 0.0, reach, transform=ax.transAxes, ha="right", va="bottom", fontsize=6.5, color=GREY)
+    value_range = f"{number(values.min(), 3)} to {number(values.max(), 3)} {unit}".replace("-", "−")
+    ax.text(1.0, 0.0, value_range, transform=ax.transAxes, ha="right", va="bottom", fontsize=6.5, color=GREY)
 
 
 def _triad(ax: Axes, low: Array, high: Array) -> None:

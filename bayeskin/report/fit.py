@@ -1,4 +1,4 @@
-"""The fit: recorded bins, what the posterior predicts for them, and what is left."""
+"""Draws the fit: the recorded bins, their prediction by the posterior, and the residual."""
 
 from __future__ import annotations
 
@@ -46,10 +46,12 @@ def figure_fit(
     noise_sd_n: ArrayLike,
     force_n: ArrayLike,
 ) -> Figure:
-    """Recorded bins against the posterior predictive, the residual, and where the uncertainty comes from.
+    """Returns a figure of the recorded bins with their predictive bands, the residual, and its uncertainty.
 
-    displacement_m (m,) LVDT displacement of each bin; fitted (m,) bool, bins in the likelihood. The four
-    others are posterior predictive draws, (s, m) each, as `predictive_bands` describes them.
+    displacement_m (m,) : LVDT displacement of each bin
+    fitted (m,) : bool, bins in the likelihood
+    mean_n, surrogate_sd_n, noise_sd_n, force_n (s, m) : posterior predictive draws [N], which
+        `predictive_bands` describes
     """
     displacement_mm = 1e3 * np.asarray(displacement_m, dtype=float)
     chosen = np.asarray(fitted, dtype=bool)
@@ -81,7 +83,7 @@ def figure_fit(
 
 
 def _draw_residual(ax: Axes, binned: BinnedForce, bands: ForceBands, chosen: Mask) -> None:
-    """Recorded minus predicted median [mN] over time, against the predictive bands around it."""
+    """Draws recorded minus predicted median [mN] over time, with the predictive bands."""
     shade_phases(ax, binned.phases)
     draw_bands(ax, binned.time_s, 1e3 * (bands.low_n - bands.median_n), 1e3 * (bands.high_n - bands.median_n))
     ax.axhline(0, color=GREY, lw=0.6)
@@ -90,14 +92,14 @@ def _draw_residual(ax: Axes, binned: BinnedForce, bands: ForceBands, chosen: Mas
 
 
 def _draw_parts(ax: Axes, binned: BinnedForce, bands: ForceBands) -> None:
-    """Half-width [mN] of the 90 % interval by its parts over time, on a log axis."""
+    """Draws the half-width [mN] of each part's 90 % interval over time, on a logarithmic axis."""
     shade_phases(ax, binned.phases)
     for name, width_n in bands.parts_n.items():
         positive = np.where(width_n > 0, 1e3 * width_n, np.nan)
         ax.plot(binned.time_s, positive, color=PARTS[name], lw=0.8 if name == "all" else 1.2, label=name)
     widths = np.concatenate([w[w > 0] for w in bands.parts_n.values()])
     if len(widths):
-        # A part that vanishes somewhere (a force known to be zero) must not flatten the rest.
+        # A part that vanishes somewhere (a force known to be zero) must not flatten the others.
         top = 1e3 * widths.max()
         ax.set_yscale("log")
         ax.set_ylim(max(1e3 * np.quantile(widths, 0.02) / 1.5, 1e-4 * top), 2 * top)
@@ -107,7 +109,7 @@ def _draw_parts(ax: Axes, binned: BinnedForce, bands: ForceBands) -> None:
 
 
 def _draw_residual_loop(ax: Axes, binned: BinnedForce, predicted_n: Array, displacement_mm: Array) -> None:
-    """Residual [mN] over displacement, each bin in the colour of its phase."""
+    """Draws the residual [mN] over displacement, with each bin in the colour of its phase."""
     kinds = np.array([p.kind for p in binned.phases])[binned.phase]
     residual_mn = 1e3 * (binned.force_n - predicted_n)
     ax.axhline(0, color=GREY, lw=0.6)

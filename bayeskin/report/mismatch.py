@@ -1,4 +1,8 @@
-"""Where a recording leaves the model, which mechanisms make up for it, and the fit before and after."""
+"""Draws the results of a diagnosis.
+
+The figures show where a recording differs from the model, which mechanisms explain the difference, and the
+fit without and with these mechanisms.
+"""
 
 from __future__ import annotations
 
@@ -34,16 +38,18 @@ from bayeskin.report.style import (
 from bayeskin.report.timeline import PHASE_COLORS, phase_legend, shade_phases
 from bayeskin.types import Array, BinnedForce, PadMotion, Parameter, Phase, PhaseKind
 
-Summaries = Mapping[str, Mapping[str, Any]]  # of parameters by name: mean, interval90
+Summaries = Mapping[str, Mapping[str, Any]]  # "mean" and "interval90" of each parameter, by its name
 Z90 = 1.645
-BAND = "#B9D6EA"  # about what is drawn in MODEL
-BELOW = "#882255"  # windows where the recorded force is below what the model allows; above: ACCENT
+BAND = "#B9D6EA"  # bands around lines in the colour MODEL
+BELOW = "#882255"  # windows where the recording lies below the model; ACCENT marks those above it
 WORDS: dict[PhaseKind, str] = {
     "load": "while loading", "unload": "while unloading", "hold": "in holds", "rest": "at rest",
 }  # fmt: skip
 
 
 class _Window(Protocol):
+    """Lists what the figures need of a `bayeskin.mismatch.locate.Window`."""
+
     @property
     def start_s(self) -> float: ...
     @property
@@ -53,6 +59,8 @@ class _Window(Protocol):
 
 
 class _Contribution(Protocol):
+    """Lists what the figures need of a `bayeskin.mismatch.contributions.Contribution`."""
+
     @property
     def name(self) -> str: ...
     @property
@@ -63,8 +71,12 @@ class _Contribution(Protocol):
     def size_n(self) -> float: ...
 
 
-class _Shown(Protocol):
-    """A fit: its force (m,), the predictive band's edges and the force of a fit to the beginning alone."""
+class _DrawnFit(Protocol):
+    """Lists what the figures need of a fit.
+
+    force_n (m,) [N]; band_n : lower and upper edge (m,) [N] of the predictive band
+    held_out_n (m,) : force [N] of a fit to the beginning of the recording alone, or None
+    """
 
     @property
     def force_n(self) -> Array: ...
@@ -75,6 +87,8 @@ class _Shown(Protocol):
 
 
 class _Located(Protocol):
+    """Lists what the figures need of a `bayeskin.mismatch.locate.Located`."""
+
     @property
     def windows(self) -> Sequence[_Window]: ...
     @property
@@ -87,7 +101,11 @@ class _Located(Protocol):
 
 @styled
 def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, force_n: Array) -> Figure:
-    """Windows on the recording, the residual and force over displacement; force_n (m,) the model's."""
+    """Returns a figure of the windows in which the recording differs from the model.
+
+    The windows are marked on the residual over time and on the force over displacement.
+    force_n (m,) : force [N] of the model's best fit
+    """
     figure = new_figure(PAGE_IN, 4.2)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.9, 1))
     force = figure.add_subplot(grid[0, 0])
@@ -111,7 +129,7 @@ def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, fo
         loops.plot(displacement_mm[inside], 1e3 * binned.force_n[inside], ".", ms=2.5, color=color)
     for ax in (force, residual):
         shade_phases(ax, binned.phases, cycles=ax is force)
-    force.margins(y=0.14)  # room for the cycles' names
+    force.margins(y=0.14)  # leaves space for the names of the cycles
     _key_above(force)
     _key_above(residual)
     force.tick_params(labelbottom=False)
@@ -136,35 +154,39 @@ def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, fo
 
 
 def _key_above(ax: Axes) -> None:
-    """The key over the axes at the right, where it hides nothing."""
+    """Puts the legend above the axes at the right, where it hides nothing."""
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.2)
 
 
 @styled
 def figure_candidates(candidates: Sequence[Mapping[str, Any]]) -> Figure:
-    """Log evidence that each mechanism gains by itself, with the standard error over phases."""
+    """Returns a figure of the log-evidence that each mechanism gains by itself, with its standard error.
+
+    candidates : "name", "delta_score" [nats] and "standard_error" (over phases) of each mechanism, with the
+        largest gain first
+    """
     rows = list(reversed(candidates))
     figure = new_figure(PAGE_IN, 0.9 + 0.2 * max(len(rows), 3))
     ax = figure.subplots()
     gain = np.array([row["delta_score"] for row in rows])
     error = np.array([row["standard_error"] for row in rows])
-    place = np.arange(len(rows))
-    ax.barh(place, gain, color=[MODEL if value > 0 else GREY for value in gain], height=0.6)
-    ax.errorbar(gain, place, xerr=error, fmt="o", ms=2.2, color=RECORDED, elinewidth=0.7)
+    position = np.arange(len(rows))
+    ax.barh(position, gain, color=[MODEL if value > 0 else GREY for value in gain], height=0.6)
+    ax.errorbar(gain, position, xerr=error, fmt="o", ms=2.2, color=RECORDED, elinewidth=0.7)
     ax.axvline(0.0, color=GREY, lw=0.6)
-    ax.set_yticks(place, [row["name"] for row in rows])
-    numbers = ax.secondary_yaxis("right")  # bars of a few nats do not show beside one of hundreds
+    ax.set_yticks(position, [row["name"] for row in rows])
+    numbers = ax.secondary_yaxis("right")  # beside a bar of hundreds of nats, a bar of a few is invisible
     digits = [0 if abs(a) >= 100.0 else 1 for a in gain]
-    said = [f"{round(a, d) + 0.0:+.{d}f} ± {b:.{d}f}" for a, b, d in zip(gain, error, digits, strict=True)]
-    numbers.set_yticks(place, [one.replace("-", "−") for one in said])
+    labels = [f"{round(a, d) + 0.0:+.{d}f} ± {b:.{d}f}" for a, b, d in zip(gain, error, digits, strict=True)]
+    numbers.set_yticks(position, [label.replace("-", "−") for label in labels])
     numbers.tick_params(length=0.0)
     numbers.spines["right"].set_visible(False)
     ax.set_xlabel("log evidence gained over the base model [nats]")
     finding = "No mechanism alone gains"
     if len(rows) and gain[-1] > 0:
-        near = int(np.sum(gain[:-1] > gain[-1] - np.hypot(error[:-1], error[-1])))
+        ties = int(np.sum(gain[:-1] > gain[-1] - np.hypot(error[:-1], error[-1])))
         finding = f"{rows[-1]['name']} alone gains most" + (
-            f", {near} {'other' if near == 1 else 'others'} as much within the error" if near else ""
+            f", {ties} {'other' if ties == 1 else 'others'} as much within the error" if ties else ""
         )
     state_finding(
         figure,
@@ -177,11 +199,11 @@ def figure_candidates(candidates: Sequence[Mapping[str, Any]]) -> Figure:
 
 @styled
 def figure_before_after(
-    binned: BinnedForce, motion: PadMotion, before: _Shown, after: _Shown, split_s: float | None
+    binned: BinnedForce, motion: PadMotion, before: _DrawnFit, after: _DrawnFit, split_s: float | None
 ) -> Figure:
-    """Force and residual over time and force over displacement, without and with the best set.
+    """Returns a figure of force and residual without and with the best set of mechanisms.
 
-    split_s : until when fits to the beginning alone were fitted, None where there are none
+    split_s : time [s] up to which the fits to the beginning alone use the recording; None without such fits
     """
     rows = 2 if split_s is None else 3
     figure = new_figure(PAGE_IN, 1.5 + 1.4 * rows)
@@ -192,10 +214,10 @@ def figure_before_after(
     time_s, displacement_mm = binned.time_s, 1e3 * motion.at(binned.time_s)
     force.plot(time_s, 1e3 * binned.force_n, ".", ms=1.5, color=RECORDED, label="recorded")
     loops.plot(displacement_mm, 1e3 * binned.force_n, ".", ms=1.5, color=RECORDED)
-    for one, color, label in ((before, GREY, "before"), (after, MODEL, "after")):
-        force.plot(time_s, 1e3 * one.force_n, color=color, lw=0.9, label=label)
-        residual.plot(time_s, 1e3 * (binned.force_n - one.force_n), color=color, lw=0.8)
-        loops.plot(displacement_mm, 1e3 * one.force_n, color=color, lw=0.8)
+    for fit, color, label in ((before, GREY, "before"), (after, MODEL, "after")):
+        force.plot(time_s, 1e3 * fit.force_n, color=color, lw=0.9, label=label)
+        residual.plot(time_s, 1e3 * (binned.force_n - fit.force_n), color=color, lw=0.8)
+        loops.plot(displacement_mm, 1e3 * fit.force_n, color=color, lw=0.8)
     for ax, zero_n in ((force, 0.0), (residual, after.force_n)):
         low_mn, high_mn = (1e3 * (edge_n - zero_n) for edge_n in after.band_n)
         ax.fill_between(time_s, low_mn, high_mn, color=BAND, lw=0, zorder=0.5, label="its 90 % band")
@@ -208,17 +230,17 @@ def figure_before_after(
     for ax in over_time:
         shade_phases(ax, binned.phases, cycles=ax is force)
         ax.tick_params(labelbottom=ax is over_time[-1])
-    force.margins(y=0.14)  # room for the cycles' names
+    force.margins(y=0.14)  # leaves space for the names of the cycles
     _key_above(force)
     force.set_ylabel("force [mN]")
     residual.set_ylabel("recorded − model [mN]")
     over_time[-1].set_xlabel("time [s]")
     loops.set(xlabel="displacement [mm]", ylabel="force [mN]")
-    inside = [100.0 * inference.coverage(binned, *one.band_n) for one in (before, after)]
+    covered = [100.0 * inference.coverage(binned, *fit.band_n) for fit in (before, after)]
     panel_title(force, "a")
-    panel_title(residual, "b", "in the 90 % bands: {:.0f} → {:.0f} % of bins".format(*inside))
+    panel_title(residual, "b", "in the 90 % bands: {:.0f} → {:.0f} % of bins".format(*covered))
     panel_title(loops, "c")
-    rms = [1e3 * inference.rmse(binned, one.force_n).whole_n for one in (before, after)]
+    rms = [1e3 * inference.rmse(binned, fit.force_n).whole_n for fit in (before, after)]
     state_finding(
         figure,
         "RMS residual {:.1f} mN before, {:.1f} mN after".format(*rms),
@@ -234,19 +256,22 @@ def _draw_held_out(
     loops: Axes,
     binned: BinnedForce,
     motion: PadMotion,
-    both: Sequence[_Shown],
+    both: Sequence[_DrawnFit],
     split_s: float,
 ) -> None:
-    """What fits to the beginning leave, over time, and of the rest over displacement."""
-    rest = [(split_s, float(binned.edges_s[-1]))]
-    bins = bins_in_windows(binned, rest) >= 0
+    """Draws the residual of the fits to the beginning over time.
+
+    `loops` shows it over displacement, for the bins after the beginning only.
+    """
+    not_fitted = [(split_s, float(binned.edges_s[-1]))]
+    bins = bins_in_windows(binned, not_fitted) >= 0
     sizes = []
-    for one, color in zip(both, (GREY, MODEL), strict=True):
-        assert one.held_out_n is not None
-        left_n = binned.force_n - one.held_out_n
-        over_time.plot(binned.time_s, 1e3 * left_n, color=color, lw=0.8)
-        loops.plot(1e3 * motion.at(binned.time_s[bins]), 1e3 * left_n[bins], ".", ms=1.5, color=color)
-        sizes.append(1e3 * inference.rmse(binned, one.held_out_n, rest).by_window_n[0])
+    for fit, color in zip(both, (GREY, MODEL), strict=True):
+        assert fit.held_out_n is not None
+        residual_n = binned.force_n - fit.held_out_n
+        over_time.plot(binned.time_s, 1e3 * residual_n, color=color, lw=0.8)
+        loops.plot(1e3 * motion.at(binned.time_s[bins]), 1e3 * residual_n[bins], ".", ms=1.5, color=color)
+        sizes.append(1e3 * inference.rmse(binned, fit.held_out_n, not_fitted).by_window_n[0])
     over_time.axvline(split_s, color=INK, lw=0.8, ls="--")
     over_time.set_ylabel("recorded − model [mN]")
     loops.set(xlabel="displacement [mm]", ylabel="recorded − model [mN]")
@@ -257,18 +282,18 @@ def _draw_held_out(
 
 @styled
 def figure_base_parameters(parameters: Sequence[Parameter], before: Summaries, after: Summaries) -> Figure:
-    """Posterior mean and 90 % interval of each of the base's parameters, without and with the best set."""
+    """Returns a figure of the base parameters' means and 90 % intervals, without and with the best set."""
     figure = new_figure(PAGE_IN, 1.0 + 0.42 * len(parameters))
     panels = np.atleast_1d(figure.subplots(len(parameters), 1))
     moved = []
     for ax, parameter in zip(panels, parameters, strict=True):
-        for place, said, color in ((1, before, GREY), (0, after, MODEL)):
-            one = said[parameter.name]
+        for height, summaries, color in ((1, before, GREY), (0, after, MODEL)):
+            summary = summaries[parameter.name]
             low, mean, high = axis_values(
-                parameter, [one["interval90"][0], one["mean"], one["interval90"][1]]
+                parameter, [summary["interval90"][0], summary["mean"], summary["interval90"][1]]
             )
-            ax.plot([low, high], [place, place], color=color, lw=2.0, solid_capstyle="butt")
-            ax.plot(mean, place, "o", ms=3.0, color=color)
+            ax.plot([low, high], [height, height], color=color, lw=2.0, solid_capstyle="butt")
+            ax.plot(mean, height, "o", ms=3.0, color=color)
         ax.set_xlim(*axis_values(parameter, [parameter.lower, parameter.upper]))
         ax.set_ylim(-0.7, 1.7)
         ax.set_yticks([])
@@ -280,10 +305,10 @@ def figure_base_parameters(parameters: Sequence[Parameter], before: Summaries, a
     panels[0].legend(
         handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.2
     )
-    leave = "leaves its interval" if len(moved) == 1 else "leave their intervals"
+    predicate = "leaves its interval" if len(moved) == 1 else "leave their intervals"
     state_finding(
         figure,
-        f"{list_symbols(moved)} {leave}" if moved else "No parameter of the base leaves its interval",
+        f"{list_symbols(moved)} {predicate}" if moved else "No parameter of the base leaves its interval",
         "Posterior means and 90 % intervals without and with the best set of mechanisms. Axes: the prior's "
         "range.",
     )
@@ -291,15 +316,19 @@ def figure_base_parameters(parameters: Sequence[Parameter], before: Summaries, a
 
 
 def _overlap(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    (low, high), (its_low, its_high) = one["interval90"], other["interval90"]
-    return bool(low <= its_high and its_low <= high)
+    """Returns whether the 90 % intervals of two parameter summaries overlap."""
+    (low, high), (other_low, other_high) = one["interval90"], other["interval90"]
+    return bool(low <= other_high and other_low <= high)
 
 
 @styled
 def figure_residual_by_phase(
     binned: BinnedForce, motion: PadMotion, before: _Located, after: _Located
 ) -> Figure:
-    """The residual without and with the best set in each kind of phase, one line a cycle."""
+    """Returns a figure of the residual in each kind of phase, without and with the best set.
+
+    Each cycle has its own line.
+    """
     kinds = [kind for kind in WORDS if any(phase.kind == kind for phase in binned.phases)]
     rows = (len(kinds) + 1) // 2
     figure = new_figure(PAGE_IN, 0.7 + 1.9 * rows)
@@ -308,10 +337,10 @@ def figure_residual_by_phase(
         spare.set_visible(False)
     sizes = {}
     for ax, kind, letter in zip(panels, kinds, "abcd", strict=False):
-        sizes[kind] = [_draw_kind(ax, kind, binned, motion, one, one is after) for one in (before, after)]
+        sizes[kind] = [_draw_kind(ax, kind, binned, motion, fit, fit is after) for fit in (before, after)]
         panel_title(ax, letter, "{}: {:.1f} → {:.1f} mN RMS".format(WORDS[kind], *sizes[kind]))
     handles = [Line2D([], [], color=GREY, label="before"), Line2D([], [], color=MODEL, label="after")]
-    panels[0].margins(y=0.22)  # room for the key
+    panels[0].margins(y=0.22)  # leaves space for the legend
     panels[0].legend(handles=[*handles, Patch(color=FAINT, label="allowed, 90 %")], loc="upper left", ncols=3)
     for ax in panels[::2]:
         ax.set_ylabel("recorded − model [mN]")
@@ -328,7 +357,10 @@ def figure_residual_by_phase(
 def _draw_kind(
     ax: Axes, kind: PhaseKind, binned: BinnedForce, motion: PadMotion, located: _Located, last: bool
 ) -> float:
-    """The residual in all phases of a kind, with what is allowed if it is the last; its RMS [mN]."""
+    """Draws the residual in all phases of a kind, and returns its RMS [mN].
+
+    With `last`, it also draws the allowed range.
+    """
     cycles = max(phase.cycle for phase in binned.phases)
     residual, allowed = 1e3 * located.residual_n, 1e3 * Z90 * located.allowed_n
     of_kind = np.zeros(len(residual), dtype=bool)
@@ -337,7 +369,7 @@ def _draw_kind(
         if phase.kind != kind or not part.any():
             continue
         of_kind |= part
-        x = _place(phase, binned.time_s[located.bins[part]], motion)
+        x = _axis_position(phase, binned.time_s[located.bins[part]], motion)
         strength = 1.0 - 0.65 * max(phase.cycle - 1, 0) / max(cycles - 1, 1)
         ax.plot(x, residual[part], color=MODEL if last else GREY, alpha=strength, lw=0.8)
         if last:
@@ -350,8 +382,11 @@ def _draw_kind(
     return float(np.sqrt(np.mean(residual[of_kind] ** 2))) if of_kind.any() else 0.0
 
 
-def _place(phase: Phase, time_s: Array, motion: PadMotion) -> Array:
-    """Where times of a phase stand on its kind's axis: displacement [mm], or time since its start [s]."""
+def _axis_position(phase: Phase, time_s: Array, motion: PadMotion) -> Array:
+    """Returns the positions of times (k,) [s] on the axis of the phase's kind.
+
+    This is the displacement [mm] while the pads move, and the time since the phase's start [s] otherwise.
+    """
     if phase.kind in ("hold", "rest"):
         return np.maximum(time_s - phase.start_s, 0.1)
     return 1e3 * motion.at(time_s)
@@ -359,7 +394,10 @@ def _place(phase: Phase, time_s: Array, motion: PadMotion) -> Array:
 
 @styled
 def figure_contributions(binned: BinnedForce, motion: PadMotion, parts: Sequence[_Contribution]) -> Figure:
-    """What each mechanism adds to the force, over time and over displacement; at least one."""
+    """Returns a figure of the force that each mechanism adds, over time and over displacement.
+
+    parts : contributions, at least one, the largest first
+    """
     figure = new_figure(PAGE_IN, 0.9 + 1.15 * len(parts))
     panels = figure.subplots(len(parts), 2, sharex="col", sharey="row", squeeze=False, width_ratios=(1.9, 1))
     displacement_mm = 1e3 * motion.at(binned.time_s)
@@ -377,7 +415,7 @@ def figure_contributions(binned: BinnedForce, motion: PadMotion, parts: Sequence
         over_time.set_title(f"{part.name}{along}: {1e3 * part.size_n:.1f} mN RMS")
         over_time.set_ylabel("force [mN]")
         low, high = min(force_mn.min(), 0.0), max(force_mn.max(), 0.0)
-        reach = max(high - low, 0.1)  # rounding is not to fill the panel
+        reach = max(high - low, 0.1)  # rounding errors must not fill the panel
         over_time.set_ylim(low - 0.08 * reach, high + 0.22 * reach)
     phase_legend(panels[0, 1], binned.phases)
     panels[-1, 0].set_xlabel("time [s]")
@@ -391,7 +429,10 @@ def figure_contributions(binned: BinnedForce, motion: PadMotion, parts: Sequence
 
 
 def faint_in_words(said: Mapping[str, Any]) -> str:
-    """What fits better than nothing does, where nothing could be named; empty where that is none."""
+    """Returns a sentence about the mechanisms that improve the fit although none could be named.
+
+    The text is empty where the verdict is another, or where no set fits better.
+    """
     if said["verdict"] != "nothing-missing" or not said.get("best_set"):
         return ""
     better = ", ".join(said["best_set"])

@@ -1,4 +1,4 @@
-"""The posterior: how wide the recording leaves each parameter, and which of them trade off."""
+"""Draws the posterior: how precisely each parameter is known, and which parameters trade off."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from bayeskin.report.triangle import label_edges, triangle
 from bayeskin.types import Array, Parameter, ParameterSpace
 
 _BINS = 80
-_TINTS = ["#C6DDEC", "#7FB3D5"]  # of the 90 % and the 50 % region
+_TINTS = ["#C6DDEC", "#7FB3D5"]  # colours of the 90 % and the 50 % region
 
 
 @styled
@@ -36,9 +36,12 @@ def figure_posterior(
     map_theta: Mapping[str, float],
     names: Sequence[str] | None = None,
 ) -> Figure:
-    """Corner plot: marginals with the prior's outline, 50 % and 90 % regions of each pair, the MAP.
+    """Returns a corner plot: marginals with the priors, 50 % and 90 % regions of each pair, and the MAP.
 
-    draws (s, d) in the order of `space`; map_theta by name (may be empty); names picks a subset.
+    draws (s, d) : of the posterior, in SI and in the order of `space`
+    map_theta : values of the MAP by name, in SI; it may be empty
+    names : parameters to draw, or None for all
+
     Raises InputError for a name that the space does not have.
     """
     draws = np.asarray(draws, dtype=float)
@@ -69,7 +72,7 @@ def figure_posterior(
 
 
 def mass_levels(density: Array, fractions: Sequence[float]) -> list[float]:
-    """Heights of a gridded density whose super-level sets hold the given fractions of its mass."""
+    """Returns levels of a gridded density; cells above a level hold the given fraction of its mass."""
     heights = np.sort(density, axis=None)[::-1]
     mass = np.cumsum(heights) / heights.sum()
     return [float(heights[np.searchsorted(mass, fraction)]) for fraction in fractions]
@@ -78,10 +81,12 @@ def mass_levels(density: Array, fractions: Sequence[float]) -> list[float]:
 def smoothed_histogram(
     x: Array, y: Array, x_range: Array, y_range: Array
 ) -> tuple[Array, Array, Array, bool]:
-    """Density (80, 80) of a pair with its cell centres, and whether it is flat but for sampling scatter.
+    """Returns the smoothed density of a pair of parameters from their draws (s,).
 
-    Smoothed by a normal kernel with the draws' own covariance, so that a ridge stays narrow, at 0.7
-    of Scott's bandwidth; mirrored at the edges, where a prior may cut the density off.
+    The four results are the cell centres of both axes, (80,) each, the density (80, 80), and whether the
+    density is flat apart from the scatter of sampling. The histogram is smoothed by a normal kernel at 0.7
+    of Scott's bandwidth. The kernel has the draws' own covariance, so that a narrow ridge stays narrow. The
+    histogram is mirrored at the edges, where a prior may cut the density off.
     """
     counts, x_edges, y_edges = np.histogram2d(x, y, bins=_BINS, range=[x_range, y_range])
     scale = _BINS / np.array([np.ptp(x_range), np.ptp(y_range)])
@@ -94,12 +99,14 @@ def smoothed_histogram(
     smooth = np.fft.irfft2(np.fft.rfft2(padded) * damping, padded.shape)
     inside = slice(_BINS // 2, -(_BINS // 2))
     density = np.maximum(smooth[inside, inside], 0.0)
-    scatter = np.sqrt(_BINS**2 / (4 * np.pi * np.sqrt(np.linalg.det(kernel)) * len(x)))  # if uniform
+    # This is the relative sd that sampling would cause in a uniform density.
+    scatter = np.sqrt(_BINS**2 / (4 * np.pi * np.sqrt(np.linalg.det(kernel)) * len(x)))
     flat = bool(density.std() < 2.5 * scatter * density.mean())
     return 0.5 * (x_edges[1:] + x_edges[:-1]), 0.5 * (y_edges[1:] + y_edges[:-1]), density, flat
 
 
 def _axis_range(parameter: Parameter, values: Array) -> Array:
+    """Returns the ends (2,) of an axis: the prior's range, or the draws' range where it is much narrower."""
     low, high = axis_values(parameter, [parameter.lower, parameter.upper])
     tails = np.quantile(values, [0.001, 0.999])
     if np.ptp(tails) > 0.35 * (high - low):
@@ -125,14 +132,14 @@ def _draw_marginal(ax: Axes, p: Parameter, values: Array, best: float, span: Arr
 
 
 def _prior_outline(p: Parameter) -> tuple[Array, Array]:
-    """The prior's density on the parameter's axis."""
+    """Returns points on the parameter's axis and the prior's density there."""
     low, high = axis_values(p, [p.lower, p.upper])
     if not p.peaked:
         return np.array([low, low, high, high]), np.array([0, 1, 1, 0]) / (high - low)
     space = ParameterSpace((p,))
     theta = space.box.from_unit(np.linspace(0.0, 1.0, 201)[:, None])
-    place = axis_values(p, theta[:, 0])
-    return place, np.gradient(space.to_unit(theta)[:, 0], place)
+    position = axis_values(p, theta[:, 0])
+    return position, np.gradient(space.to_unit(theta)[:, 0], position)
 
 
 def _draw_pair(ax: Axes, values: tuple[Array, Array], best: tuple[float, float],
@@ -163,19 +170,19 @@ def _draw_key(axes: list[list[Axes]], has_map: bool) -> None:
         handles = handles[2:]
     if has_map:
         handles.append(Line2D([], [], color=ACCENT, marker="P", ms=4.5, lw=0, label="MAP"))
-    # The room above the diagonal is free: the key stands right of the first marginal.
+    # The space above the diagonal is free, so the legend stands to the right of the first marginal.
     axes[0][0].legend(handles=handles, loc="upper left", bbox_to_anchor=(1.05, 1.0))
 
 
 def _finding(parameters: Sequence[Parameter], draws: Array) -> str:
-    """Returns what the recording says about each parameter, by draws (s, d) in their order."""
-    said = identifiability(ParameterSpace(tuple(parameters)), draws).parameters
+    """Returns which parameters the recording informs, as a sentence, from draws (s, d) in their order."""
+    results = identifiability(ParameterSpace(tuple(parameters)), draws).parameters
     kinds: dict[str, list[str]] = {"does not inform it": [], "informs it weakly": [], "informs it": []}
-    for one in said:
-        kinds[next(kind for kind in kinds if kind in one.statement)].append(one.name)
-    as_prior, little, much = kinds.values()
-    parts = [f"informs {list_symbols(much)}"] if much else []
-    parts += [f"informs {list_symbols(little)} weakly"] if little else []
-    had = "it" if len(as_prior) == 1 else "them"
-    parts += [f"leaves {list_symbols(as_prior)} as the prior had {had}"] if as_prior else []
+    for result in results:
+        kinds[next(kind for kind in kinds if kind in result.statement)].append(result.name)
+    uninformed, weakly_informed, informed = kinds.values()
+    parts = [f"informs {list_symbols(informed)}"] if informed else []
+    parts += [f"informs {list_symbols(weakly_informed)} weakly"] if weakly_informed else []
+    pronoun = "it" if len(uninformed) == 1 else "them"
+    parts += [f"leaves {list_symbols(uninformed)} as the prior had {pronoun}"] if uninformed else []
     return f"The recording {'; it '.join(parts)}"

@@ -1,4 +1,4 @@
-"""Predictions of the prior before it sees the recording."""
+"""Draws the forces that the prior predicts before the recording is used."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ from bayeskin.types import Array, BinnedForce
 
 @styled
 def figure_prior_predictive(binned: BinnedForce, draws_n: ArrayLike) -> Figure:
-    """The fan of forces that the prior predicts, draws_n (s, m), with the recorded bins in it."""
+    """Returns a figure of the forces that the prior predicts, with the recorded bins, and of their peaks.
+
+    draws_n (s, m) : forces [N] in the bins, for draws from the prior
+    """
     draws = np.atleast_2d(np.asarray(draws_n, dtype=float))
     figure = new_figure(PAGE_IN, 2.9)
     grid = figure.add_gridspec(1, 2, width_ratios=(2.4, 1))
@@ -37,7 +40,8 @@ def figure_prior_predictive(binned: BinnedForce, draws_n: ArrayLike) -> Figure:
     draw_bands(fan, binned.time_s, np.quantile(draws, tails, 0), np.quantile(draws, 1 - tails, 0))
     fan.plot(binned.time_s, np.median(draws, axis=0), color=MODEL)
     fan.plot(binned.time_s, binned.force_n, color=RECORDED, lw=1.0)
-    # Forces span decades and cross zero: linear below about a tenth of the recorded peak, log above.
+    # Forces span decades and cross zero. The axis is therefore linear below about a tenth of the recorded
+    # peak and logarithmic above.
     recorded_peak = float(np.nanmax(binned.force_n))
     threshold = 10.0 ** np.floor(np.log10(0.2 * (np.nanmax(np.abs(binned.force_n)) or 1.0)))
     fan.set_yscale("symlog", linthresh=threshold)

@@ -1,4 +1,8 @@
-"""Profile likelihoods beside the posterior: what the fit alone excludes, and what the prior adds."""
+"""Draws profile likelihoods beside the posterior.
+
+The profiles show which values the fit alone excludes. The difference from the posterior shows what the prior
+adds.
+"""
 
 from __future__ import annotations
 
@@ -26,13 +30,16 @@ from bayeskin.report.style import (
 )
 from bayeskin.types import Array, Parameter, ParameterSpace
 
-_DEEPEST = 8.0  # nats shown
-ACROSS = 6  # panels side by side, at most
+_DEEPEST = 8.0  # nats below the best fit that the axes show
+ACROSS = 6  # largest number of panels side by side
 
 
 @styled
 def figure_profiles(space: ParameterSpace, draws: ArrayLike, profiles: Sequence[Profile]) -> Figure:
-    """Each profile over its prior, with the posterior's 90 % interval, draws (n, D) in SI, under it."""
+    """Returns a figure of each parameter's profile likelihood over the range of its prior.
+
+    Behind each profile lies the 90 % interval of the posterior. draws (n, D) : of the posterior, in SI
+    """
     draws = np.atleast_2d(np.asarray(draws, dtype=float))
     rows = -(-len(profiles) // ACROSS)
     figure = new_figure(PAGE_IN, 2.5 * rows)
@@ -46,7 +53,7 @@ def figure_profiles(space: ParameterSpace, draws: ArrayLike, profiles: Sequence[
         panel_title(ax, letter)
     for ax in axes[: len(profiles) : across]:
         ax.set(ylim=(-_DEEPEST, 0.6), ylabel="below the best fit [nats]")
-    flat = [one.name for one in profiles if one.flat]
+    flat = [profile.name for profile in profiles if profile.flat]
     finding = (
         f"The fit excludes no value of {list_symbols(flat)}" if flat else "The fit bounds every parameter"
     )

@@ -1,4 +1,7 @@
-"""The proof's scoreboard: what was said of what is concealed, and how large it must be to be named."""
+"""Draws the results of the proof, in which recordings with concealed effects are diagnosed.
+
+The figures show which answer each concealed effect received, and how large an effect must be to be named.
+"""
 
 from __future__ import annotations
 
@@ -25,12 +28,12 @@ from bayeskin.report.style import (
 
 _LAST = ("both", "several names", "group too large", "unknown")
 _SHADES = LinearSegmentedColormap.from_list("shades", ["white", MODEL])
-_OPEN_END = 1.6  # the last class of sizes has no upper end: so many times its lower one
+_OPEN_END = 1.6  # ratio of the ends of a class of sizes where one end is 0 or infinite
 
 
 @styled
 def figure_proof(board: Mapping[str, Any]) -> Figure:
-    """Confusion matrix, detectability by size, and shares with their intervals, from a scoreboard."""
+    """Returns a figure of a scoreboard: confusion matrix, detectability by size, shares with intervals."""
     rows = list(board["confusion"])
     figure = new_figure(PAGE_IN, 2.6 + 0.17 * max(len(rows), 12))
     grid = figure.add_gridspec(2, 2, width_ratios=(1.45, 1))
@@ -49,7 +52,10 @@ def figure_proof(board: Mapping[str, Any]) -> Figure:
 
 @styled
 def figure_detectability(mechanisms: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Each answer by size, and the share named with its 90 % band, of each mechanism of a scoreboard."""
+    """Returns a figure with a panel for each mechanism of a scoreboard.
+
+    A panel shows every answer by the size of the effect, and the share that is named, with its 90 % band.
+    """
     columns = min(len(mechanisms), 3)
     rows = -(-len(mechanisms) // columns)
     figure = new_figure(PAGE_IN, 1.3 + 1.7 * rows)
@@ -57,17 +63,17 @@ def figure_detectability(mechanisms: Mapping[str, Mapping[str, Any]]) -> Figure:
     for ax in grid.flat[len(mechanisms) :]:
         ax.remove()
     ends: list[float] = []
-    for ax, (name, one) in zip(grid.flat, mechanisms.items(), strict=False):
-        _draw_curve(ax, one)
-        shown = [*one["curve"]["at"], *one["sizes"]]
-        ends += [0.9 * min(shown), 1.1 * max(shown)]
-        ax.set_title(f"{name}\nhalf: {half_in_words(one)}", linespacing=1.3)
+    for ax, (name, answers) in zip(grid.flat, mechanisms.items(), strict=False):
+        _draw_curve(ax, answers)
+        sizes = [*answers["curve"]["at"], *answers["sizes"]]
+        ends += [0.9 * min(sizes), 1.1 * max(sizes)]
+        ax.set_title(f"{name}\nhalf: {half_in_words(answers)}", linespacing=1.3)
     grid[0, 0].set_xlim(min(ends), max(ends))
     for ax in grid[-1]:
         ax.set_xlabel("size [noise floors]")
     for ax in grid[:, 0]:
         ax.set_ylabel("share named right")
-    right = [answer for one in mechanisms.values() for answer in one["right"]]
+    right = [is_right for answers in mechanisms.values() for is_right in answers["right"]]
     state_finding(
         figure,
         f"How large an effect has to be to be named: {sum(right)} of {len(right)} are",
@@ -81,19 +87,20 @@ def figure_detectability(mechanisms: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 
 def _draw_curve(ax: Axes, one: Mapping[str, Any]) -> None:
+    """Draws all answers about one mechanism by size, and the curve of the share that is named."""
     at, curve = np.array(one["curve"]["at"]), one["curve"]
     ax.fill_between(at, curve["low"], curve["high"], color=MODEL, alpha=0.18)
     sizes, right = np.array(one["sizes"]), np.array(one["right"], bool)
-    made = (at >= sizes.min()) & (at <= sizes.max())
+    tested = (at >= sizes.min()) & (at <= sizes.max())
     ax.plot(at, curve["mean"], color=MODEL, lw=0.7, ls="--")
-    ax.plot(at[made], np.array(curve["mean"])[made], color=MODEL)
-    alike = np.array(one["up_to"], bool) & ~right
-    for of, place, marker, color in (
+    ax.plot(at[tested], np.array(curve["mean"])[tested], color=MODEL)
+    look_alike = np.array(one["up_to"], bool) & ~right
+    for chosen, height, marker, color in (
         (right, 1.0, "o", INK),
-        (alike, 0.0, "s", GREY),
-        (~right & ~alike, 0.0, "x", ACCENT),
+        (look_alike, 0.0, "s", GREY),
+        (~right & ~look_alike, 0.0, "x", ACCENT),
     ):
-        ax.plot(sizes[of], np.full(of.sum(), place), marker, ls="none", color=color)
+        ax.plot(sizes[chosen], np.full(chosen.sum(), height), marker, ls="none", color=color)
     ax.axvline(3.0, color=ACCENT, lw=0.6, ls=":")
     ax.set_xscale("log")
     ax.set_ylim(-0.05, 1.05)
@@ -101,7 +108,10 @@ def _draw_curve(ax: Axes, one: Mapping[str, Any]) -> None:
 
 
 def half_in_words(one: Mapping[str, Any]) -> str:
-    """The size at which half are named, no further than there were recordings."""
+    """Returns, as text, the size at which half of the recordings are named, with its 90 % interval.
+
+    Where a value lies outside the sizes of the recordings, the text states a bound instead.
+    """
     half, least, largest = one["curve"]["half"], min(one["sizes"]), max(one["sizes"])
     if half["median"] > largest:
         return f"above {min(max(half['low'], least), largest):.1f}"
@@ -121,11 +131,12 @@ def _finding(board: Mapping[str, Any]) -> str:
 
 
 def _draw_confusion(ax: Axes, confusion: Mapping[str, Mapping[str, int]]) -> None:
+    """Draws how often each answer (column) was given for each concealed effect (row)."""
     rows = list(confusion)
-    said = {answer for row in confusion.values() for answer in row}
+    given_answers = {answer for row in confusion.values() for answer in row}
     known = ["nothing-missing", *(row for row in rows if row not in ("nothing", "pair", "outside"))]
-    further = sorted(said - set(known) - set(_LAST))
-    columns = [name for name in (*known, *further, *_LAST) if name in said]
+    further = sorted(given_answers - set(known) - set(_LAST))
+    columns = [name for name in (*known, *further, *_LAST) if name in given_answers]
     counts = np.array([[confusion[row].get(column, 0) for column in columns] for row in rows], dtype=float)
     counts = counts.reshape(len(rows), len(columns))
     total = np.maximum(counts.sum(axis=1, keepdims=True), 1.0)
@@ -144,20 +155,20 @@ def _draw_confusion(ax: Axes, confusion: Mapping[str, Mapping[str, int]]) -> Non
 
 
 def _draw_detectability(ax: Axes, classes: Sequence[Mapping[str, Any]]) -> None:
-    """A step for each class of sizes: its share named, with its interval."""
+    """Draws a step for each class of sizes: the share that is named, with its interval."""
     lowest = classes[0]["to"] / _OPEN_END
-    for one in classes:
-        low, high = one["from"] or lowest, one["to"] or one["from"] * _OPEN_END
+    for size_class in classes:
+        low, high = size_class["from"] or lowest, size_class["to"] or size_class["from"] * _OPEN_END
         middle = np.sqrt(low * high)
         for name, color, label, shift, width in (
             ("named", INK, "right", 0.97, 3.0),
             ("up_to_look_alikes", MODEL, "up to look-alikes", 1.03, 1.0),
         ):
-            found = one[name]
-            if not found["of"]:
+            share = size_class[name]
+            if not share["of"]:
                 continue
-            ax.hlines(found["share"], low, high, color=color, lw=width, label=label)
-            ax.vlines(middle * shift, found["low"], found["high"], color=color, lw=0.7)
+            ax.hlines(share["share"], low, high, color=color, lw=width, label=label)
+            ax.vlines(middle * shift, share["low"], share["high"], color=color, lw=0.7)
     handles, labels = ax.get_legend_handles_labels()
     unique = dict(zip(labels, handles, strict=True))
     if unique:
@@ -170,6 +181,7 @@ def _draw_detectability(ax: Axes, classes: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _draw_shares(ax: Axes, board: Mapping[str, Any]) -> None:
+    """Draws shares of a scoreboard with their intervals, and the range that each share should reach."""
     lines = (
         ("named right", board["named"]["clear"], (0.9, 1.0)),
         ("to look-alikes", board["named_up_to_look_alikes"]["clear"], (0.95, 1.0)),
@@ -178,11 +190,11 @@ def _draw_shares(ax: Axes, board: Mapping[str, Any]) -> None:
         ("base in 90 %", board["base_in_interval"]["clear"], (0.8, 0.97)),
         ("false alarms", board["false_alarms"], (0.0, 0.05)),
     )
-    for place, (_, found, wanted) in enumerate(reversed(lines)):
-        ax.hlines(place, *wanted, color=ACCENT, lw=5.0, alpha=0.35)
-        if found["of"]:
-            ax.hlines(place, found["low"], found["high"], color=MODEL, lw=1.0)
-            ax.plot(found["share"], place, "o", color=MODEL)
-    ax.set_yticks(range(len(lines)), [f"{text}, {found['of']}" for text, found, _ in reversed(lines)])
+    for position, (_, share, target) in enumerate(reversed(lines)):
+        ax.hlines(position, *target, color=ACCENT, lw=5.0, alpha=0.35)
+        if share["of"]:
+            ax.hlines(position, share["low"], share["high"], color=MODEL, lw=1.0)
+            ax.plot(share["share"], position, "o", color=MODEL)
+    ax.set_yticks(range(len(lines)), [f"{text}, {share['of']}" for text, share, _ in reversed(lines)])
     ax.set(xlim=(-0.03, 1.03), ylim=(-0.6, len(lines) - 0.4), xlabel="share of so many; orange: to reach")
     panel_title(ax, "c")

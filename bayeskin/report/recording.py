@@ -1,4 +1,4 @@
-"""The recording as measured: what the pads did, what the load cell read, and the loops they make."""
+"""Draws the recording as measured: displacement of the pads, force of the load cell, and their loops."""
 
 from __future__ import annotations
 
@@ -21,12 +21,15 @@ from bayeskin.report.style import (
 from bayeskin.report.timeline import phase_legend, shade_phases
 from bayeskin.types import Array, BinnedForce, Recording
 
-_MANY = 4000  # samples beyond which a line goes into an SVG as pixels
+_MANY = 4000  # number of samples above which an SVG stores a line as pixels
 
 
 @styled
 def figure_recording(recording: Recording, binned: BinnedForce) -> Figure:
-    """Displacement and force as recorded, phases shaded, and the bins' force against displacement."""
+    """Returns a figure of displacement and force over time, and of the bins' force over displacement.
+
+    The phases are shaded.
+    """
     phases = binned.phases
     figure = new_figure(PAGE_IN, 3.6)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.9, 1), height_ratios=(1, 1.6))
@@ -84,7 +87,7 @@ def _draw_loops(ax: Axes, recording: Recording, binned: BinnedForce) -> None:
 
 
 def _bin_displacement(recording: Recording, binned: BinnedForce) -> Array:
-    """Mean displacement [m] of the samples in each bin, (m,); NaN in an empty one."""
+    """Returns the mean displacement (m,) [m] of the samples in each bin; NaN in an empty bin."""
     counts, _ = np.histogram(recording.time_s, binned.edges_s)
     sums, _ = np.histogram(recording.time_s, binned.edges_s, weights=recording.displacement_m)
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)

@@ -1,4 +1,4 @@
-"""Residuals of a fit, compared with the noise that the likelihood assumes."""
+"""Draws the residuals of a fit beside the noise that the likelihood assumes."""
 
 from __future__ import annotations
 
@@ -25,19 +25,22 @@ _LEVEL = 0.95
 
 @styled
 def figure_residuals(found: ResidualCheck) -> Figure:
-    """Quantiles of the scores against the assumed law's, and their autocorrelation with its limits."""
+    """Returns a figure of the residuals' quantiles and autocorrelation, with limits for the assumed noise.
+
+    The residuals are drawn as scores, which are standard normal if the noise is as assumed.
+    """
     figure = new_figure(PAGE_IN, 2.9)
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.4))
     _quantiles(left, found)
     panel_title(left, "a", f"its law: Kolmogorov-Smirnov p = {found.p_law:.2g}")
     _correlation(right, found)
     panel_title(right, "b", f"its correlation: Ljung-Box p = {found.p_correlation:.2g}")
-    short, _, why = found.sentence.partition(": ")
-    finding = f"{short[0].upper()}{short[1:]}"
+    summary, _, reason = found.sentence.partition(": ")
+    finding = f"{summary[0].upper()}{summary[1:]}"
     caption = (
         "What the fit leaves, freed of the assumed correlation and brought by the assumed law to a standard "
         "normal, of each fitted bin. Grey: where the assumed noise keeps 95 % of the points. "
-        f"{'' if found.passes else why[0].upper() + why[1:] + '.'}"
+        f"{'' if found.passes else reason[0].upper() + reason[1:] + '.'}"
     )
     state_finding(figure, finding, caption)
     return figure

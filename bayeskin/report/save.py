@@ -1,4 +1,7 @@
-"""A figure to PNG and SVG, whole or not at all, the same bytes from the same input."""
+"""Saves a figure as PNG and SVG files.
+
+The same input gives the same bytes. A file is replaced as a whole or not at all.
+"""
 
 from __future__ import annotations
 
@@ -16,16 +19,16 @@ DOTS_PER_INCH = 200
 
 @styled
 def save_figure(figure: Figure, path_stem: Path | str, provenance: str) -> tuple[Path, Path]:
-    """Writes `path_stem`.png (200 dpi) and `path_stem`.svg; returns both paths.
+    """Writes `path_stem`.png (200 dpi) and `path_stem`.svg, and returns both paths.
 
-    `provenance` stands in the metadata of both files (PNG text chunk, SVG ``dc:description``).
-    Neither file carries a date, and SVG identifiers are salted with a constant. Both formats are
-    rendered before either file is replaced. The figure's layout is final from then on.
+    `provenance` is stored in the metadata of both files (PNG text chunk, SVG ``dc:description``).
+    Neither file contains a date, and a constant salts the identifiers of the SVG. Both formats are
+    rendered before either file is replaced. From then on the figure keeps its layout.
     """
     stem = Path(path_stem)
     stem.parent.mkdir(parents=True, exist_ok=True)
     png, svg = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
-    # Laid out once, with Agg measuring the text, so that both files show the same figure.
+    # The layout is computed once, with text measured by Agg, so that both files show the same figure.
     FigureCanvasAgg(figure)
     if figure.get_layout_engine() is not None:
         figure.draw_without_rendering()
@@ -37,6 +40,7 @@ def save_figure(figure: Figure, path_stem: Path | str, provenance: str) -> tuple
 
 
 def _render(figure: Figure, form: str, provenance: str) -> bytes:
+    """Returns the content of the figure's file; `form` is "png" or "svg"."""
     metadata: dict[str, str | None] = {"Description": provenance}
     metadata |= {"Software": "bayeskin"} if form == "png" else {"Creator": "bayeskin", "Date": None}
     buffer = io.BytesIO()
@@ -45,6 +49,7 @@ def _render(figure: Figure, form: str, provenance: str) -> bytes:
 
 
 def _replace(path: Path, content: bytes) -> None:
+    """Writes a temporary file and renames it, so that an interruption leaves the old file intact."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         with open(partial, "wb") as handle:

@@ -1,4 +1,4 @@
-"""Sobol indices: which parameter moves the force, and when."""
+"""Draws Sobol' indices, which show which parameter changes the force, and when."""
 
 from __future__ import annotations
 
@@ -37,11 +37,14 @@ def figure_sobol(
     total_aggregated: ArrayLike,
     inputs: str,
 ) -> Figure:
-    """First-order and total Sobol indices of the force over time, and aggregated over the recording.
+    """Returns a figure of first-order and total Sobol' indices of the force, over time and aggregated.
 
-    first, total (3, m, d): lower end, estimate and upper end of the interval, NaN where the force has
-    no variance; first_aggregated, total_aggregated (3, d) likewise; `inputs` says, for the caption,
-    over which distribution of the parameters (the prior box or the posterior) they are taken.
+    names (d,) : of the parameters
+    time_s, displacement_m (m,) : centres of the bins and the displacement there
+    first, total (3, m, d) : lower end of the interval, estimate, and upper end; NaN where the force has no
+        variance
+    first_aggregated, total_aggregated (3, d) : the same, aggregated over the recording
+    inputs : distribution of the parameters (the prior box or the posterior) as the caption names it
     """
     series = [np.asarray(values, dtype=float) for values in (first, total)]
     aggregated = [np.asarray(values, dtype=float) for values in (first_aggregated, total_aggregated)]

@@ -1,7 +1,7 @@
-"""One look for every figure: palette, type sizes, titles that state the finding, how names are set.
+"""Gives all figures the same style: colours, font sizes, titles that state the result, symbols of parameters.
 
-Figures are made with matplotlib's object interface; nothing here touches pyplot, and the
-settings hold only while a figure is drawn or saved.
+Figures are made with matplotlib's object interface. This module does not use pyplot, and its settings
+apply only while a figure is drawn or saved.
 """
 
 from __future__ import annotations
@@ -27,9 +27,10 @@ from bayeskin.types import Array, Parameter
 P = ParamSpec("P")
 R = TypeVar("R")
 
-COLUMN_IN, PAGE_IN = 3.5, 7.2  # widths of one and of two journal columns
+COLUMN_IN, PAGE_IN = 3.5, 7.2  # widths of one and of two journal columns [inch]
 
-# Okabe & Ito (2008), told apart with every common colour blindness; then Tol's muted set.
+# Readers with any common colour blindness can distinguish the colours of Okabe & Ito (2008). Where these do
+# not suffice, colours of Tol's muted set follow.
 INK, GREY, FAINT = "#222222", "#767676", "#D0D0D0"
 RECORDED, MODEL, ACCENT = INK, "#0072B2", "#D55E00"
 PARTS = {"model": "#0072B2", "surrogate": "#D55E00", "noise": "#8C8C8C", "all": INK}
@@ -42,7 +43,7 @@ GREEK = {
 
 STYLE: dict[str, Any] = {
     "figure.facecolor": "white", "savefig.facecolor": "white", "figure.dpi": 100,
-    "font.family": "DejaVu Sans",  # ships with matplotlib: the same letters on every machine
+    "font.family": "DejaVu Sans",  # comes with matplotlib, so that all machines draw the same letters
     "font.size": 7.5, "axes.titlesize": 7.5, "axes.labelsize": 7.5, "figure.titlesize": 9,
     "xtick.labelsize": 7, "ytick.labelsize": 7, "legend.fontsize": 7, "figure.titleweight": "bold",
     "text.usetex": False, "text.color": INK, "axes.labelcolor": INK, "axes.edgecolor": GREY,
@@ -57,15 +58,15 @@ STYLE: dict[str, Any] = {
     "legend.labelspacing": 0.3,
     "svg.hashsalt": "bayeskin", "svg.fonttype": "path", "path.simplify": True,
 }  # fmt: skip
-# Everything else at matplotlib's own default, so that a user's matplotlibrc changes nothing; but never
-# the backend, which belongs to the caller.
+# All other settings take matplotlib's default, so that a user's matplotlibrc changes nothing. The backend is
+# left out, because the caller chooses it.
 SETTINGS: dict[Any, Any] = {
     key: value for key, value in (dict(mpl.rcParamsDefault) | STYLE).items() if "backend" not in key
 }
 
 
 def styled(draw: Callable[P, R]) -> Callable[P, R]:
-    """Runs a drawing function under the project's settings, whatever the caller's are."""
+    """Returns a drawing function that always runs with the settings of this module."""
 
     @functools.wraps(draw)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -76,7 +77,7 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure that lays out its own axes."""
+    """Returns an empty figure of a given size [inch] that lays out its own axes."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     engine = figure.get_layout_engine()
     assert engine is not None
@@ -85,7 +86,10 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def state_finding(figure: Figure, finding: str, caption: str = "") -> tuple[Text, Text]:
-    """Heads the figure with what it shows, and foots it with how to read it; both wrapped to its width."""
+    """Writes the result above a figure and a caption below it, and returns both texts.
+
+    Both are wrapped to the width of the figure.
+    """
     width = figure.get_figwidth()
     bold = re.sub(r"(?<!\\)\$(.+?)(?<!\\)\$", r"$\\boldsymbol{\1}$", finding)
     bold = re.sub(r"(?<![\w{])-(?=\d)", "−", bold)
@@ -102,12 +106,12 @@ def state_finding(figure: Figure, finding: str, caption: str = "") -> tuple[Text
 
 
 def literal(text: str) -> str:
-    """Somebody's own words, such as a file's name, as text of a figure: no markup."""
+    """Returns text, such as a file name, with its dollar signs escaped, so that it contains no markup."""
     return text.replace("$", r"\$")
 
 
 def _wrap(text: str, columns: int) -> list[str]:
-    """Lines of at most `columns` printed characters; the markup of a symbol is not printed."""
+    """Returns lines of at most `columns` printed characters; the markup of symbols does not count."""
     lines: list[list[str]] = [[]]
     room = columns
     for word in text.split():
@@ -121,12 +125,12 @@ def _wrap(text: str, columns: int) -> list[str]:
 
 
 def panel_title(ax: Axes, letter: str, text: str = "") -> Text:
-    """A bold panel letter and a short title at the panel's upper left."""
+    """Writes a bold panel letter and a short title at the upper left of a panel, and returns the text."""
     return ax.set_title(rf"$\mathbf{{{letter}}}$  {text}".rstrip())
 
 
 def plain_log(axis: Axis) -> None:
-    """A log axis with numbers as people write them, at 1, 2 and 5 where a decade has room."""
+    """Labels a logarithmic axis with plain numbers: powers of ten, and on short axes 2 and 5 times these."""
     low, high = axis.get_view_interval()
     narrow = low > 0 and high / low < 60
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if narrow else (1.0,)))
@@ -135,7 +139,7 @@ def plain_log(axis: Axis) -> None:
 
 
 def symbol(name: str) -> str:
-    """A parameter's name as it is printed: ``E_c`` set as a symbol, ``gap_width`` as words."""
+    """Returns the printed form of a parameter's name: ``E_c`` becomes a symbol, ``gap_width`` two words."""
     name = name.removesuffix("_m") if name in LENGTHS else name
     name = re.sub(rf"^([A-Z](?=[a-z\d]$)|[a-z](?=\d$)|(?:{'|'.join(GREEK)})(?=\d$))", r"\1_", name)
     head, _, tail = name.partition("_")
@@ -150,16 +154,19 @@ def symbol(name: str) -> str:
 
 
 def unit_text(unit: str) -> str:
-    """A unit as it is printed: ``m^2`` becomes m²; a pure number has none."""
+    """Returns the printed form of a unit: ``m^2`` becomes m², and a pure number has no unit."""
     raised = {"-": "⁻", **dict(zip("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹", strict=True))}
     text = re.sub(r"\^(-?\d+)", lambda match: "".join(raised[c] for c in match.group(1)), unit)
     return "" if text in ("-", "1") else text
 
 
 def parameter_label(parameter: Parameter) -> str:
-    """Axis label of a parameter; log10 of its value in SI where the prior is log-uniform."""
+    """Returns the axis label of a parameter.
+
+    Where the prior is in logarithms, the axis shows log10 of the value in SI.
+    """
     name = symbol(parameter.name)
-    space = " " if name.startswith("$") else "\n"  # words take a line of their own
+    space = " " if name.startswith("$") else "\n"  # a name in words takes several lines
     if len(name) > 12:
         name = name.replace(" ", space, 1)
     if parameter.in_log:
@@ -170,20 +177,23 @@ def parameter_label(parameter: Parameter) -> str:
 
 
 def parameter_colors(names: Sequence[str]) -> list[str]:
-    """A colour for each parameter, the same in every figure for the article's own."""
+    """Returns a colour for each parameter; the article's parameters have the same colour in every figure."""
     spare = [name for name in names if name not in _NAMED]
     further = {name: _FURTHER[i % len(_FURTHER)] for i, name in enumerate(spare)}
     return [_NAMED.get(name) or further[name] for name in names]
 
 
 def axis_values(parameter: Parameter, values: ArrayLike) -> Array:
-    """Values of one parameter as they stand on its axis, the one that `parameter_label` names."""
+    """Returns values, given in SI, of a parameter on the axis that `parameter_label` labels; same shape."""
     values = np.asarray(values, dtype=float)
     return np.log10(values) if parameter.in_log else values * _axis(parameter)[0]
 
 
 def _axis(parameter: Parameter) -> tuple[float, str]:
-    """Factor and unit of an axis that is not logarithmic; a power of ten is taken out of long numbers."""
+    """Returns the factor and the unit of an axis that is not logarithmic.
+
+    Where numbers would be long, the factor contains a power of ten, which the unit then states.
+    """
     factor, unit = at_edge(parameter.unit)
     reach = factor * max(abs(parameter.lower), abs(parameter.upper))
     power = 3 * int(np.floor(np.log10(reach) / 3)) if reach > 0 and not 0.01 <= reach < 1e4 else 0
@@ -192,6 +202,6 @@ def _axis(parameter: Parameter) -> tuple[float, str]:
 
 
 def list_symbols(names: Sequence[str]) -> str:
-    """``E_c, E_s and k_c`` as printed."""
+    """Returns the symbols of parameters as a list in words: ``E_c, E_s and k_c``."""
     printed = [symbol(name) for name in names]
     return printed[0] if len(printed) == 1 else ", ".join(printed[:-1]) + " and " + printed[-1]

@@ -1,4 +1,4 @@
-"""What figures over time share: phases as shading, fitted windows, uncertainty as bands."""
+"""Draws the elements that figures over time share: shaded phases, fitted windows, bands of uncertainty."""
 
 from __future__ import annotations
 
@@ -22,10 +22,12 @@ _OPACITY = {0.5: 0.42, 0.9: 0.2}
 
 @dataclass(frozen=True)
 class ForceBands:
-    """Central predictive intervals of the force in each bin, and the parts that make them.
+    """Holds central predictive intervals [N] of the force in each bin, and the parts of the uncertainty.
 
-    median_n (m,); low_n, high_n (2, m) for LEVELS; parts_n: half-width (m,) of the 90 % interval
-    that each part of the uncertainty would have alone, and "all" for the sum of them.
+    median_n (m,) : of the force without noise
+    low_n, high_n (2, m) : ends of the intervals for LEVELS
+    parts_n : half-width (m,) of the 90 % interval that each part of the uncertainty would give alone; "all"
+        is the half-width of the whole 90 % interval
     """
 
     median_n: Array
@@ -37,11 +39,14 @@ class ForceBands:
 def predictive_bands(
     mean_n: ArrayLike, surrogate_sd_n: ArrayLike, noise_sd_n: ArrayLike, force_n: ArrayLike
 ) -> ForceBands:
-    """Pointwise intervals in each bin from posterior predictive draws, (s, m) each [N].
+    """Returns pointwise intervals in each bin from posterior predictive draws (s, m) [N].
 
-    mean_n: the force without noise at each draw; surrogate_sd_n, noise_sd_n: sd of the surrogate's own error
-    and of the noise at it (or (m,), the same at all); force_n: the force with noise. The intervals are
-    quantiles of force_n; what the surrogate and the noise would give alone is taken as normal.
+    mean_n : force without noise at each draw
+    surrogate_sd_n, noise_sd_n : sd of the surrogate's own error and of the noise at each draw, or (m,) where
+        it is the same at all draws
+    force_n : force with noise at each draw
+
+    The intervals are quantiles of force_n. The parts of the surrogate and of the noise are treated as normal.
     """
     mean, force = (np.atleast_2d(np.asarray(values, dtype=float)) for values in (mean_n, force_n))
     tails = np.array([(1 - level) / 2 for level in LEVELS])
@@ -62,7 +67,7 @@ def predictive_bands(
 
 
 def shade_phases(ax: Axes, phases: Sequence[Phase], cycles: bool = False) -> None:
-    """Tints the axes by phase; with `cycles`, writes each cycle's number along the top."""
+    """Shades the axes by phase. With `cycles`, it writes the number of each cycle along the top."""
     for phase in phases:
         if phase.kind != "rest":
             tint = tuple(1 - 0.1 * (1 - c) for c in to_rgb(PHASE_COLORS[phase.kind]))
@@ -81,7 +86,7 @@ def shade_phases(ax: Axes, phases: Sequence[Phase], cycles: bool = False) -> Non
 
 
 def phase_legend(ax: Axes, phases: Sequence[Phase]) -> None:
-    """A one-line key of the phase kinds present, above the axes at the right."""
+    """Adds a one-line legend of the kinds of phase that occur, above the axes at the right."""
     present = [kind for kind in PHASE_COLORS if kind != "rest" and any(p.kind == kind for p in phases)]
     handles = [Patch(facecolor=PHASE_COLORS[kind], alpha=0.35, label=kind) for kind in present]
     if handles:
@@ -90,18 +95,18 @@ def phase_legend(ax: Axes, phases: Sequence[Phase]) -> None:
             handlelength=1.0, columnspacing=1.0, handletextpad=0.4,
         )  # fmt: skip
         ax.add_artist(key)
-        ax.legend_ = None  # leaves room for a second key inside the axes
+        ax.legend_ = None  # allows a second legend inside the axes
 
 
 def draw_bands(ax: Axes, x: ArrayLike, low: Array, high: Array) -> None:
-    """Fills the 50 % and 90 % bands; low and high (2, m) for LEVELS, in the axes' unit."""
+    """Fills the 50 % and 90 % bands between low and high (2, m) for LEVELS, in the unit of the axes."""
     for level, lower, upper in reversed(list(zip(LEVELS, low, high, strict=True))):
         name = f"{100 * level:.0f} % band"
         ax.fill_between(np.asarray(x), lower, upper, color=MODEL, alpha=_OPACITY[level], lw=0, label=name)
 
 
 def runs_of(mask: ArrayLike) -> list[tuple[int, int]]:
-    """Start and end (exclusive) of each run of True in a mask (m,)."""
+    """Returns start and end (exclusive) of each unbroken sequence of True in a mask (m,)."""
     padded = np.concatenate([[False], np.asarray(mask, dtype=bool), [False]]).astype(np.int8)
     steps = np.diff(padded)
     starts, ends = np.flatnonzero(steps == 1).tolist(), np.flatnonzero(steps == -1).tolist()
@@ -109,7 +114,7 @@ def runs_of(mask: ArrayLike) -> list[tuple[int, int]]:
 
 
 def mark_windows(ax: Axes, edges_s: Array, chosen: ArrayLike, label: str) -> None:
-    """A bar with its name along the bottom of the axes wherever the bins are chosen."""
+    """Draws a labelled bar along the bottom of the axes for chosen bins; edges_s (m+1,), chosen (m,)."""
     for start, end in runs_of(chosen):
         ax.plot(
             [edges_s[start], edges_s[end]], [0, 0], transform=ax.get_xaxis_transform(), color=INK,
@@ -122,7 +127,7 @@ def mark_windows(ax: Axes, edges_s: Array, chosen: ArrayLike, label: str) -> Non
 
 
 def draw_motion(ax: Axes, time_s: ArrayLike, displacement_m: ArrayLike) -> None:
-    """The displacement, scaled to the axes' height, as a faint guide without an axis of its own."""
+    """Draws the displacement as a faint line, scaled to the height of the axes, without its own axis."""
     displacement = np.asarray(displacement_m, dtype=float)
     low, reach = np.min(displacement), np.ptp(displacement)
     scaled = 0.04 + 0.86 * (displacement - low) / (reach or 1.0)

@@ -1,4 +1,4 @@
-"""Traces of independent ensembles, with how far they have converged as the run went on."""
+"""Draws the traces of independent ensembles of walkers, and their convergence in the course of the run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ _ENSEMBLES = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", 
 
 @dataclass(frozen=True)
 class RunningConvergence:
-    """Diagnostics after step[0], step[1], ... steps: step (c,); tau_steps (c, e, d); rhat (c, d)."""
+    """Holds convergence diagnostics after step[0], step[1], ... steps.
+
+    step (c,); tau_steps (c, e, d), autocorrelation times [steps] of each ensemble; rhat (c, d)
+    """
 
     step: Array
     tau_steps: Array
@@ -38,10 +41,12 @@ class RunningConvergence:
 
 
 def running_convergence(chains: ArrayLike, checkpoints: int = 8) -> RunningConvergence:
-    """Autocorrelation time of each ensemble and split R-hat across ensembles, as the run grew.
+    """Returns each ensemble's autocorrelation time and the split R-hat across ensembles during the run.
 
-    chains (e, n, w, d) in sampling coordinates, burn-in taken off: what `inference.convergence` judges by,
-    of the first part of the run up to each checkpoint. NaN where a parameter does not move.
+    chains (e, n, w, d) : in sampling coordinates, without burn-in
+    checkpoints : number of evenly spaced steps at which the run so far is judged
+
+    The diagnostics are those of `inference.convergence`. They are NaN where a parameter does not move.
     """
     x = np.asarray(chains, dtype=float)
     e, n, _, d = x.shape
@@ -49,7 +54,7 @@ def running_convergence(chains: ArrayLike, checkpoints: int = 8) -> RunningConve
     steps = steps[steps >= 4] if n >= 4 else np.array([n])
     tau = np.array([autocorrelation_steps(x[:, :k]) if k >= 4 else np.full((e, d), np.nan) for k in steps])
     longest = np.max(np.nan_to_num(tau, nan=1.0), axis=(1, 2))
-    # Thinned by the longest autocorrelation time, as the verdict's own.
+    # The chains are thinned by the longest autocorrelation time, as they are for the verdict.
     thinned = [x[:, : k : max(1, int(np.ceil(t)))] for k, t in zip(steps, longest, strict=True)]
     rhat = np.array([[split_rhat(part[..., j].reshape(e, -1)) for j in range(d)] for part in thinned])
     return RunningConvergence(steps.astype(float), tau, rhat)
@@ -57,10 +62,11 @@ def running_convergence(chains: ArrayLike, checkpoints: int = 8) -> RunningConve
 
 @styled
 def figure_traces(space: ParameterSpace, chains: ArrayLike, verdict: Verdict, limits: Limits) -> Figure:
-    """Each parameter over the run: walkers' median by ensemble, running autocorrelation time and R-hat.
+    """Returns a figure of each parameter over the run: median walkers, autocorrelation time and R-hat.
 
-    chains (e, n, w, d): ensembles, steps after burn-in, walkers, parameters of `space` in SI; `verdict`
-    heads the figure and `limits` are drawn in it.
+    chains (e, n, w, d) : ensembles, steps after burn-in, walkers, parameters of `space` in SI
+    verdict : the title of the figure states it, with its first reason
+    limits : those of the autocorrelation time and of R-hat are drawn as dashed lines
     """
     columns = enumerate(space.parameters)
     x = np.stack([axis_values(p, np.asarray(chains)[..., j]) for j, p in columns], axis=-1)
@@ -91,7 +97,7 @@ def figure_traces(space: ParameterSpace, chains: ArrayLike, verdict: Verdict, li
 
 
 def _draw_trace(ax: Axes, step: Array, values: Array) -> None:
-    stride = max(1, len(step) // 600)  # more points than the panel has pixels only thicken the line
+    stride = max(1, len(step) // 600)  # more points than the panel has pixels would only thicken the line
     values = values[:, ::stride]
     low, high = np.quantile(values, [0.05, 0.95], axis=(0, 2))
     ax.fill_between(step[::stride], low, high, color=FAINT, alpha=0.6, lw=0)

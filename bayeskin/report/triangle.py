@@ -1,4 +1,4 @@
-"""Axes for every pair of parameters: a lower triangle of equal cells."""
+"""Lays out axes for every pair of parameters, as a lower triangle of equal cells."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ _RIGHT_IN = 0.12
 def triangle(
     across: Sequence[Parameter], gap: float, finding: str, caption: str
 ) -> tuple[Figure, list[list[Axes]]]:
-    """A figure with a column of axes for each parameter, row i holding i + 1, with finding and caption.
+    """Returns a figure with a column of axes for each parameter of `across`, and its axes by row.
 
-    Cells are equal, which automatic layout does not promise; `gap` between rows is in parts of a cell.
+    Row i holds i + 1 axes. `finding` stands above them, `caption` below. All cells have the same size, which
+    automatic layout does not guarantee. `gap` is the space between rows, as a fraction of a cell's height.
     """
     cells = len(across)
     lines = max(parameter_label(p).count("\n") for p in across) + 1
@@ -49,9 +50,9 @@ def _lines(text: Text) -> int:
 def label_edges(
     figure: Figure, axes: Sequence[Sequence[Axes]], across: Sequence[Parameter], down: Sequence[Parameter]
 ) -> None:
-    """Names and numbers along the outer edges only; `across` and `down` are the parameters of both."""
+    """Labels the outer edges only; `across` and `down` are the parameters of the columns and of the rows."""
     most = 4 if len(axes) <= 4 else 3
-    size = 7.5 if len(axes) <= 8 else 6.0  # a name is to be no longer than its panel is high
+    size = 7.5 if len(axes) <= 8 else 6.0  # a name must not be longer than its panel is high
     for i, row in enumerate(axes):
         last = i == len(axes) - 1
         for j, ax in enumerate(row):
@@ -68,7 +69,10 @@ def label_edges(
 
 
 def inner_ticks(low: float, high: float, most: int) -> list[float]:
-    """At most `most` round numbers away from both ends, where a neighbour's numbers would touch them."""
+    """Returns at most `most` round numbers between two limits.
+
+    They keep away from both limits, where they would touch the numbers of the neighbouring panel.
+    """
     margin = 0.06 * (high - low)
     power = np.floor(np.log10(high - low)) - 1
     for step in (

@@ -1,4 +1,4 @@
-"""Is the surrogate good enough? Against runs of the full model that it has never seen."""
+"""Draws tests of the surrogate against runs of the full model on which it was not trained."""
 
 from __future__ import annotations
 
@@ -37,12 +37,15 @@ def figure_validation(
     wave_error: ArrayLike,
     corrected: bool = False,
 ) -> Figure:
-    """Held-out runs against the surrogate: amplitude, error over time, coverage, error by wave.
+    """Returns a figure of the surrogate's errors on held-out runs: amplitude, coverage, waves, over time.
 
-    true_n (n, m) bin means of the full model's held-out runs; prediction at the same points;
-    noise_sd_n (m,) of the recording's bins (its noise floor); wave_error (w, q): relative error of q
-    held-out points after each of w waves (NaN where a point was not there); with `corrected` the last is of
-    the waves' surrogate with a finer model's correction.
+    edges_s (m+1,) : edges of the bins
+    true_n (n, m) : bin means [N] of the full model's held-out runs
+    prediction : of the surrogate at the same points
+    noise_sd_n (m,) : sd [N] of the recording's bins, which is its noise floor
+    wave_error (w, q) : relative error of q held-out points after each of w waves; NaN where it is unknown
+    corrected : with True, the last row of wave_error belongs to the surrogate of all waves after its
+        correction by a finer model
     """
     edges, true = np.asarray(edges_s, dtype=float), np.atleast_2d(np.asarray(true_n, dtype=float))
     noise = np.asarray(noise_sd_n, dtype=float)
@@ -76,9 +79,12 @@ def figure_validation(
 def figure_map_check(
     binned: BinnedForce, full_n: ArrayLike, surrogate_n: ArrayLike, surrogate_sd_n: ArrayLike
 ) -> Figure:
-    """Full model and surrogate at the MAP, on the recording; the surrogate's error in mN and in its sd.
+    """Returns a figure of full model, surrogate and recording at the MAP, and of the surrogate's error.
 
-    full_n, surrogate_n, surrogate_sd_n (m,): bin means, and the sd that the surrogate claims.
+    full_n, surrogate_n (m,) : bin means [N]
+    surrogate_sd_n (m,) : sd [N] that the surrogate states for its own error
+
+    The error is drawn in mN and in units of this sd.
     """
     full, surrogate, sd = (np.asarray(v, dtype=float) for v in (full_n, surrogate_n, surrogate_sd_n))
     time_s, error = binned.time_s, surrogate - full
@@ -101,7 +107,7 @@ def figure_map_check(
         in_mn.plot(time_s, sign * noise_mn, color=GREY, lw=0.8, ls=(0, (4, 2)), label=label)
     in_mn.plot(time_s, 1e3 * error, color=ACCENT, label="surrogate − full model")
     in_mn.legend(loc="lower right", bbox_to_anchor=(1, 0.97), ncols=2)
-    # A force known exactly (rest before the test) has no sd to be counted in.
+    # Where the force is known exactly (rest before the test), the sd is zero and the ratio is undefined.
     known = sd > 1e-9 * max(np.max(np.abs(full)), 1e-12)
     ratio = np.where(known, error / np.where(known, sd, 1.0), np.nan)
     for level in (-2, 2):
@@ -128,9 +134,14 @@ def figure_map_check(
 
 
 def coverage(true_n: Array, prediction: Prediction, nominal: Array) -> tuple[Array, Array]:
-    """Actual coverage of central intervals (k,), and its standard error with each run as one cluster.
+    """Returns the actual coverage (k,) of central intervals, and its standard error (k,).
 
-    Bins in which the surrogate claims no error at all (a force known to be zero) are left out.
+    true_n (n, m) : bin means [N] of n runs
+    prediction : of the surrogate at the same points
+    nominal (k,) : nominal coverage of the intervals
+
+    For the standard error, each run is one cluster. Bins in which the surrogate states no error at all (a
+    force known to be zero) are left out.
     """
     sd = prediction.sd()
     known = sd > 1e-9 * max(float(np.max(np.abs(true_n))), 1e-12)
@@ -147,15 +158,15 @@ def _draw_amplitude(ax: Axes, true: Array, prediction: Prediction) -> None:
     rows = np.arange(len(true))
     peak = np.argmax(np.abs(true), axis=1)
     amplitude = true[rows, peak]
-    some = amplitude != 0
-    percent = 100 / amplitude[some]
-    error = percent * (prediction.mean[rows, peak] - amplitude)[some]
-    spread = ndtri(0.95) * np.abs(percent) * prediction.sd()[rows, peak][some]
+    used = amplitude != 0
+    percent = 100 / amplitude[used]
+    error = percent * (prediction.mean[rows, peak] - amplitude)[used]
+    spread = ndtri(0.95) * np.abs(percent) * prediction.sd()[rows, peak][used]
     ax.axhline(0, color=GREY, lw=0.8)
     ax.errorbar(
-        np.abs(amplitude[some]), error, yerr=spread, fmt=".", ms=3.5, color=MODEL, elinewidth=0.6, alpha=0.8
+        np.abs(amplitude[used]), error, yerr=spread, fmt=".", ms=3.5, color=MODEL, elinewidth=0.6, alpha=0.8
     )
-    if some.any():
+    if used.any():
         ax.set_xscale("log")
         plain_log(ax.xaxis)
     ax.set(xlabel="peak of the full model [N]", ylabel="surrogate − full model [%]")
@@ -197,10 +208,10 @@ def _draw_error(ax: Axes, time_s: Array, error: Array, sd: Array, noise: Array) 
     claimed = 1e3 * np.sqrt(np.mean(sd**2, axis=0))
     ax.plot(time_s, claimed, color=ACCENT, ls=(0, (4, 2)), lw=0.9, label="RMS of claimed sd")
     ax.plot(time_s, 1e3 * noise, color=INK, lw=0.9, label="noise floor of the recording")
-    shown = np.concatenate([1e3 * noise, high])
-    if (shown > 0).any():
+    drawn = np.concatenate([1e3 * noise, high])
+    if (drawn > 0).any():
         ax.set_yscale("log")
-        ax.set_ylim(max(1e-4 * shown.max(), 0.3 * np.quantile(shown[shown > 0], 0.05)), 2 * shown.max())
+        ax.set_ylim(max(1e-4 * drawn.max(), 0.3 * np.quantile(drawn[drawn > 0], 0.05)), 2 * drawn.max())
         plain_log(ax.yaxis)
     ax.set_xlim(time_s[0], time_s[-1])
     ax.legend(loc="lower right", bbox_to_anchor=(1, 0.98), ncols=4, columnspacing=1.0)

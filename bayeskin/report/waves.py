@@ -1,4 +1,4 @@
-"""Where the full model was run, wave by wave."""
+"""Draws the points at which the full model was run, wave by wave."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ from bayeskin.types import Array, Design, Parameter
 
 @styled
 def figure_waves(design: Design, kept_volume: ArrayLike) -> Figure:
-    """Points of the design in each pair of parameters, by wave, with the volume each wave kept.
+    """Returns a figure of the design's points in each pair of parameters, with a colour for each wave.
 
-    kept_volume (w,): fraction of the prior box that was still plausible when the wave was drawn
-    (1 for the first).
+    kept_volume (w,) : fraction of the prior box that was still plausible when the wave was drawn (1 for the
+        first); it has its own panel where there are more than three parameters
     """
     kept = np.asarray(kept_volume, dtype=float)
     parameters, d, last = design.space.parameters, design.space.dim, int(design.wave.max(initial=0))
@@ -67,7 +67,7 @@ def _draw_pair(ax: Axes, design: Design, values: Array, pair: tuple[int, int], s
 
 
 def _draw_volume(figure: Figure, axes: Sequence[Sequence[Axes]], kept: Array, shades: Array) -> None:
-    """The share of the box still plausible at each wave, in the free room above the diagonal."""
+    """Draws the share of the box that was still plausible at each wave, in the space above the diagonal."""
     last_row, first = axes[-1], axes[0][0].get_position()
     left = last_row[-2].get_position().x0 + 0.03
     below = axes[1][0].get_position()

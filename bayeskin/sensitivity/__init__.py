@@ -1,1 +1,1 @@
-"""Global sensitivity of the force history: Sobol' indices and Shapley effects."""
+"""Computes the global sensitivity of the force history: Sobol' indices and Shapley effects."""

@@ -1,17 +1,19 @@
-"""Sobol' indices of the force over time: which parameters it informs, and when.
+"""Computes Sobol' indices of the force over time: they show which parameters the force informs, and when.
 
-Two estimators that work on any vectorised function ``theta (n, d) -> force (n, m)``:
+Two estimators work with any vectorised function ``theta (n, d) -> force (n, m)``:
 
-- `pick_freeze`: first order by Saltelli et al. (2010), Comput. Phys. Commun. 181, 259, table 2(b); total
-  by Jansen (1999), table 2(f). Intervals by bootstrap over rows, the same rows of every evaluation.
-- `projection`: least-squares projection on Legendre polynomials orthonormal under the input
-  distribution; the indices are sums of squared coefficients (Sudret 2008, Reliab. Eng. Syst. Saf. 93, 964).
+- `pick_freeze` uses the first-order estimator of Saltelli et al. (2010), Comput. Phys. Commun. 181, 259,
+  table 2(b), and the total-effect estimator of Jansen (1999), table 2(f). A bootstrap over rows gives the
+  intervals, with the same rows of every evaluation.
+- `projection` is a least-squares projection on Legendre polynomials that are orthonormal under the input
+  distribution. The indices are sums of squared coefficients (Sudret 2008, Reliab. Eng. Syst. Saf. 93, 964).
 
-Second-order indices are what two parameters explain together beyond what each does alone: in pick-freeze the
-closed index of the pair less both first-order ones (Saltelli 2002, Comput. Phys. Commun. 145, 280).
+A second-order index is the share that two parameters explain together beyond the share that each explains
+alone. In pick-freeze it is the closed index of the pair minus both first-order indices (Saltelli 2002,
+Comput. Phys. Commun. 145, 280).
 
-Indices aggregated over time are those of the whole history as one output: each bin weighs by its
-variance and width (Lamboni et al. 2011; Gamboa et al. 2014).
+Aggregated indices treat the whole history as a single output. Each bin is weighted by its variance and width
+(Lamboni et al. 2011; Gamboa et al. 2014).
 """
 
 from __future__ import annotations
@@ -33,13 +35,14 @@ from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.types import Array, Parameter, ParameterSpace, Surrogate, _FreezesArrays
 
 Function = Callable[[Array], Array]
-NEGLIGIBLE_VARIANCE = 1e-8  # of the largest bin's: an index there would be rounding
-MEANINGFUL_VARIANCE = 1e-3  # of the largest bin's: bins that can inform a parameter
+# Both constants are shares of the largest variance of any bin.
+NEGLIGIBLE_VARIANCE = 1e-8  # in bins with a smaller variance an index would be rounding error
+MEANINGFUL_VARIANCE = 1e-3  # bins with at least this variance can inform a parameter
 UNINFORMED_TOTAL = 0.01
 REPLICATES = 200
 ERROR_DRAWS = 16
-ERROR_SAMPLES = 256  # rows on which a draw's effect on the indices is measured
-ERROR_LENGTH = 0.3  # of the box: about the spacing of a hundred runs in five dimensions
+ERROR_SAMPLES = 256  # number of rows that measure the effect of an error draw on the indices
+ERROR_LENGTH = 0.3  # share of the box's width, about the spacing of a hundred runs in five dimensions
 ERROR_FEATURES = 128
 HIGHEST_DEGREE = 40
 MOST_TERMS = 600
@@ -48,12 +51,16 @@ CHUNK = 512
 
 @dataclass(frozen=True)
 class SobolResult(_FreezesArrays):
-    """First-order and total indices (d, m), NaN in bins whose force hardly varies.
+    """First-order, total and second-order Sobol' indices, for each bin and for the whole history.
 
-    Intervals (2, d, m) hold the 5 % and 95 % limits. `aggregated` are those of the whole history, (d,)
-    and (2, d). `second` are those of the pairs in the order of `pairs`, (p, m), (p,) and (2, p). variance_n2
-    (m,) of the force; `distribution` says what the parameters were drawn from;
-    `unexplained` is the share of variance that a projection leaves (NaN for pick-freeze).
+    first, total : (d, m) indices, NaN in bins whose force hardly varies
+    first_interval, total_interval : (2, d, m) the 5 % and 95 % limits
+    `*_aggregated`, `*_aggregated_interval` : the same for the whole history, (d,) and (2, d)
+    second : (p, m) indices of the pairs, in the order of `pairs`; for the whole history they are (p,), with
+        limits (2, p)
+    variance_n2 : (m,) variance of the force
+    unexplained : share of the variance that a projection does not explain (NaN for pick-freeze)
+    distribution : the distribution from which the parameters were drawn, in words
     """
 
     names: tuple[str, ...]
@@ -80,8 +87,8 @@ class SobolResult(_FreezesArrays):
         return tuple(combinations(self.names, 2))
 
 
-class _Parts(NamedTuple):
-    """Variance (r, m) and the parts of it, first and total (r, d, m), second (r, p, m), in r replicates."""
+class _VarianceParts(NamedTuple):
+    """Variance (r, m) and its parts in r replicates: first and total (r, d, m), second (r, p, m)."""
 
     variance: Array
     first: Array
@@ -96,10 +103,10 @@ def sobol(
     space: ParameterSpace | None = None,
     method: Literal["pick-freeze", "projection"] = "pick-freeze",
 ) -> SobolResult:
-    """Indices of a surrogate's force; the intervals hold the surrogate's own error too.
+    """Returns the indices of a surrogate's force; the intervals include the surrogate's own error.
 
-    `space` is the input distribution: the surrogate's box by default, or a narrower one inside it.
-    `samples` is rounded up to a power of two. Raises InputError if `space` leaves the surrogate's box.
+    `space` is the input distribution: the surrogate's box by default, or a narrower box inside it. `samples`
+    is rounded up to a power of two. Raises InputError if `space` leaves the surrogate's box.
     """
     space = surrogate.space if space is None else space
     if space.names != surrogate.space.names or not surrogate.space.contains([space.lower, space.upper]).all():
@@ -110,12 +117,12 @@ def sobol(
 
 
 def error_draws(surrogate: Surrogate, count: int, rng: np.random.Generator) -> list[Function]:
-    """Functions that differ from the surrogate's mean by draws of its error.
+    """Returns functions that differ from the surrogate's mean by random draws of its error.
 
-    A draw multiplies each column of the predicted factor (and the root of the diagonal) by its own
-    smooth random field of unit variance over the box, so that the error is that of a function, not noise
-    from point to point, which would be counted as interaction. The fields have a Gaussian correlation
-    over `ERROR_LENGTH` of the box (random Fourier features, Rahimi & Recht 2007).
+    A draw multiplies each column of the predicted factor, and the root of the diagonal, by a smooth random
+    field over the box. Each field is independent and has unit variance. The error is therefore a smooth
+    function. Independent noise at each point would count as interaction. The fields have a Gaussian
+    correlation over `ERROR_LENGTH` of the box (random Fourier features, Rahimi & Recht 2007).
     """
     rank = surrogate.predict(surrogate.space.from_unit(np.full((1, surrogate.space.dim), 0.5))).factor.shape[
         2
@@ -130,9 +137,9 @@ def error_draws(surrogate: Surrogate, count: int, rng: np.random.Generator) -> l
             field = field.reshape(len(theta), rank + 1, ERROR_FEATURES).sum(axis=2) * np.sqrt(
                 2 / ERROR_FEATURES
             )
-            at = surrogate.predict(theta)
-            shifted = at.mean + np.matmul(at.factor, field[:, :rank, None])[:, :, 0]
-            return np.asarray(shifted + field[:, rank:] * np.sqrt(at.diagonal))
+            prediction = surrogate.predict(theta)
+            shifted = prediction.mean + np.matmul(prediction.factor, field[:, :rank, None])[:, :, 0]
+            return np.asarray(shifted + field[:, rank:] * np.sqrt(prediction.diagonal))
 
         return function
 
@@ -147,9 +154,10 @@ def pick_freeze(
     samples: int = 2048,
     draws: Sequence[Function] = (),
 ) -> SobolResult:
-    """Indices from ``samples (d + 2 + d (d - 1) / 2)`` evaluations at scrambled Sobol' points.
+    """Returns indices from ``samples (d + 2 + d (d - 1) / 2)`` evaluations at scrambled Sobol' points.
 
-    Intervals: `REPLICATES` bootstrap replicates, each moved by what one of `draws` changes.
+    The intervals come from `REPLICATES` bootstrap replicates. Each replicate is shifted by the change that
+    one of `draws` causes.
     """
     points = _sobol_points(2 * space.dim, samples, rng)
     values = _evaluate_pairs(function, space, points)
@@ -157,13 +165,13 @@ def pick_freeze(
     counts = rng.multinomial(n, np.full(n, 1.0 / n), size=REPLICATES) / n
     spread = _pick_freeze_parts(values, counts)
     if draws:
-        few = slice(0, min(ERROR_SAMPLES, n))
-        even = np.full((1, few.stop), 1.0 / few.stop)
-        base = _pick_freeze_parts([rows[few] for rows in values], even)
-        moved = [_pick_freeze_parts(_evaluate_pairs(draw, space, points[few]), even) for draw in draws]
+        first_rows = slice(0, min(ERROR_SAMPLES, n))
+        even = np.full((1, first_rows.stop), 1.0 / first_rows.stop)
+        base = _pick_freeze_parts([rows[first_rows] for rows in values], even)
+        moved = [_pick_freeze_parts(_evaluate_pairs(draw, space, points[first_rows]), even) for draw in draws]
         picks = np.arange(REPLICATES) % len(draws)
-        shifts = (np.concatenate([getattr(m, part) for m in moved])[picks] for part in _Parts._fields)
-        spread = _Parts(*(a + b - c for a, b, c in zip(spread, shifts, base, strict=True)))
+        shifts = (np.concatenate([getattr(m, part) for m in moved])[picks] for part in _VarianceParts._fields)
+        spread = _VarianceParts(*(a + b - c for a, b, c in zip(spread, shifts, base, strict=True)))
     best = _pick_freeze_parts(values, np.full((1, n), 1.0 / n))
     return _result(space, edges_s, best, spread, n, "pick-freeze", float("nan"))
 
@@ -176,11 +184,14 @@ def projection(
     samples: int = 2048,
     draws: Sequence[Function] = (),
 ) -> SobolResult:
-    """Indices from the coefficients of a Legendre expansion regressed on `samples` evaluations.
+    """Returns indices from the coefficients of a Legendre expansion, regressed on `samples` evaluations.
 
-    The amplitude-and-shape form of a surrogate is a product, whose expansion is not that of its factors:
-    the force itself is projected. Intervals are over `draws` only (NaN without them): the coefficients
-    of a given function have no sampling error beyond `unexplained`, measured on as many fresh points.
+    A surrogate predicts a product of amplitude and shape. The expansion of a product does not follow simply
+    from those of its factors, so the force itself is projected. The intervals cover only `draws`, and are NaN
+    without them. The coefficients of a given function have no sampling error beyond `unexplained`, which is
+    measured on the same number of new points.
+
+    Raises InputError if there are too few samples for a polynomial of degree one.
     """
     unit, fresh = (_sobol_points(space.dim, samples, rng) for _ in range(2))
     indices = _expansion_terms(space.dim, len(unit) // 4)
@@ -193,20 +204,20 @@ def projection(
     def coefficients(values: Array) -> Array:
         return np.asarray(cho_solve(gram, basis.T @ values))
 
-    found = coefficients(_in_chunks(function, space.from_unit(unit)))
+    expansion = coefficients(_in_chunks(function, space.from_unit(unit)))
     truth = _in_chunks(function, space.from_unit(fresh))
     widths = np.diff(edges_s)
-    missed = float(np.mean((truth - legendre_basis(fresh, indices) @ found) ** 2, axis=0) @ widths)
+    error = float(np.mean((truth - legendre_basis(fresh, indices) @ expansion) ** 2, axis=0) @ widths)
     scatter = float(np.var(truth, axis=0) @ widths)
     moved = [_expansion_parts(coefficients(_in_chunks(f, space.from_unit(unit))), indices) for f in draws]
-    spread = _Parts(*(np.concatenate(part) for part in zip(*moved, strict=True))) if moved else None
-    unexplained = missed / scatter if scatter > 0.0 else float("nan")
-    best = _expansion_parts(found, indices)
+    spread = _VarianceParts(*(np.concatenate(part) for part in zip(*moved, strict=True))) if moved else None
+    unexplained = error / scatter if scatter > 0.0 else float("nan")
+    best = _expansion_parts(expansion, indices)
     return _result(space, edges_s, best, spread, len(unit), "projection", unexplained)
 
 
 def uninformed(result: SobolResult) -> tuple[str, ...]:
-    """Parameters whose total index stays below 0.01 in every bin of meaningful variance."""
+    """Returns the parameters whose total index stays below 0.01 in every bin of meaningful variance."""
     matters = result.variance_n2 >= MEANINGFUL_VARIANCE * np.max(result.variance_n2, initial=0.0)
     matters &= ~np.isnan(result.total).any(axis=0)
     if not matters.any():
@@ -216,7 +227,7 @@ def uninformed(result: SobolResult) -> tuple[str, ...]:
 
 
 def sentence(result: SobolResult) -> str:
-    """What the force does not inform, in words."""
+    """Returns a sentence that names the parameters that the force does not inform."""
     names = uninformed(result)
     if np.isnan(result.total).all():
         return "The force does not vary over the parameters' distribution: it informs none of them."
@@ -228,77 +239,80 @@ def sentence(result: SobolResult) -> str:
 
 
 def describe(space: ParameterSpace) -> str:
-    """The input distribution in words."""
-    how = "independent, correlations of their priors left out: " if space.correlations else "independent: "
-    return how + "; ".join(map(_described, space.parameters))
+    """Returns the input distribution in words."""
+    start = "independent, correlations of their priors left out: " if space.correlations else "independent: "
+    return start + "; ".join(map(_parameter_in_words, space.parameters))
 
 
-def _described(p: Parameter) -> str:
+def _parameter_in_words(p: Parameter) -> str:
     factor, unit = at_edge(p.unit)
-    scale = 1.0 if p.in_log else factor  # of a log-normal prior's spread, a logarithm
+    scale = 1.0 if p.in_log else factor  # the spread of a log-normal prior is a logarithm and has no unit
     about = f" about {factor * p.centre:g} ({scale * p.spread:g})" if p.peaked else ""
     return f"{p.name} {p.prior}{about} {factor * p.lower:g} to {factor * p.upper:g} {unit}".rstrip()
 
 
 def _sobol_points(dim: int, samples: int, rng: np.random.Generator) -> Array:
-    """Scrambled Sobol' points, a power of two of them, (n, dim)."""
+    """Returns scrambled Sobol' points (n, dim), where n is a power of two."""
     return np.asarray(qmc.Sobol(dim, seed=rng).random_base2(max(samples - 1, 1).bit_length()))
 
 
 def _in_chunks(function: Function, theta: Array) -> Array:
-    """function(theta), (n, m), without the memory that all of it at once would take."""
+    """Returns function(theta), (n, m), computed in chunks to save memory."""
     return np.concatenate([function(theta[i : i + CHUNK]) for i in range(0, len(theta), CHUNK)])
 
 
 def _evaluate_pairs(function: Function, space: ParameterSpace, points: Array) -> list[Array]:
-    """[f(A), f(B), f(A with column 1 of B), ..., f(A with columns 1 and 2 of B), ...], each (n, m).
+    """Returns [f(A), f(B), f(A with column 1 of B), ..., f(A with columns 1 and 2 of B), ...], each (n, m).
 
-    All centred on the mean of f(A) and f(B).
+    The mean of f(A) and f(B) is subtracted from all of them.
     """
     a, b = points[:, : space.dim], points[:, space.dim :]
-    taken = [*((i,) for i in range(space.dim)), *combinations(range(space.dim), 2)]
-    mixed = [np.where(np.isin(np.arange(space.dim), columns), b, a) for columns in taken]
+    chosen = [*((i,) for i in range(space.dim)), *combinations(range(space.dim), 2)]
+    mixed = [np.where(np.isin(np.arange(space.dim), columns), b, a) for columns in chosen]
     values = [_in_chunks(function, space.from_unit(unit)) for unit in (a, b, *mixed)]
     centre = 0.5 * (values[0].mean(axis=0) + values[1].mean(axis=0))
     return [value - centre for value in values]
 
 
-def _pick_freeze_parts(values: Sequence[Array], weights: Array) -> _Parts:
-    """Parts of the variance with the rows weighted by each of weights (r, n)."""
+def _pick_freeze_parts(values: Sequence[Array], weights: Array) -> _VarianceParts:
+    """Returns the parts of the variance for each set of row weights in `weights` (r, n)."""
     a, b, *mixed = values
-    dim = (isqrt(8 * len(mixed) + 1) - 1) // 2  # singles and pairs: d + d (d - 1) / 2 of them
+    dim = (isqrt(8 * len(mixed) + 1) - 1) // 2  # `mixed` has d single columns and d (d - 1) / 2 pairs
     mean = weights @ (0.5 * (a + b))
     variance = weights @ (0.5 * (a**2 + b**2)) - mean**2
     closed = np.stack([weights @ (b * (ab - a)) for ab in mixed], axis=1)
     total = np.stack([weights @ (0.5 * (a - ab) ** 2) for ab in mixed[:dim]], axis=1)
     first = closed[:, :dim]
     left, right = _pair_columns(dim)
-    return _Parts(variance, first, total, closed[:, dim:] - first[:, left] - first[:, right])
+    return _VarianceParts(variance, first, total, closed[:, dim:] - first[:, left] - first[:, right])
 
 
 def _pair_columns(dim: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First and second member of each pair, in the order of `SobolResult.pairs`."""
+    """Returns the first and the second member of each pair, in the order of `SobolResult.pairs`."""
     left, right = np.triu_indices(dim, 1)
     return left, right
 
 
 def _expansion_terms(dim: int, most: int) -> NDArray[np.int64]:
-    """Degrees (P, dim) of the largest hyperbolic set of at most `most` (and `MOST_TERMS`) terms."""
+    """Returns the degrees (P, dim) of the largest hyperbolic set with at most `most` terms.
+
+    The set never has more than `MOST_TERMS` terms.
+    """
     degree, terms = 1, multi_indices(dim, 0)
     while degree <= HIGHEST_DEGREE and len(larger := multi_indices(dim, degree)) <= min(most, MOST_TERMS):
         degree, terms = degree + 1, larger
     return terms
 
 
-def _expansion_parts(coefficients: Array, indices: NDArray[np.int64]) -> _Parts:
-    """Parts of the variance from the coefficients (P, m) of orthonormal terms (P, d)."""
+def _expansion_parts(coefficients: Array, indices: NDArray[np.int64]) -> _VarianceParts:
+    """Returns the parts of the variance from the coefficients (P, m) of orthonormal terms (P, d)."""
     square = coefficients**2
     used = (indices > 0).astype(float)
     count = used.sum(axis=1, keepdims=True)
     left, right = _pair_columns(used.shape[1])
     both = used[:, left] * used[:, right] * (count == 2)
     alone = used * (count == 1)
-    return _Parts(
+    return _VarianceParts(
         (used.any(axis=1) @ square)[None],
         (alone.T @ square)[None],
         (used.T @ square)[None],
@@ -306,8 +320,13 @@ def _expansion_parts(coefficients: Array, indices: NDArray[np.int64]) -> _Parts:
     )
 
 
-def _ratios(parts: _Parts, usable: NDArray[np.bool_], widths: Array) -> tuple[list[Array], list[Array]]:
-    """First, total and second-order indices (r, d or p, m), and aggregated over the history (r, d or p)."""
+def _ratios(
+    parts: _VarianceParts, usable: NDArray[np.bool_], widths: Array
+) -> tuple[list[Array], list[Array]]:
+    """Returns first-order, total and second-order indices for each bin and for the whole history.
+
+    Their shapes are (r, d or p, m) and (r, d or p).
+    """
     variance = np.where(usable, parts.variance, np.nan)[:, None]
     history = parts.variance @ widths
     whole = np.where(history > 0.0, history, np.nan)[:, None]
@@ -318,8 +337,8 @@ def _ratios(parts: _Parts, usable: NDArray[np.bool_], widths: Array) -> tuple[li
 def _result(
     space: ParameterSpace,
     edges_s: Array,
-    best: _Parts,
-    spread: _Parts | None,
+    best: _VarianceParts,
+    spread: _VarianceParts | None,
     samples: int,
     method: Literal["pick-freeze", "projection"],
     unexplained: float,

@@ -1,4 +1,4 @@
-"""Surrogates of the full model: trained on a design, honest about their error, stored without code."""
+"""Surrogates replace the full model: they learn from a design, predict their own error, and store no code."""
 
 from bayeskin.surrogates.files import (
     load_manifest,

@@ -1,4 +1,4 @@
-"""Whether the arrays of a surrogate belong together: shapes, finite numbers, an order of bins and bounds."""
+"""Checks that the arrays of a surrogate match: shapes, finite numbers, and the order of bins and bounds."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from bayeskin.surrogates.kernels import KERNELS
 from bayeskin.surrogates.surrogate import Latents, ShapeSurrogate
 from bayeskin.surrogates.two_fidelities import CorrectedLatents
 
-Shaped = tuple[str, NDArray[Any], tuple[int, ...]]  # name, array, the shape that it should have
+Shaped = tuple[str, NDArray[Any], tuple[int, ...]]  # name, array, expected shape
 
 
 def refuse_unsound(surrogate: ShapeSurrogate) -> None:
-    """Raises InputError that names the first array that does not belong to the others."""
+    """Raises an InputError that names the first array that does not match the others."""
     space, edges_s, active = surrogate.space, surrogate.edges_s, surrogate.active
     for p in space.parameters:
         if not (np.isfinite([p.lower, p.upper]).all() and p.lower < p.upper):
             raise InputError(f"space: {p.name}", f"{p.lower:g} to {p.upper:g}", "lower below upper")
-    for name, array, shape in _shaped(surrogate):
+    for name, array, shape in _expected_shapes(surrogate):
         if array.shape != shape:
             raise InputError(name, f"shape {array.shape}", f"shape {shape}")
         if not np.isfinite(array).all():
@@ -37,7 +37,7 @@ def refuse_unsound(surrogate: ShapeSurrogate) -> None:
         )
 
 
-def _shaped(surrogate: ShapeSurrogate) -> Iterator[Shaped]:
+def _expected_shapes(surrogate: ShapeSurrogate) -> Iterator[Shaped]:
     transform, inputs = surrogate.transform, surrogate.active.size
     bins, components = surrogate.edges_s.size - 1, len(np.atleast_1d(transform.components))
     yield "edges_s", surrogate.edges_s, (bins + 1,)
@@ -45,13 +45,13 @@ def _shaped(surrogate: ShapeSurrogate) -> Iterator[Shaped]:
     yield "transform: components", transform.components, (components, bins)
     yield "transform: truncation", transform.truncation, (bins,)
     yield "active", surrogate.active, (inputs,)
-    yield from _shaped_latents(surrogate.latents, inputs, 1 + components)
+    yield from _expected_latent_shapes(surrogate.latents, inputs, 1 + components)
 
 
-def _shaped_latents(latents: Latents, inputs: int, count: int) -> Iterator[Shaped]:
+def _expected_latent_shapes(latents: Latents, inputs: int, count: int) -> Iterator[Shaped]:
     if isinstance(latents, CorrectedLatents):
-        yield from _shaped_latents(latents.coarse, inputs, min(count, _columns(latents.coarse)))
-        yield from _shaped_latents(latents.correction, inputs, count)
+        yield from _expected_latent_shapes(latents.coarse, inputs, min(count, _latent_count(latents.coarse)))
+        yield from _expected_latent_shapes(latents.correction, inputs, count)
     if not isinstance(latents, LatentGPs | LatentChaos):
         return
     rows = len(np.atleast_1d(latents.inputs))
@@ -70,7 +70,10 @@ def _shaped_latents(latents: Latents, inputs: int, count: int) -> Iterator[Shape
     yield "latents: kernels", np.zeros(len(known)), (count,)
 
 
-def _columns(latents: Latents) -> int:
-    """How many latents the coarse model has: those of further components are the fine one's alone."""
+def _latent_count(latents: Latents) -> int:
+    """Returns the number of latents of the coarse model.
+
+    Only the fine model has latents of further components.
+    """
     known = latents.targets if isinstance(latents, LatentGPs | LatentChaos) else np.zeros((1, 1))
     return known.shape[-1] if known.ndim > 1 else 0

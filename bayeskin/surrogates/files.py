@@ -1,4 +1,4 @@
-"""A trained surrogate to and from one HDF5 file with its manifest inside: arrays and text, no code."""
+"""Saves a trained surrogate with its manifest in an HDF5 file and loads it: arrays and text, no code."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from bayeskin.surrogates.validate import Validation
 from bayeskin.types import ParameterSpace, frozen_array
 
 FORMAT = "bayeskin surrogate"
-# 2: inputs are those of `Similarity`; 3: latents may have a correction; 4: active inputs; 5: a correction may
-# have latents of its own
+# History of the format: since version 2 the inputs are those of `Similarity`, since 3 the latents may have a
+# correction, since 4 only some inputs may be active, and since 5 a correction may have additional latents.
 FORMAT_VERSION = 5
-READABLE = (3, 4, 5)  # in 3 all inputs are active
+READABLE = (3, 4, 5)  # in version 3 all inputs are active
 EXPECTED = "a surrogate that bayeskin wrote"
 LATENTS: dict[str, type[LatentGPs] | type[LatentChaos]] = {"gp": LatentGPs, "chaos": LatentChaos}
 
 
 def manifest_of(surrogate: ShapeSurrogate, validation: Validation) -> dict[str, Any]:
-    """What a reader wants to know before using a surrogate: origin, box, and its measured error."""
+    """Returns what a user needs to know before using a surrogate: its origin, box, and measured error."""
     return {
         **surrogate.provenance,
         "training_rows": validation.training_rows,
@@ -42,11 +42,11 @@ def manifest_of(surrogate: ShapeSurrogate, validation: Validation) -> dict[str, 
         "coverage_90": validation.coverage_90,
         "median_point_relative_error": float(np.median(validation.point_relative)),
         "worst_point_relative_error": float(np.max(validation.point_relative)),
-        "parameters": _described(surrogate.space),
+        "parameters": _parameter_table(surrogate.space),
     }
 
 
-def _described(space: ParameterSpace) -> dict[str, dict[str, Any]]:
+def _parameter_table(space: ParameterSpace) -> dict[str, dict[str, Any]]:
     return {
         p.name: {"unit": p.unit, "lower": p.lower, "upper": p.upper, "prior": p.prior}
         for p in space.parameters
@@ -54,9 +54,9 @@ def _described(space: ParameterSpace) -> dict[str, dict[str, Any]]:
 
 
 def save_surrogate(path: Path | str, surrogate: ShapeSurrogate, manifest: Mapping[str, Any]) -> None:
-    """Writes the surrogate and, beside it as ``.json``, its manifest; each whole or not at all.
+    """Writes the surrogate and, in a ``.json`` file beside it, its manifest.
 
-    Raises InputError where it cannot be written.
+    Each file is written completely or not at all. Raises InputError if a file cannot be written.
     """
     path, latents = Path(path), surrogate.latents
     text = ""
@@ -84,29 +84,31 @@ def save_surrogate(path: Path | str, surrogate: ShapeSurrogate, manifest: Mappin
 
 
 def load_surrogate(path: Path | str) -> ShapeSurrogate:
-    """Reads what `save_surrogate` wrote; predictions are the same bit for bit on the same machine.
+    """Returns the surrogate that `save_surrogate` wrote.
 
-    Raises InputError if the file is absent, truncated, foreign, of another format version, if its arrays
-    do not match the hash stored with them (which covers no attribute of the root: not the manifest), or if
-    they do not belong together.
+    On the same machine, its predictions are bit-for-bit identical. Raises InputError if the file is missing,
+    truncated, not from bayeskin, or of another format version. It is also raised if the arrays do not match
+    their stored hash, or do not match each other. The hash covers no attribute of the root, such as the
+    manifest.
     """
-    return _loaded(Path(path))[0]
+    return _load(Path(path))[0]
 
 
 def load_manifest(path: Path | str) -> dict[str, Any]:
-    """The manifest inside a surrogate's file, which knows the model, and the same box as the arrays.
+    """Returns the manifest inside a surrogate's file, with the hash of the model and the box of the arrays.
 
-    Raises InputError as `load_surrogate` does, and where it does not.
+    Raises InputError in the cases of `load_surrogate`, if the manifest lacks the hash of the model, or if its
+    box differs from that of the arrays.
     """
-    surrogate, manifest = _loaded(Path(path))
+    surrogate, manifest = _load(Path(path))
     if not isinstance(manifest.get("model_hash"), str):
         raise InputError(f"{path}: manifest: model_hash", repr(manifest.get("model_hash")), "a hash")
-    if manifest.get("parameters") != _described(surrogate.space):
+    if manifest.get("parameters") != _parameter_table(surrogate.space):
         raise InputError(f"{path}: manifest: parameters", "others than those of the arrays", "the same box")
     return manifest
 
 
-def _loaded(path: Path) -> tuple[ShapeSurrogate, dict[str, Any]]:
+def _load(path: Path) -> tuple[ShapeSurrogate, dict[str, Any]]:
     with storage.reading(path, EXPECTED) as handle:
         _refuse_unfit(path, handle)
         latents: Latents = storage.read(handle["latents"], LATENTS[handle.attrs["kind"]], path)

@@ -1,12 +1,12 @@
-"""Gaussian processes, one a latent: a polynomial trend, a kernel of a linear map of the inputs, a nugget.
+"""Predicts each latent by a Gaussian process with a polynomial trend, linearly mapped inputs and a nugget.
 
-Universal kriging: Rasmussen & Williams (2006), ch. 2.7.
+The method is universal kriging: Rasmussen & Williams (2006), ch. 2.7.
 
-A variance takes a product with an (n, n) matrix for each point. Where the nugget is not small, the kernel's
-rows hardly leave a subspace of few directions, found by pivoted Cholesky factors (Harbrecht, Peters &
-Schneider 2012, Appl. Numer. Math. 62:428): there an (r, n) matrix does. What lies outside counts as not
-explained, so that the variance comes out larger, never smaller, at the rows themselves by at most `SPARED` of
-the nugget.
+A variance requires a product with an (n, n) matrix for each point. If the nugget is not small, the rows of
+the kernel lie almost in a subspace of few directions. Pivoted Cholesky factors give this subspace (Harbrecht,
+Peters & Schneider 2012, Appl. Numer. Math. 62:428), and a product with an (r, n) matrix is then enough. The
+part outside the subspace counts as unexplained. The variance therefore becomes larger, never smaller. At the
+training rows it grows by at most `SPARED` of the nugget.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from bayeskin.surrogates.kernels import (
 )
 from bayeskin.types import Array, _FreezesArrays
 
-CHUNK = 128  # points whose kernel rows stay in the cache
-WORTH_IT = 100  # rows: with fewer the products cost next to nothing
-SPARED = 0.1  # of the nugget, by which a variance may be larger at a row
-LEAST_NUGGET = 1e-6  # with smaller ones no row is near a subspace, or rounding hides it
+CHUNK = 128  # number of points whose kernel rows fit into the cache
+WORTH_IT = 100  # with fewer rows the products cost almost nothing, so no subspace is sought
+SPARED = 0.1  # share of the nugget by which a variance may become larger at a training row
+LEAST_NUGGET = 1e-6  # with a smaller nugget the rows are not near a subspace, or rounding hides it
 
 
 class _Conditioned(NamedTuple):
-    """One latent conditioned on its rows: what `predict` multiplies by."""
+    """A latent conditioned on its training rows: the matrices that `predict` multiplies by."""
 
     mapped: Array  # (n, d)
     whitener: NDArray[np.float64]  # (n, n) L^-1, column-major
-    few: Array | None  # (r, n) in its place, where r is at most half of n
+    few: Array | None  # (r, n) replaces the whitener if r is at most half of n
     weights: Array  # (n,) K^-1 (y - H b)
     trend: Array  # (p,) b
     trend_weights: Array  # (n, p) K^-1 H
@@ -53,26 +53,27 @@ class _Conditioned(NamedTuple):
 
 
 class _Stack(NamedTuple):
-    """All q latents of one kernel, so that one product does for all; a lower triangular one in halves.
+    """All q latents with the same kernel, so that a single product serves all of them.
 
-    Those with few directions are a stack of their own, whose upper half has no rows.
+    The lower triangular whitener is multiplied in halves. Latents with few directions form a stack of their
+    own, in which the upper half has no rows.
     """
 
     name: str
-    latents: NDArray[np.intp]  # (q,) which
-    half: int  # of n
+    latents: NDArray[np.intp]  # (q,) indices of the latents
+    half: int  # half of n, or 0 for latents with few directions
     maps: Array  # (q, d, d)
-    inputs: Array  # (q, d + 2, n) mapped, 1, -1/2 their square
+    inputs: Array  # (q, d + 2, n) mapped inputs, 1, and -1/2 of the inputs' squared length
     top: Array  # (q, half, half) L^-1 transposed
-    bottom: Array  # (q, n, n - half + p + 1) L^-1 or the few, root H^T K^-1 and the weights, transposed
-    trend: Array  # (q, p, p + 1) the root and b, transposed
+    bottom: Array  # (q, n, n - half + p + 1) L^-1 or `few`, root H^T K^-1 and the weights, transposed
+    trend: Array  # (q, p, p + 1) root and b, transposed
     nugget: Array  # (q, 1)
     centre: Array
     deviation: Array
     spread: Array
 
     def predict(self, centred: Array, basis: Array) -> tuple[Array, Array]:
-        """Mean and variance (k, q) at k centred inputs (k, d) with trend basis (k, p)."""
+        """Returns the mean and the variance (k, q) at centred inputs (k, d) with trend basis (k, p)."""
         rows = self._correlations(centred)
         k = len(centred)
         white = rows[:, :, : self.half] @ self.top
@@ -83,13 +84,13 @@ class _Stack(NamedTuple):
         return mean.T, (self.spread * variance).T
 
     def predict_mean(self, centred: Array, basis: Array) -> Array:
-        """The mean (k, q) of `predict` alone: a product with a vector where the variance takes a matrix."""
+        """Returns only the mean (k, q) of `predict`, which needs products with vectors, not with matrices."""
         mean = self._correlations(centred) @ self.bottom[:, :, -1:]
         mean += basis @ self.trend[:, :, -1:]
         return np.asarray((self.centre + self.deviation * mean[:, :, 0]).T)
 
     def _correlations(self, centred: Array) -> Array:
-        """With the training rows, (q, k, n)."""
+        """Returns the correlations (q, k, n) with the training rows."""
         k, d = centred.shape
         mapped = np.ones((len(self.latents), k, d + 2))
         np.matmul(centred, self.maps, out=mapped[:, :, :d])
@@ -99,7 +100,7 @@ class _Stack(NamedTuple):
 
 @nb.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _collect(white: Array, linear: Array, trend: Array, mean: Array, variance: Array) -> None:
-    """Fills mean and variance (q, k), without nugget, from what `predict` has multiplied."""
+    """Fills the mean and the variance (q, k), without nugget, from the products that `predict` computes."""
     half, p = white.shape[2], trend.shape[2] - 1
     rest = linear.shape[2] - p - 1
     for j in range(mean.shape[0]):
@@ -119,10 +120,10 @@ def _collect(white: Array, linear: Array, trend: Array, mean: Array, variance: A
 
 
 def _few_directions(covariance: Array, nugget: float, whitener: Array) -> Array | None:
-    """What whitens (r, n) rows of a kernel, `covariance` (n, n) without its nugget, as `whitener` does.
+    """Returns a matrix (r, n) that whitens rows of the kernel almost as `whitener` does.
 
-    None for few rows, for a small nugget, and where that takes more than half as many directions as there are
-    rows.
+    `covariance` (n, n) is the kernel matrix without its nugget. The result is None for few rows, for a small
+    nugget, and if more directions than half the number of rows are necessary.
     """
     n = len(covariance)
     if n < WORTH_IT or nugget < LEAST_NUGGET:
@@ -148,10 +149,16 @@ def _turned(stack: Array) -> Array:
 
 @dataclass(frozen=True)
 class LatentGPs(_FreezesArrays):
-    """Independent GPs of q latents; the factors are derived from these few arrays, also after loading.
+    """Independent Gaussian processes of q latents.
 
-    inputs (n, d) in the unit cube, targets (n, q), linear_maps (q, d, d), nuggets (q,), kernels q names,
-    inflation (q,) of the standard deviations, by cross-validation.
+    The matrix factors are derived from these few arrays, also after loading.
+
+    inputs : (n, d) in the unit cube
+    targets : (n, q)
+    linear_maps : (q, d, d)
+    nuggets : (q,)
+    inflation : (q,) factors of the standard deviations, from cross-validation
+    kernels : q names
     """
 
     inputs: Array
@@ -163,7 +170,7 @@ class LatentGPs(_FreezesArrays):
 
     @classmethod
     def assemble(cls, unit: Array, targets: Array, fits: list[LatentFit]) -> LatentGPs:
-        """GPs of targets (n, q) at unit (n, d) with the hyperparameters of `fits`."""
+        """Returns Gaussian processes of targets (n, q) at unit (n, d) with the hyperparameters of `fits`."""
         return cls(
             inputs=unit,
             targets=targets,
@@ -211,7 +218,10 @@ class LatentGPs(_FreezesArrays):
         )
 
     def predict(self, unit: Array) -> tuple[Array, Array]:
-        """Mean and variance, nugget included, of every latent at unit (k, d): two arrays (k, q)."""
+        """Returns the mean and the variance of every latent at unit (k, d): two arrays (k, q).
+
+        The variance includes the nugget.
+        """
         mean = np.empty((len(unit), len(self.kernels)))
         variance = np.empty_like(mean)
         for start in range(0, len(unit), CHUNK):
@@ -223,7 +233,7 @@ class LatentGPs(_FreezesArrays):
         return mean, variance
 
     def predict_mean(self, unit: Array) -> Array:
-        """The mean (k, q) of `predict` alone."""
+        """Returns only the mean (k, q) of `predict`."""
         mean = np.empty((len(unit), len(self.kernels)))
         for start in range(0, len(unit), CHUNK):
             part = slice(start, start + CHUNK)
@@ -269,7 +279,10 @@ class LatentGPs(_FreezesArrays):
         )
 
     def leave_one_out(self) -> tuple[Array, Array]:
-        """Mean and variance of each row given all others, (n, q) each; hyperparameters kept."""
+        """Returns the mean and the variance (n, q) of each row given all other rows.
+
+        The hyperparameters stay fixed.
+        """
         mean, variance = np.empty_like(self.targets), np.empty_like(self.targets)
         for j, given in enumerate(self._conditioned):
             half = given.trend_weights @ given.trend_root.T

@@ -1,10 +1,11 @@
-"""Hyperparameters of one latent's Gaussian process, and what cross-validation says of them.
+"""Finds the hyperparameters of one latent's Gaussian process and measures its error by cross-validation.
 
-The kernel sees ``|W (x - x')|`` with a full (lower triangular) matrix W, because the force of a layered
-solid depends on products and ratios of its parameters, which are oblique directions of a log-scaled box.
-W and the nugget maximise the restricted likelihood (the trend's coefficients and the variance integrated
-out) times a weak normal prior on W's entries. Rasmussen & Williams (2006), ch. 2.7 and 5.4.1;
-leave-one-out in closed form: Dubrule (1983), Math. Geology 15, 687.
+The kernel is a function of ``|W (x - x')|`` with a full (lower triangular) matrix W. The reason is that the
+force of a layered solid depends on products and ratios of its parameters, which are oblique directions of a
+log-scaled box. W and the nugget maximise the restricted likelihood times a weak normal prior on W's entries.
+In the restricted likelihood, the trend's coefficients and the variance are integrated out. The method follows
+Rasmussen & Williams (2006), ch. 2.7 and 5.4.1. Leave-one-out in closed form: Dubrule (1983), Math. Geology
+15, 687.
 """
 
 from __future__ import annotations
@@ -21,26 +22,26 @@ from scipy.optimize import minimize
 from bayeskin.surrogates.kernels import KERNELS, kernel, squared_distances, trend_basis, trend_degree
 from bayeskin.types import Array
 
-SMALLEST_NUGGET = 1e-8  # of the kernel's variance: keeps the factorisation accurate to 1e-6
-LENGTHS = (0.05, 50.0)  # of the box's width
+SMALLEST_NUGGET = 1e-8  # share of the kernel's variance; it keeps the factorisation accurate to 1e-6
+LENGTHS = (0.05, 50.0)  # shortest and longest correlation length, as shares of the box's width
 DIAGONAL_WIDTH, OBLIQUE_WIDTH = 3.0, 0.25  # prior standard deviations of W's entries
-ROWS_TO_SEARCH = 320  # with more rows the search begins on so many of them
+ROWS_TO_SEARCH = 320  # with more rows the search begins on at most this many of them
 ALIGNED_STEPS, OBLIQUE_STEPS, ALL_ROWS_STEPS = 15, 40, 20
-ALL_ROWS_NUGGET = 1e-4  # at most, to begin with: what few rows take for noise, more of them can follow
-FEWEST_TO_SEARCH = 3  # rows for each input and the nugget; fewer have one length for all inputs
-ONE_LENGTH_RATES = (0.3, 1.0, 3.0)  # over the box's width
+ALL_ROWS_NUGGET = 1e-4  # largest initial nugget for all rows, which can follow what few rows treat as noise
+FEWEST_TO_SEARCH = 3  # least number of rows for each input and the nugget; fewer rows use a single length
+ONE_LENGTH_RATES = (0.3, 1.0, 3.0)  # inverse lengths that are tried, for a box of width 1
 ONE_LENGTH_NUGGETS = np.logspace(-6.0, 0.0, 13)
 FOLDS = 3
-FOLD_WORK = 640  # rows times search steps of a fold: few rows mislead the search more, and cost less
-NORMAL_90 = 1.6448536269514722  # 90 % of a standard normal lies within
+FOLD_WORK = 640  # rows times search steps of a fold; few rows mislead the search more, and cost less
+NORMAL_90 = 1.6448536269514722  # a standard normal variable lies within +- this value with probability 90 %
 
 
 class LatentFit(NamedTuple):
-    """Hyperparameters of one latent, and what cross-validation says of them.
+    """Hyperparameters of one latent, with their error from cross-validation.
 
-    error: weighted mean squared error of rows whose hyperparameters were fitted without them; inflation:
-    ratio of those errors' weighted 90 % quantile (of few rows the RMS) to what the predicted variance
-    promises.
+    error : weighted mean squared error of rows that were not used to fit the hyperparameters
+    inflation : ratio of the weighted 90 % quantile of these errors to the quantile that the predicted
+        variance implies. For few rows it is the ratio of the RMS errors.
     """
 
     kernel: str
@@ -51,7 +52,7 @@ class LatentFit(NamedTuple):
 
 
 class _Data(NamedTuple):
-    """inputs (n, d) centred on the cube, trend basis (n, p), target (n,) of unit variance."""
+    """Training data: inputs (n, d) centred on the cube, trend basis (n, p), target (n,) of unit variance."""
 
     inputs: Array
     basis: Array
@@ -66,12 +67,15 @@ class _Likelihood(NamedTuple):
     by_map: Array
     by_log_nugget: float
     residual: Array  # (n,) leave-one-out residuals
-    spread: Array  # (n,) their standard deviations over the process's
+    spread: Array  # (n,) standard deviations of the residuals, divided by that of the process
     variance: float
 
 
 def _likelihood(name: str, linear_map: Array, nugget: float, data: _Data) -> _Likelihood:
-    """Negative restricted log-likelihood, variance profiled out, and its gradient by W and log nugget."""
+    """Returns the negative restricted log-likelihood and its gradient by W and the log nugget.
+
+    The variance is profiled out.
+    """
     inputs, basis, target = data
     n, p = basis.shape
     mapped = inputs @ linear_map.T
@@ -83,20 +87,21 @@ def _likelihood(name: str, linear_map: Array, nugget: float, data: _Data) -> _Li
     if info:
         raise np.linalg.LinAlgError(f"kernel matrix is not positive definite (row {info})")
     log_root = np.log(lower.diagonal()).sum()
-    inverse, _ = dpotri(lower, lower=1, overwrite_c=1)  # its lower triangle, all that dsymm reads
+    inverse, _ = dpotri(lower, lower=1, overwrite_c=1)  # only the lower triangle; dsymm reads no more
     weighted = dsymm(1.0, inverse, np.column_stack([basis, target]), lower=1)
     gram, _ = dpotrf(basis.T @ weighted[:, :p], lower=1, clean=1)
     half, _ = dtrtrs(gram, weighted[:, :p].T, lower=1)
-    # with P = K^-1 - K^-1 H (H^T K^-1 H)^-1 H^T K^-1, of which only these are needed by themselves
+    # Let P = K^-1 - K^-1 H (H^T K^-1 H)^-1 H^T K^-1. Only q = P y and P's diagonal are needed separately.
     q = weighted[:, p] - half.T @ (half @ target)
     diagonal = inverse.diagonal() - np.einsum("ij,ij->j", half, half)
     variance = max(float(target @ q) / (n - p), 1e-300)
     value = 0.5 * (n - p) * np.log(variance) + log_root + np.log(gram.diagonal()).sum()
     trace = float(diagonal.sum() - q @ q / variance)
     rows = np.vstack([half, q / np.sqrt(variance)])
-    inverse -= (rows.T @ rows).T  # symmetric, and column-major as it is
+    inverse -= (rows.T @ rows).T  # symmetric, and its transpose is column-major
     inverse *= slope.T
-    # sum_ij pull_ij (x_i - x_j)(x_i - x_j)^T with pull = (P - q q^T / variance) slope, no difference formed
+    # The result is sum_ij pull_ij (x_i - x_j)(x_i - x_j)^T with pull = (P - q q^T / variance) slope. It is
+    # computed without forming the differences.
     pulled = dsymm(1.0, inverse, np.column_stack([inputs, np.ones(n)]), lower=1)
     spread = 2.0 * (inputs.T @ (pulled[:, -1:] * inputs) - inputs.T @ pulled[:, :-1])
     return _Likelihood(
@@ -107,7 +112,10 @@ def _likelihood(name: str, linear_map: Array, nugget: float, data: _Data) -> _Li
 def _search(
     name: str, data: _Data, free: NDArray[np.bool_], start: tuple[Array, float], iterations: int
 ) -> tuple[Array, float]:
-    """Linear map, entries `free` (d, d) searched, and nugget of the most probable hyperparameters."""
+    """Returns the linear map and the nugget of the most probable hyperparameters.
+
+    The search varies the entries of the map that `free` (d, d) marks, and the nugget.
+    """
     dim = len(free)
     eye = np.eye(dim, dtype=bool)
     width = np.where(eye, DIAGONAL_WIDTH, OBLIQUE_WIDTH)[free]
@@ -135,9 +143,9 @@ def _search(
 
 
 def fit_latent(unit: Array, target: Array, weights: Array) -> LatentFit:
-    """Fits one latent (n,) at unit-cube points (n, d); the kernel has the least leave-one-out error.
+    """Fits one latent (n,) at unit-cube points (n, d) with the kernel of least leave-one-out error.
 
-    weights (n,) of the rows in that error; the likelihood knows no weights.
+    `weights` (n,) are the weights of the rows in this error. The likelihood does not use them.
     """
     dim = unit.shape[1]
     deviation = float(target.std())
@@ -146,45 +154,49 @@ def fit_latent(unit: Array, target: Array, weights: Array) -> LatentFit:
     basis = trend_basis(unit, trend_degree(len(unit), dim))
     data = _Data(unit - 0.5, basis, (target - target.mean()) / deviation)
     if len(unit) < FEWEST_TO_SEARCH * (dim + 1):
-        return _one_length(data, weights, deviation)
+        return _fit_one_length(data, weights, deviation)
     aligned, oblique = np.eye(dim, dtype=bool), np.tri(dim, dtype=bool)
     few = data.rows(np.arange(len(unit)) % -(-len(unit) // ROWS_TO_SEARCH) == 0)
-    found = []
+    candidates = []
     for name in KERNELS:
-        # axis-aligned lengths first, the oblique map from there: the second search is not convex
-        at = _search(name, few, aligned, (np.eye(dim), 1e-4), ALIGNED_STEPS)
-        at = _search(name, few, oblique, at, OBLIQUE_STEPS)
+        # The search for the oblique map is not convex, so it starts from the best axis-aligned lengths.
+        optimum = _search(name, few, aligned, (np.eye(dim), 1e-4), ALIGNED_STEPS)
+        optimum = _search(name, few, oblique, optimum, OBLIQUE_STEPS)
         if len(few.target) < len(unit):
-            at = _search(name, data, oblique, (at[0], min(at[1], ALL_ROWS_NUGGET)), ALL_ROWS_STEPS)
-        residual = _likelihood(name, *at, data).residual
-        found.append((float(np.average(residual**2, weights=weights)), name, at))
-    _, name, at = min(found, key=lambda kernel: kernel[0])
-    best = _cross_validate(name, data, oblique, at, weights)
+            optimum = _search(
+                name, data, oblique, (optimum[0], min(optimum[1], ALL_ROWS_NUGGET)), ALL_ROWS_STEPS
+            )
+        residual = _likelihood(name, *optimum, data).residual
+        candidates.append((float(np.average(residual**2, weights=weights)), name, optimum))
+    _, name, optimum = min(candidates, key=lambda candidate: candidate[0])
+    best = _cross_validate(name, data, oblique, optimum, weights)
     return best._replace(error=best.error * deviation**2)
 
 
-def _one_length(data: _Data, weights: Array, deviation: float) -> LatentFit:
-    """A fit for few rows: the most probable of some lengths, the same along all inputs, and of some nuggets.
+def _fit_one_length(data: _Data, weights: Array, deviation: float) -> LatentFit:
+    """Returns a fit for few rows: the most probable length and nugget of a grid.
 
-    So few rows tell no two lengths apart, and a search that tries all the same promises far too much.
+    The length is the same for all inputs, because so few rows cannot distinguish between lengths. A search
+    for different lengths would predict far too small errors.
     """
     eye = np.eye(data.inputs.shape[1])
     choices = product(ONE_LENGTH_RATES, ONE_LENGTH_NUGGETS)
     rate, nugget = min(choices, key=lambda at: _likelihood("gaussian", at[0] * eye, at[1], data).value)
-    found = _likelihood("gaussian", rate * eye, nugget, data)
-    error = float(np.average(found.residual**2, weights=weights))
-    promised = found.variance * float(np.average(found.spread**2, weights=weights))
-    inflation = max(float(np.sqrt(error / promised)), 1.0)
+    best = _likelihood("gaussian", rate * eye, nugget, data)
+    error = float(np.average(best.residual**2, weights=weights))
+    predicted = best.variance * float(np.average(best.spread**2, weights=weights))
+    inflation = max(float(np.sqrt(error / predicted)), 1.0)
     return LatentFit("gaussian", rate * eye, float(nugget), error * deviation**2, inflation)
 
 
 def _cross_validate(
     name: str, data: _Data, free: NDArray[np.bool_], at: tuple[Array, float], weights: Array
 ) -> LatentFit:
-    """Leave-one-out errors with hyperparameters refitted, from `at` on, without the row's fold.
+    """Returns the fit with its leave-one-out errors.
 
-    With the hyperparameters of all rows the closed form is too hopeful by up to a factor of two to four
-    in the standard deviation when rows are few.
+    For each fold, the hyperparameters are refitted without the rows of this fold, starting from `at`. With
+    the hyperparameters of all rows, the closed form would be too optimistic: for few rows it gives a standard
+    deviation that is too small by a factor of up to two to four.
     """
     fold = np.arange(len(data.target)) % FOLDS
     steps = min(max(FOLD_WORK // len(fold), 5), 20)
@@ -194,9 +206,9 @@ def _cross_validate(
         linear_map, nugget = _search(name, kept, free, at, steps)
         variance = _likelihood(name, linear_map, nugget, kept).variance
         all_rows = _likelihood(name, linear_map, nugget, data)
-        out = fold == k
-        residual[out] = all_rows.residual[out]
-        ratio[out] = residual[out] / (all_rows.spread[out] * np.sqrt(variance))
+        held_out = fold == k
+        residual[held_out] = all_rows.residual[held_out]
+        ratio[held_out] = residual[held_out] / (all_rows.spread[held_out] * np.sqrt(variance))
     order = np.argsort(np.abs(ratio))
     share = (np.cumsum(weights[order]) - 0.5 * weights[order]) / weights.sum()
     inflation = float(np.interp(0.9, share, np.abs(ratio)[order])) / NORMAL_90

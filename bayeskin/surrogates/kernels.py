@@ -1,4 +1,4 @@
-"""Kernels of a squared distance, and the polynomial trend that a Gaussian process departs from."""
+"""Defines kernels of a squared distance and the polynomial trend of a Gaussian process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ KERNELS = ("matern52", "gaussian")
 
 
 def trend_basis(unit: Array, degree: int) -> Array:
-    """Monomials up to `degree` (0, 1 or 2) of ``2 unit - 1``, (n, p)."""
+    """Returns the monomials (n, p) up to `degree` (0, 1 or 2) of ``2 unit - 1``."""
     x = 2.0 * unit - 1.0
     columns = [np.ones((len(x), 1))]
     if degree >= 1:
@@ -30,13 +30,13 @@ def _pairs(dim: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 
 def trend_degree(rows: int, dim: int) -> int:
-    """The richest trend that leaves at least three rows a coefficient."""
+    """Returns the highest degree of the trend (0, 1 or 2) with at least three rows for each coefficient."""
     sizes = (1, 1 + dim, (dim + 1) * (dim + 2) // 2)
     return max([degree for degree, size in enumerate(sizes) if rows >= 3 * size], default=0)
 
 
 def kernel(name: str, squared: Array) -> tuple[Array, Array]:
-    """Kernel and its derivative by the squared distance, at squared distances of any shape."""
+    """Returns the kernel and its derivative by the squared distance, at squared distances of any shape."""
     if name == "gaussian":
         value = np.exp(-0.5 * squared)
         return value, -0.5 * value
@@ -46,7 +46,10 @@ def kernel(name: str, squared: Array) -> tuple[Array, Array]:
 
 
 def correlations(name: str, minus_half_squared: Array) -> Array:
-    """Kernel at squared distances given as minus their half, of any shape; the argument is overwritten."""
+    """Returns the kernel at squared distances of any shape, given as -1/2 times the squared distance.
+
+    The argument is overwritten.
+    """
     value = np.minimum(minus_half_squared, 0.0, out=minus_half_squared)
     if name == "gaussian":
         return np.exp(value, out=value)
@@ -61,7 +64,7 @@ def correlations(name: str, minus_half_squared: Array) -> Array:
 
 
 def squared_distances(left: Array, right: Array) -> Array:
-    """|left_i - right_j|^2, (n, k)."""
+    """Returns the squared distances |left_i - right_j|^2, (n, k)."""
     squared = left @ right.T
     squared *= -2.0
     squared += np.einsum("ij,ij->i", left, left)[:, None]

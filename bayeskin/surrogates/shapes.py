@@ -1,8 +1,8 @@
-"""Force histories as an amplitude and a shape, and the shape as a few principal components.
+"""Describes a force history by an amplitude and a shape, and the shape by a few principal components.
 
-Forces span decades over a prior box, so a history ``y`` (m,) is split in ``a = log RMS(y)`` and
-``s = y / RMS(y)``. A latent vector is ``[a, z_1 .. z_K]`` with ``s = mean + z @ components``. What the
-components leave out is kept as a variance of each bin.
+Forces span decades over a prior box. A history ``y`` (m,) is therefore split into ``a = log RMS(y)`` and
+``s = y / RMS(y)``. A latent vector is ``[a, z_1 .. z_K]`` with ``s = mean + z @ components``. The part that
+the components leave out is represented by a variance of each bin.
 """
 
 from __future__ import annotations
@@ -15,38 +15,39 @@ import numpy as np
 from bayeskin.errors import InputError
 from bayeskin.types import Array, Prediction, _FreezesArrays
 
-SMALLEST_AMPLITUDE = 1e-9  # of the largest: a history of zeros has no logarithm
+SMALLEST_AMPLITUDE = 1e-9  # share of the largest amplitude; a history of zeros has no logarithm
 
 
 @dataclass(frozen=True)
 class ShapeTransform(_FreezesArrays):
-    """mean (m,) and components (K, m) of shapes; truncation (m,) variance of a shape's remainder."""
+    """The mean (m,) and the components (K, m) of shapes; truncation (m,) is the variance of the remainder."""
 
     mean: Array
     components: Array
     truncation: Array
 
     def keep(self, count: int, shapes: Array, weights: Array, fitted: int) -> ShapeTransform:
-        """The first `count` components; what they leave of `shapes` (n, m) becomes the truncation.
+        """Returns the transform with the first `count` components.
 
-        weights (n,) of the rows; fitted: how many of the mean and components follow these very rows.
+        The remainder of `shapes` (n, m) becomes the truncation. `weights` (n,) are the weights of the rows.
+        `fitted` is the number of vectors (mean and components) that were fitted to these same rows.
         """
         components = self.components[:count]
         centred = shapes - self.mean
         rest = centred - (centred @ components.T) @ components
-        counting = weights.sum() ** 2 / np.sum(weights**2)  # rows
+        counting = weights.sum() ** 2 / np.sum(weights**2)  # effective number of rows
         freedom = max(counting - fitted, 1.0) / counting
         return ShapeTransform(self.mean, components, weights @ rest**2 / (weights.sum() * freedom))
 
     def encode(self, force_n: Array) -> Array:
-        """Latent vectors (n, 1 + K) of histories (n, m)."""
+        """Returns the latent vectors (n, 1 + K) of histories (n, m)."""
         amplitude, shapes = split(force_n)
         return np.column_stack([amplitude, (shapes - self.mean) @ self.components.T])
 
     def decode(self, latent: Array, sd: Array) -> Prediction:
-        """The force of latent vectors with independent errors, mean and sd (n, 1 + K) each.
+        """Returns the force of latent vectors with independent errors; mean and sd are (n, 1 + K) each.
 
-        Delta method: d force = force da + exp(a) components dz.
+        It uses the delta method: d force = force da + exp(a) components dz.
         """
         scale = np.exp(latent[:, 0])[:, None]
         mean = self.decode_mean(latent)
@@ -55,7 +56,7 @@ class ShapeTransform(_FreezesArrays):
         return Prediction(mean, columns.transpose(0, 2, 1), scale**2 * self.truncation)
 
     def decode_mean(self, latent: Array) -> Array:
-        """The mean (n, m) of `decode` alone."""
+        """Returns only the mean (n, m) of `decode`."""
         scale = np.exp(latent[:, 0])[:, None]
         mean = np.asarray((scale * latent[:, 1:]) @ self.components)
         mean += scale * self.mean
@@ -64,7 +65,7 @@ class ShapeTransform(_FreezesArrays):
 
 @nb.njit(cache=True, nogil=True)
 def _fill(mean: Array, components: Array, sd: Array, scaled_sd: Array, columns: Array) -> None:
-    """Fills columns (n, 1 + K, m): the mean times its sd, then each component times its own."""
+    """Fills columns (n, 1 + K, m): the mean times the amplitude's sd, then components times their sd."""
     for i in range(len(columns)):
         for j in range(columns.shape[2]):
             columns[i, 0, j] = sd[i, 0] * mean[i, j]
@@ -75,7 +76,7 @@ def _fill(mean: Array, components: Array, sd: Array, scaled_sd: Array, columns: 
 
 
 def split(force_n: Array) -> tuple[Array, Array]:
-    """log RMS (n,) and shape (n, m) of histories (n, m). Raises InputError if all of them are zero."""
+    """Returns log RMS (n,) and shape (n, m) of histories (n, m). Raises InputError if all are zero."""
     rms = np.sqrt(np.mean(force_n**2, axis=1))
     if not rms.max() > 0.0:
         raise InputError("design: force_n", "zero force in every run", "forces that differ from zero")
@@ -84,11 +85,11 @@ def split(force_n: Array) -> tuple[Array, Array]:
 
 
 def all_components(shapes: Array, weights: Array) -> tuple[ShapeTransform, Array]:
-    """Every principal component of shapes (n, m), rows weighted by (n,), and their variances (K,)."""
+    """Returns all principal components of shapes (n, m) with row weights (n,), and their variances (K,)."""
     share = weights / weights.sum()
     mean = share @ shapes
     _, singular, components = np.linalg.svd(np.sqrt(share)[:, None] * (shapes - mean), full_matrices=False)
-    # the sign of a component is arbitrary: fixed, so that the same design gives the same surrogate
+    # The sign of a component is arbitrary. It is fixed so that the same design gives the same surrogate.
     signs = np.sign(components[np.arange(len(components)), np.argmax(np.abs(components), axis=1)])
     signs[signs == 0] = 1.0
     return ShapeTransform(mean, components * signs[:, None], np.zeros_like(mean)), singular**2

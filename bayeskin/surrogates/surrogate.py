@@ -1,4 +1,4 @@
-"""A trained surrogate: parameters to latents, latents to force, both with their own error."""
+"""Defines the trained surrogate, which predicts latents, and from them the force, each with its error."""
 
 from __future__ import annotations
 
@@ -15,33 +15,37 @@ from bayeskin.surrogates.shapes import ShapeTransform
 from bayeskin.surrogates.similarity import Similarity
 from bayeskin.types import Array, ParameterSpace, Prediction, _FreezesArrays
 
-ROUNDING = 1e-12  # relative: a corner of the box computed as exp(log(corner)) still lies in it
+ROUNDING = 1e-12  # relative tolerance, so that a corner computed as exp(log(corner)) lies in the box
 
 
 class Latents(Protocol):
-    """What predicts the latent vectors of `ShapeTransform`: Gaussian processes or chaos expansions."""
+    """Predicts the latent vectors of `ShapeTransform`, by Gaussian processes or chaos expansions."""
 
     @property
     def inputs(self) -> Array: ...
 
     def predict(self, unit: Array) -> tuple[Array, Array]:
-        """Mean and variance (n, q) at inputs (n, k), those of `Similarity` that matter."""
+        """Returns the mean and the variance (n, q) at the active inputs (n, k) of `Similarity`."""
         ...
 
     def predict_mean(self, unit: Array) -> Array:
-        """The mean (n, q) of `predict` alone."""
+        """Returns only the mean (n, q) of `predict`."""
         ...
 
     def leave_one_out(self) -> tuple[Array, Array]:
-        """Mean and variance (n, q) of each training row given the others."""
+        """Returns the mean and the variance (n, q) of each training row given the other rows."""
         ...
 
 
 @dataclass(frozen=True)
 class ShapeSurrogate(_FreezesArrays):
-    """Satisfies `types.Surrogate`: force as a scale times exp(amplitude) times a shape of predicted latents.
+    """Predicts the force as a scale times exp(amplitude) times a shape; implements `types.Surrogate`.
 
-    `space` is the box in which it answers; edges_s (m+1,); active (k,) which of the inputs the latents see.
+    The latents give the amplitude and the shape.
+
+    space : the box in which the surrogate predicts
+    edges_s : (m+1,) edges of the bins [s]
+    active : (k,) indices of the inputs that the latents use
     """
 
     space: ParameterSpace
@@ -53,17 +57,17 @@ class ShapeSurrogate(_FreezesArrays):
 
     @cached_property
     def similarity(self) -> Similarity:
-        """What makes inputs of parameters."""
+        """Returns the similarity law, which converts parameters to inputs."""
         return Similarity(self.space)
 
     def inputs(self, theta: Array) -> Array:
-        """What the latents see of theta (n, d), (n, k)."""
+        """Returns the inputs (n, k) that the latents use, for theta (n, d)."""
         return self.similarity.inputs(theta)[:, self.active]
 
     def predict(self, theta: ArrayLike) -> Prediction:
-        """The force at theta (n, d) or (d,), with its uncertainty.
+        """Returns the force at theta (n, d) or (d,), with its uncertainty.
 
-        Raises InputError that names the first parameter outside the box.
+        Raises an InputError that names the first parameter outside the box.
         """
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
@@ -71,7 +75,7 @@ class ShapeSurrogate(_FreezesArrays):
         return self._decode(theta, mean, variance)
 
     def predict_mean(self, theta: ArrayLike) -> Array:
-        """The mean (n, m) of `predict` alone."""
+        """Returns only the mean (n, m) of `predict`."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         refuse_outside(self.space, theta)
         latent = self.latents.predict_mean(self.inputs(theta))
@@ -79,7 +83,10 @@ class ShapeSurrogate(_FreezesArrays):
         return self.transform.decode_mean(latent)
 
     def leave_one_out(self, theta: Array) -> Prediction:
-        """Force at the training rows, theta (n, d), as the others predict it; hyperparameters kept."""
+        """Returns the force at the training rows, theta (n, d), each predicted from the other rows.
+
+        The hyperparameters stay fixed.
+        """
         return self._decode(theta, *self.latents.leave_one_out())
 
     def _decode(self, theta: Array, mean: Array, variance: Array) -> Prediction:
@@ -95,7 +102,7 @@ def refuse_outside(space: ParameterSpace, theta: Array) -> None:
         return
     lower = space.lower - ROUNDING * np.abs(space.lower)
     upper = space.upper + ROUNDING * np.abs(space.upper)
-    outside = ~((theta >= lower) & (theta <= upper))  # also what is not a number
+    outside = ~((theta >= lower) & (theta <= upper))  # NaN counts as outside
     if outside.any():
         row, column = np.argwhere(outside)[0]
         p = space.parameters[column]

@@ -1,4 +1,4 @@
-"""From a design to a surrogate and what is known of its error."""
+"""Trains a surrogate on a design and measures its error."""
 
 from __future__ import annotations
 
@@ -23,8 +23,10 @@ from bayeskin.types import Array, Design, ParameterSpace
 Kind = Literal["gp", "chaos"]
 F = TypeVar("F", LatentFit, SparseFit)
 MOST_COMPONENTS = 12
-TRUNCATION_SHARE = 0.01  # of the shape's squared error: what is left out counts as noise of single bins
-MARGIN = 0.15  # of the region's width: rows just outside it support the surrogate at its faces
+# Components are added until the remainder is at most this share of the shape's squared error. The remainder
+# counts as noise of single bins.
+TRUNCATION_SHARE = 0.01
+MARGIN = 0.15  # share of the region's width; rows just outside the region support the surrogate at its faces
 FOLDS = 4
 
 
@@ -36,14 +38,18 @@ def train(
     region: tuple[Array, Array] | None = None,
     active: NDArray[np.int64] | None = None,
 ) -> tuple[ShapeSurrogate, Validation]:
-    """Trains on the design's training rows; the held-out rows only measure the error.
+    """Returns the surrogate that is trained on the design's training rows, and its validation.
 
-    kind: "auto" takes the one with the smaller held-out error, or, without held-out rows, the smaller
-    error over four folds drawn with `seed`. focus: weights (n,) of the design's rows in the principal
-    components and in the error that decides. region: lower and upper corner (d,) in the design's unit
-    cube; the surrogate then answers only inside, and learns from rows in and slightly around it. active:
-    which inputs of `Similarity` matter (None: all).
-    Raises InputError for too few rows or force that is not finite.
+    The held-out rows only measure the error.
+
+    kind : "auto" takes the kind with the smaller held-out error. Without held-out rows it takes the kind with
+        the smaller error over four folds, which are drawn with `seed`.
+    focus : (n,) weights of the design's rows in the principal components and in the decisive error
+    region : lower and upper corner (d,) in the design's unit cube. The surrogate then predicts only inside
+        this region, and learns from rows in the region and slightly around it.
+    active : indices of the inputs of `Similarity` that matter (None: all)
+
+    Raises InputError for too few rows, unsuitable weights, an empty region, or a force that is not finite.
     """
     space = design.space if region is None else narrowed(design.space, *region)
     focus = np.ones(len(design.theta)) if focus is None else np.asarray(focus, dtype=float)
@@ -51,7 +57,7 @@ def train(
         raise InputError("focus", f"shape {focus.shape}", f"{len(design.theta)} finite weights >= 0")
     inputs = Similarity(space).inputs(design.theta)
     active = np.arange(inputs.shape[1]) if active is None else active
-    training = design.training & _within(inputs, MARGIN) & (focus > 0.0)
+    training = design.training & _near_cube(inputs, MARGIN) & (focus > 0.0)
     testing = design.testing & space.contains(design.theta) & (focus > 0.0)
     _refuse_unusable(design, space, training)
     kinds: tuple[Kind, ...] = ("gp", "chaos") if kind == "auto" else (kind,)
@@ -67,12 +73,12 @@ def train(
     results = []
     for name in kinds:
         surrogate = _fit(name, space, design, training, focus, provenance, active)
-        results.append((surrogate, _measure(surrogate, design, training, testing, focus)))
+        results.append((surrogate, _validate_surrogate(surrogate, design, training, testing, focus)))
     return min(results, key=lambda result: result[1].relative_error)
 
 
 def narrowed(space: ParameterSpace, lower: Array, upper: Array) -> ParameterSpace:
-    """The part of a space between two corners (d,) of its unit cube. Raises InputError if empty."""
+    """Returns the part of a space between two corners (d,) of its unit cube. Raises InputError if empty."""
     low, high = np.clip(np.asarray(lower, dtype=float), 0, 1), np.clip(np.asarray(upper, dtype=float), 0, 1)
     if low.shape != (space.dim,) or high.shape != (space.dim,) or not np.all(low < high):
         cube = f"two corners of the {space.dim}-dimensional unit cube"
@@ -84,15 +90,16 @@ def narrowed(space: ParameterSpace, lower: Array, upper: Array) -> ParameterSpac
 def _refuse_unusable(design: Design, space: ParameterSpace, training: NDArray[np.bool_]) -> None:
     fewest = space.dim + 3
     if training.sum() < fewest:
-        found = f"{training.sum()} finished training rows in the box"
-        raise InputError("design", found, f"at least {fewest}")
+        problem = f"{training.sum()} finished training rows in the box"
+        raise InputError("design", problem, f"at least {fewest}")
     wrong = np.flatnonzero(design.ok & ~np.isfinite(design.force_n).all(axis=1))
     if len(wrong):
         where = f"design: row {wrong[0]}"
         raise InputError(where, "force that is not finite", "finite force in every finished run")
 
 
-def _within(inputs: Array, margin: float) -> NDArray[np.bool_]:
+def _near_cube(inputs: Array, margin: float) -> NDArray[np.bool_]:
+    """Returns whether each row lies in the unit cube or at most `margin` outside it, (n,)."""
     return np.asarray(np.all((inputs >= -margin) & (inputs <= 1.0 + margin), axis=1))
 
 
@@ -100,11 +107,12 @@ def _fit(
     kind: Kind, space: ParameterSpace, design: Design, rows: NDArray[np.bool_], focus: Array,
     provenance: dict[str, Any], active: NDArray[np.int64],
 ) -> ShapeSurrogate:  # fmt: skip
-    """One surrogate of one kind on the rows given."""
+    """Returns a surrogate of the given kind, trained on the given rows."""
     similarity = Similarity(space)
     inputs = similarity.inputs(design.theta)
     if kind == "chaos":
-        rows = rows & _within(inputs, ROUNDING)  # polynomials leave [-1, 1] steeply: a margin would rule
+        # Polynomials grow steeply outside [-1, 1], so rows in a margin would dominate the fit.
+        rows = rows & _near_cube(inputs, ROUNDING)
     inputs, log_scale, force_n = (
         inputs[rows][:, active],
         Similarity(space).log_scale(design.theta[rows]),
@@ -127,37 +135,39 @@ def fit_latents(
     force_n: Array,
     weights: Array,
 ) -> tuple[ShapeTransform, Array, list[F]]:
-    """Fits the amplitude, then components until what is left is negligible beside the error of those.
+    """Returns the transform, the targets, and the fits of the amplitude and of the components.
 
-    One that no input predicts is kept too: its error is one of all bins together. Left out it would count as
-    noise of each bin by itself, which it is not, and bend a posterior by many of its sd.
+    Components are fitted until the remainder is negligible compared with the error of the fitted components.
+    A component that no input predicts is kept too, because its error is common to all bins. If it were left
+    out, it would count as independent noise of each bin, and would shift a posterior by many of its sd.
     """
     amplitude, shapes = split(force_n)
     full, variances = all_components(shapes, weights)
     scores = (shapes - full.mean) @ full.components.T
     fits = [fit_one(inputs, amplitude - log_scale, weights)]
-    error, left = 0.0, float(variances.sum())  # of shapes, whose squares sum to the number of bins
-    for k in range(min(MOST_COMPONENTS, len(inputs) // 3, int(np.sum(variances > 1e-14 * left)))):
-        if left <= max(TRUNCATION_SHARE * error, 1e-14 * shapes.shape[1]):
+    error, remainder = 0.0, float(variances.sum())  # for shapes, whose squares sum to the number of bins
+    for k in range(min(MOST_COMPONENTS, len(inputs) // 3, int(np.sum(variances > 1e-14 * remainder)))):
+        if remainder <= max(TRUNCATION_SHARE * error, 1e-14 * shapes.shape[1]):
             break
         fit = fit_one(inputs, scores[:, k], weights)
         fits.append(fit)
         error += fit.error
-        left -= float(variances[k])
+        remainder -= float(variances[k])
     transform = full.keep(len(fits) - 1, shapes, weights, fitted=len(fits))
     targets = transform.encode(force_n)
     targets[:, 0] -= log_scale
     return transform, targets, fits
 
 
-def _measure(
+def _validate_surrogate(
     surrogate: ShapeSurrogate, design: Design, training: NDArray[np.bool_], testing: NDArray[np.bool_],
     focus: Array,
 ) -> Validation:  # fmt: skip
+    """Returns the validation on the held-out rows, or by leave-one-out if there are none."""
     if testing.any():
         return validate(surrogate, design.theta[testing], design.force_n[testing], focus[testing])
     if surrogate.provenance["kind"] == "chaos":
-        training = training & _within(surrogate.similarity.inputs(design.theta), ROUNDING)
+        training = training & _near_cube(surrogate.similarity.inputs(design.theta), ROUNDING)
     theta = design.theta[training]
     return compare(
         surrogate, surrogate.leave_one_out(theta), theta, design.force_n[training],
@@ -169,15 +179,15 @@ def _best_of_folds(
     kinds: tuple[Kind, ...], space: ParameterSpace, design: Design, training: NDArray[np.bool_],
     focus: Array, seed: int, active: NDArray[np.int64],
 ) -> Kind:  # fmt: skip
-    """The kind with the smaller squared error over folds that neither its fit nor its choices have seen."""
+    """Returns the kind with the smaller squared error over folds that neither fit nor selection has used."""
     rows = np.flatnonzero(training & space.contains(design.theta))
     order = np.random.default_rng(seed).permutation(rows)
     errors = dict.fromkeys(kinds, 0.0)
     for k in range(FOLDS):
-        out = np.zeros_like(training)
-        out[order[k::FOLDS]] = True
+        fold_rows = np.zeros_like(training)
+        fold_rows[order[k::FOLDS]] = True
         for kind in kinds:
-            surrogate = _fit(kind, space, design, training & ~out, focus, {}, active)
-            miss = surrogate.predict_mean(design.theta[out]) - design.force_n[out]
-            errors[kind] += float(focus[out] @ np.sum(miss**2, axis=1))
+            surrogate = _fit(kind, space, design, training & ~fold_rows, focus, {}, active)
+            residual = surrogate.predict_mean(design.theta[fold_rows]) - design.force_n[fold_rows]
+            errors[kind] += float(focus[fold_rows] @ np.sum(residual**2, axis=1))
     return min(kinds, key=lambda kind: errors[kind])

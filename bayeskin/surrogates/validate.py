@@ -1,4 +1,4 @@
-"""How far a surrogate is from the full model on rows it has not learnt from."""
+"""Measures the error of a surrogate against the full model, on rows from which it has not learnt."""
 
 from __future__ import annotations
 
@@ -15,13 +15,17 @@ NORMAL_90 = 1.6448536269514722
 
 @dataclass(frozen=True)
 class Validation(_FreezesArrays):
-    """Errors over n rows and m bins.
+    """Errors of a surrogate over n rows and m bins.
 
-    kind: "gp" or "chaos"; source: which rows; rms_n (m,) and predicted_sd_n (m,) over the rows [N];
-    relative_error: ||prediction - truth|| / ||truth - its mean over rows||; coverage_90: share of bins
-    and rows that the 90 % interval covers (nominal 0.90), bins with constant force left out;
-    point_rms_n (n,) [N] and point_relative (n,), the same over the row's RMS force; worst_theta (d,) the
-    row with the largest `point_relative`.
+    kind : "gp" or "chaos"
+    source : the rows on which the error is measured
+    relative_error : ||prediction - truth|| / ||truth - its mean over rows||
+    coverage_90 : share of bins and rows that the 90 % interval covers (nominal value 0.90). Bins with
+        constant force are left out.
+    rms_n, predicted_sd_n : (m,) RMS error and predicted sd over the rows [N]
+    point_rms_n : (n,) RMS error of each row [N]
+    point_relative : (n,) RMS error of each row divided by the row's RMS force
+    worst_theta : (d,) parameters of the row with the largest `point_relative`
     """
 
     kind: Literal["gp", "chaos"]
@@ -44,7 +48,7 @@ class Validation(_FreezesArrays):
 def validate(
     surrogate: ShapeSurrogate, theta: Array, force_n: Array, weights: Array | None = None
 ) -> Validation:
-    """Compares predictions at theta (n, d) with force_n (n, m) that the full model gave there."""
+    """Returns the errors of predictions at theta (n, d) against the full model's force_n (n, m)."""
     return compare(surrogate, surrogate.predict(theta), theta, force_n, "held-out", weights)
 
 
@@ -56,7 +60,10 @@ def compare(
     source: Literal["held-out", "leave-one-out"],
     weights: Array | None = None,
 ) -> Validation:
-    """The same for predictions made elsewhere; `weights` (n,) of the rows in the relative error."""
+    """Returns the errors of predictions that were made elsewhere, against force_n (n, m).
+
+    `weights` (n,) are the weights of the rows in the relative error.
+    """
     error = prediction.mean - force_n
     weights = np.ones(len(theta)) if weights is None else weights
     centred = force_n - np.average(force_n, axis=0, weights=weights)
@@ -65,11 +72,11 @@ def compare(
     point_rms = np.sqrt(np.mean(error**2, axis=1))
     point_relative = point_rms / np.sqrt(np.maximum(np.mean(force_n**2, axis=1), np.finfo(float).tiny))
     scatter = float(weights @ np.sum(centred**2, axis=1))
-    miss = float(weights @ np.sum(error**2, axis=1))
+    squared_error = float(weights @ np.sum(error**2, axis=1))
     return Validation(
         kind=surrogate.provenance["kind"],
         source=source,
-        relative_error=float(np.sqrt(miss / scatter)) if scatter > 0.0 else float("nan"),
+        relative_error=float(np.sqrt(squared_error / scatter)) if scatter > 0.0 else float("nan"),
         coverage_90=float(np.mean(covered[:, varies])) if varies.any() else float("nan"),
         rms_n=np.sqrt(np.mean(error**2, axis=0)),
         predicted_sd_n=np.sqrt(np.mean(prediction.sd() ** 2, axis=0)),

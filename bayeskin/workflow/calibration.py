@@ -1,4 +1,4 @@
-"""The posterior that a configuration asks for, and how far a predicted force is from the recorded one."""
+"""Builds the log-posterior that a configuration asks for, and compares predicted with recorded forces."""
 
 from __future__ import annotations
 
@@ -8,37 +8,39 @@ import numpy as np
 
 from bayeskin import inference, storage
 from bayeskin.config import parameter_space
+from bayeskin.forward.posterior import posterior_of
 from bayeskin.inference import LogPosterior, NoisePriors
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.surrogates import load_surrogate
 from bayeskin.types import Array, BinnedForce, PadMotion, Surrogate
 from bayeskin.workflow.engine import Run
-from bayeskin.workflow.model import model_error, model_spec
+from bayeskin.workflow.model import model_spec
 
-ARTICLE_HOLDS_S = ((18.8, 75.0), (97.8, 145.0))  # its script's; the text says 20-75 and 98-140
+ARTICLE_HOLDS_S = ((18.8, 75.0), (97.8, 145.0))  # from the article's script; its text says 20-75 and 98-140
 
 
 def log_posterior_of(run: Run, surrogate: Surrogate, binned: BinnedForce, motion: PadMotion) -> LogPosterior:
-    """Returns the posterior that the configuration asks for, of a recording's bins and protocol."""
+    """Returns the log-posterior that the configuration asks for, of a recording's bins and protocol."""
     config = run.config
     noise = {name: bounds for name, bounds in config.noise if bounds is not None}
     windows = None if config.fit.windows_s is None else tuple(config.fit.windows_s)
     space = parameter_space(config, run.config_path)
-    error = model_error(model_spec(run), motion, binned.edges_s)
-    return LogPosterior(surrogate, binned, windows, NoisePriors(**noise), space, model_error=error)
+    return posterior_of(surrogate, model_spec(run), binned, motion, NoisePriors(**noise), space, windows)
 
 
 def refined_posterior(run: Run) -> LogPosterior:
-    """The posterior with the surrogate that the check at the most probable point left."""
+    """Returns the log-posterior with the surrogate after the check at the most probable point."""
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     return log_posterior_of(run, load_surrogate(run.at("map", "surrogate.h5")), binned, motion)
 
 
 def rmse_table(log_posterior: LogPosterior, force_n: Array) -> dict[str, Any]:
-    """RMSE [N] of a predicted force (m,) on the recorded bins: all, by phase kind, fitted, not fitted.
+    """Returns the RMSE [N] of a predicted force (m,) on the recorded bins.
 
-    `article_holds_n` is over both of the article's windows; None where the recording ends before.
+    The table has the RMSE over all bins, by kind of phase, over the fitted bins, and over the bins that are
+    not fitted. `article_holds_n` is the RMSE over both windows of the article; it is None where the recording
+    ends before them.
     """
     binned = log_posterior.binned
     usable = bins_in_windows(binned, None) >= 0
@@ -47,15 +49,16 @@ def rmse_table(log_posterior: LogPosterior, force_n: Array) -> dict[str, Any]:
     holds = (bins_in_windows(binned, ARTICLE_HOLDS_S) >= 0) & covered
     square = (binned.force_n - force_n) ** 2
     return {
-        "whole_n": _root_mean(square[usable]),
+        "whole_n": _root_of_mean(square[usable]),
         "by_kind_n": dict(inference.rmse(binned, force_n).by_kind_n),
-        "fitted_n": _root_mean(square[fitted]),
-        "not_fitted_n": _root_mean(square[usable & ~fitted]),
-        "article_holds_n": _root_mean(square[holds])
+        "fitted_n": _root_of_mean(square[fitted]),
+        "not_fitted_n": _root_of_mean(square[usable & ~fitted]),
+        "article_holds_n": _root_of_mean(square[holds])
         if binned.edges_s[-1] >= ARTICLE_HOLDS_S[-1][1]
         else None,
     }
 
 
-def _root_mean(square: Array) -> float | None:
+def _root_of_mean(square: Array) -> float | None:
+    """Returns the root of the mean of squares, and None where there are none."""
     return float(np.sqrt(square.mean())) if len(square) else None

@@ -1,4 +1,4 @@
-"""The posterior checked by the full model at its own draws, and the surrogate refined there if it fails."""
+"""Checks the posterior with the full model at its own draws, and refines the surrogate if the check fails."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bayeskin.workflow.refining import Refining, full_runs, points_like
 
 @dataclass(frozen=True)
 class Checked:
-    """A posterior, what it is of, and what the full model said of it and of those before it."""
+    """A posterior with its log-posterior, and the full model's checks of it and of earlier posteriors."""
 
     log_posterior: LogPosterior
     posterior: Posterior
@@ -28,10 +28,11 @@ class Checked:
 def checked_posterior(
     run: Run, log_posterior: LogPosterior, draws_of: Callable[[LogPosterior], Posterior]
 ) -> Checked:
-    """Draws weighed by the full model; where it is elsewhere, they join the design and all is done again.
+    """Returns a posterior whose draws were weighed by the full model.
 
-    At most ``check.rounds`` times. Draws that have not converged teach nothing about where the posterior
-    is: they are weighed, and join no design.
+    Where the full model's posterior is elsewhere, the draws join the design, the surrogate is trained again
+    and sampled again, at most ``check.rounds`` times. Draws of chains that have not converged do not show
+    where the posterior is. They are weighed, but do not join the design.
     """
     config, rounds = run.config.check, list[Weighed]()
     refining = Refining(run, log_posterior.binned, "map", "map")
@@ -39,11 +40,11 @@ def checked_posterior(
         posterior = draws_of(log_posterior)
         if config.draws == 0:
             return Checked(log_posterior, posterior, ())
-        weighed, runs = _weighed(run, log_posterior, posterior, refining.design, len(rounds))
+        weighed, runs = _weighed_draws(run, log_posterior, posterior, refining.design, len(rounds))
         rounds.append(weighed)
         run.reporter.log(f"sample: {weighed.verdict.reasons[0]}")
-        done = weighed.verdict.trusted or len(rounds) > config.rounds or not runs.ok.any()
-        if done or not posterior.convergence.verdict.trusted:
+        finished = weighed.verdict.trusted or len(rounds) > config.rounds or not runs.ok.any()
+        if finished or not posterior.convergence.verdict.trusted:
             if len(rounds) > 1:
                 refining.save("sample")
             return Checked(log_posterior, posterior, tuple(rounds))
@@ -51,33 +52,37 @@ def checked_posterior(
         log_posterior = dataclasses.replace(log_posterior, surrogate=refining.learn(runs))
 
 
-def _weighed(
+def _weighed_draws(
     run: Run, log_posterior: LogPosterior, posterior: Posterior, like: Design, turn: int
 ) -> tuple[Weighed, Design]:
-    few = inference.evenly(posterior.flat, run.config.check.draws)
-    points = points_like(like, log_posterior.split(few)[0])
+    """Returns the weights of some posterior draws, and the full model's runs at them."""
+    draws = inference.evenly(posterior.flat, run.config.check.draws)
+    points = points_like(like, log_posterior.split(draws)[0])
     runs = full_runs(run, f"check {turn + 1} of the posterior", points)
     force_n = np.where(runs.ok[:, None], runs.force_n, np.nan)
-    return inference.weigh(log_posterior, few, force_n), runs
+    return inference.weigh(log_posterior, draws, force_n), runs
 
 
 def with_full_model(verdict: Verdict, checked: Checked) -> Verdict:
-    """The verdict with one more criterion: that the full model's posterior is the surrogate's."""
+    """Returns the verdict with one more criterion: the full model's posterior equals the surrogate's."""
     if not checked.rounds:
         return verdict
-    found = checked.rounds[-1].verdict
-    if found.trusted:
-        return Verdict(verdict.trusted, (*verdict.reasons, *found.reasons))
-    return Verdict(False, (*found.reasons, *verdict.reasons))
+    check = checked.rounds[-1].verdict
+    if check.trusted:
+        return Verdict(verdict.trusted, (*verdict.reasons, *check.reasons))
+    return Verdict(False, (*check.reasons, *verdict.reasons))
 
 
 def says_something(weighed: Weighed) -> bool:
-    """Whether the weights of a round describe a posterior: not where one draw, or none, has them all."""
+    """Returns whether the weights of a round describe a posterior.
+
+    They do not where one draw has all the weight, or where no draw has any.
+    """
     return weighed.effective > 1.0
 
 
 def said_of(weighed: Weighed) -> dict[str, Any]:
-    """One round for summary and report."""
+    """Returns one round as plain values, for the summary and the report."""
     finite: Array = weighed.log_ratio[np.isfinite(weighed.log_ratio)]
     return {
         "draws": len(weighed.theta),
@@ -92,15 +97,18 @@ def said_of(weighed: Weighed) -> dict[str, Any]:
 
 
 def corrected_table(checked: Checked) -> dict[str, dict[str, Any]] | None:
-    """By parameter the full model's quantiles by the last weights, and how far the mean moved."""
+    """Returns for each parameter the full model's quantiles and the shift of the mean, by the last weights.
+
+    Returns None where no round has weights that describe a posterior.
+    """
     if not checked.rounds or not says_something(checked.rounds[-1]):
         return None
-    found = inference.corrected(checked.rounds[-1], checked.posterior.flat)
+    corrections = inference.corrected(checked.rounds[-1], checked.posterior.flat)
     table = {}
-    for one in found:
-        low, median, high = one.quantiles
-        table[one.name] = {
+    for parameter in corrections:
+        low, median, high = parameter.quantiles
+        table[parameter.name] = {
             "median": median, "low_90": low, "high_90": high,
-            "shift_sd": one.shift_sd, "shift_error_sd": one.shift_error_sd,
+            "shift_sd": parameter.shift_sd, "shift_error_sd": parameter.shift_error_sd,
         }  # fmt: skip
     return table

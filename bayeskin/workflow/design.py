@@ -1,6 +1,7 @@
-"""Second stage: full runs in waves, each drawn where the last surrogate cannot rule the force out.
+"""The second stage: runs the model at the design's points, in waves.
 
-With `design.coarse` the waves run a quicker model, and then some of their points the model itself.
+Each wave is drawn where the surrogate of the earlier waves cannot rule out the recorded force. With
+`design.coarse`, the waves run a quicker model, and the model itself then runs at some of their points.
 """
 
 from __future__ import annotations
@@ -36,27 +37,29 @@ from bayeskin.workflow.model import check_protocol, full_model, own_files, reduc
 from bayeskin.workflow.provenance import caption
 from bayeskin.workflow.shipping import check_fits, shipped_files
 
-FEWEST_PER_INPUT = 4  # training runs below which no surrogate is worth its name
-FIRST_OF_POSTERIOR = 2  # wave of a quick model that is drawn from the posterior by the surrogate before it
-SHORT_RUN, WALKERS_A_PARAMETER = 500, 4  # steps and size of the ensembles that say where that is
-FEWEST_COUNTING = 5  # training runs an input, weighted, below which components and errors are anecdotes
+FEWEST_PER_INPUT = 4  # fewest training runs per input with which a surrogate can be trained
+# From this wave on, the reduced model's waves are drawn from the posterior of the surrogate before them.
+FIRST_OF_POSTERIOR = 2
+SHORT_RUN, WALKERS_A_PARAMETER = 500, 4  # steps and walkers of the short sampling for these draws
+# With a smaller weighted number of training runs per input, components and error estimates are unreliable.
+FEWEST_COUNTING = 5
 
 
 def fitted_bins(run: Run, binned: BinnedForce) -> NDArray[np.bool_]:
-    """Which bins enter the fit, (m,) bool."""
+    """Returns which bins enter the fit, (m,) bool."""
     return bins_in_windows(binned, run.config.fit.windows_s) >= 0
 
 
 def noise_floor_n(binned: BinnedForce, fitted: NDArray[np.bool_]) -> float:
-    """RMS [N] of what noise leaves in the fitted bins' means."""
+    """Returns the RMS [N] of the noise in the means of the fitted bins."""
     return float(np.sqrt(np.mean(binned.variance_n2[fitted])))
 
 
 def focus(design: Design, binned: BinnedForce, fitted: NDArray[np.bool_]) -> Array:
-    """Weights (n,) by which a surrogate is made best where the posterior can be.
+    """Returns weights (n,) with which a surrogate becomes most accurate where the posterior can be.
 
-    The inverse of a run's mean square distance to the recording, which noise keeps from zero; evened out
-    where too few runs would count.
+    The weight of a run is the inverse of its mean square distance to the recording; the noise keeps this
+    distance above zero. Where too few runs would carry the weight, the weights are made more even.
     """
     square = np.mean((design.force_n[:, fitted] - binned.force_n[fitted]) ** 2, axis=1)
     inverse = 1.0 / (noise_floor_n(binned, fitted) ** 2 + square)
@@ -69,7 +72,8 @@ def focus(design: Design, binned: BinnedForce, fitted: NDArray[np.bool_]) -> Arr
     return design.ok.astype(float)
 
 
-def _work(run: Run) -> Mapping[str, Any]:
+def _make_design(run: Run) -> Mapping[str, Any]:
+    """Makes the design, or takes the design of a shipped surrogate, and returns the stage's summary."""
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     if run.config.surrogate.file is not None:
@@ -85,66 +89,75 @@ def _work(run: Run) -> Mapping[str, Any]:
     if fine is not None:
         storage.save(run.at("design", "fine.h5"), fine)
     write_json(run.at("design", "waves.json"), records)
-    _draw(run, design, records)
+    _draw_figure(run, design, records)
     return {**_summary(design, records), **({} if fine is None else {"fine": _counts(fine)})}
 
 
 def _run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design, list[Mapping[str, Any]]]:
-    """All waves of the configuration. Runs are kept by what they depend on, so none is made twice."""
+    """Runs all waves of the configuration, and returns the design and the records of the waves.
+
+    Runs are stored by what they depend on, so no run is made twice.
+    """
     check_protocol(run, motion)
     model, config = waves_model(run), run.config.design
-    space = parameter_space(run.config, run.config_path).box  # a surrogate learns all of it alike
+    space = parameter_space(run.config, run.config_path).box  # training covers the box evenly
     file = runs_file(run, model, motion, binned.edges_s, space)
     waves: list[Wave] = []
     if run.config.model.forward is not None and not file.is_file():
-        _try_once(run, model, motion, space)
+        _try_forward_model(run, model, motion, space)
     for number, count in enumerate(config.points):
         drawn = run.at("design", f"wave-{number}.json")
         if not drawn.is_file():
-            wave = _draw_wave(run, number, count, space, (binned, motion), waves, file)
+            wave = _choose_wave(run, number, count, space, (binned, motion), waves, file)
             write_json(drawn, {"theta": wave.theta, "held_out": wave.held_out, "record": wave.record})
         waves.append(_load_wave(drawn, space, number, run.config.seed))
         label = f"wave {number + 1} of {len(config.points)}"
-        run_wave(run, label, file, waves[-1], binned.edges_s, _of_wave(model, number), motion)
+        run_wave(run, label, file, waves[-1], binned.edges_s, _model_of_wave(model, number), motion)
     return rows_of(load_design(file), waves), [wave.record for wave in waves]
 
 
-def _of_wave(model: ForceModel, number: int) -> ForceModel:
-    """The model of a wave: skins all over the prior that a reduced model cannot run, as those that fold, are
-    left out, since a full run of each takes minutes and few of them can be the recording's."""
+def _model_of_wave(model: ForceModel, number: int) -> ForceModel:
+    """Returns the model that runs a wave.
+
+    In the waves over the whole prior, points that the reduced model cannot run are left out, such as skins
+    that fold. A full run of each would take minutes, and few of them can be near the recording's posterior.
+    """
     if isinstance(model, ReducedOrFull) and number < FIRST_OF_POSTERIOR:
         return replace(model, replaces=False)
     return model
 
 
-def _try_once(run: Run, model: ForceModel, motion: PadMotion, space: ParameterSpace) -> None:
-    """A model of one's own in the middle of the box. Raises InputError where it cannot be used at all."""
+def _try_forward_model(run: Run, model: ForceModel, motion: PadMotion, space: ParameterSpace) -> None:
+    """Runs a forward model of the user's own once, in the middle of the box.
+
+    Raises InputError where the model cannot be used at all.
+    """
     forward = run.config.model.forward
     run.reporter.log(f"one run of {forward}")
     middle = dict(zip(space.names, space.from_unit([0.5] * space.dim).tolist(), strict=True))
-    found = model(motion, middle)
-    if found.status != "ok":
-        raise InputError(forward, found.message, f"a force at {middle}")
+    simulation = model(motion, middle)
+    if simulation.status != "ok":
+        raise InputError(forward, simulation.message, f"a force at {middle}")
 
 
 def _run_fine(run: Run, design: Design, motion: PadMotion) -> Design:
-    """The configuration's model at some points of the coarser one's design.
+    """Returns the runs of the configuration's model at some points of the coarser model's design.
 
-    Where the last wave is drawn from the posterior, the points that correct lie in it.
+    Where the last wave is drawn from the posterior, these points lie in the posterior too.
     """
     model, config = full_model(run), run.config.design
-    inputs, among = Similarity(design.space).inputs(design.theta), design
+    inputs, candidates = Similarity(design.space).inputs(design.theta), design
     if config.coarse == "reduced" and len(config.points) > FIRST_OF_POSTERIOR:
         near = design.held_out | (design.wave == design.wave.max())
-        among = replace(design, ok=design.ok & near)
-    wave = fine_wave(among, inputs, config.fine_points, config.fine_held_out, run.config.seed)
+        candidates = replace(design, ok=design.ok & near)
+    wave = fine_wave(candidates, inputs, config.fine_points, config.fine_held_out, run.config.seed)
     file = runs_file(run, model, motion, design.edges_s, design.space)
     run_wave(run, "fine model", file, wave, design.edges_s, model, motion)
     return rows_of(load_design(file), [wave])
 
 
 def runs_file(run: Run, model: ForceModel, motion: PadMotion, edges_s: Array, space: ParameterSpace) -> Path:
-    """Returns the path where all runs of one model on one protocol are kept."""
+    """Returns the path of the file with all runs of one model on one protocol."""
     identity = sha256_of([model.hash, vars(motion), edges_s, [vars(p) for p in space.parameters]])
     return run.folder / "runs" / f"{identity[:16]}.h5"
 
@@ -152,7 +165,7 @@ def runs_file(run: Run, model: ForceModel, motion: PadMotion, edges_s: Array, sp
 def run_wave(
     run: Run, label: str, runs_file: Path, wave: Wave, edges_s: Array, model: ForceModel, motion: PadMotion
 ) -> None:
-    """Runs the points of a wave that are not in the file yet, and keeps them there."""
+    """Runs the points of a wave that are not in the file yet, and stores them there."""
     run.reporter.log(f"{label}: {len(wave.theta)} runs")
     with crew(run) as run_all:
         run_design(
@@ -161,11 +174,11 @@ def run_wave(
 
 
 def tell(run: Run, label: str, done: int, total: int, failed: int) -> None:
-    """Tells the progress of a design in words."""
+    """Reports the progress of a design in words."""
     run.reporter.progress(label, done / max(total, 1), f"{done} of {total} runs, {failed} failed")
 
 
-def _draw_wave(
+def _choose_wave(
     run: Run,
     number: int,
     count: int,
@@ -174,6 +187,12 @@ def _draw_wave(
     before: Sequence[Wave],
     runs_file: Path,
 ) -> Wave:
+    """Returns the points of the next wave.
+
+    The first wave covers the whole box. A later wave lies in the plausible part that the surrogate of the
+    earlier waves leaves. With the reduced model, waves from `FIRST_OF_POSTERIOR` on are draws of the
+    posterior.
+    """
     config, (binned, motion) = run.config, recorded
     if not before:
         return first_wave(space, count, config.design.held_out, config.seed)
@@ -191,13 +210,16 @@ def _draw_wave(
         space, surrogate.predict, binned.force_n, fitted, floor_n, count, config.design.held_out,
         number, config.seed,
     )  # fmt: skip
-    kept = wave.record["kept_fraction"]
-    run.reporter.log(f"wave {number + 1}: drawn in {kept:.2g} of the prior's volume")
+    fraction = wave.record["kept_fraction"]
+    run.reporter.log(f"wave {number + 1}: drawn in {fraction:.2g} of the prior's volume")
     return wave
 
 
 def _posterior_draws(run: Run, log_posterior: LogPosterior, theta: Array) -> Array:
-    """Draws (n, d) of the model's parameters by a short run that sets out from about theta (d,)."""
+    """Returns draws (n, d) of the model's parameters from a short run of the sampler.
+
+    The sampler starts near theta (d,).
+    """
     middle = 0.5 * np.sum(log_posterior.bounds, axis=0)
     start = log_posterior.named(np.append(theta, log_posterior.from_sampling(middle)[len(theta) :]))
     settings = SampleSettings(2, WALKERS_A_PARAMETER * log_posterior.dim, SHORT_RUN)
@@ -208,13 +230,14 @@ def _posterior_draws(run: Run, log_posterior: LogPosterior, theta: Array) -> Arr
 
 
 def _load_wave(path: Path, space: ParameterSpace, number: int, seed: int) -> Wave:
+    """Returns a wave from its file."""
     stored = json.loads(path.read_text())
     held_out = np.array(stored["held_out"], dtype=bool)
     return Wave(space, np.array(stored["theta"], dtype=float), held_out, number, seed, stored["record"])
 
 
 def rows_of(runs: Design, waves: Sequence[Wave]) -> Design:
-    """The rows of `runs` at the waves' points, in the waves' order and with the waves' labels."""
+    """Returns the rows of `runs` at the waves' points, in the order of the waves and with their labels."""
     row_of = {theta.tobytes(): row for row, theta in enumerate(runs.theta)}
     points = np.concatenate([wave.theta for wave in waves])
     rows = np.array([row_of[theta.tobytes()] for theta in points])
@@ -229,21 +252,26 @@ def rows_of(runs: Design, waves: Sequence[Wave]) -> Design:
 
 
 def enough(design: Design) -> Design:
-    """The design, if a surrogate can be made of it; raises CannotGoOn that names the commonest failure."""
+    """Returns the design if it is large enough to train a surrogate.
+
+    Raises CannotGoOn, which names the most frequent failure, if it is not.
+    """
     needed = FEWEST_PER_INPUT * Similarity(design.space).dim
-    found = int(design.training.sum())
-    if found >= needed and design.testing.any():
+    succeeded = int(design.training.sum())
+    if succeeded >= needed and design.testing.any():
         return design
     failures = Counter(text for text, ok in zip(design.messages, design.ok, strict=True) if not ok)
     why = f"; most often: {failures.most_common(1)[0][0]}" if failures else ""
-    raise CannotGoOn(f"{found} training runs succeeded of at least {needed}{why}; narrow the prior box")
+    raise CannotGoOn(f"{succeeded} training runs succeeded of at least {needed}{why}; narrow the prior box")
 
 
 def _summary(design: Design, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Returns the stage's summary: counts of the runs, and the records of the waves."""
     return {**_counts(design), "waves": list(records)}
 
 
 def _counts(design: Design) -> dict[str, Any]:
+    """Returns counts, failures and durations of a design's runs."""
     failures = Counter(text for text, ok in zip(design.messages, design.ok, strict=True) if not ok)
     return {
         "runs": len(design.theta),
@@ -257,12 +285,14 @@ def _counts(design: Design) -> dict[str, Any]:
     }
 
 
-def _draw(run: Run, design: Design, records: Sequence[Mapping[str, Any]]) -> None:
-    kept = [record["kept_fraction"] for record in records]
-    report.save_figure(report.figure_waves(design, kept), run.at("design", "waves"), caption(run))
+def _draw_figure(run: Run, design: Design, records: Sequence[Mapping[str, Any]]) -> None:
+    """Draws the figure of the waves."""
+    fractions = [record["kept_fraction"] for record in records]
+    report.save_figure(report.figure_waves(design, fractions), run.at("design", "waves"), caption(run))
 
 
 def _files(run: Run) -> Iterable[Path]:
+    """Returns the files besides the recording that the stage reads."""
     files = [run.beside(run.config.model.mesh)] if run.config.model.mesh != "bricks" else []
     ready = shipped_files(run).present if run.config.surrogate.file is not None else ()
     return [*files, *own_files(run), *reduced_files(run), *ready]
@@ -273,6 +303,6 @@ STAGE = Stage(
     "runs the model at the design's points",
     ("recording",),
     ("seed", "model", "parameters", "design", "surrogate", "fit", "noise"),
-    _work,
+    _make_design,
     _files,
 )

@@ -1,4 +1,5 @@
-"""A hash of all that the verdict of a diagnosis depends on, by which a stored one is known to still hold."""
+"""Computes a hash of all that the verdict of a diagnosis depends on, which shows if a stored verdict is
+valid."""
 
 from __future__ import annotations
 
@@ -12,15 +13,15 @@ from bayeskin.hashing import sha256_of, sha256_of_input
 from bayeskin.shipped import shipped
 from bayeskin.workflow import diagnosis
 
-WITHOUT_EFFECT = ("report", "scripting")  # figures; what the package offers to scripts that ask for it
+WITHOUT_EFFECT = ("report", "scripting")  # figures, and functions that only scripts import
 PACKAGE = Path(bayeskin.__file__).parent
 
 
 def diagnosing_sources() -> str:
-    """Returns the sha256 of what a diagnosis is made by: its sources' behaviour, and the bytes of data.
+    """Returns the sha256 of the behaviour of a diagnosis's sources, and of the bytes of its data.
 
-    The sources are the modules that a diagnosis imports and all mechanisms; the data are the model's tables
-    and the manifest of the shipped reduced model. A corrected comment or docstring changes nothing.
+    The sources are the modules that a diagnosis imports, and all mechanisms. The data are the model's tables
+    and the manifest of the shipped reduced model. A corrected comment or docstring does not change the hash.
     """
     files = sorted({*imported(Path(diagnosis.__file__)), *Path(mechanisms.__file__).parent.glob("*.py")})
     files += sorted(PACKAGE.glob("finite_element/*.json"))
@@ -29,18 +30,18 @@ def diagnosing_sources() -> str:
 
 
 def imported(module: Path) -> set[Path]:
-    """Returns the files of the package that `module` imports, itself among them, also by way of others."""
-    found: set[Path] = set()
+    """Returns the package's files that `module` imports, directly or through others, and its own file."""
+    reached: set[Path] = set()
     waiting = {module}
     while waiting:
         file = waiting.pop()
-        found.add(file)
-        waiting |= set(_imports(file)) - found
-    return found
+        reached.add(file)
+        waiting |= set(_imports(file)) - reached
+    return reached
 
 
 def _imports(file: Path) -> Iterator[Path]:
-    """Yields what one file imports of the package, with the packages that these modules lie in."""
+    """Yields the files of the package that one file imports, with the packages that contain them."""
     for node in ast.walk(ast.parse(file.read_bytes())):
         names: list[str] = []
         if isinstance(node, ast.Import):

@@ -20,6 +20,7 @@ from bayeskin.forward.reduced import ReducedForward, stands_for
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.json_files import plain, write_json
 from bayeskin.mechanisms import Mechanism
+from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.contributions import Contribution, contributions
 from bayeskin.mismatch.discrepancy import discrepancy
 from bayeskin.mismatch.emulate import Emulated, emulate
@@ -40,11 +41,11 @@ from bayeskin.surrogates import train
 from bayeskin.types import Array, BinnedForce, Design, Surrogate
 from bayeskin.workflow import design, recording, training
 from bayeskin.workflow.diagnosis_outputs import Found, Remainder, Shown, candidates, draw, unexplained, window
+from bayeskin.workflow.diagnosis_tasks import ContextSource, asked, open_context, searches_file
 from bayeskin.workflow.engine import CannotGoOn, Reporter, Run, Stage, open_run, run_stages
 from bayeskin.workflow.model import model_spec
 from bayeskin.workflow.provenance import caption
 from bayeskin.workflow.reducing import reduced_file
-from bayeskin.workflow.workbench import Source, Workbench, asked, searches_file
 
 POSSIBLE = 1e-6  # probability of a set, below which it is not fitted to the beginning
 PREDICTIVE_DRAWS = 300
@@ -94,48 +95,55 @@ def stages_of(config: Config) -> dict[str, Stage]:
     return {name: before[name] for name in own.needs} | {NAME: own}
 
 
-def bench_of(run: Run) -> Workbench:
-    """Returns the bench of a run whose stages before are done.
+def source_of(run: Run) -> ContextSource:
+    """Returns what the context of a run's diagnosis is opened from, once the stages before are done.
 
-    Raises InputError for a device without a reduced model, and for a protocol that this does not know.
+    Raises InputError for a device without a reduced model.
     """
     spec, reduced = model_spec(run), _files(run)
     model = reduced[0] if reduced else run.at("train", "surrogate.h5")
     stated = tuple((name, bounds) for name, bounds in run.config.noise if bounds is not None)
     base = parameter_space(run.config, run.config_path)
-    bench = Workbench(Source(run.folder / "recording", model, spec, run.config.seed, base, stated))
-    if isinstance(bench.forward, ReducedForward):
-        beyond = protocol_outside(bench.forward.model.trained.protocols, bench.motion)
+    return ContextSource(run.folder / "recording", model, spec, run.config.seed, base, stated)
+
+
+def context_of(run: Run, source: ContextSource) -> DiagnosisContext:
+    """Returns the context of a run's diagnosis. Raises InputError for a protocol outside of the training."""
+    context = open_context(source)
+    if isinstance(context.forward, ReducedForward):
+        beyond = protocol_outside(context.forward.model.trained.protocols, context.motion)
         if beyond:
-            found = f"a protocol that {model.name} does not know: {beyond[0]}"
+            found = f"a protocol that {source.model.name} does not know: {beyond[0]}"
             raise InputError(run.config_path, found, KNOWN)
-    return bench
+    return context
 
 
-def searched(run: Run, bench: Workbench, ask: Ask) -> SearchResult:
+def searched(run: Run, context: DiagnosisContext, ask: Ask) -> SearchResult:
     """Returns the search of a run; after a diagnosis all its answers are kept."""
     tell = partial(_tell, run)
-    known, solves = bench.known, bench.forward.solves
-    return search(ask, bench.binned, bench.base, known, solves, bench.noise, run.config.seed, tell)
+    known, solves = context.known, context.forward.solves
+    return search(ask, context.binned, context.base, known, solves, context.noise, run.config.seed, tell)
 
 
 def _work(run: Run) -> Mapping[str, Any]:
     started, seed = time.monotonic(), run.config.seed
-    bench = bench_of(run)
-    with asked(bench, searches_file(run.folder, bench), run.config.design.workers) as ask:
-        found = searched(run, bench, ask)
+    source = source_of(run)
+    context = context_of(run, source)
+    kept = searches_file(run.folder, context)
+    with asked(source, context, kept, run.config.design.workers) as ask:
+        found = searched(run, context, ask)
         if not found.evidences:
             raise CannotGoOn("no set of mechanisms could be weighed")
         evidences, family, best = found.evidences, found.family, found.chosen
-        explained = _explained(bench.binned, found.fits[()].fit, found.fits[best].fit)
-        judged = judge_family(family, bench.known, explained)
-        split_s = end_of_second_hold(bench.binned)
+        explained = _explained(context.binned, found.fits[()].fit, found.fits[best].fit)
+        judged = judge_family(family, context.known, explained)
+        split_s = end_of_second_hold(context.binned)
         possible = [names for names in evidences
                     if not names or family.probability_of_set(names) > POSSIBLE]  # fmt: skip
         begun = fit_beginning(ask, [found.fits[names] for names in possible], split_s)
         run.reporter.log("runs where the posterior is, and draws of it")
         maxima = [found.fits[best], *found.others_of(best)]
-        emulated = _emulated(bench, ask, maxima, seed)
+        emulated = _emulated(context, ask, maxima, seed)
     base, chosen = found.fits[()].fit, emulated.fit
     before, after = (
         locate(fit, {**fit.theta, **_noise_of(fit, chosen.theta)}, seed) for fit in (base, chosen)
@@ -150,11 +158,11 @@ def _work(run: Run) -> Mapping[str, Any]:
             (best, chosen, after, None if begun is None else begun.best),
         )
     }  # fmt: skip
-    parts = contributions(best, chosen.theta, bench.reported, bench.known)
+    parts = contributions(best, chosen.theta, context.reported, context.known)
     remainder = None
     if judged.verdict == "unknown" or (judged.named and after.windows):
-        left = discrepancy(found.fits[best].fit, bench.motion)
-        remainder = Remainder(left, propose_form(chosen, bench.motion, seed))
+        left = discrepancy(found.fits[best].fit, context.motion)
+        remainder = Remainder(left, propose_form(chosen, context.motion, seed))
     answer: dict[str, Any] = {
         "verdict": judged.verdict,
         "nothing_probability": judged.nothing_probability,
@@ -162,14 +170,14 @@ def _work(run: Run) -> Mapping[str, Any]:
         "explained": explained,
         "located": [window(one) for one in before.windows],
         "remaining": [window(one) for one in after.windows],
-        "mechanisms": _mechanisms(judged, chosen, drawn[best].summary, bench.known, parts),
+        "mechanisms": _mechanisms(judged, chosen, drawn[best].summary, context.known, parts),
         "unexplained": None if remainder is None else unexplained(remainder),
-        "candidates": candidates({names: one.fit for names, one in found.fits.items()}, bench.known),
+        "candidates": candidates({names: one.fit for names, one in found.fits.items()}, context.known),
         "sets": [_set(names, found, said, family) for names, said in evidences.items()],
         "fit": {
-            "before": _fit(bench.binned, base, drawn[()], pictured[()], split_s),
+            "before": _fit(context.binned, base, drawn[()], pictured[()], split_s),
             "after": {
-                **_fit(bench.binned, chosen, drawn[best], pictured[best], split_s),
+                **_fit(context.binned, chosen, drawn[best], pictured[best], split_s),
                 "emulator": {
                     "runs": emulated.runs, "off_by": emulated.error_n, "settled": emulated.settled,
                 },
@@ -177,14 +185,14 @@ def _work(run: Run) -> Mapping[str, Any]:
         },
         "best_set": list(best),
         "held_out_set": None if begun is None else list(begun.best.names),
-        "full_model": _checked(bench, found, best),
+        "full_model": _checked(context, found, best),
         "seconds": time.monotonic() - started,
     }  # fmt: skip
     write_json(run.at(NAME, "diagnosis.json"), answer)
     figures = draw(
-        run.folder / NAME, caption(run), bench.binned, bench.motion,
+        run.folder / NAME, caption(run), context.binned, context.motion,
         Found(
-            pictured[()], pictured[best], None if begun is None else split_s, bench.base.parameters, parts,
+            pictured[()], pictured[best], None if begun is None else split_s, context.base.parameters, parts,
             remainder,
         ),
         answer["candidates"],
@@ -216,10 +224,10 @@ def _drawn(fit: Fit, seed: int) -> Resampled:
     return resample(replace(fit, log_posterior=near), seed)
 
 
-def _emulated(bench: Workbench, ask: Ask, maxima: Sequence[JointFit], seed: int) -> Emulated:
+def _emulated(context: DiagnosisContext, ask: Ask, maxima: Sequence[JointFit], seed: int) -> Emulated:
     """A set's posterior from reduced runs where it is; about the fit's run where none of them finishes."""
     found = maxima[0]
-    names, space = found.fit.names, bench.space(found.fit.names)
+    names, space = found.fit.names, context.space(found.fit.names)
 
     def forces(points: Array, count: int) -> tuple[list[Any], list[Any]]:
         values = [dict(zip(space.names, map(float, row), strict=True)) for row in points]
@@ -228,7 +236,7 @@ def _emulated(bench: Workbench, ask: Ask, maxima: Sequence[JointFit], seed: int)
         return answers[count:], answers[:count]
 
     learn = partial(_learnt, seed=seed)
-    emulated = emulate(maxima, forces, learn, noise_of(bench.binned), seed)
+    emulated = emulate(maxima, forces, learn, noise_of(context.binned), seed)
     if isinstance(emulated, str):
         return Emulated(found.fit, _drawn(found.fit, seed), 0, None, False)
     return emulated
@@ -291,14 +299,14 @@ def _shown(fit: Fit, located: Located, drawn: Resampled, begun: Fit | None) -> S
     return Shown(fit.force_n, band_n, None if begun is None else begun.force_n, located, drawn.summary)
 
 
-def _checked(bench: Workbench, found: SearchResult, names: tuple[str, ...]) -> dict[str, Any]:
+def _checked(context: DiagnosisContext, found: SearchResult, names: tuple[str, ...]) -> dict[str, Any]:
     """Returns how far the reduced model and the recording are from a full run at a set's fit."""
     check, fit = found.checks.get(names), found.fits[names].fit
     if check is None or isinstance(check.full_n, str):
         return {"message": "no run was made" if check is None else check.full_n}
-    full_n = bench.reported_of(names, fit.theta, check.full_n)
-    usable = bins_in_windows(bench.binned, None) >= 0
-    return {"fit_off_by": check.off, "rmse": _rms((bench.binned.force_n - full_n)[usable])}
+    full_n = context.reported_of(names, fit.theta, check.full_n)
+    usable = bins_in_windows(context.binned, None) >= 0
+    return {"fit_off_by": check.off, "rmse": _rms((context.binned.force_n - full_n)[usable])}
 
 
 def _rms(values: Array) -> float:

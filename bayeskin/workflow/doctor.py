@@ -1,7 +1,7 @@
-"""Whether an installation works: what is installed, what solves, a folder to write in, a test of both models.
+"""Checks an installation: packages, linear solver, working folder, full model and surrogate.
 
-Nothing of the models is imported before it is tested, so that one broken part is a finding and no crash; the
-command line itself needs click and rich.
+The parts of bayeskin that run models are imported only in their own test. A broken part is thus reported as a
+finding, and does not end the program. The command line itself needs click and rich.
 """
 
 from __future__ import annotations
@@ -24,18 +24,19 @@ from typing import Any
 import bayeskin
 
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
-LEAST_FREE_BYTES = 500_000_000  # a run's folder, chains and all, takes a tenth of it
+LEAST_FREE_BYTES = 500_000_000  # a run's folder with its chains takes a tenth of this
 _REQUIREMENT = re.compile(r"^([A-Za-z0-9_.-]+)\s*(?:\[[^]]*\])?\s*([^;]*?)\s*(?:;\s*(.*))?$")
 
-# The full model pulled 2 mm in 2 s, on the default bricks, and the demo's surrogate, both at THETA.
+# The stored forces are those of the full model on the default bricks, pulled 2 mm in 2 s, and of the demo's
+# surrogate. Both are at THETA.
 THETA = {"E_c": 60e3, "E_s": 15e3, "k_c": 2e-14, "k_s": 8e-13, "p_init": 0.0}
-FULL_MODEL_N, FULL_MODEL_TOLERANCE = 0.089143, 1e-3  # solvers differ by what Newton leaves
-SURROGATE_N, SURROGATE_TOLERANCE = 0.378489, 1e-5  # its largest mean force
+FULL_MODEL_N, FULL_MODEL_TOLERANCE = 0.089143, 1e-3  # solvers differ by Newton's residual
+SURROGATE_N, SURROGATE_TOLERANCE = 0.378489, 1e-5  # the largest mean force of its prediction
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at: whether it is as it should be, what was found, and what would mend it."""
+    """The result of one check: whether the part works, what was found, and what would correct it."""
 
     name: str
     ok: bool
@@ -44,24 +45,24 @@ class Finding:
 
 
 def examine(folder: Path) -> dict[str, Any]:
-    """The answer of `bayeskin doctor` for a folder to work in; ``ok`` is False when something is broken."""
+    """Returns the answer of `bayeskin doctor` for a folder; ``ok`` is False if something is broken."""
     packages = list(_packages())
     findings = [
         Finding("bayeskin", True, bayeskin.__version__),
         Finding("python", sys.version_info >= (3, 11), platform.python_version(), "Python 3.11 or newer"),
         *packages,
-        _tested("linear solver", _solver),
+        _finding_of("linear solver", _solver),
         _threads(),
-        _tested("disk space", partial(_room, folder)),
-        _access(folder),
-        _tested("full model", _full_model),
-        _tested("surrogate", _surrogate),
+        _finding_of("disk space", partial(_disk_space, folder)),
+        _write_access(folder),
+        _finding_of("full model", _full_model),
+        _finding_of("surrogate", _surrogate),
     ]
     ok = all(finding.ok for finding in findings)
     lines = [
-        f"{'ok    ' if one.ok else 'BROKEN'}  {one.name}: {one.found}"
-        + ("" if one.ok else f"; expected {one.advice}")
-        for one in findings
+        f"{'ok    ' if finding.ok else 'BROKEN'}  {finding.name}: {finding.found}"
+        + ("" if finding.ok else f"; expected {finding.advice}")
+        for finding in findings
     ]
     text = "\n".join([*lines, "all is well" if ok else "something is broken"])
     return {
@@ -73,13 +74,16 @@ def examine(folder: Path) -> dict[str, Any]:
 
 
 def _packages() -> Iterator[Finding]:
-    """Each package that this one asks for, with its version; those of extras only where they are there."""
+    """Yields a finding for each package that bayeskin requires, with its version.
+
+    Packages of extras are reported only where they are installed.
+    """
     try:
-        asked = metadata.requires("bayeskin") or []
+        requirements = metadata.requires("bayeskin") or []
     except metadata.PackageNotFoundError:
         yield Finding("packages", False, "bayeskin is not installed", "pip install bayeskin")
         return
-    for line in asked:
+    for line in requirements:
         matched = _REQUIREMENT.match(line)
         if matched is None:
             continue
@@ -94,6 +98,7 @@ def _packages() -> Iterator[Finding]:
 
 
 def _version(name: str) -> str | None:
+    """Returns the version of an installed package, and None where it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -101,30 +106,31 @@ def _version(name: str) -> str | None:
 
 
 def within(version: str, limits: str) -> bool:
-    """Whether a version lies within limits such as ``>=0.20,<1``; limits of other kinds hold."""
-    own = _numbers(version)
+    """Returns whether a version lies within limits such as ``>=0.20,<1``; other limits are ignored."""
+    numbers = _numbers(version)
     lows = [_numbers(limit) for limit in re.findall(r">=\s*([\d.]+)", limits)]
     highs = [_numbers(limit) for limit in re.findall(r"<(?!=)\s*([\d.]+)", limits)]
-    return all(own >= low for low in lows) and all(own < high for high in highs)
+    return all(numbers >= low for low in lows) and all(numbers < high for high in highs)
 
 
 def _numbers(version: str) -> list[int]:
-    """Of a version, such that 1 and 1.0 are the same."""
-    found = [int(part) for part in re.findall(r"\d+", version.split("+")[0])]
-    while found and found[-1] == 0:
-        found.pop()
-    return found
+    """Returns the numbers of a version without trailing zeros, so that 1 and 1.0 are the same."""
+    numbers = [int(part) for part in re.findall(r"\d+", version.split("+")[0])]
+    while numbers and numbers[-1] == 0:
+        numbers.pop()
+    return numbers
 
 
-def _tested(name: str, test: Callable[[], Finding]) -> Finding:
-    """What a test finds; that it could not be made is a finding too, whatever the reason."""
+def _finding_of(name: str, test: Callable[[], Finding]) -> Finding:
+    """Returns the finding of a test; a test that raises any error is a finding too."""
     try:
         return test()
-    except Exception as error:  # a broken installation fails in any way it likes
+    except Exception as error:  # a broken installation can raise any error
         return Finding(name, False, f"{type(error).__name__}: {error}", "a reinstalled package")
 
 
 def _solver() -> Finding:
+    """Returns which linear solver is used."""
     from bayeskin.finite_element import SOLVER_NAME
 
     slower = "" if SOLVER_NAME == "MKL PARDISO" else " (pypardiso would be faster)"
@@ -132,18 +138,21 @@ def _solver() -> Finding:
 
 
 def _threads() -> Finding:
+    """Returns the number of cores and the settings of threads."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     settings = ", ".join(f"{name}={os.environ.get(name, 'unset')}" for name in THREADS)
     return Finding("threads", True, f"{cores} cores; {settings}")
 
 
-def _room(folder: Path) -> Finding:
+def _disk_space(folder: Path) -> Finding:
+    """Returns whether the disk has enough free space for a run."""
     free = shutil.disk_usage(folder).free
     expected = f"at least {LEAST_FREE_BYTES / 1e9:g} GB"
     return Finding("disk space", free >= LEAST_FREE_BYTES, f"{free / 1e9:.1f} GB free", expected)
 
 
-def _access(folder: Path) -> Finding:
+def _write_access(folder: Path) -> Finding:
+    """Returns whether files can be written in the folder."""
     try:
         with tempfile.TemporaryFile(dir=folder) as handle:
             handle.write(b"bayeskin")
@@ -153,6 +162,7 @@ def _access(folder: Path) -> Finding:
 
 
 def _full_model() -> Finding:
+    """Returns whether a short run of the full model gives the stored force."""
     import numpy as np
 
     from bayeskin.finite_element import ModelSpec, simulate
@@ -166,6 +176,7 @@ def _full_model() -> Finding:
 
 
 def _surrogate() -> Finding:
+    """Returns whether the demo's surrogate predicts the stored force."""
     from bayeskin.shipped import shipped
     from bayeskin.surrogates import load_surrogate
 
@@ -176,6 +187,7 @@ def _surrogate() -> Finding:
 
 
 def _compared(name: str, found_n: float, expected_n: float, tolerance: float, started: float) -> Finding:
+    """Returns whether a force [N] equals the stored force within a relative tolerance."""
     ok = math.isclose(found_n, expected_n, rel_tol=tolerance)
     seconds = time.perf_counter() - started
     return Finding(

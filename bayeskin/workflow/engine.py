@@ -1,4 +1,4 @@
-"""Runs stages in order: what is done and unchanged is skipped, what was interrupted goes on."""
+"""Runs stages in order: skips those that are done and unchanged, and continues interrupted stages."""
 
 from __future__ import annotations
 
@@ -21,15 +21,19 @@ STANDINGS = ("done", "not run", "not finished", "failed", "out of date")
 
 
 class Reporter(Protocol):
-    """Who is told how a run goes on."""
+    """Receives messages and the progress of a run."""
 
-    def log(self, message: str) -> None: ...
+    def log(self, message: str) -> None:
+        """Receives a message."""
+        ...
 
-    def progress(self, label: str, share: float, note: str = "") -> None: ...
+    def progress(self, label: str, share: float, note: str = "") -> None:
+        """Receives the share, from 0 to 1, of the task `label` that is done."""
+        ...
 
 
 class Silent:
-    """A Reporter that tells nobody."""
+    """A Reporter that ignores everything."""
 
     def log(self, message: str) -> None: ...
 
@@ -37,7 +41,7 @@ class Silent:
 
 
 class CannotGoOn(Exception):
-    """A stage whose computation failed: why, and what to do. The engine makes an Outcome of it."""
+    """A stage's computation failed; the text says why and what to do. The engine turns it into an Outcome."""
 
 
 @dataclass(frozen=True)
@@ -50,27 +54,27 @@ class Run:
     reporter: Reporter
 
     def at(self, stage: str, file: str) -> Path:
-        """Path of a stage's output."""
+        """Returns the path of an output of a stage."""
         return self.folder / stage / file
 
     def beside(self, file: str) -> Path:
-        """Path of a file that the configuration names; raises InputError when there is none."""
+        """Returns the path of a file that the configuration names; raises InputError where there is none."""
         path = self.config_path.resolve().parent / file
         if not path.is_file():
             raise InputError(self.config_path, f"no file {path}", "the files that the configuration names")
         return path
 
     def summary(self, stage: str) -> Mapping[str, Any]:
-        """What a stage that is done said of itself."""
+        """Returns the summary that a stage left, and {} where there is none."""
         record = folder.read_record(self.folder / stage)
         return record.summary if record is not None else {}
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage: the sections of the configuration, the files and the earlier stages that it reads.
+    """One stage, with the sections of the configuration, the files and the earlier stages that it reads.
 
-    `work` writes its outputs into the stage's folder and returns its summary.
+    `work` writes the outputs into the stage's folder and returns the summary.
     """
 
     name: str
@@ -83,9 +87,9 @@ class Stage:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a stage ended: its record, and whether it had been done before.
+    """How a stage ended: its record, and whether it was skipped because it had been done before.
 
-    ``record.done`` is False when the computation failed; ``record.summary["message"]`` then says why.
+    ``record.done`` is False where the computation failed; ``record.summary["message"]`` then says why.
     """
 
     stage: str
@@ -94,12 +98,12 @@ class Outcome:
 
     @property
     def ok(self) -> bool:
-        """Whether the stage was done and says of itself that its answer can be relied on."""
+        """Returns whether the stage was done and its summary says that its answer is reliable."""
         return self.record.done and bool(self.record.summary.get("ok", True))
 
 
 def open_run(config_path: Path, reporter: Reporter, folder: Path | None = None) -> Run:
-    """A run from its configuration; its folder lies beside the configuration unless given.
+    """Returns the run of a configuration; its folder lies beside the configuration unless it is given.
 
     Raises InputError for a configuration that is wrong.
     """
@@ -108,17 +112,17 @@ def open_run(config_path: Path, reporter: Reporter, folder: Path | None = None) 
 
 
 def run_stages(run: Run, stages: Mapping[str, Stage], last: str | None = None) -> list[Outcome]:
-    """Runs the stages that `last` needs, in order, and itself; all of them when `last` is None.
+    """Runs the stage `last` after the stages that it needs, in order; all stages where `last` is None.
 
-    Ends with the stage that failed, if one does. An interruption leaves each stage's folder such that the
-    same call goes on from there. Raises InputError for bad input, or when another process works in the
-    run's folder.
+    The call ends with the first stage that fails. After an interruption, the same call continues with the
+    stages where they stopped. Raises InputError for wrong input, or when another process works in the run's
+    folder.
     """
-    wanted = _needed(stages, last)
+    needed = _needed(stages, last)
     outcomes: list[Outcome] = []
     with folder.locked(run.folder):
         for name, stage in stages.items():
-            if name in wanted:
+            if name in needed:
                 outcomes.append(_run_stage(run, stage))
                 if not outcomes[-1].record.done:
                     break
@@ -126,41 +130,43 @@ def run_stages(run: Run, stages: Mapping[str, Stage], last: str | None = None) -
 
 
 def standing(run: Run, stages: Mapping[str, Stage]) -> dict[str, tuple[str, Record | None]]:
-    """How each stage stands, without running any: one of the words of `STANDINGS`, and its record.
+    """Returns the state of each stage, as one of `STANDINGS`, and its record; it runs no stage.
 
-    A stage that is done was made from this configuration, its files and earlier stages that are done, by
-    this version, and its outputs are as it left them.
+    A stage counts as done if this version made it from this configuration, its files and earlier stages that
+    are done, and if its outputs have not changed since.
     """
-    found: dict[str, tuple[str, Record | None]] = {}
+    states: dict[str, tuple[str, Record | None]] = {}
     for name, stage in stages.items():
         record, inputs = folder.read_record(run.folder / name), _inputs_sha256(run, stage)
-        current = all(found[need][0] == "done" for need in stage.needs)
+        current = all(states[need][0] == "done" for need in stage.needs)
         if record is None:
-            found[name] = "not run", None
+            states[name] = "not run", None
         elif record.inputs_sha256 != inputs or not current:
-            found[name] = "out of date", record
+            states[name] = "out of date", record
         elif folder.current_record(run.folder / name, inputs) is not None:
-            found[name] = "done", record
+            states[name] = "done", record
         elif record.done:
-            found[name] = "out of date", record
+            states[name] = "out of date", record
         else:
-            found[name] = "failed" if "message" in record.summary else "not finished", record
-    return found
+            states[name] = "failed" if "message" in record.summary else "not finished", record
+    return states
 
 
 def _needed(stages: Mapping[str, Stage], last: str | None) -> set[str]:
+    """Returns the stage `last` and all stages that it needs, directly or through others."""
     if last is None:
         return set(stages)
     return {last}.union(*(_needed(stages, name) for name in stages[last].needs))
 
 
 def _inputs_sha256(run: Run, stage: Stage) -> str:
+    """Returns the hash of all that a stage depends on."""
     records = {name: folder.read_record(run.folder / name) for name in stage.needs}
     config = run.config.model_dump(mode="json", exclude=WHO_RUNS)
     sections = stage.sections
-    if "parameters" in sections:  # of a model on this device and tissue; records are older than both sections
-        usual = {"device": DeviceConfig(), "tissue": TissueConfig()}
-        sections += tuple(name for name, value in usual.items() if getattr(run.config, name) != value)
+    if "parameters" in sections:  # these depend on device and tissue too; defaults keep the old hashes
+        defaults = {"device": DeviceConfig(), "tissue": TissueConfig()}
+        sections += tuple(name for name, value in defaults.items() if getattr(run.config, name) != value)
     return sha256_of(
         {
             "version": bayeskin.__version__,
@@ -172,6 +178,7 @@ def _inputs_sha256(run: Run, stage: Stage) -> str:
 
 
 def _run_stage(run: Run, stage: Stage) -> Outcome:
+    """Runs a stage, unless it is done and unchanged, and writes its record in any case."""
     inputs, where = _inputs_sha256(run, stage), run.folder / stage.name
     record = folder.current_record(where, inputs)
     if record is not None:
@@ -202,5 +209,6 @@ def _run_stage(run: Run, stage: Stage) -> Outcome:
 
 
 def _provenance(run: Run) -> dict[str, Any]:
+    """Returns version, configuration hash and seed for the stage's record."""
     config = run.config
     return {"version": bayeskin.__version__, "config_sha256": config.sha256, "seed": config.seed}

@@ -1,4 +1,4 @@
-"""Who makes a configuration's full runs: processes of this machine, a Dask cluster, or SLURM's jobs."""
+"""Chooses the executor of a configuration's full runs: local processes, a Dask cluster, or SLURM jobs."""
 
 from __future__ import annotations
 
@@ -12,21 +12,24 @@ from bayeskin.workflow.engine import Run
 
 
 def made_by(run: Run, scheduler: str) -> Run:
-    """The run with a Dask scheduler at an address to make its full runs."""
+    """Returns the run with its full runs made through the Dask scheduler at an address."""
     design = run.config.design.model_copy(update={"scheduler": scheduler})
     return replace(run, config=run.config.model_copy(update={"design": design}))
 
 
 @contextmanager
 def crew(run: Run) -> Iterator[Map]:
-    """The map that the configuration asks for. Raises InputError where a cluster cannot be had."""
+    """Yields the executor that the configuration asks for, as a function that maps over items.
+
+    Raises InputError where a cluster is not available.
+    """
     design, slurm = run.config.design, run.config.slurm
     if design.scheduler is not None:
-        with on_scheduler(design.scheduler) as over:
-            yield over
+        with on_scheduler(design.scheduler) as run_all:
+            yield run_all
     elif slurm is not None:
         settings = slurm.model_dump(exclude={"jobs"}, exclude_none=True)
-        with on_slurm(slurm.jobs, settings) as over:
-            yield over
+        with on_slurm(slurm.jobs, settings) as run_all:
+            yield run_all
     else:
         yield local(design.workers)

@@ -21,14 +21,15 @@ from bayeskin.experiments.choice import Experiment, compete, search, weigh
 from bayeskin.experiments.protocols import Limits, Protocol, variations
 from bayeskin.forward.reduced import ReducedForward
 from bayeskin.json_files import plain, write_json
+from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.tasks import Ask
 from bayeskin.workflow import diagnosis
-from bayeskin.workflow.diagnosis import bench_of, opened, searched
+from bayeskin.workflow.diagnosis import context_of, opened, searched, source_of
+from bayeskin.workflow.diagnosis_tasks import asked, searches_file
 from bayeskin.workflow.engine import Reporter, Run
 from bayeskin.workflow.folder import Record, current_record, locked, output_hashes, read_record, write_record
 from bayeskin.workflow.provenance import caption
-from bayeskin.workflow.workbench import Workbench, asked, searches_file
 
 FOLDER = "experiment"
 LONGEST_S = 1800.0  # of a test: an arm can hardly be still for longer
@@ -55,11 +56,12 @@ def choose(source: Path, reporter: Reporter, device: Path | None = None) -> dict
     with locked(run.folder):
         started, of = time.monotonic(), _diagnosis(run)
         where.mkdir(parents=True, exist_ok=True)
-        bench = bench_of(run)
-        with asked(bench, searches_file(run.folder, bench), WORKERS) as ask:
-            fitted = [one.fit for one in searched(run, bench, ask).fits.values()]
-            fits = compete(fitted, diagnosed["best_set"], bench.known)
-            found = _searched(fits, bench, ask, reporter) if len(fits) > 1 else []
+        files = source_of(run)
+        context = context_of(run, files)
+        with asked(files, context, searches_file(run.folder, context), WORKERS) as ask:
+            fitted = [one.fit for one in searched(run, context, ask).fits.values()]
+            fits = compete(fitted, diagnosed["best_set"], context.known)
+            found = _searched(fits, context, ask, reporter) if len(fits) > 1 else []
         answer: dict[str, Any] = {
             "sets": [list(one.names) for one in fits], "experiments": [_row(one) for one in found],
             "ok": not found or any(np.isfinite(one.gain_bits) for one in found),
@@ -84,19 +86,21 @@ def _diagnosis(run: Run) -> str:
     return "" if record is None else record.sha256
 
 
-def _searched(fits: Sequence[Fit], bench: Workbench, ask: Ask, reporter: Reporter) -> list[Experiment]:
+def _searched(
+    fits: Sequence[Fit], context: DiagnosisContext, ask: Ask, reporter: Reporter
+) -> list[Experiment]:
     """Protocols judged, the most telling first."""
-    assert isinstance(bench.forward, ReducedForward)
-    trained = bench.forward.model.trained.protocols
+    assert isinstance(context.forward, ReducedForward)
+    trained = context.forward.model.trained.protocols
     limits = Limits(trained.largest_m, trained.speeds_m_s, LONGEST_S)
-    first = variations(bench.motion, limits)
+    first = variations(context.motion, limits)
 
     def judge(protocol: Protocol) -> Experiment:
-        one = weigh(protocol, fits, bench.known, ask, bench.source.seed)
+        one = weigh(protocol, fits, context.known, ask, context.seed)
         reporter.log(f"{protocol.name}: {one.gain_bits:.2f} of {one.possible_bits:.2f} bits")
         return one
 
-    return search(judge, first, limits, bench.source.seed)
+    return search(judge, first, limits, context.seed)
 
 
 def _write_corners(protocol: Protocol, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What a run shows of its fields: a series for ParaView, and a figure at chosen moments of the protocol."""
+"""Writes the fields of a run: a time series for ParaView, and a figure at chosen moments of the protocol."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bayeskin.finite_element.surface import PARTS, seen_surface, surface_state
 from bayeskin.number_format import number
 from bayeskin.types import Array, PadMotion, Phase
 
-_DOING = {"rest": "rest", "load": "loading", "hold": "hold", "unload": "unloading"}
+_PHASE_NAMES = {"rest": "rest", "load": "loading", "hold": "hold", "unload": "unloading"}
 _CAPTION = (
     "The part of the quarter near the pads, deformed, to scale (axes: 5 mm). Thick lines: pad and, around "
     "it, guard. On the planes of symmetry, x=0 and y=0, cutis over subcutis. Arrows: direction of the "
@@ -25,10 +25,12 @@ _CAPTION = (
 
 
 class FieldOutputs:
-    """Collects the states of one run for both outputs; give `on_state` to `simulate`, then write.
+    """Collects the states of one run for both outputs.
 
-    fields, figures : folders of the series and of the figure, or None for no such output
-    moments : times [s] of the figure's rows, increasing, and what goes on then
+    Give `on_state` to `simulate`, and call `write` after the run.
+
+    fields, figures : folders of the time series and of the figure, or None where the output is not wanted
+    moments : the times [s] of the figure's rows, increasing, and for each the phase that takes place then
     """
 
     def __init__(
@@ -52,7 +54,10 @@ class FieldOutputs:
             self._writer.on_state(time_s, x, force_n)
 
     def write(self, provenance: str) -> list[Path]:
-        """Writes what was asked for; returns the files. The figure is drawn before anything is written."""
+        """Writes the requested outputs and returns their files.
+
+        The figure is drawn before any file is written.
+        """
         files: list[Path] = []
         if self._figures:
             figure = field_figure(
@@ -63,10 +68,11 @@ class FieldOutputs:
 
 
 def moments_of(phases: Sequence[Phase], motion: PadMotion, at_s: Sequence[float] = ()) -> dict[float, str]:
-    """Times [s], increasing, and what goes on then: those given, or four that tell most of a test.
+    """Returns increasing times [s] and a description of the protocol at each of them.
 
-    These are the end of the first loading, the middle of the hold, the end of the unloading, and the middle
-    of the last phase. Raises InputError for a time outside the motion.
+    These are the given times, or else four characteristic moments: the end of the first loading, the middle
+    of the hold, the end of the unloading, and the middle of the last phase. Raises InputError for a time
+    outside the motion.
     """
     end_s = float(motion.time_s[-1])
     for time_s in at_s:
@@ -83,16 +89,17 @@ def moments_of(phases: Sequence[Phase], motion: PadMotion, at_s: Sequence[float]
     moments = {}
     for phase, share in [*chosen, (phases[-1], 0.5)]:
         time_s = phase.start_s + share * (phase.end_s - phase.start_s)
-        if share == 1.0:  # the protocol's corner, which may be rounded
+        if share == 1.0:  # the corner of the protocol, whose time may be rounded
             time_s = float(motion.time_s[np.abs(motion.time_s - time_s).argmin()])
         word = "end" if share == 1.0 else "middle"
-        moments[min(time_s, end_s)] = f"{word} of {_DOING[phase.kind]} {phase.cycle}"
+        moments[min(time_s, end_s)] = f"{word} of {_PHASE_NAMES[phase.kind]} {phase.cycle}"
     return dict(sorted(moments.items()))
 
 
 def _during(phases: Sequence[Phase], time_s: float) -> str:
+    """Returns the name and cycle of the phase at a time."""
     phase = next((p for p in phases if time_s <= p.end_s), phases[-1])
-    return f"{_DOING[phase.kind]} {phase.cycle}"
+    return f"{_PHASE_NAMES[phase.kind]} {phase.cycle}"
 
 
 def field_figure(
@@ -102,7 +109,10 @@ def field_figure(
     states: Sequence[Array],
     motion: PadMotion,
 ) -> Figure:
-    """Displacement, pressure and the fluid's flow on the deformed quarter; states (dofs,) at the moments."""
+    """Returns a figure of displacement, pressure and fluid flow on the deformed quarter.
+
+    states : the unknowns (dofs,) of the model at each of the moments
+    """
     surface = seen_surface(problem)
     seen = [surface_state(problem, theta, surface, x) for x in states]
     pressure_kpa = 1e-3 * np.array([state.pressure_pa for state in seen])
@@ -117,10 +127,10 @@ def field_figure(
             directions=velocity,
         ),
     ]
-    pad = surface.part == PARTS.index("pad")  # with what lies in series, not where the drive is
+    pad = surface.part == PARTS.index("pad")  # the pads, which may move less than the drive
     labels = [
-        f"{number(time_s, 4)} s\n{what}\npads at {1e3 * state.displacement_m[pad].mean():.2f} mm"
-        for (time_s, what), state in zip(moments.items(), seen, strict=True)
+        f"{number(time_s, 4)} s\n{phase}\npads at {1e3 * state.displacement_m[pad].mean():.2f} mm"
+        for (time_s, phase), state in zip(moments.items(), seen, strict=True)
     ]
     return report.figure_fields(
         labels,
@@ -129,13 +139,13 @@ def field_figure(
         surface.part + len(PARTS) * surface.plane,
         [PARTS.index("pad"), PARTS.index("guard")],
         columns,
-        _finding(moments, pressure_kpa),
+        _pressure_extremes(moments, pressure_kpa),
         _CAPTION,
     )
 
 
-def _finding(moments: Mapping[float, str], pressure_kpa: Array) -> str:
-    """Where in time the extremes of the pressure stand, of values (t, f) [kPa]."""
+def _pressure_extremes(moments: Mapping[float, str], pressure_kpa: Array) -> str:
+    """Returns a sentence with the lowest and highest pressure and their moments, from values (t, f) [kPa]."""
     rows = list(moments.items())
     low, high = int(pressure_kpa.min(axis=1).argmin()), int(pressure_kpa.max(axis=1).argmax())
     lowest, highest = (

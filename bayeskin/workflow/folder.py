@@ -1,8 +1,8 @@
-"""The folder of a run: one process at a time, and for each stage what it was made from.
+"""The folder of a run: a lock for one process at a time, and for each stage a record of its inputs.
 
-A stage's record, ``<stage>/stage.json``, holds the hash of its inputs, the hashes of its outputs, its
-seconds and its summary. A stage whose record is complete, whose inputs hash the same and whose outputs are
-still as written is not run again.
+The record of a stage, ``<stage>/stage.json``, contains the hash of its inputs, the hashes of its outputs, its
+duration in seconds and its summary. A stage is not run again if its record is complete, its inputs have the
+same hash, and its outputs are unchanged.
 """
 
 from __future__ import annotations
@@ -26,7 +26,10 @@ RECORD = "stage.json"
 
 @dataclass(frozen=True)
 class Record:
-    """What is known of one stage: `outputs` maps each file, relative to the stage's folder, to its sha256."""
+    """The record of one stage.
+
+    `outputs` maps each file, relative to the stage's folder, to its sha256.
+    """
 
     inputs_sha256: str
     done: bool
@@ -37,27 +40,28 @@ class Record:
 
     @property
     def sha256(self) -> str:
-        """Hash of the stage's outputs, which the stages above it are made from."""
+        """Returns the hash of the stage's outputs, on which later stages depend."""
         return sha256_of(dict(self.outputs))
 
 
 def read_record(stage_folder: Path) -> Record | None:
-    """The stage's record; None when there is none, or none that can be read."""
+    """Returns the record of a stage; None where there is no record, or none that can be read."""
     try:
-        found = Record(**json.loads((stage_folder / RECORD).read_text()))
+        record = Record(**json.loads((stage_folder / RECORD).read_text()))
     except (OSError, ValueError, TypeError):
         return None
-    plain_ones = isinstance(found.inputs_sha256, str) and isinstance(found.done, bool)
-    mappings = all(isinstance(one, dict) for one in (found.outputs, found.summary, found.provenance))
-    return found if plain_ones and mappings and isinstance(found.seconds, int | float) else None
+    scalars = isinstance(record.inputs_sha256, str) and isinstance(record.done, bool)
+    mappings = all(isinstance(value, dict) for value in (record.outputs, record.summary, record.provenance))
+    return record if scalars and mappings and isinstance(record.seconds, int | float) else None
 
 
 def write_record(stage_folder: Path, record: Record) -> None:
+    """Writes the record of a stage."""
     write_json(stage_folder / RECORD, vars(record))
 
 
 def current_record(stage_folder: Path, inputs_sha256: str) -> Record | None:
-    """The stage's record if it was completed from these inputs and its outputs are as it left them."""
+    """Returns the stage's record if it was completed from these inputs and its outputs are unchanged."""
     record = read_record(stage_folder)
     if record is None or not record.done or record.inputs_sha256 != inputs_sha256:
         return None
@@ -66,7 +70,7 @@ def current_record(stage_folder: Path, inputs_sha256: str) -> Record | None:
 
 
 def output_hashes(stage_folder: Path) -> dict[str, str]:
-    """sha256 of every file that the stage wrote, its record and hidden files left out."""
+    """Returns the sha256 of each file that the stage wrote, without its record and hidden files."""
     files = sorted(p for p in stage_folder.rglob("*") if p.is_file())
     return {
         str(p.relative_to(stage_folder)): sha256_of_file(p)
@@ -76,10 +80,10 @@ def output_hashes(stage_folder: Path) -> dict[str, str]:
 
 
 def begin(stage_folder: Path, inputs_sha256: str) -> float:
-    """Readies a stage's folder; returns the seconds that an interrupted attempt already spent.
+    """Prepares the folder of a stage; returns the seconds that an interrupted attempt has already taken.
 
-    What an attempt on other inputs left is removed: nothing of it may be mistaken for this one's. Raises
-    InputError for a folder that is no stage's: what others have put there stays.
+    The files of an attempt on other inputs are removed, so that none of them can be taken for a file of this
+    attempt. Raises InputError for a folder that does not belong to a stage: files of other origin stay.
     """
     _refuse_foreign(stage_folder)
     record = read_record(stage_folder)
@@ -93,7 +97,11 @@ def begin(stage_folder: Path, inputs_sha256: str) -> float:
 
 
 def _remove(stage_folder: Path) -> None:
-    """As a whole, by another name first: what a kill in between leaves has no stage's name."""
+    """Removes the folder of a stage as a whole.
+
+    The folder is renamed first. If the process is killed in between, the remaining files have no stage's
+    name.
+    """
     removed = stage_folder.with_name(f".{stage_folder.name}.removed")
     shutil.rmtree(removed, ignore_errors=True)
     if stage_folder.is_dir():
@@ -102,7 +110,10 @@ def _remove(stage_folder: Path) -> None:
 
 
 def _refuse_foreign(stage_folder: Path) -> None:
-    """A stage's folder has a record, or nothing yet but what an attempt that was killed has left hidden."""
+    """Raises InputError unless a folder belongs to a stage.
+
+    Such a folder has a record, or contains only hidden files that a killed attempt has left.
+    """
     if stage_folder.is_symlink():
         raise InputError(stage_folder, "a link to another place", "a folder of the run's own")
     if stage_folder.is_dir() and not (stage_folder / RECORD).is_file():
@@ -114,9 +125,10 @@ def _refuse_foreign(stage_folder: Path) -> None:
 
 @contextlib.contextmanager
 def locked(run_folder: Path) -> Iterator[None]:
-    """Holds the run's folder; the system lets go of it even when the process is killed.
+    """Locks the run's folder while the context lasts.
 
-    Raises InputError when another process holds it.
+    The system releases the lock even if the process is killed. Raises InputError when another process holds
+    it.
     """
     run_folder.mkdir(parents=True, exist_ok=True)
     with open(run_folder / ".lock", "a+") as handle:

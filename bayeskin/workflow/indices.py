@@ -1,4 +1,7 @@
-"""Sixth stage: Sobol' indices of the force over the prior and near the maximum, shares over the posterior."""
+"""The sixth stage: Sobol' indices of the force over the prior and near the maximum, and Shapley effects.
+
+The Shapley effects are shares of the force's variance over the posterior.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +22,16 @@ from bayeskin.workflow.provenance import caption
 from bayeskin.workflow.training import fine_design
 
 MOST_DRAWS, CHUNK = 2000, 256
-NEARBY = 0.1  # the article moves each parameter by 10 % of its calibrated value, either way
+NEARBY = 0.1  # the article varies each parameter by 10 % of its calibrated value, up and down
 
 
-def _work(run: Run) -> Mapping[str, Any]:
+def _compute_indices(run: Run) -> Mapping[str, Any]:
+    """Computes the indices, writes them with their figures, and returns the stage's summary."""
     design, fine = storage.load(run.at("map", "design.h5"), Design), fine_design(run, "map")
     space, samples = parameter_space(run.config, run.config_path), run.config.sobol.samples
     near = nearby(space, run.summary("map")["theta"])
     rng = np.random.default_rng([run.config.seed, 2])
-    # Over the whole prior no part of it may count more, so these two are trained without focus.
+    # For indices over the whole prior, all its parts count equally, so these two are trained without weights.
     gp, chaos = (train(design, kind, run.config.seed)[0] for kind in ("gp", "chaos"))
     if fine is not None:
         gp, chaos = (correct(surrogate, fine)[0] for surrogate in (gp, chaos))
@@ -40,41 +44,46 @@ def _work(run: Run) -> Mapping[str, Any]:
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     for name, result in results.items():
         storage.save(run.at("sobol", f"{name}.h5"), result)
-        report.save_figure(_figure(result, motion), run.at("sobol", f"sobol_{name}"), caption(run))
+        report.save_figure(_indices_figure(result, motion), run.at("sobol", f"sobol_{name}"), caption(run))
     tables = {name: _table(result) for name, result in results.items()}
     return {**tables, "posterior": _over_posterior(run, rng)}
 
 
 def _over_posterior(run: Run, rng: np.random.Generator) -> dict[str, Any]:
-    """Shapley effects over posterior draws, whose parameters are correlated."""
+    """Returns Shapley effects over posterior draws, whose parameters are correlated."""
     space, draws = inference.draws_of(inference.load_inference_data(run.at("sample", "posterior.nc")))
     refined = run.at("sample", "surrogate.h5")
     surrogate = load_surrogate(refined if refined.is_file() else run.at("map", "surrogate.h5"))
     material = ParameterSpace(space.parameters[: surrogate.space.dim])
-    few = inference.evenly(draws, MOST_DRAWS)[:, : material.dim]
-    force = np.concatenate([surrogate.predict_mean(few[i : i + CHUNK]) for i in range(0, len(few), CHUNK)])
-    found = shapley(material, few, force, surrogate.edges_s, rng, "the posterior, its correlations included")
-    order = np.argsort(-np.nan_to_num(found.effects))
-    shares = [f"{found.names[j]} {100 * found.effects[j]:.0f} %" for j in order[:3]]
+    chosen = inference.evenly(draws, MOST_DRAWS)[:, : material.dim]
+    force = np.concatenate(
+        [surrogate.predict_mean(chosen[i : i + CHUNK]) for i in range(0, len(chosen), CHUNK)]
+    )
+    result = shapley(
+        material, chosen, force, surrogate.edges_s, rng, "the posterior, its correlations included"
+    )
+    order = np.argsort(-np.nan_to_num(result.effects))
+    shares = [f"{result.names[j]} {100 * result.effects[j]:.0f} %" for j in order[:3]]
     return {
         "sentence": (
-            f"What the posterior leaves open of the force, {1e3 * np.sqrt(found.variance_n2):.2g} mN sd over "
-            f"time, is shared by {', '.join(shares)}."
+            f"What the posterior leaves open of the force, {1e3 * np.sqrt(result.variance_n2):.2g} mN sd "
+            f"over time, is shared by {', '.join(shares)}."
         ),
         "method": "Shapley effects by polynomial regression",
-        "distribution": found.distribution,
-        "samples": found.draws,
+        "distribution": result.distribution,
+        "samples": result.draws,
         "shares": {
-            name: {"share": found.effects[j], "share_90": found.interval[:, j]}
-            for j, name in enumerate(found.names)
+            name: {"share": result.effects[j], "share_90": result.interval[:, j]}
+            for j, name in enumerate(result.names)
         },
     }
 
 
 def nearby(space: ParameterSpace, theta: Mapping[str, float]) -> ParameterSpace:
-    """Uniform within 10 % of `theta`'s values (SI by name), cut to the prior's box."""
+    """Returns uniform priors within 10 % of the values `theta` (SI by name), limited to the prior's box."""
 
     def around(p: Parameter) -> Parameter:
+        """Returns a parameter with a uniform prior near its value."""
         reach = NEARBY * abs(theta[p.name]) or 1e-6 * (p.upper - p.lower)
         lower, upper = max(theta[p.name] - reach, p.lower), min(theta[p.name] + reach, p.upper)
         return replace(p, lower=lower, upper=upper, prior="uniform")
@@ -83,6 +92,7 @@ def nearby(space: ParameterSpace, theta: Mapping[str, float]) -> ParameterSpace:
 
 
 def _table(result: SobolResult) -> dict[str, Any]:
+    """Returns the indices of one distribution as plain values for the summary."""
     return {
         "sentence": sentence(result),
         "uninformed": list(uninformed(result)),
@@ -109,10 +119,12 @@ def _table(result: SobolResult) -> dict[str, Any]:
     }
 
 
-def _figure(result: SobolResult, motion: PadMotion) -> Any:
+def _indices_figure(result: SobolResult, motion: PadMotion) -> Any:
+    """Returns the figure of the indices over time."""
     time_s = 0.5 * (result.edges_s[1:] + result.edges_s[:-1])
 
     def with_limits(interval: Any, estimate: Any) -> Any:
+        """Returns lower limit, estimate and upper limit, (3, m, d), or (3, d) for aggregated indices."""
         return np.moveaxis(np.stack([interval[0], estimate, interval[1]]), 1, -1)
 
     return report.figure_sobol(
@@ -130,5 +142,5 @@ STAGE = Stage(
     "Sobol' indices of the force over time",
     ("recording", "map", "sample"),
     ("seed", "sobol", "parameters", "design"),
-    _work,
+    _compute_indices,
 )

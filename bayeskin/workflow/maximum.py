@@ -1,4 +1,7 @@
-"""Fourth stage: the most probable point, checked by the full model until the surrogate is right there."""
+"""The fourth stage: finds the most probable point, and checks it with the full model.
+
+The surrogate is trained further until it is accurate at this point.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +24,10 @@ from bayeskin.workflow.refining import Refining
 
 
 class _FullModel:
-    """Full runs, with derivatives where the model has them, kept by their parameters, so that none is made
-    twice."""
+    """Runs the full model, with derivatives where the model has them.
+
+    Runs are stored by their parameters, so no run is made twice.
+    """
 
     def __init__(self, run: Run) -> None:
         self.run, self.spec = run, model_spec(run)
@@ -30,26 +35,28 @@ class _FullModel:
 
     @property
     def differentiable(self) -> bool:
-        """Whether its runs carry derivatives."""
+        """Returns whether the runs have derivatives."""
         return self.spec.observation == "reaction"
 
     def __call__(self, theta: Mapping[str, float]) -> Simulation:
-        kept = self.run.at("map", f"full-run-{sha256_of([self.spec.hash, dict(theta)])[:16]}.h5")
-        if kept.is_file():
-            return storage.load(kept, Simulation)
-        said = ", ".join(f"{name} = {value:.4g}" for name, value in theta.items())
-        self.run.reporter.log(f"map: full run at {said}")
+        """Returns the run at parameters theta, from its file where it was made before."""
+        file = self.run.at("map", f"full-run-{sha256_of([self.spec.hash, dict(theta)])[:16]}.h5")
+        if file.is_file():
+            return storage.load(file, Simulation)
+        values = ", ".join(f"{name} = {value:.4g}" for name, value in theta.items())
+        self.run.reporter.log(f"map: full run at {values}")
         tell = self.run.reporter.progress
         simulation = simulate(
             self.spec, self.motion, theta, lambda share: tell("full run", share),
             gradients=logarithms(theta) if self.differentiable else None,
         )  # fmt: skip
-        if simulation.status == "ok":  # what failed may be mended meanwhile
-            storage.save(kept, simulation)
+        if simulation.status == "ok":  # the cause of a failed run may be corrected later
+            storage.save(file, simulation)
         return simulation
 
 
-def _find(run: Run) -> Mapping[str, Any]:
+def _find_maximum(run: Run) -> Mapping[str, Any]:
+    """Finds the most probable point, writes the refined surrogate, and returns the stage's summary."""
     config = run.config
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
     refining, full = Refining(run, binned, "design", "train"), _FullModel(run)
@@ -59,26 +66,27 @@ def _find(run: Run) -> Mapping[str, Any]:
     )  # fmt: skip
     refining.save("map")
     _draw_check(run, binned, refined)
-    return {**_found(refined, binned), "polished": _polish(full, refined)}
+    return {**_search_summary(refined, binned), "polished": _polish(full, refined)}
 
 
 def _polish(full: _FullModel, refined: RefinedMap) -> dict[str, Any] | None:
-    """The maximum of the full model itself, where it has derivatives."""
+    """Returns the maximum of the full model itself; None without derivatives, or where the check failed."""
     if not full.differentiable or not refined.passes:
         return None
-    found = inference.polish_map(refined.log_posterior, full, refined.map.theta)
+    polished = inference.polish_map(refined.log_posterior, full, refined.map.theta)
     return {
-        "theta": dict(found.theta),
-        "log_posterior": found.value,
-        "gained": found.gained,
-        "full_runs": len(found.runs),
-        "message": found.message,
+        "theta": dict(polished.theta),
+        "log_posterior": polished.value,
+        "gained": polished.gained,
+        "full_runs": len(polished.runs),
+        "message": polished.message,
     }
 
 
-def _found(refined: RefinedMap, binned: BinnedForce) -> dict[str, Any]:
+def _search_summary(refined: RefinedMap, binned: BinnedForce) -> dict[str, Any]:
+    """Returns the result of the search as plain values for the summary."""
     best, check = refined.map, refined.checks[-1]
-    full = check.simulation.status == "ok"
+    succeeded = check.simulation.status == "ok"
     return {
         "ok": refined.passes,
         "theta": dict(best.theta),
@@ -86,12 +94,15 @@ def _found(refined: RefinedMap, binned: BinnedForce) -> dict[str, Any]:
         "agreement": best.agreement,
         "by_search": best.by_search,
         "message": best.message,
-        "checks": [_checked(one) for one in refined.checks],
-        "rmse_of_full_model": rmse_table(refined.log_posterior, _full_n(check, binned)) if full else None,
+        "checks": [_check_summary(map_check) for map_check in refined.checks],
+        "rmse_of_full_model": rmse_table(refined.log_posterior, _full_model_means(check, binned))
+        if succeeded
+        else None,
     }
 
 
-def _checked(check: MapCheck) -> dict[str, Any]:
+def _check_summary(check: MapCheck) -> dict[str, Any]:
+    """Returns one check with the full model as plain values for the summary."""
     return {
         "passes": check.passes,
         "message": check.message,
@@ -104,16 +115,20 @@ def _checked(check: MapCheck) -> dict[str, Any]:
     }
 
 
-def _full_n(check: MapCheck, binned: BinnedForce) -> Array:
+def _full_model_means(check: MapCheck, binned: BinnedForce) -> Array:
+    """Returns the full model's bin means [N] (m,)."""
     return check.simulation.bin_means(binned.edges_s)
 
 
 def _draw_check(run: Run, binned: BinnedForce, refined: RefinedMap) -> None:
+    """Draws the figure that compares surrogate and full model at the most probable point."""
     check, surrogate = refined.checks[-1], refined.log_posterior.surrogate
     if check.simulation.status != "ok":
         return
     prediction = surrogate.predict(np.array([list(check.theta.values())]))
-    figure = report.figure_map_check(binned, _full_n(check, binned), prediction.mean[0], prediction.sd()[0])
+    figure = report.figure_map_check(
+        binned, _full_model_means(check, binned), prediction.mean[0], prediction.sd()[0]
+    )
     report.save_figure(figure, run.at("map", "map_check"), caption(run))
 
 
@@ -122,5 +137,5 @@ STAGE = Stage(
     "finds the most probable point and checks it by the full model",
     ("recording", "design", "train"),
     ("seed", "map", "fit", "noise", "parameters", "model", "surrogate", "design"),
-    _find,
+    _find_maximum,
 )

@@ -1,4 +1,7 @@
-"""A configuration for somebody's own recording, with comments on what was found and what can be set."""
+"""Writes a configuration for a recording of the user's own.
+
+Its comments describe the recording and all that can be set.
+"""
 
 from __future__ import annotations
 
@@ -25,15 +28,15 @@ from bayeskin.workflow.recording import pad_motion
 from bayeskin.workflow.reducing import find_reduced
 from bayeskin.workflow.shipping import shipped_for
 
-_SECONDS_A_RUN = (4, 15)  # of one core, on the default mesh
+_SECONDS_A_RUN = (4, 15)  # of one full run on one core, on the default mesh
 _REDUCED_SECONDS_A_RUN = (0.1, 0.4)
 _SHIPPED_KNOWS = (
     "# Another model, bin width or wider bounds need another surrogate: take [surrogate] above out.",
 )
 
 _NOISE = NoisePriors()
-_UNSTATED = {"windows_s": [[0.0, 60.0]], "sd_n": _NOISE.sd_n, "tau_s": _NOISE.tau_s, "nu": _NOISE.nu}
-# section, what it is about, its keys and what they are
+_EXAMPLES = {"windows_s": [[0.0, 60.0]], "sd_n": _NOISE.sd_n, "tau_s": _NOISE.tau_s, "nu": _NOISE.nu}
+# Each entry has the name of a section, its subject, and its keys with their meaning.
 _SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
     ("model", "the force that the model reports, and its mesh", {
         "observation": '"reaction" on the pad, or "article": what the article\'s code integrates',
@@ -68,12 +71,12 @@ _SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
 
 
 def new_config(file: Path, out: Path | None = None, device: Path | None = None) -> dict[str, Any]:
-    """Writes a configuration that fits `file`, by default beside it, and says what was found in it.
+    """Writes a configuration that fits `file`, by default beside it, and reports what the recording contains.
 
-    It takes a shipped surrogate where one knows the recording's protocol and device, else a design of its
-    own, by the reduced model where the device has one. The sections of the file `device` are written into it.
-    Raises InputError, with nothing written, for no recording of a test, a device that cannot be, or an `out`
-    that is there already.
+    The configuration uses a shipped surrogate where one was trained on the recording's protocol and device.
+    Otherwise it has a design of its own, by the reduced model where the device has one. The sections of the
+    file `device` are written into it. Raises InputError, with nothing written, for a file that is no
+    recording of a test, an impossible device, or an `out` that exists already.
     """
     stated = None if device is None else load_device_file(device)
     recording = read_recording(file)
@@ -84,28 +87,30 @@ def new_config(file: Path, out: Path | None = None, device: Path | None = None) 
         raise InputError(f"-o {out}", "a file that is there already", "a name that is free")
     phases = segment(recording)
     noise = phase_noise(recording, phases)
-    found = describe(recording, phases, noise)
+    description = describe(recording, phases, noise)
     motion, geometry = pad_motion("reaction", recording, phases, "idealised"), _geometry(stated)
     surrogate = None if geometry.sd_m else shipped_for(motion, geometry.geometry)
     reduced = None if surrogate else _reduced_for(motion, geometry.geometry, out)
-    way, section = _way(surrogate, reduced)
+    source, section = _surrogate_source(surrogate, reduced)
     reference = Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix()
-    text = _configuration(_name(out), reference, found, section, surrogate is not None, stated)
+    text = _configuration(_name(out), reference, description, section, surrogate is not None, stated)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open(out, "x", encoding="utf-8") as handle:
         handle.write(text)
     facts = describe_json(recording, phases, noise)
     answer = {"ok": True, "out": out, "surrogate": surrogate.name if surrogate else None, **facts}
-    return plain({**answer, "text": f"{found}\n\nwritten to {out}, with {way}\nnext: bayeskin run {out}"})
+    return plain(
+        {**answer, "text": f"{description}\n\nwritten to {out}, with {source}\nnext: bayeskin run {out}"}
+    )
 
 
 def new_demo(out: Path | None = None) -> dict[str, Any]:
-    """Puts the demo's configuration, by default demo.toml, and its recording beside it into a folder.
+    """Writes the demo's configuration, by default demo.toml, and the demo's recording beside it.
 
-    Raises InputError, with nothing written, where one of them is there already.
+    Raises InputError, with nothing written, where one of these files exists already.
     """
     out = out or Path("demo.toml")
-    recording = out.with_name("demo-recording.h5")  # demo.h5 is the surrogate's name
+    recording = out.with_name("demo-recording.h5")  # demo.h5 is already the name of the surrogate
     if out.suffix != ".toml":
         raise InputError(f"-o {out}", f"ending {out.suffix!r}", "ending .toml")
     for file in (out, recording):
@@ -119,39 +124,43 @@ def new_demo(out: Path | None = None) -> dict[str, Any]:
 
 
 def _geometry(stated: DeviceFile | None) -> StatedGeometry:
-    """The geometry of a device, by default the article's."""
+    """Returns the geometry of a device, by default the article's."""
     file = stated or DeviceFile()
     return stated_geometry(file.device, file.tissue, "device")
 
 
 def _reduced_for(motion: PadMotion, geometry: Geometry, out: Path) -> Path | None:
-    """The file of a reduced model that a run of the configuration `out` can make its design with."""
+    """Returns the file of a reduced model with which a run of the configuration `out` can make its design.
+
+    Returns None where no such model was trained for the protocol.
+    """
     file = find_reduced(geometry, [out])
-    known = file is not None and not protocol_outside(load_reduced(file).trained.protocols, motion)
-    return file if known else None
+    fits = file is not None and not protocol_outside(load_reduced(file).trained.protocols, motion)
+    return file if fits else None
 
 
-def _way(surrogate: Path | None, reduced: Path | None) -> tuple[str, list[str]]:
-    """Returns how a run comes by its surrogate, in words and as a section."""
+def _surrogate_source(surrogate: Path | None, reduced: Path | None) -> tuple[str, list[str]]:
+    """Returns how a run gets its surrogate, in words and as lines of the configuration."""
     if surrogate is not None:
-        return f"the shipped surrogate {surrogate.name}", _surrogate(surrogate.name)
+        return f"the shipped surrogate {surrogate.name}", _surrogate_section(surrogate.name)
     if reduced is not None:
-        return f"a design of the reduced model {reduced.name}", _reduced_design(reduced.name)
-    return "a design of full runs of its own", _full_design()
+        return f"a design of the reduced model {reduced.name}", _reduced_design_section(reduced.name)
+    return "a design of full runs of its own", _full_design_section()
 
 
 def _name(out: Path) -> str:
-    """A run's name from a file's: what a configuration does not allow becomes a hyphen."""
+    """Returns a run's name from a file's name; characters that are not allowed become hyphens."""
     return re.sub(r"^[^A-Za-z0-9]+", "", re.sub(r"[^A-Za-z0-9._-]", "-", out.stem)) or "run"
 
 
 def _configuration(
     name: str, reference: str, found: str, section: list[str], ready: bool, stated: DeviceFile | None
 ) -> str:
+    """Returns the text of the configuration."""
     config = Config(name=name, recording=RecordingConfig(file=reference))
     parts = [
         [f"name = {_quoted(name)}", f"seed = {config.seed}"],
-        _commented(found),
+        _description_lines(found),
         [
             "[recording]",
             f"file = {_quoted(reference)}  # relative to this file",
@@ -164,23 +173,25 @@ def _configuration(
             "# that of the section above it.",
             *(_SHIPPED_KNOWS if ready else ()),
             *([] if stated else _commented_device(config)),
-            *_optional(config),
+            *_optional_lines(config),
         ],
     ]
     return "\n\n".join("\n".join(part) for part in parts) + "\n"
 
 
 def _quoted(text: str) -> str:
+    """Returns a text as a TOML string."""
     return json.dumps(text, ensure_ascii=False)
 
 
-def _commented(text: str) -> list[str]:
-    """Lines as TOML allows them in comments: nothing that cannot be printed."""
+def _description_lines(text: str) -> list[str]:
+    """Returns the description of the recording as TOML comments; unprintable characters become blanks."""
     clean = ("".join(c if c.isprintable() else " " for c in line) for line in text.splitlines())
     return ["# Found in the recording:", *(f"#   {line}".rstrip() for line in clean)]
 
 
-def _surrogate(file: str) -> list[str]:
+def _surrogate_section(file: str) -> list[str]:
+    """Returns the section of a shipped surrogate."""
     return [
         "# A shipped surrogate knows this recording's protocol, so no full runs are needed before sampling.",
         "[surrogate]",
@@ -188,7 +199,8 @@ def _surrogate(file: str) -> list[str]:
     ]
 
 
-def _full_design() -> list[str]:
+def _full_design_section() -> list[str]:
+    """Returns the section of a design by the full model, with its expected duration."""
     design = DesignConfig()
     runs, (quick, slow) = _runs(design), _SECONDS_A_RUN
     low, high = (seconds * runs / (60 * design.workers) for seconds in _SECONDS_A_RUN)
@@ -199,11 +211,12 @@ def _full_design() -> list[str]:
         "# `bayeskin reduce` with this file makes a reduced model of the device once, from hundreds of runs;",
         '# with it, coarse = "reduced" takes minutes, if the pads open no further than it knows.',
         "[design]",
-        *_waves(design),
+        *_wave_lines(design),
     ]
 
 
-def _reduced_design(file: str) -> list[str]:
+def _reduced_design_section(file: str) -> list[str]:
+    """Returns the section of a design by the reduced model, with its expected duration."""
     design = DesignConfig.model_validate({"coarse": "reduced"})
     full = design.fine_points + design.fine_held_out
     low, high = (
@@ -219,15 +232,17 @@ def _reduced_design(file: str) -> list[str]:
         'coarse = "reduced"  # the model that makes the waves',
         f"fine_points = {design.fine_points}  # full runs that correct it",
         f"fine_held_out = {design.fine_held_out}  # full runs that measure the surrogate's error",
-        *_waves(design),
+        *_wave_lines(design),
     ]
 
 
 def _runs(design: DesignConfig) -> int:
+    """Returns the number of runs of a design's waves."""
     return sum(design.points) + len(design.points) * design.held_out
 
 
-def _waves(design: DesignConfig) -> list[str]:
+def _wave_lines(design: DesignConfig) -> list[str]:
+    """Returns the lines of a design's waves and workers."""
     return [
         f"points = {list(design.points)}  # training runs of each wave",
         f"held_out = {design.held_out}  # of each wave, to measure the surrogate's error",
@@ -235,27 +250,32 @@ def _waves(design: DesignConfig) -> list[str]:
     ]
 
 
-def _optional(config: Config) -> list[str]:
+def _optional_lines(config: Config) -> list[str]:
+    """Returns commented lines for all that can be set, with the defaults."""
     lines = []
-    for section, what, keys in _SECTIONS:
-        stated = {key: getattr(getattr(config, section), key) for key in keys}
-        lines += ["", f"# [{section}]  # {what}"]
-        lines += [f"# {key} = {_toml(value, key)}  # {keys[key]}" for key, value in stated.items()]
+    for section, subject, keys in _SECTIONS:
+        defaults = {key: getattr(getattr(config, section), key) for key in keys}
+        lines += ["", f"# [{section}]  # {subject}"]
+        lines += [
+            f"# {key} = {_default_as_toml(value, key)}  # {keys[key]}" for key, value in defaults.items()
+        ]
     for parameter in default_space().parameters:
-        lines += ["", *_prior(parameter)]
+        lines += ["", *_prior_lines(parameter)]
     return lines
 
 
 def _commented_device(config: Config) -> list[str]:
+    """Returns the sections of the device and the tissue as comments."""
     return ["", *(f"# {line}" if line else "" for line in device_lines(config.device, config.tissue))]
 
 
-def _toml(value: object, key: str) -> str:
-    """A default as TOML has it; where none is stated, an example or what stands for it."""
-    return json.dumps(_UNSTATED[key] if value is None else value)
+def _default_as_toml(value: object, key: str) -> str:
+    """Returns a default as TOML; where a key has no default, an example or the value that is used."""
+    return json.dumps(_EXAMPLES[key] if value is None else value)
 
 
-def _prior(parameter: Parameter) -> list[str]:
+def _prior_lines(parameter: Parameter) -> list[str]:
+    """Returns commented lines for the prior of a parameter."""
     return [
         f"# [parameters.{parameter.name}]  # {parameter.description}, {parameter.unit}",
         f"# lower = {parameter.lower!r}",

@@ -1,4 +1,4 @@
-"""The report of a run: one HTML file of whatever stages are done, made afresh each time."""
+"""The report of a run: one HTML file about the stages that are done, which is written again each time."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ FILE = "report.html"
 
 
 def write_page(run: Run, stages: Mapping[str, Stage]) -> Path:
-    """Writes the page into the run's folder, whole or not at all, and returns its path.
+    """Writes the page into the run's folder, completely or not at all, and returns its path.
 
-    A stage that is not done, or was made from something else than now, is named and left out.
+    A stage that is not done, or that was made from other inputs than the present ones, is named and left out.
     """
     path = run.folder / FILE
     storage.write_bytes(path, render_page(facts_of(run, stages)).encode())
@@ -30,13 +30,13 @@ def write_page(run: Run, stages: Mapping[str, Stage]) -> Path:
 
 
 def facts_of(run: Run, stages: Mapping[str, Stage]) -> RunFacts:
-    """All that the page says, from the stages' records."""
+    """Returns all content of the page, from the records of the stages."""
     config = run.config
     space = parameter_space(config, run.config_path)
-    stands = standing(run, stages)
-    if stands.get("diagnose", ("", None))[0] == "done" and (asked := experiment.answered(run)) is not None:
-        stands[experiment.FOLDER] = "done", asked
-    found = {name: _facts(run, name, *one) for name, one in stands.items() if name != "report"}
+    states = standing(run, stages)
+    if states.get("diagnose", ("", None))[0] == "done" and (answered := experiment.answered(run)) is not None:
+        states[experiment.FOLDER] = "done", answered
+    facts = {name: _facts(run, name, *state) for name, state in states.items() if name != "report"}
     return RunFacts(
         name=config.name,
         config_path=str(run.config_path),
@@ -47,33 +47,34 @@ def facts_of(run: Run, stages: Mapping[str, Stage]) -> RunFacts:
         observation=config.model.observation,
         mesh=config.model.forward or Path(config.model.mesh).name,
         parameters={p.name: p.description for p in space.parameters},
-        stages=found,
-        history=_history(run) if "sample" in found and found["sample"].done else None,
-        indices=_indices(run, found["sobol"]) if "sobol" in found else {},
+        stages=facts,
+        history=_history(run) if "sample" in facts and facts["sample"].done else None,
+        indices=_indices(run, facts["sobol"]) if "sobol" in facts else {},
     )
 
 
 def _facts(run: Run, name: str, stands: str, record: Record | None) -> StageFacts:
+    """Returns state, duration, summary and figures of a stage; a stage that is not done has only a state."""
     if record is None:
         return StageFacts(name, stands)
     if stands == "failed":
         return StageFacts(name, stands, record.seconds, record.summary)
     if stands != "done":
         return StageFacts(name, stands)
-    drawn = {
+    files = {
         file.removesuffix(".svg"): run.at(name, file) for file in record.outputs if file.endswith(".svg")
     }
-    figures = {figure: path.read_text(encoding="utf-8") for figure, path in drawn.items()}
+    figures = {figure: path.read_text(encoding="utf-8") for figure, path in files.items()}
     return StageFacts(name, stands, record.seconds, record.summary, figures)
 
 
 def _history(run: Run) -> dict[str, Any] | None:
-    """The stage `sample`'s bands; None of a run that was sampled before the stage wrote any."""
+    """Returns the bands of the stage `sample`; None for a run that an older version sampled without bands."""
     file = run.at("sample", "bands.json")
     return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
 
 
 def _indices(run: Run, stage: StageFacts) -> dict[str, SobolResult]:
-    """Sobol' indices over time, of those sets that the stage `sobol` has a file of."""
+    """Returns the Sobol' indices over time of each set for which the stage `sobol` has a file."""
     files = {name: run.at("sobol", f"{name}.h5") for name in stage.summary if stage.done}
     return {name: storage.load(file, SobolResult) for name, file in files.items() if file.is_file()}

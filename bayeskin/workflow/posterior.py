@@ -1,4 +1,4 @@
-"""Fifth stage: the posterior, its verdict, and what it predicts."""
+"""The fifth stage: samples the posterior, gives a verdict on it, and predicts the force."""
 
 from __future__ import annotations
 
@@ -32,13 +32,14 @@ from bayeskin.workflow.provenance import caption
 from bayeskin.workflow.shipping import shipped_files
 
 PREDICTIVE_DRAWS = 1000
-PROFILED_DRAWS = 2000  # among which a profile looks for where to begin
+PROFILED_DRAWS = 2000  # draws among which a profile likelihood finds its starting points
 
 
-def _sample(run: Run) -> Mapping[str, Any]:
+def _sample_posterior(run: Run) -> Mapping[str, Any]:
+    """Samples and checks the posterior, writes it with its figures, and returns the stage's summary."""
     config = run.config
     best = run.summary("map")["theta"]
-    checked = checked_posterior(run, refined_posterior(run), partial(_draws_of, run, best))
+    checked = checked_posterior(run, refined_posterior(run), partial(_draws, run, best))
     log_posterior, posterior = checked.log_posterior, checked.posterior
     recording = storage.load(run.at("recording", "recording.h5"), Recording)
     provenance = provenance_of(run, log_posterior, recording.sha256)
@@ -48,21 +49,24 @@ def _sample(run: Run) -> Mapping[str, Any]:
     drawn = inference.predictive_draws(log_posterior, inference.evenly(posterior.flat, PREDICTIVE_DRAWS), rng)
     profiles = inference.profiles(log_posterior, best, inference.evenly(posterior.flat, PROFILED_DRAWS))
     residuals = _residuals(checked)
-    _draw_posterior(run, checked, best, drawn, profiles, residuals)
+    _draw_figures(run, checked, best, drawn, profiles, residuals)
     bands = inference.bands_of(log_posterior.binned.time_s, drawn)
-    write_json(run.at("sample", "bands.json"), _history(log_posterior, bands))
-    return {**_sampled(checked, bands, residuals), "profiles": {one.name: _profiled(one) for one in profiles}}
+    write_json(run.at("sample", "bands.json"), _bands_by_bin(log_posterior, bands))
+    return {
+        **_posterior_summary(checked, bands, residuals),
+        "profiles": {profile.name: _profile_summary(profile) for profile in profiles},
+    }
 
 
 def _residuals(checked: Checked) -> inference.ResidualCheck:
-    """What the most probable of the draws leaves."""
+    """Returns the check of the residuals at the most probable draw."""
     log_posterior, posterior = checked.log_posterior, checked.posterior
     best = posterior.flat[int(np.argmax(posterior.log_prob))]
     return inference.check_residuals(log_posterior, log_posterior.to_sampling(best))
 
 
-def _left(residuals: inference.ResidualCheck) -> dict[str, Any]:
-    """A check of residuals in a summary."""
+def _residual_summary(residuals: inference.ResidualCheck) -> dict[str, Any]:
+    """Returns a check of residuals as plain values for the summary."""
     return {
         "passes": residuals.passes,
         "sentence": residuals.sentence,
@@ -70,17 +74,20 @@ def _left(residuals: inference.ResidualCheck) -> dict[str, Any]:
         "p_correlation": residuals.p_correlation,
         "autocorrelation": residuals.autocorrelation,
         "by_kind": {
-            one.kind: {
-                "bins": one.bins, "sd": one.sd, "p_sd": one.p_sd,
-                "correlation": one.correlation, "p_correlation": one.p_correlation,
+            kind.kind: {
+                "bins": kind.bins, "sd": kind.sd, "p_sd": kind.p_sd,
+                "correlation": kind.correlation, "p_correlation": kind.p_correlation,
             }
-            for one in residuals.kinds
+            for kind in residuals.kinds
         },
     }  # fmt: skip
 
 
-def _profiled(profile: inference.Profile) -> dict[str, Any]:
-    """A profile likelihood in a summary; an interval is open where the prior ends before the fit does."""
+def _profile_summary(profile: inference.Profile) -> dict[str, Any]:
+    """Returns a profile likelihood as plain values for the summary.
+
+    Its interval is open where the prior ends before the likelihood has dropped enough.
+    """
     low, high = profile.interval
     return {
         "low_90": low, "high_90": high, "open_below": profile.open_below, "open_above": profile.open_above,
@@ -89,16 +96,17 @@ def _profiled(profile: inference.Profile) -> dict[str, Any]:
 
 
 def provenance_of(run: Run, log_posterior: LogPosterior, recording_sha256: str) -> Provenance:
-    """What a posterior was made from, its configuration included."""
+    """Returns the origin of a posterior, which contains its configuration."""
     config = run.config
-    told = config.model_dump(mode="json", exclude_none=True)
+    settings = config.model_dump(mode="json", exclude_none=True)
     if config.surrogate.file is not None:
-        ready = shipped_files(run).surrogate
-        if ready == run.config_path.resolve().parent / config.surrogate.file:  # the configuration may move
-            told["surrogate"]["file"] = str(ready)
+        file = shipped_files(run).surrogate
+        # An absolute path stays valid if the configuration is moved.
+        if file == run.config_path.resolve().parent / config.surrogate.file:
+            settings["surrogate"]["file"] = str(file)
     extra = {
         "surrogate": dict(log_posterior.surrogate.provenance),
-        "config": told,
+        "config": settings,
         "identity": log_posterior.identity,
     }
     return Provenance(
@@ -106,16 +114,16 @@ def provenance_of(run: Run, log_posterior: LogPosterior, recording_sha256: str) 
     )
 
 
-def _draws_of(run: Run, best: Mapping[str, float], log_posterior: LogPosterior) -> Posterior:
-    """Draws of a posterior, from about its most probable point."""
+def _draws(run: Run, best: Mapping[str, float], log_posterior: LogPosterior) -> Posterior:
+    """Returns draws of a posterior; the chains start near its most probable point."""
     folder = chains_folder(run, log_posterior)
     settings, tell = settings_of(run.config), partial(_tell_sampling, run)
     threads = run.config.design.workers
     return inference.sample(log_posterior, folder, run.config.seed, best, settings, tell, threads)
 
 
-def _history(log_posterior: LogPosterior, bands: inference.Bands) -> dict[str, Any]:
-    """The recorded bins and what is predicted for them, for whoever draws or reads them; (m,) each, SI."""
+def _bands_by_bin(log_posterior: LogPosterior, bands: inference.Bands) -> dict[str, Any]:
+    """Returns the recorded bins and the predicted bands, (m,) each in SI units, for figures and programs."""
     (low_50, high_50), (low_90, high_90) = bands.interval(0.5), bands.interval(0.9)
     fitted = np.isin(np.arange(len(bands.time_s)), log_posterior.chain.bins)
     return {
@@ -126,12 +134,17 @@ def _history(log_posterior: LogPosterior, bands: inference.Bands) -> dict[str, A
 
 
 def chains_folder(run: Run, log_posterior: LogPosterior) -> Path:
-    """Where chains are kept by what they are of, so that a change of when to stop does not lose them."""
+    """Returns the folder of a posterior's chains.
+
+    Its name depends on the posterior, the seed and the number of walkers. A change of the stopping criteria
+    thus does not discard the chains.
+    """
     identity = {**log_posterior.identity, "seed": run.config.seed, "walkers": run.config.sample.walkers}
     return run.folder / "chains" / sha256_of(identity)[:16]
 
 
 def settings_of(config: Config) -> inference.SampleSettings:
+    """Returns the sampler's settings of a configuration."""
     limits = inference.Limits(effective_samples=float(config.sample.effective_samples))
     return inference.SampleSettings(
         config.sample.ensembles, config.sample.walkers, config.sample.max_steps, limits
@@ -139,10 +152,14 @@ def settings_of(config: Config) -> inference.SampleSettings:
 
 
 def _tell_sampling(run: Run, share: float, text: str) -> None:
+    """Reports the progress of the sampler."""
     run.reporter.progress("sampling", share, text)
 
 
-def _sampled(checked: Checked, bands: inference.Bands, residuals: inference.ResidualCheck) -> dict[str, Any]:
+def _posterior_summary(
+    checked: Checked, bands: inference.Bands, residuals: inference.ResidualCheck
+) -> dict[str, Any]:
+    """Returns the stage's summary."""
     log_posterior, posterior, c = checked.log_posterior, checked.posterior, checked.posterior.convergence
     low, high = bands.interval(0.9)
     learned = inference.identifiability(posterior.space, posterior.flat)
@@ -152,25 +169,25 @@ def _sampled(checked: Checked, bands: inference.Bands, residuals: inference.Resi
         "verdict": "trusted" if verdict.trusted else "not trusted",
         "reasons": list(verdict.reasons),
         "remarks": [*inference.noise_remarks(learned), *([] if residuals.passes else [residuals.sentence])],
-        "residuals": _left(residuals),
+        "residuals": _residual_summary(residuals),
         "steps": c.steps,
         "draws": len(posterior.flat),
         "parameters": _table(posterior),
-        "identifiability": [one.statement for one in learned.parameters],
-        "ridges": [one.statement for one in learned.ridges],
+        "identifiability": [parameter.statement for parameter in learned.parameters],
+        "ridges": [ridge.statement for ridge in learned.ridges],
         "learned": {
-            one.name: {
-                "contraction": one.contraction,
-                "gain_nats": one.gain_nats,
-                "sentence": one.sentence,
+            parameter.name: {
+                "contraction": parameter.contraction,
+                "gain_nats": parameter.gain_nats,
+                "sentence": parameter.sentence,
             }
-            for one in learned.parameters
+            for parameter in learned.parameters
         },
         "lengths": {
-            one.name: {"share": one.share, "sentence": one.sentence}
-            for one in inference.due_to_lengths(posterior.space, posterior.flat)
+            length.name: {"share": length.share, "sentence": length.sentence}
+            for length in inference.due_to_lengths(posterior.space, posterior.flat)
         },
-        "full_model": [said_of(one) for one in checked.rounds],
+        "full_model": [said_of(weighed) for weighed in checked.rounds],
         "corrected": corrected_table(checked),
         "rmse": rmse_table(log_posterior, bands.mean_n),
         "coverage_90": inference.coverage(log_posterior.binned, low, high),
@@ -183,20 +200,24 @@ def _sampled(checked: Checked, bands: inference.Bands, residuals: inference.Resi
 
 
 def with_surrogate_error(verdict: Verdict, bands: inference.Bands, fitted: NDArray[np.int64]) -> Verdict:
-    """The verdict with one more criterion: what the surrogate leaves open in the fitted bins.
+    """Returns the verdict with one more criterion: the surrogate's error in the fitted bins.
 
-    Where its sd exceeds the noise's, a bad fit hides in it, and the posterior goes where it is largest.
+    Where the surrogate's sd exceeds the noise's, it can hide a bad fit, and the posterior moves to where this
+    sd is largest.
     """
     surrogate, noise = (
         float(np.sqrt(np.mean(sd[fitted] ** 2))) for sd in (bands.sd_surrogate_n, bands.sd_noise_n)
     )
-    said = f"surrogate's sd {1e3 * surrogate:.3g} mN where fitted; at most the noise's {1e3 * noise:.3g} mN"
+    statement = (
+        f"surrogate's sd {1e3 * surrogate:.3g} mN where fitted; at most the noise's {1e3 * noise:.3g} mN"
+    )
     if surrogate <= noise:
-        return Verdict(verdict.trusted, (*verdict.reasons, said))
-    return Verdict(False, (f"{said}: run the full model where the posterior is", *verdict.reasons))
+        return Verdict(verdict.trusted, (*verdict.reasons, statement))
+    return Verdict(False, (f"{statement}: run the full model where the posterior is", *verdict.reasons))
 
 
 def _table(posterior: Posterior) -> dict[str, dict[str, Any]]:
+    """Returns for each parameter its posterior, its convergence and its prior as plain values."""
     c, table = posterior.convergence, {}
     for j, p in enumerate(posterior.space.parameters):
         draws = posterior.flat[:, j]
@@ -212,7 +233,7 @@ def _table(posterior: Posterior) -> dict[str, dict[str, Any]]:
     return table
 
 
-def _draw_posterior(
+def _draw_figures(
     run: Run,
     checked: Checked,
     best: Mapping[str, float],
@@ -220,13 +241,16 @@ def _draw_posterior(
     profiles: Sequence[inference.Profile],
     residuals: inference.ResidualCheck,
 ) -> None:
+    """Draws the figures of the stage."""
     log_posterior, posterior = checked.log_posterior, checked.posterior
     binned = log_posterior.binned
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     fitted = np.isin(np.arange(len(binned.force_n)), log_posterior.chain.bins)
     convergence = posterior.convergence
     folder, ensembles = chains_folder(run, log_posterior), run.config.sample.ensembles
-    kept = inference.load_chains(folder, log_posterior, ensembles)[:, convergence.burn_in : convergence.steps]
+    chains = inference.load_chains(folder, log_posterior, ensembles)[
+        :, convergence.burn_in : convergence.steps
+    ]
     material = posterior.space.names[: log_posterior.surrogate.space.dim]
     noise = posterior.space.names[len(material) :]
     figures = {
@@ -244,7 +268,7 @@ def _draw_posterior(
         "profiles": report.figure_profiles(posterior.space, posterior.flat, profiles),
         "residuals": report.figure_residuals(residuals),
         "traces": report.figure_traces(
-            posterior.space, kept, convergence.verdict, settings_of(run.config).limits
+            posterior.space, chains, convergence.verdict, settings_of(run.config).limits
         ),
     }
     if checked.rounds and says_something(checked.rounds[-1]):
@@ -260,5 +284,5 @@ STAGE = Stage(
     "samples the posterior",
     ("recording", "map"),
     ("seed", "sample", "check", "fit", "noise", "parameters", "model", "surrogate", "design"),
-    _sample,
+    _sample_posterior,
 )

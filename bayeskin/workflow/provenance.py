@@ -1,4 +1,4 @@
-"""What the outputs of a run say of where they come from."""
+"""States the origin of a run's outputs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from bayeskin.workflow.engine import Run
 
 
 def caption(run: Run) -> str:
-    """One line for a figure's metadata."""
+    """Returns one line about a figure's origin, for the metadata of its file."""
     config = run.config
     return f"bayeskin {bayeskin.__version__}, {config.name}, seed {config.seed}, config {config.sha256[:12]}"

@@ -1,4 +1,4 @@
-"""First stage: the recording as it is fitted, the motion that drives the model, the noise by phase."""
+"""The first stage: reads the recording, and derives the bins to fit, the protocol and the noise by phase."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ from bayeskin.workflow.provenance import caption
 def pad_motion(
     observation: str, recording: Recording, phases: Sequence[Phase], protocol: str = "recorded"
 ) -> PadMotion:
-    """The displacement that drives the model; the article's script takes every 50th sample, as it stands."""
+    """Returns the displacement that drives the model.
+
+    For the article's observation, this is every 50th sample, unchanged, as in the article's script.
+    """
     if observation == "article":
         return motion_of(recording)
     if protocol == "idealised":
@@ -42,7 +45,7 @@ def pad_motion(
 
 @dataclass(frozen=True)
 class Prepared:
-    """A recording as it is fitted."""
+    """A recording in the form in which it is fitted."""
 
     phases: Sequence[Phase]
     analysis: NoiseAnalysis
@@ -51,7 +54,7 @@ class Prepared:
 
 
 def prepared(run: Run, recording: Recording) -> Prepared:
-    """Phases, noise, protocol and bins of a recording as the configuration asks for them."""
+    """Returns phases, noise, protocol and bins of a recording, as the configuration asks for them."""
     phases = segment(recording)
     analysis = analyse(recording, phases)
     motion = pad_motion(run.config.model.observation, recording, phases, run.config.recording.protocol)
@@ -59,24 +62,28 @@ def prepared(run: Run, recording: Recording) -> Prepared:
     return Prepared(phases, analysis, motion, bin_recording(recording, phases, edges_s, analysis))
 
 
-def _work(run: Run) -> Mapping[str, Any]:
+def _prepare_recording(run: Run) -> Mapping[str, Any]:
+    """Prepares the recording, writes it with a figure, and returns the stage's summary."""
     recording = read_recording(run.beside(run.config.recording.file))
-    made = prepared(run, recording)
-    _refuse_empty_windows(run, made.binned)
+    fitted = prepared(run, recording)
+    _refuse_empty_windows(run, fitted.binned)
     storage.save(run.at("recording", "recording.h5"), recording)
-    storage.save(run.at("recording", "motion.h5"), made.motion)
-    storage.save(run.at("recording", "binned.h5"), made.binned)
-    figure = report.figure_recording(recording, made.binned)
+    storage.save(run.at("recording", "motion.h5"), fitted.motion)
+    storage.save(run.at("recording", "binned.h5"), fitted.binned)
+    figure = report.figure_recording(recording, fitted.binned)
     report.save_figure(figure, run.at("recording", "recording"), caption(run))
-    return describe_json(recording, made.phases, summarise(made.analysis, made.phases))
+    return describe_json(recording, fitted.phases, summarise(fitted.analysis, fitted.phases))
 
 
 def _refuse_empty_windows(run: Run, binned: BinnedForce) -> None:
-    """Raises InputError for a window to fit that holds no bin: later stages would find out after hours."""
+    """Raises InputError for a window to fit that contains no bin.
+
+    Later stages would detect this only after hours.
+    """
     windows = run.config.fit.windows_s or ()
-    held = set(bins_in_windows(binned, windows or None).tolist())
+    occupied = set(bins_in_windows(binned, windows or None).tolist())
     for index, (start, end) in enumerate(windows):
-        if index not in held:
+        if index not in occupied:
             where = f"{run.config_path}: fit.windows_s"
             first, last = binned.edges_s[[0, -1]]
             expected = f"windows that hold a bin of the recording's, {first:g} to {last:g} s"
@@ -84,7 +91,10 @@ def _refuse_empty_windows(run: Run, binned: BinnedForce) -> None:
 
 
 def _files(run: Run) -> Iterable[Path]:
+    """Returns the file that the stage reads."""
     return [run.beside(run.config.recording.file)]
 
 
-STAGE = Stage("recording", "reads the recording", (), ("recording", "model", "fit"), _work, _files)
+STAGE = Stage(
+    "recording", "reads the recording", (), ("recording", "model", "fit"), _prepare_recording, _files
+)

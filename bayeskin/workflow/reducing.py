@@ -1,4 +1,4 @@
-"""The reduced model of a device: building it, and finding the one that fits a geometry."""
+"""Builds the reduced model of a device, and finds the reduced model that fits a geometry."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from bayeskin.workflow.engine import Reporter
 from bayeskin.workflow.folder import locked
 
 SHIPPED = "surrogates/article-device-reduced.h5"
-REFINEMENT = 1  # of the bricks that reduced models stand for
+REFINEMENT = 1  # of the bricks of the full model that reduced models replace
 WORKERS = 2
 EXPECTED = "a configuration, or a file with [device] and [tissue]"
 
@@ -41,14 +41,15 @@ EXPECTED = "a configuration, or a file with [device] and [tissue]"
 def reduce(
     source: Path | None, out: Path | None, reporter: Reporter, scheduler: str | None = None
 ) -> dict[str, Any]:
-    """Builds the reduced model of a device, the base model first and then all mechanisms of the tissue.
+    """Builds the reduced model of a device: the base model first, and then all mechanisms of the tissue.
 
     source : a configuration, or a file with the sections `device` and `tissue`; None is the article's device
     out : HDF5 file to write; by default beside the source, with "-reduced" after its name
-    scheduler : address of a Dask scheduler that makes the training runs; else processes of this machine
+    scheduler : address of a Dask scheduler that makes the training runs; without it, this machine makes them
 
-    Training runs are kept in a folder beside `out` until the model is finished, so the same command goes on.
-    Raises InputError for bad input, with nothing written; an `out` that is finished stays as it is.
+    Training runs are stored in a folder beside `out` until the model is finished, so the same command
+    continues after an interruption. Raises InputError for wrong input, with nothing written. An `out` that is
+    finished stays unchanged.
     """
     geometry = _geometry(source)
     path = out or default_path(source)
@@ -64,8 +65,8 @@ def reduce(
         if scheduler is None:
             _build(path, trained, settings, folder, local(WORKERS), reporter)
         else:
-            with on_scheduler(scheduler) as over:
-                _build(path, trained, settings, folder, over, reporter)
+            with on_scheduler(scheduler) as run_all:
+                _build(path, trained, settings, folder, run_all, reporter)
     shutil.rmtree(folder)
     return _answer(path, load_reduced(path), time.perf_counter() - started, "built")
 
@@ -73,21 +74,23 @@ def reduce(
 def _build(
     path: Path, trained: Trained, settings: BuildSettings, folder: Path, run_all: Map, reporter: Reporter
 ) -> None:
-    """Builds the base model and keeps it, so that it can be used meanwhile; then the whole one."""
+    """Builds the base model and stores it, so that it can be used meanwhile; then builds the whole model."""
     full = FullRuns(trained.geometry, REFINEMENT, folder)
 
     def progress(what: str, share: float) -> None:
+        """Reports the progress."""
         reporter.progress(what, share)
 
     if not path.is_file():
         reporter.log(f"the base model learns from {settings.base_runs} full runs")
         save_reduced(path, base_model(trained, full, settings, run_all, progress), _manifest(settings))
         reporter.log(f"{path}: the base model can be used; {len(trained.mechanisms)} mechanisms follow")
-    whole = with_mechanisms(load_reduced(path), trained, full, settings, run_all, progress)
-    save_reduced(path, whole, _manifest(settings))
+    complete = with_mechanisms(load_reduced(path), trained, full, settings, run_all, progress)
+    save_reduced(path, complete, _manifest(settings))
 
 
 def _manifest(settings: BuildSettings) -> dict[str, Any]:
+    """Returns the facts that are stored with a reduced model."""
     return {"settings": asdict(settings), "made_by": "bayeskin reduce"}
 
 
@@ -100,6 +103,7 @@ def trained_for(geometry: Geometry) -> Trained:
 
 
 def _geometry(source: Path | None) -> Geometry:
+    """Returns the geometry that a source states, by default the article's."""
     if source is None:
         return Geometry()
     if not source.is_file():
@@ -111,30 +115,36 @@ def _geometry(source: Path | None) -> Geometry:
 
 
 def default_path(source: Path | None) -> Path:
-    """Returns where a source's reduced model is looked for, and written by default."""
+    """Returns the path where a source's reduced model is looked for, and written by default."""
     return (
         Path("article-device-reduced.h5") if source is None else source.with_name(f"{source.stem}-reduced.h5")
     )
 
 
 def _finished(path: Path, trained: Trained) -> bool:
-    """Returns whether a file holds the whole model already. Raises InputError for one of another device."""
+    """Returns whether a file already contains the whole model.
+
+    Raises InputError for a file of another device.
+    """
     if not path.is_file():
         return False
-    there = load_reduced(path)
-    if there.trained.geometry != trained.geometry:
+    stored = load_reduced(path)
+    if stored.trained.geometry != trained.geometry:
         raise InputError(f"-o {path}", "a reduced model of another geometry", "a name that is free")
-    return set(there.trained.mechanisms) == set(trained.mechanisms)
+    return set(stored.trained.mechanisms) == set(trained.mechanisms)
 
 
 def find_reduced(geometry: Geometry, beside: Sequence[Path]) -> Path | None:
     """Returns the file of a reduced model that fits a geometry, or None where there is none.
 
-    It is one named as `default_path` names it, beside the files given, or the shipped one; where several fit,
-    the first that was made for this very geometry. Raises InputError for such a file that cannot be read.
+    The candidates are files beside the given files that are named as in `default_path`, and the shipped file.
+    If several fit, the first one that was made for exactly this geometry is taken. Raises InputError for a
+    candidate that cannot be read.
     """
-    own = [path for source in beside for path in sorted(source.resolve().parent.glob("*-reduced.h5"))]
-    known = [(trained_geometry(path), path) for path in (*own, shipped(SHIPPED))]
+    beside_files = [
+        path for source in beside for path in sorted(source.resolve().parent.glob("*-reduced.h5"))
+    ]
+    known = [(trained_geometry(path), path) for path in (*beside_files, shipped(SHIPPED))]
     fitting = [(trained != geometry, path) for trained, path in known
                if trained is not None and not other_geometry(trained, geometry)]  # fmt: skip
     return min(fitting, key=itemgetter(0))[1] if fitting else None
@@ -142,14 +152,15 @@ def find_reduced(geometry: Geometry, beside: Sequence[Path]) -> Path | None:
 
 def reduced_file(geometry: Geometry, beside: Sequence[Path]) -> Path:
     """Returns the file that `find_reduced` finds. Raises InputError where it finds none."""
-    found = find_reduced(geometry, beside)
-    if found is None:
+    file = find_reduced(geometry, beside)
+    if file is None:
         expected = "one that `bayeskin reduce` makes of its file, once"
         raise InputError("reduced model", "none for this device and tissue", expected)
-    return found
+    return file
 
 
 def _answer(path: Path, model: ReducedModel, seconds: float, done: str) -> dict[str, Any]:
+    """Returns the command's answer."""
     base, (u, p) = model.cubatures, (model.library.base.displacement, model.library.base.pressure)
     text = (
         f"{path}: {done}; {len(u)} displacement and {len(p) + 1} pressure modes of the base model at "

@@ -1,4 +1,4 @@
-"""A design that further full runs join, and the surrogate that is trained again with them."""
+"""Adds full runs to a design, and trains the surrogate again with them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bayeskin.workflow.training import corrected, fine_design, trained
 
 
 class Refining:
-    """The designs that the stage `stage` left with runs that join them; the last surrogate trained."""
+    """The designs of a stage with the runs that are added to them, and the surrogate trained last."""
 
     def __init__(self, run: Run, binned: BinnedForce, stage: str, surrogate: str) -> None:
         self.run, self.binned = run, binned
@@ -30,12 +30,15 @@ class Refining:
         self.manifest = load_manifest(run.at(surrogate, "surrogate.h5"))
 
     def retrain(self, theta: Mapping[str, float], simulation: Simulation) -> Surrogate:
-        """With one run of the configuration's model."""
+        """Returns the surrogate after training with one more run of the configuration's model."""
         self.run.reporter.log("map: the surrogate was off there; the point joins the design")
         return self.learn(_as_design(self.design, theta, simulation))
 
     def learn(self, runs: Design) -> Surrogate:
-        """With runs of the configuration's model, those that failed left out."""
+        """Returns the surrogate after training with more runs of the configuration's model.
+
+        Failed runs are left out.
+        """
         waves = runs
         if self.fine is not None:
             waves = runs_at(self.run, "coarse model", runs, waves_model(self.run))
@@ -48,7 +51,7 @@ class Refining:
         return self.surrogate
 
     def save(self, stage: str) -> None:
-        """Surrogate and designs into a stage's folder."""
+        """Writes the surrogate and the designs into a stage's folder."""
         save_surrogate(self.run.at(stage, "surrogate.h5"), self.surrogate, self.manifest)
         storage.save(self.run.at(stage, "design.h5"), self.design)
         if self.fine is not None:
@@ -56,12 +59,12 @@ class Refining:
 
 
 def full_runs(run: Run, label: str, points: Design) -> Design:
-    """Returns the points of a design as the configuration's model runs them."""
+    """Returns the points of a design with the results of the configuration's model."""
     return runs_at(run, label, points, full_model(run))
 
 
 def runs_at(run: Run, label: str, points: Design, model: ForceModel) -> Design:
-    """Returns the points of a design as a model runs them: kept, so that no run is made twice."""
+    """Returns the points of a design with the results of a model; runs are stored, so none is made twice."""
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     training = np.zeros(len(points.theta), bool)
     wave = Wave(points.space, points.theta, training, 0, run.config.seed, {"rule": label})
@@ -71,7 +74,7 @@ def runs_at(run: Run, label: str, points: Design, model: ForceModel) -> Design:
 
 
 def points_like(design: Design, theta: Array) -> Design:
-    """Points (n, d) not yet run, in a design's space and bins."""
+    """Returns a design of points (n, d) that have not been run, with the space and bins of another design."""
     n, bins = len(theta), len(design.edges_s) - 1
     return dataclasses.replace(
         design, theta=theta, force_n=np.full((n, bins), np.nan), wave=np.zeros(n, dtype=np.int64),
@@ -80,6 +83,7 @@ def points_like(design: Design, theta: Array) -> Design:
 
 
 def _as_design(like: Design, theta: Mapping[str, float], simulation: Simulation) -> Design:
+    """Returns one run as a design with one point."""
     point = points_like(like, np.array([[theta[name] for name in like.space.names]]))
     return dataclasses.replace(
         point, force_n=simulation.bin_means(like.edges_s)[None], ok=np.array([True]),
@@ -88,7 +92,7 @@ def _as_design(like: Design, theta: Mapping[str, float], simulation: Simulation)
 
 
 def _joined(design: Design, runs: Design) -> Design:
-    """The design with further training rows, a wave of their own."""
+    """Returns the design with further training rows, which form a wave of their own."""
     number = np.full(len(runs.theta), design.wave.max() + 1)
     return dataclasses.replace(
         design,

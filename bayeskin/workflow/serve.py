@@ -1,4 +1,4 @@
-"""The forward model as a UM-Bridge model: parameters in, the force over a protocol out."""
+"""Offers the forward model as a UM-Bridge model: from parameters to the force over a protocol."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ MOST_TIMES = 1_000_000
 
 @dataclass(frozen=True)
 class Asked:
-    """One configuration of the model: what drives it, where its force is wanted, what is added to it.
+    """One request to the model: its protocol, the bins or times of the force, and the mechanisms to add.
 
-    edges_s (m+1,) : bins whose mean forces are the output; times_s (t,) : times, in their place
+    edges_s : the bins whose mean forces are the output, (m+1,)
+    times_s : times (t,) whose forces are the output instead of the bins', or None
     """
 
     motion: PadMotion
@@ -43,16 +44,18 @@ class Asked:
 
     @property
     def outputs(self) -> int:
+        """Returns the number of outputs."""
         return len(self.edges_s) - 1 if self.times_s is None else len(self.times_s)
 
 
 @dataclass(frozen=True)
 class ServedModel:
-    """The model of a configuration, as `bayeskin.external.umbridge.Model`.
+    """The model of a configuration, in the form of `bayeskin.external.umbridge.Model`.
 
-    A client may send ``protocol`` (``time_s`` [s] and ``displacement_m`` [m] of its corners, of
-    the displacement between the pads), ``edges_s`` or ``times_s`` [s], and names of ``mechanisms``, whose
-    parameters follow the base model's in the one input vector. What it leaves out is the served one's.
+    A client may send ``protocol`` (``time_s`` [s] and ``displacement_m`` [m] of its corners, as displacement
+    between the pads), ``edges_s`` or ``times_s`` [s], and names of ``mechanisms``. The parameters of
+    mechanisms follow the parameters of the base model in the one input vector. Anything that the client does
+    not send is as in `usual`.
     """
 
     spec: ModelSpec
@@ -61,36 +64,40 @@ class ServedModel:
     name: str = NAME
 
     def input_sizes(self, config: Mapping[str, Any]) -> list[int]:
-        return [len(self._names(self._asked(config)))]
+        """Returns the number of parameters, as the length of the one input vector."""
+        return [len(self._names(self._request_of(config)))]
 
     def output_sizes(self, config: Mapping[str, Any]) -> list[int]:
-        return [self._asked(config).outputs]
+        """Returns the number of forces, as the length of the one output vector."""
+        return [self._request_of(config).outputs]
 
     def evaluate(self, inputs: Vectors, config: Mapping[str, Any]) -> Vectors:
-        """One run. Raises Refused for a run that fails, with its message."""
-        asked = self._asked(config)
-        values = dict(zip(self._names(asked), inputs[0], strict=True))
-        within = {p.name for mechanism in solved(asked.mechanisms) for p in mechanism.parameters}
-        theta = {n: v for n, v in values.items() if n in within or n in self._names(self.usual)}
-        run = simulate(self.spec, asked.motion, theta, laws=laws(asked.mechanisms))
+        """Returns the forces of one run. Raises Refused for a run that fails, with its message."""
+        request = self._request_of(config)
+        values = dict(zip(self._names(request), inputs[0], strict=True))
+        solved_names = {p.name for mechanism in solved(request.mechanisms) for p in mechanism.parameters}
+        theta = {n: v for n, v in values.items() if n in solved_names or n in self._names(self.usual)}
+        run = simulate(self.spec, request.motion, theta, laws=laws(request.mechanisms))
         if run.status != "ok":
             raise Refused(run.message)
-        force = reported(run, asked.mechanisms, values, asked.motion)
-        if asked.times_s is not None:
-            return [np.atleast_2d(force(asked.times_s))[0].tolist()]
-        if not asked.mechanisms:  # a design's own means
-            return [run.bin_means(asked.edges_s).tolist()]
-        return [bin_means(force, asked.motion, asked.edges_s, asked.mechanisms)[0].tolist()]
+        force = reported(run, request.mechanisms, values, request.motion)
+        if request.times_s is not None:
+            return [np.atleast_2d(force(request.times_s))[0].tolist()]
+        if not request.mechanisms:  # the same means as in a design
+            return [run.bin_means(request.edges_s).tolist()]
+        return [bin_means(force, request.motion, request.edges_s, request.mechanisms)[0].tolist()]
 
     def _names(self, asked: Asked) -> list[str]:
-        more = [p.name for mechanism in asked.mechanisms for p in mechanism.parameters]
-        names = [*(p.name for p in self.parameters), *more]
+        """Returns the names of the parameters. Raises InputError for a name that occurs twice."""
+        added = [p.name for mechanism in asked.mechanisms for p in mechanism.parameters]
+        names = [*(p.name for p in self.parameters), *added]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise InputError("config: mechanisms", f"{twice[0]} twice", "parameters of other names")
         return names
 
-    def _asked(self, config: Mapping[str, Any]) -> Asked:
+    def _request_of(self, config: Mapping[str, Any]) -> Asked:
+        """Returns a client's config as a request. Raises InputError for a config that is wrong."""
         for key in config:
             if key not in KEYS:
                 raise InputError(f"config: {key}", "an unknown key", f"one of {', '.join(KEYS)}")
@@ -110,12 +117,12 @@ class ServedModel:
 def open_server(
     config: Path | None, host: str, port: int, reporter: Reporter
 ) -> tuple[ThreadingHTTPServer, dict[str, Any]]:
-    """A server of a configuration's model (default: the demo's) that listens, and what it offers.
+    """Returns a listening server of a configuration's model (default: the demo's), and the command's answer.
 
-    Raises InputError for bad input, or an address that cannot be had.
+    Raises InputError for wrong input, or an address that is not available.
     """
     run = open_run(config or shipped("runs/demo.toml"), reporter)
-    model = _served(run)
+    model = _served_model(run)
     listening = server(model, host, port)
     address = f"http://{host}:{listening.server_address[1]}"
     names = [p.name for p in model.parameters]
@@ -127,7 +134,8 @@ def open_server(
     return listening, {"ok": True, **offered, "text": text}
 
 
-def _served(run: Run) -> ServedModel:
+def _served_model(run: Run) -> ServedModel:
+    """Returns the model that a run's configuration serves."""
     spec, space = model_spec(run), parameter_space(run.config, run.config_path)
     if spec.forward is not None:
         check_own(spec.forward)
@@ -138,6 +146,7 @@ def _served(run: Run) -> ServedModel:
 
 
 def _protocol(given: Any) -> PadMotion:
+    """Returns a client's protocol. Raises InputError for one that is wrong."""
     keys = {"time_s", "displacement_m"}
     if not isinstance(given, dict) or set(given) != keys:
         raise InputError("config: protocol", f"{given!r:.60}", "lists time_s and displacement_m")
@@ -151,7 +160,7 @@ def _protocol(given: Any) -> PadMotion:
 
 
 def _times(key: str, given: Any, motion: PadMotion) -> Array:
-    """Increasing times within a protocol."""
+    """Returns a client's times, which increase and lie within the protocol."""
     times_s, end_s = _numbers(key, given), float(motion.time_s[-1])
     if not len(times_s) or not np.all(np.diff(times_s) > 0):
         raise InputError(f"config: {key}", f"{len(times_s)} times that do not increase", "increasing times")
@@ -162,16 +171,18 @@ def _times(key: str, given: Any, motion: PadMotion) -> Array:
 
 
 def _numbers(key: str, given: Any) -> Array:
-    numbers = isinstance(given, list) and all(
+    """Returns a client's list of numbers as an array. Raises InputError for anything else."""
+    numeric = isinstance(given, list) and all(
         isinstance(value, int | float) and not isinstance(value, bool) for value in given
     )
-    found = np.array(given, dtype=float) if numbers and len(given) <= MOST_TIMES else np.array([np.nan])
-    if not np.isfinite(found).all():
+    array = np.array(given, dtype=float) if numeric and len(given) <= MOST_TIMES else np.array([np.nan])
+    if not np.isfinite(array).all():
         raise InputError(f"config: {key}", f"{given!r:.60}", f"a list of at most {MOST_TIMES} finite numbers")
-    return found
+    return array
 
 
 def _mechanisms(given: Any) -> tuple[Mechanism, ...]:
+    """Returns the mechanisms that a client names. Raises InputError for unknown or repeated names."""
     if given == []:
         return ()
     known = catalogue()

@@ -1,5 +1,8 @@
-"""Surrogates that come ready: NAME.h5 with its manifest inside, its design NAME-design.h5 beside it, and
-NAME-fine.h5, the fine model's runs, where the design is a coarser one's."""
+"""Finds and checks surrogates that were trained before.
+
+Such a surrogate is a file NAME.h5 that contains its manifest. Its design NAME-design.h5 lies beside it. Where
+the design is a coarser model's, the runs of the finer model lie beside it too, as NAME-fine.h5.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ from bayeskin.workflow.model import model_spec, waves_model
 
 
 class ShippedFiles(NamedTuple):
-    """The files of a surrogate that comes ready; `fine` only with a coarser model's design."""
+    """The files of a surrogate that was trained before; `fine` exists only with a coarser model's design."""
 
     surrogate: Path
     design: Path
@@ -31,23 +34,25 @@ class ShippedFiles(NamedTuple):
 
     @property
     def present(self) -> tuple[Path, ...]:
+        """Returns the files, without `fine` where it is None."""
         return tuple(path for path in self if path is not None)
 
 
 def shipped_files(run: Run) -> ShippedFiles:
-    """The files that ``surrogate.file`` names: beside the configuration, or among those shipped.
+    """Returns the files that ``surrogate.file`` names: beside the configuration, or else shipped ones.
 
-    A recording of that name beside it is none of them.
+    A recording of the same name beside the configuration is not taken for a surrogate. Raises InputError
+    where a file is absent or cannot be read.
     """
     name, folder = run.config.surrogate.file, run.config_path.resolve().parent
     assert name is not None
-    own = folder / name
-    brought = own.is_file() and name != run.config.recording.file
-    path = own if brought else _shipped_folder() / name
+    beside = folder / name
+    brought = beside.is_file() and name != run.config.recording.file
+    path = beside if brought else _shipped_folder() / name
     if not path.is_file():
-        ready = ", ".join(f"{file.stem}.h5" for file in _shipped_manifests())
-        expected = f"a file beside the configuration, or one that is shipped: {ready}"
-        raise InputError(f"{run.config_path}: surrogate.file", f"no file {own}", expected)
+        names = ", ".join(f"{file.stem}.h5" for file in _shipped_manifests())
+        expected = f"a file beside the configuration, or one that is shipped: {names}"
+        raise InputError(f"{run.config_path}: surrogate.file", f"no file {beside}", expected)
     fine = None if run.config.design.coarse is None else path.with_name(f"{path.stem}-fine.h5")
     files = ShippedFiles(path, path.with_name(f"{path.stem}-design.h5"), fine)
     for file in files.present[1:]:
@@ -59,32 +64,37 @@ def shipped_files(run: Run) -> ShippedFiles:
 
 
 def _shipped_folder() -> Path:
+    """Returns the folder of the shipped surrogates."""
     return shipped("surrogates/README.md").parent
 
 
 def _shipped_manifests() -> dict[Path, Mapping[str, Any]]:
-    """Returns the manifests of the shipped surrogates by their files; a reduced model's is none of them."""
+    """Returns the manifests of the shipped surrogates by their files, without those of reduced models."""
     files = sorted(_shipped_folder().glob("*.json"))
-    said = {path: json.loads(path.read_text(encoding="utf-8")) for path in files}
-    return {path: manifest for path, manifest in said.items() if "motion_sha256" in manifest}
+    manifests = {path: json.loads(path.read_text(encoding="utf-8")) for path in files}
+    return {path: manifest for path, manifest in manifests.items() if "motion_sha256" in manifest}
 
 
 def shipped_for(motion: PadMotion, geometry: Geometry = Geometry()) -> Path | None:
-    """The shipped surrogate of the reaction on the generator's bricks for a protocol, if there is one.
+    """Returns the shipped surrogate for a protocol, and None where there is none.
 
-    All of them are of the article's device and tissue.
+    It predicts the reaction on the generator's bricks. All shipped surrogates are for the article's device
+    and tissue.
     """
     if geometry != Geometry():
         return None
-    for path, said in _shipped_manifests().items():
-        ours = (said.get("observation"), said.get("mesh")) == ("reaction", "bricks")
-        if ours and said.get("motion_sha256") == motion_sha256(motion):
+    for path, manifest in _shipped_manifests().items():
+        fits = (manifest.get("observation"), manifest.get("mesh")) == ("reaction", "bricks")
+        if fits and manifest.get("motion_sha256") == motion_sha256(motion):
             return path.with_suffix(".h5")
     return None
 
 
 def origin(run: Run, motion: PadMotion, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Returns what a manifest says beside the surrogate's own facts, so that it is used where it belongs."""
+    """Returns what a manifest states besides the surrogate's own facts.
+
+    These values show later whether the surrogate fits a run.
+    """
     model = run.config.model
     return {
         "observation": model.observation,
@@ -96,35 +106,41 @@ def origin(run: Run, motion: PadMotion, records: Sequence[Mapping[str, Any]]) ->
 
 
 def check_fits(run: Run, files: ShippedFiles, design: Design, binned: BinnedForce, motion: PadMotion) -> None:
-    """Raises InputError unless model, protocol and bins are this run's, and its priors lie in the box."""
-    said = load_manifest(files.surrogate)
+    """Raises InputError unless a surrogate fits a run.
+
+    Model, protocol and bins have to be those of the run, and the run's priors have to lie in the surrogate's
+    box.
+    """
+    manifest = load_manifest(files.surrogate)
     where = f"{run.config_path}: surrogate.file {files.surrogate.name}"
-    waves = said.get("waves")
+    waves = manifest.get("waves")
     if not isinstance(waves, list) or not all(isinstance(w, dict) and "kept_fraction" in w for w in waves):
         raise InputError(f"{where}: manifest: waves", f"{waves!r:.60}", "how the points of each were chosen")
-    if said.get("geometry_sha256", Geometry().hash) != model_spec(run).geometry.hash:
+    if manifest.get("geometry_sha256", Geometry().hash) != model_spec(run).geometry.hash:
         expected = "one of this configuration's [device] and [tissue], or a design"
         raise InputError(where, "a surrogate of another device or tissue", expected)
-    if (design.model_hash, said.get("model_hash")) != (waves_model(run).hash, model_spec(run).hash):
+    if (design.model_hash, manifest.get("model_hash")) != (waves_model(run).hash, model_spec(run).hash):
         raise InputError(where, "a surrogate of another model", "one of this configuration's model")
-    if said.get("motion_sha256") != motion_sha256(motion):
+    if manifest.get("motion_sha256") != motion_sha256(motion):
         raise InputError(where, "a surrogate of another protocol", "one of this recording's protocol")
     if len(design.edges_s) != len(binned.edges_s) or not np.allclose(design.edges_s, binned.edges_s):
         found = f"{len(design.edges_s) - 1} bins to {design.edges_s[-1]:g} s"
         expected = f"the recording's {len(binned.edges_s) - 1} bins to {binned.edges_s[-1]:g} s"
         raise InputError(where, found, expected)
-    for ours in parameter_space(run.config, run.config_path).parameters:
-        box = said["parameters"].get(ours.name)
+    for parameter in parameter_space(run.config, run.config_path).parameters:
+        box = manifest["parameters"].get(parameter.name)
         if box is None:
-            raise InputError(where, f"none of {ours.name}", "a surrogate of this configuration's parameters")
-        if ours.lower < box["lower"] or ours.upper > box["upper"]:
             raise InputError(
-                f"{run.config_path}: parameters.{ours.name}",
-                f"{ours.lower:g} to {ours.upper:g} {ours.unit}",
+                where, f"none of {parameter.name}", "a surrogate of this configuration's parameters"
+            )
+        if parameter.lower < box["lower"] or parameter.upper > box["upper"]:
+            raise InputError(
+                f"{run.config_path}: parameters.{parameter.name}",
+                f"{parameter.lower:g} to {parameter.upper:g} {parameter.unit}",
                 f"a part of {box['lower']:g} to {box['upper']:g}, the box of surrogate.file",
             )
 
 
 def motion_sha256(motion: PadMotion) -> str:
-    """Hash of a protocol's corners, to a microsecond and a nanometre."""
+    """Returns the hash of a protocol's corners, rounded to a microsecond and a nanometre."""
     return sha256_of([np.round(motion.time_s, 6), np.round(motion.displacement_m, 9)])

@@ -1,4 +1,4 @@
-"""Commands that need no run's folder: import a recording, run the full model once."""
+"""The commands that need no run folder: importing a recording, and running a model once."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from bayeskin.workflow.provenance import caption
 from bayeskin.workflow.recording import pad_motion
 from bayeskin.workflow.reducing import reduced_file
 
-REPORTED_EVERY_S = 0.1  # with mechanisms, whose force changes within a step of the model
+REPORTED_EVERY_S = 0.1  # with mechanisms, because their force changes within a time step of the model
 
 
 def import_recording(file: Path, out: Path, sheet: str | None = None) -> dict[str, Any]:
-    """Reads `file`, writes it to `out` in bayeskin's HDF5, and says what is in it.
+    """Reads `file`, writes it to `out` as an HDF5 file of bayeskin, and returns the command's answer.
 
-    Raises InputError, with nothing written, when it is no recording of a test.
+    Raises InputError, with nothing written, for a file that is no recording of a test.
     """
     _check_suffix(out, (".h5",))
     recording = read_recording(file, sheet=sheet)
@@ -67,14 +67,15 @@ def simulate_once(
     figures: Path | None = None,
     at_s: Sequence[float] = (),
 ) -> dict[str, Any]:
-    """Runs the model once on a recording's displacement, into `out` (.csv or .h5); its fields into folders.
+    """Runs the model once on a recording's displacement, and returns the command's answer.
 
-    What is not given is the configuration's, or the demo's; the sections of the file `device` go before its
-    own. Parameters that `settings` ("NAME=VALUE", SI) leave out stand at the median of their prior, uncertain
-    lengths of the tissue at their mean; those of the `mechanisms` named are among them. The
-    figure shows the fields at the times `at_s`, or at four moments of the protocol. With `reduced` the
-    device's reduced model runs in the full one's place. A run that fails is told, and nothing is written.
-    Raises InputError for bad input.
+    The force goes to `out` (.csv or .h5); the fields go to the folders `fields` and `figures`. The
+    configuration `config`, by default the demo's, supplies all values that are not given. The sections of the
+    file `device` replace its own sections. `settings` ("NAME=VALUE", SI) sets parameters of the model and of
+    the named `mechanisms`. Other parameters have the median of their prior, and uncertain lengths of the
+    tissue have their mean. The figure shows the fields at the times `at_s`, or at four moments of the
+    protocol. With `reduced`, the device's reduced model runs instead of the full model. A run that fails is
+    reported, and nothing is written. Raises InputError for wrong input.
     """
     _check_suffix(out, (".csv", ".h5"))
     _check_folders(fields, figures, at_s)
@@ -85,12 +86,12 @@ def simulate_once(
     if spec.forward is not None and (fields or figures or added):
         raise InputError("simulate", f"the model {spec.forward}", "no fields, figures or mechanisms with it")
     base = parameter_space(run.config, config_path)
-    more = tuple(p for mechanism in added for p in mechanism.parameters)
-    values = _values(ParameterSpace((*base.parameters, *more)), spec.geometry, settings)
-    for parameter in more:
-        _refuse_senseless(parameter, values[parameter.name])
+    added_parameters = tuple(p for mechanism in added for p in mechanism.parameters)
+    values = _parameter_values(ParameterSpace((*base.parameters, *added_parameters)), spec.geometry, settings)
+    for parameter in added_parameters:
+        _refuse_impossible_value(parameter, values[parameter.name])
     theta = {name: values[name] for name in base.names}
-    along = {p.name: values[p.name] for mechanism in solved(added) for p in mechanism.parameters}
+    solved_values = {p.name: values[p.name] for mechanism in solved(added) for p in mechanism.parameters}
     source = read_recording(recording or run.beside(run.config.recording.file))
     phases = segment(source)
     motion = pad_motion(spec.observation, source, phases, run.config.recording.protocol)
@@ -102,19 +103,19 @@ def simulate_once(
             found = "model.observation 'article', whose stresses are not those of the fields"
             raise InputError("--fields, --figures", found, "'reaction'")
         problem = problem_at(spec, theta)
-        _refuse_other_stresses(added, theta | along, problem)
+        _refuse_other_stresses(added, theta | solved_values, problem)
         outputs = FieldOutputs(problem, theta, motion, moments, fields, figures)
     on_state = outputs.on_state if outputs else None
     if reduced:
-        simulation = _reduced_run(spec, (device, config), motion, theta | along, added, on_state)
+        simulation = _reduced_run(spec, (device, config), motion, theta | solved_values, added, on_state)
     else:
         simulation = simulate(
-            spec, motion, theta | along, lambda share: reporter.progress("simulation", share), on_state,
-            laws=laws(added),
+            spec, motion, theta | solved_values, lambda share: reporter.progress("simulation", share),
+            on_state, laws=laws(added),
         )  # fmt: skip
     files: list[Path] = []
     if simulation.status == "ok":
-        simulation = _reported(simulation, added, values, motion)
+        simulation = _with_instrument(simulation, added, values, motion)
         write_simulation(out, simulation)
         files = [out, *(outputs.write(caption(run)) if outputs else ())]
     return _answer(simulation, spec, files, reduced)
@@ -124,9 +125,9 @@ def _reduced_run(
     spec: ModelSpec, sources: Sequence[Path | None], motion: PadMotion, theta: Mapping[str, float],
     mechanisms: Sequence[Mechanism], on_state: OnState | None,
 ) -> Simulation:  # fmt: skip
-    """A run of the reduced model that fits, with its estimated error.
+    """Returns a run of the reduced model that fits, with its estimated error.
 
-    Raises InputError where there is none for this device, mesh or observation.
+    Raises InputError where no reduced model exists for this device, mesh or observation.
     """
     if (spec.observation, spec.mesh, spec.refinement) != ("reaction", "bricks", 1):
         found = f"observation {spec.observation!r} on {spec.mesh!r}, refinement {spec.refinement}"
@@ -138,7 +139,7 @@ def _reduced_run(
 
 
 def _with_device(config: Config, device: Path | None) -> Config:
-    """The configuration with the sections of a device's file."""
+    """Returns the configuration with the sections of a device's file."""
     if device is None:
         return config
     stated = load_device_file(device)
@@ -146,12 +147,15 @@ def _with_device(config: Config, device: Path | None) -> Config:
 
 
 def _on_mesh(spec: ModelSpec) -> str:
-    """The full model in words."""
+    """Returns the observation and the mesh of the full model in words."""
     return f"{spec.observation} on {Path(spec.mesh).name}"
 
 
 def write_simulation(out: Path, simulation: Simulation) -> None:
-    """As CSV with the columns time_s, displacement_m, force_n, or as HDF5, by suffix; whole or not at all."""
+    """Writes a run, completely or not at all, as CSV or HDF5 by the suffix of `out`.
+
+    The CSV file has the columns time_s, displacement_m, force_n.
+    """
     if out.suffix == ".h5":
         storage.save(out, simulation)
         return
@@ -163,6 +167,7 @@ def write_simulation(out: Path, simulation: Simulation) -> None:
 
 
 def _mechanisms(names: Sequence[str]) -> list[Mechanism]:
+    """Returns the named mechanisms. Raises InputError for an unknown name."""
     known = catalogue()
     for name in names:
         if name not in known:
@@ -173,7 +178,7 @@ def _mechanisms(names: Sequence[str]) -> list[Mechanism]:
 def _refuse_other_stresses(
     mechanisms: Sequence[Mechanism], values: Mapping[str, float], problem: Problem
 ) -> None:
-    """Fields are those of the base law: a mechanism that changes it at a point has others."""
+    """Raises InputError for a mechanism that changes the tissue's law, because fields are of the base law."""
     for mechanism in mechanisms:
         bind = mechanism.act.bind
         if bind is not None and bind(values, problem.sites).respond is not None:
@@ -181,7 +186,8 @@ def _refuse_other_stresses(
             raise InputError("--fields, --figures", f"--mechanism {mechanism.name}", expected)
 
 
-def _refuse_senseless(parameter: Parameter, value: float) -> None:
+def _refuse_impossible_value(parameter: Parameter, value: float) -> None:
+    """Raises InputError for a value that is not finite or that the parameter cannot have."""
     positive = parameter.in_log and parameter.offset == 0.0
     least = "positive number" if positive else "number of at least 0" if parameter.in_log else "number"
     below = parameter.in_log and (value < 0.0 or (positive and value == 0.0))
@@ -190,10 +196,13 @@ def _refuse_senseless(parameter: Parameter, value: float) -> None:
         raise InputError(f"--set {parameter.name}", f"{value:g}", expected)
 
 
-def _reported(
+def _with_instrument(
     simulation: Simulation, mechanisms: Sequence[Mechanism], values: Mapping[str, float], motion: PadMotion
 ) -> Simulation:
-    """The same run as an instrument with `mechanisms` reports it, at more times than the model's steps."""
+    """Returns the same run as an instrument with `mechanisms` reports it.
+
+    It has more times than the time steps of the model.
+    """
     if not mechanisms:
         return simulation
     time_s = motion.times(REPORTED_EVERY_S, simulation.time_s)
@@ -209,7 +218,11 @@ def _reported(
     )
 
 
-def _values(space: ParameterSpace, geometry: Geometry, settings: Sequence[str]) -> dict[str, float]:
+def _parameter_values(space: ParameterSpace, geometry: Geometry, settings: Sequence[str]) -> dict[str, float]:
+    """Returns the values of all parameters by name, with the changes of `settings`.
+
+    Raises InputError for a setting that is not NAME=VALUE with a known name.
+    """
     theta = dict(zip(space.names, space.from_unit([0.5] * space.dim).tolist(), strict=True))
     theta |= {name: getattr(geometry, name) for name in LENGTHS if name in theta}
     for setting in settings:
@@ -224,13 +237,13 @@ def _values(space: ParameterSpace, geometry: Geometry, settings: Sequence[str]) 
 
 
 def _answer(simulation: Simulation, spec: ModelSpec, files: Sequence[Path], reduced: bool) -> dict[str, Any]:
-    """Returns what a run says of itself; `files` are those that it wrote, the force first."""
+    """Returns the command's answer; `files` are the files that the run wrote, the force first."""
     ok, stats = simulation.status == "ok", simulation.stats
     text = f"failed: {simulation.message}"
     if ok:
-        own = spec.forward is not None
+        own_model = spec.forward is not None
         unknowns = stats.get("modes") if reduced else stats.get("dofs")
-        steps = "one run" if own else f"{stats['steps']:.0f} steps of {unknowns:.0f} unknowns"
+        steps = "one run" if own_model else f"{stats['steps']:.0f} steps of {unknowns:.0f} unknowns"
         text = (
             f"{steps} in {stats['seconds']:.1f} s, peak force {number(stats['peak_force_n'], 4)} N, "
             f"written to {', '.join(map(str, files))}"
@@ -245,12 +258,12 @@ def _answer(simulation: Simulation, spec: ModelSpec, files: Sequence[Path], redu
         "figures": [file for file in files if file.suffix in (".png", ".svg")],
         "files": files,
     }
-    told = _told_of_reduced(simulation) if reduced else {}
-    return plain({**answer, **model, "stats": stats, **told, **written, "text": text})
+    facts = _reduced_facts(simulation) if reduced else {}
+    return plain({**answer, **model, "stats": stats, **facts, **written, "text": text})
 
 
-def _told_of_reduced(simulation: Simulation) -> dict[str, Any]:
-    """What a program asks of a reduced run first."""
+def _reduced_facts(simulation: Simulation) -> dict[str, Any]:
+    """Returns the facts of a reduced run that programs need most."""
     stats = simulation.stats
     return {
         "seconds": stats["seconds"],
@@ -260,7 +273,7 @@ def _told_of_reduced(simulation: Simulation) -> dict[str, Any]:
 
 
 def _reduced_accuracy(simulation: Simulation) -> list[str]:
-    """The estimated error of a reduced run beside the full model on the same mesh."""
+    """Returns lines with the estimated error of a reduced run against the full model on the same mesh."""
     stats = simulation.stats
     error_n = stats["error_estimate_n"]
     share = 100 * error_n / stats["peak_force_n"] if stats["peak_force_n"] > 0.0 else 0.0
@@ -271,29 +284,34 @@ def _reduced_accuracy(simulation: Simulation) -> list[str]:
 
 
 def _accuracy(simulation: Simulation, spec: ModelSpec) -> list[str]:
-    """The estimated error of a reaction; the article's force has none: it does not converge."""
+    """Returns lines with the estimated error of the full model's reaction.
+
+    The article's force has no error estimate, because it does not converge.
+    """
     if spec.observation == "own":
         return ["no estimated error: a model of your own"]
     if spec.observation == "article":
         return ["no estimated error: the article's force depends on its mesh and converges on none"]
     peak_n = simulation.stats["peak_force_n"]
     time_share = simulation.stats["time_error_n"] / peak_n if peak_n > 0.0 else 0.0
-    found = mesh_error(spec.mesh_hash)
-    mesh = "unknown, the mesh is not in the study" if found is None else f"{number(100 * found.rms, 2)} % RMS"
+    error = mesh_error(spec.mesh_hash)
+    mesh = "unknown, the mesh is not in the study" if error is None else f"{number(100 * error.rms, 2)} % RMS"
     falls = simulation.stats["falls"]
-    snapped = [f"the skin folded: it snapped to another equilibrium {falls:.0f} times"] if falls else []
+    snap_lines = [f"the skin folded: it snapped to another equilibrium {falls:.0f} times"] if falls else []
     return [
-        *snapped,
+        *snap_lines,
         f"estimated error, of the peak: time steps {number(100 * time_share, 2)} %, mesh {mesh}",
     ]
 
 
 def _check_suffix(out: Path, suffixes: tuple[str, ...]) -> None:
+    """Raises InputError for a file with another suffix than the allowed ones."""
     if out.suffix not in suffixes:
         raise InputError(f"-o {out}", f"ending {out.suffix!r}", f"ending {' or '.join(suffixes)}")
 
 
 def _check_folders(fields: Path | None, figures: Path | None, at_s: Sequence[float]) -> None:
+    """Raises InputError where a folder cannot be made, and for times of a figure without a figure."""
     for option, folder in (("--fields", fields), ("--figures", figures)):
         above = [path for path in (folder, *folder.parents) if path.exists()] if folder else []
         if above and not above[0].is_dir():

@@ -1,4 +1,4 @@
-"""All stages in their order, what a run's summary says, and the answers of the commands that run them."""
+"""All stages in order, the summary of a run, and the answers of the commands that run stages."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ BEFORE_REPORT = (
 )  # fmt: skip
 
 
-def _whose(run: Run) -> dict[str, str]:
-    """The mesh, or the model of one's own."""
-    own = run.config.model.forward
-    return {"mesh": run.config.model.mesh} if own is None else {"forward": own}
+def _mesh_or_forward(run: Run) -> dict[str, str]:
+    """Returns the mesh, or the forward model of the user's own."""
+    forward = run.config.model.forward
+    return {"mesh": run.config.model.mesh} if forward is None else {"forward": forward}
 
 
-def _summarise(run: Run) -> Mapping[str, Any]:
-    """The answer of a run, for people and programs, from what its stages said."""
-    said = {stage.name: run.summary(stage.name) for stage in BEFORE_REPORT}
-    sampled, found = said["sample"], said["map"]
-    checked = found["checks"][-1]
-    doubts = [] if found["ok"] else [checked["message"]]
+def _write_summary(run: Run) -> Mapping[str, Any]:
+    """Writes and returns the result of a run, for people and programs, from the summaries of its stages."""
+    summaries = {stage.name: run.summary(stage.name) for stage in BEFORE_REPORT}
+    sampled, map_summary = summaries["sample"], summaries["map"]
+    checked = map_summary["checks"][-1]
+    doubts = [] if map_summary["ok"] else [checked["message"]]
     doubts += [] if sampled["ok"] else [sampled["reasons"][0]]
     records = {stage.name: read_record(run.folder / stage.name) for stage in BEFORE_REPORT}
     summary = {
@@ -40,8 +40,10 @@ def _summarise(run: Run) -> Mapping[str, Any]:
         "because": doubts or list(sampled["reasons"]),
         "remarks": list(sampled["remarks"]),
         "name": run.config.name,
-        "recording": {key: said["recording"][key] for key in ("name", "sha256", "samples", "duration_s")},
-        "model": {"observation": run.config.model.observation, **_whose(run)},
+        "recording": {
+            key: summaries["recording"][key] for key in ("name", "sha256", "samples", "duration_s")
+        },
+        "model": {"observation": run.config.model.observation, **_mesh_or_forward(run)},
         "posterior": sampled["parameters"],
         "identifiability": [*sampled["identifiability"], *sampled["ridges"]],
         "learned": sampled["learned"],
@@ -50,20 +52,20 @@ def _summarise(run: Run) -> Mapping[str, Any]:
         "full_model_at_draws": sampled["full_model"],
         "corrected": sampled["corrected"],
         "map": {
-            "theta": found["theta"],
-            "message": found["message"],
+            "theta": map_summary["theta"],
+            "message": map_summary["message"],
             "surrogate_error": checked,
-            "polished": found["polished"],
+            "polished": map_summary["polished"],
         },
         "rmse": {
             "posterior_mean": sampled["rmse"],
-            "full_model_at_map": found["rmse_of_full_model"],
+            "full_model_at_map": map_summary["rmse_of_full_model"],
         },
         "coverage_90": {"whole": sampled["coverage_90"], "fitted": sampled["coverage_90_fitted"]},
         "rms_sd_n": sampled["rms_sd_n"],
-        "sobol": said["sobol"],
-        "surrogate": said["train"],
-        "design": {key: said["design"][key] for key in ("runs", "failed", "seconds_of_runs")},
+        "sobol": summaries["sobol"],
+        "surrogate": summaries["train"],
+        "design": {key: summaries["design"][key] for key in ("runs", "failed", "seconds_of_runs")},
         "seconds": {name: record.seconds for name, record in records.items() if record is not None},
     }
     write_json(run.at("report", "summary.json"), summary)
@@ -72,13 +74,13 @@ def _summarise(run: Run) -> Mapping[str, Any]:
 
 
 REPORT = Stage(
-    "report", "writes summary.json", tuple(stage.name for stage in BEFORE_REPORT), ("model",), _summarise
+    "report", "writes summary.json", tuple(stage.name for stage in BEFORE_REPORT), ("model",), _write_summary
 )
 STAGES = {stage.name: stage for stage in (*BEFORE_REPORT, REPORT, diagnosis.STAGE)}
 
 
 def stages_of(config: Config) -> Mapping[str, Stage]:
-    """Returns all stages of a configuration; what a diagnosis needs goes by its model."""
+    """Returns all stages of a configuration; the stages that a diagnosis needs depend on its model."""
     return {**STAGES, diagnosis.NAME: diagnosis.stage_of(config)}
 
 
@@ -89,10 +91,10 @@ def run(
     stages: Mapping[str, Stage] | None = None,
     scheduler: str | None = None,
 ) -> dict[str, Any]:
-    """Runs a configuration to the stage `last` (None: to the report) and gives the command's answer.
+    """Runs a configuration up to the stage `last` (None: up to the report), and returns the command's answer.
 
-    `scheduler`: the address of a Dask scheduler that makes the full runs, in the place of `design.scheduler`.
-    A run to the report ends with the page, also when a stage before it failed.
+    `scheduler` is the address of a Dask scheduler that makes the full runs; it replaces `design.scheduler`. A
+    run up to the report ends with the HTML page, even if an earlier stage failed.
     """
     opened = open_run(config, reporter)
     stages = stages or stages_of(opened.config)
@@ -101,7 +103,7 @@ def run(
     outcomes = run_stages(opened, stages, last or "report")
     answer = outcomes[-1]
     text = _in_words(answer, outcomes, opened.folder)
-    said = {
+    document = {
         **answer.record.summary,
         "ok": answer.ok,
         "stage": answer.stage,
@@ -109,72 +111,82 @@ def run(
         "skipped": [outcome.stage for outcome in outcomes if outcome.skipped],
     }
     if last in (None, "report"):
-        said["page"] = write_page(opened, stages)
-        text += f"\nreport: {said['page']}"
-    return plain({**said, "text": text})
+        document["page"] = write_page(opened, stages)
+        text += f"\nreport: {document['page']}"
+    return plain({**document, "text": text})
 
 
 def report(config: Path, reporter: Reporter, stages: Mapping[str, Stage] | None = None) -> dict[str, Any]:
-    """The page of whatever stages are done, and the command's answer; runs nothing but the summary.
+    """Writes the page about the stages that are done, and returns the command's answer.
 
-    Raises InputError for a configuration that is wrong or whose recording is not there.
+    It runs no stage but the summary. Raises InputError for a configuration that is wrong, or whose recording
+    does not exist.
     """
     opened = open_run(config, reporter)
     stages = stages or stages_of(opened.config)
     opened.beside(opened.config.recording.file)
-    stands = {name: one[0] for name, one in standing(opened, stages).items()}
-    missing = [name for name in stages["report"].needs if stands[name] != "done"]
+    states = {name: state[0] for name, state in standing(opened, stages).items()}
+    missing = [name for name in stages["report"].needs if states[name] != "done"]
     if not missing:
         return run(config, None, reporter, stages)
     page = write_page(opened, stages)
     text = "\n".join(
         [
             f"{opened.config.name}: not finished",
-            *(f"{name}: {stands[name]}" for name in missing),
+            *(f"{name}: {states[name]}" for name in missing),
             f"report: {page}",
         ]
     )
-    failed = any(stands[name] == "failed" for name in missing)
-    said = {"ok": not failed, "stage": "report", "verdict": "not finished", "missing": missing}
-    return plain({**said, "folder": opened.folder, "page": page, "text": text})
+    failed = any(states[name] == "failed" for name in missing)
+    document = {"ok": not failed, "stage": "report", "verdict": "not finished", "missing": missing}
+    return plain({**document, "folder": opened.folder, "page": page, "text": text})
 
 
 def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str:
-    said = answer.record.summary
+    """Returns the answer of a stage's command as text."""
+    summary = answer.record.summary
     if not answer.record.done:
-        return f"{answer.stage}: failed: {said['message']}"
+        return f"{answer.stage}: failed: {summary['message']}"
     if answer.stage == "report":
-        return _summary_in_words(said, folder)
+        return _summary_in_words(summary, folder)
     seconds = sum(outcome.record.seconds for outcome in outcomes)
     head = f"{answer.stage}: done, {seconds:.1f} s to here"
     lines = {
-        "design": lambda: f"{said['runs']} runs, {said['failed']} failed",
+        "design": lambda: f"{summary['runs']} runs, {summary['failed']} failed",
         "train": lambda: (
-            f"{said['kind']}, relative error {said['relative_error']:.3g} ({said['error_source']})"
+            f"{summary['kind']}, relative error {summary['relative_error']:.3g} ({summary['error_source']})"
         ),
         "map": lambda: "\n".join(
-            [said["message"], said["checks"][-1]["message"], *_polish(said["polished"])]
+            [summary["message"], summary["checks"][-1]["message"], *_polish_lines(summary["polished"])]
         ),
         "sample": lambda: "\n".join(
             [
-                *(said["verdict"], *said["reasons"], *said["remarks"]),
-                *_table(said["parameters"]),
-                *_identified([*said["identifiability"], *said["ridges"], *_lengths(said.get("lengths", {}))]),
-                *_priors(said["parameters"]),
+                *(summary["verdict"], *summary["reasons"], *summary["remarks"]),
+                *_posterior_table(summary["parameters"]),
+                *_identifiability_lines(
+                    [
+                        *summary["identifiability"],
+                        *summary["ridges"],
+                        *_length_sentences(summary.get("lengths", {})),
+                    ]
+                ),
+                *_prior_lines(summary["parameters"]),
             ]
         ),
-        "sobol": lambda: "\n".join(one["sentence"] for one in said.values()),
+        "sobol": lambda: "\n".join(result["sentence"] for result in summary.values()),
     }
     return f"{head}\n{lines[answer.stage]()}\noutputs in {folder / answer.stage}"
 
 
-def _polish(polished: Mapping[str, Any] | None) -> list[str]:
+def _polish_lines(polished: Mapping[str, Any] | None) -> list[str]:
+    """Returns a line about the maximum of the full model itself, if it was computed."""
     if polished is None:
         return []
     return [f"polished on the full model: {polished['gained']:.2f} nats gained, {polished['message']}"]
 
 
 def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
+    """Returns the summary of a run as text."""
     error = said["map"]["surrogate_error"]
     full = said["rmse"]["full_model_at_map"]
     model, rmse = (
@@ -190,9 +202,9 @@ def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
     return "\n".join(
         [
             f"{said['name']}: {said['verdict']}: {'; '.join(said['because'])}",
-            *_table(said["posterior"]),
-            *_identified([*said["identifiability"], *_lengths(said.get("lengths", {}))]),
-            *_priors(said["posterior"]),
+            *_posterior_table(said["posterior"]),
+            *_identifiability_lines([*said["identifiability"], *_length_sentences(said.get("lengths", {}))]),
+            *_prior_lines(said["posterior"]),
             *said["remarks"],
             f"{model}: RMSE {', '.join(off)}",
             error["message"],
@@ -201,27 +213,31 @@ def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
     )
 
 
-def _identified(sentences: Sequence[str]) -> list[str]:
+def _identifiability_lines(sentences: Sequence[str]) -> list[str]:
+    """Returns sentences about the information on each parameter, with a heading."""
     return ["what the data says of each:", *(f"  {sentence}" for sentence in sentences)]
 
 
-def _lengths(due: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    return [one["sentence"] for one in due.values()]
+def _length_sentences(due: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Returns the sentences about uncertain lengths."""
+    return [length["sentence"] for length in due.values()]
 
 
-def _priors(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Each prior with its bounds and where it comes from."""
-    return ["priors:", *(f"  {name}: {_prior(p['prior'], p['unit'])}" for name, p in parameters.items())]
+def _prior_lines(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Returns each prior with its bounds and its source, with a heading."""
+    return ["priors:", *(f"  {name}: {_prior_text(p['prior'], p['unit'])}" for name, p in parameters.items())]
 
 
-def _prior(prior: Mapping[str, Any], unit: str) -> str:
+def _prior_text(prior: Mapping[str, Any], unit: str) -> str:
+    """Returns one prior with its bounds and its source."""
     factor, unit = at_edge(unit)
     about = f" about {factor * prior['centre']:.4g} {unit}" if prior["kind"].endswith("normal") else ""
     low, high = factor * prior["lower"], factor * prior["upper"]
     return f"{prior['kind']}{about}, {low:.4g} to {high:.4g} {unit}; {prior['source']}"
 
 
-def _table(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def _posterior_table(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Returns the lines of a table of the parameters' posteriors."""
     rows: list[tuple[str, ...]] = [("", "unit", "mean", "sd", "median", "5 %", "95 %")]
     for name, p in parameters.items():
         factor, unit = at_edge(p["unit"])

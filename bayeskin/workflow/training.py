@@ -1,4 +1,4 @@
-"""Third stage: the surrogate, with its error on held-out runs after each wave."""
+"""The third stage: trains the surrogate, and measures its error on held-out runs after each wave."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ PRIOR_DRAWS = 256
 
 
 def trained(run: Run, design: Design, binned: BinnedForce) -> tuple[ShapeSurrogate, Validation]:
-    """The configuration's surrogate of a design, best near the recording."""
+    """Returns the configuration's surrogate of a design, most accurate near the recording, with its
+    validation."""
     config = run.config
     weights = focus(design, binned, fitted_bins(run, binned))
     return train(enough(design), config.surrogate.kind, config.seed, weights)
@@ -40,23 +41,30 @@ def trained(run: Run, design: Design, binned: BinnedForce) -> tuple[ShapeSurroga
 def corrected(
     run: Run, surrogate: ShapeSurrogate, fine: Design, binned: BinnedForce
 ) -> tuple[ShapeSurrogate, Validation]:
-    """A coarser model's surrogate, corrected by runs of the configuration's model."""
+    """Returns a coarser model's surrogate after correction by runs of the configuration's model.
+
+    The second value is its validation.
+    """
     return correct(surrogate, fine, focus(fine, binned, fitted_bins(run, binned)))
 
 
 def fine_design(run: Run, stage: str) -> Design | None:
-    """The configuration's model at points of a coarser one's design, as a stage left it; None without."""
+    """Returns the configuration's model at points of a coarser model's design, as a stage left it.
+
+    Returns None where the configuration has no coarser model.
+    """
     return None if run.config.design.coarse is None else storage.load(run.at(stage, "fine.h5"), Design)
 
 
-def _work(run: Run) -> Mapping[str, Any]:
+def _train_surrogate(run: Run) -> Mapping[str, Any]:
+    """Trains the surrogate, or takes a shipped one, writes it, and returns the stage's summary."""
     design, fine = storage.load(run.at("design", "design.h5"), Design), fine_design(run, "design")
     binned = storage.load(run.at("recording", "binned.h5"), BinnedForce)
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     uncorrected = None
     if run.config.surrogate.file is not None:
-        ready = shipped_files(run).surrogate
-        surrogate, manifest = load_surrogate(ready), load_manifest(ready)
+        file = shipped_files(run).surrogate
+        surrogate, manifest = load_surrogate(file), load_manifest(file)
     else:
         surrogate, validation = trained(run, design, binned)
         if fine is not None:
@@ -65,20 +73,21 @@ def _work(run: Run) -> Mapping[str, Any]:
         records = json.loads(run.at("design", "waves.json").read_text())
         manifest = {**manifest_of(surrogate, validation), **origin(run, motion, records)}
     save_surrogate(run.at("train", "surrogate.h5"), surrogate, manifest)
-    _draw(run, design, fine, binned, surrogate, uncorrected)
+    _draw_figures(run, design, fine, binned, surrogate, uncorrected)
     return {name: value for name, value in manifest.items() if name not in ("waves", "parameters")}
 
 
-def _draw(
+def _draw_figures(
     run: Run, design: Design, fine: Design | None, binned: BinnedForce, surrogate: ShapeSurrogate,
     uncorrected: ShapeSurrogate | None,
 ) -> None:  # fmt: skip
+    """Draws the figures of the validation and of predictions over the prior."""
     held_out = design if fine is None else fine
     testing = held_out.testing
     truth, prediction = held_out.force_n[testing], surrogate.predict(held_out.theta[testing])
     noise_sd_n = np.sqrt(binned.variance_n2)
     scale = np.sqrt(np.mean(truth**2, axis=1))
-    means = [*_former(run, design, binned, held_out, uncorrected), prediction.mean]
+    means = [*_earlier_predictions(run, design, binned, held_out, uncorrected), prediction.mean]
     errors = np.array([np.sqrt(np.mean((mean - truth) ** 2, axis=1)) / scale for mean in means])
     figure = report.figure_validation(
         design.edges_s, truth, prediction, noise_sd_n, errors, corrected=fine is not None
@@ -91,13 +100,14 @@ def _draw(
     report.save_figure(figure, run.at("train", "prior_predictive"), caption(run))
 
 
-def _former(
+def _earlier_predictions(
     run: Run, design: Design, binned: BinnedForce, held_out: Design, uncorrected: ShapeSurrogate | None
 ) -> list[Array]:
-    """What surrogates trained on the waves up to each but the last predict at held-out points, (n, m) each.
+    """Returns the predictions at held-out points of surrogates trained on fewer waves, (n, m) each.
 
-    With a fine model's held-out points, the last is of the uncorrected surrogate, of all waves. NaN where
-    the surrogate was trained elsewhere.
+    There is one surrogate for each wave but the last, trained on the waves up to it. With held-out points of
+    a fine model, the last entry is the uncorrected surrogate of all waves. The predictions are NaN where the
+    surrogate was trained elsewhere.
     """
     waves = np.unique(design.wave[design.ok])
     theta, before = held_out.theta[held_out.testing], waves[:-1]
@@ -105,8 +115,8 @@ def _former(
         count = len(before) if held_out is design else len(waves)
         return [np.full((len(theta), design.force_n.shape[1]), np.nan)] * count
     parts = [dataclasses.replace(design, ok=design.ok & (design.wave <= wave)) for wave in before]
-    found = [trained(run, part, binned)[0].predict_mean(theta) for part in parts]
-    return found if uncorrected is None else [*found, uncorrected.predict_mean(theta)]
+    predictions = [trained(run, part, binned)[0].predict_mean(theta) for part in parts]
+    return predictions if uncorrected is None else [*predictions, uncorrected.predict_mean(theta)]
 
 
 STAGE = Stage(
@@ -114,6 +124,6 @@ STAGE = Stage(
     "trains the surrogate",
     ("recording", "design"),
     ("seed", "parameters", "surrogate", "fit", "model", "design"),
-    _work,
+    _train_surrogate,
     lambda run: shipped_files(run).present if run.config.surrogate.file is not None else (),
 )

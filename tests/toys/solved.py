@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,12 +15,13 @@ import pytest
 from numpy.typing import ArrayLike
 
 from bayeskin.design import default_space
-from bayeskin.finite_element.simulate import ModelSpec
-from bayeskin.forward import opened, reduced
+from bayeskin.forward import reduced
 from bayeskin.forward.interface import ModelRun
 from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import observed
+from bayeskin.mismatch import context
+from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.reduced.region import LEAST_STIFFNESS
 from bayeskin.types import (
     Array,
@@ -34,8 +34,6 @@ from bayeskin.types import (
     Simulation,
     frozen_array,
 )
-from bayeskin.workflow import workbench
-from bayeskin.workflow.workbench import Source, Workbench
 
 MOTION = PadMotion(
     np.array([0.0, 4.0, 8.0, 25.0, 29.0, 50.0, 58.0, 66.0]),
@@ -155,22 +153,21 @@ class Full:
 def bench(
     patch: pytest.MonkeyPatch, binned: BinnedForce, base: ParameterSpace = BASE,
     full: Callable[[Mapping[str, float]], Array | str] = lambda values: means(values)[0],
-) -> Workbench:  # fmt: skip
+) -> DiagnosisContext:  # fmt: skip
     """A diagnosis's bench whose reduced model is the toy, and whose full model is a function of values."""
     model: Any = SimpleNamespace(
         trained=SimpleNamespace(geometry=Geometry(), mechanisms={"stiffness-drift": None}),
         refinement=2, hash="toy",
     )  # fmt: skip
-    patch.setattr(workbench, "calm_bins", lambda folder: (binned, NO_WORD, MOTION))
-    patch.setattr(opened, "load_reduced", lambda file: model)
     patch.setattr(reduced, "simulate_reduced", simulate)
-    patch.setattr(workbench, "FullForce", lambda spec, motion, edges_s: Full(full))
-    return Workbench(Source(Path("recording"), Path("model"), ModelSpec(), 1, base))
+    patch.setattr(context, "FullForce", lambda spec, motion, edges_s: Full(full))
+    forward = reduced.ReducedForward(model, MOTION, binned.edges_s)
+    return DiagnosisContext(binned, NO_WORD, MOTION, forward, base, 1)
 
 
-def a_run(bench: Workbench, names: Sequence[str] = (), **values: float) -> ModelRun:
+def a_run(bench: DiagnosisContext, names: Sequence[str] = (), **values: float) -> ModelRun:
     """With derivatives, at the truth but for these values."""
     neutral = {name: value for one in names for name, value in KNOWN[one].neutral.items()}
-    run = bench.skin(names, {**neutral, **TRUTH, **values})
+    run = bench.run(names, {**neutral, **TRUTH, **values})
     assert isinstance(run, ModelRun)
     return run

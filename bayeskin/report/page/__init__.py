@@ -1,4 +1,4 @@
-"""The report of a run: one HTML file that needs nothing beside it."""
+"""Builds the report of a run: one HTML file that needs no other file."""
 
 from bayeskin.report.page.facts import RunFacts, StageFacts
 from bayeskin.report.page.render import render_page

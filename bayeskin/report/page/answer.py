@@ -1,4 +1,7 @@
-"""The top of a page: what the skin is made of, how sure that is, what is missing."""
+"""Makes the answer at the top of a page.
+
+It says which parameters the skin has, how far they can be trusted, and which physics the model lacks.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,8 @@ from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.numbers import interval, number, percent, quantity, scale, with_unit
 from bayeskin.report.page.parts import Answer, Bar, Made, Verdict
 
-# The sentences of `inference.identify` begin with one of these, after the parameter's name.
+# Each row holds a phrase with which a sentence of `inference.identify` begins after the parameter's name, the
+# words that the page shows for it, and the tone of these words.
 _LEARNT: tuple[tuple[str, str, str], ...] = (
     ("the data informs it weakly", "weakly informed", "doubt"),
     ("the data informs it", "informed", "good"),
@@ -23,57 +27,61 @@ _THREE = ("low_90", "median", "high_90")
 
 def answer(facts: RunFacts) -> Answer:
     """Returns the answer of a run, as far as it is finished."""
-    return Answer(_made(facts), _made_of(facts), _sure(facts), _missing(facts))
+    return Answer(
+        _parameter_rows(facts), _material_verdict(facts), _trust_verdict(facts), _missing_physics(facts)
+    )
 
 
 def sentences(facts: RunFacts) -> dict[str, str]:
-    """Returns the sentences about each parameter, without its name at the front."""
+    """Returns the sentence about each parameter by its name, without the name at the front."""
     lines = facts.said("sample").get("identifiability", [])
     return {name: text for name, _, text in (line.partition(": ") for line in lines)}
 
 
 def without_numbers(sentence: str) -> str:
-    """Returns the sentence about a parameter whose median and interval stand beside it."""
+    """Returns a sentence about a parameter without its median and interval, which stand beside it."""
     return re.sub(r": median [^;]*", "", sentence)
 
 
 def learnt(sentence: str) -> tuple[str, str]:
-    """In two words what the data says of a parameter, and the tone to say it in."""
+    """Returns in a few words how well the data informs a parameter, and the tone of these words."""
     return next(((word, tone) for start, word, tone in _LEARNT if sentence.startswith(start)), ("", "none"))
 
 
 def prior_range(said: Mapping[str, Any]) -> str:
-    """The prior of one parameter of the stage `sample`'s table."""
+    """Returns the prior of a parameter as text, from its entry in the table of the stage `sample`."""
     prior = said["prior"]
     about = f" about {quantity(prior['centre'], said['unit'])}" if prior["kind"].endswith("normal") else ""
     return f"{prior['kind']}{about}, {interval(prior['lower'], prior['upper'], said['unit'])}"
 
 
-def _made(facts: RunFacts) -> list[Made]:
-    table, spoken = facts.said("sample").get("parameters", {}), sentences(facts)
+def _parameter_rows(facts: RunFacts) -> list[Made]:
+    """Returns a row for each parameter of the posterior."""
+    summaries, known_sentences = facts.said("sample").get("parameters", {}), sentences(facts)
     rows = []
     for name, meaning in facts.parameters.items():
-        if name not in table:
+        if name not in summaries:
             continue
-        said, sentence = table[name], spoken.get(name, "")
+        summary, sentence = summaries[name], known_sentences.get(name, "")
         word, tone = learnt(sentence)
         leans = re.search(r"leans on the prior's (\w+) bound", sentence)
         rows.append(
             Made(
                 name,
                 meaning,
-                with_unit(said["median"], *scale([said[key] for key in _THREE], said["unit"])),
-                interval(said["low_90"], said["high_90"], said["unit"], beside=said["median"]),
+                with_unit(summary["median"], *scale([summary[key] for key in _THREE], summary["unit"])),
+                interval(summary["low_90"], summary["high_90"], summary["unit"], beside=summary["median"]),
                 word + (f", at the prior's {leans.group(1)} bound" if leans else ""),
                 tone,
-                prior_range(said),
-                _bar(said),
+                prior_range(summary),
+                _bar(summary),
             )
         )
     return rows
 
 
 def _bar(said: Mapping[str, Any]) -> Bar:
+    """Returns the position of the 90 % interval in the prior's range, in logarithms for a log prior."""
     prior = said["prior"]
     line = math.log if prior["kind"].startswith("log") and prior["lower"] > 0 else float
     low, high = line(prior["lower"]), line(prior["upper"])
@@ -81,59 +89,65 @@ def _bar(said: Mapping[str, Any]) -> Bar:
     return Bar(round(left, 2), round(right - left, 2), round(median, 2))
 
 
-def _made_of(facts: RunFacts) -> Verdict:
+def _material_verdict(facts: RunFacts) -> Verdict:
+    """Returns the text above the parameters, or why there are none yet."""
     sampled = facts.stage("sample")
     if not sampled.done:
-        why = [f"The posterior has not been sampled: the stage sample is {sampled.standing}."]
-        return Verdict("not known yet", "none", why, f"bayeskin run {facts.config_path}")
+        reason = [f"The posterior has not been sampled: the stage sample is {sampled.standing}."]
+        return Verdict("not known yet", "none", reason, f"bayeskin run {facts.config_path}")
     ridges = facts.said("sample")["ridges"]
     lines = ["Posterior median and 90 % interval; the bar shows where they lie in the prior's range."]
     return Verdict("", "none", [*lines, *(f"{ridge}." for ridge in ridges)])
 
 
-def _sure(facts: RunFacts) -> Verdict:
-    said = facts.said("sample")
-    if not said:
+def _trust_verdict(facts: RunFacts) -> Verdict:
+    """Returns whether the posterior can be trusted, with reasons."""
+    summary = facts.said("sample")
+    if not summary:
         return Verdict("not known yet", "none", ["There is no posterior to trust or not to trust."])
-    checked = facts.said("map").get("checks", [])
-    doubts = [one["message"] for one in checked[-1:] if not one["passes"]]
-    trusted = said["ok"] and not doubts
-    rmse = said["rmse"]
+    checks = facts.said("map").get("checks", [])
+    doubts = [check["message"] for check in checks[-1:] if not check["passes"]]
+    trusted = summary["ok"] and not doubts
+    rmse = summary["rmse"]
     fit = (
         f"The posterior mean leaves {quantity(rmse['whole_n'], 'N')} RMSE over the whole recording; its 90 % "
-        f"band holds {percent(said['coverage_90_fitted'])} of the fitted bins."
+        f"band holds {percent(summary['coverage_90_fitted'])} of the fitted bins."
     )
-    lines = [*doubts, *(said["reasons"] if not said["ok"] else [])]
+    lines = [*doubts, *(summary["reasons"] if not summary["ok"] else [])]
     lines += [] if lines else ["Chains, surrogate and the full model at the most probable point agree."]
-    lines += [fit, *(f"{one[0].upper()}{one[1:]}." for one in said["remarks"])]
+    lines += [fit, *(f"{remark[0].upper()}{remark[1:]}." for remark in summary["remarks"])]
     return Verdict("trusted" if trusted else "not trusted", "good" if trusted else "doubt", lines)
 
 
-def _missing(facts: RunFacts) -> Verdict:
-    said = facts.said("diagnose")
-    if not said:
+def _missing_physics(facts: RunFacts) -> Verdict:
+    """Returns which physics the model lacks, from the diagnosis."""
+    diagnosis = facts.said("diagnose")
+    if not diagnosis:
         standing = facts.stage("diagnose").standing
-        why = [f"Nobody has looked yet: the stage diagnose is {standing}."]
-        return Verdict("not known yet", "none", why, f"bayeskin diagnose {facts.config_path}")
-    both = [quantity(said["fit"][when]["rmse"], "N") for when in ("before", "after")]
-    chance = number(said["smooth_probability"])
-    beyond = f"Something smooth that is not in the catalogue: probability {chance}."
-    if said["verdict"] == "nothing-missing":
-        within = f"The recording stays within what the model allows ({both[0]} RMSE)."
-        lines = [within, beyond]
-        if faint := faint_in_words(said):
+        reason = [f"Nobody has looked yet: the stage diagnose is {standing}."]
+        return Verdict("not known yet", "none", reason, f"bayeskin diagnose {facts.config_path}")
+    rmse = [quantity(diagnosis["fit"][when]["rmse"], "N") for when in ("before", "after")]
+    probability = number(diagnosis["smooth_probability"])
+    smooth_line = f"Something smooth that is not in the catalogue: probability {probability}."
+    if diagnosis["verdict"] == "nothing-missing":
+        fit_line = f"The recording stays within what the model allows ({rmse[0]} RMSE)."
+        lines = [fit_line, smooth_line]
+        if faint := faint_in_words(diagnosis):
             return Verdict("nothing that could be named", "doubt", [faint, *lines])
         return Verdict("nothing", "good", lines)
-    lines = [f"{one['statement']} (probability {number(one['probability'])})" for one in said["mechanisms"]]
-    lines.append(f"RMSE {both[0]} without, {both[1]} with what was found.")
-    left = len(said["remaining"])
-    if left:
-        lines.append(f"{left} window{'s' * (left != 1)} of the recording remain unexplained.")
-    lines.append(beyond)
-    if said["verdict"] == "named":
+    lines = [
+        f"{mechanism['statement']} (probability {number(mechanism['probability'])})"
+        for mechanism in diagnosis["mechanisms"]
+    ]
+    lines.append(f"RMSE {rmse[0]} without, {rmse[1]} with what was found.")
+    remaining = len(diagnosis["remaining"])
+    if remaining:
+        lines.append(f"{remaining} window{'s' * (remaining != 1)} of the recording remain unexplained.")
+    lines.append(smooth_line)
+    if diagnosis["verdict"] == "named":
         return Verdict("named", "doubt", lines)
-    if said["best_set"]:
-        lines.append(f"Of the catalogue {', '.join(said['best_set'])} fits best.")
-    several = said["smooth_probability"] < 0.5
+    if diagnosis["best_set"]:
+        lines.append(f"Of the catalogue {', '.join(diagnosis['best_set'])} fits best.")
+    several = diagnosis["smooth_probability"] < 0.5
     word = "something that several causes would explain" if several else "something that has no name here"
     return Verdict(word, "doubt", lines)

@@ -1,4 +1,7 @@
-"""The charts whose values can be read: force, what the fit leaves of it, Sobol' indices, over time."""
+"""Draws the interactive charts over time: force, residual, and Sobol' indices.
+
+A cross-hair shows their values as text.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,10 @@ _BANDS = Key("50 and 90 % bands", "band")
 
 
 def history_chart(history: Mapping[str, Any], phases: Phases) -> Chart:
-    """Recorded bins, predicted median, 50 and 90 % bands of the stage `sample`'s bands.json.
+    """Returns the chart of recorded bins, predicted median, and 50 and 90 % bands over time.
 
-    phases : kind, cycle, start_s and end_s of each, as the stage `recording` says.
+    history : content of bands.json, which the stage `sample` writes
+    phases : kind, cycle, start_s and end_s of each phase, as the stage `recording` writes them
     """
     series, fitted = _series(history)
     plot = Plot(series["time_s"], [values for name, values in series.items() if name != "time_s"])
@@ -42,32 +46,35 @@ def history_chart(history: Mapping[str, Any], phases: Phases) -> Chart:
 
 
 def residual_chart(history: Mapping[str, Any], phases: Phases) -> Chart:
-    """Chart of the difference between each recorded bin and the predicted median, in mN, with bands."""
+    """Returns the chart of the recorded bins minus the predicted median [mN] over time, with the bands."""
     series, fitted = _series(history)
-    median_n, left_mn = series["median_n"], 1e3 * (series["recorded_n"] - series["median_n"])
+    median_n, residual_mn = series["median_n"], 1e3 * (series["recorded_n"] - series["median_n"])
     names = ("low_90", "high_90", "low_50", "high_50")
     ends = {name: 1e3 * (series[f"{name}_n"] - median_n) for name in names}
-    plot = Plot(series["time_s"], [left_mn, *ends.values()])
+    plot = Plot(series["time_s"], [residual_mn, *ends.values()])
     parts = [
         *(plot.band(ends[f"low_{level}"], ends[f"high_{level}"], "") for level in (90, 50)),
         plot.line(np.zeros_like(median_n), "median"),
-        plot.dots(left_mn, fitted, "recorded"),
-        plot.dots(left_mn, ~fitted, "recorded unfitted"),
+        plot.dots(residual_mn, fitted, "recorded"),
+        plot.dots(residual_mn, ~fitted, "recorded unfitted"),
     ]
-    low, high = (number(end, 3) for end in (np.nanmin(left_mn), np.nanmax(left_mn)))
+    low, high = (number(end, 3) for end in (np.nanmin(residual_mn), np.nanmax(residual_mn)))
     alt = f"Recorded less predicted force over time, from {low} to {high} mN, with the 50 and 90 % bands."
     return Chart(
         "residual",
         "What the fit leaves, over time",
         plot.svg("residual", "recorded − predicted [mN]", phases, parts, 1),
-        plot.numbers([left_mn], list(_residuals(series, fitted, phases))),
+        plot.numbers([residual_mn], list(_residuals(series, fitted, phases))),
         alt,
         (Key("recorded − predicted median", "dots"), _BANDS),
     )
 
 
 def indices_chart(key: str, title: str, result: SobolResult, phases: Phases) -> Chart:
-    """Sobol' indices over time: first order as lines, totals dashed, a colour for each parameter."""
+    """Returns the chart of Sobol' indices over time.
+
+    First-order indices are solid lines, total indices are dashed, and each parameter has its own colour.
+    """
     time_s = 0.5 * (result.edges_s[1:] + result.edges_s[:-1])
     plot = Plot(time_s, [*result.first, *result.total, np.array([0.0, 1.0])])
     colors = parameter_colors(result.names)
@@ -88,37 +95,42 @@ def indices_chart(key: str, title: str, result: SobolResult, phases: Phases) -> 
 
 
 def _series(history: Mapping[str, Any]) -> tuple[dict[str, Array], NDArray[np.bool_]]:
-    """Arrays (m,) by name, NaN where there is no value, and which bins were fitted."""
+    """Returns arrays (m,) by name, with NaN where there is no value, and which bins (m,) were fitted."""
     series = {name: np.array(values, dtype=float) for name, values in history.items() if name != "fitted"}
     return series, np.array(history["fitted"], dtype=bool)
 
 
 def _forces(series: Mapping[str, Array], fitted: NDArray[np.bool_], phases: Phases) -> Iterator[str]:
+    """Yields the text of the cross-hair of the force chart for each bin."""
     for i, moment in enumerate(moments(series["time_s"], phases)):
         median, low, high = (_millinewton(series[name][i]) for name in ("median_n", "low_90_n", "high_90_n"))
         recorded = series["recorded_n"][i]
-        said = "nothing recorded" if np.isnan(recorded) else f"recorded {_millinewton(recorded)}"
-        said += "" if fitted[i] else " (not fitted)"
-        yield f"{moment}: {said}; predicted {median}, 90 % band {low} to {high}"
+        value = "nothing recorded" if np.isnan(recorded) else f"recorded {_millinewton(recorded)}"
+        value += "" if fitted[i] else " (not fitted)"
+        yield f"{moment}: {value}; predicted {median}, 90 % band {low} to {high}"
 
 
 def _residuals(series: Mapping[str, Array], fitted: NDArray[np.bool_], phases: Phases) -> Iterator[str]:
+    """Yields the text of the cross-hair of the residual chart for each bin."""
     median_n = series["median_n"]
     for i, moment in enumerate(moments(series["time_s"], phases)):
-        left = series["recorded_n"][i] - median_n[i]
+        residual = series["recorded_n"][i] - median_n[i]
         low, high = (_millinewton(series[name][i] - median_n[i]) for name in ("low_90_n", "high_90_n"))
-        said = "nothing recorded" if np.isnan(left) else f"{_millinewton(left)} left"
-        yield f"{moment}: {said}{'' if fitted[i] else ' (not fitted)'}; 90 % band {low} to {high}"
+        value = "nothing recorded" if np.isnan(residual) else f"{_millinewton(residual)} left"
+        yield f"{moment}: {value}{'' if fitted[i] else ' (not fitted)'}; 90 % band {low} to {high}"
 
 
 def _shares(time_s: Array, result: SobolResult, phases: Phases) -> Iterator[str]:
+    """Yields the text of the cross-hair of the chart of Sobol' indices for each bin."""
     for i, moment in enumerate(moments(time_s, phases)):
-        both = zip(result.names, result.first[:, i], result.total[:, i], strict=True)
-        said = [
-            f"{name} {_share(alone)} ({_share(whole)})" for name, alone, whole in both if not np.isnan(alone)
+        indices = zip(result.names, result.first[:, i], result.total[:, i], strict=True)
+        values = [
+            f"{name} {_share(first)} ({_share(total)})"
+            for name, first, total in indices
+            if not np.isnan(first)
         ]
         yield f"{moment}: " + (
-            f"first order (total): {', '.join(said)}" if said else "the force does not vary"
+            f"first order (total): {', '.join(values)}" if values else "the force does not vary"
         )
 
 

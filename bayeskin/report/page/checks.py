@@ -1,4 +1,4 @@
-"""The last two sections: what was checked, and where everything comes from."""
+"""Makes the last two sections of a page: the checks of a run, and its provenance."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from bayeskin.report.page.sections import absent, cell
 
 
 def checks(facts: RunFacts) -> Section:
-    """Convergence, the full model at the most probable point, held-out runs, the design."""
+    """Returns the section on checks: convergence, residuals, the full model, held-out runs, the design."""
     parts = (
         ("Sampling", _convergence(facts, facts.said("sample"))),
-        ("What the fit leaves", _left(facts, facts.said("sample"))),
+        ("What the fit leaves", _residuals(facts, facts.said("sample"))),
         ("The full model where the posterior is highest", _full_model(facts, facts.said("map"))),
         ("The full model at draws of the posterior", _at_draws(facts, facts.said("sample"))),
         ("The surrogate on runs held out", _held_out(facts, facts.said("train"))),
         ("The design", _design(facts, facts.said("design"))),
     )
     blocks: list[Block] = []
-    for title, found in parts:
-        blocks += [Heading(title), *found]
+    for title, part in parts:
+        blocks += [Heading(title), *part]
     return Section("checks", "Checks", blocks)
 
 
@@ -32,9 +32,15 @@ def _convergence(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
     if not said:
         return absent(facts, "sample")
     rows = [
-        row((name, Cell(f"{one['ess']:.0f}", one["ess"]), Cell(f"{one['rhat']:.4f}", one["rhat"])))
-        for name, one in said["parameters"].items()
-        if one["ess"] is not None and one["rhat"] is not None
+        row(
+            (
+                name,
+                Cell(f"{parameter['ess']:.0f}", parameter["ess"]),
+                Cell(f"{parameter['rhat']:.4f}", parameter["rhat"]),
+            )
+        )
+        for name, parameter in said["parameters"].items()
+        if parameter["ess"] is not None and parameter["rhat"] is not None
     ]
     head = ("parameter", "effective samples", "R-hat across ensembles")
     return [
@@ -45,26 +51,26 @@ def _convergence(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
     ]
 
 
-def _left(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
+def _residuals(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
     if not said:
         return absent(facts, "sample")
-    found = said["residuals"]
+    residuals = said["residuals"]
     rows = [
         row(
             (
                 kind,
-                Cell(str(one["bins"]), one["bins"]),
-                Cell(number(one["sd"]), one["sd"]),
-                Cell(number(one["p_sd"]), one["p_sd"]),
-                Cell(number(one["correlation"]), one["correlation"]),
-                Cell(number(one["p_correlation"]), one["p_correlation"]),
+                Cell(str(check["bins"]), check["bins"]),
+                Cell(number(check["sd"]), check["sd"]),
+                Cell(number(check["p_sd"]), check["p_sd"]),
+                Cell(number(check["correlation"]), check["correlation"]),
+                Cell(number(check["p_correlation"]), check["p_correlation"]),
             )
         )
-        for kind, one in found["by_kind"].items()
+        for kind, check in residuals["by_kind"].items()
     ]
     head = ("phase", "bins", "sd, 1 as assumed", "p", "correlation of neighbours, 0 as assumed", "p")
     return [
-        Text([f"{found['sentence'][0].upper()}{found['sentence'][1:]}."]),
+        Text([f"{residuals['sentence'][0].upper()}{residuals['sentence'][1:]}."]),
         Folded("By kind of phase", [Table("What the fit leaves, by kind of phase", head, rows)]),
         *pictures(facts, "sample", ["residuals"]),
     ]
@@ -77,20 +83,20 @@ def _full_model(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
         row(
             (
                 Cell(str(i), i),
-                "passes" if one["passes"] else "does not pass",
-                cell(one["rms_n"], "N"),
-                cell(one["max_n"], "N"),
-                Cell(number(one["rms_z"]), one["rms_z"]),
-                cell(one["seconds_of_full_run"], "s"),
+                "passes" if check["passes"] else "does not pass",
+                cell(check["rms_n"], "N"),
+                cell(check["max_n"], "N"),
+                Cell(number(check["rms_z"]), check["rms_z"]),
+                cell(check["seconds_of_full_run"], "s"),
             )
         )
-        for i, one in enumerate(said["checks"], start=1)
+        for i, check in enumerate(said["checks"], start=1)
     ]
     head = ("run", "check", "RMS difference", "largest", "in the surrogate's sd", "time of the full run")
     lines = [f"Most probable point: {said['message']}."]
     if said["polished"] is not None:
-        gained, how = said["polished"]["gained"], said["polished"]["message"]
-        lines.append(f"Polished on the full model: {number(gained)} nats gained, {how}.")
+        gained, message = said["polished"]["gained"], said["polished"]["message"]
+        lines.append(f"Polished on the full model: {number(gained)} nats gained, {message}.")
     table = Table("The full model against the surrogate at the most probable point", head, rows)
     return [Text(lines), table, *pictures(facts, "map")]
 
@@ -100,7 +106,7 @@ def _at_draws(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
         return absent(facts, "sample")
     if not said["full_model"]:
         return [Text(["No draw of the posterior was run by the full model (check.draws = 0)."])]
-    lines = [f"Round {i}: {one['message']}." for i, one in enumerate(said["full_model"], start=1)]
+    lines = [f"Round {i}: {check['message']}." for i, check in enumerate(said["full_model"], start=1)]
     blocks: list[Block] = [Text(lines, listed=len(lines) > 1)]
     if said["corrected"] is not None:
         rows = [
@@ -108,11 +114,11 @@ def _at_draws(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
                 (
                     name,
                     *_median(said["parameters"][name], said["parameters"][name]["unit"]),
-                    *_median(one, said["parameters"][name]["unit"]),
-                    Cell(f"{number(one['shift_sd'])} ± {number(one['shift_error_sd'])}", one["shift_sd"]),
+                    *_median(full, said["parameters"][name]["unit"]),
+                    Cell(f"{number(full['shift_sd'])} ± {number(full['shift_error_sd'])}", full["shift_sd"]),
                 )
             )
-            for name, one in said["corrected"].items()
+            for name, full in said["corrected"].items()
         ]
         head = (
             "parameter", "median, surrogate", "90 % interval", "median, full model", "90 % interval",
@@ -123,6 +129,7 @@ def _at_draws(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
 
 
 def _median(one: Mapping[str, Any], unit: str) -> tuple[Cell, Cell]:
+    """Returns the cells of a parameter's median and 90 % interval."""
     low, high = one["low_90"], one["high_90"]
     return cell(one["median"], unit), Cell(interval(low, high, unit), low)
 
@@ -163,20 +170,20 @@ def _waves(waves: Sequence[Mapping[str, Any]]) -> Table:
     rows = [
         row(
             (
-                Cell(str(one["wave"] + 1), one["wave"]),
-                Cell(str(one["training"]), one["training"]),
-                Cell(str(one["held_out"]), one["held_out"]),
-                Cell(percent(one["kept_fraction"]), one["kept_fraction"]),
-                one["rule"],
+                Cell(str(wave["wave"] + 1), wave["wave"]),
+                Cell(str(wave["training"]), wave["training"]),
+                Cell(str(wave["held_out"]), wave["held_out"]),
+                Cell(percent(wave["kept_fraction"]), wave["kept_fraction"]),
+                wave["rule"],
             )
         )
-        for one in waves
+        for wave in waves
     ]
     return Table("Waves", ("wave", "training runs", "held out", "of the prior's volume", "where"), rows)
 
 
 def provenance(facts: RunFacts) -> Section:
-    """Version, configuration, hashes, seed, and how each stage stands."""
+    """Returns the section on provenance: version, configuration, hashes, seed, and state of each stage."""
     pairs = [
         ("bayeskin", facts.version),
         ("configuration", facts.config_path),

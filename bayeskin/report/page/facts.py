@@ -1,4 +1,4 @@
-"""Input of a page: a run, and the answers and figures of its stages."""
+"""Defines the input of a page: a run, and the summaries and figures of its stages."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from bayeskin.sensitivity.sobol import SobolResult
 
 @dataclass(frozen=True)
 class StageFacts:
-    """One stage: how it stands, its seconds, and, when it is done, its summary and figures.
+    """Holds the state of one stage, its seconds and, when it is done, its summary and figures.
 
-    summary : the stage's own, in SI; a failed stage's has a "message"
-    figures : name to SVG text
+    standing : "done", "not run", "not finished", "failed" or "out of date"
+    summary : results of the stage, in SI; the summary of a failed stage has a "message"
+    figures : SVG text by name
     """
 
     name: str
@@ -25,17 +26,18 @@ class StageFacts:
 
     @property
     def done(self) -> bool:
+        """Returns whether the stage is done and up to date."""
         return self.standing == "done"
 
 
 @dataclass(frozen=True)
 class RunFacts:
-    """A run: its configuration, where it comes from, the standing of its stages.
+    """Holds the facts of a run: its configuration, its provenance, and the state of its stages.
 
-    config_path : as a person would type it; config_text : the file's own
-    parameters : those of the model, by name in their order, and what each means
-    history : the recorded bins and what is predicted for them, as the stage `sample` writes them
-    indices : Sobol' indices over time by what they are taken over, as the stage `sobol` writes them
+    config_path : as a person would type it; config_text : content of that file
+    parameters : meaning of each parameter of the model, by name and in the model's order
+    history : recorded bins and their prediction, as the stage `sample` writes them
+    indices : Sobol' indices over time, by the name of their distribution, as the stage `sobol` writes them
     """
 
     name: str
@@ -52,10 +54,10 @@ class RunFacts:
     indices: Mapping[str, SobolResult] = field(default_factory=dict)
 
     def stage(self, name: str) -> StageFacts:
-        """A stage's facts; of one that nothing is known of, that it has not been run."""
+        """Returns the facts of a stage; an unknown stage counts as not run."""
         return self.stages.get(name, StageFacts(name, "not run"))
 
     def said(self, stage: str) -> Mapping[str, Any]:
-        """The summary of a stage that is done; empty otherwise."""
+        """Returns the summary of a stage that is done, and an empty mapping otherwise."""
         facts = self.stage(stage)
         return facts.summary if facts.done else {}

@@ -1,4 +1,4 @@
-"""Place of each figure on a page, its title, and a description of what it shows."""
+"""Gives each figure its place on a page, its title, and a description of its content."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bayeskin.report.page.parts import Picture
 from bayeskin.report.page.svg import inline_svg
 
 _SOBOL = "Sobol' indices of each parameter over time, first order and total, and aggregated"
-# (stage, figure): title, what it shows
+# title and description, by stage and name of the figure
 _KNOWN = {
     ("recording", "recording"): (
         "The recording",
@@ -106,14 +106,15 @@ _KNOWN = {
 
 
 def pictures(facts: RunFacts, stage: str, names: Iterable[str] | None = None) -> list[Picture]:
-    """The figures of a stage: those named, or all of them, known ones first."""
+    """Returns the figures of a stage: those of the given names, or all, with the known ones first."""
     drawn = facts.stage(stage).figures
-    known = [name for of, name in _KNOWN if of == stage]
+    known = [name for owner, name in _KNOWN if owner == stage]
     wanted = names if names is not None else [*known, *sorted(set(drawn) - set(known))]
     return [_picture(stage, name, drawn[name]) for name in wanted if name in drawn]
 
 
 def _picture(stage: str, name: str, svg: str) -> Picture:
+    """Returns a figure with its title and description; a figure whose file is damaged stays empty."""
     plain = name.replace("_", " ")
     title, alt = _KNOWN.get((stage, name), (plain.capitalize(), f"Figure {plain} of the stage {stage}."))
     key = f"{stage}-{name}".replace("_", "-")

@@ -1,4 +1,4 @@
-"""The section on what the model leaves out, from the diagnosis."""
+"""Makes the section on the physics that the model leaves out, from the diagnosis."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ _VERDICTS = {
 
 
 def mismatch(facts: RunFacts) -> Section:
-    said = facts.said("diagnose")
+    """Returns the section on the physics that the model leaves out."""
+    diagnosis = facts.said("diagnose")
     blocks: list[Block] = list(absent(facts, "diagnose"))
-    if said:
-        verdict = _VERDICTS[said["verdict"]]
-        blocks.append(Text([f"{verdict} {faint}" if (faint := faint_in_words(said)) else verdict]))
-        if said["mechanisms"]:
-            blocks.append(_mechanisms(said["mechanisms"]))
-        blocks += [_fits(said["fit"]), Text([_checked(said["full_model"])])]
+    if diagnosis:
+        verdict = _VERDICTS[diagnosis["verdict"]]
+        blocks.append(Text([f"{verdict} {faint}" if (faint := faint_in_words(diagnosis)) else verdict]))
+        if diagnosis["mechanisms"]:
+            blocks.append(_mechanisms(diagnosis["mechanisms"]))
+        blocks += [_fits(diagnosis["fit"]), Text([_checked(diagnosis["full_model"])])]
         blocks += pictures(facts, "diagnose")
-        if said["mechanisms"]:
-            blocks.append(Folded("Parameters of the mechanisms", [_parameters(said["mechanisms"])]))
+        if diagnosis["mechanisms"]:
+            blocks.append(Folded("Parameters of the mechanisms", [_parameters(diagnosis["mechanisms"])]))
         blocks += [
-            Folded("All candidates", [_candidates(said["candidates"])]),
+            Folded("All candidates", [_candidates(diagnosis["candidates"])]),
             Folded(
-                f"Windows: {len(said['located'])} before, {len(said['remaining'])} after",
-                [_windows("Before", said["located"]), _windows("After", said["remaining"])],
+                f"Windows: {len(diagnosis['located'])} before, {len(diagnosis['remaining'])} after",
+                [_windows("Before", diagnosis["located"]), _windows("After", diagnosis["remaining"])],
             ),
-            *_unexplained(said["unexplained"]),
+            *_unexplained(diagnosis["unexplained"]),
             *_experiments(facts),
         ]
     return Section("mismatch", "Mismatch", blocks)
@@ -47,14 +48,14 @@ def _mechanisms(found: Sequence[Mapping[str, Any]]) -> Table:
     rows = [
         row(
             (
-                one["name"],
-                one["statement"],
-                Cell(number(one["probability"]), one["probability"]),
-                cell(one["contribution_n"], "N"),
-                ", ".join(name for name in one["group"] if name != one["name"]) or "none",
+                mechanism["name"],
+                mechanism["statement"],
+                Cell(number(mechanism["probability"]), mechanism["probability"]),
+                cell(mechanism["contribution_n"], "N"),
+                ", ".join(name for name in mechanism["group"] if name != mechanism["name"]) or "none",
             )
         )
-        for one in found
+        for mechanism in found
     ]
     head = ("mechanism", "what it does here", "probability", "moves the force by", "look-alikes")
     return Table("Mechanisms that were named", head, rows)
@@ -62,9 +63,9 @@ def _mechanisms(found: Sequence[Mapping[str, Any]]) -> Table:
 
 def _parameters(found: Sequence[Mapping[str, Any]]) -> Table:
     rows = [
-        row((one["name"], name, cell(p["mean"], p["unit"]), cell(p["sd"], p["unit"])))
-        for one in found
-        for name, p in one["parameters"].items()
+        row((mechanism["name"], name, cell(p["mean"], p["unit"]), cell(p["sd"], p["unit"])))
+        for mechanism in found
+        for name, p in mechanism["parameters"].items()
     ]
     return Table("Parameters of the mechanisms", ("mechanism", "parameter", "mean", "sd"), rows)
 
@@ -75,13 +76,13 @@ def _fits(fit: Mapping[str, Mapping[str, Any]]) -> Table:
         row(
             (
                 when,
-                cell(one["rmse"], "N"),
-                cell(one["rmse_held_out"], "N"),
-                *(cell(one["rmse_by_phase"].get(kind), "N") for kind in kinds),
-                Cell(percent(one["coverage90"]), one["coverage90"]),
+                cell(summary["rmse"], "N"),
+                cell(summary["rmse_held_out"], "N"),
+                *(cell(summary["rmse_by_phase"].get(kind), "N") for kind in kinds),
+                Cell(percent(summary["coverage90"]), summary["coverage90"]),
             )
         )
-        for when, one in fit.items()
+        for when, summary in fit.items()
     ]
     head = ("fit", "whole recording", "held out", *kinds, "90 % band holds")
     title = (
@@ -91,7 +92,7 @@ def _fits(fit: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def _checked(full: Mapping[str, Any]) -> str:
-    """What a run of the full model at the best values shows."""
+    """Returns a sentence about the run of the full model at the best values."""
     if "message" in full:
         return f"The full model fails at the best values: {full['message']}"
     return (
@@ -104,19 +105,19 @@ def _candidates(candidates: Sequence[Mapping[str, Any]]) -> Table:
     rows = [
         row(
             (
-                one["name"],
-                Cell(number(one["delta_score"]), one["delta_score"]),
-                Cell(number(one["standard_error"]), one["standard_error"]),
+                candidate["name"],
+                Cell(number(candidate["delta_score"]), candidate["delta_score"]),
+                Cell(number(candidate["standard_error"]), candidate["standard_error"]),
             )
         )
-        for one in candidates
+        for candidate in candidates
     ]
     head = ("mechanism", "log evidence gained [nats]", "standard error")
     return Table("Each mechanism added to the model alone", head, rows)
 
 
 def _unexplained(left: Mapping[str, Any] | None) -> list[Block]:
-    """Section on the residual that a smooth process describes: its size, variable and form."""
+    """Returns blocks on the residual that a smooth process describes: its size, variables and form."""
     if left is None:
         return []
     if not left["noticeable"]:
@@ -152,30 +153,30 @@ def _unexplained(left: Mapping[str, Any] | None) -> list[Block]:
 
 
 def _experiments(facts: RunFacts) -> list[Block]:
-    """Further tests by what they are expected to tell; nothing where nobody has asked."""
-    asked = facts.said("experiment")
-    if not asked:
+    """Returns blocks on further tests and their expected information, if these have been computed."""
+    summary = facts.said("experiment")
+    if not summary:
         return []
     title = Heading("Which further test would tell the explanations apart")
-    if len(asked["sets"]) < 2:
+    if len(summary["sets"]) < 2:
         return [title, Text(["Nothing competes with what explains the recording best."])]
     rows = [
         row(
             (
-                one["protocol"],
-                one["sentence"],
-                cell(one["seconds"], "s"),
-                Cell(number(one["gain_bits"]), one["gain_bits"]),
-                Cell(number(one["standard_error"]), one["standard_error"]),
-                Cell(percent(one["named"]), one["named"]),
+                experiment["protocol"],
+                experiment["sentence"],
+                cell(experiment["seconds"], "s"),
+                Cell(number(experiment["gain_bits"]), experiment["gain_bits"]),
+                Cell(number(experiment["standard_error"]), experiment["standard_error"]),
+                Cell(percent(experiment["named"]), experiment["named"]),
             )
         )
-        for one in asked["experiments"]
+        for experiment in summary["experiments"]
     ]
-    possible = asked["experiments"][0]["possible_bits"]
-    told = f"tells, of {number(possible)} bits"
-    head = ("protocol", "what is done", "takes", told, "±", "the true one is then named")
-    sets = "; or ".join(", ".join(names) for names in asked["sets"])
+    possible = summary["experiments"][0]["possible_bits"]
+    information = f"tells, of {number(possible)} bits"
+    head = ("protocol", "what is done", "takes", information, "±", "the true one is then named")
+    sets = "; or ".join(", ".join(names) for names in summary["sets"])
     return [
         title,
         Text([f"Taken as equally probable: {sets}."]),
@@ -188,14 +189,14 @@ def _windows(when: str, windows: Sequence[Mapping[str, Any]]) -> Table:
     rows = [
         row(
             (
-                f"{one['phase']} of cycle {one['cycle']}",
-                cell(one["t0"], "s"),
-                cell(one["t1"], "s"),
-                Cell(quantity(one["mean_residual"], "N"), one["mean_residual"]),
-                Cell(number(one["significance"]), one["significance"]),
+                f"{window['phase']} of cycle {window['cycle']}",
+                cell(window["t0"], "s"),
+                cell(window["t1"], "s"),
+                Cell(quantity(window["mean_residual"], "N"), window["mean_residual"]),
+                Cell(number(window["significance"]), window["significance"]),
             )
         )
-        for one in windows
+        for window in windows
     ]
     head = ("window", "from", "to", "recorded minus model", "chance of one such by noise")
     return Table(f"{when}: where the recording leaves what the model allows", head, rows)

@@ -1,4 +1,4 @@
-"""Numbers as people read them: three digits, units with their prefixes, typographic minus and powers."""
+"""Formats numbers for readers: three digits, units with prefixes, minus signs and powers of ten."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from bayeskin.report.style import unit_text
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-_LONGEST, _SMALLEST = 5, -3  # powers of ten between which numbers are written out
-_FAR = 100.0  # ratio of an interval's ends from which on each has its own unit
-_KEPT = "\u00a0"  # a space at which no line ends
-# From which size on a unit gets another name, largest first: (size in SI, factor, name).
+_LONGEST, _SMALLEST = 5, -3  # numbers between these powers of ten are written out
+_FAR = 100.0  # from this ratio of an interval's ends on, each end may have its own unit
+_KEPT = "\u00a0"  # a space at which no line breaks
+# A value of at least `size` is printed in the unit `name`, the largest first: (size in SI, factor, name).
 _SCALES = {
     "Pa": ((1e6, 1e-6, "MPa"), (1e3, 1e-3, "kPa"), (0.0, 1.0, "Pa")),
     "N": ((1.0, 1.0, "N"), (0.0, 1e3, "mN")),
@@ -20,7 +20,7 @@ _SCALES = {
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number with at most `digits` significant digits; a dash for none."""
+    """Returns a number with at most `digits` significant digits, or a dash if it is None or not finite."""
     if value is None or not math.isfinite(value):
         return "–"
     if value == 0:
@@ -36,7 +36,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def scale(values: Sequence[float | None], unit: str) -> tuple[float, str]:
-    """Factor and printed unit in which all of `values`, given in the SI `unit`, read well."""
+    """Returns the factor and the printed unit that suit all `values`, which are given in the SI `unit`."""
     reach = max((abs(value) for value in values if value is not None), default=0.0)
     for size, factor, name in _SCALES.get(unit, ()):
         if reach >= size:
@@ -45,21 +45,21 @@ def scale(values: Sequence[float | None], unit: str) -> tuple[float, str]:
 
 
 def quantity(value: float | None, unit: str) -> str:
-    """A number with its unit, such as "50.8 kPa"; a dash for none."""
+    """Returns a number with its unit, such as "50.8 kPa", or a dash for None."""
     return with_unit(value, *scale([value], unit))
 
 
 def with_unit(value: float | None, factor: float, name: str) -> str:
-    """A number times `factor`, with the name of that unit."""
+    """Returns a number times `factor` with the name of its unit, or a dash for None."""
     if value is None:
         return "–"
     return number(factor * value) + (f"{_KEPT}{name}" if name else "")
 
 
 def interval(low: float, high: float, unit: str, beside: float | None = None) -> str:
-    """Two numbers with one unit, such as "13.9 to 87 kPa", or with two, such as "10 kPa to 2 MPa".
+    """Returns an interval with one unit, such as "13.9 to 87 kPa", or with two, such as "10 kPa to 2 MPa".
 
-    With a number `beside` them, in the unit in which all three read well.
+    With a number `beside` it, the unit suits all three numbers.
     """
     factor, name = scale([low, high, beside], unit)
     if beside is None and scale([low], unit)[1] != name and abs(high) >= _FAR * abs(low) > 0.0:
@@ -68,8 +68,10 @@ def interval(low: float, high: float, unit: str, beside: float | None = None) ->
 
 
 def percent(share: float | None) -> str:
+    """Returns a share as a percentage, or a dash for None."""
     return "–" if share is None else f"{number(100 * share)}{_KEPT}%"
 
 
 def _short(text: str) -> str:
+    """Returns a decimal number without trailing zeros."""
     return text.rstrip("0").rstrip(".") if "." in text else text

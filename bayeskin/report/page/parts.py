@@ -1,4 +1,4 @@
-"""Parts of a page; the template turns each into HTML and computes nothing."""
+"""Defines the parts of a page. The template turns each part into HTML and computes nothing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Cell:
-    """Text of a table's cell, and the number by which it is sorted (None: by its text)."""
+    """Holds the text of a table cell and the number by which it is sorted; with None, its text is sorted."""
 
     text: str
     order: float | None = None
@@ -17,7 +17,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with a caption; the first cell of each row names it. `symbols`: names are parameters'."""
+    """Holds a table. The first cell of a row names the row; with `symbols`, these names are parameters."""
 
     caption: str
     head: Sequence[str]
@@ -27,7 +27,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure that can be enlarged. `svg` has been made safe to stand inside a page."""
+    """Holds a figure that can be enlarged. `svg` is already safe for use inside a page."""
 
     key: str
     title: str
@@ -37,21 +37,21 @@ class Picture:
 
 @dataclass(frozen=True)
 class Heading:
-    """Over the blocks that follow in a section."""
+    """Holds the heading of the blocks that follow in a section."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Facts:
-    """Short facts, each with its name."""
+    """Holds short facts, each with its name."""
 
     pairs: Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True)
 class Text:
-    """Paragraphs; with `listed`, a list of them."""
+    """Holds paragraphs, which form a list with `listed`."""
 
     lines: Sequence[str]
     listed: bool = False
@@ -59,7 +59,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Missing:
-    """A stage that is not done, why, and the command that does it."""
+    """Holds the reason why a stage is not done, and the command that runs it."""
 
     message: str
     command: str = ""
@@ -67,7 +67,7 @@ class Missing:
 
 @dataclass(frozen=True)
 class Folded:
-    """Blocks that a reader opens when he wants them."""
+    """Holds blocks that stay hidden until the reader opens them."""
 
     title: str
     blocks: Sequence[Any]
@@ -75,7 +75,7 @@ class Folded:
 
 @dataclass(frozen=True)
 class Source:
-    """Text as it stands in a file."""
+    """Holds the unchanged text of a file."""
 
     title: str
     text: str
@@ -83,7 +83,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Key:
-    """Entry of a chart's legend: "dots", "line", "dashed" or "band", in its own colour or none."""
+    """Holds an entry of a chart's legend; `mark` is "dots", "line", "dashed" or "band"."""
 
     text: str
     mark: str
@@ -92,7 +92,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Chart:
-    """A plot over time that can be enlarged: a drawing, and what a cross-hair reads from it."""
+    """Holds a plot over time that can be enlarged: its drawing, and the data that the cross-hair shows."""
 
     key: str
     title: str
@@ -107,6 +107,8 @@ Block = Heading | Table | Picture | Facts | Text | Missing | Folded | Source | C
 
 @dataclass(frozen=True)
 class Section:
+    """Holds a section of a page: its key in links, its title and its blocks."""
+
     key: str
     title: str
     blocks: Sequence[Block]
@@ -114,7 +116,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Bar:
-    """Position of a 90 % interval and its median in the prior's range, in percent of its width."""
+    """Holds the position of a 90 % interval and its median in the prior's range, in percent of the range."""
 
     left: float
     width: float
@@ -123,7 +125,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Made:
-    """One line of the answer: a parameter, what it means and was found to be."""
+    """Holds one line of the answer: a parameter, its meaning, its posterior and its prior."""
 
     name: str
     meaning: str
@@ -137,7 +139,10 @@ class Made:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A part of the answer: a word, the tone it is said in ("good", "doubt", "none"), and why."""
+    """Holds a part of the answer: a word, its tone ("good", "doubt" or "none"), and the reasons.
+
+    command : the command that would give the answer, where it is not known yet
+    """
 
     word: str
     tone: str
@@ -147,7 +152,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Answer:
-    """Answers to a reader's first questions: the skin's properties, how sure they are, what is missing."""
+    """Holds the answers to a reader's first questions: parameters, trust in them, and missing physics."""
 
     made: Sequence[Made]
     made_of: Verdict
@@ -156,5 +161,5 @@ class Answer:
 
 
 def row(cells: Iterable[str | Cell]) -> tuple[Cell, ...]:
-    """Cells of a row; plain text is sorted as such."""
+    """Returns the cells of a row; a cell of plain text is sorted by its text."""
     return tuple(cell if isinstance(cell, Cell) else Cell(cell) for cell in cells)

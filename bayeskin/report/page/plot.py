@@ -1,4 +1,4 @@
-"""A plot over time drawn in the page itself: axes, phases, lines, bands, dots, and a cross-hair over them."""
+"""Draws a plot over time as part of the page: axes, phases, lines, bands, dots, and a cross-hair."""
 
 from __future__ import annotations
 
@@ -19,26 +19,31 @@ Phases = Sequence[Mapping[str, Any]]
 
 
 class Plot:
-    """Scales of a drawing, from seconds and values to its own units; each method returns a piece of SVG."""
+    """Draws a plot piece by piece, as SVG.
+
+    It holds the scales that turn seconds and values into units of the drawing.
+    """
 
     def __init__(self, time_s: Array, values: Sequence[Array]) -> None:
-        """`values`, each (m,), are all to be seen; NaN is not drawn."""
+        """Chooses scales that show all `values`, (m,) each, at the times (m,) [s]. NaN is not drawn."""
         self.time_s = time_s
         self.t0, self.t1 = float(time_s[0]), float(time_s[-1])
-        everything = np.concatenate(values)
-        low, high = float(np.nanmin(everything)), float(np.nanmax(everything))
+        all_values = np.concatenate(values)
+        low, high = float(np.nanmin(all_values)), float(np.nanmax(all_values))
         margin = 0.04 * ((high - low) or 1.0)
         self.low, self.high = low - margin, high + margin
 
     def x(self, time_s: Any) -> Any:
+        """Returns the horizontal positions of times [s], same shape."""
         return LEFT + (np.asarray(time_s) - self.t0) / ((self.t1 - self.t0) or 1.0) * (WIDTH - LEFT - RIGHT)
 
     def y(self, values: Any) -> Any:
+        """Returns the vertical positions of values, same shape."""
         share = (np.asarray(values) - self.low) / (self.high - self.low)
         return HEIGHT - BOTTOM - share * (HEIGHT - TOP - BOTTOM)
 
     def svg(self, key: str, label: str, phases: Phases, parts: Sequence[str], dots: int) -> str:
-        """The whole drawing, `parts` between its axes and a cross-hair with so many dots."""
+        """Returns the whole drawing: phases, axes, `parts` over them, and a cross-hair with `dots` dots."""
         circles = '<circle r="4"/>' * dots
         cross = f'<g class="cross"><line class="hair"/>{circles}</g>'
         inner = "".join((self._phases(phases), self._axes(label), *parts, cross))
@@ -48,7 +53,10 @@ class Plot:
         )
 
     def numbers(self, marked: Sequence[Array], says: Sequence[str]) -> dict[str, Any]:
-        """Data of the cross-hair: its position at each time, its dots, and the values that it shows."""
+        """Returns the data of the cross-hair at each time: its position, its dots, and its text.
+
+        marked : values (m,) of each dot; says : text at each time
+        """
         dots = [[None if np.isnan(v) else round(float(v), 1) for v in self.y(values)] for values in marked]
         return {
             "x": np.round(self.x(self.time_s), 1).tolist(), "dots": dots, "says": list(says),
@@ -56,16 +64,17 @@ class Plot:
         }  # fmt: skip
 
     def line(self, values: Array, name: str, color: str = "") -> str:
-        """Interrupted where there is no value."""
+        """Returns a line over time, interrupted where there is no value."""
         colored = f' style="--own: {color}"' if color else ""
         return f'<path class="{name}" d="{self._path(self.time_s, values)}"{colored}/>'
 
     def band(self, low: Array, high: Array, name: str) -> str:
+        """Returns a band between two values (m,) over time."""
         around = np.concatenate([self.time_s, self.time_s[::-1]]), np.concatenate([high, low[::-1]])
         return f'<path class="band {name}" d="{self._path(*around)}Z"/>'
 
     def dots(self, values: Array, chosen: NDArray[np.bool_], name: str) -> str:
-        """Points as a path of lines without length, which round caps make visible."""
+        """Returns the chosen points as a path of lines without length, which round line caps make visible."""
         kept = chosen & np.isfinite(values)
         points = zip(self.x(self.time_s[kept]), self.y(values[kept]), strict=True)
         path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
@@ -98,8 +107,8 @@ class Plot:
         for tick in _ticks(self.low, self.high, 6):
             y = self.y(tick)
             parts.append(f'<line class="grid" x1="{LEFT}" y1="{y:.1f}" x2="{WIDTH - RIGHT}" y2="{y:.1f}"/>')
-            said = f"{tick:g}".replace("-", "−")
-            parts.append(f'<text x="{LEFT - 7}" y="{y + 4:.1f}" text-anchor="end">{said}</text>')
+            tick_label = f"{tick:g}".replace("-", "−")
+            parts.append(f'<text x="{LEFT - 7}" y="{y + 4:.1f}" text-anchor="end">{tick_label}</text>')
         middle = 0.5 * (LEFT + WIDTH - RIGHT)
         parts.append(f'<text x="{middle}" y="{HEIGHT - 4}" text-anchor="middle">time [s]</text>')
         parts.append(f'<text x="4" y="{TOP - 9}">{label}</text>')
@@ -107,12 +116,12 @@ class Plot:
 
 
 def moments(time_s: Array, phases: Phases) -> Iterator[str]:
-    """Each time and the phase that it lies in, such as "1.25 s, load of cycle 1"."""
+    """Yields each time with the phase in which it lies, such as "1.25 s, load of cycle 1"."""
     for t in time_s:
         inside = [p for p in phases if p["start_s"] <= t < p["end_s"]]
         yield f"{t:.2f} s" + "".join(f", {p['kind']} of cycle {p['cycle']}" for p in inside[:1])
 
 
 def _ticks(low: float, high: float, most: int) -> list[float]:
-    found = MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
-    return [float(f"{tick:.9g}") for tick in found if low <= tick <= high]
+    ticks = MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
+    return [float(f"{tick:.9g}") for tick in ticks if low <= tick <= high]

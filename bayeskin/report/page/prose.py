@@ -1,4 +1,4 @@
-"""Sentences that the stages say, as a page prints them: symbols, units with prefixes, minus signs."""
+"""Formats the sentences of the stages for a page: symbols, units with prefixes, minus signs."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ _UNIT = r"(Pa|N|m\^2)(?![\w^])"
 
 
 def prose(text: str) -> Markup:
-    """Text, escaped, with ``E_c`` as a symbol and ``5.08e+04 Pa`` as 50.8 kPa."""
+    """Returns escaped text in which ``E_c`` is a symbol and ``5.08e+04 Pa`` reads 50.8 kPa."""
     pieces, end = Markup(), 0
     text = _numbers(text)
-    for found in _NAME.finditer(text):
-        head, tail = found.groups()
-        pieces += text[end : found.start()]
+    for match in _NAME.finditer(text):
+        head, tail = match.groups()
+        pieces += text[end : match.start()]
         pieces += Markup("<i>{}</i><sub>{}</sub>").format(_GREEK.get(head, head), tail)
-        end = found.end()
+        end = match.end()
     return pieces + escape(text[end:])
 
 
 def _numbers(text: str) -> str:
+    """Returns text in which numbers and their units have the form in which a page prints them."""
     text = re.sub(
         rf"{_NUMBER} to {_NUMBER} {_UNIT}", lambda m: interval(float(m[1]), float(m[2]), m[3]), text
     )
@@ -37,5 +38,5 @@ def _numbers(text: str) -> str:
 
 
 def _number(found: re.Match[str]) -> str:
-    """Powers of ten and minus signs; other digits as they stand."""
+    """Returns a matched number in printed form: with a minus sign, and without an exponent such as e+04."""
     return number(float(found[1])) if "e" in found[1] else found[1].replace("-", "−")

@@ -1,4 +1,4 @@
-"""From facts to HTML: the sections in their order, put into the template with its style and script inside."""
+"""Renders the facts of a run as HTML: it fills the template with the sections, the style and the script."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ _HERE = Path(__file__).parent
 
 
 def render_page(facts: RunFacts) -> str:
-    """One HTML document that loads nothing: text, figures, style and script are all in it.
+    """Returns one HTML document that loads nothing: it contains all text, figures, style and script.
 
-    All that comes from a configuration or a recording is escaped, and no script but the page's own, known by
-    its hash, would be run. The same facts give the same bytes.
+    All text from a configuration or a recording is escaped. The page allows its own script only, which it
+    identifies by a hash. The same facts give the same bytes.
     """
     environment = Environment(
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,

@@ -1,4 +1,4 @@
-"""The sections of a page below its answer: recording, fit, posterior, Sobol' indices."""
+"""Makes the sections of a page below its answer: recording, fit, posterior and Sobol' indices."""
 
 from __future__ import annotations
 
@@ -27,41 +27,42 @@ _INDICES = {
 
 
 def absent(facts: RunFacts, stage: str) -> list[Block]:
-    """Says plainly that a stage is not done, and how to do it; nothing when it is."""
-    known = facts.stage(stage)
-    if known.done:
+    """Returns a block that says why a stage is not done and how to run it, and no block when it is done."""
+    state = facts.stage(stage)
+    if state.done:
         return []
-    said = known.summary.get("message") if known.standing == "failed" else None
-    why = _WHY[known.standing] + (f": {said}" if said else "")
-    return [Missing(f"The stage {stage} {why}.", f"bayeskin {stage} {facts.config_path}")]
+    message = state.summary.get("message") if state.standing == "failed" else None
+    reason = _WHY[state.standing] + (f": {message}" if message else "")
+    return [Missing(f"The stage {stage} {reason}.", f"bayeskin {stage} {facts.config_path}")]
 
 
 def cell(value: float | None, unit: str) -> Cell:
-    """A number with its unit, sorted by its value in SI."""
+    """Returns a cell with a number and its unit, which is sorted by the value in SI."""
     return Cell(quantity(value, unit), value)
 
 
 def recording(facts: RunFacts) -> Section:
-    said = facts.said("recording")
+    """Returns the section on the recording."""
+    summary = facts.said("recording")
     blocks: list[Block] = list(absent(facts, "recording"))
-    if said:
-        force, moved = said["force_n"], said["displacement_m"]
+    if summary:
+        force, displacement = summary["force_n"], summary["displacement_m"]
         blocks += [
             Facts(
                 [
-                    ("name", said["name"]),
-                    ("duration", f"{number(said['duration_s'])} s, {said['samples']} samples"),
-                    ("rate", f"{number(said['sampling_hz'])} Hz"),
-                    ("cycles", str(said["cycles"])),
-                    ("displacement", interval(moved["min"], moved["max"], "m")),
+                    ("name", summary["name"]),
+                    ("duration", f"{number(summary['duration_s'])} s, {summary['samples']} samples"),
+                    ("rate", f"{number(summary['sampling_hz'])} Hz"),
+                    ("cycles", str(summary["cycles"])),
+                    ("displacement", interval(displacement["min"], displacement["max"], "m")),
                     ("force", interval(force["min"], force["max"], "N")),
                 ]
             ),
             *pictures(facts, "recording"),
-            Folded("Phases and their noise", [_phases(said["phases"])]),
+            Folded("Phases and their noise", [_phases(summary["phases"])]),
         ]
-        if said["notes"]:
-            blocks.append(Folded("What was taken for what", [Text(said["notes"], listed=True)]))
+        if summary["notes"]:
+            blocks.append(Folded("What was taken for what", [Text(summary["notes"], listed=True)]))
     return Section("recording", "Recording", blocks)
 
 
@@ -97,14 +98,15 @@ def _phases(phases: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def fit(facts: RunFacts) -> Section:
-    said = facts.said("sample")
+    """Returns the section on the fit."""
+    summary = facts.said("sample")
     blocks: list[Block] = list(absent(facts, "sample"))
-    if said:
+    if summary:
         if facts.history is not None:
             blocks += [chart(facts.history, _phases_of(facts)) for chart in (history_chart, residual_chart)]
-        tables = {"posterior mean": said["rmse"], "full model, most probable point": None}
+        tables = {"posterior mean": summary["rmse"], "full model, most probable point": None}
         tables["full model, most probable point"] = facts.said("map").get("rmse_of_full_model")
-        blocks += [_rmse(tables), _bands(said), *pictures(facts, "sample", ["fit"])]
+        blocks += [_rmse(tables), _bands(summary), *pictures(facts, "sample", ["fit"])]
     return Section("fit", "Fit", blocks)
 
 
@@ -114,17 +116,17 @@ def _phases_of(facts: RunFacts) -> Sequence[Mapping[str, Any]]:
 
 
 def _rmse(tables: Mapping[str, Mapping[str, Any] | None]) -> Table:
-    present = {name: one for name, one in tables.items() if one is not None}
-    kinds = list(dict.fromkeys(kind for one in present.values() for kind in one["by_kind_n"]))
+    known = {name: rmse for name, rmse in tables.items() if rmse is not None}
+    kinds = list(dict.fromkeys(kind for rmse in known.values() for kind in rmse["by_kind_n"]))
     rows = [
         row(
             (
                 name,
-                *(cell(one[key], "N") for key in ("whole_n", "fitted_n", "not_fitted_n")),
-                *(cell(one["by_kind_n"].get(kind), "N") for kind in kinds),
+                *(cell(rmse[key], "N") for key in ("whole_n", "fitted_n", "not_fitted_n")),
+                *(cell(rmse["by_kind_n"].get(kind), "N") for kind in kinds),
             )
         )
-        for name, one in present.items()
+        for name, rmse in known.items()
     ]
     return Table(
         "RMSE between predicted and recorded force",
@@ -147,94 +149,109 @@ def _bands(said: Mapping[str, Any]) -> Facts:
 
 
 def posterior(facts: RunFacts) -> Section:
-    said = facts.said("sample")
+    """Returns the section on the posterior."""
+    summary = facts.said("sample")
     blocks: list[Block] = list(absent(facts, "sample"))
-    if said:
-        blocks += [_parameters(facts, said["parameters"]), *pictures(facts, "sample", ["posterior"])]
-        if said["ridges"]:
-            blocks.insert(1, Text([f"{ridge}." for ridge in said["ridges"]], listed=True))
+    if summary:
+        blocks += [_parameters(facts, summary["parameters"]), *pictures(facts, "sample", ["posterior"])]
+        if summary["ridges"]:
+            blocks.insert(1, Text([f"{ridge}." for ridge in summary["ridges"]], listed=True))
         blocks += [
-            *_taught(said),
-            *_lengths(said),
+            *_information_gained(summary),
+            *_length_shares(summary),
             *pictures(facts, "sample", ["profiles", "posterior_noise"]),
         ]
-        sources = [f"{name}: {one['prior']['source']}." for name, one in said["parameters"].items()]
+        sources = [
+            f"{name}: {parameter['prior']['source']}." for name, parameter in summary["parameters"].items()
+        ]
         blocks.append(Folded("Where the priors come from", [Text(sources, listed=True)]))
         blocks += pictures(facts, "train", ["prior_predictive"])
     return Section("posterior", "Posterior", blocks)
 
 
-def _taught(said: Mapping[str, Any]) -> list[Block]:
-    """Section on what the test taught about each material parameter: in words, and by three measures."""
+def _information_gained(said: Mapping[str, Any]) -> list[Block]:
+    """Returns sentences and a table of three measures that say what the test taught about each parameter."""
     rows = []
-    for name, one in said["profiles"].items():
+    for name, profile in said["profiles"].items():
         learned, unit = said["learned"][name], said["parameters"][name]["unit"]
-        fit = interval(one["low_90"], one["high_90"], unit) + (" (all of the prior)" if one["flat"] else "")
+        fit_interval = interval(profile["low_90"], profile["high_90"], unit) + (
+            " (all of the prior)" if profile["flat"] else ""
+        )
         rows.append(
             row(
                 (
                     name,
                     Cell(number(learned["contraction"]), learned["contraction"]),
                     Cell(number(learned["gain_nats"]), learned["gain_nats"]),
-                    fit,
+                    fit_interval,
                 )
             )
         )
     head = ("parameter", "contraction", "information gained [nats]", "90 % interval by the fit alone")
-    sentences = [said["learned"][name]["sentence"] for name in said["profiles"]]
-    return [Text(sentences, listed=True), Table("What the test taught", head, rows, symbols=True)]
+    learned_sentences = [said["learned"][name]["sentence"] for name in said["profiles"]]
+    return [Text(learned_sentences, listed=True), Table("What the test taught", head, rows, symbols=True)]
 
 
-def _lengths(said: Mapping[str, Any]) -> list[Block]:
-    """Table of the shares of posterior variances that uncertain lengths explain; nothing without any."""
-    due = said.get("lengths")
-    if not due:
+def _length_shares(said: Mapping[str, Any]) -> list[Block]:
+    """Returns the shares of posterior variances that uncertain lengths explain, if there are such lengths."""
+    explained = said.get("lengths")
+    if not explained:
         return []
-    rows = [row((name, Cell(percent(one["share"]), one["share"]))) for name, one in due.items()]
+    rows = [
+        row((name, Cell(percent(length["share"]), length["share"]))) for name, length in explained.items()
+    ]
     table = Table(
         "Share of the posterior variance that uncertain lengths explain", ("parameter", "share"), rows,
         symbols=True,
     )  # fmt: skip
-    return [Text([one["sentence"] for one in due.values()], listed=True), table]
+    return [Text([length["sentence"] for length in explained.values()], listed=True), table]
 
 
 def _parameters(facts: RunFacts, table: Mapping[str, Mapping[str, Any]]) -> Table:
-    best, spoken = facts.said("map").get("theta", {}), sentences(facts)
+    best, known_sentences = facts.said("map").get("theta", {}), sentences(facts)
     numbers = ("median", "5 %", "95 %", "unit", "most probable")
     head = ("parameter", "meaning", "prior", *numbers, "what the data says")
     rows = []
-    for name, said in table.items():
-        values = [*(said[key] for key in ("median", "low_90", "high_90")), best.get(name)]
-        factor, unit = scale(values[:3], said["unit"])
-        shown = [Cell(number(None if v is None else factor * v), v) for v in values]
-        meaning = facts.parameters.get(name) or said.get("meaning", "")
-        sentence = without_numbers(spoken.get(name, ""))
-        rows.append(row((name, meaning, prior_range(said), *shown[:3], unit, shown[3], sentence)))
+    for name, summary in table.items():
+        values = [*(summary[key] for key in ("median", "low_90", "high_90")), best.get(name)]
+        factor, unit = scale(values[:3], summary["unit"])
+        cells = [Cell(number(None if v is None else factor * v), v) for v in values]
+        meaning = facts.parameters.get(name) or summary.get("meaning", "")
+        sentence = without_numbers(known_sentences.get(name, ""))
+        rows.append(row((name, meaning, prior_range(summary), *cells[:3], unit, cells[3], sentence)))
     return Table("Parameters: prior, posterior, and what the data says of each", head, rows, symbols=True)
 
 
 def sobol(facts: RunFacts) -> Section:
-    said = facts.said("sobol")
+    """Returns the section on Sobol' indices."""
+    summaries = facts.said("sobol")
     blocks: list[Block] = list(absent(facts, "sobol"))
-    for name, one in said.items():
+    for name, summary in summaries.items():
         title = _INDICES.get(name, name)
-        tables = [_shares(one)] if "shares" in one else _indices(one, title)
-        key, found = f"indices-{name}".replace("_", "-"), facts.indices.get(name)
+        tables = [_shares(summary)] if "shares" in summary else _indices(summary, title)
+        key, indices = f"indices-{name}".replace("_", "-"), facts.indices.get(name)
         blocks += [
             *tables,
-            Text([one["sentence"]]),
-            *([indices_chart(key, title, found, _phases_of(facts))] if found is not None else []),
+            Text([summary["sentence"]]),
+            *([indices_chart(key, title, indices, _phases_of(facts))] if indices is not None else []),
             *pictures(facts, "sobol", [f"sobol_{name}"]),
             Folded(
                 f"How: {title}",
-                [Text([f"{one['method']}, {one['samples']} samples", f"inputs: {one['distribution']}"])],
+                [
+                    Text(
+                        [
+                            f"{summary['method']}, {summary['samples']} samples",
+                            f"inputs: {summary['distribution']}",
+                        ]
+                    )
+                ],
             ),
         ]
     return Section("sobol", "Sobol' indices", blocks)
 
 
 def _indices(one: Mapping[str, Any], title: str) -> list[Block]:
-    """First order and total of each parameter, and second order of each pair."""
+    """Returns a table of first-order and total indices for parameters, and of second-order ones for pairs."""
     pairs = [
         row((pair, Cell(_share(index["second"]), index["second"]), _between(index["second_90"])))
         for pair, index in one["pairs"].items()
@@ -279,5 +296,5 @@ def _between(limits: Sequence[float | None]) -> Cell:
 
 
 def _share(value: float | None) -> str:
-    """An index to three decimals: more of them would be the estimate's noise."""
+    """Returns an index with three decimals, because further decimals would only be noise of the estimate."""
     return "–" if value is None else f"{round(value, 3) + 0.0:.3f}".replace("-", "−")

@@ -1,4 +1,4 @@
-"""A figure's SVG made fit to stand inside a page among others."""
+"""Prepares the SVG of a figure for a page that contains other figures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import xml.etree.ElementTree as ElementTree
 
 _SVG, _XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 _HREF = f"{{{_XLINK}}}href"
-# What matplotlib draws with; metadata, scripts and all that could run or fetch something are not among them.
+# These are the elements with which matplotlib draws. Metadata, scripts and everything else that could run or
+# fetch something are not among them.
 _KNOWN = {f"{{{_SVG}}}{name}" for name in (
     "svg", "g", "defs", "style", "clipPath", "path", "rect", "circle", "ellipse", "line", "polyline",
     "polygon", "use", "image", "text", "tspan", "title", "desc", "linearGradient", "radialGradient", "stop",
@@ -21,12 +22,12 @@ ElementTree.register_namespace("xlink", _XLINK)
 
 
 def inline_svg(text: str, prefix: str) -> str:
-    """The `<svg>` element of an SVG file, as wide as it is given room.
+    """Returns the `<svg>` element of an SVG file, without its own width and height.
 
-    Identifiers, and what refers to them, get `prefix`, so that figures of one page do not take each other's
-    parts. Style rules hold inside this figure only. Elements that matplotlib does not draw with (metadata,
-    scripts, foreign objects), event handlers and references to anything outside of the file are left out.
-    Raises ElementTree.ParseError for text that is no SVG.
+    Identifiers and references to them get `prefix`, so that no figure of the page uses parts of another.
+    Style rules apply to this figure only. Elements with which matplotlib does not draw (metadata, scripts,
+    foreign objects), event handlers, and references to anything outside the file are left out.
+    Raises ElementTree.ParseError for text that is not an SVG.
     """
     root = ElementTree.fromstring(text)
     if root.tag != f"{{{_SVG}}}svg":
@@ -34,12 +35,14 @@ def inline_svg(text: str, prefix: str) -> str:
     for parent in list(root.iter()):
         for child in list(parent):
             if child.tail is not None and child.tail.isspace():
-                child.tail = None  # the file's indentation
+                child.tail = None  # removes the indentation of the file
             if child.tag not in _KNOWN:
                 parent.remove(child)
     for element in root.iter():
         element.attrib = dict(
-            (name, value) for name, value in (_kept(*pair, prefix) for pair in element.items()) if name
+            (name, value)
+            for name, value in (_safe_attribute(*pair, prefix) for pair in element.items())
+            if name
         )
         if element.tag == f"{{{_SVG}}}style" and element.text:
             element.text = _OUTSIDE.sub("", element.text.replace("*{", f"#{prefix} *{{"))
@@ -49,8 +52,8 @@ def inline_svg(text: str, prefix: str) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def _kept(name: str, value: str, prefix: str) -> tuple[str, str]:
-    """An attribute as it may stand in a page; an empty name for one that may not."""
+def _safe_attribute(name: str, value: str, prefix: str) -> tuple[str, str]:
+    """Returns name and value of an attribute that is safe in a page, or an empty name for any other."""
     if name.lower().startswith("on"):
         return "", ""
     if name == "id":

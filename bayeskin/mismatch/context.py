@@ -1,0 +1,153 @@
+"""The context of a diagnosis: a recording, a forward model of its test, and posteriors about its runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from bayeskin.forward.interface import ForwardModel, ModelRun
+from bayeskin.forward.observed import FullForce
+from bayeskin.forward.posterior import posterior_of
+from bayeskin.forward.reduced import ReducedForward
+from bayeskin.inference import LogPosterior, NoisePriors
+from bayeskin.inference.noise_model import ALL, noise_space
+from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed
+from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.mismatch.fit import instrument_noise, soft_on_stiff
+from bayeskin.mismatch.observed import ObservedSurrogate
+from bayeskin.mismatch.tangent import Tangent
+from bayeskin.types import Array, BinnedForce, Jumps, PadMotion, ParameterSpace, Surrogate
+
+
+@dataclass(frozen=True)
+class DiagnosisContext:
+    """A recording and a forward model of its test.
+
+    binned : the recording's bins, whose variances are those of quick noise; jumps : jumps that its samples
+        allow; motion : its protocol
+    base : priors of the base model; stated_noise : bounds of noise parameters that replace the usual ones
+    """
+
+    binned: BinnedForce
+    jumps: Jumps
+    motion: PadMotion
+    forward: ForwardModel
+    base: ParameterSpace
+    seed: int
+    stated_noise: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @cached_property
+    def known(self) -> dict[str, Mechanism]:
+        """Returns the mechanisms of the catalogue that the forward model solves, or that act on the force."""
+        solves = self.forward.solves
+        known = {
+            name: m for name, m in catalogue().items() if name in solves or not isinstance(m.act, Tissue)
+        }
+        return {name: m for name, m in known.items() if set(m.needs) <= set(known)}
+
+    @cached_property
+    def neutral(self) -> dict[str, float]:
+        """Returns the neutral values of all mechanisms' parameters."""
+        return {name: value for m in self.known.values() for name, value in m.neutral.items()}
+
+    @cached_property
+    def noise_priors(self) -> NoisePriors:
+        """Returns the bounds of the noise, which has one sd for all phases."""
+        return replace(instrument_noise(self.binned), by_kind=False, **dict(self.stated_noise))  # type: ignore[arg-type]
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Returns the values of the noise parameters that fits start from: the middle of their priors."""
+        space = noise_space([ALL], self.noise_priors)
+        return dict(zip(space.names, map(float, space.from_unit(np.full(space.dim, 0.5))), strict=True))
+
+    def solved(self, names: Sequence[str]) -> list[Mechanism]:
+        """Returns the mechanisms of a set that the forward model solves, in the order of their names."""
+        return [self.known[name] for name in sorted(names) if name in self.forward.solves]
+
+    def space(self, names: Sequence[str]) -> ParameterSpace:
+        """Returns the parameters that the forward model solves for a set: the base model's come first."""
+        mechanisms = tuple(p for m in self.solved(names) for p in m.parameters)
+        return ParameterSpace((*self.base.parameters, *mechanisms))
+
+    def run(self, names: Sequence[str], theta: Mapping[str, float], derive: bool = True) -> ModelRun | str:
+        """Returns a run of a set, with derivatives or without, or the message of a run that failed."""
+        space = self.space(names)
+        at = np.array([theta[name] for name in space.names])
+        return self.forward.run(space, at, self.solved(names), derive)
+
+    def force(self, names: Sequence[str], theta: Mapping[str, float]) -> Array | str:
+        """Returns the force (m,) [N] of the skin with a set, or the message of a run that failed."""
+        run = self.run(names, theta, derive=False)
+        return run if isinstance(run, str) else run.force_n
+
+    def full_force(self, names: Sequence[str], theta: Mapping[str, float]) -> Array | str:
+        """Returns the force (m,) [N] of the skin by the full model, or the message of a run that failed."""
+        full = FullForce(self.forward.spec, self.motion, self.binned.edges_s)
+        return full((tuple(m.name for m in self.solved(names)), theta))
+
+    def reported(self, names: Sequence[str], theta: Mapping[str, float]) -> Array | str:
+        """Returns the force (m,) [N] that the instrument reports, or the message of a run that failed."""
+        force_n = self.force(names, theta)
+        return force_n if isinstance(force_n, str) else self.reported_of(names, theta, force_n)
+
+    def reported_of(self, names: Sequence[str], theta: Mapping[str, float], force_n: Array) -> Array:
+        """Returns the force (m,) [N] that the instrument reports for a force (m,) of the skin."""
+        at = np.array([theta[name] for name in self.space(names).names])
+        seen = self.observe(names, (), [ModelRun(at, force_n, np.zeros((len(force_n), len(at))))])
+        return seen.predict_mean(np.array([theta[name] for name in seen.space.names]))[0]
+
+    def reported_elsewhere(
+        self, names: Sequence[str], theta: Mapping[str, float], motion: PadMotion, edges_s: Array
+    ) -> Array | str:
+        """Returns the force (m,) [N] that the instrument reports on another protocol, or why the run failed.
+
+        edges_s (m + 1,) : of the bins whose means are returned
+        """
+        values = {name: theta[name] for name in self.space(names).names}
+        assert isinstance(self.forward, ReducedForward)
+        run = self.forward.simulated(motion, values, self.solved(names))
+        if run.status != "ok":
+            return run.message
+        beyond = [self.known[name] for name in sorted(names) if name not in self.forward.solves]
+        rows = {name: np.array([value]) for name, value in theta.items()}
+        force = observed(beyond, rows, motion, lambda time_s: np.atleast_2d(run.at(time_s)))
+        return bin_means(force, motion, edges_s, beyond)[0]
+
+    def observe(self, names: Sequence[str], more: Sequence[str], runs: Sequence[ModelRun]) -> Surrogate:
+        """Returns the reported force about runs of a set.
+
+        more : further mechanisms, by what they do to a force
+        """
+        errors_n = self.forward.errors(runs[0].theta)
+        skin = Tangent(self.space(names), self.binned.edges_s, tuple(runs), errors_n)
+        beyond = tuple(
+            self.known[name] for name in sorted({*names, *more})
+            if name in more or name not in self.forward.solves
+        )  # fmt: skip
+        return ObservedSurrogate(skin, beyond, self.motion) if beyond else skin
+
+    def posterior(
+        self, names: Sequence[str], runs: Sequence[ModelRun], correction_n: Array | None = None,
+        until_s: float | None = None, more: Sequence[str] = (),
+    ) -> LogPosterior:  # fmt: skip
+        """Returns the posterior of a set about runs of it.
+
+        correction_n (m,) : error of the forward model that was added to the runs. It differs from place to
+            place by as much as it is large, so the likelihood allows for an error of one sd of this size
+        until_s : end of the part of the recording that is fitted, None for the whole
+        more : further mechanisms, by what they do to a force
+        """
+        seen = self.observe(names, more, runs)
+        priors = ParameterSpace(seen.space.parameters, self.base.correlations)
+        windows = None if until_s is None else ((float(self.binned.edges_s[0]), until_s),)
+        about = posterior_of(
+            seen, self.forward.spec, self.binned, self.motion, self.noise_priors, priors, windows,
+            soft_on_stiff,
+        )  # fmt: skip
+        if correction_n is None or about.model_error is None:
+            return about
+        return replace(about, model_error=replace(about.model_error, measured_n=correction_n[None]))

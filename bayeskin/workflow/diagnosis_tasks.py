@@ -1,0 +1,109 @@
+"""The context of a diagnosis opened from a run's folder, and its tasks answered by worker processes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import bayeskin
+from bayeskin import storage
+from bayeskin.execution.local import Lost, standing
+from bayeskin.finite_element.simulate import ModelSpec
+from bayeskin.forward.opened import forward_model
+from bayeskin.hashing import sha256_of
+from bayeskin.json_files import read_lines
+from bayeskin.mismatch.answers import answer, read_answer
+from bayeskin.mismatch.context import DiagnosisContext
+from bayeskin.mismatch.fit import QUICK_S, without_swings
+from bayeskin.mismatch.tasks import Ask, Task
+from bayeskin.recordings import analyse, bin_recording, jumps_of
+from bayeskin.types import BinnedForce, Jumps, PadMotion, ParameterSpace, Recording
+
+
+@dataclass(frozen=True)
+class ContextSource:
+    """The files and settings from which any process can open the context of a diagnosis.
+
+    recording : folder of a run's stage `recording`; model : file of the forward model; spec : the full model
+    that the configuration asks for; base : priors of the base model; noise : bounds of the noise parameters
+    that the configuration states
+    """
+
+    recording: Path
+    model: Path
+    spec: ModelSpec
+    seed: int
+    base: ParameterSpace
+    noise: tuple[tuple[str, tuple[float, float]], ...] = ()
+
+
+def open_context(source: ContextSource) -> DiagnosisContext:
+    """Returns the context whose files a source names."""
+    binned, jumps, motion = calm_bins(source.recording)
+    forward = forward_model(source.model, source.spec, motion, binned.edges_s)
+    return DiagnosisContext(binned, jumps, motion, forward, source.base, source.seed, dict(source.noise))
+
+
+def calm_bins(folder: Path) -> tuple[BinnedForce, Jumps, PadMotion]:
+    """Returns the bins with the variances of quick noise, the jumps that the samples allow, and the protocol.
+
+    All are read from the folder of the stage `recording`.
+    """
+    samples = storage.load(folder / "recording.h5", Recording)
+    binned = storage.load(folder / "binned.h5", BinnedForce)
+    quick = bin_recording(samples, binned.phases, binned.edges_s, analyse(samples, binned.phases, QUICK_S))
+    motion = storage.load(folder / "motion.h5", PadMotion)
+    return without_swings(binned, quick.variance_n2), jumps_of(samples, binned.phases), motion
+
+
+@dataclass(frozen=True)
+class _Worker:
+    """Answers tasks in a process of its own, which opens its context once."""
+
+    source: ContextSource
+
+    def __call__(self, task: Task) -> dict[str, Any]:
+        return answer(_opened_once(self.source), task)
+
+
+@lru_cache(maxsize=1)
+def _opened_once(source: ContextSource) -> DiagnosisContext:
+    return open_context(source)
+
+
+@contextmanager
+def asked(source: ContextSource, context: DiagnosisContext, file: Path, workers: int) -> Iterator[Ask]:
+    """Yields a function that answers tasks in worker processes; a file keeps all answers.
+
+    A task whose answer is in the file is not run again. Raises InputError for a file with other contents.
+    """
+    kept = {row["task"]: row["answer"] for row in read_lines(file)}
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with standing(_Worker(source), workers) as run_all, open(file, "a", encoding="utf-8") as handle:
+
+        def ask(tasks: Sequence[Task]) -> list[object]:
+            keys = [sha256_of([type(task).__name__, asdict(task)]) for task in tasks]
+            new = [i for i, key in enumerate(keys) if key not in kept]
+            for i, result in run_all([tasks[i] for i in new]):
+                said = {"message": result.reason} if isinstance(result, Lost) else result
+                kept[keys[new[i]]] = said
+                handle.write(json.dumps({"task": keys[new[i]], "answer": said}) + "\n")
+                handle.flush()
+            return [read_answer(context, task, kept[key]) for task, key in zip(tasks, keys, strict=True)]
+
+        yield ask
+
+
+def searches_file(run_folder: Path, context: DiagnosisContext) -> Path:
+    """Returns the file that keeps the answers to a context's tasks, named by all that they depend on."""
+    identity = [
+        bayeskin.__version__, context.seed, repr(context.base), sorted(context.stated_noise.items()),
+        context.forward.hash, asdict(context.binned), asdict(context.motion),
+        [repr(m.parameters) for m in context.known.values()],
+    ]  # fmt: skip
+    return run_folder / "searches" / f"{sha256_of(identity)[:16]}.jsonl"
