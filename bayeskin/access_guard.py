@@ -20,11 +20,11 @@ _FOLDERS: list[str] = []  # the folders that are closed at present
 
 
 @contextmanager
-def off_limits(folder: Path) -> Iterator[None]:
+def guarded(folder: Path) -> Iterator[None]:
     """Forbids access to a folder while the context lasts.
 
     Opening a file in the folder, or listing its names, raises PermissionError. The ban holds in this process,
-    in processes that it forks, and in worker processes that call `keep_out`.
+    in processes that it forks, and in worker processes that call `apply_inherited_guards`.
     """
     _set_hook()
     closed = os.path.realpath(folder)
@@ -41,7 +41,7 @@ def off_limits(folder: Path) -> Iterator[None]:
             os.environ[_VARIABLE] = before
 
 
-def keep_out() -> None:
+def apply_inherited_guards() -> None:
     """Applies the bans of the parent process in a worker process, for the rest of the worker's life.
 
     The worker reads the closed folders from an environment variable that it inherits from its parent.

@@ -26,9 +26,9 @@ from bayeskin.mismatch.locate import Located, Window
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.workflow.diagnosis import in_words
 from bayeskin.workflow.diagnosis_outputs import (
-    Found,
+    DiagnosisFigures,
+    DrawnFit,
     Remainder,
-    Shown,
     candidates,
     draw,
     unexplained,
@@ -75,14 +75,14 @@ WINDOW = Window(15.0, 45.0, "hold", 1, 5e-3, 1e-3)
 PARAMETERS = ALONE.surrogate.space.parameters
 
 
-def drawn(left_n: float, held_out_by: float | None = None) -> Shown:
+def drawn(left_n: float, held_out_by: float | None = None) -> DrawnFit:
     """A fit that leaves so much of every bin, in a band of 3 mN to either side."""
     force_n = BINNED.force_n - left_n
     held_out_n = None if held_out_by is None else BINNED.force_n - held_out_by
     values = {
         p.name: {"mean": 0.5 * (p.lower + p.upper), "interval90": [p.lower, p.upper]} for p in PARAMETERS
     }
-    return Shown(force_n, (force_n - 3e-3, force_n + 3e-3), held_out_n, located(0.0 * force_n), values)
+    return DrawnFit(force_n, (force_n - 3e-3, force_n + 3e-3), held_out_n, located(0.0 * force_n), values)
 
 
 # Parts of the force
@@ -179,7 +179,7 @@ def test_each_figure_is_written_where_it_has_something_to_show(
     rows = [{"name": "force-offset", "delta_score": 3.0, "standard_error": 1.0}]
     written = []
     for parts, left in ((parts_of("force-offset"), remainder), ([], None)):
-        found = Found(drawn(8e-3), drawn(2e-3), None, PARAMETERS, parts, left)
+        found = DiagnosisFigures(drawn(8e-3), drawn(2e-3), None, PARAMETERS, parts, left)
         written.append({path.name for path in draw(Path("x"), "", BINNED, toy.MOTION, found, rows)})
     assert written[0] - written[1] == {"contributions.png", "discrepancy.png"}
     assert {Path(name).stem for name in written[1]} == {

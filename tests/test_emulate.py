@@ -15,7 +15,7 @@ from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.emulate import EmulationSettings, Forces, emulate
 from bayeskin.mismatch.fit import fit_near
 from bayeskin.mismatch.resample import resample
-from bayeskin.mismatch.trust_region import JointFit, fit_jointly, within
+from bayeskin.mismatch.trust_region import SetFit, fit_set, within
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.surrogates import train
 from bayeskin.types import Array, Design, Surrogate
@@ -27,11 +27,11 @@ FEW = EmulationSettings(points=30)
 @pytest.fixture(params=SETS, ids=["base", "offset"])
 def fitted(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> tuple[DiagnosisContext, JointFit]:
+) -> tuple[DiagnosisContext, SetFit]:
     names = request.param
     bench = solved.bench(monkeypatch, solved.recorded(3, **({"F0": -0.03} if names else {})))
-    found = fit_jointly(names, {**bench.noise, **TRUTH, "F0": 0.0}, bench.run, bench.posterior)
-    assert isinstance(found, JointFit)
+    found = fit_set(names, {**bench.noise, **TRUTH, "F0": 0.0}, bench.run, bench.posterior)
+    assert isinstance(found, SetFit)
     return bench, found
 
 
@@ -54,7 +54,7 @@ def learnt(design: Design) -> Surrogate:
     return train(design, "gp", 1)[0]
 
 
-def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[DiagnosisContext, JointFit]) -> None:
+def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[DiagnosisContext, SetFit]) -> None:
     bench, found = fitted
     asked: list[int] = []
     emulated = emulate([found], by_the_toy(bench, found.fit.names, asked), learnt, solved.NOISE_N, 1, FEW)
@@ -71,15 +71,15 @@ def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[DiagnosisContext, Joi
 
 
 def test_the_first_points_are_about_all_maxima(
-    fitted: tuple[DiagnosisContext, JointFit], monkeypatch: pytest.MonkeyPatch
+    fitted: tuple[DiagnosisContext, SetFit], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench, found = fitted
     softer = {name: 0.7 * TRUTH[name] for name in ("E_c", "E_s")}
     recorded = solved.recorded(3)
     elsewhere = solved.bench(monkeypatch, dataclasses.replace(recorded, force_n=0.7 * recorded.force_n))
     start = {**elsewhere.noise, **TRUTH, **softer, "F0": 0.0}
-    other = fit_jointly(found.fit.names, start, elsewhere.run, elsewhere.posterior)
-    assert isinstance(other, JointFit)
+    other = fit_set(found.fit.names, start, elsewhere.run, elsewhere.posterior)
+    assert isinstance(other, SetFit)
     run, waves = by_the_toy(bench, found.fit.names, []), list[Array]()
 
     def forces(points: Array, full: int) -> tuple[Answers, Answers]:
@@ -97,7 +97,7 @@ def test_the_first_points_are_about_all_maxima(
 
 
 @pytest.mark.slow
-def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[DiagnosisContext, JointFit]) -> None:
+def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[DiagnosisContext, SetFit]) -> None:
     bench, found = fitted
     emulated = emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
     assert not isinstance(emulated, str)
@@ -119,7 +119,7 @@ def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[DiagnosisContext,
     assert np.all(np.abs(np.log(sd / exact_sd)) < np.log(1.5))
 
 
-def test_the_same_seed_gives_the_same_draws(fitted: tuple[DiagnosisContext, JointFit]) -> None:
+def test_the_same_seed_gives_the_same_draws(fitted: tuple[DiagnosisContext, SetFit]) -> None:
     bench, found = fitted
     made = [
         emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
@@ -131,7 +131,7 @@ def test_the_same_seed_gives_the_same_draws(fitted: tuple[DiagnosisContext, Join
 
 
 def test_runs_that_fail_are_done_without_and_are_the_answer_where_all_do(
-    fitted: tuple[DiagnosisContext, JointFit],
+    fitted: tuple[DiagnosisContext, SetFit],
 ) -> None:
     bench, found = fitted
     run = by_the_toy(bench, found.fit.names, [])
@@ -167,8 +167,8 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
     start = {**bench.noise, **TRUTH}
     aside = off({**TRUTH, "E_s": 1.05 * TRUTH["E_s"]})  # where the fit was checked
     local = functools.partial(bench.posterior, correction_n=aside)
-    found = fit_jointly((), start, bench.run, local, None, aside)
-    assert isinstance(found, JointFit)
+    found = fit_set((), start, bench.run, local, None, aside)
+    assert isinstance(found, SetFit)
     run = by_the_toy(bench, (), [])
     asked: list[int] = []
 
@@ -193,7 +193,7 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
     assert behind < 8.0
 
 
-def test_one_wave_alone_is_never_settled(fitted: tuple[DiagnosisContext, JointFit]) -> None:
+def test_one_wave_alone_is_never_settled(fitted: tuple[DiagnosisContext, SetFit]) -> None:
     bench, found = fitted
     one = dataclasses.replace(FEW, waves=1)
     emulated = emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, one)
@@ -203,7 +203,7 @@ def test_one_wave_alone_is_never_settled(fitted: tuple[DiagnosisContext, JointFi
 
 
 def test_an_emulator_that_is_sure_nowhere_is_believed_but_never_settled(
-    fitted: tuple[DiagnosisContext, JointFit],
+    fitted: tuple[DiagnosisContext, SetFit],
 ) -> None:
     bench, found = fitted
     never = dataclasses.replace(FEW, sure=1e-9, waves=2)

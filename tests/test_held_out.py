@@ -14,7 +14,7 @@ from bayeskin.mismatch.answers import answer, read_answer
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.held_out import Beginning, end_of_second_hold, fit_beginning
 from bayeskin.mismatch.tasks import Task
-from bayeskin.mismatch.trust_region import JointFit, fit_jointly
+from bayeskin.mismatch.trust_region import SetFit, fit_set
 from bayeskin.types import Phase
 
 SPLIT_S = 50.0
@@ -22,14 +22,14 @@ OFFSET = ("force-offset",)
 VALUES = {"F0": -0.03}
 
 
-def fitted(bench: DiagnosisContext, names: Sequence[str]) -> JointFit:
-    found = fit_jointly(names, {**bench.noise, **TRUTH, **VALUES}, bench.run, bench.posterior)
-    assert isinstance(found, JointFit)
+def fitted(bench: DiagnosisContext, names: Sequence[str]) -> SetFit:
+    found = fit_set(names, {**bench.noise, **TRUTH, **VALUES}, bench.run, bench.posterior)
+    assert isinstance(found, SetFit)
     return found
 
 
 def begun(
-    bench: DiagnosisContext, sets: Sequence[JointFit], split_s: float | None = SPLIT_S
+    bench: DiagnosisContext, sets: Sequence[SetFit], split_s: float | None = SPLIT_S
 ) -> Beginning | None:
     def ask(tasks: Sequence[Task]) -> list[object]:
         return [read_answer(bench, task, answer(bench, task)) for task in tasks]

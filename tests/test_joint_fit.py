@@ -22,8 +22,8 @@ from bayeskin.inference.reparametrisation import shear_at
 from bayeskin.mismatch.answers import answer, read_answer
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.tangent import POWER, Tangent
-from bayeskin.mismatch.tasks import Climb
-from bayeskin.mismatch.trust_region import JointFit, TrustSettings, fit_jointly, solved_columns, within
+from bayeskin.mismatch.tasks import FitTask
+from bayeskin.mismatch.trust_region import SetFit, TrustSettings, fit_set, solved_columns, within
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Correlation, ParameterSpace
 
@@ -129,9 +129,9 @@ def highest(bench: DiagnosisContext) -> tuple[float, dict[str, float]]:
 
 
 def test_a_fit_reaches_the_maximum_of_the_skin_itself(bench: DiagnosisContext) -> None:
-    found = fit_jointly(SET, start(bench), bench.run, bench.posterior)
+    found = fit_set(SET, start(bench), bench.run, bench.posterior)
     value, theta = highest(bench)
-    assert isinstance(found, JointFit)
+    assert isinstance(found, SetFit)
     assert found.settled
     assert found.fit.names == SET
     assert found.fit.value == pytest.approx(value, abs=2.0 * TrustSettings().enough)
@@ -147,20 +147,20 @@ def test_a_fit_reaches_the_maximum_of_the_skin_itself(bench: DiagnosisContext) -
 
 def test_what_is_added_to_the_force_is_part_of_each_run(bench: DiagnosisContext) -> None:
     """A recording by the reduced model and more is fitted as the recording by the reduced model alone."""
-    plain = fit_jointly(SET, start(bench), bench.run, bench.posterior)
-    off_n = 5e-3 * np.sin(np.arange(len(bench.binned.force_n)) / 7.0)
-    binned = dataclasses.replace(bench.binned, force_n=bench.binned.force_n + off_n)
+    plain = fit_set(SET, start(bench), bench.run, bench.posterior)
+    correction_n = 5e-3 * np.sin(np.arange(len(bench.binned.force_n)) / 7.0)
+    binned = dataclasses.replace(bench.binned, force_n=bench.binned.force_n + correction_n)
     other = dataclasses.replace(bench, binned=binned)
-    found = fit_jointly(SET, start(bench), other.run, other.posterior, None, off_n)
-    assert isinstance(plain, JointFit)
-    assert isinstance(found, JointFit)
+    found = fit_set(SET, start(bench), other.run, other.posterior, None, correction_n)
+    assert isinstance(plain, SetFit)
+    assert isinstance(found, SetFit)
     assert found.fit.value == pytest.approx(plain.fit.value, abs=0.2)
     assert found.fit.theta["F0"] == pytest.approx(plain.fit.theta["F0"], abs=2e-4)
     alone = bench.run(SET, found.fit.theta)
     assert isinstance(alone, ModelRun)
-    np.testing.assert_allclose(found.run.force_n, alone.force_n + off_n, atol=1e-6)
-    np.testing.assert_array_equal(found.off_n, off_n)
-    assert not plain.off_n.any()
+    np.testing.assert_allclose(found.run.force_n, alone.force_n + correction_n, atol=1e-6)
+    np.testing.assert_array_equal(found.correction_n, correction_n)
+    assert not plain.correction_n.any()
 
 
 class Unsteady:
@@ -179,8 +179,8 @@ def test_a_fit_goes_on_where_a_run_in_the_middle_fails(
     bench: DiagnosisContext, failing: tuple[int, ...]
 ) -> None:
     skin = Unsteady(bench, failing)
-    found = fit_jointly(SET, start(bench), skin, bench.posterior, TrustSettings(runs=14))
-    assert isinstance(found, JointFit)
+    found = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=14))
+    assert isinstance(found, SetFit)
     assert found.runs == skin.made > max(failing)
     assert found.settled
     assert found.fit.value == pytest.approx(highest(bench)[0], abs=2.0 * TrustSettings().enough)
@@ -188,13 +188,13 @@ def test_a_fit_goes_on_where_a_run_in_the_middle_fails(
 
 def test_a_fit_whose_first_run_fails_is_its_message(bench: DiagnosisContext) -> None:
     skin = Unsteady(bench, (1,))
-    assert fit_jointly(SET, start(bench), skin, bench.posterior) == "near folding"
+    assert fit_set(SET, start(bench), skin, bench.posterior) == "near folding"
     assert skin.made == 1
 
 
 def test_a_fit_is_the_first_run_s_where_all_others_fail(bench: DiagnosisContext) -> None:
-    found = fit_jointly(SET, start(bench), Unsteady(bench, range(2, 99)), bench.posterior)
-    assert isinstance(found, JointFit)
+    found = fit_set(SET, start(bench), Unsteady(bench, range(2, 99)), bench.posterior)
+    assert isinstance(found, SetFit)
     assert not found.settled
     np.testing.assert_array_equal(found.run.theta[:5], [START[name] for name in BASE.names])
 
@@ -212,8 +212,8 @@ def test_a_fit_takes_shorter_steps_where_long_ones_fail(bench: DiagnosisContext)
         last = moduli
         return bench.run(names, theta)
 
-    found = fit_jointly(SET, start(bench), skin, bench.posterior, TrustSettings(runs=30))
-    assert isinstance(found, JointFit)
+    found = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=30))
+    assert isinstance(found, SetFit)
     assert failed
     assert found.settled
     assert found.fit.value == pytest.approx(highest(bench)[0], abs=2.0 * TrustSettings().enough)
@@ -252,8 +252,8 @@ def test_a_step_that_fails_shortens_the_next_along_what_moved_far(bench: Diagnos
         last = theta["k_s"]
         return bench.run(names, theta)
 
-    found = fit_jointly(SET, start(bench), skin, bench.posterior, TrustSettings(runs=4))
-    assert isinstance(found, JointFit)
+    found = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=4))
+    assert isinstance(found, SetFit)
     assert failed
     stiffness = [2e-6 * theta["E_c"] + 4e-6 * theta["E_s"] for theta in (found.fit.theta, TRUTH, START)]
     assert stiffness[0] == pytest.approx(stiffness[1], rel=0.05)  # moduli have gone all the way meanwhile
@@ -270,8 +270,8 @@ def test_a_fit_does_not_go_on_from_a_run_that_is_worse(bench: DiagnosisContext) 
         made.append(dataclasses.replace(run, force_n=(10.0 if len(made) == 2 else 1.0) * run.force_n))
         return made[-1]
 
-    found = fit_jointly(SET, start(bench), skin, bench.posterior, TrustSettings(runs=3))
-    assert isinstance(found, JointFit)
+    found = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=3))
+    assert isinstance(found, SetFit)
     assert len(made) == found.runs == 3
     assert found.run is made[1]
 
@@ -283,8 +283,8 @@ def test_no_more_runs_are_made_than_asked_for_and_more_are_never_worse(
     values = []
     for most in (runs, runs + 1):
         skin = Unsteady(bench, ())
-        found = fit_jointly(SET, start(bench), skin, bench.posterior, TrustSettings(runs=most))
-        assert isinstance(found, JointFit)
+        found = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=most))
+        assert isinstance(found, SetFit)
         assert skin.made == found.runs <= most
         values.append(found.fit.value)
     assert values[1] >= values[0] - 1e-9
@@ -331,9 +331,9 @@ def test_what_lies_in_series_goes_by_its_shortcut_where_a_surrogate_is_the_skin(
     names = ("slow-recovery",)
     assert bench.space(names).names == skin.space.names
     values = {"recovery_compliance": 1e-3, "recovery_time": 20.0}
-    task = Climb(names, {**bench.noise, **SKIN, **values}, 4)
+    task = FitTask(names, {**bench.noise, **SKIN, **values}, 4)
     found = read_answer(bench, task, answer(bench, task))
-    assert isinstance(found, JointFit)
+    assert isinstance(found, SetFit)
     assert set(values) <= set(found.fit.theta)
     plain = bench.reported(names, {**found.fit.theta, "recovery_compliance": 0.0})
     slower = bench.reported(names, {**found.fit.theta, **values})

@@ -16,7 +16,7 @@ from bayeskin.inference.convergence import Limits
 from bayeskin.inference.gauss_newton import gauss_newton, promise, surrogate_error
 from bayeskin.inference.model_error import ModelError
 from bayeskin.mechanisms import catalogue
-from bayeskin.mismatch.fit import Fit, _times, fit, fit_near, likely, other_skins, soft_on_stiff
+from bayeskin.mismatch.fit import Fit, _times, fit, fit_near, likely, other_skins, subcutis_too_stiff
 from bayeskin.mismatch.hypotheses import weight
 from bayeskin.mismatch.locate import _chance, locate, model_error
 from bayeskin.mismatch.observed import ObservedSurrogate
@@ -267,12 +267,14 @@ def test_what_is_allowed_for_takes_up_no_more_than_is_believed_of_it(of_sd: floa
 
 
 def test_a_subcutis_much_stiffer_than_the_cutis_is_not_believed() -> None:
-    problem = dataclasses.replace(toy_problem(), excludes=soft_on_stiff)
+    problem = dataclasses.replace(toy_problem(), excludes=subcutis_too_stiff)
     for ratio, possible in ((1.9, True), (2.1, False)):
         theta = {**TRUTH, **NOISE, "E_c": TRUTH["E_s"] / ratio}
         assert np.isfinite(problem.log_prob(problem.vector(theta)[None])[0]) == possible
     line = line_problem()
-    assert np.isfinite(dataclasses.replace(line, excludes=soft_on_stiff).log_prob(sum(line.bounds)[None] / 2))
+    assert np.isfinite(
+        dataclasses.replace(line, excludes=subcutis_too_stiff).log_prob(sum(line.bounds)[None] / 2)
+    )
 
 
 def test_an_error_that_the_surrogate_denies_is_held_by_its_spring() -> None:
@@ -296,7 +298,7 @@ def test_an_error_that_the_surrogate_denies_is_held_by_its_spring() -> None:
 
 
 def test_starts_are_among_those_that_can_be() -> None:
-    problem = dataclasses.replace(toy_problem(), excludes=soft_on_stiff)
+    problem = dataclasses.replace(toy_problem(), excludes=subcutis_too_stiff)
     low, high = problem.bounds
     trials = np.random.default_rng(3).uniform(low, high, (400, problem.dim))
     ratio = problem.from_sampling(trials)[:, 1] / problem.from_sampling(trials)[:, 0]
@@ -309,7 +311,7 @@ def test_starts_are_among_those_that_can_be() -> None:
 def test_what_a_posterior_rules_out_is_part_of_what_it_is() -> None:
     plain = toy_problem()
     others = [
-        dataclasses.replace(plain, excludes=soft_on_stiff),
+        dataclasses.replace(plain, excludes=subcutis_too_stiff),
         dataclasses.replace(plain, sure_within_n=1.0),
     ]
     assert len({one.identity["parameters"] for one in (plain, *others)}) == 3

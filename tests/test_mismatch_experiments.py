@@ -28,7 +28,7 @@ from bayeskin.mechanisms.mechanism import Instrument, Place, added
 from bayeskin.mechanisms.viscous_drag import speed_of
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.observed import ObservedSurrogate
-from bayeskin.mismatch.tasks import Ask, OtherTest, Task
+from bayeskin.mismatch.tasks import AnswerTasks, OtherProtocolTask, Task
 from bayeskin.reduced.cases import Protocols
 from bayeskin.report import figure_experiments
 from bayeskin.types import PadMotion, Parameter
@@ -149,7 +149,7 @@ def test_protocols_vary_the_recordings_own_motion() -> None:
 LIMITS = Limits(10e-3, (1e-4, 5e-3), 1800.0)
 
 
-def toy_run(task: OtherTest) -> np.ndarray:
+def toy_run(task: OtherProtocolTask) -> np.ndarray:
     """The toy with its instrument in any test."""
     motion = PadMotion(np.array(task.time_s), np.array(task.displacement_m))
     time_s = np.unique(np.concatenate([np.linspace(0.0, motion.time_s[-1], 400), motion.time_s]))
@@ -163,7 +163,7 @@ def toy_run(task: OtherTest) -> np.ndarray:
 
 
 def asked(tasks: Sequence[Task]) -> list[object]:
-    return [toy_run(task) for task in tasks if isinstance(task, OtherTest)]
+    return [toy_run(task) for task in tasks if isinstance(task, OtherProtocolTask)]
 
 
 def fitted(name: str, **values: float) -> Fit:
@@ -181,7 +181,7 @@ def fitted(name: str, **values: float) -> Fit:
     )
 
 
-def judged(fits: Sequence[Fit], ask: Ask = asked) -> list[Experiment]:
+def judged(fits: Sequence[Fit], ask: AnswerTasks = asked) -> list[Experiment]:
     return ranked([weigh(one, fits, KNOWN, ask, 0) for one in variations(toy.MOTION, LIMITS)])
 
 

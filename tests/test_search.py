@@ -21,7 +21,15 @@ from bayeskin.mismatch.search import Searcher, search
 from bayeskin.mismatch.search_context import SearchContext
 from bayeskin.mismatch.search_record import SearchRecord, SearchResult
 from bayeskin.mismatch.search_settings import SearchSettings
-from bayeskin.mismatch.tasks import Climb, FullProbe, Join, Probe, Promise, Task, Weigh
+from bayeskin.mismatch.tasks import (
+    EvidenceTask,
+    FitTask,
+    FitWithAddedTask,
+    FullRunTask,
+    RunTask,
+    ScoreTestTask,
+    Task,
+)
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array, ParameterSpace
 
@@ -76,8 +84,8 @@ Make = Callable[..., Asked]
 
 def names_of(task: Task) -> tuple[str, ...]:
     """The set that a task is to fit or to run."""
-    asked = task.promise if isinstance(task, Join) else task
-    more = (asked.name,) if isinstance(asked, Promise) else ()
+    asked = task.score_test if isinstance(task, FitWithAddedTask) else task
+    more = (asked.name,) if isinstance(asked, ScoreTestTask) else ()
     return tuple(sorted({*asked.names, *more}))
 
 
@@ -112,7 +120,7 @@ def test_a_mechanism_of_the_tissue_is_fitted_from_what_its_probes_promise(asked:
     one = asked(stiffness_rate=rate, stiffness_time=200.0)
     one.search()
     starts = [task.start for task in one.tasks
-              if isinstance(task, Climb) and task.names == ("stiffness-drift",)]  # fmt: skip
+              if isinstance(task, FitTask) and task.names == ("stiffness-drift",)]  # fmt: skip
     assert 0.5 < starts[0]["stiffness_rate"] / rate < 1.5
 
 
@@ -127,9 +135,9 @@ def test_no_task_is_asked_twice_and_only_what_is_taken_is_fitted_from_other_skin
     one = asked(stiffness_rate=9e-4, F0=-0.03)
     found = one.search()
     assert set(Counter(key(task) for task in one.tasks).values()) == {1}
-    fitted = {names_of(task) for task in one.tasks if isinstance(task, Climb | Join)}
+    fitted = {names_of(task) for task in one.tasks if isinstance(task, FitTask | FitWithAddedTask)}
     assert fitted == set(found.fits)
-    probes = [task for task in one.tasks if isinstance(task, Probe)]
+    probes = [task for task in one.tasks if isinstance(task, RunTask)]
     drawn = {task.theta["p_init"] for task in probes if task.names == ()}  # skins that the base was run with
     assert len(drawn) > 4
     skins = {task.names for task in probes if task.theta["p_init"] in drawn}
@@ -159,19 +167,19 @@ def test_sets_are_compared_by_forces_that_runs_of_the_full_model_correct(
     best = found.best
     assert best.fit.names == tuple(sorted({"F0": "force-offset", "stiffness_rate": "stiffness-drift"}[name]
                                           for name in values))  # fmt: skip
-    np.testing.assert_allclose(best.off_n, SHAPE, atol=1e-6)
+    np.testing.assert_allclose(best.correction_n, SHAPE, atol=1e-6)
     check = found.checks[best.fit.names]
     assert check.off < 1e-6
     np.testing.assert_array_equal(check.theta, best.run.theta)
     np.testing.assert_allclose(check.full_n, best.run.force_n, atol=1e-6)
-    full = Counter(task.names for task in one.tasks if isinstance(task, FullProbe))
+    full = Counter(task.names for task in one.tasks if isinstance(task, FullRunTask))
     assert set(full) <= {(), ("stiffness-drift",)}  # sets of the same tissue share runs
     assert max(full.values()) <= FEW.checks + FEW.maxima  # each further maximum has a run of its own
 
 
 def test_where_the_reduced_model_is_exact_a_check_changes_nothing(asked: Make) -> None:
     found = asked(F0=-0.03).search()
-    assert all(not fit.off_n.any() for fit in found.fits.values())
+    assert all(not fit.correction_n.any() for fit in found.fits.values())
     for fit in found.fits.values():  # no error is allowed for that was not found
         error = fit.fit.log_posterior.model_error
         assert error is not None
@@ -193,7 +201,7 @@ def test_a_mechanism_that_stood_in_for_others_is_exchanged(asked: Make) -> None:
     one = asked(stiffness_rate=9e-4, F0=-0.03)
     found = one.search()
     assert found.best.fit.names == ("force-offset", "stiffness-drift")
-    tried = {names_of(task) for task in one.tasks if isinstance(task, Promise)}
+    tried = {names_of(task) for task in one.tasks if isinstance(task, ScoreTestTask)}
     assert ("sensor-drift", "stiffness-drift") in tried
     assert ("force-offset", "sensor-drift") in tried
 
@@ -214,15 +222,15 @@ def _as_values(found: SearchResult) -> dict[tuple[str, ...], tuple[float, dict[s
 
 
 def of_the_drift(task: Task) -> bool:
-    return isinstance(task, Probe) and "stiffness-drift" in task.names
+    return isinstance(task, RunTask) and "stiffness-drift" in task.names
 
 
 @pytest.mark.parametrize(
     ("lost", "reached"),
     [
-        (lambda task: isinstance(task, Promise), {"stiffness-drift"}),
+        (lambda task: isinstance(task, ScoreTestTask), {"stiffness-drift"}),
         (of_the_drift, {"force-offset", "sensor-drift"}),
-        (lambda task: isinstance(task, Climb | Join) and bool(names_of(task)), set()),
+        (lambda task: isinstance(task, FitTask | FitWithAddedTask) and bool(names_of(task)), set()),
     ],
     ids=["promises", "probes of a mechanism", "fits with mechanisms"],
 )
@@ -259,7 +267,7 @@ def test_a_mechanism_whose_first_fits_fail_is_fitted_from_where_a_probe_ran_or_a
         """All fits but those that begin at the values of a probe, or nearer to where it does nothing."""
         if of_the_drift(task):
             ran.append(task.theta["stiffness_rate"])
-        climbs = isinstance(task, Climb) and "stiffness-drift" in task.names
+        climbs = isinstance(task, FitTask) and "stiffness-drift" in task.names
         return climbs and not any(task.start["stiffness_rate"] == share * rate for rate in ran)
 
     found = asked(stiffness_rate=-9e-4, stiffness_time=200.0, lost=lost).search()
@@ -267,7 +275,7 @@ def test_a_mechanism_whose_first_fits_fail_is_fitted_from_where_a_probe_ran_or_a
 
 
 @pytest.mark.parametrize(
-    ("kind", "says"), [(Probe, "no skin that runs;"), (Climb, "no skin that runs: the worker ended;")]
+    ("kind", "says"), [(RunTask, "no skin that runs;"), (FitTask, "no skin that runs: the worker ended;")]
 )
 def test_a_recording_on_which_no_skin_runs_is_refused(asked: Make, kind: type, says: str) -> None:
     one = asked(lost=lambda task: isinstance(task, kind))
@@ -289,7 +297,7 @@ def test_further_maxima_are_sought_where_the_force_says_little(asked: Make) -> N
     one = asked(stiffness_rate=9e-4)
     best = one.search().best
     assert best.fit.names == ("stiffness-drift",)
-    climbs = [task for task in one.tasks if isinstance(task, Climb)]
+    climbs = [task for task in one.tasks if isinstance(task, FitTask)]
     (first,) = (i for i, task in enumerate(climbs) if task.start["k_c"] == task.start["k_s"])
     tasks = climbs[first : first + 6 + FEW.shapes]
     assert {task.names for task in tasks} == {best.fit.names}
@@ -346,7 +354,7 @@ def test_what_has_no_name_is_not_imitated_by_ever_larger_sets(asked: Make) -> No
     assert found.best.fit.names != ()
     assert found.chosen == ()
     assert found.family.smooth > 0.99
-    tried = [task for task in one.tasks if isinstance(task, Probe | Promise)]
+    tried = [task for task in one.tasks if isinstance(task, RunTask | ScoreTestTask)]
     assert max(len(names_of(task)) for task in tried) == 1
     assert any("with an unnamed smooth discrepancy, is as likely" in line for line in one.told)
 
@@ -356,6 +364,6 @@ def test_the_sets_that_are_compared_are_weighed_at_their_last_fits(asked: Make) 
     found = one.search()
     assert found.chosen == ("force-offset", "stiffness-drift")
     weighed = {tuple(task.fit["fit"]["names"]): task.fit["fit"]["value"]
-               for task in one.tasks if isinstance(task, Weigh)}  # fmt: skip
+               for task in one.tasks if isinstance(task, EvidenceTask)}  # fmt: skip
     assert set(weighed) == set(found.evidences)
     assert weighed == {names: found.fits[names].fit.value for names in weighed}

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from bayeskin.access_guard import keep_out
+from bayeskin.access_guard import apply_inherited_guards
 from bayeskin.errors import InputError
 
 ATTEMPTS = 3  # an item that has ended this many workers is given up
@@ -183,7 +183,7 @@ def _work(pipe: Connection, function: Callable[[Any], Any]) -> None:
     """Runs in the worker: reports that it is ready, then processes items until the parent closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, but the parent decides
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    keep_out()
+    apply_inherited_guards()
     pipe.send(None)
     with suppress(EOFError, OSError):  # the parent has ended
         while True:

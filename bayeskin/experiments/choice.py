@@ -20,7 +20,7 @@ from bayeskin.inference.noise_model import noise_chain, noise_covariance
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.hypotheses import weight
-from bayeskin.mismatch.tasks import Ask, OtherTest
+from bayeskin.mismatch.tasks import AnswerTasks, OtherProtocolTask
 from bayeskin.types import Array, BinnedForce, PadMotion
 
 DRAWS = 12  # number of posterior draws of each hypothesis
@@ -105,7 +105,7 @@ def search(judge: Judge, first: Sequence[Protocol], limits: Limits, seed: int) -
 
 
 def weigh(
-    protocol: Protocol, fits: Sequence[Fit], known: Mapping[str, Mechanism], ask: Ask, seed: int
+    protocol: Protocol, fits: Sequence[Fit], known: Mapping[str, Mechanism], ask: AnswerTasks, seed: int
 ) -> Experiment:
     """Returns the information that a protocol is expected to give about which of the sets is true.
 
@@ -121,7 +121,7 @@ def weigh(
         raise InputError("hypotheses", f"{len(fits)}", "two at least, each with its fit")
     motion, edges_s = protocol.motion, _bin_edges(protocol.motion, fits[0])
     tasks = [
-        OtherTest(
+        OtherProtocolTask(
             fit.names, theta, tuple(motion.time_s.tolist()), tuple(motion.displacement_m.tolist()),
             tuple(edges_s.tolist()),
         )

@@ -17,8 +17,8 @@ from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.mismatch.search_context import SearchContext, correction, gained
 from bayeskin.mismatch.search_record import Names
 from bayeskin.mismatch.search_settings import RARITY
-from bayeskin.mismatch.tasks import Climb, Join, Probe, Promise, Task
-from bayeskin.mismatch.trust_region import JointFit
+from bayeskin.mismatch.tasks import FitTask, FitWithAddedTask, RunTask, ScoreTestTask, Task
+from bayeskin.mismatch.trust_region import SetFit
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array, ParameterSpace
 
@@ -36,7 +36,7 @@ class Candidates:
         self._shapes: dict[str, Values] = {}  # by the name of the strength
         self.expanded: set[Names] = set()
 
-    def fit_beside(self, current: JointFit) -> list[Names]:
+    def fit_beside(self, current: SetFit) -> list[Names]:
         """Fits the most promising of the new sets with one mechanism more; returns these sets.
 
         A fit that fails, or that ends below the fit without the mechanism, starts again there: with the
@@ -44,7 +44,7 @@ class Candidates:
         """
         context, names, settings = self._context, current.fit.names, self._context.settings
         self.expanded.add(names)
-        off_n = correction(current)  # it holds for the same mechanisms of the tissue
+        correction_n = correction(current)  # it holds for the same mechanisms of the tissue
         promised, starts, finished = self._score_tests(current)
         order = sorted(promised, key=lambda name: -promised[name])
         least = settings.gain + RARITY
@@ -54,8 +54,8 @@ class Candidates:
         context.tell("promised: " + ", ".join(f"{name} {promised[name]:.0f} nats" for name in order[:5]))
         sets = {name: with_one(names, name, context.known) for name in chosen}
         fits = context.ask([
-            Climb(sets[name], starts[name], settings.first) if name in starts
-            else Join(Promise(names, current.fit.theta, current.run, name, off_n), settings.first)
+            FitTask(sets[name], starts[name], settings.first) if name in starts
+            else FitWithAddedTask(self._score_test(current, name), settings.first)
             for name in chosen
         ])  # fmt: skip
         better = {name: _is_better(fit, current) for name, fit in zip(chosen, fits, strict=True)}
@@ -63,8 +63,8 @@ class Candidates:
         for share in settings.again:
             worse = [name for name in chosen if not better[name]]
             more = context.ask([
-                Climb(sets[name], {**theta, **self._weaker(name, finished.get(name, {}), share)},
-                      settings.first, () if name in starts else off_n)
+                FitTask(sets[name], {**theta, **self._weaker(name, finished.get(name, {}), share)},
+                      settings.first, () if name in starts else correction_n)
                 for name in worse
             ])  # fmt: skip
             better |= {name: _is_better(fit, current) for name, fit in zip(worse, more, strict=True)}
@@ -76,9 +76,7 @@ class Candidates:
             context.tell(f"{', '.join((*names, name))}: {gain}")
         return list(sets.values())
 
-    def _score_tests(
-        self, current: JointFit
-    ) -> tuple[dict[str, float], dict[str, Values], dict[str, Values]]:
+    def _score_tests(self, current: SetFit) -> tuple[dict[str, float], dict[str, Values], dict[str, Values]]:
         """Returns, by mechanism: the gain that its score test promises [nats]; where a fit would start, and
         values with which the model runs, of the mechanisms that the model solves."""
         context, names = self._context, current.fit.names
@@ -91,10 +89,9 @@ class Candidates:
         probes = [(name, values) for name in solved for values in self._probes(context.known[name])]
         theta = {**context.neutral, **current.fit.theta}
         tasks: list[Task] = [
-            Probe(with_one(names, name, context.known), {**theta, **values}) for name, values in probes
+            RunTask(with_one(names, name, context.known), {**theta, **values}) for name, values in probes
         ]
-        off_n = correction(current)
-        tasks += [Promise(names, current.fit.theta, current.run, name, off_n) for name in quick]
+        tasks += [self._score_test(current, name) for name in quick]
         answers = context.ask(tasks)
         promised: dict[str, float] = {}
         tested: dict[str, float] = {}
@@ -103,7 +100,7 @@ class Candidates:
         for (name, values), force_n in zip(probes, answers, strict=False):
             if isinstance(force_n, str):
                 continue
-            gain, start = self._score(current, name, values, np.asarray(force_n) + current.off_n)
+            gain, start = self._score(current, name, values, np.asarray(force_n) + current.correction_n)
             strength = next(iter(values))
             if gain > tested.get(strength, -1.0):
                 tested[strength], self._shapes[strength] = gain, values
@@ -113,6 +110,10 @@ class Candidates:
             if isinstance(nats, float):
                 promised[name] = nats
         return promised, starts, finished
+
+    def _score_test(self, current: SetFit, name: str) -> ScoreTestTask:
+        """Returns the score test of a mechanism that acts on the force, beside a set."""
+        return ScoreTestTask(current.fit.names, current.fit.theta, current.run, name, correction(current))
 
     def _probes(self, mechanism: Mechanism) -> list[dict[str, float]]:
         """Returns values of each part of a mechanism, off neutral, at which the model runs.
@@ -141,7 +142,7 @@ class Candidates:
         return weaker
 
     def _score(
-        self, current: JointFit, name: str, values: Values, force_n: Array
+        self, current: SetFit, name: str, values: Values, force_n: Array
     ) -> tuple[float, dict[str, float]]:
         """Returns the gain [nats] that a mechanism promises along the change of force that a run shows, and
         the point at which it would be reached.
@@ -175,6 +176,6 @@ def shapes_of(mechanism: Mechanism, names: Sequence[str], count: int) -> list[di
     return [dict(zip(space.names, map(float, row), strict=True)) for row in space.from_unit(unit)]
 
 
-def _is_better(answer: object, current: JointFit) -> bool:
+def _is_better(answer: object, current: SetFit) -> bool:
     """Returns whether an answer is a fit that is not below another fit."""
-    return isinstance(answer, JointFit) and answer.fit.log_likelihood >= current.fit.log_likelihood
+    return isinstance(answer, SetFit) and answer.fit.log_likelihood >= current.fit.log_likelihood

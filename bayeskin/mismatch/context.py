@@ -16,7 +16,7 @@ from bayeskin.inference import LogPosterior, NoisePriors
 from bayeskin.inference.noise_model import ALL, noise_space
 from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed
 from bayeskin.mechanisms.mechanism import Tissue
-from bayeskin.mismatch.fit import instrument_noise, soft_on_stiff
+from bayeskin.mismatch.fit import instrument_noise, subcutis_too_stiff
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.tangent import Tangent
 from bayeskin.types import Array, BinnedForce, Jumps, PadMotion, ParameterSpace, Surrogate
@@ -146,7 +146,7 @@ class DiagnosisContext:
         windows = None if until_s is None else ((float(self.binned.edges_s[0]), until_s),)
         about = posterior_of(
             seen, self.forward.spec, self.binned, self.motion, self.noise_priors, priors, windows,
-            soft_on_stiff,
+            subcutis_too_stiff,
         )  # fmt: skip
         if correction_n is None or about.model_error is None:
             return about

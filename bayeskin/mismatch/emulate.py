@@ -22,8 +22,8 @@ import numpy as np
 
 from bayeskin.inference import LogPosterior
 from bayeskin.mismatch.fit import Fit, fit_near
-from bayeskin.mismatch.resample import LEGS, MODES, Resampled, resample
-from bayeskin.mismatch.trust_region import JointFit, within
+from bayeskin.mismatch.resample import LEGS, MODES, PosteriorDraws, resample
+from bayeskin.mismatch.trust_region import SetFit, within
 from bayeskin.mismatch.wrapper import Wrapper, innermost
 from bayeskin.types import Array, Design, ParameterSpace, Surrogate
 
@@ -61,7 +61,7 @@ class EmulationSettings:
 
 
 @dataclass(frozen=True)
-class Emulated:
+class EmulatedPosterior:
     """The most probable point by the emulator, draws of the posterior, runs made, the emulator's RMS error.
 
     error_n : of the last emulator but one, at the median of the runs that followed it [N]; None for one wave
@@ -69,7 +69,7 @@ class Emulated:
     """
 
     fit: Fit
-    draws: Resampled
+    draws: PosteriorDraws
     runs: int
     error_n: float | None
     settled: bool
@@ -114,9 +114,9 @@ class _Errors:
 
 
 def emulate(
-    maxima: Sequence[JointFit], forces: Forces, learn: Learn, noise_n: float, seed: int,
+    maxima: Sequence[SetFit], forces: Forces, learn: Learn, noise_n: float, seed: int,
     settings: EmulationSettings | None = None,
-) -> Emulated | str:  # fmt: skip
+) -> EmulatedPosterior | str:  # fmt: skip
     """Returns the posterior of a set about its fits; the message of a run where all of the first wave fail.
 
     maxima : fits of the set, the likeliest first, each with the forward model's error at its run
@@ -129,10 +129,10 @@ def emulate(
     reach = settings.first
     draws = _near(maxima, reach, seed)
     errors = _Errors(
-        space.box.to_unit([one.run.theta for one in maxima]), np.array([one.off_n for one in maxima])
+        space.box.to_unit([one.run.theta for one in maxima]), np.array([one.correction_n for one in maxima])
     )
     design = _none(space, about.surrogate.edges_s)
-    emulated: Emulated | None = None
+    emulated: EmulatedPosterior | None = None
     for wave in range(settings.waves):
         count = settings.more if wave else settings.points
         points = _spread(space, draws[:, : space.dim], design.theta, count, rng)
@@ -167,17 +167,17 @@ def emulate(
         known = [one.fit.theta for one in maxima]
         legs, modes = (LEGS, MODES) if last else (BEFORE, 0)
         drawn = resample(best, seed, legs, modes, known)
-        draws, emulated = drawn.draws, Emulated(best, drawn, len(design.theta), error_n, done)
+        draws, emulated = drawn.draws, EmulatedPosterior(best, drawn, len(design.theta), error_n, done)
         if done:
             break
     assert emulated is not None
     return emulated
 
 
-def _near(maxima: Sequence[JointFit], reach: float, seed: int) -> Array:
+def _near(maxima: Sequence[SetFit], reach: float, seed: int) -> Array:
     """Draws (n, D) of the posterior about each fit's run, up to so far from it, of the prior's width."""
 
-    def near(one: JointFit) -> Array:
+    def near(one: SetFit) -> Array:
         about = one.fit.log_posterior
         vector = np.clip(about.vector(one.fit.theta), *about.bounds)
         held = replace(one.fit, log_posterior=within(about, vector, reach))

@@ -78,7 +78,7 @@ def instrument_noise(binned: BinnedForce) -> NoisePriors:
     )
 
 
-def soft_on_stiff(space: ParameterSpace, theta: Array) -> NDArray[np.bool_]:
+def subcutis_too_stiff(space: ParameterSpace, theta: Array) -> NDArray[np.bool_]:
     """Returns where (n, d) the subcutis is more than `STIFFEST_BELOW` times as stiff as the cutis, (n,)."""
     names = space.names
     if not {"E_c", "E_s"} <= set(names):

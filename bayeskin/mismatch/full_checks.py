@@ -13,12 +13,12 @@ import numpy as np
 
 from bayeskin.mismatch.search_context import SearchContext, gained, noise_of, title
 from bayeskin.mismatch.search_record import Check, Names
-from bayeskin.mismatch.tasks import Climb, FullProbe
-from bayeskin.mismatch.trust_region import JointFit
+from bayeskin.mismatch.tasks import FitTask, FullRunTask
+from bayeskin.mismatch.trust_region import SetFit
 from bayeskin.types import Array
 
 
-def checked_best(context: SearchContext) -> JointFit:
+def checked_best(context: SearchContext) -> SetFit:
     """Returns the likeliest set after a check, if it contains mechanisms of the tissue.
 
     Without the check, an error of the forward model with these mechanisms could pass for further mechanisms.
@@ -39,23 +39,23 @@ def check_likely_sets(context: SearchContext) -> None:
         check(context, unchecked)
 
 
-def check(context: SearchContext, fits: Sequence[JointFit]) -> None:
+def check(context: SearchContext, fits: Sequence[SetFit]) -> None:
     """Runs the full model at fits, and fits the sets again for which the forward model is too far off."""
-    groups: dict[Names, list[JointFit]] = {}
+    groups: dict[Names, list[SetFit]] = {}
     for fit in fits:
         groups.setdefault(context.solved(fit.fit.names), []).append(fit)
     firsts = [members[0] for members in groups.values()]
-    forces = context.ask([FullProbe(names, context.solved_values(first))
+    forces = context.ask([FullRunTask(names, context.solved_values(first))
                           for names, first in zip(groups, firsts, strict=True)])  # fmt: skip
-    again: list[Climb] = []
+    again: list[FitTask] = []
     for first, members, full_n in zip(firsts, groups.values(), forces, strict=True):
         again += _record_checks(context, first, members, full_n)
     for task, answer in zip(again, context.ask(again), strict=True):
-        if isinstance(answer, JointFit):
+        if isinstance(answer, SetFit):
             context.record.fits[task.names] = answer
 
 
-def is_checked_nearby(context: SearchContext, fit: JointFit) -> bool:
+def is_checked_nearby(context: SearchContext, fit: SetFit) -> bool:
     """Returns whether the full model was run near a fit, with the same mechanisms of the tissue."""
     solved = context.solved(fit.fit.names)
     return any(
@@ -64,12 +64,12 @@ def is_checked_nearby(context: SearchContext, fit: JointFit) -> bool:
     )
 
 
-def forward_error(fit: JointFit, full_n: object) -> Array:
+def forward_error(fit: SetFit, full_n: object) -> Array:
     """Returns the error (m,) [N] of the forward model at a fit's run, without the fit's own correction."""
-    return np.asarray(full_n) - (fit.run.force_n - fit.off_n)
+    return np.asarray(full_n) - (fit.run.force_n - fit.correction_n)
 
 
-def _unchecked(context: SearchContext) -> list[JointFit]:
+def _unchecked(context: SearchContext) -> list[SetFit]:
     """Returns the fits to check.
 
     These are likely sets, parts of the likeliest set that have the same mechanisms of the tissue, and the
@@ -94,8 +94,8 @@ def _unchecked(context: SearchContext) -> list[JointFit]:
 
 
 def _record_checks(
-    context: SearchContext, first: JointFit, members: Sequence[JointFit], full_n: object
-) -> list[Climb]:
+    context: SearchContext, first: SetFit, members: Sequence[SetFit], full_n: object
+) -> list[FitTask]:
     """Records what a full run at the first of some fits shows of all of them; returns the fits to repeat.
 
     All have the same mechanisms of the tissue, so the error of the forward model is taken to be the same.
@@ -108,10 +108,10 @@ def _record_checks(
             context.tell(f"{title(names)}: the full model fails there: {full_n}")
             continue
         error_n = forward_error(first, full_n)
-        off = context.rms(error_n - fit.off_n)
+        off = context.rms(error_n - fit.correction_n)
         context.record.checks[names] = Check(first.run.theta, np.asarray(full_n), off)
         if off > context.settings.exact * noise_of(context.binned):
-            tasks.append(Climb(names, fit.fit.theta, context.settings.runs, tuple(error_n.tolist())))
+            tasks.append(FitTask(names, fit.fit.theta, context.settings.runs, tuple(error_n.tolist())))
             difference = f"the full model differs by {1e3 * off:.1f} mN"
             context.tell(f"{title(names)}: {difference}; the set is fitted again with that correction")
     return tasks

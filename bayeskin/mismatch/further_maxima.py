@@ -17,9 +17,9 @@ from bayeskin.mismatch.full_checks import forward_error
 from bayeskin.mismatch.hypotheses import weight
 from bayeskin.mismatch.search_context import SearchContext, correction, gained, noise_of, title
 from bayeskin.mismatch.search_record import Check, Names
-from bayeskin.mismatch.tasks import Climb, FullProbe
+from bayeskin.mismatch.tasks import FitTask, FullRunTask
 from bayeskin.mismatch.tissue_starts import nearest_tissues
-from bayeskin.mismatch.trust_region import JointFit
+from bayeskin.mismatch.trust_region import SetFit
 from bayeskin.types import ParameterSpace
 
 
@@ -44,16 +44,18 @@ def _record_maxima(context: SearchContext, names: Names, weigh: Callable[[], Non
         return
     best = record.fits[names]
     fits = _fits_elsewhere(context, best)
-    forces = context.ask([FullProbe(context.solved(names), context.solved_values(fit)) for fit in fits])
+    forces = context.ask([FullRunTask(context.solved(names), context.solved_values(fit)) for fit in fits])
     maxima, checks = [best], list[Check]()
     for fit, full_n in zip(fits, forces, strict=True):
         if isinstance(full_n, str):
             continue
         error_n = forward_error(fit, full_n)
-        check = Check(fit.run.theta, np.asarray(full_n), context.rms(error_n - fit.off_n))
+        check = Check(fit.run.theta, np.asarray(full_n), context.rms(error_n - fit.correction_n))
         corrected: object = fit
         if check.off > settings.exact * noise_of(context.binned):
-            (corrected,) = context.ask([Climb(names, fit.fit.theta, settings.runs, tuple(error_n.tolist()))])
+            (corrected,) = context.ask(
+                [FitTask(names, fit.fit.theta, settings.runs, tuple(error_n.tolist()))]
+            )
         for maximum in _distinct(context, [corrected], maxima, settings.close):
             context.tell(f"another maximum of {title(names)}: {gained(maximum, best):+.1f} nats")
             maxima.append(maximum)
@@ -66,13 +68,13 @@ def _record_maxima(context: SearchContext, names: Names, weigh: Callable[[], Non
         weigh()
 
 
-def fit_larger_sets(context: SearchContext, best: JointFit) -> None:
+def fit_larger_sets(context: SearchContext, best: SetFit) -> None:
     """Fits the compared sets that contain a set again, from its new maximum."""
     record = context.record
     larger = [names for names in record.evidences if set(best.fit.names) < set(names)]
     starts = [{**record.fits[names].fit.theta, **best.fit.theta} for names in larger]
-    runs, off_n = context.settings.runs, correction(best)
-    climbs = [Climb(names, start, runs, off_n) for names, start in zip(larger, starts, strict=True)]
+    runs, correction_n = context.settings.runs, correction(best)
+    climbs = [FitTask(names, start, runs, correction_n) for names, start in zip(larger, starts, strict=True)]
     for names, answer in zip(larger, context.ask(climbs), strict=True):
         before = record.fits[names]
         record.add(answer)
@@ -80,25 +82,29 @@ def fit_larger_sets(context: SearchContext, best: JointFit) -> None:
             record.checks.pop(names, None)
 
 
-def _fits_elsewhere(context: SearchContext, best: JointFit) -> list[JointFit]:
+def _fits_elsewhere(context: SearchContext, best: SetFit) -> list[SetFit]:
     """Returns fits of a set that ended elsewhere and not far behind, the likeliest first."""
-    settings, names, off_n = context.settings, best.fit.names, correction(best)
-    climbs = [Climb(names, start, settings.first, off_n) for start in _starts_elsewhere(context, best)]
+    settings, names, correction_n = context.settings, best.fit.names, correction(best)
+    climbs = [
+        FitTask(names, start, settings.first, correction_n) for start in _starts_elsewhere(context, best)
+    ]
     first = _distinct(context, context.ask(climbs), [best], settings.behind)
     left = settings.runs - settings.first
-    continued = context.ask([Climb(names, fit.fit.theta, left, off_n) for fit in first if not fit.settled])
+    continued = context.ask(
+        [FitTask(names, fit.fit.theta, left, correction_n) for fit in first if not fit.settled]
+    )
     ended = [*(fit for fit in first if fit.settled), *continued]
     return _distinct(context, ended, [best], settings.close)[: settings.maxima]
 
 
 def _distinct(
-    context: SearchContext, answers: Sequence[object], known: Sequence[JointFit], behind: float
-) -> list[JointFit]:
+    context: SearchContext, answers: Sequence[object], known: Sequence[SetFit], behind: float
+) -> list[SetFit]:
     """Returns the fits among answers that are at no known maximum, the likeliest of each new maximum.
 
     behind : largest difference in weight [nats] from the first of the known fits
     """
-    fits = sorted((a for a in answers if isinstance(a, JointFit)), key=lambda fit: -weight(fit.fit))
+    fits = sorted((a for a in answers if isinstance(a, SetFit)), key=lambda fit: -weight(fit.fit))
     kept = list(known)
     for fit in fits:
         apart = not any(context.is_alike(fit, other.run.theta) for other in kept)
@@ -107,7 +113,7 @@ def _distinct(
     return kept[len(known) :]
 
 
-def _starts_elsewhere(context: SearchContext, best: JointFit) -> list[dict[str, float]]:
+def _starts_elsewhere(context: SearchContext, best: SetFit) -> list[dict[str, float]]:
     """Returns values from which further maxima may be reached.
 
     Permeabilities are equal, or exchanged, or one of them is near an end of its prior; the moduli are those
@@ -134,7 +140,7 @@ def _starts_elsewhere(context: SearchContext, best: JointFit) -> list[dict[str, 
     return [{**theta, **change} for change in changes]
 
 
-def _with_best_moduli(context: SearchContext, theta: Mapping[str, float], best: JointFit) -> dict[str, float]:
+def _with_best_moduli(context: SearchContext, theta: Mapping[str, float], best: SetFit) -> dict[str, float]:
     """Returns the base parameters with the ratio of moduli, and the stiffness, whose force is nearest."""
     tissue = {name: theta[name] for name in context.base.names}
     first, *others = (p for p in context.base.parameters if p.stress_power > 0)

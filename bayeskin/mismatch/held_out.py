@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.hypotheses import weight
 from bayeskin.mismatch.search_context import correction
-from bayeskin.mismatch.tasks import Ask, Climb
-from bayeskin.mismatch.trust_region import JointFit
+from bayeskin.mismatch.tasks import AnswerTasks, FitTask
+from bayeskin.mismatch.trust_region import SetFit
 from bayeskin.types import BinnedForce
 
 RUNS = 6  # of a fit, at most
@@ -34,14 +34,14 @@ def end_of_second_hold(binned: BinnedForce) -> float | None:
     return holds[1].end_s if len(holds) > 2 else None
 
 
-def fit_beginning(ask: Ask, sets: Sequence[JointFit], split_s: float | None) -> Beginning | None:
+def fit_beginning(ask: AnswerTasks, sets: Sequence[SetFit], split_s: float | None) -> Beginning | None:
     """Returns the fits of some sets, the base model among them, to the beginning; None where it has no end.
 
     It is also None where the base model's fit fails.
     """
     if split_s is None:
         return None
-    answers = ask([Climb(one.fit.names, one.fit.theta, RUNS, correction(one), split_s) for one in sets])
-    fits = [one.fit for one in answers if isinstance(one, JointFit)]
+    answers = ask([FitTask(one.fit.names, one.fit.theta, RUNS, correction(one), split_s) for one in sets])
+    fits = [one.fit for one in answers if isinstance(one, SetFit)]
     base = next((one for one in fits if not one.names), None)
     return None if base is None else Beginning(base, max(fits, key=weight))

@@ -36,7 +36,7 @@ class Evidences:
     """Log evidences of a set: alone, and with something smooth beside it."""
 
     alone: float
-    with_smooth: float
+    with_discrepancy: float
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def hypotheses_of(names: tuple[str, ...], said: Evidences) -> tuple[Hypothesis, 
     own = len(names) * ODDS
     return (
         Hypothesis(names, False, said.alone + own),
-        Hypothesis(names, True, said.with_smooth + own + ODDS),
+        Hypothesis(names, True, said.with_discrepancy + own + ODDS),
     )
 
 

@@ -34,7 +34,7 @@ LIMITS = Limits(effective_samples=200.0, lengths=5.0, rhat=1.1)  # for intervals
 
 
 @dataclass(frozen=True)
-class Resampled:
+class PosteriorDraws:
     """Draws (n, D) in SI, columns `names`; rhat, the largest of all; effective, of the least known; whether
     these and the chains' times let intervals be taken from the draws (`LIMITS`)."""
 
@@ -58,7 +58,7 @@ class Resampled:
 def resample(
     found: Fit, seed: int, legs: Sequence[int] = LEGS, modes: int = MODES,
     near: Sequence[Mapping[str, float]] = (),
-) -> Resampled:  # fmt: skip
+) -> PosteriorDraws:  # fmt: skip
     """Returns draws of the posterior about `found` and other modes.
 
     They end after the first of `legs` by which they have settled.
@@ -99,14 +99,14 @@ def _moved_on(sampler: emcee.EnsembleSampler, state: emcee.State, steps: int) ->
 
 def _assessed(
     samplers: Sequence[emcee.EnsembleSampler], log_posterior: LogPosterior, forgotten: int
-) -> Resampled:
+) -> PosteriorDraws:
     """Returns the draws of ensembles after their first steps, of which so many are forgotten at least."""
     chains = np.stack([sampler.get_chain() for sampler in samplers])
     densities = np.stack([sampler.get_log_prob() for sampler in samplers])
     state = assess(chains, densities, log_posterior.names, LIMITS, forgotten)
     kept = log_posterior.from_sampling(chains[:, state.burn_in :: EVERY].reshape(-1, log_posterior.dim))
     rhat, effective = float(np.nanmax(state.rhat)), float(np.nanmin(state.ess))
-    return Resampled(log_posterior.names, kept, rhat, effective, state.verdict.trusted)
+    return PosteriorDraws(log_posterior.names, kept, rhat, effective, state.verdict.trusted)
 
 
 def _modes(

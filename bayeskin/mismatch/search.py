@@ -24,21 +24,21 @@ from scipy.stats import qmc
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, without_one
 from bayeskin.mismatch.candidates import Candidates
-from bayeskin.mismatch.fit import soft_on_stiff
+from bayeskin.mismatch.fit import subcutis_too_stiff
 from bayeskin.mismatch.full_checks import check, check_likely_sets, checked_best, is_checked_nearby
 from bayeskin.mismatch.further_maxima import find_further_maxima
 from bayeskin.mismatch.hypotheses import Evidences, weight
 from bayeskin.mismatch.search_context import SearchContext, Tell, correction, gained, title
 from bayeskin.mismatch.search_record import Names, SearchResult
 from bayeskin.mismatch.search_settings import SearchSettings
-from bayeskin.mismatch.tasks import Ask, Climb, Weigh
+from bayeskin.mismatch.tasks import AnswerTasks, EvidenceTask, FitTask
 from bayeskin.mismatch.tissue_starts import nearest_tissues
-from bayeskin.mismatch.trust_region import JointFit, as_json
+from bayeskin.mismatch.trust_region import SetFit, as_json
 from bayeskin.types import BinnedForce, ParameterSpace
 
 
 def search(
-    ask: Ask, binned: BinnedForce, base: ParameterSpace, known: Mapping[str, Mechanism],
+    ask: AnswerTasks, binned: BinnedForce, base: ParameterSpace, known: Mapping[str, Mechanism],
     solves: Collection[str], noise: Mapping[str, float], seed: int, tell: Tell,
     settings: SearchSettings | None = None,
 ) -> SearchResult:  # fmt: skip
@@ -68,16 +68,16 @@ class Searcher:
         self._context = context
         self._candidates = Candidates(context)
         self._tissues: list[dict[str, float]] = []
-        self._weighed: dict[Names, JointFit] = {}  # the fit that each evidence belongs to
+        self._weighed: dict[Names, SetFit] = {}  # the fit that each evidence belongs to
 
     def fit_base_model(self) -> None:
         """Fits the model without mechanisms. Raises InputError where no tissue of the priors runs."""
         context, settings = self._context, self._context.settings
         rows = context.base.from_unit(qmc.Sobol(context.base.dim, rng=context.seed).random(settings.skins))
-        rows = rows[~soft_on_stiff(context.base, rows)]
+        rows = rows[~subcutis_too_stiff(context.base, rows)]
         drawn = [dict(zip(context.base.names, map(float, row), strict=True)) for row in rows]
         self._tissues = nearest_tissues(context, (), drawn, {})
-        answers = context.ask([Climb((), {**context.noise, **tissue}, settings.first)
+        answers = context.ask([FitTask((), {**context.noise, **tissue}, settings.first)
                                for tissue in self._tissues[: settings.starts]])  # fmt: skip
         context.keep(answers)
         if not context.record.fits:
@@ -119,7 +119,7 @@ class Searcher:
         """Weighs hypotheses of sets, again where the fit has changed; a set that fails has no evidence."""
         record = self._context.record
         new = [names for names in sets if self._weighed.get(names) is not record.fits[names]]
-        answers = self._context.ask([Weigh(as_json(record.fits[names])) for names in new])
+        answers = self._context.ask([EvidenceTask(as_json(record.fits[names])) for names in new])
         for names, answer in zip(new, answers, strict=True):
             record.evidences.pop(names, None)
             self._weighed[names] = record.fits[names]
@@ -144,12 +144,12 @@ class Searcher:
             )
         return difference >= gain
 
-    def _gains(self, current: JointFit) -> bool:
+    def _gains(self, current: SetFit) -> bool:
         """Returns whether another set than the current one is better by enough to continue from it."""
         record = self._context.record
         return gained(record.best, record.fits[current.fit.names]) >= self._context.settings.gain
 
-    def _forward(self, current: JointFit) -> None:
+    def _forward(self, current: SetFit) -> None:
         """Fits sets with one mechanism more, and those that gain most from other tissues and without others.
 
         Where they gain much, the current set is fitted again from their tissues, and they from that of the
@@ -164,7 +164,7 @@ class Searcher:
         starts = [(current, fit.fit.theta) for fit in strong]
         starts += [(fit, {**fit.fit.theta, **context.base_values(strong[0])}) for fit in strong[1:]]
         context.keep(context.ask([
-            Climb(fit.fit.names, theta, context.settings.first, correction(fit)) for fit, theta in starts
+            FitTask(fit.fit.names, theta, context.settings.first, correction(fit)) for fit, theta in starts
         ]))  # fmt: skip
         best = record.fits[strong[0].fit.names] if strong else current
         if context.leaves_more_than_noise(best):
@@ -176,7 +176,7 @@ class Searcher:
         ])  # fmt: skip
         self._fit_smaller_sets(record.best)
 
-    def _strongest(self, sets: Sequence[Names], current: JointFit) -> list[JointFit]:
+    def _strongest(self, sets: Sequence[Names], current: SetFit) -> list[SetFit]:
         """Returns the fits that gain so much that a missing mechanism may have biased the current tissue."""
         settings, record = self._context.settings, self._context.record
         fits = sorted((record.fits[names] for names in sets if names in record.fits),
@@ -184,7 +184,7 @@ class Searcher:
         least = max(settings.near * gained(fits[0], current), settings.astray)
         return [fit for fit in fits[: settings.alike] if gained(fit, current) >= least]
 
-    def _exchange(self, current: JointFit) -> None:
+    def _exchange(self, current: SetFit) -> None:
         """Fits sets with another mechanism in the place of each mechanism of the current set."""
         context, names = self._context, current.fit.names
         if len(names) > 1:
@@ -193,22 +193,22 @@ class Searcher:
                 if smaller is not None and smaller.fit.names not in self._candidates.expanded:
                     self._candidates.fit_beside(smaller)
 
-    def _fit_from_other_tissues(self, current: JointFit) -> None:
+    def _fit_from_other_tissues(self, current: SetFit) -> None:
         """Fits a set from other tissues, with the values of its mechanisms kept."""
         context, settings, names = self._context, self._context.settings, current.fit.names
         tissues = nearest_tissues(context, names, self._tissues[: settings.others], current.fit.theta)
         context.keep(context.ask([
-            Climb(names, {**current.fit.theta, **tissue}, settings.first, correction(current))
+            FitTask(names, {**current.fit.theta, **tissue}, settings.first, correction(current))
             for tissue in tissues[: settings.tried]
         ]))  # fmt: skip
         gain = gained(context.record.fits[names], current)
         context.tell(f"{title(names)} from other tissues: {gain:+.1f} nats")
 
-    def _fit_smaller_sets(self, current: JointFit) -> None:
+    def _fit_smaller_sets(self, current: SetFit) -> None:
         """Fits the sets with one mechanism fewer that have not been fitted yet."""
         context, names = self._context, current.fit.names
         smaller = {without_one(names, name, context.known) for name in names} - {()}
         context.keep(context.ask([
-            Climb(part, current.fit.theta, context.settings.first)
+            FitTask(part, current.fit.theta, context.settings.first)
             for part in sorted(smaller) if part not in context.record.fits
         ]))  # fmt: skip

@@ -11,8 +11,8 @@ from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.hypotheses import weight
 from bayeskin.mismatch.search_record import Names, SearchRecord
 from bayeskin.mismatch.search_settings import SearchSettings
-from bayeskin.mismatch.tasks import Ask, Climb
-from bayeskin.mismatch.trust_region import JointFit
+from bayeskin.mismatch.tasks import AnswerTasks, FitTask
+from bayeskin.mismatch.trust_region import SetFit
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array, BinnedForce, ParameterSpace
 
@@ -28,7 +28,7 @@ class SearchContext:
         model solves; noise : values of the noise parameters to start from
     """
 
-    ask: Ask
+    ask: AnswerTasks
     binned: BinnedForce
     base: ParameterSpace
     known: Mapping[str, Mechanism]
@@ -48,12 +48,12 @@ class SearchContext:
         """Returns the mechanisms of a set that the forward model solves."""
         return tuple(name for name in sorted(names) if name in self.solves)
 
-    def solved_values(self, fit: JointFit) -> dict[str, float]:
+    def solved_values(self, fit: SetFit) -> dict[str, float]:
         """Returns the values of the parameters that the forward model solves, at a fit's run."""
         names = innermost(fit.fit.log_posterior.surrogate).space.names
         return dict(zip(names, map(float, fit.run.theta), strict=True))
 
-    def base_values(self, fit: JointFit) -> dict[str, float]:
+    def base_values(self, fit: SetFit) -> dict[str, float]:
         """Returns the base model's parameters of a fit."""
         return {name: fit.fit.theta[name] for name in self.base.names}
 
@@ -61,44 +61,44 @@ class SearchContext:
         """Returns the RMS [N] of a force (m,) over the bins that were recorded."""
         return float(np.sqrt(np.mean(np.square(force_n[np.isfinite(self.binned.force_n)]))))
 
-    def leaves_more_than_noise(self, fit: JointFit) -> bool:
+    def leaves_more_than_noise(self, fit: SetFit) -> bool:
         """Returns whether the residual of a fit is larger than the noise explains."""
         residual_n = self.rms(self.binned.force_n - fit.fit.force_n)
         return residual_n > self.settings.left * noise_of(self.binned)
 
-    def is_alike(self, fit: JointFit, theta: Array) -> bool:
+    def is_alike(self, fit: SetFit, theta: Array) -> bool:
         """Returns whether a fit's run is near other values (d,) of the parameters that the model solves."""
         space = innermost(fit.fit.log_posterior.surrogate).space
         apart = space.to_unit(fit.run.theta) - space.to_unit(theta)
         return bool(np.abs(apart).max() <= self.settings.alike_by)
 
-    def keep(self, answers: Sequence[object], since: JointFit | None = None) -> None:
+    def keep(self, answers: Sequence[object], since: SetFit | None = None) -> None:
         """Records fits, and continues those that have not settled: the best, and others not far behind.
 
         since : a fit that they gain on; a fit that gains a good part of what the best one gains is not far
             behind
         """
-        fits = sorted((a for a in answers if isinstance(a, JointFit)), key=lambda fit: -weight(fit.fit))
+        fits = sorted((a for a in answers if isinstance(a, SetFit)), key=lambda fit: -weight(fit.fit))
         for fit in fits:
             self.record.add(fit)
         settings, behind = self.settings, self.settings.behind
         if since is not None and fits:
             behind = max(behind, (1.0 - settings.near) * gained(fits[0], since))
         for continued in self.ask([
-            Climb(fit.fit.names, fit.fit.theta, settings.runs - settings.first, correction(fit))
+            FitTask(fit.fit.names, fit.fit.theta, settings.runs - settings.first, correction(fit))
             for i, fit in enumerate(fits)
             if not fit.settled and not self._is_recorded(fit)
             and (i < settings.best or gained(self.record.best, fit) <= behind)
         ]):  # fmt: skip
             self.record.add(continued)
 
-    def _is_recorded(self, fit: JointFit) -> bool:
+    def _is_recorded(self, fit: SetFit) -> bool:
         """Returns whether a likelier fit of the same set is near, so that both lead to one maximum."""
         best = self.record.fits.get(fit.fit.names)
         return best is not None and best is not fit and self.is_alike(fit, best.run.theta)
 
 
-def gained(fit: JointFit, before: JointFit) -> float:
+def gained(fit: SetFit, before: SetFit) -> float:
     """Returns the gain in weight [nats] of one fit over another."""
     return weight(fit.fit) - weight(before.fit)
 
@@ -108,9 +108,9 @@ def noise_of(binned: BinnedForce) -> float:
     return float(np.sqrt(np.nanmean(binned.variance_n2)))
 
 
-def correction(fit: JointFit) -> tuple[float, ...]:
+def correction(fit: SetFit) -> tuple[float, ...]:
     """Returns the force that a fit has added to its runs, in the form that tasks take; empty for none."""
-    return tuple(fit.off_n.tolist()) if fit.off_n.any() else ()
+    return tuple(fit.correction_n.tolist()) if fit.correction_n.any() else ()
 
 
 def title(names: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 
 from bayeskin.mismatch.hypotheses import Evidences, Family, hypotheses_of, weight
-from bayeskin.mismatch.trust_region import JointFit
+from bayeskin.mismatch.trust_region import SetFit
 from bayeskin.types import Array
 
 Names = tuple[str, ...]  # the sorted names of a set's mechanisms
@@ -36,12 +36,12 @@ class Check:
 class _Sets:
     """What follows from the fits and the evidences of sets."""
 
-    fits: Mapping[Names, JointFit]
+    fits: Mapping[Names, SetFit]
     evidences: Mapping[Names, Evidences]
-    others: Sequence[JointFit]
+    others: Sequence[SetFit]
 
     @property
-    def best(self) -> JointFit:
+    def best(self) -> SetFit:
         """Returns the fit of the set with the largest weight."""
         return max(self.fits.values(), key=lambda fit: weight(fit.fit))
 
@@ -57,11 +57,11 @@ class _Sets:
         """Returns the most probable of the compared sets, with or without a discrepancy beside it."""
         return max(self.evidences, key=self.family.probability_of_set)
 
-    def others_of(self, names: Names) -> list[JointFit]:
+    def others_of(self, names: Names) -> list[SetFit]:
         """Returns the further maxima of a set."""
         return [fit for fit in self.others if fit.fit.names == names]
 
-    def likeliest(self, count: int) -> list[JointFit]:
+    def likeliest(self, count: int) -> list[SetFit]:
         """Returns the `count` fits with the largest weights, and always the fit without mechanisms."""
         order = sorted(self.fits.values(), key=lambda fit: -weight(fit.fit))
         with_mechanisms = [fit for fit in order if fit.fit.names]
@@ -77,24 +77,24 @@ class SearchResult(_Sets):
     others : further maxima of the most probable set and of a part of it, less likely than those in `fits`
     """
 
-    fits: Mapping[Names, JointFit]
+    fits: Mapping[Names, SetFit]
     checks: Mapping[Names, Check]
     evidences: Mapping[Names, Evidences]
-    others: tuple[JointFit, ...]
+    others: tuple[SetFit, ...]
 
 
 @dataclass
 class SearchRecord(_Sets):
     """The record that a search keeps while it runs; the fields are those of `SearchResult`."""
 
-    fits: dict[Names, JointFit] = field(default_factory=dict)
+    fits: dict[Names, SetFit] = field(default_factory=dict)
     checks: dict[Names, Check] = field(default_factory=dict)
     evidences: dict[Names, Evidences] = field(default_factory=dict)
-    others: list[JointFit] = field(default_factory=list)
+    others: list[SetFit] = field(default_factory=list)
 
     def add(self, answer: object) -> None:
         """Keeps a fit if it is the likeliest of its set; an answer that is no fit is ignored."""
-        if isinstance(answer, JointFit) and np.isfinite(answer.fit.value):
+        if isinstance(answer, SetFit) and np.isfinite(answer.fit.value):
             names = answer.fit.names
             if names not in self.fits or weight(answer.fit) > weight(self.fits[names].fit):
                 self.fits[names] = answer

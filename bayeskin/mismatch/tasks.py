@@ -10,69 +10,76 @@ from bayeskin.forward.interface import ModelRun
 
 
 @dataclass(frozen=True)
-class Probe:
-    """Asks for the force of a set at values, by the forward model alone: (m,) or why it failed."""
+class RunTask:
+    """Asks for the force (m,) of a set by the forward model, or the message of a run that failed."""
 
     names: tuple[str, ...]
     theta: Mapping[str, float]
 
 
 @dataclass(frozen=True)
-class FullProbe:
-    """Asks for the force of a set at values by the full model: (m,) or why it failed."""
+class FullRunTask:
+    """Asks for the force (m,) of a set by the full model, or the message of a run that failed."""
 
     names: tuple[str, ...]
     theta: Mapping[str, float]
 
 
 @dataclass(frozen=True)
-class Climb:
-    """Asks for the fit of a set from values, in so many runs at most.
+class FitTask:
+    """Asks for the fit of a set.
 
-    off_n (m,) : added to the runs' force; until_s : end of what is fitted, None for the whole recording
+    start : values from which the fit starts; runs : largest number of model runs
+    correction_n (m,) : force that is added to every run; empty for none
+    until_s : end of the part of the recording that is fitted, None for the whole
     """
 
     names: tuple[str, ...]
     start: Mapping[str, float]
     runs: int
-    off_n: tuple[float, ...] = ()
+    correction_n: tuple[float, ...] = ()
     until_s: float | None = None
 
 
 @dataclass(frozen=True)
-class Promise:
-    """Asks how many nats a mechanism with a shortcut for the force promises beside a fit, about its run.
+class ScoreTestTask:
+    """Asks for the gain [nats] that a mechanism promises beside a set, about the run of the set's fit.
 
-    off_n (m,) : part of the run's force that was added to it
+    The mechanism has a shortcut for the force, so the model need not run.
+
+    correction_n (m,) : part of the run's force that was added to it
     """
 
     names: tuple[str, ...]
     theta: Mapping[str, float]
     run: ModelRun
     name: str
-    off_n: tuple[float, ...] = ()
+    correction_n: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
-class Join:
-    """Asks for the fit of a set with one such mechanism more, first searched for on the tangent of a run."""
+class FitWithAddedTask:
+    """Asks for the fit of a set with one mechanism more, whose values are first searched for on a tangent."""
 
-    promise: Promise
+    score_test: ScoreTestTask
     runs: int
 
 
 @dataclass(frozen=True)
-class Weigh:
-    """Asks for the log evidences of a fit, as JSON has it, alone and with something smooth beside it."""
+class EvidenceTask:
+    """Asks for the log-evidences of a set, alone and with an unnamed smooth discrepancy.
+
+    fit : of the set, as JSON has it
+    """
 
     fit: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class OtherTest:
-    """Asks for the force that is reported of a set at values in another test: (m,) or why it failed.
+class OtherProtocolTask:
+    """Asks for the force (m,) that the instrument reports on another protocol, or a failed run's message.
 
-    time_s, displacement_m : corners of the pads' motion; edges_s (m + 1,)
+    time_s, displacement_m : corners of the pads' motion; edges_s (m + 1,) : of the bins
     """
 
     names: tuple[str, ...]
@@ -82,5 +89,5 @@ class OtherTest:
     edges_s: tuple[float, ...]
 
 
-Task = Probe | FullProbe | Climb | Promise | Join | Weigh | OtherTest
-Ask = Callable[[Sequence[Task]], list[object]]  # answers in the order of the tasks
+Task = RunTask | FullRunTask | FitTask | ScoreTestTask | FitWithAddedTask | EvidenceTask | OtherProtocolTask
+AnswerTasks = Callable[[Sequence[Task]], list[object]]  # returns the answers in the order of the tasks

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayeskin.mismatch.search_context import SearchContext
 from bayeskin.mismatch.search_record import Names
-from bayeskin.mismatch.tasks import Probe
+from bayeskin.mismatch.tasks import RunTask
 
 
 def nearest_tissues(
@@ -23,7 +23,7 @@ def nearest_tissues(
     """
     usable = np.isfinite(context.binned.force_n)
     recorded, rows = context.binned.force_n[usable], []
-    answers = context.ask([Probe(names, {**values, **tissue}) for tissue in tissues])
+    answers = context.ask([RunTask(names, {**values, **tissue}) for tissue in tissues])
     powers = {p.name: p.stress_power for p in context.base.parameters if p.stress_power}
     for tissue, force_n in zip(tissues, answers, strict=True):
         if isinstance(force_n, str):

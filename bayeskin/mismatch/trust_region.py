@@ -59,20 +59,20 @@ Local = Callable[[Sequence[str], Sequence[ModelRun]], LogPosterior]  # the poste
 
 
 @dataclass(frozen=True)
-class JointFit:
+class SetFit:
     """A fit, the run it is about, how many runs it took, and whether little is left to be gained.
 
-    off_n (m,) : what was added to the force of each run, since the forward model is off by it near by
+    correction_n (m,) : what was added to the force of each run, since the forward model is off by it near by
     """
 
     fit: Fit
     run: ModelRun
     runs: int
     settled: bool
-    off_n: Array
+    correction_n: Array
 
 
-def as_json(found: JointFit) -> dict[str, Any]:
+def as_json(found: SetFit) -> dict[str, Any]:
     """A joint fit, as a bench reads it."""
     assert found.run.slopes_n is not None
     run = {
@@ -81,24 +81,28 @@ def as_json(found: JointFit) -> dict[str, Any]:
     }  # fmt: skip
     return {
         "fit": stored(found.fit), "run": run, "runs": found.runs, "settled": found.settled,
-        "off_n": found.off_n.tolist(),
+        "off_n": found.correction_n.tolist(),
     }  # fmt: skip
 
 
-def fit_jointly(
+def fit_set(
     names: Sequence[str], start: Mapping[str, float], skin: Skin, local: Local,
-    settings: TrustSettings | None = None, off_n: Array | None = None,
-) -> JointFit | str:  # fmt: skip
+    settings: TrustSettings | None = None, correction_n: Array | None = None,
+) -> SetFit | str:  # fmt: skip
     """Returns the maximum of a set that is reached from `start` (all parameters, SI).
 
-    off_n (m,) : added to the force of each run
+    correction_n (m,) : added to the force of each run
     Returns the message of the first run where that fails.
     """
     settings = settings or TrustSettings()
 
     def made_at(theta: Mapping[str, float]) -> ModelRun | str:
         run = skin(names, theta)
-        return run if isinstance(run, str) or off_n is None else replace(run, force_n=run.force_n + off_n)
+        return (
+            run
+            if isinstance(run, str) or correction_n is None
+            else replace(run, force_n=run.force_n + correction_n)
+        )
 
     run = made_at(start)
     if isinstance(run, str):
@@ -131,8 +135,8 @@ def fit_jointly(
             reach[far if far.any() else solved] *= settings.shrinks
         elif gained > settings.more * promised:
             reach[far] = np.minimum(settings.grows * reach[far], settings.largest)
-    off_n = np.zeros_like(run.force_n) if off_n is None else off_n
-    return JointFit(_fit(names, local(names, [run]), vector), run, made, settled, off_n)
+    correction_n = np.zeros_like(run.force_n) if correction_n is None else correction_n
+    return SetFit(_fit(names, local(names, [run]), vector), run, made, settled, correction_n)
 
 
 def _at_run(about: LogPosterior, vector: Array, rounds: int) -> tuple[Array, float]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from bayeskin import storage
-from bayeskin.access_guard import off_limits
+from bayeskin.access_guard import guarded
 from bayeskin.errors import InputError
 
 RECORDINGS, SEALS, VERDICTS = "recordings", "seals", "verdicts"
@@ -77,5 +77,5 @@ def read_keys(folder: Path) -> dict[str, Mapping[str, Any]]:
 
 
 def closed(folder: Path) -> AbstractContextManager[None]:
-    """Returns a context in which this program's processes cannot open the set's seals (`off_limits`)."""
-    return off_limits(folder / SEALS)
+    """Returns a context in which this program's processes cannot open the set's seals (`guarded`)."""
+    return guarded(folder / SEALS)

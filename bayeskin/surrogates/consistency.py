@@ -18,7 +18,7 @@ from bayeskin.surrogates.two_fidelities import CorrectedLatents
 Shaped = tuple[str, NDArray[Any], tuple[int, ...]]  # name, array, expected shape
 
 
-def refuse_unsound(surrogate: ShapeSurrogate) -> None:
+def check_consistency(surrogate: ShapeSurrogate) -> None:
     """Raises an InputError that names the first array that does not match the others."""
     space, edges_s, active = surrogate.space, surrogate.edges_s, surrogate.active
     for p in space.parameters:

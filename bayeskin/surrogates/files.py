@@ -13,7 +13,7 @@ import numpy as np
 from bayeskin import __version__, storage
 from bayeskin.errors import InputError
 from bayeskin.surrogates.chaos import LatentChaos
-from bayeskin.surrogates.consistency import refuse_unsound
+from bayeskin.surrogates.consistency import check_consistency
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.shapes import ShapeTransform
 from bayeskin.surrogates.surrogate import Latents, ShapeSurrogate
@@ -120,7 +120,7 @@ def _load(path: Path) -> tuple[ShapeSurrogate, dict[str, Any]]:
             storage.read(handle["transform"], ShapeTransform, path), latents,
             json.loads(handle.attrs["provenance"]), frozen_array(active, np.int64),
         )  # fmt: skip
-        refuse_unsound(surrogate)
+        check_consistency(surrogate)
         manifest = json.loads(handle.attrs["manifest"])
         if not isinstance(manifest, dict) or not isinstance(surrogate.provenance, dict):
             raise InputError("manifest or provenance", "JSON of another kind", "a table of names and values")

@@ -32,7 +32,7 @@ from bayeskin.surrogates import Similarity, load_manifest, train
 from bayeskin.types import Array, BinnedForce, Design, PadMotion, ParameterSpace
 from bayeskin.workflow.calibration import log_posterior_of
 from bayeskin.workflow.engine import CannotGoOn, Run, Stage
-from bayeskin.workflow.executor import crew
+from bayeskin.workflow.executor import executor
 from bayeskin.workflow.model import check_protocol, full_model, own_files, reduced_files, waves_model
 from bayeskin.workflow.provenance import caption
 from bayeskin.workflow.shipping import check_fits, shipped_files
@@ -167,7 +167,7 @@ def run_wave(
 ) -> None:
     """Runs the points of a wave that are not in the file yet, and stores them there."""
     run.reporter.log(f"{label}: {len(wave.theta)} runs")
-    with crew(run) as run_all:
+    with executor(run) as run_all:
         run_design(
             runs_file, wave, edges_s, partial(model, motion), model.hash, run_all, partial(tell, run, label)
         )

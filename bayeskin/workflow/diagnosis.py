@@ -23,24 +23,32 @@ from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.contributions import Contribution, contributions
 from bayeskin.mismatch.discrepancy import discrepancy
-from bayeskin.mismatch.emulate import Emulated, emulate
+from bayeskin.mismatch.emulate import EmulatedPosterior, emulate
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.held_out import end_of_second_hold, fit_beginning
 from bayeskin.mismatch.hypotheses import Evidences, Family, Judgement, judge_family
 from bayeskin.mismatch.locate import Located, locate
-from bayeskin.mismatch.resample import Resampled, resample
+from bayeskin.mismatch.resample import PosteriorDraws, resample
 from bayeskin.mismatch.search import search
 from bayeskin.mismatch.search_context import noise_of
 from bayeskin.mismatch.search_record import SearchResult
-from bayeskin.mismatch.tasks import Ask, FullProbe, Probe, Task
-from bayeskin.mismatch.trust_region import JointFit, within
+from bayeskin.mismatch.tasks import AnswerTasks, FullRunTask, RunTask, Task
+from bayeskin.mismatch.trust_region import SetFit, within
 from bayeskin.recordings import read_recording
 from bayeskin.reduced.region import protocol_outside
 from bayeskin.surrogates import train
 from bayeskin.types import Array, BinnedForce, Design, Surrogate
 from bayeskin.workflow import design, recording, training
-from bayeskin.workflow.diagnosis_outputs import Found, Remainder, Shown, candidates, draw, unexplained, window
+from bayeskin.workflow.diagnosis_outputs import (
+    DiagnosisFigures,
+    DrawnFit,
+    Remainder,
+    candidates,
+    draw,
+    unexplained,
+    window,
+)
 from bayeskin.workflow.diagnosis_tasks import ContextSource, asked, open_context, searches_file
 from bayeskin.workflow.engine import CannotGoOn, Reporter, Run, Stage, open_run, run_stages
 from bayeskin.workflow.model import model_spec
@@ -118,7 +126,7 @@ def context_of(run: Run, source: ContextSource) -> DiagnosisContext:
     return context
 
 
-def searched(run: Run, context: DiagnosisContext, ask: Ask) -> SearchResult:
+def searched(run: Run, context: DiagnosisContext, ask: AnswerTasks) -> SearchResult:
     """Returns the search of a run; after a diagnosis all its answers are kept."""
     tell = partial(_tell, run)
     known, solves = context.known, context.forward.solves
@@ -191,7 +199,7 @@ def _work(run: Run) -> Mapping[str, Any]:
     write_json(run.at(NAME, "diagnosis.json"), answer)
     figures = draw(
         run.folder / NAME, caption(run), context.binned, context.motion,
-        Found(
+        DiagnosisFigures(
             pictured[()], pictured[best], None if begun is None else split_s, context.base.parameters, parts,
             remainder,
         ),
@@ -217,28 +225,30 @@ def _noise_of(fit: Fit, values: Mapping[str, float]) -> dict[str, float]:
     return {name: values[name] for name in fit.log_posterior.names if name not in space}
 
 
-def _drawn(fit: Fit, seed: int) -> Resampled:
+def _drawn(fit: Fit, seed: int) -> PosteriorDraws:
     """Draws of the posterior about a fit's run, as far from it as `REACH`."""
     about = fit.log_posterior
     near = within(about, np.clip(about.vector(fit.theta), *about.bounds), REACH)
     return resample(replace(fit, log_posterior=near), seed)
 
 
-def _emulated(context: DiagnosisContext, ask: Ask, maxima: Sequence[JointFit], seed: int) -> Emulated:
+def _emulated(
+    context: DiagnosisContext, ask: AnswerTasks, maxima: Sequence[SetFit], seed: int
+) -> EmulatedPosterior:
     """A set's posterior from reduced runs where it is; about the fit's run where none of them finishes."""
     found = maxima[0]
     names, space = found.fit.names, context.space(found.fit.names)
 
     def forces(points: Array, count: int) -> tuple[list[Any], list[Any]]:
         values = [dict(zip(space.names, map(float, row), strict=True)) for row in points]
-        tasks: list[Task] = [FullProbe(names, one) for one in values[:count]]
-        answers: list[Any] = ask([*tasks, *(Probe(names, one) for one in values)])
+        tasks: list[Task] = [FullRunTask(names, one) for one in values[:count]]
+        answers: list[Any] = ask([*tasks, *(RunTask(names, one) for one in values)])
         return answers[count:], answers[:count]
 
     learn = partial(_learnt, seed=seed)
     emulated = emulate(maxima, forces, learn, noise_of(context.binned), seed)
     if isinstance(emulated, str):
-        return Emulated(found.fit, _drawn(found.fit, seed), 0, None, False)
+        return EmulatedPosterior(found.fit, _drawn(found.fit, seed), 0, None, False)
     return emulated
 
 
@@ -265,17 +275,17 @@ def _mechanisms(
 
 
 def _set(names: tuple[str, ...], found: SearchResult, said: Evidences, family: Family) -> dict[str, Any]:
-    one: JointFit = found.fits[names]
+    one: SetFit = found.fits[names]
     return {
         "mechanisms": list(names), "probability": family.probability_of_set(names),
         "log_evidence": one.fit.log_evidence, "log_evidence_alone": said.alone,
-        "log_evidence_with_smooth": said.with_smooth,
+        "log_evidence_with_smooth": said.with_discrepancy,
         "settled": one.settled, "runs": one.runs,
     }  # fmt: skip
 
 
 def _fit(
-    binned: BinnedForce, fit: Fit, drawn: Resampled, shown: Shown, split_s: float | None
+    binned: BinnedForce, fit: Fit, drawn: PosteriorDraws, shown: DrawnFit, split_s: float | None
 ) -> dict[str, Any]:
     usable, held_out = bins_in_windows(binned, None) >= 0, None
     if shown.held_out_n is not None and split_s is not None:
@@ -293,10 +303,10 @@ def _fit(
     }
 
 
-def _shown(fit: Fit, located: Located, drawn: Resampled, begun: Fit | None) -> Shown:
+def _shown(fit: Fit, located: Located, drawn: PosteriorDraws, begun: Fit | None) -> DrawnFit:
     some = inference.evenly(drawn.draws, PREDICTIVE_DRAWS)
     band_n = inference.bands(fit.log_posterior, some, np.random.default_rng(1)).interval(0.9)
-    return Shown(fit.force_n, band_n, None if begun is None else begun.force_n, located, drawn.summary)
+    return DrawnFit(fit.force_n, band_n, None if begun is None else begun.force_n, located, drawn.summary)
 
 
 def _checked(context: DiagnosisContext, found: SearchResult, names: tuple[str, ...]) -> dict[str, Any]:

@@ -28,7 +28,7 @@ class Remainder:
 
 
 @dataclass(frozen=True)
-class Shown:
+class DrawnFit:
     """A fit as it is drawn.
 
     force_n (m,) [N]; band_n : edges of the predictive band of 90 %, (m,) each
@@ -44,15 +44,15 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class Found:
+class DiagnosisFigures:
     """The contents of the figures: fits without and with the best set, what that has of the force.
 
     split_s : until when what is `held_out_n` was fitted; base : parameters of the model without mechanisms;
     remainder : None where the verdict leaves nothing to describe
     """
 
-    before: Shown
-    after: Shown
+    before: DrawnFit
+    after: DrawnFit
     split_s: float | None
     base: Sequence[Parameter]
     parts: Sequence[Contribution]
@@ -115,7 +115,7 @@ def unexplained(left: Remainder) -> dict[str, Any]:
 
 
 def draw(
-    folder: Path, made_by: str, binned: BinnedForce, motion: PadMotion, found: Found,
+    folder: Path, made_by: str, binned: BinnedForce, motion: PadMotion, found: DiagnosisFigures,
     candidates: Sequence[Mapping[str, Any]],
 ) -> list[Path]:  # fmt: skip
     """Writes the figures into a folder, the run in their metadata; returns their paths."""

@@ -20,7 +20,7 @@ from bayeskin.json_files import read_lines
 from bayeskin.mismatch.answers import answer, read_answer
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.fit import QUICK_S, without_swings
-from bayeskin.mismatch.tasks import Ask, Task
+from bayeskin.mismatch.tasks import AnswerTasks, Task
 from bayeskin.recordings import analyse, bin_recording, jumps_of
 from bayeskin.types import BinnedForce, Jumps, PadMotion, ParameterSpace, Recording
 
@@ -77,7 +77,9 @@ def _opened_once(source: ContextSource) -> DiagnosisContext:
 
 
 @contextmanager
-def asked(source: ContextSource, context: DiagnosisContext, file: Path, workers: int) -> Iterator[Ask]:
+def asked(
+    source: ContextSource, context: DiagnosisContext, file: Path, workers: int
+) -> Iterator[AnswerTasks]:
     """Yields a function that answers tasks in worker processes; a file keeps all answers.
 
     A task whose answer is in the file is not run again. Raises InputError for a file with other contents.

@@ -11,14 +11,14 @@ from bayeskin.execution.local import Map, local
 from bayeskin.workflow.engine import Run
 
 
-def made_by(run: Run, scheduler: str) -> Run:
+def with_scheduler(run: Run, scheduler: str) -> Run:
     """Returns the run with its full runs made through the Dask scheduler at an address."""
     design = run.config.design.model_copy(update={"scheduler": scheduler})
     return replace(run, config=run.config.model_copy(update={"design": design}))
 
 
 @contextmanager
-def crew(run: Run) -> Iterator[Map]:
+def executor(run: Run) -> Iterator[Map]:
     """Yields the executor that the configuration asks for, as a function that maps over items.
 
     Raises InputError where a cluster is not available.

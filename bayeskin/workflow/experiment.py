@@ -23,7 +23,7 @@ from bayeskin.forward.reduced import ReducedForward
 from bayeskin.json_files import plain, write_json
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.fit import Fit
-from bayeskin.mismatch.tasks import Ask
+from bayeskin.mismatch.tasks import AnswerTasks
 from bayeskin.workflow import diagnosis
 from bayeskin.workflow.diagnosis import context_of, opened, searched, source_of
 from bayeskin.workflow.diagnosis_tasks import asked, searches_file
@@ -87,7 +87,7 @@ def _diagnosis(run: Run) -> str:
 
 
 def _searched(
-    fits: Sequence[Fit], context: DiagnosisContext, ask: Ask, reporter: Reporter
+    fits: Sequence[Fit], context: DiagnosisContext, ask: AnswerTasks, reporter: Reporter
 ) -> list[Experiment]:
     """Protocols judged, the most telling first."""
     assert isinstance(context.forward, ReducedForward)

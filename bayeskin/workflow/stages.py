@@ -11,7 +11,7 @@ from bayeskin.json_files import plain, write_json
 from bayeskin.number_format import at_edge
 from bayeskin.workflow import design, diagnosis, indices, maximum, posterior, recording, training
 from bayeskin.workflow.engine import Outcome, Reporter, Run, Stage, open_run, run_stages, standing
-from bayeskin.workflow.executor import made_by
+from bayeskin.workflow.executor import with_scheduler
 from bayeskin.workflow.folder import read_record
 from bayeskin.workflow.page import write_page
 
@@ -99,7 +99,7 @@ def run(
     opened = open_run(config, reporter)
     stages = stages or stages_of(opened.config)
     if scheduler is not None:
-        opened = made_by(opened, scheduler)
+        opened = with_scheduler(opened, scheduler)
     outcomes = run_stages(opened, stages, last or "report")
     answer = outcomes[-1]
     text = _in_words(answer, outcomes, opened.folder)

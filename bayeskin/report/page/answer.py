@@ -13,7 +13,7 @@ from typing import Any
 from bayeskin.report.mismatch import faint_in_words
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.numbers import interval, number, percent, quantity, scale, with_unit
-from bayeskin.report.page.parts import Answer, Bar, Made, Verdict
+from bayeskin.report.page.parts import Answer, Bar, ParameterSummary, Verdict
 
 # Each row holds a phrase with which a sentence of `inference.identify` begins after the parameter's name, the
 # words that the page shows for it, and the tone of these words.
@@ -55,7 +55,7 @@ def prior_range(said: Mapping[str, Any]) -> str:
     return f"{prior['kind']}{about}, {interval(prior['lower'], prior['upper'], said['unit'])}"
 
 
-def _parameter_rows(facts: RunFacts) -> list[Made]:
+def _parameter_rows(facts: RunFacts) -> list[ParameterSummary]:
     """Returns a row for each parameter of the posterior."""
     summaries, known_sentences = facts.said("sample").get("parameters", {}), sentences(facts)
     rows = []
@@ -66,7 +66,7 @@ def _parameter_rows(facts: RunFacts) -> list[Made]:
         word, tone = learnt(sentence)
         leans = re.search(r"leans on the prior's (\w+) bound", sentence)
         rows.append(
-            Made(
+            ParameterSummary(
                 name,
                 meaning,
                 with_unit(summary["median"], *scale([summary[key] for key in _THREE], summary["unit"])),

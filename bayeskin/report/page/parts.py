@@ -124,7 +124,7 @@ class Bar:
 
 
 @dataclass(frozen=True)
-class Made:
+class ParameterSummary:
     """Holds one line of the answer: a parameter, its meaning, its posterior and its prior."""
 
     name: str
@@ -154,7 +154,7 @@ class Verdict:
 class Answer:
     """Holds the answers to a reader's first questions: parameters, trust in them, and missing physics."""
 
-    made: Sequence[Made]
+    made: Sequence[ParameterSummary]
     made_of: Verdict
     sure: Verdict
     missing: Verdict
