@@ -62,9 +62,9 @@ class ReducedForward:
         force_n = simulation.bin_means(self.edges_s)
         if not derive:
             return ModelRun(at, force_n, None)
-        slopes_n = simulation.gradient_bin_means(self.edges_s)
-        if not np.all(np.isfinite(slopes_n)):
+        if not np.all(np.isfinite(simulation.gradient_n)):
             return "the derivatives of the run are not finite"
+        slopes_n = simulation.gradient_bin_means(self.edges_s)
         offset = np.array([(values[name] - wanted) / by[name] for name, wanted in zip(by, at, strict=True)])
         return ModelRun(at, force_n - slopes_n @ offset, slopes_n)
 
