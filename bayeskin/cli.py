@@ -39,7 +39,7 @@ class _Workflow(click.Group):
     ORDER: ClassVar[dict[str, tuple[str, ...]]] = {
         "From a recording to an answer": ("doctor", "new", "import", "run", "diagnose", "report"),
         "Single stages": ("reduce", "design", "train", "map", "sample", "sobol"),
-        "Further": ("experiment", "simulate", "serve", "prove", "conceal"),
+        "Further commands": ("experiment", "simulate", "serve", "prove", "conceal"),
     }
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -77,7 +77,7 @@ def cli() -> None:
 @cli.command("import", short_help="Read a recording (xlsx, csv, tsv, h5), write it as HDF5.")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("-o", "out", required=True, type=click.Path(path_type=Path), help="HDF5 file to write.")
-@click.option("--sheet", help="Sheet of a workbook, where several hold the columns.")
+@click.option("--sheet", help="Sheet of a workbook, if several sheets have the columns.")
 @as_json
 def import_(file: Path, out: Path, sheet: str | None, as_json: bool) -> None:
     """Read a recording (xlsx, csv, tsv, h5) and write it in SI units as HDF5.
@@ -120,12 +120,14 @@ def new(recording: Path | None, out: Path | None, device: Path | None, as_json: 
     from bayeskin.workflow.new import new_config, new_demo
 
     if recording is None and device is not None:
-        raise InputError(f"--device {device}", "no RECORDING", "one: the demo is of the article's device")
+        raise InputError(
+            f"--device {device}", "no RECORDING", "a RECORDING, because the demo uses the article's device"
+        )
     _answer(new_demo(out) if recording is None else new_config(recording, out, device), as_json)
 
 
 a_scheduler = click.option(
-    "--scheduler", metavar="ADDRESS", help="Dask scheduler that makes the full runs, as tcp://HOST:PORT."
+    "--scheduler", metavar="ADDRESS", help="Dask scheduler that runs the full model, as tcp://HOST:PORT."
 )
 
 
@@ -160,16 +162,29 @@ def reduce_(source: Path | None, out: Path | None, scheduler: str | None, as_jso
 @click.option(
     "--recording", type=click.Path(path_type=Path), help="Recording whose displacement drives the run."
 )
-@click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="A parameter, in SI units.")
-@click.option("--mechanism", "mechanisms", multiple=True, metavar="NAME", help="Physics to add; repeatable.")
+@click.option(
+    "--set", "settings", multiple=True, metavar="NAME=VALUE", help="A parameter in SI units; repeatable."
+)
+@click.option(
+    "--mechanism", "mechanisms", multiple=True, metavar="NAME", help="Mechanism to add; repeatable."
+)
 @a_device
 @click.option("--mesh", help="'bricks' or a gmsh file; default as in CONFIG.")
 @click.option("--observation", type=click.Choice(["reaction", "article"]), help="Default as in CONFIG.")
 @click.option("-o", "out", required=True, type=click.Path(path_type=Path), help="File to write: .csv or .h5.")
-@click.option("--reduced", is_flag=True, help="Run the device's reduced model in the full one's place.")
+@click.option(
+    "--reduced", is_flag=True, help="Run the reduced model of the device instead of the full model."
+)
 @click.option("--fields", type=click.Path(path_type=Path), help="Folder for the fields over time (ParaView).")
 @click.option("--figures", type=click.Path(path_type=Path), help="Folder for a figure of the fields.")
-@click.option("--at", "at_s", multiple=True, type=float, metavar="SECONDS", help="A time that it shows.")
+@click.option(
+    "--at",
+    "at_s",
+    multiple=True,
+    type=float,
+    metavar="SECONDS",
+    help="Time that the figure shows; repeatable.",
+)
 @as_json
 def simulate(as_json: bool, **options: Any) -> None:
     """Run the full model once on a recording's displacement (default: the demo's).
@@ -204,7 +219,7 @@ def simulate(as_json: bool, **options: Any) -> None:
 def _stage_command(name: str, text: str, example: str = "runs/demo.toml") -> None:
     """Adds the command of a single stage; `text` and `example` appear in its help."""
 
-    @cli.command(name, help=f"{text}\n\nWhat it needs of earlier stages is done first.\n\n"
+    @cli.command(name, help=f"{text}\n\nEarlier stages that it needs run first.\n\n"
                             f"\b\nExample:\n  bayeskin {name} {example}\n"
                             f"  bayeskin {name} {example} --json")  # fmt: skip
     @a_config
@@ -215,10 +230,10 @@ def _stage_command(name: str, text: str, example: str = "runs/demo.toml") -> Non
 
 
 _stage_command("design", "Run the full model at the design's points, wave by wave.")
-_stage_command("train", "Train the surrogate on the design, validate it on held-out points.")
-_stage_command("map", "Find the most probable point and check it by the full model.")
-_stage_command("sample", "Sample the posterior, check it at draws; bands on the force.")
-_stage_command("sobol", "Sobol' indices of the force over time.")
+_stage_command("train", "Train the surrogate and validate it on held-out points.")
+_stage_command("map", "Find the most probable point and check it with the full model.")
+_stage_command("sample", "Sample the posterior and check it with the full model.")
+_stage_command("sobol", "Compute Sobol' indices of the force over time.")
 
 
 @cli.command()
@@ -287,7 +302,7 @@ def diagnose(source: Path, device: Path | None, as_json: bool) -> None:
     _answer(document, as_json)
 
 
-@cli.command(short_help="Propose the further test that tells look-alikes apart.")
+@cli.command(short_help="Propose a test that tells look-alike mechanisms apart.")
 @click.argument("source", type=click.Path(path_type=Path))
 @a_device
 @as_json
@@ -314,10 +329,12 @@ def experiment(source: Path, device: Path | None, as_json: bool) -> None:
     _answer(document, as_json)
 
 
-@cli.command(short_help="Measure how good diagnoses are, on concealed effects.")
+@cli.command(short_help="Measure how good diagnoses of concealed effects are.")
 @click.argument("folder", required=False, type=click.Path(path_type=Path))
-@click.option("--at-most", type=click.IntRange(min=0), metavar="N", help="Diagnose N more, then score.")
-@click.option("--rediagnose", default=0, type=click.IntRange(min=0), metavar="N", help="Diagnose N again.")
+@click.option(
+    "--at-most", type=click.IntRange(min=0), metavar="N", help="Diagnose at most N more, then score."
+)
+@click.option("--rediagnose", default=0, type=click.IntRange(min=0), metavar="N", help="Repeat N diagnoses.")
 @as_json
 def prove(folder: Path | None, at_most: int | None, rediagnose: int, as_json: bool) -> None:
     """Measure how good diagnoses are, on recordings with concealed effects whose keys are known.
@@ -340,11 +357,13 @@ def prove(folder: Path | None, at_most: int | None, rediagnose: int, as_json: bo
     _answer(document, as_json)
 
 
-@cli.command(short_help="Make a set of recordings for prove.")
+@cli.command(short_help="Make a set of recordings for `bayeskin prove`.")
 @click.argument("folder", type=click.Path(path_type=Path))
-@click.option("--seed", required=True, type=int, help="What the set is drawn from.")
-@click.option("--count", required=True, type=int, help="Recordings in the set.")
-@click.option("--only", multiple=True, metavar="NAME", help="`nothing`, a mechanism, an effect outside.")
+@click.option("--seed", required=True, type=int, help="Random seed of the set.")
+@click.option("--count", required=True, type=int, help="Number of recordings.")
+@click.option(
+    "--only", multiple=True, metavar="NAME", help="`nothing`, a mechanism or an effect outside the catalogue."
+)
 @as_json
 def conceal(folder: Path, seed: int, count: int, only: tuple[str, ...], as_json: bool) -> None:
     """Make a set for `bayeskin prove`: recordings by the full model, with the effects' keys under seal.
@@ -371,7 +390,9 @@ def conceal(folder: Path, seed: int, count: int, only: tuple[str, ...], as_json:
 @cli.command(short_help="Serve the full model to other tools by UM-Bridge.")
 @click.argument("config", required=False, type=click.Path(path_type=Path))
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen at.")
-@click.option("--port", default=4242, show_default=True, type=click.IntRange(0, 65535), help="0: a free one.")
+@click.option(
+    "--port", default=4242, show_default=True, type=click.IntRange(0, 65535), help="Port; 0 takes a free one."
+)
 @as_json
 def serve(config: Path | None, host: str, port: int, as_json: bool) -> None:
     """Serve the forward model by UM-Bridge, for other tools of uncertainty quantification.

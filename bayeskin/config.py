@@ -76,7 +76,9 @@ class ModelConfig(Section):
     def _observation_own_needs_a_forward_model(self) -> ModelConfig:
         """Refuses the observation "own" without a forward model, and another observation with it."""
         if (self.observation == "own") != (self.forward is not None):
-            raise ValueError(f"observation: found {self.observation!r}; expected 'own' with model.forward")
+            raise ValueError(
+                f"observation: found {self.observation!r}; expected 'own' with model.forward, and only then"
+            )
         return self
 
     @model_validator(mode="after")
@@ -118,7 +120,7 @@ class PriorConfig(Section):
         needed = {"normal": {"mean", "sd"}, "log-normal": {"median", "factor"}}.get(self.prior or "", set())
         if given != needed:
             found = ", ".join(sorted(given)) or "none of its numbers"
-            expected = f"{' and '.join(sorted(needed))}" if needed else "these with a normal prior only"
+            expected = f"{' and '.join(sorted(needed))}" if needed else "them only with a normal prior"
             raise ValueError(f"prior: found {found}; expected {expected}")
         return self
 
@@ -281,10 +283,12 @@ class Config(Section):
                 f"model.refinement {model.refinement}"
             )
             expected = "refinement 1 or more" if coarse == "reduced" else "a higher refinement"
-            raise ValueError(f"design.coarse: found {found}; expected bricks of {expected}")
+            raise ValueError(f"design.coarse: found {found}; expected bricks with {expected}")
         if model.forward is not None and (coarse is not None or self.surrogate.file is not None):
             key = "design.coarse" if coarse is not None else "surrogate.file"
-            raise ValueError(f"{key}: found one with model.forward; expected none: it is the full model's")
+            raise ValueError(
+                f"{key}: found a value with model.forward; expected none, because it concerns the full model"
+            )
         return self
 
     @property
@@ -312,8 +316,8 @@ class Config(Section):
             raise InputError(f"{where}: tissue.{name}m", found, expected)
         if self.model.observation != "reaction" and stated != StatedGeometry(Geometry()):
             section = "device" if self.device != DeviceConfig() else "tissue"
-            found = f"another than the article's, with observation {self.model.observation!r}"
-            raise InputError(f"{where}: {section}", found, "observation 'reaction' with it")
+            found = f"settings other than the article's, with observation {self.model.observation!r}"
+            raise InputError(f"{where}: {section}", found, "observation 'reaction'")
         return stated
 
 
@@ -420,7 +424,7 @@ def _space_of_forward_model(config: Config, where: object) -> ParameterSpace:
         for key in ("lower", "upper"):
             if getattr(prior, key) is None:
                 at = f"{where}: parameters.{name}.{key}"
-                raise InputError(at, "nothing", "a bound, with model.forward")
+                raise InputError(at, "nothing", "a bound, because model.forward is set")
         blank = Parameter(name, prior.unit or "", 0.0, 0.0, "uniform")
         parameters.append(_overridden(blank, prior, where))
     return ParameterSpace(tuple(parameters))
@@ -443,7 +447,9 @@ def _overridden(default: Parameter, change: PriorConfig | None, where: object) -
     centre, spread = change.centre_and_spread if change.prior else (default.centre, default.spread)
     if prior.endswith("normal") and not lower <= centre <= upper:
         raise InputError(
-            at, f"a prior about {centre:g} {default.unit}", f"{lower:g} to {upper:g}, its bounds"
+            at,
+            f"a prior centred at {centre:g} {default.unit}",
+            f"{lower:g} to {upper:g}, the bounds of the parameter",
         )
     return replace(
         default, lower=lower, upper=upper, prior=prior, source=change.source, centre=centre, spread=spread

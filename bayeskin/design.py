@@ -362,7 +362,7 @@ def _sobol_unit(dim: int, n: int, seed: int | Sequence[int], skip: int = 0) -> A
     from scipy.stats import qmc  # the import takes a second, which worker processes save
 
     if n < 0 or skip < 0 or np.min(seed) < 0:
-        raise InputError("Sobol' points", f"n = {n}, skip = {skip}, seed = {seed}", "none of them negative")
+        raise InputError("Sobol' points", f"n = {n}, skip = {skip}, seed = {seed}", "values of at least 0")
     engine = qmc.Sobol(dim, scramble=True, seed=np.random.default_rng(seed))
     if skip:
         return engine.fast_forward(skip).random(n)

@@ -18,7 +18,7 @@ from bayeskin.geometry import BOUNDS_MM, ForceOn, Geometry, Guard, moved
 from bayeskin.sections import Section, checked, read_toml
 from bayeskin.types import Parameter
 
-EXPECTED = "the sections [device] and [tissue] in TOML"
+EXPECTED = "a TOML file with the sections [device] and [tissue]"
 LARGEST_SD = 1 / 3  # as a share of the mean, so that a normal prior stays away from zero
 REACH = 3.0  # the prior of a length extends so many sd to either side of the mean
 # Relative distance of a length's bounds from impossible lengths, because derivatives take small steps.
@@ -193,15 +193,16 @@ def device_lines(device: DeviceConfig, tissue: TissueConfig) -> list[str]:
     guard_text = f"{{ gap = {guard.gap:g}, width = {guard.width:g} }}" if guard else "false"
     return [
         "[device]  # lengths in mm",
-        f"gauge_mm = {device.gauge_mm:g}  # between the pads' inner edges",
-        f"pad_mm = [{pad}]  # along the pull, across it",
-        f"guard_mm = {guard_text}  # from the pad, of the guard; or false: none",
-        f'force_on = "{device.force_on}"  # what the load cell holds; or "pad and guard"',
+        f"gauge_mm = {device.gauge_mm:g}  # distance between the inner edges of the pads",
+        f"pad_mm = [{pad}]  # length along the pull, width across it",
+        f"guard_mm = {guard_text}  # gap between pad and guard, width of the guard; false: no guard",
+        f'force_on = "{device.force_on}"  # the parts that the load cell holds: "pad" or "pad and guard"',
         "",
         "[tissue]  # lengths in mm",
-        f"cutis_mm = {_length_as_toml(tissue.cutis_mm)}",
-        f"subcutis_mm = {_length_as_toml(tissue.subcutis_mm)}",
-        f'arm_radius_mm = {_length_as_toml(tissue.arm_radius_mm)}  # below the skin; or "flat"',
+        f"cutis_mm = {_length_as_toml(tissue.cutis_mm)}  # thickness of the upper layer",
+        f"subcutis_mm = {_length_as_toml(tissue.subcutis_mm)}  # thickness of the lower layer",
+        f"arm_radius_mm = {_length_as_toml(tissue.arm_radius_mm)}"
+        '  # radius of the arm below the skin, or "flat"',
     ]
 
 

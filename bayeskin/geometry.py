@@ -78,14 +78,16 @@ class Geometry:
                 _check_length(name, value, bounds)
         if self.guard is not None and self.guard.width_m <= self.guard.gap_m:
             found = f"{_in_mm(self.guard.width_m)} with a gap of {_in_mm(self.guard.gap_m)}"
-            raise InputError("guard.width_m", found, "more than the gap: it reaches so far beside the pad")
+            raise InputError(
+                "guard.width_m", found, "a width above the gap, because beside the pad it includes the gap"
+            )
         if self.force_on not in ("pad", "pad and guard"):
             raise InputError("force_on", repr(self.force_on), "'pad' or 'pad and guard'")
         if self.force_on == "pad and guard" and self.guard is None:
-            raise InputError("force_on", "'pad and guard' without a guard", "'pad', or a guard")
+            raise InputError("force_on", "'pad and guard' without a guard", "'pad', or a device with a guard")
         if self.arm_radius_m is not None and self.box_m[1] > math.pi * self.arm_radius_m:
             least = _in_mm(self.least_radius_m)
-            expected = f"at least {least}, so that skin as wide as this device needs does not meet itself"
+            expected = f"at least {least}, so that the modelled skin does not overlap itself"
             raise InputError("arm_radius_m", _in_mm(self.arm_radius_m), expected)
 
     def _value(self, name: str) -> float | None:
@@ -182,7 +184,7 @@ def _check_length(name: str, length_m: float, bounds_mm: tuple[float, float]) ->
     if length_m <= 0.0:
         reasons = {"gauge_m": ": the pads overlap", "guard.gap_m": ": the guard lies inside the pad"}
         raise InputError(name, found + reasons.get(name, ""), f"above zero, {expected}")
-    for factor, text in ((1e-3, "1000 times too much"), (1e3, "1000 times too little")):
+    for factor, text in ((1e-3, "1000 times too large"), (1e3, "1000 times too small")):
         if low <= factor * 1e3 * length_m <= high:
-            found += f", {text} by its looks: a wrong unit?"
+            found += f", probably {text} (is the unit right?)"
     raise InputError(name, found, expected)

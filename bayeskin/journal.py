@@ -99,13 +99,15 @@ class Journal:
             try:
                 design, run = self._run(json.loads(content))
             except (KeyError, TypeError, ValueError, RecursionError):
-                expected = "one that bayeskin wrote; without the file all runs are made anew"
-                raise InputError(f"{self.path}, line {number}", "what is no run", expected) from None
+                expected = "a run that bayeskin wrote (without this file, all runs are repeated)"
+                raise InputError(
+                    f"{self.path}, line {number}", "a line that is not a run", expected
+                ) from None
             if design != self.identity:
                 raise InputError(
                     self.path,
                     "unfinished runs of another model, parameter space or time bins",
-                    "runs of this design; finish or remove those first",
+                    "runs of this design (finish or remove the other runs first)",
                 )
             runs[run.theta.tobytes()] = run
         return runs

@@ -58,6 +58,8 @@ def read_lines(file: Path) -> list[dict[str, Any]]:
             rows.append(None)
         if not isinstance(rows[-1], dict):
             raise InputError(
-                f"{file}, line {number}", "no JSON mapping", "one; without the file all begins anew"
+                f"{file}, line {number}",
+                "no JSON object",
+                "a JSON object (without this file, the work starts again)",
             )
     return rows

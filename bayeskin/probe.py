@@ -22,7 +22,7 @@ STARTS_S, BYTES_A_S = 60.0, 2e6
 MEMORY_BYTES = 4 * 2**30
 MOST_BYTES = 2 * 2**30  # the largest file that is read as a whole
 
-_READ_ALL = """
+READ_ALL = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_AS, (int(sys.argv[2]),) * 2)
 resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -49,7 +49,7 @@ def refuse_endless(path: Path, expected: str, most_bytes: int = MOST_BYTES) -> N
     except (OSError, ValueError) as error:
         raise InputError(path, f"an unreadable file ({error})", expected) from None
     if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe or a device, no file"
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe or a device instead of a file"
         raise InputError(path, kind, expected)
     if status.st_size > most_bytes:
         raise InputError(path, f"{status.st_size} bytes", f"{expected}, of at most {most_bytes} bytes")
@@ -79,14 +79,14 @@ def _fault_of(path: str, size: int, *_version: int) -> str | None:
 
     `_version` only serves the cache: a file that has changed is read again.
     """
-    command = [sys.executable, "-c", _READ_ALL, path, str(MEMORY_BYTES)]
+    command = [sys.executable, "-c", READ_ALL, path, str(MEMORY_BYTES)]
     try:
         reader = subprocess.run(
             command, capture_output=True, text=True, timeout=STARTS_S + size / BYTES_A_S, check=False
         )
     except subprocess.TimeoutExpired:
-        return "not readable as HDF5 (reading it does not end)"
+        return "a file that is not readable as HDF5 (reading it does not end)"
     if reader.returncode == 0:
         return None
-    why = " ".join(reader.stderr.split())[-120:] if reader.returncode == 1 else "it ends the reading process"
-    return f"not readable as HDF5 ({why})"
+    why = " ".join(reader.stderr.split())[-120:] if reader.returncode == 1 else "reading it ends the process"
+    return f"a file that is not readable as HDF5 ({why})"

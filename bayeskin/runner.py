@@ -140,9 +140,9 @@ def load_design(path: Path | str) -> Design:
         if getattr(design, name).shape != shape:
             raise InputError(f"{path}: {name}", f"shape {getattr(design, name).shape}", f"shape {shape}")
     if len(design.messages) != rows:
-        raise InputError(f"{path}: messages", f"{len(design.messages)} of them", f"{rows}, one a row")
+        raise InputError(f"{path}: messages", f"{len(design.messages)} messages", f"{rows}, one for each row")
     if not (np.isfinite(design.theta).all() and np.isfinite(design.force_n[design.ok]).all()):
-        raise InputError(path, "values that are not finite", "finite ones, but for runs that failed")
+        raise InputError(path, "values that are not finite", "finite values, except in runs that failed")
     return design
 
 
@@ -169,7 +169,7 @@ def _bin_means_of(simulate: Simulate, names: tuple[str, ...], edges: Array, thet
         if run.status == "ok":
             force_n, message = _checked_means(run, edges)
         elif not message:
-            message = "the run failed without saying why"
+            message = "the run failed without a message"
     except Unavailable as error:
         unavailable = (error.where, error.found, error.expected)
     except Exception as error:
@@ -182,7 +182,10 @@ def _checked_means(run: Simulation, edges: Array) -> tuple[Array | None, str]:
     slack = 1e-9 * (edges[-1] - edges[0])
     if run.time_s[0] > edges[0] + slack or run.time_s[-1] < edges[-1] - slack:
         covered = f"{run.time_s[0]:g}..{run.time_s[-1]:g} s"
-        return None, f"the run covers {covered}, the bins {edges[0]:g}..{edges[-1]:g} s: use the bins' motion"
+        return (
+            None,
+            f"the run covers {covered}, the bins {edges[0]:g}..{edges[-1]:g} s: use the motion of the bins",
+        )
     if not np.isfinite(run.force_n).all():
         return None, "the force is not finite: tighten the tolerances or narrow the prior box"
     return run.bin_means(edges), run.message
@@ -234,7 +237,7 @@ def _distinct(wave: Wave) -> dict[bytes, Array]:
     """
     theta = wave.theta
     if theta.ndim != 2 or theta.shape[1] != wave.space.dim or len(theta) != len(wave.held_out):
-        raise InputError("points of a design", f"shape {theta.shape}", f"(n, {wave.space.dim})")
+        raise InputError("points of a design", f"shape {theta.shape}", f"shape (n, {wave.space.dim})")
     outside = np.flatnonzero(~wave.space.contains(theta))
     if len(outside):
         row = outside[0]
@@ -261,9 +264,9 @@ def _box(space: ParameterSpace) -> list[list[Any]]:
 def _check_same(path: Path, design: Design, space: ParameterSpace, edges: Array, model_hash: str) -> None:
     """Raises InputError unless runs of this model, space and bins can extend the file's design."""
     if design.model_hash != model_hash:
-        raise InputError(path, f"a design of model {design.model_hash}", f"model {model_hash}")
+        raise InputError(path, f"a design of model {design.model_hash}", f"a design of model {model_hash}")
     if _box(design.space) != _box(space):
-        raise InputError(path, f"parameters {_box(design.space)}", f"{_box(space)}")
+        raise InputError(path, f"parameters {_box(design.space)}", f"parameters {_box(space)}")
     if not np.array_equal(design.edges_s, edges):
         bins, expected_bins = len(design.edges_s) - 1, len(edges) - 1
         raise InputError(

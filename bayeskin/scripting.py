@@ -1,7 +1,7 @@
 """Functions for scripts, after ``import bayeskin as bk``; each of them calls what the commands call.
 
-Settings have the names of a configuration's sections (README) and are checked in the same way. Wrong settings
-raise InputError with one line of text.
+Settings have the names of a configuration's sections (docs/configuration.md) and are checked in the same way.
+Wrong settings raise InputError with one line of text.
 """
 
 from __future__ import annotations
@@ -123,8 +123,10 @@ def check(recording: Recording, posterior: arviz.InferenceData, draws: int = 24)
         inputs = _calibration_inputs(run, recording)
         log_posterior, flat = inputs.log_posterior, inference.draws_of(posterior)[1]
         if json.loads(posterior.attrs["provenance"]).get("identity") != log_posterior.identity:
-            found = f"one by another surrogate than that of {run.config.surrogate.file}"
-            raise InputError("posterior", found, "one of bk.calibrate; `bayeskin run` has checked its own")
+            found = f"a posterior by another surrogate than that of {run.config.surrogate.file}"
+            raise InputError(
+                "posterior", found, "a posterior of bk.calibrate (`bayeskin run` checks its own)"
+            )
         chosen = inference.evenly(flat, draws)
         spec, names, edges = model_spec(run), log_posterior.surrogate.space.names, inputs.binned.edges_s
         force = np.full((len(chosen), len(edges) - 1), np.nan)
@@ -198,7 +200,7 @@ def _with_surrogate(
         if fitting is None:
             raise InputError(
                 f"calibrate {recording.name}", "a protocol that no shipped surrogate was trained on",
-                "surrogate=FILE of `bayeskin train`, or a configuration and `bayeskin run`",
+                "surrogate=FILE from `bayeskin train`, or `bayeskin run` with a configuration",
             )  # fmt: skip
         surrogate = fitting.name
     file = Path(surrogate)
@@ -212,22 +214,28 @@ def _settings_of(recording: Recording, posterior: arviz.InferenceData) -> dict[s
     """
     recording = _checked_recording(recording)
     if "recording_sha256" not in posterior.attrs:
-        raise InputError("posterior", "an InferenceData without provenance", "one made by bayeskin")
+        raise InputError(
+            "posterior", "an InferenceData without provenance", "an InferenceData that bayeskin made"
+        )
     if posterior.attrs["recording_sha256"] != recording.sha256:
         raise InputError(
-            "posterior", f"that of another recording than {recording.name}", "the recording it was made of"
+            "posterior",
+            f"the posterior of another recording than {recording.name}",
+            "the recording of this posterior",
         )
     settings = dict(json.loads(posterior.attrs["provenance"])["config"])
     if settings["surrogate"].get("file") is None:
-        expected = "one of a surrogate's file; `bayeskin run` and `diagnose` do this for a design of its own"
-        raise InputError("posterior", "one of a run with a design of its own", expected)
+        expected = "the posterior of a surrogate file (otherwise use `bayeskin run` or `bayeskin diagnose`)"
+        raise InputError("posterior", "the posterior of a run with its own design", expected)
     return settings
 
 
 def _checked_recording(given: object) -> Recording:
     """Returns the recording. Raises InputError for an object of another type."""
     if not isinstance(given, Recording):
-        raise InputError("recording", f"{type(given).__name__} {given!r:.60}", "one of bk.load_recording")
+        raise InputError(
+            "recording", f"{type(given).__name__} {given!r:.60}", "a recording of bk.load_recording"
+        )
     return given
 
 

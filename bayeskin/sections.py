@@ -14,7 +14,7 @@ from bayeskin.errors import InputError
 from bayeskin.probe import bytes_of
 
 MOST_BYTES = 1_000_000
-TOO_DEEP = "tables or lists nested too deeply"
+TOO_DEEP = "tables or lists that are nested too deeply"
 
 
 class Section(BaseModel):
@@ -59,9 +59,9 @@ def _input_error(path: Path | str, error: ValidationError, root: type[Section]) 
     if kind == "extra_forbidden":
         return InputError(f"{path}: {key}", "an unknown key", one_of(_keys_beside(root, first["loc"])))
     if kind == "missing" and isinstance(first["loc"][-1], int):
-        return InputError(f"{path}: {key}", "nothing", "one entry more")
+        return InputError(f"{path}: {key}", "nothing", "one more entry")
     if kind == "missing":
-        return InputError(f"{path}: {key}", "nothing", "this key: it has no default")
+        return InputError(f"{path}: {key}", "nothing", "a value, because this key has no default")
     if kind == "value_error":  # raised by this package: "key: found X; expected Y"
         inner, _, rest = str(first["ctx"]["error"]).partition(": found ")
         found, _, expected = rest.partition("; expected ")

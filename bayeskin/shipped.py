@@ -18,4 +18,6 @@ def shipped(name: str) -> Path:
     for root in _ROOTS:
         if (root / name).is_file():
             return root / name
-    raise InputError(name, "no such file among those shipped with bayeskin", "a reinstalled package")
+    raise InputError(
+        name, "no such file among those shipped with bayeskin", "a complete installation (reinstall bayeskin)"
+    )

@@ -73,7 +73,7 @@ def write_bytes(path: Path, contents: bytes) -> None:
         os.replace(partial, path)
     except OSError as error:
         raise InputError(
-            path, f"that it cannot be written ({error.strerror})", "room and the right to"
+            path, f"a file that cannot be written ({error.strerror})", "free space and write permission"
         ) from None
     finally:
         partial.unlink(missing_ok=True)
@@ -107,7 +107,11 @@ def reading(path: Path, expected: str) -> Iterator[h5py.File]:
             raise
         raise InputError(f"{path}: {error.where}", error.found, error.expected) from None
     except Exception as error:  # libhdf5, json and numpy raise many types of error for a damaged file
-        fault = "not readable as HDF5" if isinstance(error, OSError) else "contents that cannot be read"
+        fault = (
+            "a file that is not readable as HDF5"
+            if isinstance(error, OSError)
+            else "contents that cannot be read"
+        )
         raise InputError(path, f"{fault} ({in_a_line(error)})", expected) from None
 
 
@@ -153,7 +157,7 @@ def checked(value: T, where: object) -> T:
         if not _is(given, kinds[field.name]):
             found, expected = (
                 " ".join(repr(given).split())[:60],
-                f"{field.type}, as in a {type(value).__name__}",
+                f"{field.type}, as a {type(value).__name__} requires",
             )
             raise InputError(f"{where}: {field.name}", found, expected)
     return value

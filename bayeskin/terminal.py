@@ -84,7 +84,7 @@ def exit_code(call: Callable[[], Any]) -> int:
     except InputError as error:
         return complain(str(error), WRONG_INPUT)
     except (KeyboardInterrupt, click.Abort):
-        return complain("interrupted; the same command goes on from here", INTERRUPTED)
+        return complain("interrupted; run the same command again to continue", INTERRUPTED)
     except OSError as error:
         return complain(f"{error.filename}: {error.strerror}" if error.filename else str(error), WRONG_INPUT)
 

@@ -98,7 +98,7 @@ class ParameterSpace:
         twice = next((name for name in self.names if self.names.count(name) > 1), None)
         if twice is not None:
             raise InputError(
-                "parameters", f"{twice} twice", "names that differ, also from those of mechanisms"
+                "parameters", f"{twice} twice", "different names for all parameters, also those of mechanisms"
             )
         peaked, pairs = [p.name for p in self.parameters if p.peaked], set[frozenset[str]]()
         for first, second, value in self.correlations:
@@ -110,13 +110,13 @@ class ParameterSpace:
                 where = f"correlations: {first} and {second}"
                 raise InputError(where, f"{value:g}", "two different parameters and a value between -1 and 1")
             if {first, second} in pairs:
-                raise InputError(f"correlations: {first} and {second}", "two values", "one")
+                raise InputError(f"correlations: {first} and {second}", "two values", "one value")
             pairs.add(frozenset((first, second)))
         if self.correlations and not np.linalg.eigvalsh(self._correlation).min() > 1e-9:
             stated = ", ".join(
                 f"{first} and {second} {value:g}" for first, second, value in self.correlations
             )
-            raise InputError("correlations", stated, "correlations that can hold together")
+            raise InputError("correlations", stated, "correlations that form a positive definite matrix")
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -1,16 +1,19 @@
-"""Whether the whole chain is calibrated: draws of the prior, recordings made with them, inferred again.
+"""Tests the calibration of the whole inference: parameters drawn from the prior are inferred again.
 
-Simulation-based calibration (Talts et al. 2018, arXiv:1804.06788; Modrak et al. 2023, Bayesian Analysis):
-the rank of the true value among posterior draws is uniform if likelihood, sampler and stopping rule are
-right. Beside it the share of true values inside 50 and 90 % intervals, and of the bins of a fresh recording
-at the same parameters inside the 50 and 90 % bands. On the demo's protocol, its first loading and hold (80
-bins of 0.5 s), with the shipped surrogate, noise priors and limits of trust; 100 draws a posterior.
+The method is simulation-based calibration (Talts et al. 2018, arXiv:1804.06788; Modrak et al. 2023, Bayesian
+Analysis). Parameters are drawn from the prior, a recording is made with them, and the posterior is sampled.
+The rank of the true value among the posterior draws is uniform if likelihood, sampler and stopping rule are
+right. The table also has the share of true values inside the 50 % and 90 % intervals, and the share of the
+bins of a fresh recording at the same parameters inside the 50 % and 90 % bands. The recordings have the
+protocol of the demo, restricted to its first loading and hold (80 bins of 0.5 s). Surrogate, noise priors and
+convergence limits are the shipped ones; each posterior gives 100 draws.
 
     python benchmarks/calibration.py                     # 300 recordings made by the surrogate with its error
-    python benchmarks/calibration.py --data full --n 50  # made by the full model
+    python benchmarks/calibration.py --data full --n 50  # 50 recordings made by the full model
 
-Finished recordings are rows of benchmarks/results/calibration.csv, which a later start does not repeat. A
-chain that is not trusted at its last step is counted, and stays in. Draws docs/figures/calibration.{png,svg}.
+Finished recordings are rows of benchmarks/results/calibration.csv, and a later start does not repeat them.
+Chains that are not trusted at their last step are counted and stay in the table. The program draws
+docs/figures/calibration.{png,svg}.
 """
 
 from __future__ import annotations
@@ -54,7 +57,7 @@ ROWS = rows.Rows(
     rows.RESULTS / "calibration.csv",
     ("surrogate", "data", "seed", "index"),
     (
-        *(f"{what}_{name}" for name in NAMES for what in _EACH),
+        *(f"{quantity}_{name}" for name in NAMES for quantity in _EACH),
         "band50", "band90", "trusted", "steps", "reason", "cpu_s", "code",
     ),
 )  # fmt: skip
@@ -63,7 +66,7 @@ Item = dict[str, Any]
 
 @cache
 def problem() -> LogPosterior:
-    """The demo's posterior on the window; its recorded force is replaced in each replicate."""
+    """Returns the demo's log-posterior on the window; each replicate replaces its recorded force."""
     recording = read_recording(shipped("data/demo.h5"))
     phases = segment(recording)
     surrogate = load_surrogate(shipped("surrogates/demo.h5"))
@@ -72,18 +75,20 @@ def problem() -> LogPosterior:
 
 
 def surrogate_hash() -> str:
-    """Short name of the shipped surrogate: ranks of one say nothing of another."""
+    """Returns a short name of the shipped surrogate, since ranks are valid for one surrogate only."""
     return str(load_manifest(shipped("surrogates/demo.h5"))["arrays_sha256"])[:12]
 
 
 def made_by_surrogate(about: LogPosterior, theta: Array, rng: np.random.Generator) -> Array:
-    """Force [N] of all bins (m,) at theta (D,): mean and an error of the surrogate's, no noise."""
-    at = about.predict(theta)
-    return np.asarray(at.mean[0] + at.factor[0] @ rng.standard_normal(at.factor.shape[2]))
+    """Returns the noise-free force [N] (m,) of all bins: mean plus a draw of the surrogate's error."""
+    prediction = about.predict(theta)
+    return np.asarray(
+        prediction.mean[0] + prediction.factor[0] @ rng.standard_normal(prediction.factor.shape[2])
+    )
 
 
 def made_by_model(about: LogPosterior, theta: Array) -> Array:
-    """Force [N] of all bins (m,) by a full run; raises RuntimeError where it fails."""
+    """Returns the force [N] of all bins (m,) by a full run; raises RuntimeError where the run fails."""
     recording = read_recording(shipped("data/demo.h5"))
     motion = pad_motion("reaction", recording, segment(recording), "idealised")
     names = about.surrogate.space.names
@@ -97,27 +102,30 @@ def made_by_model(about: LogPosterior, theta: Array) -> Array:
 def noisy(
     about: LogPosterior, theta: Array, force_n: Array, diagonal: Array, rng: np.random.Generator
 ) -> Array:
-    """The fitted bins of force_n (m,) with noise drawn at theta (D,); the others as they are."""
+    """Returns force_n (m,) with noise drawn at theta (D,) in the fitted bins; the other bins stay the same.
+
+    diagonal (m,) : independent variance [N^2] of each bin, which is added to the noise
+    """
     chain = about.chain
     noise = draw_noise(chain, about.split(theta)[1], diagonal[None, chain.bins], rng)[0]
-    out = force_n.copy()
-    out[chain.bins] += noise
-    return out
+    noisy_n = force_n.copy()
+    noisy_n[chain.bins] += noise
+    return noisy_n
 
 
 def replicate(item: Item, about: LogPosterior, settings: SampleSettings = SETTINGS) -> Item:
-    """One recording made, inferred and ranked, as a row."""
+    """Makes one recording, infers it, and returns its ranks and coverages as a row."""
     started = time.process_time()
     rng = np.random.default_rng([item["seed"], item["index"], int(item["data"] == "full")])
     theta = about.space.from_unit(rng.uniform(size=about.dim))
-    blank = np.zeros(len(about.surrogate.edges_s) - 1)
+    no_variance = np.zeros(len(about.surrogate.edges_s) - 1)
     if item["data"] == "full":
-        own = fresh = made_by_model(about, theta)
-        diagonal = blank
+        true_n = fresh_true_n = made_by_model(about, theta)
+        diagonal = no_variance
     else:
-        own, fresh = (made_by_surrogate(about, theta, rng) for _ in range(2))
+        true_n, fresh_true_n = (made_by_surrogate(about, theta, rng) for _ in range(2))
         diagonal = about.predict(theta).diagonal[0]
-    recorded, seen = (noisy(about, theta, force, diagonal, rng) for force in (own, fresh))
+    recorded, fresh_n = (noisy(about, theta, force, diagonal, rng) for force in (true_n, fresh_true_n))
     measured = replace(about, binned=replace(about.binned, force_n=recorded))
     seed = int(rng.integers(2**31))
     best = inference.find_map(measured, seed, starts=3, evaluations=2000).theta
@@ -126,7 +134,7 @@ def replicate(item: Item, about: LogPosterior, settings: SampleSettings = SETTIN
     verdict = posterior.convergence.verdict
     return item | {
         **ranked(posterior.flat, theta, rng),
-        **dict(zip(("band50", "band90"), banded(measured, posterior.flat, seen, rng), strict=True)),
+        **dict(zip(("band50", "band90"), banded(measured, posterior.flat, fresh_n, rng), strict=True)),
         "trusted": verdict.trusted, "steps": posterior.convergence.steps,
         "reason": "" if verdict.trusted else verdict.reasons[0],
         "cpu_s": time.process_time() - started, "code": rows.CODE,
@@ -134,32 +142,35 @@ def replicate(item: Item, about: LogPosterior, settings: SampleSettings = SETTIN
 
 
 def ranked(flat: Array, theta: Array, rng: np.random.Generator) -> Item:
-    """Rank of each true value among `DRAWS` draws, 0 to DRAWS, and whether central intervals hold it."""
-    few = flat[rng.choice(len(flat), DRAWS, replace=len(flat) < DRAWS)]
-    out: Item = {}
+    """Returns for each parameter its true value and the rank of that value among `DRAWS` draws, 0 to `DRAWS`.
+
+    The row also says whether the central 50 % and 90 % intervals contain the true value.
+    """
+    draws = flat[rng.choice(len(flat), DRAWS, replace=len(flat) < DRAWS)]
+    row: Item = {}
     for j, name in enumerate(NAMES):
         share = float(np.mean(flat[:, j] < theta[j]))
-        out[f"true_{name}"] = float(theta[j])
-        out[f"rank_{name}"] = int(np.sum(few[:, j] < theta[j]))
-        out[f"in50_{name}"], out[f"in90_{name}"] = 0.25 <= share <= 0.75, 0.05 <= share <= 0.95
-    return out
+        row[f"true_{name}"] = float(theta[j])
+        row[f"rank_{name}"] = int(np.sum(draws[:, j] < theta[j]))
+        row[f"in50_{name}"], row[f"in90_{name}"] = 0.25 <= share <= 0.75, 0.05 <= share <= 0.95
+    return row
 
 
 def banded(measured: LogPosterior, flat: Array, seen: Array, rng: np.random.Generator) -> tuple[float, float]:
-    """Share of the fitted bins of a fresh recording (m,) inside the 50 and the 90 % band."""
-    some = flat[np.linspace(0, len(flat) - 1, min(1000, len(flat))).astype(int)]
-    found = inference.bands(measured, some, rng)
-    again = dataclasses.replace(measured.binned, force_n=seen)
-    low50, high50 = found.interval(0.5)
-    low90, high90 = found.interval(0.9)
+    """Returns the shares of the fitted bins of a fresh recording (m,) inside the 50 % and the 90 % band."""
+    draws = flat[np.linspace(0, len(flat) - 1, min(1000, len(flat))).astype(int)]
+    bands = inference.bands(measured, draws, rng)
+    fresh = dataclasses.replace(measured.binned, force_n=seen)
+    low50, high50 = bands.interval(0.5)
+    low90, high90 = bands.interval(0.9)
     return (
-        inference.coverage(again, low50, high50, WINDOW_S),
-        inference.coverage(again, low90, high90, WINDOW_S),
+        inference.coverage(fresh, low50, high50, WINDOW_S),
+        inference.coverage(fresh, low90, high90, WINDOW_S),
     )
 
 
 def perform(item: Item) -> Item | str:
-    """One replicate in a worker; the message of a full run that failed."""
+    """Runs one replicate in a worker process; returns the error message if a full run fails."""
     try:
         return replicate(item, problem())
     except RuntimeError as error:
@@ -167,7 +178,10 @@ def perform(item: Item) -> Item | str:
 
 
 def uniformity(ranks: Array) -> float:
-    """p-value of chi-square for ranks (n,) in ten bins of as near equal size as DRAWS + 1 ranks allow."""
+    """Returns the p-value of a chi-square test that ranks (n,) are uniform.
+
+    The ten bins are as nearly equal in size as `DRAWS` + 1 ranks allow.
+    """
     edges = np.linspace(0, DRAWS + 1, 11).round()
     counts = np.histogram(ranks, edges - 0.5)[0]
     expected = len(ranks) * np.diff(edges) / (DRAWS + 1)
@@ -175,20 +189,25 @@ def uniformity(ranks: Array) -> float:
 
 
 def table(found: Sequence[Mapping[str, str]]) -> str:
-    """By parameter: p-value of uniform ranks, shares inside the intervals; then the bands'."""
-    lines = []
+    """Returns the table: for each parameter the p-value of uniform ranks and the shares inside the intervals.
+
+    The last row has the shares of a fresh recording inside the predictive bands.
+    """
+    table_rows = []
     for name in NAMES:
         ranks = np.array([int(r[f"rank_{name}"]) for r in found])
-        held = [np.mean([r[f"in{level}_{name}"] == "True" for r in found]) for level in (50, 90)]
-        lines.append([name, f"{uniformity(ranks):.3f}", *(f"{100 * h:.1f} %" for h in held)])
+        shares = [np.mean([r[f"in{level}_{name}"] == "True" for r in found]) for level in (50, 90)]
+        table_rows.append([name, f"{uniformity(ranks):.3f}", *(f"{100 * share:.1f} %" for share in shares)])
     bands = [np.mean([float(r[f"band{level}"]) for r in found]) for level in (50, 90)]
-    lines.append(["bands of a fresh recording", "", *(f"{100 * b:.1f} %" for b in bands)])
-    return rows.markdown(["", "p of uniform ranks", "inside 50 %", "inside 90 %"], lines)
+    table_rows.append(["predictive bands, fresh recording", "", *(f"{100 * b:.1f} %" for b in bands)])
+    return rows.markdown(
+        ["", "p-value of uniform ranks", "inside 50 % interval", "inside 90 % interval"], table_rows
+    )
 
 
 @styled
 def figure_calibration(found: Sequence[Mapping[str, str]], data: str) -> Figure:
-    """Rank histograms of all parameters, with what uniform ranks would scatter."""
+    """Returns rank histograms of all parameters, with the range that uniform ranks would have."""
     figure = new_figure(PAGE_IN, 3.6)
     axes = figure.subplots(2, 5).ravel()
     for ax, name in zip(axes, NAMES, strict=False):
@@ -196,10 +215,10 @@ def figure_calibration(found: Sequence[Mapping[str, str]], data: str) -> Figure:
         ax.set_title(symbol(name))
     axes[-1].axis("off")
     failed = sum(r["trusted"] != "True" for r in found)
-    least = min(uniformity(np.array([int(r[f"rank_{n}"]) for r in found])) for n in NAMES)
+    smallest = min(uniformity(np.array([int(r[f"rank_{n}"]) for r in found])) for n in NAMES)
     source = "the surrogate with its error" if data == "surrogate" else "the full model"
     state_finding(
-        figure, f"Ranks of the true values among posterior draws: least p-value of nine {least:.2g}",
+        figure, f"Ranks of the true values among posterior draws: least p-value of nine {smallest:.2g}",
         f"{len(found)} recordings made by {source} at draws of the prior; {failed} of the chains did not "
         f"reach the limits of trust. Grey: 99 % of uniform ranks' counts. Ten bins of {DRAWS + 1} ranks.",
     )  # fmt: skip
@@ -207,6 +226,7 @@ def figure_calibration(found: Sequence[Mapping[str, str]], data: str) -> Figure:
 
 
 def _draw_ranks(ax: Axes, ranks: Array) -> None:
+    """Draws the histogram of ranks (n,), and the range in which 99 % of uniform ranks' counts lie."""
     edges = np.linspace(0, DRAWS + 1, 11).round()
     low, high = (binom.ppf(q, len(ranks), 0.1) for q in (0.005, 0.995))
     ax.axhspan(low, high, color=GREY, alpha=0.25, lw=0)
@@ -218,32 +238,34 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--n", type=int, default=300, help="recordings (default 300)")
+    parser.add_argument("--n", type=int, default=300, help="number of recordings (default 300)")
     parser.add_argument("--data", choices=("surrogate", "full"), default="surrogate")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--results", type=Path, default=rows.RESULTS)
     parser.add_argument("--figures", type=Path, default=FIGURES)
-    asked = parser.parse_args()
-    store = replace(ROWS, path=asked.results / ROWS.path.name)
-    known = {"surrogate": surrogate_hash(), "data": asked.data, "seed": asked.seed}
-    items = [{**known, "index": index} for index in range(asked.n)]
-    there = {store.key_of(row): row for row in store.read()}
-    todo = [item for item in items if store.key_of(item) not in there]
-    rows.say(f"{len(items) - len(todo)} of {len(items)} are there already")
-    for done, (i, result) in enumerate(run_parallel(perform, todo, asked.workers), start=1):
+    options = parser.parse_args()
+    store = replace(ROWS, path=options.results / ROWS.path.name)
+    inputs = {"surrogate": surrogate_hash(), "data": options.data, "seed": options.seed}
+    items = [{**inputs, "index": index} for index in range(options.n)]
+    stored_rows = {store.key_of(row): row for row in store.read()}
+    todo = [item for item in items if store.key_of(item) not in stored_rows]
+    rows.say(f"{len(items) - len(todo)} of {len(items)} are finished already")
+    for done, (i, result) in enumerate(run_parallel(perform, todo, options.workers), start=1):
         if isinstance(result, Lost | str):
             rows.say(f"{todo[i]['index']} failed: {result.reason if isinstance(result, Lost) else result}")
             continue
-        there[store.key_of(result)] = store.append(**result)
+        stored_rows[store.key_of(result)] = store.append(**result)
         rows.say(f"{done} of {len(todo)}: {float(result['cpu_s']):.1f} CPU s, {result['steps']} steps")
-    found = [there[store.key_of(item)] for item in items if store.key_of(item) in there]
-    rows.warn_of_mixed_code(found)
-    failed = sum(row["trusted"] != "True" for row in found)
-    print(f"{asked.data}, seed {asked.seed}: {len(found)} recordings, {failed} chains not trusted\n")
-    print(table(found))
-    stem = "calibration" if asked.data == "surrogate" else "calibration-full"
-    save_figure(figure_calibration(found, asked.data), asked.figures / stem, "benchmarks/calibration.py")
+    recordings = [stored_rows[store.key_of(item)] for item in items if store.key_of(item) in stored_rows]
+    rows.warn_of_mixed_code(recordings)
+    failed = sum(row["trusted"] != "True" for row in recordings)
+    print(f"{options.data}, seed {options.seed}: {len(recordings)} recordings, {failed} chains not trusted\n")
+    print(table(recordings))
+    stem = "calibration" if options.data == "surrogate" else "calibration-full"
+    save_figure(
+        figure_calibration(recordings, options.data), options.figures / stem, "benchmarks/calibration.py"
+    )
 
 
 if __name__ == "__main__":

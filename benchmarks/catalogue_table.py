@@ -1,8 +1,8 @@
-"""The catalogue of mechanisms as a table: parameters with priors and neutral values, and look-alikes.
+"""Prints the catalogue of mechanisms as a table: parameters with priors and neutral values, and look-alikes.
 
     python benchmarks/catalogue_table.py
 
-Writes the table between its markers of docs/mechanisms.md.
+The program writes the table between its markers of docs/mechanisms.md.
 """
 
 from __future__ import annotations
@@ -20,25 +20,27 @@ HEADER = ("mechanism", "acts on", "parameters", "look-alikes")
 
 
 def table() -> str:
-    """All mechanisms that come with bayeskin, by name."""
-    return rows.markdown(HEADER, [_line(one) for _, one in sorted(catalogue().items())])
+    """Returns a Markdown table of all mechanisms that come with bayeskin, in the order of their names."""
+    return rows.markdown(HEADER, [_line(mechanism) for _, mechanism in sorted(catalogue().items())])
 
 
 def _line(mechanism: Mechanism) -> list[str]:
-    others = [f"`{name}`" for name in mechanism.group if name != mechanism.name]
+    """Returns the table's row of a mechanism."""
+    look_alikes = [f"`{name}`" for name in mechanism.group if name != mechanism.name]
     place = "instrument" if isinstance(mechanism.act, Instrument) else "tissue"
     if place == "instrument" and mechanism.act.bind is not None:
         place = "displacement, in series with the skin"
-    parameters = "; ".join(_told(p, mechanism.neutral.get(p.name)) for p in mechanism.parameters)
-    return [f"`{mechanism.name}`", place, parameters, ", ".join(others)]
+    parameters = "; ".join(_description(p, mechanism.neutral.get(p.name)) for p in mechanism.parameters)
+    return [f"`{mechanism.name}`", place, parameters, ", ".join(look_alikes)]
 
 
-def _told(parameter: Parameter, neutral: float | None) -> str:
+def _description(parameter: Parameter, neutral: float | None) -> str:
+    """Returns a parameter's range, prior, neutral value and description in one phrase."""
     unit = "" if parameter.unit in ("1", "-") else f" {parameter.unit}"
-    off = "" if neutral is None else f" ({neutral:g})"
-    span = f"{parameter.lower:.3g} to {parameter.upper:.3g}{unit}"
-    law = f"{parameter.prior}, offset {parameter.offset:.0e}" if parameter.offset else parameter.prior
-    return f"`{parameter.name}` {span}, {law}{off}: {parameter.description}"
+    neutral_value = "" if neutral is None else f" ({neutral:g})"
+    prior_range = f"{parameter.lower:.3g} to {parameter.upper:.3g}{unit}"
+    prior = f"{parameter.prior}, offset {parameter.offset:.0e}" if parameter.offset else parameter.prior
+    return f"`{parameter.name}` {prior_range}, {prior}{neutral_value}: {parameter.description}"
 
 
 def main() -> None:

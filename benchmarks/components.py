@@ -1,14 +1,16 @@
-"""How many components of a force's shape a surrogate needs, so that a posterior does not take them for skin.
+"""Shows how many principal components a surrogate's force shape needs for an unbiased posterior.
 
-What the components leave out of a shape counts as noise of each bin by itself. It is none: it is the same
-over many bins, and a millinewton of it, kept up over a recording, moves a posterior by many of its sd. The
-shipped surrogate of the healthy-skin protocol, cut to fewer components than it has, against held-out runs,
-both brought to a peak of 1 N: the error, what of it counts as noise of bins, and by how many nats a run's own
-parameters are the less likely, beside a noise of 2 mN, for what the surrogate's factor does not explain.
+The surrogate treats the part of a shape that its components do not represent as independent noise of each
+bin. In truth this part is the same over many bins. A millinewton of it that lasts over a whole recording
+shifts a posterior by many of its sd. This benchmark takes the shipped surrogate of the healthy-skin protocol,
+reduces it to fewer components, and compares it with held-out runs. Both are scaled to a peak force of 1 N.
+The table has the held-out error and the part of it that counts as noise of the bins. It also has the loss of
+log-likelihood [nats] at a run's own parameters that the surrogate's factor does not explain, beside a noise
+of 2 mN.
 
     python benchmarks/components.py
 
-Writes the table between the markers of docs/surrogate.md.
+The program writes the table between the markers of docs/surrogate.md.
 """
 
 from __future__ import annotations
@@ -30,11 +32,17 @@ from bayeskin.types import Array, Design
 NOISE_N = 2e-3
 FEWEST = 2
 DOCS = Path(__file__).parents[1] / "docs"
-HEADER = ("components", "held-out error [mN]", "of it noise of bins [mN]", "median [nats]", "largest [nats]")
+HEADER = (
+    "components", "held-out error [mN]", "sd treated as noise of bins [mN]", "median loss [nats]",
+    "largest loss [nats]",
+)  # fmt: skip
 
 
 def cut(surrogate: ShapeSurrogate, count: int, shapes: Array) -> ShapeSurrogate:
-    """The same with its first `count` components alone; shapes (n, m) of the runs that it has learnt from."""
+    """Returns the surrogate with only its first `count` components.
+
+    shapes (n, m) : force shapes of the runs that the surrogate was trained on
+    """
     latents, kept = surrogate.latents, count + 1
     assert isinstance(latents, LatentGPs)
     fewer = LatentGPs(
@@ -49,23 +57,30 @@ def cut(surrogate: ShapeSurrogate, count: int, shapes: Array) -> ShapeSurrogate:
 
 
 def unexplained(error_n: Array, factor: Array, diagonal: Array) -> float:
-    """Nats of an error (m,) [N] that a factor (m, r) leaves, beside the noise and diagonal (m,)."""
+    """Returns the loss of log-likelihood [nats] by the part of an error that the surrogate does not state.
+
+    error_n (m,) : error of the surrogate [N]
+    factor (m, r) : factor of the covariance that the surrogate states [N]
+    diagonal (m,) : independent variance of each bin that the surrogate states [N^2]; the noise is added to it
+    """
     precision = 1.0 / (diagonal + NOISE_N**2)
-    normal = factor.T @ (precision[:, None] * factor) + np.eye(factor.shape[1])
-    taken = factor @ np.linalg.solve(normal, factor.T @ (precision * error_n))
-    return 0.5 * float(error_n @ (precision * (error_n - taken)))
+    normal_matrix = factor.T @ (precision[:, None] * factor) + np.eye(factor.shape[1])
+    explained_n = factor @ np.linalg.solve(normal_matrix, factor.T @ (precision * error_n))
+    return 0.5 * float(error_n @ (precision * (error_n - explained_n)))
 
 
 def judged(surrogate: ShapeSurrogate, theta: Array, force_n: Array) -> tuple[float, float, float, float]:
-    """Of held-out runs theta (n, d) with forces (n, m): the columns of the table."""
-    found = surrogate.predict(theta)
+    """Returns the table's columns after the first, for held-out runs at theta (n, d) with forces (n, m)."""
+    prediction = surrogate.predict(theta)
     peak = np.abs(force_n).max(axis=1)
-    error = (found.mean - force_n) / peak[:, None]
-    diagonal = found.diagonal / peak[:, None] ** 2
-    nats = [unexplained(e, f / p, d) for e, f, d, p in zip(error, found.factor, diagonal, peak, strict=True)]
-    rms = 1e3 * np.sqrt(np.mean(error**2, axis=1))
+    error = (prediction.mean - force_n) / peak[:, None]
+    diagonal = prediction.diagonal / peak[:, None] ** 2
+    nats = [
+        unexplained(e, f / p, d) for e, f, d, p in zip(error, prediction.factor, diagonal, peak, strict=True)
+    ]
+    rms_mn = 1e3 * np.sqrt(np.mean(error**2, axis=1))
     return (
-        float(np.median(rms)), 1e3 * float(np.sqrt(np.median(diagonal.mean(axis=1)))),
+        float(np.median(rms_mn)), 1e3 * float(np.sqrt(np.median(diagonal.mean(axis=1)))),
         float(np.median(nats)), float(np.max(nats)),
     )  # fmt: skip
 
@@ -76,11 +91,11 @@ def main() -> None:
     design = storage.load(shipped("surrogates/healthy-skin-reaction-design.h5"), Design)
     shapes = split(design.force_n[design.training])[1]
     theta, force_n = design.theta[design.testing], design.force_n[design.testing]
-    lines = []
+    table = []
     for count in range(FEWEST, len(surrogate.transform.components) + 1):
-        error, bins, typical, most = judged(cut(surrogate, count, shapes), theta, force_n)
-        lines.append([str(count), f"{error:.2f}", f"{bins:.2f}", f"{typical:.1f}", f"{most:.1f}"])
-    text = rows.markdown(HEADER, lines)
+        error, bins, typical, largest = judged(cut(surrogate, count, shapes), theta, force_n)
+        table.append([str(count), f"{error:.2f}", f"{bins:.2f}", f"{typical:.1f}", f"{largest:.1f}"])
+    text = rows.markdown(HEADER, table)
     print(text)
     rows.into_docs(DOCS / "surrogate.md", "components", text)
 

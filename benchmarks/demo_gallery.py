@@ -1,9 +1,9 @@
-"""The figures of docs/gallery.md that the demo leaves: those of its run, and the fields inside the skin.
+"""Makes the figures of docs/gallery.md that show the demo: its run, and the fields inside the skin.
 
     python benchmarks/demo_gallery.py
 
-Runs `bayeskin run runs/demo.toml`, where what is done is skipped, and `bayeskin simulate --figures`, and
-copies what they draw to docs/figures/demo-*.png, in 256 colours.
+The program runs `bayeskin run runs/demo.toml`, which skips finished stages, and `bayeskin simulate
+--figures`. It copies their figures to docs/figures/demo-*.png, reduced to 256 colours.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ OF_THE_RUN = (
 
 
 def called(*arguments: str) -> None:
-    """A command of bayeskin in the checkout; ends the program where the input is wrong."""
+    """Runs a command of bayeskin in the checkout; ends the program where the input is wrong."""
     command = [sys.executable, "-c", "from bayeskin.cli import main; main()", *arguments]
     if subprocess.run(command, cwd=ROOT, check=False).returncode > 1:
         raise SystemExit(f"bayeskin {' '.join(arguments)} failed")
 
 
 def smaller(path: Path, target: Path) -> None:
-    """A PNG in 256 colours, its texts kept: what a repository is to hold."""
+    """Saves a PNG in 256 colours and keeps its text entries, so that the repository stays small."""
     with Image.open(path) as image:
         texts = PngInfo()
         for key, text in image.info.items():
@@ -46,9 +46,9 @@ def main() -> None:
     called("run", "runs/demo.toml")
     with tempfile.TemporaryDirectory() as folder:
         called("simulate", "-o", f"{folder}/force.csv", "--figures", folder)
-        made = [Path(folder) / "fields.png"]
-        made += [ROOT / "runs" / "demo" / f"{name}.png" for name in OF_THE_RUN]
-        for path in made:
+        figures = [Path(folder) / "fields.png"]
+        figures += [ROOT / "runs" / "demo" / f"{name}.png" for name in OF_THE_RUN]
+        for path in figures:
             target = FIGURES / f"demo-{path.stem.replace('_', '-')}.png"
             smaller(path, target)
             print(target.relative_to(ROOT))

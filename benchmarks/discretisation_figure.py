@@ -1,4 +1,4 @@
-"""The figure of the discretisation study."""
+"""Draws the figure of the discretisation study (benchmarks/discretisation_study.py)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from bayeskin.report.style import (
 )
 from bayeskin.types import Simulation
 
-PEAK_S, CYCLE_END_S = 19.0, 88.5  # of the healthy-skin protocol
+PEAK_S, CYCLE_END_S = 19.0, 88.5  # first peak and end of the first cycle of the healthy-skin protocol
 COLOURS = {"A": "#0072B2", "C": "#D55E00", "soft": "#009E73"}
 MESH_COLOURS = (INK, "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9")
 
@@ -33,17 +33,19 @@ def figure_discretisation(
     histories: Sequence[tuple[str, Simulation, Simulation]],
     time_target: float,
 ) -> Figure:
-    """Errors against cells and tolerance, and both observations of force on every mesh.
+    """Returns the figure: errors against cells and tolerance, and both observations of force on every mesh.
 
-    space : RMS over peak by (cells, mesh, point); times : by protocol, then (tolerance, point);
-    histories : mesh, reaction, face stress over the first cycle
+    space : RMS error over the peak by (cells, mesh, point)
+    times : RMS error over the peak by protocol, then by (tolerance, point)
+    histories : mesh, reaction and face stress over the first cycle
+    time_target : RMS error over the peak that the tolerance has to reach
     """
     figure = new_figure(PAGE_IN, 5.0)
     axes = figure.subplots(2, 2)
     _draw_space(axes[0][0], space)
     _draw_times(axes[0][1], times, time_target)
     _draw_histories(axes[1][0], [(mesh, force) for mesh, force, _ in histories], "c", "reaction [N]")
-    _draw_histories(axes[1][1], [(mesh, s) for mesh, _, s in histories], "d", "face stress [N]")
+    _draw_histories(axes[1][1], [(mesh, stress) for mesh, _, stress in histories], "d", "face stress [N]")
     if histories:
         axes[1][0].legend(loc="lower center")
     state_finding(
@@ -56,6 +58,7 @@ def figure_discretisation(
 
 
 def _finding(histories: Sequence[tuple[str, Simulation, Simulation]]) -> str:
+    """Returns the figure's headline: how much both observations vary over the meshes at the first peak."""
     if len(histories) < 2:
         return "Error of the discretisation"
     reaction, stress = (
@@ -68,14 +71,15 @@ def _finding(histories: Sequence[tuple[str, Simulation, Simulation]]) -> str:
 
 
 def _draw_space(ax: Axes, space: Mapping[tuple[int, str, str], float]) -> None:
+    """Draws the errors against the number of cells, and connects the refinements of the default bricks."""
     for (cells, mesh, point), rms in sorted(space.items()):
         marker = "^" if mesh.endswith(".msh") else "s" if "halved" in mesh else "o"
         ax.plot(cells, 100 * rms, marker, color=COLOURS[point], ms=4)
     for point, colour in COLOURS.items():
-        even = {
+        graded = {
             key: rms for key, rms in space.items() if key[1].startswith("bricks") and "halved" not in key[1]
         }
-        line = sorted((cells, 100 * rms) for (cells, _, p), rms in even.items() if p == point)
+        line = sorted((cells, 100 * rms) for (cells, _, p), rms in graded.items() if p == point)
         if line:
             ax.plot(*zip(*line, strict=True), color=colour, lw=0.8, label=f"point {point}")
     panel_title(ax, "a", "space")
@@ -88,12 +92,13 @@ def _draw_space(ax: Axes, space: Mapping[tuple[int, str, str], float]) -> None:
 
 
 def _draw_times(ax: Axes, times: Mapping[str, Mapping[tuple[float, str], float]], target: float) -> None:
-    for (protocol, errors), dashes, filled in zip(times.items(), ("-", "--"), (True, False), strict=False):
+    """Draws the errors against the tolerance."""
+    for (protocol, errors), dashes, is_filled in zip(times.items(), ("-", "--"), (True, False), strict=False):
         for point in dict.fromkeys(p for _, p in errors):
             line = sorted((t, 100 * e) for (t, p), e in errors.items() if p == point)
             name = f"{point}, {protocol.split(',')[0]}"
             colour = COLOURS[point]
-            fill = colour if filled else "white"
+            fill = colour if is_filled else "white"
             ax.plot(*zip(*line, strict=True), dashes, marker="o", mfc=fill, color=colour, label=name)
     ax.axhline(100 * target, color=FAINT, lw=0.8, zorder=0)
     ax.annotate(
@@ -110,6 +115,7 @@ def _draw_times(ax: Axes, times: Mapping[str, Mapping[tuple[float, str], float]]
 
 
 def _draw_histories(ax: Axes, histories: Sequence[tuple[str, Simulation]], letter: str, label: str) -> None:
+    """Draws one observation of force over time on every mesh."""
     for (mesh, history), colour in zip(histories, MESH_COLOURS, strict=False):
         time_s = np.linspace(0.0, CYCLE_END_S, 886)
         ax.plot(time_s, history.at(time_s), color=colour, lw=0.9, label=mesh.removesuffix(".msh"))

@@ -1,11 +1,13 @@
-"""How far the default bricks are from finer ones for other devices and other skin than the article's.
+"""Compares the default bricks with finer ones for other devices and other skin than the article's.
 
-Each geometry is run at two skins over one shortened cycle, in proportion to the gauge as long as the
-healthy-skin recording's: loading, a hold of some ten seconds, unloading. The reference is refinement 2.
+Each geometry is run at two skins over one shortened cycle of loading, a hold of some ten seconds, and
+unloading. In proportion to the gauge the displacement is as large as in the healthy-skin recording. The
+reference is refinement 2.
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/discretisation_geometries.py
 
-Takes some ten minutes of one core. Writes the table between the markers of docs/discretisation.md.
+The program takes some ten minutes of one core. It writes the table between the markers of
+docs/discretisation.md.
 """
 
 from __future__ import annotations
@@ -26,12 +28,12 @@ from bayeskin.types import PadMotion, Simulation
 REFERENCE = 2
 SKINS = ("A", "C")
 CORNERS_S = (0.0, 9.4, 20.0, 29.4)
-EXTENSION = 9.45e-3 / Geometry().gauge_m  # of the gauge, as in the healthy-skin recording
+EXTENSION = 9.45e-3 / Geometry().gauge_m  # as a share of the gauge, as in the healthy-skin recording
 DOCS = Path(__file__).parents[1] / "docs"
 GEOMETRIES = {
     "the article's": Geometry(),
-    "its device, force on pad and guard": Geometry(force_on="pad and guard"),
-    "its device; cutis 3.5, subcutis 20, arm 35": Geometry(
+    "the article's device, force on pad and guard": Geometry(force_on="pad and guard"),
+    "the article's device; cutis 3.5, subcutis 20, arm 35": Geometry(
         cutis_m=3.5e-3, subcutis_m=20e-3, arm_radius_m=35e-3
     ),
     "gauge 20, pads 10 x 20, no guard": Geometry(
@@ -51,25 +53,26 @@ GEOMETRIES = {
 
 
 def run(geometry: Geometry, refinement: int, skin: str) -> Simulation:
-    """One cycle of the reaction."""
+    """Returns the reaction over one cycle."""
     far_m = EXTENSION * geometry.gauge_m
     motion = PadMotion(np.array(CORNERS_S), np.array([0.0, far_m, far_m, 0.0]))
     return simulate(ModelSpec(refinement=refinement, geometry=geometry), motion, healthy_skin.POINTS[skin])
 
 
 def line(name: str, geometry: Geometry) -> list[str]:
-    """One row of the table: bricks, and the errors of refinements 1 and 0 at each skin."""
+    """Returns one row of the table: number of bricks, and the errors of refinements 1 and 0 at each skin."""
     rows.say(name)
     references = [run(geometry, REFERENCE, skin) for skin in SKINS]
     cells = []
     for refinement in (1, 0):
         cells.append(str(problem_of("bricks", refinement, geometry).mesh.geometry.nelements))
         runs = [run(geometry, refinement, skin) for skin in SKINS]
-        cells += [_said(error(*pair)) for pair in zip(runs, references, strict=True)]
+        cells += [_error_text(error(*pair)) for pair in zip(runs, references, strict=True)]
     return [name, *cells]
 
 
-def _said(found: Error) -> str:
+def _error_text(found: Error) -> str:
+    """Returns an error as text: RMS, RMS after the best factor, and that factor."""
     return f"{100 * found.rms:.2f}, {100 * found.rms_scaled:.2f} (x {found.scale:.4f})"
 
 
@@ -77,14 +80,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of discretisation.md")
-    asked = parser.parse_args()
+    parser.add_argument("--docs", type=Path, default=DOCS, help="folder that holds discretisation.md")
+    options = parser.parse_args()
     header = ["device [mm]"]
     for kind in ("default", "coarsest"):
-        header += [f"{kind} bricks", *(f"{skin}: rms, after one factor [% of peak]" for skin in SKINS)]
-    block = rows.markdown(header, [line(*one) for one in GEOMETRIES.items()])
+        header += [f"{kind} bricks", *(f"{skin}: RMS error, after best factor [% of peak]" for skin in SKINS)]
+    block = rows.markdown(header, [line(*device) for device in GEOMETRIES.items()])
     print(block)
-    rows.into_docs(asked.docs / "discretisation.md", "geometries", block)
+    rows.into_docs(options.docs / "discretisation.md", "geometries", block)
 
 
 if __name__ == "__main__":

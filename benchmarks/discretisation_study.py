@@ -1,25 +1,28 @@
-"""Error of the `reaction` against cells and time steps, up to references; chooses mesh and tolerance.
+"""Measures the error of the `reaction` against cells and time steps, and chooses mesh and tolerance.
 
-Three points of the prior box (A, C, soft: benchmarks/healthy_skin.py). Errors are differences of two force
-histories every 0.1 s, RMS and largest, over the reference's peak.
+The study uses three points of the prior box (A, C and soft: benchmarks/healthy_skin.py). An error is the
+difference between two force histories every 0.1 s. Its RMS and its largest value are given relative to the
+peak of the reference.
 
-- Time: tolerances on bricks-1 against 1e-6 with the nonlinear solver 1000 times tighter, at least 40 steps a
-  phase, and steps as short as need be. The tolerance is chosen on the demo's protocol and tested on the
-  healthy-skin one.
-- Space: bricks-1, bricks-2 and the article's mesh over the whole healthy-skin protocol; finer ones over its
-  first cycle, among them the reference, bricks-3, and bricks-1 with every edge of every brick halved. The
-  first loading alone, on finer ones still, tells how far the reference itself is from converged. The
-  article's meshes are those of the supplement, the folder above its `data/` that BAYESKIN_SUPPLEMENT
-  names; unset, they are left out.
-- The normal stress sigma_xx - p over the pad's top face, not doubled, at each step of the space runs: the
-  total-Lagrangian analogue of the article's force, beside the reaction.
+- Time: bricks-1 is run with several tolerances. The reference has a tolerance of 1e-6, a nonlinear solver
+  1000 times tighter, at least 40 steps in each phase, and steps as short as needed. The tolerance is chosen
+  on the demo's protocol and tested on the healthy-skin protocol.
+- Space: bricks-1, bricks-2 and the article's mesh are run over the whole healthy-skin protocol. Finer meshes
+  are run over its first cycle: the reference, bricks-3, and bricks-1 with every edge of every brick halved,
+  among others. Still finer meshes are run over the first loading alone, which shows how far the reference
+  itself is from convergence. The article's meshes are in the supplement. The environment variable
+  BAYESKIN_SUPPLEMENT names the folder above its `data/`; where it is not set, these meshes are left out.
+- The runs in space also record at each step the normal stress sigma_xx - p, integrated over the pad's top
+  face and not doubled. It is the total-Lagrangian analogue of the article's force, and stands beside the
+  reaction.
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/discretisation_study.py
 
-`--first-cycle` takes the first cycle only of every protocol. A stopped study goes on: finished runs are rows
-of benchmarks/results/discretisation.csv, their histories lie beside it. Writes the tables between the markers
-of docs/discretisation.md, docs/figures/discretisation.{png,svg}, and the meshes' errors into
-bayeskin/finite_element/discretisation.json, from which `bayeskin simulate` states them.
+`--first-cycle` takes only the first cycle of every protocol. A study that was stopped continues where it
+ended: finished runs are rows of benchmarks/results/discretisation.csv, and their histories are stored beside
+it. The study writes the tables between the markers of docs/discretisation.md, and draws
+docs/figures/discretisation.{png,svg}. It also writes the meshes' errors into
+bayeskin/finite_element/discretisation.json, from which `bayeskin simulate` reports them.
 """
 
 from __future__ import annotations
@@ -97,12 +100,13 @@ ROWS = rows.Rows(
 
 
 def demo_motion() -> PadMotion:
-    """The idealised protocol of the shipped demo, as `bayeskin run` takes it."""
+    """Returns the idealised protocol of the shipped demo, as `bayeskin run` uses it."""
     recording = storage.load(Path(__file__).parents[1] / "data" / "demo.h5", Recording)
     return idealised_motion(recording, segment(recording))
 
 
 def motions() -> dict[str, PadMotion]:
+    """Returns all protocols of the study by their names: whole, first cycle only, and first loading only."""
     whole = {"healthy": healthy_skin.HEALTHY_SKIN, "demo": demo_motion()}
     cycles = {f"{name}, first cycle": healthy_skin.first_cycle(motion) for name, motion in whole.items()}
     loading = PadMotion(np.array([0.0, 9.4]), np.array([0.0, 9.45e-3]))
@@ -110,7 +114,7 @@ def motions() -> dict[str, PadMotion]:
 
 
 def perform(run: Run, table: rows.Rows) -> Result:
-    """Runs it, or takes it from the table and the histories beside it."""
+    """Returns the result of a run; simulates the run where the table or its histories lack it."""
     try:
         with healthy_skin.spec_on(run.mesh, run.tolerance) as spec:
             inputs = vars(run) | {"model_hash": spec.hash}
@@ -118,7 +122,7 @@ def perform(run: Run, table: rows.Rows) -> Result:
             row = table.find(**inputs)
             if row is None or (row["status"] == "ok" and not stem.with_suffix(".stress.h5").is_file()):
                 row = _simulate(run, spec, table, stem)
-    except InputError as error:  # a mesh that is not there or cannot be read
+    except InputError as error:  # the mesh does not exist or cannot be read
         return Result(run, {"status": "not run", "message": str(error)})
     if row["status"] != "ok":
         return Result(run, row)
@@ -127,6 +131,7 @@ def perform(run: Run, table: rows.Rows) -> Result:
 
 
 def _simulate(run: Run, spec: ModelSpec, table: rows.Rows, stem: Path) -> rows.Row:
+    """Simulates a run, saves its histories beside the table, and appends its row."""
     rows.say(f"{run.protocol}, point {run.point}, {run.mesh}, tolerance {run.tolerance:g}, {run.settings}")
     theta, problem = healthy_skin.POINTS[run.point], problem_of(spec.mesh, spec.refinement)
     face = FaceStress(problem, theta)
@@ -135,31 +140,34 @@ def _simulate(run: Run, spec: ModelSpec, table: rows.Rows, stem: Path) -> rows.R
         for (module, name), value in SETTINGS[run.settings].items():
             patches.enter_context(mock.patch.object(module, name, value))
         started = time.process_time()
-        found = simulate(
+        simulation = simulate(
             spec, motions()[run.protocol], theta, rows.progress(run.mesh),
             lambda _time, x, _force: stress.append(face.force_n(x)),
         )  # fmt: skip
         seconds = time.process_time() - started
-    storage.save(stem.with_suffix(".force.h5"), found)
-    storage.save(stem.with_suffix(".stress.h5"), replace(found, force_n=np.array(stress)))
+    storage.save(stem.with_suffix(".force.h5"), simulation)
+    storage.save(stem.with_suffix(".stress.h5"), replace(simulation, force_n=np.array(stress)))
     return table.append(
         **vars(run),
         model_hash=spec.hash,
-        status=found.status,
+        status=simulation.status,
         cells=problem.mesh.geometry.nelements,
         dofs=problem.space.dofs,
-        steps=int(found.stats["steps"]),
-        factorisations=int(found.stats["factorisations"]),
-        iterations=int(found.stats["iterations"]),
+        steps=int(simulation.stats["steps"]),
+        factorisations=int(simulation.stats["factorisations"]),
+        iterations=int(simulation.stats["iterations"]),
         cpu_s=round(seconds, 2),
-        peak_n=found.stats["peak_force_n"],
+        peak_n=simulation.stats["peak_force_n"],
         code=rows.CODE,
-        message=found.message,
+        message=simulation.message,
     )
 
 
 class FaceStress:
-    """Integral of sigma_xx - p over the pad's top face [N], whose area its clamping leaves as it is."""
+    """Integrates sigma_xx - p over the pad's top face [N].
+
+    The face is clamped, so its area does not change.
+    """
 
     def __init__(self, problem: Problem, theta: dict[str, float]) -> None:
         mesh, bricks = problem.mesh.geometry, isinstance(problem.mesh.geometry, skfem.MeshHex)
@@ -174,7 +182,7 @@ class FaceStress:
         self._mu, self._lam = (c[self._u.tind][:, None] for c in (cells.mu, cells.lam))
 
     def force_n(self, x: Array) -> float:
-        """From the unknowns x (dofs,)."""
+        """Returns the integral [N] at the unknowns x (dofs,)."""
         gradient = np.stack([self._u.interpolate(x[i : self._n : 3]).grad for i in range(3)])
         f = np.eye(3) + gradient.transpose(2, 3, 0, 1)  # (facets, points, 3, 3)
         j = np.linalg.det(f)
@@ -186,11 +194,14 @@ class FaceStress:
 def time_study(
     asked: argparse.Namespace, table: rows.Rows
 ) -> tuple[dict[str, dict[tuple[float, str], Error]], dict[str, dict[str, Error]]]:
-    """Errors by protocol, then by tolerance and point; and the reference's own by protocol and point."""
+    """Returns the errors by protocol, then by tolerance and point; and the errors of the reference itself.
+
+    The latter are by protocol and point. They compare the reference with a run of ten times its tolerance.
+    """
     suffix = ", first cycle" if asked.first_cycle else ""
     names = ("demo" + suffix, "healthy" + suffix)
-    found: dict[str, dict[tuple[float, str], Error]] = {name: {} for name in names}
-    own: dict[str, dict[str, Error]] = {name: {} for name in names}
+    errors: dict[str, dict[tuple[float, str], Error]] = {name: {} for name in names}
+    reference_errors: dict[str, dict[str, Error]] = {name: {} for name in names}
     for name, point in product(names, asked.points):
         reference, check = (
             perform(Run(name, point, tolerance=t, settings="reference"), table)
@@ -199,22 +210,22 @@ def time_study(
         if not (reference.force and check.force):
             rows.say(f"no reference: {reference.row['message'] or check.row['message']}")
             continue
-        own[name][point] = error(check.force, reference.force)
+        reference_errors[name][point] = error(check.force, reference.force)
         for tolerance in asked.tolerances:
             result = perform(Run(name, point, tolerance=tolerance), table)
             if result.force:
-                found[name][tolerance, point] = error(result.force, reference.force)
-    return found, own
+                errors[name][tolerance, point] = error(result.force, reference.force)
+    return errors, reference_errors
 
 
 def space_study(asked: argparse.Namespace, table: rows.Rows) -> list[Result]:
-    """All runs in space, the reference's among them; cheap ones first."""
+    """Returns the results of all runs in space, including those of the reference; cheap runs come first."""
     cycle = "healthy, first cycle"
-    whole = cycle if asked.first_cycle else "healthy"
-    runs = [Run(whole, point, mesh) for mesh in WHOLE_MESHES for point in asked.points]
+    whole_or_cycle = cycle if asked.first_cycle else "healthy"
+    runs = [Run(whole_or_cycle, point, mesh) for mesh in WHOLE_MESHES for point in asked.points]
     runs += [Run(cycle, point, mesh) for mesh in (*CYCLE_MESHES, SPACE_REFERENCE) for point in asked.points]
-    every = ("bricks-1", "bricks-1-halved", "bricks-2", SPACE_REFERENCE, *LOADING_MESHES)
-    runs += [Run(LOADING, "C", mesh) for mesh in every if "C" in asked.points]
+    loading_meshes = ("bricks-1", "bricks-1-halved", "bricks-2", SPACE_REFERENCE, *LOADING_MESHES)
+    runs += [Run(LOADING, "C", mesh) for mesh in loading_meshes if "C" in asked.points]
     supplement = healthy_skin.supplement_mesh("") is not None
     kept = [
         r for r in runs if r.mesh in asked.meshes and (supplement or r.mesh not in healthy_skin.GMSH_MESHES)
@@ -223,11 +234,11 @@ def space_study(asked: argparse.Namespace, table: rows.Rows) -> list[Result]:
 
 
 def write_mesh_errors(errors: dict[str, dict[str, float]]) -> None:
-    """Into the package, by the mesh's hash, where `bayeskin simulate` finds them."""
+    """Writes the errors into the package by the mesh's hash, where `bayeskin simulate` looks them up."""
     by_hash = {}
-    for name, found in errors.items():
+    for name, mesh_error in errors.items():
         with healthy_skin.spec_on(name, SPACE_TOLERANCE) as spec:
-            rounded = {key: float(f"{value:.3g}") for key, value in found.items()}
+            rounded = {key: float(f"{value:.3g}") for key, value in mesh_error.items()}
             by_hash[problem_of(spec.mesh, spec.refinement).mesh.hash] = {"mesh": name, **rounded}
     path = Path(accuracy.__file__).with_name(accuracy.FILE)
     path.write_text(json.dumps(by_hash, indent=2) + "\n")
@@ -237,50 +248,63 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    every = (*WHOLE_MESHES, *CYCLE_MESHES, SPACE_REFERENCE, *LOADING_MESHES)
-    parser.add_argument("--first-cycle", action="store_true", help="of every protocol only the first cycle")
+    all_meshes = (*WHOLE_MESHES, *CYCLE_MESHES, SPACE_REFERENCE, *LOADING_MESHES)
+    parser.add_argument(
+        "--first-cycle", action="store_true", help="use only the first cycle of every protocol"
+    )
     parser.add_argument("--points", nargs="+", default=list(healthy_skin.POINTS), choices=healthy_skin.POINTS)
-    parser.add_argument("--tolerances", nargs="*", type=float, default=TOLERANCES, help="none: no time study")
-    parser.add_argument("--meshes", nargs="*", default=every, choices=every, help="none: no space study")
-    parser.add_argument("--time-target", type=float, default=5e-4, help="RMS over peak (default 5e-4)")
-    parser.add_argument("--mesh-target", type=float, default=0.005, help="RMS over peak (default 0.005)")
+    parser.add_argument(
+        "--tolerances", nargs="*", type=float, default=TOLERANCES, help="leave empty to skip the time study"
+    )
+    parser.add_argument(
+        "--meshes",
+        nargs="*",
+        default=all_meshes,
+        choices=all_meshes,
+        help="leave empty to skip the space study",
+    )
+    parser.add_argument(
+        "--time-target", type=float, default=5e-4, help="required RMS error over the peak (default 5e-4)"
+    )
+    parser.add_argument(
+        "--mesh-target", type=float, default=0.005, help="required RMS error over the peak (default 0.005)"
+    )
     parser.add_argument("--results", type=Path, default=rows.RESULTS)
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder of discretisation.md")
+    parser.add_argument("--docs", type=Path, default=DOCS, help="folder that holds discretisation.md")
     return parser.parse_args()
 
 
 def main() -> None:
-    asked = arguments()
-    table = replace(ROWS, path=asked.results / ROWS.path.name)
-    times, own = time_study(asked, table) if asked.tolerances else ({}, {})
-    results = space_study(asked, table) if asked.meshes else []
+    args = arguments()
+    table = replace(ROWS, path=args.results / ROWS.path.name)
+    times, reference_errors = time_study(args, table) if args.tolerances else ({}, {})
+    results = space_study(args, table) if args.meshes else []
     rows.warn_of_mixed_code(table.read())
     parts = [
-        f"Time, `{name}`:\n\n{time_table(errors, own[name], asked.points)}" for name, errors in times.items()
+        f"Time, `{name}`:\n\n{time_table(errors, reference_errors[name], args.points)}"
+        for name, errors in times.items()
     ]
     if results:
-        parts.append(
-            f"Space, first cycle, against {SPACE_REFERENCE}:\n\n{space_table(results, asked.points)}"
-        )
-        if not asked.first_cycle:
-            parts.append(f"Space, whole protocol, against bricks-2:\n\n{whole_table(results, asked.points)}")
+        parts.append(f"Space, first cycle, against {SPACE_REFERENCE}:\n\n{space_table(results, args.points)}")
+        if not args.first_cycle:
+            parts.append(f"Space, whole protocol, against bricks-2:\n\n{whole_table(results, args.points)}")
         parts.append(f"Reaction and face stress at point C:\n\n{peak_table(results)}")
-    parts.append(verdict(times, results, asked.time_target, asked.mesh_target))
+    parts.append(verdict(times, results, args.time_target, args.mesh_target))
     parts.append("![Errors in space and time, two observations of force by mesh](figures/discretisation.png)")
-    if results and not asked.first_cycle:
+    if results and not args.first_cycle:
         write_mesh_errors(mesh_errors(results))
     block = "\n\n".join(parts)
     print(block)
-    rows.into_docs(asked.docs / "discretisation.md", "study", block)
+    rows.into_docs(args.docs / "discretisation.md", "study", block)
     cells = {r.run.mesh: int(r.row["cells"]) for r in results if r.force}
     at_c = [r for r in results if r.run.point == "C" and r.force and r.run.protocol != LOADING]
     figure = figure_discretisation(
         {(cells[m], m, p): e.rms for (m, p), e in space_errors(results).items() if m != SPACE_REFERENCE},
         {name: {key: e.rms for key, e in errors.items()} for name, errors in times.items()},
         [(r.run.mesh, r.force, r.face_stress) for r in at_c],
-        asked.time_target,
+        args.time_target,
     )
-    save_figure(figure, asked.docs / "figures" / "discretisation", "benchmarks/discretisation_study.py")
+    save_figure(figure, args.docs / "figures" / "discretisation", "benchmarks/discretisation_study.py")
 
 
 if __name__ == "__main__":

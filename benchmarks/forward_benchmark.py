@@ -1,29 +1,29 @@
-"""What one full run costs, stage by stage, beside the floor that its factorisations and solves set.
+"""Measures what one full run costs, stage by stage, and compares it with its factorisations and solves alone.
 
-The `reaction` at point C over the whole healthy-skin protocol (benchmarks/healthy_skin.py), default
-tolerance, on the default bricks and, where BAYESKIN_SUPPLEMENT names the folder above the supplement's
-`data/`, on the article's mesh. Each run has a fresh process with one thread, and a short run before it that
-compiles. CPU seconds by stage:
+The run is the `reaction` at point C over the whole healthy-skin protocol (benchmarks/healthy_skin.py) with
+the default tolerance, on the default bricks. Where the environment variable BAYESKIN_SUPPLEMENT names the
+folder above the supplement's `data/`, the article's mesh is measured too. Each run has a fresh process with
+one thread. A short run before it compiles the code. The CPU seconds are counted by stage:
 
-    evaluation       from unknowns to quadrature points
-    law              stress, fluid content and flux there, and their derivatives
-    residual         its assembly
-    tangent          its assembly
+    evaluation       fields at the quadrature points from the unknowns
+    law              stress, fluid content and flux at these points, and their derivatives
+    residual         assembly of the residual
+    tangent          assembly of the tangent stiffness
     analysis         the first factorisation, with the ordering
-    factorisation    the others
+    factorisation    all other factorisations
     solve            back-substitution
     rest             everything else (Python, NumPy)
 
-A second run with the force's derivatives by the parameters gives what they cost beyond the run.
+A second run with the force's derivatives by the parameters shows what these cost in addition.
 
-The floor is one factorisation and one solve, each measured alone (median) on the run's last tangent, times
-how many the run asked for. The article's script takes about 3,600 CPU s for its 694 steps on one core; that
-is a stated number, it is not run here.
+The floor is the time of one factorisation and one solve, each multiplied by how many the run needed. Both
+times are medians, measured alone on the last tangent of the run. The article's script takes about 3,600 CPU s
+for its 694 steps on one core. This number was given to the project; the script is not run here.
 
     python benchmarks/forward_benchmark.py
 
-Finished runs are rows of benchmarks/results/forward.csv, which a later start does not repeat; a change of the
-model's source does. Prints medians, draws docs/figures/forward.{png,svg}.
+Finished runs are rows of benchmarks/results/forward.csv. A later start does not repeat them, unless the
+source of the model has changed. The program prints medians and draws docs/figures/forward.{png,svg}.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from bayeskin.finite_element.linear import SOLVER_NAME, Factorisations
 from bayeskin.finite_element.simulate import ModelSpec, problem_of
 from bayeskin.types import Array, PadMotion
 
-ARTICLE_CPU_S = 3600.0  # stated, for 694 steps; see above
+ARTICLE_CPU_S = 3600.0  # not measured here, for 694 steps; see above
 STAGES = ("evaluation", "law", "residual", "tangent", "analysis", "factorisation", "solve", "rest")
 FACTORISATIONS_ALONE, SOLVES_ALONE = 5, 30
 MESHES = ("bricks-1", "Mesh_SKIN.msh")
@@ -69,12 +69,14 @@ ROWS = rows.Rows(
 
 @dataclass
 class Clock:
-    """CPU seconds and calls by stage."""
+    """Counts CPU seconds and calls by stage."""
 
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(STAGES, 0))
 
     def timed(self, stage: str, action: Callable[..., Any]) -> Callable[..., Any]:
+        """Returns the action so that each call adds its time and its number to a stage."""
+
         def wrapper(*args: Any) -> Any:
             started = time.process_time()
             try:
@@ -87,7 +89,7 @@ class Clock:
 
 
 class TimedFactorisations:
-    """Factorisations on a clock; keeps the last matrix."""
+    """Wraps factorisations so that a clock counts their stages; keeps the last matrix."""
 
     def __init__(self, inner: Factorisations, clock: Clock) -> None:
         self.inner, self.last = inner, None
@@ -106,12 +108,12 @@ class TimedFactorisations:
 
 @contextmanager
 def on_the_clock(clock: Clock) -> Iterator[list[TimedFactorisations]]:
-    """Puts the model's stages on a clock, from outside; yields a list that will hold its factorisations."""
-    made: list[TimedFactorisations] = []
+    """Replaces the model's stages by timed ones; yields a list that will hold its factorisations."""
+    timed_factorisations: list[TimedFactorisations] = []
 
     def factorisations(symmetric: bool) -> TimedFactorisations:
-        made.append(TimedFactorisations(linear.factorisations(symmetric), clock))
-        return made[-1]
+        timed_factorisations.append(TimedFactorisations(linear.factorisations(symmetric), clock))
+        return timed_factorisations[-1]
 
     stages = (
         (assembly, "evaluate", "evaluation"), (assembly, "residual", "residual"),
@@ -122,11 +124,11 @@ def on_the_clock(clock: Clock) -> Iterator[list[TimedFactorisations]]:
         for module, name, stage in stages:
             action = clock.timed(stage, getattr(module, name))
             patches.enter_context(mock.patch.object(module, name, action))
-        yield made
+        yield timed_factorisations
 
 
 def measure(item: tuple[str, str, int]) -> dict[str, Any]:
-    """One row for (protocol, mesh, repeat); runs in a process of its own."""
+    """Returns one row for (protocol, mesh, repeat); runs in a process of its own."""
     protocol, mesh, repeat = item
     motion = healthy_skin.HEALTHY_SKIN
     motion = healthy_skin.first_cycle(motion) if protocol == "first cycle" else motion
@@ -134,34 +136,35 @@ def measure(item: tuple[str, str, int]) -> dict[str, Any]:
     with healthy_skin.spec_on(mesh, ModelSpec().tolerance) as spec:
         compiling = PadMotion(np.array([0.0, 1.0]), np.array([0.0, 1e-4]))
         simulate(ModelSpec(tolerance=1.0), compiling, theta, gradients=logarithms(theta))
-        problem = problem_of(spec.mesh, spec.refinement)  # a process builds it once, for all of its runs
+        # A process builds the problem once for all of its runs, so this is not timed.
+        problem = problem_of(spec.mesh, spec.refinement)
         clock = Clock()
-        with on_the_clock(clock) as made:
+        with on_the_clock(clock) as timed_factorisations:
             started = time.process_time()
-            found = simulate(spec, motion, theta, rows.progress(mesh))
+            run = simulate(spec, motion, theta, rows.progress(mesh))
             cpu_s = time.process_time() - started
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-        of_gradients_s = gradients_s(spec, motion, theta)
+        derivatives_s = gradients_s(spec, motion, theta)
     clock.seconds["rest"] = cpu_s - sum(clock.seconds.values())
-    matrix, scale = made[0].last
+    matrix, scale = timed_factorisations[0].last
     factorisation_s, solve_s, factor_bytes = alone(matrix, scale)
     factorisations = clock.counts["factorisation"] + clock.counts["analysis"]
     return {
         "protocol": protocol, "mesh": mesh, "repeat": repeat, "tolerance": spec.tolerance,
-        "model_hash": found.model_hash, "code": rows.CODE, "status": found.status,
+        "model_hash": run.model_hash, "code": rows.CODE, "status": run.status,
         "linear_solver": SOLVER_NAME, "cells": problem.mesh.geometry.nelements, "dofs": problem.space.dofs,
-        "steps": int(found.stats["steps"]), "iterations": int(found.stats["iterations"]), "cpu_s": cpu_s,
+        "steps": int(run.stats["steps"]), "iterations": int(run.stats["iterations"]), "cpu_s": cpu_s,
         **{f"{stage}_s": seconds for stage, seconds in clock.seconds.items()},
         **{f"{stage}_count": count for stage, count in clock.counts.items()},
         "one_factorisation_s": factorisation_s, "one_solve_s": solve_s,
         "floor_s": factorisations * factorisation_s + clock.counts["solve"] * solve_s,
         "factor_bytes": factor_bytes, "matrix_entries": matrix.nnz, "peak_memory_bytes": memory,
-        "gradients_s": of_gradients_s,
+        "gradients_s": derivatives_s,
     }  # fmt: skip
 
 
 def gradients_s(spec: ModelSpec, motion: PadMotion, theta: dict[str, float]) -> float:
-    """CPU seconds that the force's derivatives take along a run."""
+    """Returns the CPU seconds that the force's derivatives take along a run."""
     clock = Clock()
     clock.seconds["gradients"], clock.counts["gradients"] = 0.0, 0
     follow = clock.timed("gradients", ForceGradients.follow)
@@ -171,9 +174,9 @@ def gradients_s(spec: ModelSpec, motion: PadMotion, theta: dict[str, float]) -> 
 
 
 def alone(matrix: sp.csr_matrix, scale: Array) -> tuple[float, float, int]:
-    """CPU seconds of one factorisation and of one solve, and the factors' bytes."""
+    """Returns the CPU seconds of one factorisation and of one solve, and the factors' size in bytes."""
     factors, right = linear.factorisations(True), np.random.default_rng(0).normal(size=matrix.shape[0])
-    factors.factorise(0, matrix, scale)  # analyses the pattern too
+    factors.factorise(0, matrix, scale)  # not timed, because it also analyses the pattern
     factorisation_s = _median_s(lambda: factors.factorise(0, matrix, scale), FACTORISATIONS_ALONE)
     solve_s = _median_s(lambda: factors.solve(0, right), SOLVES_ALONE)
     size = _bytes_of(factors)
@@ -182,6 +185,7 @@ def alone(matrix: sp.csr_matrix, scale: Array) -> tuple[float, float, int]:
 
 
 def _median_s(action: Callable[[], Any], times: int) -> float:
+    """Returns the median CPU seconds of some calls."""
     seconds = []
     for _ in range(times):
         started = time.process_time()
@@ -191,14 +195,18 @@ def _median_s(action: Callable[[], Any], times: int) -> float:
 
 
 def _bytes_of(factors: Any) -> int:
-    """PARDISO: entries of the factor by its own count, in single precision. SuperLU: values and indices."""
+    """Returns the size of the factors in bytes.
+
+    PARDISO reports the entries of its factor, which are in single precision. SuperLU's size has values and
+    indices.
+    """
     if SOLVER_NAME == "SuperLU":
         return 12 * int(factors._stored[0][0].nnz)
     return 4 * int(factors._settings[linear._ENTRIES_OF_FACTOR - 1])
 
 
 def medians(found: Sequence[rows.Row]) -> dict[str, dict[str, float]]:
-    """Medians over repeats of every number, by mesh."""
+    """Returns the medians over repeats of every number, by mesh."""
     numbers = [name for name in ROWS.values if name not in ("status", "linear_solver")]
     return {
         mesh: {n: float(np.median([float(r[n]) for r in found if r["mesh"] == mesh])) for n in numbers}
@@ -207,10 +215,11 @@ def medians(found: Sequence[rows.Row]) -> dict[str, dict[str, float]]:
 
 
 def table(found: dict[str, dict[str, float]], whole: bool) -> str:
+    """Returns the medians as a table with one column for each mesh."""
     lines = [["CPU s", *(f"{m['cpu_s']:.2f}" for m in found.values())]]
     if whole:
         ratios = [f"{ARTICLE_CPU_S / m['cpu_s']:.0f}" for m in found.values()]
-        lines.append([f"the article's {ARTICLE_CPU_S:.0f} CPU s over that", *ratios])
+        lines.append([f"ratio of the article's {ARTICLE_CPU_S:.0f} CPU s to these", *ratios])
     lines.append(["cells, unknowns", *(f"{m['cells']:.0f}, {m['dofs']:.0f}" for m in found.values())])
     lines.append(["steps, iterations", *(f"{m['steps']:.0f}, {m['iterations']:.0f}" for m in found.values())])
     for stage in STAGES:
@@ -221,16 +230,23 @@ def table(found: dict[str, dict[str, float]], whole: bool) -> str:
                 *(f"{m[f'{stage}_s']:.2f}{n}" for m, n in zip(found.values(), calls, strict=True)),
             ]
         )
-    ms = [(1e3 * m["one_factorisation_s"], 1e3 * m["one_solve_s"]) for m in found.values()]
-    lines.append(["one factorisation, one solve, alone [ms]", *(f"{a:.0f}, {b:.1f}" for a, b in ms)])
-    lines.append(["floor: those times their numbers [s]", *(f"{m['floor_s']:.2f}" for m in found.values())])
-    lines.append(["CPU s over the floor", *(f"{m['cpu_s'] / m['floor_s']:.2f}" for m in found.values())])
+    alone_ms = [(1e3 * m["one_factorisation_s"], 1e3 * m["one_solve_s"]) for m in found.values()]
+    lines.append(["one factorisation, one solve, alone [ms]", *(f"{a:.0f}, {b:.1f}" for a, b in alone_ms)])
+    lines.append(
+        ["floor: these times the number of calls [s]", *(f"{m['floor_s']:.2f}" for m in found.values())]
+    )
+    lines.append(
+        [
+            "ratio of the run's CPU s to the floor",
+            *(f"{m['cpu_s'] / m['floor_s']:.2f}" for m in found.values()),
+        ]
+    )
     lines.append(["derivatives [CPU s]", *(f"{m['gradients_s']:.2f}" for m in found.values())])
     shares = [f"{m['gradients_s'] / m['cpu_s']:.2f}" for m in found.values()]
-    lines.append(["derivatives, of the run", *shares])
+    lines.append(["ratio of derivatives to the run", *shares])
     lines.append(["factors [MB]", *(f"{m['factor_bytes'] / 1e6:.1f}" for m in found.values())])
     rate = [2 * m["factor_bytes"] / m["one_solve_s"] / 1e9 for m in found.values()]
-    lines.append(["factors read twice a solve [GB/s]", *(f"{r:.1f}" for r in rate)])
+    lines.append(["rate of reading the factors twice per solve [GB/s]", *(f"{r:.1f}" for r in rate)])
     memory = [m["peak_memory_bytes"] / 2**20 for m in found.values()]
     lines.append(["peak memory of the process [MiB]", *(f"{b:.0f}" for b in memory)])
     return rows.markdown(["", *found], lines)
@@ -243,7 +259,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--meshes", nargs="+", default=MESHES, choices=MESHES)
     parser.add_argument(
-        "--first-cycle", action="store_true", help="of the protocol; no ratio to the article's"
+        "--first-cycle",
+        action="store_true",
+        help="run only the first cycle; leaves out the ratio to the article's time",
     )
     parser.add_argument("--results", type=Path, default=rows.RESULTS)
     parser.add_argument("--figures", type=Path, default=FIGURES)
@@ -251,19 +269,20 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> None:
-    from forward_figure import figure_forward  # drawing is not for the processes whose memory is measured
+    # Not imported above, so that plotting does not count in the memory of the measured processes.
+    from forward_figure import figure_forward
 
     from bayeskin.report import save_figure
 
-    asked = arguments()
-    results = replace(ROWS, path=asked.results / ROWS.path.name)
-    protocol = "first cycle" if asked.first_cycle else "whole"
+    options = arguments()
+    results = replace(ROWS, path=options.results / ROWS.path.name)
+    protocol = "first cycle" if options.first_cycle else "whole"
     supplement = healthy_skin.supplement_mesh("") is not None
-    found = []
-    for mesh in [m for m in asked.meshes if supplement or m not in healthy_skin.GMSH_MESHES]:
+    table_rows = []
+    for mesh in [m for m in options.meshes if supplement or m not in healthy_skin.GMSH_MESHES]:
         with healthy_skin.spec_on(mesh, ModelSpec().tolerance) as spec:
             same = {"tolerance": spec.tolerance, "model_hash": spec.hash, "code": rows.CODE}
-        for repeat in range(asked.repeats):
+        for repeat in range(options.repeats):
             row = results.find(protocol=protocol, mesh=mesh, repeat=repeat, **same)
             if row is None:
                 rows.say(f"{mesh}, {protocol}, repeat {repeat}")
@@ -271,10 +290,12 @@ def main() -> None:
                 if isinstance(measured, Lost):
                     raise SystemExit(f"{mesh}: {measured.reason}")
                 row = results.append(**measured)
-            found.append(row)
-    by_mesh = medians(found)
-    print(table(by_mesh, whole=not asked.first_cycle))
-    save_figure(figure_forward(by_mesh, STAGES), asked.figures / "forward", "benchmarks/forward_benchmark.py")
+            table_rows.append(row)
+    by_mesh = medians(table_rows)
+    print(table(by_mesh, whole=not options.first_cycle))
+    save_figure(
+        figure_forward(by_mesh, STAGES), options.figures / "forward", "benchmarks/forward_benchmark.py"
+    )
 
 
 if __name__ == "__main__":

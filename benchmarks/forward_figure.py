@@ -1,4 +1,4 @@
-"""The figure of benchmarks/forward_benchmark.py."""
+"""Draws the figure of benchmarks/forward_benchmark.py."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ COLOURS = ("#56B4E9", "#0072B2", "#009E73", "#E69F00", "#882255", "#D55E00", "#C
 
 @styled
 def figure_forward(found: Mapping[str, Mapping[str, float]], stages: Sequence[str]) -> Figure:
-    """Stages as shares of the run on each mesh, with the floor."""
+    """Returns the figure: each stage as a share of the run on each mesh, with the floor."""
     figure = new_figure(PAGE_IN, 0.75 + 0.55 * len(found) + 0.6)
     ax = figure.subplots()
-    for y, m in enumerate(found.values()):
+    for y, run in enumerate(found.values()):
         left = 0.0
         for stage, colour in zip(stages, COLOURS, strict=True):
-            share = 100 * m[f"{stage}_s"] / m["cpu_s"]
+            share = 100 * run[f"{stage}_s"] / run["cpu_s"]
             ax.barh(y, share, 0.55, left, color=colour, label=stage if y == 0 else None)
             left += share
-        floor = 100 * m["floor_s"] / m["cpu_s"]
+        floor = 100 * run["floor_s"] / run["cpu_s"]
         ax.plot([floor, floor], [y - 0.38, y + 0.38], color=INK, lw=1.4, label="floor" if y == 0 else None)
-    names = [f"{mesh.removesuffix('.msh')}\n{m['cpu_s']:.1f} s" for mesh, m in found.items()]
+    names = [f"{mesh.removesuffix('.msh')}\n{run['cpu_s']:.1f} s" for mesh, run in found.items()]
     ax.set(
         yticks=range(len(found)), yticklabels=names, xlabel="share of the run's CPU time [%]", xlim=(0, 100)
     )
@@ -39,8 +39,9 @@ def figure_forward(found: Mapping[str, Mapping[str, float]], stages: Sequence[st
 
 
 def _finding(found: Mapping[str, Mapping[str, float]]) -> str:
-    mesh, m = list(found.items())[-1]
+    """Returns the figure's headline, on the run with the last mesh."""
+    mesh, run = list(found.items())[-1]
     return (
-        f"On {mesh.removesuffix('.msh')} ({m['dofs']:,.0f} unknowns) a run takes {m['cpu_s']:.0f} CPU s, "
-        f"{m['cpu_s'] / m['floor_s']:.1f} times its factorisations and solves alone"
+        f"On {mesh.removesuffix('.msh')} ({run['dofs']:,.0f} unknowns) a run takes {run['cpu_s']:.0f} CPU s, "
+        f"{run['cpu_s'] / run['floor_s']:.1f} times its factorisations and solves alone"
     )

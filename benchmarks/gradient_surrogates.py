@@ -1,18 +1,19 @@
-"""Whether a surrogate should learn from derivatives: error against what its runs cost, with and without.
+"""Shows whether surrogates should learn from derivatives: their error against the cost of their runs.
 
-Runs of the `reaction` on 80 bricks over the healthy-skin protocol at the first points of a design of the
-default prior box, each with its derivatives by the four inputs of the surrogate (benchmarks/healthy_skin.py,
-bayeskin/surrogates/similarity.py); a run's CPU seconds count with those of its derivatives only where these
-are used. Four surrogates of the same latents, for 24, 48, ... runs, at the same held-out runs:
+The runs are those of the `reaction` on 80 bricks over the healthy-skin protocol (benchmarks/healthy_skin.py),
+at the first points of a design of the default prior box. Each run has its derivatives by the four inputs of
+the surrogate (bayeskin/surrogates/similarity.py). The CPU seconds of the derivatives count only where a
+surrogate uses them. Four surrogates of the same latents are trained on 24, 48 and 96 runs, and compared at
+the same held-out runs:
 
-    chaos, GP                        from forces, as `bayeskin train` makes them
-    chaos with derivatives           matching pursuit over rows of values and of slopes
-    GP with derivatives              rows at small steps from each run, as its derivatives predict them
+    chaos, GP                        are trained on forces, as by `bayeskin train`
+    chaos with derivatives           uses matching pursuit over rows of values and of slopes
+    GP with derivatives              adds rows at small steps from each run, predicted by its derivatives
 
     python benchmarks/gradient_surrogates.py
 
-Finished runs lie in benchmarks/results/gradient_surrogates, which a later start does not repeat. Prints the
-table and draws docs/figures/gradient_surrogates.{png,svg}.
+Finished runs are stored in benchmarks/results/gradient_surrogates, and a later start does not repeat them.
+The program prints the table and draws docs/figures/gradient_surrogates.{png,svg}.
 """
 
 from __future__ import annotations
@@ -57,36 +58,36 @@ SIZES = (24, 48, 96)
 HELD_OUT = 32
 SPEC = ModelSpec(refinement=0)
 EDGES_S = np.arange(9.5, 347.0, 0.5)
-STEERED = ("E_s", "k_c", "k_s", "p_init")  # one of them for each input
+STEERED = ("E_s", "k_c", "k_s", "p_init")  # the force is differentiated by one parameter for each input
 P_INIT_CHANGE_PA = 100.0
-SLOPE_WEIGHTS = (0.03, 0.1, 0.3)  # of a derivative over the box's width beside a value
-STEP = 0.003  # of the box's width, to a row that derivatives predict; of 0.001 ... 0.06 the best
+SLOPE_WEIGHTS = (0.03, 0.1, 0.3)  # weight of a derivative over the box's width, relative to a value
+STEP = 0.003  # from a run to a predicted row, over the box's width; the best of 0.001 to 0.06
 KINDS = ("chaos", "GP", "chaos with derivatives", "GP with derivatives")
 COLOURS = ("#E69F00", "#0072B2", "#D55E00", "#009E73")
 
 
 @cache
 def _compile() -> None:
-    """Once a process, so that no run is timed with it."""
+    """Compiles the model once in each process, so that no run's time includes it."""
     simulate(SPEC, healthy_skin.first_cycle(healthy_skin.HEALTHY_SKIN), healthy_skin.POINTS["C"])
 
 
 def _run(task: tuple[int, dict[str, float]]) -> str:
-    """One run and its derivatives, into its file; what went wrong, or nothing."""
+    """Stores one run and its derivatives in a file; returns an error message, or an empty text."""
     index, theta = task
     changes = {name: theta[name] for name in STEERED} | {"p_init": P_INIT_CHANGE_PA}
     _compile()
     started = time.process_time()
     plain = simulate(SPEC, healthy_skin.HEALTHY_SKIN, theta)
     between = time.process_time()
-    found = simulate(SPEC, healthy_skin.HEALTHY_SKIN, theta, gradients=changes)
+    with_slopes = simulate(SPEC, healthy_skin.HEALTHY_SKIN, theta, gradients=changes)
     ended = time.process_time()
-    for one in (plain, found):
-        if one.status != "ok":
-            return f"{theta}: {one.message}"
+    for simulation in (plain, with_slopes):
+        if simulation.status != "ok":
+            return f"{theta}: {simulation.message}"
     partial = FOLDER / f"{index}.part.npz"
     np.savez(
-        partial, force_n=found.bin_means(EDGES_S), slopes_n=found.gradient_bin_means(EDGES_S),
+        partial, force_n=with_slopes.bin_means(EDGES_S), slopes_n=with_slopes.gradient_bin_means(EDGES_S),
         run_s=between - started, both_s=ended - between,
     )  # fmt: skip
     partial.rename(FOLDER / f"{index}.npz")
@@ -94,7 +95,11 @@ def _run(task: tuple[int, dict[str, float]]) -> str:
 
 
 def _jacobian(similarity: Similarity, theta: Array) -> Array:
-    """Derivatives (n, inputs, steered) of the inputs by the changes that the slopes are for."""
+    """Returns the derivatives (n, inputs, steered) of the surrogate's inputs by the steered parameters.
+
+    The units are the changes by which the stored slopes are taken: the value itself, for p_init
+    `P_INIT_CHANGE_PA`.
+    """
     names = similarity.space.names
     columns = []
     for name in STEERED:
@@ -108,7 +113,7 @@ def _jacobian(similarity: Similarity, theta: Array) -> Array:
 
 
 def _latent_slopes(transform: ShapeTransform, force_n: Array, slopes_n: Array) -> Array:
-    """Derivatives (n, q, inputs) of the latents from those of the force (n, m, inputs)."""
+    """Returns the derivatives (n, q, inputs) of the latents from those of the force (n, m, inputs)."""
     shapes = split(force_n)[1]
     rms = np.sqrt(np.mean(force_n**2, axis=1))
     relative = slopes_n / rms[:, None, None]
@@ -119,7 +124,7 @@ def _latent_slopes(transform: ShapeTransform, force_n: Array, slopes_n: Array) -
 
 
 def _slope_basis(unit: Array, indices: np.ndarray) -> Array:
-    """Derivatives of the basis by each input, (inputs, n, P)."""
+    """Returns the derivatives (inputs, n, P) of the basis by each input."""
     step = 1e-5
     columns = []
     for j in range(unit.shape[1]):
@@ -131,7 +136,10 @@ def _slope_basis(unit: Array, indices: np.ndarray) -> Array:
 
 
 def _pursued(unit: Array, target: Array, slopes: Array) -> Callable[[Array], Array]:
-    """A sparse expansion of one latent, (n,) with slopes (n, inputs); terms and weight by folds."""
+    """Returns a sparse expansion of one latent (n,) with slopes (n, inputs).
+
+    Cross-validation over folds chooses its terms and the weight of the slopes.
+    """
     n, dim = unit.shape
     fold = np.arange(n) % FOLDS
     best = (np.inf, 0.0, np.zeros((0, dim), dtype=np.int64), [0])
@@ -139,16 +147,18 @@ def _pursued(unit: Array, target: Array, slopes: Array) -> Callable[[Array], Arr
         indices = multi_indices(dim, degree)
         if len(indices) > n * (1 + dim):
             break
-        basis, steep = legendre_basis(unit, indices), _slope_basis(unit, indices)
-        most = min(n * (1 + dim) // 3, MOST_TERMS, len(indices))
+        basis, slope_basis = legendre_basis(unit, indices), _slope_basis(unit, indices)
+        term_limit = min(n * (1 + dim) // 3, MOST_TERMS, len(indices))
         for weight in SLOPE_WEIGHTS:
-            stacked = np.concatenate([basis, *(weight * steep)])
+            stacked = np.concatenate([basis, *(weight * slope_basis)])
             aims = np.concatenate([target, *(weight * slopes.T)])
-            missed = np.empty((n, most))
+            residual = np.empty((n, term_limit))
             for k in range(FOLDS):
-                learn = np.tile(fold != k, 1 + dim)
-                missed[fold == k] = _pursue(stacked, aims, learn, most)[1][: int(np.sum(fold == k))]
-            errors = np.mean(missed**2, axis=0)
+                is_training = np.tile(fold != k, 1 + dim)
+                residual[fold == k] = _pursue(stacked, aims, is_training, term_limit)[1][
+                    : int(np.sum(fold == k))
+                ]
+            errors = np.mean(residual**2, axis=0)
             if errors.min() < best[0]:
                 chosen = _pursue(stacked, aims, np.ones(len(aims), dtype=bool), int(np.argmin(errors)) + 1)[0]
                 best = (float(errors.min()), weight, indices, chosen)
@@ -160,38 +170,38 @@ def _pursued(unit: Array, target: Array, slopes: Array) -> Callable[[Array], Arr
 
 
 def _predictions(kind: str, inputs: Array, targets: Array, slopes: Array, at: Array) -> Array:
-    """Latents (k, q) at inputs `at` from targets (n, q) and slopes (n, q, inputs)."""
+    """Returns the latents (k, q) at inputs `at`, learnt from targets (n, q) and slopes (n, q, inputs)."""
     ones = np.ones(len(inputs))
     if kind == "chaos":
         fits = [fit_sparse(inputs, column, ones) for column in targets.T]
         return LatentChaos.assemble(inputs, targets, fits).predict(at)[0]
     if kind == "chaos with derivatives":
-        found = [_pursued(inputs, targets[:, q], slopes[:, q])(at) for q in range(targets.shape[1])]
-        return np.stack(found, axis=1)
+        columns = [_pursued(inputs, targets[:, q], slopes[:, q])(at) for q in range(targets.shape[1])]
+        return np.stack(columns, axis=1)
     if kind == "GP with derivatives":
         steps = STEP * np.eye(inputs.shape[1])
-        near = [(inputs + step, targets + slopes @ step) for step in steps]
-        inputs = np.concatenate([inputs, *(where for where, _ in near)])
-        targets = np.concatenate([targets, *(what for _, what in near)])
+        stepped = [(inputs + step, targets + slopes @ step) for step in steps]
+        inputs = np.concatenate([inputs, *(at_step for at_step, _ in stepped)])
+        targets = np.concatenate([targets, *(predicted for _, predicted in stepped)])
         ones = np.ones(len(inputs))
-    # All rows at once: a subset would part the rows of a run.
+    # The fit uses all rows at once, because a subset could separate rows that belong to the same run.
     with mock.patch.object(hyperparameters, "ROWS_TO_SEARCH", len(inputs)):
         gps = [fit_latent(inputs, column, ones) for column in targets.T]
     return LatentGPs.assemble(inputs, targets, gps).predict(at)[0]
 
 
 def _rows(theta: Array) -> list[tuple[str, int, float, float, float]]:
-    """Kind, runs, CPU seconds of its runs, error [%] at held-out runs, seconds of training."""
+    """Returns each surrogate's kind, runs, their CPU seconds, held-out error [%] and training seconds."""
     stored = [np.load(FOLDER / f"{index}.npz") for index in range(len(theta))]
     force_n, slopes_n, run_s, both_s = (
-        np.stack([one[name] for one in stored]) for name in ("force_n", "slopes_n", "run_s", "both_s")
+        np.stack([run[name] for run in stored]) for name in ("force_n", "slopes_n", "run_s", "both_s")
     )
     similarity = Similarity(default_space())
     inputs, log_scale = similarity.inputs(theta), similarity.log_scale(theta)
     slopes_n = np.einsum("nms,nsi->nmi", slopes_n, np.linalg.inv(_jacobian(similarity, theta)))
     test = np.arange(len(theta)) >= max(SIZES)
     truth = force_n[test] / np.sqrt(np.mean(force_n[test] ** 2, axis=1))[:, None]
-    found = []
+    results = []
     for size in SIZES:
         train = np.arange(len(theta)) < size
         transform, targets, _ = fit_latents(
@@ -201,23 +211,26 @@ def _rows(theta: Array) -> list[tuple[str, int, float, float, float]]:
         for kind in KINDS:
             started = time.process_time()
             latents = _predictions(kind, inputs[train], targets, slopes, inputs[test])
-            took = time.process_time() - started
+            training_s = time.process_time() - started
             times = np.exp(log_scale[test])
             force = transform.decode(latents, np.zeros_like(latents), times).mean
-            miss = force / np.sqrt(np.mean(force_n[test] ** 2, axis=1))[:, None] - truth
+            error = force / np.sqrt(np.mean(force_n[test] ** 2, axis=1))[:, None] - truth
             cost = (both_s if "derivatives" in kind else run_s)[train].sum()
-            found.append((kind, size, float(cost), 100.0 * float(np.sqrt(np.mean(miss**2))), took))
-            rows.say(f"{kind}, {size} runs: {found[-1][3]:.3f} %")
-    return found
+            results.append((kind, size, float(cost), 100.0 * float(np.sqrt(np.mean(error**2))), training_s))
+            rows.say(f"{kind}, {size} runs: {results[-1][3]:.3f} %")
+    return results
 
 
 @styled
 def _draw(found: Sequence[tuple[str, int, float, float, float]]) -> Figure:
+    """Returns the figure of error against CPU time."""
     figure = new_figure(0.7 * PAGE_IN, 3.4)
     axes = figure.subplots()
     for kind, colour in zip(KINDS, COLOURS, strict=True):
-        mine = [row for row in found if row[0] == kind]
-        axes.loglog([row[2] / 60 for row in mine], [row[3] for row in mine], "o-", color=colour, label=kind)
+        of_kind = [row for row in found if row[0] == kind]
+        axes.loglog(
+            [row[2] / 60 for row in of_kind], [row[3] for row in of_kind], "o-", color=colour, label=kind
+        )
     plain_log(axes.xaxis)
     plain_log(axes.yaxis)
     axes.set_xlabel("CPU time of the runs, with derivatives where used [min]")
@@ -231,7 +244,7 @@ def _draw(found: Sequence[tuple[str, int, float, float, float]]) -> Figure:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs what is missing, prints the table, draws."""
+    """Makes the runs that are missing, prints the table and draws the figure."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--workers", type=int, default=2)
     workers = parser.parse_args(arguments).workers
@@ -248,14 +261,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(outcome, Lost) or outcome:
             raise SystemExit(f"run {missing[index][0]}: {outcome}")
         rows.say(f"{done + 1} of {len(missing)} runs")
-    found = _rows(theta)
+    results = _rows(theta)
     header = ("surrogate", "runs", "CPU s of runs", "held-out error [%]", "training [CPU s]")
     cells = [
-        (kind, str(size), f"{cost:.0f}", f"{error:.3f}", f"{took:.1f}")
-        for kind, size, cost, error, took in found
+        (kind, str(size), f"{cost:.0f}", f"{error:.3f}", f"{training_s:.1f}")
+        for kind, size, cost, error, training_s in results
     ]
     print(rows.markdown(header, cells))
-    save_figure(_draw(found), FIGURE, "benchmarks/gradient_surrogates.py")
+    save_figure(_draw(results), FIGURE, "benchmarks/gradient_surrogates.py")
     return 0
 
 

@@ -1,7 +1,8 @@
-"""What the benchmarks of the full model run: a protocol, points of the parameters, meshes.
+"""Provides a protocol, parameter points and meshes for the benchmarks of the full model.
 
-The protocol is that of the article's healthy-skin recording in idealised corners (times to 0.1 s, heights to
-0.01 mm): four extensions of 9.45 mm at 1 mm/s, of which the third is released to 1.76 mm only.
+The protocol is that of the article's healthy-skin recording in idealised corners, with times rounded to 0.1 s
+and heights to 0.01 mm. It has four extensions of 9.45 mm at 1 mm/s. The third of them is released to 1.76 mm
+only.
 """
 
 from __future__ import annotations
@@ -36,29 +37,32 @@ GMSH_MESHES = ("Mesh_SKIN.msh", "Symmetric_skin_XY_RF.msh")
 
 
 def first_cycle(motion: PadMotion) -> PadMotion:
-    """Rest, first loading, hold and unloading: the first five corners."""
+    """Returns the first five corners of a protocol: rest, first loading, hold and unloading."""
     return PadMotion(motion.time_s[:5], motion.displacement_m[:5])
 
 
 def supplement_mesh(name: str) -> Path | None:
-    """Path of one of the article's meshes, or None where the supplement is not there."""
-    root = os.environ.get("BAYESKIN_SUPPLEMENT")
-    return Path(root) / "data" / name if root else None
+    """Returns the path of one of the article's meshes, or None if BAYESKIN_SUPPLEMENT is not set."""
+    supplement = os.environ.get("BAYESKIN_SUPPLEMENT")
+    return Path(supplement) / "data" / name if supplement else None
 
 
 @contextmanager
 def spec_on(mesh: str, tolerance: float) -> Iterator[ModelSpec]:
-    """The `reaction` on a mesh: "bricks-2", "bricks-1-halved" (every edge of every brick), or a gmsh file of
-    the supplement."""
-    bricks = re.fullmatch(r"bricks-(\d+)(-halved)?", mesh)
-    if not bricks:
+    """Yields the specification of the `reaction` on a mesh.
+
+    mesh : "bricks-2", "bricks-1-halved" (every edge of every brick is halved), or a gmsh file of the
+    supplement
+    """
+    match = re.fullmatch(r"bricks-(\d+)(-halved)?", mesh)
+    if not match:
         path = supplement_mesh(mesh)
         if path is None:
             raise SystemExit(f"{mesh}: BAYESKIN_SUPPLEMENT is not set")
         yield ModelSpec(mesh=str(path), tolerance=tolerance)
         return
-    spec = ModelSpec(refinement=int(bricks[1]), tolerance=tolerance)
-    if not bricks[2]:
+    spec = ModelSpec(refinement=int(match[1]), tolerance=tolerance)
+    if not match[2]:
         yield spec
         return
     with mock.patch.object(mesh_module, "brick_lines", halved_lines):
@@ -72,11 +76,12 @@ def spec_on(mesh: str, tolerance: float) -> Iterator[ModelSpec]:
 def halved_lines(
     refinement: int, geometry: Geometry = Geometry(), like: Geometry | None = None
 ) -> tuple[Array, ...]:
-    """Lines of the bricks with one more in the middle of every cell [m]."""
+    """Returns the lines of the bricks with an additional line in the middle of every cell [m]."""
     lines = brick_lines(refinement, geometry, like)
     return tuple(np.sort(np.concatenate([axis, 0.5 * (axis[1:] + axis[:-1])])) for axis in lines)
 
 
 def _forget_meshes() -> None:
+    """Clears the caches of meshes and problems, which do not know that the lines were replaced."""
     _mesh.cache_clear()
     problem_of.cache_clear()

@@ -1,11 +1,12 @@
-"""What a diagnosis says of the article's recording, as tables and figures of docs/mismatch.md.
+"""Writes the diagnosis of the article's recording as tables and figures of docs/mismatch-scoreboard.md.
 
     bayeskin import Healthy_skin.xlsx -o runs/healthy-skin.h5
     cp Mesh_SKIN.msh runs/
     python benchmarks/healthy_skin_page.py
 
-The first two take their files from the article's supplement. Diagnoses the recording by both observations,
-where what is done is skipped, writes between the markers of the page and copies the figures, in 256 colours.
+The first two commands take their files from the article's supplement. The program diagnoses the recording by
+both observations of the force, and skips what is finished already. It writes the tables between the markers
+of the page, and copies the figures in 256 colours.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from typing import Any
 import rows
 from demo_gallery import FIGURES, ROOT, called, smaller
 
-PAGE = ROOT / "docs" / "mismatch.md"
-WHOLE_MN, HELD_OUT_MN = "12 mN", "18 mN"  # this project's aims on this recording
+PAGE = ROOT / "docs" / "mismatch-scoreboard.md"
+WHOLE_MN, HELD_OUT_MN = "9 mN", "18 mN"  # the aims of this project on this recording
 KINDS = ("rest", "load", "hold", "unload")
 RUNS = {
     "healthy-skin": ("located", "before_after", "candidates"),
@@ -27,50 +28,60 @@ RUNS = {
 
 
 def fits(answer: Mapping[str, Any]) -> str:
-    """Errors before and after, and that of a full run at the best values."""
-    both, full = [answer["fit"][when] for when in ("before", "after")], answer["full_model"]
+    """Returns a table of the errors before and after the diagnosis, and of a run of the full model."""
+    fit_pair, full = [answer["fit"][when] for when in ("before", "after")], answer["full_model"]
     table = [
-        ["RMSE over the whole recording", *_mn(both, "rmse"), WHOLE_MN],
-        [f"its {' / '.join(KINDS)}", *(_by_phase(one) for one in both), ""],
-        ["fitted up to the end of the second hold, RMSE on what follows", *_mn(both, "rmse_held_out"),
+        ["RMSE over the whole recording", *_mn(fit_pair, "rmse"), WHOLE_MN],
+        [f"RMSE by phase: {' / '.join(KINDS)}", *(_by_phase(fit) for fit in fit_pair), ""],
+        ["RMSE after the second hold, of a fit up to its end", *_mn(fit_pair, "rmse_held_out"),
          HELD_OUT_MN],
-        ["a run of the full model at the best values, RMSE", "",
+        ["full model at the best values, RMSE", "",
          full["message"] if "message" in full else f"{1e3 * full['rmse']:.1f} mN", ""],
-        ["recorded bins in the 90 % band", *(f"{100 * one['coverage90']:.0f} %" for one in both), ""],
-        ["windows in which they differ",
+        ["recorded bins inside the 90 % band", *(f"{100 * fit['coverage90']:.0f} %" for fit in fit_pair), ""],
+        ["windows in which recording and model differ",
          *(str(len(answer[where])) for where in ("located", "remaining")), ""],
     ]  # fmt: skip
-    return rows.markdown(("", "base model", "with what was found", "to reach"), table)
+    return rows.markdown(("", "base model", "with the best set", "aim"), table)
 
 
 def named(answer: Mapping[str, Any]) -> str:
-    """The verdict, and what was named, the largest contribution first."""
-    best = ", ".join(answer["best_set"]) or "none"
+    """Returns the verdict in sentences, and a table of named mechanisms, the largest contribution first."""
+    best_set = ", ".join(answer["best_set"]) or "none"
     verdict = (
-        f"The verdict is `{answer['verdict']}`. Best set: {best}, which explains "
+        f"The verdict is `{answer['verdict']}`. Best set: {best_set}, which explains "
         f"{100 * answer['explained']:.1f} % of the squared residual; R-hat of its draws {_rhat(answer)}. "
-        "Something smooth that is not in the catalogue: "
-        f"probability {answer['smooth_probability']:.2f}. {answer['seconds'] / 60.0:.0f} minutes."
+        "The probability of an unnamed smooth discrepancy is "
+        f"{answer['smooth_probability']:.2f}. Time: {answer['seconds'] / 60.0:.0f} minutes."
     )
     table = [
-        [one["name"], f"{one['probability']:.2f}", *_mn([one], "contribution_n"), one["statement"]]
-        for one in sorted(answer["mechanisms"], key=lambda one: -(one["contribution_n"] or 0.0))
+        [
+            mechanism["name"],
+            f"{mechanism['probability']:.2f}",
+            *_mn([mechanism], "contribution_n"),
+            mechanism["statement"],
+        ]
+        for mechanism in sorted(
+            answer["mechanisms"], key=lambda mechanism: -(mechanism["contribution_n"] or 0.0)
+        )
     ]
     if not table:
         return verdict
-    return verdict + "\n\n" + rows.markdown(("named", "probability", "contributes, RMS", "as fitted"), table)
+    return verdict + "\n\n" + rows.markdown(("named", "probability", "contribution, RMS", "as fitted"), table)
 
 
 def _rhat(answer: Mapping[str, Any]) -> str:
+    """Returns R-hat of the draws as text, and whether they have settled."""
     sampled = answer["fit"]["after"]["sampled"]
     return f"{sampled['rhat']:.2f} ({'settled' if sampled['settled'] else 'not settled'})"
 
 
 def _mn(some: list[Mapping[str, Any]], what: str) -> list[str]:
-    return ["none" if one[what] is None else f"{1e3 * one[what]:.1f} mN" for one in some]
+    """Returns one value of each entry in mN as text."""
+    return ["not available" if entry[what] is None else f"{1e3 * entry[what]:.1f} mN" for entry in some]
 
 
 def _by_phase(one: Mapping[str, Any]) -> str:
+    """Returns the RMSE of each kind of phase in mN as text."""
     return " / ".join(f"{1e3 * one['rmse_by_phase'][kind]:.0f}" for kind in KINDS) + " mN"
 
 

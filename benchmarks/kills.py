@@ -1,10 +1,11 @@
-"""kill -9 at random times of designing, training, sampling and diagnosing: what is lost, and what comes out.
+"""Kills stages with `kill -9` at random times, and checks what is lost and whether the result is the same.
 
     python benchmarks/kills.py --kills 14 --seed 1
 
-makes a recording with a small model of its own, runs `bayeskin` on it undisturbed, then each stage again from
-where the one before ended: started, killed from outside at a random time, looked at, started again. Prints a
-table: kills, what had been finished and was gone after a kill, and whether the end is the undisturbed one.
+The benchmark makes a recording with a small model of its own, and runs `bayeskin` on it undisturbed. Then
+each of the stages design, train, sample and diagnose is run again from the end of the stage before it. It is
+started, killed from outside at a random time, inspected, and started again. The program prints a table of
+kills, of finished items that were gone after a kill, and whether the result equals the undisturbed one.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from bayeskin.types import Recording
 from bayeskin.workflow.folder import current_record, read_record
 
 STAGES = ("design", "train", "sample", "diagnose")
-KILLS_A_ROUND = 5  # then the stage is let to its end, and begun anew
+KILLS_A_ROUND = 5  # after these kills the stage runs to its end, and a new round begins
 MODEL = """
 import time
 import numpy as np
@@ -79,7 +80,12 @@ max_steps = 1500
 
 @dataclass(frozen=True)
 class Row:
-    """What became of one stage: how often it was killed, what was lost, whether its end is the same."""
+    """Holds the outcome for one stage.
+
+    kills, rounds : number of kills, and number of times the stage began from its start
+    lost : finished items that were gone after a kill
+    same : True if the result equals the undisturbed one in every round
+    """
 
     stage: str
     kills: int
@@ -89,16 +95,19 @@ class Row:
 
 
 def make_case(folder: Path) -> Path:
-    """A recording of the model, drifting sensor and all, its file and its configuration."""
+    """Writes a recording of the model with noise and sensor drift, the model's file and its configuration.
+
+    Returns the path of the configuration.
+    """
     folder.mkdir(parents=True)
-    known: dict[str, Any] = {}
-    exec(MODEL, known)
+    namespace: dict[str, Any] = {}
+    exec(MODEL, namespace)
     time_s = np.arange(0.0, 130.001, 0.1)
     corners_s = [0.0, 5.0, 15.0, 45.0, 55.0, 65.0, 75.0, 105.0, 115.0, 130.1]
-    pulled_m = np.interp(time_s, corners_s, [0.0, 0.0, 9e-3, 9e-3, 0.0, 0.0, 9e-3, 9e-3, 0.0, 0.0])
-    force_n = known["force"]({"stiffness": 100.0, "share": 0.6, "tau": 8.0}, time_s, pulled_m)
+    displacement_m = np.interp(time_s, corners_s, [0.0, 0.0, 9e-3, 9e-3, 0.0, 0.0, 9e-3, 9e-3, 0.0, 0.0])
+    force_n = namespace["force"]({"stiffness": 100.0, "share": 0.6, "tau": 8.0}, time_s, displacement_m)
     noise_n = 2e-3 * np.random.default_rng(5).standard_normal(len(time_s))
-    recording = Recording(time_s, pulled_m, force_n + noise_n + 3e-4 * time_s, "spring", "0" * 64)
+    recording = Recording(time_s, displacement_m, force_n + noise_n + 3e-4 * time_s, "spring", "0" * 64)
     storage.save(folder / "measured.h5", recording)
     (folder / "model.py").write_text(MODEL)
     (folder / "case.toml").write_text(CONFIG)
@@ -106,49 +115,59 @@ def make_case(folder: Path) -> Path:
 
 
 def study(where: Path, kills: int, seed: int) -> Iterator[Row]:
-    """One row a stage, of at least `kills` each."""
+    """Yields one row for each stage, with at least `kills` kills."""
     rng, config = np.random.default_rng(seed), make_case(where / "undisturbed")
     for stage in STAGES:
         before = where / f"before-{stage}"
         shutil.copytree(config.parent, before)
         started = time.monotonic()
         _finish(config, stage)
-        yield _killed(where, before, config.parent, stage, kills, rng, time.monotonic() - started)
+        yield _kill_repeatedly(where, before, config.parent, stage, kills, rng, time.monotonic() - started)
         shutil.rmtree(before)
 
 
-def _killed(
+def _kill_repeatedly(
     where: Path, before: Path, undisturbed: Path, stage: str, kills: int, rng: Any, lasts_s: float
 ) -> Row:
+    """Kills one stage repeatedly until there are enough kills, and returns its row.
+
+    lasts_s : seconds that the undisturbed stage took; a kill comes at a random time within them
+    """
     count, rounds, lost, same = 0, 0, list[str](), True
     while count < kills:
-        here = where / "disturbed"
-        shutil.copytree(before, here)
+        disturbed = where / "disturbed"
+        shutil.copytree(before, disturbed)
         rounds += 1
         for _ in range(min(KILLS_A_ROUND, kills - count)):
-            had = _finished(here)
-            if not _kill_after(here / "case.toml", stage, float(rng.uniform(0.0, lasts_s))):
+            before_kill = finished_items(disturbed)
+            if not _kill_after(disturbed / "case.toml", stage, float(rng.uniform(0.0, lasts_s))):
                 break
             count += 1
-            lost += [f"{what} {key}" for what, keys in had.items() for key in keys - _finished(here)[what]]
-        _finish(here / "case.toml", stage)
-        same = same and _result(here, stage) == _result(undisturbed, stage)
-        shutil.rmtree(here)
+            lost += [
+                f"{kind} {key}"
+                for kind, keys in before_kill.items()
+                for key in keys - finished_items(disturbed)[kind]
+            ]
+        _finish(disturbed / "case.toml", stage)
+        same = same and _result(disturbed, stage) == _result(undisturbed, stage)
+        shutil.rmtree(disturbed)
     return Row(stage, count, rounds, tuple(lost), same)
 
 
 def _command(config: Path, stage: str) -> list[str]:
+    """Returns the command line that runs a stage."""
     return [sys.executable, "-c", "from bayeskin.cli import main; main()", stage, str(config)]
 
 
 def _finish(config: Path, stage: str) -> None:
-    done = subprocess.run(_command(config, stage), capture_output=True, text=True, check=False)
-    if done.returncode not in (0, 1):  # 1: an answer that is not to be trusted is an answer
-        raise SystemExit(f"{stage}: {done.stderr[-2000:]}")
+    """Runs a stage to its end; ends the program where it fails."""
+    process = subprocess.run(_command(config, stage), capture_output=True, text=True, check=False)
+    if process.returncode not in (0, 1):  # exit code 1: the stage has finished, but its result is not trusted
+        raise SystemExit(f"{stage}: {process.stderr[-2000:]}")
 
 
 def _kill_after(config: Path, stage: str, seconds: float) -> bool:
-    """Whether the stage was still running by then, and was killed."""
+    """Kills a stage after some seconds; returns True if it was still running then."""
     process = subprocess.Popen(_command(config, stage), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         process.wait(timeout=seconds)
@@ -159,30 +178,30 @@ def _kill_after(config: Path, stage: str, seconds: float) -> bool:
     return False
 
 
-def _finished(folder: Path) -> dict[str, set[str]]:
-    """Names of all that is finished in a run's folder: it may only grow."""
+def finished_items(folder: Path) -> dict[str, set[str]]:
+    """Returns the names of everything that is finished in a run's folder; these sets may only grow."""
     run = folder / "case"
-    found: dict[str, set[str]] = {"run": set(), "steps": set(), "fit": set(), "stage": set()}
+    finished: dict[str, set[str]] = {"run": set(), "steps": set(), "fit": set(), "stage": set()}
     for file in run.glob("runs/*.h5"):
         with h5py.File(file) as handle:
-            found["run"] |= {row.tobytes().hex() for row in handle["theta"][()]}
+            finished["run"] |= {row.tobytes().hex() for row in handle["theta"][()]}
     for journal in run.glob("runs/*.journal"):
-        found["run"] |= set(map(_point, journal.read_bytes().split(b"\n"))) - {""}
+        finished["run"] |= set(map(_point, journal.read_bytes().split(b"\n"))) - {""}
     for chain in run.glob("chains/*/*.h5"):
         with h5py.File(chain) as handle:
-            found["steps"] |= {f"{chain.name} {n}" for n in range(int(handle["mcmc"].attrs["iteration"]))}
+            finished["steps"] |= {f"{chain.name} {n}" for n in range(int(handle["mcmc"].attrs["iteration"]))}
     for search in run.glob("searches/*.jsonl"):
         text = search.read_text()
-        found["fit"] |= {f"{search.name} {line}" for line in text[: text.rfind("\n") + 1].splitlines()}
+        finished["fit"] |= {f"{search.name} {line}" for line in text[: text.rfind("\n") + 1].splitlines()}
     for record in run.glob("*/stage.json"):
-        known = read_record(record.parent)
-        if known is not None and current_record(record.parent, known.inputs_sha256) is not None:
-            found["stage"].add(record.parent.name)
-    return found
+        stage_record = read_record(record.parent)
+        if stage_record is not None and current_record(record.parent, stage_record.inputs_sha256) is not None:
+            finished["stage"].add(record.parent.name)
+    return finished
 
 
 def _point(line: bytes) -> str:
-    """The point of a journal's line; nothing of one that is cut short."""
+    """Returns the parameter point in a journal's line, or an empty text where the line is cut short."""
     try:
         return np.array(json.loads(line.split(b" ", 2)[2])["theta"]).tobytes().hex()
     except (IndexError, ValueError):
@@ -190,7 +209,7 @@ def _point(line: bytes) -> str:
 
 
 def _result(folder: Path, stage: str) -> Any:
-    """What a stage came to, without how long it took."""
+    """Returns the result of a stage without the times that it took."""
     record = read_record(folder / "case" / stage)
     assert record is not None
     numbers: dict[str, Any] = {"done": record.done, "summary": _timeless(record.summary)}
@@ -206,27 +225,31 @@ def _result(folder: Path, stage: str) -> Any:
 
 
 def _arrays(file: Path) -> dict[str, bytes]:
-    """Every array of numbers in an HDF5 file, by its path; texts hold times."""
-    found: dict[str, bytes] = {}
+    """Returns every numeric array of an HDF5 file by its path, apart from seconds.
+
+    Texts are left out, because they contain times.
+    """
+    arrays: dict[str, bytes] = {}
 
     def visit(name: str, node: Any) -> None:
         if isinstance(node, h5py.Dataset) and node.dtype.kind in "fiub" and "seconds" not in name:
-            found[name] = np.asarray(node[()]).tobytes()
+            arrays[name] = np.asarray(node[()]).tobytes()
 
     with h5py.File(file) as handle:
         handle.visititems(visit)
-    return found
+    return arrays
 
 
 def _timeless(value: Any) -> Any:
+    """Returns a value without the entries of its mappings that are seconds."""
     if isinstance(value, Mapping):
         return {k: _timeless(v) for k, v in value.items() if "seconds" not in k}
     return [_timeless(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def table(rows: list[Row]) -> str:
-    """Markdown, as docs/faults.md has it."""
-    lines = ["| killed in | kills | from the start | finished things lost | end as undisturbed |"]
+    """Returns the rows as a Markdown table."""
+    lines = ["| stage | kills | rounds | finished items lost | same result as undisturbed |"]
     lines += ["|---|--:|--:|--:|---|"]
     for row in rows:
         end = "yes" if row.same else "NO"
@@ -236,7 +259,7 @@ def table(rows: list[Row]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=14, help="of each stage")
+    parser.add_argument("--kills", type=int, default=14, help="number of kills of each stage")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     rows = []

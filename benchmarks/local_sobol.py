@@ -1,13 +1,18 @@
-"""The article's local sensitivity estimates (its appendix), for its force and for the reaction.
+"""Repeats the local sensitivities of the article's appendix, for the article's force and for the reaction.
 
-Its metric is the mean over 18 s to 50 s of the force relative to the calibrated point's; theta_i is the
-metric's slope by a relative change of parameter i, and S_i = theta_i^2 / sum theta^2. Printed side by side:
+The article's metric is the mean over 18 s to 50 s of the force relative to the force at the calibrated point.
+theta_i is the slope of this metric by a relative change of parameter i, and S_i = theta_i^2 / sum theta^2.
+The program prints side by side:
 
-- the article's table, recomputed from its own force histories (`data/Sobol_indice.xlsx`), +-10 %;
-- our `article` observation on its mesh and steps, +-10 % (nine runs to 50 s, some minutes);
-- our `reaction`, by the derivatives that one run carries.
+- the article's table, recomputed from its own force histories (`data/Sobol_indice.xlsx`) with changes of
+  +-10 %;
+- our `article` observation on the article's mesh and time steps with changes of +-10 % (nine runs to 50 s,
+  which take some minutes);
+- our `reaction`, by the derivatives that are computed along one run.
 
-Run with the supplement's folder in BAYESKIN_SUPPLEMENT:  python benchmarks/local_sobol.py
+    python benchmarks/local_sobol.py
+
+The environment variable BAYESKIN_SUPPLEMENT must name the supplement's folder.
 """
 
 from __future__ import annotations
@@ -31,19 +36,22 @@ CHANGE = 0.1
 
 
 def main() -> int:
-    """Prints the table; exit code 2 without the supplement."""
+    """Prints the table; returns exit code 2 where the supplement is missing."""
     folder = os.environ.get("BAYESKIN_SUPPLEMENT")
     if not folder:
-        print("BAYESKIN_SUPPLEMENT: found nothing; expected the supplement's folder", file=sys.stderr)
+        print(
+            "BAYESKIN_SUPPLEMENT is not set; set it to the folder of the article's supplement",
+            file=sys.stderr,
+        )
         return 2
     supplement = Path(folder)
     mesh = str(supplement / "data" / "Mesh_SKIN.msh")
     motion = _motion(supplement)
     columns = {
-        "article's files": _of_files(supplement),
-        "article, ours": _of_article(mesh, motion),
-        "reaction, its mesh": _of_reaction(ModelSpec(mesh=mesh), motion),
-        "reaction, bricks": _of_reaction(ModelSpec(), motion),
+        "article's files": _slopes_of_files(supplement),
+        "article, bayeskin": _slopes_of_article(mesh, motion),
+        "reaction, article's mesh": _slopes_of_reaction(ModelSpec(mesh=mesh), motion),
+        "reaction, bricks": _slopes_of_reaction(ModelSpec(), motion),
     }
     print(f"{'':>6}" + "".join(f"{name:>34}" for name in columns))
     for i, name in enumerate(NAMES):
@@ -53,16 +61,19 @@ def main() -> int:
 
 
 def _shares(columns: dict[str, Array], i: int) -> list[tuple[Array, float]]:
+    """Returns for each column its slopes (4,) and the share S_i of parameter i."""
     return [(slopes, float(slopes[i] ** 2 / np.sum(slopes**2))) for slopes in columns.values()]
 
 
 def _motion(supplement: Path) -> PadMotion:
+    """Returns the pads' motion of the article's script up to the end of the window."""
     table = np.loadtxt(supplement / "reference" / "article_forward.csv", delimiter=",", skiprows=1)
     time_s, pad_m = np.concatenate([[[0.0, 0.0]], table[table[:, 0] <= WINDOW_S[1], :2]]).T
     return PadMotion(time_s, 2.0 * pad_m)
 
 
-def _of_files(supplement: Path) -> Array:
+def _slopes_of_files(supplement: Path) -> Array:
+    """Returns the slopes (4,) from the article's own force histories."""
     book = openpyxl.load_workbook(supplement / "data" / "Sobol_indice.xlsx", data_only=True, read_only=True)
 
     def force(sheet: str) -> tuple[Array, Array]:
@@ -71,16 +82,17 @@ def _of_files(supplement: Path) -> Array:
         return time_s, force_n
 
     time_s, reference = force("reference")
-    held = (time_s >= WINDOW_S[0]) & (time_s <= WINDOW_S[1])
+    in_window = (time_s >= WINDOW_S[0]) & (time_s <= WINDOW_S[1])
 
     def slope(sheet: str) -> float:
-        up, down = (np.mean(force(sheet + sign)[1][held] / reference[held]) for sign in "pm")
+        up, down = (np.mean(force(sheet + sign)[1][in_window] / reference[in_window]) for sign in "pm")
         return float((up - down) / (2 * CHANGE))
 
     return np.array([slope(SHEETS[name]) for name in NAMES])
 
 
-def _of_article(mesh: str, motion: PadMotion) -> Array:
+def _slopes_of_article(mesh: str, motion: PadMotion) -> Array:
+    """Returns the slopes (4,) by central differences of our `article` observation."""
     spec = ModelSpec("article", mesh)
 
     def force(theta: dict[str, float]) -> Array:
@@ -101,7 +113,8 @@ def _of_article(mesh: str, motion: PadMotion) -> Array:
     return np.array([slope(name) for name in NAMES])
 
 
-def _of_reaction(spec: ModelSpec, motion: PadMotion) -> Array:
+def _slopes_of_reaction(spec: ModelSpec, motion: PadMotion) -> Array:
+    """Returns the slopes (4,) by the derivatives along one run of the `reaction`."""
     corners = np.flatnonzero(np.abs(np.diff(np.diff(motion.displacement_m) / np.diff(motion.time_s))) > 1e-4)
     kept = np.concatenate([[0], 1 + corners, [len(motion.time_s) - 1]])
     run = simulate(

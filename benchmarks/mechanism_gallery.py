@@ -1,13 +1,14 @@
-"""What each mechanism does to the force: one small figure each, and a table with shortcuts checked.
+"""Shows what each mechanism does to the force: one small figure each, and a table that checks the shortcuts.
 
-One set of base parameters (point A of benchmarks/healthy_skin.py), the first two cycles of the healthy-skin
-protocol, the default mesh. Tissue mechanisms and those that change the displacement that the skin sees are
-solved in the full model; the shortcuts of the latter are shown beside, dashed, and their RMS distance from
-the full model is in the table. Where a mechanism needs another one, that one is on in both curves.
+The runs have one set of base parameters (point A of benchmarks/healthy_skin.py), the first two cycles of the
+healthy-skin protocol and the default mesh. Mechanisms of the tissue, and mechanisms that change the
+displacement that the skin sees, are solved in the full model. The latter also have shortcuts that act on the
+force alone. The figures show these as dashed lines, and the table has their RMS distance from the full model.
+Where a mechanism needs another one, the other one is active in both curves.
 
     python benchmarks/mechanism_gallery.py
 
-Writes docs/figures/mechanisms.{png,svg} and the table between the markers of docs/mechanisms.md.
+The program writes docs/figures/mechanisms.{png,svg} and the table between the markers of docs/mechanisms.md.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ DOCUMENT, FIGURE = ROOT / "docs" / "mechanisms.md", ROOT / "docs" / "figures" / 
 MOTION = PadMotion(healthy_skin.HEALTHY_SKIN.time_s[:8], healthy_skin.HEALTHY_SKIN.displacement_m[:8])
 BASE = healthy_skin.POINTS["A"]
 TIMES_S = np.arange(0.0, MOTION.time_s[-1], 0.25)
-SHOWN = {  # values at which the effect is seen
+SHOWN = {  # parameter values at which the effect is visible
     "amplifier-lag": {"amplifier_time": 1.0},
     "backlash": {"gap": 3e-4, "frame_compliance": 1e-3},
     "bottom-adherence": {"adherence": 1e7},
@@ -64,7 +65,12 @@ WITH = {"friction-creep": "device-friction"}
 
 @dataclass(frozen=True)
 class Shown:
-    """Forces [N] at TIMES_S without and with a mechanism; by its shortcut, if it has one; wall seconds."""
+    """Holds the forces of one mechanism at `TIMES_S`.
+
+    without, force : forces without and with the mechanism [N]
+    shortcut : force by the shortcut [N], or None where the mechanism has none
+    seconds : wall seconds of the full run
+    """
 
     without: Array
     force: Array
@@ -73,61 +79,64 @@ class Shown:
 
 
 def values_of(mechanism: Mechanism) -> dict[str, float]:
-    """Neutral but for what is shown."""
+    """Returns a mechanism's parameters: the values to show, and neutral values for the rest."""
     return dict(mechanism.neutral) | SHOWN[mechanism.name]
 
 
 def shown(mechanism: Mechanism, known: Mapping[str, Mechanism]) -> Shown:
-    """Runs a mechanism, and the base model without it."""
-    values, further = values_of(mechanism), WITH.get(mechanism.name)
-    others = [known[further]] if further else []
-    values |= values_of(known[further]) if further else {}
+    """Runs a mechanism, and the base model without it; returns both forces."""
+    values, required_name = values_of(mechanism), WITH.get(mechanism.name)
+    required = [known[required_name]] if required_name else []
+    values |= values_of(known[required_name]) if required_name else {}
     columns = {name: np.array([value]) for name, value in values.items()}
-    bare = run({}, [])[0]
+    base_force = run({}, [])[0]
 
     def instrument(mechanisms: list[Mechanism], force: Array) -> Array:
-        seen = observed(mechanisms, columns, MOTION, lambda t: np.atleast_2d(np.interp(t, *force)))
-        return seen(TIMES_S)[0]
+        observed_force = observed(mechanisms, columns, MOTION, lambda t: np.atleast_2d(np.interp(t, *force)))
+        return observed_force(TIMES_S)[0]
 
-    without = instrument(others, bare)
+    without = instrument(required, base_force)
     if mechanism.act.bind is None:
-        return Shown(without, instrument([*others, mechanism], bare), None, 0.0)
+        return Shown(without, instrument([*required, mechanism], base_force), None, 0.0)
     curve, seconds = run(values, solved([mechanism]))
-    with_it = np.interp(TIMES_S, *curve)
-    shortcut = instrument([mechanism], bare) if isinstance(mechanism.act, Instrument) else None
-    return Shown(without, with_it, shortcut, seconds)
+    force_with = np.interp(TIMES_S, *curve)
+    shortcut = instrument([mechanism], base_force) if isinstance(mechanism.act, Instrument) else None
+    return Shown(without, force_with, shortcut, seconds)
 
 
 _RUNS: dict[str, tuple[Array, float]] = {}
 
 
 def run(values: Mapping[str, float], mechanisms: list[Mechanism]) -> tuple[Array, float]:
-    """Times and forces (2, n) of a full run, kept, and its seconds."""
+    """Returns times and forces (2, n) of a full run, and its seconds.
+
+    A run with the same values is made only once.
+    """
     key = repr((sorted(values.items()), [m.name for m in mechanisms]))
     if key not in _RUNS:
-        found = simulate(ModelSpec(), MOTION, {**BASE, **values}, laws=laws(mechanisms))
-        if found.status != "ok":
-            raise SystemExit(f"{[m.name for m in mechanisms]}: {found.message}")
-        _RUNS[key] = np.stack([found.time_s, found.force_n]), found.stats["seconds"]
+        simulation = simulate(ModelSpec(), MOTION, {**BASE, **values}, laws=laws(mechanisms))
+        if simulation.status != "ok":
+            raise SystemExit(f"{[m.name for m in mechanisms]}: {simulation.message}")
+        _RUNS[key] = np.stack([simulation.time_s, simulation.force_n]), simulation.stats["seconds"]
     return _RUNS[key]
 
 
 @styled
 def figure_mechanisms(found: Mapping[str, Shown]):
-    """What each mechanism adds to the force, a panel each, over the force without it."""
+    """Returns the figure: the force that each mechanism adds, in its own panel, over the force without it."""
     columns = 4
-    high = -(-(len(found) + 1) // columns)
-    figure = new_figure(PAGE_IN, 1.2 * high + 0.5)
-    axes = figure.subplots(high, columns).ravel()
-    for ax, (name, one) in zip(axes, found.items(), strict=False):
-        behind = ax.twinx()
-        behind.fill_between(TIMES_S, one.without, color=FAINT, alpha=0.6)
-        behind.set_axis_off()
+    row_count = -(-(len(found) + 1) // columns)
+    figure = new_figure(PAGE_IN, 1.2 * row_count + 0.5)
+    axes = figure.subplots(row_count, columns).ravel()
+    for ax, (name, forces) in zip(axes, found.items(), strict=False):
+        background = ax.twinx()
+        background.fill_between(TIMES_S, forces.without, color=FAINT, alpha=0.6)
+        background.set_axis_off()
         ax.set_zorder(1)
         ax.patch.set_visible(False)
-        ax.plot(TIMES_S, 1e3 * (one.force - one.without), color=MODEL)
-        if one.shortcut is not None:
-            ax.plot(TIMES_S, 1e3 * (one.shortcut - one.without), color=ACCENT, ls=(0, (3, 2)))
+        ax.plot(TIMES_S, 1e3 * (forces.force - forces.without), color=MODEL)
+        if forces.shortcut is not None:
+            ax.plot(TIMES_S, 1e3 * (forces.shortcut - forces.without), color=ACCENT, ls=(0, (3, 2)))
         ax.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
         ax.margins(y=0.1)
         ax.set_title(name.replace("-dependent-", "-dependent\n"))
@@ -137,11 +146,11 @@ def figure_mechanisms(found: Mapping[str, Shown]):
         ax.set_xlabel("time [s]")
     for ax in axes[len(found) :]:
         ax.set_axis_off()
-    last = axes[len(found)]
-    last.plot([], [], color=MODEL, label="what it adds")
-    last.plot([], [], color=ACCENT, ls=(0, (3, 2)), label="by its shortcut on\nthe force alone")
-    last.fill_between([], [], color=FAINT, alpha=0.6, label="the force without,\nto another scale")
-    last.legend(loc="center left")
+    legend_panel = axes[len(found)]
+    legend_panel.plot([], [], color=MODEL, label="what it adds")
+    legend_panel.plot([], [], color=ACCENT, ls=(0, (3, 2)), label="by its shortcut on\nthe force alone")
+    legend_panel.fill_between([], [], color=FAINT, alpha=0.6, label="the force without,\nto another scale")
+    legend_panel.legend(loc="center left")
     state_finding(
         figure,
         "Each mechanism leaves its own mark on the force",
@@ -151,28 +160,32 @@ def figure_mechanisms(found: Mapping[str, Shown]):
 
 
 def table(found: Mapping[str, Shown], known: Mapping[str, Mechanism]) -> str:
-    """The mechanisms as Markdown: what they say, how large, how near a shortcut comes."""
+    """Returns the mechanisms as a Markdown table: effect, error of the shortcut, seconds and description."""
     lines = [
-        "| mechanism | effect, RMS [mN] | shortcut off by [mN] | run [s] | in words |",
+        "| mechanism | effect, RMS [mN] | RMS error of the shortcut [mN] | run [s] | description |",
         "|---|--:|--:|--:|---|",
     ]
-    for name, one in found.items():
-        effect = 1e3 * np.sqrt(np.mean((one.force - one.without) ** 2))
-        off = "" if one.shortcut is None else f"{1e3 * np.sqrt(np.mean((one.shortcut - one.force) ** 2)):.2f}"
-        seconds = f"{one.seconds:.1f}" if one.seconds else ""
-        said = known[name].statement({**BASE, **values_of(known[name])})
-        lines.append(f"| `{name}` | {effect:.1f} | {off} | {seconds} | {said} |")
+    for name, forces in found.items():
+        effect_mn = 1e3 * np.sqrt(np.mean((forces.force - forces.without) ** 2))
+        shortcut_error = (
+            ""
+            if forces.shortcut is None
+            else f"{1e3 * np.sqrt(np.mean((forces.shortcut - forces.force) ** 2)):.2f}"
+        )
+        seconds = f"{forces.seconds:.1f}" if forces.seconds else ""
+        description = known[name].statement({**BASE, **values_of(known[name])})
+        lines.append(f"| `{name}` | {effect_mn:.1f} | {shortcut_error} | {seconds} | {description} |")
     return "\n".join(lines)
 
 
 def main() -> None:
     known = catalogue()
-    found = {}
+    forces = {}
     for name, mechanism in known.items():
-        found[name] = shown(mechanism, known)
-        print(name, f"{found[name].seconds:.1f} s", flush=True)
-    save_figure(figure_mechanisms(found), FIGURE, "benchmarks/mechanism_gallery.py")
-    text = table(found, known)
+        forces[name] = shown(mechanism, known)
+        print(name, f"{forces[name].seconds:.1f} s", flush=True)
+    save_figure(figure_mechanisms(forces), FIGURE, "benchmarks/mechanism_gallery.py")
+    text = table(forces, known)
     print(text)
     rows.into_docs(DOCUMENT, "gallery", text)
 

@@ -1,11 +1,12 @@
-"""What a few full runs near a point make of the reduced model's error, on sets of mechanisms.
+"""Measures how a few full runs near a point reduce the reduced model's error, on sets of mechanisms.
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/reduced_enriched.py --folder F [--skins 15 19 23]
 
-Skins are those of reduced_model.py, by number, on the article's protocol; by default its pairs, triples and
-quadruples of mechanisms. Before: the error of the shipped model at the skin. After: the error of the enriched
-one on the last full run that it predicted, a skin near by that it had not learnt from. Full runs stay in the
-folder, so that a second start makes none. Workers are two processes.
+The skins are those of reduced_model.py, given by their numbers, on the article's protocol. By default these
+are its pairs, triples and quadruples of mechanisms. The error before is that of the shipped model at the
+skin. The errors after are those of the enriched model at each further full run, at a skin nearby, before the
+model is trained on this run. Full runs are stored in the folder, so that a second start makes none. Two
+processes make the runs.
 """
 
 from __future__ import annotations
@@ -29,38 +30,38 @@ from bayeskin.shipped import shipped
 from bayeskin.workflow.reducing import SHIPPED
 
 HEADER = (
-    "skin", "mechanisms", "before [% of peak]", "after, as full runs join [% of peak]", "full runs",
-    "CPU s to enrich", "CPU s a run before", "after",
+    "skin", "mechanisms", "error before [% of peak]", "error after, as full runs are added [% of peak]",
+    "full runs", "CPU s to enrich", "CPU s per run before", "CPU s per run after",
 )  # fmt: skip
 
 
 def spent_s() -> float:
-    """Processor seconds of this process and of those that it has ended."""
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(one.ru_utime + one.ru_stime for one in used)
+    """Returns the CPU seconds of this process and of its processes that have ended."""
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
 def row(model: ReducedModel, number: int, folder: Path) -> list[str]:
-    """The table's row of one skin."""
+    """Returns the table's row of one skin."""
     skin, motion = held_out()[number], PROTOCOLS["article"]
     with h5py.File(RESULTS) as handle:
         before = compared(model, motion, skin.theta, skin.mechanisms, handle[f"{number:02d}/article"])
     started = spent_s()
-    found = enrich(
+    result = enrich(
         model, skin.theta, skin.mechanisms, motion, EnrichmentSettings(), folder / f"{number:02d}", local(2),
         lambda what, share: None,
     )  # fmt: skip
-    enriching = spent_s() - started
-    acting, cost = [catalogue()[name] for name in skin.mechanisms], []
-    for which in (model, found.model):
-        simulate_reduced(which, motion, skin.theta, acting)
-        begun = time.process_time()
-        simulate_reduced(which, motion, skin.theta, acting)
-        cost.append(f"{time.process_time() - begun:.2f}")
+    total_s = spent_s() - started
+    mechanisms, costs = [catalogue()[name] for name in skin.mechanisms], []
+    for either in (model, result.model):
+        simulate_reduced(either, motion, skin.theta, mechanisms)
+        run_started = time.process_time()
+        simulate_reduced(either, motion, skin.theta, mechanisms)
+        costs.append(f"{time.process_time() - run_started:.2f}")
     return [
         str(number), ", ".join(skin.mechanisms), before.message or f"{100 * before.rms:.3f}",
-        " ".join(f"{100 * error:.3f}" for error in found.errors), str(found.full_runs), f"{enriching:.0f}",
-        *cost,
+        " ".join(f"{100 * error:.3f}" for error in result.errors), str(result.full_runs), f"{total_s:.0f}",
+        *costs,
     ]  # fmt: skip
 
 
@@ -69,7 +70,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--folder", type=Path, required=True, help="where full runs stay")
+    parser.add_argument("--folder", type=Path, required=True, help="folder that keeps the full runs")
     sets = [number for number, skin in enumerate(held_out()) if len(skin.mechanisms) > 1]
     parser.add_argument("--skins", type=int, nargs="*", default=sets)
     options = parser.parse_args()

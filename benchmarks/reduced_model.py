@@ -1,12 +1,12 @@
-"""How far the shipped reduced model is from the full one on skins and protocols never seen, and its cost.
+"""Measures the error of the shipped reduced model on unseen skins and protocols, and its cost.
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/reduced_model.py [--full]
 
-Thirty-one skins drawn from the priors: four of the base model, one of each of the eleven mechanisms of the
-tissue, four pairs, triples and quadruples of them, and four of the base model whose subcutis is more than
-twice as stiff as the cutis; the article's protocol and four others. Forces of the full model
-are in results/reduced_held_out.h5; with --full those that are missing there are made, some ten seconds each.
-What the model says of its own error is tested by reduced_error.py.
+Thirty-one skins are drawn from the priors: four of the base model, one with each of the eleven mechanisms of
+the tissue, four each with two, three and four of these mechanisms, and four of the base model whose subcutis
+is more than twice as stiff as the cutis. Each skin is run on the article's protocol and on four others. The
+forces of the full model are stored in results/reduced_held_out.h5. With --full the missing ones are computed,
+in some ten seconds each. reduced_error.py tests the error that the model itself estimates.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from bayeskin.workflow.reducing import SHIPPED
 
 RESULTS = Path(__file__).with_name("results") / "reduced_held_out.h5"
 SEED = 20261127
-STIFF_SUBCUTIS = 2.0  # times the cutis' modulus
+STIFF_SUBCUTIS = 2.0  # ratio to the cutis' modulus above which a subcutis counts as stiff
 
 
 def motion(time_s: Sequence[float], height_mm: Sequence[float]) -> PadMotion:
-    """A protocol from its corners."""
+    """Returns a protocol with the given corners."""
     return PadMotion(np.array(time_s, float), np.round(1e-3 * np.array(height_mm, float), 12))
 
 
@@ -54,14 +54,14 @@ PROTOCOLS = {
 
 
 class Skin(NamedTuple):
-    """A held-out skin: values of all parameters, and the mechanisms that act in it."""
+    """Holds the values of all parameters of a held-out skin, and the mechanisms that act in it."""
 
     theta: dict[str, float]
     mechanisms: tuple[str, ...]
 
     @property
     def group(self) -> str:
-        """A row of the table."""
+        """Returns the label of the table's row that the skin belongs to."""
         count = len(self.mechanisms)
         if count == 0:
             stiff = self.theta["E_s"] > STIFF_SUBCUTIS * self.theta["E_c"]
@@ -70,18 +70,21 @@ class Skin(NamedTuple):
 
 
 def held_out() -> list[Skin]:
-    """The skins, drawn anew from their seed."""
+    """Returns the held-out skins, which are the same in every call because their seed is fixed."""
     rng, base = np.random.default_rng(SEED), default_space()
     spaces = {
-        name: ParameterSpace(m.parameters) for name, m in catalogue().items() if isinstance(m.act, Tissue)
+        name: ParameterSpace(mechanism.parameters)
+        for name, mechanism in catalogue().items()
+        if isinstance(mechanism.act, Tissue)
     }
-    tissue = list(spaces)
-    sets: list[tuple[str, ...]] = [()] * 4 + [(name,) for name in tissue]
-    sets += [
-        tuple(sorted(rng.choice(tissue, n, replace=False).tolist())) for n in (2,) * 4 + (3,) * 4 + (4,) * 4
+    tissue_mechanisms = list(spaces)
+    mechanism_sets: list[tuple[str, ...]] = [()] * 4 + [(name,) for name in tissue_mechanisms]
+    mechanism_sets += [
+        tuple(sorted(rng.choice(tissue_mechanisms, n, replace=False).tolist()))
+        for n in (2,) * 4 + (3,) * 4 + (4,) * 4
     ]
     skins = []
-    for names in sets:
+    for names in mechanism_sets:
         theta = where(base, rng, stiff_subcutis=False)
         for name in names:
             theta |= drawn(spaces[name], rng)
@@ -90,7 +93,7 @@ def held_out() -> list[Skin]:
 
 
 def where(base: ParameterSpace, rng: np.random.Generator, stiff_subcutis: bool) -> dict[str, float]:
-    """A draw of the priors whose subcutis is more than twice as stiff as the cutis, or is not."""
+    """Returns a draw of the priors whose subcutis is, or is not, more than twice as stiff as the cutis."""
     while True:
         theta = drawn(base, rng)
         if (theta["E_s"] > STIFF_SUBCUTIS * theta["E_c"]) == stiff_subcutis:
@@ -98,19 +101,19 @@ def where(base: ParameterSpace, rng: np.random.Generator, stiff_subcutis: bool) 
 
 
 def drawn(space: ParameterSpace, rng: np.random.Generator) -> dict[str, float]:
-    """A draw of a prior by name."""
+    """Returns one draw of a prior by the parameters' names."""
     return dict(zip(space.names, map(float, space.from_unit(rng.uniform(size=space.dim))), strict=True))
 
 
 def keep_full_run(
     file: Path, key: str, motion: PadMotion, theta: Mapping[str, float], mechanisms: Sequence[str]
 ) -> None:
-    """Runs the full model and keeps its force, where the file does not hold it yet."""
+    """Runs the full model and stores its force in the file, unless the file has it already."""
     with h5py.File(file, "a") as handle:
         if key in handle:
             return
-    acting = [catalogue()[name] for name in mechanisms]
-    run = simulate(ModelSpec(), motion, theta, laws=laws(acting), falls_too=False)
+    active = [catalogue()[name] for name in mechanisms]
+    run = simulate(ModelSpec(), motion, theta, laws=laws(active), falls_too=False)
     with h5py.File(file, "a") as handle:
         group = handle.create_group(key)
         group["time_s"], group["force_n"] = run.time_s, run.force_n.astype(np.float32)
@@ -119,7 +122,7 @@ def keep_full_run(
 
 
 class Row(NamedTuple):
-    """A reduced run beside a full one: true and estimated errors over the peak, or why there are none."""
+    """Holds true and estimated errors of a reduced run over the peak, or the message why it failed."""
 
     rms: float
     largest: float
@@ -131,20 +134,23 @@ def compared(
     model: ReducedModel, motion: PadMotion, theta: Mapping[str, float], mechanisms: Sequence[str],
     group: h5py.Group, estimate: bool = False,
 ) -> Row:  # fmt: skip
-    """Runs the reduced model and compares it at the full run's own steps."""
-    acting = [catalogue()[name] for name in mechanisms]
-    run = simulate_reduced(model, motion, theta, acting, estimate=estimate)
+    """Runs the reduced model, and returns its errors at the time steps of the full run."""
+    active = [catalogue()[name] for name in mechanisms]
+    run = simulate_reduced(model, motion, theta, active, estimate=estimate)
     if run.status != "ok":
         return Row(np.nan, np.nan, np.nan, run.message)
     time_s, force_n = group["time_s"][()], group["force_n"][()].astype(float)
-    wrong_n, peak_n = run.at(time_s) - force_n, np.abs(force_n).max()
-    rms_n = float(np.sqrt(np.average(wrong_n**2, weights=np.gradient(time_s))))
+    error_n, peak_n = run.at(time_s) - force_n, np.abs(force_n).max()
+    rms_n = float(np.sqrt(np.average(error_n**2, weights=np.gradient(time_s))))
     estimate_n = run.stats.get("error_estimate_n", np.nan)
-    return Row(rms_n / peak_n, float(np.abs(wrong_n).max() / peak_n), estimate_n / peak_n, "")
+    return Row(rms_n / peak_n, float(np.abs(error_n).max() / peak_n), estimate_n / peak_n, "")
 
 
 def table(model: ReducedModel) -> list[str]:
-    """The table in Markdown: medians of RMS and largest error in % of the peak; 0.1 % is 1 mN at 1 N."""
+    """Returns the lines of the Markdown table: medians of RMS and largest error in % of the peak.
+
+    At a peak of 1 N, 0.1 % is 1 mN.
+    """
     skins, rows = held_out(), dict[tuple[str, str], list[Row]]()
     with h5py.File(RESULTS) as handle:
         for number, skin in enumerate(skins):
@@ -164,37 +170,38 @@ def table(model: ReducedModel) -> list[str]:
 
 
 def _cell(rows: Sequence[Row]) -> str:
-    fine = [row for row in rows if not row.message]
-    failed = f", {len(rows) - len(fine)} refused" if len(fine) < len(rows) else ""
-    if not fine:
-        return failed.lstrip(", ") or "–"
-    rms, largest = (100 * np.median([getattr(row, name) for row in fine]) for name in ("rms", "largest"))
-    return f"{rms:.3f}, {largest:.3f}{failed}"
+    """Returns the table's cell of some runs: median errors, and the number of refused runs."""
+    finished = [row for row in rows if not row.message]
+    refused = f", {len(rows) - len(finished)} refused" if len(finished) < len(rows) else ""
+    if not finished:
+        return refused.lstrip(", ") or "–"
+    rms, largest = (100 * np.median([getattr(row, name) for row in finished]) for name in ("rms", "largest"))
+    return f"{rms:.3f}, {largest:.3f}{refused}"
 
 
 def timed(model: ReducedModel, skin: Skin) -> str:
-    """A reduced and a full run of the article's protocol in CPU seconds, side by side, as one line."""
-    acting = [catalogue()[name] for name in skin.mechanisms]
+    """Returns a line with the CPU seconds of a reduced and of a full run of the article's protocol."""
+    active = [catalogue()[name] for name in skin.mechanisms]
     changes = {name: max(abs(0.1 * value), 1e-12) for name, value in skin.theta.items()}
-    spent = []
+    spent_s = []
     for run in (
-        lambda: simulate_reduced(model, MOTION, skin.theta, acting),
-        lambda: simulate_reduced(model, MOTION, skin.theta, acting, gradients=changes),
-        lambda: simulate(ModelSpec(), MOTION, skin.theta, laws=laws(acting), falls_too=False),
+        lambda: simulate_reduced(model, MOTION, skin.theta, active),
+        lambda: simulate_reduced(model, MOTION, skin.theta, active, gradients=changes),
+        lambda: simulate(ModelSpec(), MOTION, skin.theta, laws=laws(active), falls_too=False),
     ):
         run()
         started = time.process_time()
         run()
-        spent.append(time.process_time() - started)
-    reduced, slopes, full = spent
+        spent_s.append(time.process_time() - started)
+    reduced_s, with_derivatives, full_s = spent_s
     return (
-        f"{', '.join(skin.mechanisms) or 'base model'}: {reduced:.2f} CPU s, {slopes:.2f} with "
-        f"{len(changes)} derivatives; the full model {full:.1f}, {full / reduced:.0f} times as much."
+        f"{', '.join(skin.mechanisms) or 'base model'}: {reduced_s:.2f} CPU s, {with_derivatives:.2f} with "
+        f"{len(changes)} derivatives; the full model {full_s:.1f}, {full_s / reduced_s:.0f} times as much."
     )
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Prints the table."""
+    """Prints the table and the costs."""
     if "--full" in arguments:
         for number, skin in enumerate(held_out()):
             for name, protocol in PROTOCOLS.items():

@@ -1,10 +1,14 @@
-"""Our models against other programs over the whole recording: how far off they are, and in what CPU time.
+"""Compares the models with other programs over the whole recording: differences of the force, and CPU time.
 
-- `reaction` against an independent solver at three points (`reference/reaction_independent_A.csv`, B, C): the
-  full model on the solver's own mesh and on the default mesh, and the shipped reduced model;
-- `article` against its released script (`reference/article_forward.csv`).
+- The `reaction` is compared with an independent solver at three points
+  (`reference/reaction_independent_A.csv`, B, C). The models are the full model on the solver's own mesh and
+  on the default mesh, and the shipped reduced model.
+- The `article` observation is compared with the article's released script (`reference/article_forward.csv`).
 
-Run with the supplement's folder in BAYESKIN_SUPPLEMENT, some nine minutes:  python benchmarks/references.py
+    python benchmarks/references.py
+
+The environment variable BAYESKIN_SUPPLEMENT must name the supplement's folder. The program takes some nine
+minutes.
 """
 
 from __future__ import annotations
@@ -30,14 +34,17 @@ POINTS = {
     "B": {"E_c": 200e3, "E_s": 5e3, "k_c": 1e-13, "k_s": 5e-12, "p_init": 700.0},
     "C": {"E_c": 684250.48, "E_s": 47789.13, "k_c": 9.428584e-15, "k_s": 5.0299945e-13, "p_init": 700.0},
 }
-CORNER_M_S = 1e-4  # change of the pads' speed that makes a corner of the protocol
+CORNER_M_S = 1e-4  # a larger change of the pads' speed is a corner of the protocol
 
 
 def main() -> int:
-    """Prints one line a comparison; exit code 2 without the supplement."""
+    """Prints one line for each comparison; returns exit code 2 where the supplement is missing."""
     folder = os.environ.get("BAYESKIN_SUPPLEMENT")
     if not folder:
-        print("BAYESKIN_SUPPLEMENT: found nothing; expected the supplement's folder", file=sys.stderr)
+        print(
+            "BAYESKIN_SUPPLEMENT is not set; set it to the folder of the article's supplement",
+            file=sys.stderr,
+        )
         return 2
     mesh, reference = str(Path(folder) / "data" / "Mesh_SKIN.msh"), Path(folder) / "reference"
     reduced = partial(simulate_reduced, load_reduced(shipped(SHIPPED)))
@@ -48,7 +55,7 @@ def main() -> int:
         kept = np.concatenate([[0], corners, [len(time_s) - 1]])
         motion = PadMotion(time_s[kept], 2.0 * pad_m[kept])
         for name, model in {
-            "its mesh": partial(simulate, ModelSpec(mesh=mesh)),
+            "solver's mesh": partial(simulate, ModelSpec(mesh=mesh)),
             "default mesh": partial(simulate, ModelSpec()),
             "reduced": reduced,
         }.items():
@@ -60,7 +67,7 @@ def main() -> int:
 
 
 def _read(path: Path) -> tuple[Array, Array, Array]:
-    """Time [s], displacement of a pad [m] and force [N], from the start at rest."""
+    """Returns time [s], displacement of a pad [m] and force [N], from the start at rest."""
     table = np.loadtxt(path, delimiter=",", skiprows=1)[:, :3]
     time_s, pad_m, force_n = table.T if table[0, 0] == 0.0 else np.vstack([np.zeros(3), table]).T
     return time_s, pad_m, force_n
@@ -74,16 +81,21 @@ def _compare(
     time_s: Array,
     force_n: Array,
 ) -> None:
+    """Runs a model, and prints its difference from a reference force and its CPU time."""
     started = time.process_time()
     run = model(motion, theta)
     cpu_s = time.process_time() - started
     if run.status != "ok":
         raise SystemExit(f"{label}: {run.message}")
-    off = run.at(time_s) - force_n
-    rmse, most, peak = np.sqrt(np.mean(off**2)), np.abs(off).max(), np.abs(force_n).max()
+    difference_n = run.at(time_s) - force_n
+    rmse_n, largest_n, peak_n = (
+        np.sqrt(np.mean(difference_n**2)),
+        np.abs(difference_n).max(),
+        np.abs(force_n).max(),
+    )
     print(
-        f"{label:>26}: RMSE {1e3 * rmse:.4f} mN ({100 * rmse / peak:.3f} % of the peak), at most "
-        f"{1e3 * most:.4f} mN, {len(run.time_s) - 1} steps, {cpu_s:.1f} CPU s",
+        f"{label:>26}: RMSE {1e3 * rmse_n:.4f} mN ({100 * rmse_n / peak_n:.3f} % of the peak), at most "
+        f"{1e3 * largest_n:.4f} mN, {len(run.time_s) - 1} steps, {cpu_s:.1f} CPU s",
         flush=True,
     )
 

@@ -1,15 +1,17 @@
-"""How many full runs fail at random parameters, and how long one takes.
+"""Counts how many full runs fail at random parameters, and measures how long a run takes.
 
-N points of each of two boxes, independent and seeded: the article's (E 10 kPa..500 MPa, k 1e-16..1e-10 m^2 in
-both layers, log-uniform, as in its text; p_init as default) and the default prior box. Each is run with the
-`reaction` on the default mesh over the whole healthy-skin protocol (benchmarks/healthy_skin.py). Counts
-finished and failed runs, lists every failure with its parameters, and checks that all forces are finite.
+N independent points are drawn from each of two boxes, with a fixed seed. The first is the box of the
+article's text (E 10 kPa to 500 MPa, k 1e-16 to 1e-10 m^2 in both layers, log-uniform; p_init as in the
+default box). The second is the default prior box. Each point is run with the `reaction` on the default mesh
+over the whole healthy-skin protocol (benchmarks/healthy_skin.py). The program counts finished and failed
+runs, lists every failure with its parameters, and checks that all forces are finite.
 
-    python benchmarks/robustness.py                  # on the default mesh, some hours
+    python benchmarks/robustness.py                  # on the default mesh; takes some hours
     python benchmarks/robustness.py --refinement 0   # on 80 bricks
 
-Finished runs are rows of benchmarks/results/robustness.csv, which a later start does not repeat; more points
-keep those already run. Draws docs/figures/robustness-80-bricks.{png,svg} or -448-bricks.
+Finished runs are rows of benchmarks/results/robustness.csv, and a later start does not repeat them. A start
+with more points keeps the finished ones. The program draws docs/figures/robustness-80-bricks.{png,svg} or
+-448-bricks.
 """
 
 from __future__ import annotations
@@ -70,55 +72,61 @@ Item = dict[str, Any]
 
 
 def boxes() -> dict[str, ParameterSpace]:
-    """The article's text's box, and the default."""
+    """Returns the box of the article's text, and the default box."""
     default = default_space()
-    wide = {"E": (10e3, 500e6), "k": (1e-16, 1e-10)}
+    article_bounds = {"E": (10e3, 500e6), "k": (1e-16, 1e-10)}
     article = [
-        replace(p, lower=wide[p.name[0]][0], upper=wide[p.name[0]][1]) if p.name[0] in wide else p
+        replace(p, lower=article_bounds[p.name[0]][0], upper=article_bounds[p.name[0]][1])
+        if p.name[0] in article_bounds
+        else p
         for p in default.parameters
     ]
     return {"article": ParameterSpace(tuple(article)), "default": default}
 
 
 def points(space: ParameterSpace, n: int, seed: int) -> list[dict[str, float]]:
-    """The first n of the seed's points."""
+    """Returns the first n points of a box for this seed."""
     unit = np.random.default_rng(seed).random((n, space.dim))
     return [dict(zip(space.names, map(float, row), strict=True)) for row in space.from_unit(unit)]
 
 
 def perform(spec: ModelSpec, item: Item) -> Item:
-    """One run as a row; what it raises, which it never should, is a failure too."""
+    """Returns one run as a row.
+
+    An exception counts as a failure too, although the model should never raise one.
+    """
     motion = healthy_skin.HEALTHY_SKIN
     motion = healthy_skin.first_cycle(motion) if item["protocol"] == "first cycle" else motion
     theta = {name: item[name] for name in NAMES}
     _compile(spec)
     started = time.process_time()
     try:
-        found = simulate(spec, motion, theta)
-    except Exception as error:  # one run must not end the count
+        simulation = simulate(spec, motion, theta)
+    except Exception as error:  # one failing run must not end the count
         return item | _no_run("raised", f"{type(error).__name__}: {error}", time.process_time() - started)
     return item | {
-        "status": found.status,
-        "finite": bool(np.isfinite(found.force_n).all()),
-        "peak_n": found.stats["peak_force_n"],
-        "end_s": float(found.time_s[-1]),
-        "steps": int(found.stats["steps"]),
-        "factorisations": int(found.stats["factorisations"]),
-        "falls": int(found.stats["falls"]),
+        "status": simulation.status,
+        "finite": bool(np.isfinite(simulation.force_n).all()),
+        "peak_n": simulation.stats["peak_force_n"],
+        "end_s": float(simulation.time_s[-1]),
+        "steps": int(simulation.stats["steps"]),
+        "factorisations": int(simulation.stats["factorisations"]),
+        "falls": int(simulation.stats["falls"]),
         "cpu_s": time.process_time() - started,
         "code": rows.CODE,
-        "message": found.message,
+        "message": simulation.message,
     }
 
 
 @cache
 def _compile(spec: ModelSpec) -> None:
-    """A short run, once a process, so that no time is that of compiling and of building the mesh's space."""
+    """Makes a short run once in each process, so that compilation and mesh setup are not timed."""
     compiling = PadMotion(np.array([0.0, 1.0]), np.array([0.0, 1e-4]))
     simulate(replace(spec, tolerance=1.0), compiling, healthy_skin.POINTS["C"])
 
 
 def _no_run(status: str, message: str, cpu_s: float) -> Item:
+    """Returns the result columns of a run that gave no force."""
     return {
         "status": status, "finite": False, "peak_n": np.nan, "end_s": np.nan, "steps": 0, "factorisations": 0,
         "falls": 0, "cpu_s": cpu_s, "code": rows.CODE, "message": message,
@@ -126,57 +134,65 @@ def _no_run(status: str, message: str, cpu_s: float) -> Item:
 
 
 def run_all(spec: ModelSpec, items: Sequence[Item], table: rows.Rows, workers: int) -> list[rows.Row]:
-    """Rows of all items, those that are there already among them."""
-    there = {table.key_of(row): row for row in table.read()}
-    todo = [item for item in items if table.key_of(item) not in there]
-    rows.say(f"{len(items) - len(todo)} of {len(items)} runs are there already")
-    for done, (i, result) in enumerate(run_parallel(partial(perform, spec), todo, workers), start=1):
-        row = todo[i] | _no_run("lost", result.reason, np.nan) if isinstance(result, Lost) else result
-        there[table.key_of(row)] = table.append(**row)
-        if row["status"] != "ok" or done % 20 == 0 or done == len(todo):
-            rows.say(f"{done} of {len(todo)}: {row['box']} {row['index']} {row['status']} {row['message']}")
-    return [there[table.key_of(item)] for item in items]
+    """Returns the rows of all items, including those that were finished before."""
+    table_rows = {table.key_of(row): row for row in table.read()}
+    remaining = [item for item in items if table.key_of(item) not in table_rows]
+    rows.say(f"{len(items) - len(remaining)} of {len(items)} runs are finished already")
+    for done, (i, result) in enumerate(run_parallel(partial(perform, spec), remaining, workers), start=1):
+        row = remaining[i] | _no_run("lost", result.reason, np.nan) if isinstance(result, Lost) else result
+        table_rows[table.key_of(row)] = table.append(**row)
+        if row["status"] != "ok" or done % 20 == 0 or done == len(remaining):
+            rows.say(
+                f"{done} of {len(remaining)}: {row['box']} {row['index']} {row['status']} {row['message']}"
+            )
+    return [table_rows[table.key_of(item)] for item in items]
 
 
 def summary(found: dict[str, list[rows.Row]]) -> str:
-    header = ["box", "runs", "finished", "failed", "with NaN or infinite force", "finished after falls"]
+    """Returns a table of finished and failed runs and of CPU times, by box."""
+    header = ["box", "runs", "finished", "failed", "with NaN or infinite force", "finished after folding"]
     header += ["CPU s a run: median", "95 %", "largest"]
     lines = []
-    for box, its in found.items():
-        ok = sum(r["status"] == "ok" for r in its)
-        seconds = np.array([float(r["cpu_s"]) for r in its])
+    for box, runs in found.items():
+        finished = sum(r["status"] == "ok" for r in runs)
+        seconds = np.array([float(r["cpu_s"]) for r in runs])
         spread = [np.nanmedian(seconds), np.nanquantile(seconds, 0.95), np.nanmax(seconds)]
-        bad = sum(r["finite"] != "True" for r in its)
-        fell = sum(r["status"] == "ok" and int(r["falls"]) > 0 for r in its)
+        not_finite = sum(r["finite"] != "True" for r in runs)
+        after_falls = sum(r["status"] == "ok" and int(r["falls"]) > 0 for r in runs)
         lines.append(
-            [box, *map(str, (len(its), ok, len(its) - ok, bad, fell)), *(f"{s:.2f}" for s in spread)]
+            [
+                box,
+                *map(str, (len(runs), finished, len(runs) - finished, not_finite, after_falls)),
+                *(f"{s:.2f}" for s in spread),
+            ]
         )
     return rows.markdown(header, lines)
 
 
 def failures(found: dict[str, list[rows.Row]]) -> str:
-    its = [r for rs in found.values() for r in rs if r["status"] != "ok" or r["finite"] != "True"]
-    if not its:
+    """Returns a table of the failed runs with their parameters."""
+    failed = [r for runs in found.values() for r in runs if r["status"] != "ok" or r["finite"] != "True"]
+    if not failed:
         return "No run failed."
     cells = [
         [r["box"], r["index"], *(f"{float(r[n]):.3g}" for n in NAMES), r["end_s"], r["status"], r["message"]]
-        for r in its
+        for r in failed
     ]
     return rows.markdown(["box", "index", *NAMES, "time [s]", "status", "message"], cells)
 
 
 @styled
 def figure_robustness(found: dict[str, list[rows.Row]], mesh: str) -> Figure:
-    """Where runs failed, by the two ratios that govern them, and the CPU time of all."""
+    """Returns the figure: the failed runs by the two ratios that govern them, and the CPU times."""
     figure = new_figure(PAGE_IN, 2.9)
     axes = figure.subplots(1, len(found) + 1)
-    for letter, ax, (box, its) in zip("abc", axes, found.items(), strict=False):
-        _draw_box(ax, its)
-        panel_title(ax, letter, f"{box} box, {len(its)} runs")
-    for (box, its), colour in zip(found.items(), (INK, "#0072B2"), strict=False):
-        seconds = np.sort([float(r["cpu_s"]) for r in its])
+    for letter, ax, (box, runs) in zip("abc", axes, found.items(), strict=False):
+        _draw_box(ax, runs)
+        panel_title(ax, letter, f"{box} box, {len(runs)} runs")
+    for (box, runs), colour in zip(found.items(), (INK, "#0072B2"), strict=False):
+        seconds = np.sort([float(r["cpu_s"]) for r in runs])
         axes[-1].step(
-            seconds, 100 * np.arange(1, len(its) + 1) / len(its), color=colour, where="post", label=box
+            seconds, 100 * np.arange(1, len(runs) + 1) / len(runs), color=colour, where="post", label=box
         )
     axes[-1].set(
         xscale="log", xlabel="CPU time of a run [s]", ylabel="runs that took no longer [%]", ylim=(0, 102)
@@ -184,7 +200,7 @@ def figure_robustness(found: dict[str, list[rows.Row]], mesh: str) -> Figure:
     plain_log(axes[-1].xaxis)
     axes[-1].legend(loc="lower right")
     panel_title(axes[-1], "c", "cost")
-    failed = sum(r["status"] != "ok" for its in found.values() for r in its)
+    failed = sum(r["status"] != "ok" for runs in found.values() for r in runs)
     total = sum(map(len, found.values()))
     state_finding(
         figure, f"{total - failed} of {total} runs at random parameters finish",
@@ -195,11 +211,12 @@ def figure_robustness(found: dict[str, list[rows.Row]], mesh: str) -> Figure:
 
 
 def _draw_box(ax: Axes, its: Sequence[rows.Row]) -> None:
+    """Draws the runs of one box over k_s E_s and E_s / E_c."""
     values = {name: np.array([float(r[name]) for r in its]) for name in NAMES}
     x, y = values["k_s"] * values["E_s"], values["E_s"] / values["E_c"]
-    ok = np.array([r["status"] == "ok" for r in its])
-    ax.scatter(x[ok], y[ok], s=4, color="#0072B2", lw=0)
-    ax.scatter(x[~ok], y[~ok], s=16, marker="x", color=ACCENT, lw=0.9)
+    finished = np.array([r["status"] == "ok" for r in its])
+    ax.scatter(x[finished], y[finished], s=4, color="#0072B2", lw=0)
+    ax.scatter(x[~finished], y[~finished], s=16, marker="x", color=ACCENT, lw=0.9)
     ax.set(xscale="log", yscale="log", xlabel="$k_s E_s$ [N]", ylabel="$E_s / E_c$")
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_minor_formatter(NullFormatter())
@@ -209,37 +226,38 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--n", type=int, default=500, help="points of each box (default 500)")
-    parser.add_argument("--refinement", type=int, choices=(0, 1), default=1, help="of the bricks")
+    parser.add_argument("--n", type=int, default=500, help="number of points in each box (default 500)")
+    parser.add_argument("--refinement", type=int, choices=(0, 1), default=1, help="refinement of the bricks")
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--first-cycle", action="store_true", help="the first cycle of the protocol only")
+    parser.add_argument("--first-cycle", action="store_true", help="run only the first cycle of the protocol")
     parser.add_argument("--results", type=Path, default=rows.RESULTS)
     parser.add_argument("--figures", type=Path, default=FIGURES)
     return parser.parse_args()
 
 
 def main() -> None:
-    asked = arguments()
-    spec, mesh = ModelSpec(refinement=asked.refinement), ("80 bricks", "448 bricks")[asked.refinement]
-    table = replace(ROWS, path=asked.results / ROWS.path.name)
-    same = {
-        "protocol": "first cycle" if asked.first_cycle else "whole",
-        "seed": asked.seed,
+    args = arguments()
+    spec, mesh = ModelSpec(refinement=args.refinement), ("80 bricks", "448 bricks")[args.refinement]
+    table = replace(ROWS, path=args.results / ROWS.path.name)
+    shared = {
+        "protocol": "first cycle" if args.first_cycle else "whole",
+        "seed": args.seed,
         "model_hash": spec.hash,
     }
-    drawn = {box: points(space, asked.n, asked.seed) for box, space in boxes().items()}
+    points_of = {box: points(space, args.n, args.seed) for box, space in boxes().items()}
+    # The boxes alternate, so that a count that was stopped has points of both.
     items = [
-        {**same, "box": box, "index": index, **theta}
-        for index, both in enumerate(zip(*drawn.values(), strict=True))  # a partial count has some of each
-        for box, theta in zip(drawn, both, strict=True)
+        {**shared, "box": box, "index": index, **theta}
+        for index, pair in enumerate(zip(*points_of.values(), strict=True))
+        for box, theta in zip(points_of, pair, strict=True)
     ]
-    done = run_all(spec, items, table, asked.workers)
-    rows.warn_of_mixed_code(done)
-    found = {box: [r for r in done if r["box"] == box] for box in boxes()}
-    print(f"seed {asked.seed}\n\n{summary(found)}\n\n{failures(found)}")
+    finished = run_all(spec, items, table, args.workers)
+    rows.warn_of_mixed_code(finished)
+    rows_by_box = {box: [r for r in finished if r["box"] == box] for box in boxes()}
+    print(f"seed {args.seed}\n\n{summary(rows_by_box)}\n\n{failures(rows_by_box)}")
     stem = f"robustness-{mesh.replace(' ', '-')}"
-    save_figure(figure_robustness(found, mesh), asked.figures / stem, "benchmarks/robustness.py")
+    save_figure(figure_robustness(rows_by_box, mesh), args.figures / stem, "benchmarks/robustness.py")
 
 
 if __name__ == "__main__":

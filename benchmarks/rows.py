@@ -1,4 +1,4 @@
-"""A benchmark's finished rows: a CSV that grows by whole lines, so that a stopped benchmark goes on."""
+"""Stores the finished rows of a benchmark in a CSV, so that a benchmark that was stopped can continue."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ Row = dict[str, str]
 
 @dataclass(frozen=True)
 class Rows:
-    """A CSV with the columns `key` (all inputs of a row and the model's hash) and then `values`.
+    """Describes a CSV with the columns `key` (all inputs of a row and the model's hash) and then `values`.
 
-    A line is written by one call of the system; a line that a crash cut short is no row.
+    The CSV grows by whole lines. Each line is written by one system call; a line that a crash has cut short
+    does not count as a row.
     """
 
     path: Path
@@ -36,10 +37,14 @@ class Rows:
 
     @property
     def columns(self) -> tuple[str, ...]:
+        """Returns all columns of the CSV in their order."""
         return (*self.key, *self.values)
 
     def read(self) -> list[Row]:
-        """All whole rows; of several with one key, the last. A file with other columns is refused."""
+        """Returns all complete rows; of several rows with the same key, the last one.
+
+        Ends the program where the file has other columns.
+        """
         if not self.path.is_file():
             return []
         lines = self.path.read_text().splitlines(keepends=True)
@@ -50,20 +55,21 @@ class Rows:
         return list({self.key_of(row): row for row in rows[1:]}.values())
 
     def key_of(self, row: Mapping[str, Any]) -> tuple[str, ...]:
+        """Returns the key of a row as texts."""
         return tuple(_text(row[name]) for name in self.key)
 
     def find(self, **inputs: Any) -> Row | None:
-        """The row of these inputs, or None."""
+        """Returns the row of these inputs, or None."""
         return next((row for row in self.read() if self.key_of(row) == self.key_of(inputs)), None)
 
     def append(self, **row: Any) -> Row:
-        """Adds one row at once; returns it as it will be read."""
+        """Appends one row at once, and returns it as it will be read."""
         text = {name: _text(row[name]).replace("\n", " ") for name in self.columns}
         self.path.parent.mkdir(parents=True, exist_ok=True)
         before = self.path.read_bytes() if self.path.is_file() else b""
         buffer = io.StringIO()
         if before and not before.endswith(b"\n"):
-            buffer.write("\n")  # closes a line that was cut short; it has too few columns to be a row
+            buffer.write("\n")  # ends a line that was cut short, which has too few columns to count as a row
         writer = csv.writer(buffer, lineterminator="\n")
         if not before:
             writer.writerow(self.columns)
@@ -78,46 +84,51 @@ class Rows:
 
 
 def _text(value: Any) -> str:
+    """Returns a value as it is written in the CSV."""
     return format(value, ".10g") if isinstance(value, float) else str(value)
 
 
 def digest(inputs: Mapping[str, Any]) -> str:
-    """Short name of a row's inputs, for a file beside the CSV."""
+    """Returns a short name of a row's inputs, for a file beside the CSV."""
     text = json.dumps({name: _text(value) for name, value in inputs.items()}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _code_digest() -> str:
+    """Returns a hash of how the sources of bayeskin/finite_element behave."""
     folder = Path(bayeskin.finite_element.__file__).parent
-    whole = "".join(sha256_of_behaviour(path.read_bytes()) for path in sorted(folder.glob("*.py")))
-    return hashlib.sha256(whole.encode()).hexdigest()[:12]
+    hashes = "".join(sha256_of_behaviour(path.read_bytes()) for path in sorted(folder.glob("*.py")))
+    return hashlib.sha256(hashes.encode()).hexdigest()[:12]
 
 
-# How the model's source behaves, as it was loaded: times and small errors depend on more than the model hash.
+# This is a hash of the model's source when it was loaded. Times and small errors depend on more than the
+# model hash covers.
 CODE = _code_digest()
 
 
 def warn_of_mixed_code(rows: Sequence[Row]) -> None:
-    """Says so when the rows of one table come from more than one state of the model's source."""
-    found = sorted({row["code"] for row in rows})
-    if len(found) > 1:
-        states = ", ".join(found)
-        say(f"warning: rows from {len(found)} states of bayeskin/finite_element ({states}) in one table")
+    """Prints a warning if the rows of one table come from more than one state of the model's source."""
+    codes = sorted({row["code"] for row in rows})
+    if len(codes) > 1:
+        states = ", ".join(codes)
+        say(f"warning: rows from {len(codes)} states of bayeskin/finite_element ({states}) in one table")
 
 
 class Log(Silent):
-    """Tells on stderr what stages log."""
+    """Prints on stderr what stages log."""
 
     def log(self, message: str) -> None:
+        """Prints a message on stderr."""
         say(message)
 
 
 def say(text: str) -> None:
+    """Prints a text on stderr."""
     print(text, file=sys.stderr, flush=True)
 
 
 def progress(label: str, every_s: float = 20.0) -> Callable[[float], None]:
-    """Prints on stderr how much of a run is done, now and then."""
+    """Returns a function that prints on stderr how much of a run is done, at most every `every_s` seconds."""
     last = time.monotonic()
 
     def show(fraction: float) -> None:
@@ -130,18 +141,18 @@ def progress(label: str, every_s: float = 20.0) -> Callable[[float], None]:
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table; numbers as they were formatted."""
+    """Returns a Markdown table of cells that are already formatted."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def into_docs(path: Path, name: str, block: str) -> None:
-    """Puts a block between the page's markers of this name. Ends the program where there are none."""
+    """Writes a block between the markers of this name in a page; ends the program where they are missing."""
     start, end = f"<!-- {name} -->", f"<!-- /{name} -->"
-    whole = path.read_text()
-    if not re.search(f"{start}\n.*{end}", whole, re.DOTALL):
+    page = path.read_text()
+    if not re.search(f"{start}\n.*{end}", page, re.DOTALL):
         raise SystemExit(f"{path}: no markers {start} and {end}")
-    written = re.sub(f"{start}\n.*{end}", lambda _: f"{start}\n\n{block}\n\n{end}", whole, flags=re.DOTALL)
+    written = re.sub(f"{start}\n.*{end}", lambda _: f"{start}\n\n{block}\n\n{end}", page, flags=re.DOTALL)
     staged = path.with_name(f".{path.name}.partial")
     staged.write_text(written)
     staged.replace(path)

@@ -1,14 +1,14 @@
-"""How long a posterior takes from a shipped surrogate, and what of that is the moves' doing.
+"""Measures how long a posterior takes with a shipped surrogate, and what the sampler's moves contribute.
 
-The shipped settings: four ensembles of 40 walkers on two threads, until the parameter that has fewest has
-5,000 effective samples and R-hat across ensembles is 1.01. Beside it emcee with its own default move (the
-stretch move of Goodman & Weare 2010) on the same density, from the same start, for the same number of steps,
-judged by the same measures.
+The shipped settings are four ensembles of 40 walkers on two threads. They sample until R-hat across ensembles
+is 1.01, and until the parameter with the fewest effective samples has 5,000 of them. For comparison emcee
+samples the same density with its own default move (the stretch move of Goodman & Weare 2010), from the same
+start and for the same number of steps, and is judged by the same measures.
 
     python benchmarks/sampling_speed.py                                          # the demo
-    python benchmarks/sampling_speed.py --recording FILE.h5 --surrogate FILE.h5  # another
+    python benchmarks/sampling_speed.py --recording FILE.h5 --surrogate FILE.h5  # another recording
 
-Prints one line a seed and the medians.
+The program prints one line for each seed, and the medians.
 """
 
 from __future__ import annotations
@@ -36,36 +36,42 @@ from bayeskin.types import Array
 SETTINGS = SampleSettings(max_steps=30000)
 THREADS = 2
 HEADER = (
-    "seed", "recording and surrogate [s]", "most probable point [s]", "sampling [s]", "steps",
-    "fewest effective samples", "R-hat", "chains", "default move [s]", "fewest effective samples", "R-hat",
-    "effective samples a second, ratio",
+    "seed", "reading of the files [s]", "most probable point [s]", "sampling [s]", "steps",
+    "fewest effective samples", "R-hat", "chains", "default move: sampling [s]",
+    "default move: fewest effective samples", "default move: R-hat", "ratio of effective samples a second",
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Timed:
-    """Wall time of one way to draw the posterior, and what its chains are worth."""
+    """Holds the wall time of one way to sample the posterior, and the convergence of its chains."""
 
     seconds: float
     found: Convergence
 
     @property
     def fewest(self) -> float:
-        """Effective samples of the parameter that has fewest; 0 where one does not move."""
+        """Returns the effective samples of the parameter that has the fewest; 0 where one does not move."""
         return float(np.nan_to_num(self.found.ess).min())
 
     @property
     def highest(self) -> float:
+        """Returns R-hat of the parameter that has the largest."""
         return float(self.found.rhat.max())
 
 
 def problem(recording: Path, surrogate: Path) -> LogPosterior:
-    recorded, knows = read_recording(recording), load_surrogate(surrogate)
-    phases = segment(recorded)
-    return LogPosterior(knows, bin_recording(recorded, phases, knows.edges_s, analyse(recorded, phases)))
+    """Returns the log-posterior of a recording by a surrogate."""
+    loaded_recording, loaded_surrogate = read_recording(recording), load_surrogate(surrogate)
+    phases = segment(loaded_recording)
+    return LogPosterior(
+        loaded_surrogate,
+        bin_recording(loaded_recording, phases, loaded_surrogate.edges_s, analyse(loaded_recording, phases)),
+    )
 
 
 def shipped_sampler(about: LogPosterior, start: dict[str, float], seed: int) -> Timed:
+    """Samples with the shipped settings."""
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()
         posterior = inference.sample(about, folder, seed, start, SETTINGS, threads=THREADS)
@@ -73,7 +79,7 @@ def shipped_sampler(about: LogPosterior, start: dict[str, float], seed: int) -> 
 
 
 def default_move(about: LogPosterior, start: dict[str, float], seed: int, steps: int) -> Timed:
-    """emcee as it comes, so many steps of as many ensembles and walkers."""
+    """Samples with emcee's default move, with the shipped number of ensembles and walkers."""
     origin = about.vector(start)
 
     def chain(own: np.random.SeedSequence) -> tuple[Array, Array]:
@@ -88,46 +94,48 @@ def default_move(about: LogPosterior, start: dict[str, float], seed: int, steps:
 
     started = time.perf_counter()
     with ThreadPoolExecutor(THREADS) as pool:
-        made = list(pool.map(chain, np.random.SeedSequence(seed).spawn(SETTINGS.ensembles)))
-    chains, log_prob = (np.stack(part) for part in zip(*made, strict=True))
+        results = list(pool.map(chain, np.random.SeedSequence(seed).spawn(SETTINGS.ensembles)))
+    chains, log_prob = (np.stack(arrays) for arrays in zip(*results, strict=True))
     seconds = time.perf_counter() - started
     return Timed(seconds, assess(chains, log_prob, about.names, SETTINGS.limits))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--recording", type=Path, help="default: the demo's")
-    parser.add_argument("--surrogate", type=Path, help="that knows its protocol; default: the demo's")
-    parser.add_argument("--seeds", type=int, default=3, help="posteriors sampled (default 3)")
-    asked = parser.parse_args()
+    parser.add_argument("--recording", type=Path, help="recording (default: the demo's)")
+    parser.add_argument(
+        "--surrogate", type=Path, help="surrogate of the recording's protocol (default: the demo's)"
+    )
+    parser.add_argument("--seeds", type=int, default=3, help="number of posteriors (default 3)")
+    options = parser.parse_args()
     lines = []
-    for seed in range(1, asked.seeds + 1):
+    for seed in range(1, options.seeds + 1):
         started = time.perf_counter()
         about = problem(
-            asked.recording or shipped("data/demo.h5"), asked.surrogate or shipped("surrogates/demo.h5")
+            options.recording or shipped("data/demo.h5"), options.surrogate or shipped("surrogates/demo.h5")
         )
-        opened = time.perf_counter()
+        loaded = time.perf_counter()
         best = dict(inference.find_map(about, seed).theta)
-        climbed = time.perf_counter()
-        own = shipped_sampler(about, best, seed)
-        peer = default_move(about, best, seed, own.found.steps)
-        rows.say(f"seed {seed}: {own.fewest:.0f} effective samples in {own.seconds:.0f} s")
-        rate = (own.fewest / own.seconds) / (peer.fewest / peer.seconds) if peer.fewest else np.inf
+        fitted = time.perf_counter()
+        ours = shipped_sampler(about, best, seed)
+        peer = default_move(about, best, seed, ours.found.steps)
+        rows.say(f"seed {seed}: {ours.fewest:.0f} effective samples in {ours.seconds:.0f} s")
+        rate = (ours.fewest / ours.seconds) / (peer.fewest / peer.seconds) if peer.fewest else np.inf
         lines.append(
-            [opened - started, climbed - opened, own.seconds, own.found.steps, own.fewest, own.highest,
-             float(own.found.verdict.trusted), peer.seconds, peer.fewest, peer.highest, rate]
+            [loaded - started, fitted - loaded, ours.seconds, ours.found.steps, ours.fewest, ours.highest,
+             float(ours.found.verdict.trusted), peer.seconds, peer.fewest, peer.highest, rate]
         )  # fmt: skip
-    body = [[str(seed), *told(line)] for seed, line in enumerate(lines, start=1)]
-    print(rows.markdown(HEADER, [*body, ["median", *told(np.median(lines, axis=0))]]))
+    seed_rows = [[str(seed), *told(line)] for seed, line in enumerate(lines, start=1)]
+    print(rows.markdown(HEADER, [*seed_rows, ["median", *told(np.median(lines, axis=0))]]))
 
 
 def told(line: list[float] | Array) -> list[str]:
-    """A line's numbers as they are printed."""
-    opened, climbed, sampled, steps, ess, rhat, trusted, seconds, others, other_rhat, rate = line
+    """Returns a line's numbers as formatted texts."""
+    load_s, maximum_s, sample_s, steps, ess, rhat, trusted, default_s, default_ess, default_rhat, rate = line
     return [
-        f"{opened:.1f}", f"{climbed:.1f}", f"{sampled:.1f}", f"{steps:.0f}", f"{ess:.0f}", f"{rhat:.4f}",
+        f"{load_s:.1f}", f"{maximum_s:.1f}", f"{sample_s:.1f}", f"{steps:.0f}", f"{ess:.0f}", f"{rhat:.4f}",
         "trusted" if trusted == 1.0 else "not trusted",
-        f"{seconds:.1f}", f"{others:.0f}", f"{other_rhat:.3f}", f"{rate:.1f}",
+        f"{default_s:.1f}", f"{default_ess:.0f}", f"{default_rhat:.3f}", f"{rate:.1f}",
     ]  # fmt: skip
 
 

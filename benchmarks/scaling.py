@@ -1,15 +1,16 @@
-"""What running a design costs beside its runs: one and two local processes, Dask with one and two workers.
+"""Measures the overhead of running a design by local processes and by Dask, with one and two workers.
 
-The same full runs (default bricks, first cycle of the healthy-skin protocol, first points of a design of the
-default box), timed by the clock:
+The same full runs are timed by the clock in several ways (default bricks, first cycle of the healthy-skin
+protocol, first points of a design of the default box):
 
-    alone            one after the other in this process, no runner
-    local 1, 2       `bayeskin.runner` with processes of its own, started anew for each design
-    Dask 1, 2        the runner over a LocalCluster of this machine, one thread a worker (extra `cluster`)
+    alone            one run after the other in this process, without the runner
+    local 1, 2       `bayeskin.runner` with processes of its own, started again for each design
+    Dask 1, 2        the runner with a LocalCluster of this machine, one thread a worker (extra `cluster`)
 
-Every way runs the points once before it is timed, so that no compilation is. Prints medians over the repeats,
-what a run costs beyond the serial one, and the efficiency: serial time over workers times time. Nothing is
-stored. Needs as many idle cores as workers.
+Every way runs the points once before it is timed, so that no compilation is timed. The program prints medians
+over the repeats, the additional time of a run over a serial one, and the efficiency, which is the serial time
+over the product of workers and time. Nothing is stored. The machine needs as many idle cores as there are
+workers.
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/scaling.py
 """
@@ -44,25 +45,25 @@ RUN = partial(simulate, SPEC, MOTION)
 
 @contextmanager
 def dask(workers: int) -> Iterator[Map]:
-    """Over a cluster on this machine. Raises InputError without Dask."""
+    """Yields a map over a Dask cluster on this machine; raises InputError where Dask is not installed."""
     distributed = cluster.extra("distributed")
     with (
         distributed.LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1"
-        ) as here,
-        cluster.on_scheduler(here.scheduler_address) as over,
+        ) as local_cluster,
+        cluster.on_scheduler(local_cluster.scheduler_address) as run_all,
     ):
-        yield over
+        yield run_all
 
 
 def alone(wave: Wave) -> None:
-    """Every run here."""
+    """Makes every run in this process."""
     for point in wave.theta:
         RUN(dict(zip(wave.space.names, map(float, point), strict=True)))
 
 
 def designed(wave: Wave, run_all: Map) -> None:
-    """Every run by the runner, into a new file."""
+    """Makes every run by the runner, into a new file."""
     with tempfile.TemporaryDirectory() as folder:
         design = run_design(Path(folder) / "design.h5", wave, EDGES_S, RUN, SPEC.hash, run_all)
     if not design.ok.all():
@@ -70,16 +71,16 @@ def designed(wave: Wave, run_all: Map) -> None:
 
 
 def timed(wave: Wave, way: str, workers: int, repeats: int) -> list[float]:
-    """Seconds of each repeat, one before them not counted."""
+    """Returns the seconds of each repeat; one more repeat before them is not counted."""
     maps = {"local": lambda: nullcontext(local(workers)), "Dask": lambda: dask(workers)}
-    found = []
+    seconds = []
     with maps[way]() if way in maps else nullcontext(None) as run_all:
         for repeat in range(repeats + 1):
             started = time.perf_counter()
             alone(wave) if run_all is None else designed(wave, run_all)
-            found.append(time.perf_counter() - started)
-            rows.say(f"{way} {workers}, repeat {repeat}: {found[-1]:.2f} s")
-    return found[1:]
+            seconds.append(time.perf_counter() - started)
+            rows.say(f"{way} {workers}, repeat {repeat}: {seconds[-1]:.2f} s")
+    return seconds[1:]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -89,24 +90,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--runs", type=int, default=32)
     parser.add_argument("--repeats", type=int, default=3)
-    asked = parser.parse_args(arguments)
-    wave = first_wave(default_space(), asked.runs, 0, SEED)
+    options = parser.parse_args(arguments)
+    wave = first_wave(default_space(), options.runs, 0, SEED)
     lines, serial = [], 0.0
     for way, workers in (("alone", 1), ("local", 1), ("local", 2), ("Dask", 1), ("Dask", 2)):
         try:
-            seconds = float(np.median(timed(wave, way, workers, asked.repeats)))
+            seconds = float(np.median(timed(wave, way, workers, options.repeats)))
         except InputError as error:
             rows.say(str(error))
             continue
         serial = serial or seconds
-        beyond = (workers * seconds - serial) / asked.runs
-        share = serial / (workers * seconds)
+        overhead_s = (workers * seconds - serial) / options.runs
+        efficiency = serial / (workers * seconds)
         lines.append(
-            [way, str(workers), f"{seconds:.2f}", f"{1e3 * beyond:+.0f}", f"{100 * share:.0f}",
+            [way, str(workers), f"{seconds:.2f}", f"{1e3 * overhead_s:+.0f}", f"{100 * efficiency:.0f}",
              f"{serial / seconds:.2f}"]
         )  # fmt: skip
-    header = ["way", "workers", "seconds", "worker ms beyond serial, a run", "efficiency [%]", "speed-up"]
-    print(f"{asked.runs} runs, median of {asked.repeats}\n\n{rows.markdown(header, lines)}")
+    header = ["way", "workers", "seconds", "overhead of a run [worker ms]", "efficiency [%]", "speed-up"]
+    print(f"{options.runs} runs, median of {options.repeats}\n\n{rows.markdown(header, lines)}")
     return 0
 
 

@@ -1,15 +1,19 @@
-"""Surrogate of a visco-hyperelastic force with six parameters, learnt from 128 points.
+"""Compares surrogates of a visco-hyperelastic force with six parameters, trained on 128 points.
 
     F(t) = E_inf g + sum_i E_i int_0^t exp(-(t - s) / tau_i) dg(s),   g = (exp(b e) - 1) / b
 
-with the stretch e(t) going 0 to 1 over 0-10 s, held to 80 s, back to 0 by 90 s, at rest to 120 s; 200
-times. E_inf [0.5, 2], E_1 [0.3, 3], E_2 [0.1, 1], tau_1 [1, 6] s, tau_2 [15, 60] s log-uniform, b [0.5, 2]
-uniform. Error: ||prediction - truth|| / ||truth - its mean|| over 512 random points.
+The stretch e(t) rises from 0 to 1 over 0-10 s, is held until 80 s, falls back to 0 by 90 s, and rests until
+120 s. The force is given at 200 times. The parameters are E_inf [0.5, 2], E_1 [0.3, 3], E_2 [0.1, 1], tau_1
+[1, 6] s and tau_2 [15, 60] s, all log-uniform, and b [0.5, 2], uniform. The error is ||prediction - truth|| /
+||truth - its mean|| over 512 random points.
 
-Run with one thread: ``OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/surrogate_benchmark.py``.
-Prints medians over designs of other seeds beside the targets; times are CPU seconds. Other packages (extra
-`benchmark`) are measured on the same designs, one after the other in processes of their own, where they are
-installed: in this environment, or in one given by ``--peer NAME=PYTHON`` (`surrogate_peers`).
+Run the benchmark with one thread:
+
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/surrogate_benchmark.py
+
+It prints medians over designs of different seeds beside the targets; times are CPU seconds. Other packages
+(extra `benchmark`) are measured on the same designs, one after the other in processes of their own. They must
+be installed in this environment, or in one given by ``--peer NAME=PYTHON`` (see surrogate_peers.py).
 """
 
 from __future__ import annotations
@@ -43,7 +47,8 @@ SPACE = ParameterSpace(
     )
 )
 TIME_S = np.linspace(0.0, 120.0, 200)
-EDGES_S = np.linspace(-0.5, 1.0, 201) * 120.0  # bins are not means here; only their number matters
+# The forces are not means over these bins. Only the number of bins matters.
+EDGES_S = np.linspace(-0.5, 1.0, 201) * 120.0
 RAMPS = ((0.0, 10.0, 0.0, 0.1), (80.0, 90.0, 1.0, -0.1))  # start, end [s], stretch, its rate [1/s]
 POINTS, TESTS, BATCH = 128, 512, 512
 SEEDS = 5
@@ -54,23 +59,23 @@ TARGETS = {"held_out_error": 0.015, "training_s": 2.0, "log_likelihoods_per_s": 
 
 
 def force(theta: np.ndarray, time_s: np.ndarray = TIME_S) -> np.ndarray:
-    """F (n, m) [N] at theta (n, 6), in closed form on each ramp of the stretch."""
+    """Returns the force F (n, m) [N] at theta (n, 6), in closed form on each ramp of the stretch."""
     e_inf, e_1, e_2, tau_1, tau_2, b = (column[:, None] for column in theta.T)
     stretch = np.interp(time_s, [0.0, 10.0, 80.0, 90.0], [0.0, 1.0, 1.0, 0.0])
     total = e_inf * np.expm1(b * stretch) / b
     for stiffness, tau in ((e_1, tau_1), (e_2, tau_2)):
-        for start, end, at, rate in RAMPS:
+        for start, end, start_stretch, rate in RAMPS:
             inside = np.clip(time_s, start, end) - start
             rise = np.exp(b * rate * inside) - np.exp(-inside / tau)
-            memory = rate * np.exp(b * at) * rise / (b * rate + 1.0 / tau)
+            memory = rate * np.exp(b * start_stretch) * rise / (b * rate + 1.0 / tau)
             total = total + stiffness * memory * np.exp(-np.maximum(time_s - end, 0.0) / tau)
     return total
 
 
 def design(seed: int, points: int = POINTS, tests: int = TESTS) -> Design:
-    """Scrambled Sobol' points to learn from, uniform ones held out."""
-    learnt = qmc.Sobol(SPACE.dim, seed=seed).random(points)
-    unit = np.vstack([learnt, np.random.default_rng(seed + 1000).random((tests, SPACE.dim))])
+    """Returns a design with scrambled Sobol' points for training and uniform points held out."""
+    training = qmc.Sobol(SPACE.dim, seed=seed).random(points)
+    unit = np.vstack([training, np.random.default_rng(seed + 1000).random((tests, SPACE.dim))])
     n, theta = len(unit), SPACE.from_unit(unit)
     return Design(
         space=SPACE, edges_s=EDGES_S, theta=theta, force_n=force(theta), wave=np.zeros(n, np.int64),
@@ -80,7 +85,7 @@ def design(seed: int, points: int = POINTS, tests: int = TESTS) -> Design:
 
 
 def rate(action, points: int) -> float:  # type: ignore[no-untyped-def]
-    """Points a CPU second, the median of five rounds."""
+    """Returns points per CPU second, the median of five rounds."""
     action()
     rates = []
     for _ in range(5):
@@ -92,7 +97,10 @@ def rate(action, points: int) -> float:  # type: ignore[no-untyped-def]
 
 
 def run(seed: int) -> dict[str, float]:
-    """One design: error, coverage, training time, predictions and log-likelihoods a second."""
+    """Returns the error, coverage, training time and rates of one design.
+
+    The rates are predictions and log-likelihoods per CPU second.
+    """
     runs = design(seed)
     start = time.process_time()
     surrogate, validation = train(runs, "gp", seed)
@@ -120,36 +128,39 @@ def run(seed: int) -> dict[str, float]:
 
 
 def without_factor(prediction: Prediction) -> Prediction:
-    """The prediction as if its error were independent from bin to bin."""
+    """Returns the prediction as if its error were independent from bin to bin."""
     return Prediction(prediction.mean, prediction.factor[:, :, :0], prediction.diagonal)
 
 
 def peer_rows(package: str, python: str) -> list[Row]:
-    """Medians of each of a package's methods over the designs; one line and no row where it is absent."""
-    known = f"import importlib.util, sys; sys.exit(importlib.util.find_spec({package!r}) is None)"
-    if subprocess.run([python, "-c", known], check=False).returncode:
+    """Returns the medians over the designs for each method of a package.
+
+    Where the package is not installed, prints one line and returns no row.
+    """
+    probe = f"import importlib.util, sys; sys.exit(importlib.util.find_spec({package!r}) is None)"
+    if subprocess.run([python, "-c", probe], check=False).returncode:
         print(f"{package}: not installed for {python}, skipped")
         return []
-    script, found = Path(__file__).with_name("surrogate_peers.py"), {}  # type: ignore[var-annotated]
+    script, by_method = Path(__file__).with_name("surrogate_peers.py"), {}  # type: ignore[var-annotated]
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(SEEDS):
             runs, file = design(seed), Path(folder) / f"{seed}.npz"
-            unit, out = SPACE.to_unit(runs.theta), runs.held_out
+            unit, held_out = SPACE.to_unit(runs.theta), runs.held_out
             np.savez(
-                file, unit=unit[~out], force_n=runs.force_n[~out], test_unit=unit[out],
-                test_force_n=runs.force_n[out],
+                file, unit=unit[~held_out], force_n=runs.force_n[~held_out], test_unit=unit[held_out],
+                test_force_n=runs.force_n[held_out],
             )  # fmt: skip
             command = [python, str(script), package, str(file)]
-            done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-            for line in done.stdout.splitlines():
+            process = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+            for line in process.stdout.splitlines():
                 if line.startswith("ROW "):
                     row = json.loads(line[4:])
-                    found.setdefault(row.pop("method"), []).append(row)
-    return [{"method": name, **medians(rows)} for name, rows in found.items()]
+                    by_method.setdefault(row.pop("method"), []).append(row)
+    return [{"method": name, **medians(rows)} for name, rows in by_method.items()]
 
 
 def medians(rows: list[Row]) -> Row:
-    """Of each column over the designs; None where a method has no number."""
+    """Returns the median of each column over the designs, or None where a method has no number."""
     return {
         key: None if value is None else float(np.median([row[key] for row in rows]))
         for key, value in rows[0].items()
@@ -157,7 +168,7 @@ def medians(rows: list[Row]) -> Row:
 
 
 def table(rows: list[Row]) -> str:
-    """Rows below the targets, as Markdown; in brackets how many times the first row's."""
+    """Returns the rows below the targets as Markdown; brackets have the ratio to the first row."""
     lines = [["method", *COLUMNS], ["---"] * (1 + len(COLUMNS))]
     signs = {key: ">=" if key.endswith("per_s") else "<=" for key in TARGETS}
     targets = [f"{signs[key]} {TARGETS[key]:,g}" if key in TARGETS else "" for key in COLUMNS]
@@ -175,7 +186,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--peer", action="append", default=[], metavar="NAME=PYTHON")
     pythons = dict.fromkeys(PEERS, sys.executable)
-    pythons |= dict(one.split("=", 1) for one in parser.parse_args().peer)
+    pythons |= dict(peer.split("=", 1) for peer in parser.parse_args().peer)
     ours = medians([run(seed) for seed in range(SEEDS)])
     print(json.dumps(ours, indent=2))
     rows: list[Row] = [{"method": f"bayeskin {__version__}", **ours}]

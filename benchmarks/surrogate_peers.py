@@ -1,9 +1,12 @@
-"""What other packages make of `surrogate_benchmark`'s problem; each may live in an environment of its own.
+"""Measures surrogates of other packages on the problem of surrogate_benchmark.py.
 
-``PYTHON benchmarks/surrogate_peers.py PACKAGE PROBLEM.npz`` prints one JSON line a method. Needs numpy and
-the package. All are given inputs on the unit cube, logarithms taken where the prior is log-uniform. Those
-that know no field outputs are given their principal components; noise is white, the cheapest case for all.
-OpenTURNS' settings gave the least error of a few tried on the first design; the others have one each.
+    PYTHON benchmarks/surrogate_peers.py PACKAGE PROBLEM.npz
+
+The program prints one JSON line for each method. PYTHON needs numpy and the package, so each package may have
+an environment of its own. All packages are given the inputs on the unit cube, in logarithms where the prior
+is log-uniform. Packages without field outputs are given the principal components of the outputs. The noise is
+white, which is the cheapest case for all. The settings of OpenTURNS are those with the smallest error of a
+few tried on the first design. The other packages have one setting each.
 """
 
 from __future__ import annotations
@@ -19,15 +22,16 @@ from importlib.metadata import version
 import numpy as np
 
 Array = np.ndarray
-Predict = Callable[[Array, bool], tuple[Array, Array]]  # inputs (n, d), whether the error is asked for
+# The arguments are inputs (n, d), and True if the error is needed.
+Predict = Callable[[Array, bool], tuple[Array, Array]]
 Fit = Callable[[Array, Array], Predict]
-KEPT = 1e-7  # of the outputs' variance: components with less are left out
+KEPT = 1e-7  # components with a smaller share of the outputs' variance are left out
 NOISE_N = 1e-2
-STRATA = 9  # of terms that the sparse chaos chooses from, in the order of their hyperbolic norm
+STRATA = 9  # the sparse chaos chooses terms from these first strata of the hyperbolic norm
 
 
 def scores_of(force_n: Array) -> tuple[Array, Array, Array]:
-    """Mean (m,), components (q, m) and scores (n, q) of forces (n, m)."""
+    """Returns mean (m,), principal components (q, m) and scores (n, q) of forces (n, m)."""
     mean = force_n.mean(axis=0)
     left, size, right = np.linalg.svd(force_n - mean, full_matrices=False)
     kept = size**2 > KEPT * np.sum(size**2)
@@ -35,7 +39,10 @@ def scores_of(force_n: Array) -> tuple[Array, Array, Array]:
 
 
 def openturns_gp(unit: Array, scores: Array) -> Predict:
-    """One GP a score: squared exponential with a length an input, over a linear trend."""
+    """Fits one GP for each score.
+
+    The kernel is squared exponential with a length for each input, over a linear trend.
+    """
     import openturns as ot
 
     fitted = []
@@ -49,8 +56,8 @@ def openturns_gp(unit: Array, scores: Array) -> Predict:
         first.run()
         second = ot.GaussianProcessRegression(first.getResult())
         second.run()
-        found = second.getResult()
-        fitted.append((scale, found.getMetaModel(), ot.GaussianProcessConditionalCovariance(found)))
+        result = second.getResult()
+        fitted.append((scale, result.getMetaModel(), ot.GaussianProcessConditionalCovariance(result)))
 
     def predict(at: Array, error: bool) -> tuple[Array, Array]:
         points = ot.Sample(at)
@@ -64,7 +71,7 @@ def openturns_gp(unit: Array, scores: Array) -> Predict:
 
 
 def openturns_chaos(unit: Array, scores: Array) -> Predict:
-    """Sparse chaos: least-angle regression, corrected leave-one-out. States no error."""
+    """Fits sparse chaos by least-angle regression with corrected leave-one-out; it states no error."""
     import openturns as ot
 
     dim = unit.shape[1]
@@ -81,7 +88,10 @@ def openturns_chaos(unit: Array, scores: Array) -> Predict:
 
 
 def bayesvalidrox(kind: str) -> Fit:
-    """Its GPs (a length an input), or its sparse chaos (fast ARD, degrees to 5), of the scores."""
+    """Returns a fit of the scores by GPs with a length for each input, or by sparse chaos.
+
+    The chaos uses fast ARD and degrees up to 5.
+    """
     import bayesvalidrox as bvr
 
     def fit(unit: Array, scores: Array) -> Predict:
@@ -106,7 +116,10 @@ def bayesvalidrox(kind: str) -> Fit:
 
 
 def surmise_forces(unit: Array, force_n: Array) -> Predict:
-    """PCGP (Higdon et al. 2008), which takes components itself: mean (n, m) and factor (n, q, m)."""
+    """Fits PCGP (Higdon et al. 2008), which computes principal components itself.
+
+    Its predictions are mean (n, m) and factor (n, q, m) of the forces.
+    """
     from surmise.emulation import emulator
     from surmise.set_RNG import set_RNG
 
@@ -115,27 +128,30 @@ def surmise_forces(unit: Array, force_n: Array) -> Predict:
     model = emulator(x=times, theta=unit, f=force_n.T, method="PCGP", args={"epsilon": KEPT})
 
     def predict(at: Array, error: bool) -> tuple[Array, Array]:
-        found = model.predict(x=times, theta=at, args={"computecov": error})
-        mean = found.mean().T
-        return mean, found.covxhalf().transpose(1, 2, 0) if error else mean[:, :0, None]
+        prediction = model.predict(x=times, theta=at, args={"computecov": error})
+        mean = prediction.mean().T
+        return mean, prediction.covxhalf().transpose(1, 2, 0) if error else mean[:, :0, None]
 
     return predict
 
 
 def log_likelihood(residual: Array, factor: Array | None) -> Array:
-    """Of residuals (n, m) with white noise and, if given, a factor (n, q, m) of the surrogate's own error."""
+    """Returns the log-likelihoods (n,) of residuals (n, m) with white noise.
+
+    factor (n, q, m) : factor of the surrogate's own error, or None
+    """
     weight, m = NOISE_N**-2, residual.shape[1]
     square = weight * np.sum(residual**2, axis=1) + m * np.log(2.0 * np.pi / weight)
     if factor is None:
         return -0.5 * square
     lower = np.linalg.cholesky(np.eye(factor.shape[1]) + weight * factor @ factor.transpose(0, 2, 1))
-    pulled = np.linalg.solve(lower, weight * (factor @ residual[:, :, None]))[:, :, 0]
+    whitened = np.linalg.solve(lower, weight * (factor @ residual[:, :, None]))[:, :, 0]
     logs = 2.0 * np.sum(np.log(np.diagonal(lower, axis1=1, axis2=2)), axis=1)
-    return -0.5 * (square - np.sum(pulled**2, axis=1) + logs)
+    return -0.5 * (square - np.sum(whitened**2, axis=1) + logs)
 
 
 def of_scores(fit: Fit) -> Fit:
-    """A method for scores as one for forces."""
+    """Returns a fit for forces from a fit for scores."""
 
     def fitted(unit: Array, force_n: Array) -> Predict:
         mean, components, scores = scores_of(force_n)
@@ -154,7 +170,7 @@ def of_scores(fit: Fit) -> Fit:
 
 
 def methods(package: str) -> Iterator[tuple[str, Fit]]:
-    """The methods of one package by name."""
+    """Yields the names and fits of one package's methods."""
     if package == "openturns":
         yield "GP", of_scores(openturns_gp)
         yield "sparse chaos", of_scores(openturns_chaos)
@@ -166,7 +182,7 @@ def methods(package: str) -> Iterator[tuple[str, Fit]]:
 
 
 def rate(action: Callable[[], object], points: int) -> float:
-    """Points a CPU second: the median of three rounds."""
+    """Returns points per CPU second, the median of three rounds."""
     rates = []
     for _ in range(3):
         start = time.process_time()
@@ -176,7 +192,7 @@ def rate(action: Callable[[], object], points: int) -> float:
 
 
 def measured(fit: Fit, problem: dict[str, Array]) -> dict[str, float | None]:
-    """Error, training time and rates of one method."""
+    """Returns error, training time and rates of one method."""
     unit, force_n, at, truth = (problem[name] for name in ("unit", "force_n", "test_unit", "test_force_n"))
     start = time.process_time()
     predict = fit(unit, force_n)

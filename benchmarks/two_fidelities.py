@@ -1,14 +1,16 @@
-"""Posteriors of one recording by a coarse model, by the fine one, and by the coarse one corrected.
+"""Compares posteriors of one recording by a coarse model, by a fine model, and by the corrected coarse model.
 
-The demo's recording, three times: the design on 80 bricks only; the same design corrected by a few runs of
-the default 448 bricks, finer at the pads' edges; a design of those fine runs only. The corrected posterior
-is to be the fine one's, at a fraction of its runs. Compared parameter by parameter and where the recording
-says most, in the stiffness that the peak force follows, about 3.8e-6 E_c + 9.9e-6 E_s [N, Pa].
+The demo's recording is inferred three times: with a design on 80 bricks only, with the same design corrected
+by a few runs of the default 448 bricks, which are finer at the pads' edges, and with a design of these fine
+runs only. The corrected posterior should equal the fine one, with a fraction of the fine runs. The posteriors
+are compared parameter by parameter. They are also compared in the quantity that the recording determines
+best, the stiffness that the peak force follows, about 3.8e-6 E_c + 9.9e-6 E_s [N, Pa].
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/two_fidelities.py
 
-Some 15 minutes on two cores; a stopped benchmark goes on. Prints the table and writes
-docs/figures/two_fidelities.{png,svg}; the runs lie in benchmarks/results/two_fidelities.
+The benchmark takes some 15 minutes on two cores. A benchmark that was stopped continues where it ended. The
+program prints the table and writes docs/figures/two_fidelities.{png,svg}. The runs are stored in
+benchmarks/results/two_fidelities.
 """
 
 from __future__ import annotations
@@ -44,12 +46,12 @@ CASES = {
     "fine": COMMON,
 }
 COLOURS = {"coarse": "#D55E00", "corrected": "#0072B2", "fine": INK}
-PEAK_N_PER_PA = (3.8e-6, 9.9e-6)  # by E_c and by E_s
+PEAK_N_PER_PA = (3.8e-6, 9.9e-6)  # change of the peak force by E_c and by E_s
 QUANTITIES = ("stiffness", "E_c", "E_s", "k_c", "k_s")
 
 
 class Teller:
-    """Says on stderr how a run goes on."""
+    """Prints on stderr how a run proceeds."""
 
     def log(self, message: str) -> None:
         rows.say(message)
@@ -59,7 +61,7 @@ class Teller:
 
 
 def sampled(case: str) -> tuple[dict[str, Array], str]:
-    """Draws of every quantity, and in words what they cost and whether they are trusted."""
+    """Returns the draws of every quantity, and a sentence on their cost and on whether they are trusted."""
     FOLDER.mkdir(parents=True, exist_ok=True)
     path = FOLDER / f"{case}.toml"
     path.write_text(CASES[case])
@@ -70,16 +72,19 @@ def sampled(case: str) -> tuple[dict[str, Array], str]:
     draws["stiffness"] = PEAK_N_PER_PA[0] * draws["E_c"] + PEAK_N_PER_PA[1] * draws["E_s"]
     design = json.loads((FOLDER / case / "design" / "stage.json").read_text())["summary"]
     check = answer["full_model"][-1]
-    said = (
-        f"{case}: {design['seconds_of_runs']:.0f} s of {design['runs']} runs; of {check['draws']} draws "
-        f"{check['effective']:.1f} effective in the full model; {answer['verdict']}"
+    sentence = (
+        f"{case}: {design['seconds_of_runs']:.0f} s for {design['runs']} runs; of {check['draws']} draws "
+        f"{check['effective']:.1f} are effective in the full model; {answer['verdict']}"
     )
-    return draws, said
+    return draws, sentence
 
 
 def table(draws: dict[str, dict[str, Array]]) -> str:
-    """Medians and 90 % intervals; in brackets how far the median is from the fine one's in `spread`s of it,
-    and the ratio of both, of logarithms."""
+    """Returns a table of medians and 90 % intervals.
+
+    Brackets have the distance of the median from that of the fine posterior in `spread`s of the latter, and
+    the ratio of both spreads. These are of logarithms.
+    """
     lines = []
     for name in QUANTITIES:
         fine = np.log(draws["fine"][name])
@@ -94,14 +99,17 @@ def table(draws: dict[str, dict[str, Array]]) -> str:
 
 
 def spread(values: Array) -> float:
-    """Half of what 68 % of the values span: the sd of a normal law, which tails do not move."""
+    """Returns half of the range that 68 % of the values span.
+
+    This is the sd of a normal distribution, and the tails do not affect it.
+    """
     low, high = np.quantile(values, [0.16, 0.84])
     return float(0.5 * (high - low))
 
 
 @styled
 def figure(draws: dict[str, dict[str, Array]]) -> Figure:
-    """One panel a quantity, one line a posterior."""
+    """Returns the figure, with one panel for each quantity and one line for each posterior."""
     drawn = new_figure(PAGE_IN, 2.4)
     axes = drawn.subplots(1, 3)
     for ax, name, letter, unit in zip(axes, QUANTITIES, "abc", ("N", "Pa", "Pa"), strict=False):
@@ -128,11 +136,11 @@ def figure(draws: dict[str, dict[str, Array]]) -> Figure:
 
 
 def main() -> None:
-    found = {case: sampled(case) for case in CASES}
-    draws = {case: of for case, (of, _) in found.items()}
+    results = {case: sampled(case) for case in CASES}
+    draws = {case: case_draws for case, (case_draws, _) in results.items()}
     print(table(draws))
-    for _, said in found.values():
-        print(said)
+    for _, sentence in results.values():
+        print(sentence)
     save_figure(figure(draws), FIGURE, "benchmarks/two_fidelities.py")
 
 

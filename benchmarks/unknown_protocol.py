@@ -1,9 +1,10 @@
-"""How long a recording of a protocol that no file knows takes to a trusted posterior, stage by stage.
+"""Measures how long a recording with an unknown protocol takes to a trusted posterior, stage by stage.
 
-The full model makes a staircase test of random holds on a skin, with correlated noise; `bayeskin new` writes
-its configuration and the stages run as `bayeskin run` has them. Prints seconds of the clock and of the
-processors of each stage, full runs, effective draws of the check, the verdict, and whether true values lie
-in the 90 % intervals. A second start with the same folder goes on, and repeats nothing.
+No shipped file knows the protocol. The full model makes a staircase test with random holds on a skin, with
+correlated noise. `bayeskin new` writes its configuration, and the stages run as in `bayeskin run`. The
+program prints the wall seconds and CPU seconds of each stage, the number of full runs, the effective draws of
+the check, the verdict, and whether the true values lie in the 90 % intervals. A second start with the same
+folder continues, and repeats nothing.
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/unknown_protocol.py --seed 1 --folder /tmp/unknown-1
 """
@@ -31,15 +32,18 @@ from bayeskin.workflow.new import new_config
 from bayeskin.workflow.stages import BEFORE_REPORT, run
 
 TRUTH = {"E_c": 300e3, "E_s": 20e3, "k_c": 3e-14, "k_s": 2e-13, "p_init": 300.0}
-SPREAD = 0.3  # sd of the logarithms of a seed's skin about it
+SPREAD = 0.3  # sd of the logarithms of a seed's skin about `TRUTH`
 REST_S, STEP_MM, STEPS, SPEED_MM_S = 5.0, 3.0, 3, 1.0
 HOLDS_S = (20.0, 40.0)
 RATE_HZ = 20.0
-WHITE_N, SLOW_N, SLOW_S = 4e-3, 2e-3, 0.5  # white noise, and correlated noise with its time
+WHITE_N, SLOW_N, SLOW_S = 4e-3, 2e-3, 0.5  # sd of white noise, sd and correlation time of slow noise
 
 
 def skin(rng: np.random.Generator) -> dict[str, float]:
-    """A skin about `TRUTH`, SI; the initial pressure is its own."""
+    """Returns the parameters of a random skin about `TRUTH`, in SI units.
+
+    The initial pressure is that of `TRUTH`.
+    """
     return {
         name: value if name == "p_init" else float(value * np.exp(SPREAD * rng.standard_normal()))
         for name, value in TRUTH.items()
@@ -47,7 +51,7 @@ def skin(rng: np.random.Generator) -> dict[str, float]:
 
 
 def staircase(rng: np.random.Generator) -> PadMotion:
-    """Steps of 3 mm with holds between `HOLDS_S`, one unload, and a rest."""
+    """Returns steps of 3 mm with holds between `HOLDS_S`, one unloading, and a rest."""
     time_s, height_mm = [0.0, REST_S], [0.0, 0.0]
     for level in (*(STEP_MM * (step + 1) for step in range(STEPS)), 0.0):
         ramp_s = abs(level - height_mm[-1]) / SPEED_MM_S
@@ -58,14 +62,14 @@ def staircase(rng: np.random.Generator) -> PadMotion:
 
 
 def noise(rng: np.random.Generator, count: int) -> Array:
-    """Noise [N] of so many samples, (count,)."""
-    keep = np.exp(-1.0 / (RATE_HZ * SLOW_S))
-    slow = lfilter([SLOW_N * np.sqrt(1.0 - keep**2)], [1.0, -keep], rng.standard_normal(count))
+    """Returns noise (count,) [N] for `count` samples."""
+    correlation = np.exp(-1.0 / (RATE_HZ * SLOW_S))
+    slow = lfilter([SLOW_N * np.sqrt(1.0 - correlation**2)], [1.0, -correlation], rng.standard_normal(count))
     return np.asarray(WHITE_N * rng.standard_normal(count) + slow)
 
 
 def make(file: Path, seed: int) -> dict[str, float]:
-    """Writes a seed's recording, if it is not there, and returns its skin."""
+    """Writes a seed's recording, if it does not exist, and returns the parameters of its skin."""
     rng = np.random.default_rng([seed, 30])
     theta, motion = skin(rng), staircase(rng)
     if not file.exists():
@@ -80,24 +84,29 @@ def make(file: Path, seed: int) -> dict[str, float]:
 
 
 def spent_s() -> tuple[float, float]:
-    """Seconds of the clock, and of the processors in this process and those that it has ended."""
-    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return time.perf_counter(), sum(one.ru_utime + one.ru_stime for one in used)
+    """Returns the wall seconds, and the CPU seconds of this process and of its processes that have ended."""
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return time.perf_counter(), sum(usage.ru_utime + usage.ru_stime for usage in usages)
 
 
 def stage_by_stage(config: Path) -> tuple[list[list[str]], dict[str, Any]]:
-    """A table row of each stage, the first with the reading of the recording, and the summary of the run."""
-    table, begin = [], spent_s()
+    """Returns a table row of each stage, and the summary of the run.
+
+    The first row includes the reading of the recording.
+    """
+    table, started = [], spent_s()
     for name in (*(stage.name for stage in BEFORE_REPORT[1:]), None):
-        before = spent_s()
-        said = run(config, name, rows.Log())
-        table.append([name or "report", *(f"{b - a:.1f}" for a, b in zip(before, spent_s(), strict=True))])
-    table.append(["all", *(f"{b - a:.1f}" for a, b in zip(begin, spent_s(), strict=True))])
-    return table, said
+        stage_started = spent_s()
+        summary = run(config, name, rows.Log())
+        table.append(
+            [name or "report", *(f"{b - a:.1f}" for a, b in zip(stage_started, spent_s(), strict=True))]
+        )
+    table.append(["all", *(f"{b - a:.1f}" for a, b in zip(started, spent_s(), strict=True))])
+    return table, summary
 
 
 def covered(posterior: Mapping[str, Mapping[str, Any]], theta: Mapping[str, float]) -> list[list[str]]:
-    """A table row of each parameter: the true value, the 90 % interval, and whether it lies inside."""
+    """Returns a table row of each parameter: true value, 90 % interval, and whether it contains the value."""
     return [
         [
             name, *(f"{value:.4g}" for value in (theta[name], p["low_90"], p["high_90"])),
@@ -112,7 +121,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--folder", type=Path, help="where the run stays; by default nowhere")
+    parser.add_argument("--folder", type=Path, help="folder that keeps the run (default: a temporary one)")
     options = parser.parse_args()
     with ExitStack() as stack:
         folder = options.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -121,14 +130,14 @@ def main() -> None:
         config = folder / "staircase.toml"
         if not config.exists():
             new_config(folder / "staircase.h5")
-        table, said = stage_by_stage(config)
+        table, summary = stage_by_stage(config)
     print(rows.markdown(["stage", "seconds", "CPU seconds"], table))
-    print(rows.markdown(["", "true", "5 %", "95 %", "inside"], covered(said["posterior"], theta)))
-    for one in said["full_model_at_draws"]:
-        print(one["message"])
-    polished = said["map"]["polished"] or {"full_runs": 0}
+    print(rows.markdown(["", "true", "5 %", "95 %", "inside"], covered(summary["posterior"], theta)))
+    for check in summary["full_model_at_draws"]:
+        print(check["message"])
+    polished = summary["map"]["polished"] or {"full_runs": 0}
     print(f"{polished['full_runs']} full runs polish the maximum")
-    print(f"{said['verdict']}: {'; '.join(said['because'])}")
+    print(f"{summary['verdict']}: {'; '.join(summary['because'])}")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from bayeskin import storage
-from bayeskin.model import ModelSpec, simulate
+from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.types import PadMotion, Recording
 
 TRUTH = {"E_c": 60e3, "E_s": 15e3, "k_c": 2e-14, "k_s": 8e-13, "p_init": 700.0}

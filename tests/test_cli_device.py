@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gmsh_file import coarse_tetrahedra, gmsh_text
+from toys.gmsh_file import coarse_tetrahedra, gmsh_text
 
 from bayeskin import cli, storage
 from bayeskin.config import load_config, parameter_space
@@ -67,7 +67,7 @@ def test_simulate_takes_a_device_and_the_means_of_an_uncertain_tissue(
         ("[device]\ngauge_mm = 0\n", "device.gauge_mm: found 0 mm: the pads overlap"),
         ("[device]\nguard_mm = { gap = 0, width = 8 }\n", "device.guard_mm.gap: found 0 mm: the guard lies"),
         ("[tissue]\ncutis_mm = -2\n", "tissue.cutis_mm: found -2 mm"),
-        ("[device]\ngauge_mm = 0.036\n", "device.gauge_mm: found 0.036 mm, 1000 times too little"),
+        ("[device]\ngauge_mm = 0.036\n", "device.gauge_mm: found 0.036 mm, probably 1000 times too small"),
         ("[tissue]\narm_radius_mm = 20\n", "tissue.arm_radius_mm: found 20 mm"),
         ("[device]\nguard_mm = false\nforce_on = 'pad and guard'\n", "device.force_on"),
         ("[device]\nguage_mm = 36\n", "device.guage_mm: found an unknown key"),
@@ -96,7 +96,7 @@ def test_a_wrong_device_is_one_line_and_nothing_is_written(
 @pytest.mark.parametrize(
     ("unit", "device", "says"),
     [
-        (1e3, FLAT, "millimetres, by their looks"),
+        (1e3, FLAT, "probably in millimetres"),
         (1.0, f"[device]\ngauge_mm = 40\n{FLAT}", "right_patch: found x 18 to 26 mm; expected x 20 to 28 mm"),
         (1.0, f"[device]\nguard_mm = false\n{FLAT}", "u_right: found a guard"),
         (1.0, f"{FLAT}cutis_mm = 3\n", "top_layer: found z 8 to 10 mm"),
@@ -129,7 +129,7 @@ def test_new_writes_the_device_into_the_configuration(bayeskin: Command, tmp_pat
     assert parameter_space(config).names[-1] == "cutis_m"
     code, line = bayeskin("diagnose", tmp_path / "case.toml")
     assert code == 2
-    assert "found none for this device and tissue; expected one that `bayeskin reduce` makes" in line
+    assert "found none for this device and tissue; expected a reduced model that `bayeskin reduce`" in line
     assert not (tmp_path / "case").exists()
 
 
@@ -158,7 +158,7 @@ def test_the_demo_comes_with_its_own_device(bayeskin: Command, tmp_path: Path) -
     (tmp_path / "device.toml").write_text("")
     code, line = bayeskin("new", "--device", tmp_path / "device.toml", "-o", tmp_path / "demo.toml")
     assert code == 2
-    assert "the demo is of the article's device" in line
+    assert "because the demo uses the article's device" in line
     assert not (tmp_path / "demo.toml").exists()
 
 
@@ -168,7 +168,7 @@ UNCERTAIN = "[tissue]\ncutis_mm = { mean = 2.0, sd = 0.2 }\n"
 @pytest.mark.parametrize(
     ("device", "says"),
     [
-        ("[tissue]\ncutis_mm = 4.0\n", "one that `bayeskin reduce` makes"),
+        ("[tissue]\ncutis_mm = 4.0\n", "a reduced model that `bayeskin reduce` makes"),
         ("[device]\ngauge_mm = 0\n", "device.gauge_mm: found 0 mm: the pads overlap"),
         (None, "device.toml: found no such file"),
     ],
@@ -193,7 +193,7 @@ def test_a_device_beside_a_configuration_which_states_its_own_is_refused(
     (tmp_path / "case.toml").write_text(f'[recording]\nfile = "{short.name}"\n')
     code, line = bayeskin("diagnose", tmp_path / "case.toml", "--device", tmp_path / "device.toml")
     assert (code, line[:20]) == (2, "bayeskin: --device: ")
-    assert "device.toml beside a configuration; expected the device in [device] and [tissue]" in line
+    assert "device.toml together with a configuration; expected its sections [device] and [tissue]" in line
     assert {file.name for file in tmp_path.iterdir()} == {"short.h5", "device.toml", "case.toml"}
 
 
@@ -204,5 +204,5 @@ def test_a_recording_beyond_what_the_reduced_model_was_trained_for_is_refused(
     storage.save(short, replace(recording, displacement_m=6.0 * recording.displacement_m))
     code, line = bayeskin("diagnose", short)
     assert code == 2
-    assert "short.h5: found a protocol that article-device-reduced.h5 does not know" in line
-    assert "the pads open by 12.00 mm, trained up to 10 mm" in line
+    assert "short.h5: found a protocol that article-device-reduced.h5 was not trained for" in line
+    assert "the pads open by 12.00 mm, more than the trained 10 mm" in line

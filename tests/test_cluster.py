@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import toy_runs
-from test_runner import SHORT, assert_same_rows, run
-from toy import toy_simulate
-from toy_runs import COARSE_S
+from toys import unreliable_models
+from toys.closed_form_model import toy_simulate
+from toys.design_runs import SHORT, assert_same_rows, run
+from toys.unreliable_models import COARSE_S
 
 from bayeskin.errors import InputError
 from bayeskin.execution.cluster import on_scheduler, on_slurm
@@ -43,7 +43,7 @@ def test_the_file_is_the_same_whoever_made_the_runs(cluster, tmp_path: Path, exp
     with on_scheduler(cluster.scheduler_address) as over:
         found = run_design(tmp_path / "design.h5", SHORT, COARSE_S, toy_simulate, "toy", over)
     assert_same_rows(found, expected)
-    again = run_design(tmp_path / "design.h5", SHORT, COARSE_S, toy_runs.failing, "toy", local(1))
+    again = run_design(tmp_path / "design.h5", SHORT, COARSE_S, unreliable_models.failing, "toy", local(1))
     assert_same_rows(again, expected)
 
 
@@ -58,7 +58,7 @@ def test_a_worker_killed_in_mid_run_costs_its_own_point_which_is_run_again(
         killed.append(next(iter(cluster.workers.values())).pid)
         os.kill(killed[0], signal.SIGKILL)
 
-    simulate = partial(toy_runs.slow, seconds=1.0)
+    simulate = partial(unreliable_models.slow, seconds=1.0)
     thread = threading.Thread(target=kill)
     thread.start()
     with on_scheduler(cluster.scheduler_address) as over:
@@ -69,7 +69,7 @@ def test_a_worker_killed_in_mid_run_costs_its_own_point_which_is_run_again(
 
 
 def test_a_point_that_kills_every_worker_is_a_failed_row(cluster, tmp_path: Path) -> None:
-    simulate = partial(toy_runs.deadly, folder=str(tmp_path), deaths=99)
+    simulate = partial(unreliable_models.deadly, folder=str(tmp_path), deaths=99)
     with on_scheduler(cluster.scheduler_address) as over:
         found = run_design(tmp_path / "out" / "design.h5", SHORT, COARSE_S, simulate, "toy", over)
     stiff = SHORT.theta[:, 0] > 3e5
@@ -87,7 +87,7 @@ def test_what_stands_in_the_queue_of_a_worker_that_dies_is_not_lost_with_it() ->
         ) as cluster,
         on_scheduler(cluster.scheduler_address) as over,
     ):
-        found = dict(over(toy_runs.deadly_first, range(3)))
+        found = dict(over(unreliable_models.deadly_first, range(3)))
     assert isinstance(found[0], Lost)
     assert (found[1], found[2]) == (1, 2)
 

@@ -64,7 +64,7 @@ def test_the_hash_follows_the_content_and_ignores_the_workers(tmp_path: Path) ->
         ),
         (SMALLEST + "[fit]\nbin_width_s = 0.0\n", "fit.bin_width_s", "found 0.0; expected greater than 0"),
         (SMALLEST + "[fit]\nwindows_s = [[75.0, 18.8]]\n", "fit.windows_s", "start below end"),
-        (SMALLEST + "[fit]\nwindows_s = [[75.0]]\n", "fit.windows_s.0.1", "nothing; expected one entry more"),
+        (SMALLEST + "[fit]\nwindows_s = [[75.0]]\n", "fit.windows_s.0.1", "nothing; expected one more entry"),
         (SMALLEST + "[noise]\nnu = [1, 2, 3]\n", "noise.nu", "expected at most 2 entries"),
         ("fit = 3\n" + SMALLEST, "fit", "found 3; expected a table"),
         (
@@ -164,8 +164,8 @@ def test_what_is_no_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     for path, found in (
         (tmp_path, "a folder"),
-        (tmp_path / "pipe.toml", "a pipe or a device, no file"),
-        (Path(os.devnull), "a pipe or a device, no file"),
+        (tmp_path / "pipe.toml", "a pipe or a device instead of a file"),
+        (Path(os.devnull), "a pipe or a device instead of a file"),
     ):
         with pytest.raises(InputError, match=f": found {found}; expected a TOML"):
             load_config(path)

@@ -11,16 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import qmc
-from toy import SPACE, toy_force
+from toys.closed_form_model import SPACE, toy_force
 
-from bayeskin.design import (
-    default_space,
-    first_wave,
-    misfit_bounds,
-    next_wave,
-    posterior_wave,
-    sobol_points,
-)
+from bayeskin.design import default_space, first_wave, misfit_bounds, next_wave, posterior_wave, sobol_points
 from bayeskin.errors import InputError
 from bayeskin.types import Array, Parameter, ParameterSpace, Prediction
 

@@ -67,5 +67,5 @@ def test_a_model_that_no_reduced_one_stands_for_needs_a_surrogate(tmp_path: Path
 
 
 def test_a_device_stands_beside_no_configuration(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"--device: found device\.toml beside a configuration"):
+    with pytest.raises(InputError, match=r"--device: found device\.toml together with a configuration"):
         opened(tmp_path / "case.toml", Silent(), Path("device.toml"))

@@ -10,9 +10,9 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-import toy
 from matplotlib.figure import Figure
-from toy_inference import NOISE, TRUTH, ToySurrogate, toy_problem
+from toys import closed_form_model
+from toys.inference_problems import NOISE, TRUTH, ToySurrogate, toy_problem
 
 from bayeskin import report
 from bayeskin.inference import LogPosterior
@@ -46,7 +46,9 @@ def build(names: Sequence[str]) -> LogPosterior:
     if not names:
         return ALONE
     these = tuple(catalogue()[name] for name in names)
-    return dataclasses.replace(ALONE, surrogate=ObservedSurrogate(ToySurrogate(), these, toy.MOTION))
+    return dataclasses.replace(
+        ALONE, surrogate=ObservedSurrogate(ToySurrogate(), these, closed_form_model.MOTION)
+    )
 
 
 def fitted(*names: str) -> Fit:
@@ -124,7 +126,9 @@ def drifting() -> Fit:
 @pytest.fixture(scope="module")
 def remainder() -> Remainder:
     fit = drifting()
-    return Remainder(discrepancy(fit, toy.MOTION), propose_form(fit, toy.MOTION, 0))
+    return Remainder(
+        discrepancy(fit, closed_form_model.MOTION), propose_form(fit, closed_form_model.MOTION, 0)
+    )
 
 
 def test_what_is_left_is_said_with_its_size_parts_and_form(remainder: Remainder) -> None:
@@ -151,18 +155,18 @@ def test_words_say_what_was_found_and_how_far_the_models_are_off() -> None:
     }  # fmt: skip
     words = in_words(answer)
     assert "something smooth that is not in the catalogue: probability 0.97" in words
-    assert "before: RMSE 1.0 mN, 3.0 mN on what follows the second hold, not fitted" in words
+    assert "before: RMSE 1.0 mN, 3.0 mN after the second hold, which was not fitted" in words
     assert "RMSE 2.5 mN. The model that was fitted is off by 0.40 mN there." in words
-    assert "rough" not in words
+    assert "The intervals are" not in words
     rough = {**answer, "fit": {"before": fits, "after": {**fits, "sampled": {"settled": False}}}}
-    assert "The intervals are rough" in in_words(rough)
+    assert "The intervals are approximate" in in_words(rough)
     assert "The full model fails at the best values: it folds" in in_words(
         {**answer, "full_model": {"message": "it folds"}}
     )
     faint = in_words({**answer, "verdict": "nothing-missing", "best_set": ["pre-stretch"]})
-    assert "With pre-stretch it would fit better" in faint
+    assert "The model fits better with pre-stretch" in faint
     for alike in ({"verdict": "nothing-missing"}, {"best_set": ["x"]}):
-        assert "would fit better" not in in_words({**answer, **alike})
+        assert "fits better with" not in in_words({**answer, **alike})
 
 
 # Figures
@@ -180,7 +184,9 @@ def test_each_figure_is_written_where_it_has_something_to_show(
     written = []
     for parts, left in ((parts_of("force-offset"), remainder), ([], None)):
         found = DiagnosisFigures(drawn(8e-3), drawn(2e-3), None, PARAMETERS, parts, left)
-        written.append({path.name for path in draw(Path("x"), "", BINNED, toy.MOTION, found, rows)})
+        written.append(
+            {path.name for path in draw(Path("x"), "", BINNED, closed_form_model.MOTION, found, rows)}
+        )
     assert written[0] - written[1] == {"contributions.png", "discrepancy.png"}
     assert {Path(name).stem for name in written[1]} == {
         "located", "candidates", "before_after", "residual_by_phase", "base_parameters"
@@ -189,18 +195,18 @@ def test_each_figure_is_written_where_it_has_something_to_show(
 
 def test_before_and_after_have_their_band_and_what_was_not_fitted() -> None:
     before, after = drawn(8e-3, held_out_by=2e-2), drawn(2e-3, held_out_by=5e-3)
-    figure = report.figure_before_after(BINNED, toy.MOTION, before, after, 60.0)
+    figure = report.figure_before_after(BINNED, closed_form_model.MOTION, before, after, 60.0)
     assert headline(figure) == "RMS residual 8.0 mN before, 2.0 mN after"
     titles = {ax.get_title(loc="left")[-60:]: ax for ax in figure.axes}
     assert [title.split("  ")[-1] for title in titles][1:4:2] == [
-        "in the 90 % bands: 0 → 100 % of bins", "fitted up to 60 s; beyond that 20.0 → 5.0 mN RMS"
+        "bins inside the 90 % bands: 0 → 100 %", "fitted up to 60 s; later 20.0 → 5.0 mN RMS"
     ]  # fmt: skip
     residual, left = figure.axes[1], figure.axes[3]
     (band,) = residual.collections[:1]
     edges = band.get_paths()[0].vertices[:, 1]  # type: ignore[index]
     np.testing.assert_allclose([edges.min(), edges.max()], [-3.0, 3.0], atol=1e-9)
     assert [line.get_xdata()[0] for line in left.get_lines() if line.get_linestyle() == "--"] == [60.0]  # type: ignore[index]
-    whole = report.figure_before_after(BINNED, toy.MOTION, drawn(8e-3), drawn(2e-3), None)
+    whole = report.figure_before_after(BINNED, closed_form_model.MOTION, drawn(8e-3), drawn(2e-3), None)
     assert len(whole.axes) == 3
 
 
@@ -208,14 +214,14 @@ def test_the_base_s_parameters_that_leave_their_intervals_are_said() -> None:
     values = {p.name: {"mean": TRUTH[p.name], "interval90": [0.9 * TRUTH[p.name], 1.1 * TRUTH[p.name]]}
               for p in PARAMETERS}  # fmt: skip
     stays = report.figure_base_parameters(PARAMETERS, values, values)
-    assert headline(stays) == "No parameter of the base leaves its interval"
+    assert headline(stays) == "No base parameter moves out of its 90 % interval"
     assert len(stays.axes) == len(PARAMETERS)
     far = {
         **values,
         "E_c": {"mean": 2.0 * TRUTH["E_c"], "interval90": [1.8 * TRUTH["E_c"], 2.2 * TRUTH["E_c"]]},
     }
     moves = report.figure_base_parameters(PARAMETERS, values, far)
-    assert headline(moves).endswith("leaves its interval")
+    assert headline(moves).endswith("moves out of its 90 % interval")
     before, after = (line.get_xdata() for line in moves.axes[0].get_lines()[::2])
     np.testing.assert_allclose(10.0 ** (np.array(after) - before), 2.0)  # a log-uniform prior
 
@@ -224,8 +230,8 @@ def test_residuals_by_phase_have_a_line_a_cycle_and_the_rms_of_their_kind() -> N
     kinds = np.array([phase.kind for phase in BINNED.phases])[BINNED.phase]
     residual = np.where(kinds == "hold", 8e-3, 2e-3)
     before, after = located(residual, WINDOW), located(0.25 * residual)
-    figure = report.figure_residual_by_phase(BINNED, toy.MOTION, before, after)
-    assert headline(figure) == "Most is left in holds: 8.0 mN RMS before, 2.0 mN after"
+    figure = report.figure_residual_by_phase(BINNED, closed_form_model.MOTION, before, after)
+    assert headline(figure) == "Largest residual in holds: 8.0 mN RMS before, 2.0 mN after"
     titles = {ax.get_title(loc="left"): ax for ax in figure.axes}
     assert [title[title.index("  ") + 2 :] for title in titles] == [
         "while loading: 2.0 → 0.5 mN RMS",
@@ -245,20 +251,20 @@ def test_residuals_by_phase_have_a_line_a_cycle_and_the_rms_of_their_kind() -> N
 def test_residuals_of_a_part_of_the_recording_leave_the_other_phases_out() -> None:
     inside = np.flatnonzero(BINNED.time_s < 50.0)
     part = Located((), inside, np.full(len(inside), 1e-3), np.full(len(inside), 1e-3), 1.0)
-    figure = report.figure_residual_by_phase(BINNED, toy.MOTION, part, part)
+    figure = report.figure_residual_by_phase(BINNED, closed_form_model.MOTION, part, part)
     assert [len(ax.get_lines()) for ax in figure.axes] == [2, 2, 2, 2]
     moving = dataclasses.replace(
         BINNED,
         phases=tuple(dataclasses.replace(p, kind="hold") if p.kind == "rest" else p for p in BINNED.phases),
     )
-    panels = report.figure_residual_by_phase(moving, toy.MOTION, part, part).axes
+    panels = report.figure_residual_by_phase(moving, closed_form_model.MOTION, part, part).axes
     assert [ax.get_visible() for ax in panels] == [True, True, True, False]
 
 
 def test_contributions_have_a_row_each_and_rounding_does_not_fill_one() -> None:
     parts = parts_of("device-friction", "force-offset", "friction-creep")
     parts.append(Contribution("pad-slip", (), np.full(len(BINNED.force_n), 1e-17)))
-    figure = report.figure_contributions(BINNED, toy.MOTION, parts)
+    figure = report.figure_contributions(BINNED, closed_form_model.MOTION, parts)
     assert len(figure.axes) == 2 * len(parts)
     assert headline(figure) == f"{parts[0].name} moves the force most, by {1e3 * parts[0].size_n:.1f} mN RMS"
     titles = [ax.get_title(loc="left") for ax in figure.axes[::2]]
@@ -292,6 +298,6 @@ def test_candidates_of_a_few_nats_are_read_off_beside_one_of_hundreds() -> None:
     assert [label.get_text() for label in numbers.get_yticklabels()] == [
         "+0.0 ± 0.0", "−1.3 ± 0.4", "+812 ± 100"
     ]  # fmt: skip
-    assert headline(figure).endswith("viscous-drag alone gains most")
+    assert headline(figure).endswith("viscous-drag gains most on its own")
     rows[1] |= {"delta_score": 750.0}
-    assert headline(report.figure_candidates(rows)).endswith("most, 1 other as much within the error")
+    assert headline(report.figure_candidates(rows)).endswith("own, 1 other as much within the error")

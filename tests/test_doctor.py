@@ -16,7 +16,7 @@ import pytest
 from bayeskin import cli
 from bayeskin.workflow import doctor
 
-TESTS = ("_full_model", "_surrogate")
+TESTS = ("full_model_finding", "surrogate_finding")
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_a_model_that_gives_another_number_is_broken(
     monkeypatch: pytest.MonkeyPatch, number: str, name: str
 ) -> None:
     monkeypatch.setattr(doctor, number, 1.01 * getattr(doctor, number))
-    finding = {"full model": doctor._full_model, "surrogate": doctor._surrogate}[name]()
+    finding = {"full model": doctor.full_model_finding, "surrogate": doctor.surrogate_finding}[name]()
     assert (finding.name, finding.ok) == (name, False)
     assert "within" in finding.advice
 

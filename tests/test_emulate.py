@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
-from toys import solved
-from toys.solved import TRUTH, Exact
+from toys import closed_form_reduced
+from toys.closed_form_reduced import TRUTH, Exact
 
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.emulate import EmulationSettings, Forces, emulate
@@ -29,7 +29,9 @@ def fitted(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> tuple[DiagnosisContext, SetFit]:
     names = request.param
-    bench = solved.bench(monkeypatch, solved.recorded(3, **({"F0": -0.03} if names else {})))
+    bench = closed_form_reduced.bench(
+        monkeypatch, closed_form_reduced.recorded(3, **({"F0": -0.03} if names else {}))
+    )
     found = fit_set(names, {**bench.noise, **TRUTH, "F0": 0.0}, bench.run, bench.posterior)
     assert isinstance(found, SetFit)
     return bench, found
@@ -57,11 +59,13 @@ def learnt(design: Design) -> Surrogate:
 def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[DiagnosisContext, SetFit]) -> None:
     bench, found = fitted
     asked: list[int] = []
-    emulated = emulate([found], by_the_toy(bench, found.fit.names, asked), learnt, solved.NOISE_N, 1, FEW)
+    emulated = emulate(
+        [found], by_the_toy(bench, found.fit.names, asked), learnt, closed_form_reduced.NOISE_N, 1, FEW
+    )
     assert not isinstance(emulated, str)
     assert emulated.settled
     assert emulated.error_n is not None
-    assert emulated.error_n < FEW.enough * solved.NOISE_N
+    assert emulated.error_n < FEW.enough * closed_form_reduced.NOISE_N
     assert emulated.runs == sum(asked) == FEW.points + FEW.more
     assert emulated.fit.value == pytest.approx(found.fit.value, abs=1.0)
     low, high = np.quantile(emulated.draws.draws, [0.01, 0.99], axis=0)
@@ -75,8 +79,10 @@ def test_the_first_points_are_about_all_maxima(
 ) -> None:
     bench, found = fitted
     softer = {name: 0.7 * TRUTH[name] for name in ("E_c", "E_s")}
-    recorded = solved.recorded(3)
-    elsewhere = solved.bench(monkeypatch, dataclasses.replace(recorded, force_n=0.7 * recorded.force_n))
+    recorded = closed_form_reduced.recorded(3)
+    elsewhere = closed_form_reduced.bench(
+        monkeypatch, dataclasses.replace(recorded, force_n=0.7 * recorded.force_n)
+    )
     start = {**elsewhere.noise, **TRUTH, **softer, "F0": 0.0}
     other = fit_set(found.fit.names, start, elsewhere.run, elsewhere.posterior)
     assert isinstance(other, SetFit)
@@ -86,7 +92,7 @@ def test_the_first_points_are_about_all_maxima(
         waves.append(points)
         return run(points, full)
 
-    emulated = emulate([found, other], forces, learnt, solved.NOISE_N, 1, FEW)
+    emulated = emulate([found, other], forces, learnt, closed_form_reduced.NOISE_N, 1, FEW)
     assert not isinstance(emulated, str)
     np.testing.assert_array_equal(waves[0][-2:], [found.run.theta, other.run.theta])
     unit = bench.space(found.fit.names).to_unit
@@ -99,7 +105,9 @@ def test_the_first_points_are_about_all_maxima(
 @pytest.mark.slow
 def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[DiagnosisContext, SetFit]) -> None:
     bench, found = fitted
-    emulated = emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
+    emulated = emulate(
+        [found], by_the_toy(bench, found.fit.names, []), learnt, closed_form_reduced.NOISE_N, 1, FEW
+    )
     assert not isinstance(emulated, str)
     about = found.fit.log_posterior
     exact = Exact(innermost(about.surrogate).space)
@@ -122,7 +130,7 @@ def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[DiagnosisContext,
 def test_the_same_seed_gives_the_same_draws(fitted: tuple[DiagnosisContext, SetFit]) -> None:
     bench, found = fitted
     made = [
-        emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, FEW)
+        emulate([found], by_the_toy(bench, found.fit.names, []), learnt, closed_form_reduced.NOISE_N, 1, FEW)
         for _ in range(2)
     ]
     assert not isinstance(made[0], str)
@@ -142,13 +150,15 @@ def test_runs_that_fail_are_done_without_and_are_the_answer_where_all_do(
     def none(points: Array, full: int) -> tuple[Answers, Answers]:
         return ["near folding"] * len(points), []
 
-    emulated = emulate([found], some, learnt, solved.NOISE_N, 1, dataclasses.replace(FEW, waves=2))
+    emulated = emulate(
+        [found], some, learnt, closed_form_reduced.NOISE_N, 1, dataclasses.replace(FEW, waves=2)
+    )
     assert not isinstance(emulated, str)
     assert emulated.runs == 24 + 16
-    assert emulate([found], none, learnt, solved.NOISE_N, 1, FEW) == "near folding"
+    assert emulate([found], none, learnt, closed_form_reduced.NOISE_N, 1, FEW) == "near folding"
 
 
-MIDDLE = 0.5 * (solved.EDGES_S[1:] + solved.EDGES_S[:-1])
+MIDDLE = 0.5 * (closed_form_reduced.EDGES_S[1:] + closed_form_reduced.EDGES_S[:-1])
 
 
 @pytest.mark.parametrize("fails", [False, True], ids=["all run", "one fails"])
@@ -161,9 +171,9 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
     def off(values: Mapping[str, float]) -> Array:
         return shape * (1.0 + 10.0 * np.log(values["E_s"] / TRUTH["E_s"]))
 
-    recorded = solved.recorded(3)
+    recorded = closed_form_reduced.recorded(3)
     recorded = dataclasses.replace(recorded, force_n=recorded.force_n + off(TRUTH))
-    bench = solved.bench(monkeypatch, recorded)
+    bench = closed_form_reduced.bench(monkeypatch, recorded)
     start = {**bench.noise, **TRUTH}
     aside = off({**TRUTH, "E_s": 1.05 * TRUTH["E_s"]})  # where the fit was checked
     local = functools.partial(bench.posterior, correction_n=aside)
@@ -179,7 +189,7 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
                 for force, row in zip(forward[:count], points[:count], strict=True)]  # fmt: skip
         return forward, ["it folds", *full[1:]] if fails and count else full
 
-    emulated = emulate([found], forces, learnt, solved.NOISE_N, 1, FEW)
+    emulated = emulate([found], forces, learnt, closed_form_reduced.NOISE_N, 1, FEW)
     assert not isinstance(emulated, str)
     assert asked[0] == FEW.checks
     assert sum(asked) == FEW.checks
@@ -196,7 +206,9 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
 def test_one_wave_alone_is_never_settled(fitted: tuple[DiagnosisContext, SetFit]) -> None:
     bench, found = fitted
     one = dataclasses.replace(FEW, waves=1)
-    emulated = emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, one)
+    emulated = emulate(
+        [found], by_the_toy(bench, found.fit.names, []), learnt, closed_form_reduced.NOISE_N, 1, one
+    )
     assert not isinstance(emulated, str)
     assert emulated.error_n is None
     assert not emulated.settled
@@ -207,7 +219,9 @@ def test_an_emulator_that_is_sure_nowhere_is_believed_but_never_settled(
 ) -> None:
     bench, found = fitted
     never = dataclasses.replace(FEW, sure=1e-9, waves=2)
-    emulated = emulate([found], by_the_toy(bench, found.fit.names, []), learnt, solved.NOISE_N, 1, never)
+    emulated = emulate(
+        [found], by_the_toy(bench, found.fit.names, []), learnt, closed_form_reduced.NOISE_N, 1, never
+    )
     assert not isinstance(emulated, str)
     assert np.isfinite(emulated.fit.value)
     assert not emulated.settled

@@ -6,7 +6,6 @@ What is done to the bytes of files stands in test_fuzz.py; kill -9 at random tim
 from __future__ import annotations
 
 import ctypes
-import importlib
 import os
 import resource
 import shutil
@@ -17,12 +16,13 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from own_models import PARAMETERS, SPRING, TRUE, spring
-from toy import MOTION
+from toys.closed_form_model import MOTION
+from toys.external_models import PARAMETERS, SPRING, TRUE, spring
 
 from bayeskin import storage
 from bayeskin.errors import InputError
@@ -118,16 +118,16 @@ FILLED = """
 import resource, sys, tempfile
 from pathlib import Path
 sys.path.insert(0, {tests!r})
-import test_fuzz
+from toys import fuzzed_files
 kind, path, size = sys.argv[1], Path(sys.argv[2]), sys.argv[3]
-make = test_fuzz.HDF5[kind][0]
+make = fuzzed_files.HDF5[kind][0]
 with tempfile.TemporaryDirectory() as elsewhere:
     make(Path(elsewhere) / kind)  # what is compiled on the way has files of its own
 if size:
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(size), int(size)))
 try:
     make(path)
-except test_fuzz.InputError as error:
+except fuzzed_files.InputError as error:
     print(error)
 """
 
@@ -140,7 +140,7 @@ def told_of_a_full_disk(kind: str, folder: Path, size: str) -> None:
     command = [sys.executable, "-c", code, kind, str(path), size]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr) == (0, "")
-    assert f"{kind}: found that it cannot be written" in ended.stdout
+    assert f"{kind}: found a file that cannot be written" in ended.stdout
     assert path.read_bytes() == b"what was there before"
     assert [file.name for file in folder.iterdir()] == [kind]
 
@@ -217,7 +217,7 @@ def test_a_torn_last_line_is_cut_off_and_another_one_is_told(tmp_path: Path) -> 
     assert file.read_bytes() == b'{"a": 1}\n'
     for line in (b"[1]\n", b"{nonsense\n", b"\xff\n"):
         file.write_bytes(b'{"a": 1}\n' + line)
-        with pytest.raises(InputError, match="line 2: found no JSON mapping"):
+        with pytest.raises(InputError, match="line 2: found no JSON object"):
             read_lines(file)
 
 
@@ -314,29 +314,26 @@ def test_memory_grows_by_at_most_200_bytes_a_sample(tmp_path: Path, counts: tupl
 
 
 @pytest.mark.slow
-def test_kills_lose_nothing_and_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    kills = importlib.import_module("kills")
-    rows = list(kills.study(tmp_path, 14, 1))
+def test_kills_lose_nothing_and_change_nothing(tmp_path: Path, benchmark: Callable[[str], Any]) -> None:
+    rows = list(benchmark("kills").study(tmp_path, 14, 1))
     assert sum(row.kills for row in rows) >= 50
     assert [row.lost for row in rows] == [()] * 4
     assert all(row.same for row in rows)
 
 
 def test_one_kill_of_a_design_loses_nothing_and_is_seen_by_the_study(
-    case: Path, monkeypatch: pytest.MonkeyPatch
+    case: Path, benchmark: Callable[[str], Any]
 ) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    kills = importlib.import_module("kills")
+    kills = benchmark("kills")
     process = subprocess.Popen([sys.executable, "-c", MAIN, "design", str(case)], stderr=subprocess.DEVNULL)
-    while len(kills._finished(case.parent)["run"]) < 3:
+    while len(kills.finished_items(case.parent)["run"]) < 3:
         assert process.poll() is None
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    had = kills._finished(case.parent)["run"]
+    had = kills.finished_items(case.parent)["run"]
     assert bayeskin("design", case)[0] == 0
-    now = kills._finished(case.parent)
+    now = kills.finished_items(case.parent)
     assert had <= now["run"]
     assert now["stage"] == {"recording", "design"}
     assert len(now["run"]) == 30

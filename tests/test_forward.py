@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from toys import solved
+from toys import closed_form_reduced
 
 from bayeskin.forward import reduced
 from bayeskin.types import Simulation
@@ -16,7 +16,7 @@ from bayeskin.types import Simulation
 def test_a_run_whose_derivatives_are_not_finite_is_its_message(
     monkeypatch: pytest.MonkeyPatch, value: float
 ) -> None:
-    context = solved.bench(monkeypatch, solved.recorded(0))
+    context = closed_form_reduced.bench(monkeypatch, closed_form_reduced.recorded(0))
     simulate = reduced.simulate_reduced
 
     def overflowing(*arguments, **options) -> Simulation:
@@ -28,5 +28,5 @@ def test_a_run_whose_derivatives_are_not_finite_is_its_message(
         return simulation
 
     monkeypatch.setattr(reduced, "simulate_reduced", overflowing)
-    assert context.run((), solved.TRUTH) == "the derivatives of the run are not finite"
-    assert not isinstance(context.run((), solved.TRUTH, derive=False), str)
+    assert context.run((), closed_form_reduced.TRUTH) == "the derivatives of the run are not finite"
+    assert not isinstance(context.run((), closed_form_reduced.TRUTH, derive=False), str)

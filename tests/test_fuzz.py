@@ -6,174 +6,42 @@ those of another format, or all random. The slow runs together take more than a 
 
 from __future__ import annotations
 
-import dataclasses
-import io
-import json
 import os
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import arviz as az
-import emcee
 import h5py
 import numpy as np
-import openpyxl
 import pytest
-from gmsh_file import coarse_tetrahedra, gmsh_text
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from toy import EDGES_S, MOTION, SPACE, toy_bin_means, toy_force
+from toys.fuzzed_files import (
+    HDF5,
+    MODEL,
+    READERS,
+    REQUEST,
+    ROOT,
+    TOKENS,
+    as_hdf5,
+    as_text,
+    as_workbook,
+    refused,
+)
 
-from bayeskin import probe, storage
-from bayeskin.config import load_config
-from bayeskin.device import load_device
+from bayeskin import probe
 from bayeskin.errors import InputError
-from bayeskin.external.umbridge import Refused, _understood
-from bayeskin.finite_element.gmsh import read_gmsh
-from bayeskin.finite_element.simulate import ModelSpec
-from bayeskin.geometry import Geometry
-from bayeskin.inference import chains, draws_of, inference_data, load_inference_data, save_inference_data
-from bayeskin.journal import Journal, Run
-from bayeskin.recordings import phase_noise, read_recording, segment
-from bayeskin.runner import load_waves
+from bayeskin.inference import inference_data, load_inference_data
+from bayeskin.recordings import read_recording
 from bayeskin.storage import contents_hash
-from bayeskin.surrogates import load_manifest, manifest_of, save_surrogate, train
-from bayeskin.types import Design, Recording
-from bayeskin.workflow import folder
-from bayeskin.workflow.serve import Asked, ServedModel
 
-ROOT = Path(__file__).parents[1]
-TOKENS = [
-    b"nan",
-    b"inf",
-    b"-1e999",
-    b"",
-    b"\0",
-    b"\xff\xfe",
-    b"[",
-    b"]]",
-    b'"',
-    b"{}",
-    b"null",
-    b"1e400",
-    b"0x",
-    b"\n\n",
-]
-
-
-def a_test() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    time_s = np.arange(0.0, 130.0, 0.1)
-    force_n = 1e-3 * toy_force(SPACE.from_unit(np.full((1, 5), 0.5)), time_s)[0]
-    return time_s, MOTION.at(time_s), force_n + 1e-3 * np.random.default_rng(1).standard_normal(len(time_s))
-
-
-def as_text(delimiter: str) -> bytes:
-    out = io.StringIO()
-    header = delimiter.join(["time (s)", "displacement (m)", "force (N)"])
-    np.savetxt(out, np.column_stack(a_test()), delimiter=delimiter, header=header, comments="", fmt="%.6g")
-    return out.getvalue().encode()
-
-
-def as_workbook() -> bytes:
-    book, out = openpyxl.Workbook(), io.BytesIO()
-    book.active.append(["time (s)", "displacement (m)", "force (N)"])
-    for row in zip(*(column.tolist() for column in a_test()), strict=True):
-        book.active.append(row)
-    book.save(out)
-    return out.getvalue()
-
-
-FLAT = Geometry(arm_radius_m=None)
-DEVICE = b"[device]\nguard_mm = { gap = 1, width = 8 }\n[tissue]\ncutis_mm = { mean = 2, sd = 0.2 }\n"
-
-
-def as_mesh() -> bytes:
-    """Flat skin as gmsh writes it."""
-    return gmsh_text(coarse_tetrahedra(FLAT)).encode()
-
-
-def as_journal(tmp: Path) -> bytes:
-    with Journal(tmp / "j", "same", 3) as journal:
-        for n in range(4):
-            journal.append(Run(np.full(5, float(n)), np.arange(3.0), n != 2, "why", 0.5))
-        found = (tmp / "j").read_bytes()
-    return found
-
-
-def as_hdf5(tmp: Path) -> bytes:
-    storage.save(tmp / "sound.h5", Recording(*a_test(), "toy", "0" * 64))
-    return (tmp / "sound.h5").read_bytes()
-
-
-def read_and_segment(path: Path) -> object:
-    recording = read_recording(path)
-    return phase_noise(recording, segment(recording))
-
-
-def read_journal(path: Path) -> object:
-    with Journal(path, "same", 3) as journal:
-        return journal.runs
-
-
-def read_stage(path: Path) -> object:
-    record = folder.read_record(path.parent)
-    return None if record is None else (record.sha256, folder.current_record(path.parent, "x"))
-
-
-def read_answer(path: Path) -> object:
-    try:
-        return _understood("http://here", path.read_bytes())
-    except Refused:
-        return None
-
-
-MODEL = ServedModel(ModelSpec(), SPACE.parameters, Asked(MOTION, np.arange(0.0, 131.0), None, ()))
-
-
-def read_request(path: Path) -> object:
-    try:
-        config = json.loads(path.read_bytes())
-    except (ValueError, RecursionError):
-        return None
-    return MODEL.output_sizes(config) if isinstance(config, dict) else None
-
-
-REQUEST = {
-    "protocol": {"time_s": [0, 1.5, 3], "displacement_m": [0, 1e-3, 0]},
-    "edges_s": [0, 1, 2, 3], "times_s": [0.5, 1.0], "mechanisms": ["force-offset", "backlash"],
-}  # fmt: skip
-STAGE = {
-    "inputs_sha256": "x",
-    "done": True,
-    "seconds": 1.5,
-    "outputs": {"a.h5": "00"},
-    "summary": {"ok": True},
-}
-
-# name of the file, how it is read, how a sound one is made, examples a run of the tests
-READERS: dict[str, tuple[Callable[[Path], object], Callable[[Path], bytes], int]] = {
-    "a.csv": (read_and_segment, lambda tmp: as_text(","), 2),
-    "a.tsv": (read_and_segment, lambda tmp: as_text("\t"), 1),
-    "a.txt": (read_and_segment, lambda tmp: as_text(" "), 1),
-    "a.xlsx": (read_and_segment, lambda tmp: as_workbook(), 1),
-    "a.toml": (load_config, lambda tmp: (ROOT / "runs/demo.toml").read_bytes(), 10),
-    "device.toml": (load_device, lambda tmp: DEVICE, 10),
-    "a.msh": (lambda path: read_gmsh(path, FLAT), lambda tmp: as_mesh(), 4),
-    "a.journal": (read_journal, as_journal, 10),
-    "stage.json": (read_stage, lambda tmp: json.dumps(STAGE).encode(), 10),
-    "answer.json": (read_answer, lambda tmp: b'{"output": [[1.0, 2.0]], "inputSizes": [5]}', 10),
-    "request.json": (read_request, lambda tmp: json.dumps(REQUEST).encode(), 10),
-}
 EACH = 10
 MOST_HDF5 = 400  # each takes a process
 MANY = 170  # times the examples, in a slow run
 GUIDED = 10_000  # inputs of each reader that coverage leads to, in a slow run
-HERE = {"name": "toy", "contents": "1"}  # what a chain is of
 TIMES = pytest.mark.parametrize("times", [1, pytest.param(MANY, marks=pytest.mark.slow)])
 
 
@@ -200,18 +68,6 @@ def damaged(sound: bytes, rng: np.random.Generator, others: list[bytes]) -> byte
             data[at : at + long] = TOKENS[int(rng.integers(len(TOKENS)))]
         data = data or bytearray(b" ")
     return bytes(data)
-
-
-def refused(read: Callable[[Any], Any], given: Any) -> bool:
-    """Whether an input was refused; fails unless it was read, or refused in words that fit one line."""
-    said = "one line"
-    try:
-        read(given)
-        return False
-    except (InputError, OSError) as error:
-        said = str(error)
-    assert len(said.splitlines()) == 1, said
-    return True
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -245,7 +101,7 @@ def test_damaged_files_are_read_or_refused_in_one_line(name: str, times: int, tm
 @pytest.mark.parametrize("name", READERS)
 def test_inputs_that_reach_new_code_are_read_or_refused_in_one_line(name: str, tmp_path: Path) -> None:
     pytest.importorskip("atheris", reason="atheris is not installed (extra `fuzz`)")
-    command = [sys.executable, str(ROOT / "tests" / "coverage_fuzz.py"), name, str(GUIDED)]
+    command = [sys.executable, str(ROOT / "tests/toys/coverage_fuzz.py"), name, str(GUIDED)]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (ended.returncode, f"Done {GUIDED}" in ended.stderr) == (0, True), ended.stdout[-3000:]
 
@@ -281,39 +137,6 @@ def test_damaged_hdf5_neither_hangs_nor_ends_us(name: str, times: int, tmp_path:
     assert count
 
 
-def a_design() -> Design:
-    theta = SPACE.from_unit(np.random.default_rng(3).random((40, SPACE.dim)))
-    force_n, held_out = toy_bin_means(theta), np.arange(40) % 5 == 0
-    wave, ok = np.zeros(40, dtype=np.int64), np.ones(40, dtype=bool)
-    return Design(SPACE, EDGES_S, theta, force_n, wave, held_out, ok, ("",) * 40, np.ones(40), 1, "toy")
-
-
-def as_surrogate(path: Path) -> None:
-    surrogate, validation = train(a_design(), "gp", seed=0)
-    save_surrogate(path, surrogate, manifest_of(surrogate, validation))
-
-
-def as_posterior(path: Path) -> None:
-    draws = SPACE.from_unit(np.random.default_rng(4).random((2, 30, SPACE.dim)))
-    columns = {name: draws[..., j] for j, name in enumerate(SPACE.names)}
-    said = json.dumps([dataclasses.asdict(p) for p in SPACE.parameters])
-    save_inference_data(path, az.from_dict(columns, attrs={"parameters": said, "correlations": "[]"}))
-
-
-def as_chain(path: Path) -> None:
-    backend = emcee.backends.Backend()
-    sampler = emcee.EnsembleSampler(8, 2, lambda x: -0.5 * float(x @ x), backend=backend)
-    sampler.run_mcmc(np.random.default_rng(5).standard_normal((8, 2)), 5)
-    chains.save(path, backend, ("a", "b"), HERE)
-
-
-# name of the file, how a sound one is made, how it is read, examples a run: of altered contents, of bytes
-HDF5: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], int, int]] = {
-    "surrogate.h5": (as_surrogate, load_manifest, 40, 2),
-    "design.h5": (lambda path: storage.save(path, a_design(), {"waves": "[{}]"}), load_waves, 40, 2),
-    "posterior.nc": (as_posterior, lambda path: draws_of(load_inference_data(path)), 10, 2),
-    "chain.h5": (as_chain, lambda path: chains.load(path, ("a", "b"), HERE), 40, 0),  # a run's own
-}
 NONSENSE = [
     np.ones((2, 2)), np.zeros(0), np.arange(3), np.nan, -1, 2**62, True, "[" * 9999, "[]", "[1]", "{}",
     '{"a": [null]}', "text", b"\xff\xfe", "", h5py.Empty("f8"),
@@ -377,15 +200,15 @@ def test_the_file_that_libhdf5_reads_for_ever_is_refused(
 ) -> None:
     path = tmp_path / "a.h5"
     path.write_bytes(as_hdf5(tmp_path))
-    monkeypatch.setattr(probe, "_READ_ALL", "import time; time.sleep(600)")
+    monkeypatch.setattr(probe, "READ_ALL", "import time; time.sleep(600)")
     monkeypatch.setattr(probe, "STARTS_S", 0.5)
     with pytest.raises(InputError, match=r"not readable as HDF5 \(reading it does not end\)"):
         read_recording(path)
     path.write_bytes(as_hdf5(tmp_path))
     os.utime(path, (1, 1))
-    monkeypatch.setattr(probe, "_READ_ALL", "import os; os.abort()")
+    monkeypatch.setattr(probe, "READ_ALL", "import os; os.abort()")
     monkeypatch.setattr(probe, "STARTS_S", 60.0)
-    with pytest.raises(InputError, match="it ends the reading process"):
+    with pytest.raises(InputError, match="reading it ends the process"):
         read_recording(path)
 
 

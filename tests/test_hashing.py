@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import bayeskin
 from bayeskin import mechanisms
 from bayeskin.hashing import sha256_of_behaviour, sha256_of_input
-from bayeskin.mechanisms.hashes import _law
+from bayeskin.mechanisms.hashes import law_source
 from bayeskin.workflow import diagnosing_sources, diagnosis
 
 PACKAGE = Path(bayeskin.__file__).parent
@@ -300,5 +300,5 @@ def test_an_entry_of_the_catalogue_is_no_part_of_a_law(tmp_path: Path) -> None:
     ):
         assert before in source
         file.write_text(source.replace(before, after) if before else source)
-        seen.append(_law(file))
+        seen.append(law_source(file))
     assert seen[0] == seen[1] == seen[2] != seen[3]

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from toys import solved
-from toys.solved import TRUTH
+from toys import closed_form_reduced
+from toys.closed_form_reduced import TRUTH
 
 from bayeskin.mismatch.answers import answer, read_answer
 from bayeskin.mismatch.context import DiagnosisContext
@@ -38,19 +38,19 @@ def begun(
 
 
 def test_what_follows_does_not_count_and_is_predicted(monkeypatch: pytest.MonkeyPatch) -> None:
-    recorded = solved.recorded(3, **VALUES)
+    recorded = closed_form_reduced.recorded(3, **VALUES)
     later = recorded.time_s > SPLIT_S
-    bench = solved.bench(monkeypatch, recorded)
+    bench = closed_form_reduced.bench(monkeypatch, recorded)
     sets = [fitted(bench, names) for names in ((), OFFSET)]
     found = begun(bench, sets)
     assert found is not None
     assert found.best.names == OFFSET
     left_n = [(recorded.force_n - one.force_n)[later] for one in (found.base, found.best)]
     before, after = (np.sqrt(np.mean(np.square(one))) for one in left_n)
-    assert after < 3.0 * solved.NOISE_N
+    assert after < 3.0 * closed_form_reduced.NOISE_N
     assert after < 0.5 * before
     force_n = np.where(later, recorded.force_n + 0.1, recorded.force_n)
-    other = solved.bench(monkeypatch, dataclasses.replace(recorded, force_n=force_n))
+    other = closed_form_reduced.bench(monkeypatch, dataclasses.replace(recorded, force_n=force_n))
     same = begun(other, sets)
     assert same is not None
     assert same.best.theta == pytest.approx(found.best.theta)
@@ -58,8 +58,8 @@ def test_what_follows_does_not_count_and_is_predicted(monkeypatch: pytest.Monkey
 
 
 def test_nothing_is_held_out_of_a_test_without_a_third_hold(monkeypatch: pytest.MonkeyPatch) -> None:
-    recorded = solved.recorded(3)
-    bench = solved.bench(monkeypatch, recorded)
+    recorded = closed_form_reduced.recorded(3)
+    bench = closed_form_reduced.bench(monkeypatch, recorded)
     assert end_of_second_hold(recorded) is None
     assert begun(bench, [fitted(bench, ())], None) is None
     longer = (*recorded.phases, Phase("hold", 2, 66.0, 70.0))

@@ -6,7 +6,7 @@ import arviz as az
 import numpy as np
 import pytest
 from scipy.special import ndtri
-from toy_inference import LineSurrogate, line_problem
+from toys.inference_problems import LineSurrogate, line_problem
 
 from bayeskin.inference import LogPosterior, Weighed, corrected, weigh
 from bayeskin.inference.convergence import Verdict

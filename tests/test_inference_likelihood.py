@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import optimize, stats
-from toy_inference import NOISE, TRUTH, empty_recording, toy_problem
+from toys.inference_problems import NOISE, TRUTH, empty_recording, toy_problem
 
 from bayeskin.errors import InputError
 from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
@@ -324,7 +324,7 @@ def test_windows_are_the_same_as_lists_and_as_tuples() -> None:
 SCRIPT = """
 import hashlib
 import numpy as np
-from toy_inference import toy_problem
+from toys.inference_problems import toy_problem
 posterior = toy_problem()
 low, high = posterior.bounds
 values = posterior.log_prob(np.random.default_rng(1).uniform(low, high, (200, posterior.dim)))

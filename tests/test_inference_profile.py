@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from toy_inference import NOISE, TRUTH, line_problem, toy_problem
+from toys.inference_problems import NOISE, TRUTH, line_problem, toy_problem
 
 from bayeskin.inference import LogPosterior, find_map, profile, profiles
 from bayeskin.inference.profile import DROP

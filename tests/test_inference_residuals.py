@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from scipy import stats
-from toy_inference import NOISE, TRUTH, ToySurrogate, toy_problem
+from toys.inference_problems import NOISE, TRUTH, ToySurrogate, toy_problem
 
 from bayeskin.inference import LogPosterior, ResidualCheck, check_residuals, find_map
 from bayeskin.inference.gauss_newton import gauss_newton, surrogate_error
@@ -47,7 +47,7 @@ def test_noise_as_assumed_gives_uniform_p_values_and_passes() -> None:
         [kind.p_correlation for one in found for kind in one.kinds],
     ):
         assert stats.kstest(p, "uniform").pvalue > 1e-3
-    assert found[0].sentence.startswith("what the fit leaves looks like the assumed noise: in its law")
+    assert found[0].sentence.startswith("the residual looks like the assumed noise: in its distribution")
     assert [(kind.kind, kind.bins) for kind in found[0].kinds] == [
         ("rest", 30), ("load", 20), ("hold", 60), ("unload", 20)
     ]  # fmt: skip
@@ -62,9 +62,9 @@ def test_noise_as_assumed_passes_at_the_fit_too() -> None:
 @pytest.mark.parametrize(
     ("draw", "word"),
     [
-        (lambda rng, t, sd: sd * rng.standard_normal(len(t)), "correlated otherwise"),  # white
+        (lambda rng, t, sd: sd * rng.standard_normal(len(t)), "has a different correlation"),  # white
         (lambda rng, t, sd: sd * rng.standard_cauchy(len(t)), "its sd is"),
-        (lambda rng, t, sd: correlated(rng, t, sd) + 6e-3 * np.sin(t / 3.0), "correlated otherwise"),
+        (lambda rng, t, sd: correlated(rng, t, sd) + 6e-3 * np.sin(t / 3.0), "has a different correlation"),
         (lambda rng, t, sd: 3.0 * correlated(rng, t, sd), "its sd is"),
         (lambda rng, t, sd: correlated(rng, t, 2e-3 + 0.0 * sd), "while pads load its sd is 0."),
     ],
@@ -76,7 +76,7 @@ def test_other_noise_fails_and_is_named(
     found = [at_truth(with_noise(draw, seed)) for seed in range(10)]
     assert sum(not one.passes for one in found) >= 8
     named = [one.sentence for one in found if not one.passes]
-    assert all(one.startswith("what the fit leaves is not the assumed noise: ") for one in named)
+    assert all(one.startswith("the residual is not the assumed noise: ") for one in named)
     assert sum(word in one for one in named) >= 6
 
 

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import toy
-from toy_inference import TRUTH as SKIN
-from toy_inference import ToySurrogate, toy_problem
-from toys import solved
-from toys.solved import BASE, TRUTH, Exact, a_run
+from toys import closed_form_model, closed_form_reduced
+from toys.closed_form_reduced import BASE, TRUTH, Exact, a_run
+from toys.inference_problems import TRUTH as SKIN
+from toys.inference_problems import ToySurrogate, toy_problem
 
 from bayeskin.finite_element import ModelSpec
 from bayeskin.forward.interface import ModelRun
@@ -37,7 +36,9 @@ PEAKED = dataclasses.replace(BASE.parameters[0], prior="log-normal", centre=150e
 
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> DiagnosisContext:
-    return solved.bench(monkeypatch, solved.recorded(0, F0=-0.03, stiffness_rate=-8e-4))
+    return closed_form_reduced.bench(
+        monkeypatch, closed_form_reduced.recorded(0, F0=-0.03, stiffness_rate=-8e-4)
+    )
 
 
 def start(bench: DiagnosisContext) -> dict[str, float]:
@@ -47,7 +48,7 @@ def start(bench: DiagnosisContext) -> dict[str, float]:
 def tangent(bench: DiagnosisContext, space: ParameterSpace = BASE) -> tuple[Tangent, ModelRun]:
     run = a_run(bench)
     assert run.slopes_n is not None
-    return Tangent(space, solved.EDGES_S, (run,)), run
+    return Tangent(space, closed_form_reduced.EDGES_S, (run,)), run
 
 
 @pytest.mark.parametrize("first", [BASE.parameters[0], PEAKED], ids=["flat", "peaked"])
@@ -89,7 +90,7 @@ def test_moduli_times_c_and_permeabilities_over_c_pull_c_times_as_hard(
     by_log = run.slopes_n[:, :4] / width
     by_log[:, 1] = run.force_n + by_log[:, 2] + by_log[:, 3] - by_log[:, 0]
     slopes_n = np.column_stack([by_log * width, run.slopes_n[:, 4:]])
-    near = Tangent(BASE, solved.EDGES_S, (ModelRun(run.theta, run.force_n, slopes_n),))
+    near = Tangent(BASE, closed_form_reduced.EDGES_S, (ModelRun(run.theta, run.force_n, slopes_n),))
     aside = run.theta * np.array([1.5, 0.7, 2.0, 0.4, 1.0])
     stiffer = aside * np.array([factor, factor, 1.0 / factor, 1.0 / factor, 1.0])
     for here, there in ((run.theta, run.theta * (stiffer / aside)), (aside, stiffer)):
@@ -101,8 +102,8 @@ def test_several_runs_are_all_met_with_their_slopes(bench: DiagnosisContext) -> 
     first = a_run(bench)
     second = bench.run((), {**start(bench), "E_c": 130e3, "k_s": 6e-14})
     assert isinstance(second, ModelRun)
-    near, step = Tangent(BASE, solved.EDGES_S, (first, second)), 1e-4
-    between = Tangent(BASE, solved.EDGES_S, (first,)).predict_mean(second.theta)[0]
+    near, step = Tangent(BASE, closed_form_reduced.EDGES_S, (first, second)), 1e-4
+    between = Tangent(BASE, closed_form_reduced.EDGES_S, (first,)).predict_mean(second.theta)[0]
     assert np.abs(between - second.force_n).max() > 1e-3  # which one alone does not know
     for run in (first, second):
         assert run.slopes_n is not None
@@ -314,7 +315,7 @@ def test_priors_that_go_together_do_so_in_a_fit_and_its_trust_region(
     other = dataclasses.replace(BASE.parameters[1], prior="log-normal", centre=30e3, spread=0.5)
     together = (Correlation("E_c", "E_s", 0.6),)
     base = ParameterSpace((PEAKED, other, *BASE.parameters[2:]), together)
-    bench = solved.bench(monkeypatch, solved.recorded(0), base)
+    bench = closed_form_reduced.bench(monkeypatch, closed_form_reduced.recorded(0), base)
     for names in ((), ("force-offset",), SET):
         about = bench.posterior(names, [a_run(bench, names)])
         assert about.space.correlations == together
@@ -326,7 +327,9 @@ def test_what_lies_in_series_goes_by_its_shortcut_where_a_surrogate_is_the_skin(
     skin: Any = ToySurrogate()
     binned = toy_problem().binned
     forward = SurrogateForward(skin, ModelSpec())
-    bench = DiagnosisContext(binned, solved.NO_WORD, toy.MOTION, forward, skin.space, 1)
+    bench = DiagnosisContext(
+        binned, closed_form_reduced.NO_WORD, closed_form_model.MOTION, forward, skin.space, 1
+    )
     assert "slow-recovery" in bench.known
     names = ("slow-recovery",)
     assert bench.space(names).names == skin.space.names

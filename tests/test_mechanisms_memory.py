@@ -6,22 +6,21 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from consolidation import compression_stress
-from driven import driven
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
-from test_mechanisms_tissue import IN_SERIES, SOLVED, STRONG, THETA, skin, strong, unknowns
-from test_model_consolidation import EDGE_M, Point, block, by_layer, corner_points, march
-from test_model_physics import LAM, MU, drained_bar
+from toys.bar_models import LAM, MU
+from toys.consolidation_references import EDGE_M, compression_stress
+from toys.driven_model import Point, block, by_layer, corner_points, driven, march
+from toys.pulled_bar import BAR, STRETCH_M, bound, elastic_force, pulled
+from toys.skin_with_mechanisms import IN_SERIES, SOLVED, STRONG, THETA, skin, strong, unknowns
 
 from bayeskin.finite_element import ModelSpec, simulate
-from bayeskin.finite_element.lagrangian import LagrangianModel, State
+from bayeskin.finite_element.lagrangian import State
 from bayeskin.finite_element.mesh import brick_mesh
 from bayeskin.finite_element.problem import build_problem
 from bayeskin.finite_element.space import taylor_hood
-from bayeskin.finite_element.stepping import advance
 from bayeskin.mechanisms import laws, observed
 from bayeskin.mechanisms.backlash import trailing
 from bayeskin.mechanisms.preconditioning import damaged
@@ -30,7 +29,6 @@ from bayeskin.mechanisms.slow_recovery import KelvinVoigt
 from bayeskin.types import PadMotion
 
 SHORT = PadMotion(np.array([0.0, 6.0, 12.0, 18.0]), 1e-3 * np.array([0.0, 6.0, 6.0, 0.0]))
-STRETCH_M = 0.3  # of the bar of unit length
 
 
 @pytest.fixture(scope="module")
@@ -41,34 +39,6 @@ def problem():
 @pytest.fixture(scope="module")
 def base():
     return simulate(ModelSpec(), SHORT, THETA)
-
-
-def elastic_force(stretch):
-    """Of the drained bar free to contract: first Piola-Kirchhoff stress and the stretch across."""
-    across = brentq(lambda a: MU * (a - 1 / a) + LAM * np.log(stretch * a**2) / a, 0.3, 2.0)
-    return MU * (stretch - 1 / stretch) + LAM * np.log(stretch * across**2) / stretch, across
-
-
-BAR = drained_bar("bricks")
-
-
-def bound(name, **values):
-    """A mechanism's law at the points of the bar."""
-    return SOLVED[name].act.bind(values, BAR.problem.sites)
-
-
-def pulled(motion, *laws, steps=24):
-    """Times and forces a unit area of a drained bar with laws, in equal steps of each phase."""
-    held = LagrangianModel(BAR.problem, BAR.material, motion, laws)
-    past = [held.initial_state(0.0)]
-    found = [(0.0, 0.0)]
-    for start, end in pairwise(held.motion.time_s):
-        past = past[-1:]
-        for _ in range(steps):
-            step = advance(held, past[-3:], (end - start) / steps)
-            past.append(step.state)
-            found.append((step.state.time_s, step.force_n / 2.0))
-    return np.array(found).T
 
 
 def test_a_step_stretch_relaxes_by_the_branches_exponentials():

@@ -7,9 +7,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from test_mechanisms_memory import BAR, STRETCH_M, bound, elastic_force, pulled
-from test_mechanisms_tissue import ONE, SOLVED, THETA, strong
-from test_model_physics import LAM, MU
+from toys.bar_models import LAM, MU
+from toys.pulled_bar import BAR, STRETCH_M, bound, elastic_force, pulled
+from toys.skin_with_mechanisms import ONE, SOLVED, THETA, strong
 
 from bayeskin.errors import InputError
 from bayeskin.finite_element import ModelSpec, poroelastic, simulate

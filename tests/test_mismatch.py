@@ -7,21 +7,23 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-import toy
 from scipy.stats import kstest, norm
-from toy_inference import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
+from toys import closed_form_model
+from toys.inference_problems import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
 
 from bayeskin.inference import LogPosterior, NoisePriors, find_map
 from bayeskin.inference.convergence import Limits
 from bayeskin.inference.gauss_newton import gauss_newton, promise, surrogate_error
 from bayeskin.inference.model_error import ModelError
 from bayeskin.mechanisms import catalogue
-from bayeskin.mismatch.fit import Fit, _times, fit, fit_near, likely, other_skins, subcutis_too_stiff
+from bayeskin.mismatch.fit import Fit, fit, fit_near, value_for_multiple
+from bayeskin.mismatch.fit_starts import likely, other_skins
 from bayeskin.mismatch.hypotheses import weight
-from bayeskin.mismatch.locate import _chance, locate, model_error
+from bayeskin.mismatch.locate import exceedance_probability, locate, model_error
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.refuted import refuted
 from bayeskin.mismatch.resample import resample
+from bayeskin.mismatch.stiffness_ratio import subcutis_too_stiff
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Jumps, ParameterSpace
 
@@ -37,7 +39,7 @@ def concealing(seed: int, names: Sequence[str] = (), **values: float) -> LogPost
     plain = toy_problem(seed)
     mechanisms = tuple(KNOWN[name] for name in names)
     theta = [*TRUTH.values(), *(values[p.name] for one in mechanisms for p in one.parameters)]
-    seen = ObservedSurrogate(ToySurrogate(), mechanisms, toy.MOTION).predict([theta]).mean[0]
+    seen = ObservedSurrogate(ToySurrogate(), mechanisms, closed_form_model.MOTION).predict([theta]).mean[0]
     alone = ToySurrogate().predict([list(TRUTH.values())]).mean[0]
     binned = dataclasses.replace(plain.binned, force_n=plain.binned.force_n + seen - alone)
     return dataclasses.replace(plain, binned=binned, noise_priors=QUIET)
@@ -53,7 +55,9 @@ def building(alone: LogPosterior, names: Sequence[str]) -> LogPosterior:
     mechanisms = tuple(KNOWN[name] for name in names)
     if not mechanisms:
         return alone
-    return dataclasses.replace(alone, surrogate=ObservedSurrogate(alone.surrogate, mechanisms, toy.MOTION))
+    return dataclasses.replace(
+        alone, surrogate=ObservedSurrogate(alone.surrogate, mechanisms, closed_form_model.MOTION)
+    )
 
 
 def test_the_chance_of_the_farthest_window_is_uniform_where_nothing_is_missing() -> None:
@@ -88,7 +92,7 @@ def test_the_chance_of_a_window_farther_than_all_draws_is_read_from_their_tail(s
         tall = scale * np.abs(np.random.default_rng(seed).standard_normal((1000, 200))).max(axis=1)
         for chance in (0.3, 1e-3, 1e-5):
             height = scale * norm.isf(0.5 * (1.0 - (1.0 - chance) ** (1.0 / 200.0)))
-            found.append(np.log(_chance(tall, height) / chance))
+            found.append(np.log(exceedance_probability(tall, height) / chance))
     by_chance = np.reshape(found, (20, 3))
     assert np.all(np.abs(by_chance.mean(axis=0)) < np.log([1.05, 1.3, 2.0]))
     assert np.all(by_chance.std(axis=0) < np.log([1.1, 1.7, 3.0]))
@@ -107,7 +111,7 @@ def test_what_is_off_at_infinity_is_climbed_to_from_there() -> None:
     both = tuple(catalogue()[name] for name in ("device-friction", "friction-creep"))
     names = tuple(one.name for one in both)
     truth = {"Fc": 0.08, "presliding": 5e-5, "friction_start": 0.0, "friction_tau": 15.0}
-    seen = ObservedSurrogate(ToySurrogate(), both, toy.MOTION)
+    seen = ObservedSurrogate(ToySurrogate(), both, closed_form_model.MOTION)
     plain = concealing(0)
     gap = (
         seen.predict([[*TRUTH.values(), *truth.values()]]).mean
@@ -122,15 +126,15 @@ def test_what_is_off_at_infinity_is_climbed_to_from_there() -> None:
     best = fit_near(names, wide, {**base.theta, **TRUTH, **truth})
     assert found.value > best.value - 0.5
     assert found.theta["friction_tau"] == pytest.approx(15.0, rel=0.3)
-    assert _times(2.0, 30.0, np.inf) == 15.0
-    assert _times(-1.0, 30.0, np.inf) == np.inf
-    assert _times(2.0, 0.3, 0.1) == pytest.approx(0.5)
+    assert value_for_multiple(2.0, 30.0, np.inf) == 15.0
+    assert value_for_multiple(-1.0, 30.0, np.inf) == np.inf
+    assert value_for_multiple(2.0, 0.3, 0.1) == pytest.approx(0.5)
 
 
 def test_whole_skins_are_drawn_anew_and_no_instrument_also_from_a_bound() -> None:
     """All that the innermost surrogate has is drawn; rounding loses none."""
     plain = concealing(0)
-    inner = ObservedSurrogate(ToySurrogate(), (KNOWN["sensor-drift"],), toy.MOTION)
+    inner = ObservedSurrogate(ToySurrogate(), (KNOWN["sensor-drift"],), closed_form_model.MOTION)
     wide = dataclasses.replace(plain, surrogate=inner)
     low, high = wide.bounds
     vector = 0.5 * (low + high)
@@ -218,7 +222,7 @@ def test_a_mechanism_that_does_nothing_gains_nothing() -> None:
 
 def allowing(amplitude: float) -> ModelError | None:
     """Errors of the toy whose factor has this sd; none of 0."""
-    return ModelError(toy.MOTION, ToySurrogate().edges_s, amplitude) if amplitude else None
+    return ModelError(closed_form_model.MOTION, ToySurrogate().edges_s, amplitude) if amplitude else None
 
 
 def test_a_mesh_that_is_off_by_a_factor_stays_inside_the_intervals() -> None:
@@ -336,4 +340,4 @@ def test_samples_refute_no_step_beside_what_smooths_or_shifts_it(smoother: str |
     theta = {name: value for one in known.values() for name, value in one.neutral.items()}
     theta |= {"event_1_step": 0.03}
     found = Fit(names, alone, theta, 0.0, 0.0, np.eye(1), np.zeros(1))
-    assert refuted(found, known, toy.MOTION, none) == ([] if smoother else ["sensor-events"])
+    assert refuted(found, known, closed_form_model.MOTION, none) == ([] if smoother else ["sensor-events"])

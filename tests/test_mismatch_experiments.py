@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
-from toy_inference import NOISE, SCALE, TRUTH, ToySurrogate, empty_recording
+from toys import closed_form_model
+from toys.inference_problems import NOISE, SCALE, TRUTH, ToySurrogate, empty_recording
 
 from bayeskin.errors import InputError
 from bayeskin.experiments.choice import DRAWS, OPEN, Experiment, compete, noise_of, ranked, search, weigh
@@ -124,14 +124,14 @@ def test_too_few_draws_are_refused() -> None:
     forces, noise = gaussians(1.0, 3, 0)
     with pytest.raises(InputError, match="4 draws"):
         expected_gain(forces, noise, [1.0, 1.0], 0)
-    with pytest.raises(InputError, match="two at least"):
+    with pytest.raises(InputError, match="at least two"):
         expected_gain(forces[:1], noise, [1.0], 0)
 
 
 def test_protocols_vary_the_recordings_own_motion() -> None:
-    amplitude, speed, hold = own(toy.MOTION)
+    amplitude, speed, hold = own(closed_form_model.MOTION)
     assert (amplitude, speed, hold) == pytest.approx((9e-3, OWN_SPEED, 30.0))
-    listed = {one.name: one for one in variations(toy.MOTION, LIMITS)}
+    listed = {one.name: one for one in variations(closed_form_model.MOTION, LIMITS)}
     assert len(listed) == 9
     for one in listed.values():
         assert np.all(np.diff(one.motion.time_s) > 0.0)
@@ -154,7 +154,10 @@ def toy_run(task: OtherProtocolTask) -> np.ndarray:
     motion = PadMotion(np.array(task.time_s), np.array(task.displacement_m))
     time_s = np.unique(np.concatenate([np.linspace(0.0, motion.time_s[-1], 400), motion.time_s]))
     force = (
-        SCALE * toy.toy_force(np.array([[task.theta[name] for name in toy.SPACE.names]]), time_s, motion)[0]
+        SCALE
+        * closed_form_model.toy_force(
+            np.array([[task.theta[name] for name in closed_form_model.SPACE.names]]), time_s, motion
+        )[0]
     )
     rows = {name: np.array([value]) for name, value in task.theta.items()}
     beyond = [KNOWN[name] for name in task.names]
@@ -168,7 +171,7 @@ def asked(tasks: Sequence[Task]) -> list[object]:
 
 def fitted(name: str, **values: float) -> Fit:
     """A set of one mechanism at the truth of the base, known to a hundredth of each prior."""
-    seen = ObservedSurrogate(ToySurrogate(), (KNOWN[name],), toy.MOTION)
+    seen = ObservedSurrogate(ToySurrogate(), (KNOWN[name],), closed_form_model.MOTION)
     log_posterior = LogPosterior(seen, empty_recording())
     return Fit(
         (name,),
@@ -182,7 +185,7 @@ def fitted(name: str, **values: float) -> Fit:
 
 
 def judged(fits: Sequence[Fit], ask: AnswerTasks = asked) -> list[Experiment]:
-    return ranked([weigh(one, fits, KNOWN, ask, 0) for one in variations(toy.MOTION, LIMITS)])
+    return ranked([weigh(one, fits, KNOWN, ask, 0) for one in variations(closed_form_model.MOTION, LIMITS)])
 
 
 def test_friction_is_told_from_drag_by_another_speed_and_not_by_a_repeat() -> None:
@@ -216,7 +219,7 @@ def test_failed_runs_are_counted_and_leave_a_row() -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
     table = judged(fits, failing)
     assert all(np.isnan(one.gain_bits) and one.failed == 2 * (DRAWS - 3) for one in table)
-    with pytest.raises(InputError, match="two at least"):
+    with pytest.raises(InputError, match="at least two"):
         judged(fits[:1])
 
 
@@ -224,7 +227,7 @@ def test_changes_of_the_most_telling_tests_are_judged_and_tell_more() -> None:
     """Drag and friction of one speed differ by speed alone; here no test to begin with has another."""
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
     others = ("quarter speed", "five times faster")
-    first = [one for one in variations(toy.MOTION, LIMITS) if one.name not in others]
+    first = [one for one in variations(closed_form_model.MOTION, LIMITS) if one.name not in others]
     found = search(lambda one: weigh(one, fits, KNOWN, asked, 0), first, LIMITS, 1)
     listed = [one for one in found if one.protocol in first]
     assert found[0].protocol not in first
@@ -239,7 +242,7 @@ def test_changes_of_the_most_telling_tests_are_judged_and_tell_more() -> None:
 @given(st.integers(0, 10**6), st.floats(60.0, 3000.0))
 def test_changed_tests_stay_within_the_limits_of_the_device(seed: int, longest_s: float) -> None:
     rng, limits = np.random.default_rng(seed), Limits(8e-3, (2e-4, 2e-3), longest_s)
-    one = variations(toy.MOTION, limits)[seed % 9]
+    one = variations(closed_form_model.MOTION, limits)[seed % 9]
     for _ in range(4):
         one = changed(one, limits, "changed", rng)
         speed = np.abs(np.diff(one.motion.displacement_m) / np.diff(one.motion.time_s))
@@ -266,9 +269,11 @@ def test_sets_with_look_alikes_in_the_place_of_the_likeliest_compete() -> None:
 
 def test_noise_of_a_test_to_come_is_that_of_the_fit() -> None:
     found = fitted("rub", rubbing=4e-3)
-    covariance = noise_of(found, toy.MOTION, found.log_posterior.binned.edges_s)
-    kinds = [p.kind for p in phases_of(toy.MOTION)]
-    phase = np.searchsorted([p.end_s for p in phases_of(toy.MOTION)], found.log_posterior.binned.time_s)
+    covariance = noise_of(found, closed_form_model.MOTION, found.log_posterior.binned.edges_s)
+    kinds = [p.kind for p in phases_of(closed_form_model.MOTION)]
+    phase = np.searchsorted(
+        [p.end_s for p in phases_of(closed_form_model.MOTION)], found.log_posterior.binned.time_s
+    )
     expected = [NOISE[f"sd_{kinds[i]}"] ** 2 + 1e-6 for i in phase]
     np.testing.assert_allclose(np.diag(covariance), expected, rtol=1e-12)
     assert np.linalg.eigvalsh(covariance).min() > 0.0
@@ -305,8 +310,8 @@ def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
     )
     trained = SimpleNamespace(protocols=Protocols())
     model: Any = SimpleNamespace(trained=trained)
-    skin = ReducedForward(model, toy.MOTION, np.zeros(2))
-    bench = SimpleNamespace(motion=toy.MOTION, known=KNOWN, forward=skin, seed=0)
+    skin = ReducedForward(model, closed_form_model.MOTION, np.zeros(2))
+    bench = SimpleNamespace(motion=closed_form_model.MOTION, known=KNOWN, forward=skin, seed=0)
     monkeypatch.setattr(experiment, "opened", lambda *_: run)
     monkeypatch.setattr(experiment, "source_of", lambda _: None)
     monkeypatch.setattr(experiment, "context_of", lambda *_: bench)
@@ -331,7 +336,7 @@ def test_without_a_diagnosis_its_answer_is_given_and_without_its_fits_one_line(
     diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(experiment, "searched", lambda *_: made([]))
-    with pytest.raises(InputError, match="no fit of rub; expected those that `bayeskin diagnose` left"):
+    with pytest.raises(InputError, match="no fit of rub; expected the fits that `bayeskin diagnose` stores"):
         experiment.choose(diagnosed.source, Silent())
     failed = {"ok": False, "message": "too few runs", "text": "design: failed: too few runs"}
     monkeypatch.setattr(diagnosis, "diagnose", lambda *_: failed)
@@ -346,7 +351,7 @@ def test_the_test_to_run_next_is_written_for_the_machine(
     answer = experiment.choose(diagnosed.source, Silent())
     best = answer["experiments"][0]
     words = answer["text"].splitlines()
-    assert words[0] == "taken as equally probable: rub; or drag"
+    assert words[0] == "sets taken as equally probable: rub; or drag"
     assert best["sentence"] in words[1]
     assert words[-1].startswith(f"Run next: {best['protocol']}.")
     corners = np.loadtxt(diagnosed.folder / "next.csv", delimiter=",", skiprows=1)
@@ -364,5 +369,5 @@ def test_tests_whose_processes_are_lost_are_said_to_be_unjudged(
     )
     answer = experiment.choose(diagnosed.source, Silent())
     assert (answer["ok"], len(answer["experiments"])) == (False, 9)
-    assert answer["text"].count("could not be judged") == 9
+    assert answer["text"].count("could not be assessed") == 9
     assert "None of these tests" in answer["text"]

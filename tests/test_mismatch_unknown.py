@@ -7,22 +7,23 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import toy
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
-from toy_inference import NOISE, TRUTH, ToySurrogate, empty_recording
+from toys import closed_form_model
+from toys.inference_problems import NOISE, TRUTH, ToySurrogate, empty_recording
 
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.noise_model import draw_noise
 from bayeskin.mismatch.discrepancy import (
     Discrepancy,
-    _masks,
-    _squared_distances,
-    _unlikely,
     discrepancy,
+    kernel_masks,
+    negative_log_evidence,
+    squared_distances,
 )
-from bayeskin.mismatch.fit import Fit, instrument_noise
+from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
+from bayeskin.mismatch.noise_bounds import instrument_noise
 from bayeskin.mismatch.terms import library, memory
 from bayeskin.mismatch.unexplained import Place, derivatives, place, unexplained
 from bayeskin.report import figure_discrepancy
@@ -42,7 +43,7 @@ def known_fit(seed: int, extra: Extra | None = None, sd_n: float = 1e-4, memory_
     force = prediction.mean[0] + prediction.factor[0] @ rng.standard_normal(3)
     force = force + draw_noise(chain, np.array([[sd_n] * 4 + [memory_s, 100.0]]), prediction.diagonal, rng)[0]
     if extra:
-        force = force + extra(place(binned.time_s, binned.phase, binned.phases, toy.MOTION))
+        force = force + extra(place(binned.time_s, binned.phase, binned.phases, closed_form_model.MOTION))
     recorded = dataclasses.replace(binned, force_n=force)
     log_posterior = LogPosterior(surrogate, recorded, noise_priors=instrument_noise(recorded))
     noise = {name: sd_n for name in NOISE if name.startswith("sd")}
@@ -72,11 +73,11 @@ def in_second_cycle(at: Place) -> np.ndarray:
 
 
 def test_noise_is_no_discrepancy() -> None:
-    found = [discrepancy(known_fit(seed), toy.MOTION) for seed in range(8)]
+    found = [discrepancy(known_fit(seed), closed_form_model.MOTION) for seed in range(8)]
     assert sum(one.noticeable for one in found) == 0
     assert all(np.all(np.abs(one.mean_n) <= 3.0 * one.sd_n + 1e-5) for one in found)
     assert all(one.size_n < 5e-4 for one in found)
-    assert found[0].features == ("nothing beyond the noise",)
+    assert found[0].features == ("nothing is left beyond the noise",)
 
 
 def gained(found: Discrepancy) -> float:
@@ -87,7 +88,10 @@ def gained(found: Discrepancy) -> float:
 @pytest.mark.parametrize("memory_s", [0.1, 0.5, 2.0, 5.0, 8.0])
 def test_noise_with_a_memory_is_no_discrepancy(memory_s: float) -> None:
     """Twice as large as the noise that the bins show."""
-    nats = [gained(discrepancy(known_fit(seed, None, 2e-3, memory_s), toy.MOTION)) for seed in range(6)]
+    nats = [
+        gained(discrepancy(known_fit(seed, None, 2e-3, memory_s), closed_form_model.MOTION))
+        for seed in range(6)
+    ]
     assert np.mean(nats) < 0.0
     assert max(nats) < 4.0
 
@@ -95,7 +99,9 @@ def test_noise_with_a_memory_is_no_discrepancy(memory_s: float) -> None:
 @pytest.mark.parametrize("memory_s", [0.5, 2.0, 5.0])
 @pytest.mark.parametrize("extra", [rubbing, creeping])
 def test_a_discrepancy_is_found_in_noise_with_a_memory(extra: Extra, memory_s: float) -> None:
-    found = [discrepancy(known_fit(seed, extra, 1.5e-3, memory_s), toy.MOTION) for seed in range(4)]
+    found = [
+        discrepancy(known_fit(seed, extra, 1.5e-3, memory_s), closed_form_model.MOTION) for seed in range(4)
+    ]
     assert min(map(gained, found)) > 4.0
 
 
@@ -103,8 +109,8 @@ def test_a_discrepancy_is_found_in_noise_with_a_memory(extra: Extra, memory_s: f
 def test_noise_is_seldom_noticed_or_given_a_form() -> None:
     """Of 200 recordings of noise, each is counted at its stated level: 1 % and 5 %."""
     fits = [known_fit(seed) for seed in range(200)]
-    assert sum(discrepancy(one, toy.MOTION).noticeable for one in fits) <= 6
-    assert sum(propose_form(one, toy.MOTION, seed).found for seed, one in enumerate(fits)) <= 20
+    assert sum(discrepancy(one, closed_form_model.MOTION).noticeable for one in fits) <= 6
+    assert sum(propose_form(one, closed_form_model.MOTION, seed).found for seed, one in enumerate(fits)) <= 20
 
 
 @pytest.mark.parametrize("extra", [rubbing, creeping, drifting, less_displaced])
@@ -112,7 +118,7 @@ def test_a_discrepancy_is_found_and_its_band_holds_it(extra: Extra) -> None:
     covered = []
     for seed in range(6):
         fit = known_fit(seed, extra)
-        found, rest = discrepancy(fit, toy.MOTION), unexplained(fit, toy.MOTION)
+        found, rest = discrepancy(fit, closed_form_model.MOTION), unexplained(fit, closed_form_model.MOTION)
         truth = rest.beyond(extra(rest.at))
         covered.append(np.mean(np.abs(found.mean_n - truth) < 1.645 * found.sd_n))
         assert found.noticeable
@@ -121,20 +127,20 @@ def test_a_discrepancy_is_found_and_its_band_holds_it(extra: Extra) -> None:
 
 
 def test_parts_shares_and_residual_add_up() -> None:
-    found = discrepancy(known_fit(1, creeping), toy.MOTION)
+    found = discrepancy(known_fit(1, creeping), closed_form_model.MOTION)
     np.testing.assert_allclose(np.sum(list(found.parts_n.values()), axis=0), found.mean_n, atol=1e-15)
     assert 0.5 < sum(found.share.values()) < 1.0
     assert found.share["phase"] == max(found.share.values())
-    changed = discrepancy(known_fit(1, less_displaced), toy.MOTION)
+    changed = discrepancy(known_fit(1, less_displaced), closed_form_model.MOTION)
     assert changed.share["change"] == max(changed.share.values())
-    rest = unexplained(known_fit(1, creeping), toy.MOTION)
+    rest = unexplained(known_fit(1, creeping), closed_form_model.MOTION)
     np.testing.assert_allclose(found.beyond_n + found.taken_n, rest.residual_n, atol=1e-15)
 
 
 def test_mean_and_sd_are_those_of_a_dense_gaussian_process_with_a_flat_prior_of_parameters() -> None:
     fit = known_fit(1, creeping)
-    found = discrepancy(fit, toy.MOTION)
-    rest = dataclasses.replace(unexplained(fit, toy.MOTION), memory=found.memory)
+    found = discrepancy(fit, closed_form_model.MOTION)
+    rest = dataclasses.replace(unexplained(fit, closed_form_model.MOTION), memory=found.memory)
     at, memory_s = rest.at, np.log1p(rest.at.since_s)
     displacement = at.displacement_m / 9e-3
     axes = {"displacement": displacement, "change": displacement, "phase": memory_s, "cycle": memory_s}
@@ -162,7 +168,7 @@ def test_mean_and_sd_are_those_of_a_dense_gaussian_process_with_a_flat_prior_of_
 def test_the_evidence_without_a_discrepancy_is_the_integral_over_the_parameters() -> None:
     """Of a force that is linear in them, normal about the fit and as dense there as their box."""
     fit = known_fit(1, creeping)
-    rest = unexplained(fit, toy.MOTION)
+    rest = unexplained(fit, closed_form_model.MOTION)
     d = fit.log_posterior.surrogate.space.dim
     moves = (fit.unit[:d] > 1e-3) & (fit.unit[:d] < 1.0 - 1e-3)
     slopes = derivatives(fit.log_posterior, fit.unit)[:, moves]
@@ -178,7 +184,7 @@ def test_the_evidence_without_a_discrepancy_is_the_integral_over_the_parameters(
 
 def test_a_parameter_that_a_bound_holds_pays_for_the_room_that_it_does_not_use() -> None:
     """Against the integral over its prior, the others at the fit."""
-    rest = unexplained(known_fit(1, creeping), toy.MOTION)
+    rest = unexplained(known_fit(1, creeping), closed_form_model.MOTION)
     slope = 40.0 * np.sqrt(rest.noise_n2[0, 0]) * np.linspace(-1.0, 1.0, len(rest.residual_n))
     slope *= -np.sign(slope @ rest.residual_n) or 1.0
     alone = dataclasses.replace(rest, slopes=rest.slopes[:, :0], inwards=slope[:, None])
@@ -192,7 +198,9 @@ def test_a_parameter_that_a_bound_holds_pays_for_the_room_that_it_does_not_use()
 
 
 def test_a_discrepancy_pays_for_its_sizes_and_lengths() -> None:
-    without, with_it = (discrepancy(known_fit(1, extra), toy.MOTION) for extra in (None, creeping))
+    without, with_it = (
+        discrepancy(known_fit(1, extra), closed_form_model.MOTION) for extra in (None, creeping)
+    )
     for found in (without, with_it):
         cost = found.log_evidence - found.without_log_evidence - found.gain_nats
         assert -30.0 < cost < 0.1
@@ -201,18 +209,20 @@ def test_a_discrepancy_pays_for_its_sizes_and_lengths() -> None:
 
 
 def test_slopes_of_the_likelihood_are_its_differences() -> None:
-    rest = unexplained(known_fit(1, creeping), toy.MOTION)
-    given = (rest, _squared_distances(rest.at), _masks(rest.at))
+    rest = unexplained(known_fit(1, creeping), closed_form_model.MOTION)
+    given = (rest, squared_distances(rest.at), kernel_masks(rest.at))
     whole = np.log([8.0, 3.0, 2e-3, 3e-3, 4e-3, 1e-3, 0.4, 0.5, 0.7, 1.1])
     for line, of in ((whole, given), (whole[:2], given[:1])):
         for i, step in enumerate(1e-4 * np.eye(len(line))):
-            difference = (_unlikely(line + step, *of)[0] - _unlikely(line - step, *of)[0]) / 2e-4
-            assert _unlikely(line, *of)[1][i] == pytest.approx(difference, rel=1e-3)
+            difference = (
+                negative_log_evidence(line + step, *of)[0] - negative_log_evidence(line - step, *of)[0]
+            ) / 2e-4
+            assert negative_log_evidence(line, *of)[1][i] == pytest.approx(difference, rel=1e-3)
 
 
 def test_the_discrepancy_is_orthogonal_to_what_parameters_do() -> None:
     fit = known_fit(2, rubbing)
-    found = discrepancy(fit, toy.MOTION)
+    found = discrepancy(fit, closed_form_model.MOTION)
     slopes = derivatives(fit.log_posterior, fit.unit)
     moving = slopes[:, np.linalg.norm(slopes, axis=0) > 1e-6]
     cosine = moving.T @ found.mean_n / np.linalg.norm(moving, axis=0) / np.linalg.norm(found.mean_n)
@@ -226,7 +236,7 @@ def test_what_looks_like_a_parameter_does_not_change_the_discrepancy(parameter: 
     binned = fit.log_posterior.binned
     shifted = dataclasses.replace(binned, force_n=binned.force_n + 0.02 * slope)
     other = dataclasses.replace(fit, log_posterior=dataclasses.replace(fit.log_posterior, binned=shifted))
-    one, two = discrepancy(fit, toy.MOTION), discrepancy(other, toy.MOTION)
+    one, two = discrepancy(fit, closed_form_model.MOTION), discrepancy(other, closed_form_model.MOTION)
     assert np.linalg.norm(two.taken_n - one.taken_n) > 1e-5
     # As far as climbs to the hyperparameters end alike: a micronewton is a thousandth of the noise.
     np.testing.assert_allclose(two.mean_n, one.mean_n, atol=1e-6)
@@ -238,21 +248,24 @@ def test_a_parameter_at_its_bound_takes_up_nothing() -> None:
     fit = known_fit(2, rubbing)
     raised = {"E_s": TRUTH["E_s"], "k_s": TRUTH["k_s"]}
     material = ParameterSpace(
-        tuple(dataclasses.replace(p, lower=raised.get(p.name, p.lower)) for p in toy.SPACE.parameters)
+        tuple(
+            dataclasses.replace(p, lower=raised.get(p.name, p.lower))
+            for p in closed_form_model.SPACE.parameters
+        )
     )
     at_bound = dataclasses.replace(
         fit, log_posterior=dataclasses.replace(fit.log_posterior, material=material)
     )
-    width = [unexplained(one, toy.MOTION).basis.shape[1] for one in (fit, at_bound)]
+    width = [unexplained(one, closed_form_model.MOTION).basis.shape[1] for one in (fit, at_bound)]
     assert width == [127, 128]
 
 
 def test_features_say_where_and_how_it_grows() -> None:
-    words = " | ".join(discrepancy(known_fit(0, in_second_cycle), toy.MOTION).features)
+    words = " | ".join(discrepancy(known_fit(0, in_second_cycle), closed_form_model.MOTION).features)
     assert "while loading" in words
     assert "in holds" not in words
     assert "grows from" in words
-    words = " | ".join(discrepancy(known_fit(0, drifting), toy.MOTION).features)
+    words = " | ".join(discrepancy(known_fit(0, drifting), closed_form_model.MOTION).features)
     assert "rises with time" in words
 
 
@@ -275,11 +288,11 @@ def test_a_form_of_the_library_is_found_with_its_coefficient(
 ) -> None:
     named = 0
     for seed in range(3):
-        form = propose_form(known_fit(seed, extra), toy.MOTION, 0)
+        form = propose_form(known_fit(seed, extra), closed_form_model.MOTION, 0)
         first = form.terms[0]
         assert name in (first.name, *first.alike)
         assert form.r2_left_out > 0.4
-        assert "in phases left out" in form.sentence
+        assert "in held-out phases" in form.sentence
         if first.name == name:
             named += 1
             assert first.unit == unit
@@ -289,10 +302,10 @@ def test_a_form_of_the_library_is_found_with_its_coefficient(
 
 
 def test_noise_has_no_form_and_neither_has_what_one_phase_does_alone() -> None:
-    forms = [propose_form(known_fit(seed), toy.MOTION, seed) for seed in range(8)]
+    forms = [propose_form(known_fit(seed), closed_form_model.MOTION, seed) for seed in range(8)]
     assert sum(one.found for one in forms) <= 1
     assert forms[0].sentence.startswith("No form found")
-    alone = propose_form(known_fit(0, in_second_cycle), toy.MOTION, 0)
+    alone = propose_form(known_fit(0, in_second_cycle), closed_form_model.MOTION, 0)
     assert not alone.found
     assert alone.r2_left_out == 0.0
 
@@ -300,11 +313,11 @@ def test_noise_has_no_form_and_neither_has_what_one_phase_does_alone() -> None:
 def test_the_share_left_out_is_that_of_fits_without_each_phase() -> None:
     fit = known_fit(0, lambda at: rubbing(at) + drifting(at))
     form, rest, binned = (
-        propose_form(fit, toy.MOTION, 0),
-        unexplained(fit, toy.MOTION),
+        propose_form(fit, closed_form_model.MOTION, 0),
+        unexplained(fit, closed_form_model.MOTION),
         fit.log_posterior.binned,
     )
-    terms = {t.name: t.values for t in library(rest, binned.edges_s, binned.phases, toy.MOTION)}
+    terms = {t.name: t.values for t in library(rest, binned.edges_s, binned.phases, closed_form_model.MOTION)}
     shapes = rest.beyond(np.stack([terms[one.name] for one in form.terms], axis=1))
     target, errors = rest.beyond(rest.residual_n), []
     for phase in range(len(binned.phases)):
@@ -320,7 +333,7 @@ def test_the_share_left_out_is_that_of_fits_without_each_phase() -> None:
 
 def test_the_same_seed_gives_the_same_form() -> None:
     fit = known_fit(4, drifting)
-    one, two = propose_form(fit, toy.MOTION, 7), propose_form(fit, toy.MOTION, 7)
+    one, two = propose_form(fit, closed_form_model.MOTION, 7), propose_form(fit, closed_form_model.MOTION, 7)
     assert one.sentence == two.sentence
     np.testing.assert_array_equal(one.force_n, two.force_n)
 
@@ -335,9 +348,11 @@ def test_memory_of_a_ramp_and_hold_is_the_closed_form() -> None:
 
 def test_terms_are_in_si_and_averaged_over_bins() -> None:
     fit = known_fit(0)
-    rest, binned = unexplained(fit, toy.MOTION), fit.log_posterior.binned
-    terms = {t.name: t for t in library(rest, binned.edges_s, binned.phases, toy.MOTION)}
-    np.testing.assert_allclose(terms["displacement"].values, toy.MOTION.at(binned.time_s), atol=1e-6)
+    rest, binned = unexplained(fit, closed_form_model.MOTION), fit.log_posterior.binned
+    terms = {t.name: t for t in library(rest, binned.edges_s, binned.phases, closed_form_model.MOTION)}
+    np.testing.assert_allclose(
+        terms["displacement"].values, closed_form_model.MOTION.at(binned.time_s), atol=1e-6
+    )
     np.testing.assert_allclose(terms["time"].values, binned.time_s, atol=1e-9)
     assert set(np.round(terms["speed"].values, 9)) == {-9e-4, 0.0, 9e-4}
 
@@ -345,13 +360,15 @@ def test_terms_are_in_si_and_averaged_over_bins() -> None:
 def test_the_figure_says_what_is_unexplained() -> None:
     fit = known_fit(0, drifting)
     binned = fit.log_posterior.binned
-    figure = figure_discrepancy(binned, toy.MOTION, discrepancy(fit, toy.MOTION))
+    figure = figure_discrepancy(binned, closed_form_model.MOTION, discrepancy(fit, closed_form_model.MOTION))
     assert figure.get_suptitle().startswith("The model leaves 3.")
     assert "rises with time" in figure.get_supxlabel().replace("\n", " ")
     assert [ax.get_xlabel() for ax in figure.axes] == [
-        "time [s]", "displacement [mm]", "time since the corner [s]"
+        "time [s]", "displacement [mm]", "time since the start of the phase [s]"
     ]  # fmt: skip
-    nothing = figure_discrepancy(binned, toy.MOTION, discrepancy(known_fit(0), toy.MOTION))
+    nothing = figure_discrepancy(
+        binned, closed_form_model.MOTION, discrepancy(known_fit(0), closed_form_model.MOTION)
+    )
     assert "nothing" in nothing.get_suptitle()
 
 
@@ -359,6 +376,6 @@ def test_windows_that_were_fitted_are_all_that_is_described() -> None:
     fit = known_fit(0, drifting)
     half = dataclasses.replace(fit.log_posterior, fit_windows=((0.0, 45.0), (65.0, 105.0)))
     part = dataclasses.replace(fit, log_posterior=half)
-    found = discrepancy(part, toy.MOTION)
+    found = discrepancy(part, closed_form_model.MOTION)
     assert len(found.mean_n) == len(found.bins) == 85
-    assert len(figure_discrepancy(half.binned, toy.MOTION, found).axes) == 3
+    assert len(figure_discrepancy(half.binned, closed_form_model.MOTION, found).axes) == 3

@@ -44,7 +44,7 @@ def own(tmp_path: Path) -> Path:
     displacement_m = np.interp(time_s, [0.0, 5.0, 15.0, 40.0, 50.0, 60.0], [0.0, 0.0, 7e-3, 7e-3, 0.0, 0.0])
     noise_n = 0.002 * np.random.default_rng(1).standard_normal(len(time_s))
     path = tmp_path / "own.h5"
-    note = "column 'F\x07 [N]\n]#' taken as force, N"
+    note = "column 'F\x07 [N]\n]#' read as force, in N"
     storage.save(
         path, Recording(time_s, displacement_m, 30 * displacement_m + noise_n, "own", "0" * 64, (note,))
     )
@@ -72,8 +72,8 @@ def test_an_unknown_protocol_gets_a_design_of_its_own(own: Path) -> None:
     assert (said["surrogate"], config.surrogate.file) == (None, None)
     assert config == Config(name="own", recording=RecordingConfig(file="own.h5"), design=REDUCED)
     text = own.with_suffix(".toml").read_text()
-    assert "# 416 by the reduced model article-device-reduced.h5" in text
-    assert "and 12 by the full model, which correct them: 1 to 3 minutes with 2 workers." in text
+    assert "# 416 runs of the reduced model article-device-reduced.h5" in text
+    assert "and 12 runs of the full model, which correct them: 1 to 3 minutes with 2 workers." in text
 
 
 def test_a_device_without_a_reduced_model_gets_a_design_of_full_runs(own: Path) -> None:
@@ -81,7 +81,7 @@ def test_a_device_without_a_reduced_model_gets_a_design_of_full_runs(own: Path) 
     device.write_text("[device]\ngauge_mm = 30.0\n")
     new_config(own, device=device)
     assert load_config(own.with_suffix(".toml")).design == DesignConfig()
-    assert "# 336 runs of some 4 to 15 s each, 11 to 42 minutes with 2 workers." in (
+    assert "# 336 runs of about 4 to 15 s each, 11 to 42 minutes with 2 workers." in (
         own.with_suffix(".toml").read_text()
     )
 
@@ -115,7 +115,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 def test_nothing_is_written_over(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = own.with_suffix(".toml")
     out.write_text("mine")
-    assert "own.toml: found a file that is there already" in refused(capsys, "new", own)
+    assert "own.toml: found a file that exists already" in refused(capsys, "new", own)
     assert out.read_text() == "mine"
 
 
@@ -157,7 +157,7 @@ def test_without_a_recording_it_is_the_demo(tmp_path: Path) -> None:
     assert run.config == load_config(shipped("runs/demo.toml")).model_copy(
         update={"recording": run.config.recording}
     )
-    with pytest.raises(InputError, match="there already"):
+    with pytest.raises(InputError, match="exists already"):
         new_demo(tmp_path / "other.toml")
     assert not (tmp_path / "other.toml").exists()
 
@@ -191,7 +191,7 @@ def test_a_window_without_a_bin_is_refused_before_anything_is_run(own: Path) -> 
     ("change", "says"),
     [
         ({"waves": None}, "manifest: waves: found None"),
-        ({"parameters": {}}, "manifest: parameters: found others"),
+        ({"parameters": {}}, "manifest: parameters: found other parameters"),
     ],
     ids=["no waves", "no box"],
 )

@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from browser import NAMES, Browser, found
-from finished_run import facts
+from toys.browser import NAMES, Browser, found
+from toys.finished_run import facts
 
 from bayeskin.report.page import render_page
-from bayeskin.report.page.figures import _KNOWN
+from bayeskin.report.page.figures import FIGURES
 
 CHARTS = ["history", "residual", "indices-prior-gp"]
 UNFOLD = "document.querySelectorAll('details').forEach((d) => { d.open = true; })"
@@ -43,7 +43,7 @@ def test_the_page_fits_its_width_and_a_browser_has_nothing_to_complain_of(
     assert shown.ask("innerWidth") == width
     assert shown.ask(SCROLLED_WIDTH) <= width
     drawn = shown.ask("[...document.querySelectorAll('figure svg')].map((s) => [s.id, s.clientHeight])")
-    assert len(drawn) == len(_KNOWN) + len(CHARTS)
+    assert len(drawn) == len(FIGURES) + len(CHARTS)
     assert [key for key, height in drawn if height < 50] == []
     ink, paper = (
         sum(map(int, re.findall(r"\d+", shown.ask(f"getComputedStyle(document.body).{name}"))))
@@ -113,7 +113,7 @@ def test_every_figure_is_enlarged_and_comes_back(shown: Browser, page: Path) -> 
       }
       return told;
     })()""")
-    assert len(said) == len(_KNOWN) + len(CHARTS)
+    assert len(said) == len(FIGURES) + len(CHARTS)
     assert [key for key, wider, back in said if not (wider and back)] == []
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import stats
-from toy_inference import line_problem
+from toys.inference_problems import line_problem
 
 from bayeskin.config import load_config, parameter_space, to_toml
 from bayeskin.errors import InputError
@@ -199,7 +199,7 @@ def test_a_joint_prior_that_cannot_be_is_refused(tmp_path: Path, text: str, says
 def test_correlations_that_cannot_hold_together_are_refused():
     three = [Parameter(name, "Pa", -9.0, 9.0, "normal") for name in "abc"]
     pairs = (Correlation("a", "b", 0.9), Correlation("b", "c", 0.9), Correlation("a", "c", -0.9))
-    with pytest.raises(InputError, match="correlations that can hold together"):
+    with pytest.raises(InputError, match="correlations that form a positive definite matrix"):
         ParameterSpace(tuple(three), pairs)
 
 
@@ -215,8 +215,8 @@ def test_a_configuration_states_a_prior_and_its_source(tmp_path: Path):
     [
         ('prior = "normal"\nmean = 1e5', "prior: found mean; expected mean and sd"),
         ('prior = "log-normal"', "prior: found none of its numbers; expected factor and median"),
-        ("mean = 1e5\nsd = 1e4", "prior: found mean, sd; expected these with a normal prior only"),
-        ('prior = "normal"\nmean = 5e6\nsd = 1e4', "found a prior about 5e+06 Pa; expected 10000 to 2e+06"),
+        ("mean = 1e5\nsd = 1e4", "prior: found mean, sd; expected them only with a normal prior"),
+        ('prior = "normal"\nmean = 5e6\nsd = 1e4', "a prior centred at 5e+06 Pa; expected 10000 to 2e+06"),
     ],
 )
 def test_a_prior_without_its_numbers_is_refused(tmp_path: Path, text: str, says: str):

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.linalg import toeplitz
-from skin_test import (
+from toys.synthetic_recordings import (
     INTERVAL_S,
     KINDS,
     MOTION,
@@ -19,7 +19,7 @@ from skin_test import (
 )
 
 from bayeskin.errors import InputError
-from bayeskin.mismatch.fit import QUICK_S, without_swings
+from bayeskin.mismatch.noise_bounds import QUICK_S, without_swings
 from bayeskin.recordings import (
     NoiseAnalysis,
     analyse,
@@ -320,7 +320,7 @@ def test_a_recording_too_coarse_to_tell_noise_is_refused() -> None:
     time_s = np.arange(0.0, 130.0, 1.0)
     made = recording(true_force(time_s), MOTION, time_s)
     phases = tuple(Phase("hold", 1, a, a + 10.0) for a in np.arange(0.0, 130.0, 10.0))
-    with pytest.raises(InputError, match="to know their noise"):
+    with pytest.raises(InputError, match="to estimate their noise"):
         phase_noise(made, phases)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from skin_test import (
+from toys.synthetic_recordings import (
     CORNERS_S,
     KINDS,
     MOTION,
@@ -19,13 +19,7 @@ from skin_test import (
 )
 
 from bayeskin.errors import InputError
-from bayeskin.recordings import (
-    idealised_motion,
-    motion_of,
-    recorded_motion,
-    resolution_m,
-    segment,
-)
+from bayeskin.recordings import idealised_motion, motion_of, recorded_motion, resolution_m, segment
 from bayeskin.recordings.polyline import simplify
 from bayeskin.types import PadMotion, Phase, Recording
 

@@ -10,7 +10,7 @@ import openpyxl
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from skin_test import article_recording
+from toys.synthetic_recordings import article_recording
 
 from bayeskin import storage
 from bayeskin.errors import InputError
@@ -82,7 +82,7 @@ def test_text_in_any_usual_dress_gives_the_same_recording(
     recording = read_recording(path)
     assert_is_the_test(recording)
     assert recording.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
-    assert "column 'Déplacement (mm)' taken as displacement, mm" in recording.notes
+    assert "column 'Déplacement (mm)' read as displacement in mm" in recording.notes
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_units_may_stand_in_a_row_of_their_own_below_a_preamble(tmp_path: Path) 
 def test_a_unit_left_out_is_taken_where_only_one_fits_and_asked_for_where_not(tmp_path: Path) -> None:
     recording = read_recording(written(tmp_path / "a.csv", [["time", "disp", "force"], *ROWS]))
     assert_is_the_test(recording)
-    assert any("the unit that fits the numbers" in note for note in recording.notes)
+    assert any("which fits the numbers" in note for note in recording.notes)
     ambiguous = [[t, u, str(50 * float(f))] for t, u, f in ROWS]  # up to 19: newtons, or millinewtons
     with pytest.raises(InputError, match=r"'force'.* fit N and mN; expected the unit in the header"):
         read_recording(written(tmp_path / "b.csv", [["time", "disp", "force"], *ambiguous]))
@@ -134,7 +134,7 @@ def test_further_columns_and_rates_are_named_and_ignored(tmp_path: Path) -> None
     path = written(tmp_path / "a.csv", [[*HEADER, "Displacement rate (mm/s)", "note"], *rows])
     recording = read_recording(path)
     assert_is_the_test(recording)
-    assert "columns ignored: 'Displacement rate (mm/s)', 'note'" in recording.notes
+    assert "ignored columns: 'Displacement rate (mm/s)', 'note'" in recording.notes
 
 
 def test_a_clock_that_starts_late_is_shifted_and_noted(tmp_path: Path) -> None:
@@ -232,7 +232,7 @@ def test_a_force_against_the_pull_is_remarked(tmp_path: Path) -> None:
 
 def test_a_sheet_of_a_text_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path / "a.csv", [HEADER, *ROWS], ";")
-    with pytest.raises(InputError, match=r"sheet 'Test 3': found ending '.csv'; expected a workbook"):
+    with pytest.raises(InputError, match=r"sheet 'Test 3': found the ending '.csv'; expected a workbook"):
         read_recording(path, sheet="Test 3")
 
 
@@ -260,7 +260,7 @@ def test_a_file_that_is_absent_or_a_folder_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("ending", [".csv", ".xlsx", ".h5", ""])
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path, ending: str) -> None:
     os.mkfifo(tmp_path / f"pipe{ending}")
-    with pytest.raises(InputError, match="found a pipe or a device, no file; expected a recording"):
+    with pytest.raises(InputError, match="found a pipe or a device instead of a file; expected a recording"):
         read_recording(tmp_path / f"pipe{ending}")
 
 
@@ -273,7 +273,7 @@ def test_a_file_beyond_memory_is_refused_before_it_is_read(tmp_path: Path) -> No
 
 def test_bins_beyond_memory_are_refused() -> None:
     for width_s, end_s in ((1e-9, 130.0), (1e-320, 130.0), (0.5, 1e300), (0.5, np.nan)):
-        with pytest.raises(InputError, match=r"bin_width_s: found .*; expected bins so wide"):
+        with pytest.raises(InputError, match=r"bin_width_s: found .*; expected a width that gives fewer"):
             uniform_edges(end_s, width_s)
 
 
@@ -354,8 +354,10 @@ def test_the_articles_recording_is_read_whole() -> None:
     assert recording.displacement_m.max() == pytest.approx(9.46e-3)
     assert recording.force_n[0] == -0.077
     assert recording.notes == tuple(
-        f"column {name} taken as {what}"
+        f"column {name} read as {what}"
         for name, what in (
-            ("'Temps (s)'", "time, s"), ("'Deplacement (mm)'", "displacement, mm"), ("'RF (N)'", "force, N")
+            ("'Temps (s)'", "time in s"),
+            ("'Deplacement (mm)'", "displacement in mm"),
+            ("'RF (N)'", "force in N"),
         )
     )  # fmt: skip

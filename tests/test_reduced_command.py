@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bayeskin import cli
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.shipped import shipped
@@ -18,19 +16,6 @@ from bayeskin.workflow.reducing import SHIPPED, default_path, reduced_file
 
 DEVICE = "[device]\ngauge_mm = 30\n"
 NEAR = "[tissue]\ncutis_mm = 2.3\nsubcutis_mm = 6\narm_radius_mm = 44\n"
-
-
-@pytest.fixture
-def bayeskin(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Runs the command; gives exit code, stdout and stderr."""
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as stop:
-            cli.main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return int(stop.value.code or 0), captured.out, captured.err
-
-    return call
 
 
 def test_a_reduced_run_is_near_the_full_one_and_says_how_near(bayeskin, tmp_path) -> None:

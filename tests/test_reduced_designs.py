@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import toy_model
-from toy import MOTION, toy_force
+from toys import stand_in_model
+from toys.closed_form_model import MOTION, toy_force
 from toys.small_reduced import hollow
 
 from bayeskin import cli, report, storage
@@ -54,7 +54,7 @@ class ToyReduced(ReducedOrFull):
 
     def __call__(self, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
         spec = replace(self.full.spec, refinement=1)
-        return replace(toy_model.simulate(spec, motion, theta), model_hash=self.hash)
+        return replace(stand_in_model.simulate(spec, motion, theta), model_hash=self.hash)
 
 
 @pytest.fixture(autouse=True)
@@ -68,8 +68,8 @@ def ships(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPa
 def measured(where: Path, largest_m: float = float(MOTION.displacement_m.max())) -> Path:
     """A configuration whose waves a reduced model makes, with its recording."""
     time_s = np.arange(0.0, 130.001, 0.1)
-    force_n = toy_model.SCALE * toy_force(np.array([list(TRUE.values())]), time_s)[0]
-    force_n = toy_model.finer(3, TRUE) * force_n
+    force_n = stand_in_model.SCALE * toy_force(np.array([list(TRUE.values())]), time_s)[0]
+    force_n = stand_in_model.finer(3, TRUE) * force_n
     force_n += 0.02 * np.random.default_rng(5).standard_normal(len(time_s))
     displacement_m = MOTION.at(time_s) * largest_m / MOTION.displacement_m.max()
     storage.save(where / "measured.h5", Recording(time_s, displacement_m, force_n, "toy", "0" * 64))
@@ -92,9 +92,9 @@ def test_a_run_with_a_reduced_design_is_corrected_by_the_full_model(
 ) -> None:
     case = measured(tmp_path)
     monkeypatch.setattr(report, "save_figure", lambda figure, stem, provenance: None)
-    monkeypatch.setattr(model, "FullModel", toy_model.ToyModel)
+    monkeypatch.setattr(model, "FullModel", stand_in_model.ToyModel)
     monkeypatch.setattr(model, "ReducedOrFull", ToyReduced)
-    monkeypatch.setattr(maximum, "simulate", toy_model.simulate)
+    monkeypatch.setattr(maximum, "simulate", stand_in_model.simulate)
     stages.run(case, "map", Silent())
     run = open_run(case, Silent())
     waves, fine = (storage.load(run.at("design", f"{name}.h5"), Design) for name in ("design", "fine"))
@@ -106,7 +106,7 @@ def test_a_run_with_a_reduced_design_is_corrected_by_the_full_model(
     assert np.median(left_n[waves.wave == 2]) < 0.7 * np.median(left_n[waves.wave == 1])
     assert (fine.training.sum(), fine.testing.sum()) == (few.fine_points, few.fine_held_out)
     check = json.loads(run.at("map", "stage.json").read_text())["summary"]["checks"][-1]
-    assert check["rms_n"] < 0.005 * toy_model.SCALE * 2000  # the toy's coarsest mesh is off by 3 %
+    assert check["rms_n"] < 0.005 * stand_in_model.SCALE * 2000  # the toy's coarsest mesh is off by 3 %
     hollow(tmp_path / "mine-reduced.h5", size=2.0)
     assert standing(run, stages.STAGES)["design"][0] == "out of date"
     assert waves_model(run).hash != waves.model_hash
@@ -115,12 +115,12 @@ def test_a_run_with_a_reduced_design_is_corrected_by_the_full_model(
 def test_the_full_model_runs_where_the_reduced_one_was_not_trained(
     ships: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    waves = ReducedOrFull(ships, toy_model.ToyModel(ModelSpec()))
+    waves = ReducedOrFull(ships, stand_in_model.ToyModel(ModelSpec()))
     found = pickle.loads(pickle.dumps(waves))(MOTION, STIFF)
-    right = toy_model.simulate(ModelSpec(), MOTION, STIFF)
+    right = stand_in_model.simulate(ModelSpec(), MOTION, STIFF)
     np.testing.assert_array_equal(found.force_n, right.force_n)
     assert (found.status, found.model_hash) == ("ok", waves.hash)
-    assert found.message == "run by the full model: E_c is 3e+06, trained 10000 to 2e+06"
+    assert found.message == "run by the full model: E_c is 3e+06, not within 10000 to 2e+06"
     inside = replace(right, stats={"inside": 1.0}, force_n=2.0 * right.force_n)
     monkeypatch.setattr(design_model, "simulate_reduced", lambda *arguments, **more: inside)
     found = waves(MOTION, TRUE)
@@ -154,12 +154,12 @@ def test_the_reduced_model_of_the_very_geometry_goes_first(ships: Path, tmp_path
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"refinement = 3": 'mesh = "skin.msh"'}, "bricks of refinement 1 or more"),
-        ({"refinement = 3": 'mesh = "skin.msh"\nobservation = "article"'}, "bricks of refinement 1 or more"),
-        ({"refinement = 3": "refinement = 0"}, "bricks of refinement 1 or more"),
-        ({"refinement = 3": 'forward = "own.py:force"'}, "none: it is the full model's"),
+        ({"refinement = 3": 'mesh = "skin.msh"'}, "bricks with refinement 1 or more"),
+        ({"refinement = 3": 'mesh = "a.msh"\nobservation = "article"'}, "bricks with refinement 1 or more"),
+        ({"refinement = 3": "refinement = 0"}, "bricks with refinement 1 or more"),
+        ({"refinement = 3": 'forward = "own.py:force"'}, "none, because it concerns the full model"),
         ({'"reduced"': '"redced"'}, "design.coarse"),
-        ({"[map]": "[tissue]\ncutis_mm = 4.0\n[map]"}, "one that `bayeskin reduce` makes"),
+        ({"[map]": "[tissue]\ncutis_mm = 4.0\n[map]"}, "a reduced model that `bayeskin reduce` makes"),
     ],
     ids=["gmsh", "article", "coarsest", "own", "misspelt", "device"],
 )
@@ -179,8 +179,8 @@ def test_a_protocol_beyond_the_training_is_refused(
 ) -> None:
     case = measured(tmp_path, 12e-3)
     line = refused(capsys, "design", case)
-    assert "design.coarse: found 'reduced' on a protocol that article-device-reduced.h5 does not know" in line
-    assert "the pads open by 12.00 mm, trained up to 10 mm" in line
+    assert "design.coarse: found 'reduced' on a protocol that article-device-reduced.h5 was not" in line
+    assert "the pads open by 12.00 mm, more than the trained 10 mm" in line
 
 
 def test_new_takes_the_reduced_model_where_it_knows_device_and_protocol(tmp_path: Path) -> None:

@@ -187,7 +187,7 @@ def test_a_run_that_is_inside_out_between_its_points_has_failed(model, monkeypat
     found = simulate_reduced(model, MOTION, THETA, (), estimate=True)
     assert found.status == "failed"
     assert found.stats["inside"] == 0.0
-    assert "inside out; run the full model" in found.message
+    assert "the mesh is inverted between the cubature points; run the full model" in found.message
 
 
 def test_full_runs_are_made_once(model, folder) -> None:

@@ -18,7 +18,7 @@ from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import catalogue
 from bayeskin.reduced.basis import inner_products, pod, weighted_modes
 from bayeskin.reduced.cases import BASE, SETS, Protocols, Trained, random_motion
-from bayeskin.reduced.cubature import CubatureSettings, _tested, choose_points
+from bayeskin.reduced.cubature import CubatureSettings, choose_points, rows_of_state
 from bayeskin.reduced.library import Library, Modes, modes_beyond, modes_of, scaled_basis
 from bayeskin.reduced.model import reduced_space
 from bayeskin.reduced.operators import Rule, linear_parts, point_fields, whole_linear_parts
@@ -130,7 +130,7 @@ def test_a_full_run_that_fails_at_once_is_kept_without_modes(problem, inner, mon
         ({"E_c": 5e6}, (), Geometry(), MOTION, "E_c is 5e+06"),
         ({}, ("fluid-leakage",), Geometry(), MOTION, "mechanism fluid-leakage was not trained"),
         ({}, (), Geometry(cutis_m=4e-3), MOTION, "cutis is 4 mm"),
-        ({}, (), Geometry(gauge_m=30e-3), MOTION, "pads, guard or load cell"),
+        ({}, (), Geometry(gauge_m=30e-3), MOTION, "the pads, the guard or the load cell differ"),
         ({}, (), Geometry(arm_radius_m=None), MOTION, "flat"),
         ({}, (), Geometry(), PadMotion(np.array([0.0, 9.0]), np.array([0.0, 12e-3])), "open by 12.00 mm"),
         ({}, (), Geometry(), PadMotion(np.array([0.0, 9.0]), np.array([0.0, -1e-3])), "pushed together"),
@@ -232,7 +232,7 @@ def test_a_state_beyond_all_measure_outweighs_no_other(problem, inner) -> None:
     own, dual = CubatureSettings(), np.ones(shape[1])
     integrand = np.random.default_rng(2).standard_normal(shape)
     rows = {
-        size: _tested(size * integrand, dual, at, 1.0, own, np.random.default_rng(3))
+        size: rows_of_state(size * integrand, dual, at, 1.0, own, np.random.default_rng(3))
         for size in (1.0, 10.0, 1e9)
     }
     norms = {size: np.linalg.norm(r, axis=1).max() for size, r in rows.items()}

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import toy_model
-from toy import MOTION, SPACE, toy_force
+from toys import stand_in_model
+from toys.closed_form_model import MOTION, SPACE, toy_force
 
 from bayeskin import report, storage
 from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data
@@ -58,7 +58,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder in which the run was interrupted at the full model's check, and then finished."""
     where = tmp_path_factory.mktemp("toy")
     time_s = np.arange(0.0, 130.001, 0.1)
-    force_n = toy_model.SCALE * toy_force(np.array([list(TRUE.values())]), time_s)[0]
+    force_n = stand_in_model.SCALE * toy_force(np.array([list(TRUE.values())]), time_s)[0]
     noise_n = 0.003 * np.random.default_rng(5).standard_normal(len(time_s))
     recording = Recording(time_s, MOTION.at(time_s), force_n + noise_n, "toy", "0" * 64)
     storage.save(where / "measured.h5", recording)
@@ -73,11 +73,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "save_figure", drawn)  # rendering is most of a small run's time
-        patch.setattr(model, "FullModel", toy_model.ToyModel)
+        patch.setattr(model, "FullModel", stand_in_model.ToyModel)
         patch.setattr(maximum, "simulate", interrupted)
         with pytest.raises(KeyboardInterrupt):
             stages.run(where / "case.toml", None, Silent())
-        patch.setattr(maximum, "simulate", toy_model.simulate)
+        patch.setattr(maximum, "simulate", stand_in_model.simulate)
         patch.setattr(design, "run_wave", interrupted)  # must not be needed again
         answer = stages.run(where / "case.toml", None, Silent())
     (where / "answer.json").write_text(json.dumps(answer, allow_nan=False))
@@ -204,7 +204,7 @@ def test_the_full_model_weighs_draws_of_the_posterior(folder: Path) -> None:
 
 
 @dataclass(frozen=True)
-class Steeper(toy_model.ToyModel):
+class Steeper(stand_in_model.ToyModel):
     """The toy whose force depends more on E_c."""
 
     about_pa: float
@@ -259,7 +259,7 @@ def test_longer_sampling_repeats_no_stage_before_it_and_keeps_the_chains(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(report, "save_figure", lambda *arguments: None)
-    monkeypatch.setattr(model, "FullModel", toy_model.ToyModel)
+    monkeypatch.setattr(model, "FullModel", stand_in_model.ToyModel)
     chains = list((folder / "case" / "chains").iterdir())
     (folder / "case.toml").write_text(CONFIG.format(steps=600))
     answer = stages.run(folder / "case.toml", "sample", Silent())

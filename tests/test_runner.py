@@ -3,48 +3,30 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import time
-import zlib
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-import toy_runs
-from toy import SPACE, toy_bin_means, toy_simulate
-from toy_runs import COARSE_S, WAVE
+from toys import unreliable_models
+from toys.closed_form_model import SPACE, toy_bin_means, toy_simulate
+from toys.design_runs import SHORT, assert_same_rows, run
+from toys.unreliable_models import COARSE_S, WAVE
 
 from bayeskin import runner, storage
-from bayeskin.design import Wave, first_wave
+from bayeskin.design import first_wave
 from bayeskin.errors import InputError
 from bayeskin.execution import local as workers
 from bayeskin.execution.local import local
-from bayeskin.journal import Journal, Run
+from bayeskin.journal import Journal
 from bayeskin.runner import add_points, load_design, load_waves, run_design
 from bayeskin.types import Design
 
 HERE = Path(__file__).parent
-SHORT = replace(WAVE, theta=WAVE.theta[:4], held_out=WAVE.held_out[:4])
-
-
-def run(
-    path: Path, wave: Wave = WAVE, simulate: object = toy_simulate, workers: int = 1, **options: object
-) -> Design:
-    return run_design(path, wave, COARSE_S, simulate, "toy", local(workers), **options)
-
-
-def assert_same_rows(found: Design, expected: Design) -> None:
-    """Equal bit by bit, durations excepted."""
-    for name in ("edges_s", "theta", "force_n", "wave", "held_out", "ok"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
-    assert found.space == expected.space
-    assert (found.messages, found.seed, found.model_hash) == (
-        expected.messages, expected.seed, expected.model_hash,
-    )  # fmt: skip
 
 
 def assert_one_file(path: Path) -> None:
@@ -61,9 +43,9 @@ def serial(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Design:
-    """The program of toy_runs, never interrupted, with one worker."""
+    """The program of unreliable_models, never interrupted, with one worker."""
     path = tmp_path_factory.mktemp("whole") / "design.h5"
-    toy_runs.main(str(path), workers=1, seconds=0.0)
+    unreliable_models.main(str(path), workers=1, seconds=0.0)
     assert_one_file(path)
     return load_design(path)
 
@@ -82,7 +64,7 @@ def test_rows_are_the_points_and_the_models_bin_means(whole: Design) -> None:
 
 def test_order_and_workers_leave_no_trace(tmp_path: Path, whole: Design) -> None:
     path = tmp_path / "design.h5"
-    toy_runs.main(str(path), workers=3, seconds=0.02)
+    unreliable_models.main(str(path), workers=3, seconds=0.02)
     assert_same_rows(load_design(path), whole)
     assert_one_file(path)
 
@@ -90,7 +72,7 @@ def test_order_and_workers_leave_no_trace(tmp_path: Path, whole: Design) -> None
 def kill_until_done(path: Path, workers: int, kills: int, rng: np.random.Generator) -> None:
     """Starts the program, kills it at a random moment, again and again; at last lets it finish."""
     paths = os.pathsep.join([str(HERE), str(HERE.parent)])
-    command = [sys.executable, str(HERE / "toy_runs.py"), str(path), str(workers), "0.15"]
+    command = [sys.executable, str(HERE / "toys/unreliable_models.py"), str(path), str(workers), "0.15"]
     environment = {**os.environ, "PYTHONPATH": paths}
     for _ in range(kills):
         program = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE)
@@ -140,7 +122,7 @@ def test_a_kill_at_each_step_of_the_fold_loses_nothing(
 
     path, calls = tmp_path / "design.h5", tmp_path / "calls"
     calls.mkdir()
-    simulate = partial(toy_runs.counted, folder=str(calls))
+    simulate = partial(unreliable_models.counted, folder=str(calls))
     first = replace(WAVE, theta=WAVE.theta[:3], held_out=WAVE.held_out[:3])
     with monkeypatch.context() as patch:
         patch.setattr(owner, name, dies)
@@ -158,7 +140,7 @@ def test_a_kill_at_each_step_of_the_fold_loses_nothing(
 def test_a_worker_that_dies_loses_only_its_own_point_which_is_run_again(
     tmp_path: Path, whole: Design
 ) -> None:
-    simulate = partial(toy_runs.deadly, folder=str(tmp_path), deaths=2)
+    simulate = partial(unreliable_models.deadly, folder=str(tmp_path), deaths=2)
     design = run(tmp_path / "out" / "design.h5", SHORT, simulate, workers=2)
     assert len(list(tmp_path.glob("*.*"))) == 2 * np.sum(SHORT.theta[:, 0] > 3e5) > 0, "workers did die"
     np.testing.assert_array_equal(design.force_n, whole.force_n[: len(SHORT.theta)])
@@ -166,7 +148,7 @@ def test_a_worker_that_dies_loses_only_its_own_point_which_is_run_again(
 
 
 def test_a_point_that_kills_three_workers_is_a_failed_row(tmp_path: Path) -> None:
-    simulate = partial(toy_runs.deadly, folder=str(tmp_path), deaths=99)
+    simulate = partial(unreliable_models.deadly, folder=str(tmp_path), deaths=99)
     design = run(tmp_path / "out" / "design.h5", SHORT, simulate)
     stiff = SHORT.theta[:, 0] > 3e5
     assert stiff.any()
@@ -179,7 +161,7 @@ def test_a_point_that_kills_three_workers_is_a_failed_row(tmp_path: Path) -> Non
 @pytest.mark.usefixtures("serial")
 def test_failed_runs_are_rows_with_their_message(tmp_path: Path) -> None:
     path = tmp_path / "design.h5"
-    design = run(path, first_wave(SPACE, 24, 0, seed=1), toy_runs.failing)
+    design = run(path, first_wave(SPACE, 24, 0, seed=1), unreliable_models.failing)
     e_c, e_s = design.theta[:, 0], design.theta[:, 1]
     expected = np.where(
         e_c < 3e4, "Newton stalled",
@@ -193,7 +175,12 @@ def test_failed_runs_are_rows_with_their_message(tmp_path: Path) -> None:
     assert not (design.training & ~design.ok).any()
     assert_same_rows(load_design(path), design)
     seen = []
-    run(path, first_wave(SPACE, 24, 0, seed=1), toy_runs.failing, progress=lambda *now: seen.append(now))
+    run(
+        path,
+        first_wave(SPACE, 24, 0, seed=1),
+        unreliable_models.failing,
+        progress=lambda *now: seen.append(now),
+    )
     assert seen == [(24, 24, int((~design.ok).sum()))], "failures are remembered, not run again"
 
 
@@ -201,7 +188,7 @@ def test_failed_runs_are_rows_with_their_message(tmp_path: Path) -> None:
 def test_a_longer_wave_runs_only_what_is_new(tmp_path: Path, whole: Design) -> None:
     path, calls = tmp_path / "design.h5", tmp_path / "calls"
     calls.mkdir()
-    simulate = partial(toy_runs.counted, folder=str(calls))
+    simulate = partial(unreliable_models.counted, folder=str(calls))
     run(path, SHORT, simulate)
     repeated = replace(WAVE, theta=np.tile(WAVE.theta, (2, 1)), held_out=np.tile(WAVE.held_out, 2))
     design = run(path, repeated, simulate)
@@ -228,65 +215,6 @@ def test_progress_counts(tmp_path: Path) -> None:
     run(tmp_path / "design.h5", progress=lambda *now: seen.append(now))
     n = len(WAVE.theta)
     assert seen == [(i, n, 0) for i in range(n + 1)]
-
-
-def test_workers_have_one_thread_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
-    design = run(tmp_path / "design.h5", first_wave(SPACE, 1, 0, seed=1), toy_runs.threads)
-    assert design.messages == ("1,1,1",)
-    assert os.environ["OMP_NUM_THREADS"] == "7"
-    assert "MKL_NUM_THREADS" not in os.environ
-
-
-RUN = Run(WAVE.theta[0], np.arange(3.0) / 7.0, True, "", 1.5)
-LOST = Run(WAVE.theta[1], np.full(3, np.nan), False, "Newton stalled é\n", float("nan"))
-
-
-def test_a_journal_gives_back_what_it_was_given(tmp_path: Path) -> None:
-    path = tmp_path / "j"
-    with Journal(path, "a", bins=3) as journal:
-        journal.append(RUN)
-        journal.append(LOST)
-    with Journal(path, "a", bins=3) as journal:
-        for before, after in zip((RUN, LOST), journal.runs.values(), strict=True):
-            for x, y in zip(before, after, strict=True):
-                np.testing.assert_array_equal(x, y)
-        journal.forget({RUN.theta.tobytes()})
-    with Journal(path, "a", bins=3) as journal:
-        assert list(journal.runs) == [LOST.theta.tobytes()]
-        journal.forget(set(journal.runs))
-    assert not path.exists()
-
-
-def test_a_journal_cut_at_any_byte_keeps_the_whole_lines_and_can_be_continued(tmp_path: Path) -> None:
-    path = tmp_path / "j"
-    with Journal(path, "a", bins=3) as journal:
-        journal.append(RUN)
-        first = path.stat().st_size
-        journal.append(LOST)
-    text = path.read_bytes()
-    for cut in range(first, len(text)):
-        path.write_bytes(text[:cut])
-        with Journal(path, "a", bins=3) as journal:
-            whole_but_for_its_end = cut == len(text) - 1
-            assert len(journal.runs) == (2 if whole_but_for_its_end else 1)
-            journal.append(LOST)
-        with Journal(path, "a", bins=3) as journal:
-            assert list(journal.runs) == [RUN.theta.tobytes(), LOST.theta.tobytes()]
-
-
-def test_a_flipped_bit_in_a_journal_costs_that_run_only(tmp_path: Path) -> None:
-    path = tmp_path / "j"
-    with Journal(path, "a", bins=3) as journal:
-        journal.append(RUN)
-        first = path.stat().st_size
-        journal.append(LOST)
-    text = path.read_bytes()
-    for at in range(0, first - 1):
-        path.write_bytes(text[:at] + bytes([text[at] ^ 1]) + text[at + 1 :])
-        with Journal(path, "a", bins=3) as journal:
-            assert list(journal.runs) == [LOST.theta.tobytes()]
 
 
 @pytest.mark.usefixtures("serial")
@@ -352,16 +280,6 @@ def test_a_file_of_another_design_is_refused_and_left_alone(tmp_path: Path) -> N
     assert path.read_bytes() == b"not HDF5"
 
 
-def test_unfinished_runs_of_another_model_are_refused_and_kept(tmp_path: Path) -> None:
-    journal = tmp_path / "design.h5.journal"
-    with Journal(journal, "of another design", len(COARSE_S) - 1) as other:
-        other.append(RUN)
-    before = journal.read_bytes()
-    with pytest.raises(InputError, match="another model"):
-        run(tmp_path / "design.h5")
-    assert journal.read_bytes() == before
-
-
 @pytest.mark.usefixtures("serial")
 def test_a_simulate_of_another_model_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="model toy"):
@@ -376,67 +294,6 @@ def test_bins_beyond_the_run_are_failures_not_extrapolations(tmp_path: Path) -> 
     assert "covers 0..130 s" in design.messages[0]
 
 
-def interruptible() -> None:
-    """A shell that starts its commands in the background has them ignore Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks processes up in /proc")
-@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGINT])
-def test_workers_end_with_their_parent(tmp_path: Path, ending: signal.Signals) -> None:
-    script = (
-        "import sys, toy_runs; from functools import partial\n"
-        "if __name__ == '__main__':\n"
-        "    simulate = partial(toy_runs.stuck, folder=sys.argv[1])\n"
-        "    toy_runs.run_design(sys.argv[2], toy_runs.WAVE, toy_runs.COARSE_S, simulate, 'toy')\n"
-    )
-    (tmp_path / "program.py").write_text(script)
-    command = [sys.executable, str(tmp_path / "program.py"), str(tmp_path), str(tmp_path / "out" / "d.h5")]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent)])}
-    program = subprocess.Popen(
-        command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        preexec_fn=interruptible,
-    )  # fmt: skip
-    patience = time.monotonic() + 60
-    while len(pids := [int(p.stem) for p in tmp_path.glob("*.pid")]) < 2 and time.monotonic() < patience:
-        time.sleep(0.05)
-    assert len(pids) == 2
-    if ending == signal.SIGINT:
-        os.killpg(program.pid, ending)  # a terminal's Ctrl-C reaches the workers as well
-    else:
-        program.send_signal(ending)
-    _, complaint = program.communicate(timeout=60)
-    while any(alive(pid) for pid in pids) and time.monotonic() < patience:
-        time.sleep(0.05)
-    assert not any(alive(pid) for pid in pids)
-    if ending == signal.SIGINT:
-        assert complaint.rstrip().endswith("KeyboardInterrupt")
-        assert complaint.count("Traceback") == 1, "the workers are silent"
-        assert not list((tmp_path / "out").iterdir())
-
-
-def test_workers_that_cannot_start_are_the_users_to_mend(tmp_path: Path) -> None:
-    script = (
-        "from toy_runs import *\n"
-        "def homemade(theta): return toy_simulate(theta)\n"
-        f"run_design({str(tmp_path / 'd.h5')!r}, WAVE, COARSE_S, homemade, 'toy')\n"
-    )
-    (tmp_path / "unguarded.py").write_text(script)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent)])}
-    done = subprocess.run(
-        [sys.executable, str(tmp_path / "unguarded.py")], env=environment, capture_output=True, text=True
-    )
-    assert "InputError: worker processes" in done.stderr.splitlines()[-1]
-    assert "__main__" in done.stderr.splitlines()[-1]
-
-
 def test_a_design_file_is_an_ordinary_file_of_the_project(tmp_path: Path, whole: Design) -> None:
     storage.save(tmp_path / "copy.h5", whole)
     assert_same_rows(load_design(tmp_path / "copy.h5"), whole)
@@ -449,7 +306,7 @@ def test_a_design_file_is_an_ordinary_file_of_the_project(tmp_path: Path, whole:
     ("name", "value", "says"),
     [
         ("theta", np.zeros((3, 2)), r"theta: found shape \(3, 2\); expected shape"),
-        ("messages", ("",), "messages: found 1 of them"),
+        ("messages", ("",), "messages: found 1 messages"),
         ("edges_s", np.zeros((2, 2)), "edges_s: found shape"),
         ("theta", np.full(WAVE.theta.shape, np.nan), "values that are not finite"),
     ],
@@ -461,16 +318,3 @@ def test_a_design_whose_arrays_do_not_belong_together_is_refused(
     storage.save(tmp_path / "other.h5", replace(made, **{name: value}))
     with pytest.raises(InputError, match=says):
         load_design(tmp_path / "other.h5")
-
-
-@pytest.mark.parametrize(
-    "contents",
-    [b'{"design": "a"}', b"{", b"[]", b"3", b'{"design": "a", "theta": "x", "force_n": null}', b"[" * 9999],
-)
-def test_a_line_with_the_right_checksum_that_is_no_run_is_refused(tmp_path: Path, contents: bytes) -> None:
-    path = tmp_path / "j"
-    path.write_bytes(b"%08x %d %s\n" % (zlib.crc32(contents), len(contents), contents))
-    with pytest.raises(
-        InputError, match=r"j, line 1: found what is no run; expected one that bayeskin wrote"
-    ):
-        Journal(path, "a", bins=3)

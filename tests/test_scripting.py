@@ -111,7 +111,7 @@ def test_draws_by_another_surrogate_are_not_weighed(said: dict[str, Any]) -> Non
     made_of = json.loads(posterior.attrs["provenance"])
     made_of["identity"]["surrogate"] = "of a run that has trained on"
     posterior.attrs["provenance"] = json.dumps(made_of)
-    with pytest.raises(InputError, match="posterior: found one by another surrogate"):
+    with pytest.raises(InputError, match="posterior: found a posterior by another surrogate"):
         bk.check(said["recording"], posterior, 8)
 
 
@@ -149,7 +149,7 @@ def test_numbers_of_numpy_are_settings_too(tmp_path: Path) -> None:
 
 def test_wrong_input_is_one_line() -> None:
     for call in (bk.calibrate, bk.simulate, bk.diagnose):
-        with pytest.raises(InputError, match=r"found str 'data/demo.h5'; expected one of bk.load_recording"):
+        with pytest.raises(InputError, match=r"found str 'data/demo.h5'; expected a recording of bk.load"):
             call("data/demo.h5")
     recording = bk.load_recording(ROOT / "data" / "demo.h5")
     with pytest.raises(InputError, match=r"settings: sample.walker: found an unknown key"):
@@ -166,7 +166,7 @@ def test_wrong_input_is_one_line() -> None:
 def test_a_posterior_of_another_recording_is_refused(said: dict[str, Any]) -> None:
     time_s = np.linspace(0.0, 60.0, 601)
     other = Recording(time_s, 1e-4 * time_s, 0.01 * time_s, "other", "1" * 64)
-    with pytest.raises(InputError, match="that of another recording than other"):
+    with pytest.raises(InputError, match="found the posterior of another recording than other"):
         bk.check(other, said["posterior"])
 
 

@@ -9,8 +9,8 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
-from toys import solved
-from toys.solved import BASE, KNOWN
+from toys import closed_form_reduced
+from toys.closed_form_reduced import BASE, KNOWN
 
 from bayeskin.errors import InputError
 from bayeskin.mismatch.answers import answer, read_answer
@@ -38,7 +38,7 @@ Full = Callable[[Mapping[str, float]], Array | str]
 
 def exact(values: Mapping[str, float]) -> Array:
     """The full model where the reduced one is exact."""
-    return solved.means(values)[0]
+    return closed_form_reduced.means(values)[0]
 
 
 FEW = SearchSettings(skins=8, others=4, tried=1)
@@ -73,8 +73,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Asked]:
     def make(
         seed: int = 0, lost: Callable[[Task], bool] = lambda task: False, full: Full = exact, **values: float
     ) -> Asked:
-        recorded = solved.recorded(seed, **values)
-        return Asked(solved.bench(monkeypatch, recorded, full=full), lost)
+        recorded = closed_form_reduced.recorded(seed, **values)
+        return Asked(closed_form_reduced.bench(monkeypatch, recorded, full=full), lost)
 
     return make
 
@@ -112,7 +112,7 @@ def test_what_is_concealed_is_found(asked: Make, values: dict[str, float], names
             sd = np.sqrt(best.covariance[at, at]) * (high - low)[at]
             assert abs(best.theta[name] - values[name]) < 4.0 * sd
             assert sd < 0.5 * abs(values[name])
-    assert any("promised: " in line for line in one.told)
+    assert any("predicted gains: " in line for line in one.told)
 
 
 @pytest.mark.parametrize("rate", [-9e-4, 9e-4])
@@ -128,7 +128,9 @@ def test_nothing_is_found_where_nothing_is_concealed(asked: Make) -> None:
     for seed in range(3):
         found = asked(seed).search()
         assert found.best.fit.names == ()
-        np.testing.assert_allclose(found.best.fit.mean_n, solved.means(solved.TRUTH)[0], atol=6e-3)
+        np.testing.assert_allclose(
+            found.best.fit.mean_n, closed_form_reduced.means(closed_form_reduced.TRUTH)[0], atol=6e-3
+        )
 
 
 def test_no_task_is_asked_twice_and_only_what_is_taken_is_fitted_from_other_skins(asked: Make) -> None:
@@ -144,7 +146,7 @@ def test_no_task_is_asked_twice_and_only_what_is_taken_is_fitted_from_other_skin
     assert skins == {(), ("force-offset",)}  # both together leave nothing but noise
 
 
-MIDDLE = 0.5 * (solved.EDGES_S[1:] + solved.EDGES_S[:-1])
+MIDDLE = 0.5 * (closed_form_reduced.EDGES_S[1:] + closed_form_reduced.EDGES_S[:-1])
 SHAPE = 3e-3 * np.sin(MIDDLE / 3.0)  # what the reduced model leaves out: RMS twice the noise
 
 
@@ -193,7 +195,7 @@ def test_a_check_in_which_the_full_model_fails_is_told(asked: Make) -> None:
     found = one.search()
     assert found.best.fit.names == ("force-offset",)
     assert found.checks[("force-offset",)].full_n == "the skin folds"
-    assert "force-offset: the full model fails there: the skin folds" in one.told
+    assert "force-offset: the full model fails at the fit: the skin folds" in one.told
 
 
 def test_a_mechanism_that_stood_in_for_others_is_exchanged(asked: Make) -> None:
@@ -275,7 +277,11 @@ def test_a_mechanism_whose_first_fits_fail_is_fitted_from_where_a_probe_ran_or_a
 
 
 @pytest.mark.parametrize(
-    ("kind", "says"), [(RunTask, "no skin that runs;"), (FitTask, "no skin that runs: the worker ended;")]
+    ("kind", "says"),
+    [
+        (RunTask, "no tissue for which the model runs;"),
+        (FitTask, "no tissue for which the model runs: the worker ended;"),
+    ],
 )
 def test_a_recording_on_which_no_skin_runs_is_refused(asked: Make, kind: type, says: str) -> None:
     one = asked(lost=lambda task: isinstance(task, kind))
@@ -288,8 +294,8 @@ def test_priors_without_a_skin_that_can_be_are_refused(monkeypatch: pytest.Monke
     soft, stiff = (replace(p, lower=low, upper=high) for p, low, high in
                    zip(BASE.parameters[:2], (10e3, 200e3), (20e3, 400e3), strict=True))  # fmt: skip
     base = ParameterSpace((soft, stiff, *BASE.parameters[2:]))
-    with pytest.raises(InputError, match="priors: found no skin that runs"):
-        Asked(solved.bench(monkeypatch, solved.recorded(0), base)).search()
+    with pytest.raises(InputError, match="priors: found no tissue for which the model runs"):
+        Asked(closed_form_reduced.bench(monkeypatch, closed_form_reduced.recorded(0), base)).search()
 
 
 def test_further_maxima_are_sought_where_the_force_says_little(asked: Make) -> None:

@@ -4,37 +4,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from toy import SPACE
+from toys.closed_form_model import SPACE
+from toys.ishigami import ONE_BIN, box, ishigami, ishigami_indices
 
 from bayeskin.errors import InputError
-from bayeskin.sensitivity.sobol import (
-    error_draws,
-    pick_freeze,
-    projection,
-    sentence,
-    sobol,
-    uninformed,
-)
+from bayeskin.sensitivity.sobol import error_draws, pick_freeze, projection, sentence, sobol, uninformed
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_surrogate
-from bayeskin.types import Parameter, ParameterSpace, Prediction
+from bayeskin.types import ParameterSpace, Prediction
 
-ONE_BIN = np.array([0.0, 1.0])
 METHODS = [pick_freeze, projection]
-
-
-def box(dim, lower, upper):
-    return ParameterSpace(tuple(Parameter(f"x{i}", "", lower, upper, "uniform") for i in range(dim)))
-
-
-def ishigami(x):
-    return (np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0]))[:, None]
-
-
-def ishigami_indices():
-    one, two, both = 0.5 * (1 + 0.1 * np.pi**4 / 5) ** 2, 49 / 8, 8 * 0.01 * np.pi**8 / 225
-    whole = one + two + both
-    return np.array([one, two, 0]) / whole, np.array([one + both, two, both]) / whole
 
 
 G_WEIGHTS = np.array([0.0, 1.0, 4.5, 9.0, 99.0])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_sensitivity import ONE_BIN, box, ishigami, ishigami_indices
+from toys.ishigami import ONE_BIN, box, ishigami, ishigami_indices
 
 from bayeskin.sensitivity.shapley import shapley
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import toy_model
-from toy import EDGES_S, MOTION, SPACE, toy_bin_means, toy_force
+from toys import stand_in_model
+from toys.closed_form_model import EDGES_S, MOTION, SPACE, toy_bin_means, toy_force
 
 from bayeskin import report, storage
 from bayeskin.design import fine_wave, first_wave, spread_out
@@ -23,7 +23,7 @@ from bayeskin.workflow.engine import Silent
 def designed(refinement: int, theta: np.ndarray, held_out: np.ndarray) -> Design:
     n = len(theta)
     named = [dict(zip(SPACE.names, row, strict=True)) for row in theta]
-    force_n = toy_bin_means(theta) * np.array([[toy_model.finer(refinement, one)] for one in named])
+    force_n = toy_bin_means(theta) * np.array([[stand_in_model.finer(refinement, one)] for one in named])
     return Design(
         SPACE, EDGES_S, theta, force_n, np.zeros(n, dtype=np.int64), held_out,
         np.ones(n, dtype=bool), ("",) * n, np.zeros(n), 1, f"refinement {refinement}",
@@ -145,8 +145,8 @@ TRUE = {"E_c": 200e3, "E_s": 30e3, "k_c": 1e-14, "k_s": 1e-13, "p_init": 300.0}
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     where = tmp_path_factory.mktemp("fine")
     time_s = np.arange(0.0, 130.001, 0.1)
-    force_n = toy_model.SCALE * toy_force(np.array([list(TRUE.values())]), time_s)[0]
-    force_n = toy_model.finer(3, TRUE) * force_n
+    force_n = stand_in_model.SCALE * toy_force(np.array([list(TRUE.values())]), time_s)[0]
+    force_n = stand_in_model.finer(3, TRUE) * force_n
     force_n += 0.02 * np.random.default_rng(5).standard_normal(len(time_s))
     storage.save(where / "measured.h5", Recording(time_s, MOTION.at(time_s), force_n, "toy", "0" * 64))
     (where / "case.toml").write_text(CONFIG)
@@ -156,8 +156,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "save_figure", drawn)
-        patch.setattr(model, "FullModel", toy_model.ToyModel)
-        patch.setattr(maximum, "simulate", toy_model.simulate)
+        patch.setattr(model, "FullModel", stand_in_model.ToyModel)
+        patch.setattr(maximum, "simulate", stand_in_model.simulate)
         stages.run(where / "case.toml", "map", Silent())
     return where / "case"
 
@@ -172,13 +172,13 @@ def test_a_run_with_a_coarse_design_is_checked_against_the_fine_model(folder: Pa
     found = json.loads((folder / "map" / "stage.json").read_text())["summary"]
     assert found["ok"]
     check = found["checks"][-1]
-    assert check["rms_n"] < 0.005 * toy_model.SCALE * 2000  # the coarse model is off by 3 %
+    assert check["rms_n"] < 0.005 * stand_in_model.SCALE * 2000  # the coarse model is off by 3 %
     assert storage.load(folder / "map" / "fine.h5", Design).model_hash == fine.model_hash
 
 
 def test_coarse_bricks_must_be_coarser(tmp_path: Path) -> None:
     (tmp_path / "case.toml").write_text(CONFIG.replace("coarse = 1", "coarse = 3"))
     with pytest.raises(
-        InputError, match=r"case.toml: design.coarse: found 3 .*; expected bricks of a higher"
+        InputError, match=r"case.toml: design.coarse: found 3 .*; expected bricks with a higher"
     ):
         stages.run(tmp_path / "case.toml", "map", Silent())

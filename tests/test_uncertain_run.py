@@ -90,7 +90,7 @@ def test_a_shipped_surrogate_knows_no_length(tmp_path: Path, capsys: pytest.Capt
         cli.main(["run", str(case)])
     assert end.value.code == 2
     last = capsys.readouterr().err.splitlines()[-1]
-    assert "surrogate.file demo.h5: found none of cutis_m" in last
+    assert "surrogate.file demo.h5: found a surrogate without cutis_m" in last
 
 
 def test_new_writes_a_configuration_that_runs(tmp_path: Path) -> None:

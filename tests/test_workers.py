@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from toys.busy import counted, dead_once, met, slept
+from toys.worker_functions import counted, dead_once, met, slept
 
 from bayeskin.execution.local import Lost, standing
 

@@ -85,7 +85,7 @@ def _result(future: Any, distributed: Any) -> Any:
     try:
         return future.result()
     except distributed.KilledWorker as killed:
-        return Lost(f"the worker process ended each time; last: {killed.last_worker}")
+        return Lost(f"the worker process ended in each attempt; last: {killed.last_worker}")
 
 
 def extra(name: str) -> Any:
@@ -95,4 +95,6 @@ def extra(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise InputError("cluster", f"no {name} installed", "pip install '.[cluster]'") from None
+        raise InputError(
+            "cluster", f"no {name} installed", "the packages of `pip install '.[cluster]'`"
+        ) from None

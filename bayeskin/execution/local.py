@@ -129,7 +129,7 @@ def _check_start(false_starts: int, reason: str) -> None:
     if false_starts >= ATTEMPTS:
         raise InputError(
             "worker processes",
-            f"{false_starts} in a row that end before they start ({reason})",
+            f"{false_starts} in a row that ended before they started ({reason})",
             "a model that a fresh interpreter can import, and in a script the guard "
             "`if __name__ == '__main__':`",
         )

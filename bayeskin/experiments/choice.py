@@ -66,7 +66,7 @@ def compete(found: Sequence[Fit], names: Sequence[str], known: Mapping[str, Mech
     """
     fits_of_set = [fit for fit in found if fit.names == tuple(names)]
     if not fits_of_set:
-        expected = "those that `bayeskin diagnose` left: remove the run's folder `diagnose` to make them anew"
+        expected = "the fits that `bayeskin diagnose` stores; remove the run's folder `diagnose` to fit again"
         raise InputError("searches", f"no fit of {', '.join(names) or 'the base model'}", expected)
     best = max(fits_of_set, key=weight)
 
@@ -118,7 +118,7 @@ def weigh(
     Raises InputError for fewer than two hypotheses.
     """
     if len(fits) < 2:
-        raise InputError("hypotheses", f"{len(fits)}", "two at least, each with its fit")
+        raise InputError("hypotheses", f"{len(fits)}", "at least two, each with its fit")
     motion, edges_s = protocol.motion, _bin_edges(protocol.motion, fits[0])
     tasks = [
         OtherProtocolTask(

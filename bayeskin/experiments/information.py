@@ -173,12 +173,12 @@ def _refuse(forces_n: Sequence[Array], noise: Array, prior: Array) -> None:
         raise InputError(
             "hypotheses",
             f"{len(forces_n)} with probabilities {prior}",
-            "two at least, each probability above 0",
+            "at least two, each with a probability above 0",
         )
     for h, forces in enumerate(forces_n):
         if forces.ndim != 2 or len(forces) < FEWEST or forces.shape[1:] != noise.shape[:1]:
             raise InputError(
                 f"hypothesis {h}",
                 f"forces of shape {forces.shape}",
-                f"{FEWEST} draws on {len(noise)} bins at least",
+                f"at least {FEWEST} draws on {len(noise)} bins",
             )

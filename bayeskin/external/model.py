@@ -100,7 +100,7 @@ def simulate_server(url: str, motion: PadMotion, theta: Mapping[str, float]) -> 
         answer = client.evaluate(name, [[next(values) for _ in range(size)] for size in sizes], config)
         force_n, message = np.array(answer), ""
     except Refused as refusal:
-        force_n, message = np.full(len(time_s), np.nan), f"the server: {refusal}"
+        force_n, message = np.full(len(time_s), np.nan), f"the server refused: {refusal}"
     seconds = time.perf_counter() - started
     return _simulation(motion, theta, time_s, force_n, identity(url), seconds, message)
 
@@ -115,10 +115,10 @@ def _simulation(
     message: str = "",
 ) -> Simulation:
     if force_n.shape != time_s.shape:
-        expected = f"({len(time_s)},), a force for each time"
-        raise InputError("the own forward model", f"a force of shape {force_n.shape}", expected)
+        expected = f"shape ({len(time_s)},), one force for each time"
+        raise InputError("your own forward model", f"a force of shape {force_n.shape}", expected)
     if not message and not np.isfinite(force_n).all():
-        message = "the own forward model's force is not finite"
+        message = "the force of your own forward model is not finite"
     return Simulation(
         theta={name: float(value) for name, value in theta.items()},
         time_s=time_s,

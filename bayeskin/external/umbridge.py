@@ -88,7 +88,7 @@ class Client:
         try:
             return [float(value) for vector in answer["output"] for value in vector]
         except (KeyError, TypeError, ValueError):
-            raise InputError(self.url, "an answer without numbers", "output vectors") from None
+            raise InputError(self.url, "an answer without numbers", "vectors of numbers") from None
 
     def _request(self, method: str, path: str, content: Mapping[str, Any] | None) -> dict[str, Any]:
         parts = _checked_url(self.url)
@@ -105,7 +105,7 @@ class Client:
             raise Unavailable(self.url, f"no answer ({error or type(error).__name__})", EXPECTED) from None
         finally:
             connection.close()
-        return _understood(self.url, text)
+        return parsed_answer(self.url, text)
 
 
 def _checked_url(url: str) -> Any:
@@ -116,11 +116,15 @@ def _checked_url(url: str) -> Any:
     except ValueError:  # the port is not a number
         fits = False
     if not fits:
-        raise InputError(url, "no address of a server", expected)
+        raise InputError(url, "an invalid address", expected)
     return parts
 
 
-def _understood(url: str, text: bytes) -> dict[str, Any]:
+def parsed_answer(url: str, text: bytes) -> dict[str, Any]:
+    """Returns the JSON object with which a server answers.
+
+    Raises Refused where the server reports an error, and InputError where the text is no JSON object.
+    """
     try:
         answer = json.loads(text)
     except (ValueError, RecursionError):
@@ -142,7 +146,7 @@ def server(model: Model, host: str, port: int) -> ThreadingHTTPServer:
     try:
         return _Server((host, port), handler)
     except (OSError, OverflowError) as error:
-        raise InputError(f"{host}:{port}", str(error), "an address of this machine, a free port") from None
+        raise InputError(f"{host}:{port}", str(error), "an address of this machine and a free port") from None
 
 
 class _Server(ThreadingHTTPServer):
@@ -168,7 +172,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.path == "/Info":
             self._send(200, {"protocolVersion": VERSION, "models": [self.model.name]})
         else:
-            self._refuse(404, "UnsupportedFeature", f"no {self.path}")
+            self._refuse(404, "UnsupportedFeature", f"no such path: {self.path}")
 
     def do_POST(self) -> None:
         length = self.headers.get("Content-Length", "")
@@ -192,9 +196,9 @@ class _Handler(BaseHTTPRequestHandler):
         except (ValueError, RecursionError):
             request = None
         if not isinstance(request, dict) or not isinstance(request.get("config", {}), dict):
-            raise Refused("the request is no JSON object with a config that is one")
+            raise Refused("the request must be a JSON object, and its config too")
         if request.get("name") != self.model.name:
-            raise Refused(f"no model {request.get('name')!r:.60}; there is {self.model.name!r}")
+            raise Refused(f"no model {request.get('name')!r:.60}; the model here is {self.model.name!r}")
         return request
 
     def _answer(self, path: str, asked: Mapping[str, Any]) -> dict[str, Any]:

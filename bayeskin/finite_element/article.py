@@ -102,7 +102,7 @@ class ArticleModel:
             for on_cell in (self._ref_u, self._ref_p)
         )
         weight = np.abs(volume)[:, None] * self._weight
-        equations = self._equations(x, grad_u, grad_p, weight, dt)
+        equations = self.equations(x, grad_u, grad_p, weight, dt)
         target = self.problem.prescribe(x if guess is None else guess, pad_displacement_m)
         start: Array | None = target
         if guess is None:
@@ -117,7 +117,7 @@ class ArticleModel:
         n = len(corners)
         return corners + (new - old)[: 3 * n].reshape(n, 3)
 
-    def _equations(self, old: Array, grad_u: Array, grad_p: Array, weight: Array, dt: float) -> Equations:
+    def equations(self, old: Array, grad_u: Array, grad_p: Array, weight: Array, dt: float) -> Equations:
         """Returns the equations of a step that starts at `old` (dofs,), with gradients on the mesh there."""
         s, m, pattern = self.problem.space, self.material, self.problem.pattern
 
@@ -244,8 +244,8 @@ def run(
         turns = np.diff(forces)
         if len(turns) == 2 and turns[0] * turns[1] < 0 and np.abs(turns).min() > SWING * largest:
             return (
-                f"the force swings by {np.abs(turns).min():.2g} N a step at t = {time_s[n]:.2f} s, at a "
-                "steady speed of the pads: the article's updated mesh is unstable; try a stiffer subcutis"
+                f"the force oscillates by {np.abs(turns).min():.2g} N per step at t = {time_s[n]:.2f} s "
+                "at constant pad speed: the article's updated mesh is unstable; try a stiffer subcutis"
             )
         x, old_speed = new, speed
         past = [*past, (float(time_s[n]), x)][-EXTRAPOLATION_POINTS:]

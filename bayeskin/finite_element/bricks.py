@@ -75,7 +75,9 @@ def brick_lines(
     if like is None:
         return tuple(1e-3 * np.array(axis) for axis in _lines_mm(refinement, geometry))
     if (like.along_m, like.across_m) != (geometry.along_m, geometry.across_m):
-        raise InputError("geometry", "other pads or another guard", "the lengths of the device it is like")
+        raise InputError(
+            "geometry", "other pads or another guard", "the pads and the guard of the reference device"
+        )
     x, y, z = _lines_mm(refinement, like)
     old, new = ([0.0, _mm(tissue.subcutis_m), _mm(tissue.thickness_m)] for tissue in (like, geometry))
     return 1e-3 * np.array(x), 1e-3 * np.array(y), 1e-3 * np.interp(z, old, new)

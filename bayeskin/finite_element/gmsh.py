@@ -118,7 +118,7 @@ def _check_units(path: Path, points: Array) -> None:
     longest_m = float(np.ptp(points, axis=1).max())
     if longest_m > LONGEST_M:
         expected = "coordinates in metres (in gmsh: Mesh.ScalingFactor = 0.001 before it is saved)"
-        raise InputError(path, f"a length of {longest_m:g}: millimetres, by their looks", expected)
+        raise InputError(path, f"a length of {longest_m:g}, probably in millimetres", expected)
 
 
 def _check_layers(path: Path, points: Array, cells: np.ndarray, solid: _Cells, geometry: Geometry) -> None:
@@ -126,7 +126,7 @@ def _check_layers(path: Path, points: Array, cells: np.ndarray, solid: _Cells, g
     layers = [solid.named[name] for name in GMSH_LAYERS]
     stray = int(np.sum(layers[0] == layers[1]))
     if stray:
-        message = f"{stray} tetrahedra of no layer, or of both"
+        message = f"{stray} tetrahedra in no layer or in both layers"
         raise InputError(path, message, f"each in one of {', '.join(GMSH_LAYERS)}")
     depths = (0.0, geometry.subcutis_m), (geometry.subcutis_m, geometry.thickness_m)
     for name, inside, depth in zip(GMSH_LAYERS, layers, depths, strict=True):
@@ -139,9 +139,11 @@ def _check_guard(path: Path, surface: _Cells, geometry: Geometry) -> None:
     """Raises InputError if the device has no guard but the mesh does, or if guard and pad share triangles."""
     guard = surface.named.get("u_right", np.empty(0, bool))
     if geometry.guard is None and guard.any():
-        raise InputError(f"{path}: u_right", "a guard", "none, as this device has none")
+        raise InputError(f"{path}: u_right", "a guard", "no guard, because this device has none")
     if geometry.guard is not None and (guard & surface.named["right_patch"]).any():
-        raise InputError(f"{path}: u_right", "triangles that are right_patch, too", "pad and guard apart")
+        raise InputError(
+            f"{path}: u_right", "triangles that also belong to right_patch", "separate pad and guard"
+        )
 
 
 def _check_boundary(where: str, points: Array, name: str, geometry: Geometry) -> None:
@@ -166,7 +168,7 @@ def _check_extent(
     ends = float(found_m.min()), float(found_m.max())
     if not np.allclose(ends, expected_m, rtol=0.0, atol=tolerance_m):
         measured, expected = (f"{axis} {1e3 * a:.4g} to {1e3 * b:.4g} mm" for a, b in (ends, expected_m))
-        raise InputError(where, measured, f"{expected}, as the device and the tissue have it")
+        raise InputError(where, measured, f"{expected}, as the device and the tissue require")
 
 
 def _facet_indices(mesh: skfem.Mesh, nodes: np.ndarray) -> np.ndarray:

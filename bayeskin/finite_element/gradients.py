@@ -122,7 +122,7 @@ class ForceGradients:
     ) -> None:  # fmt: skip
         unknown = [name for name in changes if name not in theta]
         if unknown:
-            raise InputError("gradients", unknown[0], f"among {', '.join(theta)}")
+            raise InputError("gradients", unknown[0], f"one of {', '.join(theta)}")
         self.names = tuple(changes)
         self._model, self._follows = model, _scaling_rule(model, theta, changes)
         self._solved = tuple(name for name in changes if not (self._follows and name == "E_c"))
@@ -351,7 +351,7 @@ def _varied(
     bound = tuple(sorted((bind(values, model.problem.sites) for bind in laws), key=lambda law: law.rank))
     drive = on_the_way(model.protocol, bound)
     if drive.starts_s != model.starts_s:
-        raise InputError(f"gradients: {name}", theta[name], "pads that were opened before the test")
+        raise InputError(f"gradients: {name}", theta[name], "a run whose pads are opened before the test")
     return _Varied(model, material(values, model.problem.mesh.cutis), bound, drive)
 
 
@@ -409,7 +409,7 @@ class _ResidualDifferences:
             # a cell has turned inside out, although the unknowns changed by only about a millionth
             if evaluated is None:
                 at_s = self._base.time_s
-                raise FloatingPointError(f"no derivative at t = {at_s:.3f} s: a cell is all but flat")
+                raise FloatingPointError(f"no derivative at t = {at_s:.3f} s: a cell is nearly flat")
             self._columns.append(evaluated)
         self.residual = self._slope(lambda f: f.residual, stage.residual)
 

@@ -107,7 +107,7 @@ class LagrangianModel:
     def __post_init__(self) -> None:
         self.laws = tuple(sorted(self.laws, key=lambda law: law.rank))
         self.drive = on_the_way(self.protocol, self.laws)
-        self._series = SeriesSolver(self.drive)
+        self.series_solver = SeriesSolver(self.drive)
         self.full_residual = np.zeros(self.problem.space.dofs)
         shape = self.problem.space.weight.shape
         self._chunks = assembly.chunks(shape)
@@ -139,11 +139,11 @@ class LagrangianModel:
         """
         if len(past) < 2:
             return
-        way_m = self._pad_of(past[-1]) - self._pad_of(past[-2])
+        way_m = self.pad_displacement_m(past[-1]) - self.pad_displacement_m(past[-2])
         if abs(way_m) > 1e-3 * self.drive.largest_m:
             self._travel = (past[-1].x - past[-2].x) / way_m
 
-    def _pad_of(self, state: State) -> float:
+    def pad_displacement_m(self, state: State) -> float:
         """Returns the displacement of the pads in a state [m]."""
         return float(state.x[3 * self.problem.pads[0]])
 
@@ -338,7 +338,7 @@ class LagrangianModel:
 
         known = self.drive.elements and not (jump or fall)
         expected_m = float(guess[3 * self.problem.pads[0]]) if known else None
-        solved = self._series.solve(time_s, elapsed_s, old.lost, expected_m, first, again)
+        solved = self.series_solver.solve(time_s, elapsed_s, old.lost, expected_m, first, again)
         if solved is None:
             return None
         (x, _), lost = solved
@@ -365,7 +365,7 @@ class LagrangianModel:
         elif not jump:
             x = self.solver.solve(equations, target)
         elif self._travel is not None:
-            ride = self._travel * (pad_m - self._pad_of(old))
+            ride = self._travel * (pad_m - self.pad_displacement_m(old))
             x = self.solver.solve(equations, self.problem.prescribe(guess + ride, pad_m))
         if x is None and jump:
             start = self.solver.respond(equations, guess, target, self.problem.pattern.fixed)

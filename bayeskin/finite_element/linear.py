@@ -69,7 +69,7 @@ class Factorisations(Protocol):
         ...
 
 
-class _Pardiso:
+class Pardiso:
     """Factorisations by MKL PARDISO.
 
     The class calls MKL directly, because the methods of pypardiso allow only double precision and only one
@@ -167,7 +167,7 @@ def _scaled_mean(indptr, indices, own, mirrored, data, scale, out):  # type: ign
             out[k] = 0.5 * (data[own[k]] + data[mirrored[k]]) * scale[row] * scale[indices[k]]
 
 
-class _SuperLU:
+class SuperLU:
     """Factorisations by SuperLU, which scipy includes."""
 
     def __init__(self) -> None:
@@ -198,4 +198,4 @@ def factorisations(symmetric: bool) -> Factorisations:
 
     symmetric : the matrices are nearly symmetric, so that PARDISO may factorise their symmetric part alone
     """
-    return _Pardiso(symmetric) if pypardiso is not None else _SuperLU()
+    return Pardiso(symmetric) if pypardiso is not None else SuperLU()

@@ -65,11 +65,13 @@ class ModelSpec:
 
     def __post_init__(self) -> None:
         if (self.observation == "own") != (self.forward is not None):
-            raise InputError("model.forward", self.forward, "one with observation 'own', and only there")
+            raise InputError(
+                "model.forward", self.forward, "a forward model if the observation is 'own', and only then"
+            )
         if self.observation == "article" and self.mesh == "bricks":
             raise InputError("model.mesh", "bricks", "the article's gmsh mesh for observation 'article'")
         if self.observation != "reaction" and self.geometry != Geometry():
-            given = f"another than the article's, with observation {self.observation!r}"
+            given = f"settings other than the article's, with observation {self.observation!r}"
             raise InputError("geometry", given, "observation 'reaction', or the article's device and tissue")
 
     @property
@@ -110,7 +112,7 @@ def problem_at(spec: ModelSpec, theta: Mapping[str, float]) -> Problem:
     if geometry == spec.geometry:
         return nominal
     if spec.mesh != "bricks":
-        raise InputError("model.mesh", f"{spec.mesh!r} with another length of the tissue", "'bricks'")
+        raise InputError("model.mesh", f"{spec.mesh!r} with changed lengths of the tissue", "'bricks'")
     return moved_problem(nominal, brick_mesh(spec.refinement, geometry, spec.geometry))
 
 

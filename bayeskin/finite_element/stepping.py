@@ -165,22 +165,22 @@ def integrate(
             if spent["crawls"] > MOST_CRAWLS:
                 return (
                     f"step {count + 1} at t = {at_s:.3f} s: the skin has folded and snapped "
-                    f"{spent['falls']} times; try layers less unlike in stiffness, or a coarser mesh"
+                    f"{spent['falls']} times; try layers of more similar stiffness, or a coarser mesh"
                 )
             h = _next_length(max(h, shortest), end - state.time_s, longest)
             step = advance(model, past, h)
             falls = step is None and h <= shortest
             if falls and not falls_too:
                 return (
-                    f"step {count + 1} at t = {at_s:.3f} s: the skin folds, or does not converge; "
-                    "try layers less unlike in stiffness, or a coarser mesh"
+                    f"step {count + 1} at t = {at_s:.3f} s: the skin folds, or the run does not converge; "
+                    "try layers of more similar stiffness, or a coarser mesh"
                 )
             if falls:
                 step = _fall(model, state, h)
                 if step is None:
                     return (
-                        f"step {count + 1} at t = {at_s:.3f} s did not converge down to "
-                        f"{shortest:.2g} s; try a finer mesh or parameters nearer to a skin's"
+                        f"step {count + 1} at t = {at_s:.3f} s did not converge with steps down "
+                        f"to {shortest:.2g} s; try a finer mesh, or parameters closer to those of skin"
                     )
             excess = step.error_n / allowed_n if step else np.inf
             if step is None or (excess > 1.0 and h > shortest):

@@ -73,7 +73,7 @@ def seen_surface(problem: Problem) -> Surface:
         (skfem.ElementHex2(), skfem.ElementHex1()) if bricks else (skfem.ElementTetP2(), skfem.ElementTetP1())
     )
     local, small = (
-        _divided_square(DIVISIONS["brick"]) if bricks else _divided_triangle(DIVISIONS["tetrahedron"])
+        divided_square(DIVISIONS["brick"]) if bricks else divided_triangle(DIVISIONS["tetrahedron"])
     )
     facets, plane = _seen_facets(problem)
     basis = skfem.FacetBasis(
@@ -130,7 +130,7 @@ def _face_means(surface: Surface, values: Array) -> Array:
     return values[:, surface.small].mean(axis=2)[surface.near]
 
 
-def _divided_square(n: int) -> tuple[Array, np.ndarray]:
+def divided_square(n: int) -> tuple[Array, np.ndarray]:
     """Returns points (2, (n+1)^2) in the unit square, and the n^2 squares between them (n^2, 4)."""
     ticks = np.linspace(0.0, 1.0, n + 1)
     number = np.arange((n + 1) ** 2).reshape(n + 1, n + 1)
@@ -138,7 +138,7 @@ def _divided_square(n: int) -> tuple[Array, np.ndarray]:
     return np.stack(np.meshgrid(ticks, ticks, indexing="ij")).reshape(2, -1), squares.reshape(-1, 4)
 
 
-def _divided_triangle(n: int) -> tuple[Array, np.ndarray]:
+def divided_triangle(n: int) -> tuple[Array, np.ndarray]:
     """Returns points (2, (n+1)(n+2)/2) in the unit triangle, and the n^2 triangles between them (n^2, 3)."""
     number = {(i, j): k for k, (i, j) in enumerate((i, j) for i in range(n + 1) for j in range(n + 1 - i))}
     upright = [((i, j), (i + 1, j), (i, j + 1)) for i, j in number if i + j < n]

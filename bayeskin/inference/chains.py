@@ -50,16 +50,16 @@ def load(path: Path, names: tuple[str, ...], identity: Mapping[str, str]) -> emc
     Raises InputError when the file is not readable, has other parameters, or differs in any entry of
     `identity`. Entries that `identity` lacks are not compared.
     """
-    with storage.reading(path, "ensemble_N.h5 of `sample`") as handle:
+    with storage.reading(path, "an ensemble_N.h5 that `bayeskin sample` wrote") as handle:
         stored = json.loads(handle["mcmc"].attrs["bayeskin"])
         stored_names, stored_identity = tuple(map(str, stored["names"])), dict(stored["identity"])
         if stored_names != names:
-            raise InputError(path, f"a chain of {', '.join(stored_names)}", f"one of {', '.join(names)}")
+            raise InputError(path, f"a chain of {', '.join(stored_names)}", f"a chain of {', '.join(names)}")
         for entry, value in identity.items():
             if stored_identity.get(entry) != value:
                 raise InputError(
-                    path, f"a chain with another {entry} ({stored_identity.get(entry, 'none')!s:.12})",
-                    f"the same {entry} ({value[:12]}); sample into another folder",
+                    path, f"a chain of different input: {entry} {stored_identity.get(entry, 'none')!s:.12}",
+                    f"{entry} {value[:12]}; use another folder for this sampling",
                 )  # fmt: skip
         return _in_memory(emcee.backends.HDFBackend(str(path), read_only=True), len(names))
 
@@ -79,7 +79,7 @@ def _in_memory(disk: emcee.backends.HDFBackend, count: int) -> emcee.backends.Ba
     steps = (memory.iteration, walkers, count)
     if dim != count or (memory.chain.shape, memory.log_prob.shape) != (steps, steps[:2]):
         raise InputError(
-            "chain", f"shape {memory.chain.shape}", f"shape {steps}, and of log_prob {steps[:2]}"
+            "chain", f"shape {memory.chain.shape}", f"shape {steps}, and shape {steps[:2]} for log_prob"
         )
     memory.random_state = tuple(
         part.item() if isinstance(part, np.generic) else part for part in disk.random_state

@@ -87,18 +87,20 @@ def check_map(
     as_claimed, negligible = rms_z <= Z_LIMIT, rms <= NOISE_SHARE * noise_sd_n
     where_fitted_n = float(np.sqrt(np.mean(error[slice(None) if fitted is None else fitted] ** 2)))
     below_noise = noise_sd_n == 0.0 or where_fitted_n <= noise_sd_n
-    text = f"surrogate off by {1e3 * rms:.3g} mN rms ({1e3 * largest:.3g} at most), {rms_z:.2f} of its own sd"
+    text = (
+        f"surrogate off by {1e3 * rms:.3g} mN RMS ({1e3 * largest:.3g} at most), {rms_z:.2f} of its stated sd"
+    )
     if as_claimed and below_noise:
-        text += f": within the {Z_LIMIT:g} allowed"
+        text += f": below the limit of {Z_LIMIT:g}"
     elif negligible:
-        text += f", but within {NOISE_SHARE:g} of the noise ({1e3 * noise_sd_n:.3g} mN)"
+        text += f", but less than {NOISE_SHARE:g} times the noise ({1e3 * noise_sd_n:.3g} mN)"
     elif as_claimed:
         text += (
-            f", but {1e3 * where_fitted_n:.3g} mN where fitted, more than the noise's "
-            f"{1e3 * noise_sd_n:.3g}; add the point to the design and train again"
+            f", but {1e3 * where_fitted_n:.3g} mN RMS in the fitted bins, more than the noise "
+            f"({1e3 * noise_sd_n:.3g} mN); add the point to the design and train again"
         )
     else:
-        text += f": more than the {Z_LIMIT:g} allowed; add the point to the design and train again"
+        text += f": above the limit of {Z_LIMIT:g}; add the point to the design and train again"
     passes = bool((as_claimed and below_noise) or negligible)
     return MapCheck(
         material, error, rms, largest, rms_z, _mahalanobis(error, prediction), passes, text, simulation

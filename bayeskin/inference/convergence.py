@@ -154,28 +154,29 @@ def _verdict(
     checks = [
         (
             lengths >= limits.lengths,
-            f"{lengths:.0f} autocorrelation lengths a run of {kept} steps "
-            f"({_extreme(names, tau.max(axis=0), 'max')}, {longest:.0f} steps); {limits.lengths:.0f} needed",
+            f"the run of {kept} steps has {lengths:.0f} autocorrelation lengths "
+            f"({_extreme(names, tau.max(axis=0), 'max')}: {longest:.0f} steps); "
+            f"{limits.lengths:.0f} are needed",
         ),
         (
             fewest >= limits.effective_samples,
             f"{fewest:.0f} effective samples of {_extreme(names, ess, 'min')}; "
-            f"{limits.effective_samples:.0f} needed",
+            f"{limits.effective_samples:.0f} are needed",
         ),
         (
             worst <= limits.rhat,
-            f"R-hat across {len(tau)} ensembles {worst:.4f} of {_extreme(names, rhat, 'max')}; "
-            f"at most {limits.rhat:g} allowed",
+            f"R-hat across {len(tau)} ensembles is {worst:.4f} for {_extreme(names, rhat, 'max')}; "
+            f"at most {limits.rhat:g} is allowed",
         ),
         (
             not stuck,
             f"{len(stuck)} stuck walkers"
             + "".join(f", ensemble {e} walker {w}" for e, w in stuck[:3])
-            + "; none allowed",
+            + "; none is allowed",
         ),
     ]
     if len(tau) < 2:
-        checks.append((False, "one ensemble only; at least 2 independent ones needed"))
+        checks.append((False, "there is only one ensemble; at least 2 independent ones are needed"))
     checks.sort(key=lambda check: bool(check[0]))
     return Verdict(all(bool(ok) for ok, _ in checks), tuple(text for _, text in checks))
 

@@ -119,8 +119,8 @@ def noise_remarks(found: Identifiability) -> tuple[str, ...]:
     if not leaning:
         return ()
     return (
-        f"what the fit leaves is {' and '.join(leaning)}: hardly noise, rather something that the model "
-        "leaves out, so the parameters stand for it too; bayeskin diagnose looks for it",
+        f"the residual is {' and '.join(leaning)}: this is hardly noise but rather something that the model "
+        "leaves out, and it biases the parameters; `bayeskin diagnose` looks for it",
     )
 
 
@@ -167,7 +167,7 @@ def _statement(
     of_unit = "" if unit_name == "1" else f" {unit_name}"
     numbers = f"median {middle:.3g}, 90 % interval {low:.3g} to {high:.3g}{of_unit}"
     leans = [
-        f"leans on the prior's {side} bound, {factor * bound:.3g}{of_unit}, so the prior shapes it"
+        f"leans on the prior's {side} bound, {factor * bound:.3g}{of_unit}, so that the prior shapes it"
         for side, bound, mass in (
             ("lower", p.lower, np.mean(unit < _EDGE)), ("upper", p.upper, np.mean(unit > 1 - _EDGE)),
         )
@@ -189,7 +189,7 @@ def _sentence(p: Parameter, contraction: float, gain: float, quantiles: tuple[fl
     text = f"{p.description or 'parameter'} ({p.name})"
     if gain < _NOTHING_NATS and abs(contraction) < _NOTHING_CONTRACTION:
         return (
-            f"This test says nothing of the {text}: what is known of it is what was assumed, "
+            f"This test says nothing about the {text}, which is only known to lie in the assumed range, "
             f"{factor * p.lower:.3g} to {factor * p.upper:.3g}{unit}."
         )
     low, middle, high = (factor * value for value in quantiles)
@@ -198,13 +198,13 @@ def _sentence(p: Parameter, contraction: float, gain: float, quantiles: tuple[fl
         return f"This test narrows the {text} only a little: with 90 % probability it is {range_}."
     times = 1.0 / np.sqrt(max(1.0 - contraction, 1e-12))
     return (
-        f"The {text} is about {middle:.3g}{unit}, with 90 % probability {range_}: {times:.2g} times narrower "
-        f"than assumed before the test."
+        f"The {text} is about {middle:.3g}{unit}, with 90 % probability {range_}; this range is {times:.2g} "
+        f"times narrower than assumed before the test."
     )
 
 
 def _ridge(space: ParameterSpace, i: int, j: int, correlation: float) -> Ridge:
     first, second = space.names[i], space.names[j]
-    how = "they rise and fall together" if correlation > 0 else "one makes up for the other"
+    how = "they rise and fall together" if correlation > 0 else "one compensates for the other"
     statement = f"{first} and {second} form a ridge (rank correlation {correlation:+.2f}): {how}"
     return Ridge(first, second, correlation, statement)

@@ -118,11 +118,11 @@ def _weights(log_ratio: Array) -> tuple[Array, float]:
 def _verdict(weights: Array, effective: float, khat: float, failed: int) -> Verdict:
     count = len(weights)
     text = (
-        f"full model at {count} posterior draws: {effective:.1f} effective, at least "
-        f"{EFFECTIVE_SHARE * count:g} needed; largest weight {weights.max():.2g}"
+        f"full model at {count} posterior draws: {effective:.1f} effective draws, at least "
+        f"{EFFECTIVE_SHARE * count:g} are needed; the largest weight is {weights.max():.2g}"
     )
     good = effective >= EFFECTIVE_SHARE * count
     if np.isfinite(khat):
-        text += f"; Pareto k-hat {khat:.2f}, at most {KHAT_LIMIT:g} allowed"
+        text += f"; Pareto k-hat is {khat:.2f}, at most {KHAT_LIMIT:g} is allowed"
         good = good and khat <= KHAT_LIMIT
     return Verdict(bool(good), (text + (f"; {failed} runs failed" if failed else ""),))

@@ -61,7 +61,7 @@ def to_inference_data(
         constant_data=constant,
         coords={"time": log_posterior.binned.time_s, "phase": _labels(log_posterior)},
         dims={"phases": ["phase"], **{k: ["time"] for k in ("force", "mean", "surrogate_sd", *constant)}},
-        attrs=_attributes(posterior, provenance),
+        attrs=posterior_attributes(posterior, provenance),
     )
     for group in ("posterior", "prior"):
         for p in space.parameters:
@@ -90,14 +90,14 @@ def load_inference_data(path: Path | str) -> arviz.InferenceData:
     """
     import arviz as az
 
-    path, expected = Path(path), "a posterior in NetCDF"
+    path, expected = Path(path), "a posterior in a NetCDF file"
     refuse_damaged(path, expected)
     try:
         idata = az.from_netcdf(str(path), engine=_ENGINE)
     except Exception as error:  # h5netcdf and xarray raise many kinds of error on a damaged file
-        raise InputError(path, f"not readable ({in_a_line(error)})", expected) from None
+        raise InputError(path, f"a file that cannot be read ({in_a_line(error)})", expected) from None
     if "posterior" not in idata.groups():
-        raise InputError(path, f"groups {', '.join(idata.groups()) or 'none'}", "a group 'posterior'")
+        raise InputError(path, f"the groups {', '.join(idata.groups()) or 'none'}", "a group 'posterior'")
     return idata
 
 
@@ -106,7 +106,7 @@ def draws_of(idata: arviz.InferenceData) -> tuple[ParameterSpace, Array]:
 
     Raises InputError for an InferenceData of another origin, or where its parts do not belong together.
     """
-    where, expected = "InferenceData", "one made by bayeskin"
+    where, expected = "InferenceData", "InferenceData that bayeskin made"
     stored = idata.attrs.get("parameters")
     if stored is None:
         raise InputError(where, "no attribute 'parameters'", expected)
@@ -157,7 +157,7 @@ def _labels(log_posterior: LogPosterior) -> list[str]:
     ]
 
 
-def _attributes(posterior: Posterior, provenance: Provenance) -> dict[str, Any]:
+def posterior_attributes(posterior: Posterior, provenance: Provenance) -> dict[str, Any]:
     """Returns attributes as texts and numbers, which NetCDF can hold; lists and mappings are JSON texts."""
     c = posterior.convergence
     by_name: Sequence[tuple[str, Array]] = (

@@ -106,7 +106,9 @@ def bins_in_windows(binned: BinnedForce, windows: Windows | None) -> NDArray[np.
     slack = 1e-9 * float(np.ptp(binned.edges_s))
     for index, (start, end) in enumerate(windows):
         if not (last <= start < end):
-            raise InputError(f"fit window {index}", f"{start}..{end} s", "windows in order, none overlapping")
+            raise InputError(
+                f"fit window {index}", f"{start}..{end} s", "windows in order that do not overlap"
+            )
         last = end
         within = (binned.edges_s[:-1] >= start - slack) & (binned.edges_s[1:] <= end + slack)
         inside[within & usable] = index

@@ -76,8 +76,10 @@ class MapResult:
         summary = f"{round(self.agreement * len(self.starts))} of {len(self.starts)} starts reached it"
         summary += f", by {', '.join(reached)}"
         if len(reached) > 1 or self.agreement >= 0.5:
-            return f"maximum of log posterior {self.value:.2f}: {summary}"
-        return f"maximum of log posterior {self.value:.2f}: only {summary}; allow more evaluations a start"
+            return f"maximum of the log-posterior {self.value:.2f}: {summary}"
+        return (
+            f"maximum of the log-posterior {self.value:.2f}: only {summary}; allow more evaluations a start"
+        )
 
 
 def find_map(
@@ -97,8 +99,10 @@ def find_map(
     InputError when there is no start to make.
     """
     if starts < 1 or evaluations < 4:
-        raise InputError("map", f"{starts} starts, {evaluations} evaluations", "at least 1 start of 4")
-    space = _SearchSpace(log_posterior)
+        raise InputError(
+            "map", f"{starts} starts, {evaluations} evaluations", "at least 1 start and 4 evaluations"
+        )
+    space = SearchSpace(log_posterior)
     seeds = np.random.SeedSequence(seed).generate_state(starts)
     results: list[StartResult] = []
     for index, state in enumerate(seeds):
@@ -122,22 +126,22 @@ def climb(
 
     shear : the map that straightens this posterior, where it is already known
     """
-    space = _SearchSpace(log_posterior, shear)
+    space = SearchSpace(log_posterior, shear)
     low, high = log_posterior.bounds
-    search = _Search(space)
+    search = Search(space)
     search.best = space.unit(np.clip(log_posterior.vector(start), low, high)[None])[0]
-    status = "failed: no density found"
+    status = "failed: no point with a density above zero"
     for algorithm in (nlopt.LD_LBFGS, nlopt.LN_SBPLX, nlopt.LD_LBFGS):
         status = search.run(algorithm, search.best, evaluations // 3, 1e-6)
     theta = log_posterior.from_sampling(space.points(search.best[None])[0][0])
     return StartResult(log_posterior.named(theta), search.value, status, search.evaluations)
 
 
-def _one_start(search_space: _SearchSpace, kind: str, seed: int, evaluations: int) -> StartResult:
-    search = _Search(search_space)
+def _one_start(search_space: SearchSpace, kind: str, seed: int, evaluations: int) -> StartResult:
+    search = Search(search_space)
     SEARCHES[kind](search, seed, evaluations // 2)
     log_posterior = search_space.log_posterior
-    status = "failed: no density found"
+    status = "failed: no point with a density above zero"
     if np.isfinite(search.value):
         reached = search_space.points(search.best[None])[0][0]
         search.offer(gauss_newton(log_posterior, reached, search_space.shear).vector)
@@ -147,13 +151,13 @@ def _one_start(search_space: _SearchSpace, kind: str, seed: int, evaluations: in
     return StartResult(log_posterior.named(theta), search.value, status, search.evaluations, kind)
 
 
-def _controlled_random(search: _Search, seed: int, evaluations: int) -> None:
+def _controlled_random(search: Search, seed: int, evaluations: int) -> None:
     nlopt.srand(seed)
     unit = np.random.default_rng(seed).uniform(size=len(search.best))
     search.run(nlopt.GN_CRS2_LM, unit, evaluations, 1e-3)
 
 
-def _evolution(search: _Search, seed: int, evaluations: int) -> None:
+def _evolution(search: Search, seed: int, evaluations: int) -> None:
     dim = len(search.best)
     generations = max(evaluations // (_POPULATION * dim) - 1, 1)
     differential_evolution(
@@ -163,14 +167,14 @@ def _evolution(search: _Search, seed: int, evaluations: int) -> None:
     )  # fmt: skip
 
 
-def _climbs(search: _Search, seed: int, evaluations: int) -> None:
+def _climbs(search: Search, seed: int, evaluations: int) -> None:
     log_posterior, shear = search.space.log_posterior, search.space.shear
     low, high = log_posterior.bounds
     for start in np.random.default_rng(seed).uniform(low, high, (_CLIMBS, len(low))):
         search.offer(gauss_newton(log_posterior, start, shear).vector)
 
 
-class _SearchSpace:
+class SearchSpace:
     """The unit cube over straightened coordinates; the density is continued outside the prior box."""
 
     def __init__(self, log_posterior: LogPosterior, shear: Shear | None = None) -> None:
@@ -203,10 +207,10 @@ class _SearchSpace:
         return np.maximum(self.log_posterior.log_prob(inside) - _STEEP * outside, _WORST)
 
 
-class _Search:
+class Search:
     """The objective on the unit cube; it keeps the best point so far, which NLopt drops when it fails."""
 
-    def __init__(self, space: _SearchSpace) -> None:
+    def __init__(self, space: SearchSpace) -> None:
         self.space = space
         self.best = np.full(len(space.low), 0.5)
         self.value = -np.inf
@@ -254,7 +258,7 @@ class _Search:
         return _STATUS.get(opt.last_optimize_result(), "stopped")
 
 
-SEARCHES: dict[str, Callable[[_Search, int, int], None]] = {
+SEARCHES: dict[str, Callable[[Search, int, int], None]] = {
     "controlled random search": _controlled_random,
     "differential evolution": _evolution,
     "Gauss-Newton from the prior": _climbs,

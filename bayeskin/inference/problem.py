@@ -262,13 +262,13 @@ def _chunks(index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 def _check_inside(material: ParameterSpace, box: ParameterSpace) -> None:
     if material.names != box.names:
         raise InputError(
-            "priors", ", ".join(material.names), f"those of the surrogate: {', '.join(box.names)}"
+            "priors", ", ".join(material.names), f"the surrogate's parameters: {', '.join(box.names)}"
         )
     for ours, theirs in zip(material.parameters, box.parameters, strict=True):
         if ours.lower < theirs.lower or ours.upper > theirs.upper or not ours.lower < ours.upper:
             raise InputError(
                 f"prior of {ours.name}", f"{ours.lower:g}..{ours.upper:g} {ours.unit}",
-                f"a part of the surrogate's box, {theirs.lower:g}..{theirs.upper:g}",
+                f"bounds inside those of the surrogate, {theirs.lower:g}..{theirs.upper:g}",
             )  # fmt: skip
 
 

@@ -71,9 +71,9 @@ class ResidualCheck(_FreezesArrays):
     def sentence(self) -> str:
         """Returns the outcome in plain words."""
         if not self.passes:
-            return f"what the fit leaves is not the assumed noise: {'; '.join(self._failures())}"
+            return f"the residual is not the assumed noise: {'; '.join(self._failures())}"
         return (
-            "what the fit leaves looks like the assumed noise: in its law (Kolmogorov-Smirnov "
+            "the residual looks like the assumed noise: in its distribution (Kolmogorov-Smirnov "
             f"p = {self.p_law:.2g}), in its correlation (Ljung-Box over {len(self.autocorrelation)} lags "
             f"p = {self.p_correlation:.2g}) and in each kind of phase"
         )
@@ -81,17 +81,17 @@ class ResidualCheck(_FreezesArrays):
     def _failures(self) -> list[str]:
         out = []
         if self.p_law < self.limit:
-            out.append(f"it has another law (Kolmogorov-Smirnov p = {self.p_law:.2g})")
+            out.append(f"it has a different distribution (Kolmogorov-Smirnov p = {self.p_law:.2g})")
         if self.p_correlation < self.limit:
             lags, p = len(self.autocorrelation), self.p_correlation
-            out.append(f"it is correlated otherwise (Ljung-Box over {lags} lags p = {p:.2g})")
+            out.append(f"it has a different correlation (Ljung-Box over {lags} lags p = {p:.2g})")
         for check in self.kinds:
             when = f"while pads {check.kind}"
             if check.p_sd < self.limit:
-                out.append(f"{when} its sd is {check.sd:.2g} of the assumed (p = {check.p_sd:.2g})")
+                out.append(f"{when} its sd is {check.sd:.2g} times the assumed sd (p = {check.p_sd:.2g})")
             if check.p_correlation < self.limit:
                 r, p = check.correlation, check.p_correlation
-                out.append(f"{when} neighbours correlate by {r:+.2f} beyond the assumed (p = {p:.2g})")
+                out.append(f"{when} the correlation of neighbours differs by {r:+.2f} (p = {p:.2g})")
         return out
 
 

@@ -285,7 +285,7 @@ def initial_walkers(
         if len(out) >= walkers:
             return out[:walkers]
     raise InputError(
-        "start", "no density at nearly all points of the prior", "a surrogate with finite values"
+        "start", "a density of zero at nearly all points of the prior", "a surrogate with finite values"
     )
 
 
@@ -306,14 +306,14 @@ def _check_settings(settings: SampleSettings, dim: int) -> None:
         raise InputError(
             "sample.walkers",
             settings.walkers,
-            f"at least {2 * dim + 2}, twice the {dim} parameters and 2 more",
+            f"at least {2 * dim + 2}, which is twice the {dim} parameters plus 2",
         )
     if settings.ensembles < 1:
         raise InputError("sample.ensembles", settings.ensembles, "at least 1")
     if settings.max_steps < _FIRST_CHECK:
         raise InputError(
             "sample.max_steps", settings.max_steps,
-            f"at least {_FIRST_CHECK}: the first steps are not yet of the posterior",
+            f"at least {_FIRST_CHECK}, because the first steps do not yet follow the posterior",
         )  # fmt: skip
 
 

@@ -74,12 +74,14 @@ MECHANISM = Mechanism(
     name="backlash",
     parameters=(
         Parameter("gap", "m", 0.0, 3e-4, "uniform", "lost motion of the drive"),
-        Parameter("frame_compliance", "m/N", 0.0, 2e-3, "uniform", "of the frame", stress_power=-1),
+        Parameter(
+            "frame_compliance", "m/N", 0.0, 2e-3, "uniform", "compliance of the frame", stress_power=-1
+        ),
     ),
     neutral={"gap": 0.0, "frame_compliance": 0.0},
     statement=lambda v: (
-        f"The drive loses {number(1e3 * v['gap'], 2)} mm at each reversal, and the frame yields "
-        f"{number(1e3 * v['frame_compliance'], 2)} mm a newton."
+        f"At each reversal the drive moves {number(1e3 * v['gap'], 2)} mm without effect, and the frame "
+        f"yields {number(1e3 * v['frame_compliance'], 2)} mm for each newton."
     ),
     group=("backlash",),
     act=Instrument(Place.PADS, observe, bind, adds=False),

@@ -54,14 +54,15 @@ MECHANISM = Mechanism(
             0.0,
             1e9,
             "log-uniform",
-            "tangential stiffness of the bond to the fascia, by area",
+            "tangential stiffness of the bond to the fascia, per area",
             stress_power=1,
             offset=1e5,
         ),
     ),
     neutral={"adherence": 0.0},
     statement=lambda v: (
-        f"The subcutis sticks to the fascia below with {number(1e-6 * v['adherence'], 3)} kPa a mm."
+        "The subcutis sticks to the fascia below it; the bond has a tangential stiffness of "
+        f"{number(1e-6 * v['adherence'], 3)} kPa for each mm."
     ),
     group=("bottom-adherence",),
     act=Tissue(bind),

@@ -31,13 +31,13 @@ MECHANISM = Mechanism(
     name="cell-nonlinearity",
     parameters=(
         Parameter(
-            "cell_bend", "1/N", -0.5, 0.5, "uniform", "share that the load cell reads too much, by force"
+            "cell_bend", "1/N", -0.5, 0.5, "uniform", "relative error of the load cell's reading, per force"
         ),
     ),
     neutral={"cell_bend": 0.0},
     statement=lambda v: (
-        f"The load cell's curve bends: it reads {number(100 * abs(v['cell_bend']), 2)} % too "
-        f"{'much' if v['cell_bend'] > 0 else 'little'} at 1 N, and at other forces a share in proportion."
+        f"The load cell is not linear: at 1 N it reads {number(100 * abs(v['cell_bend']), 2)} % too "
+        f"{'much' if v['cell_bend'] > 0 else 'little'}, and this percentage grows in proportion to the force."
     ),
     group=("cell-nonlinearity", "strain-stiffening", "fibre-anisotropy"),
     act=Instrument(Place.CELL, observe, adds=False),

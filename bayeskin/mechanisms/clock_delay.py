@@ -19,11 +19,11 @@ def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTim
 
 MECHANISM = Mechanism(
     name="clock-delay",
-    parameters=(Parameter("delay", "s", -1.0, 1.0, "uniform", "time by which the force is stamped late"),),
+    parameters=(Parameter("delay", "s", -1.0, 1.0, "uniform", "delay of the time stamps of the force"),),
     neutral={"delay": 0.0},
     statement=lambda v: (
-        f"The force is stamped {1e3 * abs(v['delay']):.0f} ms {'late' if v['delay'] > 0 else 'early'} "
-        "beside the displacement."
+        f"The time stamps of the force are {1e3 * abs(v['delay']):.0f} ms too "
+        f"{'late' if v['delay'] > 0 else 'early'} compared with those of the displacement."
     ),
     group=("clock-delay", "amplifier-lag"),
     act=Instrument(Place.CLOCK, observe, adds=False),

@@ -74,13 +74,20 @@ MECHANISM = Mechanism(
     name="device-friction",
     parameters=(
         Parameter("Fc", "N", 0.0, 0.1, "uniform", "sliding friction of the drive"),
-        Parameter("presliding", "m", 5e-6, 3e-4, "log-uniform", "travel over which it turns"),
-        Parameter("friction_start", "-", -1.0, 1.0, "uniform", "friction at t = 0, over Fc"),
+        Parameter(
+            "presliding",
+            "m",
+            5e-6,
+            3e-4,
+            "log-uniform",
+            "presliding length, over which friction changes sign",
+        ),
+        Parameter("friction_start", "-", -1.0, 1.0, "uniform", "friction at t = 0, as a share of Fc"),
     ),
     neutral={"Fc": 0.0, "presliding": 5e-5, "friction_start": 0.0},
     statement=lambda v: (
-        f"The slide rubs: {1e3 * v['Fc']:.0f} mN against each motion, turning over within "
-        f"{number(1e3 * v['presliding'], 2)} mm after a reversal and kept during holds."
+        f"The slide has a dry friction of {1e3 * v['Fc']:.0f} mN against the motion, which changes sign over "
+        f"a presliding length of {number(1e3 * v['presliding'], 2)} mm and persists during holds."
     ),
     group=("device-friction", "viscous-drag", "plastic-set"),
     act=Instrument(Place.DRIVE, observe),

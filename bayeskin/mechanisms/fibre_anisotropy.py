@@ -37,14 +37,21 @@ def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
 MECHANISM = Mechanism(
     name="fibre-anisotropy",
     parameters=(
-        Parameter("langer_ratio", "-", 1.0, 5.0, "uniform", "stiffness along the Langer lines over across"),
-        Parameter("langer_angle", "rad", 0.0, np.pi / 2, "uniform", "of the Langer lines to the pull"),
+        Parameter(
+            "langer_ratio",
+            "-",
+            1.0,
+            5.0,
+            "uniform",
+            "ratio of the stiffness along the Langer lines to that across",
+        ),
+        Parameter("langer_angle", "rad", 0.0, np.pi / 2, "uniform", "angle of the Langer lines to the pull"),
     ),
     neutral={"langer_ratio": 1.0, "langer_angle": 0.0},
     statement=lambda v: (
-        f"The cutis is {v['langer_ratio']:.1f} times as stiff along lines at "
-        f"{np.degrees(v['langer_angle']):.0f} degrees to the pull; "
-        "in one uniaxial test most of this looks like a stiffer cutis, and a pull across would tell."
+        f"The cutis is {v['langer_ratio']:.1f} times as stiff along the Langer lines as across them, and the "
+        f"lines are at {np.degrees(v['langer_angle']):.0f} degrees to the pull; a single uniaxial test can "
+        "hardly distinguish this from a stiffer cutis, but a further test across the pull can."
     ),
     group=("fibre-anisotropy", "cell-nonlinearity"),
     act=Tissue(bind),

@@ -42,14 +42,15 @@ MECHANISM = Mechanism(
             0.0,
             1e-8,
             "log-uniform",
-            "conductance of the surface: outflow by its area and pressure",
+            "conductance of the surface: outflow per area and pressure",
             stress_power=-1,
             offset=1e-12,
         ),
     ),
     neutral={"leakage": 0.0},
     statement=lambda v: (
-        f"Fluid leaves through the surface, {number(6e7 * v['leakage'], 3)} micrometres a minute at each kPa."
+        f"Fluid leaks through the surface: {number(6e7 * v['leakage'], 3)} micrometres a minute for each kPa "
+        "of pressure."
     ),
     group=("fluid-leakage",),
     act=Tissue(bind),

@@ -17,7 +17,7 @@ MECHANISM = Mechanism(
     name="force-offset",
     parameters=(Parameter("F0", "N", -0.15, 0.05, "uniform", "force reported at zero force"),),
     neutral={"F0": 0.0},
-    statement=lambda v: f"The load cell reads {1e3 * v['F0']:+.0f} mN when the skin pulls with none.",
+    statement=lambda v: f"The load cell reads {1e3 * v['F0']:+.0f} mN when the skin exerts no force.",
     group=("force-offset", "device-friction"),
     act=Instrument(Place.CELL, observe),
 )

@@ -30,11 +30,14 @@ def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTim
 MECHANISM = Mechanism(
     name="friction-creep",
     parameters=(
-        Parameter("friction_tau", "s", 3.0, 1000.0, "log-uniform", "time in which friction relaxes"),
+        Parameter(
+            "friction_tau", "s", 3.0, 1000.0, "log-uniform", "time constant with which friction relaxes"
+        ),
     ),
     neutral={"friction_tau": np.inf},
     statement=lambda v: (
-        f"Friction that a stop locks in relaxes with a time constant of {number(v['friction_tau'], 3)} s."
+        "When the motion stops, the remaining friction relaxes with a time constant of "
+        f"{number(v['friction_tau'], 3)} s."
     ),
     group=(
         "friction-creep",

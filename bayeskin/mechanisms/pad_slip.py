@@ -52,18 +52,18 @@ MECHANISM = Mechanism(
             0.0,
             1e-3,
             "log-uniform",
-            "speed of the slip, by the force beyond what the adhesive bears",
+            "speed of the slip per force above the threshold",
             stress_power=-1,
             offset=1e-6,
         ),
         Parameter(
-            "slip_threshold", "N", 0.0, 0.3, "uniform", "force that it bears without creep", stress_power=1
+            "slip_threshold", "N", 0.0, 0.3, "uniform", "force above which the pads slip", stress_power=1
         ),
     ),
     neutral={"slip_rate": 0.0, "slip_threshold": 0.1},
     statement=lambda v: (
-        f"The pads slip on the skin, {number(1e3 * v['slip_rate'], 2)} mm a second for each newton beyond "
-        f"{number(v['slip_threshold'], 2)} N, and do not come back."
+        f"The pads slip on the skin by {number(1e3 * v['slip_rate'], 2)} mm a second for each newton above "
+        f"{number(v['slip_threshold'], 2)} N, and do not slip back."
     ),
     group=("pad-slip", "preconditioning", "slow-recovery", "plastic-set"),
     act=Instrument(Place.PADS, observe, bind, adds=False),

@@ -42,18 +42,16 @@ def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTim
 MECHANISM = Mechanism(
     name="periodic-motion",
     parameters=(
-        Parameter("motion_amplitude", "N", 0.0, 0.03, "uniform", "half of the swing at no force"),
-        Parameter(
-            "motion_period", "s", SHORTEST_S, LONGEST_S, "log-uniform", "time after which the arm is back"
-        ),
+        Parameter("motion_amplitude", "N", 0.0, 0.03, "uniform", "amplitude of the swing at zero force"),
+        Parameter("motion_period", "s", SHORTEST_S, LONGEST_S, "log-uniform", "period of the swing"),
         Parameter("motion_phase", "rad", -np.pi, np.pi, "uniform", "phase of the swing at t = 0"),
-        Parameter("motion_share", "-", 0.0, 0.1, "uniform", "what the force adds to the amplitude, as share"),
+        Parameter("motion_share", "-", 0.0, 0.1, "uniform", "share of the force that adds to the amplitude"),
     ),
     neutral={"motion_amplitude": 0.0, "motion_period": 4.0, "motion_phase": 0.0, "motion_share": 0.0},
     statement=lambda v: (
-        f"The arm moves to and fro under the device every {number(v['motion_period'], 2)} s: the force "
-        f"swings by {1e3 * v['motion_amplitude']:.1f} mN and {number(100 * v['motion_share'], 2)} % "
-        "to either side."
+        f"The arm moves to and fro under the device with a period of {number(v['motion_period'], 2)} s; the "
+        f"force swings to either side by {1e3 * v['motion_amplitude']:.1f} mN plus "
+        f"{number(100 * v['motion_share'], 2)} % of its value."
     ),
     group=("periodic-motion",),
     parts=(("motion_amplitude", "motion_period", "motion_phase"), ("motion_share",)),

@@ -101,13 +101,16 @@ def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
 MECHANISM = Mechanism(
     name="plastic-set",
     parameters=(
-        Parameter("set_share", "-", 0.0, 0.6, "uniform", "share of the stretch beyond that stays"),
-        Parameter("yield_stretch", "-", 1.02, 1.3, "uniform", "stretch along the pull from which it stays"),
+        Parameter("set_share", "-", 0.0, 0.6, "uniform", "share of the excess stretch that stays"),
+        Parameter(
+            "yield_stretch", "-", 1.02, 1.3, "uniform", "stretch along the pull above which skin yields"
+        ),
     ),
     neutral={"set_share": 0.0, "yield_stretch": 1.1},
     statement=lambda v: (
         f"Skin that is stretched by more than {100 * (v['yield_stretch'] - 1):.0f} % along the pull stays "
-        f"longer, by {100 * v['set_share']:.0f} % of what is beyond; later cycles start later and lower."
+        f"longer, by {100 * v['set_share']:.0f} % of the excess, so that in later cycles the force starts "
+        "to rise later and is lower."
     ),
     group=("plastic-set", "preconditioning", "pad-slip", "device-friction"),
     act=Tissue(bind),

@@ -33,17 +33,23 @@ MECHANISM = Mechanism(
     name="position-ripple",
     parameters=(
         Parameter(
-            "ripple_period", "m", SHORTEST_M, LONGEST_M, "log-uniform", "travel in which the ripple repeats"
+            "ripple_period",
+            "m",
+            SHORTEST_M,
+            LONGEST_M,
+            "log-uniform",
+            "travel after which the ripple repeats",
         ),
-        Parameter("ripple_amplitude", "N", 0.0, 0.015, "uniform", "half of the ripple from top to bottom"),
+        Parameter("ripple_amplitude", "N", 0.0, 0.015, "uniform", "amplitude of the ripple"),
         Parameter(
             "ripple_phase", "rad", -np.pi, np.pi, "uniform", "phase of the ripple at zero displacement"
         ),
     ),
     neutral={"ripple_period": 5e-4, "ripple_amplitude": 0.0, "ripple_phase": 0.0},
     statement=lambda v: (
-        f"While it moves, the drive ripples by {1e3 * v['ripple_amplitude']:.1f} mN every "
-        f"{number(1e3 * v['ripple_period'], 2)} mm of its travel."
+        "While the drive moves, the force has a ripple with an amplitude of "
+        f"{1e3 * v['ripple_amplitude']:.1f} mN and a period of {number(1e3 * v['ripple_period'], 2)} mm "
+        "of travel."
     ),
     group=("position-ripple",),
     act=Instrument(Place.DRIVE, observe, repeats_m=SHORTEST_M),

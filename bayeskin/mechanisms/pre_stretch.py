@@ -25,10 +25,17 @@ def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
 MECHANISM = Mechanism(
     name="pre-stretch",
     parameters=(
-        Parameter("opening", "-", 0.0, 0.15, "uniform", "of each pad before, of the half gauge length"),
+        Parameter(
+            "opening",
+            "-",
+            0.0,
+            0.15,
+            "uniform",
+            "displacement of each pad before the test, as a share of half the gauge length",
+        ),
     ),
     neutral={"opening": 0.0},
-    statement=lambda v: f"The skin was stretched by {100 * v['opening']:.1f} % when the test began.",
+    statement=lambda v: f"The skin was already stretched by {100 * v['opening']:.1f} % when the test began.",
     group=("pre-stretch", "force-offset", "strain-stiffening"),
     act=Tissue(bind),
 )

@@ -117,14 +117,14 @@ MECHANISM = Mechanism(
             1e2,
             1e5,
             "log-uniform",
-            "stored energy at which 63 % of that is lost",
+            "stored energy at which 63 % of this loss is reached",
             stress_power=1,
         ),
     ),
     neutral={"damage": 0.0, "damage_energy": 1e3},
     statement=lambda v: (
-        f"The first stretch softens the skin, by {100 * v['damage']:.0f} % at most, most of it where it "
-        f"has stored {number(1e-3 * v['damage_energy'], 3)} kPa; later cycles repeat."
+        f"The first stretch softens the skin by at most {100 * v['damage']:.0f} %, of which 63 % is reached "
+        f"at a stored energy of {number(1e-3 * v['damage_energy'], 3)} kPa; later cycles repeat this."
     ),
     group=("preconditioning", "pad-slip", "slow-recovery", "plastic-set"),
     act=Tissue(bind),

@@ -47,7 +47,7 @@ MECHANISM = Mechanism(
         for i in EVENTS
         for parameter in (
             Parameter(
-                f"event_{i}_at", "-", 0.02, 0.98, "uniform", "moment of a step, as share of the recording"
+                f"event_{i}_at", "-", 0.02, 0.98, "uniform", "moment of a step, as a share of the duration"
             ),
             Parameter(f"event_{i}_step", "N", -0.05, 0.05, "uniform", "step of the load cell's zero"),
         )

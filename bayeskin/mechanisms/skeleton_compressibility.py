@@ -31,8 +31,8 @@ MECHANISM = Mechanism(
     ),
     neutral={"nu_c": Constants.nu_c, "nu_s": Constants.nu_s},
     statement=lambda v: (
-        f"Drained of its fluid, the solid has Poisson's ratios of {v['nu_c']:.2f} in the cutis and "
-        f"{v['nu_s']:.2f} in the subcutis, so that stretch changes its volume and fluid has to flow."
+        f"The drained solid has a Poisson's ratio of {v['nu_c']:.2f} in the cutis and of {v['nu_s']:.2f} in "
+        "the subcutis, so that a stretch changes its volume and makes fluid flow."
     ),
     group=(
         "skeleton-compressibility",

@@ -63,15 +63,15 @@ MECHANISM = Mechanism(
             0.0,
             2e-3,
             "log-uniform",
-            "displacement that the surrounding tissue yields, by the force",
+            "compliance of the surrounding tissue",
             stress_power=-1,
             offset=2e-5,
         ),
-        Parameter("recovery_time", "s", 1.0, 300.0, "log-uniform", "over which it yields and returns"),
+        Parameter("recovery_time", "s", 1.0, 300.0, "log-uniform", "time constant of yield and return"),
     ),
     neutral={"recovery_compliance": 0.0, "recovery_time": 30.0},
     statement=lambda v: (
-        f"Tissue around the test yields, {number(1e3 * v['recovery_compliance'], 2)} mm for each newton "
+        f"The surrounding tissue yields by {number(1e3 * v['recovery_compliance'], 2)} mm for each newton, "
         f"with a time constant of {v['recovery_time']:.0f} s, and returns as slowly."
     ),
     group=("slow-recovery", "preconditioning", "pad-slip", "skeleton-compressibility"),

@@ -129,16 +129,17 @@ def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
 MECHANISM = Mechanism(
     name="solid-viscoelasticity",
     parameters=(
-        Parameter("g_1", "-", 0.0, 2.0, "uniform", "stress of the first branch, over that in the long run"),
+        Parameter("g_1", "-", 0.0, 2.0, "uniform", "stress of the first branch over the long-run one"),
         Parameter("tau_1", "s", 0.2, 15.0, "log-uniform", "relaxation time of the first branch"),
-        Parameter("g_2", "-", 0.0, 2.0, "uniform", "stress of the second branch, over that in the long run"),
+        Parameter("g_2", "-", 0.0, 2.0, "uniform", "stress of the second branch over the long-run one"),
         Parameter("tau_2", "s", 15.0, 300.0, "log-uniform", "relaxation time of the second branch"),
     ),
     neutral={"g_1": 0.0, "tau_1": 2.0, "g_2": 0.0, "tau_2": 60.0},
     statement=lambda v: (
-        f"The solid itself relaxes: stretched at once it pulls {100 * (v['g_1'] + v['g_2']):.0f} % harder "
-        f"than in the long run; {100 * v['g_1']:.0f} % of the long-run force fade with a time constant of "
-        f"{number(v['tau_1'], 2)} s, {100 * v['g_2']:.0f} % with one of {number(v['tau_2'], 2)} s."
+        f"The solid itself is viscoelastic: right after a sudden stretch its stress is "
+        f"{100 * (v['g_1'] + v['g_2']):.0f} % above the long-run stress; {100 * v['g_1']:.0f} % of the "
+        f"long-run stress relaxes with a time constant of {number(v['tau_1'], 2)} s, and "
+        f"{100 * v['g_2']:.0f} % with one of {number(v['tau_2'], 2)} s."
     ),
     group=(
         "solid-viscoelasticity",

@@ -106,8 +106,12 @@ def _told(values: Mapping[str, float]) -> str:
 MECHANISM = Mechanism(
     name="stiffness-drift",
     parameters=(
-        Parameter("stiffness_rate", "1/s", -1e-3, 1e-3, "uniform", "change of all moduli at first, as share"),
-        Parameter("stiffness_time", "s", 30.0, 1000.0, "log-uniform", "over which that change comes to rest"),
+        Parameter(
+            "stiffness_rate", "1/s", -1e-3, 1e-3, "uniform", "initial relative rate of change of all moduli"
+        ),
+        Parameter(
+            "stiffness_time", "s", 30.0, 1000.0, "log-uniform", "time constant with which this change settles"
+        ),
     ),
     neutral={"stiffness_rate": 0.0, "stiffness_time": 300.0},
     statement=_told,

@@ -62,11 +62,18 @@ def bind(values: Mapping[str, float], sites: Sites) -> TissueLaw:
 MECHANISM = Mechanism(
     name="strain-dependent-permeability",
     parameters=(
-        Parameter("M_k", "-", -100.0, 100.0, "uniform", "k = k0 exp(M_k (J - 1)), J the relative volume"),
+        Parameter(
+            "M_k",
+            "-",
+            -100.0,
+            100.0,
+            "uniform",
+            "exponent of the permeability, k = k0 exp(M_k (J - 1)) at the relative volume J",
+        ),
     ),
     neutral={"M_k": 0.0},
     statement=lambda v: (
-        f"Permeability changes by {100 * np.expm1(0.01 * v['M_k']):+.0f} % where the volume grows by 1 %."
+        f"The permeability changes by {100 * np.expm1(0.01 * v['M_k']):+.0f} % where the volume grows by 1 %."
     ),
     group=(
         "strain-dependent-permeability",

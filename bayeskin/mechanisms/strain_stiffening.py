@@ -51,18 +51,25 @@ MECHANISM = Mechanism(
             0.0,
             1e6,
             "log-uniform",
-            "2nd Piola-Kirchhoff stress of the fibres in skin a quarter longer",
+            "2nd Piola-Kirchhoff stress of the fibres at a stretch of 1.25",
             stress_power=1,
             offset=1e3,
         ),
-        Parameter("k2", "-", 1.0, 50.0, "log-uniform", "how fast the fibres stiffen with stretch"),
-        Parameter("dispersion", "-", 0.0, 1 / 3, "uniform", "of the fibres: 0 all along the pull, 1/3 none"),
+        Parameter("k2", "-", 1.0, 50.0, "log-uniform", "exponent with which the fibres stiffen"),
+        Parameter(
+            "dispersion",
+            "-",
+            0.0,
+            1 / 3,
+            "uniform",
+            "dispersion of the fibres: 0 if all lie along the pull, 1/3 if they have no direction",
+        ),
     ),
     neutral={"fibre_stress": 0.0, "k2": 5.0, "dispersion": 0.0},
     statement=lambda v: (
         f"Fibres of the cutis stiffen with stretch: k1 = {number(1e-3 * first_modulus(v), 3)} kPa, "
-        f"k2 = {number(v['k2'], 2)}, so that they pull with {number(1e-3 * v['fibre_stress'], 3)} kPa "
-        "in skin that is a quarter longer."
+        f"k2 = {number(v['k2'], 2)}, so that their 2nd Piola-Kirchhoff stress is "
+        f"{number(1e-3 * v['fibre_stress'], 3)} kPa at a stretch of 1.25."
     ),
     group=("strain-stiffening", "pre-stretch"),
     act=Tissue(bind),

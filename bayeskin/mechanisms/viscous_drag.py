@@ -25,9 +25,9 @@ def observe(values: Values, motion: PadMotion, force: ForceOfTime) -> ForceOfTim
 
 MECHANISM = Mechanism(
     name="viscous-drag",
-    parameters=(Parameter("drag", "N s/m", 0.0, 40.0, "uniform", "drag of the drive by its speed"),),
+    parameters=(Parameter("drag", "N s/m", 0.0, 40.0, "uniform", "drag of the drive per speed"),),
     neutral={"drag": 0.0},
-    statement=lambda v: f"The drive drags with {v['drag']:.0f} mN at each mm/s, in the direction of motion.",
+    statement=lambda v: f"The drive has a viscous drag of {v['drag']:.0f} mN for each mm/s of its speed.",
     group=("viscous-drag", "device-friction"),
     act=Instrument(Place.DRIVE, observe),
 )

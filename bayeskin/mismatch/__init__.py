@@ -1,1 +1,1 @@
-"""Where a recording and the model differ, which physics was left out, and what remains."""
+"""Finds where a recording and the model differ, which physics is left out, and what stays unexplained."""

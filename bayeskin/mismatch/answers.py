@@ -1,4 +1,4 @@
-"""Answers to the tasks of a search: any process works them out as JSON, and a search reads them back."""
+"""Answers the tasks of a search: any process computes an answer as JSON, and the search reads it back."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from bayeskin.mismatch.discrepancy import discrepancy
 from bayeskin.mismatch.fit import fit, promised, restored
 from bayeskin.mismatch.hypotheses import Evidences
 from bayeskin.mismatch.refuted import refuted
+from bayeskin.mismatch.stiffness_ratio import STIFFEST_BELOW
 from bayeskin.mismatch.tasks import (
     EvidenceTask,
     FitTask,
@@ -30,29 +31,29 @@ from bayeskin.mismatch.tasks import (
 from bayeskin.mismatch.trust_region import SetFit, TrustSettings, as_json, fit_set, within
 from bayeskin.types import Array, PadMotion
 
-TRUST = 0.15  # half width about a run within which a mechanism is searched for on its tangent, of the prior
+TRUST = 0.15  # half width, as a share of the prior, of the region near a run in which its tangent is trusted
 
 
 def answer(context: DiagnosisContext, task: Task) -> dict[str, Any]:
-    """Returns the answer to a task, as JSON has it; of a run that failed, its message."""
+    """Returns the answer to a task in JSON's types; if a run fails, the answer is its message."""
     if isinstance(task, RunTask | FullRunTask | OtherProtocolTask):
         force = _force(context, task)
         return {"message": force} if isinstance(force, str) else {"force_n": force.tolist()}
     if isinstance(task, ScoreTestTask):
         return {"nats": _promised_gain(context, task)}
     if isinstance(task, EvidenceTask):
-        left = discrepancy(_fit_of(context, task.fit).fit, context.motion)
-        return asdict(Evidences(left.without_log_evidence, left.log_evidence))
+        unnamed = discrepancy(_fit_from_json(context, task.fit).fit, context.motion)
+        return asdict(Evidences(unnamed.without_log_evidence, unnamed.log_evidence))
     if isinstance(task, FitWithAddedTask):
-        beside = task.score_test
-        names = with_one(beside.names, beside.name, context.known)
-        start = {**context.neutral, **beside.theta, **_values_on_tangent(context, beside)}
-        return _fitted(context, FitTask(names, start, task.runs, beside.correction_n))
-    return _fitted(context, task)
+        test = task.score_test
+        names = with_one(test.names, test.name, context.known)
+        start = {**context.neutral, **test.theta, **_values_on_tangent(context, test)}
+        return _fit_answer(context, FitTask(names, start, task.runs, test.correction_n))
+    return _fit_answer(context, task)
 
 
 def read_answer(context: DiagnosisContext, task: Task, said: Mapping[str, Any]) -> object:
-    """Returns an answer as a search reads it: a fit, a gain [nats], a force, evidences, or a message."""
+    """Returns an answer in the form that a search uses: a fit, gain [nats], force, evidences, or message."""
     if "message" in said:
         return said["message"]
     if isinstance(task, RunTask | FullRunTask | OtherProtocolTask):
@@ -61,12 +62,13 @@ def read_answer(context: DiagnosisContext, task: Task, said: Mapping[str, Any]) 
         return said["nats"]
     if isinstance(task, EvidenceTask):
         return Evidences(**said)
-    found = _fit_of(context, said, task.until_s if isinstance(task, FitTask) else None)
-    against = refuted(found.fit, context.known, context.motion, context.jumps)
-    return f"the recording's samples show nothing of {', '.join(against)}" if against else found
+    set_fit = _fit_from_json(context, said, task.until_s if isinstance(task, FitTask) else None)
+    contradicted = refuted(set_fit.fit, context.known, context.motion, context.jumps)
+    return f"the samples of the recording contradict {', '.join(contradicted)}" if contradicted else set_fit
 
 
 def _force(context: DiagnosisContext, task: RunTask | FullRunTask | OtherProtocolTask) -> Array | str:
+    """Returns the force (m,) [N] that a task asks for, or the message of a run that failed."""
     if isinstance(task, OtherProtocolTask):
         motion = PadMotion(np.array(task.time_s), np.array(task.displacement_m))
         return context.reported_elsewhere(task.names, task.theta, motion, np.array(task.edges_s))
@@ -74,48 +76,56 @@ def _force(context: DiagnosisContext, task: RunTask | FullRunTask | OtherProtoco
     return run(task.names, task.theta)
 
 
-def _fitted(context: DiagnosisContext, task: FitTask) -> dict[str, Any]:
+def _fit_answer(context: DiagnosisContext, task: FitTask) -> dict[str, Any]:
+    """Returns the fit that a task asks for, or the message of a run that failed, in JSON's types."""
     start = dict(task.start)
     if {"E_c", "E_s"} <= set(start):
-        start["E_c"] = max(start["E_c"], start["E_s"] / 1.9)  # the prior rules a stiffer subcutis out
+        # The prior is zero where the subcutis is stiffer than `STIFFEST_BELOW` times the cutis.
+        start["E_c"] = max(start["E_c"], start["E_s"] / (0.95 * STIFFEST_BELOW))
     correction_n = _as_array(task.correction_n)
     posterior = partial(context.posterior, correction_n=correction_n, until_s=task.until_s)
     settings = TrustSettings(runs=task.runs)
-    found = fit_set(task.names, start, context.run, posterior, settings, correction_n)
-    return {"message": found} if isinstance(found, str) else as_json(found)
+    result = fit_set(task.names, start, context.run, posterior, settings, correction_n)
+    return {"message": result} if isinstance(result, str) else as_json(result)
 
 
 def _promised_gain(context: DiagnosisContext, task: ScoreTestTask) -> float:
-    """Returns the gain [nats] that a mechanism promises by what it does to a force."""
-    about, new = _posterior_beside(context, task)
+    """Returns the gain [nats] that the score test promises for a mechanism that acts on the force."""
+    posterior, new = _posterior_with_added(context, task)
     parts = [part for name in new for part in context.known[name].whole_or_parts]
-    return promised(about, task.theta, context.neutral, parts, context.seed)
+    return promised(posterior, task.theta, context.neutral, parts, context.seed)
 
 
 def _values_on_tangent(context: DiagnosisContext, task: ScoreTestTask) -> Mapping[str, float]:
-    """Returns the best values of a set with one mechanism more, on the tangent of the run without it."""
-    about, new = _posterior_beside(context, task)
-    vector = np.clip(about.vector({**context.neutral, **task.theta}), *about.bounds)
+    """Returns the best values of a set with one mechanism added, on the tangent of a run without it."""
+    posterior, new = _posterior_with_added(context, task)
+    vector = np.clip(posterior.vector({**context.neutral, **task.theta}), *posterior.bounds)
     parts = [part for name in new for part in context.known[name].whole_or_parts]
-    near = within(about, vector, TRUST)
+    near = within(posterior, vector, TRUST)
     return fit((*task.names, *new), near, task.theta, context.neutral, context.seed, parts).theta
 
 
-def _posterior_beside(context: DiagnosisContext, task: ScoreTestTask) -> tuple[LogPosterior, list[str]]:
-    """Returns the posterior with one mechanism more about a run without it, and the names that are new."""
+def _posterior_with_added(context: DiagnosisContext, task: ScoreTestTask) -> tuple[LogPosterior, list[str]]:
+    """Returns the posterior with one mechanism added, near a run without it, and the names of the new ones.
+
+    The new mechanisms are the added one and those that it needs.
+    """
     new = [name for name in with_one(task.names, task.name, context.known) if name not in task.names]
     return context.posterior(task.names, [task.run], _as_array(task.correction_n), more=new), new
 
 
-def _fit_of(context: DiagnosisContext, said: Mapping[str, Any], until_s: float | None = None) -> SetFit:
-    """Returns a fit from what `as_json` made of it."""
-    run = ModelRun(*(np.array(said["run"][name]) for name in ("theta", "force_n", "slopes_n")))
-    correction_n = np.array(said["off_n"])
-    about = context.posterior(
-        said["fit"]["names"], [run], correction_n if correction_n.any() else None, until_s
+def _fit_from_json(
+    context: DiagnosisContext, plain: Mapping[str, Any], until_s: float | None = None
+) -> SetFit:
+    """Returns the fit that `as_json` converted to JSON's types."""
+    run = ModelRun(*(np.array(plain["run"][name]) for name in ("theta", "force_n", "slopes_n")))
+    correction_n = np.array(plain["off_n"])
+    posterior = context.posterior(
+        plain["fit"]["names"], [run], correction_n if correction_n.any() else None, until_s
     )
-    return SetFit(restored(said["fit"], about), run, said["runs"], said["settled"], correction_n)
+    return SetFit(restored(plain["fit"], posterior), run, plain["runs"], plain["settled"], correction_n)
 
 
 def _as_array(values: tuple[float, ...]) -> Array | None:
+    """Returns the values (m,) as an array, and None where there are none."""
     return np.array(values) if values else None

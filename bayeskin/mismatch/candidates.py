@@ -1,7 +1,8 @@
-"""Candidate mechanisms beside a set: score tests of all of them, and fits of the most promising ones.
+"""Tests every mechanism that could be added to a set with a score test, and fits the most promising ones.
 
 A mechanism that acts on the force alone is tested on the tangent of the set's last run, and its values are
-searched for there. A mechanism that the forward model solves is tested by a few runs off its neutral value.
+searched for there. A mechanism of the tissue is tested by a few runs of the forward model off its neutral
+value.
 """
 
 from __future__ import annotations
@@ -26,32 +27,35 @@ Values = Mapping[str, float]
 
 
 class Candidates:
-    """Finds the mechanisms that are worth fitting beside a set.
+    """Finds the mechanisms that are worth adding to a set.
 
-    It remembers the shape of each mechanism that promised most, and the sets that it was asked about.
+    It remembers the most promising shape of each mechanism, and in `expanded` the sets to which it has
+    already added mechanisms.
     """
 
     def __init__(self, context: SearchContext) -> None:
         self._context = context
-        self._shapes: dict[str, Values] = {}  # by the name of the strength
+        self._shapes: dict[str, Values] = {}  # the keys are names of strength parameters
         self.expanded: set[Names] = set()
 
     def fit_beside(self, current: SetFit) -> list[Names]:
-        """Fits the most promising of the new sets with one mechanism more; returns these sets.
+        """Fits the most promising of the new sets that have one mechanism more, and returns these sets.
 
-        A fit that fails, or that ends below the fit without the mechanism, starts again there: with the
-        values of a run that finished, and then with a weaker mechanism.
+        A fit may fail, or end below the fit without the mechanism. It then starts again from the fit without
+        the mechanism: with the mechanism's values of a run that finished, and then with a weaker mechanism.
         """
         context, names, settings = self._context, current.fit.names, self._context.settings
         self.expanded.add(names)
-        correction_n = correction(current)  # it holds for the same mechanisms of the tissue
+        correction_n = correction(current)  # valid for sets with the same mechanisms of the tissue
         promised, starts, finished = self._score_tests(current)
         order = sorted(promised, key=lambda name: -promised[name])
         least = settings.gain + RARITY
         if context.leaves_more_than_noise(current):
             least = settings.promised
         chosen = [name for name in order if promised[name] > least][: settings.shortlist]
-        context.tell("promised: " + ", ".join(f"{name} {promised[name]:.0f} nats" for name in order[:5]))
+        context.tell(
+            "predicted gains: " + ", ".join(f"{name} {promised[name]:.0f} nats" for name in order[:5])
+        )
         sets = {name: with_one(names, name, context.known) for name in chosen}
         fits = context.ask([
             FitTask(sets[name], starts[name], settings.first) if name in starts
@@ -62,13 +66,13 @@ class Candidates:
         theta = {**context.neutral, **current.fit.theta}
         for share in settings.again:
             worse = [name for name in chosen if not better[name]]
-            more = context.ask([
+            repeated = context.ask([
                 FitTask(sets[name], {**theta, **self._weaker(name, finished.get(name, {}), share)},
                       settings.first, () if name in starts else correction_n)
                 for name in worse
             ])  # fmt: skip
-            better |= {name: _is_better(fit, current) for name, fit in zip(worse, more, strict=True)}
-            fits += more
+            better |= {name: _is_better(fit, current) for name, fit in zip(worse, repeated, strict=True)}
+            fits += repeated
         context.keep(fits, current)
         for name, with_name in sets.items():
             fit = context.record.fits.get(with_name)
@@ -77,15 +81,18 @@ class Candidates:
         return list(sets.values())
 
     def _score_tests(self, current: SetFit) -> tuple[dict[str, float], dict[str, Values], dict[str, Values]]:
-        """Returns, by mechanism: the gain that its score test promises [nats]; where a fit would start, and
-        values with which the model runs, of the mechanisms that the model solves."""
+        """Returns the gain [nats] that the score test promises for each mechanism that is not in the set.
+
+        For mechanisms of the tissue it also returns the values from which a fit would start, and values of
+        the mechanism with which the forward model runs.
+        """
         context, names = self._context, current.fit.names
-        others = [
+        untried = [
             name for name in context.known
             if name not in names and with_one(names, name, context.known) not in context.record.fits
         ]  # fmt: skip
-        solved = [name for name in others if isinstance(context.known[name].act, Tissue)]
-        quick = [name for name in others if name not in solved]
+        solved = [name for name in untried if isinstance(context.known[name].act, Tissue)]
+        quick = [name for name in untried if name not in solved]
         probes = [(name, values) for name in solved for values in self._probes(context.known[name])]
         theta = {**context.neutral, **current.fit.theta}
         tasks: list[Task] = [
@@ -112,13 +119,13 @@ class Candidates:
         return promised, starts, finished
 
     def _score_test(self, current: SetFit, name: str) -> ScoreTestTask:
-        """Returns the score test of a mechanism that acts on the force, beside a set."""
+        """Returns the task of a score test: a mechanism that acts on the force is added to a set."""
         return ScoreTestTask(current.fit.names, current.fit.theta, current.run, name, correction(current))
 
     def _probes(self, mechanism: Mechanism) -> list[dict[str, float]]:
-        """Returns values of each part of a mechanism, off neutral, at which the model runs.
+        """Returns values of each part of a mechanism, off the neutral value, with which the model is run.
 
-        The first time they have several shapes, later the shape that promised most.
+        The first test of a mechanism uses several shapes. Later tests use the most promising shape.
         """
         settings = self._context.settings
         by_name, rows = {p.name: p for p in mechanism.parameters}, []
@@ -134,7 +141,7 @@ class Candidates:
         return rows
 
     def _weaker(self, name: str, values: Values, share: float) -> dict[str, float]:
-        """Returns values of a mechanism whose strength is only a share of its distance from neutral."""
+        """Returns values of a mechanism whose strength is only `share` as far from its neutral value."""
         weaker = dict(values)
         for strength in list(values)[:1]:
             neutral = self._context.known[name].neutral[strength]
@@ -144,32 +151,32 @@ class Candidates:
     def _score(
         self, current: SetFit, name: str, values: Values, force_n: Array
     ) -> tuple[float, dict[str, float]]:
-        """Returns the gain [nats] that a mechanism promises along the change of force that a run shows, and
-        the point at which it would be reached.
+        """Returns the gain [nats] that a score test promises for a mechanism, and the values that reach it.
 
-        The change of the skin's force counts as a change of the reported force.
+        The test uses the change of force that a run with the mechanism shows. The change of the skin's force
+        is taken as the change of the reported force.
         """
-        about, mechanism = current.fit.log_posterior, self._context.known[name]
-        low, high = about.bounds
-        vector = np.clip(about.vector(current.fit.theta), low, high)
-        skin = innermost(about.surrogate)
+        posterior, mechanism = current.fit.log_posterior, self._context.known[name]
+        low, high = posterior.bounds
+        vector = np.clip(posterior.vector(current.fit.theta), low, high)
+        skin = innermost(posterior.surrogate)
         skin_n = skin.predict_mean(np.array([current.fit.theta[p] for p in skin.space.names]))
-        mean = about.predict_mean(about.from_sampling(vector)) + (force_n - skin_n)
+        mean = posterior.predict_mean(posterior.from_sampling(vector)) + (force_n - skin_n)
         free = np.full(len(vector), True)
-        ((_, gain, multiple, moved),) = promise(about, vector, vector[None], free, 1, mean)
+        ((_, gain, multiple, moved),) = promise(posterior, vector, vector[None], free, 1, mean)
         strength = next(iter(values))
         parameter = next(p for p in mechanism.parameters if p.name == strength)
         neutral = mechanism.neutral[strength]
         wanted = neutral + multiple * (values[strength] - neutral)
         inside = float(np.clip(wanted, parameter.lower, parameter.upper))
-        if (inside - neutral) * (wanted - neutral) <= 0.0:  # its prior does not allow this direction
+        if (inside - neutral) * (wanted - neutral) <= 0.0:  # the prior does not allow this direction
             return 0.0, {}
-        named = about.named(about.from_sampling(np.clip(moved, low, high)))
+        named = posterior.named(posterior.from_sampling(np.clip(moved, low, high)))
         return gain, {**self._context.neutral, **named, **values, strength: inside}
 
 
 def shapes_of(mechanism: Mechanism, names: Sequence[str], count: int) -> list[dict[str, float]]:
-    """Returns `count` values of some of a mechanism's parameters, spread over their priors."""
+    """Returns `count` points of some of a mechanism's parameters, spread over their priors."""
     by_name = {p.name: p for p in mechanism.parameters}
     space = ParameterSpace(tuple(by_name[name] for name in names))
     unit = qmc.Halton(space.dim, scramble=False).random(count + 1)[1:]
@@ -177,5 +184,5 @@ def shapes_of(mechanism: Mechanism, names: Sequence[str], count: int) -> list[di
 
 
 def _is_better(answer: object, current: SetFit) -> bool:
-    """Returns whether an answer is a fit that is not below another fit."""
+    """Returns whether an answer is a fit whose log-likelihood is at least that of the current fit."""
     return isinstance(answer, SetFit) and answer.fit.log_likelihood >= current.fit.log_likelihood

@@ -1,4 +1,4 @@
-"""The context of a diagnosis: a recording, a forward model of its test, and posteriors about its runs."""
+"""The context of a diagnosis: a recording, a forward model of its test, and posteriors near runs of it."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from bayeskin.inference import LogPosterior, NoisePriors
 from bayeskin.inference.noise_model import ALL, noise_space
 from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed
 from bayeskin.mechanisms.mechanism import Tissue
-from bayeskin.mismatch.fit import instrument_noise, subcutis_too_stiff
+from bayeskin.mismatch.noise_bounds import instrument_noise
 from bayeskin.mismatch.observed import ObservedSurrogate
+from bayeskin.mismatch.stiffness_ratio import subcutis_too_stiff
 from bayeskin.mismatch.tangent import Tangent
 from bayeskin.types import Array, BinnedForce, Jumps, PadMotion, ParameterSpace, Surrogate
 
@@ -26,8 +27,8 @@ from bayeskin.types import Array, BinnedForce, Jumps, PadMotion, ParameterSpace,
 class DiagnosisContext:
     """A recording and a forward model of its test.
 
-    binned : the recording's bins, whose variances are those of quick noise; jumps : jumps that its samples
-        allow; motion : its protocol
+    binned : the recording's bins, whose variances contain only quick noise; jumps : the jumps that its
+        samples allow; motion : its protocol
     base : priors of the base model; stated_noise : bounds of noise parameters that replace the usual ones
     """
 
@@ -55,26 +56,29 @@ class DiagnosisContext:
 
     @cached_property
     def noise_priors(self) -> NoisePriors:
-        """Returns the bounds of the noise, which has one sd for all phases."""
+        """Returns the bounds of the noise parameters; all phases share one sd."""
         return replace(instrument_noise(self.binned), by_kind=False, **dict(self.stated_noise))  # type: ignore[arg-type]
 
     @property
     def noise(self) -> dict[str, float]:
-        """Returns the values of the noise parameters that fits start from: the middle of their priors."""
+        """Returns the noise parameters from which fits start: the middle of their priors."""
         space = noise_space([ALL], self.noise_priors)
         return dict(zip(space.names, map(float, space.from_unit(np.full(space.dim, 0.5))), strict=True))
 
     def solved(self, names: Sequence[str]) -> list[Mechanism]:
-        """Returns the mechanisms of a set that the forward model solves, in the order of their names."""
+        """Returns the mechanisms of a set that the forward model solves, ordered by name."""
         return [self.known[name] for name in sorted(names) if name in self.forward.solves]
 
     def space(self, names: Sequence[str]) -> ParameterSpace:
-        """Returns the parameters that the forward model solves for a set: the base model's come first."""
+        """Returns the parameters of the forward model for a set: the base model's, then the mechanisms'."""
         mechanisms = tuple(p for m in self.solved(names) for p in m.parameters)
         return ParameterSpace((*self.base.parameters, *mechanisms))
 
     def run(self, names: Sequence[str], theta: Mapping[str, float], derive: bool = True) -> ModelRun | str:
-        """Returns a run of a set, with derivatives or without, or the message of a run that failed."""
+        """Returns a run of the forward model with a set, or the message of a run that failed.
+
+        derive : whether the run computes derivatives
+        """
         space = self.space(names)
         at = np.array([theta[name] for name in space.names])
         return self.forward.run(space, at, self.solved(names), derive)
@@ -97,15 +101,15 @@ class DiagnosisContext:
     def reported_of(self, names: Sequence[str], theta: Mapping[str, float], force_n: Array) -> Array:
         """Returns the force (m,) [N] that the instrument reports for a force (m,) of the skin."""
         at = np.array([theta[name] for name in self.space(names).names])
-        seen = self.observe(names, (), [ModelRun(at, force_n, np.zeros((len(force_n), len(at))))])
-        return seen.predict_mean(np.array([theta[name] for name in seen.space.names]))[0]
+        surrogate = self.observe(names, (), [ModelRun(at, force_n, np.zeros((len(force_n), len(at))))])
+        return surrogate.predict_mean(np.array([theta[name] for name in surrogate.space.names]))[0]
 
     def reported_elsewhere(
         self, names: Sequence[str], theta: Mapping[str, float], motion: PadMotion, edges_s: Array
     ) -> Array | str:
         """Returns the force (m,) [N] that the instrument reports on another protocol, or why the run failed.
 
-        edges_s (m + 1,) : of the bins whose means are returned
+        edges_s (m + 1,) : edges of the bins whose means are returned
         """
         values = {name: theta[name] for name in self.space(names).names}
         assert isinstance(self.forward, ReducedForward)
@@ -118,36 +122,37 @@ class DiagnosisContext:
         return bin_means(force, motion, edges_s, beyond)[0]
 
     def observe(self, names: Sequence[str], more: Sequence[str], runs: Sequence[ModelRun]) -> Surrogate:
-        """Returns the reported force about runs of a set.
+        """Returns a surrogate of the reported force near runs of a set.
 
-        more : further mechanisms, by what they do to a force
+        more : further mechanisms, which act on the force of these runs
         """
         errors_n = self.forward.errors(runs[0].theta)
-        skin = Tangent(self.space(names), self.binned.edges_s, tuple(runs), errors_n)
+        tissue = Tangent(self.space(names), self.binned.edges_s, tuple(runs), errors_n)
         beyond = tuple(
             self.known[name] for name in sorted({*names, *more})
             if name in more or name not in self.forward.solves
         )  # fmt: skip
-        return ObservedSurrogate(skin, beyond, self.motion) if beyond else skin
+        return ObservedSurrogate(tissue, beyond, self.motion) if beyond else tissue
 
     def posterior(
         self, names: Sequence[str], runs: Sequence[ModelRun], correction_n: Array | None = None,
         until_s: float | None = None, more: Sequence[str] = (),
     ) -> LogPosterior:  # fmt: skip
-        """Returns the posterior of a set about runs of it.
+        """Returns the posterior of a set near runs of the set.
 
-        correction_n (m,) : error of the forward model that was added to the runs. It differs from place to
-            place by as much as it is large, so the likelihood allows for an error of one sd of this size
-        until_s : end of the part of the recording that is fitted, None for the whole
-        more : further mechanisms, by what they do to a force
+        correction_n (m,) : force that was added to the runs to correct the forward model's error. This error
+            varies between points by as much as its own size, so the likelihood allows for an error with this
+            sd
+        until_s : end of the part of the recording that is fitted [s]; None for the whole recording
+        more : further mechanisms, which act on the force of these runs
         """
-        seen = self.observe(names, more, runs)
-        priors = ParameterSpace(seen.space.parameters, self.base.correlations)
+        force = self.observe(names, more, runs)
+        priors = ParameterSpace(force.space.parameters, self.base.correlations)
         windows = None if until_s is None else ((float(self.binned.edges_s[0]), until_s),)
-        about = posterior_of(
-            seen, self.forward.spec, self.binned, self.motion, self.noise_priors, priors, windows,
+        posterior = posterior_of(
+            force, self.forward.spec, self.binned, self.motion, self.noise_priors, priors, windows,
             subcutis_too_stiff,
         )  # fmt: skip
-        if correction_n is None or about.model_error is None:
-            return about
-        return replace(about, model_error=replace(about.model_error, measured_n=correction_n[None]))
+        if correction_n is None or posterior.model_error is None:
+            return posterior
+        return replace(posterior, model_error=replace(posterior.model_error, measured_n=correction_n[None]))

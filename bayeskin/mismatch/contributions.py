@@ -1,7 +1,8 @@
-"""What each mechanism of a fit does to the force: with it, less without it, all else as it was fitted.
+"""Computes how much each mechanism of a fit contributes to the force.
 
-What has nothing to act on without a mechanism goes with it. Contributions need not add up: what mechanisms
-do to each other counts for each of them.
+A contribution is the force with the mechanism minus the force without it, with all other parameters at their
+fitted values. Mechanisms that need the removed one are removed with it. Contributions need not add up to the
+total effect, because an interaction of two mechanisms counts for each of them.
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ from bayeskin.types import Array
 
 @dataclass(frozen=True)
 class Contribution:
-    """One mechanism's part of the force (m,) [N] in all bins, and what was taken out along with it."""
+    """The contribution (m,) [N] of one mechanism to the force in all bins.
+
+    along : names of the mechanisms that were removed along with it, because they need it
+    """
 
     name: str
     along: tuple[str, ...]
@@ -25,22 +29,26 @@ class Contribution:
 
     @property
     def size_n(self) -> float:
-        """RMS over all bins [N]."""
+        """Returns the RMS of the contribution over all bins [N]."""
         return float(np.sqrt(np.mean(self.force_n**2)))
 
 
-Force = Callable[[Sequence[str], Mapping[str, float]], Array | str]  # of a set at values: (m,)
+# Returns the force (m,) [N] of a set at given values, or the message of a run that failed.
+Force = Callable[[Sequence[str], Mapping[str, float]], Array | str]
 
 
 def contributions(
     names: Sequence[str], theta: Mapping[str, float], force: Force, known: Mapping[str, Mechanism]
 ) -> list[Contribution]:
-    """Of each mechanism of a set at its values, the largest first; none where a force cannot be had."""
-    whole, parts = force(names, theta), []
+    """Returns the contribution of each mechanism of a set at given values, the largest first.
+
+    A mechanism is left out where the run with or without it fails.
+    """
+    force_n, parts = force(names, theta), []
     for name in names:
-        rest = without_one(names, name, known)
-        without = force(rest, theta)
-        if not isinstance(whole, str) and not isinstance(without, str):
-            along = tuple(other for other in names if other not in (name, *rest))
-            parts.append(Contribution(name, along, whole - without))
+        remaining = without_one(names, name, known)
+        without_n = force(remaining, theta)
+        if not isinstance(force_n, str) and not isinstance(without_n, str):
+            along = tuple(removed for removed in names if removed not in (name, *remaining))
+            parts.append(Contribution(name, along, force_n - without_n))
     return sorted(parts, key=lambda part: -part.size_n)

@@ -1,7 +1,7 @@
-"""Predictions at points of which many agree in all that one part of a surrogate depends on.
+"""Predicts only once for points that agree in all parameters on which a part of a surrogate depends.
 
-Differences by one parameter and draws of one mechanism leave the others as they are: what depends on these
-alone is predicted once.
+Finite differences in one parameter, and draws of one mechanism's parameters, do not change the other
+parameters. A part of a surrogate that depends only on unchanged parameters is then predicted once.
 """
 
 from __future__ import annotations
@@ -15,22 +15,25 @@ from bayeskin.types import Array, Prediction
 
 
 def at_distinct(predict: Callable[[Array, Array], Prediction], theta: Array, also: Array) -> Prediction:
-    """predict(theta, also), once for all rows of theta (n, d) that agree; `also` (n, ...) agrees with it."""
+    """Returns predict(theta, also), computed once for all rows of theta (n, d) that are equal.
+
+    also : further arguments (n, ...) of `predict`, which must be equal where the rows of theta are equal
+    """
     first, place = _distinct(theta)
     if len(first) == len(theta):
         return predict(theta, also)
-    found = predict(theta[first], also[first])
-    rows = found.factor.transpose(0, 2, 1)  # as they lie in memory
-    return Prediction(found.mean[place], rows[place].transpose(0, 2, 1), found.diagonal[place])
+    distinct = predict(theta[first], also[first])
+    rows = distinct.factor.transpose(0, 2, 1)  # the layout of the factor in memory
+    return Prediction(distinct.mean[place], rows[place].transpose(0, 2, 1), distinct.diagonal[place])
 
 
 def mean_at_distinct(predict: Callable[[Array, Array], Array], theta: Array, also: Array) -> Array:
-    """The same of a mean (n, m) alone."""
+    """Returns the same as `at_distinct` for a function that predicts only the mean (n, m)."""
     first, place = _distinct(theta)
     return predict(theta, also) if len(first) == len(theta) else predict(theta[first], also[first])[place]
 
 
 def _distinct(theta: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Of rows (n, d): where each distinct one first stands, and for each row which of these it is (n,)."""
+    """Returns the first index of each distinct row of theta (n, d), and the position of each row in them."""
     _, first, place = np.unique(theta, axis=0, return_index=True, return_inverse=True)
     return first, place.reshape(-1)

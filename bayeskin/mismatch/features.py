@@ -1,4 +1,4 @@
-"""What a discrepancy looks like, in plain words."""
+"""Describes in plain words where a discrepancy is large, how it changes, and what it correlates with."""
 
 from __future__ import annotations
 
@@ -8,64 +8,75 @@ from numpy.typing import NDArray
 from bayeskin.mismatch.unexplained import Place, Unexplained
 from bayeskin.types import Array
 
-CERTAIN = 2.0  # standard deviations from zero
-WIDESPREAD = 0.25  # of a phase kind's bins
-CHANGED = 1.5  # ratio of the last cycle's size to the first's
-FOLLOWS = 0.5  # squared correlation
-SEEN = 1e-3  # of an axis' length that must remain beyond what parameters take up
+CERTAIN = 2.0  # standard deviations from zero beyond which a discrepancy is certain
+WIDESPREAD = 0.25  # share of the bins of a kind of phase that must be certain
+CHANGED = 1.5  # ratio of the last cycle's size to the first cycle's from which it has changed
+FOLLOWS = 0.5  # squared correlation from which a discrepancy follows a coordinate
+SEEN = 1e-3  # smallest share of a coordinate's norm that must remain after the parameters' part is removed
 WORDS = {"rest": "at rest", "load": "while loading", "hold": "in holds", "unload": "while unloading"}
 
 
 def describe(rest: Unexplained, mean_n: Array, sd_n: Array) -> tuple[str, ...]:
-    """Where a discrepancy of mean and sd (k,) stands out, its sign, trend over cycles, what it follows."""
+    """Returns sentences that describe a discrepancy of given mean and sd, (k,) each [N].
+
+    They say in which phases it is certain, its sign, its trend over the cycles, and the coordinates that it
+    correlates with.
+    """
     at, certain = rest.at, np.abs(mean_n) > CERTAIN * sd_n
-    lines = [_of_kind(kind, at, mean_n, certain) for kind in WORDS]
-    lines += [_over_cycles(at, mean_n, certain), *_followed(rest, mean_n)]
-    return tuple(line for line in lines if line)
+    sentences = [_in_phases(kind, at, mean_n, certain) for kind in WORDS]
+    sentences += [_over_cycles(at, mean_n, certain), *_correlations(rest, mean_n)]
+    return tuple(sentence for sentence in sentences if sentence)
 
 
-def _of_kind(kind: str, at: Place, mean_n: Array, certain: NDArray[np.bool_]) -> str:
+def _in_phases(kind: str, at: Place, mean_n: Array, certain: NDArray[np.bool_]) -> str:
+    """Returns the size and sign of a discrepancy in one kind of phase, if enough of its bins are certain."""
     inside = at.kind == kind
     if not inside.any() or np.mean(certain[inside]) < WIDESPREAD:
         return ""
     level, size = float(np.mean(mean_n[inside])), float(np.sqrt(np.mean(mean_n[inside] ** 2)))
     if abs(level) < 0.5 * size:
-        return f"{WORDS[kind]} of changing sign, {1e3 * size:.1f} mN RMS"
+        return f"{WORDS[kind]} the difference changes its sign and is {1e3 * size:.1f} mN RMS"
     side = "above" if level > 0 else "below"
     return f"{WORDS[kind]} the recorded force is {1e3 * abs(level):.1f} mN {side} the model's on average"
 
 
 def _over_cycles(at: Place, mean_n: Array, certain: NDArray[np.bool_]) -> str:
+    """Returns how the size of a discrepancy changes from the first cycle to the last."""
     cycles = [cycle for cycle in np.unique(at.cycle) if cycle > 0]
     if len(cycles) < 2 or not certain.any():
         return ""
     size = [float(np.sqrt(np.mean(mean_n[at.cycle == cycle] ** 2))) for cycle in cycles]
     ratio = size[-1] / size[0] if size[0] > 0.0 else np.inf
     if 1.0 / CHANGED < ratio < CHANGED:
-        return "about as large in the last cycle as in the first"
+        return "the difference is about as large in the last cycle as in the first"
     return (
-        f"{'grows' if ratio > 1.0 else 'fades'} from {1e3 * size[0]:.1f} to {1e3 * size[-1]:.1f} mN RMS "
-        + (f"between cycle {cycles[0]:.0f} and cycle {cycles[-1]:.0f}")
+        f"the difference {'grows' if ratio > 1.0 else 'shrinks'} from {1e3 * size[0]:.1f} to "
+        f"{1e3 * size[-1]:.1f} mN RMS between cycle {cycles[0]:.0f} and cycle {cycles[-1]:.0f}"
     )
 
 
-def _followed(rest: Unexplained, mean_n: Array) -> list[str]:
-    """What the discrepancy rises or falls along, beyond what parameters take up of it."""
-    at, everywhere = rest.at, np.ones(len(mean_n), bool)
-    axes = [
+def _correlations(remainder: Unexplained, mean_n: Array) -> list[str]:
+    """Returns the coordinates that a discrepancy correlates with.
+
+    Only the part of a coordinate that the parameters cannot explain is compared.
+    """
+    at, everywhere = remainder.at, np.ones(len(mean_n), bool)
+    coordinates = [
         ("displacement while the pads move", at.displacement_m, at.direction != 0.0),
         ("displacement over all phases", at.displacement_m, everywhere),
-        ("speed and direction", at.speed_m_s, everywhere),
-        ("the logarithm of time since the corner in holds", np.log1p(at.since_s), at.kind == "hold"),
-        ("the logarithm of time since the corner at rest", np.log1p(at.since_s), at.kind == "rest"),
+        ("the signed speed", at.speed_m_s, everywhere),
+        ("the logarithm of the time in a hold", np.log1p(at.since_s), at.kind == "hold"),
+        ("the logarithm of the time at rest", np.log1p(at.since_s), at.kind == "rest"),
         ("time", at.time_s, everywhere),
     ]
-    lines = []
-    for words, axis, inside in axes:
-        shape = rest.beyond(np.where(inside, axis, 0.0))[inside]
-        if np.linalg.norm(shape) <= SEEN * np.linalg.norm(axis) or np.ptp(mean_n[inside]) == 0.0:
+    sentences = []
+    for description, coordinate, inside in coordinates:
+        part = remainder.beyond(np.where(inside, coordinate, 0.0))[inside]
+        if np.linalg.norm(part) <= SEEN * np.linalg.norm(coordinate) or np.ptp(mean_n[inside]) == 0.0:
             continue
-        r = float(np.corrcoef(shape, mean_n[inside])[0, 1])
+        r = float(np.corrcoef(part, mean_n[inside])[0, 1])
         if r * r > FOLLOWS:
-            lines.append(f"{'rises' if r > 0 else 'falls'} with {words} (r² = {r * r:.2f})")
-    return lines
+            sentences.append(
+                f"the difference {'rises' if r > 0 else 'falls'} with {description} (r² = {r * r:.2f})"
+            )
+    return sentences

@@ -1,8 +1,8 @@
-"""Checks of fits by runs of the full model, and fits again where the forward model is too far off.
+"""Checks fits by runs of the full model, and repeats fits for which the forward model is too far off.
 
-The forward model has an error, which differs from one set of mechanisms to another. A full run at a fit shows
-it. The difference is then added to the force of the forward model, and the set is fitted again. So the sets
-that compete at the end are compared by forces that are as exact as the noise requires.
+The forward model has an error, which differs from one set of mechanisms to another. A run of the full model
+at a fit shows it. The error is then added to the force of the forward model, and the set is fitted again. The
+sets that compete at the end are therefore compared by forces that are as exact as the noise requires.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from bayeskin.types import Array
 
 
 def checked_best(context: SearchContext) -> SetFit:
-    """Returns the likeliest set after a check, if it contains mechanisms of the tissue.
+    """Returns the likeliest set; if the forward model solves mechanisms of the set, it is checked before.
 
     Without the check, an error of the forward model with these mechanisms could pass for further mechanisms.
     """
@@ -40,7 +40,10 @@ def check_likely_sets(context: SearchContext) -> None:
 
 
 def check(context: SearchContext, fits: Sequence[SetFit]) -> None:
-    """Runs the full model at fits, and fits the sets again for which the forward model is too far off."""
+    """Runs the full model at fits, and repeats the fits for which the forward model is too far off.
+
+    Fits with the same mechanisms of the tissue share one run, at the first of them.
+    """
     groups: dict[Names, list[SetFit]] = {}
     for fit in fits:
         groups.setdefault(context.solved(fit.fit.names), []).append(fit)
@@ -65,27 +68,30 @@ def is_checked_nearby(context: SearchContext, fit: SetFit) -> bool:
 
 
 def forward_error(fit: SetFit, full_n: object) -> Array:
-    """Returns the error (m,) [N] of the forward model at a fit's run, without the fit's own correction."""
+    """Returns the error (m,) [N] of the forward model at a fit's run, before the fit's own correction.
+
+    full_n : force (m,) [N] of the full model at the same values
+    """
     return np.asarray(full_n) - (fit.run.force_n - fit.correction_n)
 
 
 def _unchecked(context: SearchContext) -> list[SetFit]:
     """Returns the fits to check.
 
-    These are likely sets, parts of the likeliest set that have the same mechanisms of the tissue, and the
-    likeliest set itself if it has moved since its check.
+    These are the likely sets, subsets of the likeliest set that have the same mechanisms of the tissue, and
+    the likeliest set itself if its run has changed since its check.
     """
     record, settings = context.record, context.settings
     order = record.likeliest(len(record.fits))
     best = order[0]
     likely = [fit for fit in order[: settings.compared] if gained(best, fit) <= settings.close]
     solved = context.solved(best.fit.names)
-    parts = [
+    subsets = [
         fit for fit in order
         if set(fit.fit.names) < set(best.fit.names) and context.solved(fit.fit.names) == solved
     ]  # fmt: skip
     unchecked = {
-        fit.fit.names: fit for fit in (*likely, *parts)
+        fit.fit.names: fit for fit in (*likely, *subsets)
         if fit.fit.names not in record.checks and not is_checked_nearby(context, fit)
     }  # fmt: skip
     last = record.checks.get(best.fit.names)
@@ -96,22 +102,23 @@ def _unchecked(context: SearchContext) -> list[SetFit]:
 def _record_checks(
     context: SearchContext, first: SetFit, members: Sequence[SetFit], full_n: object
 ) -> list[FitTask]:
-    """Records what a full run at the first of some fits shows of all of them; returns the fits to repeat.
+    """Records the result of a full run at the first of some fits for all of them; returns the fits to repeat.
 
-    All have the same mechanisms of the tissue, so the error of the forward model is taken to be the same.
+    All fits have the same mechanisms of the tissue, so they are taken to have the same error of the forward
+    model.
     """
     tasks = []
     for fit in members:
         names = fit.fit.names
         if isinstance(full_n, str):
             context.record.checks[names] = Check(first.run.theta, full_n, np.inf)
-            context.tell(f"{title(names)}: the full model fails there: {full_n}")
+            context.tell(f"{title(names)}: the full model fails at the fit: {full_n}")
             continue
         error_n = forward_error(first, full_n)
         off = context.rms(error_n - fit.correction_n)
         context.record.checks[names] = Check(first.run.theta, np.asarray(full_n), off)
         if off > context.settings.exact * noise_of(context.binned):
             tasks.append(FitTask(names, fit.fit.theta, context.settings.runs, tuple(error_n.tolist())))
-            difference = f"the full model differs by {1e3 * off:.1f} mN"
-            context.tell(f"{title(names)}: {difference}; the set is fitted again with that correction")
+            difference = f"the full model differs by {1e3 * off:.1f} mN RMS"
+            context.tell(f"{title(names)}: {difference}; the set is fitted again with this correction")
     return tasks

@@ -1,9 +1,9 @@
-"""Further maxima of the posterior of the most probable set, from values that the force says little about.
+"""Finds further maxima of the posterior of the most probable set, from values that the force hardly informs.
 
-A posterior often has several maxima whose forces hardly differ. A force hardly tells which layer drains while
-it is observed, and of the other layer whether it drains at once or not at all. Intervals that ignore the
-further maxima are too narrow, and a mechanism may have gained only because the smaller set was not at its
-highest maximum.
+A posterior often has several maxima whose forces hardly differ. The force hardly shows which of the layers
+drains during the test, and whether the other layer drains at once or not at all. Intervals that ignore the
+further maxima are too narrow. Besides, a mechanism may have gained only because the smaller set was not at
+its highest maximum.
 """
 
 from __future__ import annotations
@@ -24,21 +24,26 @@ from bayeskin.types import ParameterSpace
 
 
 def find_further_maxima(context: SearchContext, weigh: Callable[[], None]) -> None:
-    """Records further maxima of the most probable set, after those of the likeliest of its parts.
+    """Records further maxima of the likeliest subset of the most probable set, then those of this set.
 
-    weigh : compares the hypotheses again, after a fit of theirs has changed
+    weigh : compares the hypotheses again after a fit has changed
     """
     record = context.record
     family, names = record.family, record.chosen
-    behind = {part: family.likeliest(names) - family.likeliest(part) for part in record.evidences}
-    parts = [part for part in behind if set(part) < set(names) and behind[part] < context.settings.behind]
-    if parts:
-        _record_maxima(context, min(parts, key=lambda part: behind[part]), weigh)
+    behind = {subset: family.likeliest(names) - family.likeliest(subset) for subset in record.evidences}
+    subsets = [
+        subset for subset in behind if set(subset) < set(names) and behind[subset] < context.settings.behind
+    ]
+    if subsets:
+        _record_maxima(context, min(subsets, key=lambda subset: behind[subset]), weigh)
     _record_maxima(context, record.chosen, weigh)
 
 
 def _record_maxima(context: SearchContext, names: Names, weigh: Callable[[], None]) -> None:
-    """Records further maxima of a set; their forces differ by so little that each needs a full run."""
+    """Records further maxima of a set.
+
+    Their forces differ by so little that each maximum needs a run of the full model.
+    """
     record, settings = context.record, context.settings
     if record.others_of(names):
         return
@@ -69,7 +74,7 @@ def _record_maxima(context: SearchContext, names: Names, weigh: Callable[[], Non
 
 
 def fit_larger_sets(context: SearchContext, best: SetFit) -> None:
-    """Fits the compared sets that contain a set again, from its new maximum."""
+    """Repeats the fits of the compared sets that contain a set, from this set's new maximum."""
     record = context.record
     larger = [names for names in record.evidences if set(best.fit.names) < set(names)]
     starts = [{**record.fits[names].fit.theta, **best.fit.theta} for names in larger]
@@ -83,15 +88,15 @@ def fit_larger_sets(context: SearchContext, best: SetFit) -> None:
 
 
 def _fits_elsewhere(context: SearchContext, best: SetFit) -> list[SetFit]:
-    """Returns fits of a set that ended elsewhere and not far behind, the likeliest first."""
+    """Returns fits of a set that ended at other maxima and are not much less likely, the likeliest first."""
     settings, names, correction_n = context.settings, best.fit.names, correction(best)
     climbs = [
         FitTask(names, start, settings.first, correction_n) for start in _starts_elsewhere(context, best)
     ]
     first = _distinct(context, context.ask(climbs), [best], settings.behind)
-    left = settings.runs - settings.first
+    remaining = settings.runs - settings.first
     continued = context.ask(
-        [FitTask(names, fit.fit.theta, left, correction_n) for fit in first if not fit.settled]
+        [FitTask(names, fit.fit.theta, remaining, correction_n) for fit in first if not fit.settled]
     )
     ended = [*(fit for fit in first if fit.settled), *continued]
     return _distinct(context, ended, [best], settings.close)[: settings.maxima]
@@ -100,14 +105,14 @@ def _fits_elsewhere(context: SearchContext, best: SetFit) -> list[SetFit]:
 def _distinct(
     context: SearchContext, answers: Sequence[object], known: Sequence[SetFit], behind: float
 ) -> list[SetFit]:
-    """Returns the fits among answers that are at no known maximum, the likeliest of each new maximum.
+    """Returns the fits among the answers that lie at new maxima: the likeliest fit of each maximum.
 
-    behind : largest difference in weight [nats] from the first of the known fits
+    known : fits at known maxima; behind : largest difference in weight [nats] from the first of them
     """
     fits = sorted((a for a in answers if isinstance(a, SetFit)), key=lambda fit: -weight(fit.fit))
     kept = list(known)
     for fit in fits:
-        apart = not any(context.is_alike(fit, other.run.theta) for other in kept)
+        apart = not any(context.is_alike(fit, maximum.run.theta) for maximum in kept)
         if apart and gained(known[0], fit) <= behind:
             kept.append(fit)
     return kept[len(known) :]
@@ -116,8 +121,9 @@ def _distinct(
 def _starts_elsewhere(context: SearchContext, best: SetFit) -> list[dict[str, float]]:
     """Returns values from which further maxima may be reached.
 
-    Permeabilities are equal, or exchanged, or one of them is near an end of its prior; the moduli are those
-    that suit the recording best. Or a mechanism that the model solves has another shape.
+    In some of them the permeabilities are equal, or exchanged, or one of them is near an end of its prior,
+    and the moduli are those that suit the recording best. In others, a mechanism that the forward model
+    solves has another shape.
     """
     theta, settings = best.fit.theta, context.settings
     limits = {p.name: (p.lower, p.upper) for p in context.base.parameters}
@@ -125,10 +131,10 @@ def _starts_elsewhere(context: SearchContext, best: SetFit) -> list[dict[str, fl
     changes: list[dict[str, float]] = []
     if flow.dim:
         middle = float(np.exp(np.mean([np.log(theta[name]) for name in flow.names])))
-        exchanged = {name: theta[other] for name, other in zip(flow.names, flow.names[::-1], strict=True)}
+        exchanged = {name: theta[partner] for name, partner in zip(flow.names, flow.names[::-1], strict=True)}
         changes = [dict.fromkeys(flow.names, middle), exchanged]
-        for share in settings.ends:
-            at_end = flow.from_unit(np.full(flow.dim, share))
+        for position in settings.ends:
+            at_end = flow.from_unit(np.full(flow.dim, position))
             changes += [{name: float(value)} for name, value in zip(flow.names, at_end, strict=True)]
     changes = [{name: float(np.clip(value, *limits[name])) for name, value in change.items()}
                for change in changes]  # fmt: skip
@@ -141,12 +147,15 @@ def _starts_elsewhere(context: SearchContext, best: SetFit) -> list[dict[str, fl
 
 
 def _with_best_moduli(context: SearchContext, theta: Mapping[str, float], best: SetFit) -> dict[str, float]:
-    """Returns the base parameters with the ratio of moduli, and the stiffness, whose force is nearest."""
+    """Returns the base parameters, with the moduli changed so that the force is nearest to the recorded one.
+
+    Several ratios of the moduli are tried, each at the stiffness that suits it best.
+    """
     tissue = {name: theta[name] for name in context.base.names}
-    first, *others = (p for p in context.base.parameters if p.stress_power > 0)
+    first_modulus, *other_moduli = (p for p in context.base.parameters if p.stress_power > 0)
     tissues = [
-        {**tissue, p.name: float(np.clip(ratio * tissue[first.name], p.lower, p.upper))}
-        for p in others for ratio in context.settings.ratios
+        {**tissue, p.name: float(np.clip(ratio * tissue[first_modulus.name], p.lower, p.upper))}
+        for p in other_moduli for ratio in context.settings.ratios
     ]  # fmt: skip
     nearest = nearest_tissues(context, best.fit.names, [tissue, *tissues], theta)
     return next(iter(nearest), tissue)

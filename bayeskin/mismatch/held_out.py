@@ -1,8 +1,8 @@
-"""Prediction of the end of a recording by fits to its beginning.
+"""Tests how well fits to the beginning of a recording predict its end.
 
-Sets of mechanisms are fitted to what ends with the second hold, from their values in fits to the whole
-recording, and the likeliest of them is chosen by the beginning alone. What follows is held out: it tests the
-forces of the base model and of the chosen set.
+Sets of mechanisms are fitted to the part of the recording up to the end of the second hold. The fits start
+from the values of fits to the whole recording. The likeliest set is chosen by this beginning alone. The rest
+of the recording is held out: it tests the forces of the base model and of the chosen set.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bayeskin.mismatch.tasks import AnswerTasks, FitTask
 from bayeskin.mismatch.trust_region import SetFit
 from bayeskin.types import BinnedForce
 
-RUNS = 6  # of a fit, at most
+RUNS = 6  # largest number of model runs of a fit
 
 
 @dataclass(frozen=True)
@@ -29,19 +29,22 @@ class Beginning:
 
 
 def end_of_second_hold(binned: BinnedForce) -> float | None:
-    """Returns the time at which the held-out part starts; None where no third hold follows."""
+    """Returns the time [s] at which the held-out part starts, or None where no third hold follows."""
     holds = [phase for phase in binned.phases if phase.kind == "hold"]
     return holds[1].end_s if len(holds) > 2 else None
 
 
 def fit_beginning(ask: AnswerTasks, sets: Sequence[SetFit], split_s: float | None) -> Beginning | None:
-    """Returns the fits of some sets, the base model among them, to the beginning; None where it has no end.
+    """Returns the fits of the base model and of the likeliest set to the beginning of a recording.
 
-    It is also None where the base model's fit fails.
+    The result is None where the base model's fit fails.
+
+    sets : fits to the whole recording, the base model's among them
+    split_s : end of the beginning [s]; if it is None, the result is None
     """
     if split_s is None:
         return None
-    answers = ask([FitTask(one.fit.names, one.fit.theta, RUNS, correction(one), split_s) for one in sets])
-    fits = [one.fit for one in answers if isinstance(one, SetFit)]
-    base = next((one for one in fits if not one.names), None)
+    answers = ask([FitTask(fit.fit.names, fit.fit.theta, RUNS, correction(fit), split_s) for fit in sets])
+    fits = [answer.fit for answer in answers if isinstance(answer, SetFit)]
+    base = next((fit for fit in fits if not fit.names), None)
     return None if base is None else Beginning(base, max(fits, key=weight))

@@ -1,16 +1,17 @@
-"""One rule for the verdict: probabilities of hypotheses in one family.
+"""Decides the verdict by one rule, from the probabilities of a family of hypotheses.
 
-A hypothesis is a set of mechanisms, with or without something smooth beside it that has no name (a Gaussian
-process, `discrepancy`). Each mechanism is there with the same prior probability, and so is what has no name.
-The evidence of both kinds is that of the force linear about the set's fit, with the measured noise
-(`Unexplained.log_evidence`). Probabilities are shares of all hypotheses that were weighed; sets that were
-never fitted count as nothing.
+A hypothesis is a set of mechanisms, with or without an unnamed smooth discrepancy (a Gaussian process,
+`discrepancy`). Every mechanism has the same prior probability, and the discrepancy has it, too. The evidence
+of every hypothesis takes the force as linear near the set's fit, and uses the measured noise
+(`Unexplained.log_evidence`). A probability is a share of the weights of all hypotheses that were compared;
+sets that were never fitted do not count.
 
-A mechanism is named where it has nine chances in ten, or its look-alikes have them together and it is the
-likeliest of these. But where something smooth is likelier than not, and the likeliest set explains less than
-nine tenths of the squared misfit, nothing is named: a Gaussian process is a poor model of what is missing,
-and mechanisms that fill its gaps gain beside it, too. Where none is named the mismatch is unknown, unless it
-is likelier than not that nothing is missing.
+A mechanism is named if its probability is at least 0.9. It is also named if its group of look-alikes has this
+probability together, and it is the likeliest of the group. There is an exception: nothing is named where the
+discrepancy is likelier than not and the likeliest set explains less than nine tenths of the squared misfit. A
+Gaussian process is a poor model of a missing mechanism, and mechanisms that fill the gaps of this model gain
+evidence, too. Where nothing is named the verdict is unknown, unless it is likelier than not that nothing is
+missing.
 """
 
 from __future__ import annotations
@@ -24,16 +25,17 @@ import numpy as np
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.fit import Fit
 
-PRIOR = 0.05  # of a mechanism to be at work, before the recording is seen
+PRIOR = 0.05  # prior probability that a mechanism acts
 ODDS = float(np.log(PRIOR / (1.0 - PRIOR)))
-PROBABLE = 0.9  # of a mechanism or its look-alikes, to be named
+PROBABLE = 0.9  # probability of a mechanism, or of its look-alikes, from which it is named
 LIKELIER_THAN_NOT = 0.5
-MOST_OF_IT = 0.9  # of the squared misfit, which names beside something smooth have to explain
+# Share of the squared misfit that named mechanisms must explain where a discrepancy is likelier than not.
+MOST_OF_IT = 0.9
 
 
 @dataclass(frozen=True)
 class Evidences:
-    """Log evidences of a set: alone, and with something smooth beside it."""
+    """Log-evidences of a set: alone, and with an unnamed smooth discrepancy."""
 
     alone: float
     with_discrepancy: float
@@ -41,7 +43,7 @@ class Evidences:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A set of mechanisms, with something smooth beside it or not; the logarithm of its weight."""
+    """A set of mechanisms, with or without an unnamed discrepancy (`smooth`), and its log weight."""
 
     names: tuple[str, ...]
     smooth: bool
@@ -50,7 +52,11 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class NamedMechanism:
-    """A mechanism that is named, its probability, and that of its look-alikes that are not named already."""
+    """A named mechanism and its probability.
+
+    group : the look-alikes of the mechanism, with its own name
+    group_probability : probability that one of them acts, without those that are named already
+    """
 
     name: str
     probability: float
@@ -60,7 +66,11 @@ class NamedMechanism:
 
 @dataclass(frozen=True)
 class Judgement:
-    """The verdict; probability that nothing is missing, and that something smooth without a name acts."""
+    """The verdict and the named mechanisms.
+
+    nothing_probability : probability that nothing is missing
+    smooth_probability : probability that an unnamed smooth discrepancy acts
+    """
 
     verdict: Literal["nothing-missing", "named", "unknown"]
     named: tuple[NamedMechanism, ...]
@@ -69,16 +79,16 @@ class Judgement:
 
 
 def weight(found: Fit) -> float:
-    """Returns the logarithm of a set's weight: its evidence times the prior of its mechanisms."""
+    """Returns the logarithm of a set's weight: its evidence times the prior odds of its mechanisms."""
     return found.log_evidence + len(found.names) * ODDS
 
 
 def hypotheses_of(names: tuple[str, ...], said: Evidences) -> tuple[Hypothesis, Hypothesis]:
-    """Returns both hypotheses of a set."""
-    own = len(names) * ODDS
+    """Returns both hypotheses of a set: without and with an unnamed discrepancy."""
+    log_prior = len(names) * ODDS
     return (
-        Hypothesis(names, False, said.alone + own),
-        Hypothesis(names, True, said.with_discrepancy + own + ODDS),
+        Hypothesis(names, False, said.alone + log_prior),
+        Hypothesis(names, True, said.with_discrepancy + log_prior + ODDS),
     )
 
 
@@ -89,45 +99,47 @@ class Family:
     hypotheses: Sequence[Hypothesis]
 
     def probability(self, names: Collection[str]) -> float:
-        """Returns the probability that any of these mechanisms acts."""
-        return self._share([bool(set(names) & set(one.names)) for one in self.hypotheses])
+        """Returns the probability that at least one of these mechanisms acts."""
+        return self._share([bool(set(names) & set(hypothesis.names)) for hypothesis in self.hypotheses])
 
     def probability_of_set(self, names: tuple[str, ...]) -> float:
-        """Returns the probability that just these mechanisms act, something smooth beside them or not."""
-        return self._share([one.names == names for one in self.hypotheses])
+        """Returns the probability that exactly these mechanisms act, with or without a discrepancy."""
+        return self._share([hypothesis.names == names for hypothesis in self.hypotheses])
 
     def likeliest(self, names: tuple[str, ...]) -> float:
         """Returns the logarithm of the weight of a set's likeliest hypothesis."""
-        return max(one.log_weight for one in self.hypotheses if one.names == names)
+        return max(hypothesis.log_weight for hypothesis in self.hypotheses if hypothesis.names == names)
 
     @property
     def smooth(self) -> float:
-        """Probability that something smooth without a name acts."""
-        return self._share([one.smooth for one in self.hypotheses])
+        """Returns the probability that an unnamed smooth discrepancy acts."""
+        return self._share([hypothesis.smooth for hypothesis in self.hypotheses])
 
     @property
     def nothing(self) -> float:
-        """Probability that nothing is missing."""
-        return self._share([not one.names and not one.smooth for one in self.hypotheses])
+        """Returns the probability that nothing is missing."""
+        return self._share([not hypothesis.names and not hypothesis.smooth for hypothesis in self.hypotheses])
 
     def _share(self, among: Sequence[bool]) -> float:
-        logs = np.array([one.log_weight for one in self.hypotheses])
-        share = np.exp(logs - logs.max())
+        """Returns the share of the weight that some of the hypotheses have."""
+        log_weights = np.array([hypothesis.log_weight for hypothesis in self.hypotheses])
+        share = np.exp(log_weights - log_weights.max())
         return float(share[np.array(among)].sum() / share.sum())
 
 
 def judge_family(family: Family, known: Mapping[str, Mechanism], explained: float) -> Judgement:
-    """Returns the verdict.
+    """Returns the verdict with the named mechanisms.
 
+    known : all mechanisms by name
     explained : share of the base model's squared misfit that the likeliest set explains
     """
     alone = {name: family.probability([name]) for name in known}
     named: list[NamedMechanism] = []
     for name, probability in sorted(alone.items(), key=lambda item: -item[1]):
-        likelier = [one.name for one in named]
-        group = [other for other in known[name].group if other in known and other not in likelier]
+        already_named = [mechanism.name for mechanism in named]
+        group = [member for member in known[name].group if member in known and member not in already_named]
         together = family.probability(group)
-        likeliest = probability >= max(alone[other] for other in group)
+        likeliest = probability >= max(alone[member] for member in group)
         if probability >= PROBABLE or (likeliest and together >= PROBABLE):
             named.append(NamedMechanism(name, probability, known[name].group, together))
     if family.smooth > LIKELIER_THAN_NOT and explained < MOST_OF_IT:

@@ -1,13 +1,17 @@
-"""Where a recording leaves what the calibrated model allows: windows, the error of the whole search held.
+"""Locates the windows of a recording in which the residual is larger than the calibrated model allows.
 
-What is allowed is the residual that noise alone leaves after a fit: draws of the noise, with its parameters
-of a fit that takes no mismatch for noise, less what parameters and the errors allowed for take up of each;
-and, in each phase, an error of `MODEL_ERROR` of the force's range, which mesh and time steps leave beyond
-what is allowed for (`inference.model_error`; docs/discretisation.md: 0.02 and 0.04 %, RMS), or `MESH_ERROR`,
-which they leave beside a factor alone (0.10 %, there), where no shape of a mesh's error is allowed for. Mean
-residuals over windows of every length inside each phase are counted in standard deviations of the same means
-of draws; the largest over all windows has its distribution from the draws themselves, so that one chance in
-`LEVEL` finds any window where nothing is missing (a scan statistic: Glaz, Naus & Wallenstein 2001).
+The allowed residual is the one that noise alone leaves after a fit. It is computed from draws of the noise,
+minus the part of each draw that the parameters and the allowed errors can explain. The noise parameters come
+from a fit that does not mistake a mismatch for noise. In addition, each phase may have an error of
+`MODEL_ERROR` of the force's range. Mesh and time steps leave this error beyond the errors that are allowed
+for (`inference.model_error`; docs/discretisation.md: 0.02 and 0.04 %, RMS). Where no shapes of the mesh's
+error are allowed for, it is `MESH_ERROR` instead, which mesh and time steps leave beyond a factor alone
+(0.10 %, docs/discretisation.md).
+
+The residual is averaged over windows of many lengths inside each phase. Each mean is divided by the standard
+deviation of the same mean over the draws. The draws also give the distribution of the largest of these
+values over all windows. Where nothing is missing, the probability of finding any window is therefore `LEVEL`
+(a scan statistic: Glaz, Naus & Wallenstein 2001).
 """
 
 from __future__ import annotations
@@ -23,22 +27,27 @@ from scipy.optimize import lsq_linear
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.likelihood import FARTHEST
 from bayeskin.inference.noise_model import draw_noise
-from bayeskin.mismatch.fit import EDGE, Fit
+from bayeskin.mismatch.evidence import EDGE
+from bayeskin.mismatch.fit import Fit
 from bayeskin.types import Array
 
-DRAWS = 1000
-LEVEL = 0.05
-TAIL = 0.1  # of the draws, from whose farthest windows the chance of going farther is read
-SHORTEST = 2  # bins
-MODEL_ERROR = 4e-4  # of the force's range
-MESH_ERROR = 1e-3  # the same
-PRIOR_PRECISION = 12.0  # of a uniform prior over the unit cube
-STEP = 1e-4  # of the unit cube, inwards, for derivatives
+DRAWS = 1000  # number of draws of the noise
+LEVEL = 0.05  # probability of finding any window where nothing is missing
+TAIL = 0.1  # share of the draws with the farthest windows, from which larger distances are extrapolated
+SHORTEST = 2  # smallest number of bins of a window
+MODEL_ERROR = 4e-4  # share of the force's range
+MESH_ERROR = 1e-3  # share of the force's range
+PRIOR_PRECISION = 12.0  # inverse variance of a uniform prior over the unit cube
+STEP = 1e-4  # step of differences in the unit cube, away from the nearer bound
 
 
 @dataclass(frozen=True)
 class Window:
-    """One stretch of a phase: times [s], mean residual [N], chance that any window goes so far by itself."""
+    """A part of a phase in which the residual is larger than allowed.
+
+    start_s, end_s : its times; mean_n : mean residual [N]
+    significance : probability that noise alone makes any window of the recording as significant
+    """
 
     start_s: float
     end_s: float
@@ -50,9 +59,11 @@ class Window:
 
 @dataclass(frozen=True)
 class Located:
-    """Windows in time order; residual (k,) [N] and what is allowed of it, sd (k,) [N], at bins (k,).
+    """The windows of a recording, in order of time.
 
-    chance : that some window goes by itself as far as the farthest does
+    bins : indices of the fitted bins, (k,)
+    residual_n : residual (k,) [N]; allowed_n : sd (k,) [N] of the residual that is allowed
+    chance : probability that noise alone makes any window as significant as the most significant one
     """
 
     windows: tuple[Window, ...]
@@ -63,118 +74,129 @@ class Located:
 
 
 def model_error(log_posterior: LogPosterior) -> float:
-    """What the full model itself is wrong by [N], beyond the shapes that are allowed for."""
+    """Returns the error [N] of the full model beyond the shapes of error that are allowed for."""
     force_n = log_posterior.binned.force_n
     share = MODEL_ERROR if log_posterior.model_error is not None else MESH_ERROR
     return share * float(np.nanmax(force_n) - np.nanmin(force_n))
 
 
 def locate(found: Fit, noise: Mapping[str, float], seed: int) -> Located:
-    """Windows in which the recording differs from the model at `found`, or at another point as near by.
+    """Returns the windows in which the recording differs from the model at a fit, and at all points near it.
 
-    A residual is tested as draws of noise are: less what small changes of the parameters take up of it, so
-    that `found` need not be the best there is. `noise` holds the noise parameters among its values: those of
-    a fit that takes no mismatch for noise.
+    The residual is tested in the same way as draws of the noise: the part that small changes of the
+    parameters explain is subtracted. The fit therefore need not be the best point.
+
+    noise : values by name, with the noise parameters of a fit that does not mistake a mismatch for noise
     """
     log_posterior, rng = found.log_posterior, np.random.default_rng(seed)
     chain = log_posterior.chain
     residual = chain.force_n - found.force_n[chain.bins]
     phase = log_posterior.binned.phase[chain.bins]
-    spread, tested = _allowed(found, noise, residual, rng)
+    drawn, tested = _allowed(found, noise, residual, rng)
     error_n = model_error(log_posterior) * rng.standard_normal((DRAWS, len(log_posterior.binned.phases)))
-    spread += error_n[:, phase]
+    drawn += error_n[:, phase]
     spans = _spans(phase)
-    scale = np.array([_means(spread, *span).std() for span in spans])
-    tall = np.zeros(len(spread))
+    scale = np.array([_means(drawn, *span).std() for span in spans])
+    farthest = np.zeros(len(drawn))
     for span, sd in zip(spans, scale, strict=True):
-        centred = _means(spread, *span)
-        tall = np.maximum(tall, np.abs(centred - centred.mean()) / sd)
+        centred = _means(drawn, *span)
+        farthest = np.maximum(farthest, np.abs(centred - centred.mean()) / sd)
     z = np.array([_means(tested[None], *span)[0] for span in spans]) / scale
     windows = []
-    for a, b in _chosen(spans, z, float(np.quantile(tall, 1.0 - LEVEL))):
-        mean, left = float(residual[a:b].mean()), float(tested[a:b].mean())
-        sd = float(_means(spread, a, b).std())
-        within = log_posterior.binned.phases[phase[a]]
+    for a, b in _chosen(spans, z, float(np.quantile(farthest, 1.0 - LEVEL))):
+        mean, tested_mean = float(residual[a:b].mean()), float(tested[a:b].mean())
+        sd = float(_means(drawn, a, b).std())
+        at_phase = log_posterior.binned.phases[phase[a]]
         edges = log_posterior.binned.edges_s
         windows.append(
             Window(
                 float(edges[chain.bins[a]]), float(edges[chain.bins[b - 1] + 1]),
-                within.kind, within.cycle, mean, _chance(tall, abs(left) / sd),
+                at_phase.kind, at_phase.cycle, mean, exceedance_probability(farthest, abs(tested_mean) / sd),
             )
         )  # fmt: skip
-    chance = _chance(tall, float(np.abs(z).max(initial=0.0)))
-    return Located(tuple(windows), chain.bins, residual, spread.std(axis=0), chance)
+    chance = exceedance_probability(farthest, float(np.abs(z).max(initial=0.0)))
+    return Located(tuple(windows), chain.bins, residual, drawn.std(axis=0), chance)
 
 
-def _chance(tall: Array, height: float) -> float:
-    """Of some window of a draw going so high, in sd.
+def exceedance_probability(tall: Array, height: float) -> float:
+    """Returns the probability that noise alone makes some window as far from zero as `height` [sd].
 
-    From draws; beyond the highest tenth of them by its own tail, in which squares are exponential as a
-    Gaussian's are.
+    The probability is counted among the draws. Within the highest tenth of the draws and beyond, it is
+    extrapolated: there the squares are taken to be exponentially distributed, as those of a Gaussian are.
+
+    tall : distance from zero of the farthest window of each draw, (n,) [sd]
     """
-    edge = float(np.quantile(tall, 1.0 - TAIL))
-    if height <= edge:
+    tail_start = float(np.quantile(tall, 1.0 - TAIL))
+    if height <= tail_start:
         return float((1 + np.sum(tall >= height)) / (1 + len(tall)))
-    scale = float(np.mean(tall[tall > edge] ** 2 - edge**2))
-    return float(TAIL * np.exp(-(height**2 - edge**2) / scale))
+    scale = float(np.mean(tall[tall > tail_start] ** 2 - tail_start**2))
+    return float(TAIL * np.exp(-(height**2 - tail_start**2) / scale))
 
 
 def _allowed(
-    found: Fit, noise: Mapping[str, float], residual: Array, rng: np.random.Generator
+    fit: Fit, noise: Mapping[str, float], residual: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Draws (n, k) of the residual that noise, parameters and what the surrogate leaves open allow; and what
-    is left of the recorded one (k,) when these have taken up what they can, as of the draws.
+    """Returns draws (n, k) [N] of the residual that noise leaves after a fit, and the recorded residual (k,).
 
-    Of that they take up no more than is believed: parameters in their box, errors within `FARTHEST` sd,
-    or as far as they are. Noise alone does not bring a draw's there.
+    From both, the part is subtracted that the parameters and the surrogate's error can explain. For the
+    recorded residual the parameters stay in their box, and the surrogate's errors within `FARTHEST` sd, or
+    within their fitted size if that is larger. The draws need no such limits, because noise alone does not
+    reach them.
     """
-    log_posterior, chain = found.log_posterior, found.log_posterior.chain
-    own = [noise[name] for name in log_posterior.names[log_posterior.surrogate.space.dim :]]
-    point = log_posterior.from_sampling(log_posterior.vector(found.theta))[None]
+    log_posterior, chain = fit.log_posterior, fit.log_posterior.chain
+    noise_values = [noise[name] for name in log_posterior.names[log_posterior.surrogate.space.dim :]]
+    point = log_posterior.from_sampling(log_posterior.vector(fit.theta))[None]
     best = log_posterior.predict(point)
     diagonal = np.repeat(best.diagonal[:, chain.bins], DRAWS, axis=0)
-    drawn = draw_noise(chain, np.tile(own, (DRAWS, 1)), diagonal, rng)
-    # What parameters and the surrogate's latent error leave open is what the recording does not fix: noise,
-    # seen through the fit, moves both; a fit to each draw would take that part out of it again.
+    drawn = draw_noise(chain, np.tile(noise_values, (DRAWS, 1)), diagonal, rng)
+    # Noise moves the fitted parameters and the fitted error of the surrogate. A fit to a draw would therefore
+    # explain a part of the draw, which is computed here by weighted least squares.
     weight = 1.0 / np.maximum(drawn.var(axis=0), 1e-18)
-    free = _free(found)
-    unit = found.unit[free]
-    design = np.concatenate([_slopes(found, free), best.factor[0, chain.bins]], axis=1)
+    free_columns = _free(fit)
+    unit = fit.unit[free_columns]
+    design = np.concatenate([_slopes(fit, free_columns), best.factor[0, chain.bins]], axis=1)
     prior = np.concatenate([np.full(design.shape[1] - best.factor.shape[2], PRIOR_PRECISION),
                             np.ones(best.factor.shape[2])])  # fmt: skip
     normal = (design * weight[:, None]).T @ design + np.diag(prior)
-    taken = design @ np.linalg.solve(normal, (design * weight[:, None]).T @ drawn.T)
-    reach = np.maximum(np.abs(found.latent), FARTHEST)
-    root = np.sqrt(weight)
-    at = lsq_linear(
-        np.concatenate([root[:, None] * design, np.diag(np.sqrt(prior))]),
-        np.concatenate([root * residual, np.zeros(len(prior))]),
-        (np.concatenate([-unit, -reach - found.latent]), np.concatenate([1.0 - unit, reach - found.latent])),
+    explained = design @ np.linalg.solve(normal, (design * weight[:, None]).T @ drawn.T)
+    farthest = np.maximum(np.abs(fit.latent), FARTHEST)
+    root_weight = np.sqrt(weight)
+    solution = lsq_linear(
+        np.concatenate([root_weight[:, None] * design, np.diag(np.sqrt(prior))]),
+        np.concatenate([root_weight * residual, np.zeros(len(prior))]),
+        (
+            np.concatenate([-unit, -farthest - fit.latent]),
+            np.concatenate([1.0 - unit, farthest - fit.latent]),
+        ),
     )
-    return drawn - taken.T, residual - design @ at.x
+    return drawn - explained.T, residual - design @ solution.x
 
 
-def _free(found: Fit) -> list[int]:
-    """Which material parameters are not on a bound."""
-    inner = found.log_posterior.surrogate.space.dim
-    return [i for i in range(inner) if EDGE < found.unit[i] < 1.0 - EDGE]
+def _free(fit: Fit) -> list[int]:
+    """Returns the columns of the material parameters that do not lie on a bound."""
+    count = fit.log_posterior.surrogate.space.dim
+    return [i for i in range(count) if EDGE < fit.unit[i] < 1.0 - EDGE]
 
 
-def _slopes(found: Fit, free: list[int]) -> Array:
-    """Derivatives (k, d) [N] by these parameters, over the unit cube."""
-    log_posterior = found.log_posterior
+def _slopes(fit: Fit, free: list[int]) -> Array:
+    """Returns the derivatives (k, d) [N] of the force by these parameters, over the unit cube."""
+    log_posterior = fit.log_posterior
     low, high = log_posterior.bounds
     if not free:
         return np.zeros((len(log_posterior.chain.bins), 0))
-    step = np.where(found.unit[free] < 0.5, STEP, -STEP)
-    inwards = found.unit + step[:, None] * np.eye(len(low))[free]
-    points = low + np.concatenate([found.unit[None], inwards]) * (high - low)
+    step = np.where(fit.unit[free] < 0.5, STEP, -STEP)
+    moved = fit.unit + step[:, None] * np.eye(len(low))[free]
+    points = low + np.concatenate([fit.unit[None], moved]) * (high - low)
     mean = log_posterior.predict_mean(log_posterior.from_sampling(points))[:, log_posterior.chain.bins]
     return np.asarray((mean[1:] - mean[0]).T / step)
 
 
 def _spans(phase: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Windows (first, end) of doubling lengths at half steps, and whole phases."""
+    """Returns windows (first, end) inside the phases, where `end` is the bin after the last.
+
+    Their lengths are `SHORTEST` times powers of two, and their starts are half a length apart. Whole phases
+    are windows, too.
+    """
     edges = [0, *(np.flatnonzero(np.diff(phase)) + 1).tolist(), len(phase)]
     spans = set()
     for a, b in pairwise(edges):
@@ -189,22 +211,28 @@ def _spans(phase: NDArray[np.int64]) -> list[tuple[int, int]]:
 
 
 def _means(values: Array, a: int, b: int) -> Array:
+    """Returns the means (n,) of values (n, k) over a window."""
     return np.asarray(values[:, a:b].mean(axis=1))
 
 
 def _chosen(spans: list[tuple[int, int]], z: Array, limit: float) -> list[tuple[int, int]]:
-    """The most significant windows that do not overlap, neighbours of one sign joined, in order."""
-    taken: list[tuple[int, int, float]] = []
+    """Returns the most significant windows that do not overlap, in order of time.
+
+    Adjacent windows of the same sign are joined if they lie in the same phase.
+
+    z : mean residual of each window in standard deviations; limit : smallest |z| of a significant window
+    """
+    chosen: list[tuple[int, int, float]] = []
     for i in np.argsort(-np.abs(z)):
         if abs(z[i]) <= limit:
             break
         a, b = spans[i]
-        if all(b <= start or a >= end for start, end, _ in taken):
-            taken.append((a, b, float(np.sign(z[i]))))
+        if all(b <= start or a >= end for start, end, _ in chosen):
+            chosen.append((a, b, float(np.sign(z[i]))))
     joined: list[tuple[int, int, float]] = []
-    for a, b, sign in sorted(taken):
-        inside = bool(joined) and joined[-1][1] == a and joined[-1][2] == sign
-        if inside and any(s <= joined[-1][0] and b <= e for s, e in spans):
+    for a, b, sign in sorted(chosen):
+        same_sign = bool(joined) and joined[-1][1] == a and joined[-1][2] == sign
+        if same_sign and any(start <= joined[-1][0] and b <= end for start, end in spans):
             joined[-1] = (joined[-1][0], b, sign)
         else:
             joined.append((a, b, sign))

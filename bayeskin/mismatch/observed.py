@@ -1,8 +1,9 @@
-"""A surrogate of the force as an instrument with mechanisms reports it.
+"""Provides a surrogate of the force that an instrument with mechanisms reports.
 
-Bins know only means. What mechanisms add is taken of a force that goes straight from one bin's middle to the
-next, with a corner where the protocol has one, and added to the surrogate's means; of those that add the same
-whatever the force is, that is exact. The surrogate's own error passes through unchanged.
+The wrapped surrogate predicts only means over bins. The effect of the mechanisms is therefore computed from a
+force that is linear between the middles of bins and has corners where the protocol has them. This effect is
+added to the surrogate's means. It is exact for mechanisms that add the same force whatever the skin's force
+is. The surrogate's own error does not change.
 """
 
 from __future__ import annotations
@@ -25,46 +26,48 @@ from bayeskin.types import Array, PadMotion, ParameterSpace, Prediction
 
 @dataclass(frozen=True)
 class ObservedSurrogate(Wrapper):
-    """The parameters of `inner`, then those of the instrument's `mechanisms`."""
+    """A surrogate of the skin's force, `inner`, with the instrument's `mechanisms` applied to its force."""
 
     mechanisms: tuple[Mechanism, ...]
     motion: PadMotion
 
     @cached_property
     def space(self) -> ParameterSpace:
-        """The parameters of the skin, then those of each mechanism."""
-        more = tuple(p for mechanism in self.mechanisms for p in mechanism.parameters)
-        return ParameterSpace((*self.inner.space.parameters, *more))
+        """Returns the parameters of `inner`, then those of each mechanism."""
+        added = tuple(p for mechanism in self.mechanisms for p in mechanism.parameters)
+        return ParameterSpace((*self.inner.space.parameters, *added))
 
     @property
     def provenance(self) -> Mapping[str, Any]:
         return {**self.inner.provenance, "instrument": [m.name for m in self.mechanisms]}
 
     def predict(self, theta: ArrayLike) -> Prediction:
-        """Force at theta (n, d) or (d,). Raises InputError outside the box."""
-        skin, values = self._split(theta)
-        found = at_distinct(lambda these, _: self.inner.predict(these), skin, skin)
-        return Prediction(found.mean + self._added(values, found.mean), found.factor, found.diagonal)
+        """Returns the reported force at theta (n, d) or (d,). Raises InputError outside the box."""
+        inner, values = self._split(theta)
+        prediction = at_distinct(lambda rows, _: self.inner.predict(rows), inner, inner)
+        return Prediction(
+            prediction.mean + self._added(values, prediction.mean), prediction.factor, prediction.diagonal
+        )
 
     def predict_mean(self, theta: ArrayLike) -> Array:
-        """The mean (n, m) of `predict` alone."""
-        skin, values = self._split(theta)
-        mean = mean_at_distinct(lambda these, _: self.inner.predict_mean(these), skin, skin)
+        """Returns only the mean (n, m) of `predict`."""
+        inner, values = self._split(theta)
+        mean = mean_at_distinct(lambda rows, _: self.inner.predict_mean(rows), inner, inner)
         return mean + self._added(values, mean)
 
     def _split(self, theta: ArrayLike) -> tuple[Array, dict[str, Array]]:
-        """The skin's parameters (n, k), and the instrument's by name, (n,) each."""
+        """Returns the parameters of `inner` (n, k), and the mechanisms' parameters by name, (n,) each."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
-        inner = self.inner.space.dim
-        return theta[:, :inner], dict(zip(self.space.names[inner:], theta[:, inner:].T, strict=True))
+        count = self.inner.space.dim
+        return theta[:, :count], dict(zip(self.space.names[count:], theta[:, count:].T, strict=True))
 
     def _added(self, values: Mapping[str, Array], mean_n: Array) -> Array:
-        """Returns what the mechanisms add to the bins' means (n, m)."""
+        """Returns the force (n, m) [N] that the mechanisms add to the bins' means."""
         if all(isinstance(m.act, Instrument) and m.act.adds for m in self.mechanisms):
-            seen = observed(
+            force = observed(
                 self.mechanisms, values, self.motion, lambda t: np.zeros((len(mean_n), np.shape(t)[-1]))
             )
-            return self._forces.bins.means(seen)
+            return self._forces.bins.means(force)
         return self._forces.change(partial(observed, self.mechanisms, values, self.motion), mean_n)
 
     @cached_property

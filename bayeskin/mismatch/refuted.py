@@ -1,4 +1,4 @@
-"""What the samples of a recording, between which bins take means, speak against."""
+"""Finds fitted mechanisms that single samples of a recording contradict, although its bin means do not."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ from bayeskin.types import Jumps, PadMotion
 
 
 def refuted(found: Fit, known: Mapping[str, Mechanism], motion: PadMotion, jumps: Jumps) -> list[str]:
-    """Mechanisms of a fit that the samples it is of speak against.
+    """Returns the mechanisms of a fit that the recording's samples contradict.
 
-    None beside an amplifier that smooths, or a clock that is off.
+    The list is empty if the fit has an amplifier that smooths the force, or a clock that is off.
+
+    jumps : the force jumps that the samples allow; only those in the fitted part are used
     """
     acts = {name: known[name].act for name in found.names}
     instrument = {name: act for name, act in acts.items() if isinstance(act, Instrument)}
     if any(act.place >= Place.AMPLIFIER for act in instrument.values()):
         return []
     values = {name: np.array([value]) for name, value in found.theta.items()}
-    fitted = found.log_posterior
-    seen = jumps.until(fitted.binned.edges_s[fitted.chain.bins[-1] + 1])
+    log_posterior = found.log_posterior
+    fitted_jumps = jumps.until(log_posterior.binned.edges_s[log_posterior.chain.bins[-1] + 1])
     return [name for name, act in instrument.items()
-            if act.refuted is not None and act.refuted(values, motion, seen)[0]]  # fmt: skip
+            if act.refuted is not None and act.refuted(values, motion, fitted_jumps)[0]]  # fmt: skip

@@ -1,8 +1,8 @@
-"""The posterior of one set of mechanisms sampled, from all the modes that climbs find.
+"""Samples the posterior of one set of mechanisms, from all modes that climbs find.
 
-Laplace's Gaussian knows one mode: of permeabilities, which a force informs little, there are often several,
-and the moduli lie along a curved ridge. Two ensembles set out from the modes, each walker near one of them
-taken by its share of the evidence, and move as those of a run do (`inference.moves`).
+Laplace's Gaussian describes a single mode. The permeabilities, which a force informs little, often have
+several modes, and the moduli lie along a curved ridge. Two ensembles start from the modes. Each walker starts
+near one mode, which is drawn in proportion to its evidence. The moves are those of `inference.moves`.
 """
 
 from __future__ import annotations
@@ -21,22 +21,32 @@ from bayeskin.inference.convergence import Limits, assess
 from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.moves import mixed_moves
-from bayeskin.mismatch.fit import APART, FIRST_ROUNDS, Fit, evidence, likely, other_skins
+from bayeskin.mismatch.evidence import evidence
+from bayeskin.mismatch.fit import FIRST_ROUNDS, Fit
+from bayeskin.mismatch.fit_starts import likely, other_skins
 from bayeskin.mismatch.wrapper import skins
 from bayeskin.types import Array
 
+APART = 0.1  # maxima are the same if no parameter differs by more than this share of the prior's width
 ENSEMBLES, FEWEST_WALKERS = 2, 40
-LEGS = (120, 300, 600, 900)  # steps after which draws may do
-FORGOTTEN, EVERY = 1 / 3, 5  # of these steps, at least; one of so many is kept
-MODES = 6  # climbs from other skins
-NEAR, NEARER = 0.5, 0.7  # of Laplace's sd, about a mode; of that, each time that too few walkers can be there
-LIMITS = Limits(effective_samples=200.0, lengths=5.0, rhat=1.1)  # for intervals, not for tails
+LEGS = (120, 300, 600, 900)  # numbers of steps after which it is checked whether the draws suffice
+# Smallest share of the steps that counts as burn-in; one of every EVERY later steps is kept.
+FORGOTTEN, EVERY = 1 / 3, 5
+MODES = 6  # number of climbs from other tissues
+# Distance of the walkers from a mode, over Laplace's sd; factor on it each time that too few walkers start at
+# a possible point.
+NEAR, NEARER = 0.5, 0.7
+LIMITS = Limits(effective_samples=200.0, lengths=5.0, rhat=1.1)  # sufficient for intervals, not for tails
 
 
 @dataclass(frozen=True)
 class PosteriorDraws:
-    """Draws (n, D) in SI, columns `names`; rhat, the largest of all; effective, of the least known; whether
-    these and the chains' times let intervals be taken from the draws (`LIMITS`)."""
+    """Draws of a posterior.
+
+    draws : (n, D) in SI; the columns are `names`
+    rhat : largest R-hat of all parameters; effective : smallest number of effective samples
+    settled : whether intervals may be taken from the draws (`LIMITS`)
+    """
 
     names: tuple[str, ...]
     draws: Array
@@ -46,7 +56,7 @@ class PosteriorDraws:
 
     @cached_property
     def summary(self) -> dict[str, dict[str, Any]]:
-        """Mean, sd and the ends of the 90 % interval of each parameter."""
+        """Returns the mean, the sd and the ends of the 90 % interval of each parameter."""
         low, high = np.quantile(self.draws, [0.05, 0.95], axis=0)
         rows = zip(self.names, self.draws.mean(axis=0), self.draws.std(axis=0), low, high, strict=True)
         return {
@@ -59,11 +69,12 @@ def resample(
     found: Fit, seed: int, legs: Sequence[int] = LEGS, modes: int = MODES,
     near: Sequence[Mapping[str, float]] = (),
 ) -> PosteriorDraws:  # fmt: skip
-    """Returns draws of the posterior about `found` and other modes.
+    """Returns draws of the posterior at a fit's mode and at other modes.
 
-    They end after the first of `legs` by which they have settled.
+    Sampling ends after the first of `legs` by which the draws have settled.
 
-    modes : climbs to other modes from skins of the prior; near : values by name from which further ones start
+    modes : number of climbs to other modes, from tissues of the prior
+    near : values by name from which further climbs start
     """
     log_posterior = found.log_posterior
     rng = np.random.default_rng([seed, 7])
@@ -81,26 +92,27 @@ def resample(
         emcee.State(starts(walkers), random_state=np.random.RandomState(int(rng.integers(2**32))).get_state())
         for _ in samplers
     ]
-    made = 0
-    with ThreadPoolExecutor(ENSEMBLES) as pool:  # the likelihood frees the interpreter
+    steps_done = 0
+    with ThreadPoolExecutor(ENSEMBLES) as pool:  # the likelihood releases the interpreter's lock
         for steps in legs:
-            more = partial(_moved_on, steps=steps - made)
-            states = list(pool.map(more, samplers, states))
-            made = steps
+            advance = partial(_continued, steps=steps - steps_done)
+            states = list(pool.map(advance, samplers, states))
+            steps_done = steps
             drawn = _assessed(samplers, log_posterior, int(FORGOTTEN * steps))
             if drawn.settled:
                 break
     return drawn
 
 
-def _moved_on(sampler: emcee.EnsembleSampler, state: emcee.State, steps: int) -> emcee.State:
+def _continued(sampler: emcee.EnsembleSampler, state: emcee.State, steps: int) -> emcee.State:
+    """Returns the state of an ensemble after further steps."""
     return sampler.run_mcmc(state, steps, skip_initial_state_check=True)
 
 
 def _assessed(
     samplers: Sequence[emcee.EnsembleSampler], log_posterior: LogPosterior, forgotten: int
 ) -> PosteriorDraws:
-    """Returns the draws of ensembles after their first steps, of which so many are forgotten at least."""
+    """Returns the draws of ensembles, with at least the first `forgotten` steps left out."""
     chains = np.stack([sampler.get_chain() for sampler in samplers])
     densities = np.stack([sampler.get_log_prob() for sampler in samplers])
     state = assess(chains, densities, log_posterior.names, LIMITS, forgotten)
@@ -110,49 +122,54 @@ def _assessed(
 
 
 def _modes(
-    found: Fit, seed: int, count: int, near: Sequence[Mapping[str, float]]
+    fit: Fit, seed: int, count: int, near: Sequence[Mapping[str, float]]
 ) -> list[tuple[Array, float, Array]]:
-    """Vector (D,), log evidence and covariance (D, D) over the unit cube of each mode, that of `found` first.
+    """Returns vector (D,), log-evidence and covariance (D, D) over the unit cube of each mode.
 
-    Climbs that end nearer than `APART` to a mode that is known have found nothing new.
+    The mode of `found` comes first. A climb that ends nearer than `APART` to a known mode gives no new mode.
     """
-    log_posterior = found.log_posterior
+    log_posterior = fit.log_posterior
     low, high = log_posterior.bounds
-    best = low + found.unit * (high - low)
-    skin = skins(log_posterior.surrogate)[-1]
+    best = low + fit.unit * (high - low)
+    tissue_size = skins(log_posterior.surrogate)[-1]
     starts = [np.clip(log_posterior.vector(theta), low, high) for theta in near]
     if count:
-        starts += likely(log_posterior, other_skins(best, log_posterior, seed, skin), count)
-    modes = [(best, found.log_evidence, found.covariance)]
+        starts += likely(log_posterior, other_skins(best, log_posterior, seed, tissue_size), count)
+    modes = [(best, fit.log_evidence, fit.covariance)]
     for start in starts:
         top = gauss_newton(log_posterior, start, None, sum(FIRST_ROUNDS))
-        apart = [np.abs((top.vector - vector) / (high - low))[:skin].max() for vector, _, _ in modes]
+        apart = [np.abs((top.vector - vector) / (high - low))[:tissue_size].max() for vector, _, _ in modes]
         if min(apart) > APART:
             modes.append((top.vector, *evidence(log_posterior, top)))
     return modes
 
 
 def _starts(
-    found: Fit, rng: np.random.Generator, modes: Sequence[tuple[Array, float, Array]]
+    fit: Fit, rng: np.random.Generator, modes: Sequence[tuple[Array, float, Array]]
 ) -> Callable[[int], Array]:
-    """A function that draws so many walkers (n, D) about the modes, to each by its share of the evidence."""
-    log_posterior = found.log_posterior
+    """Returns a function that draws a given number of walkers (n, D) near the modes.
+
+    The expected number of walkers near a mode is proportional to the mode's evidence.
+    """
+    log_posterior = fit.log_posterior
     low, high = log_posterior.bounds
-    masses = np.array([log_evidence for _, log_evidence, _ in modes])
-    share = np.exp(masses - masses.max())
-    aside = 1e-12 * np.eye(len(low))
-    roots = np.array([np.linalg.cholesky(one + aside) * (high - low)[:, None] for _, _, one in modes])
+    log_evidences = np.array([log_evidence for _, log_evidence, _ in modes])
+    share = np.exp(log_evidences - log_evidences.max())
+    jitter = 1e-12 * np.eye(len(low))
+    roots = np.array(
+        [np.linalg.cholesky(covariance + jitter) * (high - low)[:, None] for _, _, covariance in modes]
+    )
     centres = np.array([vector for vector, _, _ in modes])
 
     def draw(count: int) -> Array:
-        out, near = np.empty((0, len(low))), NEAR
-        while len(out) < count:
+        walkers, near = np.empty((0, len(low))), NEAR
+        while len(walkers) < count:
             mode = rng.choice(len(modes), count, p=share / share.sum())
             normal = rng.standard_normal((count, len(low)))
-            trial = centres[mode] + near * np.einsum("nij,nj->ni", roots[mode], normal)
-            trial = low + np.abs(np.mod((trial - low) / (high - low) + 1.0, 2.0) - 1.0) * (high - low)
-            out = np.concatenate([out, trial[np.isfinite(log_posterior.log_prob(trial))]])
-            near *= NEARER  # where next to nothing is possible farther away
-        return out[:count]
+            proposals = centres[mode] + near * np.einsum("nij,nj->ni", roots[mode], normal)
+            proposals = low + np.abs(np.mod((proposals - low) / (high - low) + 1.0, 2.0) - 1.0) * (high - low)
+            walkers = np.concatenate([walkers, proposals[np.isfinite(log_posterior.log_prob(proposals))]])
+            near *= NEARER  # the density may be zero farther away from a mode
+        return walkers[:count]
 
     return draw

@@ -1,18 +1,18 @@
-"""The search for mechanisms: the forward model solves all mechanisms of a set together.
+"""Searches for mechanisms; the forward model solves all mechanisms of a set together.
 
-The search starts from the fit without mechanisms and goes forward. Score tests of all other mechanisms
-beside the current set order them (`candidates`). The most promising are fitted, with all other parameters
-free again, and the set with the largest weight becomes the current set if its weight is larger. A missing
-mechanism biases the tissue's parameters, so the sets that gain most are also fitted from other tissues.
-Then each mechanism of the best set is left out in turn. Where nothing gains any more, each mechanism of the
-best set is exchanged: it is left out, and every other mechanism is tried beside the remaining ones.
+The search starts from the fit without mechanisms and adds mechanisms. Score tests rank all mechanisms that
+could be added to the current set (`candidates`). The most promising ones are fitted, with all other
+parameters free again. The set with the largest weight becomes the current set if it gains weight. A missing
+mechanism biases the tissue's parameters, so the sets that gain most are also fitted from other tissues. Then
+each mechanism of the best set is left out in turn. Where nothing gains any more, each mechanism of the best
+set is exchanged: it is left out, and every other mechanism is added to the remaining ones.
 
-A mechanism that is not in the catalogue is imitated by several that are, and each of these gains. The search
-therefore continues from a larger set only if this is likelier than the smaller set with an unnamed smooth
-discrepancy, and likelier than itself with such a discrepancy.
+A mechanism that is not in the catalogue is imitated by several mechanisms of the catalogue, and each of these
+gains. The search therefore continues from a larger set only if one of its two hypotheses, alone or with an
+unnamed smooth discrepancy, is likelier than both hypotheses of the smaller set.
 
-Runs of the full model check the fits (`full_checks`) before the search continues from a set, and all likely
-sets at the end. The weight of a set is its evidence times the prior probability of its mechanisms.
+Runs of the full model check a fit before the search continues from its set, and all likely sets at the end
+(`full_checks`). The weight of a set is its evidence times the prior odds of its mechanisms.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from scipy.stats import qmc
 from bayeskin.errors import InputError
 from bayeskin.mechanisms import Mechanism, without_one
 from bayeskin.mismatch.candidates import Candidates
-from bayeskin.mismatch.fit import subcutis_too_stiff
 from bayeskin.mismatch.full_checks import check, check_likely_sets, checked_best, is_checked_nearby
 from bayeskin.mismatch.further_maxima import find_further_maxima
 from bayeskin.mismatch.hypotheses import Evidences, weight
 from bayeskin.mismatch.search_context import SearchContext, Tell, correction, gained, title
 from bayeskin.mismatch.search_record import Names, SearchResult
 from bayeskin.mismatch.search_settings import SearchSettings
+from bayeskin.mismatch.stiffness_ratio import subcutis_too_stiff
 from bayeskin.mismatch.tasks import AnswerTasks, EvidenceTask, FitTask
 from bayeskin.mismatch.tissue_starts import nearest_tissues
 from bayeskin.mismatch.trust_region import SetFit, as_json
@@ -42,11 +42,11 @@ def search(
     solves: Collection[str], noise: Mapping[str, float], seed: int, tell: Tell,
     settings: SearchSettings | None = None,
 ) -> SearchResult:  # fmt: skip
-    """Returns the fits of all sets that the search has come across, and the evidences of the likely ones.
+    """Returns the fits of all sets that the search has fitted, and the evidences of the likely ones.
 
-    ask : answers tasks by running the models; tell : takes a line of progress
-    base : priors of the base model; known : mechanisms by name; solves : names of those that the forward
-        model solves; noise : values of the noise parameters to start from
+    ask : answers tasks by running the models; tell : receives lines of progress
+    base : priors of the base model; known : mechanisms by name; solves : names of the mechanisms that the
+        forward model solves; noise : values of the noise parameters from which fits start
     Raises InputError where the model runs with no tissue of these priors.
     """
     context = SearchContext(
@@ -62,13 +62,13 @@ def search(
 
 
 class Searcher:
-    """The steps of a search; each of them changes the context's record."""
+    """Makes the steps of a search, each of which changes the context's record."""
 
     def __init__(self, context: SearchContext) -> None:
         self._context = context
         self._candidates = Candidates(context)
         self._tissues: list[dict[str, float]] = []
-        self._weighed: dict[Names, SetFit] = {}  # the fit that each evidence belongs to
+        self._weighed: dict[Names, SetFit] = {}  # the fit to which each evidence belongs
 
     def fit_base_model(self) -> None:
         """Fits the model without mechanisms. Raises InputError where no tissue of the priors runs."""
@@ -82,11 +82,11 @@ class Searcher:
         context.keep(answers)
         if not context.record.fits:
             why = next((f": {answer}" for answer in answers if isinstance(answer, str)), "")
-            expected = "skins that the model runs, whose E_s is at most twice E_c"
-            raise InputError("priors", f"no skin that runs{why}", expected)
+            expected = "tissues for which the model runs, with an E_s of at most twice E_c"
+            raise InputError("priors", f"no tissue for which the model runs{why}", expected)
 
     def search_sets(self) -> None:
-        """Adds, leaves out and exchanges mechanisms as long as that gains weight."""
+        """Adds, leaves out and exchanges mechanisms as long as this gains weight."""
         context, settings = self._context, self._context.settings
         for _ in range(2 * settings.most):
             current = checked_best(context)
@@ -103,7 +103,10 @@ class Searcher:
                 return
 
     def weigh_likely_sets(self) -> None:
-        """Weighs the hypotheses of the likeliest sets, and of those that the search has stopped at."""
+        """Computes the evidences of the likeliest sets, and of all sets that have been weighed before.
+
+        The most probable set is then checked by the full model, until it has been checked.
+        """
         record, settings = self._context.record, self._context.settings
         before = list(record.evidences)
         sets = [fit.fit.names for fit in record.likeliest(settings.weighed)]
@@ -116,7 +119,10 @@ class Searcher:
             self._weigh([names])
 
     def _weigh(self, sets: Iterable[Names]) -> None:
-        """Weighs hypotheses of sets, again where the fit has changed; a set that fails has no evidence."""
+        """Computes the evidences of sets that are new or whose fit has changed.
+
+        A set for which this fails has no evidence.
+        """
         record = self._context.record
         new = [names for names in sets if self._weighed.get(names) is not record.fits[names]]
         answers = self._context.ask([EvidenceTask(as_json(record.fits[names])) for names in new])
@@ -126,10 +132,13 @@ class Searcher:
             if isinstance(answer, Evidences):
                 record.evidences[names] = answer
             else:
-                self._context.tell(f"{title(names)} could not be weighed: {answer}")
+                self._context.tell(f"{title(names)}: the evidence could not be computed: {answer}")
 
     def _beats_discrepancy(self, names: Names) -> bool:
-        """Returns whether the best set is likelier than a smaller one with an unnamed discrepancy."""
+        """Returns whether the best set is likelier than a smaller set, by more than the required gain.
+
+        Each of the two sets is taken with or without an unnamed discrepancy, whichever is likelier.
+        """
         record, gain = self._context.record, self._context.settings.gain
         best = record.best.fit.names
         self._weigh([names, best])
@@ -139,22 +148,24 @@ class Searcher:
         difference = family.likeliest(best) - family.likeliest(names)
         if difference < gain:
             self._context.tell(
-                f"{title(names)}, with an unnamed smooth discrepancy, is as likely as {title(best)}, "
-                f"alone or with the same: {-difference:+.1f} nats"
+                f"{title(names)} with an unnamed smooth discrepancy is as likely as {title(best)} with or "
+                f"without one: {-difference:+.1f} nats"
             )
         return difference >= gain
 
     def _gains(self, current: SetFit) -> bool:
-        """Returns whether another set than the current one is better by enough to continue from it."""
+        """Returns whether the best set gains enough over the current one for the search to continue."""
         record = self._context.record
         return gained(record.best, record.fits[current.fit.names]) >= self._context.settings.gain
 
     def _forward(self, current: SetFit) -> None:
-        """Fits sets with one mechanism more, and those that gain most from other tissues and without others.
+        """Fits the sets with one mechanism more, and improves the fits of those that gain most.
 
-        Where they gain much, the current set is fitted again from their tissues, and they from that of the
-        best one: they may have gained by a better tissue, and not by a mechanism. Then the full model
-        checks them, since the forward model may be far off with one of them.
+        Sets that gain much may have gained by a better tissue, and not by a mechanism. So the current set is
+        fitted again from their tissues, and they from the tissue of the best of them. The best set is also
+        fitted from other tissues if it leaves more than noise. Then the full model checks the sets that gain
+        much, since the forward model may be far off with one of their mechanisms. At last, each mechanism of
+        the best set is left out.
         """
         context, record = self._context, self._context.record
         sets = self._candidates.fit_beside(current)
@@ -185,7 +196,7 @@ class Searcher:
         return [fit for fit in fits[: settings.alike] if gained(fit, current) >= least]
 
     def _exchange(self, current: SetFit) -> None:
-        """Fits sets with another mechanism in the place of each mechanism of the current set."""
+        """Fits sets in which each mechanism of the current set is replaced by another one."""
         context, names = self._context, current.fit.names
         if len(names) > 1:
             for name in names:
@@ -194,7 +205,7 @@ class Searcher:
                     self._candidates.fit_beside(smaller)
 
     def _fit_from_other_tissues(self, current: SetFit) -> None:
-        """Fits a set from other tissues, with the values of its mechanisms kept."""
+        """Fits a set again from other tissues, with the present values of its mechanisms."""
         context, settings, names = self._context, self._context.settings, current.fit.names
         tissues = nearest_tissues(context, names, self._tissues[: settings.others], current.fit.theta)
         context.keep(context.ask([
@@ -202,10 +213,10 @@ class Searcher:
             for tissue in tissues[: settings.tried]
         ]))  # fmt: skip
         gain = gained(context.record.fits[names], current)
-        context.tell(f"{title(names)} from other tissues: {gain:+.1f} nats")
+        context.tell(f"{title(names)}, fitted from other tissues: {gain:+.1f} nats")
 
     def _fit_smaller_sets(self, current: SetFit) -> None:
-        """Fits the sets with one mechanism fewer that have not been fitted yet."""
+        """Fits the sets with one mechanism less that have not been fitted yet."""
         context, names = self._context, current.fit.names
         smaller = {without_one(names, name, context.known) for name in names} - {()}
         context.keep(context.ask([

@@ -1,4 +1,4 @@
-"""The recording, the models and the record that all parts of a search work with."""
+"""Provides the recording, the models and the record to all parts of a search."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ Tell = Callable[[str], None]
 
 @dataclass(frozen=True)
 class SearchContext:
-    """The inputs of a search, its record, and the comparisons that every part of it makes.
+    """The inputs of a search, its record, and the comparisons that every part of the search makes.
 
-    ask : answers tasks by running the models; tell : takes a line of progress
-    base : priors of the base model; known : mechanisms by name; solves : names of those that the forward
-        model solves; noise : values of the noise parameters to start from
+    ask : answers tasks by running the models; tell : receives lines of progress
+    base : priors of the base model; known : mechanisms by name; solves : names of the mechanisms that the
+        forward model solves; noise : values of the noise parameters from which fits start
     """
 
     ask: AnswerTasks
@@ -45,38 +45,38 @@ class SearchContext:
         return {name: value for m in self.known.values() for name, value in m.neutral.items()}
 
     def solved(self, names: Sequence[str]) -> Names:
-        """Returns the mechanisms of a set that the forward model solves."""
+        """Returns the names of a set's mechanisms that the forward model solves, sorted."""
         return tuple(name for name in sorted(names) if name in self.solves)
 
     def solved_values(self, fit: SetFit) -> dict[str, float]:
-        """Returns the values of the parameters that the forward model solves, at a fit's run."""
+        """Returns the values of the forward model's parameters at a fit's run, by name."""
         names = innermost(fit.fit.log_posterior.surrogate).space.names
         return dict(zip(names, map(float, fit.run.theta), strict=True))
 
     def base_values(self, fit: SetFit) -> dict[str, float]:
-        """Returns the base model's parameters of a fit."""
+        """Returns a fit's values of the base model's parameters, by name."""
         return {name: fit.fit.theta[name] for name in self.base.names}
 
     def rms(self, force_n: Array) -> float:
-        """Returns the RMS [N] of a force (m,) over the bins that were recorded."""
+        """Returns the RMS [N] of a force (m,) over the bins that have a recorded force."""
         return float(np.sqrt(np.mean(np.square(force_n[np.isfinite(self.binned.force_n)]))))
 
     def leaves_more_than_noise(self, fit: SetFit) -> bool:
-        """Returns whether the residual of a fit is larger than the noise explains."""
+        """Returns whether the residual of a fit is larger than noise explains."""
         residual_n = self.rms(self.binned.force_n - fit.fit.force_n)
         return residual_n > self.settings.left * noise_of(self.binned)
 
     def is_alike(self, fit: SetFit, theta: Array) -> bool:
-        """Returns whether a fit's run is near other values (d,) of the parameters that the model solves."""
+        """Returns whether a fit's run is near other values (d,) of the forward model's parameters."""
         space = innermost(fit.fit.log_posterior.surrogate).space
         apart = space.to_unit(fit.run.theta) - space.to_unit(theta)
         return bool(np.abs(apart).max() <= self.settings.alike_by)
 
     def keep(self, answers: Sequence[object], since: SetFit | None = None) -> None:
-        """Records fits, and continues those that have not settled: the best, and others not far behind.
+        """Records fits, and continues those that have not settled: the best ones, and others not far behind.
 
-        since : a fit that they gain on; a fit that gains a good part of what the best one gains is not far
-            behind
+        since : a fit with which they are compared; a fit that gains over it a large share of what the best
+            fit gains is not far behind
         """
         fits = sorted((a for a in answers if isinstance(a, SetFit)), key=lambda fit: -weight(fit.fit))
         for fit in fits:
@@ -93,7 +93,7 @@ class SearchContext:
             self.record.add(continued)
 
     def _is_recorded(self, fit: SetFit) -> bool:
-        """Returns whether a likelier fit of the same set is near, so that both lead to one maximum."""
+        """Returns whether a likelier fit of the same set lies near, so that both lead to the same maximum."""
         best = self.record.fits.get(fit.fit.names)
         return best is not None and best is not fit and self.is_alike(fit, best.run.theta)
 
@@ -109,7 +109,7 @@ def noise_of(binned: BinnedForce) -> float:
 
 
 def correction(fit: SetFit) -> tuple[float, ...]:
-    """Returns the force that a fit has added to its runs, in the form that tasks take; empty for none."""
+    """Returns the force [N] that a fit has added to its runs, in the form for tasks; empty for none."""
     return tuple(fit.correction_n.tolist()) if fit.correction_n.any() else ()
 
 

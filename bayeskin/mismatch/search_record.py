@@ -1,6 +1,6 @@
-"""The sets of mechanisms that a search has fitted, with the checks of these fits and the evidences.
+"""Records the sets of mechanisms that a search has fitted, the checks of these fits, and the evidences.
 
-While a search runs it keeps a `SearchRecord`, which changes. It returns a `SearchResult`, which does not.
+While a search runs it keeps a `SearchRecord`, which changes. It returns a `SearchResult`, which is frozen.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ Names = tuple[str, ...]  # the sorted names of a set's mechanisms
 class Check:
     """A run of the full model that checks a fit.
 
-    theta : values of the parameters that the forward model solves, at this run
-    full_n : force (m,) of the skin by the full model [N], or the message of a run that failed
-    off : difference between full model and forward model, beyond the correction that the fit has, RMS over
-        bins [N]; infinite where the run failed
+    theta : values of the forward model's parameters at this run
+    full_n : force (m,) [N] of the skin by the full model, or the message of a run that failed
+    off : difference between full model and forward model after the fit's correction, RMS over bins [N];
+        infinite where the run failed
     """
 
     theta: Array
@@ -34,7 +34,7 @@ class Check:
 
 
 class _Sets:
-    """What follows from the fits and the evidences of sets."""
+    """Computes properties of the fits and the evidences of sets."""
 
     fits: Mapping[Names, SetFit]
     evidences: Mapping[Names, Evidences]
@@ -54,7 +54,7 @@ class _Sets:
 
     @property
     def chosen(self) -> Names:
-        """Returns the most probable of the compared sets, with or without a discrepancy beside it."""
+        """Returns the most probable of the compared sets, with or without a discrepancy."""
         return max(self.evidences, key=self.family.probability_of_set)
 
     def others_of(self, names: Names) -> list[SetFit]:
@@ -72,9 +72,9 @@ class _Sets:
 class SearchResult(_Sets):
     """The result of a search.
 
-    fits : of each set, the fit with the largest weight; checks : of each set, its last check
-    evidences : of the sets whose hypotheses are compared
-    others : further maxima of the most probable set and of a part of it, less likely than those in `fits`
+    fits : the fit with the largest weight, for each set; checks : the last check of each set
+    evidences : evidences of the sets whose hypotheses are compared
+    others : further maxima of the most probable set and of a subset of it, less likely than those in `fits`
     """
 
     fits: Mapping[Names, SetFit]
@@ -85,7 +85,7 @@ class SearchResult(_Sets):
 
 @dataclass
 class SearchRecord(_Sets):
-    """The record that a search keeps while it runs; the fields are those of `SearchResult`."""
+    """The record that a search keeps while it runs; its fields are those of `SearchResult`."""
 
     fits: dict[Names, SetFit] = field(default_factory=dict)
     checks: dict[Names, Check] = field(default_factory=dict)

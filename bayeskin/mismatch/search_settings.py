@@ -1,4 +1,4 @@
-"""The numeric settings of a search for mechanisms."""
+"""Defines the numeric settings of a search for mechanisms."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from bayeskin.mismatch.hypotheses import ODDS
 
-RARITY = -ODDS  # gain in log-likelihood with which a mechanism is as probable as its absence
+RARITY = -ODDS  # gain in log-evidence with which a mechanism is as probable as its absence
 
 
 @dataclass(frozen=True)
@@ -14,38 +14,39 @@ class SearchSettings:
     """Settings of a search. Weights and gains are in nats.
 
     Starting points of the base model
-    skins : number of tissues, spread over the prior, that the model runs with at first
-    starts, best : number of base fits from the nearest of these, and how many are continued
+    skins : number of tissues, spread over the prior, with which the model runs at first
+    starts, best : number of base fits that start from the nearest of these tissues, and number of fits that
+        are always continued
 
     Effort of a fit
-    first, runs : largest number of model runs before fits that are far behind are given up, and in all
-    behind : difference in weight from the best set at which a fit is given up
+    first, runs : largest number of model runs of a fit before it is compared with others, and in total
+    behind : difference in weight from the best set from which a fit is given up
     again : shares of a mechanism's strength with which a fit starts again after it failed
 
     Candidate mechanisms
-    probes, off : runs for each part of a mechanism that the model solves, and their distance from the neutral
+    probes, off : number of runs for each part of a tissue mechanism, and their distance from the neutral
         value, as a share of the prior
-    shortlist, promised : largest number of mechanisms that are fitted beside a set, and the gain that the
-        score test must promise each, which is too low while the tissue's parameters are biased by a missing
-        mechanism
+    shortlist : largest number of mechanisms that are fitted in addition to a set
+    promised : smallest promised gain of a mechanism that is fitted, where more than noise is left; score
+        tests promise too little while a missing mechanism biases the tissue's parameters
     gain : smallest gain in weight for which the search continues; most : largest number of mechanisms
 
     Other tissues
-    astray : gain in weight from which a set may have biased the tissue of the smaller set
+    astray : gain in weight from which a missing mechanism may have biased the tissue of the smaller set
     near, alike : share of the best gain from which sets are fitted from other tissues, and their largest
         number
-    others, tried : number of tissues that a set runs with, and of those that it is fitted from
-    left : RMS residual over that of the noise, from which more than noise is left
+    others, tried : number of tissues with which a set runs, and number of those from which it is fitted
+    left : RMS residual, divided by the RMS noise, from which more than noise is left
 
     Checks by the full model
-    close : difference in weight from the best set up to which a set is checked
+    close : largest difference in weight from the best set with which a set is checked
     compared, checks : largest number of sets that are checked in a round, and of rounds
     weighed : number of sets whose hypotheses are compared
-    exact : error of the forward model that needs no correction, RMS over bins, over that of the noise
+    exact : largest error of the forward model that needs no correction, RMS over bins, divided by the noise
 
     Further maxima
-    shapes : number of shapes of each part of a mechanism from which further maxima are sought
-    ends, ratios : positions of a permeability in its prior, and ratios of the moduli, that fits start from
+    shapes : number of shapes of each part of a mechanism from which further maxima are searched for
+    ends, ratios : positions of a permeability in its prior, and ratios of the moduli, from which fits start
     maxima : largest number of further maxima that are kept
     alike_by : largest difference between two runs that count as the same maximum, as a share of the prior
     """

@@ -1,14 +1,15 @@
-"""The force of a skin near runs of a forward model, by the runs' own derivatives.
+"""Predicts the force of the skin near runs of a forward model, from the derivatives of these runs.
 
-Moduli multiplied by c and permeabilities by 1/c give forces multiplied by c (`surrogates.similarity`), which
-holds here exactly. Beyond that, the force about one run is linear in a power of each modulus and in the
-coordinates of the prior's box for all other parameters. Layers do not share a load as springs side by side,
-whose force would be linear in their moduli. The best power goes from a half, for layers alike, to one, for a
-cutis that is fifteen times as stiff as the subcutis; 0.8 serves all.
+If the moduli are multiplied by c and the permeabilities by 1/c, the force is multiplied by c
+(`surrogates.similarity`). This law holds exactly here. Apart from it, the force near one run is linear in a
+power of each modulus, and for all other parameters in the coordinates of the prior's box. Layers do not share
+a load like parallel springs, whose force would be linear in their moduli. The best power ranges from a half
+for layers of equal stiffness to one for a cutis that is fifteen times as stiff as the subcutis; 0.8 suits all
+of them.
 
-Between runs the force is an average of what each of them says, weighted by the inverse square of its distance
-in the box, so that it has the value and the slopes of every run (Shepard 1968, Proc. 23rd ACM Nat. Conf.,
-517; with slopes: Franke & Nielson 1980, Int. J. Numer. Meth. Eng. 15:1691).
+Between runs the force is an average of the linear forces of all runs, each weighted by the inverse square of
+its distance in the box. It therefore has the value and the slopes of every run at that run (Shepard 1968,
+Proc. 23rd ACM Nat. Conf., 517; with slopes: Franke & Nielson 1980, Int. J. Numer. Meth. Eng. 15:1691).
 """
 
 from __future__ import annotations
@@ -23,16 +24,17 @@ from numpy.typing import ArrayLike, NDArray
 from bayeskin.forward.interface import ModelRun
 from bayeskin.types import Array, ParameterSpace, Prediction, _FreezesArrays
 
-AT_A_RUN = 1e-12  # square of a distance in the box that is none
-POWER = 0.8  # of a modulus, which the force is linear in
+AT_A_RUN = 1e-12  # added to the square of a distance in the box, so that it is never zero
+POWER = 0.8  # the force is linear in this power of a modulus
 
 
 @dataclass(frozen=True)
 class Tangent(_FreezesArrays):
-    """Satisfies `types.Surrogate`.
+    """The force near runs of a forward model; it satisfies `types.Surrogate`.
 
-    edges_s (m+1,) : of the bins whose means the runs' forces are; runs : one or more, each with slopes
-    errors_n (r, m) : of the runs, as their model says, of one sd each; None for none
+    edges_s (m+1,) : edges of the bins over which the runs' forces are averaged
+    runs : one run or several, each with slopes
+    errors_n (r, m) : errors [N] of the runs that their model states, of one sd each; None for no errors
     """
 
     space: ParameterSpace
@@ -45,7 +47,7 @@ class Tangent(_FreezesArrays):
         return {"tangent_at": [[float(value) for value in run.theta] for run in self.runs]}
 
     def predict(self, theta: ArrayLike) -> Prediction:
-        """Force at theta (n, d) or (d,)."""
+        """Returns the force at theta (n, d) or (d,)."""
         mean = self.predict_mean(theta)
         errors_n = np.zeros((1, mean.shape[1]))
         if self.errors_n is not None and len(self.errors_n):
@@ -54,19 +56,22 @@ class Tangent(_FreezesArrays):
         return Prediction(mean, factor, np.zeros(mean.shape))
 
     def predict_mean(self, theta: ArrayLike) -> Array:
-        """The mean (n, m) of `predict` alone."""
+        """Returns only the mean (n, m) of `predict`."""
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         unit = self.space.box.to_unit(theta)
-        found, weight = np.zeros((len(theta), len(self.edges_s) - 1)), np.zeros((len(theta), 1))
+        weighted_n, total_weight = np.zeros((len(theta), len(self.edges_s) - 1)), np.zeros((len(theta), 1))
         for run in self.runs:
             change = unit - self.space.box.to_unit(run.theta)
-            near = 1.0 / (np.sum(change**2, axis=1, keepdims=True) + AT_A_RUN)
-            found += near * self._about(run, theta, change)
-            weight += near
-        return np.asarray(found / weight)
+            run_weight = 1.0 / (np.sum(change**2, axis=1, keepdims=True) + AT_A_RUN)
+            weighted_n += run_weight * self._force_near(run, theta, change)
+            total_weight += run_weight
+        return np.asarray(weighted_n / total_weight)
 
-    def _about(self, run: ModelRun, theta: Array, change: Array) -> Array:
-        """The force (n, m) at theta (n, d) by one run, from which it is `change` (n, d) away in the box."""
+    def _force_near(self, run: ModelRun, theta: Array, change: Array) -> Array:
+        """Returns the force (n, m) [N] at theta (n, d) by the derivatives of a single run.
+
+        change : differences (n, d) between theta and the run in coordinates of the box
+        """
         assert run.slopes_n is not None
         moduli, flow = self.space.scaled(1), self.space.scaled(-1)
         if not len(moduli):
@@ -80,10 +85,12 @@ class Tangent(_FreezesArrays):
         power = ((ratio / scale[:, None]) ** POWER - 1.0) / POWER
         change[:, moduli] = power / self._log_widths(moduli)
         change[:, flow] += np.log(scale)[:, None] / self._log_widths(flow)
-        unlike = run.force_n + by_flow.sum(axis=1) - by_modulus.sum(axis=1)  # none where the law is exact
+        deviation_n = (
+            run.force_n + by_flow.sum(axis=1) - by_modulus.sum(axis=1)
+        )  # zero where the similarity law is exact
         scaled = scale[:, None] * (run.force_n + change @ run.slopes_n.T)
-        return np.asarray(scaled - np.outer(scale - 1.0, unlike))
+        return np.asarray(scaled - np.outer(scale - 1.0, deviation_n))
 
     def _log_widths(self, columns: NDArray[np.intp]) -> Array:
-        """Logarithms over which priors of parameters extend."""
+        """Returns the widths of the parameters' priors in logarithms."""
         return np.asarray(np.log(self.space.upper[columns] / self.space.lower[columns]))

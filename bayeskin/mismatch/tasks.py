@@ -1,4 +1,4 @@
-"""The tasks that a search gives to the processes that run the models; they travel by value."""
+"""Defines the tasks that a search gives to the processes that run the models; they can be pickled."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class FullRunTask:
 
 @dataclass(frozen=True)
 class FitTask:
-    """Asks for the fit of a set.
+    """Asks for the fit of a set, or the message that says why there is none.
 
     start : values from which the fit starts; runs : largest number of model runs
-    correction_n (m,) : force that is added to every run; empty for none
-    until_s : end of the part of the recording that is fitted, None for the whole
+    correction_n (m,) : force [N] that is added to every run; empty for none
+    until_s : end of the part of the recording that is fitted [s]; None for the whole recording
     """
 
     names: tuple[str, ...]
@@ -43,11 +43,12 @@ class FitTask:
 
 @dataclass(frozen=True)
 class ScoreTestTask:
-    """Asks for the gain [nats] that a mechanism promises beside a set, about the run of the set's fit.
+    """Asks for the gain [nats] that a score test promises for a mechanism that is added to a fitted set.
 
-    The mechanism has a shortcut for the force, so the model need not run.
+    The mechanism acts on the force of the fit's run, so the forward model need not run.
 
-    correction_n (m,) : part of the run's force that was added to it
+    names, theta, run : the set, the values of its fit, and the run of its fit; name : the added mechanism
+    correction_n (m,) : part of the run's force [N] that was added as a correction; empty for none
     """
 
     names: tuple[str, ...]
@@ -59,7 +60,10 @@ class ScoreTestTask:
 
 @dataclass(frozen=True)
 class FitWithAddedTask:
-    """Asks for the fit of a set with one mechanism more, whose values are first searched for on a tangent."""
+    """Asks for the fit of a set with one mechanism more, whose values are first searched for on a tangent.
+
+    score_test : the set and the added mechanism; runs : largest number of model runs
+    """
 
     score_test: ScoreTestTask
     runs: int
@@ -69,7 +73,7 @@ class FitWithAddedTask:
 class EvidenceTask:
     """Asks for the log-evidences of a set, alone and with an unnamed smooth discrepancy.
 
-    fit : of the set, as JSON has it
+    fit : the fit of the set, in JSON's types
     """
 
     fit: Mapping[str, Any]
@@ -79,7 +83,7 @@ class EvidenceTask:
 class OtherProtocolTask:
     """Asks for the force (m,) that the instrument reports on another protocol, or a failed run's message.
 
-    time_s, displacement_m : corners of the pads' motion; edges_s (m + 1,) : of the bins
+    time_s, displacement_m : corners of the pads' motion; edges_s (m + 1,) : edges of the bins
     """
 
     names: tuple[str, ...]

@@ -1,6 +1,8 @@
-"""The library of which a mismatch's form is made: functions of where the test stands, in units of mm and s.
+"""Provides the library of terms for the form of a mismatch: functions of the test's state over time.
 
-Each is evaluated at several times inside a bin and averaged. The memory of displacement over tau is
+The state is displacement, speed, time, cycle, phase and force. Coefficients are printed in units of mN, mm
+and s. Each function is evaluated at several times inside a bin and averaged. The memory of displacement over
+tau is
 
     m(t) = int_0^t exp(-(t - s) / tau) du(s) .
 """
@@ -15,16 +17,18 @@ import numpy as np
 from bayeskin.mismatch.unexplained import Place, Unexplained, place
 from bayeskin.types import Array, PadMotion, Phase
 
-POINTS = 8  # inside a bin
+POINTS = 8  # number of times inside a bin
 TAUS_S = (1.0, 3.0, 10.0, 30.0, 100.0)
 KINDS = {"hold": "in holds", "rest": "at rest", "load": "while loading", "unload": "while unloading"}
 
 
 @dataclass(frozen=True)
 class Term:
-    """One function: name in words, unit of a force divided by it (SI), values (k,) in SI.
+    """One function of the library.
 
-    shown_unit and shown: unit in which a coefficient is printed, and the factor to it from SI.
+    name : the function in words; values : its values (k,) in SI
+    unit : SI unit of its coefficient, which is a force divided by the function
+    shown_unit, shown : unit in which the coefficient is printed, and the factor that converts SI to it
     """
 
     name: str
@@ -34,7 +38,8 @@ class Term:
     values: Array
 
 
-_UNITS = {  # of a term, hence of its coefficient, as it is printed, and the factor
+# For the unit of a term: the SI unit of its coefficient, the unit in which it is printed, and the factor.
+_UNITS = {
     "1": ("N", "mN", 1e3),
     "m": ("N/m", "mN/mm", 1.0),
     "m^2": ("N/m^2", "mN/mm^2", 1e-3),
@@ -48,7 +53,7 @@ _UNITS = {  # of a term, hence of its coefficient, as it is printed, and the fac
 
 
 def library(rest: Unexplained, edges_s: Array, phases: tuple[Phase, ...], motion: PadMotion) -> list[Term]:
-    """All terms on the fitted bins of a recording, the simpler ones first."""
+    """Returns all terms on the fitted bins of a recording, the simpler ones first."""
     start, end = edges_s[rest.bins], edges_s[rest.bins + 1]
     share = (np.arange(POINTS) + 0.5) / POINTS
     time_s = start[:, None] + share * (end - start)[:, None]
@@ -62,28 +67,28 @@ def library(rest: Unexplained, edges_s: Array, phases: tuple[Phase, ...], motion
 
 
 def _functions(at: Place, force_n: Array, motion: PadMotion) -> Iterator[tuple[str, str, Array]]:
-    """Name, unit and values at times (k, POINTS)."""
+    """Yields the name, the unit and the values at times (k, POINTS) of each function."""
     u, direction = at.displacement_m, at.direction
-    done = np.maximum(at.cycle - 1.0, 0.0)
-    first = (at.cycle <= 1.0).astype(float)
+    cycles_done = np.maximum(at.cycle - 1.0, 0.0)
+    in_first_cycle = (at.cycle <= 1.0).astype(float)
     yield "a constant", "1", np.ones_like(u)
     yield "the direction of motion", "1", direction
     yield "displacement", "m", u
     yield "time", "s", at.time_s
-    yield "cycles done", "1", done
+    yield "cycles done", "1", cycles_done
     for kind, words in KINDS.items():
         yield f"a constant {words}", "1", (at.kind == kind).astype(float)
     yield "speed", "m/s", at.speed_m_s
     yield "the model's force", "N", force_n * np.ones_like(u)
     yield "displacement squared", "m^2", u**2
     yield "displacement with the sign of motion", "m", u * direction
-    yield "displacement in the first cycle", "m", u * first
-    yield "displacement while loading in the first cycle", "m", u * first * (at.kind == "load")
-    yield "displacement times cycles done", "m", u * done
+    yield "displacement in the first cycle", "m", u * in_first_cycle
+    yield "displacement while loading in the first cycle", "m", u * in_first_cycle * (at.kind == "load")
+    yield "displacement times cycles done", "m", u * cycles_done
     yield "displacement times time", "m s", u * at.time_s
     yield "the model's force squared", "N^2", force_n**2 * np.ones_like(u)
     yield "the model's force with the sign of motion", "N", force_n * direction
-    yield "the model's force times cycles done", "N", force_n * done
+    yield "the model's force times cycles done", "N", force_n * cycles_done
     yield "the model's force times time", "N s", force_n * at.time_s
     for tau_s in TAUS_S:
         yield f"memory of displacement over {tau_s:g} s", "m", memory(motion, at.time_s, tau_s)
@@ -98,7 +103,7 @@ def _functions(at: Place, force_n: Array, motion: PadMotion) -> Iterator[tuple[s
 
 
 def memory(motion: PadMotion, time_s: Array, tau_s: float) -> Array:
-    """The module's m(t) [m] at times of any shape, exact for straight stretches."""
+    """Returns the memory of displacement m(t) [m] at times of any shape; exact for straight stretches."""
     speed = np.diff(motion.displacement_m) / np.diff(motion.time_s)
     corners = [0.0]
     for v, lasts_s in zip(speed, np.diff(motion.time_s), strict=True):

@@ -1,4 +1,4 @@
-"""Tissues from which fits start: those whose force is nearest to the recorded one."""
+"""Chooses the tissues from which fits start: those whose force is nearest to the recorded force."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from bayeskin.mismatch.tasks import RunTask
 def nearest_tissues(
     context: SearchContext, names: Names, tissues: Sequence[Mapping[str, float]], values: Mapping[str, float]
 ) -> list[dict[str, float]]:
-    """Returns tissues, scaled to the stiffness that suits them best, the nearest to the recorded force first.
+    """Returns the tissues, each scaled to the stiffness that suits the recording best, the nearest first.
 
-    The force of a tissue whose moduli are all c times as large, and whose permeabilities are 1/c times as
-    large, is c times as large. A tissue with which the model does not run is left out.
+    If all moduli of a tissue are multiplied by c, and its permeabilities by 1/c, its force is multiplied by
+    c. A tissue for which the model's run fails is left out.
 
-    names, values : the set of mechanisms that the model runs with, and the values of its parameters
+    names, values : the set of mechanisms with which the model runs, and the values of all other parameters
+    tissues : values of the base model's parameters
     """
     usable = np.isfinite(context.binned.force_n)
     recorded, rows = context.binned.force_n[usable], []
@@ -39,7 +40,10 @@ def nearest_tissues(
 def _allowed_factors(
     context: SearchContext, tissue: Mapping[str, float], powers: Mapping[str, int]
 ) -> tuple[float, float]:
-    """Returns the factors between which all scaled parameters stay within their priors."""
+    """Returns the smallest and the largest factor with which all scaled parameters stay within their priors.
+
+    powers : the powers of the factor by which the parameters are multiplied
+    """
     lowest, highest = 0.0, np.inf
     for p in context.base.parameters:
         if power := powers.get(p.name, 0):

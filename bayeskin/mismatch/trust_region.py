@@ -1,11 +1,12 @@
-"""A set of mechanisms fitted by a forward model that solves all of them together.
+"""Fits a set of mechanisms in a trust region; the forward model solves all of its mechanisms together.
 
-Each run of the model carries its derivatives, so the posterior is known about it (`tangent`); what acts on
-the force alone, and the noise, are exact there. A round maximises this posterior, as all runs so far tell it,
-within a trust region of the parameters that the model solves, makes a run at the maximum, and goes on from
-it if the posterior has risen there. A run that was no gain tells where not to go.
+Each run of the model comes with its derivatives, which give the posterior near the run (`tangent`). For the
+noise, and for mechanisms that act on the force alone, this posterior is exact. Each round maximises the
+posterior that all runs so far give, within a trust region of the forward model's parameters. It then runs the
+model at the maximum. The next round starts from this run if the posterior has risen. A run without a gain
+still improves the posterior of the next rounds.
 
-Conn, Gould & Toint, Trust-Region Methods (2000), chapter 6.
+The method is that of Conn, Gould & Toint, Trust-Region Methods (2000), chapter 6.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from bayeskin.forward.interface import ModelRun
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import Top, gauss_newton, with_less_noise
 from bayeskin.inference.reparametrisation import Shear, shear_at
-from bayeskin.mismatch.fit import Fit, evidence, stored
+from bayeskin.mismatch.evidence import evidence
+from bayeskin.mismatch.fit import Fit, stored
 from bayeskin.mismatch.tangent import POWER
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Array
@@ -28,15 +30,18 @@ from bayeskin.types import Array
 
 @dataclass(frozen=True)
 class TrustSettings:
-    """Half widths of the trust region, of the prior's width: at first, at most and at last.
+    """Settings of a fit in a trust region.
 
-    kept : share of the promised gain that a step has to reach for the region to stay as it is; more : from
-        which on it grows; shrinks, grows : by what factors
-    moved : share of its half width, from which on a parameter has moved far: the region shrinks and grows
-        along those that have
-    enough : nats still promised at which a fit is settled
-    runs : at most
-    climb, held : rounds of Gauss-Newton in a trust region, and with the model's parameters held
+    first, largest, smallest : half width of the region at the start, its largest value, and the value below
+        which the fit ends; as shares of the prior's width
+    kept, more : shares of the promised gain that a step must reach so that the region does not shrink, and
+        so that it grows
+    shrinks, grows : factors on the half width
+    moved : share of its half width from which a parameter has moved far; the region shrinks and grows along
+        such parameters
+    enough : promised gain [nats] below which a fit is settled
+    runs : largest number of runs
+    climb, held : rounds of Gauss-Newton in a trust region, and with the forward model's parameters held
     """
 
     first: float = 0.2
@@ -53,16 +58,18 @@ class TrustSettings:
     held: int = 6
 
 
-# Names of a set and values by name to a run with derivatives, or why it failed.
+# Returns for a set and values by name a run with derivatives, or the message of a run that failed.
 Skin = Callable[[Sequence[str], Mapping[str, float]], ModelRun | str]
-Local = Callable[[Sequence[str], Sequence[ModelRun]], LogPosterior]  # the posterior of a set about runs
+Local = Callable[[Sequence[str], Sequence[ModelRun]], LogPosterior]  # returns a set's posterior near runs
 
 
 @dataclass(frozen=True)
 class SetFit:
-    """A fit, the run it is about, how many runs it took, and whether little is left to be gained.
+    """A fit of a set by the forward model.
 
-    correction_n (m,) : what was added to the force of each run, since the forward model is off by it near by
+    run : the run at which the fit ended; runs : number of runs that the fit took
+    settled : whether hardly any gain is still promised
+    correction_n (m,) : force [N] that was added to each run, because the forward model is off by it near by
     """
 
     fit: Fit
@@ -73,7 +80,7 @@ class SetFit:
 
 
 def as_json(found: SetFit) -> dict[str, Any]:
-    """A joint fit, as a bench reads it."""
+    """Returns a fit in JSON's types."""
     assert found.run.slopes_n is not None
     run = {
         "theta": found.run.theta.tolist(), "force_n": found.run.force_n.tolist(),
@@ -89,14 +96,15 @@ def fit_set(
     names: Sequence[str], start: Mapping[str, float], skin: Skin, local: Local,
     settings: TrustSettings | None = None, correction_n: Array | None = None,
 ) -> SetFit | str:  # fmt: skip
-    """Returns the maximum of a set that is reached from `start` (all parameters, SI).
+    """Returns the fit of a set that is reached from `start`; if the first run fails, its message.
 
-    correction_n (m,) : added to the force of each run
-    Returns the message of the first run where that fails.
+    start : values of all parameters by name, SI
+    skin : runs the forward model; local : returns the posterior near runs
+    correction_n (m,) : force [N] that is added to each run
     """
     settings = settings or TrustSettings()
 
-    def made_at(theta: Mapping[str, float]) -> ModelRun | str:
+    def run_at(theta: Mapping[str, float]) -> ModelRun | str:
         run = skin(names, theta)
         return (
             run
@@ -104,84 +112,89 @@ def fit_set(
             else replace(run, force_n=run.force_n + correction_n)
         )
 
-    run = made_at(start)
+    run = run_at(start)
     if isinstance(run, str):
         return run
-    runs, about = [run], local(names, [run])
-    vector, value = _at_run(about, np.clip(about.vector(start), *about.bounds), settings.held)
-    (low, high), solved = about.bounds, solved_columns(about)
+    runs, posterior = [run], local(names, [run])
+    vector, value = _at_run(posterior, np.clip(posterior.vector(start), *posterior.bounds), settings.held)
+    (low, high), solved = posterior.bounds, solved_columns(posterior)
     reach = np.where(solved, settings.first, 1.0)
-    settled, made = False, 1
-    while made < settings.runs and reach.min() >= settings.smallest:
-        ridge = shear_at(about, vector, POWER)
-        ahead, promised = _highest(about, in_box(about, vector, reach), vector, settings.climb, ridge)
-        moved = (np.abs(ahead - vector) / (high - low))[: len(reach)]
-        far = np.logical_and(solved, moved >= settings.moved * reach)
+    settled, run_count = False, 1
+    while run_count < settings.runs and reach.min() >= settings.smallest:
+        ridge = shear_at(posterior, vector, POWER)
+        proposal, promised = _highest(
+            posterior, in_box(posterior, vector, reach), vector, settings.climb, ridge
+        )
+        moved = (np.abs(proposal - vector) / (high - low))[: len(reach)]
+        moved_far = np.logical_and(solved, moved >= settings.moved * reach)
         promised -= value
         if promised < settings.enough:
             settled = True
             break
-        made += 1
-        there = made_at(about.named(about.from_sampling(ahead)))
-        gained = -np.inf
-        if not isinstance(there, str):
-            runs.append(there)
-            about = local(names, runs)
-            ahead, its_value = _at_run(about, ahead, settings.held)
-            gained = its_value - value
-        if gained > 0.0 and not isinstance(there, str):
-            run, vector, value = there, ahead, its_value
-        if gained < settings.kept * promised:
-            reach[far if far.any() else solved] *= settings.shrinks
-        elif gained > settings.more * promised:
-            reach[far] = np.minimum(settings.grows * reach[far], settings.largest)
+        run_count += 1
+        new_run = run_at(posterior.named(posterior.from_sampling(proposal)))
+        gain = -np.inf
+        if not isinstance(new_run, str):
+            runs.append(new_run)
+            posterior = local(names, runs)
+            proposal, new_value = _at_run(posterior, proposal, settings.held)
+            gain = new_value - value
+        if gain > 0.0 and not isinstance(new_run, str):
+            run, vector, value = new_run, proposal, new_value
+        if gain < settings.kept * promised:
+            reach[moved_far if moved_far.any() else solved] *= settings.shrinks
+        elif gain > settings.more * promised:
+            reach[moved_far] = np.minimum(settings.grows * reach[moved_far], settings.largest)
     correction_n = np.zeros_like(run.force_n) if correction_n is None else correction_n
-    return SetFit(_fit(names, local(names, [run]), vector), run, made, settled, correction_n)
+    return SetFit(_fit(names, local(names, [run]), vector), run, run_count, settled, correction_n)
 
 
-def _at_run(about: LogPosterior, vector: Array, rounds: int) -> tuple[Array, float]:
-    """Returns the most probable point (D,) with the model's parameters held, and its log density."""
-    return _highest(about, within(about, vector, 0.0), vector, rounds)
+def _at_run(posterior: LogPosterior, vector: Array, rounds: int) -> tuple[Array, float]:
+    """Returns the most probable point (D,) with the forward model's parameters held, and its log density."""
+    return _highest(posterior, within(posterior, vector, 0.0), vector, rounds)
 
 
 def _highest(
-    about: LogPosterior, near: LogPosterior, vector: Array, rounds: int, ridge: Shear | None = None
+    posterior: LogPosterior, near: LogPosterior, vector: Array, rounds: int, ridge: Shear | None = None
 ) -> tuple[Array, float]:
     """Returns the most probable point (D,) of a part of the posterior, and its log density.
 
-    ridge : of the moduli, which steps may follow
+    One climb starts with the noise at `vector`, and another one with a smaller noise. Otherwise noise that
+    has explained the misfit of an earlier run would remain.
 
-    Climbs set out from the noise as it is and from little: noise that took up another run's misfit stays.
+    near : the posterior in a smaller box; ridge : ridge of the moduli, which steps may follow
     """
-    starts = [vector, with_less_noise(about, vector)]
+    starts = [vector, with_less_noise(posterior, vector)]
     tops = [gauss_newton(near, np.clip(start, *near.bounds), ridge, rounds) for start in starts]
-    better = np.clip(max(tops, key=lambda top: top.value).vector, *about.bounds)
-    return better, float(about.log_prob(better[None])[0])
+    best = np.clip(max(tops, key=lambda top: top.value).vector, *posterior.bounds)
+    return best, float(posterior.log_prob(best[None])[0])
 
 
-def _fit(names: Sequence[str], about: LogPosterior, vector: Array) -> Fit:
-    top: Top = gauss_newton(about, vector, None, 0)
-    theta = about.named(about.from_sampling(top.vector))
-    return Fit(tuple(names), about, theta, top.value, *evidence(about, top), top.latent)
+def _fit(names: Sequence[str], posterior: LogPosterior, vector: Array) -> Fit:
+    """Returns the fit at a point (D,) of a posterior."""
+    top: Top = gauss_newton(posterior, vector, None, 0)
+    theta = posterior.named(posterior.from_sampling(top.vector))
+    return Fit(tuple(names), posterior, theta, top.value, *evidence(posterior, top), top.latent)
 
 
 def within(about: LogPosterior, vector: Array, reach: float) -> LogPosterior:
-    """Returns the same posterior with the parameters that the model solves held near a point (D,).
+    """Returns the same posterior with the forward model's parameters limited to values near a point (D,).
 
-    reach : of the prior's width, on either side
+    reach : largest distance on either side, as a share of the prior's width
     """
     return in_box(about, vector, np.where(solved_columns(about), reach, 1.0))
 
 
 def in_box(about: LogPosterior, vector: Array, reach: Array) -> LogPosterior:
-    """Returns the same posterior in a smaller box about a point (D,).
+    """Returns the same posterior in a smaller box with a point (D,) at its centre.
 
-    reach (d,) : of the prior's width, on either side, for each of the surrogate's parameters
+    reach (d,) : largest distance on either side, as a share of the prior's width, for each parameter of the
+        surrogate
     """
     space, (low, high) = about.surrogate.space, about.bounds
-    low, high, line = low[: space.dim], high[: space.dim], vector[: space.dim]
-    far = np.maximum(reach, 1e-9) * (high - low)
-    lower, upper = (space.from_line(np.clip(line + sign * far, low, high)) for sign in (-1.0, 1.0))
+    low, high, centre = low[: space.dim], high[: space.dim], vector[: space.dim]
+    half_width = np.maximum(reach, 1e-9) * (high - low)
+    lower, upper = (space.from_line(np.clip(centre + sign * half_width, low, high)) for sign in (-1.0, 1.0))
     prior = about.material or space
     narrowed = tuple(
         replace(p, lower=float(max(a, p.lower)), upper=float(min(b, p.upper)))
@@ -191,6 +204,6 @@ def in_box(about: LogPosterior, vector: Array, reach: Array) -> LogPosterior:
 
 
 def solved_columns(about: LogPosterior) -> Array:
-    """Returns whether the forward model solves each of the surrogate's parameters, (d,)."""
+    """Returns which of the surrogate's parameters belong to the forward model, (d,)."""
     inner = set(innermost(about.surrogate).space.names)
     return np.array([name in inner for name in about.surrogate.space.names])

@@ -1,17 +1,18 @@
-"""What a fit leaves over, with all that its parameters could still take up projected out of it.
+"""Computes the residual of a fit, and removes the part of it that the parameters could still explain.
 
-With r the residual at a fit, G the derivatives of the force by the surrogate's parameters (central
-differences in sampling coordinates), e the noise and the errors that are allowed for, of covariance R, and d
-the discrepancy,
+Let r be the residual at a fit, G the derivatives of the force by the surrogate's parameters (central
+differences in sampling coordinates), e the noise and the errors that are allowed for, with covariance R, and
+d the discrepancy. Then
 
     r = G b + d + e ,    G' d = 0 .
 
-In describing d, b has no prior: whatever looks like a parameter is the parameter's, and is no discrepancy
-(Plumlee 2017, JASA 112:1274; without this the two compete and the parameters lose their meaning:
-Brynjarsdottir & O'Hagan 2014, Inverse Problems 30:114007). A parameter at a bound of its prior has no column
-in G. With N an orthonormal basis of what is orthogonal to G, and N' R N = M M', both the flat prior of b and
-the condition on d hold in the coordinates a = M^-1 N' r, in which the noise is the identity. The price: what
-parameters can imitate of a true discrepancy is not seen. Evidence, which compares sets, gives b its prior.
+When d is described, b has no prior: every change of the force that a parameter can make is attributed to this
+parameter, and not to the discrepancy (Plumlee 2017, JASA 112:1274). Otherwise the two compete, and the
+parameters lose their meaning (Brynjarsdottir & O'Hagan 2014, Inverse Problems 30:114007). A parameter at a
+bound of its prior has no column in G. Let N be an orthonormal basis of the space orthogonal to G, and let
+N' R N = M M'. The coordinates a = M^-1 N' r satisfy both the flat prior of b and the condition on d, and in
+them the covariance of the noise is the identity. The disadvantage is that the part of a true discrepancy that
+parameters can imitate remains hidden. The evidence, which compares sets, gives b its prior.
 """
 
 from __future__ import annotations
@@ -25,21 +26,24 @@ from scipy.linalg import solve_triangular
 
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.noise_model import noise_covariance
-from bayeskin.mismatch.fit import Fit, held_density
+from bayeskin.mismatch.evidence import held_density
+from bayeskin.mismatch.fit import Fit
 from bayeskin.types import Array, PadMotion, Phase
 
-STEP = 1e-3  # of the prior box in sampling coordinates, for derivatives
-AT_BOUND = 1e-3  # of the box: nearer to its bound than this a parameter does not move
-SMALLEST = 1e-6  # singular value of the derivatives, of the largest, that still is a direction
+STEP = 1e-3  # step of central differences, as a share of the prior box in sampling coordinates
+AT_BOUND = 1e-3  # distance from a bound, as a share of the box, below which a parameter is held there
+SMALLEST = 1e-6  # smallest singular value of the derivatives that counts, as a share of the largest one
 DIRECTION = {"rest": 0.0, "load": 1.0, "hold": 0.0, "unload": -1.0}
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where times stand in a test: arrays of one shape.
+    """The state of a test at given times; all arrays have the same shape.
 
-    time_s; displacement_m; speed_m_s; since_s, since the last corner; kind ("rest", "load", ...);
-    cycle; phase, index into the recording's; direction, 1 loading, -1 unloading, 0 still.
+    since_s : time since the last corner
+    kind : kind of the phase ("rest", "load", ...); cycle : number of the cycle
+    phase : index of the phase in the recording's phases
+    direction : 1 for loading, -1 for unloading, 0 for still pads
     """
 
     time_s: Array
@@ -53,7 +57,10 @@ class Place:
 
 
 def place(time_s: ArrayLike, phase: ArrayLike, phases: tuple[Phase, ...], motion: PadMotion) -> Place:
-    """Of times (any shape) that belong to phases (same shape, index)."""
+    """Returns the state of a test at times of any shape.
+
+    phase : index of the phase to which each time belongs, same shape
+    """
     time_s, phase = np.asarray(time_s, dtype=float), np.asarray(phase, dtype=np.int64)
     speed = np.diff(motion.displacement_m) / np.diff(motion.time_s)
     stretch = np.clip(np.searchsorted(motion.time_s, time_s, side="right") - 1, 0, len(speed) - 1)
@@ -69,10 +76,10 @@ def place(time_s: ArrayLike, phase: ArrayLike, phases: tuple[Phase, ...], motion
 
 @dataclass(frozen=True)
 class Memory:
-    """Noise with a memory: as many times sd_n (k,) as `size` says, forgotten within time_s.
+    """Noise with a memory; its sd is sd_n (k,) [N] times `size`, and its correlation time is time_s.
 
-    apart_s (k, k) : between bins, infinite between fit windows
-    size_within, time_within : what its priors allow
+    apart_s (k, k) : time between bins, infinite for bins of different fit windows
+    size_within, time_within : bounds of size and time_s by the priors
     """
 
     sd_n: Array
@@ -84,19 +91,23 @@ class Memory:
 
     @cached_property
     def covariance_n2(self) -> Array:
-        """(k, k) [N^2]."""
+        """Returns the covariance (k, k) [N^2]."""
         return np.asarray(self.size**2 * np.outer(self.sd_n, self.sd_n) * np.exp(-self.apart_s / self.time_s))
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """A fit's residual and what it takes to split it; k bins, r of them taken up by parameters.
+    """The residual of a fit in k bins, and the quantities that split it.
 
-    residual_n (k,) recorded minus model; force_n (k,) the model's; measured_n2 (k, k) covariance of the
-    noise that the bins carry themselves and of the errors that are allowed for; memory: the noise with a
-    memory beside it; slopes (k, d) of the force over the priors' widths of the d parameters that move, and
-    inwards (k, h) of those that a bound holds; taken (k, r), an orthonormal basis of the slopes, and basis
-    (k, k - r), N; at: where the bins stand.
+    bins : indices of the fitted bins, (k,)
+    residual_n : recorded force minus the model's, (k,) [N]; force_n : the model's force, (k,) [N]
+    measured_n2 : covariance (k, k) [N^2] of the noise that the bins themselves state, and of the errors that
+        are allowed for
+    memory : the noise with a memory, which is not part of measured_n2
+    slopes : derivatives (k, d) [N] of the force over the priors' widths, by the d parameters that can move
+    inwards : the same (k, h) by the h parameters that a bound holds, in the direction away from this bound
+    taken : orthonormal basis (k, r) of the slopes; basis : orthonormal basis N (k, k - r) of all other forces
+    at : the state of the test in the bins
     """
 
     bins: NDArray[np.int64]
@@ -112,57 +123,62 @@ class Unexplained:
 
     @cached_property
     def noise_n2(self) -> Array:
-        """R, (k, k) [N^2]."""
+        """Returns R, the covariance of noise and allowed errors, (k, k) [N^2]."""
         return self.measured_n2 + self.memory.covariance_n2
 
     def with_memory(self, line: Array) -> Unexplained:
-        """The same beside noise of another size and time, from their logarithms (2,)."""
+        """Returns the same residual with another noise with a memory.
+
+        line : logarithms (2,) of its size and its time
+        """
         size, time_s = (float(value) for value in np.exp(line))
         return replace(self, memory=replace(self.memory, size=size, time_s=time_s))
 
     def log_evidence(self, kernel_n2: Array | None = None) -> float:
-        """Of the fit, with a discrepancy of covariance (k, k) or without any, its force linear in the
-        parameters, up to a constant that is the same for all fits to the same bins.
+        """Returns the log-evidence of the fit, with a force that is linear in the parameters.
 
-        b is normal, as dense at the fit as the uniform prior is; what a bound holds moves inwards only.
+        It lacks a constant that is the same for all fits to the same bins. The prior of b is normal, with the
+        same density at the fit as the uniform prior. Parameters that a bound holds move only inwards.
+
+        kernel_n2 : covariance (k, k) [N^2] of a discrepancy, None without a discrepancy
         """
         covariance = self.noise_n2 + self.open_n2
         if kernel_n2 is not None:
             covariance = covariance + self.beyond(self.beyond(kernel_n2).T)
-        root = np.linalg.cholesky(covariance)
-        white = solve_triangular(root, self.residual_n, lower=True)
-        moved = solve_triangular(root, self.inwards, lower=True)
-        t, density = held_density(np.maximum(-moved.T @ white, 0.0), np.sum(moved**2, axis=0))
+        lower = np.linalg.cholesky(covariance)
+        whitened = solve_triangular(lower, self.residual_n, lower=True)
+        inward = solve_triangular(lower, self.inwards, lower=True)
+        t, density = held_density(np.maximum(-inward.T @ whitened, 0.0), np.sum(inward**2, axis=0))
         mass = np.trapezoid(density, t, axis=1)
-        return float(np.sum(np.log(mass)) - np.sum(np.log(np.diag(root))) - 0.5 * white @ white)
+        return float(np.sum(np.log(mass)) - np.sum(np.log(np.diag(lower))) - 0.5 * whitened @ whitened)
 
     @cached_property
     def open_n2(self) -> Array:
-        """Covariance (k, k) [N^2] of the force by what the priors leave open of the parameters."""
+        """Returns the covariance (k, k) [N^2] of the force that follows from the priors of the parameters."""
         return np.asarray(self.slopes @ self.slopes.T / (2.0 * np.pi))
 
     @cached_property
     def _root(self) -> Array:
-        """M, (k - r, k - r)."""
+        """Returns M, (k - r, k - r)."""
         return np.asarray(np.linalg.cholesky(self.basis.T @ self.noise_n2 @ self.basis))
 
     @cached_property
     def reduce(self) -> Array:
-        """M^-1 N', (k - r, k): from forces to the coordinates a."""
+        """Returns M^-1 N', (k - r, k), which maps forces to the coordinates a."""
         return np.asarray(solve_triangular(self._root, self.basis.T, lower=True))
 
     @cached_property
     def expand(self) -> Array:
-        """N M, (k, k - r): back to forces, orthogonal to what parameters take up."""
+        """Returns N M, (k, k - r), which maps coordinates a to forces that are orthogonal to G."""
         return np.asarray(self.basis @ self._root)
 
     def beyond(self, forces_n: Array) -> Array:
-        """What parameters cannot take up of forces (k,) or (k, p), by least squares."""
+        """Returns the part of forces (k,) or (k, p) that parameters cannot explain, by least squares."""
         return np.asarray(forces_n - self.taken @ (self.taken.T @ forces_n))
 
 
 def unexplained(found: Fit, motion: PadMotion) -> Unexplained:
-    """The residual at a fit, on the bins that were fitted."""
+    """Returns the residual at a fit on the fitted bins; `motion` is the protocol of the recording."""
     log_posterior = found.log_posterior
     chain, binned = log_posterior.chain, log_posterior.binned
     theta = log_posterior.from_sampling(log_posterior.vector(found.theta))[None]
@@ -173,20 +189,23 @@ def unexplained(found: Fit, motion: PadMotion) -> Unexplained:
     covariance = noise_covariance(chain, measured, prediction.diagonal[0, chain.bins])
     factor = prediction.factor[0, chain.bins]
     material = found.unit[: log_posterior.surrogate.space.dim]
-    moves = (material > AT_BOUND) & (material < 1.0 - AT_BOUND)
+    can_move = (material > AT_BOUND) & (material < 1.0 - AT_BOUND)
     all_slopes = derivatives(log_posterior, found.unit)[chain.bins]
-    slopes, inwards = all_slopes[:, moves], (all_slopes * np.where(material < 0.5, 1.0, -1.0))[:, ~moves]
-    left, size, _ = np.linalg.svd(slopes)
+    slopes, inwards = (
+        all_slopes[:, can_move],
+        (all_slopes * np.where(material < 0.5, 1.0, -1.0))[:, ~can_move],
+    )
+    vectors, size, _ = np.linalg.svd(slopes)
     rank = int(np.sum(size > SMALLEST * size.max(initial=0.0)))
     at = place(binned.time_s[chain.bins], binned.phase[chain.bins], binned.phases, motion)
     return Unexplained(
         chain.bins, chain.force_n - force, force, covariance + factor @ factor.T,
-        _memory(log_posterior, noise), slopes, inwards, left[:, :rank], left[:, rank:], at,
+        _memory(log_posterior, noise), slopes, inwards, vectors[:, :rank], vectors[:, rank:], at,
     )  # fmt: skip
 
 
 def _memory(log_posterior: LogPosterior, noise: Array) -> Memory:
-    """The noise with a memory of a fit, with noise parameters (q,)."""
+    """Returns the noise with a memory of a fit, whose noise parameters are `noise` (q,)."""
     chain, priors = log_posterior.chain, log_posterior.noise_priors
     window, sd_n = np.cumsum(chain.starts), noise[chain.kind]
     time_s = np.cumsum(chain.gap_s)
@@ -196,7 +215,10 @@ def _memory(log_posterior: LogPosterior, noise: Array) -> Memory:
 
 
 def derivatives(log_posterior: LogPosterior, unit: Array) -> Array:
-    """Of the force by each material parameter, over its prior's whole range [N], (m, d), at unit (D,)."""
+    """Returns the derivatives (m, d) [N] of the force by the material parameters, over their priors' widths.
+
+    unit : point (D,) in the unit cube
+    """
     d = log_posterior.surrogate.space.dim
     low, high = log_posterior.bounds
     centre = np.clip(unit, STEP, 1.0 - STEP)

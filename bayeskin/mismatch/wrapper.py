@@ -1,4 +1,4 @@
-"""A surrogate about another: what is not said anew is the inner one's."""
+"""Provides a surrogate that wraps another one, and functions that look inside wrapped surrogates."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from bayeskin.types import Array, ParameterSpace, Prediction, Surrogate
 
 @dataclass(frozen=True)
 class Wrapper:
-    """Satisfies `types.Surrogate`."""
+    """A surrogate that delegates to `inner` everything that a subclass does not override.
+
+    It satisfies `types.Surrogate`.
+    """
 
     inner: Surrogate
 
@@ -31,23 +34,27 @@ class Wrapper:
         return self.inner.provenance
 
     def predict(self, theta: ArrayLike) -> Prediction:
-        """Force at theta (n, d) or (d,). Raises InputError outside the box."""
+        """Returns the force at theta (n, d) or (d,). Raises InputError outside the box."""
         return self.inner.predict(theta)
 
     def predict_mean(self, theta: ArrayLike) -> Array:
-        """The mean (n, m) of `predict` alone."""
+        """Returns only the mean (n, m) of `predict`."""
         return self.inner.predict_mean(theta)
 
 
 def innermost(surrogate: Surrogate) -> Surrogate:
-    """Returns the surrogate of the skin and of what changes it: the one that is about no other."""
+    """Returns the innermost surrogate, which predicts the force of the skin with the tissue's mechanisms."""
     while isinstance(surrogate, Wrapper):
         surrogate = surrogate.inner
     return surrogate
 
 
 def skins(surrogate: Surrogate) -> tuple[int, ...]:
-    """Returns how many of the first parameters are the skin's, without and with mechanisms of the tissue."""
+    """Returns the number of the skin's parameters, without and with those of tissue mechanisms.
+
+    These are the first parameters of the surrogate. The result is a single number if the surrogate has no
+    tissue mechanisms.
+    """
     names = innermost(surrogate).space.names
     of_mechanisms = {p.name for mechanism in catalogue().values() for p in mechanism.parameters}
     return tuple(sorted({sum(name not in of_mechanisms for name in names), len(names)}))

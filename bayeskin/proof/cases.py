@@ -267,7 +267,7 @@ def _nearest_draw(
             break
     if nearest is None:
         found_n = f"no draw of {', '.join(plan.mechanisms)} with a peak of {PEAK_N[0]:g} to {PEAK_N[1]:g} N"
-        raise InputError("proof", found_n, f"one among {BATCHES * BATCH}")
+        raise InputError("proof", found_n, f"at least one such draw among {BATCHES * BATCH}")
     return Case(plan, _by_name(screen, nearest[0]), nearest[1], 0.0, floor_n, target)
 
 

@@ -117,7 +117,7 @@ def conceal(
     with closing(run_all(make, [wanted[place] for place in missing])) as results:
         for index, result in results:
             if isinstance(result, Lost):
-                raise InputError("proof", result.reason, "a worker process that lives")
+                raise InputError("proof", result.reason, "a worker process that finishes its work")
             if not isinstance(result, Concealed):
                 raise InputError(*result)
             _write(folder, numbers[missing[index]], result)
@@ -139,7 +139,7 @@ def concealed(plan: Plan, screen: Screen, run: Run = full_run) -> Concealed:
         if runs.ok:
             return _recording_and_key(case, runs, screen, attempt)
     raise InputError(
-        f"proof: {plan.label}", f"{ATTEMPTS} runs of the full model that failed", "one that ends"
+        f"proof: {plan.label}", f"{ATTEMPTS} runs of the full model that failed", "one that succeeds"
     )
 
 
@@ -246,11 +246,13 @@ def _start_or_check(folder: Path, seed: int, count: int, only: Sequence[str]) ->
     settings: dict[str, Any] = {"seed": seed, "count": count, **({"only": list(only)} if only else {})}
     if not path.is_file():
         if (folder / seals.INDEX).is_file() and seals.read_index(folder):
-            raise InputError(folder, "a set without its seals", "a folder of its own for a new set")
+            raise InputError(folder, "a set without its seals", "another folder for a new set")
         seals.write_json(folder / seals.INDEX, {"recordings": {}})
         seals.write_json(path, settings)
     elif (stored := seals.read_json(path)) != settings:
-        raise InputError(folder, f"a set of another making than {settings}: {stored}", "another folder")
+        raise InputError(
+            folder, f"a set with the settings {stored}", f"the settings {settings}, or another folder"
+        )
 
 
 def _finished(folder: Path, number: str) -> bool:

@@ -255,17 +255,17 @@ OUTSIDE: dict[str, Outside] = {
     "thick-cutis": Outside("thickness of the cutis [m]", (2.5e-3, 4e-3), _as_thick),
     "thin-arm": Outside("radius below the subcutis [m]", (0.03, 0.042), _on_an_arm),
     "thick-arm": Outside("radius below the subcutis [m]", (0.058, 0.09), _on_an_arm),
-    "muscle": Outside("a third layer, stiffer by a factor", (4.0, 40.0), lambda s: Change(deep=s)),
-    "soft-fat": Outside("a third layer, of moduli times", (0.03, 0.3), lambda s: Change(deep=s)),
+    "muscle": Outside("factor by which a third layer is stiffer", (4.0, 40.0), lambda s: Change(deep=s)),
+    "soft-fat": Outside("factor of the moduli of a third layer", (0.03, 0.3), lambda s: Change(deep=s)),
     "hardening": Outside(
-        "moduli grow evenly, by this share in all", (0.03, 0.4),
+        "share by which the moduli grow evenly in all", (0.03, 0.4),
         lambda s: ageing([(0.0, 1.0, s / END_S, np.inf)]),
     ),
     "fatigue": Outside(
-        "moduli fall by this share, most of it within a minute", (0.03, 0.4),
+        "share by which the moduli fall, most of it within a minute", (0.03, 0.4),
         lambda s: ageing([(0.0, 1.0, -s / FATIGUE_S, FATIGUE_S)]),
     ),
-    "thixotropy": Outside("moduli lose this share while the skin is moved", (0.03, 0.4), thixotropy),
+    "thixotropy": Outside("share that the moduli lose while the skin is moved", (0.03, 0.4), thixotropy),
     "strain-softening": Outside("loss of stiffness by tr C - 3", (0.3, 10.0), softening),
     "plastic-set": Outside("share of the farthest displacement that is kept", (0.01, 0.1), plastic_set),
     "peeling": Outside("share of the displacement that is lost from cycle 3 on", (0.01, 0.1), peeling),
@@ -274,7 +274,7 @@ OUTSIDE: dict[str, Outside] = {
         lambda s: scaled(lambda t, f: 1.0 + s * np.sin(2.0 * np.pi * t / BREATH_S)),
     ),
     "bent-cell": Outside(
-        "share more that the load cell reads at 1 N", (0.05, 0.6), lambda s: scaled(lambda t, f: 1.0 + s * f)
+        "share that the cell reads too much at 1 N", (0.05, 0.6), lambda s: scaled(lambda t, f: 1.0 + s * f)
     ),
     "twitches": Outside("height of two pulls of the muscle [N]", (5e-3, 0.1), twitching),
     "slow-amplifier": Outside("time constant of the amplifier [s]", (0.3, 5.0), slow_amplifier),

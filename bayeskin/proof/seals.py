@@ -41,7 +41,7 @@ def read_json(path: Path) -> Any:
     except OSError as error:
         raise InputError(path, error.strerror or "an unreadable file", "a file of a proof's set") from None
     except ValueError:
-        raise InputError(path, "no JSON", "a file of a proof's set") from None
+        raise InputError(path, "a file that is not JSON", "a file of a proof's set") from None
 
 
 def read_index(folder: Path) -> dict[str, dict[str, str]]:
@@ -54,7 +54,7 @@ def read_index(folder: Path) -> dict[str, dict[str, str]]:
     if not isinstance(hashes, dict) or not all(
         isinstance(pair, dict) and set(pair) == {"recording_sha256", "key_sha256"} for pair in hashes.values()
     ):
-        raise InputError(folder / INDEX, "no index of a set", "hashes of recordings and keys, by number")
+        raise InputError(folder / INDEX, "no index of a set", "the hashes of recordings and keys, by number")
     return dict(sorted(hashes.items()))
 
 

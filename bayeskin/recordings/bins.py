@@ -30,8 +30,8 @@ def uniform_edges(recording_or_end_s: Recording | float, width_s: float = 0.5) -
     source = recording_or_end_s
     end_s = float(source.time_s[-1]) if isinstance(source, Recording) else float(source)
     if not end_s < MOST_BINS * width_s:
-        problem = f"{width_s:g} s for {end_s:g} s"
-        raise InputError("bin_width_s", problem, f"bins so wide that they are fewer than {MOST_BINS}")
+        problem = f"{width_s:g} s for a recording of {end_s:g} s"
+        raise InputError("bin_width_s", problem, f"a width that gives fewer than {MOST_BINS} bins")
     return width_s * np.arange(int(end_s / width_s + 1e-6) + 1, dtype=float)
 
 

@@ -39,7 +39,7 @@ def describe(recording: Recording, phases: Sequence[Phase], noise: Sequence[Phas
         f"{facts['duration_s']:.2f} s, {facts['cycles']} cycle{'s' * (facts['cycles'] != 1)}",
         *(f"  {note}" for note in recording.notes),
         f"  displacement {1e3 * displacement['min']:.3f} to {1e3 * displacement['max']:.3f} mm "
-        f"(resolved to {number(1e3 * displacement['resolution'], 2)} mm), "
+        f"(resolution {number(1e3 * displacement['resolution'], 2)} mm), "
         f"force {number(force['min'], 4)} to {number(force['max'], 4)} N",
         "",
         "  ".join(f"{title:>{width}}" for title, width in zip(_HEADINGS, _WIDTHS, strict=True)),

@@ -104,9 +104,11 @@ def choose_columns(where: str, headers: Sequence[str]) -> dict[str, Column]:
         accepted = ", ".join(UNITS[quantity])
         if not named:
             listed = ", ".join(repr(h.strip()) for h in headers if h.strip()) or "no header"
-            raise InputError(where, listed[:200], f"a {quantity} column in one of {accepted}")
+            raise InputError(where, listed[:200], f"a {quantity} column with one of the units {accepted}")
         if not fitting:
-            raise InputError(where, f"column {named[0].header!r}", f"{quantity} in one of {accepted}")
+            raise InputError(
+                where, f"column {named[0].header!r}", f"{quantity} with one of the units {accepted}"
+            )
         if len(fitting) > 1:
             candidates = " and ".join(repr(c.header) for c in fitting)
             raise InputError(where, f"{candidates}, each a {quantity} column", f"one {quantity} column")

@@ -212,12 +212,12 @@ def _analyse_once(
     longest = int(np.max(np.diff(breaks)))
     size = min(max(round(window_s / interval_s), _LEAST_WINDOW), int(0.7 * longest))
     if round(WINDOW_S / interval_s) < _LEAST_WINDOW:
-        expected = f"at most {WINDOW_S / _LEAST_WINDOW:.2g} s, to know their noise"
+        expected = f"at most {WINDOW_S / _LEAST_WINDOW:.2g} s, to estimate their noise"
         raise InputError(recording.name, f"samples {interval_s:.3g} s apart", expected)
     if size < _LEAST_WINDOW:
         problem = f"{longest} samples in the longest phase"
         raise InputError(
-            recording.name, problem, f"at least {round(_LEAST_WINDOW / 0.7) + 1}, to know its noise"
+            recording.name, problem, f"at least {round(_LEAST_WINDOW / 0.7) + 1}, to estimate its noise"
         )
     windows = [
         _phase_windows(time_s, despiked, breaks[(breaks >= a) & (breaks <= b)], size, interval_s)

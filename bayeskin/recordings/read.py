@@ -51,9 +51,9 @@ def read_recording(path: Path | str, *, sheet: str | None = None) -> Recording:
     refuse_endless(path, "a recording")
     kind, accepted = path.suffix.lower(), _WORKBOOKS | _TEXTS | _STORED
     if kind not in accepted:
-        raise InputError(path, f"ending {kind!r}", f"one of {', '.join(sorted(accepted))}")
+        raise InputError(path, f"the ending {kind!r}", f"one of {', '.join(sorted(accepted))}")
     if sheet is not None and kind not in _WORKBOOKS:
-        raise InputError(f"{path}: sheet {sheet!r}", f"ending {kind!r}", "a workbook, .xlsx or .xlsm")
+        raise InputError(f"{path}: sheet {sheet!r}", f"the ending {kind!r}", "a workbook, .xlsx or .xlsm")
     if kind in _STORED:
         return _read_stored(path)
     data = bytes_of(path, "a recording")
@@ -68,7 +68,9 @@ def _read_stored(path: Path) -> Recording:
     arrays = [recording.time_s, recording.displacement_m, recording.force_n]
     valid = len({a.shape for a in arrays}) == 1 and all(a.ndim == 1 and a.dtype.kind == "f" for a in arrays)
     if not valid:
-        raise InputError(path, "arrays of other shapes or kinds", "three arrays of numbers of one length")
+        raise InputError(
+            path, "arrays of different shapes or types", "three arrays of numbers with equal lengths"
+        )
     _refuse_invalid(str(path), 0, *arrays)
     return recording
 
@@ -81,12 +83,12 @@ def _to_recording(name: str, table: Table, sha256: str) -> Recording:
         _refuse_infinite(f"{table.where}, row", table.first_row, column.header, raw)
         unit = column.unit or _guess_unit(table, column, raw)
         values[quantity] = raw * UNITS[quantity][unit]
-        stated = "" if column.unit else ", the unit that fits the numbers (the header gives none)"
-        notes.append(f"column {column.header!r} taken as {quantity}, {unit}{stated}")
+        stated = "" if column.unit else ", which fits the numbers (the header gives no unit)"
+        notes.append(f"column {column.header!r} read as {quantity} in {unit}{stated}")
     used = {column.index for column in table.columns.values()}
     ignored = [h.strip() for i, h in enumerate(table.headers) if i not in used and h.strip()]
     if ignored:
-        notes.append("columns ignored: " + ", ".join(map(repr, ignored)))
+        notes.append("ignored columns: " + ", ".join(map(repr, ignored)))
     time_s, displacement_m, force_n = values["time"], values["displacement"], values["force"]
     _refuse_invalid(table.where, table.first_row, time_s, displacement_m, force_n)
     recording = Recording(time_s, displacement_m, force_n, name, sha256)

@@ -73,7 +73,9 @@ def segment(recording: Recording) -> tuple[Phase, ...]:
     )
     if len(pieces) < 2:
         raise InputError(
-            recording.name, "a displacement with one phase only", "a load, a hold or an unload more"
+            recording.name,
+            "a displacement with one phase only",
+            "at least two of loading, hold and unloading",
         )
     corners = [_corner_s(time_s, smooth, a, b) for a, b in pairwise(pieces)]
     edges = [float(time_s[0]), *corners, float(time_s[-1])]

@@ -53,7 +53,7 @@ def read_text(path: Path, data: bytes) -> Table:
     try:
         table = _tabulate(str(path), split(_lines(text)))
     except csv.Error as error:
-        raise InputError(path, f"text that is not a table ({error})", "rows of cells") from None
+        raise InputError(path, f"text that is not a table ({error})", "a table of rows and columns") from None
     if encoding == "utf-8":
         return table
     return replace(table, notes=(f"text read as {encoding}",))
@@ -81,7 +81,7 @@ def read_workbook(path: Path, data: bytes, sheet: str | None) -> Table:
         wanted = [sheet] if sheet is not None else [n for n in names if _sheet_has_header(book[n])]
         if len(wanted) != 1:
             problem = f"the columns in {len(wanted)} of the sheets {names}"
-            raise InputError(path, problem, "time, displacement and force in one sheet, or its name given")
+            raise InputError(path, problem, "time, displacement and force in one sheet, or the sheet's name")
         return _tabulate(f"{path}: sheet {wanted[0]!r}", book[wanted[0]].iter_rows(values_only=True))
     except InputError:
         raise
@@ -117,7 +117,9 @@ def _decode(path: Path, data: bytes) -> tuple[str, str]:
             continue
         if "\0" not in text:
             return text, encoding.removesuffix("-sig")
-    raise InputError(path, "bytes that are not text", "text in UTF-8, UTF-16 with its mark, or Windows-1252")
+    raise InputError(
+        path, "bytes that are not text", "text in UTF-8, UTF-16 with a byte order mark, or Windows-1252"
+    )
 
 
 def _lines(text: str) -> Iterator[str]:
@@ -205,7 +207,7 @@ def _until_blank(where: str, rows: Iterable[tuple[int, Row]]) -> Iterator[tuple[
         if _blank(row):
             blank = blank or number
         elif blank:
-            raise InputError(f"{where}, row {blank}", f"an empty row before row {number}", "numbers")
+            raise InputError(f"{where}, row {blank}", f"an empty row before row {number}", "a row of numbers")
         else:
             yield number, row
 

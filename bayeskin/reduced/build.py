@@ -97,7 +97,7 @@ def with_mechanisms(
         for kind, cases_of_kind in cases.items()
     }
     library = Library(modes_of_base, beyond)
-    teacher = Teacher(full, library, settings, "cubature of sets")
+    teacher = Teacher(full, library, settings, "cubature of mechanism sets")
     shadows = [trained.case(SETS, index, settings.seed + 1) for index in range(settings.set_shadows)]
     rule = teacher.rule(shadows, settings.set_points, run_all, progress)
     return replace(base, trained=trained, library=library, cubatures=Cubatures(base.cubatures.base, rule))
@@ -110,7 +110,7 @@ def weighted_modes_of(full: FullRuns, cases: Sequence[Case], inner: Inner) -> Mo
     """
     finished = [run for run in map(full.read, cases) if not run.message]
     if not finished:
-        raise InputError(f"{full.folder}", "no full run that finished", "one at least")
+        raise InputError(f"{full.folder}", "no full run that finished", "at least one")
 
     def weighted(name: str, product: sp.csr_matrix) -> Array:
         rows = np.concatenate([getattr(run, name) for run in finished]).astype(float)
@@ -164,8 +164,8 @@ class Teacher:
                 progress(self.label, (done + len(runs)) / len(cases))
             rows += [runs[number].rows for number in sorted(runs) if self._is_near(runs[number])]
             if not rows:
-                message = "no reduced run that stays near the full model"
-                raise InputError(self.label, message, "a point away from folds")
+                message = "no reduced run close to the full model"
+                raise InputError(self.label, message, "parameters without folding of the skin")
             all_rows = with_volumes(np.concatenate(rows), at, self.settings.cubature)
             rule = choose_points(all_rows, [points], self.settings.cubature)[points][0]
             done = end

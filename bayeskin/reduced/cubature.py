@@ -76,7 +76,7 @@ def take(run: ReducedEquations, shadow: Shadow, p_init: float, settings: Cubatur
         for stage in step.stages:
             at_all_points = shadow.follow(stage, max(stage.state.time_s - run.starts_s, 0.0))
             if at_all_points is None:
-                raise FloatingPointError("a point that was not chosen is inside out")
+                raise FloatingPointError("the mesh is inverted at a point that was not chosen")
         if at_all_points is None:
             return
         forces.append(step.force_n)
@@ -92,12 +92,12 @@ def take(run: ReducedEquations, shadow: Shadow, p_init: float, settings: Cubatur
         message = str(error)
     peak_n = max(map(abs, forces))
     at = shadow.equations.space.at
-    rows = [_tested(integrand, dual, at, peak_n, settings, rng) for integrand, dual, _ in states]
+    rows = [rows_of_state(integrand, dual, at, peak_n, settings, rng) for integrand, dual, _ in states]
     missing = np.array([missing_n for _, _, missing_n in states]) / peak_n if states else np.zeros(0)
     return Taken(np.concatenate([np.zeros((0, len(at.weight)), np.float32), *rows]), missing, message)
 
 
-def _tested(
+def rows_of_state(
     integrand: Array, dual: Array, at: PointFields, peak_n: float, settings: CubatureSettings,
     rng: np.random.Generator,
 ) -> Array:  # fmt: skip

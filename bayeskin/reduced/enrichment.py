@@ -155,7 +155,11 @@ def _library(
     """Returns a library whose base modes are the modes of full runs; its mechanisms add no modes."""
     finished = [run for run in runs if not run.message]
     if not finished:
-        raise InputError("enrichment", "no full run that finishes near this point", "a point away from folds")
+        raise InputError(
+            "enrichment",
+            "no full run that finishes near this point",
+            "parameters without folding of the skin",
+        )
     modes = Modes(
         _largest_modes([run.displacement for run in finished], inner.displacement, settings, 0),
         _largest_modes([run.pressure for run in finished], inner.pressure, settings, 1),

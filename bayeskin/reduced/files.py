@@ -144,7 +144,7 @@ def _geometry(said: Mapping[str, Any]) -> Geometry:
 
 def _check_versions(path: Path, model: ReducedModel, laws: Mapping[str, str]) -> None:
     spec = ModelSpec(refinement=model.refinement, geometry=model.trained.geometry)
-    remedy = "one of this version: make it anew with `bayeskin reduce`"
+    remedy = "a model of this version (run `bayeskin reduce` again)"
     if model.full_hash != spec.hash:
         raise InputError(path, "a reduced model of another version of the full model", remedy)
     known = catalogue()

@@ -46,13 +46,13 @@ def protocol_outside(trained: Protocols, motion: PadMotion) -> list[str]:
     largest_m, lowest_m = float(motion.displacement_m.max()), float(motion.displacement_m.min())
     if largest_m > trained.largest_m * (1.0 + 1e-9):
         lines.append(
-            f"the pads open by {1e3 * largest_m:.2f} mm, trained up to {1e3 * trained.largest_m:g} mm"
+            f"the pads open by {1e3 * largest_m:.2f} mm, more than the trained {1e3 * trained.largest_m:g} mm"
         )
     if lowest_m < -1e-6:
         lines.append(f"the pads are pushed together by {-1e3 * lowest_m:.2f} mm")
     fastest = float(np.abs(np.diff(motion.displacement_m) / np.diff(motion.time_s)).max(initial=0.0))
     if fastest > FASTER * trained.speeds_m_s[1]:
-        lines.append(f"the pads move at {1e3 * fastest:.3g} mm/s")
+        lines.append(f"the pads move at {1e3 * fastest:.3g} mm/s, faster than in the training")
     return lines
 
 
@@ -62,7 +62,7 @@ def _outside_prior(space: ParameterSpace, theta: Mapping[str, float]) -> str:
         value = theta[parameter.name]
         slack = 1e-9 * (parameter.upper - parameter.lower)
         if not parameter.lower - slack <= value <= parameter.upper + slack:
-            return f"{parameter.name} is {value:g}, trained {parameter.lower:g} to {parameter.upper:g}"
+            return f"{parameter.name} is {value:g}, not within {parameter.lower:g} to {parameter.upper:g}"
     return ""
 
 
@@ -76,7 +76,7 @@ def other_geometry(trained: Geometry, geometry: Geometry) -> list[str]:
         arm_radius_m=trained.arm_radius_m,
     )
     if same_tissue != trained:
-        lines.append("pads, guard or load cell are others")
+        lines.append("the pads, the guard or the load cell differ")
     for name, share in (
         ("cutis_m", THICKNESS_RANGE), ("subcutis_m", THICKNESS_RANGE), ("arm_radius_m", RADIUS_RANGE)
     ):  # fmt: skip
@@ -84,8 +84,8 @@ def other_geometry(trained: Geometry, geometry: Geometry) -> list[str]:
         if (ref_m is None) != (given_m is None):
             lines.append("the arm is flat" if given_m is None else "the arm is round")
         elif ref_m is not None and abs(given_m / ref_m - 1.0) > share * (1.0 + 1e-9):
-            lines.append(f"{name.removesuffix('_m')} is {1e3 * given_m:.3g} mm, trained {1e3 * ref_m:.3g} mm "
-                         f"+- {100 * share:.0f} %")  # fmt: skip
+            lines.append(f"{name.removesuffix('_m')} is {1e3 * given_m:.3g} mm, not within "
+                         f"{1e3 * ref_m:.3g} mm +- {100 * share:.0f} %")  # fmt: skip
     return lines
 
 
@@ -119,6 +119,6 @@ class Stability:
         if self.left >= self._least:
             return ""
         return (
-            f"the skin is near folding where the pads come back: {100 * self.left:.1f} % of its stiffness is "
+            f"the skin is near folding where the pads return: {100 * self.left:.1f} % of its stiffness is "
             "left; run the full model"
         )

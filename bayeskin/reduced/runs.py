@@ -87,7 +87,7 @@ class FullRuns:
         for number, result in run_all(self, todo):
             if isinstance(result, Lost):
                 where = f"full run {self.path(todo[number]).stem}"
-                raise InputError(where, result.reason, "a worker that finishes it")
+                raise InputError(where, result.reason, "a worker that finishes this run")
             done += 1
             progress("full runs", done / len(wanted))
 

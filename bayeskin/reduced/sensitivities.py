@@ -62,7 +62,7 @@ class ReducedGradients:
     ) -> None:  # fmt: skip
         unknown = [name for name in changes if name not in theta]
         if unknown:
-            raise InputError("gradients", unknown[0], f"among {', '.join(theta)}")
+            raise InputError("gradients", unknown[0], f"one of {', '.join(theta)}")
         self.names = tuple(changes)
         self._equations = equations
         self._moved: dict[int, list[ReducedEquations]] = {}

@@ -24,7 +24,7 @@ from bayeskin.types import PadMotion, Simulation, frozen_array
 
 TOLERANCE = 1e-3  # allowed error of a time step, relative to the nominal force; the default of the full model
 ESTIMATES = 12  # approximate number of states, besides the corners, at which the error is estimated
-INSIDE_OUT = "between the points of the cubature the mesh is inside out; run the full model"
+INSIDE_OUT = "the mesh is inverted between the cubature points; run the full model"
 SAFETY = 3.0  # factor on the error that the residual gives; chosen on the skins of docs/reduced.md
 
 

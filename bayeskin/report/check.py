@@ -38,11 +38,11 @@ def figure_model_check(weighed: Weighed, corrected: Sequence[Corrected]) -> Figu
     left.bar(np.arange(1, count + 1), np.sort(weighed.weights)[::-1], color=MODEL, alpha=0.7, width=0.8)
     left.axhline(1 / count, color=GREY, lw=0.8)
     left.annotate(
-        "all alike", (1, 1 / count), xycoords=("axes fraction", "data"), xytext=(0, 2),
+        "equal weights", (1, 1 / count), xycoords=("axes fraction", "data"), xytext=(0, 2),
         textcoords="offset points", ha="right", color=GREY, fontsize=6.5,
     )  # fmt: skip
-    left.set(xlabel="draw, heaviest first", ylabel="weight")
-    panel_title(left, "a", "weights by the full model")
+    left.set(xlabel="draw, largest weight first", ylabel="weight")
+    panel_title(left, "a", "weights of the draws")
     position = np.arange(len(corrected))
     ratio = [parameter.sd_ratio for parameter in corrected]
     shift = [parameter.shift_sd for parameter in corrected]
@@ -54,18 +54,19 @@ def figure_model_check(weighed: Weighed, corrected: Sequence[Corrected]) -> Figu
     right.errorbar(position + 0.12, shift, yerr=error, fmt="none", color=ACCENT, elinewidth=3.0, alpha=0.5)
     right.axhline(0.0, color=GREY, lw=0.8)
     right.set_xticks(position, [symbol(parameter.name).replace(" ", "\n") for parameter in corrected])
-    right.set_ylabel("mean ± sd [sd of the surrogate's]")
+    right.set_ylabel("mean ± sd [surrogate's sd]")
     right.set_ylim(top=1.25 * right.get_ylim()[1])
     right.legend(loc="upper right", ncols=2)
-    panel_title(right, "b", "what the weights do to the posterior")
+    panel_title(right, "b", "posterior before and after weighting")
     largest = max(corrected, key=lambda parameter: abs(parameter.shift_sd))
     finding = (
-        f"By {count} full runs {weighed.effective:.0f} draws remain effective; "
+        f"Of {count} draws with full runs, {weighed.effective:.0f} are effective; "
         f"{symbol(largest.name)} moves most, by {abs(largest.shift_sd):.2f} of its sd"
     )
     caption = (
-        "Thin bars: sd of the posterior; thick: standard error of the full model's mean, from so few draws. "
-        "Each in units of the sd of the surrogate's posterior, in logarithms where the prior is."
+        "Thin bars: sd of the posterior. Thick bars: standard error of the full model's mean, because there "
+        "are few draws. Both are in units of the sd of the surrogate's posterior; where the prior is "
+        "logarithmic, they refer to the logarithm of the parameter."
     )
     state_finding(figure, finding, caption)
     return figure

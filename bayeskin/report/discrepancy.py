@@ -94,21 +94,22 @@ def figure_discrepancy(binned: BinnedForce, motion: PadMotion, found: _Discrepan
         ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
         ax.set_ylabel("unexplained [mN]")
     over_displacement.set_xlabel("displacement [mm]")
-    over_memory.set(xlabel="time since the corner [s]", xscale="log")
+    over_memory.set(xlabel="time since the start of the phase [s]", xscale="log")
     plain_log(over_memory.xaxis)
     panel_title(over_time, "a")
     panel_title(over_displacement, "b", "while the pads move")
-    panel_title(over_memory, "c", "while they stand")
+    panel_title(over_memory, "c", "while the pads are still")
     finding = (
         f"The model leaves {1e3 * found.size_n:.1f} mN RMS unexplained"
         if found.noticeable
-        else "The model leaves nothing unexplained but noise"
+        else "The model leaves nothing but noise unexplained"
     )
     features = "; ".join(found.features)
     state_finding(
         figure, finding,
-        "Dots: residual beyond what any change of the parameters takes up. Lines and bands: the discrepancy "
-        f"and its 90 % interval; in b and c later cycles are fainter. {features[:1].upper()}{features[1:]}.",
+        "Dots: the part of the residual that no change of the parameters can explain. Lines and bands: the "
+        "discrepancy and its 90 % interval; in b and c, later cycles are fainter. "
+        f"{features[:1].upper()}{features[1:]}.",
     )  # fmt: skip
     return figure
 
@@ -201,7 +202,9 @@ def figure_experiments(table: Sequence[_Experiment]) -> Figure:
     possible = table[0].possible_bits if table else 0.0
     ax.axvline(possible, color=ACCENT, lw=0.8, ls=(0, (4, 2)))
     ax.text(possible, len(rows) - 0.45, "certainty ", color=ACCENT, ha="right", va="bottom", fontsize=6.5)
-    ax.set(xlabel="expected information about which is true [bits]", xlim=(0.0, 1.15 * possible or 1.0))
+    ax.set(
+        xlabel="expected information about the true explanation [bits]", xlim=(0.0, 1.15 * possible or 1.0)
+    )
     ax.set_ylim(-0.6, max(len(rows), 1) - 0.1)
     ax.tick_params(left=False)
     sketch.set_yticks(position, [experiment.protocol.name for experiment in rows])
@@ -209,13 +212,13 @@ def figure_experiments(table: Sequence[_Experiment]) -> Figure:
     sketch.spines[["left", "bottom"]].set_visible(False)
     sketch.tick_params(left=False)
     finding = (
-        f"“{rows[-1].protocol.name[0].upper()}{rows[-1].protocol.name[1:]}” tells most about what is missing"
+        f"“{rows[-1].protocol.name[0].upper()}{rows[-1].protocol.name[1:]}” is the most informative next test"
         if len(rows) and gain[-1] > 0.0
-        else "None of these tests is shown to tell what is missing"
+        else "None of these tests is expected to show what is missing"
     )
     state_finding(
         figure, finding,
-        "Lines: standard error over posterior draws. Percentages: probability that the right explanation is "
-        "expected to have after the test. Times: how long the test takes.",
+        "Lines: standard error over posterior draws. Percentages: expected probability of the right "
+        "explanation after the test. Times: duration of the test.",
     )  # fmt: skip
     return figure

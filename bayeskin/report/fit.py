@@ -70,13 +70,14 @@ def figure_fit(
     _draw_residual_loop(residual_loop, binned, bands.median_n, displacement_mm)
     for ax in (force, residual, loop):
         ax.tick_params(labelbottom=False)
-    titles = ("", "residual in the predictive bands", "90 % half-width", "force", "residual by phase")
+    titles = ("", "residual with the predictive bands", "90 % half-width", "force", "residual by phase")
     for ax, letter, title in zip((force, residual, parts, loop, residual_loop), "abcde", titles, strict=True):
         panel_title(ax, letter, title)
     caption = (
-        f"Bands are pointwise and include parameters, errors of model and surrogate, and noise; "
+        f"Bands are pointwise and include the uncertainty of the parameters, the errors of model and "
+        "surrogate, and noise; "
         f"{np.atleast_2d(np.asarray(force_n)).shape[0]} posterior draws. "
-        "Residual: recorded minus posterior median. Open points, where there are any, were not fitted."
+        "Residual: recorded minus posterior median. Open points, if any, were not fitted."
     )
     state_finding(figure, _finding(binned, bands, chosen), caption)
     return figure
@@ -159,9 +160,9 @@ def _finding(binned: BinnedForce, bands: ForceBands, chosen: Mask) -> str:
 
     if not chosen.any():
         held = f"{100 * inside.mean():.0f} % of bins in the 90 % band"
-        return f"Predicted without fitting: {part(~chosen)} apart, {held}"
+        return f"Predicted without fitting: residual {part(~chosen)}, {held}"
     elsewhere = "" if chosen.all() else f", {part(~chosen)} elsewhere"
     return (
-        f"The fit leaves {part(chosen)} where it was fitted{elsewhere}; "
+        f"The residual is {part(chosen)} in the fitted bins{elsewhere}; "
         f"the 90 % band holds {100 * inside[chosen].mean():.0f} % of the fitted bins"
     )

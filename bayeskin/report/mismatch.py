@@ -134,7 +134,7 @@ def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, fo
     _key_above(residual)
     force.tick_params(labelbottom=False)
     force.set_ylabel("force [mN]")
-    residual.set(xlabel="time [s]", ylabel="force left [mN]")
+    residual.set(xlabel="time [s]", ylabel="residual [mN]")
     loops.set(xlabel="displacement [mm]", ylabel="force [mN]")
     panel_title(force, "a", "best fit")
     panel_title(residual, "b", "recorded − model")
@@ -145,10 +145,10 @@ def figure_located(binned: BinnedForce, motion: PadMotion, located: _Located, fo
         f"The recording differs from the model in {count} window{'s' * (count != 1)}"
         if count
         else "The recording stays within what the model allows",
-        "Orange: windows where the recording is above the model by more than is allowed and than other "
-        "values of the parameters take up; purple: below; grey: neither. Allowed: measured noise, the "
-        "model's own error, the parameters' uncertainty. One search in twenty finds a window where "
-        "nothing is missing.",
+        "Orange: windows where the recording lies above the model by more than is allowed and by more than "
+        "other parameter values can explain. Purple: the same, but below the model. Grey: outside these "
+        "windows. Allowed: measured noise, the model's own error and the uncertainty of the parameters. "
+        "Where nothing is missing, one search in twenty still finds a window.",
     )
     return figure
 
@@ -181,18 +181,19 @@ def figure_candidates(candidates: Sequence[Mapping[str, Any]]) -> Figure:
     numbers.set_yticks(position, [label.replace("-", "−") for label in labels])
     numbers.tick_params(length=0.0)
     numbers.spines["right"].set_visible(False)
-    ax.set_xlabel("log evidence gained over the base model [nats]")
-    finding = "No mechanism alone gains"
+    ax.set_xlabel("gain in log-evidence over the base model [nats]")
+    finding = "No mechanism gains on its own"
     if len(rows) and gain[-1] > 0:
         ties = int(np.sum(gain[:-1] > gain[-1] - np.hypot(error[:-1], error[-1])))
-        finding = f"{rows[-1]['name']} alone gains most" + (
+        finding = f"{rows[-1]['name']} gains most on its own" + (
             f", {ties} {'other' if ties == 1 else 'others'} as much within the error" if ties else ""
         )
     state_finding(
         figure,
         finding,
-        "All other parameters are free again for each. Lines: standard error over phases. Mechanisms that "
-        "promised too little to be fitted, and those that the recording's samples refute, are not shown.",
+        "For each mechanism, all other parameters are fitted again. Lines: standard error over phases. "
+        "Mechanisms whose predicted gain was too small for a fit, and mechanisms that the samples of the "
+        "recording contradict, are not shown.",
     )
     return figure
 
@@ -220,7 +221,7 @@ def figure_before_after(
         loops.plot(displacement_mm, 1e3 * fit.force_n, color=color, lw=0.8)
     for ax, zero_n in ((force, 0.0), (residual, after.force_n)):
         low_mn, high_mn = (1e3 * (edge_n - zero_n) for edge_n in after.band_n)
-        ax.fill_between(time_s, low_mn, high_mn, color=BAND, lw=0, zorder=0.5, label="its 90 % band")
+        ax.fill_between(time_s, low_mn, high_mn, color=BAND, lw=0, zorder=0.5, label="90 % band")
     over_time = [force, residual]
     if split_s is not None:
         over_time.append(figure.add_subplot(grid[2, 0], sharex=force))
@@ -238,15 +239,15 @@ def figure_before_after(
     loops.set(xlabel="displacement [mm]", ylabel="force [mN]")
     covered = [100.0 * inference.coverage(binned, *fit.band_n) for fit in (before, after)]
     panel_title(force, "a")
-    panel_title(residual, "b", "in the 90 % bands: {:.0f} → {:.0f} % of bins".format(*covered))
+    panel_title(residual, "b", "bins inside the 90 % bands: {:.0f} → {:.0f} %".format(*covered))
     panel_title(loops, "c")
     rms = [1e3 * inference.rmse(binned, fit.force_n).whole_n for fit in (before, after)]
     state_finding(
         figure,
         "RMS residual {:.1f} mN before, {:.1f} mN after".format(*rms),
-        "Before: the base model's best fit. After: that with the best set of mechanisms. Bands: predictive, "
-        "noise and all; b: less the force after."
-        + (" d, e: both, chosen and fitted up to the dashed line alone." if split_s else ""),
+        "Before: best fit of the base model. After: best fit with the best set of mechanisms. Bands: "
+        "predictive bands after, including noise; in b, minus the force after."
+        + (" d, e: both fits, chosen and fitted up to the dashed line only." if split_s else ""),
     )
     return figure
 
@@ -275,9 +276,9 @@ def _draw_held_out(
     over_time.axvline(split_s, color=INK, lw=0.8, ls="--")
     over_time.set_ylabel("recorded − model [mN]")
     loops.set(xlabel="displacement [mm]", ylabel="recorded − model [mN]")
-    title = "fitted up to {:.0f} s; beyond that {:.1f} → {:.1f} mN RMS".format(split_s, *sizes)
+    title = "fitted up to {:.0f} s; later {:.1f} → {:.1f} mN RMS".format(split_s, *sizes)
     panel_title(over_time, "d", title)
-    panel_title(loops, "e", "what was not fitted")
+    panel_title(loops, "e", "the part not fitted")
 
 
 @styled
@@ -305,12 +306,12 @@ def figure_base_parameters(parameters: Sequence[Parameter], before: Summaries, a
     panels[0].legend(
         handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.2
     )
-    predicate = "leaves its interval" if len(moved) == 1 else "leave their intervals"
+    predicate = "moves out of its 90 % interval" if len(moved) == 1 else "move out of their 90 % intervals"
     state_finding(
         figure,
-        f"{list_symbols(moved)} {predicate}" if moved else "No parameter of the base leaves its interval",
-        "Posterior means and 90 % intervals without and with the best set of mechanisms. Axes: the prior's "
-        "range.",
+        f"{list_symbols(moved)} {predicate}" if moved else "No base parameter moves out of its 90 % interval",
+        "Posterior means and 90 % intervals without (before) and with (after) the best set of mechanisms. A "
+        "parameter moves out if its two intervals do not overlap. Axes: the range of the prior.",
     )
     return figure
 
@@ -347,9 +348,10 @@ def figure_residual_by_phase(
     most = max(sizes, key=lambda kind: sizes[kind][1])
     state_finding(
         figure,
-        "Most is left {}: {:.1f} mN RMS before, {:.1f} mN after".format(WORDS[most], *sizes[most]),
-        "Before: the base model's best fit. After: that with the best set of mechanisms. Later cycles are "
-        "fainter. Allowed: measured noise, the model's own error, the parameters' uncertainty, after.",
+        "Largest residual {}: {:.1f} mN RMS before, {:.1f} mN after".format(WORDS[most], *sizes[most]),
+        "Before: best fit of the base model. After: best fit with the best set of mechanisms. Later cycles "
+        "are fainter. Allowed (after): measured noise, the model's own error and the uncertainty of the "
+        "parameters.",
     )
     return figure
 
@@ -375,7 +377,7 @@ def _draw_kind(
         if last:
             ax.fill_between(x, -allowed[part], allowed[part], color=FAINT, lw=0, zorder=0.5)
     if kind in ("hold", "rest"):
-        ax.set(xlabel="time since the corner [s]", xscale="log")
+        ax.set(xlabel="time since the start of the phase [s]", xscale="log")
         plain_log(ax.xaxis)
     else:
         ax.set_xlabel("displacement [mm]")
@@ -423,7 +425,7 @@ def figure_contributions(binned: BinnedForce, motion: PadMotion, parts: Sequence
     state_finding(
         figure,
         f"{parts[0].name} moves the force most, by {1e3 * parts[0].size_n:.1f} mN RMS",
-        "The force at the best fit, less that without the mechanism and all else as it is.",
+        "Force at the best fit minus the force without the mechanism, with all other parameters unchanged.",
     )
     return figure
 
@@ -437,6 +439,6 @@ def faint_in_words(said: Mapping[str, Any]) -> str:
         return ""
     better = ", ".join(said["best_set"])
     return (
-        f"With {better} it would fit better, too little or not surely enough for a name, but the skin's "
-        "values depend on it and are not to be relied on."
+        f"The model fits better with {better}, but too little or too uncertainly to name it. The skin's "
+        "parameters depend on whether it acts, so do not rely on them."
     )

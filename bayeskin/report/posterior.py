@@ -55,7 +55,7 @@ def figure_posterior(
     ranges = [_axis_range(p, column) for p, column in zip(parameters, columns, strict=True)]
     caption = (
         f"{len(draws)} posterior draws. Regions hold 50 % and 90 % of them (smoothed histogram); "
-        "a pair without structure beyond the draws' own scatter is tinted evenly. "
+        "a pair without structure beyond the scatter of the draws has an even tint. "
         "Above each marginal: median and 90 % interval. Dashed: prior."
     )
     d = len(parameters)
@@ -184,5 +184,5 @@ def _finding(parameters: Sequence[Parameter], draws: Array) -> str:
     parts = [f"informs {list_symbols(informed)}"] if informed else []
     parts += [f"informs {list_symbols(weakly_informed)} weakly"] if weakly_informed else []
     pronoun = "it" if len(uninformed) == 1 else "them"
-    parts += [f"leaves {list_symbols(uninformed)} as the prior had {pronoun}"] if uninformed else []
+    parts += [f"leaves {list_symbols(uninformed)} as the prior states {pronoun}"] if uninformed else []
     return f"The recording {'; it '.join(parts)}"

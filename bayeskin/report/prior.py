@@ -56,7 +56,7 @@ def figure_prior_predictive(binned: BinnedForce, draws_n: ArrayLike) -> Figure:
     panel_title(peaks, "b", "the prior's peak forces")
     finding = (
         f"The recorded peak of {number(recorded_peak, 3)} N (a bin's mean) lies above "
-        f"{100 * share:.0f} % of the prior's"
+        f"{100 * share:.0f} % of the peaks that the prior predicts"
     )
     caption = (
         f"Black: recorded. Blue: median, 50 % and 90 % band of {len(draws)} draws from the prior; grey: "

@@ -52,14 +52,15 @@ def figure_profiles(space: ParameterSpace, draws: ArrayLike, profiles: Sequence[
         _draw(ax, space.parameters[column], profile, draws[:, column])
         panel_title(ax, letter)
     for ax in axes[: len(profiles) : across]:
-        ax.set(ylim=(-_DEEPEST, 0.6), ylabel="below the best fit [nats]")
+        ax.set(ylim=(-_DEEPEST, 0.6), ylabel="relative to the best fit [nats]")
     flat = [profile.name for profile in profiles if profile.flat]
     finding = (
         f"The fit excludes no value of {list_symbols(flat)}" if flat else "The fit bounds every parameter"
     )
     caption = (
-        "Black: best fit with the parameter held, all others and the noise free. Dashed: 1.35 nats below the "
-        "top, where its 90 % interval ends. Blue: 5 to 95 % of the posterior. The axes span the prior."
+        "Black: best fit with the parameter held fixed and all others and the noise free. Dashed: 1.35 nats "
+        "below the maximum, where the 90 % interval ends. Blue: 5 to 95 % of the posterior. Axes: range of "
+        "the prior."
     )
     state_finding(figure, finding, caption)
     return figure

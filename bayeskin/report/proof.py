@@ -43,9 +43,9 @@ def figure_proof(board: Mapping[str, Any]) -> Figure:
     state_finding(
         figure,
         _finding(board),
-        "a: number of recordings; pairs and effects outside the catalogue in one row each. b, c: 90 % Wilson "
-        "intervals. Size: what remains of the effect after the base model's best refit, over the noise floor "
-        "of 0.5 s means; c: of sizes from 3 on.",
+        "a: number of recordings; pairs, and effects outside the catalogue, have one row each. b, c: 90 % "
+        "Wilson intervals. Size: the part of the effect that remains after the base model is fitted again, "
+        "divided by the noise floor of 0.5 s means. c: effects with a size of at least 3.",
     )
     return figure
 
@@ -72,16 +72,16 @@ def figure_detectability(mechanisms: Mapping[str, Mapping[str, Any]]) -> Figure:
     for ax in grid[-1]:
         ax.set_xlabel("size [noise floors]")
     for ax in grid[:, 0]:
-        ax.set_ylabel("share named right")
+        ax.set_ylabel("share named correctly")
     right = [is_right for answers in mechanisms.values() for is_right in answers["right"]]
     state_finding(
         figure,
-        f"How large an effect has to be to be named: {sum(right)} of {len(right)} are",
-        "Each mark is one recording: dots named right, squares a look-alike named, crosses neither. Curve: "
-        "logistic in the logarithm of size, mean and 90 % band of its posterior, dashed where no recording "
-        "is. Half: the size at which half are named, with its 90 % interval, or a bound of 95 %, within the "
-        "sizes made. Size: what remains of the effect after the base model's best refit, over the noise "
-        "floor of 0.5 s means; dotted: 3.",
+        f"Size from which an effect is named: {sum(right)} of {len(right)} are named correctly",
+        "Each mark is one recording: dots are named correctly, squares are named as a look-alike, crosses "
+        "are neither. Curve: logistic function of the logarithm of the size, mean and 90 % band of its "
+        "posterior, dashed where there are no recordings. Half: the size at which half are named, with its "
+        "90 % interval, or a 95 % bound within the sizes of the recordings. Size: part of the effect that "
+        "remains after the base model is fitted again, divided by the noise floor of 0.5 s means; dotted: 3.",
     )
     return figure
 
@@ -125,8 +125,8 @@ def half_in_words(one: Mapping[str, Any]) -> str:
 def _finding(board: Mapping[str, Any]) -> str:
     named, alarms = board["named_up_to_look_alikes"]["clear"], board["false_alarms"]
     return (
-        f"Of {named['of']} clear effects {named['hits']} are named right up to look-alikes; "
-        f"{alarms['hits']} false alarms in {alarms['of']} recordings without any"
+        f"Of {named['of']} clear effects, {named['hits']} are named correctly or as a look-alike; "
+        f"{alarms['hits']} false alarms in {alarms['of']} recordings without an effect"
     )
 
 
@@ -150,7 +150,7 @@ def _draw_confusion(ax: Axes, confusion: Mapping[str, Mapping[str, int]]) -> Non
     ax.set_yticks(np.arange(len(rows) + 1) - 0.5, minor=True)
     ax.grid(which="minor", color=GREY, lw=0.2)
     ax.tick_params(which="both", length=0)
-    ax.set(xlabel="said", ylabel="concealed")
+    ax.set(xlabel="answer", ylabel="concealed effect")
     panel_title(ax, "a")
 
 
@@ -161,8 +161,8 @@ def _draw_detectability(ax: Axes, classes: Sequence[Mapping[str, Any]]) -> None:
         low, high = size_class["from"] or lowest, size_class["to"] or size_class["from"] * _OPEN_END
         middle = np.sqrt(low * high)
         for name, color, label, shift, width in (
-            ("named", INK, "right", 0.97, 3.0),
-            ("up_to_look_alikes", MODEL, "up to look-alikes", 1.03, 1.0),
+            ("named", INK, "correctly", 0.97, 3.0),
+            ("up_to_look_alikes", MODEL, "or as a look-alike", 1.03, 1.0),
         ):
             share = size_class[name]
             if not share["of"]:
@@ -183,9 +183,9 @@ def _draw_detectability(ax: Axes, classes: Sequence[Mapping[str, Any]]) -> None:
 def _draw_shares(ax: Axes, board: Mapping[str, Any]) -> None:
     """Draws shares of a scoreboard with their intervals, and the range that each share should reach."""
     lines = (
-        ("named right", board["named"]["clear"], (0.9, 1.0)),
-        ("to look-alikes", board["named_up_to_look_alikes"]["clear"], (0.95, 1.0)),
-        ("unknown outside", board["unknown_outside"]["clear"], (0.8, 1.0)),
+        ("correctly named", board["named"]["clear"], (0.9, 1.0)),
+        ("or a look-alike", board["named_up_to_look_alikes"]["clear"], (0.95, 1.0)),
+        ("outside: unknown", board["unknown_outside"]["clear"], (0.8, 1.0)),
         ("effect in 90 %", board["effect_in_interval"]["clear"], (0.8, 0.97)),
         ("base in 90 %", board["base_in_interval"]["clear"], (0.8, 0.97)),
         ("false alarms", board["false_alarms"], (0.0, 0.05)),
@@ -196,5 +196,5 @@ def _draw_shares(ax: Axes, board: Mapping[str, Any]) -> None:
             ax.hlines(position, share["low"], share["high"], color=MODEL, lw=1.0)
             ax.plot(share["share"], position, "o", color=MODEL)
     ax.set_yticks(range(len(lines)), [f"{text}, {share['of']}" for text, share, _ in reversed(lines)])
-    ax.set(xlim=(-0.03, 1.03), ylim=(-0.6, len(lines) - 0.4), xlabel="share of so many; orange: to reach")
+    ax.set(xlim=(-0.03, 1.03), ylim=(-0.6, len(lines) - 0.4), xlabel="share, of how many; orange: target")
     panel_title(ax, "c")

@@ -61,7 +61,7 @@ def figure_recording(recording: Recording, binned: BinnedForce) -> Figure:
     rate_hz = 1.0 / np.median(np.diff(recording.time_s))
     width_s = np.median(np.diff(binned.edges_s))
     caption = (
-        f"a and b as recorded, nothing smoothed: {len(recording.time_s)} samples at {number(rate_hz, 4)} Hz. "
+        f"a, b: as recorded, without smoothing, {len(recording.time_s)} samples at {number(rate_hz, 4)} Hz. "
         f"c: robust means over {number(width_s, 3)} s."
     )
     state_finding(figure, finding, caption)

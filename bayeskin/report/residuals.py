@@ -32,14 +32,14 @@ def figure_residuals(found: ResidualCheck) -> Figure:
     figure = new_figure(PAGE_IN, 2.9)
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.4))
     _quantiles(left, found)
-    panel_title(left, "a", f"its law: Kolmogorov-Smirnov p = {found.p_law:.2g}")
+    panel_title(left, "a", f"distribution: Kolmogorov-Smirnov p = {found.p_law:.2g}")
     _correlation(right, found)
-    panel_title(right, "b", f"its correlation: Ljung-Box p = {found.p_correlation:.2g}")
+    panel_title(right, "b", f"correlation: Ljung-Box p = {found.p_correlation:.2g}")
     summary, _, reason = found.sentence.partition(": ")
     finding = f"{summary[0].upper()}{summary[1:]}"
     caption = (
-        "What the fit leaves, freed of the assumed correlation and brought by the assumed law to a standard "
-        "normal, of each fitted bin. Grey: where the assumed noise keeps 95 % of the points. "
+        "Residuals of the fitted bins, without the assumed correlation and transformed from the assumed "
+        "distribution to a standard normal one. Grey: 95 % of points lie here if the noise is as assumed. "
         f"{'' if found.passes else reason[0].upper() + reason[1:] + '.'}"
     )
     state_finding(figure, finding, caption)
@@ -55,7 +55,7 @@ def _quantiles(ax: Axes, found: ResidualCheck) -> None:
     ax.fill_between(expected, low, high, color=FAINT, alpha=0.6, lw=0)
     ax.plot(expected, expected, color=GREY, lw=0.8)
     ax.plot(expected, np.sort(found.scores), ".", color=MODEL, ms=3)
-    ax.set(xlabel="assumed noise [sd]", ylabel="what the fit leaves [sd]")
+    ax.set(xlabel="assumed noise [sd]", ylabel="residual [sd]")
 
 
 def _correlation(ax: Axes, found: ResidualCheck) -> None:

@@ -33,13 +33,13 @@ def save_figure(figure: Figure, path_stem: Path | str, provenance: str) -> tuple
     if figure.get_layout_engine() is not None:
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
-    rendered = {png: _render(figure, "png", provenance), svg: _render(figure, "svg", provenance)}
+    rendered = {png: figure_bytes(figure, "png", provenance), svg: figure_bytes(figure, "svg", provenance)}
     for path, content in rendered.items():
         _replace(path, content)
     return png, svg
 
 
-def _render(figure: Figure, form: str, provenance: str) -> bytes:
+def figure_bytes(figure: Figure, form: str, provenance: str) -> bytes:
     """Returns the content of the figure's file; `form` is "png" or "svg"."""
     metadata: dict[str, str | None] = {"Description": provenance}
     metadata |= {"Software": "bayeskin"} if form == "png" else {"Creator": "bayeskin", "Date": None}

@@ -67,8 +67,8 @@ def figure_sobol(
     panel_title(lower, "b", "with all its interactions")
     panel_title(bars, "c", "over the whole recording")
     caption = (
-        f"Inputs: {inputs}. Bands and whiskers: intervals of the estimates. Over the whole recording: "
-        "indices weighted by the variance of the force. No line where the force does not vary."
+        f"Inputs: {inputs}. Bands and whiskers: intervals of the estimates. c: indices weighted by the "
+        "variance of the force over the whole recording. There is no line where the force does not vary."
     )
     state_finding(figure, _finding(names, aggregated[0][1], aggregated[1][1]), caption)
     return figure

@@ -64,7 +64,7 @@ def figure_validation(
     below = np.mean(np.sqrt(np.mean(error**2, axis=0)) <= noise)
     inside = coverage(true, prediction, np.array([0.9]))[0][0]
     finding = (
-        f"RMS error below the recording's noise in {100 * below:.0f} % of bins; "
+        f"The RMS error is below the recording's noise in {100 * below:.0f} % of bins; "
         f"90 % intervals hold {100 * inside:.0f} % of the held-out forces"
     )
     caption = (
@@ -119,15 +119,15 @@ def figure_map_check(
     in_mn.set_ylabel("error [mN]")
     in_sd.set(xlabel="time [s]", ylabel="error [surrogate sd]")
     for ax, letter, title in zip(
-        (force, in_mn, in_sd), "abc", ("", "surrogate's error", "the same in its own sd; dashed: ±2"),
+        (force, in_mn, in_sd), "abc", ("", "surrogate's error", "error over the surrogate's sd; dashed: ±2"),
         strict=True,
     ):  # fmt: skip
         panel_title(ax, letter, title)
     in_its_sd = f" (at most {number(np.nanmax(np.abs(ratio)), 2)} of its sd)" if known.any() else ""
     misfit_n = np.sqrt(np.nanmean((binned.force_n - full) ** 2))
     finding = (
-        f"At the MAP the surrogate is off by {number(1e3 * np.sqrt(np.mean(error**2)), 2)} mN RMS"
-        f"{in_its_sd}; the full model leaves {number(1e3 * misfit_n, 2)} mN to the recording"
+        f"At the MAP the surrogate's error is {number(1e3 * np.sqrt(np.mean(error**2)), 2)} mN RMS"
+        f"{in_its_sd}; the full model's residual is {number(1e3 * misfit_n, 2)} mN RMS"
     )
     state_finding(figure, finding)
     return figure
@@ -206,7 +206,7 @@ def _draw_error(ax: Axes, time_s: Array, error: Array, sd: Array, noise: Array) 
     ax.fill_between(time_s, 1e-12, high, color=MODEL, alpha=0.2, lw=0, label="95 % of runs")
     ax.plot(time_s, 1e3 * np.sqrt(np.mean(error**2, axis=0)), color=MODEL, label="RMS error")
     claimed = 1e3 * np.sqrt(np.mean(sd**2, axis=0))
-    ax.plot(time_s, claimed, color=ACCENT, ls=(0, (4, 2)), lw=0.9, label="RMS of claimed sd")
+    ax.plot(time_s, claimed, color=ACCENT, ls=(0, (4, 2)), lw=0.9, label="RMS of the stated sd")
     ax.plot(time_s, 1e3 * noise, color=INK, lw=0.9, label="noise floor of the recording")
     drawn = np.concatenate([1e3 * noise, high])
     if (drawn > 0).any():

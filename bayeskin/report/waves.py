@@ -36,7 +36,7 @@ def figure_waves(design: Design, kept_volume: ArrayLike) -> Figure:
     parameters, d, last = design.space.parameters, design.space.dim, int(design.wave.max(initial=0))
     shades = colormaps["cividis_r"](np.linspace(0.15, 1.0, last + 1) if last else [0.85])
     values = np.column_stack([axis_values(p, design.theta[:, j]) for j, p in enumerate(parameters)])
-    caption = "Axes span the prior box. Held-out runs never teach the surrogate."
+    caption = "Axes span the prior box. Held-out runs are never used to train the surrogate."
     figure, axes = triangle(parameters[: max(d - 1, 1)], 0.14, _finding(design, kept), caption)
     for i in range(1, d):
         for j in range(i):

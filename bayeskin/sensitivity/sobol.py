@@ -55,7 +55,7 @@ class SobolResult(_FreezesArrays):
 
     first, total : (d, m) indices, NaN in bins whose force hardly varies
     first_interval, total_interval : (2, d, m) the 5 % and 95 % limits
-    `*_aggregated`, `*_aggregated_interval` : the same for the whole history, (d,) and (2, d)
+    first_aggregated, total_aggregated and their intervals : the same for the whole history, (d,) and (2, d)
     second : (p, m) indices of the pairs, in the order of `pairs`; for the whole history they are (p,), with
         limits (2, p)
     variance_n2 : (m,) variance of the force
@@ -240,7 +240,7 @@ def sentence(result: SobolResult) -> str:
 
 def describe(space: ParameterSpace) -> str:
     """Returns the input distribution in words."""
-    start = "independent, correlations of their priors left out: " if space.correlations else "independent: "
+    start = "independent, without their priors' correlations: " if space.correlations else "independent: "
     return start + "; ".join(map(_parameter_in_words, space.parameters))
 
 

@@ -33,7 +33,7 @@ def check_consistency(surrogate: ShapeSurrogate) -> None:
         raise InputError("edges_s", "edges that do not increase", "increasing edges")
     if not np.all((active >= 0) & (active < surrogate.similarity.dim)):
         raise InputError(
-            "active", f"inputs {active.tolist()}", f"some of 0 to {surrogate.similarity.dim - 1}"
+            "active", f"inputs {active.tolist()}", f"indices from 0 to {surrogate.similarity.dim - 1}"
         )
 
 

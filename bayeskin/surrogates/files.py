@@ -104,7 +104,11 @@ def load_manifest(path: Path | str) -> dict[str, Any]:
     if not isinstance(manifest.get("model_hash"), str):
         raise InputError(f"{path}: manifest: model_hash", repr(manifest.get("model_hash")), "a hash")
     if manifest.get("parameters") != _parameter_table(surrogate.space):
-        raise InputError(f"{path}: manifest: parameters", "others than those of the arrays", "the same box")
+        raise InputError(
+            f"{path}: manifest: parameters",
+            "other parameters than in the arrays",
+            "the same parameters and bounds",
+        )
     return manifest
 
 
@@ -123,7 +127,9 @@ def _load(path: Path) -> tuple[ShapeSurrogate, dict[str, Any]]:
         check_consistency(surrogate)
         manifest = json.loads(handle.attrs["manifest"])
         if not isinstance(manifest, dict) or not isinstance(surrogate.provenance, dict):
-            raise InputError("manifest or provenance", "JSON of another kind", "a table of names and values")
+            raise InputError(
+                "manifest or provenance", "JSON that is no object", "a table of names and values"
+            )
         return surrogate, manifest
 
 

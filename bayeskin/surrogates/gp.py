@@ -37,7 +37,7 @@ SPARED = 0.1  # share of the nugget by which a variance may become larger at a t
 LEAST_NUGGET = 1e-6  # with a smaller nugget the rows are not near a subspace, or rounding hides it
 
 
-class _Conditioned(NamedTuple):
+class Conditioned(NamedTuple):
     """A latent conditioned on its training rows: the matrices that `predict` multiplies by."""
 
     mapped: Array  # (n, d)
@@ -185,10 +185,10 @@ class LatentGPs(_FreezesArrays):
         return trend_degree(*self.inputs.shape)
 
     @cached_property
-    def _conditioned(self) -> list[_Conditioned]:
+    def conditioned(self) -> list[Conditioned]:
         return [self._condition(j) for j in range(len(self.kernels))]
 
-    def _condition(self, j: int) -> _Conditioned:
+    def _condition(self, j: int) -> Conditioned:
         n = len(self.inputs)
         basis = trend_basis(self.inputs, self.degree)
         centre = float(self.targets[:, j].mean())
@@ -204,7 +204,7 @@ class LatentGPs(_FreezesArrays):
         gram = np.linalg.cholesky(white_basis.T @ white_basis)
         trend = np.linalg.solve(gram.T, np.linalg.solve(gram, white_basis.T @ white_target))
         rest = white_target - white_basis @ trend
-        return _Conditioned(
+        return Conditioned(
             mapped,
             np.asfortranarray(whitener),
             _few_directions(covariance, float(self.nuggets[j]), whitener),
@@ -245,12 +245,12 @@ class LatentGPs(_FreezesArrays):
     @cached_property
     def _stacks(self) -> list[_Stack]:
         alike: dict[tuple[str, bool], list[int]] = {}
-        for j, one in enumerate(self._conditioned):
+        for j, one in enumerate(self.conditioned):
             alike.setdefault((self.kernels[j], one.few is None), []).append(j)
         return [self._stack(name, np.array(latents)) for (name, _), latents in sorted(alike.items())]
 
     def _stack(self, name: str, latents: NDArray[np.intp]) -> _Stack:
-        given = [self._conditioned[j] for j in latents]
+        given = [self.conditioned[j] for j in latents]
         whiteners = [one.whitener if one.few is None else one.few for one in given]
         half = len(self.inputs) // 2 if given[0].few is None else 0
         longest = max(len(whitener) for whitener in whiteners)
@@ -284,7 +284,7 @@ class LatentGPs(_FreezesArrays):
         The hyperparameters stay fixed.
         """
         mean, variance = np.empty_like(self.targets), np.empty_like(self.targets)
-        for j, given in enumerate(self._conditioned):
+        for j, given in enumerate(self.conditioned):
             half = given.trend_weights @ given.trend_root.T
             diagonal = np.sum(given.whitener**2, axis=0) - np.sum(half**2, axis=1)
             mean[:, j] = self.targets[:, j] - given.deviation * given.weights / diagonal

@@ -51,18 +51,20 @@ class LatentFit(NamedTuple):
     inflation: float
 
 
-class _Data(NamedTuple):
+class TrainingData(NamedTuple):
     """Training data: inputs (n, d) centred on the cube, trend basis (n, p), target (n,) of unit variance."""
 
     inputs: Array
     basis: Array
     target: Array
 
-    def rows(self, chosen: NDArray[np.bool_]) -> _Data:
-        return _Data(self.inputs[chosen], self.basis[chosen], self.target[chosen])
+    def rows(self, chosen: NDArray[np.bool_]) -> TrainingData:
+        return TrainingData(self.inputs[chosen], self.basis[chosen], self.target[chosen])
 
 
-class _Likelihood(NamedTuple):
+class Likelihood(NamedTuple):
+    """The negative restricted log-likelihood, its gradient, and the leave-one-out residuals."""
+
     value: float
     by_map: Array
     by_log_nugget: float
@@ -71,7 +73,7 @@ class _Likelihood(NamedTuple):
     variance: float
 
 
-def _likelihood(name: str, linear_map: Array, nugget: float, data: _Data) -> _Likelihood:
+def restricted_likelihood(name: str, linear_map: Array, nugget: float, data: TrainingData) -> Likelihood:
     """Returns the negative restricted log-likelihood and its gradient by W and the log nugget.
 
     The variance is profiled out.
@@ -104,13 +106,13 @@ def _likelihood(name: str, linear_map: Array, nugget: float, data: _Data) -> _Li
     # computed without forming the differences.
     pulled = dsymm(1.0, inverse, np.column_stack([inputs, np.ones(n)]), lower=1)
     spread = 2.0 * (inputs.T @ (pulled[:, -1:] * inputs) - inputs.T @ pulled[:, :-1])
-    return _Likelihood(
+    return Likelihood(
         float(value), linear_map @ spread, 0.5 * nugget * trace, q / diagonal, diagonal**-0.5, variance
     )
 
 
 def _search(
-    name: str, data: _Data, free: NDArray[np.bool_], start: tuple[Array, float], iterations: int
+    name: str, data: TrainingData, free: NDArray[np.bool_], start: tuple[Array, float], iterations: int
 ) -> tuple[Array, float]:
     """Returns the linear map and the nugget of the most probable hyperparameters.
 
@@ -123,7 +125,7 @@ def _search(
     def objective(x: Array) -> tuple[float, Array]:
         linear_map = np.zeros((dim, dim))
         linear_map[free] = x[:-1]
-        at = _likelihood(name, linear_map, float(np.exp(x[-1])), data)
+        at = restricted_likelihood(name, linear_map, float(np.exp(x[-1])), data)
         prior = 0.5 * float(np.sum((x[:-1] / width) ** 2))
         return at.value + prior, np.append(at.by_map[free] + x[:-1] / width**2, at.by_log_nugget)
 
@@ -152,7 +154,7 @@ def fit_latent(unit: Array, target: Array, weights: Array) -> LatentFit:
     if deviation <= 1e-12 * max(abs(float(target.mean())), 1e-300):
         return LatentFit("gaussian", np.eye(dim), 1.0, 0.0, 1.0)
     basis = trend_basis(unit, trend_degree(len(unit), dim))
-    data = _Data(unit - 0.5, basis, (target - target.mean()) / deviation)
+    data = TrainingData(unit - 0.5, basis, (target - target.mean()) / deviation)
     if len(unit) < FEWEST_TO_SEARCH * (dim + 1):
         return _fit_one_length(data, weights, deviation)
     aligned, oblique = np.eye(dim, dtype=bool), np.tri(dim, dtype=bool)
@@ -166,14 +168,14 @@ def fit_latent(unit: Array, target: Array, weights: Array) -> LatentFit:
             optimum = _search(
                 name, data, oblique, (optimum[0], min(optimum[1], ALL_ROWS_NUGGET)), ALL_ROWS_STEPS
             )
-        residual = _likelihood(name, *optimum, data).residual
+        residual = restricted_likelihood(name, *optimum, data).residual
         candidates.append((float(np.average(residual**2, weights=weights)), name, optimum))
     _, name, optimum = min(candidates, key=lambda candidate: candidate[0])
     best = _cross_validate(name, data, oblique, optimum, weights)
     return best._replace(error=best.error * deviation**2)
 
 
-def _fit_one_length(data: _Data, weights: Array, deviation: float) -> LatentFit:
+def _fit_one_length(data: TrainingData, weights: Array, deviation: float) -> LatentFit:
     """Returns a fit for few rows: the most probable length and nugget of a grid.
 
     The length is the same for all inputs, because so few rows cannot distinguish between lengths. A search
@@ -181,8 +183,10 @@ def _fit_one_length(data: _Data, weights: Array, deviation: float) -> LatentFit:
     """
     eye = np.eye(data.inputs.shape[1])
     choices = product(ONE_LENGTH_RATES, ONE_LENGTH_NUGGETS)
-    rate, nugget = min(choices, key=lambda at: _likelihood("gaussian", at[0] * eye, at[1], data).value)
-    best = _likelihood("gaussian", rate * eye, nugget, data)
+    rate, nugget = min(
+        choices, key=lambda at: restricted_likelihood("gaussian", at[0] * eye, at[1], data).value
+    )
+    best = restricted_likelihood("gaussian", rate * eye, nugget, data)
     error = float(np.average(best.residual**2, weights=weights))
     predicted = best.variance * float(np.average(best.spread**2, weights=weights))
     inflation = max(float(np.sqrt(error / predicted)), 1.0)
@@ -190,7 +194,7 @@ def _fit_one_length(data: _Data, weights: Array, deviation: float) -> LatentFit:
 
 
 def _cross_validate(
-    name: str, data: _Data, free: NDArray[np.bool_], at: tuple[Array, float], weights: Array
+    name: str, data: TrainingData, free: NDArray[np.bool_], at: tuple[Array, float], weights: Array
 ) -> LatentFit:
     """Returns the fit with its leave-one-out errors.
 
@@ -204,8 +208,8 @@ def _cross_validate(
     for k in range(FOLDS):
         kept = data.rows(fold != k)
         linear_map, nugget = _search(name, kept, free, at, steps)
-        variance = _likelihood(name, linear_map, nugget, kept).variance
-        all_rows = _likelihood(name, linear_map, nugget, data)
+        variance = restricted_likelihood(name, linear_map, nugget, kept).variance
+        all_rows = restricted_likelihood(name, linear_map, nugget, data)
         held_out = fold == k
         residual[held_out] = all_rows.residual[held_out]
         ratio[held_out] = residual[held_out] / (all_rows.spread[held_out] * np.sqrt(variance))

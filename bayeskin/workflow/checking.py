@@ -48,7 +48,9 @@ def checked_posterior(
             if len(rounds) > 1:
                 refining.save("sample")
             return Checked(log_posterior, posterior, tuple(rounds))
-        run.reporter.log("sample: the surrogate is off where the posterior is; these runs join the design")
+        run.reporter.log(
+            "sample: the surrogate is not accurate where the posterior is; these runs join the design"
+        )
         log_posterior = dataclasses.replace(log_posterior, surrogate=refining.learn(runs))
 
 

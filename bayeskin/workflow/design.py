@@ -133,7 +133,7 @@ def _try_forward_model(run: Run, model: ForceModel, motion: PadMotion, space: Pa
     Raises InputError where the model cannot be used at all.
     """
     forward = run.config.model.forward
-    run.reporter.log(f"one run of {forward}")
+    run.reporter.log(f"trial run of {forward}")
     middle = dict(zip(space.names, space.from_unit([0.5] * space.dim).tolist(), strict=True))
     simulation = model(motion, middle)
     if simulation.status != "ok":
@@ -200,7 +200,7 @@ def _choose_wave(
     weights = focus(design, binned, fitted)
     surrogate, _ = train(design, config.surrogate.kind, config.seed, weights)
     if config.design.coarse == "reduced" and number >= FIRST_OF_POSTERIOR:
-        run.reporter.log(f"wave {number + 1}: a short run of the sampler says where the posterior is")
+        run.reporter.log(f"wave {number + 1}: a short run of the sampler locates the posterior")
         nearest = design.theta[int(np.argmax(np.where(design.training, weights, 0.0)))]
         draws = _posterior_draws(run, log_posterior_of(run, surrogate, binned, motion), nearest)
         inputs = surrogate.inputs(draws)
@@ -211,7 +211,7 @@ def _choose_wave(
         number, config.seed,
     )  # fmt: skip
     fraction = wave.record["kept_fraction"]
-    run.reporter.log(f"wave {number + 1}: drawn in {fraction:.2g} of the prior's volume")
+    run.reporter.log(f"wave {number + 1}: points from {fraction:.2g} of the prior's volume")
     return wave
 
 
@@ -261,8 +261,10 @@ def enough(design: Design) -> Design:
     if succeeded >= needed and design.testing.any():
         return design
     failures = Counter(text for text, ok in zip(design.messages, design.ok, strict=True) if not ok)
-    why = f"; most often: {failures.most_common(1)[0][0]}" if failures else ""
-    raise CannotGoOn(f"{succeeded} training runs succeeded of at least {needed}{why}; narrow the prior box")
+    why = f" (most frequent failure: {failures.most_common(1)[0][0]})" if failures else ""
+    raise CannotGoOn(
+        f"{succeeded} training runs succeeded, at least {needed} are needed{why}; narrow the prior box"
+    )
 
 
 def _summary(design: Design, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

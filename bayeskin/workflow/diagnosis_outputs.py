@@ -1,4 +1,4 @@
-"""The outputs of a diagnosis: entries of its JSON, and figures."""
+"""Makes the outputs of a diagnosis: entries of its JSON, and figures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from bayeskin.types import Array, BinnedForce, PadMotion, Parameter
 
 @dataclass(frozen=True)
 class Remainder:
-    """The rest that a set leaves: a discrepancy, and the form that is proposed for it."""
+    """The force that a set leaves unexplained: a discrepancy, and the form that is proposed for it."""
 
     discrepancy: Discrepancy
     form: Form
@@ -29,11 +29,11 @@ class Remainder:
 
 @dataclass(frozen=True)
 class DrawnFit:
-    """A fit as it is drawn.
+    """The data of a fit that figures show.
 
-    force_n (m,) [N]; band_n : edges of the predictive band of 90 %, (m,) each
-    held_out_n (m,) : force of a fit to the recording's beginning, None where there is none
-    located : windows that it leaves; values : summaries of its parameters
+    force_n : force of the fit, (m,) [N]; band_n : edges of the predictive 90 % band, (m,) each [N]
+    held_out_n : force (m,) [N] of a fit to the recording's beginning, or None without one
+    located : windows in which the fit differs from the recording; values : summaries of its parameters
     """
 
     force_n: Array
@@ -45,10 +45,12 @@ class DrawnFit:
 
 @dataclass(frozen=True)
 class DiagnosisFigures:
-    """The contents of the figures: fits without and with the best set, what that has of the force.
+    """The contents of the figures.
 
-    split_s : until when what is `held_out_n` was fitted; base : parameters of the model without mechanisms;
-    remainder : None where the verdict leaves nothing to describe
+    before, after : fits without mechanisms and with the best set
+    split_s : end of the part of the recording [s] to which the fits with `held_out_n` were made
+    base : parameters of the base model; parts : contributions of the set's mechanisms to the force
+    remainder : the force that remains unexplained, or None where the verdict leaves nothing to describe
     """
 
     before: DrawnFit
@@ -60,6 +62,7 @@ class DiagnosisFigures:
 
 
 def window(one: Window) -> dict[str, Any]:
+    """Returns the entry of a window in the JSON."""
     return {
         "t0": one.start_s, "t1": one.end_s, "phase": one.phase, "cycle": one.cycle,
         "mean_residual": one.mean_n, "significance": one.significance,
@@ -67,46 +70,50 @@ def window(one: Window) -> dict[str, Any]:
 
 
 def candidates(fits: Mapping[tuple[str, ...], Fit], known: Mapping[str, Mechanism]) -> list[dict[str, Any]]:
-    """Returns what each mechanism gains alone, or with those that it needs, the largest gain first.
+    """Returns the gain of each fitted mechanism alone, or with the mechanisms that it needs.
 
-    Of each fitted one the gain of log evidence on the base model, and its standard error.
+    Each entry has the gain of log-evidence over the base model, and its standard error. The largest gain
+    comes first.
     """
     rows = []
     for name in known:
-        one = fits.get(with_one((), name, known))
-        if one is None:
+        fit = fits.get(with_one((), name, known))
+        if fit is None:
             continue
         rows.append(
             {
                 "name": name,
-                "delta_score": one.log_evidence - fits[()].log_evidence,
-                "standard_error": _score_error(fits[()], one),
+                "delta_score": fit.log_evidence - fits[()].log_evidence,
+                "standard_error": _score_error(fits[()], fit),
             }
         )
     return sorted(rows, key=lambda row: -float(row["delta_score"]))
 
 
-def _score_error(base: Fit, one: Fit) -> float:
-    """Returns the standard error of a difference of log likelihoods, from its scatter over the phases."""
-    differences = _blocks(one) - _blocks(base)
+def _score_error(base: Fit, fit: Fit) -> float:
+    """Returns the standard error of a difference of log-likelihoods, from its scatter over the phases."""
+    differences = _log_likelihood_by_phase(fit) - _log_likelihood_by_phase(base)
     return float(np.sqrt(len(differences)) * differences.std(ddof=1)) if len(differences) > 1 else 0.0
 
 
-def _blocks(found: Fit) -> Array:
-    log_posterior = found.log_posterior
-    return log_posterior.block_log_likelihood(_theta(found))[0]
+def _log_likelihood_by_phase(fit: Fit) -> Array:
+    """Returns the log-likelihood of each phase at a fit, given the other phases, (b,)."""
+    log_posterior = fit.log_posterior
+    return log_posterior.block_log_likelihood(_theta(fit))[0]
 
 
-def _theta(found: Fit) -> Array:
-    log_posterior = found.log_posterior
-    return log_posterior.from_sampling(log_posterior.vector(found.theta))[None]
+def _theta(fit: Fit) -> Array:
+    """Returns the values of a fit in SI, (1, D)."""
+    log_posterior = fit.log_posterior
+    return log_posterior.from_sampling(log_posterior.vector(fit.theta))[None]
 
 
 def unexplained(left: Remainder) -> dict[str, Any]:
-    found, form = left.discrepancy, left.form
+    """Returns the entry of the unexplained force in the JSON."""
+    discrepancy, form = left.discrepancy, left.form
     return {
-        "size_n": found.size_n, "share": dict(found.share), "gain_nats": found.gain_nats,
-        "noticeable": found.noticeable, "features": list(found.features),
+        "size_n": discrepancy.size_n, "share": dict(discrepancy.share), "gain_nats": discrepancy.gain_nats,
+        "noticeable": discrepancy.noticeable, "features": list(discrepancy.features),
         "form": {
             "terms": [asdict(term) for term in form.terms],
             "r2_left_out": form.r2_left_out, "sentence": form.sentence,
@@ -118,7 +125,10 @@ def draw(
     folder: Path, made_by: str, binned: BinnedForce, motion: PadMotion, found: DiagnosisFigures,
     candidates: Sequence[Mapping[str, Any]],
 ) -> list[Path]:  # fmt: skip
-    """Writes the figures into a folder, the run in their metadata; returns their paths."""
+    """Writes the figures into a folder and returns their paths.
+
+    made_by : description of the run, which is stored in the figures' metadata
+    """
     before, after = found.before, found.after
     figures = {
         "located": report.figure_located(binned, motion, before.located, before.force_n),

@@ -1,4 +1,4 @@
-"""The context of a diagnosis opened from a run's folder, and its tasks answered by worker processes."""
+"""Opens the context of a diagnosis from a run's folder, and answers its tasks in worker processes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from bayeskin.hashing import sha256_of
 from bayeskin.json_files import read_lines
 from bayeskin.mismatch.answers import answer, read_answer
 from bayeskin.mismatch.context import DiagnosisContext
-from bayeskin.mismatch.fit import QUICK_S, without_swings
+from bayeskin.mismatch.noise_bounds import QUICK_S, without_swings
 from bayeskin.mismatch.tasks import AnswerTasks, Task
 from bayeskin.recordings import analyse, bin_recording, jumps_of
 from bayeskin.types import BinnedForce, Jumps, PadMotion, ParameterSpace, Recording
@@ -29,9 +29,9 @@ from bayeskin.types import BinnedForce, Jumps, PadMotion, ParameterSpace, Record
 class ContextSource:
     """The files and settings from which any process can open the context of a diagnosis.
 
-    recording : folder of a run's stage `recording`; model : file of the forward model; spec : the full model
-    that the configuration asks for; base : priors of the base model; noise : bounds of the noise parameters
-    that the configuration states
+    recording : folder of the run's stage `recording`; model : file of the forward model
+    spec : the full model that the configuration asks for; base : priors of the base model
+    noise : bounds of the noise parameters that the configuration states
     """
 
     recording: Path
@@ -43,16 +43,16 @@ class ContextSource:
 
 
 def open_context(source: ContextSource) -> DiagnosisContext:
-    """Returns the context whose files a source names."""
+    """Returns the context from the files and settings of a source."""
     binned, jumps, motion = calm_bins(source.recording)
     forward = forward_model(source.model, source.spec, motion, binned.edges_s)
     return DiagnosisContext(binned, jumps, motion, forward, source.base, source.seed, dict(source.noise))
 
 
 def calm_bins(folder: Path) -> tuple[BinnedForce, Jumps, PadMotion]:
-    """Returns the bins with the variances of quick noise, the jumps that the samples allow, and the protocol.
+    """Returns the bins with variances of quick noise, the jumps that the samples allow, and the protocol.
 
-    All are read from the folder of the stage `recording`.
+    folder : the folder of the stage `recording`, from which all of them are read
     """
     samples = storage.load(folder / "recording.h5", Recording)
     binned = storage.load(folder / "binned.h5", BinnedForce)
@@ -63,7 +63,7 @@ def calm_bins(folder: Path) -> tuple[BinnedForce, Jumps, PadMotion]:
 
 @dataclass(frozen=True)
 class _Worker:
-    """Answers tasks in a process of its own, which opens its context once."""
+    """Answers tasks in a worker process, which opens its context once."""
 
     source: ContextSource
 
@@ -73,6 +73,7 @@ class _Worker:
 
 @lru_cache(maxsize=1)
 def _opened_once(source: ContextSource) -> DiagnosisContext:
+    """Returns the context of a source, which this process opens only at the first call."""
     return open_context(source)
 
 
@@ -80,7 +81,7 @@ def _opened_once(source: ContextSource) -> DiagnosisContext:
 def asked(
     source: ContextSource, context: DiagnosisContext, file: Path, workers: int
 ) -> Iterator[AnswerTasks]:
-    """Yields a function that answers tasks in worker processes; a file keeps all answers.
+    """Yields a function that answers tasks in worker processes, and keeps all answers in a file.
 
     A task whose answer is in the file is not run again. Raises InputError for a file with other contents.
     """
@@ -92,9 +93,9 @@ def asked(
             keys = [sha256_of([type(task).__name__, asdict(task)]) for task in tasks]
             new = [i for i, key in enumerate(keys) if key not in kept]
             for i, result in run_all([tasks[i] for i in new]):
-                said = {"message": result.reason} if isinstance(result, Lost) else result
-                kept[keys[new[i]]] = said
-                handle.write(json.dumps({"task": keys[new[i]], "answer": said}) + "\n")
+                plain_answer = {"message": result.reason} if isinstance(result, Lost) else result
+                kept[keys[new[i]]] = plain_answer
+                handle.write(json.dumps({"task": keys[new[i]], "answer": plain_answer}) + "\n")
                 handle.flush()
             return [read_answer(context, task, kept[key]) for task, key in zip(tasks, keys, strict=True)]
 
@@ -102,7 +103,10 @@ def asked(
 
 
 def searches_file(run_folder: Path, context: DiagnosisContext) -> Path:
-    """Returns the file that keeps the answers to a context's tasks, named by all that they depend on."""
+    """Returns the file that keeps the answers to a context's tasks.
+
+    Its name is a hash of everything on which the answers depend.
+    """
     identity = [
         bayeskin.__version__, context.seed, repr(context.base), sorted(context.stated_noise.items()),
         context.forward.hash, asdict(context.binned), asdict(context.motion),

@@ -55,8 +55,8 @@ def examine(folder: Path) -> dict[str, Any]:
         _threads(),
         _finding_of("disk space", partial(_disk_space, folder)),
         _write_access(folder),
-        _finding_of("full model", _full_model),
-        _finding_of("surrogate", _surrogate),
+        _finding_of("full model", full_model_finding),
+        _finding_of("surrogate", surrogate_finding),
     ]
     ok = all(finding.ok for finding in findings)
     lines = [
@@ -126,7 +126,9 @@ def _finding_of(name: str, test: Callable[[], Finding]) -> Finding:
     try:
         return test()
     except Exception as error:  # a broken installation can raise any error
-        return Finding(name, False, f"{type(error).__name__}: {error}", "a reinstalled package")
+        return Finding(
+            name, False, f"{type(error).__name__}: {error}", "a complete installation (reinstall bayeskin)"
+        )
 
 
 def _solver() -> Finding:
@@ -157,11 +159,13 @@ def _write_access(folder: Path) -> Finding:
         with tempfile.TemporaryFile(dir=folder) as handle:
             handle.write(b"bayeskin")
     except OSError as error:
-        return Finding("write access", False, f"{folder}: {error.strerror}", "a folder to write runs in")
+        return Finding(
+            "write access", False, f"{folder}: {error.strerror}", "a folder in which runs can be written"
+        )
     return Finding("write access", True, str(folder))
 
 
-def _full_model() -> Finding:
+def full_model_finding() -> Finding:
     """Returns whether a short run of the full model gives the stored force."""
     import numpy as np
 
@@ -171,11 +175,11 @@ def _full_model() -> Finding:
     started = time.perf_counter()
     run = simulate(ModelSpec(), PadMotion(np.array([0.0, 2.0]), np.array([0.0, 2e-3])), THETA)
     if run.status != "ok":
-        return Finding("full model", False, run.message, "a run that ends")
+        return Finding("full model", False, run.message, "a run without an error")
     return _compared("full model", float(run.force_n[-1]), FULL_MODEL_N, FULL_MODEL_TOLERANCE, started)
 
 
-def _surrogate() -> Finding:
+def surrogate_finding() -> Finding:
     """Returns whether the demo's surrogate predicts the stored force."""
     from bayeskin.shipped import shipped
     from bayeskin.surrogates import load_surrogate

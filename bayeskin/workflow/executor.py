@@ -12,14 +12,14 @@ from bayeskin.workflow.engine import Run
 
 
 def with_scheduler(run: Run, scheduler: str) -> Run:
-    """Returns the run with its full runs made through the Dask scheduler at an address."""
+    """Returns the same run, except that a Dask scheduler at the given address makes the full runs."""
     design = run.config.design.model_copy(update={"scheduler": scheduler})
     return replace(run, config=run.config.model_copy(update={"design": design}))
 
 
 @contextmanager
 def executor(run: Run) -> Iterator[Map]:
-    """Yields the executor that the configuration asks for, as a function that maps over items.
+    """Yields the executor that the configuration asks for: a function that applies a function to many items.
 
     Raises InputError where a cluster is not available.
     """

@@ -1,7 +1,7 @@
-"""The choice of the further test that tells the explanations of a mismatch apart, after a diagnosis.
+"""Chooses, after a diagnosis, the further test that best distinguishes the explanations of a mismatch.
 
-The reduced model of the device runs them. It knows the protocols that it was trained for, which are taken as
-what the device can do.
+The reduced model of the device simulates the tests. The range of protocols for which it was trained is taken
+as the range that the device can perform.
 """
 
 from __future__ import annotations
@@ -32,79 +32,87 @@ from bayeskin.workflow.folder import Record, current_record, locked, output_hash
 from bayeskin.workflow.provenance import caption
 
 FOLDER = "experiment"
-LONGEST_S = 1800.0  # of a test: an arm can hardly be still for longer
+LONGEST_S = 1800.0  # longest test: a person can hardly keep an arm still for longer
 WORKERS = 2
 
 
 def choose(source: Path, reporter: Reporter, device: Path | None = None) -> dict[str, Any]:
-    """The answer of `bayeskin experiment` on a configuration's run, or on a recording by itself.
+    """Returns the answer of `bayeskin experiment` for a configuration's run, or for a single recording.
 
-    device : file of the device that a recording by itself was made with
+    The recording is diagnosed first, unless this has been done. If the diagnosis fails, its answer is
+    returned. Outputs go to the run's folder `experiment`.
 
-    Diagnoses first, where that is not done, and answers as `diagnose` where that fails. Outputs go to the
-    run's folder `experiment`. Raises InputError for bad input, among it the article's observation, which no
-    other protocol has, and a device without a reduced model.
+    source : configuration or recording; device : file of the device with which a single recording was made
+    Raises InputError for bad input, for a device without a reduced model, and for the article's observation,
+    which is not defined on other protocols.
     """
     run = opened(source, reporter, device)
     observation = run.config.model.observation
     if observation != "reaction":
-        raise InputError(source, f"model.observation {observation!r}", "'reaction'")
+        raise InputError(source, f"model.observation {observation!r}", "model.observation 'reaction'")
     diagnosed = diagnosis.diagnose(source, reporter, device)
     if "best_set" not in diagnosed:
         return diagnosed
-    where = run.folder / FOLDER
+    folder = run.folder / FOLDER
     with locked(run.folder):
-        started, of = time.monotonic(), _diagnosis(run)
-        where.mkdir(parents=True, exist_ok=True)
-        files = source_of(run)
-        context = context_of(run, files)
-        with asked(files, context, searches_file(run.folder, context), WORKERS) as ask:
-            fitted = [one.fit for one in searched(run, context, ask).fits.values()]
-            fits = compete(fitted, diagnosed["best_set"], context.known)
-            found = _searched(fits, context, ask, reporter) if len(fits) > 1 else []
+        started, diagnosis_hash = time.monotonic(), _diagnosis_hash(run)
+        folder.mkdir(parents=True, exist_ok=True)
+        context_source = source_of(run)
+        context = context_of(run, context_source)
+        with asked(context_source, context, searches_file(run.folder, context), WORKERS) as ask:
+            all_fits = [set_fit.fit for set_fit in searched(run, context, ask).fits.values()]
+            fits = compete(all_fits, diagnosed["best_set"], context.known)
+            experiments = _judged_protocols(fits, context, ask, reporter) if len(fits) > 1 else []
         answer: dict[str, Any] = {
-            "sets": [list(one.names) for one in fits], "experiments": [_row(one) for one in found],
-            "ok": not found or any(np.isfinite(one.gain_bits) for one in found),
+            "sets": [list(fit.names) for fit in fits],
+            "experiments": [_row(experiment) for experiment in experiments],
+            "ok": not experiments or any(np.isfinite(experiment.gain_bits) for experiment in experiments),
         }  # fmt: skip
-        if found:
-            made = report.save_figure(report.figure_experiments(found), where / "experiments", caption(run))
-            answer["figures"] = [path.name for path in made]
-            _write_corners(found[0].protocol, where / "next.csv")
-        write_json(where / "experiment.json", answer)
+        if experiments:
+            figures = report.save_figure(
+                report.figure_experiments(experiments), folder / "experiments", caption(run)
+            )
+            answer["figures"] = [path.name for path in figures]
+            _write_corners(experiments[0].protocol, folder / "next.csv")
+        write_json(folder / "experiment.json", answer)
         seconds = time.monotonic() - started
-        write_record(where, Record(of, True, seconds, output_hashes(where), plain(answer)))
-    return plain({**answer, "folder": where, "text": _in_words(answer)})
+        write_record(folder, Record(diagnosis_hash, True, seconds, output_hashes(folder), plain(answer)))
+    return plain({**answer, "folder": folder, "text": _in_words(answer)})
 
 
 def answered(run: Run) -> Record | None:
-    """Returns what was answered about the diagnosis in the run's folder, if anything was asked of it."""
-    return current_record(run.folder / FOLDER, _diagnosis(run))
+    """Returns the record of the experiments for the diagnosis in the run's folder, or None without one."""
+    return current_record(run.folder / FOLDER, _diagnosis_hash(run))
 
 
-def _diagnosis(run: Run) -> str:
+def _diagnosis_hash(run: Run) -> str:
+    """Returns the hash of the diagnosis in the run's folder, or "" without one."""
     record = read_record(run.folder / diagnosis.NAME)
     return "" if record is None else record.sha256
 
 
-def _searched(
+def _judged_protocols(
     fits: Sequence[Fit], context: DiagnosisContext, ask: AnswerTasks, reporter: Reporter
 ) -> list[Experiment]:
-    """Protocols judged, the most telling first."""
+    """Returns the judged protocols, the most informative first.
+
+    fits : fits of the competing sets, the most probable first
+    """
     assert isinstance(context.forward, ReducedForward)
     trained = context.forward.model.trained.protocols
     limits = Limits(trained.largest_m, trained.speeds_m_s, LONGEST_S)
     first = variations(context.motion, limits)
 
     def judge(protocol: Protocol) -> Experiment:
-        one = weigh(protocol, fits, context.known, ask, context.seed)
-        reporter.log(f"{protocol.name}: {one.gain_bits:.2f} of {one.possible_bits:.2f} bits")
-        return one
+        experiment = weigh(protocol, fits, context.known, ask, context.seed)
+        reporter.log(f"{protocol.name}: {experiment.gain_bits:.2f} of {experiment.possible_bits:.2f} bits")
+        return experiment
 
     return search(judge, first, limits, context.seed)
 
 
 def _write_corners(protocol: Protocol, path: Path) -> None:
-    """Writes a test's corners as a table that a machine can be given."""
+    """Writes the corners of a test as a table that can be given to a testing machine."""
     with open(path, "w", encoding="utf-8", newline="") as handle:
         writer = csv.writer(handle)
         writer.writerow(["time_s", "displacement_mm"])
@@ -112,28 +120,32 @@ def _write_corners(protocol: Protocol, path: Path) -> None:
             writer.writerow([f"{time_s:.3f}", f"{1e3 * at_m:.4f}"])
 
 
-def _row(one: Experiment) -> dict[str, Any]:
+def _row(experiment: Experiment) -> dict[str, Any]:
+    """Returns the entry of an experiment in the JSON."""
     return {
-        "protocol": one.protocol.name, "sentence": one.protocol.sentence,
-        "seconds": float(one.protocol.motion.time_s[-1]),
-        "cycles": [asdict(cycle) for cycle in one.protocol.cycles], "gain_bits": one.gain_bits,
-        "standard_error": one.standard_error, "named": one.named, "possible_bits": one.possible_bits,
-        "failed": one.failed,
+        "protocol": experiment.protocol.name, "sentence": experiment.protocol.sentence,
+        "seconds": float(experiment.protocol.motion.time_s[-1]),
+        "cycles": [asdict(cycle) for cycle in experiment.protocol.cycles], "gain_bits": experiment.gain_bits,
+        "standard_error": experiment.standard_error, "named": experiment.named,
+        "possible_bits": experiment.possible_bits, "failed": experiment.failed,
     }  # fmt: skip
 
 
 def _in_words(answer: Mapping[str, Any]) -> str:
+    """Returns the answer as text."""
     if len(answer["sets"]) < 2:
-        return "nothing competes: no look-alike was tried in the place of what explains the recording best"
-    lines = ["taken as equally probable: " + "; or ".join(", ".join(one) for one in answer["sets"])]
-    for one in answer["experiments"]:
-        told = "could not be judged"
-        if np.isfinite(one["gain_bits"]):
-            told = f"{one['gain_bits']:.2f} of {one['possible_bits']:.2f} bits"
-        lines.append(f"  {one['protocol']}, {one['seconds']:.0f} s: {told}. {one['sentence']}")
+        return (
+            "nothing competes: no look-alike was tried in place of the mechanisms that fit the recording best"
+        )
+    lines = ["sets taken as equally probable: " + "; or ".join(", ".join(names) for names in answer["sets"])]
+    for entry in answer["experiments"]:
+        result = "could not be assessed"
+        if np.isfinite(entry["gain_bits"]):
+            result = f"{entry['gain_bits']:.2f} of {entry['possible_bits']:.2f} bits"
+        lines.append(f"  {entry['protocol']}, {entry['seconds']:.0f} s: {result}. {entry['sentence']}")
     best = answer["experiments"][0]
     if best["gain_bits"] > 0.0:
         lines.append(f"Run next: {best['protocol']}. Its corners are in {FOLDER}/next.csv.")
     else:
-        lines.append("None of these tests is shown to tell them apart.")
+        lines.append("None of these tests has been shown to tell the sets apart.")
     return "\n".join(lines)

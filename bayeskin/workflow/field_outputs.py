@@ -18,9 +18,9 @@ from bayeskin.types import Array, PadMotion, Phase
 
 _PHASE_NAMES = {"rest": "rest", "load": "loading", "hold": "hold", "unload": "unloading"}
 _CAPTION = (
-    "The part of the quarter near the pads, deformed, to scale (axes: 5 mm). Thick lines: pad and, around "
-    "it, guard. On the planes of symmetry, x=0 and y=0, cutis over subcutis. Arrows: direction of the "
-    "velocity, all of one length. Below each panel: range of what it shows."
+    "Part of the modelled quarter near the pads, deformed, to scale (axes: 5 mm). Thick lines: pad, and the "
+    "guard around it. The planes of symmetry, x=0 and y=0, show the cutis above the subcutis. Arrows: "
+    "direction of the velocity, all of equal length. Below each panel: range of its values."
 )
 
 
@@ -121,7 +121,7 @@ def field_figure(
         report.SurfaceField("displacement", "mm", 1e3 * np.array([state.displacement_m for state in seen])),
         report.SurfaceField("pressure", "kPa", pressure_kpa, signed=True),
         report.SurfaceField(
-            "fluid velocity past the solid",
+            "fluid velocity relative to solid",
             "µm/s",
             1e6 * np.linalg.norm(velocity, axis=-1),
             directions=velocity,

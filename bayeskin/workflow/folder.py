@@ -115,11 +115,11 @@ def _refuse_foreign(stage_folder: Path) -> None:
     Such a folder has a record, or contains only hidden files that a killed attempt has left.
     """
     if stage_folder.is_symlink():
-        raise InputError(stage_folder, "a link to another place", "a folder of the run's own")
+        raise InputError(stage_folder, "a link to another place", "a folder that belongs to the run")
     if stage_folder.is_dir() and not (stage_folder / RECORD).is_file():
         others = sorted(p.name for p in stage_folder.iterdir() if not p.name.startswith("."))
         if others:
-            expected = "a folder that a run may fill and empty: move it, or give the run another name"
+            expected = "a folder that only this run uses (move these files, or give the run another name)"
             raise InputError(stage_folder, f"other files, among them {others[0]}", expected)
 
 
@@ -138,7 +138,9 @@ def locked(run_folder: Path) -> Iterator[None]:
             handle.seek(0)
             holder = handle.read().strip() or "unknown"
             raise InputError(
-                run_folder, f"in use by another bayeskin (process {holder})", "one process a run"
+                run_folder,
+                f"a folder in use by another bayeskin (process {holder})",
+                "one process for each run",
             ) from None
         handle.truncate(0)
         handle.write(str(os.getpid()))

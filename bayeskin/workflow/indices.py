@@ -66,8 +66,8 @@ def _over_posterior(run: Run, rng: np.random.Generator) -> dict[str, Any]:
     shares = [f"{result.names[j]} {100 * result.effects[j]:.0f} %" for j in order[:3]]
     return {
         "sentence": (
-            f"What the posterior leaves open of the force, {1e3 * np.sqrt(result.variance_n2):.2g} mN sd "
-            f"over time, is shared by {', '.join(shares)}."
+            f"The posterior's uncertainty of the force, {1e3 * np.sqrt(result.variance_n2):.2g} mN sd "
+            f"over time, comes from {', '.join(shares)}."
         ),
         "method": "Shapley effects by polynomial regression",
         "distribution": result.distribution,

@@ -134,7 +134,7 @@ def _draw_check(run: Run, binned: BinnedForce, refined: RefinedMap) -> None:
 
 STAGE = Stage(
     "map",
-    "finds the most probable point and checks it by the full model",
+    "finds the most probable point and checks it with the full model",
     ("recording", "design", "train"),
     ("seed", "map", "fit", "noise", "parameters", "model", "surrogate", "design"),
     _find_maximum,

@@ -26,7 +26,9 @@ def model_spec(run: Run, mesh: str | None = None, observation: str | None = None
     if model.forward is not None and mesh is None and observation is None:
         return ModelSpec(observation="own", forward=_beside(run, model.forward))
     if model.observation == "own" and observation is None:
-        raise InputError(f"--mesh {mesh}", "a model of your own, which has none", "--observation with it")
+        raise InputError(
+            f"--mesh {mesh}", "a mesh for a model of your own", "--observation too, to run the full model"
+        )
     if mesh is None:
         mesh = model.mesh if model.mesh == "bricks" else str(run.beside(model.mesh))
     return ModelSpec(
@@ -85,5 +87,5 @@ def check_protocol(run: Run, motion: PadMotion) -> None:
     for file in reduced_files(run):
         lines = protocol_outside(load_reduced(file).trained.protocols, motion)
         if lines:
-            found = f"'reduced' on a protocol that {file.name} does not know: {lines[0]}"
-            raise InputError(f"{run.config_path}: design.coarse", found, "coarse = 0, or no such key")
+            found = f"'reduced' on a protocol that {file.name} was not trained for: {lines[0]}"
+            raise InputError(f"{run.config_path}: design.coarse", found, "coarse = 0, or no coarse model")

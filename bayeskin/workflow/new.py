@@ -31,42 +31,43 @@ from bayeskin.workflow.shipping import shipped_for
 _SECONDS_A_RUN = (4, 15)  # of one full run on one core, on the default mesh
 _REDUCED_SECONDS_A_RUN = (0.1, 0.4)
 _SHIPPED_KNOWS = (
-    "# Another model, bin width or wider bounds need another surrogate: take [surrogate] above out.",
+    "# The shipped surrogate was trained for this model, this bin width and these bounds. For another model",
+    "# or bin width, or for wider bounds, remove [surrogate] above. The run then trains its own surrogate.",
 )
 
 _NOISE = NoisePriors()
 _EXAMPLES = {"windows_s": [[0.0, 60.0]], "sd_n": _NOISE.sd_n, "tau_s": _NOISE.tau_s, "nu": _NOISE.nu}
 # Each entry has the name of a section, its subject, and its keys with their meaning.
 _SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
-    ("model", "the force that the model reports, and its mesh", {
-        "observation": '"reaction" on the pad, or "article": what the article\'s code integrates',
-        "mesh": "or a gmsh file",
-        "refinement": "of the bricks: 0 coarse and quick, 2 fine and slow",
+    ("model", "the force that the model reports, and the mesh", {
+        "observation": '"reaction": force on the pad; "article": force as the article\'s code computes it',
+        "mesh": '"bricks" or the name of a gmsh file',
+        "refinement": "refinement of the bricks: 0 is coarse and fast, 2 is fine and slow",
     }),
-    ("fit", "what is fitted", {
-        "windows_s": "for example; without it the whole recording",
-        "bin_width_s": "of the force's means",
+    ("fit", "the part of the recording that is fitted", {
+        "windows_s": "an example, in s; without this key, the whole recording is fitted",
+        "bin_width_s": "width of the bins, in s; the mean force of each bin is fitted",
     }),
-    ("noise", "bounds of its log-uniform priors", {
-        "sd_n": "N, of each kind of phase",
-        "tau_s": "s, correlation time",
-        "nu": "tail index: small is heavy",
+    ("noise", "bounds of the log-uniform priors of the noise", {
+        "sd_n": "standard deviation, in N, of each kind of phase",
+        "tau_s": "correlation time, in s",
+        "nu": "degrees of freedom of the Student-t noise; small values mean heavy tails",
     }),
     ("map", "the search for the most probable point", {
-        "starts": "by three kinds of search in turn",
-        "evaluations": "of each start, at most",
+        "starts": "number of starting points; three kinds of search take turns",
+        "evaluations": "largest number of evaluations for each start",
     }),
-    ("sample", "when the posterior has been sampled enough", {
-        "ensembles": "that share nothing but the posterior",
-        "walkers": "in each",
-        "effective_samples": "of the parameter that has fewest",
-        "max_steps": "it stops there, trusted or not",
+    ("sample", "the sampler of the posterior, and when it stops", {
+        "ensembles": "number of independent ensembles of walkers",
+        "walkers": "number of walkers in each ensemble",
+        "effective_samples": "sampling stops when every parameter has so many effective samples",
+        "max_steps": "sampling stops after so many steps, even if the result is not trusted",
     }),
-    ("check", "the full model at draws of the posterior", {
-        "draws": "0 for none; each is a full run",
-        "rounds": "in which they may join the design, where the surrogate is off",
+    ("check", "the check of the posterior with the full model", {
+        "draws": "number of posterior draws at which the full model runs; 0 for no check",
+        "rounds": "how often these runs may be added to the design, if the surrogate is not accurate",
     }),
-    ("sobol", "indices over the prior", {"samples": "more make their intervals narrower"}),
+    ("sobol", "Sobol' indices over the prior", {"samples": "more samples give narrower intervals"}),
 )  # fmt: skip
 
 
@@ -82,9 +83,9 @@ def new_config(file: Path, out: Path | None = None, device: Path | None = None) 
     recording = read_recording(file)
     out = out or file.with_suffix(".toml")
     if out.suffix != ".toml":
-        raise InputError(f"-o {out}", f"ending {out.suffix!r}", "ending .toml")
+        raise InputError(f"-o {out}", f"the ending {out.suffix!r}", "the ending .toml")
     if out.exists():
-        raise InputError(f"-o {out}", "a file that is there already", "a name that is free")
+        raise InputError(f"-o {out}", "a file that exists already", "the name of a new file")
     phases = segment(recording)
     noise = phase_noise(recording, phases)
     description = describe(recording, phases, noise)
@@ -112,10 +113,10 @@ def new_demo(out: Path | None = None) -> dict[str, Any]:
     out = out or Path("demo.toml")
     recording = out.with_name("demo-recording.h5")  # demo.h5 is already the name of the surrogate
     if out.suffix != ".toml":
-        raise InputError(f"-o {out}", f"ending {out.suffix!r}", "ending .toml")
+        raise InputError(f"-o {out}", f"the ending {out.suffix!r}", "the ending .toml")
     for file in (out, recording):
         if file.exists():
-            raise InputError(file, "a file that is there already", "a folder without one")
+            raise InputError(file, "a file that exists already", "a folder without this file")
     text = shipped("runs/demo.toml").read_text(encoding="utf-8")
     out.parent.mkdir(parents=True, exist_ok=True)
     recording.write_bytes(shipped("data/demo.h5").read_bytes())
@@ -145,7 +146,7 @@ def _surrogate_source(surrogate: Path | None, reduced: Path | None) -> tuple[str
         return f"the shipped surrogate {surrogate.name}", _surrogate_section(surrogate.name)
     if reduced is not None:
         return f"a design of the reduced model {reduced.name}", _reduced_design_section(reduced.name)
-    return "a design of full runs of its own", _full_design_section()
+    return "a design of full runs", _full_design_section()
 
 
 def _name(out: Path) -> str:
@@ -163,14 +164,14 @@ def _configuration(
         _description_lines(found),
         [
             "[recording]",
-            f"file = {_quoted(reference)}  # relative to this file",
-            f'# protocol = {_quoted(config.recording.protocol)}  # or "recorded": as it was, dearer',
+            f"file = {_quoted(reference)}  # path relative to this file",
+            f'# protocol = {_quoted(config.recording.protocol)}  # or "recorded": as measured, but slower',
         ],
         *([device_lines(stated.device, stated.tissue)] if stated else []),
         section,
         [
-            "# What can be set besides, with its default. To change one, take the # from its line and from",
-            "# that of the section above it.",
+            "# All other settings, with their defaults. To change one, remove the # from its line and from",
+            "# the line of its [section].",
             *(_SHIPPED_KNOWS if ready else ()),
             *([] if stated else _commented_device(config)),
             *_optional_lines(config),
@@ -187,13 +188,13 @@ def _quoted(text: str) -> str:
 def _description_lines(text: str) -> list[str]:
     """Returns the description of the recording as TOML comments; unprintable characters become blanks."""
     clean = ("".join(c if c.isprintable() else " " for c in line) for line in text.splitlines())
-    return ["# Found in the recording:", *(f"#   {line}".rstrip() for line in clean)]
+    return ["# Contents of the recording:", *(f"#   {line}".rstrip() for line in clean)]
 
 
 def _surrogate_section(file: str) -> list[str]:
     """Returns the section of a shipped surrogate."""
     return [
-        "# A shipped surrogate knows this recording's protocol, so no full runs are needed before sampling.",
+        "# A shipped surrogate was trained for this protocol, so no full runs are needed before sampling.",
         "[surrogate]",
         f"file = {_quoted(file)}",
     ]
@@ -205,11 +206,11 @@ def _full_design_section() -> list[str]:
     runs, (quick, slow) = _runs(design), _SECONDS_A_RUN
     low, high = (seconds * runs / (60 * design.workers) for seconds in _SECONDS_A_RUN)
     return [
-        "# No shipped surrogate knows this protocol on this device, so the full model is run first, here:",
-        f"# {runs} runs of some {quick} to {slow} s each, {low:.0f} to {high:.0f} minutes with "
+        "# No shipped surrogate was trained for this protocol and this device, so the full model runs first:",
+        f"# {runs} runs of about {quick} to {slow} s each, {low:.0f} to {high:.0f} minutes with "
         f"{design.workers} workers.",
-        "# `bayeskin reduce` with this file makes a reduced model of the device once, from hundreds of runs;",
-        '# with it, coarse = "reduced" takes minutes, if the pads open no further than it knows.',
+        "# `bayeskin reduce` with this file builds a reduced model of the device from hundreds of full runs.",
+        '# A design with coarse = "reduced" then takes minutes if the pads open no further than in training.',
         "[design]",
         *_wave_lines(design),
     ]
@@ -224,14 +225,14 @@ def _reduced_design_section(file: str) -> list[str]:
         for seconds, quick in zip(_SECONDS_A_RUN, _REDUCED_SECONDS_A_RUN, strict=True)
     )
     return [
-        "# No shipped surrogate knows this protocol on this device, so runs are made first, here:",
-        f"# {_runs(design)} by the reduced model {file}, but for skins that fold,",
-        f"# and {full} by the full model, which correct them: {low:.0f} to {high:.0f} minutes with "
+        "# No shipped surrogate was trained for this protocol and this device, so these runs come first:",
+        f"# {_runs(design)} runs of the reduced model {file}, except where the skin folds,",
+        f"# and {full} runs of the full model, which correct them: {low:.0f} to {high:.0f} minutes with "
         f"{design.workers} workers.",
         "[design]",
-        'coarse = "reduced"  # the model that makes the waves',
-        f"fine_points = {design.fine_points}  # full runs that correct it",
-        f"fine_held_out = {design.fine_held_out}  # full runs that measure the surrogate's error",
+        'coarse = "reduced"  # the model that runs the points of the waves',
+        f"fine_points = {design.fine_points}  # full runs that correct the reduced model",
+        f"fine_held_out = {design.fine_held_out}  # further full runs, which measure the surrogate's error",
         *_wave_lines(design),
     ]
 
@@ -244,9 +245,9 @@ def _runs(design: DesignConfig) -> int:
 def _wave_lines(design: DesignConfig) -> list[str]:
     """Returns the lines of a design's waves and workers."""
     return [
-        f"points = {list(design.points)}  # training runs of each wave",
-        f"held_out = {design.held_out}  # of each wave, to measure the surrogate's error",
-        f"workers = {design.workers}  # processes",
+        f"points = {list(design.points)}  # number of training runs in each wave",
+        f"held_out = {design.held_out}  # further runs in each wave, which measure the surrogate's error",
+        f"workers = {design.workers}  # number of worker processes",
     ]
 
 

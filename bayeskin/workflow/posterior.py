@@ -209,11 +209,14 @@ def with_surrogate_error(verdict: Verdict, bands: inference.Bands, fitted: NDArr
         float(np.sqrt(np.mean(sd[fitted] ** 2))) for sd in (bands.sd_surrogate_n, bands.sd_noise_n)
     )
     statement = (
-        f"surrogate's sd {1e3 * surrogate:.3g} mN where fitted; at most the noise's {1e3 * noise:.3g} mN"
+        f"surrogate's sd {1e3 * surrogate:.3g} mN in the fitted bins; "
+        f"at most the noise's sd of {1e3 * noise:.3g} mN allowed"
     )
     if surrogate <= noise:
         return Verdict(verdict.trusted, (*verdict.reasons, statement))
-    return Verdict(False, (f"{statement}: run the full model where the posterior is", *verdict.reasons))
+    return Verdict(
+        False, (f"{statement}: run the full model in the region of the posterior", *verdict.reasons)
+    )
 
 
 def _table(posterior: Posterior) -> dict[str, dict[str, Any]]:

@@ -56,7 +56,7 @@ def prove(
     folder = shipped(SET).parent if folder is None else folder
     index, sources = seals.read_index(folder), diagnosing_sources()
     if not index:
-        raise InputError(folder, "a set without recordings", "one that `bayeskin conceal` made")
+        raise InputError(folder, "a set without recordings", "a set that `bayeskin conceal` made")
     hashes = {number: entry["recording_sha256"] for number, entry in index.items()}
     diagnoser = _Diagnoser(folder, hashes, reporter, diagnose)
     rediagnosed = diagnoser.work(sources, at_most, rediagnose)
@@ -131,7 +131,7 @@ class _Diagnoser:
         """
         source, expected = seals.recording_path(self.folder, number), self.hashes[number]
         if sha256_of_file(source) != expected:
-            raise InputError(source, "other contents than the index says", f"sha256 {expected[:12]}...")
+            raise InputError(source, "other contents than the index states", f"sha256 {expected[:12]}...")
         with tempfile.TemporaryDirectory(prefix="bayeskin-prove-", ignore_cleanup_errors=True) as place:
             copy = Path(shutil.copyfile(source, Path(place) / "recording.h5"))
             try:
@@ -162,9 +162,9 @@ def _record_and_draw(
                 figures += report.save_figure(curves, folder / "detectability", stamp)
             return figures
     except InputError as error:
-        reporter.log(f"{error}: neither figure nor scoring is kept")
+        reporter.log(f"{error}: figure and scoring are not stored")
     except OSError as error:  # a set inside an installed package may be read-only
-        reporter.log(f"{folder}: {error.strerror}: neither figure nor scoring is kept")
+        reporter.log(f"{folder}: {error.strerror}: figure and scoring are not stored")
     return ()
 
 
@@ -176,7 +176,7 @@ def conceal(
     Raises InputError as `proof.conceal`, and where another process works on the set.
     """
     if count < 1 or seed < 0:
-        raise InputError("--seed, --count", f"{seed}, {count}", "a seed from 0 on and at least one recording")
+        raise InputError("--seed, --count", f"{seed}, {count}", "a seed of at least 0, a count of at least 1")
     started = time.monotonic()
 
     def tell(share: float, note: str) -> None:
@@ -207,7 +207,7 @@ def _stored_verdict(folder: Path, number: str, recording_sha256: str) -> dict[st
     if verdict is None:
         return None
     if not isinstance(verdict, dict) or not {"recording_sha256", "sources_sha256", "answer"} <= set(verdict):
-        raise InputError(path, "no verdict of a proof", "one that `bayeskin prove` wrote")
+        raise InputError(path, "no verdict of a proof", "a verdict that `bayeskin prove` wrote")
     return verdict if verdict["recording_sha256"] == recording_sha256 else None
 
 
@@ -286,34 +286,34 @@ def _in_words(document: Mapping[str, Any]) -> str:
     board = document["scoreboard"]
     lines = [
         f"{board['judged']} of {board['recordings']} recordings judged, "
-        f"{document['verdicts_of_these_sources']} by the present sources",
+        f"{document['verdicts_of_these_sources']} of them by the present sources",
         f"false alarms where nothing is concealed: {_share(board['false_alarms'])}",
     ]
     for name, text in (
-        ("named", "named right"),
-        ("named_up_to_look_alikes", "named right up to look-alikes"),
-        ("unknown_outside", "unknown for what is outside the catalogue"),
-        ("effect_in_interval", "effect's parameters in their 90 % intervals, where named right"),
-        ("base_in_interval", "base's parameters in theirs"),
+        ("named", "named correctly"),
+        ("named_up_to_look_alikes", "named correctly or by a look-alike"),
+        ("unknown_outside", "effects outside the catalogue with verdict unknown"),
+        ("effect_in_interval", "effect's parameters in their 90 % intervals, where named correctly"),
+        ("base_in_interval", "base model's parameters in their 90 % intervals"),
     ):
-        for size, words in (("clear", "3 x floor and more"), ("below", "below")):
+        for size, words in (("clear", "effects of at least 3 x floor"), ("below", "smaller effects")):
             lines.append(f"{text}, {words}: {_share(board[name][size])}")
     for name, text in (
-        ("clear_mechanisms_named", "mechanisms that add 3 x floor and more, named"),
-        ("named_mechanisms_there", "named mechanisms that are there"),
+        ("clear_mechanisms_named", "mechanisms that add at least 3 x floor and are named"),
+        ("named_mechanisms_there", "named mechanisms that are in the recording"),
     ):
         lines.append(f"{text}: {_share(board[name])}")
     for name, text in (
         ("location_overlap", "overlap of located windows"),
-        ("held_out_over_floor", "held-out RMSE over the floor, where named right"),
+        ("held_out_over_floor", "held-out RMSE divided by the floor, where named correctly"),
     ):
         score = board[name]["clear"]
         middle = "none" if score["median"] is None else f"{score['median']:.2f}"
-        lines.append(f"{text}, 3 x floor and more: median {middle} of {score['of']}")
+        lines.append(f"{text}, effects of at least 3 x floor: median {middle} of {score['of']}")
     for number, same in document["rediagnosed_the_same"].items():
         current = document["rediagnosed_of_these_sources"][number]
         different = (
-            "ANOTHER VERDICT" if current else "another verdict than that stored, which other sources gave"
+            "ANOTHER VERDICT" if current else "another verdict than the stored one, which other sources gave"
         )
         lines.append(f"{number} diagnosed again: {'the same' if same else different}")
     return "\n".join(lines)

@@ -86,7 +86,7 @@ def _refuse_empty_windows(run: Run, binned: BinnedForce) -> None:
         if index not in occupied:
             where = f"{run.config_path}: fit.windows_s"
             first, last = binned.edges_s[[0, -1]]
-            expected = f"windows that hold a bin of the recording's, {first:g} to {last:g} s"
+            expected = f"windows that contain a bin of the recording, {first:g} to {last:g} s"
             raise InputError(where, f"[{start:g}, {end:g}]", expected)
 
 

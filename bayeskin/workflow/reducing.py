@@ -54,7 +54,7 @@ def reduce(
     geometry = _geometry(source)
     path = out or default_path(source)
     if path.suffix != ".h5":
-        raise InputError(f"-o {path}", f"ending {path.suffix!r}", "ending .h5")
+        raise InputError(f"-o {path}", f"the ending {path.suffix!r}", "the ending .h5")
     trained = trained_for(geometry)
     finished = _finished(path, trained)
     if finished:
@@ -82,7 +82,7 @@ def _build(
         reporter.progress(what, share)
 
     if not path.is_file():
-        reporter.log(f"the base model learns from {settings.base_runs} full runs")
+        reporter.log(f"the base model is trained with {settings.base_runs} full runs")
         save_reduced(path, base_model(trained, full, settings, run_all, progress), _manifest(settings))
         reporter.log(f"{path}: the base model can be used; {len(trained.mechanisms)} mechanisms follow")
     complete = with_mechanisms(load_reduced(path), trained, full, settings, run_all, progress)
@@ -130,7 +130,7 @@ def _finished(path: Path, trained: Trained) -> bool:
         return False
     stored = load_reduced(path)
     if stored.trained.geometry != trained.geometry:
-        raise InputError(f"-o {path}", "a reduced model of another geometry", "a name that is free")
+        raise InputError(f"-o {path}", "a reduced model of another geometry", "another file name")
     return set(stored.trained.mechanisms) == set(trained.mechanisms)
 
 
@@ -154,7 +154,7 @@ def reduced_file(geometry: Geometry, beside: Sequence[Path]) -> Path:
     """Returns the file that `find_reduced` finds. Raises InputError where it finds none."""
     file = find_reduced(geometry, beside)
     if file is None:
-        expected = "one that `bayeskin reduce` makes of its file, once"
+        expected = "a reduced model that `bayeskin reduce` makes from the device's file"
         raise InputError("reduced model", "none for this device and tissue", expected)
     return file
 
@@ -163,8 +163,8 @@ def _answer(path: Path, model: ReducedModel, seconds: float, done: str) -> dict[
     """Returns the command's answer."""
     base, (u, p) = model.cubatures, (model.library.base.displacement, model.library.base.pressure)
     text = (
-        f"{path}: {done}; {len(u)} displacement and {len(p) + 1} pressure modes of the base model at "
-        f"{len(base.base.points)} points, {len(model.library.beyond)} mechanisms"
+        f"{path}: {done}; {len(u)} displacement and {len(p) + 1} pressure modes in the base model, "
+        f"{len(base.base.points)} cubature points, {len(model.library.beyond)} mechanisms"
     )
     return plain({
         "ok": True, "out": path, "seconds": seconds, "mechanisms": sorted(model.library.beyond),

@@ -31,7 +31,9 @@ class Refining:
 
     def retrain(self, theta: Mapping[str, float], simulation: Simulation) -> Surrogate:
         """Returns the surrogate after training with one more run of the configuration's model."""
-        self.run.reporter.log("map: the surrogate was off there; the point joins the design")
+        self.run.reporter.log(
+            "map: the surrogate is not accurate at this point; the run is added to the design"
+        )
         return self.learn(_as_design(self.design, theta, simulation))
 
     def learn(self, runs: Design) -> Surrogate:

@@ -93,7 +93,7 @@ class ServedModel:
         names = [*(p.name for p in self.parameters), *added]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise InputError("config: mechanisms", f"{twice[0]} twice", "parameters of other names")
+            raise InputError("config: mechanisms", f"{twice[0]} twice", "parameters with different names")
         return names
 
     def _request_of(self, config: Mapping[str, Any]) -> Asked:
@@ -149,13 +149,19 @@ def _protocol(given: Any) -> PadMotion:
     """Returns a client's protocol. Raises InputError for one that is wrong."""
     keys = {"time_s", "displacement_m"}
     if not isinstance(given, dict) or set(given) != keys:
-        raise InputError("config: protocol", f"{given!r:.60}", "lists time_s and displacement_m")
+        raise InputError(
+            "config: protocol", f"{given!r:.60}", "a table with the lists time_s and displacement_m"
+        )
     time_s, displacement_m = (_numbers(f"protocol.{key}", given[key]) for key in ("time_s", "displacement_m"))
     if len(time_s) != len(displacement_m) or len(time_s) < 2:
         found = f"{len(time_s)} times, {len(displacement_m)} displacements"
-        raise InputError("config: protocol", found, "as many of both, two or more")
+        raise InputError("config: protocol", found, "two lists of equal length, at least 2")
     if time_s[0] != 0.0 or not np.all(np.diff(time_s) > 0):
-        raise InputError("config: protocol.time_s", f"{time_s[0]:g} first", "times that increase from 0")
+        raise InputError(
+            "config: protocol.time_s",
+            f"times that start at {time_s[0]:g} or do not increase",
+            "times that increase from 0",
+        )
     return PadMotion(time_s, displacement_m)
 
 

@@ -84,7 +84,11 @@ def simulate_once(
     added = _mechanisms(mechanisms)
     spec = model_spec(run, mesh, observation)
     if spec.forward is not None and (fields or figures or added):
-        raise InputError("simulate", f"the model {spec.forward}", "no fields, figures or mechanisms with it")
+        raise InputError(
+            "simulate",
+            f"the model {spec.forward}",
+            "no fields, figures or mechanisms with a model of your own",
+        )
     base = parameter_space(run.config, config_path)
     added_parameters = tuple(p for mechanism in added for p in mechanism.parameters)
     values = _parameter_values(ParameterSpace((*base.parameters, *added_parameters)), spec.geometry, settings)
@@ -100,8 +104,8 @@ def simulate_once(
     outputs = None
     if fields or figures:
         if spec.observation == "article":
-            found = "model.observation 'article', whose stresses are not those of the fields"
-            raise InputError("--fields, --figures", found, "'reaction'")
+            found = "model.observation 'article', whose stresses differ from those of the fields"
+            raise InputError("--fields, --figures", found, "model.observation 'reaction'")
         problem = problem_at(spec, theta)
         _refuse_other_stresses(added, theta | solved_values, problem)
         outputs = FieldOutputs(problem, theta, motion, moments, fields, figures)
@@ -182,7 +186,9 @@ def _refuse_other_stresses(
     for mechanism in mechanisms:
         bind = mechanism.act.bind
         if bind is not None and bind(values, problem.sites).respond is not None:
-            expected = "none that changes the tissue's stress or flow: fields are of the base law"
+            expected = (
+                "no mechanism that changes the tissue's stress or flow, because fields are of the base law"
+            )
             raise InputError("--fields, --figures", f"--mechanism {mechanism.name}", expected)
 
 
@@ -278,8 +284,8 @@ def _reduced_accuracy(simulation: Simulation) -> list[str]:
     error_n = stats["error_estimate_n"]
     share = 100 * error_n / stats["peak_force_n"] if stats["peak_force_n"] > 0.0 else 0.0
     return [
-        f"estimated error beside the full model: {number(1e3 * error_n, 2)} mN, {number(share, 2)} % of peak",
-        f"{stats['seconds_of_run']:.2f} s of these the run itself, the rest its preparation and the estimate",
+        f"estimated error from the full model: {number(1e3 * error_n, 2)} mN, {number(share, 2)} % of peak",
+        f"{stats['seconds_of_run']:.2f} s of this time for the run itself, the rest to prepare and check it",
     ]
 
 
@@ -289,25 +295,29 @@ def _accuracy(simulation: Simulation, spec: ModelSpec) -> list[str]:
     The article's force has no error estimate, because it does not converge.
     """
     if spec.observation == "own":
-        return ["no estimated error: a model of your own"]
+        return ["no error estimate: this is a model of your own"]
     if spec.observation == "article":
-        return ["no estimated error: the article's force depends on its mesh and converges on none"]
+        return ["no error estimate: the article's force depends on the mesh and does not converge"]
     peak_n = simulation.stats["peak_force_n"]
     time_share = simulation.stats["time_error_n"] / peak_n if peak_n > 0.0 else 0.0
     error = mesh_error(spec.mesh_hash)
-    mesh = "unknown, the mesh is not in the study" if error is None else f"{number(100 * error.rms, 2)} % RMS"
+    mesh = (
+        "unknown, because the mesh is not in the convergence study"
+        if error is None
+        else f"{number(100 * error.rms, 2)} % RMS"
+    )
     falls = simulation.stats["falls"]
     snap_lines = [f"the skin folded: it snapped to another equilibrium {falls:.0f} times"] if falls else []
     return [
         *snap_lines,
-        f"estimated error, of the peak: time steps {number(100 * time_share, 2)} %, mesh {mesh}",
+        f"estimated error, relative to the peak: time steps {number(100 * time_share, 2)} %, mesh {mesh}",
     ]
 
 
 def _check_suffix(out: Path, suffixes: tuple[str, ...]) -> None:
     """Raises InputError for a file with another suffix than the allowed ones."""
     if out.suffix not in suffixes:
-        raise InputError(f"-o {out}", f"ending {out.suffix!r}", f"ending {' or '.join(suffixes)}")
+        raise InputError(f"-o {out}", f"the ending {out.suffix!r}", f"the ending {' or '.join(suffixes)}")
 
 
 def _check_folders(fields: Path | None, figures: Path | None, at_s: Sequence[float]) -> None:
@@ -315,6 +325,6 @@ def _check_folders(fields: Path | None, figures: Path | None, at_s: Sequence[flo
     for option, folder in (("--fields", fields), ("--figures", figures)):
         above = [path for path in (folder, *folder.parents) if path.exists()] if folder else []
         if above and not above[0].is_dir():
-            raise InputError(f"{option} {folder}", f"{above[0]} is a file", "a folder")
+            raise InputError(f"{option} {folder}", f"the file {above[0]}", "a folder")
     if at_s and figures is None:
-        raise InputError(f"--at {at_s[0]:g}", "no --figures", "--figures DIR with it")
+        raise InputError(f"--at {at_s[0]:g}", "no --figures", "--at together with --figures DIR")

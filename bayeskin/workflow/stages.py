@@ -150,7 +150,7 @@ def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str
     if answer.stage == "report":
         return _summary_in_words(summary, folder)
     seconds = sum(outcome.record.seconds for outcome in outcomes)
-    head = f"{answer.stage}: done, {seconds:.1f} s to here"
+    head = f"{answer.stage}: done, {seconds:.1f} s so far"
     lines = {
         "design": lambda: f"{summary['runs']} runs, {summary['failed']} failed",
         "train": lambda: (
@@ -182,7 +182,7 @@ def _polish_lines(polished: Mapping[str, Any] | None) -> list[str]:
     """Returns a line about the maximum of the full model itself, if it was computed."""
     if polished is None:
         return []
-    return [f"polished on the full model: {polished['gained']:.2f} nats gained, {polished['message']}"]
+    return [f"refined with the full model: {polished['gained']:.2f} nats gained, {polished['message']}"]
 
 
 def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
@@ -215,7 +215,7 @@ def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
 
 def _identifiability_lines(sentences: Sequence[str]) -> list[str]:
     """Returns sentences about the information on each parameter, with a heading."""
-    return ["what the data says of each:", *(f"  {sentence}" for sentence in sentences)]
+    return ["what the data say about each parameter:", *(f"  {sentence}" for sentence in sentences)]
 
 
 def _length_sentences(due: Mapping[str, Mapping[str, Any]]) -> list[str]:

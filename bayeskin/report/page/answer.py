@@ -104,17 +104,17 @@ def _trust_verdict(facts: RunFacts) -> Verdict:
     """Returns whether the posterior can be trusted, with reasons."""
     summary = facts.said("sample")
     if not summary:
-        return Verdict("not known yet", "none", ["There is no posterior to trust or not to trust."])
+        return Verdict("not known yet", "none", ["There is no posterior yet."])
     checks = facts.said("map").get("checks", [])
     doubts = [check["message"] for check in checks[-1:] if not check["passes"]]
     trusted = summary["ok"] and not doubts
     rmse = summary["rmse"]
     fit = (
-        f"The posterior mean leaves {quantity(rmse['whole_n'], 'N')} RMSE over the whole recording; its 90 % "
-        f"band holds {percent(summary['coverage_90_fitted'])} of the fitted bins."
+        f"The posterior mean has an RMSE of {quantity(rmse['whole_n'], 'N')} over the whole recording; the "
+        f"90 % band holds {percent(summary['coverage_90_fitted'])} of the fitted bins."
     )
     lines = [*doubts, *(summary["reasons"] if not summary["ok"] else [])]
-    lines += [] if lines else ["Chains, surrogate and the full model at the most probable point agree."]
+    lines += [] if lines else ["The chains have converged, and the surrogate agrees with the full model."]
     lines += [fit, *(f"{remark[0].upper()}{remark[1:]}." for remark in summary["remarks"])]
     return Verdict("trusted" if trusted else "not trusted", "good" if trusted else "doubt", lines)
 
@@ -124,11 +124,11 @@ def _missing_physics(facts: RunFacts) -> Verdict:
     diagnosis = facts.said("diagnose")
     if not diagnosis:
         standing = facts.stage("diagnose").standing
-        reason = [f"Nobody has looked yet: the stage diagnose is {standing}."]
+        reason = [f"The physics that is missing is not known: the stage diagnose is {standing}."]
         return Verdict("not known yet", "none", reason, f"bayeskin diagnose {facts.config_path}")
     rmse = [quantity(diagnosis["fit"][when]["rmse"], "N") for when in ("before", "after")]
     probability = number(diagnosis["smooth_probability"])
-    smooth_line = f"Something smooth that is not in the catalogue: probability {probability}."
+    smooth_line = f"Probability of a smooth effect that is not in the catalogue: {probability}."
     if diagnosis["verdict"] == "nothing-missing":
         fit_line = f"The recording stays within what the model allows ({rmse[0]} RMSE)."
         lines = [fit_line, smooth_line]
@@ -139,7 +139,7 @@ def _missing_physics(facts: RunFacts) -> Verdict:
         f"{mechanism['statement']} (probability {number(mechanism['probability'])})"
         for mechanism in diagnosis["mechanisms"]
     ]
-    lines.append(f"RMSE {rmse[0]} without, {rmse[1]} with what was found.")
+    lines.append(f"The RMSE is {rmse[0]} without and {rmse[1]} with the best set of mechanisms.")
     remaining = len(diagnosis["remaining"])
     if remaining:
         lines.append(f"{remaining} window{'s' * (remaining != 1)} of the recording remain unexplained.")
@@ -147,7 +147,7 @@ def _missing_physics(facts: RunFacts) -> Verdict:
     if diagnosis["verdict"] == "named":
         return Verdict("named", "doubt", lines)
     if diagnosis["best_set"]:
-        lines.append(f"Of the catalogue {', '.join(diagnosis['best_set'])} fits best.")
+        lines.append(f"The best set of the catalogue is {', '.join(diagnosis['best_set'])}.")
     several = diagnosis["smooth_probability"] < 0.5
-    word = "something that several causes would explain" if several else "something that has no name here"
+    word = "something that several causes would explain" if several else "something outside the catalogue"
     return Verdict(word, "doubt", lines)

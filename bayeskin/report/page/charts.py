@@ -59,10 +59,10 @@ def residual_chart(history: Mapping[str, Any], phases: Phases) -> Chart:
         plot.dots(residual_mn, ~fitted, "recorded unfitted"),
     ]
     low, high = (number(end, 3) for end in (np.nanmin(residual_mn), np.nanmax(residual_mn)))
-    alt = f"Recorded less predicted force over time, from {low} to {high} mN, with the 50 and 90 % bands."
+    alt = f"Recorded minus predicted force over time, from {low} to {high} mN, with the 50 and 90 % bands."
     return Chart(
         "residual",
-        "What the fit leaves, over time",
+        "Residual over time",
         plot.svg("residual", "recorded − predicted [mN]", phases, parts, 1),
         plot.numbers([residual_mn], list(_residuals(series, fitted, phases))),
         alt,
@@ -116,7 +116,7 @@ def _residuals(series: Mapping[str, Array], fitted: NDArray[np.bool_], phases: P
     for i, moment in enumerate(moments(series["time_s"], phases)):
         residual = series["recorded_n"][i] - median_n[i]
         low, high = (_millinewton(series[name][i] - median_n[i]) for name in ("low_90_n", "high_90_n"))
-        value = "nothing recorded" if np.isnan(residual) else f"{_millinewton(residual)} left"
+        value = "nothing recorded" if np.isnan(residual) else f"residual {_millinewton(residual)}"
         yield f"{moment}: {value}{'' if fitted[i] else ' (not fitted)'}; 90 % band {low} to {high}"
 
 

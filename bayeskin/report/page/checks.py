@@ -16,10 +16,10 @@ def checks(facts: RunFacts) -> Section:
     """Returns the section on checks: convergence, residuals, the full model, held-out runs, the design."""
     parts = (
         ("Sampling", _convergence(facts, facts.said("sample"))),
-        ("What the fit leaves", _residuals(facts, facts.said("sample"))),
-        ("The full model where the posterior is highest", _full_model(facts, facts.said("map"))),
+        ("Residuals", _residuals(facts, facts.said("sample"))),
+        ("The full model at the most probable point", _full_model(facts, facts.said("map"))),
         ("The full model at draws of the posterior", _at_draws(facts, facts.said("sample"))),
-        ("The surrogate on runs held out", _held_out(facts, facts.said("train"))),
+        ("The surrogate on held-out runs", _held_out(facts, facts.said("train"))),
         ("The design", _design(facts, facts.said("design"))),
     )
     blocks: list[Block] = []
@@ -68,10 +68,10 @@ def _residuals(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
         )
         for kind, check in residuals["by_kind"].items()
     ]
-    head = ("phase", "bins", "sd, 1 as assumed", "p", "correlation of neighbours, 0 as assumed", "p")
+    head = ("phase", "bins", "sd (1 if as assumed)", "p", "correlation of neighbours (0 if as assumed)", "p")
     return [
         Text([f"{residuals['sentence'][0].upper()}{residuals['sentence'][1:]}."]),
-        Folded("By kind of phase", [Table("What the fit leaves, by kind of phase", head, rows)]),
+        Folded("By kind of phase", [Table("Residuals by kind of phase", head, rows)]),
         *pictures(facts, "sample", ["residuals"]),
     ]
 
@@ -105,7 +105,7 @@ def _at_draws(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
     if not said:
         return absent(facts, "sample")
     if not said["full_model"]:
-        return [Text(["No draw of the posterior was run by the full model (check.draws = 0)."])]
+        return [Text(["The full model was not run at draws of the posterior (check.draws = 0)."])]
     lines = [f"Round {i}: {check['message']}." for i, check in enumerate(said["full_model"], start=1)]
     blocks: list[Block] = [Text(lines, listed=len(lines) > 1)]
     if said["corrected"] is not None:
@@ -124,7 +124,7 @@ def _at_draws(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
             "parameter", "median, surrogate", "90 % interval", "median, full model", "90 % interval",
             "shift in sd",
         )  # fmt: skip
-        blocks.append(Table("The posterior by the full model's weights", head, rows, symbols=True))
+        blocks.append(Table("The posterior after weighting by the full model", head, rows, symbols=True))
     return [*blocks, *pictures(facts, "sample", ["model_check"])]
 
 
@@ -144,7 +144,7 @@ def _held_out(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
                 (f"relative error, {said['error_source']}", percent(said["relative_error"])),
                 ("median run", percent(said["median_point_relative_error"])),
                 ("worst run", percent(said["worst_point_relative_error"])),
-                ("its own 90 % band holds", percent(said["coverage_90"])),
+                ("its 90 % band holds", percent(said["coverage_90"])),
             ]
         ),
         *pictures(facts, "train", ["validation"]),
@@ -193,7 +193,7 @@ def provenance(facts: RunFacts) -> Section:
         ("model's hash", str(facts.said("design").get("model_hash", "–"))),
         ("seed", str(facts.seed)),
     ]
-    head = ("stage", "stands", "time")
+    head = ("stage", "state", "time")
     rows = [row((stage.name, stage.standing, _seconds(stage))) for stage in facts.stages.values()]
     return Section(
         "provenance",
@@ -201,7 +201,7 @@ def provenance(facts: RunFacts) -> Section:
         [
             Facts(pairs),
             Table("Stages", head, rows),
-            Source("The configuration as it stands", facts.config_text),
+            Source("The configuration file", facts.config_text),
         ],
     )
 

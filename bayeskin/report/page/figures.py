@@ -9,12 +9,12 @@ from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.parts import Picture
 from bayeskin.report.page.svg import inline_svg
 
-_SOBOL = "Sobol' indices of each parameter over time, first order and total, and aggregated"
+_SOBOL = "Sobol' indices of each parameter, first order and total, over time and aggregated"
 # title and description, by stage and name of the figure
-_KNOWN = {
+FIGURES = {
     ("recording", "recording"): (
         "The recording",
-        "Displacement and force over time as recorded, phases shaded, and force over displacement.",
+        "Displacement and force over time as recorded, with shaded phases, and force over displacement.",
     ),
     ("design", "waves"): (
         "The design, wave by wave",
@@ -22,12 +22,12 @@ _KNOWN = {
         "has not ruled the force out.",
     ),
     ("train", "prior_predictive"): (
-        "What the prior expects",
-        "Forces over time that the surrogate gives over the prior, with the recorded force among them.",
+        "Prediction by the prior",
+        "Forces over time that the surrogate predicts for the prior, with the recorded force.",
     ),
     ("train", "validation"): (
         "The surrogate on held-out runs",
-        "Errors of the surrogate on full runs that it was not trained on.",
+        "Errors of the surrogate on runs of the full model that were not used to train it.",
     ),
     ("map", "map_check"): (
         "Surrogate and full model at the most probable point",
@@ -37,30 +37,30 @@ _KNOWN = {
     ("sample", "fit"): (
         "The fit",
         "Recorded force with the predictive bands, the residual over time and over displacement, and the "
-        "parts of the uncertainty.",
+        "sources of the uncertainty.",
     ),
     ("sample", "posterior"): (
         "The posterior",
-        "Marginal distributions of the material parameters beside their priors, and pairs of them.",
+        "Marginal and pairwise distributions of the material parameters, with their priors.",
     ),
     ("sample", "posterior_noise"): (
         "The noise",
-        "Marginal distributions of the noise's parameters beside their priors, and pairs of them.",
+        "Marginal and pairwise distributions of the noise parameters, with their priors.",
     ),
     ("sample", "profiles"): (
         "Profile likelihoods",
-        "How well the recording can be fitted with one parameter held, over its prior, beside the posterior.",
+        "Best fit of the recording for each value of one parameter over its prior, with the posterior.",
     ),
-    ("sample", "traces"): ("The chains", "Traces of each parameter over the sampling's steps, by ensemble."),
+    ("sample", "traces"): ("The chains", "Traces of each parameter over the sampler's steps, by ensemble."),
     ("sample", "residuals"): (
-        "What the fit leaves, against the assumed noise",
-        "Quantiles of what the fit leaves against those of the assumed noise, and its autocorrelation with "
-        "the limits that the assumed noise keeps.",
+        "Residuals and the assumed noise",
+        "Quantiles of the residuals against those of the assumed noise, and their autocorrelation with the "
+        "limits for the assumed noise.",
     ),
     ("sample", "model_check"): (
-        "The posterior by the full model",
-        "Weights that the full model gives draws of the posterior, and what they do to each parameter's mean "
-        "and sd.",
+        "The posterior after weighting by the full model",
+        "Weights of the posterior draws under the full model, and the mean and sd of each parameter before "
+        "and after weighting.",
     ),
     ("sobol", "sobol_prior_gp"): ("Over the prior, from the Gaussian process", f"{_SOBOL}, over the prior."),
     ("sobol", "sobol_prior_chaos"): ("Over the prior, from polynomial chaos", f"{_SOBOL}, over the prior."),
@@ -70,37 +70,38 @@ _KNOWN = {
     ),
     ("diagnose", "located"): (
         "Where recording and model differ",
-        "Recorded and modelled force, the residual with what is allowed, and windows where it leaves that.",
+        "Recorded and modelled force, the residual with its allowed range, and windows where it leaves it.",
     ),
     ("diagnose", "candidates"): (
-        "What each mechanism gains by itself",
-        "Log evidence that each mechanism of the catalogue gains over the base model, with standard errors.",
+        "The gain of each mechanism on its own",
+        "Gain in log-evidence of each mechanism over the base model, with standard errors.",
     ),
     ("diagnose", "before_after"): (
         "The fit before and after",
-        "Force and residual over time and force over displacement, without and with the mechanisms found; "
-        "the predictive band, and what fits to the beginning leave of the rest.",
+        "Force and residual over time and force over displacement, without and with the best set of "
+        "mechanisms; the predictive band; and the residual that fits to the beginning leave in the rest.",
     ),
     ("diagnose", "base_parameters"): (
-        "What becomes of the base's parameters",
-        "Posterior means and 90 % intervals of the base's parameters, without and with the mechanisms found.",
+        "The base parameters before and after",
+        "Posterior means and 90 % intervals of the base parameters, without and with the best set of "
+        "mechanisms.",
     ),
     ("diagnose", "residual_by_phase"): (
         "The residual by phase",
-        "Recorded minus modelled force in each kind of phase, without and with the mechanisms found.",
+        "Recorded minus modelled force in each kind of phase, without and with the best set of mechanisms.",
     ),
     ("diagnose", "contributions"): (
-        "What each mechanism adds to the force",
-        "Force of each mechanism over time and over displacement, at the best fit less that without it.",
+        "The force of each mechanism",
+        "Force at the best fit minus the force without the mechanism, over time and over displacement.",
     ),
     ("diagnose", "discrepancy"): (
-        "What is left, described",
-        "The residual beyond what parameters take up, and the smooth process that describes it, over time "
-        "and displacement.",
+        "The unexplained force",
+        "The part of the residual that no change of the parameters can explain, and the smooth process that "
+        "describes it, over time and displacement.",
     ),
     ("experiment", "experiments"): (
-        "What further tests would tell",
-        "Expected information of each protocol about which explanation is true, with standard errors.",
+        "What further tests would show",
+        "Expected information of each protocol about the true explanation, with standard errors.",
     ),
 }  # fmt: skip
 
@@ -108,7 +109,7 @@ _KNOWN = {
 def pictures(facts: RunFacts, stage: str, names: Iterable[str] | None = None) -> list[Picture]:
     """Returns the figures of a stage: those of the given names, or all, with the known ones first."""
     drawn = facts.stage(stage).figures
-    known = [name for owner, name in _KNOWN if owner == stage]
+    known = [name for owner, name in FIGURES if owner == stage]
     wanted = names if names is not None else [*known, *sorted(set(drawn) - set(known))]
     return [_picture(stage, name, drawn[name]) for name in wanted if name in drawn]
 
@@ -116,7 +117,7 @@ def pictures(facts: RunFacts, stage: str, names: Iterable[str] | None = None) ->
 def _picture(stage: str, name: str, svg: str) -> Picture:
     """Returns a figure with its title and description; a figure whose file is damaged stays empty."""
     plain = name.replace("_", " ")
-    title, alt = _KNOWN.get((stage, name), (plain.capitalize(), f"Figure {plain} of the stage {stage}."))
+    title, alt = FIGURES.get((stage, name), (plain.capitalize(), f"Figure {plain} of the stage {stage}."))
     key = f"{stage}-{name}".replace("_", "-")
     try:
         return Picture(key, title, alt, inline_svg(svg, key))

@@ -13,9 +13,9 @@ from bayeskin.report.page.parts import Block, Cell, Folded, Heading, Section, Ta
 from bayeskin.report.page.sections import absent, cell
 
 _VERDICTS = {
-    "nothing-missing": "The model leaves nothing out that the recording shows.",
+    "nothing-missing": "The recording shows no physics that the model leaves out.",
     "named": "The recording shows physics that the model leaves out, and it has been named.",
-    "unknown": "The model leaves something out, and no mechanism is likely enough to be named.",
+    "unknown": "The model leaves something out, but no mechanism is likely enough to be named.",
 }
 
 
@@ -57,7 +57,7 @@ def _mechanisms(found: Sequence[Mapping[str, Any]]) -> Table:
         )
         for mechanism in found
     ]
-    head = ("mechanism", "what it does here", "probability", "moves the force by", "look-alikes")
+    head = ("mechanism", "effect in this recording", "probability", "changes the force by", "look-alikes")
     return Table("Mechanisms that were named", head, rows)
 
 
@@ -85,9 +85,7 @@ def _fits(fit: Mapping[str, Mapping[str, Any]]) -> Table:
         for when, summary in fit.items()
     ]
     head = ("fit", "whole recording", "held out", *kinds, "90 % band holds")
-    title = (
-        "RMSE without and with the mechanisms; held out: after the second hold, by a fit to what is before it"
-    )
+    title = "RMSE without and with the mechanisms; held out: after the second hold, by a fit to what precedes"
     return Table(title, head, rows)
 
 
@@ -96,8 +94,8 @@ def _checked(full: Mapping[str, Any]) -> str:
     if "message" in full:
         return f"The full model fails at the best values: {full['message']}"
     return (
-        f"A run of the full model at the best values leaves {quantity(full['rmse'], 'N')} RMSE; the "
-        f"model that was fitted is off by {quantity(full['fit_off_by'], 'N')} there."
+        f"The full model at the best values has an RMSE of {quantity(full['rmse'], 'N')}; the fitted model "
+        f"differs from it by {quantity(full['fit_off_by'], 'N')} there."
     )
 
 
@@ -112,7 +110,7 @@ def _candidates(candidates: Sequence[Mapping[str, Any]]) -> Table:
         )
         for candidate in candidates
     ]
-    head = ("mechanism", "log evidence gained [nats]", "standard error")
+    head = ("mechanism", "gain in log-evidence [nats]", "standard error")
     return Table("Each mechanism added to the model alone", head, rows)
 
 
@@ -122,8 +120,8 @@ def _unexplained(left: Mapping[str, Any] | None) -> list[Block]:
         return []
     if not left["noticeable"]:
         return [
-            Heading("What is left"),
-            Text(["Nothing beyond the noise and what the models are allowed to be off by."]),
+            Heading("The unexplained force"),
+            Text(["Nothing is left beyond the noise and the allowed errors of the models."]),
         ]
     form = left["form"]
     rows = [
@@ -138,17 +136,17 @@ def _unexplained(left: Mapping[str, Any] | None) -> list[Block]:
         )
         for term in form["terms"]
     ]
-    head = ("term", "coefficient", "standard error", "unit", "not told from")
+    head = ("term", "coefficient", "standard error", "unit", "not distinguishable from")
     shares = ", ".join(f"{percent(share)} with {name}" for name, share in left["share"].items())
     lines = [
-        f"{quantity(left['size_n'], 'N')} RMS beyond what parameters take up; it varies {shares}.",
+        f"{quantity(left['size_n'], 'N')} RMS that the parameters cannot explain; it varies {shares}.",
         *left["features"],
         form["sentence"],
     ]
     return [
-        Heading("What is left"),
+        Heading("The unexplained force"),
         Text(lines, listed=True),
-        *([Table("The form that predicts it in phases left out", head, rows)] if rows else []),
+        *([Table("The form that predicts it in held-out phases", head, rows)] if rows else []),
     ]
 
 
@@ -157,9 +155,9 @@ def _experiments(facts: RunFacts) -> list[Block]:
     summary = facts.said("experiment")
     if not summary:
         return []
-    title = Heading("Which further test would tell the explanations apart")
+    title = Heading("Which further test would distinguish the explanations")
     if len(summary["sets"]) < 2:
-        return [title, Text(["Nothing competes with what explains the recording best."])]
+        return [title, Text(["No other explanation competes with the best one."])]
     rows = [
         row(
             (
@@ -174,12 +172,12 @@ def _experiments(facts: RunFacts) -> list[Block]:
         for experiment in summary["experiments"]
     ]
     possible = summary["experiments"][0]["possible_bits"]
-    information = f"tells, of {number(possible)} bits"
-    head = ("protocol", "what is done", "takes", information, "±", "the true one is then named")
+    information = f"information, of {number(possible)} bits"
+    head = ("protocol", "description", "duration", information, "±", "expected probability of the true one")
     sets = "; or ".join(", ".join(names) for names in summary["sets"])
     return [
         title,
-        Text([f"Taken as equally probable: {sets}."]),
+        Text([f"Explanations, taken as equally probable: {sets}."]),
         Table("Further tests, the most informative first", head, rows),
         *pictures(facts, "experiment"),
     ]
@@ -198,5 +196,5 @@ def _windows(when: str, windows: Sequence[Mapping[str, Any]]) -> Table:
         )
         for window in windows
     ]
-    head = ("window", "from", "to", "recorded minus model", "chance of one such by noise")
-    return Table(f"{when}: where the recording leaves what the model allows", head, rows)
+    head = ("window", "from", "to", "recorded minus model", "probability of such a window by noise")
+    return Table(f"{when}: windows where the recording leaves the range that the model allows", head, rows)

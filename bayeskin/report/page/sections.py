@@ -62,7 +62,7 @@ def recording(facts: RunFacts) -> Section:
             Folded("Phases and their noise", [_phases(summary["phases"])]),
         ]
         if summary["notes"]:
-            blocks.append(Folded("What was taken for what", [Text(summary["notes"], listed=True)]))
+            blocks.append(Folded("How the file was read", [Text(summary["notes"], listed=True)]))
     return Section("recording", "Recording", blocks)
 
 
@@ -76,7 +76,7 @@ def _phases(phases: Sequence[Mapping[str, Any]]) -> Table:
         "noise sd",
         "correlation time",
         "spikes",
-        "steps of zero",
+        "steps of the zero",
     )
     rows = [
         row(
@@ -143,7 +143,7 @@ def _bands(said: Mapping[str, Any]) -> Facts:
             ("of the fitted bins", percent(said["coverage_90_fitted"])),
             ("sd of the force without noise", quantity(parts["model"], "N")),
             ("sd of the noise", quantity(parts["noise"], "N")),
-            ("sd that the surrogate states of its own error", quantity(parts["surrogate"], "N")),
+            ("sd that the surrogate states for its error", quantity(parts["surrogate"], "N")),
         ]
     )
 
@@ -187,9 +187,12 @@ def _information_gained(said: Mapping[str, Any]) -> list[Block]:
                 )
             )
         )
-    head = ("parameter", "contraction", "information gained [nats]", "90 % interval by the fit alone")
+    head = ("parameter", "contraction", "information gained [nats]", "90 % interval from the fit alone")
     learned_sentences = [said["learned"][name]["sentence"] for name in said["profiles"]]
-    return [Text(learned_sentences, listed=True), Table("What the test taught", head, rows, symbols=True)]
+    return [
+        Text(learned_sentences, listed=True),
+        Table("What the test shows", head, rows, symbols=True),
+    ]
 
 
 def _length_shares(said: Mapping[str, Any]) -> list[Block]:
@@ -219,7 +222,7 @@ def _parameters(facts: RunFacts, table: Mapping[str, Mapping[str, Any]]) -> Tabl
         meaning = facts.parameters.get(name) or summary.get("meaning", "")
         sentence = without_numbers(known_sentences.get(name, ""))
         rows.append(row((name, meaning, prior_range(summary), *cells[:3], unit, cells[3], sentence)))
-    return Table("Parameters: prior, posterior, and what the data says of each", head, rows, symbols=True)
+    return Table("Parameters: prior, posterior, and what the data says about each", head, rows, symbols=True)
 
 
 def sobol(facts: RunFacts) -> Section:
@@ -236,7 +239,7 @@ def sobol(facts: RunFacts) -> Section:
             *([indices_chart(key, title, indices, _phases_of(facts))] if indices is not None else []),
             *pictures(facts, "sobol", [f"sobol_{name}"]),
             Folded(
-                f"How: {title}",
+                f"Method: {title}",
                 [
                     Text(
                         [

@@ -1,0 +1,92 @@
+"""Charts, sentences and numbers of the report's page."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from toys.finished_run import HISTORY, INDICES, summaries
+
+from bayeskin.report.page.charts import history_chart, indices_chart, residual_chart
+from bayeskin.report.page.numbers import interval, number, quantity
+from bayeskin.report.page.prose import prose
+
+PHASES = summaries()["recording"]["phases"]
+
+
+def test_under_the_cross_hair_stands_what_the_stage_says() -> None:
+    chart = history_chart(HISTORY, PHASES)
+    assert chart.data["says"][1:3] == [
+        "0.75 s, load of cycle 1: recorded 100.0 mN; predicted 110.0 mN, 90 % band 90.0 mN to 130.0 mN",
+        "1.25 s, load of cycle 1: nothing recorded (not fitted); predicted 200.0 mN, "
+        "90 % band 180.0 mN to 220.0 mN",
+    ]
+    x, (y,) = chart.data["x"], chart.data["dots"]
+    assert x == sorted(x)
+    assert y == sorted(y, reverse=True)  # more force stands higher
+    assert (x[0], x[-1]) == (54.0, 750.0)
+    assert chart.svg.count("M") > 3
+    assert "nan" not in chart.svg
+    json.dumps(chart.data, allow_nan=False)
+
+
+def test_what_the_fit_leaves_can_be_read() -> None:
+    chart = residual_chart(HISTORY, PHASES)
+    assert chart.data["says"][1:3] == [
+        "0.75 s, load of cycle 1: residual −10.0 mN; 90 % band −20.0 mN to 20.0 mN",
+        "1.25 s, load of cycle 1: nothing recorded (not fitted); 90 % band −20.0 mN to 20.0 mN",
+    ]
+    zero, below, none, above = chart.data["dots"][0]
+    assert below > zero > above
+    assert none is None
+    assert "nan" not in chart.svg
+
+
+def test_sobol_indices_over_time_can_be_read() -> None:
+    chart = indices_chart("key", "over the prior", INDICES, PHASES)
+    assert chart.data["says"][::3] == [
+        "0.25 s, load of cycle 1: the force does not vary",
+        "1.75 s, load of cycle 1: first order (total): E_c 0.60 (0.65), p_init 0.00 (0.05)",
+    ]
+    leading, other = chart.data["dots"]
+    assert leading[0] is None
+    assert all(high < low for high, low in zip(leading[1:], other[1:], strict=True))
+    assert [key.text for key in chart.keys] == ["E_c", "p_init", "total, with all interactions"]
+    assert len({key.color for key in chart.keys}) == 3
+    assert "nan" not in chart.svg
+
+
+@pytest.mark.parametrize(
+    ("said", "printed"),
+    [
+        ("E_c is 5.11e+04 Pa", "<i>E</i><sub>c</sub> is 51.1 kPa"),
+        ("sd_hold (correlation -1.00)", "<i>σ</i><sub>hold</sub> (correlation −1.00)"),
+        ("is 1.33e-16 to 5.56e-12 m^2.", "is 1.33 × 10⁻¹⁶ to 5.56 × 10⁻¹² m²."),
+        ("-670 to 2.14e+03 Pa", "−0.67 to 2.14 kPa"),
+        ("1.3 mN in 60.25 s, 2026-11-23", "1.3 mN in 60.25 s, 2026-11-23"),
+        ("see runs/x_one.toml & <b>", "see runs/x_one.toml &amp; &lt;b&gt;"),
+    ],
+)
+def test_sentences_are_printed_with_symbols_and_units_that_read_well(said: str, printed: str) -> None:
+    assert str(prose(said)).replace("\u00a0", " ") == printed
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (50830.0, "Pa", "50.8 kPa"), (2e6, "Pa", "2 MPa"), (745.0, "Pa", "745 Pa"),
+        (-0.0253, "N", "−25.3 mN"),
+        (1.234, "N", "1.23 N"), (0.0094, "m", "9.4 mm"), (1.64e-14, "m^2", "1.64 × 10⁻¹⁴ m²"),
+        (13.29, "s", "13.3 s"), (None, "N", "–"),
+        (0.0, "1", "0"), (99.96, "1", "100"), (1.2e6, "1", "1.2 × 10⁶"),
+    ],
+)  # fmt: skip
+def test_numbers_read_well(value: float | None, unit: str, text: str) -> None:
+    assert quantity(value, unit).replace("\u00a0", " ") == text
+
+
+def test_an_interval_has_one_unit_unless_its_ends_are_far_apart() -> None:
+    assert interval(13.9e3, 87e3, "Pa") == "13.9 to 87\u00a0kPa"
+    assert interval(1e4, 2e6, "Pa") == "10\u00a0kPa to 2\u00a0MPa"
+    assert interval(-670.0, 2144.0, "Pa") == "−0.67 to 2.14\u00a0kPa"
+    assert number(float("nan")) == "–"

@@ -1,0 +1,101 @@
+"""The report that a run leaves behind, and that `report` makes again."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+from toys.finished_run import HISTORY, drawing, summaries
+
+from bayeskin.report.page.figures import FIGURES
+from bayeskin.workflow import folder, page, stages
+from bayeskin.workflow.engine import CannotGoOn, Run, Silent, Stage
+
+CONFIG = 'seed = {seed}\n[recording]\nfile = "r.csv"\n'
+
+
+def stubs(fails: str = "") -> dict[str, Stage]:
+    """The stages by name and need, each of which writes its figures and says what a finished run's would."""
+
+    def working(name: str) -> Any:
+        def work(run: Run) -> dict[str, Any]:
+            if name == fails:
+                raise CannotGoOn("too few runs; narrow the prior box")
+            for of, figure in FIGURES:
+                if of == name:
+                    run.at(name, f"{figure}.svg").write_text(drawing(figure))
+            if name == "sample":
+                folder.write_json(run.at(name, "bands.json"), HISTORY)
+            return summaries().get(name, {})
+
+        return work
+
+    return {
+        name: Stage(name, "does", stage.needs, ("seed",), stage.work if name == "report" else working(name))
+        for name, stage in stages.STAGES.items()
+    }
+
+
+def configured(where: Path, seed: int = 1) -> Path:
+    (where / "r.csv").write_text("as measured")
+    (where / "case.toml").write_text(CONFIG.format(seed=seed))
+    return where / "case.toml"
+
+
+def test_a_run_ends_with_its_page_and_report_makes_it_again(tmp_path: Path) -> None:
+    config = configured(tmp_path)
+    said = stages.run(config, None, Silent(), stubs())
+    path = tmp_path / "case" / page.FILE
+    assert said["page"] == str(path)
+    first = path.read_bytes()
+    assert b'id="sample-posterior"' in first
+    path.unlink()
+    again = stages.report(config, Silent(), stubs())
+    assert (again["ok"], again["page"]) == (True, str(path))
+    assert path.read_bytes() == first
+
+
+def test_report_runs_nothing_and_names_what_is_missing(tmp_path: Path) -> None:
+    config = configured(tmp_path)
+    said = stages.report(config, Silent(), stubs())
+    assert (said["ok"], said["verdict"]) == (True, "not finished")
+    assert said["missing"] == ["recording", "design", "train", "map", "sample", "sobol"]
+    assert [path.name for path in (tmp_path / "case").iterdir()] == [page.FILE]
+    stages.run(config, "train", Silent(), stubs())
+    assert stages.report(config, Silent(), stubs())["missing"] == ["map", "sample", "sobol"]
+    assert "Phases of the recording" in (tmp_path / "case" / page.FILE).read_text()
+
+
+def test_a_changed_configuration_puts_what_was_made_before_it_out_of_date(tmp_path: Path) -> None:
+    stages.run(configured(tmp_path), None, Silent(), stubs())
+    text = stages.report(configured(tmp_path, seed=2), Silent(), stubs())["text"]
+    assert "sample: out of date" in text
+    shown = (tmp_path / "case" / page.FILE).read_text()
+    assert "out of date" in shown
+    assert "50.8" not in shown  # nothing of the other configuration's answer
+
+
+def test_a_run_that_fails_leaves_a_page_that_says_where(tmp_path: Path) -> None:
+    said = stages.run(configured(tmp_path), None, Silent(), stubs(fails="train"))
+    assert said["ok"] is False
+    shown = (tmp_path / "case" / page.FILE).read_text()
+    assert "The stage train failed: too few runs; narrow the prior box." in shown
+    assert stages.report(tmp_path / "case.toml", Silent(), stubs(fails="train"))["ok"] is False
+
+
+def test_a_run_sampled_before_there_were_bands_has_a_page_without_the_chart(tmp_path: Path) -> None:
+    config = configured(tmp_path)
+    old = stubs()
+    write = old["sample"].work
+
+    def without_bands(run: Run) -> Any:
+        summary = write(run)
+        run.at("sample", "bands.json").unlink()
+        return summary
+
+    old["sample"] = dataclasses.replace(old["sample"], work=without_bands)
+    stages.run(config, None, Silent(), old)
+    shown = (tmp_path / "case" / page.FILE).read_text()
+    assert 'id="history"' not in shown
+    assert 'id="sample-fit"' in shown

@@ -1,0 +1,33 @@
+"""Runs a small design on the closed-form model, and compares the rows of two designs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from toys.closed_form_model import toy_simulate
+from toys.unreliable_models import COARSE_S, WAVE
+
+from bayeskin.design import Wave
+from bayeskin.execution.local import local
+from bayeskin.runner import run_design
+from bayeskin.types import Design
+
+SHORT = replace(WAVE, theta=WAVE.theta[:4], held_out=WAVE.held_out[:4])
+
+
+def run(
+    path: Path, wave: Wave = WAVE, simulate: object = toy_simulate, workers: int = 1, **options: object
+) -> Design:
+    return run_design(path, wave, COARSE_S, simulate, "toy", local(workers), **options)
+
+
+def assert_same_rows(found: Design, expected: Design) -> None:
+    """Equal bit by bit, durations excepted."""
+    for name in ("edges_s", "theta", "force_n", "wave", "held_out", "ok"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+    assert found.space == expected.space
+    assert (found.messages, found.seed, found.model_hash) == (
+        expected.messages, expected.seed, expected.model_hash,
+    )  # fmt: skip
