@@ -162,7 +162,7 @@ def _draw_detectability(ax: Axes, classes: Sequence[Mapping[str, Any]]) -> None:
         middle = np.sqrt(low * high)
         for name, color, label, shift, width in (
             ("named", INK, "correctly", 0.97, 3.0),
-            ("up_to_look_alikes", MODEL, "or as a look-alike", 1.03, 1.0),
+            ("up_to_look_alikes", MODEL, "or look-alike", 1.03, 1.0),
         ):
             share = size_class[name]
             if not share["of"]:
