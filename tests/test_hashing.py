@@ -294,7 +294,7 @@ def test_an_entry_of_the_catalogue_is_no_part_of_a_law(tmp_path: Path) -> None:
     file, seen = tmp_path / "law.py", []
     for before, after in (
         ("", ""),
-        ("pulls", "draws"),
+        ("statement=lambda v: (", "statement=lambda v: 'In short: ' + ("),
         ("0.2, 15.0", "0.3, 15.0"),
         ("past[:] = 0.0", "past[:] = 1.0"),
     ):

@@ -127,7 +127,7 @@ def test_of_look_alikes_that_share_the_chances_the_likeliest_is_named() -> None:
 def test_a_mechanism_is_not_named_for_a_likelier_look_alike() -> None:
     """Where the likelier of two is not said to look like the other."""
     pair = ("sensor-drift", "stiffness-drift")
-    known = {**KNOWN, "sensor-drift": replace(KNOWN["sensor-drift"], group=pair)}
+    known = {**KNOWN, "sensor-drift": replace(KNOWN["sensor-drift"], look_alikes=pair[1:])}
     assert judge_family(of(sensor_drift=20.0, stiffness_drift=20.5), known, 1.0).named == ()
     (one,) = judge_family(of(sensor_drift=20.5, stiffness_drift=20.0), known, 1.0).named
     assert (one.name, one.group) == ("sensor-drift", pair)

@@ -294,7 +294,7 @@ from bayeskin.types import Parameter
 MECHANISM = Mechanism(
     name="{name}", parameters=(Parameter("{parameter}", "N", 0.0, 1.0, "uniform"),),
     neutral={{"{parameter}": 0.0}},
-    statement=lambda v: "A magnet.", group=("magnet",),
+    statement=lambda v: "A magnet.",
     act=Instrument(
         Place.CELL,
         lambda values, motion, force: added(force, lambda t: values["{parameter}"][:, None] + 0 * t),

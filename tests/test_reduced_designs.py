@@ -120,7 +120,7 @@ def test_the_full_model_runs_where_the_reduced_one_was_not_trained(
     right = stand_in_model.simulate(ModelSpec(), MOTION, STIFF)
     np.testing.assert_array_equal(found.force_n, right.force_n)
     assert (found.status, found.model_hash) == ("ok", waves.hash)
-    assert found.message == "run by the full model: E_c is 3e+06, not within 10000 to 2e+06"
+    assert found.message == "run by the full model: E_c is 3e+06, outside the trained range 10000 to 2e+06"
     inside = replace(right, stats={"inside": 1.0}, force_n=2.0 * right.force_n)
     monkeypatch.setattr(design_model, "simulate_reduced", lambda *arguments, **more: inside)
     found = waves(MOTION, TRUE)

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Mapping
+from dataclasses import replace
 from importlib.metadata import entry_points
 
 from bayeskin.errors import InputError
@@ -44,7 +46,17 @@ def catalogue() -> dict[str, Mechanism]:
             if name not in known or known[name].needs:
                 expected = "a mechanism of the catalogue that needs none itself"
                 raise InputError(mechanism.name, f"a need of {name}", expected)
-    return known
+    return _with_both_look_alikes(known)
+
+
+def _with_both_look_alikes(known: Mapping[str, Mechanism]) -> dict[str, Mechanism]:
+    """Returns mechanisms whose look-alikes name them in turn, wherever a pair is stated."""
+    pairs = {(m.name, other) for m in known.values() for other in m.look_alikes}
+    pairs |= {(other, name) for name, other in pairs}
+    return {
+        name: replace(m, look_alikes=tuple(sorted(other for one, other in pairs if one == name)))
+        for name, m in known.items()
+    }
 
 
 __all__ = [

@@ -99,6 +99,6 @@ MECHANISM = Mechanism(
         f"The load cell's amplifier smooths the force, with a time constant of "
         f"{number(1e3 * v['amplifier_time'], 2)} ms."
     ),
-    group=("amplifier-lag", "clock-delay"),
+    look_alikes=("clock-delay",),
     act=Instrument(Place.AMPLIFIER, observe, adds=False, settles_s=QUICKEST_S),
 )

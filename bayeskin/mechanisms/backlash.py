@@ -83,6 +83,5 @@ MECHANISM = Mechanism(
         f"At each reversal the drive moves {number(1e3 * v['gap'], 2)} mm without effect, and the frame "
         f"yields {number(1e3 * v['frame_compliance'], 2)} mm for each newton."
     ),
-    group=("backlash",),
     act=Instrument(Place.PADS, observe, bind, adds=False),
 )

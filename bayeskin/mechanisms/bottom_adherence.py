@@ -64,6 +64,5 @@ MECHANISM = Mechanism(
         "The subcutis sticks to the fascia below it; the bond has a tangential stiffness of "
         f"{number(1e-6 * v['adherence'], 3)} kPa for each mm."
     ),
-    group=("bottom-adherence",),
     act=Tissue(bind),
 )

@@ -25,6 +25,5 @@ MECHANISM = Mechanism(
         f"The time stamps of the force are {1e3 * abs(v['delay']):.0f} ms too "
         f"{'late' if v['delay'] > 0 else 'early'} compared with those of the displacement."
     ),
-    group=("clock-delay", "amplifier-lag"),
     act=Instrument(Place.CLOCK, observe, adds=False),
 )

@@ -53,6 +53,5 @@ MECHANISM = Mechanism(
         f"lines are at {np.degrees(v['langer_angle']):.0f} degrees to the pull; a single uniaxial test can "
         "hardly distinguish this from a stiffer cutis, but a further test across the pull can."
     ),
-    group=("fibre-anisotropy", "cell-nonlinearity"),
     act=Tissue(bind),
 )

@@ -52,6 +52,5 @@ MECHANISM = Mechanism(
         f"Fluid leaks through the surface: {number(6e7 * v['leakage'], 3)} micrometres a minute for each kPa "
         "of pressure."
     ),
-    group=("fluid-leakage",),
     act=Tissue(bind),
 )

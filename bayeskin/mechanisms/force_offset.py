@@ -18,6 +18,6 @@ MECHANISM = Mechanism(
     parameters=(Parameter("F0", "N", -0.15, 0.05, "uniform", "force reported at zero force"),),
     neutral={"F0": 0.0},
     statement=lambda v: f"The load cell reads {1e3 * v['F0']:+.0f} mN when the skin exerts no force.",
-    group=("force-offset", "device-friction"),
+    look_alikes=("pre-stretch",),
     act=Instrument(Place.CELL, observe),
 )

@@ -39,12 +39,7 @@ MECHANISM = Mechanism(
         "When the motion stops, the remaining friction relaxes with a time constant of "
         f"{number(v['friction_tau'], 3)} s."
     ),
-    group=(
-        "friction-creep",
-        "solid-viscoelasticity",
-        "strain-dependent-permeability",
-        "skeleton-compressibility",
-    ),
+    look_alikes=("skeleton-compressibility", "solid-viscoelasticity", "strain-dependent-permeability"),
     act=Instrument(Place.DRIVE, observe),
     needs=("device-friction",),
 )

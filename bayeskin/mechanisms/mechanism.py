@@ -82,7 +82,8 @@ class Mechanism:
     parameters : its parameters in SI units, with priors
     neutral : values of these parameters that switch it off
     statement : returns one plain sentence for a report, from the parameters' values
-    group : names of the look-alikes that one force channel cannot tell apart from it, including its own name
+    look_alikes : names of mechanisms that one force channel cannot tell apart from it. One entry of a pair
+        states the other; the catalogue completes both
     parts : groups of parameters, by name, that act without the others. The first parameter of each part
         switches it on. () means that all parameters form one part
     act : its action, on the force or on the full model
@@ -93,10 +94,15 @@ class Mechanism:
     parameters: tuple[Parameter, ...]
     neutral: Mapping[str, float]
     statement: Callable[[Mapping[str, float]], str]
-    group: tuple[str, ...]
     act: Instrument | Tissue
+    look_alikes: tuple[str, ...] = ()
     parts: tuple[tuple[str, ...], ...] = ()
     needs: tuple[str, ...] = ()
+
+    @property
+    def group(self) -> tuple[str, ...]:
+        """Returns the names of the mechanism and of its look-alikes."""
+        return (self.name, *self.look_alikes)
 
     @property
     def whole_or_parts(self) -> tuple[tuple[str, ...], ...]:

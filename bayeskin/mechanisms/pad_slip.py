@@ -65,6 +65,6 @@ MECHANISM = Mechanism(
         f"The pads slip on the skin by {number(1e3 * v['slip_rate'], 2)} mm a second for each newton above "
         f"{number(v['slip_threshold'], 2)} N, and do not slip back."
     ),
-    group=("pad-slip", "preconditioning", "slow-recovery", "plastic-set"),
+    look_alikes=("plastic-set", "preconditioning", "slow-recovery"),
     act=Instrument(Place.PADS, observe, bind, adds=False),
 )

@@ -53,7 +53,6 @@ MECHANISM = Mechanism(
         f"force swings to either side by {1e3 * v['motion_amplitude']:.1f} mN plus "
         f"{number(100 * v['motion_share'], 2)} % of its value."
     ),
-    group=("periodic-motion",),
     parts=(("motion_amplitude", "motion_period", "motion_phase"), ("motion_share",)),
     act=Instrument(Place.ARM, observe, adds=False, repeats_s=SHORTEST_S),
 )

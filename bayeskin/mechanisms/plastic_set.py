@@ -112,6 +112,6 @@ MECHANISM = Mechanism(
         f"longer, by {100 * v['set_share']:.0f} % of the excess, so that in later cycles the force starts "
         "to rise later and is lower."
     ),
-    group=("plastic-set", "preconditioning", "pad-slip", "device-friction"),
+    look_alikes=("preconditioning",),
     act=Tissue(bind),
 )

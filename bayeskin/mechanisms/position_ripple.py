@@ -51,7 +51,6 @@ MECHANISM = Mechanism(
         f"{1e3 * v['ripple_amplitude']:.1f} mN and a period of {number(1e3 * v['ripple_period'], 2)} mm "
         "of travel."
     ),
-    group=("position-ripple",),
     act=Instrument(Place.DRIVE, observe, repeats_m=SHORTEST_M),
     parts=(("ripple_amplitude", "ripple_period", "ripple_phase"),),
 )

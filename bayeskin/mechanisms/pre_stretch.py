@@ -36,6 +36,6 @@ MECHANISM = Mechanism(
     ),
     neutral={"opening": 0.0},
     statement=lambda v: f"The skin was already stretched by {100 * v['opening']:.1f} % when the test began.",
-    group=("pre-stretch", "force-offset", "strain-stiffening"),
+    look_alikes=("strain-stiffening",),
     act=Tissue(bind),
 )

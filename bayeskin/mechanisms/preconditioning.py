@@ -126,6 +126,6 @@ MECHANISM = Mechanism(
         f"The first stretch softens the skin by at most {100 * v['damage']:.0f} %, of which 63 % is reached "
         f"at a stored energy of {number(1e-3 * v['damage_energy'], 3)} kPa; later cycles repeat this."
     ),
-    group=("preconditioning", "pad-slip", "slow-recovery", "plastic-set"),
+    look_alikes=("slow-recovery",),
     act=Tissue(bind),
 )

@@ -17,6 +17,5 @@ MECHANISM = Mechanism(
     parameters=(Parameter("drift", "N/s", -3e-4, 3e-4, "uniform", "drift of the load cell's zero"),),
     neutral={"drift": 0.0},
     statement=lambda v: f"The load cell drifts by {number(6e4 * v['drift'], 2, sign=True)} mN a minute.",
-    group=("sensor-drift",),
     act=Instrument(Place.CELL, observe),
 )

@@ -61,7 +61,6 @@ MECHANISM = Mechanism(
         )
         + "."
     ),
-    group=("sensor-events",),
     parts=tuple((f"event_{i}_step", f"event_{i}_at") for i in EVENTS),
     act=Instrument(Place.CELL, observe, refuted=refuted),
 )

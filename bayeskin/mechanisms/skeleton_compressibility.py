@@ -34,13 +34,7 @@ MECHANISM = Mechanism(
         f"The drained solid has a Poisson's ratio of {v['nu_c']:.2f} in the cutis and of {v['nu_s']:.2f} in "
         "the subcutis, so that a stretch changes its volume and makes fluid flow."
     ),
-    group=(
-        "skeleton-compressibility",
-        "solid-viscoelasticity",
-        "slow-recovery",
-        "friction-creep",
-        "strain-dependent-permeability",
-    ),
+    look_alikes=("slow-recovery", "solid-viscoelasticity", "strain-dependent-permeability"),
     act=Tissue(bind),
     parts=(("nu_c",), ("nu_s",)),
 )

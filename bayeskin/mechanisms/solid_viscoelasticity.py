@@ -33,8 +33,6 @@ from bayeskin.mechanisms.mechanism import Mechanism, Tissue
 from bayeskin.number_format import number
 from bayeskin.types import Parameter
 
-STEPS_A_PHASE = 100
-
 
 @compiled
 def _decay(elapsed_s, tau_s):
@@ -141,12 +139,7 @@ MECHANISM = Mechanism(
         f"long-run stress relaxes with a time constant of {number(v['tau_1'], 2)} s, and "
         f"{100 * v['g_2']:.0f} % with one of {number(v['tau_2'], 2)} s."
     ),
-    group=(
-        "solid-viscoelasticity",
-        "strain-dependent-permeability",
-        "friction-creep",
-        "skeleton-compressibility",
-    ),
+    look_alikes=("strain-dependent-permeability",),
     act=Tissue(bind),
     parts=(("g_1", "tau_1"), ("g_2", "tau_2")),
 )

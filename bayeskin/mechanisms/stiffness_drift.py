@@ -115,6 +115,5 @@ MECHANISM = Mechanism(
     ),
     neutral={"stiffness_rate": 0.0, "stiffness_time": 300.0},
     statement=_told,
-    group=("stiffness-drift",),
     act=Tissue(bind),
 )

@@ -75,11 +75,5 @@ MECHANISM = Mechanism(
     statement=lambda v: (
         f"The permeability changes by {100 * np.expm1(0.01 * v['M_k']):+.0f} % where the volume grows by 1 %."
     ),
-    group=(
-        "strain-dependent-permeability",
-        "solid-viscoelasticity",
-        "friction-creep",
-        "skeleton-compressibility",
-    ),
     act=Tissue(bind),
 )

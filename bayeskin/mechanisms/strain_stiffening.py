@@ -71,6 +71,5 @@ MECHANISM = Mechanism(
         f"k2 = {number(v['k2'], 2)}, so that their 2nd Piola-Kirchhoff stress is "
         f"{number(1e-3 * v['fibre_stress'], 3)} kPa at a stretch of 1.25."
     ),
-    group=("strain-stiffening", "pre-stretch"),
     act=Tissue(bind),
 )

@@ -28,6 +28,5 @@ MECHANISM = Mechanism(
     parameters=(Parameter("drag", "N s/m", 0.0, 40.0, "uniform", "drag of the drive per speed"),),
     neutral={"drag": 0.0},
     statement=lambda v: f"The drive has a viscous drag of {v['drag']:.0f} mN for each mm/s of its speed.",
-    group=("viscous-drag", "device-friction"),
     act=Instrument(Place.DRIVE, observe),
 )

@@ -62,7 +62,10 @@ def _outside_prior(space: ParameterSpace, theta: Mapping[str, float]) -> str:
         value = theta[parameter.name]
         slack = 1e-9 * (parameter.upper - parameter.lower)
         if not parameter.lower - slack <= value <= parameter.upper + slack:
-            return f"{parameter.name} is {value:g}, not within {parameter.lower:g} to {parameter.upper:g}"
+            return (
+                f"{parameter.name} is {value:g}, outside the trained range "
+                f"{parameter.lower:g} to {parameter.upper:g}"
+            )
     return ""
 
 
@@ -84,7 +87,7 @@ def other_geometry(trained: Geometry, geometry: Geometry) -> list[str]:
         if (ref_m is None) != (given_m is None):
             lines.append("the arm is flat" if given_m is None else "the arm is round")
         elif ref_m is not None and abs(given_m / ref_m - 1.0) > share * (1.0 + 1e-9):
-            lines.append(f"{name.removesuffix('_m')} is {1e3 * given_m:.3g} mm, not within "
+            lines.append(f"{name.removesuffix('_m')} is {1e3 * given_m:.3g} mm, outside the trained range "
                          f"{1e3 * ref_m:.3g} mm +- {100 * share:.0f} %")  # fmt: skip
     return lines
 
