@@ -151,6 +151,14 @@ class ParameterSpace:
             tuple(replace(p, prior=flat[p.in_log]) if p.peaked else p for p in self.parameters)
         )
 
+    @property
+    def without_texts(self) -> ParameterSpace:
+        """Returns the space without descriptions and sources, as hashes of stored results take it.
+
+        A better sentence then leaves the results valid.
+        """
+        return replace(self, parameters=tuple(replace(p, description="", source="") for p in self.parameters))
+
     def draw(self, rng: np.random.Generator, count: int) -> Array:
         """Returns draws of the prior, (count, d).
 

@@ -61,7 +61,7 @@ def test_the_page_of_the_recording_says_what_the_diagnosis_says(benchmark):
         "full_model": {"rmse": 0.011, "fit_off_by": 1e-3},
     }  # fmt: skip
     whole = page.fits(answer)
-    assert "| 70.0 mN | 9.5 mN | 12 mN |" in whole
+    assert "| 70.0 mN | 9.5 mN | 9 mN |" in whole
     assert "| 140.0 mN | 19.0 mN | 18 mN |" in whole
     assert "RMSE |  | 11.0 mN |" in whole
     assert "| 3 | 1 |" in whole

@@ -223,3 +223,20 @@ def test_a_prior_without_its_numbers_is_refused(tmp_path: Path, text: str, says:
     with pytest.raises(InputError) as caught:
         load_config(written(tmp_path, text))
     assert says in str(caught.value)
+
+
+def test_a_better_sentence_leaves_stored_posteriors_valid() -> None:
+    said = line_problem()
+    space = said.surrogate.space
+    worded = dataclasses.replace(
+        space,
+        parameters=tuple(dataclasses.replace(p, description="in other words") for p in space.parameters),
+    )
+    wider = dataclasses.replace(
+        space, parameters=tuple(dataclasses.replace(p, upper=2.0 * p.upper) for p in space.parameters)
+    )
+    assert worded.without_texts == space.without_texts != wider.without_texts
+    assert (
+        dataclasses.replace(said, material=worded).identity
+        == dataclasses.replace(said, material=space).identity
+    )

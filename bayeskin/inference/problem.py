@@ -223,7 +223,7 @@ class LogPosterior:
         b = self.binned
         arrays = (b.edges_s, b.force_n, b.variance_n2, b.correlation, b.phase)
         return {
-            "parameters": _sha256(repr(self.space), *self._restriction_texts()),
+            "parameters": _sha256(repr(self.space.without_texts), *self._restriction_texts()),
             "surrogate": _sha256(
                 json.dumps(dict(self.surrogate.provenance), sort_keys=True, default=str),
                 *self._probe_texts(),

@@ -158,7 +158,9 @@ def _run_fine(run: Run, design: Design, motion: PadMotion) -> Design:
 
 def runs_file(run: Run, model: ForceModel, motion: PadMotion, edges_s: Array, space: ParameterSpace) -> Path:
     """Returns the path of the file with all runs of one model on one protocol."""
-    identity = sha256_of([model.hash, vars(motion), edges_s, [vars(p) for p in space.parameters]])
+    identity = sha256_of(
+        [model.hash, vars(motion), edges_s, [vars(p) for p in space.without_texts.parameters]]
+    )
     return run.folder / "runs" / f"{identity[:16]}.h5"
 
 

@@ -108,8 +108,9 @@ def searches_file(run_folder: Path, context: DiagnosisContext) -> Path:
     Its name is a hash of everything on which the answers depend.
     """
     identity = [
-        bayeskin.__version__, context.seed, repr(context.base), sorted(context.stated_noise.items()),
+        bayeskin.__version__, context.seed, repr(context.base.without_texts),
+        sorted(context.stated_noise.items()),
         context.forward.hash, asdict(context.binned), asdict(context.motion),
-        [repr(m.parameters) for m in context.known.values()],
+        [repr(ParameterSpace(m.parameters).without_texts) for m in context.known.values()],
     ]  # fmt: skip
     return run_folder / "searches" / f"{sha256_of(identity)[:16]}.jsonl"
