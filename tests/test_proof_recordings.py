@@ -88,7 +88,7 @@ def test_a_set_is_the_same_when_it_is_made_again_and_what_is_there_is_not_made_a
 
     assert conceal(concealed_set, SEED, COUNT, make=never, run_all=one_by_one) == 0
     for seed, only in ((SEED + 1, ()), (SEED, ["nothing"])):
-        with pytest.raises(InputError, match="another making"):
+        with pytest.raises(InputError, match="a set with the settings"):
             conceal(concealed_set, seed, COUNT, only, make=never, run_all=one_by_one)
 
 

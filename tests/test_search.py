@@ -362,7 +362,7 @@ def test_what_has_no_name_is_not_imitated_by_ever_larger_sets(asked: Make) -> No
     assert found.family.smooth > 0.99
     tried = [task for task in one.tasks if isinstance(task, RunTask | ScoreTestTask)]
     assert max(len(names_of(task)) for task in tried) == 1
-    assert any("with an unnamed smooth discrepancy, is as likely" in line for line in one.told)
+    assert any("with an unnamed smooth discrepancy is as likely" in line for line in one.told)
 
 
 def test_the_sets_that_are_compared_are_weighed_at_their_last_fits(asked: Make) -> None:
