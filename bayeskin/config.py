@@ -225,7 +225,7 @@ class SampleConfig(Section):
 
 
 class CheckConfig(Section):
-    """How many posterior draws the full model runs as a check, and how often they may join the design."""
+    """The number of posterior draws that full runs check, and how often these may join the design."""
 
     draws: Annotated[int, Field(ge=0, le=100_000)] = 24
     rounds: Annotated[int, Field(ge=0, le=1000)] = 2
@@ -239,14 +239,14 @@ class CheckConfig(Section):
 
 
 class MapConfig(Section):
-    """How many starts the search for the most probable point has, and the evaluations of each start."""
+    """The number of starts of the search for the most probable point, and of evaluations of each start."""
 
     starts: Annotated[int, Field(gt=0, le=100_000)] = 8
     evaluations: Positive = 20000
 
 
 class SobolConfig(Section):
-    """How many samples each matrix of the pick-freeze estimate has, on the Gaussian process."""
+    """The number of samples in each matrix of the pick-freeze estimate, on the Gaussian process."""
 
     samples: Annotated[int, Field(gt=0, le=2**20)] = 2048
 

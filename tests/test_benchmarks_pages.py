@@ -21,7 +21,7 @@ def test_the_page_of_mechanisms_has_the_catalogue_as_it_is(benchmark):
 
 @pytest.mark.parametrize("data", ["surrogate", "full"])
 def test_stored_ranks_are_uniform_and_stand_in_the_documentation(benchmark, data):
-    """What `benchmarks/calibration.py` has found so far: no parameter's intervals are wrong for certain."""
+    """The rows of `benchmarks/calibration.py` show no parameter whose intervals are certainly wrong."""
     calibration = benchmark("calibration")
     stored = [row for row in calibration.ROWS.read() if (row["data"], row["seed"]) == (data, "1")]
     on_page = []
@@ -41,7 +41,7 @@ def test_stored_ranks_are_uniform_and_stand_in_the_documentation(benchmark, data
 
 
 def shown(table: str) -> bool:
-    """Whether a page of the documentation has the rows of a table."""
+    """Returns whether a page of the documentation has the rows of a table."""
     page = (Path(__file__).parents[1] / "docs" / "inference.md").read_text()
     return all(line in page for line in table.splitlines()[2:])
 

@@ -132,7 +132,7 @@ def test_force_fields_and_figure_come_of_one_run(
 
 
 def drawn_fields(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Where what the figure of fields is given will be found."""
+    """Returns a mapping that takes the arguments of the figure of fields by name."""
     given: dict[str, Any] = {}
     names = ("labels", "points_m", "faces", "part", "strong", "columns", "finding", "caption")
 

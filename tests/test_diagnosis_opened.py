@@ -1,4 +1,4 @@
-"""What a diagnosis of a recording by itself, or of a configuration, works on."""
+"""Tests of the inputs of a diagnosis, which starts from a recording alone or from a configuration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a diagnosis says and draws: parts of the force, what is left and when that is told, figures, words."""
+"""Tests of the outputs of a diagnosis: parts of the force, the remainder, figures and sentences."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def fitted(*names: str) -> Fit:
 
 
 def parts_of(*names: str) -> list[Contribution]:
-    """By the toy itself."""
+    """Returns the contributions of mechanisms to the force of the closed-form model."""
 
     def force(names: Sequence[str], theta: Mapping[str, float]) -> np.ndarray:
         log_posterior = build(names)
@@ -117,7 +117,7 @@ def test_friction_takes_its_creep_along() -> None:
 
 
 def drifting() -> Fit:
-    """What a sensor's drift leaves where no mechanism is known."""
+    """Returns the remainder that a drift of the load cell leaves if no mechanism is known."""
     plain_fit, drift = fitted(), 2e-4 * BINNED.time_s
     noisy = dataclasses.replace(BINNED, force_n=BINNED.force_n + drift)
     return dataclasses.replace(plain_fit, log_posterior=dataclasses.replace(ALONE, binned=noisy))
@@ -154,7 +154,7 @@ def test_words_say_what_was_found_and_how_far_the_models_are_off() -> None:
         "fit": {"before": fits, "after": fits}, "full_model": {"rmse": 2.5e-3, "fit_off_by": 4e-4},
     }  # fmt: skip
     words = in_words(answer)
-    assert "something smooth that is not in the catalogue: probability 0.97" in words
+    assert "an unnamed smooth discrepancy: probability 0.97" in words
     assert "before: RMSE 1.0 mN, 3.0 mN after the second hold, which was not fitted" in words
     assert "RMSE 2.5 mN. The model that was fitted is off by 0.40 mN there." in words
     assert "The intervals are" not in words

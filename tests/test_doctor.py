@@ -1,4 +1,4 @@
-"""What `bayeskin doctor` finds: a sound installation whole, and each broken part by its name."""
+"""Tests of `bayeskin doctor`: it passes a sound installation, and names each broken part."""
 
 from __future__ import annotations
 

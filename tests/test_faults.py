@@ -79,7 +79,7 @@ def refused(answer: tuple[int, str], says: str) -> None:
 
 
 def files_at_most(size: int) -> Callable[[], None]:
-    """What a full disk does to a write, without one."""
+    """Returns a function that limits the size of files, so that writes fail as on a full disk."""
     return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 

@@ -67,7 +67,7 @@ def test_regions_hold_their_share_of_a_correlated_normal() -> None:
 
 
 def test_mass_levels_of_a_known_density() -> None:
-    """Of exp(-r^2/2) the region that holds a share s of the mass is bounded at the height 1 - s."""
+    """The region of exp(-r^2/2) that holds a share s of the mass is bounded at the height 1 - s."""
     axis = np.linspace(-6, 6, 241)
     density = np.exp(-0.5 * (axis[:, None] ** 2 + axis**2))
     np.testing.assert_allclose(posterior.mass_levels(density, (0.5, 0.9)), [0.5, 0.1], atol=0.002)

@@ -1,4 +1,4 @@
-"""What lies in series with a spring in the skin's place: closed forms, and their derivatives."""
+"""Tests of elements in series with the skin, which a spring replaces: closed forms and derivatives."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_a_skin_that_cannot_be_solved_for_is_no_solution():
 
 
 def test_derivatives_are_those_of_two_springs_in_series():
-    """By the compliance, by the skin's stiffness, and by the drive's displacement; F = k u / (1 + c k)."""
+    """Derivatives of F = k u / (1 + c k) by the compliance c, the stiffness k and the displacement u."""
     u, k, c, step = 4e-3, STIFFNESS, COMPLIANCE, 1e-8
     drive = driven(Play(0.0, c))
     force_n = k * u / (1 + c * k)

@@ -26,7 +26,7 @@ CHANCES = st.floats(0.0) | st.floats(0.0, 1e-6)
 
 @st.composite
 def families(draw: st.DrawFn) -> Family:
-    """Of a few sets, that without mechanisms among them; evidences near each other as often as far apart."""
+    """Draws evidences, near each other or far apart, of a few sets and the set without mechanisms."""
     names = {tuple(sorted(one)) for one in draw(SETS)} | {()}
     near = st.floats(-4.0, 4.0)
     evidence = draw(st.sampled_from([EVIDENCES, near]))
@@ -125,7 +125,7 @@ def test_of_look_alikes_that_share_the_chances_the_likeliest_is_named() -> None:
 
 
 def test_a_mechanism_is_not_named_for_a_likelier_look_alike() -> None:
-    """Where the likelier of two is not said to look like the other."""
+    """Only one of the two states the other as its look-alike, and that one is the less likely."""
     pair = ("sensor-drift", "stiffness-drift")
     known = {**KNOWN, "sensor-drift": replace(KNOWN["sensor-drift"], look_alikes=pair[1:])}
     assert judge_family(of(sensor_drift=20.0, stiffness_drift=20.5), known, 1.0).named == ()

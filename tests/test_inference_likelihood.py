@@ -50,7 +50,7 @@ def noise_vectors(kinds: int, nu: float, rng: np.random.Generator, points: int =
 
 
 def covariance(chain: NoiseChain, noise: Array, diagonal: Array) -> Array:
-    """Of the noise at one point, entry by entry: a noise with a memory, a quicker one, and a white one."""
+    """Returns the covariance of noise with a memory, quicker noise and white noise, entry by entry."""
     k, sd = len(chain.bins), noise[chain.kind]
     time_s, out = np.cumsum(chain.gap_s), np.diag(diagonal[chain.bins])
     for a in range(k):

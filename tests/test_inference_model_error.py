@@ -1,4 +1,4 @@
-"""What is allowed for the full model itself: its shapes, where it stands in a posterior, and whose it is."""
+"""Tests of the error of the full model: its shapes, its place in the posterior, the models with it."""
 
 from __future__ import annotations
 

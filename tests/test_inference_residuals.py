@@ -1,4 +1,4 @@
-"""What a fit leaves: noise as assumed passes, noise of another law, correlation or size does not."""
+"""Tests of residuals: noise as assumed passes, noise of another law, correlation or size fails."""
 
 import dataclasses
 from collections.abc import Callable

@@ -49,7 +49,7 @@ def values_of(*names: str, **chosen: float) -> dict[str, np.ndarray]:
 
 
 def reported(*names: str, time_s: np.ndarray = TIMES_S, **chosen: float) -> np.ndarray:
-    """What the load cell reports beyond the skin's force, (t,)."""
+    """Returns the force (t,) that the load cell reports in excess of the skin's force."""
     force = observed([ALL[n] for n in names], values_of(*names, **chosen), MOTION, skin)
     return (force(time_s) - skin(time_s))[0]
 

@@ -1,4 +1,4 @@
-"""What changes the solid itself: its compressibility, moduli that drift, a set that stays."""
+"""Tests of mechanisms of the solid: its compressibility, drifting moduli and plastic set."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_moduli_that_would_vanish_are_refused_and_those_that_nearly_do_stay_abov
 
 
 def set_force(stretch, rest):
-    """Of the bar whose rest length has grown by a factor, free to contract: stress along it."""
+    """Returns the axial stress of a bar, free to contract, whose rest length has grown by a factor."""
     across = brentq(lambda a: MU * (a * rest - 1 / a) + LAM * np.log(stretch * a**2) / a, 0.3, 2.0)
     return MU * (stretch / rest**2 - 1 / stretch) + LAM * np.log(stretch * across**2) / stretch
 

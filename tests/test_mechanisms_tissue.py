@@ -205,7 +205,7 @@ def test_leakage_of_a_uniform_pressure_is_conductance_times_the_open_area(proble
 
 
 def test_pre_stretched_skin_pulls_as_skin_that_was_pulled_slowly_before():
-    """Of drained skin, whose force follows the displacement alone: F(u) = G(u + d) - G(d)."""
+    """The force of drained skin follows the displacement alone, so that F(u) = G(u + d) - G(d)."""
     theta = THETA | {"k_c": 1e-11, "k_s": 1e-11}
     opening_m = 2 * STRONG["opening"] * 18e-3
     motion = PadMotion(np.array([0.0, 10.0]), np.array([0.0, 4e-3]))

@@ -86,7 +86,7 @@ def test_what_the_model_is_wrong_by_is_no_mismatch(share: float, monkeypatch: py
 
 @pytest.mark.parametrize("scale", [1.0, 0.7])
 def test_the_chance_of_a_window_farther_than_all_draws_is_read_from_their_tail(scale: float) -> None:
-    """Of the largest of 200 Gaussians of one sd or another."""
+    """The largest of 200 Gaussians has a known exceedance probability, whatever their sd."""
     found = []
     for seed in range(20):
         tall = scale * np.abs(np.random.default_rng(seed).standard_normal((1000, 200))).max(axis=1)

@@ -91,7 +91,7 @@ def test_a_dozen_draws_give_too_little_rather_than_too_much(distance: float) -> 
 
 
 def test_draws_that_spread_in_as_many_directions_as_there_are_draws_do_not_hide_all() -> None:
-    """Of 0.63 nats; single densities, sure and wrong, once made it 0.05 and less."""
+    """The expected gain is 0.63 nats; with single densities, sure but wrong, it was 0.05 or less."""
     gains = []
     for seed in range(8):
         rng = np.random.default_rng(1)
@@ -289,7 +289,7 @@ def made(fits: Sequence[Fit]) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Asked:
-    """What `choose` sees of a run that has been diagnosed."""
+    """The parts of a diagnosed run that `choose` uses."""
 
     source: Path
     folder: Path

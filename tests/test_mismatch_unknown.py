@@ -1,4 +1,4 @@
-"""What is left unexplained is described without taking the parameters' part, and noise is called noise."""
+"""Tests of the discrepancy: it leaves out what the parameters could explain, and noise is called noise."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_a_discrepancy_is_found_in_noise_with_a_memory(extra: Extra, memory_s: f
 
 @pytest.mark.slow
 def test_noise_is_seldom_noticed_or_given_a_form() -> None:
-    """Of 200 recordings of noise, each is counted at its stated level: 1 % and 5 %."""
+    """Among 200 recordings of noise, alarms are as frequent as their stated levels of 1 % and 5 %."""
     fits = [known_fit(seed) for seed in range(200)]
     assert sum(discrepancy(one, closed_form_model.MOTION).noticeable for one in fits) <= 6
     assert sum(propose_form(one, closed_form_model.MOTION, seed).found for seed, one in enumerate(fits)) <= 20
@@ -166,7 +166,7 @@ def test_mean_and_sd_are_those_of_a_dense_gaussian_process_with_a_flat_prior_of_
 
 
 def test_the_evidence_without_a_discrepancy_is_the_integral_over_the_parameters() -> None:
-    """Of a force that is linear in them, normal about the fit and as dense there as their box."""
+    """The force is linear in the parameters; their normal prior is as dense at the fit as their box."""
     fit = known_fit(1, creeping)
     rest = unexplained(fit, closed_form_model.MOTION)
     d = fit.log_posterior.surrogate.space.dim

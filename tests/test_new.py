@@ -1,4 +1,4 @@
-"""What `bayeskin new` writes: a configuration that loads, for this recording, over nothing."""
+"""Tests of `bayeskin new`: its configuration loads, suits the recording, and overwrites no file."""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ def test_a_run_that_fails_is_drawn_anew() -> None:
 
 
 def test_the_screen_adds_what_mechanisms_change_and_marks_a_run_that_fails() -> None:
-    """By the shipped reduced model, beside the full one."""
+    """Compares the screen, which uses the shipped reduced model, with the full model."""
     screen = shipped_screen()
     theta = np.array([THETA[name] for name in screen.refit.surrogate.space.names])[None]
     alone_n = screen.refit.force(theta)

@@ -1,4 +1,4 @@
-"""What a dataclass made of a file may hold: what its annotations say, by whatever name they are called."""
+"""Tests of dataclasses read from a file: their fields hold the types that the annotations state."""
 
 import dataclasses
 from typing import Any, TypeVar

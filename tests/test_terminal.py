@@ -1,4 +1,4 @@
-"""What a person sees of a run that goes on: bars, the time that passed and the time that is left."""
+"""Tests of the progress of a run on the terminal: bars, elapsed time and remaining time."""
 
 from __future__ import annotations
 

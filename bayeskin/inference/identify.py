@@ -29,7 +29,7 @@ _CELLS = 200
 
 @dataclass(frozen=True)
 class Learned:
-    """What the posterior says about one parameter.
+    """The information about one parameter that the posterior has gained over the prior.
 
     contraction : 1 - posterior variance / prior variance, in the coordinate in which the prior is uniform
     gain_nats : Kullback-Leibler divergence of the posterior from the prior [nats]

@@ -46,16 +46,14 @@ def rmse_table(log_posterior: LogPosterior, force_n: Array) -> dict[str, Any]:
     usable = bins_in_windows(binned, None) >= 0
     fitted = np.isin(np.arange(len(usable)), log_posterior.chain.bins)
     covered = binned.edges_s[-1] >= ARTICLE_HOLDS_S[-1][1]
-    holds = (bins_in_windows(binned, ARTICLE_HOLDS_S) >= 0) & covered
+    holds = bins_in_windows(binned, ARTICLE_HOLDS_S) >= 0
     square = (binned.force_n - force_n) ** 2
     return {
         "whole_n": _root_of_mean(square[usable]),
         "by_kind_n": dict(inference.rmse(binned, force_n).by_kind_n),
         "fitted_n": _root_of_mean(square[fitted]),
         "not_fitted_n": _root_of_mean(square[usable & ~fitted]),
-        "article_holds_n": _root_of_mean(square[holds])
-        if binned.edges_s[-1] >= ARTICLE_HOLDS_S[-1][1]
-        else None,
+        "article_holds_n": _root_of_mean(square[holds]) if covered else None,
     }
 
 

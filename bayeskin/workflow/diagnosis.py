@@ -372,9 +372,7 @@ def in_words(answer: Mapping[str, Any]) -> str:
     lines += [f"  {mechanism['name']} (probability {mechanism['probability']:.2f}): {mechanism['statement']}"
               for mechanism in answer["mechanisms"]]  # fmt: skip
     lines.append(f"  nothing is missing: probability {answer['nothing_probability']:.2f}")
-    lines.append(
-        f"  something smooth that is not in the catalogue: probability {answer['smooth_probability']:.2f}"
-    )
+    lines.append(f"  an unnamed smooth discrepancy: probability {answer['smooth_probability']:.2f}")
     if faint := report.faint_in_words(answer):
         lines.append(f"  {faint}")
     lines.append(

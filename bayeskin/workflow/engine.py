@@ -87,7 +87,7 @@ class Stage:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a stage ended: its record, and whether it was skipped because it had been done before.
+    """The end of a stage: its record, and whether the stage was skipped because it had been done before.
 
     ``record.done`` is False where the computation failed; ``record.summary["message"]`` then says why.
     """

@@ -17,7 +17,7 @@ VARIANCE = np.array([1.0, 2.0 + THIN**2, 15.0 / 9.0 + THIN**2, 1.0, 1.0, 1.0])
 
 
 class Banana:
-    """What `sample` needs of a posterior: unit normal a, d, e and f, and the ridge."""
+    """A posterior with all that `sample` needs: unit normal a, d, e and f, and a ridge."""
 
     low = np.array([-5.0, -3.0, -40.0, -8.0, -8.0, -8.0])
     high = np.array([5.0, 26.0, 40.0, 8.0, 8.0, 8.0])

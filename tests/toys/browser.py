@@ -17,7 +17,7 @@ PATIENCE_S = 60.0
 
 
 def found() -> str | None:
-    """Where a browser is on the PATH."""
+    """Returns the path of a browser that the PATH has."""
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
@@ -83,7 +83,7 @@ class Browser:
         self.tell("Emulation.setEmulatedMedia", media=medium, features=features)
 
     def ask(self, expression: str) -> Any:
-        """What JavaScript in the page comes to, a promise's value included."""
+        """Returns the value of JavaScript in the page; of a promise, the value that it settles at."""
         said = self.tell(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True, userGesture=True
         )

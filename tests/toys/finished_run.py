@@ -1,4 +1,4 @@
-"""What the stages of a finished run say, in the form that they say it, and what they draw."""
+"""The summaries and figures of the stages of a finished run."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _parameter(prior: str, low: float, median: float, high: float, unit: str = "
 
 
 def summaries() -> dict[str, dict[str, Any]]:
-    """By stage; a trusted posterior, and a diagnosis that named something."""
+    """Returns the summaries by stage: a trusted posterior, and a diagnosis that has named a mechanism."""
     return {
         "recording": {
             "name": "forearm", "sha256": "a" * 64, "notes": ["column 'F' read as force in N"],

@@ -159,7 +159,7 @@ HERE = {"name": "toy", "contents": "1"}  # what a chain is of
 
 
 def refused(read: Callable[[Any], Any], given: Any) -> bool:
-    """Whether an input was refused; fails unless it was read, or refused in words that fit one line."""
+    """Returns whether an input was refused; fails unless it was read, or refused in one line."""
     said = "one line"
     try:
         read(given)

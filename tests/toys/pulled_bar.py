@@ -16,7 +16,7 @@ STRETCH_M = 0.3  # of the bar of unit length
 
 
 def elastic_force(stretch):
-    """Of the drained bar free to contract: first Piola-Kirchhoff stress and the stretch across."""
+    """Returns the first Piola-Kirchhoff stress and the transverse stretch of a drained, free bar."""
     across = brentq(lambda a: MU * (a - 1 / a) + LAM * np.log(stretch * a**2) / a, 0.3, 2.0)
     return MU * (stretch - 1 / stretch) + LAM * np.log(stretch * across**2) / stretch, across
 

@@ -43,7 +43,7 @@ class QuickSkin:
 
 
 class QuickScreen(Screen):
-    """What the instrument makes of `QuickSkin`; mechanisms of the tissue do nothing."""
+    """The force of `QuickSkin` as the instrument reports it; mechanisms of the tissue have no effect."""
 
     def force(self, names, theta, values):
         mean_n = self.refit.force(theta)

@@ -59,7 +59,7 @@ def simulate(
 
 @dataclass(frozen=True)
 class ToyModel:
-    """Stands in the place of `bayeskin.workflow.model.FullModel`."""
+    """Stands in the place of `bayeskin.forward.design_model.FullModel`."""
 
     spec: ModelSpec
 

@@ -1,4 +1,4 @@
-"""What worker processes do in tests: they say which one they are, wait for each other, or die."""
+"""Functions for worker processes in tests: they identify themselves, wait for each other, or end."""
 
 from __future__ import annotations
 
