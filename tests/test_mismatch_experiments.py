@@ -41,16 +41,16 @@ DRAG = 4e-3 / OWN_SPEED
 KNOWN = {
     "rub": Mechanism(
         "rub", (Parameter("rubbing", "N", 0.0, 0.1, "uniform"),), {"rubbing": 0.0}, lambda v: "",
-        ("rub", "drag"),
         Instrument(
             Place.DRIVE,
             lambda v, m, f: added(f, lambda t: v["rubbing"][:, None] * np.sign(speed_of(m, t))),
         ),
+        ("drag",),
     ),
     "drag": Mechanism(
         "drag", (Parameter("dragging", "N s/m", 0.0, 40.0, "uniform"),), {"dragging": 0.0}, lambda v: "",
-        ("rub", "drag"),
         Instrument(Place.DRIVE, lambda v, m, f: added(f, lambda t: v["dragging"][:, None] * speed_of(m, t))),
+        ("rub",),
     ),
 }  # fmt: skip
 
