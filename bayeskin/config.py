@@ -76,18 +76,14 @@ class ModelConfig(Section):
     def _observation_own_needs_a_forward_model(self) -> ModelConfig:
         """Refuses the observation "own" without a forward model, and another observation with it."""
         if (self.observation == "own") != (self.forward is not None):
-            raise ValueError(
-                f"observation: found {self.observation!r}; expected 'own' with model.forward, and only then"
-            )
+            raise InputError("observation", repr(self.observation), "'own' with model.forward, and only then")
         return self
 
     @model_validator(mode="after")
     def _article_needs_its_mesh(self) -> ModelConfig:
         """Refuses the article's observation on the generator's bricks."""
         if self.observation == "article" and self.mesh == "bricks":
-            raise ValueError(
-                "mesh: found 'bricks'; expected the article's gmsh file with observation 'article'"
-            )
+            raise InputError("mesh", "'bricks'", "the article's gmsh file with observation 'article'")
         return self
 
 
@@ -121,7 +117,7 @@ class PriorConfig(Section):
         if given != needed:
             found = ", ".join(sorted(given)) or "none of its numbers"
             expected = f"{' and '.join(sorted(needed))}" if needed else "them only with a normal prior"
-            raise ValueError(f"prior: found {found}; expected {expected}")
+            raise InputError("prior", found, expected)
         return self
 
     @property
@@ -191,10 +187,10 @@ class FitConfig(Section):
     def _windows_start_before_they_end(self) -> FitConfig:
         """Refuses an empty list of windows, and a window that does not start before it ends."""
         if self.windows_s is not None and not self.windows_s:
-            raise ValueError("windows_s: found an empty list; expected at least one [start, end]")
+            raise InputError("windows_s", "an empty list", "at least one [start, end]")
         for start, end in self.windows_s or ():
             if not start < end:
-                raise ValueError(f"windows_s: found [{start:g}, {end:g}]; expected start below end")
+                raise InputError("windows_s", f"[{start:g}, {end:g}]", "start below end")
         return self
 
 
@@ -211,7 +207,7 @@ class NoiseConfig(Section):
         for name, bounds in self:
             if bounds is not None and not 0 < bounds[0] < bounds[1]:
                 found = f"[{bounds[0]:g}, {bounds[1]:g}]"
-                raise ValueError(f"{name}: found {found}; expected lower below upper, both above zero")
+                raise InputError(name, found, "lower below upper, both above zero")
         return self
 
 
@@ -234,7 +230,7 @@ class CheckConfig(Section):
     def _very_few_draws_are_refused(self) -> CheckConfig:
         """Refuses numbers of draws whose importance weights carry almost no information."""
         if 0 < self.draws < FEWEST_CHECKED:
-            raise ValueError(f"draws: found {self.draws}; expected 0 for none, or at least {FEWEST_CHECKED}")
+            raise InputError("draws", self.draws, f"0 for none, or at least {FEWEST_CHECKED}")
         return self
 
 
@@ -283,12 +279,10 @@ class Config(Section):
                 f"model.refinement {model.refinement}"
             )
             expected = "refinement 1 or more" if coarse == "reduced" else "a higher refinement"
-            raise ValueError(f"design.coarse: found {found}; expected bricks with {expected}")
+            raise InputError("design.coarse", found, f"bricks with {expected}")
         if model.forward is not None and (coarse is not None or self.surrogate.file is not None):
             key = "design.coarse" if coarse is not None else "surrogate.file"
-            raise ValueError(
-                f"{key}: found a value with model.forward; expected none, because it concerns the full model"
-            )
+            raise InputError(key, "a value with model.forward", "none, because it concerns the full model")
         return self
 
     @property

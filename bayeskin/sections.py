@@ -51,9 +51,9 @@ def checked(kind: type[Checked], plain: Mapping[str, Any], where: Path | str, ex
         raise InputError(where, str(error), expected) from None
 
 
-def _input_error(path: Path | str, error: ValidationError, root: type[Section]) -> InputError:
+def _input_error(path: Path | str, complaint: ValidationError, root: type[Section]) -> InputError:
     """Returns pydantic's first complaint as an InputError, whose text is one line."""
-    first = error.errors()[0]
+    first = complaint.errors()[0]
     key = ".".join(str(part) for part in first["loc"] if not str(part).startswith("<"))  # no tags
     kind, given = first["type"], first["input"]
     if kind == "extra_forbidden":
@@ -62,11 +62,11 @@ def _input_error(path: Path | str, error: ValidationError, root: type[Section]) 
         return InputError(f"{path}: {key}", "nothing", "one more entry")
     if kind == "missing":
         return InputError(f"{path}: {key}", "nothing", "a value, because this key has no default")
-    if kind == "value_error":  # raised by this package: "key: found X; expected Y"
-        inner, _, rest = str(first["ctx"]["error"]).partition(": found ")
-        found, _, expected = rest.partition("; expected ")
-        where = f"{key}.{inner}" if key else inner
-        return InputError(f"{path}: {where}", found, expected)
+    if kind == "value_error":
+        error = first["ctx"]["error"]
+        assert isinstance(error, InputError)  # the checks of this package raise no other
+        where = f"{key}.{error.where}" if key else error.where
+        return InputError(f"{path}: {where}", error.found, error.expected)
     expected = first["msg"].removeprefix("Input should be ").removeprefix("Value should be ")
     if kind in ("model_type", "model_attributes_type", "dict_type"):
         expected = "a table"
