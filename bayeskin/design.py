@@ -59,8 +59,8 @@ def default_space() -> ParameterSpace:
     human skin during extension", and the literature cited there.
     """
     article = "Lavigne et al., initial material parameters"
-    stiffness = f"within the 5 kPa..196 MPa of Payan & Ohayon (2017) in {article}; narrowed to a skin test"
-    permeability = f"literature range 1e-16..1e-11 m^2 in {article}"
+    stiffness = f"within the 5 kPa to 196 MPa of Payan & Ohayon (2017) in {article}; narrowed to a skin test"
+    permeability = f"literature range 10⁻¹⁶ to 10⁻¹¹ m² in {article}"
     pressure = f"Wiig & Reed (1983), Hargens et al. (1981) in {article}"
     cutis, subcutis = "of the cutis", "of the subcutis"
     log: Literal["log-uniform"] = "log-uniform"

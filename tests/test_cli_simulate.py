@@ -156,7 +156,7 @@ def test_the_figure_of_fields_shows_four_moments_or_those_asked_for(
         ("end of unloading 1", "pads at 0.00 mm"), ("middle of rest 2", "pads at 0.00 mm"),
     ]  # fmt: skip
     assert given["columns"][1].values[:, 0] == pytest.approx([-0.9, -0.9, 0.0, 0.0])
-    assert given["finding"].startswith("Pressure from -0.9 kPa (15 s, end of loading 1) to ")
+    assert given["finding"].startswith("Pressure from −0.9 kPa (15 s, end of loading 1) to ")
     assert bayeskin(*common, "--at", 60, "--at", 10, "--at", 10, "--at", 0)[0] == 0
     assert [label.splitlines()[:2] for label in given["labels"]] == [
         ["0 s", "rest 0"], ["10 s", "loading 1"], ["60 s", "rest 1"],

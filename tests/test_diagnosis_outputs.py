@@ -156,7 +156,7 @@ def test_words_say_what_was_found_and_how_far_the_models_are_off() -> None:
     words = in_words(answer)
     assert "an unnamed smooth discrepancy: probability 0.97" in words
     assert "before: RMSE 1.0 mN, 3.0 mN after the second hold, which was not fitted" in words
-    assert "RMSE 2.5 mN. The model that was fitted is off by 0.40 mN there." in words
+    assert "an RMSE of 2.5 mN. The fitted model differs from it by 0.4 mN there." in words
     assert "The intervals are" not in words
     rough = {**answer, "fit": {"before": fits, "after": {**fits, "sampled": {"settled": False}}}}
     assert "The intervals are approximate" in in_words(rough)

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from bayeskin.inference import identifiability, noise_remarks
-from bayeskin.inference.identify import information_gain_nats, parts
+from bayeskin.inference.identify import Informed, information_gain_nats, parts
 from bayeskin.types import Array, Parameter, ParameterSpace
 
 SPACE = ParameterSpace(
@@ -29,6 +29,7 @@ def ridge_draws(n: int = 4000) -> Array:
 def test_a_parameter_with_its_prior_back_is_said_to_be_uninformed() -> None:
     found = identifiability(SPACE, ridge_draws())
     assert found.parameters[2].statement == "p_init: the data does not inform it (posterior = prior)"
+    assert [one.informed for one in found.parameters] == [Informed.WELL, Informed.WELL, Informed.NOT]
     assert found.parameters[2].contraction == pytest.approx(0.0, abs=0.05)
     e = found.parameters[0]
     assert e.contraction == pytest.approx(1 - 12 * 1.01 / 100, abs=0.02)
@@ -54,8 +55,10 @@ def test_two_separate_ranges_are_said_and_one_of_any_shape_is_not() -> None:
     few = np.concatenate([0.2 + 0.03 * rng.standard_normal(1970), 0.7 + 0.03 * rng.standard_normal(30)])
     assert len(parts(few)) == 1
     space = ParameterSpace((Parameter("E", "Pa", 1.0, np.exp(10.0), "log-uniform"),))
-    statement = identifiability(space, space.from_unit(two[:, None])).parameters[0].statement
-    assert "2 separate ranges fit: " in statement
+    (learned,) = identifiability(space, space.from_unit(two[:, None])).parameters
+    np.testing.assert_allclose(np.log(learned.ranges) / 10.0, found, atol=1e-6)
+    assert "2 separate ranges fit: " in learned.statement
+    assert identifiability(space, space.from_unit(one[1][:, None])).parameters[0].ranges == ()
 
 
 def test_noise_parameters_at_their_bounds_are_remarked_on() -> None:
@@ -94,7 +97,12 @@ def test_a_curved_ridge_is_named() -> None:
 def test_a_posterior_on_a_bound_is_said_to_lean_on_it() -> None:
     draws = ridge_draws()
     draws[:, 0] = np.exp(np.random.default_rng(1).exponential(0.3, len(draws)))
-    assert "leans on the prior's lower bound, 1 Pa" in identifiability(SPACE, draws).parameters[0].statement
+    first, second, _ = identifiability(SPACE, draws).parameters
+    assert (first.leans_on, second.leans_on) == (("lower",), ())
+    assert "leans on the prior's lower bound, 1 Pa" in first.statement
+    assert first.outcome == (
+        "the data informs it; leans on the prior's lower bound, 1 Pa, so that the prior shapes it"
+    )
 
 
 @pytest.mark.parametrize("sd", [0.1, 0.01, 0.001])

@@ -47,7 +47,7 @@ def test_noise_as_assumed_gives_uniform_p_values_and_passes() -> None:
         [kind.p_correlation for one in found for kind in one.kinds],
     ):
         assert stats.kstest(p, "uniform").pvalue > 1e-3
-    assert found[0].sentence.startswith("the residual looks like the assumed noise: in its distribution")
+    assert found[0].sentence.startswith("The residual looks like the assumed noise: in its distribution")
     assert [(kind.kind, kind.bins) for kind in found[0].kinds] == [
         ("rest", 30), ("load", 20), ("hold", 60), ("unload", 20)
     ]  # fmt: skip
@@ -76,7 +76,7 @@ def test_other_noise_fails_and_is_named(
     found = [at_truth(with_noise(draw, seed)) for seed in range(10)]
     assert sum(not one.passes for one in found) >= 8
     named = [one.sentence for one in found if not one.passes]
-    assert all(one.startswith("the residual is not the assumed noise: ") for one in named)
+    assert all(one.startswith("The residual is not the assumed noise: ") for one in named)
     assert sum(word in one for one in named) >= 6
 
 

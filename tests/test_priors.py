@@ -149,7 +149,7 @@ def test_a_joint_prior_pulls_the_posterior_of_a_line():
 
 
 def test_the_distribution_stands_in_words():
-    assert "E log-normal about 20000 (1.09861) 1000 to 1e+06 Pa" in describe(SPACE)
+    assert "E log-normal about 20 kPa (sd: factor 3), 1 kPa to 1 MPa" in describe(SPACE)
 
 
 def written(where: Path, text: str) -> Path:

@@ -7,8 +7,8 @@ import json
 import pytest
 from toys.finished_run import HISTORY, INDICES, summaries
 
+from bayeskin.number_format import interval, number, quantity
 from bayeskin.report.page.charts import history_chart, indices_chart, residual_chart
-from bayeskin.report.page.numbers import interval, number, quantity
 from bayeskin.report.page.prose import prose
 
 PHASES = summaries()["recording"]["phases"]
@@ -59,16 +59,14 @@ def test_sobol_indices_over_time_can_be_read() -> None:
 @pytest.mark.parametrize(
     ("said", "printed"),
     [
-        ("E_c is 5.11e+04 Pa", "<i>E</i><sub>c</sub> is 51.1 kPa"),
-        ("sd_hold (correlation -1.00)", "<i>σ</i><sub>hold</sub> (correlation −1.00)"),
-        ("is 1.33e-16 to 5.56e-12 m^2.", "is 1.33 × 10⁻¹⁶ to 5.56 × 10⁻¹² m²."),
-        ("-670 to 2.14e+03 Pa", "−0.67 to 2.14 kPa"),
-        ("1.3 mN in 60.25 s, 2026-11-23", "1.3 mN in 60.25 s, 2026-11-23"),
+        ("E_c is 51.1 kPa", "<i>E</i><sub>c</sub> is 51.1 kPa"),
+        ("sd_hold (correlation −1)", "<i>σ</i><sub>hold</sub> (correlation −1)"),
+        ("-5e+04 Pa in 60.25 s, 2026-11-23", "-5e+04 Pa in 60.25 s, 2026-11-23"),
         ("see runs/x_one.toml & <b>", "see runs/x_one.toml &amp; &lt;b&gt;"),
     ],
 )
-def test_sentences_are_printed_with_symbols_and_units_that_read_well(said: str, printed: str) -> None:
-    assert str(prose(said)).replace("\u00a0", " ") == printed
+def test_names_in_sentences_are_symbols_and_nothing_else_changes(said: str, printed: str) -> None:
+    assert str(prose(said)) == printed
 
 
 @pytest.mark.parametrize(
@@ -82,11 +80,11 @@ def test_sentences_are_printed_with_symbols_and_units_that_read_well(said: str, 
     ],
 )  # fmt: skip
 def test_numbers_read_well(value: float | None, unit: str, text: str) -> None:
-    assert quantity(value, unit).replace("\u00a0", " ") == text
+    assert quantity(value, unit) == text
 
 
 def test_an_interval_has_one_unit_unless_its_ends_are_far_apart() -> None:
-    assert interval(13.9e3, 87e3, "Pa") == "13.9 to 87\u00a0kPa"
-    assert interval(1e4, 2e6, "Pa") == "10\u00a0kPa to 2\u00a0MPa"
-    assert interval(-670.0, 2144.0, "Pa") == "−0.67 to 2.14\u00a0kPa"
+    assert interval(13.9e3, 87e3, "Pa") == "13.9 to 87 kPa"
+    assert interval(1e4, 2e6, "Pa") == "10 kPa to 2 MPa"
+    assert interval(-670.0, 2144.0, "Pa") == "−0.67 to 2.14 kPa"
     assert number(float("nan")) == "–"

@@ -84,18 +84,11 @@ def test_a_run_that_fails_leaves_a_page_that_says_where(tmp_path: Path) -> None:
     assert stages.report(tmp_path / "case.toml", Silent(), stubs(fails="train"))["ok"] is False
 
 
-def test_a_run_sampled_before_there_were_bands_has_a_page_without_the_chart(tmp_path: Path) -> None:
-    config = configured(tmp_path)
-    old = stubs()
-    write = old["sample"].work
-
-    def without_bands(run: Run) -> Any:
-        summary = write(run)
-        run.at("sample", "bands.json").unlink()
-        return summary
-
-    old["sample"] = dataclasses.replace(old["sample"], work=without_bands)
-    stages.run(config, None, Silent(), old)
-    shown = (tmp_path / "case" / page.FILE).read_text()
-    assert 'id="history"' not in shown
-    assert 'id="sample-fit"' in shown
+def test_a_summary_in_an_earlier_format_is_out_of_date_with_all_that_follows(tmp_path: Path) -> None:
+    config, now = configured(tmp_path), stubs()
+    stages.run(config, None, Silent(), now)
+    now["sample"] = dataclasses.replace(now["sample"], format=2)
+    assert stages.report(config, Silent(), now)["missing"] == ["sample", "sobol"]
+    assert 'id="sample-fit"' not in (tmp_path / "case" / page.FILE).read_text()
+    assert stages.run(config, None, Silent(), now)["skipped"] == ["recording", "design", "train", "map"]
+    assert stages.report(config, Silent(), now)["ok"] is True

@@ -99,7 +99,7 @@ def diagnosed_as(changed: dict[str, object]) -> str:
 def test_the_fit_and_its_check_by_the_full_model_are_said() -> None:
     text = diagnosed_as({})
     assert "The RMSE is 80 mN without and 24.7 mN with" in text
-    assert "has an RMSE of 21.3 mN; the fitted model differs from it by 0.4 mN there" in text
+    assert "has an RMSE of 21.3 mN. The fitted model differs from it by 0.4 mN there." in text
     failed = diagnosed_as({"full_model": {"message": "the skin folds"}})
     assert "The full model fails at the best values: the skin folds" in failed
 
@@ -138,7 +138,6 @@ def test_the_table_of_parameters_has_prior_interval_unit_and_sentence(whole: str
     compact = re.sub(r"\s", "", text)
     assert re.sub(r"\s", "", row) + "thedatadoesnotinformit(posterior=prior)" in compact
     assert "thedatainformsitweakly" in compact
-    assert "median 5.08e+04" not in text  # its numbers stand beside it, in a unit that reads well
 
 
 def test_what_is_left_and_which_test_would_tell_stand_in_the_mismatch(whole: str) -> None:

@@ -18,6 +18,7 @@ from toys.closed_form_model import MOTION, SPACE, toy_force
 
 from bayeskin import report, storage
 from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data
+from bayeskin.number_format import interval
 from bayeskin.report.page.prose import prose
 from bayeskin.runner import load_design
 from bayeskin.types import Design, PadMotion, Recording, Simulation
@@ -121,8 +122,8 @@ def test_priors_with_their_sources_and_what_the_data_says_are_printed(folder: Pa
         text = stages.run(folder / "case.toml", stage, Silent())["text"]
         for name, one in summary["posterior"].items():
             prior = one["prior"]
-            low, high = (f"{prior[end]:.4g}" for end in ("lower", "upper"))
-            assert f"  {name}: {prior['kind']}, {low} to {high} {one['unit']}; {prior['source']}" in text
+            bounds = interval(prior["lower"], prior["upper"], one["unit"])
+            assert f"  {name}: {prior['kind']}, {bounds}; {prior['source']}" in text
         assert [line for line in summary["identifiability"] if f"  {line}" not in text] == []
     assert set(summary["profiles"]) == set(SPACE.names)
 
@@ -133,7 +134,7 @@ def test_what_the_fit_leaves_is_tested_and_said(folder: Path) -> None:
     assert sum(one["bins"] for one in found["by_kind"].values()) == 75  # those fitted
     assert found["passes"] == (found["sentence"] not in said["remarks"])
     shown = (folder / "case" / "report.html").read_text()
-    assert str(prose(found["sentence"]))[1:] in shown  # there its first letter is a capital
+    assert str(prose(found["sentence"])) in shown
     assert len(found["autocorrelation"]) == 10
 
 

@@ -8,6 +8,7 @@ from toys.closed_form_model import SPACE
 from toys.ishigami import ONE_BIN, box, ishigami, ishigami_indices
 
 from bayeskin.errors import InputError
+from bayeskin.number_format import interval
 from bayeskin.sensitivity.sobol import error_draws, pick_freeze, projection, sentence, sobol, uninformed
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_surrogate
@@ -246,7 +247,7 @@ def test_the_input_distribution_is_stated_and_can_be_narrower():
     )  # fmt: skip
     surrogate = KnownSurrogate(0.0)
     result = sobol(surrogate, np.random.default_rng(0), 64, space=narrow)
-    assert f"E_c log-uniform {narrow.lower[0]:g} to {narrow.upper[0]:g} Pa" in result.distribution
+    assert f"E_c log-uniform, {interval(narrow.lower[0], narrow.upper[0], 'Pa')}" in result.distribution
     wide = ParameterSpace((replace(SPACE.parameters[0], upper=1e7), *SPACE.parameters[1:]))
     with pytest.raises(InputError, match="sobol: space"):
         sobol(surrogate, np.random.default_rng(0), 64, space=wide)

@@ -130,7 +130,7 @@ def test_lengths_are_shown_in_millimetres() -> None:
     np.testing.assert_allclose(axis_values(length, [48e-3]), [48.0])
     draws = np.random.default_rng(0).uniform(47e-3, 49e-3, (4000, 1))
     (said,) = identifiability(ParameterSpace((length,)), draws).parameters
-    assert "median 48, 90 % interval 47.1 to 48.9 mm" in said.statement
+    assert "median 48 mm, 90 % interval 47.1 to 48.9 mm" in said.statement
     assert "about 48 mm" in said.sentence
     assert said.quantiles[1] == pytest.approx(48e-3, rel=1e-2)
 

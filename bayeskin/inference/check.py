@@ -12,6 +12,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from bayeskin.inference.optimise import MapResult, find_map
 from bayeskin.inference.problem import LogPosterior
+from bayeskin.number_format import quantity
 from bayeskin.types import Array, Prediction, Simulation, Surrogate, _FreezesArrays
 
 FullRun = Callable[[Mapping[str, float]], Simulation]
@@ -88,16 +89,17 @@ def check_map(
     where_fitted_n = float(np.sqrt(np.mean(error[slice(None) if fitted is None else fitted] ** 2)))
     below_noise = noise_sd_n == 0.0 or where_fitted_n <= noise_sd_n
     text = (
-        f"surrogate off by {1e3 * rms:.3g} mN RMS ({1e3 * largest:.3g} at most), {rms_z:.2f} of its stated sd"
+        f"surrogate off by {quantity(rms, 'N')} RMS ({quantity(largest, 'N')} at most), "
+        f"{rms_z:.2f} of its stated sd"
     )
     if as_claimed and below_noise:
         text += f": below the limit of {Z_LIMIT:g}"
     elif negligible:
-        text += f", but less than {NOISE_SHARE:g} times the noise ({1e3 * noise_sd_n:.3g} mN)"
+        text += f", but less than {NOISE_SHARE:g} times the noise ({quantity(noise_sd_n, 'N')})"
     elif as_claimed:
         text += (
-            f", but {1e3 * where_fitted_n:.3g} mN RMS in the fitted bins, more than the noise "
-            f"({1e3 * noise_sd_n:.3g} mN); add the point to the design and train again"
+            f", but {quantity(where_fitted_n, 'N')} RMS in the fitted bins, more than the noise "
+            f"({quantity(noise_sd_n, 'N')}); add the point to the design and train again"
         )
     else:
         text += f": above the limit of {Z_LIMIT:g}; add the point to the design and train again"

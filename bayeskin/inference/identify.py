@@ -1,19 +1,18 @@
-"""Compares posterior with prior: what the data teach about each parameter, and which parameters form ridges.
-
-Each parameter gets a statement with numbers, and a sentence in plain words.
-"""
+"""Compares posterior with prior: what the data teach about each parameter, and which form ridges."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 from scipy.stats import rankdata
 
-from bayeskin.number_format import at_edge
+from bayeskin.number_format import interval, number, quantity
 from bayeskin.types import Array, Parameter, ParameterSpace
 
 _NOTHING_NATS, _NOTHING_CONTRACTION = 0.03, 0.1  # below both, the posterior counts as equal to the prior
@@ -26,6 +25,23 @@ _VALLEY = 0.4
 _SIDE = 0.05  # smallest share of the draws that counts as a part
 _CELLS = 200
 
+Side = Literal["lower", "upper"]
+
+
+class Informed(StrEnum):
+    """How well the data inform a parameter."""
+
+    NOT = "not informed"
+    WEAKLY = "weakly informed"
+    WELL = "informed"
+
+
+_OUTCOMES = {
+    Informed.NOT: "the data does not inform it (posterior = prior)",
+    Informed.WEAKLY: "the data informs it weakly",
+    Informed.WELL: "the data informs it",
+}
+
 
 @dataclass(frozen=True)
 class Learned:
@@ -34,15 +50,67 @@ class Learned:
     contraction : 1 - posterior variance / prior variance, in the coordinate in which the prior is uniform
     gain_nats : Kullback-Leibler divergence of the posterior from the prior [nats]
     quantiles : 5, 50 and 95 % quantiles in SI
-    statement, sentence : the result with these numbers, and in a sentence without statistics
+    leans_on : bounds of the prior near which the posterior has too much of its mass
+    ranges : 5 and 95 % quantiles in SI of each separate range of the draws; empty if there is only one range
     """
 
-    name: str
+    parameter: Parameter
     contraction: float
     gain_nats: float
+    informed: Informed
     quantiles: tuple[float, float, float]
-    statement: str
-    sentence: str
+    leans_on: tuple[Side, ...]
+    ranges: tuple[tuple[float, float], ...]
+
+    @property
+    def name(self) -> str:
+        return self.parameter.name
+
+    @property
+    def outcome(self) -> str:
+        """Returns what the data say about the parameter, without its name, median and interval."""
+        return "; ".join([_OUTCOMES[self.informed], *self._remarks])
+
+    @property
+    def statement(self) -> str:
+        """Returns the outcome with the name, the median and the 90 % interval."""
+        if self.informed is Informed.NOT:
+            return f"{self.name}: {self.outcome}"
+        (low, middle, high), unit = self.quantiles, self.parameter.unit
+        numbers = f"median {quantity(middle, unit)}, 90 % interval {interval(low, high, unit)}"
+        return "; ".join([f"{self.name}: {_OUTCOMES[self.informed]}: {numbers}", *self._remarks])
+
+    @property
+    def sentence(self) -> str:
+        """Returns a sentence without statistics on what the test taught about the parameter."""
+        p, (low, middle, high) = self.parameter, self.quantiles
+        text, between = f"{p.description or 'parameter'} ({p.name})", interval(low, high, p.unit)
+        if self.informed is Informed.NOT:
+            return (
+                f"This test says nothing about the {text}, which is only known to lie in the assumed range, "
+                f"{interval(p.lower, p.upper, p.unit)}."
+            )
+        if self.informed is Informed.WEAKLY:
+            return f"This test narrows the {text} only a little: with 90 % probability it is {between}."
+        times = 1.0 / np.sqrt(max(1.0 - self.contraction, 1e-12))
+        return (
+            f"The {text} is about {quantity(middle, p.unit)}, with 90 % probability {between}; this range is "
+            f"{number(times, 2)} times narrower than assumed before the test."
+        )
+
+    @property
+    def _remarks(self) -> list[str]:
+        """Returns remarks on bounds and separate ranges."""
+        p = self.parameter
+        remarks = [
+            f"leans on the prior's {side} bound, {quantity(bound, p.unit)}, so that the prior shapes it"
+            for side, bound in (("lower", p.lower), ("upper", p.upper))
+            if side in self.leans_on
+        ]
+        if self.ranges:
+            listed = " and ".join(interval(low, high, p.unit) for low, high in self.ranges)
+            remarks.append(f"{len(self.ranges)} separate ranges fit: {listed}")
+        return remarks
 
 
 @dataclass(frozen=True)
@@ -55,7 +123,13 @@ class Ridge:
     first: str
     second: str
     correlation: float
-    statement: str
+
+    @property
+    def statement(self) -> str:
+        """Returns the names, the correlation and what it means."""
+        how = "they rise and fall together" if self.correlation > 0 else "one compensates for the other"
+        correlation = number(self.correlation, 2, sign=True)
+        return f"{self.first} and {self.second} form a ridge (rank correlation {correlation}): {how}"
 
 
 @dataclass(frozen=True)
@@ -69,12 +143,13 @@ class Identifiability:
 def identifiability(space: ParameterSpace, draws: ArrayLike) -> Identifiability:
     """Returns what posterior draws (s, D) in SI say beyond the prior of `space`."""
     unit = space.to_unit(np.asarray(draws, dtype=float))
-    learned = tuple(_learn(p, unit[:, j], space, j) for j, p in enumerate(space.parameters))
+    learned = tuple(map(_learn, space.parameters, unit.T))
     with np.errstate(invalid="ignore"):
         correlation: Array = np.nan_to_num(np.atleast_2d(np.corrcoef(rankdata(unit, axis=0), rowvar=False)))
     pairs = [(i, j) for j in range(space.dim) for i in range(j) if abs(correlation[i, j]) > _RIDGE]
     pairs.sort(key=lambda pair: -abs(correlation[pair]))
-    return Identifiability(learned, tuple(_ridge(space, i, j, float(correlation[i, j])) for i, j in pairs))
+    ridges = [Ridge(space.names[i], space.names[j], float(correlation[i, j])) for i, j in pairs]
+    return Identifiability(learned, tuple(ridges))
 
 
 def parts(unit: ArrayLike) -> list[tuple[float, float]]:
@@ -114,13 +189,13 @@ def noise_remarks(found: Identifiability) -> tuple[str, ...]:
             ("nu_noise", "lower", "with the heaviest tails that its prior allows"),
         )
         for parameter in found.parameters
-        if parameter.name == name and f"leans on the prior's {side} bound" in parameter.statement
+        if parameter.name == name and side in parameter.leans_on
     ]
     if not leaning:
         return ()
     return (
-        f"the residual is {' and '.join(leaning)}: this is hardly noise but rather something that the model "
-        "leaves out, and it biases the parameters; `bayeskin diagnose` looks for it",
+        f"The residual is {' and '.join(leaning)}: this is hardly noise but rather something that the model "
+        "leaves out, and it biases the parameters; `bayeskin diagnose` looks for it.",
     )
 
 
@@ -145,66 +220,25 @@ def _spacing_entropy(ordered: Array) -> float:
     return float(np.mean(np.log(spacing * n / (high - low))))
 
 
-def _learn(parameter: Parameter, unit: Array, space: ParameterSpace, column: int) -> Learned:
+def _learn(parameter: Parameter, unit: Array) -> Learned:
+    box = ParameterSpace((parameter,))
+
+    def in_si(places: ArrayLike) -> list[float]:
+        return [float(value) for value in box.from_unit(np.asarray(places)[:, None])[:, 0]]
+
     contraction = float(1.0 - 12.0 * unit.var())  # a uniform coordinate has variance 1/12
-    gain = information_gain_nats(unit)
-    corners = np.full((3, space.dim), 0.5)
-    corners[:, column] = np.quantile(unit, [0.05, 0.5, 0.95])
-    low, middle, high = (float(v) for v in space.from_unit(corners)[:, column])
-    quantiles = (low, middle, high)
-    statement = _statement(parameter, unit, contraction, gain, quantiles)
-    sentence = _sentence(parameter, contraction, gain, quantiles)
-    return Learned(parameter.name, contraction, gain, quantiles, statement, sentence)
-
-
-def _statement(
-    p: Parameter, unit: Array, contraction: float, gain: float, quantiles: tuple[float, float, float]
-) -> str:
-    if gain < _NOTHING_NATS and abs(contraction) < _NOTHING_CONTRACTION:
-        return f"{p.name}: the data does not inform it (posterior = prior)"
-    factor, unit_name = at_edge(p.unit)
-    low, middle, high = (factor * value for value in quantiles)
-    of_unit = "" if unit_name == "1" else f" {unit_name}"
-    numbers = f"median {middle:.3g}, 90 % interval {low:.3g} to {high:.3g}{of_unit}"
-    leans = [
-        f"leans on the prior's {side} bound, {factor * bound:.3g}{of_unit}, so that the prior shapes it"
-        for side, bound, mass in (
-            ("lower", p.lower, np.mean(unit < _EDGE)), ("upper", p.upper, np.mean(unit > 1 - _EDGE)),
-        )
-        if mass > _LEANS and not p.peaked
-    ]  # fmt: skip
-    ranges = parts(unit)
-    if len(ranges) > 1 and not p.peaked:
-        box = ParameterSpace((p,))
-        ends = [factor * box.from_unit(np.array(limits)[:, None])[:, 0] for limits in ranges]
-        listed = " and ".join(f"{a:.3g} to {b:.3g}{of_unit}" for a, b in ends)
-        leans.append(f"{len(ranges)} separate ranges fit: {listed}")
-    strength = "the data informs it" if contraction >= _WEAK else "the data informs it weakly"
-    return "; ".join([f"{p.name}: {strength}: {numbers}", *leans])
-
-
-def _sentence(p: Parameter, contraction: float, gain: float, quantiles: tuple[float, float, float]) -> str:
-    factor, name = at_edge(p.unit)
-    unit = "" if name == "1" else f" {name}"
-    text = f"{p.description or 'parameter'} ({p.name})"
-    if gain < _NOTHING_NATS and abs(contraction) < _NOTHING_CONTRACTION:
-        return (
-            f"This test says nothing about the {text}, which is only known to lie in the assumed range, "
-            f"{factor * p.lower:.3g} to {factor * p.upper:.3g}{unit}."
-        )
-    low, middle, high = (factor * value for value in quantiles)
-    range_ = f"{low:.3g} to {high:.3g}{unit}"
-    if contraction < _WEAK:
-        return f"This test narrows the {text} only a little: with 90 % probability it is {range_}."
-    times = 1.0 / np.sqrt(max(1.0 - contraction, 1e-12))
-    return (
-        f"The {text} is about {middle:.3g}{unit}, with 90 % probability {range_}; this range is {times:.2g} "
-        f"times narrower than assumed before the test."
+    gain_nats = information_gain_nats(unit)
+    informed = Informed.WELL if contraction >= _WEAK else Informed.WEAKLY
+    if gain_nats < _NOTHING_NATS and abs(contraction) < _NOTHING_CONTRACTION:
+        informed = Informed.NOT
+    low, middle, high = in_si(np.quantile(unit, [0.05, 0.5, 0.95]))
+    leans_on: list[Side] = []
+    ranges: list[list[float]] = []
+    if informed is not Informed.NOT and not parameter.peaked:
+        leans_on += ["lower"] if np.mean(unit < _EDGE) > _LEANS else []
+        leans_on += ["upper"] if np.mean(unit > 1.0 - _EDGE) > _LEANS else []
+        ranges = [in_si(ends) for ends in parts(unit)]
+    separate = tuple((first, last) for first, last in ranges) if len(ranges) > 1 else ()
+    return Learned(
+        parameter, contraction, gain_nats, informed, (low, middle, high), tuple(leans_on), separate
     )
-
-
-def _ridge(space: ParameterSpace, i: int, j: int, correlation: float) -> Ridge:
-    first, second = space.names[i], space.names[j]
-    how = "they rise and fall together" if correlation > 0 else "one compensates for the other"
-    statement = f"{first} and {second} form a ridge (rank correlation {correlation:+.2f}): {how}"
-    return Ridge(first, second, correlation, statement)

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from bayeskin.inference.convergence import Verdict
 from bayeskin.inference.likelihood import log_likelihood
 from bayeskin.inference.problem import LogPosterior
+from bayeskin.number_format import number
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
 SMOOTHED_FROM = 200  # number of draws from which on the weights are smoothed
@@ -119,7 +120,7 @@ def _verdict(weights: Array, effective: float, khat: float, failed: int) -> Verd
     count = len(weights)
     text = (
         f"full model at {count} posterior draws: {effective:.1f} effective draws, at least "
-        f"{EFFECTIVE_SHARE * count:g} are needed; the largest weight is {weights.max():.2g}"
+        f"{EFFECTIVE_SHARE * count:g} are needed; the largest weight is {number(weights.max(), 2)}"
     )
     good = effective >= EFFECTIVE_SHARE * count
     if np.isfinite(khat):

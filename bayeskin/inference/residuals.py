@@ -21,6 +21,7 @@ from scipy import stats
 from bayeskin.inference.gauss_newton import surrogate_error
 from bayeskin.inference.noise_model import innovations
 from bayeskin.inference.problem import LogPosterior
+from bayeskin.number_format import number
 from bayeskin.types import Array, _FreezesArrays
 
 LAGS = 10
@@ -65,34 +66,43 @@ class ResidualCheck(_FreezesArrays):
 
     @property
     def passes(self) -> bool:
-        return not self._failures()
+        return not self.failures
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """Returns how the residual differs from the assumed noise, one entry for each test that fails."""
+        out = []
+        lags, limit = len(self.autocorrelation), self.limit
+        if self.p_law < limit:
+            out.append(f"it has a different distribution (Kolmogorov-Smirnov p = {number(self.p_law, 2)})")
+        if self.p_correlation < limit:
+            p = number(self.p_correlation, 2)
+            out.append(f"it has a different correlation (Ljung-Box over {lags} lags p = {p})")
+        for check in self.kinds:
+            when = f"while pads {check.kind}"
+            if check.p_sd < limit:
+                times, p = number(check.sd, 2), number(check.p_sd, 2)
+                out.append(f"{when} its sd is {times} times the assumed sd (p = {p})")
+            if check.p_correlation < limit:
+                r, p = number(check.correlation, 2, sign=True), number(check.p_correlation, 2)
+                out.append(f"{when} the correlation of neighbours differs by {r} (p = {p})")
+        return tuple(out)
+
+    @property
+    def outcome(self) -> str:
+        """Returns whether the residual passes, in words without a full stop."""
+        return f"The residual {'looks like' if self.passes else 'is not'} the assumed noise"
 
     @property
     def sentence(self) -> str:
-        """Returns the outcome in plain words."""
+        """Returns the outcome with its reasons, as one sentence."""
         if not self.passes:
-            return f"the residual is not the assumed noise: {'; '.join(self._failures())}"
+            return f"{self.outcome}: {'; '.join(self.failures)}."
         return (
-            "the residual looks like the assumed noise: in its distribution (Kolmogorov-Smirnov "
-            f"p = {self.p_law:.2g}), in its correlation (Ljung-Box over {len(self.autocorrelation)} lags "
-            f"p = {self.p_correlation:.2g}) and in each kind of phase"
+            f"{self.outcome}: in its distribution (Kolmogorov-Smirnov p = {number(self.p_law, 2)}), in its "
+            f"correlation (Ljung-Box over {len(self.autocorrelation)} lags "
+            f"p = {number(self.p_correlation, 2)}) and in each kind of phase."
         )
-
-    def _failures(self) -> list[str]:
-        out = []
-        if self.p_law < self.limit:
-            out.append(f"it has a different distribution (Kolmogorov-Smirnov p = {self.p_law:.2g})")
-        if self.p_correlation < self.limit:
-            lags, p = len(self.autocorrelation), self.p_correlation
-            out.append(f"it has a different correlation (Ljung-Box over {lags} lags p = {p:.2g})")
-        for check in self.kinds:
-            when = f"while pads {check.kind}"
-            if check.p_sd < self.limit:
-                out.append(f"{when} its sd is {check.sd:.2g} times the assumed sd (p = {check.p_sd:.2g})")
-            if check.p_correlation < self.limit:
-                r, p = check.correlation, check.p_correlation
-                out.append(f"{when} the correlation of neighbours differs by {r:+.2f} (p = {p:.2g})")
-        return out
 
 
 def check_residuals(log_posterior: LogPosterior, vector: Array) -> ResidualCheck:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayeskin.mechanisms.mechanism import ForceOfTime, Instrument, Mechanism, Place, Values, added
+from bayeskin.number_format import number
 from bayeskin.types import PadMotion, Parameter
 
 
@@ -17,7 +18,9 @@ MECHANISM = Mechanism(
     name="force-offset",
     parameters=(Parameter("F0", "N", -0.15, 0.05, "uniform", "force reported at zero force"),),
     neutral={"F0": 0.0},
-    statement=lambda v: f"The load cell reads {1e3 * v['F0']:+.0f} mN when the skin exerts no force.",
+    statement=lambda v: (
+        f"The load cell reads {number(1e3 * v['F0'], sign=True)} mN when the skin exerts no force."
+    ),
     look_alikes=("pre-stretch",),
     act=Instrument(Place.CELL, observe),
 )

@@ -15,6 +15,7 @@ from bayeskin.finite_element.kernels import linearise_kernel, respond_kernel
 from bayeskin.finite_element.problem import Sites
 from bayeskin.finite_element.tissue import TissueLaw
 from bayeskin.mechanisms.mechanism import Mechanism, Tissue
+from bayeskin.number_format import number
 from bayeskin.types import Parameter
 
 
@@ -73,7 +74,8 @@ MECHANISM = Mechanism(
     ),
     neutral={"M_k": 0.0},
     statement=lambda v: (
-        f"The permeability changes by {100 * np.expm1(0.01 * v['M_k']):+.0f} % where the volume grows by 1 %."
+        f"The permeability changes by {number(100 * np.expm1(0.01 * v['M_k']), 2, sign=True)} % where the "
+        "volume grows by 1 %."
     ),
     act=Tissue(bind),
 )

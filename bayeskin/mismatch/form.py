@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.terms import Term, library
 from bayeskin.mismatch.unexplained import Unexplained, unexplained
+from bayeskin.number_format import number, unit_text
 from bayeskin.types import Array, PadMotion
 
 MOST = 4  # largest number of terms
@@ -226,7 +227,7 @@ def _in_words(picked: tuple[FormTerm, ...], terms: list[Term], r2: float) -> str
     def text(fitted: FormTerm, term: Term) -> str:
         value, error = term.shown * fitted.coefficient, term.shown * fitted.standard_error
         also = f" (or {fitted.alike[0]})" if fitted.alike else ""
-        return f"{value:.3g} ± {error:.2g} {term.shown_unit} × {fitted.name}{also}"
+        return f"{number(value)} ± {number(error, 2)} {unit_text(term.shown_unit)} × {fitted.name}{also}"
 
     parts = " plus ".join(text(fitted, term) for fitted, term in zip(picked, terms, strict=True))
     share = f"{100 * r2:.0f} % of its square in held-out phases"

@@ -10,6 +10,7 @@ import numpy as np
 
 from bayeskin import storage
 from bayeskin.errors import InputError
+from bayeskin.number_format import number
 from bayeskin.probe import bytes_of, refuse_damaged, refuse_endless
 from bayeskin.recordings.headers import UNITS, Column
 from bayeskin.recordings.tables import Table, read_text, read_workbook
@@ -107,12 +108,13 @@ def _remarks_on_sign(displacement_m: Array, force_n: Array) -> list[str]:
 def _remarks_on_clock(time_s: Array) -> list[str]:
     remarks = []
     if time_s[0] != 0.0:
-        remarks.append(f"time starts at {time_s[0]:g} s in the file; shifted to 0")
+        remarks.append(f"time starts at {number(time_s[0], 6)} s in the file; shifted to 0")
     intervals = np.diff(time_s)
     gap, usual = int(np.argmax(intervals)), float(np.median(intervals))
     if intervals[gap] > 5 * usual:
         remarks.append(
-            f"a gap of {intervals[gap]:.3g} s after {time_s[gap]:.3f} s (samples are {usual:.3g} s apart)"
+            f"a gap of {number(intervals[gap])} s after {time_s[gap]:.3f} s "
+            f"(samples are {number(usual)} s apart)"
         )
     return remarks
 

@@ -3,19 +3,16 @@
 Each `figure_...` function returns a matplotlib figure, and `save_figure` writes it as PNG and SVG.
 """
 
+from bayeskin.report.before_after import (
+    figure_base_parameters,
+    figure_before_after,
+    figure_residual_by_phase,
+)
 from bayeskin.report.check import figure_model_check
 from bayeskin.report.discrepancy import figure_discrepancy, figure_experiments
 from bayeskin.report.fields import SurfaceField, figure_fields
 from bayeskin.report.fit import figure_fit
-from bayeskin.report.mismatch import (
-    faint_in_words,
-    figure_base_parameters,
-    figure_before_after,
-    figure_candidates,
-    figure_contributions,
-    figure_located,
-    figure_residual_by_phase,
-)
+from bayeskin.report.mismatch import figure_candidates, figure_contributions, figure_located
 from bayeskin.report.posterior import figure_posterior
 from bayeskin.report.prior import figure_prior_predictive
 from bayeskin.report.profiles import figure_profiles
@@ -30,7 +27,6 @@ from bayeskin.report.waves import figure_waves
 
 __all__ = [
     "SurfaceField",
-    "faint_in_words",
     "figure_base_parameters",
     "figure_before_after",
     "figure_candidates",

@@ -202,7 +202,7 @@ def _frame(ax: Axes, low: Array, high: Array, values: Array, unit: str) -> None:
     ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
     ax.set(xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
-    value_range = f"{number(values.min(), 3)} to {number(values.max(), 3)} {unit}".replace("-", "−")
+    value_range = f"{number(values.min(), 3)} to {number(values.max(), 3)} {unit}"
     ax.text(1.0, 0.0, value_range, transform=ax.transAxes, ha="right", va="bottom", fontsize=6.5, color=GREY)
 
 

@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
 from bayeskin.errors import InputError
-from bayeskin.inference.identify import identifiability
+from bayeskin.inference.identify import Informed, identifiability
 from bayeskin.report.style import (
     ACCENT,
     GREY,
@@ -176,13 +176,12 @@ def _draw_key(axes: list[list[Axes]], has_map: bool) -> None:
 
 def _finding(parameters: Sequence[Parameter], draws: Array) -> str:
     """Returns which parameters the recording informs, as a sentence, from draws (s, d) in their order."""
-    results = identifiability(ParameterSpace(tuple(parameters)), draws).parameters
-    kinds: dict[str, list[str]] = {"does not inform it": [], "informs it weakly": [], "informs it": []}
-    for result in results:
-        kinds[next(kind for kind in kinds if kind in result.statement)].append(result.name)
-    uninformed, weakly_informed, informed = kinds.values()
-    parts = [f"informs {list_symbols(informed)}"] if informed else []
-    parts += [f"informs {list_symbols(weakly_informed)} weakly"] if weakly_informed else []
+    kinds: dict[Informed, list[str]] = {kind: [] for kind in Informed}
+    for result in identifiability(ParameterSpace(tuple(parameters)), draws).parameters:
+        kinds[result.informed].append(result.name)
+    well, weakly, uninformed = (kinds[kind] for kind in (Informed.WELL, Informed.WEAKLY, Informed.NOT))
+    parts = [f"informs {list_symbols(well)}"] if well else []
+    parts += [f"informs {list_symbols(weakly)} weakly"] if weakly else []
     pronoun = "it" if len(uninformed) == 1 else "them"
     parts += [f"leaves {list_symbols(uninformed)} as the prior states {pronoun}"] if uninformed else []
     return f"The recording {'; it '.join(parts)}"

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from scipy.stats import beta, norm
 
 from bayeskin.inference import ResidualCheck
+from bayeskin.number_format import number
 from bayeskin.report.style import (
     ACCENT,
     FAINT,
@@ -32,17 +33,16 @@ def figure_residuals(found: ResidualCheck) -> Figure:
     figure = new_figure(PAGE_IN, 2.9)
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.4))
     _quantiles(left, found)
-    panel_title(left, "a", f"distribution: Kolmogorov-Smirnov p = {found.p_law:.2g}")
+    panel_title(left, "a", f"distribution: Kolmogorov-Smirnov p = {number(found.p_law, 2)}")
     _correlation(right, found)
-    panel_title(right, "b", f"correlation: Ljung-Box p = {found.p_correlation:.2g}")
-    summary, _, reason = found.sentence.partition(": ")
-    finding = f"{summary[0].upper()}{summary[1:]}"
+    panel_title(right, "b", f"correlation: Ljung-Box p = {number(found.p_correlation, 2)}")
+    reasons = f" The residual differs from this noise: {'; '.join(found.failures)}." if found.failures else ""
     caption = (
         "Residuals of the fitted bins, without the assumed correlation and transformed from the assumed "
-        "distribution to a standard normal one. Grey: 95 % of points lie here if the noise is as assumed. "
-        f"{'' if found.passes else reason[0].upper() + reason[1:] + '.'}"
+        "distribution to a standard normal one. Grey: 95 % of points lie here if the noise is as assumed."
+        + reasons
     )
-    state_finding(figure, finding, caption)
+    state_finding(figure, found.outcome, caption)
     return figure
 
 

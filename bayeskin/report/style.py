@@ -21,7 +21,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import ArrayLike
 
 from bayeskin.geometry import LENGTHS
-from bayeskin.number_format import at_edge
+from bayeskin.number_format import at_edge, unit_text
 from bayeskin.types import Array, Parameter
 
 P = ParamSpec("P")
@@ -92,7 +92,6 @@ def state_finding(figure: Figure, finding: str, caption: str = "") -> tuple[Text
     """
     width = figure.get_figwidth()
     bold = re.sub(r"(?<!\\)\$(.+?)(?<!\\)\$", r"$\\boldsymbol{\1}$", finding)
-    bold = re.sub(r"(?<![\w{])-(?=\d)", "−", bold)
     head = figure.suptitle("\n".join(_wrap(bold, int(13 * width))), x=0.01, ha="left", linespacing=1.25)
     foot = figure.supxlabel(
         "\n".join(_wrap(caption, int(19.5 * width))),
@@ -129,6 +128,11 @@ def panel_title(ax: Axes, letter: str, text: str = "") -> Text:
     return ax.set_title(rf"$\mathbf{{{letter}}}$  {text}".rstrip())
 
 
+def legend_above(ax: Axes) -> None:
+    """Puts the legend above the axes at the right, where it hides nothing."""
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.2)
+
+
 def plain_log(axis: Axis) -> None:
     """Labels a logarithmic axis with plain numbers: powers of ten, and on short axes 2 and 5 times these."""
     low, high = axis.get_view_interval()
@@ -151,13 +155,6 @@ def symbol(name: str) -> str:
         sub = tail.replace("_", ",") if len(tail) <= 1 else rf"\mathrm{{{tail.replace('_', ',')}}}"
         return rf"${base}_{{{sub}}}$" if tail else rf"${base}$"
     return name.replace("_", " ")
-
-
-def unit_text(unit: str) -> str:
-    """Returns the printed form of a unit: ``m^2`` becomes m², and a pure number has no unit."""
-    raised = {"-": "⁻", **dict(zip("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹", strict=True))}
-    text = re.sub(r"\^(-?\d+)", lambda match: "".join(raised[c] for c in match.group(1)), unit)
-    return "" if text in ("-", "1") else text
 
 
 def parameter_label(parameter: Parameter) -> str:

@@ -30,7 +30,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import qmc
 
 from bayeskin.errors import InputError
-from bayeskin.number_format import at_edge
+from bayeskin.number_format import interval, number, quantity
 from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.types import Array, Parameter, ParameterSpace, Surrogate, _FreezesArrays
 
@@ -245,10 +245,9 @@ def describe(space: ParameterSpace) -> str:
 
 
 def _parameter_in_words(p: Parameter) -> str:
-    factor, unit = at_edge(p.unit)
-    scale = 1.0 if p.in_log else factor  # the spread of a log-normal prior is a logarithm and has no unit
-    about = f" about {factor * p.centre:g} ({scale * p.spread:g})" if p.peaked else ""
-    return f"{p.name} {p.prior}{about} {factor * p.lower:g} to {factor * p.upper:g} {unit}".rstrip()
+    sd = f"factor {number(np.exp(p.spread))}" if p.in_log else quantity(p.spread, p.unit)
+    about = f" about {quantity(p.centre, p.unit)} (sd: {sd})" if p.peaked else ""
+    return f"{p.name} {p.prior}{about}, {interval(p.lower, p.upper, p.unit)}"
 
 
 def _sobol_points(dim: int, samples: int, rng: np.random.Generator) -> Array:

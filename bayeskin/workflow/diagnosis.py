@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bayeskin import inference, report
+from bayeskin import inference
 from bayeskin.config import Config, RecordingConfig, parameter_space
 from bayeskin.device import load_device_file
 from bayeskin.errors import InputError
@@ -37,6 +37,7 @@ from bayeskin.mismatch.tasks import AnswerTasks, FullRunTask, RunTask, Task
 from bayeskin.mismatch.trust_region import SetFit, within
 from bayeskin.recordings import read_recording
 from bayeskin.reduced.region import protocol_outside
+from bayeskin.report.words import faint_in_words, full_run_in_words
 from bayeskin.surrogates import train
 from bayeskin.types import Array, BinnedForce, Design, Surrogate
 from bayeskin.workflow import design, recording, training
@@ -373,8 +374,7 @@ def in_words(answer: Mapping[str, Any]) -> str:
               for mechanism in answer["mechanisms"]]  # fmt: skip
     lines.append(f"  nothing is missing: probability {answer['nothing_probability']:.2f}")
     lines.append(f"  an unnamed smooth discrepancy: probability {answer['smooth_probability']:.2f}")
-    if faint := report.faint_in_words(answer):
-        lines.append(f"  {faint}")
+    lines += [f"  {faint}" for faint in faint_in_words(answer)]
     lines.append(
         f"The model deviates from the recording in {len(answer['located'])} windows, "
         f"and in {len(answer['remaining'])} with {', '.join(answer['best_set']) or 'no mechanism'}."
@@ -387,15 +387,7 @@ def in_words(answer: Mapping[str, Any]) -> str:
             else f", {1e3 * rmse_held_out:.1f} mN after the second hold, which was not fitted"
         )
         lines.append(f"{label}: RMSE {1e3 * answer['fit'][label]['rmse']:.1f} mN{held_out_text}")
-    full = answer["full_model"]
-    if "message" in full:
-        lines.append(f"The full model fails at the best values: {full['message']}")
-    else:
-        lines.append(
-            f"A run of the full model at the best values, without allowances for its mesh and the load "
-            f"cell: RMSE {1e3 * full['rmse']:.1f} mN. The model that was fitted is off "
-            f"by {1e3 * full['fit_off_by']:.2f} mN there."
-        )
+    lines.append(full_run_in_words(answer["full_model"]))
     after = answer["fit"]["after"]
     if not (after["emulator"]["settled"] and after["sampled"]["settled"]):
         lines.append("The intervals are approximate, because their runs or draws have not converged.")

@@ -74,7 +74,8 @@ class Run:
 class Stage:
     """One stage, with the sections of the configuration, the files and the earlier stages that it reads.
 
-    `work` writes the outputs into the stage's folder and returns the summary.
+    `work` writes the outputs into the stage's folder and returns the summary. `format` is increased when the
+    contents of the summary change, so that summaries in an earlier format count as out of date.
     """
 
     name: str
@@ -83,6 +84,7 @@ class Stage:
     sections: tuple[str, ...]
     work: Callable[[Run], Mapping[str, Any]]
     files: Callable[[Run], Iterable[Path]] = field(default=lambda run: ())
+    format: int = 1
 
 
 @dataclass(frozen=True)
@@ -173,6 +175,7 @@ def _inputs_sha256(run: Run, stage: Stage) -> str:
             "config": {section: config[section] for section in sections},
             "files": [sha256_of_input(path) for path in stage.files(run)],
             "stages": {name: record.sha256 for name, record in records.items() if record is not None},
+            **({"format": stage.format} if stage.format > 1 else {}),  # the first format keeps the old hashes
         }
     )
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from bayeskin import inference, report, storage
 from bayeskin.config import parameter_space
+from bayeskin.number_format import quantity
 from bayeskin.sensitivity.shapley import shapley
 from bayeskin.sensitivity.sobol import SobolResult, sentence, sobol, uninformed
 from bayeskin.surrogates import correct, load_surrogate, train
@@ -66,7 +67,7 @@ def _over_posterior(run: Run, rng: np.random.Generator) -> dict[str, Any]:
     shares = [f"{result.names[j]} {100 * result.effects[j]:.0f} %" for j in order[:3]]
     return {
         "sentence": (
-            f"The posterior's uncertainty of the force, {1e3 * np.sqrt(result.variance_n2):.2g} mN sd "
+            f"The posterior's uncertainty of the force, {quantity(np.sqrt(result.variance_n2), 'N', 2)} sd "
             f"over time, comes from {', '.join(shares)}."
         ),
         "method": "Shapley effects by polynomial regression",

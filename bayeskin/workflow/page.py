@@ -68,10 +68,10 @@ def _facts(run: Run, name: str, stands: str, record: Record | None) -> StageFact
     return StageFacts(name, stands, record.seconds, record.summary, figures)
 
 
-def _history(run: Run) -> dict[str, Any] | None:
-    """Returns the bands of the stage `sample`; None for a run that an older version sampled without bands."""
-    file = run.at("sample", "bands.json")
-    return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+def _history(run: Run) -> dict[str, Any]:
+    """Returns the bands of the stage `sample`."""
+    history: dict[str, Any] = json.loads(run.at("sample", "bands.json").read_text(encoding="utf-8"))
+    return history
 
 
 def _indices(run: Run, stage: StageFacts) -> dict[str, SobolResult]:

@@ -16,6 +16,7 @@ from bayeskin.config import Config
 from bayeskin.hashing import sha256_of
 from bayeskin.inference import LogPosterior, Posterior, Verdict
 from bayeskin.json_files import write_json
+from bayeskin.number_format import quantity
 from bayeskin.types import PadMotion, Provenance, Recording
 from bayeskin.workflow.calibration import refined_posterior, rmse_table
 from bayeskin.workflow.checking import (
@@ -179,6 +180,10 @@ def _posterior_summary(
             parameter.name: {
                 "contraction": parameter.contraction,
                 "gain_nats": parameter.gain_nats,
+                "informed": parameter.informed,
+                "leans_on": parameter.leans_on,
+                "ranges": parameter.ranges,
+                "outcome": parameter.outcome,
                 "sentence": parameter.sentence,
             }
             for parameter in learned.parameters
@@ -209,8 +214,8 @@ def with_surrogate_error(verdict: Verdict, bands: inference.Bands, fitted: NDArr
         float(np.sqrt(np.mean(sd[fitted] ** 2))) for sd in (bands.sd_surrogate_n, bands.sd_noise_n)
     )
     statement = (
-        f"surrogate's sd {1e3 * surrogate:.3g} mN in the fitted bins; "
-        f"at most the noise's sd of {1e3 * noise:.3g} mN allowed"
+        f"surrogate's sd {quantity(surrogate, 'N')} in the fitted bins; "
+        f"at most the noise's sd of {quantity(noise, 'N')} allowed"
     )
     if surrogate <= noise:
         return Verdict(verdict.trusted, (*verdict.reasons, statement))
@@ -288,4 +293,5 @@ STAGE = Stage(
     ("recording", "map"),
     ("seed", "sample", "check", "fit", "noise", "parameters", "model", "surrogate", "design"),
     _sample_posterior,
+    format=2,
 )

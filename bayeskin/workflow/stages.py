@@ -9,6 +9,7 @@ from typing import Any
 from bayeskin.config import Config
 from bayeskin.json_files import plain, write_json
 from bayeskin.number_format import at_edge
+from bayeskin.report.words import polished_in_words, prior_in_words
 from bayeskin.workflow import design, diagnosis, indices, maximum, posterior, recording, training
 from bayeskin.workflow.engine import Outcome, Reporter, Run, Stage, open_run, run_stages, standing
 from bayeskin.workflow.executor import with_scheduler
@@ -47,7 +48,7 @@ def _write_summary(run: Run) -> Mapping[str, Any]:
         "posterior": sampled["parameters"],
         "identifiability": [*sampled["identifiability"], *sampled["ridges"]],
         "learned": sampled["learned"],
-        "lengths": sampled.get("lengths", {}),
+        "lengths": sampled["lengths"],
         "profiles": sampled["profiles"],
         "full_model_at_draws": sampled["full_model"],
         "corrected": sampled["corrected"],
@@ -157,7 +158,7 @@ def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str
             f"{summary['kind']}, relative error {summary['relative_error']:.3g} ({summary['error_source']})"
         ),
         "map": lambda: "\n".join(
-            [summary["message"], summary["checks"][-1]["message"], *_polish_lines(summary["polished"])]
+            [summary["message"], summary["checks"][-1]["message"], *polished_in_words(summary["polished"])]
         ),
         "sample": lambda: "\n".join(
             [
@@ -167,7 +168,7 @@ def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str
                     [
                         *summary["identifiability"],
                         *summary["ridges"],
-                        *_length_sentences(summary.get("lengths", {})),
+                        *_length_sentences(summary["lengths"]),
                     ]
                 ),
                 *_prior_lines(summary["parameters"]),
@@ -176,13 +177,6 @@ def _in_words(answer: Outcome, outcomes: Sequence[Outcome], folder: Path) -> str
         "sobol": lambda: "\n".join(result["sentence"] for result in summary.values()),
     }
     return f"{head}\n{lines[answer.stage]()}\noutputs in {folder / answer.stage}"
-
-
-def _polish_lines(polished: Mapping[str, Any] | None) -> list[str]:
-    """Returns a line about the maximum of the full model itself, if it was computed."""
-    if polished is None:
-        return []
-    return [f"refined with the full model: {polished['gained']:.2f} nats gained, {polished['message']}"]
 
 
 def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
@@ -203,7 +197,7 @@ def _summary_in_words(said: Mapping[str, Any], folder: Path) -> str:
         [
             f"{said['name']}: {said['verdict']}: {'; '.join(said['because'])}",
             *_posterior_table(said["posterior"]),
-            *_identifiability_lines([*said["identifiability"], *_length_sentences(said.get("lengths", {}))]),
+            *_identifiability_lines([*said["identifiability"], *_length_sentences(said["lengths"])]),
             *_prior_lines(said["posterior"]),
             *said["remarks"],
             f"{model}: RMSE {', '.join(off)}",
@@ -225,15 +219,11 @@ def _length_sentences(due: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 def _prior_lines(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Returns each prior with its bounds and its source, with a heading."""
-    return ["priors:", *(f"  {name}: {_prior_text(p['prior'], p['unit'])}" for name, p in parameters.items())]
-
-
-def _prior_text(prior: Mapping[str, Any], unit: str) -> str:
-    """Returns one prior with its bounds and its source."""
-    factor, unit = at_edge(unit)
-    about = f" about {factor * prior['centre']:.4g} {unit}" if prior["kind"].endswith("normal") else ""
-    low, high = factor * prior["lower"], factor * prior["upper"]
-    return f"{prior['kind']}{about}, {low:.4g} to {high:.4g} {unit}; {prior['source']}"
+    lines = (
+        f"  {name}: {prior_in_words(p['prior'], p['unit'])}; {p['prior']['source']}"
+        for name, p in parameters.items()
+    )
+    return ["priors:", *lines]
 
 
 def _posterior_table(parameters: Mapping[str, Mapping[str, Any]]) -> list[str]:

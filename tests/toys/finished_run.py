@@ -82,23 +82,18 @@ def summaries() -> dict[str, dict[str, Any]]:
         },
         "sample": {
             "ok": True, "verdict": "trusted", "reasons": ["3554 effective samples of E_c; 2000 needed"],
-            "remarks": ["the residual is hardly noise"],
+            "remarks": ["The residual is hardly noise."],
             "steps": 16000, "draws": 3776,
             "parameters": {
                 "E_c": _parameter("log-uniform", 13.9e3, 50.8e3, 87e3),
                 "p_init": _parameter("uniform", -522.0, 842.0, 2021.0),
                 "sd_rest": _parameter("log-uniform", 0.0019, 0.0028, 0.0045, "N"),
             },
-            "identifiability": [
-                "E_c: the data informs it: median 5.08e+04, 90 % interval 1.39e+04 to 8.7e+04 Pa; leans on "
-                "the prior's lower bound, 1e+04 Pa, so the prior shapes it",
-                "p_init: the data does not inform it (posterior = prior)",
-                "sd_rest: the data informs it weakly: median 0.0028, 90 % interval 0.0019 to 0.0045 N",
-            ],
+            "identifiability": ["E_c: the data informs it: median 50.8 kPa"],
             "ridges": ["E_c and E_s form a ridge (correlation -0.87): one makes up for the other"],
             "residuals": {
                 "passes": True,
-                "sentence": "the residual looks like the assumed noise: in its distribution and all else",
+                "sentence": "The residual looks like the assumed noise: in its distribution and all else.",
                 "p_law": 0.43, "p_correlation": 0.3, "autocorrelation": [0.1, -0.05],
                 "by_kind": {
                     "rest": {"bins": 40, "sd": 0.97, "p_sd": 0.8, "correlation": 0.06, "p_correlation": 0.7},
@@ -106,9 +101,17 @@ def summaries() -> dict[str, dict[str, Any]]:
                 },
             },
             "learned": {
-                name: {"contraction": 0.6, "gain_nats": 0.9, "sentence": f"This test taught of {name}."}
-                for name in ("E_c", "p_init", "sd_rest")
+                name: {
+                    "contraction": 0.6, "gain_nats": 0.9, "informed": informed, "leans_on": leans_on,
+                    "ranges": [], "outcome": outcome, "sentence": f"This test taught of {name}.",
+                }
+                for name, informed, leans_on, outcome in (
+                    ("E_c", "informed", ["lower"], "the data informs it; leans on the prior's lower bound"),
+                    ("p_init", "not informed", [], "the data does not inform it (posterior = prior)"),
+                    ("sd_rest", "weakly informed", [], "the data informs it weakly"),
+                )
             },
+            "lengths": {},
             "profiles": {
                 "E_c": {"low_90": 33e3, "high_90": 95e3, "flat": False},
                 "p_init": {"low_90": -670.0, "high_90": 2144.0, "flat": True},

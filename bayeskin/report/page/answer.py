@@ -6,22 +6,16 @@ It says which parameters the skin has, how far they can be trusted, and which ph
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from typing import Any
 
-from bayeskin.report.mismatch import faint_in_words
+from bayeskin.inference.identify import Informed
+from bayeskin.number_format import interval, number, percent, quantity, scale, with_unit
 from bayeskin.report.page.facts import RunFacts
-from bayeskin.report.page.numbers import interval, number, percent, quantity, scale, with_unit
 from bayeskin.report.page.parts import Answer, Bar, ParameterSummary, Verdict
+from bayeskin.report.words import faint_in_words, prior_in_words
 
-# Each row holds a phrase with which a sentence of `inference.identify` begins after the parameter's name, the
-# words that the page shows for it, and the tone of these words.
-_LEARNT: tuple[tuple[str, str, str], ...] = (
-    ("the data informs it weakly", "weakly informed", "doubt"),
-    ("the data informs it", "informed", "good"),
-    ("the data does not inform it", "not informed", "none"),
-)
+_TONES = {Informed.WELL: "good", Informed.WEAKLY: "doubt", Informed.NOT: "none"}
 _THREE = ("low_90", "median", "high_90")
 
 
@@ -32,48 +26,24 @@ def answer(facts: RunFacts) -> Answer:
     )
 
 
-def sentences(facts: RunFacts) -> dict[str, str]:
-    """Returns the sentence about each parameter by its name, without the name at the front."""
-    lines = facts.said("sample").get("identifiability", [])
-    return {name: text for name, _, text in (line.partition(": ") for line in lines)}
-
-
-def without_numbers(sentence: str) -> str:
-    """Returns a sentence about a parameter without its median and interval, which stand beside it."""
-    return re.sub(r": median [^;]*", "", sentence)
-
-
-def learnt(sentence: str) -> tuple[str, str]:
-    """Returns in a few words how well the data informs a parameter, and the tone of these words."""
-    return next(((word, tone) for start, word, tone in _LEARNT if sentence.startswith(start)), ("", "none"))
-
-
-def prior_range(said: Mapping[str, Any]) -> str:
-    """Returns the prior of a parameter as text, from its entry in the table of the stage `sample`."""
-    prior = said["prior"]
-    about = f" about {quantity(prior['centre'], said['unit'])}" if prior["kind"].endswith("normal") else ""
-    return f"{prior['kind']}{about}, {interval(prior['lower'], prior['upper'], said['unit'])}"
-
-
 def _parameter_rows(facts: RunFacts) -> list[ParameterSummary]:
     """Returns a row for each parameter of the posterior."""
-    summaries, known_sentences = facts.said("sample").get("parameters", {}), sentences(facts)
+    summaries, known = facts.said("sample").get("parameters", {}), facts.said("sample").get("learned", {})
     rows = []
     for name, meaning in facts.parameters.items():
         if name not in summaries:
             continue
-        summary, sentence = summaries[name], known_sentences.get(name, "")
-        word, tone = learnt(sentence)
-        leans = re.search(r"leans on the prior's (\w+) bound", sentence)
+        summary, informed = summaries[name], Informed(known[name]["informed"])
+        bounds = [f"at the prior's {side} bound" for side in known[name]["leans_on"]]
         rows.append(
             ParameterSummary(
                 name,
                 meaning,
                 with_unit(summary["median"], *scale([summary[key] for key in _THREE], summary["unit"])),
                 interval(summary["low_90"], summary["high_90"], summary["unit"], beside=summary["median"]),
-                word + (f", at the prior's {leans.group(1)} bound" if leans else ""),
-                tone,
-                prior_range(summary),
+                ", ".join([informed, *bounds]),
+                _TONES[informed],
+                prior_in_words(summary["prior"], summary["unit"]),
                 _bar(summary),
             )
         )
@@ -115,7 +85,7 @@ def _trust_verdict(facts: RunFacts) -> Verdict:
     )
     lines = [*doubts, *(summary["reasons"] if not summary["ok"] else [])]
     lines += [] if lines else ["The chains have converged, and the surrogate agrees with the full model."]
-    lines += [fit, *(f"{remark[0].upper()}{remark[1:]}." for remark in summary["remarks"])]
+    lines += [fit, *summary["remarks"]]
     return Verdict("trusted" if trusted else "not trusted", "good" if trusted else "doubt", lines)
 
 
@@ -133,7 +103,7 @@ def _missing_physics(facts: RunFacts) -> Verdict:
         fit_line = f"The recording stays within what the model allows ({rmse[0]} RMSE)."
         lines = [fit_line, smooth_line]
         if faint := faint_in_words(diagnosis):
-            return Verdict("nothing that could be named", "doubt", [faint, *lines])
+            return Verdict("nothing that could be named", "doubt", [*faint, *lines])
         return Verdict("nothing", "good", lines)
     lines = [
         f"{mechanism['statement']} (probability {number(mechanism['probability'])})"

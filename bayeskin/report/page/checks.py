@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from bayeskin.number_format import interval, number, percent, quantity
 from bayeskin.report.page.facts import RunFacts, StageFacts
 from bayeskin.report.page.figures import pictures
-from bayeskin.report.page.numbers import interval, number, percent, quantity
 from bayeskin.report.page.parts import Block, Cell, Facts, Folded, Heading, Section, Source, Table, Text, row
 from bayeskin.report.page.sections import absent, cell
+from bayeskin.report.words import polished_in_words
 
 
 def checks(facts: RunFacts) -> Section:
@@ -70,7 +71,7 @@ def _residuals(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
     ]
     head = ("phase", "bins", "sd (1 if as assumed)", "p", "correlation of neighbours (0 if as assumed)", "p")
     return [
-        Text([f"{residuals['sentence'][0].upper()}{residuals['sentence'][1:]}."]),
+        Text([residuals["sentence"]]),
         Folded("By kind of phase", [Table("Residuals by kind of phase", head, rows)]),
         *pictures(facts, "sample", ["residuals"]),
     ]
@@ -93,10 +94,7 @@ def _full_model(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
         for i, check in enumerate(said["checks"], start=1)
     ]
     head = ("run", "check", "RMS difference", "largest", "in the surrogate's sd", "time of the full run")
-    lines = [f"Most probable point: {said['message']}."]
-    if said["polished"] is not None:
-        gained, message = said["polished"]["gained"], said["polished"]["message"]
-        lines.append(f"Polished on the full model: {number(gained)} nats gained, {message}.")
+    lines = [f"Most probable point: {said['message']}.", *polished_in_words(said["polished"])]
     table = Table("The full model against the surrogate at the most probable point", head, rows)
     return [Text(lines), table, *pictures(facts, "map")]
 

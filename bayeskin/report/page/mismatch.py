@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bayeskin.report.mismatch import faint_in_words
+from bayeskin.number_format import number, percent, quantity, unit_text
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
-from bayeskin.report.page.numbers import number, percent, quantity
 from bayeskin.report.page.parts import Block, Cell, Folded, Heading, Section, Table, Text, row
 from bayeskin.report.page.sections import absent, cell
+from bayeskin.report.words import faint_in_words, full_run_in_words
 
 _VERDICTS = {
     "nothing-missing": "The recording shows no physics that the model leaves out.",
@@ -24,11 +24,10 @@ def mismatch(facts: RunFacts) -> Section:
     diagnosis = facts.said("diagnose")
     blocks: list[Block] = list(absent(facts, "diagnose"))
     if diagnosis:
-        verdict = _VERDICTS[diagnosis["verdict"]]
-        blocks.append(Text([f"{verdict} {faint}" if (faint := faint_in_words(diagnosis)) else verdict]))
+        blocks.append(Text([" ".join([_VERDICTS[diagnosis["verdict"]], *faint_in_words(diagnosis)])]))
         if diagnosis["mechanisms"]:
             blocks.append(_mechanisms(diagnosis["mechanisms"]))
-        blocks += [_fits(diagnosis["fit"]), Text([_checked(diagnosis["full_model"])])]
+        blocks += [_fits(diagnosis["fit"]), Text([full_run_in_words(diagnosis["full_model"])])]
         blocks += pictures(facts, "diagnose")
         if diagnosis["mechanisms"]:
             blocks.append(Folded("Parameters of the mechanisms", [_parameters(diagnosis["mechanisms"])]))
@@ -89,16 +88,6 @@ def _fits(fit: Mapping[str, Mapping[str, Any]]) -> Table:
     return Table(title, head, rows)
 
 
-def _checked(full: Mapping[str, Any]) -> str:
-    """Returns a sentence about the run of the full model at the best values."""
-    if "message" in full:
-        return f"The full model fails at the best values: {full['message']}"
-    return (
-        f"The full model at the best values has an RMSE of {quantity(full['rmse'], 'N')}; the fitted model "
-        f"differs from it by {quantity(full['fit_off_by'], 'N')} there."
-    )
-
-
 def _candidates(candidates: Sequence[Mapping[str, Any]]) -> Table:
     rows = [
         row(
@@ -130,7 +119,7 @@ def _unexplained(left: Mapping[str, Any] | None) -> list[Block]:
                 term["name"],
                 Cell(number(term["coefficient"]), term["coefficient"]),
                 Cell(number(term["standard_error"]), term["standard_error"]),
-                term["unit"],
+                unit_text(term["unit"]),
                 ", ".join(term["alike"]) or "none",
             )
         )

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from bayeskin.report.page.answer import prior_range, sentences, without_numbers
+from bayeskin.number_format import interval, number, percent, quantity, scale
 from bayeskin.report.page.charts import history_chart, indices_chart, residual_chart
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
-from bayeskin.report.page.numbers import interval, number, percent, quantity, scale
 from bayeskin.report.page.parts import Block, Cell, Facts, Folded, Missing, Section, Table, Text, row
+from bayeskin.report.words import prior_in_words
 
 _WHY = {
     "not run": "has not been run",
@@ -197,7 +197,7 @@ def _information_gained(said: Mapping[str, Any]) -> list[Block]:
 
 def _length_shares(said: Mapping[str, Any]) -> list[Block]:
     """Returns the shares of posterior variances that uncertain lengths explain, if there are such lengths."""
-    explained = said.get("lengths")
+    explained = said["lengths"]
     if not explained:
         return []
     rows = [
@@ -211,7 +211,7 @@ def _length_shares(said: Mapping[str, Any]) -> list[Block]:
 
 
 def _parameters(facts: RunFacts, table: Mapping[str, Mapping[str, Any]]) -> Table:
-    best, known_sentences = facts.said("map").get("theta", {}), sentences(facts)
+    best, known = facts.said("map").get("theta", {}), facts.said("sample")["learned"]
     numbers = ("median", "5 %", "95 %", "unit", "most probable")
     head = ("parameter", "meaning", "prior", *numbers, "what the data says")
     rows = []
@@ -220,8 +220,8 @@ def _parameters(facts: RunFacts, table: Mapping[str, Mapping[str, Any]]) -> Tabl
         factor, unit = scale(values[:3], summary["unit"])
         cells = [Cell(number(None if v is None else factor * v), v) for v in values]
         meaning = facts.parameters.get(name) or summary.get("meaning", "")
-        sentence = without_numbers(known_sentences.get(name, ""))
-        rows.append(row((name, meaning, prior_range(summary), *cells[:3], unit, cells[3], sentence)))
+        prior, outcome = prior_in_words(summary["prior"], summary["unit"]), known[name]["outcome"]
+        rows.append(row((name, meaning, prior, *cells[:3], unit, cells[3], outcome)))
     return Table("Parameters: prior, posterior, and what the data says about each", head, rows, symbols=True)
 
 

@@ -1,0 +1,46 @@
+"""Puts facts of the stages' summaries into words, for the terminal and for the page of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bayeskin.number_format import interval, number, quantity
+
+
+def prior_in_words(prior: Mapping[str, Any], unit: str) -> str:
+    """Returns the kind, the centre and the bounds of a prior, from the table of the stage `sample`."""
+    about = f" about {quantity(prior['centre'], unit)}" if "centre" in prior else ""
+    return f"{prior['kind']}{about}, {interval(prior['lower'], prior['upper'], unit)}"
+
+
+def polished_in_words(polished: Mapping[str, Any] | None) -> list[str]:
+    """Returns a sentence about the maximum of the full model itself, and none if it was not computed."""
+    if polished is None:
+        return []
+    return [f"Refined with the full model: {number(polished['gained'])} nats gained, {polished['message']}."]
+
+
+def faint_in_words(diagnosis: Mapping[str, Any]) -> list[str]:
+    """Returns a sentence about the mechanisms that improve the fit although none could be named.
+
+    There is no sentence where the verdict is another, or where no set fits better.
+    """
+    if diagnosis["verdict"] != "nothing-missing" or not diagnosis["best_set"]:
+        return []
+    better = ", ".join(diagnosis["best_set"])
+    return [
+        f"The model fits better with {better}, but too little or too uncertainly to name it. The skin's "
+        "parameters depend on whether it acts, so do not rely on them."
+    ]
+
+
+def full_run_in_words(full: Mapping[str, Any]) -> str:
+    """Returns a sentence about the run of the full model at the best values of a diagnosis."""
+    if "message" in full:
+        return f"The full model fails at the best values: {full['message']}"
+    return (
+        "A run of the full model at the best values, without allowances for its mesh and the load cell, has "
+        f"an RMSE of {quantity(full['rmse'], 'N')}. The fitted model differs from it by "
+        f"{quantity(full['fit_off_by'], 'N')} there."
+    )
