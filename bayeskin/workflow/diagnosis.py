@@ -14,7 +14,7 @@ import numpy as np
 
 from bayeskin import inference, report
 from bayeskin.config import Config, RecordingConfig, parameter_space
-from bayeskin.device import load_device_file
+from bayeskin.config.device import load_device_file
 from bayeskin.errors import InputError
 from bayeskin.forward.reduced import ReducedForward, stands_for
 from bayeskin.inference.noise_model import bins_in_windows

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from bayeskin.config import Config, DesignConfig, RecordingConfig
+from bayeskin.config.device import DeviceFile, StatedGeometry, device_lines, load_device_file, stated_geometry
 from bayeskin.design import default_space
-from bayeskin.device import DeviceFile, StatedGeometry, device_lines, load_device_file, stated_geometry
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.inference import NoisePriors

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from bayeskin.config import load_config
+from bayeskin.config.device import load_device, stated_geometry
+from bayeskin.config.sections import read_toml
 from bayeskin.design import default_space
-from bayeskin.device import load_device, stated_geometry
 from bayeskin.errors import InputError
 from bayeskin.execution.cluster import on_scheduler
 from bayeskin.execution.local import Map, local
@@ -26,7 +27,6 @@ from bayeskin.reduced.files import load_reduced, save_reduced, trained_geometry
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.region import other_geometry
 from bayeskin.reduced.runs import FullRuns
-from bayeskin.sections import read_toml
 from bayeskin.shipped import shipped
 from bayeskin.types import ParameterSpace
 from bayeskin.workflow.engine import Reporter

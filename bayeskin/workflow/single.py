@@ -13,7 +13,7 @@ import numpy as np
 
 from bayeskin import storage
 from bayeskin.config import Config, load_config, parameter_space
-from bayeskin.device import load_device_file
+from bayeskin.config.device import load_device_file
 from bayeskin.errors import InputError
 from bayeskin.finite_element.accuracy import mesh_error
 from bayeskin.finite_element.problem import Problem
