@@ -64,10 +64,10 @@ def simulate(**options: Any) -> Mapping[str, Any]:
       bayeskin simulate --reduced -o force.csv --mechanism solid-viscoelasticity --json
       bayeskin simulate -o force.csv --device device.toml
     """
-    from bayeskin.workflow import single
+    from bayeskin.workflow.simulating import SimulationRequest, simulate_once
 
     with Terminal() as terminal:
-        return single.simulate_once(reporter=terminal, **options)
+        return simulate_once(SimulationRequest(**options), terminal)
 
 
 @click.command("reduce", short_help="Build the reduced model of a device: once, for all protocols.")

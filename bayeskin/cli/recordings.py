@@ -29,9 +29,9 @@ def import_(file: Path, out: Path, sheet: str | None) -> Mapping[str, Any]:
       bayeskin import Healthy_skin.xlsx -o runs/healthy-skin.h5
       bayeskin import series.xlsx --sheet "Test 3" -o runs/test-3.h5
     """
-    from bayeskin.workflow import single
+    from bayeskin.workflow.importing import import_recording
 
-    return single.import_recording(file, out, sheet)
+    return import_recording(file, out, sheet)
 
 
 @click.command(short_help="Write a configuration for a recording of your own.")

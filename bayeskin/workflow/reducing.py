@@ -31,6 +31,7 @@ from bayeskin.shipped import shipped
 from bayeskin.types import ParameterSpace
 from bayeskin.workflow.engine import Reporter
 from bayeskin.workflow.folder import locked
+from bayeskin.workflow.output_paths import check_ending
 
 SHIPPED = "surrogates/article-device-reduced.h5"
 REFINEMENT = 1  # of the bricks of the full model that reduced models replace
@@ -53,8 +54,7 @@ def reduce(
     """
     geometry = _geometry(source)
     path = out or default_path(source)
-    if path.suffix != ".h5":
-        raise InputError(f"-o {path}", f"the ending {path.suffix!r}", "the ending .h5")
+    check_ending(path, ".h5")
     trained = trained_for(geometry)
     finished = _finished(path, trained)
     if finished:
