@@ -21,10 +21,9 @@ T = TypeVar("T")
 FORMAT = "bayeskin"
 FORMAT_VERSION = 1
 
+# Files name the class of each value in them.
 _STORED = {
-    cls.__name__: cls
-    for cls in vars(types).values()
-    if isinstance(cls, type) and dataclasses.is_dataclass(cls) and cls.__module__ == types.__name__
+    name: cls for name, cls in vars(types).items() if isinstance(cls, type) and dataclasses.is_dataclass(cls)
 }
 
 

@@ -35,7 +35,7 @@ from scipy.stats import binomtest
 
 from bayeskin.mechanisms import catalogue
 from bayeskin.mismatch import hypotheses
-from bayeskin.proof.score import score
+from bayeskin.proof import score
 from bayeskin.workflow.diagnosis import diagnose
 
 DATA = Path(__file__).parent.parent / "data"

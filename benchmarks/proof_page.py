@@ -19,7 +19,8 @@ import rows
 from demo_gallery import FIGURES, smaller
 
 from bayeskin.proof import seals
-from bayeskin.proof.score import CLEAR, share, share_of_parts
+from bayeskin.proof.scoring.judgement import CLEAR
+from bayeskin.proof.scoring.shares import share, share_of_parts
 from bayeskin.report import half_in_words
 from bayeskin.workflow.engine import Silent
 from bayeskin.workflow.proof import prove

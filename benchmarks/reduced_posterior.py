@@ -23,7 +23,7 @@ import rows
 
 from bayeskin.config import load_config
 from bayeskin.types import Array
-from bayeskin.workflow.single import import_recording
+from bayeskin.workflow.importing import import_recording
 from bayeskin.workflow.stages import run
 
 CONFIG = """name = "{name}"

@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import binom
 
 from bayeskin.proof import score, seals
-from bayeskin.proof.curves import curve
+from bayeskin.proof.scoring.curves import curve
 
 
 def test_the_page_of_mechanisms_has_the_catalogue_as_it_is(benchmark):

@@ -203,9 +203,9 @@ def test_the_exit_code_says_whether_the_answer_can_be_relied_on(
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 def test_a_command_that_is_interrupted_says_how_to_go_on(measured: Path, tmp_path: Path, ending: int) -> None:
     code = (
-        "import sys, time; from bayeskin import cli; from bayeskin.workflow import single\n"
+        "import sys, time; from bayeskin import cli; from bayeskin.workflow import importing\n"
         "def slow(*_): print('at work', flush=True); time.sleep(60)\n"
-        "single.import_recording = slow; cli.main(['import', *sys.argv[1:]])"
+        "importing.import_recording = slow; cli.main(['import', *sys.argv[1:]])"
     )
     command = [sys.executable, "-c", code, str(measured), "-o", str(tmp_path / "r.h5")]
     process = subprocess.Popen(

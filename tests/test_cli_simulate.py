@@ -19,14 +19,14 @@ from toys.command_line import Command, assert_refused
 from bayeskin import report, storage
 from bayeskin.finite_element.simulate import ModelSpec, OnState, problem_of
 from bayeskin.types import PadMotion, Simulation
-from bayeskin.workflow import single
+from bayeskin.workflow import simulating
 from bayeskin.workflow.field_outputs import FieldOutputs
 
 
 def test_simulate_writes_the_columns_that_scripts_rely_on(
     bayeskin: Command, measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(single, "simulate", stand_in_model.simulate)
+    monkeypatch.setattr(simulating, "simulate", stand_in_model.simulate)
     common = ("simulate", "--recording", measured, "--set", "E_c=200e3", "--json")
     code, out, _ = bayeskin(*common, "-o", tmp_path / "force.csv")
     said = json.loads(out)
@@ -44,7 +44,7 @@ def test_simulate_writes_the_columns_that_scripts_rely_on(
 def test_simulate_adds_the_mechanisms_that_are_named(
     bayeskin: Command, measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(single, "simulate", stand_in_model.simulate)
+    monkeypatch.setattr(simulating, "simulate", stand_in_model.simulate)
     common = ("simulate", "--recording", measured, "--set", "E_c=200e3")
     mechanisms = (
         "--mechanism",
@@ -113,7 +113,7 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             on_state(float(time_s), x, 0.0)
         return stand_in_model.simulate(spec, motion, theta)
 
-    monkeypatch.setattr(single, "simulate", stretch)
+    monkeypatch.setattr(simulating, "simulate", stretch)
     return made
 
 
@@ -207,7 +207,7 @@ def test_a_simulation_that_fails_exits_with_1_and_writes_nothing(
         run = stand_in_model.simulate(*arguments, **options)  # type: ignore[arg-type]
         return replace(run, status="failed", message="no convergence at 3 s; take smaller steps")
 
-    monkeypatch.setattr(single, "simulate", failing)
+    monkeypatch.setattr(simulating, "simulate", failing)
     monkeypatch.setattr(FieldOutputs, "on_state", lambda *state: None)
     (tmp_path / "force.csv").write_text("earlier")
     outputs = ("-o", tmp_path / "force.csv", "--fields", tmp_path / "a", "--figures", tmp_path / "b")

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -18,21 +19,17 @@ from bayeskin import report
 from bayeskin.inference import LogPosterior
 from bayeskin.json_files import plain
 from bayeskin.mechanisms import catalogue
+from bayeskin.mismatch.assess import Diagnosis, Remainder
+from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.contributions import Contribution, contributions
 from bayeskin.mismatch.discrepancy import discrepancy
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.form import propose_form
 from bayeskin.mismatch.locate import Located, Window
 from bayeskin.mismatch.observed import ObservedSurrogate
-from bayeskin.workflow.diagnosis import in_words
-from bayeskin.workflow.diagnosis_outputs import (
-    DiagnosisFigures,
-    DrawnFit,
-    Remainder,
-    candidates,
-    draw,
-    unexplained,
-)
+from bayeskin.workflow.diagnosis_answer import candidate_entries, remainder_entry
+from bayeskin.workflow.diagnosis_figures import draw
+from bayeskin.workflow.diagnosis_text import in_words
 
 CREEP_S = 20.0
 VALUES = {
@@ -75,6 +72,17 @@ def located(residual_n: np.ndarray, *windows: Window) -> Located:
 
 WINDOW = Window(15.0, 45.0, "hold", 1, 5e-3, 1e-3)
 PARAMETERS = ALONE.surrogate.space.parameters
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawnFit:
+    """What the figures need of an assessed fit."""
+
+    force_n: np.ndarray
+    band_n: tuple[np.ndarray, np.ndarray]
+    held_out_n: np.ndarray | None
+    located: Located
+    values: Mapping[str, Mapping[str, Any]]
 
 
 def drawn(left_n: float, held_out_by: float | None = None) -> DrawnFit:
@@ -132,7 +140,7 @@ def remainder() -> Remainder:
 
 
 def test_what_is_left_is_said_with_its_size_parts_and_form(remainder: Remainder) -> None:
-    said = json.loads(json.dumps(plain(unexplained(remainder)), allow_nan=False))
+    said = json.loads(json.dumps(plain(remainder_entry(remainder)), allow_nan=False))
     assert said["size_n"] == pytest.approx(remainder.discrepancy.size_n)
     assert set(said["share"]) == {"displacement", "change", "phase", "cycle"}
     assert said["noticeable"]
@@ -181,12 +189,12 @@ def test_each_figure_is_written_where_it_has_something_to_show(
 ) -> None:
     monkeypatch.setattr(report, "save_figure", lambda figure, stem, made_by: (stem.with_suffix(".png"),))
     rows = [{"name": "force-offset", "delta_score": 3.0, "standard_error": 1.0}]
+    context = DiagnosisContext(BINNED, None, closed_form_model.MOTION, None, ALONE.surrogate.space, 0)  # type: ignore[arg-type]
+    explanation = SimpleNamespace(beginning=None, split_s=60.0)
     written = []
     for parts, left in ((parts_of("force-offset"), remainder), ([], None)):
-        found = DiagnosisFigures(drawn(8e-3), drawn(2e-3), None, PARAMETERS, parts, left)
-        written.append(
-            {path.name for path in draw(Path("x"), "", BINNED, closed_form_model.MOTION, found, rows)}
-        )
+        diagnosis = Diagnosis(explanation, drawn(8e-3), drawn(2e-3), parts, left, "")  # type: ignore[arg-type]
+        written.append({path.name for path in draw(Path("x"), "", context, diagnosis, rows)})
     assert written[0] - written[1] == {"contributions.png", "discrepancy.png"}
     assert {Path(name).stem for name in written[1]} == {
         "located", "candidates", "before_after", "residual_by_phase", "base_parameters"
@@ -280,10 +288,10 @@ def test_what_a_pair_gains_is_no_candidate_s_alone() -> None:
     known = catalogue()
     sets: list[tuple[str, ...]] = [(), ("device-friction",), ("device-friction", "force-offset")]
     fits = {names: fitted(*names) for names in sets}
-    assert [row["name"] for row in candidates(fits, known)] == ["device-friction"]
+    assert [row["name"] for row in candidate_entries(fits, known)] == ["device-friction"]
     needed = ("device-friction", "friction-creep")
     fits[needed] = fitted(*needed)
-    assert {row["name"] for row in candidates(fits, known)} == set(needed)
+    assert {row["name"] for row in candidate_entries(fits, known)} == set(needed)
 
 
 def test_candidates_of_a_few_nats_are_read_off_beside_one_of_hundreds() -> None:

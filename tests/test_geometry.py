@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bayeskin.config import load_config
-from bayeskin.device import load_device
+from bayeskin.config.device import load_device
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry, Guard
 

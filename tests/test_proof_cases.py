@@ -14,11 +14,12 @@ from bayeskin.finite_element.mesh import brick_mesh
 from bayeskin.finite_element.problem import build_problem, material
 from bayeskin.mechanisms import catalogue
 from bayeskin.proof import seals
-from bayeskin.proof.cases import CONCEALED, Plan, draw, plans
+from bayeskin.proof.cases import draw
 from bayeskin.proof.outside import OUTSIDE, Change
+from bayeskin.proof.plans import CONCEALED, Plan, plans
 from bayeskin.proof.protocol import MOTION
 from bayeskin.proof.refit_residual import rms, windows
-from bayeskin.proof.score import group_of
+from bayeskin.proof.scoring.look_alikes import group_of
 from bayeskin.types import PadMotion
 
 

@@ -9,7 +9,7 @@ from toys.made_up_verdicts import key, made_up, said
 
 from bayeskin import report
 from bayeskin.proof import score
-from bayeskin.proof.curves import curve
+from bayeskin.proof.scoring.curves import curve
 from bayeskin.report import half_in_words
 
 

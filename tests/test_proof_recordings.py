@@ -18,12 +18,14 @@ from bayeskin.execution.local import local
 from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.mechanisms import catalogue, laws
 from bayeskin.proof import conceal, seals
-from bayeskin.proof.cases import Case, Plan, plans, shipped_screen
+from bayeskin.proof.cases import Case
 from bayeskin.proof.conceal import Concealed, concealed, full_run
 from bayeskin.proof.noise import noise
 from bayeskin.proof.outside import OUTSIDE, Change
+from bayeskin.proof.plans import Plan, plans
 from bayeskin.proof.protocol import EDGES_S, KINDS, MOTION, SURROGATE, kind_at, samples_s
 from bayeskin.proof.refit_residual import rms
+from bayeskin.proof.screen import shipped_screen
 from bayeskin.recordings import bin_recording, read_recording, segment, uniform_edges
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_manifest, load_surrogate
@@ -149,7 +151,7 @@ def test_the_screen_adds_what_mechanisms_change_and_marks_a_run_that_fails() -> 
     change_n = relaxes - plain
     np.testing.assert_allclose(more_n - alone_n, [change_n], atol=0.02 * np.ptp(change_n))
     failed = Simulation({}, *np.zeros((3, 1)), np.ones(1, dtype=bool), "failed", "the skin folds", {}, "")
-    with mock.patch("bayeskin.proof.cases.simulate_reduced", return_value=failed):
+    with mock.patch("bayeskin.proof.screen.simulate_reduced", return_value=failed):
         assert np.isnan(screen.force(["force-offset"], theta, {"F0": np.array([-0.03])})).all()
 
 

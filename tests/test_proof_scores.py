@@ -12,7 +12,9 @@ from bayeskin.mechanisms import catalogue
 from bayeskin.proof import score
 from bayeskin.proof.noise import floor_after, noise
 from bayeskin.proof.protocol import EDGES_S, HELD_OUT_FROM_S, samples_s
-from bayeskin.proof.score import is_listed, judge, overlap, share, share_of_parts, stands_for
+from bayeskin.proof.scoring.judgement import judge, overlap
+from bayeskin.proof.scoring.look_alikes import is_listed, stands_for
+from bayeskin.proof.scoring.shares import share, share_of_parts
 
 
 @pytest.mark.parametrize(
@@ -60,10 +62,10 @@ def test_the_probability_of_a_pair_is_that_of_its_less_probable_part() -> None:
 def test_of_a_pair_each_mechanism_that_adds_enough_counts_and_each_name() -> None:
     both = key("pad-slip + sensor-drift", "pair", sizes={"pad-slip": 8e-3, "sensor-drift": 5e-3})
     found = judge("001", both, said("pad-slip", "backlash"))
-    assert found.found == {"pad-slip": True}  # of the other 2.5 floors remain
-    assert found.there == {"pad-slip": True, "backlash": False}
+    assert found.clear_parts_named == {"pad-slip": True}  # of the other 2.5 floors remain
+    assert found.names_concealed == {"pad-slip": True, "backlash": False}
     other = judge("002", key("nothing", "nothing", 0.0), said("backlash"))
-    assert (other.found, other.there) == ({}, {"backlash": False})
+    assert (other.clear_parts_named, other.names_concealed) == ({}, {"backlash": False})
     keys = {"001": both, "002": key("nothing", "nothing", 0.0), "003": key("sensor-drift")}
     answers = {"001": said("pad-slip", "backlash"), "002": said("backlash"), "003": said()}
     board = score(keys, answers)

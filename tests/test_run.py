@@ -22,7 +22,7 @@ from bayeskin.number_format import interval
 from bayeskin.report.page.prose import prose
 from bayeskin.runner import load_design
 from bayeskin.types import Design, PadMotion, Recording, Simulation
-from bayeskin.workflow import design, maximum, model, stages
+from bayeskin.workflow import maximum, model, stages, waves
 from bayeskin.workflow.calibration import refined_posterior
 from bayeskin.workflow.checking import checked_posterior, with_full_model
 from bayeskin.workflow.engine import Silent, open_run
@@ -79,7 +79,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         with pytest.raises(KeyboardInterrupt):
             stages.run(where / "case.toml", None, Silent())
         patch.setattr(maximum, "simulate", stand_in_model.simulate)
-        patch.setattr(design, "run_wave", interrupted)  # must not be needed again
+        patch.setattr(waves, "run_wave", interrupted)  # must not be needed again
         answer = stages.run(where / "case.toml", None, Silent())
     (where / "answer.json").write_text(json.dumps(answer, allow_nan=False))
     return where

@@ -7,7 +7,7 @@ import re
 
 from rich.console import Console
 
-from bayeskin.terminal import Terminal
+from bayeskin.cli.terminal import Terminal
 
 
 class Watched:

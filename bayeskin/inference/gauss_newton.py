@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_triangular
 from scipy.optimize import minimize
 
@@ -22,7 +23,7 @@ from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
 from bayeskin.inference.noise_model import NoiseChain, innovations
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.reparametrisation import Shear
-from bayeskin.types import Array, NDArray, Prediction
+from bayeskin.types import Array, Prediction
 
 STEP = 1e-4  # step of finite differences, as a share of the box
 # Multiples of the information's diagonal that are added to it. The second group is tried only where the first

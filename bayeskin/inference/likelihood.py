@@ -22,9 +22,10 @@ import math
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
 from bayeskin.inference.noise_model import NoiseChain, filter_gains
-from bayeskin.types import Array, NDArray, Prediction
+from bayeskin.types import Array, Prediction
 
 _STEPS = 40  # upper limit on the steps of the mode search; five or six are usual
 FARTHEST, STIFF = 3.0, 100.0  # number of sd within which z is normal, and the added stiffness beyond

@@ -26,12 +26,12 @@ from itertools import pairwise
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 
 from bayeskin.errors import InputError
 from bayeskin.types import (
     Array,
     BinnedForce,
-    NDArray,
     Parameter,
     ParameterSpace,
     PhaseKind,

@@ -22,10 +22,11 @@ from typing import Any
 
 import numba as nb
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from bayeskin.inference.problem import LogPosterior
-from bayeskin.types import Array, NDArray, _FreezesArrays
+from bayeskin.types import Array, _FreezesArrays
 
 _POINTS = 2048  # points of the prior from which the amplitude is learnt
 _CHUNK = 256

@@ -5,7 +5,7 @@ module that diagnoses imports this package, and this package imports no module t
 """
 
 from bayeskin.proof.conceal import conceal
-from bayeskin.proof.score import score
+from bayeskin.proof.scoring import score
 from bayeskin.proof.seals import closed
 
 __all__ = ["closed", "conceal", "score"]

@@ -27,11 +27,13 @@ from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import bin_means, catalogue, laws, observed
 from bayeskin.mechanisms.mechanism import ForceOfTime
 from bayeskin.proof import seals
-from bayeskin.proof.cases import Case, Plan, Screen, draw, plans, shipped_screen
+from bayeskin.proof.cases import Case, draw
 from bayeskin.proof.noise import noise
 from bayeskin.proof.outside import OUTSIDE, Change
+from bayeskin.proof.plans import Plan, plans
 from bayeskin.proof.protocol import EDGES_S, MOTION, samples_s
 from bayeskin.proof.refit_residual import rms, windows
+from bayeskin.proof.screen import Screen, shipped_screen
 from bayeskin.types import Array, Recording, Simulation
 
 # Grid lines of the bricks [mm]: more than in the model of the shipped surrogates, and graded differently.

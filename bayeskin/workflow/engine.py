@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import bayeskin
 from bayeskin.config import WHO_RUNS, Config, load_config
-from bayeskin.device import DeviceConfig, TissueConfig
+from bayeskin.config.device import DeviceConfig, TissueConfig
 from bayeskin.errors import InputError
 from bayeskin.hashing import sha256_of, sha256_of_input
 from bayeskin.json_files import plain

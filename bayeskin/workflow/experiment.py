@@ -22,10 +22,11 @@ from bayeskin.experiments.protocols import Limits, Protocol, variations
 from bayeskin.forward.reduced import ReducedForward
 from bayeskin.json_files import plain, write_json
 from bayeskin.mismatch.context import DiagnosisContext
+from bayeskin.mismatch.explain import searched
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.tasks import AnswerTasks
 from bayeskin.workflow import diagnosis
-from bayeskin.workflow.diagnosis import context_of, opened, searched, source_of
+from bayeskin.workflow.diagnosis import context_of, opened, source_of
 from bayeskin.workflow.diagnosis_tasks import asked, searches_file
 from bayeskin.workflow.engine import Reporter, Run
 from bayeskin.workflow.folder import Record, current_record, locked, output_hashes, read_record, write_record
@@ -60,7 +61,7 @@ def choose(source: Path, reporter: Reporter, device: Path | None = None) -> dict
         context_source = source_of(run)
         context = context_of(run, context_source)
         with asked(context_source, context, searches_file(run.folder, context), WORKERS) as ask:
-            all_fits = [set_fit.fit for set_fit in searched(run, context, ask).fits.values()]
+            all_fits = [set_fit.fit for set_fit in searched(context, ask, reporter.log).fits.values()]
             fits = compete(all_fits, diagnosed["best_set"], context.known)
             experiments = _judged_protocols(fits, context, ask, reporter) if len(fits) > 1 else []
         answer: dict[str, Any] = {

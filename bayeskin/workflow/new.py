@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from bayeskin.config import Config, DesignConfig, RecordingConfig
+from bayeskin.config.device import DeviceFile, StatedGeometry, device_lines, load_device_file, stated_geometry
 from bayeskin.design import default_space
-from bayeskin.device import DeviceFile, StatedGeometry, device_lines, load_device_file, stated_geometry
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.inference import NoisePriors
@@ -24,6 +24,7 @@ from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.region import protocol_outside
 from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, Parameter
+from bayeskin.workflow.output_paths import check_ending
 from bayeskin.workflow.recording import pad_motion
 from bayeskin.workflow.reducing import find_reduced
 from bayeskin.workflow.shipping import shipped_for
@@ -82,8 +83,7 @@ def new_config(file: Path, out: Path | None = None, device: Path | None = None) 
     stated = None if device is None else load_device_file(device)
     recording = read_recording(file)
     out = out or file.with_suffix(".toml")
-    if out.suffix != ".toml":
-        raise InputError(f"-o {out}", f"the ending {out.suffix!r}", "the ending .toml")
+    check_ending(out, ".toml")
     if out.exists():
         raise InputError(f"-o {out}", "a file that exists already", "the name of a new file")
     phases = segment(recording)
@@ -112,8 +112,7 @@ def new_demo(out: Path | None = None) -> dict[str, Any]:
     """
     out = out or Path("demo.toml")
     recording = out.with_name("demo-recording.h5")  # demo.h5 is already the name of the surrogate
-    if out.suffix != ".toml":
-        raise InputError(f"-o {out}", f"the ending {out.suffix!r}", "the ending .toml")
+    check_ending(out, ".toml")
     for file in (out, recording):
         if file.exists():
             raise InputError(file, "a file that exists already", "a folder without this file")

@@ -12,24 +12,33 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import bayeskin
 from bayeskin import proof, report
 from bayeskin.errors import InputError
-from bayeskin.hashing import sha256_of, sha256_of_file, sha256_of_input
-from bayeskin.json_files import plain, write_json
+from bayeskin.hashing import sha256_of_file
+from bayeskin.json_files import plain
 from bayeskin.proof import seals
+from bayeskin.proof.scoring_history import record_scoring
+from bayeskin.proof.verdicts import (
+    FAILED,
+    has_verdict,
+    in_short,
+    read_verdict,
+    same_verdict,
+    store_verdict,
+)
 from bayeskin.shipped import shipped
 from bayeskin.workflow import diagnosis
 from bayeskin.workflow.diagnosing_sources import diagnosing_sources
 from bayeskin.workflow.engine import Reporter
 from bayeskin.workflow.folder import locked
+from bayeskin.workflow.proof_text import in_words
 
 Diagnose = Callable[[Path, Reporter], Mapping[str, Any]]
-FAILED = "failed"  # takes the place of a verdict where a diagnosis has failed
 SET = "data/proof/index.json"
 
 
@@ -58,30 +67,26 @@ def prove(
     if not index:
         raise InputError(folder, "a set without recordings", "a set that `bayeskin conceal` made")
     hashes = {number: entry["recording_sha256"] for number, entry in index.items()}
-    diagnoser = _Diagnoser(folder, hashes, reporter, diagnose)
-    rediagnosed = diagnoser.work(sources, at_most, rediagnose)
+    diagnosed_again = _Diagnoser(folder, hashes, reporter, diagnose).work(sources, at_most, rediagnose)
     verdicts = {
         number: verdict
         for number, expected in hashes.items()
-        if (verdict := _stored_verdict(folder, number, expected))
+        if (verdict := read_verdict(folder, number, expected))
     }
-    board = proof.score(
-        seals.read_keys(folder), {number: verdict["answer"] for number, verdict in verdicts.items()}
-    )
-    current = sum(verdict["sources_sha256"] == sources for verdict in verdicts.values())
-    compared = {
-        number: _same_verdict(answer, verdicts[number]["answer"]) for number, answer in rediagnosed.items()
-    }
+    board = proof.score(seals.read_keys(folder), {number: v.answer for number, v in verdicts.items()})
+    of_these_sources = {number: v.sources_sha256 == sources for number, v in verdicts.items()}
+    current = sum(of_these_sources.values())
+    same = {n: same_verdict(answer, verdicts[n].answer) for n, answer in diagnosed_again.items()}
     document = {
-        "ok": all(same or verdicts[n]["sources_sha256"] != sources for n, same in compared.items()),
+        "ok": all(same[number] or not of_these_sources[number] for number in same),
         "folder": folder,
         "scoreboard": board,
         "verdicts_of_these_sources": current,
-        "rediagnosed_the_same": compared,
-        "rediagnosed_of_these_sources": {n: verdicts[n]["sources_sha256"] == sources for n in compared},
+        "rediagnosed_the_same": same,
+        "rediagnosed_of_these_sources": {number: of_these_sources[number] for number in same},
         "figures": list(_record_and_draw(folder, sources, current, board, reporter)),
     }
-    return plain({**document, "text": _in_words(document)})
+    return plain({**document, "text": in_words(document)})
 
 
 @dataclass(frozen=True)
@@ -107,12 +112,12 @@ class _Diagnoser:
             for place, number in enumerate(new[:at_most]):
                 self.reporter.progress("recordings", place / len(new), f"{number} of {len(self.hashes)}")
                 answer = self._diagnosed(number)
-                _store(self.folder, number, self.hashes[number], sources, answer)
-                self.reporter.log(f"{number}: {_short_answer(answer)}")
+                store_verdict(self.folder, number, self.hashes[number], sources, answer)
+                self.reporter.log(f"{number}: {in_short(answer)}")
             judged = [
                 number
                 for number, expected in self.hashes.items()
-                if _stored_verdict(self.folder, number, expected)
+                if read_verdict(self.folder, number, expected)
             ]
             return {number: self._diagnosed(number) for number in _evenly_chosen(judged, rediagnose)}
 
@@ -121,7 +126,7 @@ class _Diagnoser:
         return [
             number
             for number, expected in self.hashes.items()
-            if not _has_verdict(self.folder, number, expected)
+            if not has_verdict(self.folder, number, expected)
         ]
 
     def _diagnosed(self, number: str) -> dict[str, Any]:
@@ -154,7 +159,7 @@ def _record_and_draw(
     """
     try:
         with locked(folder):
-            _record_scoring(folder, sources, current, board)
+            record_scoring(folder, sources, current, board)
             stamp = f"bayeskin {bayeskin.__version__}, {folder.name}"
             figures = [*report.save_figure(report.figure_proof(board), folder / "scoreboard", stamp)]
             if board["by_mechanism"]:
@@ -171,7 +176,7 @@ def _record_and_draw(
 def conceal(
     folder: Path, seed: int, count: int, reporter: Reporter, only: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Makes a set of concealed recordings, or its missing recordings; `only` is as in `proof.cases.plans`.
+    """Makes a set of concealed recordings, or its missing recordings; `only` is as in `proof.plans.plans`.
 
     Raises InputError as `proof.conceal`, and where another process works on the set.
     """
@@ -179,12 +184,8 @@ def conceal(
         raise InputError("--seed, --count", f"{seed}, {count}", "a seed of at least 0, a count of at least 1")
     started = time.monotonic()
 
-    def tell(share: float, note: str) -> None:
-        """Reports the progress."""
-        reporter.progress("recordings", share, note)
-
     with locked(folder):
-        new_count = proof.conceal(folder, seed, count, only, tell)
+        new_count = proof.conceal(folder, seed, count, only, partial(reporter.progress, "recordings"))
     seconds = time.monotonic() - started
     text = f"{new_count} of {count} recordings made in {seconds:.0f} s; keys in {folder / seals.SEALS}"
     return plain(
@@ -192,136 +193,7 @@ def conceal(
     )
 
 
-def _verdict_path(folder: Path, number: str) -> Path:
-    """Returns the path of a recording's verdict."""
-    return folder / seals.VERDICTS / f"{number}.json"
-
-
-def _stored_verdict(folder: Path, number: str, recording_sha256: str) -> dict[str, Any] | None:
-    """Returns the stored verdict on this very recording, and None where there is none.
-
-    Raises InputError for a file that is no verdict.
-    """
-    path = _verdict_path(folder, number)
-    verdict: dict[str, Any] | None = seals.read_json(path) if path.is_file() else None
-    if verdict is None:
-        return None
-    if not isinstance(verdict, dict) or not {"recording_sha256", "sources_sha256", "answer"} <= set(verdict):
-        raise InputError(path, "no verdict of a proof", "a verdict that `bayeskin prove` wrote")
-    return verdict if verdict["recording_sha256"] == recording_sha256 else None
-
-
-def _has_verdict(folder: Path, number: str, recording_sha256: str) -> bool:
-    """Returns whether there is a verdict other than that the diagnosis failed."""
-    verdict = _stored_verdict(folder, number, recording_sha256)
-    return verdict is not None and verdict["answer"]["verdict"] != FAILED
-
-
-def _store(folder: Path, number: str, recording_sha256: str, sources: str, answer: Mapping[str, Any]) -> None:
-    """Stores the verdict on a recording."""
-    path = _verdict_path(folder, number)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(
-        path,
-        {
-            "recording_sha256": recording_sha256,
-            "version": bayeskin.__version__,
-            "sources_sha256": sources,
-            "answer": answer,
-        },
-    )
-
-
-def _record_scoring(folder: Path, sources: str, current: int, board: Mapping[str, Any]) -> None:
-    """Adds this scoring to the earlier ones.
-
-    There is one entry for each state of the sources, of the scorer and of the verdicts.
-    """
-    path = folder / seals.SCORINGS
-    before = seals.read_json(path) if path.is_file() else []
-    verdicts = sha256_of([sha256_of_file(p) for p in sorted((folder / seals.VERDICTS).glob("*.json"))])
-    scorer = sha256_of_input(Path(proof.__file__).with_name("score.py"))
-    identity = {"sources_sha256": sources, "verdicts_sha256": verdicts, "scorer_sha256": scorer}
-    if any(identity.items() <= scoring.items() for scoring in before):
-        return
-    scores = {
-        name: value for name, value in board.items() if name not in ("each", "by_mechanism", "confusion")
-    }
-    new = {
-        "date": datetime.now(UTC).date().isoformat(),
-        "version": bayeskin.__version__,
-        **identity,
-        "verdicts_of_these_sources": current,
-        "scoreboard": scores,
-    }
-    write_json(path, [*before, new])
-
-
 def _evenly_chosen(numbers: list[str], count: int) -> list[str]:
     """Returns `count` of the numbers, evenly spread over the set."""
     count = min(count, len(numbers))
     return [numbers[(2 * i + 1) * len(numbers) // (2 * count)] for i in range(count)]
-
-
-def _same_verdict(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Returns whether two answers have the same verdict and the same mechanisms."""
-
-    def named(answer: Mapping[str, Any]) -> list[str]:
-        """Returns the names of an answer's mechanisms, sorted."""
-        return sorted(mechanism["name"] for mechanism in answer.get("mechanisms", []))
-
-    return one["verdict"] == other["verdict"] and named(one) == named(other)
-
-
-def _short_answer(answer: Mapping[str, Any]) -> str:
-    """Returns the verdict and the mechanisms of an answer in a few words."""
-    if answer["verdict"] == FAILED:
-        return f"{FAILED}: {answer.get('message', '')}"
-    names = ", ".join(mechanism["name"] for mechanism in answer.get("mechanisms", []))
-    return f"{answer['verdict']}{': ' + names if names else ''}"
-
-
-def _in_words(document: Mapping[str, Any]) -> str:
-    """Returns the command's answer as text."""
-    board = document["scoreboard"]
-    lines = [
-        f"{board['judged']} of {board['recordings']} recordings judged, "
-        f"{document['verdicts_of_these_sources']} of them by the present sources",
-        f"false alarms where nothing is concealed: {_share(board['false_alarms'])}",
-    ]
-    for name, text in (
-        ("named", "named correctly"),
-        ("named_up_to_look_alikes", "named correctly or by a look-alike"),
-        ("unknown_outside", "effects outside the catalogue with verdict unknown"),
-        ("effect_in_interval", "effect's parameters in their 90 % intervals, where named correctly"),
-        ("base_in_interval", "base model's parameters in their 90 % intervals"),
-    ):
-        for size, words in (("clear", "effects of at least 3 x floor"), ("below", "smaller effects")):
-            lines.append(f"{text}, {words}: {_share(board[name][size])}")
-    for name, text in (
-        ("clear_mechanisms_named", "mechanisms that add at least 3 x floor and are named"),
-        ("named_mechanisms_there", "named mechanisms that are in the recording"),
-    ):
-        lines.append(f"{text}: {_share(board[name])}")
-    for name, text in (
-        ("location_overlap", "overlap of located windows"),
-        ("held_out_over_floor", "held-out RMSE divided by the floor, where named correctly"),
-    ):
-        score = board[name]["clear"]
-        middle = "none" if score["median"] is None else f"{score['median']:.2f}"
-        lines.append(f"{text}, effects of at least 3 x floor: median {middle} of {score['of']}")
-    for number, same in document["rediagnosed_the_same"].items():
-        current = document["rediagnosed_of_these_sources"][number]
-        different = (
-            "ANOTHER VERDICT" if current else "another verdict than the stored one, which other sources gave"
-        )
-        lines.append(f"{number} diagnosed again: {'the same' if same else different}")
-    return "\n".join(lines)
-
-
-def _share(found: Mapping[str, Any]) -> str:
-    """Returns a share with its interval as text."""
-    if not found["of"]:
-        return "none"
-    low, high = 100 * found["low"], 100 * found["high"]
-    return f"{found['hits']} of {found['of']}, {100 * found['share']:.0f} % ({low:.0f} to {high:.0f})"

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from bayeskin import report, storage
 from bayeskin.errors import InputError
 from bayeskin.inference.noise_model import bins_in_windows
@@ -41,6 +44,11 @@ def pad_motion(
     if protocol == "idealised":
         return idealised_motion(recording, phases)
     return recorded_motion(recording, phases)
+
+
+def fitted_bins(run: Run, binned: BinnedForce) -> NDArray[np.bool_]:
+    """Returns which bins enter the fit, (m,) bool."""
+    return bins_in_windows(binned, run.config.fit.windows_s) >= 0
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from bayeskin.config import load_config
+from bayeskin.config.device import load_device, stated_geometry
+from bayeskin.config.sections import read_toml
 from bayeskin.design import default_space
-from bayeskin.device import load_device, stated_geometry
 from bayeskin.errors import InputError
 from bayeskin.execution.cluster import on_scheduler
 from bayeskin.execution.local import Map, local
@@ -26,11 +27,11 @@ from bayeskin.reduced.files import load_reduced, save_reduced, trained_geometry
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.region import other_geometry
 from bayeskin.reduced.runs import FullRuns
-from bayeskin.sections import read_toml
 from bayeskin.shipped import shipped
 from bayeskin.types import ParameterSpace
 from bayeskin.workflow.engine import Reporter
 from bayeskin.workflow.folder import locked
+from bayeskin.workflow.output_paths import check_ending
 
 SHIPPED = "surrogates/article-device-reduced.h5"
 REFINEMENT = 1  # of the bricks of the full model that reduced models replace
@@ -53,8 +54,7 @@ def reduce(
     """
     geometry = _geometry(source)
     path = out or default_path(source)
-    if path.suffix != ".h5":
-        raise InputError(f"-o {path}", f"the ending {path.suffix!r}", "the ending .h5")
+    check_ending(path, ".h5")
     trained = trained_for(geometry)
     finished = _finished(path, trained)
     if finished:

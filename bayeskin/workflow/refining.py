@@ -13,7 +13,7 @@ from bayeskin.forward.design_model import ForceModel
 from bayeskin.runner import load_design
 from bayeskin.surrogates import load_manifest, load_surrogate, manifest_of, save_surrogate
 from bayeskin.types import Array, BinnedForce, Design, PadMotion, Simulation, Surrogate
-from bayeskin.workflow.design import rows_of, run_wave, runs_file
+from bayeskin.workflow.design_runs import rows_of, run_wave, runs_file
 from bayeskin.workflow.engine import Run
 from bayeskin.workflow.model import full_model, waves_model
 from bayeskin.workflow.training import corrected, fine_design, trained

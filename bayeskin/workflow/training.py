@@ -21,10 +21,12 @@ from bayeskin.surrogates import (
     save_surrogate,
     train,
 )
+from bayeskin.surrogates.focus import focus
 from bayeskin.types import Array, BinnedForce, Design, PadMotion
-from bayeskin.workflow.design import enough, fitted_bins, focus
+from bayeskin.workflow.design_runs import enough
 from bayeskin.workflow.engine import Run, Stage
 from bayeskin.workflow.provenance import caption
+from bayeskin.workflow.recording import fitted_bins
 from bayeskin.workflow.shipping import origin, shipped_files
 
 PRIOR_DRAWS = 256

@@ -18,7 +18,7 @@ from toys.gmsh_file import coarse_tetrahedra, gmsh_text
 
 from bayeskin import storage
 from bayeskin.config import load_config
-from bayeskin.device import load_device
+from bayeskin.config.device import load_device
 from bayeskin.errors import InputError
 from bayeskin.external.umbridge import Refused, parsed_answer
 from bayeskin.finite_element.gmsh import read_gmsh

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from toys.quick_proof import THETA
 
-from bayeskin.proof.score import CLEAR
+from bayeskin.proof.scoring.judgement import CLEAR
 
 
 def key(label: str, kind: str = "alone", size: float = 5.0, **more) -> dict:

@@ -13,11 +13,13 @@ from bayeskin.mechanisms import catalogue, observed
 from bayeskin.mechanisms.binned import BinnedForces
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.proof import conceal
-from bayeskin.proof.cases import Case, Plan, Screen
+from bayeskin.proof.cases import Case
 from bayeskin.proof.conceal import Concealed, concealed
 from bayeskin.proof.outside import Change
+from bayeskin.proof.plans import Plan
 from bayeskin.proof.protocol import EDGES_S, MOTION
 from bayeskin.proof.refit_residual import Refit
+from bayeskin.proof.screen import Screen
 from bayeskin.types import Prediction, Simulation
 
 SEED, COUNT = 5, 4

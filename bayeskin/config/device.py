@@ -13,9 +13,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag
 
+from bayeskin.config.sections import Section, checked, read_toml
 from bayeskin.errors import InputError
 from bayeskin.geometry import BOUNDS_MM, ForceOn, Geometry, Guard, moved
-from bayeskin.sections import Section, checked, read_toml
 from bayeskin.types import Parameter
 
 EXPECTED = "a TOML file with the sections [device] and [tissue]"

@@ -1,0 +1,82 @@
+"""The commands that run the stages of a configuration: `run`, `report` and the single stages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from bayeskin.cli.answers import answered
+from bayeskin.cli.options import config_argument, scheduler_option
+from bayeskin.cli.terminal import Terminal
+
+
+@click.command(short_help="Run all stages of a configuration that are not done yet.")
+@config_argument
+@scheduler_option
+@answered
+def run(config: Path, scheduler: str | None) -> Mapping[str, Any]:
+    """Run all stages of a configuration in order; skip those that are done and unchanged.
+
+    Outputs are written to a folder beside CONFIG that has the configuration's name. Read report.html in this
+    folder for the result. If the command is interrupted, the same command continues the run.
+
+    \b
+    Example:
+      bayeskin run runs/demo.toml
+      bayeskin run runs/test.toml --scheduler tcp://10.0.0.5:8786
+    """
+    return _run(config, None, scheduler)
+
+
+@click.command()
+@config_argument
+@answered
+def report(config: Path) -> Mapping[str, Any]:
+    """Write one HTML page about a run, from the stages that are done.
+
+    The command runs no stage, and lists the stages that are missing. The page is report.html in the run's
+    folder. It needs no network and no other file, so it can be sent as a single file.
+
+    \b
+    Example:
+      bayeskin report runs/demo.toml
+      bayeskin report runs/demo.toml --json > answer.json
+    """
+    from bayeskin.workflow import stages
+
+    with Terminal() as terminal:
+        return stages.report(config, terminal)
+
+
+def _stage_command(name: str, text: str) -> click.Command:
+    """Returns the command that runs a single stage; `text` appears in its help."""
+    example = f"\b\nExample:\n  bayeskin {name} runs/demo.toml\n  bayeskin {name} runs/demo.toml --json"
+
+    @click.command(name, help=f"{text}\n\nEarlier stages that it needs run first.\n\n{example}")
+    @config_argument
+    @scheduler_option
+    @answered
+    def command(config: Path, scheduler: str | None) -> Mapping[str, Any]:
+        return _run(config, name, scheduler)
+
+    return command
+
+
+STAGES = (
+    _stage_command("design", "Run the full model at the design's points, wave by wave."),
+    _stage_command("train", "Train the surrogate and validate it on held-out points."),
+    _stage_command("map", "Find the most probable point and check it with the full model."),
+    _stage_command("sample", "Sample the posterior and check it with the full model."),
+    _stage_command("sobol", "Compute Sobol' indices of the force over time."),
+)
+
+
+def _run(config: Path, last: str | None, scheduler: str | None) -> Mapping[str, Any]:
+    """Runs a configuration up to the stage `last` (None: all stages) and returns the answer."""
+    from bayeskin.workflow import stages
+
+    with Terminal() as terminal:
+        return stages.run(config, last, terminal, scheduler=scheduler)

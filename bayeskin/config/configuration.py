@@ -1,0 +1,103 @@
+"""The configuration of a whole run; every key has a default except ``recording.file``."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Annotated, Any
+
+from pydantic import Field, model_validator
+
+from bayeskin.config.device import DeviceConfig, StatedGeometry, TissueConfig, stated_geometry
+from bayeskin.config.run_sections import (
+    CheckConfig,
+    DesignConfig,
+    FitConfig,
+    MapConfig,
+    ModelConfig,
+    NoiseConfig,
+    PriorConfig,
+    RecordingConfig,
+    SampleConfig,
+    SlurmConfig,
+    SobolConfig,
+    SurrogateConfig,
+)
+from bayeskin.config.sections import Section
+from bayeskin.errors import InputError
+from bayeskin.geometry import Geometry
+
+# These keys say where runs are made, so no result depends on them.
+WHO_RUNS: Any = {"design": {"workers", "scheduler"}, "slurm": True}
+
+
+class Config(Section):
+    """The configuration of a whole run, which `load_config` reads from a file."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+    recording: RecordingConfig
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    model: ModelConfig = ModelConfig()
+    device: DeviceConfig = DeviceConfig()
+    tissue: TissueConfig = TissueConfig()
+    parameters: dict[str, PriorConfig] = {}
+    design: DesignConfig = DesignConfig()
+    slurm: SlurmConfig | None = None
+    surrogate: SurrogateConfig = SurrogateConfig()
+    fit: FitConfig = FitConfig()
+    noise: NoiseConfig = NoiseConfig()
+    sample: SampleConfig = SampleConfig()
+    check: CheckConfig = CheckConfig()
+    map: MapConfig = MapConfig()
+    sobol: SobolConfig = SobolConfig()
+
+    @model_validator(mode="after")
+    def _coarse_model_is_coarser(self) -> Config:
+        """Refuses a coarse model that is not coarser than the model itself."""
+        coarse, model = self.design.coarse, self.model
+        below = 0 if coarse == "reduced" else coarse
+        if below is not None and (model.mesh != "bricks" or below >= model.refinement):
+            found = (
+                f"{coarse} with model.observation {model.observation!r}, model.mesh {model.mesh!r}, "
+                f"model.refinement {model.refinement}"
+            )
+            expected = "refinement 1 or more" if coarse == "reduced" else "a higher refinement"
+            raise InputError("design.coarse", found, f"bricks with {expected}")
+        return self
+
+    @model_validator(mode="after")
+    def _forward_model_has_no_keys_of_the_full_model(self) -> Config:
+        """Refuses keys that concern the full model where a forward model of the user's own replaces it."""
+        coarse = self.design.coarse
+        if self.model.forward is not None and (coarse is not None or self.surrogate.file is not None):
+            key = "design.coarse" if coarse is not None else "surrogate.file"
+            raise InputError(key, "a value with model.forward", "none, because it concerns the full model")
+        return self
+
+    @property
+    def sha256(self) -> str:
+        """Returns the hash of all keys that can change a result; where runs are made is left out."""
+        plain = self.model_dump(mode="json", exclude=WHO_RUNS)
+        for name, default in (("device", DeviceConfig()), ("tissue", TissueConfig())):
+            if getattr(self, name) == default:  # keeps hashes from before these sections existed
+                del plain[name]
+        return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+    def geometry(self, where: object = "configuration") -> StatedGeometry:
+        """Returns device and tissue as the sections `device` and `tissue` state them.
+
+        An uncertain length moves the nodes of the mesh, so it needs the generator's bricks. Raises
+        InputError, which names `where`, for lengths that are impossible or do not go with the model.
+        """
+        stated = stated_geometry(self.device, self.tissue, where)
+        if stated.sd_m and (self.model.observation, self.model.mesh) != ("reaction", "bricks"):
+            name, model = next(iter(stated.sd_m)), self.model
+            conflict = model.observation if model.observation != "reaction" else model.mesh
+            found = f"a mean and an sd, with {conflict!r} in [model]"
+            expected = "a number, or observation 'reaction' on mesh 'bricks'"
+            raise InputError(f"{where}: tissue.{name}m", found, expected)
+        if self.model.observation != "reaction" and stated != StatedGeometry(Geometry()):
+            section = "device" if self.device != DeviceConfig() else "tissue"
+            found = f"settings other than the article's, with observation {self.model.observation!r}"
+            raise InputError(f"{where}: {section}", found, "observation 'reaction'")
+        return stated

@@ -1,0 +1,36 @@
+"""The data types that the parts of bayeskin exchange: frozen, in SI units, with the unit in the name.
+
+Arrays in these types are read-only; `dataclasses.replace` makes a changed copy. In shapes, ``n`` counts
+samples or parameter points, ``d`` parameters, ``m`` time bins, and ``k`` corners. Files that bayeskin writes
+name each dataclass of this package, so a dataclass keeps its name.
+"""
+
+from bayeskin.types.arrays import Array, _FreezesArrays, frozen_array
+from bayeskin.types.design import Design
+from bayeskin.types.parameters import Correlation, Parameter, ParameterSpace
+from bayeskin.types.protocol import PadMotion, Phase, PhaseKind
+from bayeskin.types.provenance import Provenance
+from bayeskin.types.recording import BinnedForce, Jumps, Recording
+from bayeskin.types.simulation import Observation, Simulation
+from bayeskin.types.surrogate import Prediction, Surrogate
+
+__all__ = [
+    "Array",
+    "BinnedForce",
+    "Correlation",
+    "Design",
+    "Jumps",
+    "Observation",
+    "PadMotion",
+    "Parameter",
+    "ParameterSpace",
+    "Phase",
+    "PhaseKind",
+    "Prediction",
+    "Provenance",
+    "Recording",
+    "Simulation",
+    "Surrogate",
+    "_FreezesArrays",
+    "frozen_array",
+]

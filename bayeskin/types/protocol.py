@@ -1,0 +1,53 @@
+"""The protocol of a test: the displacement over time, and its phases."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bayeskin.types.arrays import Array, _FreezesArrays
+
+PhaseKind = Literal["rest", "load", "hold", "unload"]
+
+
+@dataclass(frozen=True)
+class Phase(_FreezesArrays):
+    """A phase of the protocol, in which the pads rest, load, hold or unload."""
+
+    kind: PhaseKind
+    cycle: int  # 1 for the first loading; the rest phase before it belongs to cycle 0
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True)
+class PadMotion(_FreezesArrays):
+    """The protocol: the LVDT displacement over time, as straight lines between corners.
+
+    `displacement_m` is the *full* LVDT reading; each pad of the symmetric model moves by half of it. Both
+    arrays have shape (k,). `time_s` increases strictly and starts at 0.
+    """
+
+    time_s: Array
+    displacement_m: Array
+
+    def at(self, time_s: ArrayLike) -> Array:
+        """Returns the LVDT displacement [m] at given times, same shape."""
+        return np.interp(np.asarray(time_s, dtype=float), self.time_s, self.displacement_m)
+
+    def times(self, step_s: float, beside_s: ArrayLike | None = None) -> Array:
+        """Returns times (n,) [s] every `step_s`, and at the corners or at `beside_s`.
+
+        Regular times closer than a microsecond to one of these are left out.
+        """
+        fixed = self.time_s if beside_s is None else np.asarray(beside_s, dtype=float)
+        every = np.arange(0.0, self.time_s[-1], step_s)
+        after = np.searchsorted(fixed, every)
+        nearest = np.minimum(
+            np.abs(every - fixed[np.maximum(after - 1, 0)]),
+            np.abs(every - fixed[np.minimum(after, len(fixed) - 1)]),
+        )
+        return np.union1d(fixed, every[nearest > 1e-6])  # rounding could make two times out of one

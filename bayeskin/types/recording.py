@@ -1,0 +1,74 @@
+"""A recording as measured, its force in bins, and the jumps of the force that its samples allow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayeskin.types.arrays import Array, _FreezesArrays
+from bayeskin.types.protocol import Phase
+
+
+@dataclass(frozen=True)
+class Recording(_FreezesArrays):
+    """A recording as measured, in SI units, without smoothing and without a zero correction; arrays (n,)."""
+
+    time_s: Array
+    displacement_m: Array
+    force_n: Array
+    name: str
+    sha256: str  # hash of the source file's bytes
+    notes: tuple[str, ...] = ()  # how the importer interpreted columns and units
+
+
+@dataclass(frozen=True)
+class BinnedForce(_FreezesArrays):
+    """Robust bin means of a recording's force, with the noise of each mean.
+
+    edges_s : the edges of the bins, (m+1,)
+    force_n : robust means, (m,)
+    variance_n2 : the variance of each mean, (m,), which includes the correlation of samples within the bin
+    correlation : the correlation of the noise of neighbouring bins, (m-1,)
+    phase : for each bin the index in `phases` of the phase that covers most of it, (m,)
+    """
+
+    edges_s: Array
+    force_n: Array
+    variance_n2: Array
+    correlation: Array
+    phase: NDArray[np.int64]
+    phases: tuple[Phase, ...]
+
+    @property
+    def time_s(self) -> Array:
+        """Returns the bin centres, (m,)."""
+        return 0.5 * (self.edges_s[1:] + self.edges_s[:-1])
+
+
+@dataclass(frozen=True)
+class Jumps(_FreezesArrays):
+    """The range of force jumps that a recording's samples allow.
+
+    lowest_n, highest_n : the smallest and the largest jump at time_s, (n,) each; infinite where the samples
+        do not limit it
+    """
+
+    time_s: Array
+    lowest_n: Array
+    highest_n: Array
+
+    def refute(self, time_s: Array, size_n: Array) -> NDArray[np.bool_]:
+        """Returns whether the samples contradict jumps of size_n (k,) [N] at time_s (k,)."""
+        at = np.clip(np.searchsorted(self.time_s, time_s), 0, len(self.time_s) - 1)
+        return np.asarray((size_n < self.lowest_n[at]) | (size_n > self.highest_n[at]))
+
+    def until(self, end_s: float) -> Jumps:
+        """Returns the range of jumps that the samples up to a given time allow."""
+        known = self.time_s <= end_s
+        return replace(
+            self,
+            lowest_n=np.where(known, self.lowest_n, -np.inf),
+            highest_n=np.where(known, self.highest_n, np.inf),
+        )

@@ -1,0 +1,42 @@
+"""Writes the answer of `bayeskin diagnose` as text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bayeskin.report.words import faint_in_words, full_run_in_words
+
+
+def in_words(answer: Mapping[str, Any]) -> str:
+    """Returns the answer as text."""
+    lines = [f"verdict: {answer['verdict']}"]
+    lines += [f"  {mechanism['name']} (probability {mechanism['probability']:.2f}): {mechanism['statement']}"
+              for mechanism in answer["mechanisms"]]  # fmt: skip
+    lines.append(f"  nothing is missing: probability {answer['nothing_probability']:.2f}")
+    lines.append(f"  an unnamed smooth discrepancy: probability {answer['smooth_probability']:.2f}")
+    lines += [f"  {faint}" for faint in faint_in_words(answer)]
+    lines.append(
+        f"The model deviates from the recording in {len(answer['located'])} windows, "
+        f"and in {len(answer['remaining'])} with {', '.join(answer['best_set']) or 'no mechanism'}."
+    )
+    lines += [_fit_line(label, answer["fit"][label]) for label in ("before", "after")]
+    lines.append(full_run_in_words(answer["full_model"]))
+    after = answer["fit"]["after"]
+    if not (after["emulator"]["settled"] and after["sampled"]["settled"]):
+        lines.append("The intervals are approximate, because their runs or draws have not converged.")
+    best = ", ".join(
+        f"{candidate['name']} {candidate['delta_score']:+.1f}" for candidate in answer["candidates"][:5]
+    )
+    if best:
+        lines.append(f"gain of log-evidence by single mechanisms: {best}")
+    lines.append(f"outputs in {answer['folder']}")
+    return "\n".join(lines)
+
+
+def _fit_line(label: str, fit: Mapping[str, Any]) -> str:
+    """Returns a line with the errors of a fit."""
+    line, held_out = f"{label}: RMSE {1e3 * fit['rmse']:.1f} mN", fit["rmse_held_out"]
+    if held_out is None:
+        return line
+    return f"{line}, {1e3 * held_out:.1f} mN after the second hold, which was not fitted"
