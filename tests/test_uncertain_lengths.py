@@ -15,8 +15,8 @@ from toys.snapshots import binds_of, full_model, snapshot_basis
 from bayeskin.errors import InputError
 from bayeskin.finite_element import lagrangian, series
 from bayeskin.finite_element.gradients import ForceGradients
-from bayeskin.finite_element.lagrangian import Step
 from bayeskin.finite_element.simulate import ModelSpec, problem_at, problem_of, simulate
+from bayeskin.finite_element.stages import Step
 from bayeskin.finite_element.stepping import integrate
 from bayeskin.geometry import Geometry
 from bayeskin.reduced import equations as equations_module

@@ -29,7 +29,8 @@ import scipy.sparse as sp
 import skfem
 
 from bayeskin.finite_element import article_law, assembly
-from bayeskin.finite_element.newton import EXTRAPOLATION_POINTS, Equations, NewtonSolver, extrapolate
+from bayeskin.finite_element.extrapolation import EXTRAPOLATION_POINTS, extrapolate
+from bayeskin.finite_element.newton import Equations, NewtonSolver
 from bayeskin.finite_element.problem import Material, Problem
 from bayeskin.types import Array
 

@@ -43,11 +43,13 @@ from typing import Union
 import numpy as np
 
 from bayeskin.errors import InputError
+from bayeskin.finite_element.balances import Evaluated
 from bayeskin.finite_element.directional import TangentAction
-from bayeskin.finite_element.lagrangian import Evaluated, LagrangianModel, Stage, State, Step
+from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.newton import Equations
 from bayeskin.finite_element.problem import Material, Problem, material
 from bayeskin.finite_element.series import Drive, Memories, lost_slopes, memory_slopes, on_the_way, yielding
+from bayeskin.finite_element.stages import Stage, State, Step
 from bayeskin.finite_element.tissue import Bind, TissueLaw
 from bayeskin.geometry import LENGTHS
 from bayeskin.types import Array

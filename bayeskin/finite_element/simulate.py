@@ -17,7 +17,7 @@ from bayeskin.external.model import identity, simulate_own
 from bayeskin.finite_element import article
 from bayeskin.finite_element.gmsh import read_gmsh
 from bayeskin.finite_element.gradients import ForceGradients
-from bayeskin.finite_element.lagrangian import LagrangianModel, Step
+from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.linear import SOLVER_NAME
 from bayeskin.finite_element.mesh import SkinMesh, brick_mesh
 from bayeskin.finite_element.newton import NewtonSolver
@@ -30,6 +30,7 @@ from bayeskin.finite_element.problem import (
     material,
     moved_problem,
 )
+from bayeskin.finite_element.stages import Step
 from bayeskin.finite_element.stepping import integrate
 from bayeskin.finite_element.tissue import Bind
 from bayeskin.geometry import LENGTHS, Geometry, moved

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from bayeskin.finite_element.lagrangian import Stage, State, Step
 from bayeskin.finite_element.problem import Material, Problem, Sites, material, nominal_force
 from bayeskin.finite_element.series import SeriesSolver, Solved, on_the_way
+from bayeskin.finite_element.stages import Stage, State, Step
 from bayeskin.finite_element.tissue import Bind, SurfaceTerm, TissueLaw
 from bayeskin.geometry import Geometry
 from bayeskin.reduced import kernels

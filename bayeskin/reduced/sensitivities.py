@@ -18,9 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayeskin.errors import InputError
-from bayeskin.finite_element.lagrangian import Stage, State, Step
-from bayeskin.finite_element.newton import extrapolate
+from bayeskin.finite_element.extrapolation import extrapolate
 from bayeskin.finite_element.series import Memories, lost_slopes, memory_slopes, on_the_way, yielding
+from bayeskin.finite_element.stages import Stage, State, Step
 from bayeskin.finite_element.tissue import Bind
 from bayeskin.geometry import LENGTHS
 from bayeskin.reduced import kernels, slopes

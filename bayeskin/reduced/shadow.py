@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayeskin.finite_element.lagrangian import Stage, State
+from bayeskin.finite_element.stages import Stage, State
 from bayeskin.finite_element.tissue import Bind
 from bayeskin.reduced import kernels
 from bayeskin.reduced.equations import ReducedEquations, ReducedSpace

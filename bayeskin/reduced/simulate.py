@@ -8,9 +8,10 @@ from functools import partial
 
 import numpy as np
 
-from bayeskin.finite_element.lagrangian import LagrangianModel, Step
+from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.problem import material
 from bayeskin.finite_element.simulate import OnState
+from bayeskin.finite_element.stages import Step
 from bayeskin.finite_element.stepping import integrate
 from bayeskin.geometry import Geometry, moved
 from bayeskin.mechanisms import Mechanism, solved
