@@ -26,9 +26,10 @@ from bayeskin.device import (
     stated_geometry,
 )
 from bayeskin.errors import InputError
+from bayeskin.finite_element import ModelSpec
 from bayeskin.geometry import LENGTHS, Geometry, moved
 from bayeskin.sections import Section, checked, one_of, read_toml
-from bayeskin.types import Correlation, Parameter, ParameterSpace
+from bayeskin.types import Correlation, Observation, Parameter, ParameterSpace
 
 EXPECTED = "a TOML configuration, as `bayeskin new RECORDING` writes one"
 FEWEST_CHECKED = 8  # importance weights of fewer draws carry almost no information
@@ -61,7 +62,7 @@ class ModelConfig(Section):
     The observation of such a model is "own".
     """
 
-    observation: Literal["reaction", "article", "own"] = "reaction"
+    observation: Observation = "reaction"
     mesh: str = "bricks"
     refinement: Refinement = 1  # of the bricks, towards the edges of the pads; 0 gives 80 bricks
     forward: str | None = None
@@ -81,14 +82,12 @@ class ModelConfig(Section):
             )
         return self
 
-    @model_validator(mode="after")
-    def _article_needs_its_mesh(self) -> ModelConfig:
-        """Refuses the article's observation on the generator's bricks."""
-        if self.observation == "article" and self.mesh == "bricks":
-            raise ValueError(
-                "mesh: found 'bricks'; expected the article's gmsh file with observation 'article'"
-            )
-        return self
+    def spec(self) -> ModelSpec:
+        """Returns the specification of the model on the article's device, with the paths as they are written.
+
+        Raises InputError for a mesh that does not go with the observation.
+        """
+        return ModelSpec(self.observation, self.mesh, self.refinement, forward=self.forward)
 
 
 class PriorConfig(Section):
@@ -272,6 +271,12 @@ class Config(Section):
     sobol: SobolConfig = SobolConfig()
 
     @model_validator(mode="after")
+    def _model_has_a_specification(self) -> Config:
+        """Refuses a mesh that does not go with the observation."""
+        self.model.spec()
+        return self
+
+    @model_validator(mode="after")
     def _coarse_model_is_coarser(self) -> Config:
         """Refuses a coarse model that is not coarser, and keys that do not go with a forward model of the
         user."""
@@ -308,15 +313,15 @@ class Config(Section):
         InputError, which names `where`, for lengths that are impossible or do not go with the model.
         """
         stated = stated_geometry(self.device, self.tissue, where)
-        if stated.sd_m and (self.model.observation, self.model.mesh) != ("reaction", "bricks"):
-            name, model = next(iter(stated.sd_m)), self.model
-            conflict = model.observation if model.observation != "reaction" else model.mesh
+        model, any_device = self.model, self.model.spec().formulation.any_device
+        if stated.sd_m and not (any_device and model.mesh == "bricks"):
+            name, conflict = next(iter(stated.sd_m)), model.mesh if any_device else model.observation
             found = f"a mean and an sd, with {conflict!r} in [model]"
             expected = "a number, or observation 'reaction' on mesh 'bricks'"
             raise InputError(f"{where}: tissue.{name}m", found, expected)
-        if self.model.observation != "reaction" and stated != StatedGeometry(Geometry()):
+        if not any_device and stated != StatedGeometry(Geometry()):
             section = "device" if self.device != DeviceConfig() else "tissue"
-            found = f"settings other than the article's, with observation {self.model.observation!r}"
+            found = f"settings other than the article's, with observation {model.observation!r}"
             raise InputError(f"{where}: {section}", found, "observation 'reaction'")
         return stated
 

@@ -42,7 +42,7 @@ BELOW = {
     "journal": BASE,
     "sections": {"errors", "probe"},
     "device": {"errors", "geometry", "sections", "types"},
-    "config": BASE | {"design", "device", "sections"},
+    "config": BASE | {"design", "device", "finite_element", "sections"},
     "external": {"errors", "hashing", "types"},
     "mechanisms": BASE | {"finite_element"},
     "reduced": BASE | {"finite_element", "mechanisms"},

@@ -19,6 +19,7 @@ from bayeskin.finite_element.accuracy import mesh_error
 from bayeskin.finite_element.problem import Problem
 from bayeskin.finite_element.simulate import ModelSpec, OnState, problem_at, simulate
 from bayeskin.forward.observed import reported
+from bayeskin.forward.reduced import stands_for
 from bayeskin.geometry import LENGTHS, Geometry
 from bayeskin.json_files import plain
 from bayeskin.mechanisms import Mechanism, catalogue, laws, solved
@@ -98,13 +99,13 @@ def simulate_once(
     solved_values = {p.name: values[p.name] for mechanism in solved(added) for p in mechanism.parameters}
     source = read_recording(recording or run.beside(run.config.recording.file))
     phases = segment(source)
-    motion = pad_motion(spec.observation, source, phases, run.config.recording.protocol)
+    motion = pad_motion(spec, source, phases, run.config.recording.protocol)
     moments = moments_of(phases, motion, at_s)
     reporter.log(f"simulating {motion.time_s[-1]:.1f} s, {spec.forward or _on_mesh(spec)}")
     outputs = None
     if fields or figures:
-        if spec.observation == "article":
-            found = "model.observation 'article', whose stresses differ from those of the fields"
+        if not spec.formulation.has_fields:
+            found = f"model.observation {spec.observation!r}, whose stresses differ from those of the fields"
             raise InputError("--fields, --figures", found, "model.observation 'reaction'")
         problem = problem_at(spec, theta)
         _refuse_other_stresses(added, theta | solved_values, problem)
@@ -133,7 +134,7 @@ def _reduced_run(
 
     Raises InputError where no reduced model exists for this device, mesh or observation.
     """
-    if (spec.observation, spec.mesh, spec.refinement) != ("reaction", "bricks", 1):
+    if not stands_for(spec) or spec.refinement != 1:
         found = f"observation {spec.observation!r} on {spec.mesh!r}, refinement {spec.refinement}"
         raise InputError("--reduced", found, "observation 'reaction' on 'bricks', refinement 1")
     model = load_reduced(reduced_file(spec.geometry, [source for source in sources if source is not None]))
@@ -290,14 +291,9 @@ def _reduced_accuracy(simulation: Simulation) -> list[str]:
 
 
 def _accuracy(simulation: Simulation, spec: ModelSpec) -> list[str]:
-    """Returns lines with the estimated error of the full model's reaction.
-
-    The article's force has no error estimate, because it does not converge.
-    """
-    if spec.observation == "own":
-        return ["no error estimate: this is a model of your own"]
-    if spec.observation == "article":
-        return ["no error estimate: the article's force depends on the mesh and does not converge"]
+    """Returns lines with the estimated error of the model's force."""
+    if spec.formulation.error_unknown:
+        return [f"no error estimate: {spec.formulation.error_unknown}"]
     peak_n = simulation.stats["peak_force_n"]
     time_share = simulation.stats["time_error_n"] / peak_n if peak_n > 0.0 else 0.0
     error = mesh_error(spec.mesh_hash)
