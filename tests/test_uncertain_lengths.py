@@ -23,7 +23,8 @@ from bayeskin.reduced import equations as equations_module
 from bayeskin.reduced.basis import inner_products
 from bayeskin.reduced.build import whole_space
 from bayeskin.reduced.cases import Case
-from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
+from bayeskin.reduced.equations import ReducedEquations
+from bayeskin.reduced.operators import ReducedSpace
 from bayeskin.reduced.sensitivities import ReducedGradients
 from bayeskin.types import Array, PadMotion
 

@@ -16,9 +16,10 @@ from bayeskin.finite_element.stepping import integrate
 from bayeskin.geometry import Geometry, moved
 from bayeskin.mechanisms import Mechanism, solved
 from bayeskin.mechanisms.mechanism import Tissue
-from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
+from bayeskin.reduced.equations import ReducedEquations
 from bayeskin.reduced.error import DualWeightedResidual
 from bayeskin.reduced.model import ReducedModel
+from bayeskin.reduced.operators import ReducedSpace
 from bayeskin.reduced.region import LEAST_STIFFNESS, Stability, outside
 from bayeskin.reduced.sensitivities import ReducedGradients
 from bayeskin.types import PadMotion, Simulation, frozen_array
