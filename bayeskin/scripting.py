@@ -24,7 +24,7 @@ from bayeskin.errors import InputError
 from bayeskin.finite_element import simulate as run_model
 from bayeskin.inference import LogPosterior, Weighed
 from bayeskin.json_files import plain
-from bayeskin.recordings import read_recording, segment
+from bayeskin.recordings import idealised_motion, read_recording, segment
 from bayeskin.runner import load_design
 from bayeskin.surrogates import load_surrogate
 from bayeskin.types import BinnedForce, PadMotion, Recording, Simulation
@@ -65,7 +65,7 @@ def simulate(
             raise InputError("simulate: theta", found, f"some of {', '.join(space.names)}")
         middle = dict(zip(space.names, map(float, space.from_unit(np.full(space.dim, 0.5))), strict=True))
         spec, protocol = model_spec(run), run.config.recording.protocol
-        motion = pad_motion(spec.observation, recording, segment(recording), protocol)
+        motion = pad_motion(spec, recording, segment(recording), protocol)
         return run_model(spec, motion, {**middle, **(theta or {})})
 
 
@@ -196,7 +196,7 @@ def _with_surrogate(
     if surrogate is None and settings.get("surrogate", {}).get("file") is not None:
         return dict(settings)
     if surrogate is None:
-        fitting = shipped_for(pad_motion("reaction", recording, segment(recording), "idealised"))
+        fitting = shipped_for(idealised_motion(recording, segment(recording)))
         if fitting is None:
             raise InputError(
                 f"calibrate {recording.name}", "a protocol that no shipped surrogate was trained on",

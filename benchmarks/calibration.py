@@ -39,13 +39,12 @@ from bayeskin.execution.local import Lost, run_parallel
 from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.inference import Limits, LogPosterior, SampleSettings
 from bayeskin.inference.noise_model import draw_noise
-from bayeskin.recordings import bin_recording, read_recording, segment, uniform_edges
+from bayeskin.recordings import bin_recording, idealised_motion, read_recording, segment, uniform_edges
 from bayeskin.report import save_figure
 from bayeskin.report.style import GREY, MODEL, PAGE_IN, new_figure, state_finding, styled, symbol
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_manifest, load_surrogate
 from bayeskin.types import Array
-from bayeskin.workflow.recording import pad_motion
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 WINDOW_S = ((5.0, 45.0),)
@@ -90,7 +89,7 @@ def made_by_surrogate(about: LogPosterior, theta: Array, rng: np.random.Generato
 def made_by_model(about: LogPosterior, theta: Array) -> Array:
     """Returns the force [N] of all bins (m,) by a full run; raises RuntimeError where the run fails."""
     recording = read_recording(shipped("data/demo.h5"))
-    motion = pad_motion("reaction", recording, segment(recording), "idealised")
+    motion = idealised_motion(recording, segment(recording))
     names = about.surrogate.space.names
     material = map(float, about.split(theta)[0][0])
     run = simulate(ModelSpec(), motion, dict(zip(names, material, strict=True)))

@@ -23,6 +23,7 @@ from bayeskin.finite_element.stepping import integrate
 from bayeskin.forward.interface import change
 from bayeskin.mechanisms import catalogue
 from bayeskin.reduced import kernels
+from bayeskin.reduced.arrays import History
 from bayeskin.reduced.equations import ReducedEquations
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.model import ReducedModel, reduced_space
@@ -65,9 +66,7 @@ def median_ms(call: Callable[[], object]) -> float:
 def row(label: str, eq: ReducedEquations, p_init: float) -> list[str]:
     """Returns the table's row of one size: milliseconds of a residual and of a tangent."""
     state = eq.initial_state(p_init)
-    past = kernels.History(
-        state.volume, state.pressure, state.memory[0], state.x[: eq.space.modes[0]], 1.0, 1.0, 1.0
-    )
+    past = History(state.volume, state.pressure, state.memory[0], state.x[: eq.space.modes[0]], 1.0, 1.0, 1.0)
     scratch, output, t = eq.make_room(), np.empty(len(state.x)), eq.tangent
     residual = median_ms(lambda: kernels.residual(eq.system, eq.packed, past, state.x, scratch, output))
     tangent = median_ms(

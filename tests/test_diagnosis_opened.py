@@ -16,6 +16,7 @@ from bayeskin.shipped import shipped
 from bayeskin.types import Recording
 from bayeskin.workflow.diagnosis import STAGE, opened, stage_of
 from bayeskin.workflow.engine import Silent
+from bayeskin.workflow.experiment import choose
 
 
 def recording(path: Path) -> Path:
@@ -64,6 +65,8 @@ def test_a_model_that_no_reduced_one_stands_for_needs_a_surrogate(tmp_path: Path
     run = opened(case, Silent())
     assert stage_of(run.config).needs == ("recording", "design", "train")
     assert list(stage_of(run.config).files(run)) == []
+    with pytest.raises(InputError, match=r"on 'own\.msh'; expected .*'reaction' on 'bricks'"):
+        choose(case, Silent())
 
 
 def test_a_device_stands_beside_no_configuration(tmp_path: Path) -> None:

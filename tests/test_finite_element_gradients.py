@@ -11,11 +11,13 @@ from toys.same_steps import on_steps_of, start_at_zero
 
 from bayeskin.errors import InputError
 from bayeskin.finite_element import ModelSpec, lagrangian, series, simulate
+from bayeskin.finite_element.balances import Evaluated
 from bayeskin.finite_element.directional import TangentAction
 from bayeskin.finite_element.gradients import ForceGradients, logarithms
-from bayeskin.finite_element.lagrangian import Evaluated, LagrangianModel, Stage, State, Step
+from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.problem import Material, material
 from bayeskin.finite_element.simulate import problem_of
+from bayeskin.finite_element.stages import Stage, State, Step
 from bayeskin.finite_element.stepping import integrate
 from bayeskin.finite_element.tissue import Bind
 from bayeskin.mechanisms import catalogue, laws

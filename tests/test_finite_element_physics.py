@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from toys.bar_models import LAM, MU, YOUNG, bar, drained_bar, model
 from toys.driven_model import corner_points
 
-from bayeskin.finite_element.lagrangian import LagrangianModel, State
+from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.simulate import ModelSpec, simulate
 from bayeskin.finite_element.space import taylor_hood
+from bayeskin.finite_element.stages import State
 from bayeskin.finite_element.stepping import GAMMA, advance
 from bayeskin.types import PadMotion
 

@@ -14,7 +14,7 @@ import pytest
 from toys.synthetic_recordings import supplement
 
 from bayeskin.finite_element import ModelSpec, article, simulate
-from bayeskin.finite_element.article import ArticleModel
+from bayeskin.finite_element.article_equations import ArticleModel
 from bayeskin.finite_element.gmsh import read_gmsh
 from bayeskin.finite_element.problem import build_problem, material
 from bayeskin.geometry import Geometry
@@ -154,5 +154,5 @@ class ScriptedForces:
 def test_an_article_run_whose_force_swings_has_failed(forces, stable):
     time_s = np.arange(0.0, 3.5, 0.5)
     pads = np.array([0.0, 1e-3, 2e-3, 2e-3, 2e-3, 2e-3, 2e-3])
-    message = article.run(ScriptedForces(forces), time_s, pads, 0.0, lambda *_: None)
+    message = article.integrate(ScriptedForces(forces), time_s, pads, 0.0, lambda *_: None)
     assert (message == "") is stable, message

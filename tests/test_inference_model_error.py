@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -97,5 +95,4 @@ def test_the_mesh_and_the_load_cell_are_allowed_for_where_the_force_is_the_pad_s
     other = model_error(ModelSpec(geometry=longer), closed_form_model.MOTION, edges_s)
     assert other is not None
     assert other.amplitude == pytest.approx(np.hypot(UNKNOWN_MESH, CALIBRATION))
-    article: Any = SimpleNamespace(observation="article")
-    assert model_error(article, closed_form_model.MOTION, edges_s) is None
+    assert model_error(ModelSpec("article", "some.msh"), closed_form_model.MOTION, edges_s) is None

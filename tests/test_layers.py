@@ -40,7 +40,7 @@ BELOW = {
     **dict.fromkeys(SIBLINGS, BASE),
     "finite_element": BASE | {"external"},
     "journal": BASE,
-    "config": BASE | {"design"},
+    "config": BASE | {"design", "finite_element"},
     "external": {"errors", "hashing", "types"},
     "mechanisms": BASE | {"finite_element"},
     "reduced": BASE | {"finite_element", "mechanisms"},

@@ -17,10 +17,10 @@ from toys.pulled_bar import BAR, STRETCH_M, bound, elastic_force, pulled
 from toys.skin_with_mechanisms import IN_SERIES, SOLVED, STRONG, THETA, skin, strong, unknowns
 
 from bayeskin.finite_element import ModelSpec, simulate
-from bayeskin.finite_element.lagrangian import State
 from bayeskin.finite_element.mesh import brick_mesh
 from bayeskin.finite_element.problem import build_problem
 from bayeskin.finite_element.space import taylor_hood
+from bayeskin.finite_element.stages import State
 from bayeskin.mechanisms import laws, observed
 from bayeskin.mechanisms.backlash import trailing
 from bayeskin.mechanisms.preconditioning import damaged

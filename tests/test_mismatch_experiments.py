@@ -17,6 +17,7 @@ from scipy.stats import norm
 from toys import closed_form_model
 from toys.inference_problems import NOISE, SCALE, TRUTH, ToySurrogate, empty_recording
 
+from bayeskin.config import ModelConfig
 from bayeskin.errors import InputError
 from bayeskin.experiments.choice import DRAWS, OPEN, Experiment, compete, noise_of, ranked, search, weigh
 from bayeskin.experiments.information import expected_gain
@@ -302,9 +303,7 @@ def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
     record = Record("inputs", True, 1.0, {"diagnosis.json": "00"})
     (tmp_path / "x" / "diagnose").mkdir(parents=True)
     write_record(tmp_path / "x" / "diagnose", record)
-    config = SimpleNamespace(
-        model=SimpleNamespace(observation="reaction"), design=SimpleNamespace(coarse=None), seed=0
-    )
+    config = SimpleNamespace(model=ModelConfig(), design=SimpleNamespace(coarse=None), seed=0)
     run = SimpleNamespace(
         config=config, folder=tmp_path / "x", at=lambda *parts: tmp_path.joinpath("x", *parts)
     )

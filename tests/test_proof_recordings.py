@@ -26,18 +26,17 @@ from bayeskin.proof.plans import Plan, plans
 from bayeskin.proof.protocol import EDGES_S, KINDS, MOTION, SURROGATE, kind_at, samples_s
 from bayeskin.proof.refit_residual import rms
 from bayeskin.proof.screen import shipped_screen
-from bayeskin.recordings import bin_recording, read_recording, segment, uniform_edges
+from bayeskin.recordings import bin_recording, idealised_motion, read_recording, segment, uniform_edges
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_manifest, load_surrogate
 from bayeskin.types import Recording, Simulation
-from bayeskin.workflow.recording import pad_motion
 from bayeskin.workflow.shipping import motion_sha256
 
 
 def test_a_recording_comes_back_with_the_protocol_of_the_shipped_surrogate(concealed_set: Path) -> None:
     recording = read_recording(seals.recording_path(concealed_set, "001"))
     phases = segment(recording)
-    motion = pad_motion("reaction", recording, phases, "idealised")
+    motion = idealised_motion(recording, phases)
     assert motion_sha256(motion) == load_manifest(shipped(SURROGATE))["motion_sha256"]
     assert tuple(phase.kind for phase in phases) == KINDS
     edges_s = uniform_edges(float(min(recording.time_s[-1], motion.time_s[-1])))

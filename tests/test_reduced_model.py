@@ -16,8 +16,8 @@ from toys.small_reduced import NAMES, SETTINGS, built, one_by_one, unheard
 from bayeskin import storage
 from bayeskin.errors import InputError
 from bayeskin.finite_element import series
-from bayeskin.finite_element.lagrangian import Step
 from bayeskin.finite_element.simulate import ModelSpec, simulate
+from bayeskin.finite_element.stages import Step
 from bayeskin.finite_element.stepping import integrate
 from bayeskin.geometry import Geometry
 from bayeskin.mechanisms import Mechanism, catalogue, laws

@@ -15,15 +15,16 @@ from toys.snapshots import binds_of, full_model, snapshot_basis
 from bayeskin.errors import InputError
 from bayeskin.finite_element import lagrangian, series
 from bayeskin.finite_element.gradients import ForceGradients
-from bayeskin.finite_element.lagrangian import Step
 from bayeskin.finite_element.simulate import ModelSpec, problem_at, problem_of, simulate
+from bayeskin.finite_element.stages import Step
 from bayeskin.finite_element.stepping import integrate
 from bayeskin.geometry import Geometry
 from bayeskin.reduced import equations as equations_module
 from bayeskin.reduced.basis import inner_products
 from bayeskin.reduced.build import whole_space
 from bayeskin.reduced.cases import Case
-from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
+from bayeskin.reduced.equations import ReducedEquations
+from bayeskin.reduced.operators import ReducedSpace
 from bayeskin.reduced.sensitivities import ReducedGradients
 from bayeskin.types import Array, PadMotion
 

@@ -52,6 +52,12 @@ class Config(Section):
     sobol: SobolConfig = SobolConfig()
 
     @model_validator(mode="after")
+    def _model_has_a_specification(self) -> Config:
+        """Refuses a mesh that does not go with the observation."""
+        self.model.spec()
+        return self
+
+    @model_validator(mode="after")
     def _coarse_model_is_coarser(self) -> Config:
         """Refuses a coarse model that is not coarser than the model itself."""
         coarse, model = self.design.coarse, self.model
@@ -90,14 +96,14 @@ class Config(Section):
         InputError, which names `where`, for lengths that are impossible or do not go with the model.
         """
         stated = stated_geometry(self.device, self.tissue, where)
-        if stated.sd_m and (self.model.observation, self.model.mesh) != ("reaction", "bricks"):
-            name, model = next(iter(stated.sd_m)), self.model
-            conflict = model.observation if model.observation != "reaction" else model.mesh
+        model, any_device = self.model, self.model.spec().formulation.any_device
+        if stated.sd_m and not (any_device and model.mesh == "bricks"):
+            name, conflict = next(iter(stated.sd_m)), model.mesh if any_device else model.observation
             found = f"a mean and an sd, with {conflict!r} in [model]"
             expected = "a number, or observation 'reaction' on mesh 'bricks'"
             raise InputError(f"{where}: tissue.{name}m", found, expected)
-        if self.model.observation != "reaction" and stated != StatedGeometry(Geometry()):
+        if not any_device and stated != StatedGeometry(Geometry()):
             section = "device" if self.device != DeviceConfig() else "tissue"
-            found = f"settings other than the article's, with observation {self.model.observation!r}"
+            found = f"settings other than the article's, with observation {model.observation!r}"
             raise InputError(f"{where}: {section}", found, "observation 'reaction'")
         return stated

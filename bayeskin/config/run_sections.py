@@ -13,6 +13,8 @@ from pydantic import Field, model_validator
 
 from bayeskin.config.sections import Section
 from bayeskin.errors import InputError
+from bayeskin.finite_element import ModelSpec
+from bayeskin.types import Observation
 
 FEWEST_CHECKED = 8  # importance weights of fewer draws carry almost no information
 # The upper bounds catch typing errors, which would exhaust the memory. No real computation comes near them.
@@ -40,7 +42,7 @@ class ModelConfig(Section):
     The observation of such a model is "own".
     """
 
-    observation: Literal["reaction", "article", "own"] = "reaction"
+    observation: Observation = "reaction"
     mesh: str = "bricks"
     refinement: Refinement = 1  # of the bricks, towards the edges of the pads; 0 gives 80 bricks
     forward: str | None = None
@@ -58,12 +60,12 @@ class ModelConfig(Section):
             raise InputError("observation", repr(self.observation), "'own' with model.forward, and only then")
         return self
 
-    @model_validator(mode="after")
-    def _article_needs_its_mesh(self) -> ModelConfig:
-        """Refuses the article's observation on the generator's bricks."""
-        if self.observation == "article" and self.mesh == "bricks":
-            raise InputError("mesh", "'bricks'", "the article's gmsh file with observation 'article'")
-        return self
+    def spec(self) -> ModelSpec:
+        """Returns the specification of the model on the article's device, with the paths as they are written.
+
+        Raises InputError for a mesh that does not go with the observation.
+        """
+        return ModelSpec(self.observation, self.mesh, self.refinement, forward=self.forward)
 
 
 class PriorConfig(Section):

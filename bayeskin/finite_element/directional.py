@@ -19,8 +19,10 @@ import numpy as np
 
 from bayeskin.finite_element import assembly
 from bayeskin.finite_element.assembly import compiled, inverse_and_determinant
-from bayeskin.finite_element.lagrangian import Evaluated, LagrangianModel, Stage
+from bayeskin.finite_element.balances import Evaluated
+from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.space import TaylorHood
+from bayeskin.finite_element.stages import Stage
 from bayeskin.types import Array
 
 

@@ -7,20 +7,17 @@ the right-hand side minus K v is a directional derivative of the residual,
     -r = [R(x + eps v, J* + eps dJ*, p* + eps dp*; theta + eps) - R(x, J*, p*; theta)] / eps
 
 so that no tangent needs to be formed. For the base model, `directional` computes r exactly and for all
-parameters at once. With further laws, r is the difference of two residuals for each parameter. The same holds
-for all parameters if a length of the tissue is among them. For such a length the changed residual is the one
-on moved nodes, at the same unknowns.
+parameters at once. With further laws, r is the difference of two residuals for each parameter
+(`differences`). The same holds for all parameters if a length of the tissue is among them. For such a length
+the changed residual is the one on moved nodes, at the same unknowns.
 
 The guess is a linear combination of the derivatives at earlier stages. Its weights are
 those with which the unknowns of these stages best approximate the unknowns of this stage. The guess is then
 corrected by back-substitution of r with the kept factorisation M that is nearest to the stage. Where
 residuals are differenced, M is the stage's own tangent, because factorising it costs less than a correction.
 
-The derivative of the reaction is the same directional derivative on the pad's rows. A
-correction would add g M^-1 r to it, where g is the derivative of the reaction with respect to the unknowns.
-Since M is symmetric, M^-1 g gives this term before the correction is made. If the term is small enough, it is
-added and no correction is made. The error of the force is then the product of the errors of v and of the
-factorisation.
+The derivative of the reaction is the same directional derivative on the pad's rows, and the term that a
+correction would still add (`corrections`).
 
 An element in series with the skin loses a displacement s before it reaches the pads.
 The derivative ds follows (`series`) from two quantities: the derivative of the force with s held, and the
@@ -36,30 +33,31 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Union
+from dataclasses import replace
 
 import numpy as np
 
 from bayeskin.errors import InputError
+from bayeskin.finite_element.corrections import Corrector, Differentiated
+from bayeskin.finite_element.differences import (
+    EPSILON,
+    ResidualDifferences,
+    Slopes,
+    material_rates,
+    vary,
+)
 from bayeskin.finite_element.directional import TangentAction
-from bayeskin.finite_element.lagrangian import Evaluated, LagrangianModel, Stage, State, Step
+from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.newton import Equations
-from bayeskin.finite_element.problem import Material, Problem, material
-from bayeskin.finite_element.series import Drive, Memories, lost_slopes, memory_slopes, on_the_way, yielding
-from bayeskin.finite_element.tissue import Bind, TissueLaw
+from bayeskin.finite_element.problem import ProblemAt, material
+from bayeskin.finite_element.series import Memories, lost_slopes, memory_slopes, yielding
+from bayeskin.finite_element.stages import Stage, State, Step
+from bayeskin.finite_element.tissue import Bind
 from bayeskin.geometry import LENGTHS
 from bayeskin.types import Array
 
 SCALING = {"E_c": 1.0, "E_s": 1.0, "k_c": -1.0, "k_s": -1.0}  # F = sum of these times dF/dlog (base model)
-EPSILON = 1e-5  # difference step, as a share of a parameter's change; error: truncation 1e-5, rounding 1e-9
-TOLERANCE = 1e-4  # largest force that a correction may still add, relative to the nominal force
-UNCORRECTED = 0.05  # factor on TOLERANCE for an uncorrected guess, whose error adds up from stage to stage
-MOST_CORRECTIONS = 12
-ANDERSON_DEPTH = 4
 GUESS_POINTS = 4
-DUALS = 10  # largest number of kept dual solutions
 
 
 def logarithms(theta: Mapping[str, float]) -> dict[str, float]:
@@ -68,42 +66,6 @@ def logarithms(theta: Mapping[str, float]) -> dict[str, float]:
     They are the changes of the base model's four parameters and of the lengths in theta.
     """
     return {name: theta[name] for name in (*SCALING, *LENGTHS) if name in theta}
-
-
-@dataclass(frozen=True)
-class _Varied:
-    """The constants of a run in which one parameter differs by EPSILON times its change.
-
-    model : the model with its nodes at the changed positions; its material and laws do not change
-    material, laws, drive : these at the changed parameter
-    """
-
-    model: LagrangianModel
-    material: Material
-    laws: tuple[TissueLaw, ...]
-    drive: Drive
-
-
-@dataclass(frozen=True)
-class _Slopes:
-    """The derivatives of a `State` with respect to r parameters.
-
-    x (dofs, r) : derivatives of the unknowns. If elements lie in series with the skin, a last column holds
-        the response to the pads' travel
-    volume, pressure (e, q, r) : derivatives of J and p
-    memory (e q, m, r), lost (k, r) : derivatives of the memories of each law, and of each element in series
-    """
-
-    state: State
-    x: Array
-    volume: Array
-    pressure: Array
-    memory: tuple[Array, ...]
-    lost: Memories
-
-
-_Evaluated = Union[Evaluated, "_ResidualDifferences"]
-ProblemAt = Callable[[Mapping[str, float]], Problem]
 
 
 class ForceGradients:
@@ -128,25 +90,25 @@ class ForceGradients:
         self._solved = tuple(name for name in changes if not (self._follows and name == "E_c"))
         self._by_differences = bool(model.laws) or not set(LENGTHS).isdisjoint(changes)
         self._varied = [
-            _varied(model, theta, name, EPSILON * changes[name], laws, problem_at) for name in self._solved
+            vary(model, theta, name, EPSILON * changes[name], laws, problem_at) for name in self._solved
         ]
         back = [{**theta, name: theta[name] - EPSILON * changes[name]} for name in self._solved]
-        self._rates = _rates(
+        self._rates = material_rates(
             [varied.material for varied in self._varied],
             [material(values, model.problem.mesh.cutis) for values in back],
         )
         self._in_series = bool(model.drive.elements)
         self._reach_m = 2.0 * model.drive.largest_m
         self._start = self._at_rest(theta["p_init"], changes.get("p_init", 0.0))
-        self._known: dict[int, _Slopes] = {}  # by id of the state, which each entry keeps alive
-        self._phase: list[_Slopes] = [self._start]  # derivatives at the ends of this phase's stages
+        self._known: dict[int, Slopes] = {}  # by id of the state, which each entry keeps alive
+        self._phase: list[Slopes] = [self._start]  # derivatives at the ends of this phase's stages
         self._travel: Array | None = None
-        self._duals: dict[int, tuple[Array, Array]] = {}  # by id of the place, which each entry keeps alive
+        self._corrector = Corrector(model)
         self._zero_n = np.zeros(len(self._solved))  # derivatives of the force when the test starts
         self.force_n: list[Array] = [np.zeros(len(changes))]
-        self.corrections, self.seconds = 0, 0.0
+        self.seconds = 0.0
 
-    def _at_rest(self, p_init: float, change: float) -> _Slopes:
+    def _at_rest(self, p_init: float, change: float) -> Slopes:
         """Returns the derivatives of the state of rest.
 
         change : change of p_init; 0 if the derivative with respect to p_init is not asked for
@@ -159,7 +121,7 @@ class ForceGradients:
         shape = (*rest.volume.shape, r)
         memory = tuple(np.zeros((*before.shape, r)) for before in rest.memory)
         lost = tuple(np.zeros((*before.shape, r)) for before in rest.lost)
-        return _Slopes(rest, x, np.zeros(shape), np.zeros(shape) + by_p_init, memory, lost)
+        return Slopes(rest, x, np.zeros(shape), np.zeros(shape) + by_p_init, memory, lost)
 
     def follow(self, step: Step) -> None:
         """Differentiates an accepted step, and appends the derivatives (r,) [N] of its force to `force_n`."""
@@ -193,7 +155,7 @@ class ForceGradients:
         drive = self._model.drive
         return drive.pads_m(end.time_s, 0.0) - drive.pads_m(start.time_s, 0.0)
 
-    def _slopes_at(self, state: State) -> _Slopes:
+    def _slopes_at(self, state: State) -> Slopes:
         """Returns the known derivatives of a state; a state that is not known is the state of rest."""
         return self._known.get(id(state), self._start)
 
@@ -215,26 +177,28 @@ class ForceGradients:
         shares = np.linalg.lstsq(moves, weighted(state.x), rcond=1e-10)[0]
         return last.x + sum(share * (old.x - last.x) for share, old in zip(shares, before, strict=True))
 
-    def _differentiate(self, stage: Stage) -> tuple[_Slopes, Array]:
+    def _differentiate(self, stage: Stage) -> tuple[Slopes, Array]:
         """Returns the derivatives of a stage's end, and of the force there (r,) [N]."""
         before = self._history_slopes(stage)
         equations = self._model.equations(stage.length_s, stage.history, stage.elapsed_s)
         x = self._guess(stage.state, equations)
         x[self._model.problem.pattern.fixed] = 0.0
         x[3 * self._model.problem.pads] = self._pad_slopes(stage.state.time_s, before)
-        x, slopes, force = self._solve(stage, equations, self._action(stage, before), x)
+        if self._by_differences:
+            self._model.solver.renew(equations, stage.state.x)
+        x, slopes, force = self._corrector.correct(equations, self._action(stage, before), x)
         if self._in_series:
             return self._subtract_lost(stage, before, x, slopes, force)
-        return _Slopes(stage.state, x, slopes.volume, slopes.pressure, slopes.memory, before.lost), force
+        return Slopes(stage.state, x, slopes.volume, slopes.pressure, slopes.memory, before.lost), force
 
-    def _history_slopes(self, stage: Stage) -> _Slopes:
+    def _history_slopes(self, stage: Stage) -> Slopes:
         """Returns the derivatives of the stage's history."""
         sources = [(weight, self._slopes_at(state)) for weight, state in stage.sources]
         volume = np.asarray(sum(weight * slopes.volume for weight, slopes in sources))
         pressure = np.asarray(sum(weight * slopes.pressure for weight, slopes in sources))
         return replace(sources[-1][1], volume=volume, pressure=pressure)
 
-    def _pad_slopes(self, time_s: float, before: _Slopes) -> Array:
+    def _pad_slopes(self, time_s: float, before: Slopes) -> Array:
         """Returns the derivatives of the pads' displacement [m].
 
         The derivatives of the displacement lost in series are those before the stage. If elements lie in
@@ -245,54 +209,18 @@ class ForceGradients:
         moved = moved - sum(lost[0] for lost in before.lost)
         return 0.5 * np.append(moved, [self._reach_m] * self._in_series)
 
-    def _solve(
-        self,
-        stage: Stage,
-        equations: Equations,
-        action: Callable[[Array], _Evaluated],
-        x: Array,
-    ) -> tuple[Array, _Evaluated, Array]:
-        """Corrects a guess x (dofs, r), whose fixed rows must already be right.
-
-        Returns the corrected x, the derivatives of all that is `Evaluated` there, and of the force (r,) [N].
-        """
-        model, solver, free = self._model, self._model.solver, self._model.problem.pattern.free
-        if self._by_differences:
-            solver.renew(equations, stage.state.x)
-        dual = self._dual(solver.toward(equations.place))
-        weight, allowed_n = equations.weight[:, None], TOLERANCE * model.nominal_force()
-        tried: list[tuple[Array, Array]] = []  # unknowns, and the correction computed at each
-        for _ in range(MOST_CORRECTIONS):
-            evaluated = action(x)
-            missing_n = -dual @ evaluated.residual[free]
-            if np.abs(missing_n).max() <= (allowed_n if tried else UNCORRECTED * allowed_n):
-                break
-            correction = -solver.back_substitute(evaluated.residual[free])
-            tried = [*tried, (x[free] * weight, correction * weight)][-ANDERSON_DEPTH:]
-            x[free] += _anderson_step(tried) / weight
-            self.corrections += 1
-        return x, evaluated, 2.0 * evaluated.residual[model.problem.measured_x].sum(axis=0) + missing_n
-
-    def _dual(self, place: Array) -> Array:
-        """Returns M^-1 g (free,) for the factorisation M made at `place`; the result is kept."""
-        known = self._duals.get(id(place))
-        if known is None:
-            known = place, self._model.solver.back_substitute(self._model.pad_gradient)
-            self._duals = dict([*self._duals.items(), (id(place), known)][-DUALS:])
-        return known[1]
-
-    def _action(self, stage: Stage, before: _Slopes) -> Callable[[Array], _Evaluated]:
+    def _action(self, stage: Stage, before: Slopes) -> Callable[[Array], Differentiated]:
         """Returns a function that takes the derivatives of the unknowns at the stage's end.
 
         The function returns the derivatives of all that is `Evaluated` there.
         """
         if self._by_differences:
-            return lambda x: _ResidualDifferences(self._model, self._varied, stage, before, x)
+            return lambda x: ResidualDifferences(self._model, self._varied, stage, before, x)
         return TangentAction(self._model, stage, self._rates, before.volume, before.pressure)
 
     def _subtract_lost(
-        self, stage: Stage, before: _Slopes, x: Array, found: _Evaluated, force: Array
-    ) -> tuple[_Slopes, Array]:
+        self, stage: Stage, before: Slopes, x: Array, found: Differentiated, force: Array
+    ) -> tuple[Slopes, Array]:
         """Returns all derivatives after the elements in series with the skin have responded to the force.
 
         x, found, force : the derivatives with the lost displacement held, with the response to the pads'
@@ -310,10 +238,10 @@ class ForceGradients:
             return np.asarray(values[..., :r] - values[..., r:] / self._reach_m * lost_change)
 
         memory = tuple(less(slope) for slope in found.memory)
-        slopes = _Slopes(stage.state, columns, less(found.volume), less(found.pressure), memory, lost)
+        slopes = Slopes(stage.state, columns, less(found.volume), less(found.pressure), memory, lost)
         return slopes, force[:r] - stiffness * lost_change
 
-    def _lost(self, stage: Stage, before: _Slopes, force: Array, stiffness: float) -> tuple[Array, Memories]:
+    def _lost(self, stage: Stage, before: Slopes, force: Array, stiffness: float) -> tuple[Array, Memories]:
         """Returns the change (r,) of the derivatives of the lost displacement during the stage.
 
         It also returns the derivatives (k, r) of the elements' memories.
@@ -337,37 +265,6 @@ class ForceGradients:
         return lost_slopes(force - self._zero_n, held_m, softness, stiffness, follow)
 
 
-def _varied(
-    model: LagrangianModel, theta: Mapping[str, float], name: str, by: float, laws: Sequence[Bind],
-    problem_at: ProblemAt,
-) -> _Varied:  # fmt: skip
-    """Returns the constants of the run with the parameter `name` increased by `by`.
-
-    Raises InputError if the change opens the pads before the test while in the run they were not opened.
-    """
-    values = {**theta, name: theta[name] + by}
-    if name in LENGTHS:
-        model = LagrangianModel(problem_at(values), model.material, model.protocol, model.laws)
-    bound = tuple(sorted((bind(values, model.problem.sites) for bind in laws), key=lambda law: law.rank))
-    drive = on_the_way(model.protocol, bound)
-    if drive.starts_s != model.starts_s:
-        raise InputError(f"gradients: {name}", theta[name], "a run whose pads are opened before the test")
-    return _Varied(model, material(values, model.problem.mesh.cutis), bound, drive)
-
-
-def _rates(up: Sequence[Material], down: Sequence[Material]) -> tuple[Array, Array, Array]:
-    """Returns the derivatives of mu, lam and mobility with respect to r parameters, (e, r) each.
-
-    up, down : the materials with each parameter increased and decreased, for central differences
-    """
-
-    def rate(of: Callable[[Material], Array]) -> Array:
-        pairs = zip(up, down, strict=True)
-        return np.stack([(of(high) - of(low)) / (2.0 * EPSILON) for high, low in pairs], axis=1)
-
-    return rate(lambda m: m.mu), rate(lambda m: m.lam), rate(lambda m: m.mobility)
-
-
 def _scaling_rule(
     model: LagrangianModel, theta: Mapping[str, float], changes: Mapping[str, float]
 ) -> Callable[[Array, float], Array] | None:
@@ -383,79 +280,3 @@ def _scaling_rule(
     share = np.array([SCALING.get(name, 0.0) * theta[name] / changes[name] for name in names])
     place, scale = tuple(changes).index("E_c"), changes["E_c"] / theta["E_c"]
     return lambda force, force_n: np.insert(force, place, scale * (force_n - share @ force))
-
-
-class _ResidualDifferences:
-    """Derivatives at a stage's end with respect to r parameters, by differences of the residual.
-
-    The fields have the names of those of `Evaluated`.
-
-    before : derivatives of the stage's history
-    x (dofs, r) : derivatives of the unknowns. A further column beyond r belongs to the pads' travel, on which
-        the history does not depend
-    """
-
-    def __init__(
-        self, model: LagrangianModel, varied: Sequence[_Varied], stage: Stage, before: _Slopes, x: Array
-    ) -> None:
-        self._base, self._columns = stage.state, []
-        for r, column in enumerate(x.T):
-            column_model, history, changed = model, stage.history, (model.material, model.laws)
-            if r < len(varied):
-                constants, history = varied[r], _moved_history(history, before, r)
-                column_model, changed = constants.model, (constants.material, constants.laws)
-            moved = self._base.x + EPSILON * column
-            evaluated = column_model.residual(moved, stage.length_s, history, stage.elapsed_s, changed)
-            # a cell has turned inside out, although the unknowns changed by only about a millionth
-            if evaluated is None:
-                at_s = self._base.time_s
-                raise FloatingPointError(f"no derivative at t = {at_s:.3f} s: a cell is nearly flat")
-            self._columns.append(evaluated)
-        self.residual = self._slope(lambda f: f.residual, stage.residual)
-
-    @property
-    def volume(self) -> Array:
-        return self._slope(lambda f: f.volume, self._base.volume)
-
-    @property
-    def pressure(self) -> Array:
-        return self._slope(lambda f: f.pressure, self._base.pressure)
-
-    @property
-    def memory(self) -> tuple[Array, ...]:
-        return tuple(self._slope(lambda f, k=k: f.memory[k], m) for k, m in enumerate(self._base.memory))  # type: ignore[misc]
-
-    def _slope(self, of: Callable[[Evaluated], Array], at: Array) -> Array:
-        """Returns the derivatives of a quantity `of` the evaluations, from its value `at` the stage's end."""
-        return np.stack([(of(evaluated) - at) / EPSILON for evaluated in self._columns], axis=-1)
-
-
-def _moved_history(history: State, before: _Slopes, r: int) -> State:
-    """Returns a stage's history with parameter r increased by EPSILON times its change."""
-    memory = zip(history.memory, before.memory, strict=True)
-    return State(
-        history.time_s,
-        history.x,
-        history.volume + EPSILON * before.volume[..., r],
-        history.pressure + EPSILON * before.pressure[..., r],
-        tuple(m + EPSILON * slope[..., r] for m, slope in memory),
-    )
-
-
-def _anderson_step(tried: list[tuple[Array, Array]]) -> Array:
-    """Returns Anderson's step (SIAM J. Numer. Anal. 49, 2011, 1715) from the last of the tried points.
-
-    tried : unknowns and corrections (free, r) of the last iterations; each column is accelerated by itself
-    """
-    correction = tried[-1][1]
-    if len(tried) == 1:
-        return correction
-    moves = np.stack([after[0] - before[0] for before, after in pairwise(tried)], axis=2)
-    turns = np.stack([after[1] - before[1] for before, after in pairwise(tried)], axis=2)
-    gram = np.einsum("nrk,nrl->rkl", turns, turns)
-    size = (
-        np.trace(gram, axis1=1, axis2=2) + np.finfo(float).tiny
-    )  # the trace is 0 for a parameter without effect
-    ridge = 1e-12 * size[:, None, None] * np.eye(gram.shape[1])
-    gain = np.linalg.solve(gram + ridge, np.einsum("nrk,nr->rk", turns, correction)[:, :, None])[:, :, 0]
-    return np.asarray(correction - np.einsum("nrk,rk->nr", moves + turns, gain))

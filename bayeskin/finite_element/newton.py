@@ -6,15 +6,11 @@ therefore keeps a few factorisations, each with the place where it was made (`Eq
 serves as approximate inverse, corrected by Broyden's rank-one updates (C. T. Kelley, Iterative Methods for
 Linear and Nonlinear Equations, SIAM 1995, section 7.3). If it does not contract well, the solver factorises a
 new tangent.
-
-Beyond a fold of the equilibria (a limit point) there is no solution near the last one, and Newton's method
-does not converge. The body then moves by itself to another equilibrium, and `NewtonSolver.relax` follows this
-motion until the body comes to rest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -31,10 +27,7 @@ MAX_BROYDEN = 25
 DEAR = 8.0
 SMALLEST_DAMPING = 1 / 64
 SAME_PLACE = 0.2  # a new factorisation replaces an old one that is nearer than this
-EXTRAPOLATION_POINTS = 3
 COUNTED = ("iterations", "residuals", "factorisations", "solves", "falls", "crawls")
-MOST_RELAXING, RELAXED = 400, 1e5  # largest number of steps of `relax`; step length with negligible drag
-ALLOWED_CONTRACTION, WANTED_CONTRACTION, MOST_GROWTH = 0.8, 0.25, 10.0
 
 
 @dataclass(frozen=True)
@@ -115,7 +108,7 @@ class NewtonSolver:
         a cell is inside out at x.
         """
         free_fixed = self.renew(equations, x)
-        right = self._residual(equations, x)
+        right = self.residual(equations, x)
         if right is None:
             return None
         guess = target.copy()
@@ -162,64 +155,15 @@ class NewtonSolver:
             x_new, converged = self._broyden(equations, x, fresh)
             if converged:
                 return x_new
-            if x_new is None and (fresh or self._residual(equations, x) is None):
+            if x_new is None and (fresh or self.residual(equations, x) is None):
                 return None
             x = x if x_new is None else x_new
             self.renew(equations, x)
             fresh = True
         return None
 
-    def relax(self, equations: Equations, x: Array, drag: Array) -> Array | None:
-        """Returns the unknowns (dofs,) at which a body comes to rest that starts at x in a viscous medium.
-
-        x : starting point (dofs,), with the fixed dofs at their prescribed values
-        drag : (free,) resistance of each unknown to motion, in units of its stiffness. It is zero for the
-            pressures, so that the energy of the step decreases
-
-        The method is pseudo-transient continuation (Kelley & Keyes, SIAM J. Numer. Anal. 35, 1998, 508). It
-        takes implicit Euler steps of one Newton iteration each, and halves a step in which the iteration does
-        not contract. The steps grow as the body comes to rest. The result solves the equations without drag.
-        It is None if the body does not come to rest, or if a cell is inside out at x.
-        """
-        right = self._residual(equations, x)
-        if right is None:
-            return None
-        self.counts["falls"] += 1
-        length, growth = 1.0, MOST_GROWTH
-        for _ in range(MOST_RELAXING):
-            trial, after, moved, contraction = self._relaxation_step(equations, x, right, drag / length)
-            if after is None or not contraction < ALLOWED_CONTRACTION:
-                length, growth = 0.5 * length, 1.0
-                continue
-            x, right = trial, after
-            if length > RELAXED and moved < 1.0:
-                return self.solve(equations, x)
-            change = np.sqrt(WANTED_CONTRACTION / contraction) if contraction > 0.0 else growth
-            length, growth = length * float(np.clip(change, 0.5, growth)), MOST_GROWTH
-        return None
-
-    def _relaxation_step(
-        self, equations: Equations, x: Array, right: Array, drag: Array
-    ) -> tuple[Array, Array | None, float, float]:
-        """Takes one step against the drag, and tests how a second iteration would contract.
-
-        Returns the new unknowns (dofs,), the residual there (None if a cell has turned inside out), the size
-        of the step in units of the tolerance, and the size of a second iteration relative to the step. The
-        last is 0 if the step is smaller than the tolerance, because it may then consist of rounding errors.
-        """
-        self.counts["crawls"] += 1
-        self.renew(equations, x, drag)
-        step = -self.back_substitute(right)
-        trial = x.copy()
-        trial[equations.free] += step
-        after, moved = self._residual(equations, trial), float(np.abs(step * equations.weight).max())
-        if after is None or moved < 1.0:
-            return trial, after, moved, 0.0
-        second = self.back_substitute(after + drag * step)
-        sizes = [float(np.linalg.norm(move * equations.weight)) for move in (second, step)]
-        return trial, after, moved, sizes[0] / sizes[1]
-
-    def _residual(self, equations: Equations, x: Array) -> Array | None:
+    def residual(self, equations: Equations, x: Array) -> Array | None:
+        """Returns the residual (free,) at x, or None if a cell has turned inside out, and counts it."""
         self.counts["residuals"] += 1
         return equations.residual(x)
 
@@ -229,7 +173,7 @@ class NewtonSolver:
         fresh : the tangent was factorised at x
         Returns (x, True) if the iteration converges, (x, False) if it is slow, and (None, False) if it fails.
         """
-        right = self._residual(equations, x)
+        right = self.residual(equations, x)
         if right is None:
             return None, False
         steps = [self._newton_step(equations, right)]
@@ -242,7 +186,7 @@ class NewtonSolver:
                 return (x if fresh else None), False
             trial = x.copy()
             trial[free] += steps[-1] / equations.weight
-            right, after = self._residual(equations, trial), None
+            right, after = self.residual(equations, trial), None
             if right is not None and fresh and iteration == 0:
                 after = self._newton_step(equations, right)
             if right is None or (after is not None and not _shorter(after, steps[0])):
@@ -275,7 +219,7 @@ class NewtonSolver:
         while damping >= SMALLEST_DAMPING:
             trial = x.copy()
             trial[equations.free] += damping * step / equations.weight
-            right = self._residual(equations, trial)
+            right = self.residual(equations, trial)
             if right is not None and _shorter(
                 self._newton_step(equations, right), step, 1.0 - 0.25 * damping
             ):
@@ -307,21 +251,3 @@ def _iterations_left(size: float, before: list[float]) -> float:
     """
     contraction = np.sqrt(size / before[-2])
     return float(np.log(size) / -np.log(contraction)) if contraction < 1.0 else np.inf
-
-
-def extrapolate(past: Sequence[tuple[float, Array]], time_s: float) -> Array:
-    """Returns the unknowns (dofs,) at a later time, extrapolated from the past pairs of time and unknowns.
-
-    The polynomial passes through the last three pairs, or through all if there are fewer.
-    """
-    last = past[-EXTRAPOLATION_POINTS:]
-    weights = extrapolation_weights([time for time, _ in last], time_s)
-    return np.asarray(sum(weight * x for weight, (_, x) in zip(weights, last, strict=True)))
-
-
-def extrapolation_weights(times_s: Sequence[float], time_s: float) -> list[float]:
-    """Returns the weights of the values at `times_s` in the Lagrange polynomial's value at another time."""
-    return [
-        float(np.prod([(time_s - other_s) / (node_s - other_s) for other_s in times_s if other_s != node_s]))
-        for node_s in times_s
-    ]

@@ -159,6 +159,9 @@ class Problem:
         return float(2.0 * residual[self.measured_x].sum())
 
 
+ProblemAt = Callable[[Mapping[str, float]], Problem]  # its nodes moved to the lengths of the tissue in theta
+
+
 def nominal_force(solid: Material, cutis: np.ndarray, lengths: Geometry, moved_m: float) -> float:
     """Returns a scale of the force [N].
 

@@ -10,7 +10,7 @@ tangent (Hosea & Shampine 1996), gives an error of the force in newtons. This er
 steps.
 
 A soft cutis on a stiff subcutis folds: it snaps from one equilibrium to another. A step that fails at the
-smallest length is treated as such a fall (`NewtonSolver.relax`), and the integration restarts after it. On
+smallest length is treated as such a fall (`relaxation`), and the integration restarts after it. On
 fine meshes wrinkles may follow each other without end. A run whose falls take too many steps is therefore
 stopped.
 """
@@ -23,8 +23,8 @@ from typing import Protocol
 
 import numpy as np
 
-from bayeskin.finite_element.lagrangian import Stage, State, Step
-from bayeskin.finite_element.newton import EXTRAPOLATION_POINTS, extrapolate, extrapolation_weights
+from bayeskin.finite_element.extrapolation import EXTRAPOLATION_POINTS, extrapolate, extrapolation_weights
+from bayeskin.finite_element.stages import Stage, State, Step
 from bayeskin.types import Array, PadMotion
 
 GAMMA = 1.0 - np.sqrt(0.5)

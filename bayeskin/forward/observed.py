@@ -65,7 +65,7 @@ class FullForce:
         mechanisms = [catalogue()[name] for name in names]
         used = {p.name for mechanism in solved(mechanisms) for p in mechanism.parameters}
         theta = dict(values)
-        if self.spec.forward is None:  # a user's own model may have parameters of any name
+        if not self.spec.formulation.any_parameters:
             theta = {name: value for name, value in values.items() if name in {*used, *PARAMETERS, *LENGTHS}}
         simulation = simulate(self.spec, self.motion, theta, laws=laws(mechanisms), falls_too=False)
         if simulation.status != "ok":

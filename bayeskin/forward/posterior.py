@@ -35,10 +35,9 @@ def posterior_of(
 def model_error(spec: ModelSpec, motion: PadMotion, edges_s: Array) -> ModelError | None:
     """Returns the errors that are allowed for of a model's force in bins.
 
-    None for the article's observation, which is defined on its own mesh and steps, and for a model of one's
-    own, of whose error nothing is known.
+    None for a model whose error cannot be estimated, such as that of the article or of the user's own.
     """
-    if spec.observation != "reaction":
+    if spec.formulation.error_unknown:
         return None
     known = mesh_error(spec.mesh_hash)
     mesh = UNKNOWN_MESH if known is None else known.rms

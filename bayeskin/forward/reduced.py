@@ -81,5 +81,5 @@ class ReducedForward:
 
 
 def stands_for(spec: ModelSpec) -> bool:
-    """Returns whether a reduced model can replace a full model, which must give the reaction, on bricks."""
-    return (spec.observation, spec.mesh) == ("reaction", "bricks")
+    """Returns whether a reduced model can replace a full model."""
+    return spec.formulation.reducible and spec.mesh == "bricks"

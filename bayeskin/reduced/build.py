@@ -19,10 +19,10 @@ from bayeskin.finite_element.simulate import ModelSpec, problem_of
 from bayeskin.reduced.basis import Inner, pod
 from bayeskin.reduced.cases import BASE, SETS, Case, Trained
 from bayeskin.reduced.cubature import CubatureSettings, Taken, choose_points, take, with_volumes
-from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
+from bayeskin.reduced.equations import ReducedEquations
 from bayeskin.reduced.library import Library, Modes, modes_beyond, modes_of
 from bayeskin.reduced.model import Cubatures, ReducedModel, SurfacesOf, inner_of, reduced_space
-from bayeskin.reduced.operators import Basis, LinearParts, Rule, point_fields
+from bayeskin.reduced.operators import Basis, LinearParts, ReducedSpace, Rule, point_fields
 from bayeskin.reduced.runs import FullRuns, Progress, binds_of, tissue_of
 from bayeskin.reduced.shadow import Shadow
 from bayeskin.types import Array

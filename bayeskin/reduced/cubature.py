@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from bayeskin.finite_element.lagrangian import Step
+from bayeskin.finite_element.stages import Step
 from bayeskin.finite_element.stepping import integrate
 from bayeskin.reduced.equations import ReducedEquations
 from bayeskin.reduced.operators import PointFields, Rule

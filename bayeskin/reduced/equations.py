@@ -5,127 +5,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import numpy as np
-import scipy.sparse as sp
 
-from bayeskin.finite_element.lagrangian import Stage, State, Step
-from bayeskin.finite_element.problem import Material, Problem, Sites, material, nominal_force
+from bayeskin.finite_element.problem import nominal_force
 from bayeskin.finite_element.series import SeriesSolver, Solved, on_the_way
-from bayeskin.finite_element.tissue import Bind, SurfaceTerm, TissueLaw
-from bayeskin.geometry import Geometry
+from bayeskin.finite_element.stages import Stage, State, Step
+from bayeskin.finite_element.tissue import Bind
 from bayeskin.reduced import kernels
-from bayeskin.reduced.calls import address
-from bayeskin.reduced.operators import LinearParts, PointFields
+from bayeskin.reduced.arrays import History, Room, System
+from bayeskin.reduced.binding import bound, exact_units, packed
+from bayeskin.reduced.operators import ReducedSpace
 from bayeskin.reduced.tangents import Tangent, Tangents
 from bayeskin.types import Array, PadMotion
 
 SOLVER_TOLERANCE = 1e-5  # relative to the amplitude of displacements and to the nominal force
-SurfaceUnit = Callable[[Problem], sp.csr_matrix]
-
-
-@dataclass(frozen=True)
-class ReducedSpace:
-    """A basis at the points of a cubature, and the parts of the equations that are integrated exactly.
-
-    lengths : geometry of device and tissue; at : fields of the basis at the points
-    exact : exact integrals of the base law's linear parts minus their sums over the points
-    surfaces : function that returns a unit surface term, projected on all fields, (k + m, k + m)
-    """
-
-    lengths: Geometry
-    at: PointFields
-    exact: LinearParts
-    surfaces: Callable[[SurfaceUnit], Array]
-
-    @property
-    def modes(self) -> tuple[int, int]:
-        """Returns the number k of displacement fields (pads and dual included) and m of pressure modes."""
-        return self.at.gradient.shape[2], self.at.pressure.shape[1]
-
-    @property
-    def sites(self) -> Sites:
-        """Returns the points in the form that laws are given."""
-        return Sites(self.at.cutis, self.at.points_m, self.lengths)
-
-
-@dataclass(frozen=True)
-class Bound:
-    """Constants and laws of a run at the points, for given values of all parameters.
-
-    solid_by (s,), flow_by (t,) : coefficients of the matrices of the exact parts (`exact_units`)
-    """
-
-    solid: Material
-    laws: tuple[TissueLaw, ...]
-    solid_by: Array
-    flow_by: Array
-
-    @property
-    def par(self) -> Array:
-        """Returns the constants of all laws in one flat array."""
-        return _flat([law.par for law in self.laws])
-
-    @property
-    def data(self) -> Array:
-        """Returns the constants of all laws at the points in one flat array."""
-        return _flat([law.data for law in self.laws])
-
-
-def bound(space: ReducedSpace, theta: Mapping[str, float], binds: Sequence[Bind]) -> Bound:
-    """Binds the base law and the laws of mechanisms to values of their parameters."""
-    sites, cutis = space.sites, space.at.cutis
-    solid = material(theta, cutis)
-    laws = tuple(sorted((bind(theta, sites) for bind in binds), key=lambda law: law.rank))
-    in_cutis, in_subcutis = int(np.argmax(cutis)), int(np.argmin(cutis))  # the first point of each layer
-
-    def of_layers(name: str) -> Array:
-        return np.array([getattr(solid, name)[in_cutis], getattr(solid, name)[in_subcutis]])
-
-    still, rates = surface_terms(laws)
-    return Bound(
-        solid, laws,
-        np.concatenate([of_layers("mu"), of_layers("lam"), [term.value for term in still]]),
-        np.concatenate([-of_layers("mobility"), [term.value for term in rates]]),
-    )  # fmt: skip
-
-
-def surface_terms(laws: Sequence[TissueLaw]) -> tuple[list[SurfaceTerm], list[SurfaceTerm]]:
-    """Returns two lists of the laws' surface terms: terms of the displacement, and rates of the fluid."""
-    terms = [term for law in laws for term in law.surfaces]
-    return [t for t in terms if not t.per_second], [t for t in terms if t.per_second]
-
-
-def exact_units(space: ReducedSpace, laws: Sequence[TissueLaw]) -> tuple[Array, Array]:
-    """Returns the matrices (s, k, k) and (t, m, m) whose linear combinations are the exact parts."""
-    k, exact = space.modes[0], space.exact
-    still, rates = surface_terms(laws)
-    solid = [*exact.shear, *exact.bulk, *(space.surfaces(term.unit)[:k, :k] for term in still)]
-    flow = [*exact.flow, *(space.surfaces(term.unit)[k:, k:] for term in rates)]
-    return np.array(solid), np.array(flow)
-
-
-def _flat(arrays: Sequence[Array]) -> Array:
-    return np.concatenate([np.zeros(0), *(np.ravel(array) for array in arrays)])
-
-
-def packed(laws: Sequence[TissueLaw], points: int) -> kernels.Laws:
-    """Returns laws in the form that the compiled driver takes; points : number of points."""
-    par, widths = [len(law.par) for law in laws], [law.data.shape[1] for law in laws]
-    memory = [law.remembers for law in laws]
-
-    def starts(counts: Sequence[int]) -> np.ndarray:
-        return np.concatenate([[0], np.cumsum(np.asarray(counts, dtype=np.int64))]).astype(np.int64)
-
-    return kernels.Laws(
-        np.array([address(law.respond) for law in laws], dtype=np.int64),
-        np.array([address(law.linearise) for law in laws], dtype=np.int64),
-        _flat([law.par for law in laws]), starts(par), _flat([law.data for law in laws]),
-        np.array(widths, dtype=np.int64), points * starts(widths),
-        np.array(memory, dtype=np.int64), points * starts(memory),
-    )  # fmt: skip
 
 
 class ReducedEquations:
@@ -152,7 +47,7 @@ class ReducedEquations:
         units = exact_units(space, run.laws)
         at, solid = space.at, run.solid
         self.units = units
-        self.system = kernels.System(
+        self.system = System(
             at.gradient, at.pressure, at.slope, at.weight, solid.mu, solid.lam, solid.mobility,
             solid.storage, np.tensordot(run.solid_by, units[0], 1), space.exact.coupling,
             np.tensordot(run.flow_by, units[1], 1),
@@ -164,8 +59,8 @@ class ReducedEquations:
         self.zero_n = 0.0
         self._nominal_n = nominal_force(solid, at.cutis, space.lengths, self.drive.largest_m)
         self._travel: Array | None = None
-        self.room: kernels.Room | None = None
-        self.past: kernels.History | None = None
+        self.room: Room | None = None
+        self.past: History | None = None
         self.counts = {"crawls": 0, "falls": 0}
 
     @property
@@ -253,30 +148,28 @@ class ReducedEquations:
         """
         return float(self.drive.motion.at(time_s)) / self.drive.largest_m, float(np.log(length_s))
 
-    def _history(
-        self, sources: tuple[tuple[float, State], ...], length_s: float, time_s: float
-    ) -> kernels.History:
+    def _history(self, sources: tuple[tuple[float, State], ...], length_s: float, time_s: float) -> History:
         """Returns the history of a stage that ends at a time; the last of its sources carries the memory."""
         last, k = sources[-1][1], self.space.modes[0]
-        return kernels.History(
+        return History(
             np.asarray(sum(w * s.volume for w, s in sources)),
             np.asarray(sum(w * s.pressure for w, s in sources)), last.memory[0],
             np.asarray(sum(w * s.x[:k] for w, s in sources)), length_s, time_s - last.time_s,
             max(time_s - self.starts_s, 0.0),
         )  # fmt: skip
 
-    def past_of(self, stage: Stage) -> kernels.History:
+    def past_of(self, stage: Stage) -> History:
         """Returns the history of a solved stage."""
         return self._history(stage.sources, stage.length_s, stage.state.time_s)
 
-    def make_room(self) -> kernels.Room:
+    def make_room(self) -> Room:
         n = len(self.space.at.weight)
-        return kernels.Room(
+        return Room(
             np.empty((n, 3, 3)), np.empty(n), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty(n),
             np.empty((n, 3)), np.empty(n), np.empty(int(self.packed.memory_at[-1])),
         )  # fmt: skip
 
-    def _guess_by_travel(self, past: kernels.History, last: State, pads_m: float) -> Array:
+    def _guess_by_travel(self, past: History, last: State, pads_m: float) -> Array:
         """Returns a guess of the unknowns where the pads start to move from the last state.
 
         It uses the stored change per pad travel, or the tangent where no change is stored yet.
@@ -290,13 +183,13 @@ class ReducedEquations:
         x[2:] -= self.tangent.inverse @ (right[2:] + self.tangent.by_pads[:-1] * travel_m)
         return x
 
-    def _renew_tangent(self, past: kernels.History, x: Array) -> None:
+    def _renew_tangent(self, past: History, x: Array) -> None:
         """Computes a new tangent for a stage, at the unknowns x."""
         t = self.tangent
         kernels.renew(self.system, self.packed, past, x, self.make_room(), t.inverse, t.force_row, t.by_pads)
         self.spent[2] += 1
 
-    def _solve(self, past: kernels.History, guess: Array, pads_m: float) -> Solved | None:
+    def _solve(self, past: History, guess: Array, pads_m: float) -> Solved | None:
         """Returns the unknowns with the pads at `pads_m`, and the force beyond that at the start of the test.
 
         Returns None where the solve does not converge.

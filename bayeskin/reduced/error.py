@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayeskin.finite_element.lagrangian import LagrangianModel, Stage, State
+from bayeskin.finite_element.lagrangian import LagrangianModel
+from bayeskin.finite_element.stages import Stage, State
 from bayeskin.reduced.operators import Basis
 from bayeskin.types import Array
 

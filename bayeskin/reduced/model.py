@@ -19,9 +19,16 @@ from bayeskin.finite_element.simulate import problem_of
 from bayeskin.geometry import Geometry
 from bayeskin.reduced.basis import Inner, inner_products
 from bayeskin.reduced.cases import Trained
-from bayeskin.reduced.equations import ReducedSpace, SurfaceUnit
 from bayeskin.reduced.library import Library
-from bayeskin.reduced.operators import Basis, Rule, fields_at, linear_parts, whole_linear_parts
+from bayeskin.reduced.operators import (
+    Basis,
+    ReducedSpace,
+    Rule,
+    SurfaceUnit,
+    fields_at,
+    linear_parts,
+    whole_linear_parts,
+)
 from bayeskin.types import Array
 
 MOST_SPACES = 32  # largest number of spaces that a model keeps

@@ -1,12 +1,15 @@
-"""Evaluates a basis at the quadrature points of a mesh and integrates the linear parts of the base law."""
+"""Evaluates a basis at quadrature points, and integrates the linear parts of the base law."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
+import scipy.sparse as sp
 
-from bayeskin.finite_element.problem import Problem
+from bayeskin.finite_element.problem import Problem, Sites
+from bayeskin.geometry import Geometry
 from bayeskin.types import Array
 
 CELLS_AT_ONCE = 64
@@ -94,6 +97,34 @@ class LinearParts:
             self.shear - other.shear, self.bulk - other.bulk, self.flow - other.flow,
             self.coupling - other.coupling,
         )  # fmt: skip
+
+
+SurfaceUnit = Callable[[Problem], sp.csr_matrix]  # returns the matrix (dofs, dofs) of a unit surface term
+
+
+@dataclass(frozen=True)
+class ReducedSpace:
+    """A basis at the points of a cubature, and the parts of the equations that are integrated exactly.
+
+    lengths : geometry of device and tissue; at : fields of the basis at the points
+    exact : exact integrals of the base law's linear parts minus their sums over the points
+    surfaces : function that returns a unit surface term, projected on all fields, (k + m, k + m)
+    """
+
+    lengths: Geometry
+    at: PointFields
+    exact: LinearParts
+    surfaces: Callable[[SurfaceUnit], Array]
+
+    @property
+    def modes(self) -> tuple[int, int]:
+        """Returns the number k of displacement fields (pads and dual included) and m of pressure modes."""
+        return self.at.gradient.shape[2], self.at.pressure.shape[1]
+
+    @property
+    def sites(self) -> Sites:
+        """Returns the points in the form that laws are given."""
+        return Sites(self.at.cutis, self.at.points_m, self.lengths)
 
 
 def linear_parts(at: PointFields) -> LinearParts:

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import scipy.linalg
 
-from bayeskin.finite_element.lagrangian import Step
+from bayeskin.finite_element.stages import Step
 from bayeskin.geometry import Geometry
 from bayeskin.reduced.cases import RADIUS_RANGE, THICKNESS_RANGE, Protocols, Trained
 from bayeskin.types import Array, PadMotion, ParameterSpace

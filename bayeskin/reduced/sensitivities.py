@@ -18,13 +18,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayeskin.errors import InputError
-from bayeskin.finite_element.lagrangian import Stage, State, Step
-from bayeskin.finite_element.newton import extrapolate
+from bayeskin.finite_element.extrapolation import extrapolate
 from bayeskin.finite_element.series import Memories, lost_slopes, memory_slopes, on_the_way, yielding
+from bayeskin.finite_element.stages import Stage, State, Step
 from bayeskin.finite_element.tissue import Bind
 from bayeskin.geometry import LENGTHS
 from bayeskin.reduced import kernels, slopes
-from bayeskin.reduced.equations import Bound, ReducedEquations, ReducedSpace, bound
+from bayeskin.reduced.arrays import History
+from bayeskin.reduced.binding import Bound, bound
+from bayeskin.reduced.equations import ReducedEquations
+from bayeskin.reduced.operators import ReducedSpace
 from bayeskin.types import Array, PadMotion
 
 STEP = 1e-6  # of a parameter's change; truncation error 1e-6, rounding error 1e-10
@@ -143,9 +146,7 @@ class ReducedGradients:
         known = [(state.time_s, self._derivatives_of(state).slopes.x) for _, state in stage.sources]
         return extrapolate(known, stage.state.time_s)
 
-    def _by_length(
-        self, i: int, past: kernels.History, x: Array, before: slopes.Slopes, out: slopes.Slopes
-    ) -> float:
+    def _by_length(self, i: int, past: History, x: Array, before: slopes.Slopes, out: slopes.Slopes) -> float:
         """Fills row i of `out`, the derivatives by a length, and returns the derivative of the force [N].
 
         Row i of ``out.x`` is a guess at the start.
@@ -154,7 +155,7 @@ class ReducedGradients:
         rooms = [equations.make_room() for equations in self._moved[i]]
         residuals = np.empty((2, len(x)))
         pasts = [
-            kernels.History(
+            History(
                 past.volume + way * before.volume[i], past.pressure + way * before.pressure[i],
                 past.memory + way * before.memory[i], past.displacement + way * before.x[i], past.length_s,
                 past.elapsed_s, past.time_s,

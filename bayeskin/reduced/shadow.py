@@ -10,10 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayeskin.finite_element.lagrangian import Stage, State
+from bayeskin.finite_element.stages import Stage, State
 from bayeskin.finite_element.tissue import Bind
 from bayeskin.reduced import kernels
-from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
+from bayeskin.reduced.arrays import History, Room
+from bayeskin.reduced.equations import ReducedEquations
+from bayeskin.reduced.operators import ReducedSpace
 from bayeskin.types import Array, PadMotion
 
 REMEMBERED = 8  # number of states that are kept at all points; a step needs at most three
@@ -23,8 +25,8 @@ REMEMBERED = 8  # number of states that are kept at all points; a step needs at 
 class Followed:
     """One stage at all points: the arrays there, the history, and the residual (k + m,) of all points."""
 
-    room: kernels.Room
-    past: kernels.History
+    room: Room
+    past: History
     residual: Array
 
 
@@ -45,7 +47,7 @@ class Shadow:
         """
         eq, k = self.equations, self.equations.space.modes[0]
         sources = [(weight, self._at_all_points(state), state) for weight, state in stage.sources]
-        past = kernels.History(
+        past = History(
             np.asarray(sum(w * s.volume for w, s, _ in sources)),
             np.asarray(sum(w * s.pressure for w, s, _ in sources)), sources[-1][1].memory[0],
             np.asarray(sum(w * run.x[:k] for w, _, run in sources)), stage.length_s, stage.elapsed_s, time_s,

@@ -8,16 +8,18 @@ from functools import partial
 
 import numpy as np
 
-from bayeskin.finite_element.lagrangian import LagrangianModel, Step
+from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.problem import material
 from bayeskin.finite_element.simulate import OnState
+from bayeskin.finite_element.stages import Step
 from bayeskin.finite_element.stepping import integrate
 from bayeskin.geometry import Geometry, moved
 from bayeskin.mechanisms import Mechanism, solved
 from bayeskin.mechanisms.mechanism import Tissue
-from bayeskin.reduced.equations import ReducedEquations, ReducedSpace
+from bayeskin.reduced.equations import ReducedEquations
 from bayeskin.reduced.error import DualWeightedResidual
 from bayeskin.reduced.model import ReducedModel
+from bayeskin.reduced.operators import ReducedSpace
 from bayeskin.reduced.region import LEAST_STIFFNESS, Stability, outside
 from bayeskin.reduced.sensitivities import ReducedGradients
 from bayeskin.types import PadMotion, Simulation, frozen_array

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from bayeskin.finite_element.assembly import compiled
-from bayeskin.reduced.kernels import SLOW_CONTRACTION, History, Laws, Room, System, answer, renew, update
+from bayeskin.reduced.arrays import History, Laws, Room, System
+from bayeskin.reduced.kernels import SLOW_CONTRACTION, answer, renew, update
 from bayeskin.types import Array
 
 ENOUGH = 1e-3  # relative to the largest derivatives so far; the solve ends with a step below it

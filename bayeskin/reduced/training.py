@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayeskin.finite_element.lagrangian import LagrangianModel, Step
+from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.problem import Problem, material
+from bayeskin.finite_element.stages import Step
 from bayeskin.finite_element.stepping import integrate
 from bayeskin.finite_element.tissue import Bind
 from bayeskin.reduced.basis import Inner, weighted_modes

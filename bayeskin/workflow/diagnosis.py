@@ -152,6 +152,6 @@ def stage_of(config: Config) -> Stage:
 
     If no reduced model can replace the full model, a surrogate must be trained before.
     """
-    if (config.model.observation, config.model.mesh) == ("reaction", "bricks"):
+    if stands_for(config.model.spec()):
         return STAGE
     return replace(STAGE, needs=("recording", "design", "train"))

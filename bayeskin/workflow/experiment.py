@@ -19,7 +19,7 @@ from bayeskin import report
 from bayeskin.errors import InputError
 from bayeskin.experiments.choice import Experiment, compete, search, weigh
 from bayeskin.experiments.protocols import Limits, Protocol, variations
-from bayeskin.forward.reduced import ReducedForward
+from bayeskin.forward.reduced import ReducedForward, stands_for
 from bayeskin.json_files import plain, write_json
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.explain import searched
@@ -44,13 +44,14 @@ def choose(source: Path, reporter: Reporter, device: Path | None = None) -> dict
     returned. Outputs go to the run's folder `experiment`.
 
     source : configuration or recording; device : file of the device with which a single recording was made
-    Raises InputError for bad input, for a device without a reduced model, and for the article's observation,
-    which is not defined on other protocols.
+    Raises InputError for bad input, for a device without a reduced model, and for a model that no reduced
+    model can replace.
     """
     run = opened(source, reporter, device)
-    observation = run.config.model.observation
-    if observation != "reaction":
-        raise InputError(source, f"model.observation {observation!r}", "model.observation 'reaction'")
+    model = run.config.model
+    if not stands_for(model.spec()):
+        found = f"model.observation {model.observation!r} on {model.mesh!r}"
+        raise InputError(source, found, "model.observation 'reaction' on 'bricks'")
     diagnosed = diagnosis.diagnose(source, reporter, device)
     if "best_set" not in diagnosed:
         return diagnosed

@@ -36,7 +36,7 @@ class _FullModel:
     @property
     def differentiable(self) -> bool:
         """Returns whether the runs have derivatives."""
-        return self.spec.observation == "reaction"
+        return self.spec.formulation.differentiable
 
     def __call__(self, theta: Mapping[str, float]) -> Simulation:
         """Returns the run at parameters theta, from its file where it was made before."""

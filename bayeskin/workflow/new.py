@@ -19,13 +19,19 @@ from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.inference import NoisePriors
 from bayeskin.json_files import plain
-from bayeskin.recordings import describe, describe_json, phase_noise, read_recording, segment
+from bayeskin.recordings import (
+    describe,
+    describe_json,
+    idealised_motion,
+    phase_noise,
+    read_recording,
+    segment,
+)
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.region import protocol_outside
 from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, Parameter
 from bayeskin.workflow.output_paths import check_ending
-from bayeskin.workflow.recording import pad_motion
 from bayeskin.workflow.reducing import find_reduced
 from bayeskin.workflow.shipping import shipped_for
 
@@ -89,7 +95,7 @@ def new_config(file: Path, out: Path | None = None, device: Path | None = None) 
     phases = segment(recording)
     noise = phase_noise(recording, phases)
     description = describe(recording, phases, noise)
-    motion, geometry = pad_motion("reaction", recording, phases, "idealised"), _geometry(stated)
+    motion, geometry = idealised_motion(recording, phases), _geometry(stated)
     surrogate = None if geometry.sd_m else shipped_for(motion, geometry.geometry)
     reduced = None if surrogate else _reduced_for(motion, geometry.geometry, out)
     source, section = _surrogate_source(surrogate, reduced)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bayeskin import report, storage
 from bayeskin.errors import InputError
+from bayeskin.finite_element import ModelSpec
 from bayeskin.inference.noise_model import bins_in_windows
 from bayeskin.recordings import (
     NoiseAnalysis,
@@ -33,13 +34,13 @@ from bayeskin.workflow.provenance import caption
 
 
 def pad_motion(
-    observation: str, recording: Recording, phases: Sequence[Phase], protocol: str = "recorded"
+    spec: ModelSpec, recording: Recording, phases: Sequence[Phase], protocol: str = "recorded"
 ) -> PadMotion:
     """Returns the displacement that drives the model.
 
-    For the article's observation, this is every 50th sample, unchanged, as in the article's script.
+    For a formulation with fixed steps, this is every 50th sample, unchanged, as in the article's script.
     """
-    if observation == "article":
+    if spec.formulation.fixed_discretisation:
         return motion_of(recording)
     if protocol == "idealised":
         return idealised_motion(recording, phases)
@@ -65,7 +66,7 @@ def prepared(run: Run, recording: Recording) -> Prepared:
     """Returns phases, noise, protocol and bins of a recording, as the configuration asks for them."""
     phases = segment(recording)
     analysis = analyse(recording, phases)
-    motion = pad_motion(run.config.model.observation, recording, phases, run.config.recording.protocol)
+    motion = pad_motion(run.config.model.spec(), recording, phases, run.config.recording.protocol)
     edges_s = uniform_edges(covered_s(recording, motion), run.config.fit.bin_width_s)
     return Prepared(phases, analysis, motion, bin_recording(recording, phases, edges_s, analysis))
 

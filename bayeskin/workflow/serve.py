@@ -140,7 +140,7 @@ def _served_model(run: Run) -> ServedModel:
     if spec.forward is not None:
         check_own(spec.forward)
     recording = read_recording(run.beside(run.config.recording.file))
-    motion = pad_motion(spec.observation, recording, segment(recording), run.config.recording.protocol)
+    motion = pad_motion(spec, recording, segment(recording), run.config.recording.protocol)
     edges_s = uniform_edges(covered_s(recording, motion), run.config.fit.bin_width_s)
     return ServedModel(spec, space.parameters, Asked(motion, edges_s, None, ()))
 

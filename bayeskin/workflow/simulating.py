@@ -18,6 +18,7 @@ from bayeskin.errors import InputError
 from bayeskin.finite_element.problem import Problem
 from bayeskin.finite_element.simulate import ModelSpec, OnState, problem_at, simulate
 from bayeskin.forward.observed import reported
+from bayeskin.forward.reduced import stands_for
 from bayeskin.geometry import LENGTHS, Geometry
 from bayeskin.mechanisms import Mechanism, catalogue, laws, solved
 from bayeskin.recordings import read_recording, segment
@@ -158,7 +159,7 @@ def _case(request: SimulationRequest, reporter: Reporter) -> _Case:
         _refuse_impossible_value(parameter, values[parameter.name])
     recording = read_recording(request.recording or run.beside(run.config.recording.file))
     phases = segment(recording)
-    motion = pad_motion(spec.observation, recording, phases, run.config.recording.protocol)
+    motion = pad_motion(spec, recording, phases, run.config.recording.protocol)
     return _Case(run, spec, mechanisms, {name: values[name] for name in base.names}, values, phases, motion)
 
 
@@ -216,8 +217,8 @@ def _field_outputs(
     """
     if not (request.fields or request.figures):
         return None
-    if case.spec.observation == "article":
-        found = "model.observation 'article', whose stresses differ from those of the fields"
+    if not case.spec.formulation.has_fields:
+        found = f"model.observation {case.spec.observation!r}, whose stresses differ from those of the fields"
         raise InputError("--fields, --figures", found, "model.observation 'reaction'")
     problem = problem_at(case.spec, case.theta)
     _refuse_other_stresses(case.mechanisms, case.solved_theta, problem)
@@ -244,7 +245,7 @@ def _reduced_run(case: _Case, sources: Sequence[Path | None], on_state: OnState 
     Raises InputError where no reduced model exists for this device, mesh or observation.
     """
     spec = case.spec
-    if (spec.observation, spec.mesh, spec.refinement) != ("reaction", "bricks", 1):
+    if not stands_for(spec) or spec.refinement != 1:
         found = f"observation {spec.observation!r} on {spec.mesh!r}, refinement {spec.refinement}"
         raise InputError("--reduced", found, "observation 'reaction' on 'bricks', refinement 1")
     model = load_reduced(reduced_file(spec.geometry, [source for source in sources if source is not None]))

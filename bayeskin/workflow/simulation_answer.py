@@ -78,14 +78,9 @@ def _reduced_accuracy(simulation: Simulation) -> list[str]:
 
 
 def _accuracy(simulation: Simulation, spec: ModelSpec) -> list[str]:
-    """Returns lines with the estimated error of the full model's reaction.
-
-    The article's force has no error estimate, because it does not converge.
-    """
-    if spec.observation == "own":
-        return ["no error estimate: this is a model of your own"]
-    if spec.observation == "article":
-        return ["no error estimate: the article's force depends on the mesh and does not converge"]
+    """Returns lines with the estimated error of the model's force."""
+    if spec.formulation.error_unknown:
+        return [f"no error estimate: {spec.formulation.error_unknown}"]
     peak_n = simulation.stats["peak_force_n"]
     time_share = simulation.stats["time_error_n"] / peak_n if peak_n > 0.0 else 0.0
     error = mesh_error(spec.mesh_hash)

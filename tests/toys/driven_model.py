@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import skfem
 
-from bayeskin.finite_element.lagrangian import LagrangianModel, State
+from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.mesh import SkinMesh, roll
 from bayeskin.finite_element.problem import Material, Problem
 from bayeskin.finite_element.series import Drive, SeriesSolver
 from bayeskin.finite_element.space import TaylorHood, sparsity, taylor_hood
+from bayeskin.finite_element.stages import State
 from bayeskin.finite_element.stepping import advance
 from bayeskin.types import Array, PadMotion
 

@@ -13,8 +13,8 @@ import numpy as np
 import skfem
 from toys.driven_model import Load, Point, corner_points, elements
 
-from bayeskin.finite_element.lagrangian import State
 from bayeskin.finite_element.space import QUADRATURE_DEGREE, TaylorHood
+from bayeskin.finite_element.stages import State
 from bayeskin.types import Array
 
 COMPLEX_STEP = 1e-30

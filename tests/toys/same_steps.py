@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayeskin.finite_element.lagrangian import LagrangianModel, Step
-from bayeskin.finite_element.newton import EXTRAPOLATION_POINTS
+from bayeskin.finite_element.extrapolation import EXTRAPOLATION_POINTS
+from bayeskin.finite_element.lagrangian import LagrangianModel
+from bayeskin.finite_element.stages import Step
 from bayeskin.finite_element.stepping import advance, integrate
 from bayeskin.reduced.equations import ReducedEquations
 from bayeskin.types import Array
