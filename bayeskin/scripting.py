@@ -64,7 +64,7 @@ def simulate(
             found = ", ".join(sorted(unknown))
             raise InputError("simulate: theta", found, f"some of {', '.join(space.names)}")
         middle = dict(zip(space.names, map(float, space.from_unit(np.full(space.dim, 0.5))), strict=True))
-        spec, protocol = model_spec(run), run.config.recording.protocol
+        spec, protocol = model_spec(run), run.config.each_recording[0].protocol
         motion = pad_motion(spec, recording, segment(recording), protocol)
         return run_model(spec, motion, {**middle, **(theta or {})})
 
@@ -150,7 +150,7 @@ def diagnose(
         _run_on(recording, _with_surrogate(recording, settings, None), folder) as run,
         _without_caller_script(),
     ):
-        return diagnosis.diagnose(run.config_path, Silent())
+        return diagnosis.diagnose([run.config_path], Silent())
 
 
 @contextmanager
@@ -178,7 +178,7 @@ class _CalibrationInputs:
 
 def _calibration_inputs(run: Run, recording: Recording) -> _CalibrationInputs:
     """Returns bins, protocol and log-posterior of a run whose surrogate exists already."""
-    fitted = prepared(run, recording)
+    fitted = prepared(run, recording, run.config.each_recording[0].protocol)
     files = shipped_files(run)
     check_fits(run, files, load_design(files.design), fitted.binned, fitted.motion)
     log_posterior = log_posterior_of(run, load_surrogate(files.surrogate), fitted.binned, fitted.motion)

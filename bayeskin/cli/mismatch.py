@@ -14,40 +14,44 @@ from bayeskin.cli.terminal import Terminal
 
 
 @click.command(short_help="Find the physics that the model leaves out, and where.")
-@click.argument("source", type=PATH)
+@click.argument("sources", type=PATH, nargs=-1, required=True)
 @device_option
 @answered
-def diagnose(source: Path, device: Path | None) -> Mapping[str, Any]:
+def diagnose(sources: tuple[Path, ...], device: Path | None) -> Mapping[str, Any]:
     """Find the physics that the model leaves out of a recording, and where; show how the fit improves.
 
-    SOURCE is a configuration, or a recording by itself, of any protocol. The reduced model of the device
-    solves all mechanisms of a set together, and the full model checks the result. The likeliest sets are
-    fitted again to the recording up to the end of its second hold, and tested on the rest of it. This takes
-    two to ten minutes, and longer if many mechanisms act. For the article's observation, and for a forward
-    model of your own, a surrogate is trained first, and mechanisms of the tissue are not tried. The exit code
-    is 0 for every verdict.
+    SOURCES is a configuration, a recording by itself, of any protocol, or several recordings of one skin.
+    Several recordings share the skin and its mechanisms. Each has its own initial pressure, noise and
+    mechanisms of the instrument. A recording that contradicts the others is pointed out.
+
+    The reduced model of the device solves all mechanisms of a set together, and the full model checks the
+    result. The likeliest sets are fitted again to the recording up to the end of its second hold, and tested
+    on the rest of it. This takes two to ten minutes, and longer if many mechanisms act. For the article's
+    observation, and for a forward model of your own, a surrogate is trained first, and mechanisms of the
+    tissue are not tried. The exit code is 0 for every verdict.
 
     \b
     Example:
       bayeskin diagnose runs/healthy-skin.toml
       bayeskin diagnose runs/healthy-skin.h5 --json
       bayeskin diagnose first.h5 --device device.toml
+      bayeskin diagnose first.h5 second.h5
     """
     from bayeskin.workflow import diagnosis
 
     with Terminal() as terminal:
-        return diagnosis.diagnose(source, terminal, device)
+        return diagnosis.diagnose(sources, terminal, device)
 
 
 @click.command(short_help="Propose a test that tells look-alike mechanisms apart.")
-@click.argument("source", type=PATH)
+@click.argument("sources", type=PATH, nargs=-1, required=True)
 @device_option
 @answered
-def experiment(source: Path, device: Path | None) -> Mapping[str, Any]:
+def experiment(sources: tuple[Path, ...], device: Path | None) -> Mapping[str, Any]:
     """Propose the further test that would best tell look-alike mechanisms apart.
 
-    SOURCE is the same as for `bayeskin diagnose`, which runs first if the diagnosis is not done. The command
-    works for the reaction only, because no other protocol has the article's observation. The set that
+    SOURCES are those of `bayeskin diagnose`, which runs first if the diagnosis is not done. The command works
+    for the reaction only, because no other protocol has the article's observation. The set that
     explains the recording best, and the sets with look-alikes in its place, are taken as equally probable.
     The reduced model of the device runs draws of their posteriors in other tests. The forces give the
     expected information, in bits, about which set is true. The command first tries nine variations of the
@@ -58,8 +62,9 @@ def experiment(source: Path, device: Path | None) -> Mapping[str, Any]:
     Example:
       bayeskin experiment runs/healthy-skin.toml
       bayeskin experiment first.h5 --device device.toml
+      bayeskin experiment first.h5 second.h5
     """
     from bayeskin.workflow import experiment
 
     with Terminal() as terminal:
-        return experiment.choose(source, terminal, device)
+        return experiment.choose(sources, terminal, device)

@@ -35,15 +35,16 @@ def import_(file: Path, out: Path, sheet: str | None) -> Mapping[str, Any]:
 
 
 @click.command(short_help="Write a configuration for a recording of your own.")
-@click.argument("recording", required=False, type=PATH)
-@click.option("-o", "out", type=PATH, help="TOML file to write; default: beside RECORDING.")
+@click.argument("recordings", nargs=-1, type=PATH)
+@click.option("-o", "out", type=PATH, help="TOML file to write; default: beside the first recording.")
 @device_option
 @answered
-def new(recording: Path | None, out: Path | None, device: Path | None) -> Mapping[str, Any]:
-    """Write a commented configuration for your own recording; without RECORDING, write the demo's.
+def new(recordings: tuple[Path, ...], out: Path | None, device: Path | None) -> Mapping[str, Any]:
+    """Write a commented configuration for recordings of your own; without any, write the demo's.
 
-    The command reads the recording and reports what it contains. The configuration uses a shipped surrogate
-    if one was trained on the recording's protocol, and a design of model runs otherwise. Existing files are
+    The command reads the recordings and reports what they contain. Several recordings are of one skin. The
+    configuration of a single one uses a shipped surrogate if one was trained on the recording's protocol, and
+    a design of model runs otherwise. Existing files are
     never overwritten. The demo's recording is written beside its configuration. With --device, the sections
     [device] and [tissue] of that file are written into the configuration; without it, the article's device
     and tissue are used.
@@ -53,13 +54,14 @@ def new(recording: Path | None, out: Path | None, device: Path | None) -> Mappin
       bayeskin new && bayeskin run demo.toml
       bayeskin new test.xlsx -o runs/test.toml --device device.toml
       bayeskin new runs/test.h5 && bayeskin run runs/test.toml
+      bayeskin new first.h5 second.h5 -o both.toml
     """
     from bayeskin.workflow.new import new_config, new_demo
 
-    if recording is not None:
-        return new_config(recording, out, device)
+    if recordings:
+        return new_config(recordings, out, device)
     if device is not None:
         raise InputError(
-            f"--device {device}", "no RECORDING", "a RECORDING, because the demo uses the article's device"
+            f"--device {device}", "no recording", "a recording, because the demo uses the article's device"
         )
     return new_demo(out)

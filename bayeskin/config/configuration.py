@@ -1,9 +1,10 @@
-"""The configuration of a whole run; every key has a default except ``recording.file``."""
+"""The configuration of a whole run; every key has a default except the file of the recording."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+from pathlib import PurePath
 from typing import Annotated, Any
 
 from pydantic import Field, model_validator
@@ -32,10 +33,14 @@ WHO_RUNS: Any = {"design": {"workers", "scheduler"}, "slurm": True}
 
 
 class Config(Section):
-    """The configuration of a whole run, which `load_config` reads from a file."""
+    """The configuration of a whole run, which `load_config` reads from a file.
+
+    It has either one `recording`, or several `recordings` of one skin, which share the skin's parameters.
+    """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
-    recording: RecordingConfig
+    recording: RecordingConfig | None = None
+    recordings: tuple[RecordingConfig, ...] = ()
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
     model: ModelConfig = ModelConfig()
     device: DeviceConfig = DeviceConfig()
@@ -56,6 +61,42 @@ class Config(Section):
         """Refuses a mesh that does not go with the observation."""
         self.model.spec()
         return self
+
+    @model_validator(mode="after")
+    def _one_recording_or_several(self) -> Config:
+        """Refuses a configuration without a recording, and one that has both forms."""
+        expected = "[recording], or two or more [[recordings]]"
+        if self.recording is None and not self.recordings:
+            raise InputError("recording", "nothing", expected)
+        if self.recording is not None and self.recordings:
+            raise InputError("recordings", "[recording] too", expected)
+        if len(self.recordings) == 1:
+            raise InputError("recordings", "a single one", expected)
+        stems = [PurePath(recording.file).stem for recording in self.recordings]
+        twice = next((stem for stem in stems if stems.count(stem) > 1), None)
+        if twice is not None:
+            raise InputError("recordings", f"{twice!r} twice", "files of different names")
+        if self.recordings and self.fit.windows_s is not None:
+            raise InputError("fit.windows_s", "windows", "none with several recordings")
+        if self.recordings and self.model.spec().formulation.fixed_discretisation:
+            found = f"{self.model.observation!r} with several recordings"
+            raise InputError("model.observation", found, "'reaction'")
+        if self.recordings and self.surrogate.file is not None:
+            raise InputError("surrogate.file", "a value", "none with several recordings")
+        return self
+
+    @property
+    def each_recording(self) -> tuple[RecordingConfig, ...]:
+        """Returns the recordings, in order."""
+        return self.recordings or ((self.recording,) if self.recording is not None else ())
+
+    def only_recording(self, where: object = "configuration") -> RecordingConfig:
+        """Returns the recording. Raises InputError, which names `where`, where there are several."""
+        if self.recordings:
+            raise InputError(
+                f"{where}: recordings", f"{len(self.recordings)} recordings", "a single one for this command"
+            )
+        return self.each_recording[0]
 
     @model_validator(mode="after")
     def _coarse_model_is_coarser(self) -> Config:
@@ -87,6 +128,10 @@ class Config(Section):
         for name, default in (("device", DeviceConfig()), ("tissue", TissueConfig())):
             if getattr(self, name) == default:  # keeps hashes from before these sections existed
                 del plain[name]
+        if not self.recordings:
+            del plain["recordings"]
+        if not self.fit.shared:
+            del plain["fit"]["shared"]
         return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
     def geometry(self, where: object = "configuration") -> StatedGeometry:

@@ -12,6 +12,7 @@ from bayeskin.design import default_space
 from bayeskin.errors import InputError
 from bayeskin.geometry import LENGTHS, Geometry, moved
 from bayeskin.types import Correlation, Parameter, ParameterSpace
+from bayeskin.types.joint import own_name
 
 
 def parameter_space(config: Config, where: object = "configuration") -> ParameterSpace:
@@ -32,10 +33,21 @@ def parameter_space(config: Config, where: object = "configuration") -> Paramete
         for name, prior in config.parameters.items()
         for partner, value in prior.correlations.items()
     )
+    space = ParameterSpace((*space.parameters, *_further_initial_pressures(config, space)))
     try:
         return replace(space, correlations=correlations)
     except InputError as error:
         raise InputError(f"{where}: {error.where}", error.found, error.expected) from None
+
+
+def _further_initial_pressures(config: Config, space: ParameterSpace) -> list[Parameter]:
+    """Returns the initial pressure of each recording after the first, with the prior of the first."""
+    pressures = [p for p in space.parameters if p.name == "p_init" and p.name not in config.fit.shared]
+    return [
+        replace(p, name=own_name(p.name, number), description=f"{p.description}, in recording {number + 1}")
+        for number in range(1, len(config.each_recording))
+        for p in pressures
+    ]
 
 
 def _space_of_full_model(config: Config, where: object) -> ParameterSpace:

@@ -159,10 +159,15 @@ class SurrogateConfig(Section):
 
 
 class FitConfig(Section):
-    """The windows of the recording that are fitted (default: all of it), and the width of the bins."""
+    """The windows of the recording that are fitted (default: all of it), and the width of the bins.
+
+    shared : what several recordings share, although each usually has its own: "p_init", "noise", or names of
+        mechanisms of the instrument
+    """
 
     windows_s: list[tuple[float, float]] | None = None
     bin_width_s: Annotated[float, Field(gt=0)] = 0.5
+    shared: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def _windows_start_before_they_end(self) -> FitConfig:

@@ -13,6 +13,7 @@ from bayeskin.geometry import LENGTHS
 from bayeskin.mechanisms import Mechanism, bin_means, catalogue, laws, observed, solved
 from bayeskin.mechanisms.mechanism import ForceOfTime
 from bayeskin.types import Array, PadMotion, Simulation
+from bayeskin.types.joint import edges_of, end_to_end, values_in
 
 BESIDE = 1e-4  # of a change; distance from a neutral value at which derivatives are computed
 
@@ -62,6 +63,19 @@ class FullForce:
 
     def __call__(self, case: tuple[Sequence[str], Mapping[str, float]]) -> Array | str:
         names, values = case
+        if not self.motion.spans:
+            return self._on_one_recording(names, values)
+        forces: list[Array] = []
+        edges = edges_of(self.motion.spans, self.edges_s)
+        for number, (part, edges_s) in enumerate(zip(self.motion.parts, edges, strict=True)):
+            force_n = FullForce(self.spec, part, edges_s)((names, values_in(values, number)))
+            if isinstance(force_n, str):
+                return f"recording {number + 1}: {force_n}"
+            forces.append(force_n)
+        return end_to_end(forces, 0.0)
+
+    def _on_one_recording(self, names: Sequence[str], values: Mapping[str, float]) -> Array | str:
+        """Returns the force (m,) [N] of a single recording, or the message of a run that failed."""
         mechanisms = [catalogue()[name] for name in names]
         used = {p.name for mechanism in solved(mechanisms) for p in mechanism.parameters}
         theta = dict(values)

@@ -6,15 +6,22 @@ from pathlib import Path
 
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.forward.interface import ForwardModel
+from bayeskin.forward.joint import JointForward
 from bayeskin.forward.reduced import ReducedForward, stands_for
 from bayeskin.forward.surrogate import SurrogateForward
 from bayeskin.reduced.files import load_reduced
 from bayeskin.surrogates import load_surrogate
 from bayeskin.types import Array, PadMotion
+from bayeskin.types.joint import edges_of
 
 
 def forward_model(file: Path, spec: ModelSpec, motion: PadMotion, edges_s: Array) -> ForwardModel:
-    """Returns the model in a file: a reduced model where it can replace `spec`, otherwise a surrogate."""
+    """Returns the model in a file: a reduced model where it can replace `spec`, otherwise a surrogate.
+
+    Several recordings of one skin have a joint model.
+    """
     if stands_for(spec):
-        return ReducedForward(load_reduced(file), motion, edges_s)
+        model, edges = load_reduced(file), edges_of(motion.spans, edges_s)
+        each = tuple(ReducedForward(model, *part) for part in zip(motion.parts, edges, strict=True))
+        return each[0] if len(each) == 1 else JointForward(each)
     return SurrogateForward(load_surrogate(file), spec)

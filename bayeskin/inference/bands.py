@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,7 @@ from bayeskin.inference.gauss_newton import drawn_errors
 from bayeskin.inference.noise_model import (
     KINDS,
     NoiseChain,
+    NoisePriors,
     Windows,
     bins_in_windows,
     draw_noise,
@@ -92,7 +93,7 @@ def predictive_draws(log_posterior: LogPosterior, theta: ArrayLike, rng: np.rand
     """
     theta = np.atleast_2d(np.asarray(theta, dtype=float))
     fitted = log_posterior.chain
-    chain = _whole_chain(log_posterior.binned, log_posterior.noise_priors.by_kind)
+    chain = _whole_chain(log_posterior.binned, log_posterior.noise_priors)
     parts = [_predictive(log_posterior, fitted, chain, theta[a : a + _CHUNK], rng)
              for a in range(0, len(theta), _CHUNK)]  # fmt: skip
     return ForceDraws(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -145,20 +146,17 @@ def _root_mean(square: Array) -> float:
     return float(np.sqrt(square.mean())) if len(square) else float("nan")
 
 
-def _whole_chain(binned: BinnedForce, by_kind: bool) -> NoiseChain:
+def _whole_chain(binned: BinnedForce, noise: NoisePriors) -> NoiseChain:
     """Returns a chain over all bins, including bins without a recorded force.
 
     All forces are zero, because drawing noise does not need them. A variance that is not finite becomes zero.
     """
-    filled = BinnedForce(
-        edges_s=binned.edges_s,
+    filled = replace(
+        binned,
         force_n=np.zeros_like(binned.force_n),
         variance_n2=np.nan_to_num(binned.variance_n2, nan=0.0, posinf=0.0),
-        correlation=binned.correlation,
-        phase=binned.phase,
-        phases=binned.phases,
     )
-    return noise_chain(filled, by_kind=by_kind)
+    return noise_chain(filled, by_kind=noise.by_kind, by_recording=noise.by_recording)
 
 
 def _predictive(

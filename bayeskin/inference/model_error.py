@@ -21,6 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from bayeskin.types import Array, PadMotion, Prediction
+from bayeskin.types.joint import recording_at
 
 CALIBRATION = 0.01  # sd of a factor on the force: the error of a load cell of class 1 (ISO 7500-1:2018)
 BEND = 3e-3  # b, a share of the force
@@ -75,8 +76,18 @@ def shapes(motion: PadMotion, edges_s: Array) -> tuple[Array, Array]:
 def relaxing(motion: PadMotion, time_s: Array) -> Array:
     """Returns the force (k, m) of springs and dashpots in series at given times, stretched by d / max d.
 
-    It is exact, because a protocol is straight between its corners.
+    It is exact, because a protocol is straight between its corners. Each of several recordings starts
+    relaxed. The times (n,) [s] are in order.
     """
+    if motion.spans:
+        recording = recording_at(motion.spans, time_s)
+        return np.concatenate(
+            [
+                relaxing(part, time_s[recording == number] - span.start_s)
+                for number, (part, span) in enumerate(zip(motion.parts, motion.spans, strict=True))
+            ],
+            axis=1,
+        )
     largest = float(np.max(np.abs(motion.displacement_m)))
     rate = np.diff(motion.displacement_m) / largest / np.diff(motion.time_s)
     out = np.zeros((len(RELAXATION_S), len(time_s)))

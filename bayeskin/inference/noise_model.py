@@ -37,6 +37,7 @@ from bayeskin.types import (
     PhaseKind,
     _FreezesArrays,
 )
+from bayeskin.types.joint import own_name, plain_name, recording_at, recording_of
 
 KINDS: tuple[PhaseKind, ...] = ("rest", "load", "hold", "unload")
 ALL = "noise"  # the kind of all phases where they share one sd
@@ -49,12 +50,15 @@ class NoisePriors:
     """Bounds of the log-uniform priors on the noise: sd [N], correlation time [s], tail index.
 
     by_kind : whether each kind of phase has an sd of its own
+    by_recording : whether each of several recordings has an sd of its own; all share memory and tails, which
+        are the load cell's
     """
 
     sd_n: tuple[float, float] = (1e-4, 0.3)
     tau_s: tuple[float, float] = (0.1, 10.0)
     nu: tuple[float, float] = (2.0, 100.0)
     by_kind: bool = True
+    by_recording: bool = True
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,7 @@ def noise_space(kinds: Sequence[str], priors: NoisePriors | None = None) -> Para
     sds = [
         Parameter(
             f"sd_{kind}", "N", *priors.sd_n, "log-uniform",
-            "noise sd" if kind == ALL else f"noise sd while pads {kind}", _SOURCE,
+            "noise sd" if plain_name(kind) == ALL else f"noise sd while pads {plain_name(kind)}", _SOURCE,
         )
         for kind in kinds
     ]  # fmt: skip
@@ -116,16 +120,22 @@ def bins_in_windows(binned: BinnedForce, windows: Windows | None) -> NDArray[np.
 
 
 def noise_chain(
-    binned: BinnedForce, windows: Windows | None = None, omit: int | None = None, by_kind: bool = True
-) -> NoiseChain:
+    binned: BinnedForce, windows: Windows | None = None, omit: int | None = None, by_kind: bool = True,
+    by_recording: bool = True,
+) -> NoiseChain:  # fmt: skip
     """Returns the chain through the bins of `windows`, or through all bins.
 
     omit : index of a phase that is left out as a gap
-    by_kind : whether each kind of phase has an sd of its own
+    by_kind, by_recording : whether each kind of phase, and each of several recordings, has an sd of its own
     Raises InputError when no bin is left or a variance is negative.
     """
     window = bins_in_windows(binned, windows)
-    kinds = _kinds(binned, np.flatnonzero(window >= 0)) if by_kind else (ALL,)
+    recording = recording_at(binned.spans, binned.time_s)
+    kind_of_bin = [
+        own_name(binned.phases[p].kind if by_kind else ALL, int(r) if by_recording else 0)
+        for p, r in zip(binned.phase, recording, strict=True)
+    ]
+    kinds = _ordered({kind_of_bin[i] for i in np.flatnonzero(window >= 0)})
     keep = window >= 0 if omit is None else (window >= 0) & (binned.phase != omit)
     bins = np.flatnonzero(keep)
     if not len(bins):
@@ -133,11 +143,10 @@ def noise_chain(
     variance = binned.variance_n2[bins]
     if np.any(variance < 0):
         raise InputError("binned force", "a negative variance", "variances of at least 0")
-    starts = np.concatenate([[True], np.diff(window[bins]) != 0])
+    starts = np.concatenate([[True], (np.diff(window[bins]) != 0) | (np.diff(recording[bins]) != 0)])
     # In a Markov chain, the correlation across omitted bins is the product of the neighbours' correlations.
     neighbour = np.clip(np.nan_to_num(binned.correlation), -0.999, 0.999)
     bridge = np.array([0.0, *(np.prod(neighbour[a:b]) for a, b in pairwise(bins))])
-    of_kind = [kinds.index(binned.phases[p].kind) if by_kind else 0 for p in binned.phase[bins]]
     return NoiseChain(
         bins=bins.astype(np.int64),
         force_n=binned.force_n[bins],
@@ -146,14 +155,15 @@ def noise_chain(
         # After rounding, equal gaps are equal to the last bit and share one exponential.
         gap_s=np.round(np.diff(binned.time_s[bins], prepend=binned.time_s[bins[0]]), 12),
         starts=starts,
-        kind=np.array(of_kind, dtype=np.int64),
+        kind=np.array([kinds.index(kind_of_bin[i]) for i in bins], dtype=np.int64),
         kinds=kinds,
     )
 
 
-def _kinds(binned: BinnedForce, bins: NDArray[np.int64]) -> tuple[PhaseKind, ...]:
-    present = {binned.phases[p].kind for p in binned.phase[bins]}
-    return tuple(kind for kind in KINDS if kind in present)
+def _ordered(kinds: set[str]) -> tuple[str, ...]:
+    """Returns names of kinds in the order of the recordings, then of `KINDS`."""
+    order = (*KINDS, ALL)
+    return tuple(sorted(kinds, key=lambda kind: (recording_of(kind), order.index(plain_name(kind)))))
 
 
 def filter_gains(

@@ -68,7 +68,12 @@ class LogPosterior:
     @cached_property
     def chain(self) -> NoiseChain:
         """Returns the fitted bins in order."""
-        return noise_chain(self.binned, self.fit_windows, by_kind=self.noise_priors.by_kind)
+        return self._chain_without(None)
+
+    def _chain_without(self, phase: int | None) -> NoiseChain:
+        """Returns the fitted bins in order; the bins of a phase are left out as a gap."""
+        noise = self.noise_priors
+        return noise_chain(self.binned, self.fit_windows, phase, noise.by_kind, noise.by_recording)
 
     @cached_property
     def space(self) -> ParameterSpace:
@@ -189,9 +194,7 @@ class LogPosterior:
         theta = np.atleast_2d(np.asarray(theta, dtype=float))
         if len(self.blocks) == 1:
             return self._in_chunks([self.chain], theta)
-        without_phase = [
-            noise_chain(self.binned, self.fit_windows, b, self.noise_priors.by_kind) for b in self.blocks
-        ]
+        without_phase = [self._chain_without(b) for b in self.blocks]
         each = self._in_chunks([self.chain, *without_phase], theta)
         return each[:, :1] - each[:, 1:]
 

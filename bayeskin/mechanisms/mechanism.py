@@ -56,6 +56,8 @@ class Instrument:
         it does not repeat
     settles_s : the shortest time constant [s] with which its response to a corner decays; infinite if it has
         no such response
+    of_skin : True for a property of the skin or the arm, which several recordings of one skin share; the
+        properties of an instrument may differ between them
     """
 
     place: Place
@@ -66,6 +68,7 @@ class Instrument:
     repeats_m: float = np.inf
     repeats_s: float = np.inf
     settles_s: float = np.inf
+    of_skin: bool = False
 
 
 @dataclass(frozen=True)

@@ -74,5 +74,5 @@ MECHANISM = Mechanism(
         f"The surrounding tissue yields by {number(1e3 * v['recovery_compliance'], 2)} mm for each newton, "
         f"with a time constant of {v['recovery_time']:.0f} s, and returns as slowly."
     ),
-    act=Instrument(Place.PADS, observe, bind, adds=False),
+    act=Instrument(Place.PADS, observe, bind, adds=False, of_skin=True),
 )

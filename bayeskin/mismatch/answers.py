@@ -36,6 +36,7 @@ TRUST = 0.15  # half width, as a share of the prior, of the region near a run in
 
 def answer(context: DiagnosisContext, task: Task) -> dict[str, Any]:
     """Returns the answer to a task in JSON's types; if a run fails, the answer is its message."""
+    context = _context_of(context, task)
     if isinstance(task, RunTask | FullRunTask | OtherProtocolTask):
         force = _force(context, task)
         return {"message": force} if isinstance(force, str) else {"force_n": force.tolist()}
@@ -56,6 +57,7 @@ def read_answer(context: DiagnosisContext, task: Task, said: Mapping[str, Any]) 
     """Returns an answer in the form that a search uses: a fit, gain [nats], force, evidences, or message."""
     if "message" in said:
         return said["message"]
+    context = _context_of(context, task)
     if isinstance(task, RunTask | FullRunTask | OtherProtocolTask):
         return np.array(said["force_n"])
     if isinstance(task, ScoreTestTask):
@@ -65,6 +67,12 @@ def read_answer(context: DiagnosisContext, task: Task, said: Mapping[str, Any]) 
     set_fit = _fit_from_json(context, said, task.until_s if isinstance(task, FitTask) else None)
     contradicted = refuted(set_fit.fit, context.known, context.motion, context.jumps)
     return f"the samples of the recording contradict {', '.join(contradicted)}" if contradicted else set_fit
+
+
+def _context_of(context: DiagnosisContext, task: Task) -> DiagnosisContext:
+    """Returns the context of the recording that a task is about, or of all recordings."""
+    recording = task.recording if isinstance(task, FitTask) else None
+    return context if recording is None else context.alone[recording]
 
 
 def _force(context: DiagnosisContext, task: RunTask | FullRunTask | OtherProtocolTask) -> Array | str:

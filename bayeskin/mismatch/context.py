@@ -9,18 +9,21 @@ from functools import cached_property
 import numpy as np
 
 from bayeskin.forward.interface import ForwardModel, ModelRun
+from bayeskin.forward.joint import JointForward
 from bayeskin.forward.observed import FullForce
 from bayeskin.forward.posterior import posterior_of
 from bayeskin.forward.reduced import ReducedForward
 from bayeskin.inference import LogPosterior, NoisePriors
 from bayeskin.inference.noise_model import ALL, noise_space
 from bayeskin.mechanisms import Mechanism, bin_means, catalogue, observed
+from bayeskin.mechanisms.each_recording import in_each_recording, in_one_recording
 from bayeskin.mechanisms.mechanism import Tissue
 from bayeskin.mismatch.noise_bounds import instrument_noise
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.stiffness_ratio import subcutis_too_stiff
 from bayeskin.mismatch.tangent import Tangent
 from bayeskin.types import Array, BinnedForce, Jumps, PadMotion, ParameterSpace, Surrogate
+from bayeskin.types.joint import own_name, plain_name, values_in
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,7 @@ class DiagnosisContext:
     binned : the recording's bins, whose variances contain only quick noise; jumps : the jumps that its
         samples allow; motion : its protocol
     base : priors of the base model; stated_noise : bounds of noise parameters that replace the usual ones
+    shared : what several recordings share besides the skin: "noise", or names of mechanisms of the instrument
     """
 
     binned: BinnedForce
@@ -39,15 +43,38 @@ class DiagnosisContext:
     base: ParameterSpace
     seed: int
     stated_noise: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    shared: tuple[str, ...] = ()
 
     @cached_property
     def known(self) -> dict[str, Mechanism]:
-        """Returns the mechanisms of the catalogue that the forward model solves, or that act on the force."""
-        solves = self.forward.solves
+        """Returns the mechanisms of the catalogue that the forward model solves, or that act on the force.
+
+        Each of several recordings has its own values of an instrument's mechanism, unless they share it.
+        """
+        solves, recordings = self.forward.solves, [span.name for span in self.binned.spans]
         known = {
             name: m for name, m in catalogue().items() if name in solves or not isinstance(m.act, Tissue)
         }
-        return {name: m for name, m in known.items() if set(m.needs) <= set(known)}
+        return {
+            name: m if name in self.shared else in_each_recording(m, recordings)
+            for name, m in known.items()
+            if set(m.needs) <= set(known)
+        }
+
+    @cached_property
+    def alone(self) -> tuple[DiagnosisContext, ...]:
+        """Returns the context of each of several recordings by itself, whose values have plain names."""
+        assert isinstance(self.forward, JointForward)
+        plain = tuple(p for p in self.base.parameters if p.name == plain_name(p.name))
+        base = ParameterSpace(plain, self.base.correlations)
+        return tuple(
+            DiagnosisContext(
+                binned, self.jumps.part(span), motion, forward, base, self.seed, self.stated_noise
+            )
+            for binned, span, motion, forward in zip(
+                self.binned.parts, self.binned.spans, self.motion.parts, self.forward.parts, strict=True
+            )
+        )
 
     @cached_property
     def neutral(self) -> dict[str, float]:
@@ -57,12 +84,14 @@ class DiagnosisContext:
     @cached_property
     def noise_priors(self) -> NoisePriors:
         """Returns the bounds of the noise parameters; all phases share one sd."""
-        return replace(instrument_noise(self.binned), by_kind=False, **dict(self.stated_noise))  # type: ignore[arg-type]
+        usual = replace(instrument_noise(self.binned), by_kind=False, by_recording="noise" not in self.shared)
+        return replace(usual, **dict(self.stated_noise))  # type: ignore[arg-type]
 
     @property
     def noise(self) -> dict[str, float]:
         """Returns the noise parameters from which fits start: the middle of their priors."""
-        space = noise_space([ALL], self.noise_priors)
+        recordings = range(len(self.binned.parts) if self.noise_priors.by_recording else 1)
+        space = noise_space([own_name(ALL, number) for number in recordings], self.noise_priors)
         return dict(zip(space.names, map(float, space.from_unit(np.full(space.dim, 0.5))), strict=True))
 
     def solved(self, names: Sequence[str]) -> list[Mechanism]:
@@ -109,15 +138,21 @@ class DiagnosisContext:
     ) -> Array | str:
         """Returns the force (m,) [N] that the instrument reports on another protocol, or why the run failed.
 
+        With several recordings, the values that each has for itself are those of the first one.
+
         edges_s (m + 1,) : edges of the bins whose means are returned
         """
-        values = {name: theta[name] for name in self.space(names).names}
-        assert isinstance(self.forward, ReducedForward)
-        run = self.forward.simulated(motion, values, self.solved(names))
+        plain = values_in(theta, 0)
+        values = {name: plain[name] for name in self.space(names).names if name in plain}
+        forward = self.forward.parts[0] if isinstance(self.forward, JointForward) else self.forward
+        assert isinstance(forward, ReducedForward)
+        run = forward.simulated(motion, values, self.solved(names))
         if run.status != "ok":
             return run.message
-        beyond = [self.known[name] for name in sorted(names) if name not in self.forward.solves]
-        rows = {name: np.array([value]) for name, value in theta.items()}
+        beyond = [
+            in_one_recording(self.known[name]) for name in sorted(names) if name not in self.forward.solves
+        ]
+        rows = {name: np.array([value]) for name, value in plain.items()}
         force = observed(beyond, rows, motion, lambda time_s: np.atleast_2d(run.at(time_s)))
         return bin_means(force, motion, edges_s, beyond)[0]
 

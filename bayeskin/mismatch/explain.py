@@ -5,8 +5,10 @@ All runs of the models that a diagnosis needs are made here, by tasks that worke
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from bayeskin.mismatch.agreement import Agreement, agreements
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.emulate import EmulatedPosterior, Learn
 from bayeskin.mismatch.held_out import Beginning, end_of_second_hold, fit_beginning
@@ -29,6 +31,7 @@ class Explanation:
     split_s : end of the recording's beginning [s], or None where no third hold follows
     beginning : fits to the beginning, or None where they failed
     emulated : posterior of the best set
+    agreement : of each of several recordings with the others; empty for a single recording
     """
 
     search: SearchResult
@@ -37,6 +40,7 @@ class Explanation:
     split_s: float | None
     beginning: Beginning | None
     emulated: EmulatedPosterior
+    agreement: Sequence[Agreement] = ()
 
     @property
     def best(self) -> Names:
@@ -74,4 +78,5 @@ def explain(context: DiagnosisContext, ask: AnswerTasks, learn: Learn, tell: Tel
     tell("runs in the region of the posterior, and draws from it")
     maxima = [result.fits[best], *result.others_of(best)]
     emulated = posterior_by_emulator(context, ask, maxima, learn)
-    return Explanation(result, judgement, explained, split_s, beginning, emulated)
+    agreement = agreements(ask, context, result.fits[best])
+    return Explanation(result, judgement, explained, split_s, beginning, emulated, agreement)

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.hypotheses import weight
 from bayeskin.mismatch.search_context import correction
@@ -29,8 +31,12 @@ class Beginning:
 
 
 def end_of_second_hold(binned: BinnedForce) -> float | None:
-    """Returns the time [s] at which the held-out part starts, or None where no third hold follows."""
-    holds = [phase for phase in binned.phases if phase.kind == "hold"]
+    """Returns the time [s] at which the held-out part starts, or None where no third hold follows.
+
+    With several recordings, this is a part of the last one.
+    """
+    start_s = binned.spans[-1].start_s if binned.spans else -np.inf
+    holds = [phase for phase in binned.phases if phase.kind == "hold" and phase.start_s >= start_s]
     return holds[1].end_s if len(holds) > 2 else None
 
 

@@ -44,8 +44,11 @@ def without_swings(binned: BinnedForce, quick_n2: Array) -> BinnedForce:
 
 
 def instrument_noise(binned: BinnedForce) -> NoisePriors:
-    """Returns the bounds of the noise of a diagnosis, from the scatter within the recording's bins."""
-    typical = float(np.sqrt(np.nanmedian(binned.variance_n2)))
+    """Returns the bounds of the noise of a diagnosis, from the scatter within the recording's bins.
+
+    With several recordings, the bounds are those of the noisiest one.
+    """
+    typical = max(float(np.sqrt(np.nanmedian(part.variance_n2))) for part in binned.parts)
     lowest = NoisePriors().sd_n[0]
     return NoisePriors(
         sd_n=(lowest, max(NOISE_SHARE * typical, 2.0 * lowest)),

@@ -18,10 +18,12 @@ from numpy.typing import ArrayLike
 
 from bayeskin.mechanisms import Mechanism, observed
 from bayeskin.mechanisms.binned import BinnedForces
+from bayeskin.mechanisms.each_recording import in_one_recording
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.distinct import at_distinct, mean_at_distinct
 from bayeskin.mismatch.wrapper import Wrapper
 from bayeskin.types import Array, PadMotion, ParameterSpace, Prediction
+from bayeskin.types.joint import bins_of, edges_of, end_to_end, values_in
 
 
 @dataclass(frozen=True)
@@ -62,14 +64,33 @@ class ObservedSurrogate(Wrapper):
         return theta[:, :count], dict(zip(self.space.names[count:], theta[:, count:].T, strict=True))
 
     def _added(self, values: Mapping[str, Array], mean_n: Array) -> Array:
-        """Returns the force (n, m) [N] that the mechanisms add to the bins' means."""
+        """Returns the force (n, m) [N] that the mechanisms add to the bins' means, recording by recording."""
+        return end_to_end(
+            [
+                self._added_in(forces, motion, values_in(values, number), mean_n[:, bins])
+                for number, (motion, forces, bins) in enumerate(self._recordings)
+            ],
+            0.0,
+        )
+
+    def _added_in(
+        self, forces: BinnedForces, motion: PadMotion, values: Mapping[str, Array], mean_n: Array
+    ) -> Array:
+        """Returns the force (n, k) [N] that the mechanisms add to the bins' means of one recording."""
         if all(isinstance(m.act, Instrument) and m.act.adds for m in self.mechanisms):
             force = observed(
-                self.mechanisms, values, self.motion, lambda t: np.zeros((len(mean_n), np.shape(t)[-1]))
+                self.mechanisms, values, motion, lambda t: np.zeros((len(mean_n), np.shape(t)[-1]))
             )
-            return self._forces.bins.means(force)
-        return self._forces.change(partial(observed, self.mechanisms, values, self.motion), mean_n)
+            return forces.bins.means(force)
+        return forces.change(partial(observed, self.mechanisms, values, motion), mean_n)
 
     @cached_property
-    def _forces(self) -> BinnedForces:
-        return BinnedForces(self.edges_s, self.motion, self.mechanisms)
+    def _recordings(self) -> list[tuple[PadMotion, BinnedForces, slice]]:
+        """Returns the protocol, the forces and the bins of each recording."""
+        spans, plain = self.motion.spans, tuple(in_one_recording(m) for m in self.mechanisms)
+        return [
+            (part, BinnedForces(edges_s, part, plain), bins)
+            for part, edges_s, bins in zip(
+                self.motion.parts, edges_of(spans, self.edges_s), bins_of(spans, self.edges_s), strict=True
+            )
+        ]

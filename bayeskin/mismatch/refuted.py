@@ -10,6 +10,7 @@ from bayeskin.mechanisms import Mechanism
 from bayeskin.mechanisms.mechanism import Instrument, Place
 from bayeskin.mismatch.fit import Fit
 from bayeskin.types import Jumps, PadMotion
+from bayeskin.types.joint import Span, values_in
 
 
 def refuted(found: Fit, known: Mapping[str, Mechanism], motion: PadMotion, jumps: Jumps) -> list[str]:
@@ -26,5 +27,10 @@ def refuted(found: Fit, known: Mapping[str, Mechanism], motion: PadMotion, jumps
     values = {name: np.array([value]) for name, value in found.theta.items()}
     log_posterior = found.log_posterior
     fitted_jumps = jumps.until(log_posterior.binned.edges_s[log_posterior.chain.bins[-1] + 1])
+    spans = motion.spans or (Span("", 0.0, float(motion.time_s[-1])),)
+    parts = [
+        (values_in(values, number), part, fitted_jumps.part(span) if motion.spans else fitted_jumps)
+        for number, (part, span) in enumerate(zip(motion.parts, spans, strict=True))
+    ]
     return [name for name, act in instrument.items()
-            if act.refuted is not None and act.refuted(values, motion, fitted_jumps)[0]]  # fmt: skip
+            if act.refuted is not None and any(act.refuted(*part)[0] for part in parts)]  # fmt: skip

@@ -32,6 +32,8 @@ class FitTask:
     start : values from which the fit starts; runs : largest number of model runs
     correction_n (m,) : force [N] that is added to every run; empty for none
     until_s : end of the part of the recording that is fitted [s]; None for the whole recording
+    recording : number of the recording that is fitted alone, with its values by their plain names; None for
+        all recordings together
     """
 
     names: tuple[str, ...]
@@ -39,6 +41,7 @@ class FitTask:
     runs: int
     correction_n: tuple[float, ...] = ()
     until_s: float | None = None
+    recording: int | None = None
 
 
 @dataclass(frozen=True)

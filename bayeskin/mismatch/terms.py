@@ -16,6 +16,7 @@ import numpy as np
 
 from bayeskin.mismatch.unexplained import Place, Unexplained, place
 from bayeskin.types import Array, PadMotion, Phase
+from bayeskin.types.joint import recording_at
 
 POINTS = 8  # number of times inside a bin
 TAUS_S = (1.0, 3.0, 10.0, 30.0, 100.0)
@@ -104,6 +105,11 @@ def _functions(at: Place, force_n: Array, motion: PadMotion) -> Iterator[tuple[s
 
 def memory(motion: PadMotion, time_s: Array, tau_s: float) -> Array:
     """Returns the memory of displacement m(t) [m] at times of any shape; exact for straight stretches."""
+    if motion.spans:
+        out, recording = np.empty(time_s.shape), recording_at(motion.spans, time_s)
+        for number, (part, span) in enumerate(zip(motion.parts, motion.spans, strict=True)):
+            out[recording == number] = memory(part, time_s[recording == number] - span.start_s, tau_s)
+        return out
     speed = np.diff(motion.displacement_m) / np.diff(motion.time_s)
     corners = [0.0]
     for v, lasts_s in zip(speed, np.diff(motion.time_s), strict=True):

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from bayeskin.mechanisms import catalogue
 from bayeskin.types import Array, ParameterSpace, Prediction, Surrogate
+from bayeskin.types.joint import plain_name
 
 
 @dataclass(frozen=True)
@@ -57,4 +58,5 @@ def skins(surrogate: Surrogate) -> tuple[int, ...]:
     """
     names = innermost(surrogate).space.names
     of_mechanisms = {p.name for mechanism in catalogue().values() for p in mechanism.parameters}
-    return tuple(sorted({sum(name not in of_mechanisms for name in names), len(names)}))
+    of_base = sum(plain_name(name) not in of_mechanisms for name in names)
+    return tuple(sorted({of_base, len(names)}))

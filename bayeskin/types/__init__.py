@@ -7,6 +7,7 @@ name each dataclass of this package, so a dataclass keeps its name.
 
 from bayeskin.types.arrays import Array, _FreezesArrays, frozen_array
 from bayeskin.types.design import Design
+from bayeskin.types.joint import Span
 from bayeskin.types.parameters import Correlation, Parameter, ParameterSpace
 from bayeskin.types.protocol import PadMotion, Phase, PhaseKind
 from bayeskin.types.provenance import Provenance
@@ -30,6 +31,7 @@ __all__ = [
     "Provenance",
     "Recording",
     "Simulation",
+    "Span",
     "Surrogate",
     "_FreezesArrays",
     "frozen_array",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from bayeskin.types.arrays import Array, _FreezesArrays
+from bayeskin.types.joint import Span
 
 PhaseKind = Literal["rest", "load", "hold", "unload"]
 
@@ -22,6 +23,10 @@ class Phase(_FreezesArrays):
     start_s: float
     end_s: float
 
+    def later(self, by_s: float) -> Phase:
+        """Returns the phase on an axis of time on which it begins `by_s` later."""
+        return replace(self, start_s=self.start_s + by_s, end_s=self.end_s + by_s)
+
 
 @dataclass(frozen=True)
 class PadMotion(_FreezesArrays):
@@ -29,10 +34,30 @@ class PadMotion(_FreezesArrays):
 
     `displacement_m` is the *full* LVDT reading; each pad of the symmetric model moves by half of it. Both
     arrays have shape (k,). `time_s` increases strictly and starts at 0.
+
+    spans : the parts of the time axis that several recordings of one skin cover; () for a single recording
     """
 
     time_s: Array
     displacement_m: Array
+    spans: tuple[Span, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "spans", tuple(Span(*span) for span in self.spans))  # a file has lists
+
+    @property
+    def parts(self) -> tuple[PadMotion, ...]:
+        """Returns the protocol of each recording, on the recording's own axis of time."""
+        if not self.spans:
+            return (self,)
+        inside = [
+            (self.time_s >= span.start_s - 1e-9) & (self.time_s <= span.end_s + 1e-9) for span in self.spans
+        ]
+        return tuple(
+            PadMotion(np.round(self.time_s[rows] - span.start_s, 9), self.displacement_m[rows])
+            for span, rows in zip(self.spans, inside, strict=True)
+        )
 
     def at(self, time_s: ArrayLike) -> Array:
         """Returns the LVDT displacement [m] at given times, same shape."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayeskin.types.arrays import Array, _FreezesArrays
+from bayeskin.types.joint import Span, bins_of
 from bayeskin.types.protocol import Phase
 
 
@@ -22,6 +23,14 @@ class Recording(_FreezesArrays):
     sha256: str  # hash of the source file's bytes
     notes: tuple[str, ...] = ()  # how the importer interpreted columns and units
 
+    def part(self, span: Span) -> Recording:
+        """Returns the samples of one of several recordings, on this recording's own axis of time."""
+        inside = (self.time_s >= span.start_s - 1e-9) & (self.time_s <= span.end_s + 1e-9)
+        return replace(
+            self, name=span.name, time_s=self.time_s[inside] - span.start_s,
+            displacement_m=self.displacement_m[inside], force_n=self.force_n[inside],
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class BinnedForce(_FreezesArrays):
@@ -32,6 +41,7 @@ class BinnedForce(_FreezesArrays):
     variance_n2 : the variance of each mean, (m,), which includes the correlation of samples within the bin
     correlation : the correlation of the noise of neighbouring bins, (m-1,)
     phase : for each bin the index in `phases` of the phase that covers most of it, (m,)
+    spans : the parts of the time axis that several recordings of one skin cover; () for a single recording
     """
 
     edges_s: Array
@@ -40,11 +50,38 @@ class BinnedForce(_FreezesArrays):
     correlation: Array
     phase: NDArray[np.int64]
     phases: tuple[Phase, ...]
+    spans: tuple[Span, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "spans", tuple(Span(*span) for span in self.spans))  # a file has lists
 
     @property
     def time_s(self) -> Array:
         """Returns the bin centres, (m,)."""
         return 0.5 * (self.edges_s[1:] + self.edges_s[:-1])
+
+    @property
+    def slices(self) -> list[slice]:
+        """Returns the bins of each recording."""
+        return bins_of(self.spans, self.edges_s)
+
+    @property
+    def parts(self) -> tuple[BinnedForce, ...]:
+        """Returns the bins of each recording, on the recording's own axis of time."""
+        if not self.spans:
+            return (self,)
+        return tuple(self._part(span, bins) for span, bins in zip(self.spans, self.slices, strict=True))
+
+    def _part(self, span: Span, bins: slice) -> BinnedForce:
+        """Returns the bins of one recording."""
+        phases = [p for p in self.phases if span.start_s - 1e-9 <= p.start_s < span.end_s]
+        return BinnedForce(
+            self.edges_s[bins.start : bins.stop + 1] - span.start_s,
+            self.force_n[bins], self.variance_n2[bins], self.correlation[bins.start : bins.stop - 1],
+            self.phase[bins] - self.phases.index(phases[0]),
+            tuple(p.later(-span.start_s) for p in phases),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -63,6 +100,11 @@ class Jumps(_FreezesArrays):
         """Returns whether the samples contradict jumps of size_n (k,) [N] at time_s (k,)."""
         at = np.clip(np.searchsorted(self.time_s, time_s), 0, len(self.time_s) - 1)
         return np.asarray((size_n < self.lowest_n[at]) | (size_n > self.highest_n[at]))
+
+    def part(self, span: Span) -> Jumps:
+        """Returns the range of jumps in one of several recordings, on this recording's own axis of time."""
+        inside = (self.time_s >= span.start_s - 1e-9) & (self.time_s <= span.end_s + 1e-9)
+        return Jumps(self.time_s[inside] - span.start_s, self.lowest_n[inside], self.highest_n[inside])
 
     def until(self, end_s: float) -> Jumps:
         """Returns the range of jumps that the samples up to a given time allow."""

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bayeskin.config import Config, RecordingConfig, parameter_space
+from bayeskin.config import Config, config_of, parameter_space
 from bayeskin.config.device import load_device_file
 from bayeskin.errors import InputError
+from bayeskin.forward.joint import JointForward
 from bayeskin.forward.reduced import ReducedForward, stands_for
 from bayeskin.json_files import plain, write_json
+from bayeskin.mechanisms import catalogue
+from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.assess import assess
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.explain import explain
@@ -36,15 +40,16 @@ KNOWN = "pads that only open, no further and no faster than in the training of t
 NAME = "diagnose"
 
 
-def diagnose(source: Path, reporter: Reporter, device: Path | None = None) -> dict[str, Any]:
-    """Returns the answer of `bayeskin diagnose` for a configuration's run, or for a single recording.
+def diagnose(sources: Sequence[Path], reporter: Reporter, device: Path | None = None) -> dict[str, Any]:
+    """Returns the answer of `bayeskin diagnose` for a configuration's run, or for recordings by themselves.
 
-    Outputs go to the run's folder, or for a single recording to STEM-diagnosis in the recording's folder.
+    Outputs go to the run's folder. For recordings, they go to STEM-diagnosis in the folder of the first one.
 
-    source : configuration or recording; device : file of the device with which a single recording was made
+    sources : a configuration, or one or several recordings of one skin
+    device : file of the device with which the recordings were made
     Raises InputError for bad input, and for a device without a reduced model.
     """
-    run = opened(source, reporter, device)
+    run = opened(sources, reporter, device)
     _files(run)  # a device without a reduced model is refused before anything is written
     outcome = run_stages(run, stages_of(run.config))[-1]
     answer = {**outcome.record.summary, "ok": outcome.ok, "folder": run.folder / NAME}
@@ -52,23 +57,31 @@ def diagnose(source: Path, reporter: Reporter, device: Path | None = None) -> di
     return plain({**answer, "text": text})
 
 
-def opened(source: Path, reporter: Reporter, device: Path | None = None) -> Run:
-    """Returns the run of a configuration, or of a single recording that was made with the device of a file.
+def opened(sources: Sequence[Path], reporter: Reporter, device: Path | None = None) -> Run:
+    """Returns the run of a configuration, or of recordings of one skin that were made with one device.
 
-    Raises InputError for bad input, and for a device file together with a configuration, which states its
-    own device.
+    Raises InputError for bad input, for a device file together with a configuration, which states its own
+    device, and for a configuration together with other sources.
     """
-    if source.suffix == ".toml":
+    source = sources[0]
+    configuration = next((file for file in sources if file.suffix == ".toml"), None)
+    if configuration is not None and len(sources) > 1:
+        raise InputError(configuration, "a configuration beside other files", "[[recordings]] in it")
+    if configuration is not None:
         if device is not None:
             raise InputError(
                 "--device", f"{device} together with a configuration", "its sections [device] and [tissue]"
             )
         return open_run(source, reporter)
-    read_recording(source)
-    sections: dict[str, Any] = {} if device is None else dict(load_device_file(device))
-    name = re.sub(r"[^A-Za-z0-9._-]", "-", f"run-{source.stem}")
-    config = Config(name=name, recording=RecordingConfig(file=source.name), **sections)
-    return Run(config, source, source.resolve().with_name(f"{source.stem}-diagnosis"), reporter)
+    for file in sources:
+        read_recording(file)
+    stems, folder = "-".join(file.stem for file in sources), source.resolve().parent
+    files = [{"file": os.path.relpath(file.resolve(), folder)} for file in sources]
+    given: dict[str, Any] = {"recording": files[0]} if len(files) == 1 else {"recordings": files}
+    if device is not None:
+        given |= {key: section.model_dump() for key, section in load_device_file(device)}
+    config = config_of({"name": re.sub(r"[^A-Za-z0-9._-]", "-", f"run-{stems}"), **given}, source)
+    return Run(config, source, folder / f"{stems}-diagnosis", reporter)
 
 
 def stages_of(config: Config) -> dict[str, Stage]:
@@ -87,7 +100,18 @@ def source_of(run: Run) -> ContextSource:
     model = reduced[0] if reduced else run.at("train", "surrogate.h5")
     stated = tuple((name, bounds) for name, bounds in run.config.noise if bounds is not None)
     base = parameter_space(run.config, run.config_path)
-    return ContextSource(run.folder / "recording", model, spec, run.config.seed, base, stated)
+    shared = _shared(run)
+    return ContextSource(run.folder / "recording", model, spec, run.config.seed, base, stated, shared)
+
+
+def _shared(run: Run) -> tuple[str, ...]:
+    """Returns what several recordings share. Raises InputError for names that are not known."""
+    own = [name for name, m in catalogue().items() if isinstance(m.act, Instrument) and not m.act.of_skin]
+    unknown = set(run.config.fit.shared) - {"p_init", "noise", *own}
+    if unknown:
+        expected = f"some of p_init, noise, {', '.join(own)}"
+        raise InputError(f"{run.config_path}: fit.shared", ", ".join(sorted(unknown)), expected)
+    return run.config.fit.shared
 
 
 def context_of(run: Run, source: ContextSource) -> DiagnosisContext:
@@ -96,11 +120,14 @@ def context_of(run: Run, source: ContextSource) -> DiagnosisContext:
     Raises InputError for a protocol outside the training range of the reduced model.
     """
     context = open_context(source)
-    if isinstance(context.forward, ReducedForward):
-        outside = protocol_outside(context.forward.model.trained.protocols, context.motion)
-        if outside:
-            problem = f"a protocol that {source.model.name} was not trained for: {outside[0]}"
-            raise InputError(run.config_path, problem, KNOWN)
+    forwards = context.forward.parts if isinstance(context.forward, JointForward) else (context.forward,)
+    for section, forward in zip(run.config.each_recording, forwards, strict=True):
+        if isinstance(forward, ReducedForward):
+            outside = protocol_outside(forward.model.trained.protocols, forward.motion)
+            if outside:
+                where = run.config_path if len(forwards) == 1 else run.beside(section.file)
+                problem = f"a protocol that {source.model.name} was not trained for: {outside[0]}"
+                raise InputError(where, problem, KNOWN)
     return context
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
+
+import numpy as np
 
 from bayeskin import inference
 from bayeskin.mechanisms import Mechanism
@@ -15,6 +17,8 @@ from bayeskin.mismatch.hypotheses import Family
 from bayeskin.mismatch.locate import Window
 from bayeskin.mismatch.misfit import misfit_n
 from bayeskin.mismatch.search_record import Names, SearchResult
+from bayeskin.types import Span
+from bayeskin.types.joint import recording_at
 
 
 def answer_of(diagnosis: Diagnosis, known: Mapping[str, Mechanism]) -> dict[str, Any]:
@@ -27,8 +31,11 @@ def answer_of(diagnosis: Diagnosis, known: Mapping[str, Mechanism]) -> dict[str,
         "nothing_probability": judgement.nothing_probability,
         "smooth_probability": judgement.smooth_probability,
         "explained": explanation.explained,
-        "located": [_window_entry(window) for window in before.located.windows],
-        "remaining": [_window_entry(window) for window in after.located.windows],
+        "located": [_window_entry(window, after.binned.spans) for window in before.located.windows],
+        "remaining": [_window_entry(window, after.binned.spans) for window in after.located.windows],
+        "recordings": [
+            {**asdict(one), "contradicts": one.contradicts} for one in explanation.agreement
+        ],
         "mechanisms": _mechanism_entries(diagnosis, known),
         "unexplained": None if diagnosis.remainder is None else remainder_entry(diagnosis.remainder),
         "candidates": candidate_entries({names: fit.fit for names, fit in result.fits.items()}, known),
@@ -48,10 +55,14 @@ def answer_of(diagnosis: Diagnosis, known: Mapping[str, Mechanism]) -> dict[str,
     }  # fmt: skip
 
 
-def _window_entry(window: Window) -> dict[str, Any]:
-    """Returns the entry of a window."""
+def _window_entry(window: Window, spans: Sequence[Span]) -> dict[str, Any]:
+    """Returns the entry of a window, on its recording's own axis of time; one of several is named."""
+    number = int(recording_at(spans, np.array([window.start_s]))[0])
+    start_s = spans[number].start_s if spans else 0.0
     return {
-        "t0": window.start_s, "t1": window.end_s, "phase": window.phase, "cycle": window.cycle,
+        **({"recording": spans[number].name} if spans else {}),
+        "t0": window.start_s - start_s, "t1": window.end_s - start_s,
+        "phase": window.phase, "cycle": window.cycle,
         "mean_residual": window.mean_n, "significance": window.significance,
     }  # fmt: skip
 

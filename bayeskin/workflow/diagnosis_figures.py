@@ -2,13 +2,71 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from matplotlib.figure import Figure
+
 from bayeskin import report
-from bayeskin.mismatch.assess import Diagnosis
+from bayeskin.mismatch.assess import AssessedFit, Diagnosis
 from bayeskin.mismatch.context import DiagnosisContext
+from bayeskin.mismatch.locate import Located
+from bayeskin.types import Array, BinnedForce
+
+
+@dataclass(frozen=True)
+class _FitInRecording:
+    """A fit in one recording, on the recording's own axis of time; see `AssessedFit`."""
+
+    force_n: Array
+    band_n: tuple[Array, Array]
+    held_out_n: Array | None
+    located: Located
+
+
+def _of_recording(
+    context: DiagnosisContext, diagnosis: Diagnosis, number: int
+) -> Iterator[tuple[str, Figure]]:
+    """Yields the names and the figures of one of several recordings, or of a single one."""
+    whole, explanation = context.binned, diagnosis.explanation
+    bins, binned, motion = whole.slices[number], whole.parts[number], context.motion.parts[number]
+    before, after = (_in_recording(fit, whole, number) for fit in (diagnosis.before, diagnosis.after))
+    split_s = None if explanation.beginning is None else explanation.split_s
+    if split_s is not None and whole.spans:
+        span = whole.spans[number]
+        split_s = split_s - span.start_s if span.start_s <= split_s < span.end_s else None
+    yield "located", report.figure_located(binned, motion, before.located, before.force_n)
+    yield "before_after", report.figure_before_after(binned, motion, before, after, split_s)
+    yield (
+        "residual_by_phase",
+        report.figure_residual_by_phase(binned, motion, before.located, after.located),
+    )
+    if diagnosis.contributions:
+        parts = [replace(part, force_n=part.force_n[bins]) for part in diagnosis.contributions]
+        yield "contributions", report.figure_contributions(binned, motion, parts)
+
+
+def _in_recording(fit: AssessedFit, binned: BinnedForce, number: int) -> _FitInRecording:
+    """Returns a fit in one recording."""
+    bins, located, held_out_n = binned.slices[number], fit.located, fit.held_out_n
+    if binned.spans:
+        span = binned.spans[number]
+        inside = (located.bins >= bins.start) & (located.bins < bins.stop)
+        windows = tuple(
+            replace(window, start_s=window.start_s - span.start_s, end_s=window.end_s - span.start_s)
+            for window in located.windows
+            if span.start_s - 1e-9 <= window.start_s < span.end_s
+        )
+        located = replace(
+            located, windows=windows, bins=located.bins[inside] - bins.start,
+            residual_n=located.residual_n[inside], allowed_n=located.allowed_n[inside],
+        )  # fmt: skip
+    return _FitInRecording(
+        fit.force_n[bins], (fit.band_n[0][bins], fit.band_n[1][bins]),
+        None if held_out_n is None else held_out_n[bins], located,
+    )  # fmt: skip
 
 
 def draw(
@@ -21,19 +79,15 @@ def draw(
     candidates : gains of single mechanisms, as the answer lists them
     """
     binned, motion = context.binned, context.motion
-    before, after, explanation = diagnosis.before, diagnosis.after, diagnosis.explanation
-    split_s = None if explanation.beginning is None else explanation.split_s
     figures = {
-        "located": report.figure_located(binned, motion, before.located, before.force_n),
         "candidates": report.figure_candidates(candidates),
-        "before_after": report.figure_before_after(binned, motion, before, after, split_s),
-        "residual_by_phase": report.figure_residual_by_phase(binned, motion, before.located, after.located),
         "base_parameters": report.figure_base_parameters(
-            context.base.parameters, before.values, after.values
+            context.base.parameters, diagnosis.before.values, diagnosis.after.values
         ),
     }
-    if diagnosis.contributions:
-        figures["contributions"] = report.figure_contributions(binned, motion, diagnosis.contributions)
+    for number in range(len(binned.parts)):
+        suffix = "" if number == 0 else f"-{number + 1}"
+        figures |= {f"{name}{suffix}": made for name, made in _of_recording(context, diagnosis, number)}
     if diagnosis.remainder is not None:
         figures["discrepancy"] = report.figure_discrepancy(binned, motion, diagnosis.remainder.discrepancy)
     return [

@@ -22,6 +22,7 @@ from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.noise_bounds import QUICK_S, without_swings
 from bayeskin.mismatch.tasks import AnswerTasks, Task
 from bayeskin.recordings import analyse, bin_recording, jumps_of
+from bayeskin.recordings.join import join_bins, join_jumps
 from bayeskin.types import BinnedForce, Jumps, PadMotion, ParameterSpace, Recording
 
 
@@ -32,6 +33,7 @@ class ContextSource:
     recording : folder of the run's stage `recording`; model : file of the forward model
     spec : the full model that the configuration asks for; base : priors of the base model
     noise : bounds of the noise parameters that the configuration states
+    shared : what several recordings share besides the skin (`DiagnosisContext`)
     """
 
     recording: Path
@@ -40,13 +42,15 @@ class ContextSource:
     seed: int
     base: ParameterSpace
     noise: tuple[tuple[str, tuple[float, float]], ...] = ()
+    shared: tuple[str, ...] = ()
 
 
 def open_context(source: ContextSource) -> DiagnosisContext:
     """Returns the context from the files and settings of a source."""
     binned, jumps, motion = calm_bins(source.recording)
     forward = forward_model(source.model, source.spec, motion, binned.edges_s)
-    return DiagnosisContext(binned, jumps, motion, forward, source.base, source.seed, dict(source.noise))
+    noise = dict(source.noise)
+    return DiagnosisContext(binned, jumps, motion, forward, source.base, source.seed, noise, source.shared)
 
 
 def calm_bins(folder: Path) -> tuple[BinnedForce, Jumps, PadMotion]:
@@ -56,9 +60,18 @@ def calm_bins(folder: Path) -> tuple[BinnedForce, Jumps, PadMotion]:
     """
     samples = storage.load(folder / "recording.h5", Recording)
     binned = storage.load(folder / "binned.h5", BinnedForce)
-    quick = bin_recording(samples, binned.phases, binned.edges_s, analyse(samples, binned.phases, QUICK_S))
     motion = storage.load(folder / "motion.h5", PadMotion)
-    return without_swings(binned, quick.variance_n2), jumps_of(samples, binned.phases), motion
+    if not binned.spans:
+        return *_calm(samples, binned), motion
+    parts = [_calm(samples.part(span), part) for span, part in zip(binned.spans, binned.parts, strict=True)]
+    calm, jumps = zip(*parts, strict=True)
+    return join_bins(calm, binned.spans), join_jumps(jumps, binned.spans), motion
+
+
+def _calm(samples: Recording, binned: BinnedForce) -> tuple[BinnedForce, Jumps]:
+    """Returns the bins of one recording with variances of quick noise, and the jumps of its samples."""
+    quick = bin_recording(samples, binned.phases, binned.edges_s, analyse(samples, binned.phases, QUICK_S))
+    return without_swings(binned, quick.variance_n2), jumps_of(samples, binned.phases)
 
 
 @dataclass(frozen=True)
@@ -109,7 +122,7 @@ def searches_file(run_folder: Path, context: DiagnosisContext) -> Path:
     """
     identity = [
         bayeskin.__version__, context.seed, repr(context.base.without_texts),
-        sorted(context.stated_noise.items()),
+        sorted(context.stated_noise.items()), sorted(context.shared),
         context.forward.hash, asdict(context.binned), asdict(context.motion),
         [repr(ParameterSpace(m.parameters).without_texts) for m in context.known.values()],
     ]  # fmt: skip

@@ -169,6 +169,10 @@ def _inputs_sha256(run: Run, stage: Stage) -> str:
     if "parameters" in sections:  # these depend on device and tissue too; defaults keep the old hashes
         defaults = {"device": DeviceConfig(), "tissue": TissueConfig()}
         sections += tuple(name for name, value in defaults.items() if getattr(run.config, name) != value)
+    if "recording" in sections and run.config.recordings:
+        sections += ("recordings",)
+    if not run.config.fit.shared:  # keeps the hashes from before there were several recordings
+        del config["fit"]["shared"]
     return sha256_of(
         {
             "version": bayeskin.__version__,

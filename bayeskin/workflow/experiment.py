@@ -19,6 +19,7 @@ from bayeskin import report
 from bayeskin.errors import InputError
 from bayeskin.experiments.choice import Experiment, compete, search, weigh
 from bayeskin.experiments.protocols import Limits, Protocol, variations
+from bayeskin.forward.joint import JointForward
 from bayeskin.forward.reduced import ReducedForward, stands_for
 from bayeskin.json_files import plain, write_json
 from bayeskin.mismatch.context import DiagnosisContext
@@ -37,22 +38,23 @@ LONGEST_S = 1800.0  # longest test: a person can hardly keep an arm still for lo
 WORKERS = 2
 
 
-def choose(source: Path, reporter: Reporter, device: Path | None = None) -> dict[str, Any]:
-    """Returns the answer of `bayeskin experiment` for a configuration's run, or for a single recording.
+def choose(sources: Sequence[Path], reporter: Reporter, device: Path | None = None) -> dict[str, Any]:
+    """Returns the answer of `bayeskin experiment` for a configuration's run, or for recordings by themselves.
 
-    The recording is diagnosed first, unless this has been done. If the diagnosis fails, its answer is
+    The recordings are diagnosed first, unless this has been done. If the diagnosis fails, its answer is
     returned. Outputs go to the run's folder `experiment`.
 
-    source : configuration or recording; device : file of the device with which a single recording was made
+    sources : a configuration, or one or several recordings of one skin
+    device : file of the device with which the recordings were made
     Raises InputError for bad input, for a device without a reduced model, and for a model that no reduced
     model can replace.
     """
-    run = opened(source, reporter, device)
+    run = opened(sources, reporter, device)
     model = run.config.model
     if not stands_for(model.spec()):
         found = f"model.observation {model.observation!r} on {model.mesh!r}"
-        raise InputError(source, found, "model.observation 'reaction' on 'bricks'")
-    diagnosed = diagnosis.diagnose(source, reporter, device)
+        raise InputError(sources[0], found, "model.observation 'reaction' on 'bricks'")
+    diagnosed = diagnosis.diagnose(sources, reporter, device)
     if "best_set" not in diagnosed:
         return diagnosed
     folder = run.folder / FOLDER
@@ -100,10 +102,11 @@ def _judged_protocols(
 
     fits : fits of the competing sets, the most probable first
     """
-    assert isinstance(context.forward, ReducedForward)
-    trained = context.forward.model.trained.protocols
+    forward = context.forward.parts[0] if isinstance(context.forward, JointForward) else context.forward
+    assert isinstance(forward, ReducedForward)
+    trained = forward.model.trained.protocols
     limits = Limits(trained.largest_m, trained.speeds_m_s, LONGEST_S)
-    first = variations(context.motion, limits)
+    first = variations(context.motion.parts[-1], limits)
 
     def judge(protocol: Protocol) -> Experiment:
         experiment = weigh(protocol, fits, context.known, ask, context.seed)

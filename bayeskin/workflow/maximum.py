@@ -13,6 +13,7 @@ import numpy as np
 from bayeskin import inference, report, storage
 from bayeskin.finite_element.gradients import logarithms
 from bayeskin.finite_element.simulate import simulate
+from bayeskin.forward.joint import on_each_recording
 from bayeskin.hashing import sha256_of
 from bayeskin.inference import MapCheck, RefinedMap
 from bayeskin.types import Array, BinnedForce, PadMotion, Simulation
@@ -45,14 +46,18 @@ class _FullModel:
             return storage.load(file, Simulation)
         values = ", ".join(f"{name} = {value:.4g}" for name, value in theta.items())
         self.run.reporter.log(f"map: full run at {values}")
-        tell = self.run.reporter.progress
-        simulation = simulate(
-            self.spec, self.motion, theta, lambda share: tell("full run", share),
-            gradients=logarithms(theta) if self.differentiable else None,
-        )  # fmt: skip
+        by = logarithms(theta) if self.differentiable else None
+        simulation = on_each_recording(self._simulated, self.motion, theta, by)
         if simulation.status == "ok":  # the cause of a failed run may be corrected later
             storage.save(file, simulation)
         return simulation
+
+    def _simulated(
+        self, motion: PadMotion, theta: Mapping[str, float], by: Mapping[str, float] | None
+    ) -> Simulation:
+        """Returns a run on one protocol, with derivatives by the parameters of `by`."""
+        tell = self.run.reporter.progress
+        return simulate(self.spec, motion, theta, lambda share: tell("full run", share), gradients=by)
 
 
 def _find_maximum(run: Run) -> Mapping[str, Any]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from bayeskin.errors import InputError
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.forward.design_model import ForceModel, FullModel, ReducedOrFull
+from bayeskin.forward.joint import EachRecording
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.region import protocol_outside
 from bayeskin.types import PadMotion
@@ -53,7 +54,12 @@ def _beside(run: Run, forward: str) -> str:
 
 def full_model(run: Run) -> ForceModel:
     """Returns the configuration's model. Raises InputError as `model_spec`."""
-    return FullModel(model_spec(run))
+    return _on_all_recordings(run, FullModel(model_spec(run)))
+
+
+def _on_all_recordings(run: Run, model: ForceModel) -> ForceModel:
+    """Returns a model that runs on the protocol of each recording, where there are several."""
+    return EachRecording(model) if run.config.recordings else model
 
 
 def waves_model(run: Run) -> ForceModel:
@@ -64,11 +70,12 @@ def waves_model(run: Run) -> ForceModel:
     """
     coarse, spec = run.config.design.coarse, model_spec(run)
     if coarse is None:
-        return FullModel(spec)
+        return full_model(run)
     if coarse != "reduced":
-        return FullModel(replace(spec, refinement=coarse))
+        return _on_all_recordings(run, FullModel(replace(spec, refinement=coarse)))
     (file,) = reduced_files(run)
-    return ReducedOrFull(file, FullModel(replace(spec, refinement=load_reduced(file).refinement)))
+    full = FullModel(replace(spec, refinement=load_reduced(file).refinement))
+    return _on_all_recordings(run, ReducedOrFull(file, full))
 
 
 def reduced_files(run: Run) -> list[Path]:
@@ -85,7 +92,8 @@ def reduced_files(run: Run) -> list[Path]:
 def check_protocol(run: Run, motion: PadMotion) -> None:
     """Raises InputError where a reduced model runs the waves and was not trained for the protocol."""
     for file in reduced_files(run):
-        lines = protocol_outside(load_reduced(file).trained.protocols, motion)
+        protocols = load_reduced(file).trained.protocols
+        lines = [line for part in motion.parts for line in protocol_outside(protocols, part)]
         if lines:
             found = f"'reduced' on a protocol that {file.name} was not trained for: {lines[0]}"
             raise InputError(f"{run.config_path}: design.coarse", found, "coarse = 0, or no coarse model")

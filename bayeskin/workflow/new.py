@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bayeskin.config import Config, DesignConfig, RecordingConfig
+from bayeskin.config import Config, DesignConfig, config_of
 from bayeskin.config.device import DeviceFile, StatedGeometry, device_lines, load_device_file, stated_geometry
 from bayeskin.design import default_space
 from bayeskin.errors import InputError
@@ -78,34 +78,40 @@ _SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
 )  # fmt: skip
 
 
-def new_config(file: Path, out: Path | None = None, device: Path | None = None) -> dict[str, Any]:
-    """Writes a configuration that fits `file`, by default beside it, and reports what the recording contains.
+def new_config(files: Sequence[Path], out: Path | None = None, device: Path | None = None) -> dict[str, Any]:
+    """Writes a configuration that fits recordings of one skin, and reports what they contain.
 
-    The configuration uses a shipped surrogate where one was trained on the recording's protocol and device.
-    Otherwise it has a design of its own, by the reduced model where the device has one. The sections of the
-    file `device` are written into it. Raises InputError, with nothing written, for a file that is no
-    recording of a test, an impossible device, or an `out` that exists already.
+    By default it lies beside the first recording. The configuration of a single recording uses a shipped
+    surrogate where one was trained on the recording's protocol and device. Otherwise it has a design of its
+    own, by the reduced model where the device has one. The sections of the file `device` are written into it.
+    Raises InputError, with nothing written, for a file that is no recording of a test, two files of one name,
+    an impossible device, or an `out` that exists already.
     """
     stated = None if device is None else load_device_file(device)
-    recording = read_recording(file)
-    out = out or file.with_suffix(".toml")
+    recordings = [read_recording(file) for file in files]
+    out = out or files[0].with_suffix(".toml")
     check_ending(out, ".toml")
     if out.exists():
         raise InputError(f"-o {out}", "a file that exists already", "the name of a new file")
-    phases = segment(recording)
-    noise = phase_noise(recording, phases)
-    description = describe(recording, phases, noise)
-    motion, geometry = idealised_motion(recording, phases), _geometry(stated)
-    surrogate = None if geometry.sd_m else shipped_for(motion, geometry.geometry)
-    reduced = None if surrogate else _reduced_for(motion, geometry.geometry, out)
+    phases = [segment(recording) for recording in recordings]
+    both = list(zip(recordings, phases, strict=True))
+    described = [(*pair, phase_noise(*pair)) for pair in both]
+    description, motions = (
+        "\n\n".join(describe(*one) for one in described),
+        [idealised_motion(*p) for p in both],
+    )
+    geometry, single = _geometry(stated), len(files) == 1
+    surrogate = shipped_for(motions[0], geometry.geometry) if single and not geometry.sd_m else None
+    reduced = None if surrogate else _reduced_for(motions, geometry.geometry, out)
     source, section = _surrogate_source(surrogate, reduced)
-    reference = Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix()
-    text = _configuration(_name(out), reference, description, section, surrogate is not None, stated)
+    references = [Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix() for file in files]
+    text = _configuration(_name(out), references, description, section, surrogate is not None, stated)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open(out, "x", encoding="utf-8") as handle:
         handle.write(text)
-    facts = describe_json(recording, phases, noise)
-    answer = {"ok": True, "out": out, "surrogate": surrogate.name if surrogate else None, **facts}
+    facts = [describe_json(*one) for one in described]
+    contents = facts[0] if single else {"recordings": facts}
+    answer = {"ok": True, "out": out, "surrogate": surrogate.name if surrogate else None, **contents}
     return plain(
         {**answer, "text": f"{description}\n\nwritten to {out}, with {source}\nnext: bayeskin run {out}"}
     )
@@ -135,14 +141,16 @@ def _geometry(stated: DeviceFile | None) -> StatedGeometry:
     return stated_geometry(file.device, file.tissue, "device")
 
 
-def _reduced_for(motion: PadMotion, geometry: Geometry, out: Path) -> Path | None:
+def _reduced_for(motions: Sequence[PadMotion], geometry: Geometry, out: Path) -> Path | None:
     """Returns the file of a reduced model with which a run of the configuration `out` can make its design.
 
-    Returns None where no such model was trained for the protocol.
+    Returns None where no such model was trained for the protocols.
     """
     file = find_reduced(geometry, [out])
-    fits = file is not None and not protocol_outside(load_reduced(file).trained.protocols, motion)
-    return file if fits else None
+    if file is None:
+        return None
+    trained = load_reduced(file).trained.protocols
+    return None if any(protocol_outside(trained, motion) for motion in motions) else file
 
 
 def _surrogate_source(surrogate: Path | None, reduced: Path | None) -> tuple[str, list[str]]:
@@ -160,18 +168,25 @@ def _name(out: Path) -> str:
 
 
 def _configuration(
-    name: str, reference: str, found: str, section: list[str], ready: bool, stated: DeviceFile | None
-) -> str:
-    """Returns the text of the configuration."""
-    config = Config(name=name, recording=RecordingConfig(file=reference))
+    name: str, references: Sequence[str], found: str, section: list[str], ready: bool,
+    stated: DeviceFile | None,
+) -> str:  # fmt: skip
+    """Returns the text of the configuration. Raises InputError for two recordings of one name."""
+    given = [{"file": reference} for reference in references]
+    sections: dict[str, Any] = {"recording": given[0]} if len(given) == 1 else {"recordings": given}
+    config = config_of({"name": name, **sections}, "recordings")
+    table = "[recording]" if len(given) == 1 else "[[recordings]]"
     parts = [
         [f"name = {_quoted(name)}", f"seed = {config.seed}"],
         _description_lines(found),
-        [
-            "[recording]",
-            f"file = {_quoted(reference)}  # path relative to this file",
-            f'# protocol = {_quoted(config.recording.protocol)}  # or "recorded": as measured, but slower',
-        ],
+        *(
+            [
+                table,
+                f"file = {_quoted(recording.file)}  # path relative to this file",
+                f'# protocol = {_quoted(recording.protocol)}  # or "recorded": as measured, but slower',
+            ]
+            for recording in config.each_recording
+        ),
         *([device_lines(stated.device, stated.tissue)] if stated else []),
         section,
         [

@@ -38,7 +38,7 @@ from bayeskin.workflow.engine import Reporter
 from bayeskin.workflow.folder import locked
 from bayeskin.workflow.proof_text import in_words
 
-Diagnose = Callable[[Path, Reporter], Mapping[str, Any]]
+Diagnose = Callable[[Sequence[Path], Reporter], Mapping[str, Any]]
 SET = "data/proof/index.json"
 
 
@@ -140,7 +140,7 @@ class _Diagnoser:
         with tempfile.TemporaryDirectory(prefix="bayeskin-prove-", ignore_cleanup_errors=True) as place:
             copy = Path(shutil.copyfile(source, Path(place) / "recording.h5"))
             try:
-                answer = dict(self.diagnose(copy, self.reporter))
+                answer = dict(self.diagnose([copy], self.reporter))
             except Exception as error:  # an error of any type concerns this one recording only
                 known = isinstance(error, InputError)
                 answer = {"message": str(error) if known else f"{type(error).__name__}: {error}"}

@@ -1,9 +1,9 @@
-"""The first stage: reads the recording, and derives the bins to fit, the protocol and the noise by phase."""
+"""The first stage: reads the recordings, and derives the bins to fit, the protocol and the noise by phase."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayeskin import report, storage
+from bayeskin.config import RecordingConfig
 from bayeskin.errors import InputError
 from bayeskin.finite_element import ModelSpec
 from bayeskin.inference.noise_model import bins_in_windows
@@ -28,6 +29,7 @@ from bayeskin.recordings import (
     summarise,
     uniform_edges,
 )
+from bayeskin.recordings.join import join_bins, join_motions, join_samples, spans_of
 from bayeskin.types import BinnedForce, PadMotion, Phase, Recording
 from bayeskin.workflow.engine import Run, Stage
 from bayeskin.workflow.provenance import caption
@@ -62,26 +64,55 @@ class Prepared:
     binned: BinnedForce
 
 
-def prepared(run: Run, recording: Recording) -> Prepared:
+def prepared(run: Run, recording: Recording, protocol: str) -> Prepared:
     """Returns phases, noise, protocol and bins of a recording, as the configuration asks for them."""
     phases = segment(recording)
     analysis = analyse(recording, phases)
-    motion = pad_motion(run.config.model.spec(), recording, phases, run.config.recording.protocol)
+    motion = pad_motion(run.config.model.spec(), recording, phases, protocol)
     edges_s = uniform_edges(covered_s(recording, motion), run.config.fit.bin_width_s)
     return Prepared(phases, analysis, motion, bin_recording(recording, phases, edges_s, analysis))
 
 
-def _prepare_recording(run: Run) -> Mapping[str, Any]:
-    """Prepares the recording, writes it with a figure, and returns the stage's summary."""
-    recording = read_recording(run.beside(run.config.recording.file))
-    fitted = prepared(run, recording)
-    _refuse_empty_windows(run, fitted.binned)
-    storage.save(run.at("recording", "recording.h5"), recording)
-    storage.save(run.at("recording", "motion.h5"), fitted.motion)
-    storage.save(run.at("recording", "binned.h5"), fitted.binned)
-    figure = report.figure_recording(recording, fitted.binned)
-    report.save_figure(figure, run.at("recording", "recording"), caption(run))
-    return describe_json(recording, fitted.phases, summarise(fitted.analysis, fitted.phases))
+def _prepare_recordings(run: Run) -> Mapping[str, Any]:
+    """Prepares the recordings, writes them with a figure of each, and returns the stage's summary.
+
+    Several recordings are laid end to end. The summary then has what they have in common, and an entry for
+    each of them.
+    """
+    recordings = [_named(run, section) for section in run.config.each_recording]
+    parts = [
+        prepared(run, recording, section.protocol)
+        for recording, section in zip(recordings, run.config.each_recording, strict=True)
+    ]
+    facts = [
+        describe_json(recording, part.phases, summarise(part.analysis, part.phases))
+        for recording, part in zip(recordings, parts, strict=True)
+    ]
+    samples, motion, binned = recordings[0], parts[0].motion, parts[0].binned
+    if len(parts) > 1:
+        spans = spans_of(recordings, [part.motion for part in parts])
+        samples = join_samples(recordings, spans)
+        motion = join_motions([part.motion for part in parts], spans)
+        binned = join_bins([part.binned for part in parts], spans)
+    _refuse_empty_windows(run, binned)
+    storage.save(run.at("recording", "recording.h5"), samples)
+    storage.save(run.at("recording", "motion.h5"), motion)
+    storage.save(run.at("recording", "binned.h5"), binned)
+    for number, (recording, part) in enumerate(zip(recordings, parts, strict=True)):
+        figure = report.figure_recording(recording, part.binned)
+        name = "recording" if number == 0 else f"recording-{number + 1}"
+        report.save_figure(figure, run.at("recording", name), caption(run))
+    if len(parts) == 1:
+        return facts[0]
+    total = {key: sum(fact[key] for fact in facts) for key in ("samples", "duration_s")}
+    return {**facts[0], "name": samples.name, "sha256": samples.sha256, **total, "recordings": facts}
+
+
+def _named(run: Run, section: RecordingConfig) -> Recording:
+    """Returns a recording; one of several has the name of its file."""
+    file = run.beside(section.file)
+    recording = read_recording(file)
+    return replace(recording, name=file.stem) if run.config.recordings else recording
 
 
 def _refuse_empty_windows(run: Run, binned: BinnedForce) -> None:
@@ -100,10 +131,10 @@ def _refuse_empty_windows(run: Run, binned: BinnedForce) -> None:
 
 
 def _files(run: Run) -> Iterable[Path]:
-    """Returns the file that the stage reads."""
-    return [run.beside(run.config.recording.file)]
+    """Returns the files that the stage reads."""
+    return [run.beside(section.file) for section in run.config.each_recording]
 
 
 STAGE = Stage(
-    "recording", "reads the recording", (), ("recording", "model", "fit"), _prepare_recording, _files
+    "recording", "reads the recordings", (), ("recording", "model", "fit"), _prepare_recordings, _files
 )

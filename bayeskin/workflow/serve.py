@@ -139,8 +139,9 @@ def _served_model(run: Run) -> ServedModel:
     spec, space = model_spec(run), parameter_space(run.config, run.config_path)
     if spec.forward is not None:
         check_own(spec.forward)
-    recording = read_recording(run.beside(run.config.recording.file))
-    motion = pad_motion(spec, recording, segment(recording), run.config.recording.protocol)
+    only = run.config.only_recording(run.config_path)
+    recording = read_recording(run.beside(only.file))
+    motion = pad_motion(spec, recording, segment(recording), only.protocol)
     edges_s = uniform_edges(covered_s(recording, motion), run.config.fit.bin_width_s)
     return ServedModel(spec, space.parameters, Asked(motion, edges_s, None, ()))
 

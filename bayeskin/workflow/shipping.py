@@ -47,7 +47,7 @@ def shipped_files(run: Run) -> ShippedFiles:
     name, folder = run.config.surrogate.file, run.config_path.resolve().parent
     assert name is not None
     beside = folder / name
-    brought = beside.is_file() and name != run.config.recording.file
+    brought = beside.is_file() and name != run.config.only_recording(run.config_path).file
     path = beside if brought else _shipped_folder() / name
     if not path.is_file():
         names = ", ".join(f"{file.stem}.h5" for file in _shipped_manifests())

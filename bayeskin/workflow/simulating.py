@@ -157,9 +157,10 @@ def _case(request: SimulationRequest, reporter: Reporter) -> _Case:
     values = _parameter_values(ParameterSpace((*base.parameters, *added)), spec.geometry, request.settings)
     for parameter in added:
         _refuse_impossible_value(parameter, values[parameter.name])
-    recording = read_recording(request.recording or run.beside(run.config.recording.file))
+    file = request.recording or run.beside(run.config.only_recording(config_path).file)
+    recording = read_recording(file)
     phases = segment(recording)
-    motion = pad_motion(spec, recording, phases, run.config.recording.protocol)
+    motion = pad_motion(spec, recording, phases, run.config.each_recording[0].protocol)
     return _Case(run, spec, mechanisms, {name: values[name] for name in base.names}, values, phases, motion)
 
 

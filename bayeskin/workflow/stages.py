@@ -125,7 +125,8 @@ def report(config: Path, reporter: Reporter, stages: Mapping[str, Stage] | None 
     """
     opened = open_run(config, reporter)
     stages = stages or stages_of(opened.config)
-    opened.beside(opened.config.recording.file)
+    for section in opened.config.each_recording:
+        opened.beside(section.file)
     states = {name: state[0] for name, state in standing(opened, stages).items()}
     missing = [name for name in stages["report"].needs if states[name] != "done"]
     if not missing:

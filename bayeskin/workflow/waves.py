@@ -18,6 +18,7 @@ from bayeskin.config import parameter_space
 from bayeskin.design import Wave, fine_wave, first_wave, next_wave, posterior_wave
 from bayeskin.errors import InputError
 from bayeskin.forward.design_model import ForceModel, ReducedOrFull
+from bayeskin.forward.joint import EachRecording
 from bayeskin.inference import LogPosterior, SampleSettings, sample
 from bayeskin.json_files import write_json
 from bayeskin.runner import load_design
@@ -80,9 +81,11 @@ def _model_of_wave(model: ForceModel, number: int) -> ForceModel:
     In the waves over the whole prior, points that the reduced model cannot run are left out, such as skins
     that fold. A full run of each would take minutes, and few of them can be near the recording's posterior.
     """
-    if isinstance(model, ReducedOrFull) and number < FIRST_OF_POSTERIOR:
-        return replace(model, replaces=False)
-    return model
+    if number >= FIRST_OF_POSTERIOR:
+        return model
+    if isinstance(model, EachRecording):
+        return EachRecording(_model_of_wave(model.model, number))
+    return replace(model, replaces=False) if isinstance(model, ReducedOrFull) else model
 
 
 def _try_forward_model(run: Run, model: ForceModel, motion: PadMotion, space: ParameterSpace) -> None:
