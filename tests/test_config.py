@@ -46,7 +46,7 @@ def test_the_hash_follows_the_content_and_ignores_the_workers(tmp_path: Path) ->
     ("text", "key", "says"),
     [
         ("", "recording", "found nothing"),
-        ("colour = 1\n" + SMALLEST, "colour", "unknown key; expected one of name, recording, seed"),
+        ("colour = 1\n" + SMALLEST, "colour", "unknown key; expected one of name, recording, recordings"),
         (SMALLEST + "[fit]\nbin_width = 1\n", "fit.bin_width", "expected one of windows_s, bin_width_s"),
         (
             SMALLEST + "[parameters.E_c]\nlow = 1\n",

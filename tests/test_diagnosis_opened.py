@@ -14,7 +14,7 @@ from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
 from bayeskin.shipped import shipped
 from bayeskin.types import Recording
-from bayeskin.workflow.diagnosis import STAGE, opened, stage_of
+from bayeskin.workflow.diagnosis import STAGE, opened, source_of, stage_of
 from bayeskin.workflow.engine import Silent
 from bayeskin.workflow.experiment import choose
 
@@ -29,7 +29,7 @@ def recording(path: Path) -> Path:
 
 
 def test_a_recording_by_itself_takes_the_article_s_reduced_model(tmp_path: Path) -> None:
-    run = opened(recording(tmp_path), Silent())
+    run = opened([recording(tmp_path)], Silent())
     assert stage_of(run.config) is STAGE
     assert run.config.geometry(run.config_path).geometry == Geometry()
     assert run.folder == tmp_path / "a test-diagnosis"
@@ -39,7 +39,7 @@ def test_a_recording_by_itself_takes_the_article_s_reduced_model(tmp_path: Path)
 def test_a_recording_of_a_stated_device_takes_that_device_s_reduced_model(tmp_path: Path) -> None:
     thin = Geometry(cutis_m=1.5e-3)
     (tmp_path / "device.toml").write_text("[tissue]\ncutis_mm = 1.5\n")
-    run = opened(recording(tmp_path), Silent(), tmp_path / "device.toml")
+    run = opened([recording(tmp_path)], Silent(), tmp_path / "device.toml")
     assert run.config.geometry(run.config_path).geometry == thin
     own = hollow(tmp_path / "device-reduced.h5", thin)
     assert list(STAGE.files(run)) == [own]
@@ -49,11 +49,11 @@ def test_an_uncertain_length_is_a_parameter(tmp_path: Path) -> None:
     recording(tmp_path)
     tissue = "[tissue]\ncutis_mm = { mean = 2.0, sd = 0.2 }\n"
     (tmp_path / "device.toml").write_text(tissue)
-    run = opened(tmp_path / "a test.h5", Silent(), tmp_path / "device.toml")
+    run = opened([tmp_path / "a test.h5"], Silent(), tmp_path / "device.toml")
     assert "cutis_m" in parameter_space(run.config).names
     case = tmp_path / "case.toml"
     case.write_text(f'[recording]\nfile = "a test.h5"\n{tissue}')
-    assert opened(case, Silent()).config.geometry(case).sd_m == {"cutis_m": 0.2e-3}
+    assert opened([case], Silent()).config.geometry(case).sd_m == {"cutis_m": 0.2e-3}
 
 
 @pytest.mark.parametrize("model", ['observation = "article"\nmesh = "own.msh"', 'mesh = "own.msh"'])
@@ -62,13 +62,71 @@ def test_a_model_that_no_reduced_one_stands_for_needs_a_surrogate(tmp_path: Path
     (tmp_path / "own.msh").write_text("")
     case = tmp_path / "case.toml"
     case.write_text(f'[recording]\nfile = "a test.h5"\n[model]\n{model}\n')
-    run = opened(case, Silent())
+    run = opened([case], Silent())
     assert stage_of(run.config).needs == ("recording", "design", "train")
     assert list(stage_of(run.config).files(run)) == []
     with pytest.raises(InputError, match=r"on 'own\.msh'; expected .*'reaction' on 'bricks'"):
-        choose(case, Silent())
+        choose([case], Silent())
 
 
 def test_a_device_stands_beside_no_configuration(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"--device: found device\.toml together with a configuration"):
-        opened(tmp_path / "case.toml", Silent(), Path("device.toml"))
+        opened([tmp_path / "case.toml"], Silent(), Path("device.toml"))
+
+
+def two(path: Path) -> tuple[Path, Path]:
+    """Two recordings of one skin in a folder."""
+    first = recording(path)
+    second = first.with_name("second.h5")
+    second.write_bytes(first.read_bytes())
+    return first, second
+
+
+def test_several_recordings_have_their_own_initial_pressures(tmp_path: Path) -> None:
+    run = opened(two(tmp_path), Silent())
+    assert run.folder == tmp_path / "a test-second-diagnosis"
+    assert [one.file for one in run.config.each_recording] == ["a test.h5", "second.h5"]
+    assert parameter_space(run.config).names[-2:] == ("p_init", "p_init@2")
+    case = tmp_path / "case.toml"
+    case.write_text(
+        '[[recordings]]\nfile = "a test.h5"\n[[recordings]]\nfile = "second.h5"\n[fit]\nshared = ["p_init"]\n'
+    )
+    assert parameter_space(opened([case], Silent()).config).names[-1] == "p_init"
+    assert source_of(opened([case], Silent())).shared == ("p_init",)
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("", r"recording: found nothing; expected \[recording\], or two or more \[\[recordings\]\]"),
+        ('[recording]\nfile="b.h5"\n[[recordings]]\nfile="c.h5"\n', r"recordings: found \[recording\] too"),
+        ('[[recordings]]\nfile = "b.h5"\n', "recordings: found a single one"),
+        ('[[recordings]]\nfile="b.h5"\n[[recordings]]\nfile="x/b.csv"\n', "recordings: found 'b' twice"),
+        (
+            '[[recordings]]\nfile="b.h5"\n[[recordings]]\nfile="c.h5"\n[fit]\nwindows_s=[[0, 9]]\n',
+            "fit.windows_s: found windows; expected none with several recordings",
+        ),
+    ],
+)
+def test_a_wrong_list_of_recordings_is_one_line(tmp_path: Path, text: str, line: str) -> None:
+    (tmp_path / "case.toml").write_text(text)
+    with pytest.raises(InputError, match=line):
+        opened([tmp_path / "case.toml"], Silent())
+
+
+def test_what_recordings_may_share_is_listed(tmp_path: Path) -> None:
+    two(tmp_path)
+    case = tmp_path / "case.toml"
+    case.write_text(
+        '[[recordings]]\nfile = "a test.h5"\n[[recordings]]\nfile = "second.h5"\n[fit]\nshared = ["skin"]\n'
+    )
+    with pytest.raises(
+        InputError, match=r"fit.shared: found skin; expected some of p_init, noise, .*backlash"
+    ):
+        source_of(opened([case], Silent()))
+
+
+def test_a_configuration_stands_beside_no_other_file(tmp_path: Path) -> None:
+    first, _ = two(tmp_path)
+    with pytest.raises(InputError, match="a configuration beside other files"):
+        opened([tmp_path / "case.toml", first], Silent())

@@ -158,7 +158,7 @@ def test_words_say_what_was_found_and_how_far_the_models_are_off() -> None:
     }  # fmt: skip
     answer: dict[str, Any] = {
         "verdict": "unknown", "mechanisms": [], "nothing_probability": 0.02, "smooth_probability": 0.974,
-        "located": [], "remaining": [], "best_set": [], "candidates": [], "folder": "x",
+        "located": [], "remaining": [], "recordings": [], "best_set": [], "candidates": [], "folder": "x",
         "fit": {"before": fits, "after": fits}, "full_model": {"rmse": 2.5e-3, "fit_off_by": 4e-4},
     }  # fmt: skip
     words = in_words(answer)
@@ -171,6 +171,15 @@ def test_words_say_what_was_found_and_how_far_the_models_are_off() -> None:
     assert "The full model fails at the best values: it folds" in in_words(
         {**answer, "full_model": {"message": "it folds"}}
     )
+    pair = [
+        {"name": "A", "rms_n": 2e-3, "noise_n": 1e-3, "tension": 0.4, "contradicts": False},
+        {"name": "B", "rms_n": 5e-3, "noise_n": 1e-3, "tension": 5.2, "contradicts": True},
+        {"name": "C", "rms_n": 5e-3, "noise_n": 1e-3, "tension": None, "contradicts": False},
+    ]
+    joint = in_words({**answer, "recordings": pair})
+    assert "A agrees with the others, by 0.4 sd: RMS residual 2.0 mN, 2.0 sd of its noise" in joint
+    assert "B contradicts the others, by 5.2 sd" in joint
+    assert "C: RMS residual 5.0 mN, 5.0 sd of its noise; it could not be fitted alone" in joint
     faint = in_words({**answer, "verdict": "nothing-missing", "best_set": ["pre-stretch"]})
     assert "The model fits better with pre-stretch" in faint
     for alike in ({"verdict": "nothing-missing"}, {"best_set": ["x"]}):

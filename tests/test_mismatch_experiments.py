@@ -17,7 +17,7 @@ from scipy.stats import norm
 from toys import closed_form_model
 from toys.inference_problems import NOISE, SCALE, TRUTH, ToySurrogate, empty_recording
 
-from bayeskin.config import ModelConfig
+from bayeskin.config.run_sections import ModelConfig
 from bayeskin.errors import InputError
 from bayeskin.experiments.choice import DRAWS, OPEN, Experiment, compete, noise_of, ranked, search, weigh
 from bayeskin.experiments.information import expected_gain
@@ -325,7 +325,7 @@ def test_nothing_competes_with_the_only_set_that_was_tried(
     diagnosed: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(experiment, "searched", lambda *_: made([fitted("rub", rubbing=4e-3)]))
-    answer = experiment.choose(diagnosed.source, Silent())
+    answer = experiment.choose([diagnosed.source], Silent())
     assert (answer["ok"], answer["sets"]) == (True, [["rub"]])
     assert "nothing competes" in answer["text"]
     assert (diagnosed.folder / "experiment.json").is_file()
@@ -336,10 +336,10 @@ def test_without_a_diagnosis_its_answer_is_given_and_without_its_fits_one_line(
 ) -> None:
     monkeypatch.setattr(experiment, "searched", lambda *_: made([]))
     with pytest.raises(InputError, match="no fit of rub; expected the fits that `bayeskin diagnose` stores"):
-        experiment.choose(diagnosed.source, Silent())
+        experiment.choose([diagnosed.source], Silent())
     failed = {"ok": False, "message": "too few runs", "text": "design: failed: too few runs"}
     monkeypatch.setattr(diagnosis, "diagnose", lambda *_: failed)
-    assert experiment.choose(diagnosed.source, Silent()) == failed
+    assert experiment.choose([diagnosed.source], Silent()) == failed
 
 
 def test_the_test_to_run_next_is_written_for_the_machine(
@@ -347,7 +347,7 @@ def test_the_test_to_run_next_is_written_for_the_machine(
 ) -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
     monkeypatch.setattr(experiment, "searched", lambda *_: made(fits))
-    answer = experiment.choose(diagnosed.source, Silent())
+    answer = experiment.choose([diagnosed.source], Silent())
     best = answer["experiments"][0]
     words = answer["text"].splitlines()
     assert words[0] == "sets taken as equally probable: rub; or drag"
@@ -366,7 +366,7 @@ def test_tests_whose_processes_are_lost_are_said_to_be_unjudged(
     monkeypatch.setattr(
         experiment, "asked", lambda *_: nullcontext(lambda tasks: ["the process was lost"] * len(tasks))
     )
-    answer = experiment.choose(diagnosed.source, Silent())
+    answer = experiment.choose([diagnosed.source], Silent())
     assert (answer["ok"], len(answer["experiments"])) == (False, 9)
     assert answer["text"].count("could not be assessed") == 9
     assert "None of these tests" in answer["text"]

@@ -53,7 +53,7 @@ def own(tmp_path: Path) -> Path:
 
 def test_a_known_protocol_takes_the_shipped_surrogate_and_the_design_stage_accepts_it(demo: Path) -> None:
     out = demo.parent.parent / "forearm.toml"
-    said = new_config(demo, out)
+    said = new_config([demo], out)
     assert (said["out"], said["surrogate"], said["cycles"]) == (str(out), "demo.h5", 2)
     assert load_config(out) == Config(
         name="forearm",
@@ -67,7 +67,7 @@ def test_a_known_protocol_takes_the_shipped_surrogate_and_the_design_stage_accep
 
 
 def test_an_unknown_protocol_gets_a_design_of_its_own(own: Path) -> None:
-    said = new_config(own)
+    said = new_config([own])
     config = load_config(own.with_suffix(".toml"))
     assert (said["surrogate"], config.surrogate.file) == (None, None)
     assert config == Config(name="own", recording=RecordingConfig(file="own.h5"), design=REDUCED)
@@ -79,7 +79,7 @@ def test_an_unknown_protocol_gets_a_design_of_its_own(own: Path) -> None:
 def test_a_device_without_a_reduced_model_gets_a_design_of_full_runs(own: Path) -> None:
     device = own.with_name("device.toml")
     device.write_text("[device]\ngauge_mm = 30.0\n")
-    new_config(own, device=device)
+    new_config([own], device=device)
     assert load_config(own.with_suffix(".toml")).design == DesignConfig()
     assert "# 336 runs of about 4 to 15 s each, 11 to 42 minutes with 2 workers." in (
         own.with_suffix(".toml").read_text()
@@ -87,7 +87,7 @@ def test_a_device_without_a_reduced_model_gets_a_design_of_full_runs(own: Path) 
 
 
 def test_every_key_that_is_commented_out_is_a_default(own: Path) -> None:
-    new_config(own)
+    new_config([own])
     text = own.with_suffix(".toml").read_text()
     with_keys = re.sub(r"^# (?=\[|\w+ = )", "", text, flags=re.MULTILINE)
     assert re.findall(r"^# \w+ = .*[^#]# *$", text, re.MULTILINE) == []  # each says what it is
@@ -129,7 +129,7 @@ def test_what_cannot_be_done_is_refused_in_one_line_and_nothing_written(
 
 
 def test_a_folder_that_is_not_there_is_made(own: Path, tmp_path: Path) -> None:
-    new_config(own, tmp_path / "a" / "b" / "own.toml")
+    new_config([own], tmp_path / "a" / "b" / "own.toml")
     new_demo(tmp_path / "c" / "demo.toml")
     assert open_run(tmp_path / "a" / "b" / "own.toml", Silent()).config.recording.file == "../../own.h5"
     assert (tmp_path / "c" / "demo-recording.h5").is_file()
@@ -180,7 +180,7 @@ def test_a_surrogate_that_is_nowhere_is_told_apart_from_a_broken_installation(tm
 
 
 def test_a_window_without_a_bin_is_refused_before_anything_is_run(own: Path) -> None:
-    new_config(own)
+    new_config([own])
     case = own.with_suffix(".toml")
     case.write_text(case.read_text() + "\n[fit]\nwindows_s = [[0.0, 20.0], [60.2, 90.0]]\n")
     with pytest.raises(InputError, match=r"fit.windows_s: found \[60.2, 90\]; expected .*, 0 to 59.5 s"):

@@ -22,9 +22,9 @@ from bayeskin.workflow.folder import locked
 
 
 def test_a_diagnosis_that_fails_ends_no_set(concealed_set: Path, tmp_path: Path) -> None:
-    def fails(path: Path, reporter) -> dict:
+    def fails(sources: list[Path], reporter) -> dict:
         failing = len(seen)
-        seen.append(path)
+        seen.append(sources[0])
         if failing == 0:
             raise InputError("priors", "none but impossible skins", "others")
         if failing == 2:
@@ -32,7 +32,7 @@ def test_a_diagnosis_that_fails_ends_no_set(concealed_set: Path, tmp_path: Path)
         return (
             {"ok": False, "message": "design: all runs failed"}
             if failing == 1
-            else nothing_found(path, reporter)
+            else nothing_found(sources, reporter)
         )
 
     seen: list[Path] = []
@@ -78,8 +78,8 @@ def test_a_set_without_its_seals_is_not_made_again(concealed_set: Path, tmp_path
 def test_another_verdict_is_a_failure_of_the_same_sources_only(
     concealed_set: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def other(path: Path, reporter) -> dict:
-        return {**nothing_found(path, reporter), "verdict": "unknown"}
+    def other(sources: list[Path], reporter) -> dict:
+        return {**nothing_found(sources, reporter), "verdict": "unknown"}
 
     copy = Path(shutil.copytree(concealed_set, tmp_path / "copy"))
     pipeline.prove(copy, Silent(), diagnose=nothing_found)
@@ -141,11 +141,11 @@ def test_prove_goes_on_where_it_was_interrupted_and_records_one_scoring(
 ) -> None:
     copy, seen = Path(shutil.copytree(concealed_set, tmp_path / "copy")), []
 
-    def stops_at_third(path: Path, reporter) -> dict:
-        seen.append(path)
+    def stops_at_third(sources: list[Path], reporter) -> dict:
+        seen.append(sources[0])
         if len(seen) == 3:
             raise KeyboardInterrupt
-        return nothing_found(path, reporter)
+        return nothing_found(sources, reporter)
 
     with pytest.raises(KeyboardInterrupt):
         pipeline.prove(copy, Silent(), diagnose=stops_at_third)

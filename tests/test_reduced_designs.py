@@ -189,7 +189,7 @@ def test_new_takes_the_reduced_model_where_it_knows_device_and_protocol(tmp_path
     recording = tmp_path / "measured.h5"
 
     def coarse(name: str, *device: Path) -> object:
-        said = new_config(recording, tmp_path / name, *device)
+        said = new_config([recording], tmp_path / name, *device)
         text = (tmp_path / name).read_text()
         config = load_config(tmp_path / name).design
         assert ("a design of the reduced model" in said["text"]) == (config.coarse == "reduced")

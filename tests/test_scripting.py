@@ -98,12 +98,14 @@ def test_a_diagnosis_takes_the_posteriors_settings(
     said: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     asked: list[Path] = []
-    monkeypatch.setattr(diagnosis, "diagnose", lambda source, reporter: asked.append(source) or {"ok": True})
+    monkeypatch.setattr(
+        diagnosis, "diagnose", lambda sources, reporter: asked.extend(sources) or {"ok": True}
+    )
     assert bk.diagnose(said["recording"], said["stiff"], folder=tmp_path) == {"ok": True}
     config = load_config(asked[0])
     assert config.parameters["E_s"].lower == 50e3
     assert config.surrogate.file == "demo.h5"
-    assert (asked[0].parent / config.recording.file).is_file()
+    assert (asked[0].parent / config.each_recording[0].file).is_file()
 
 
 def test_draws_by_another_surrogate_are_not_weighed(said: dict[str, Any]) -> None:

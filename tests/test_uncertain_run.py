@@ -96,7 +96,7 @@ def test_a_shipped_surrogate_knows_no_length(tmp_path: Path, capsys: pytest.Capt
 def test_new_writes_a_configuration_that_runs(tmp_path: Path) -> None:
     (tmp_path / "skin.h5").write_bytes(shipped("data/demo.h5").read_bytes())
     (tmp_path / "device.toml").write_text(UNCERTAIN)
-    new_config(tmp_path / "skin.h5", tmp_path / "case.toml", tmp_path / "device.toml")
+    new_config([tmp_path / "skin.h5"], tmp_path / "case.toml", tmp_path / "device.toml")
     run = open_run(tmp_path / "case.toml", Silent())
     assert run.config.surrogate.file is None
     assert run.config.design.coarse == "reduced"

@@ -81,5 +81,5 @@ def conceal_quickly(folder: Path) -> None:
     assert conceal(folder, SEED, COUNT, make=quickly, run_all=one_by_one) == COUNT
 
 
-def nothing_found(path: Path, reporter) -> dict:
+def nothing_found(sources: list[Path], reporter) -> dict:
     return {"verdict": "nothing-missing", "located": [], "mechanisms": [], "fit": {"after": {}}}
