@@ -31,13 +31,13 @@ def test_a_key_or_a_recording_that_was_changed_shows(concealed_set: Path, tmp_pa
 
 
 def test_while_it_is_diagnosed_no_key_can_be_opened(concealed_set: Path, tmp_path: Path) -> None:
-    def peeks(path: Path, reporter) -> dict:
-        assert path.parent != concealed_set / "recordings"
+    def peeks(sources: list[Path], reporter) -> dict:
+        assert sources[0].parent != concealed_set / "recordings"
         with pytest.raises(PermissionError):
             (concealed_set / "seals" / "001.json").read_text()
         with pytest.raises(PermissionError):
             os.listdir(concealed_set / "seals")
-        return nothing_found(path, reporter)
+        return nothing_found(sources, reporter)
 
     copy = Path(shutil.copytree(concealed_set, tmp_path / "copy"))
     with closed(concealed_set):
