@@ -227,6 +227,18 @@ def test_help_teaches_each_command_by_an_example(bayeskin: Command) -> None:
         assert f"bayeskin {name} " in out.split("Example:")[1]
 
 
+def test_the_command_line_starts_without_the_packages_of_the_computation() -> None:
+    script = (
+        "import sys; from bayeskin.cli import cli\n"
+        "print(*{'numpy', 'scipy', 'h5py', 'matplotlib', 'pydantic'} & set(sys.modules))\n"
+        "print(*(name for name in sys.modules if name.startswith('bayeskin')), sep='\\n')"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    heavy, *own = ended.stdout.splitlines()
+    assert heavy == ""
+    assert {name for name in own if not name.startswith("bayeskin.cli")} == {"bayeskin", "bayeskin.errors"}
+
+
 def test_a_set_of_what_nobody_knows_is_refused(tmp_path: Path, bayeskin: Command) -> None:
     code, _, said = bayeskin("conceal", tmp_path / "set", "--seed", 1, "--count", 2, "--only", "pad-slop")
     assert code == 2
