@@ -8,26 +8,32 @@ The rows have the order of the points, in whatever order the runs finished.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from functools import partial
-from glob import escape
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayeskin import storage
 from bayeskin.design import Wave
+from bayeskin.design_files import (
+    check_same,
+    extended,
+    identity_of,
+    load_design,
+    load_waves,
+    remove_stale,
+    rows_ok,
+    save_design,
+)
 from bayeskin.errors import InputError, Unavailable
 from bayeskin.execution.local import Lost, Map, local
 from bayeskin.journal import Journal, Run
-from bayeskin.types import Array, Design, ParameterSpace, Simulation
+from bayeskin.types import Array, Design, Simulation
 
 Simulate = Callable[[Mapping[str, float]], Simulation]
 Progress = Callable[[int, int, int], None]
@@ -77,13 +83,13 @@ def run_design(
     """
     path, edges = Path(path), np.asarray(edges_s, dtype=float)
     points = _distinct(wave)
-    identity, bins = _identity(wave.space, edges, model_hash), len(edges) - 1
+    identity, bins = identity_of(wave.space, edges, model_hash), len(edges) - 1
     with Journal(path.with_name(f"{path.name}.journal"), identity, bins) as journal:
-        _remove_stale(path)
+        remove_stale(path)
         before = load_design(path) if path.exists() else None
         if before is not None:
-            _check_same(path, before, wave.space, edges, model_hash)
-        known = _rows_ok(before) | {key: run.ok for key, run in journal.runs.items()}
+            check_same(path, before, wave.space, edges, model_hash)
+        known = rows_ok(before) | {key: run.ok for key, run in journal.runs.items()}
         todo = [row for key, row in points.items() if key not in known]
         report = _progress_reporter(progress, len(points), [known[key] for key in points if key in known])
         report(None)
@@ -95,11 +101,11 @@ def run_design(
                 run = _as_run(path, todo[index], outcome, bins, model_hash)
                 journal.append(run)
                 report(run)
-        stored = set(_rows_ok(before))
+        stored = set(rows_ok(before))
         fresh = [journal.runs[key] for key in points if key not in stored]
-        design = _extended(before, wave, edges, model_hash, fresh)
+        design = extended(before, wave, edges, model_hash, fresh)
         if fresh:
-            _write(path, design, [*(load_waves(path) if before else ()), dict(wave.record)])
+            save_design(path, design, [*(load_waves(path) if before else ()), dict(wave.record)])
         journal.forget(stored | set(points))
     return design
 
@@ -123,37 +129,6 @@ def add_points(
     record = {"wave": number, "seed": design.seed, "training": len(theta), "held_out": 0, "rule": reason}
     wave = Wave(design.space, theta, np.zeros(len(theta), bool), number, design.seed, record)
     return run_design(path, wave, design.edges_s, simulate, design.model_hash, run_all, progress)
-
-
-def load_design(path: Path | str) -> Design:
-    """Returns the finished waves of a design file.
-
-    Raises InputError where there is no such file, or where its arrays do not fit each other.
-    """
-    design = storage.load(path, Design)
-    rows, bins = len(np.atleast_1d(design.ok)), design.edges_s.size - 1
-    shapes = {
-        "edges_s": (bins + 1,), "theta": (rows, design.space.dim), "force_n": (rows, bins), "wave": (rows,),
-        "held_out": (rows,), "ok": (rows,), "seconds": (rows,),
-    }  # fmt: skip
-    for name, shape in shapes.items():
-        if getattr(design, name).shape != shape:
-            raise InputError(f"{path}: {name}", f"shape {getattr(design, name).shape}", f"shape {shape}")
-    if len(design.messages) != rows:
-        raise InputError(f"{path}: messages", f"{len(design.messages)} messages", f"{rows}, one for each row")
-    if not (np.isfinite(design.theta).all() and np.isfinite(design.force_n[design.ok]).all()):
-        raise InputError(path, "values that are not finite", "finite values, except in runs that failed")
-    return design
-
-
-def load_waves(path: Path | str) -> tuple[dict[str, Any], ...]:
-    """Returns how the points of each wave were chosen, oldest wave first.
-
-    Raises InputError as `load_design`.
-    """
-    load_design(path)
-    with storage.reading(Path(path), "a bayeskin Design file") as handle:
-        return tuple(map(dict, json.loads(handle.attrs.get("waves", "[]"))))
 
 
 def _bin_means_of(simulate: Simulate, names: tuple[str, ...], edges: Array, theta: Array) -> _Outcome:
@@ -223,13 +198,6 @@ def _progress_reporter(
     return report
 
 
-def _rows_ok(design: Design | None) -> dict[bytes, bool]:
-    """Returns whether the run of each stored point is ok, by the bytes of theta."""
-    if design is None:
-        return {}
-    return {row.tobytes(): bool(ok) for row, ok in zip(design.theta, design.ok, strict=True)}
-
-
 def _distinct(wave: Wave) -> dict[bytes, Array]:
     """Returns the wave's points by their bytes, in order, each point once.
 
@@ -245,70 +213,3 @@ def _distinct(wave: Wave) -> dict[bytes, Array]:
             f"points of a design: row {row}", theta[row].tolist(), "a point inside the prior box"
         )
     return {row.tobytes(): row for row in theta}
-
-
-def _identity(space: ParameterSpace, edges: Array, model_hash: str) -> str:
-    """Returns the hash of all that results depend on besides theta.
-
-    The wording of a parameter's description is not part of it.
-    """
-    parts = [_box(space), edges.tobytes().hex(), model_hash]
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-
-
-def _box(space: ParameterSpace) -> list[list[Any]]:
-    """Returns the parameters with their units, bounds and priors as plain values."""
-    return [[p.name, p.unit, float(p.lower), float(p.upper), p.prior, p.offset] for p in space.parameters]
-
-
-def _check_same(path: Path, design: Design, space: ParameterSpace, edges: Array, model_hash: str) -> None:
-    """Raises InputError unless runs of this model, space and bins can extend the file's design."""
-    if design.model_hash != model_hash:
-        raise InputError(path, f"a design of model {design.model_hash}", f"a design of model {model_hash}")
-    if _box(design.space) != _box(space):
-        raise InputError(path, f"parameters {_box(design.space)}", f"parameters {_box(space)}")
-    if not np.array_equal(design.edges_s, edges):
-        bins, expected_bins = len(design.edges_s) - 1, len(edges) - 1
-        raise InputError(
-            path, f"{bins} time bins to {design.edges_s[-1]:g} s", f"{expected_bins} bins to {edges[-1]:g} s"
-        )
-
-
-def _extended(before: Design | None, wave: Wave, edges: Array, model_hash: str, fresh: list[Run]) -> Design:
-    """Returns the design with the `fresh` runs of `wave` as its last rows."""
-    held_out = dict(zip((t.tobytes() for t in wave.theta[::-1]), wave.held_out[::-1], strict=True))
-    new = Design(
-        space=wave.space,
-        edges_s=edges,
-        theta=np.array([run.theta for run in fresh]).reshape(-1, wave.space.dim),
-        force_n=np.array([run.force_n for run in fresh]).reshape(-1, len(edges) - 1),
-        wave=np.full(len(fresh), wave.number, dtype=np.int64),
-        held_out=np.array([held_out[run.theta.tobytes()] for run in fresh], dtype=bool),
-        ok=np.array([run.ok for run in fresh], dtype=bool),
-        messages=tuple(run.message for run in fresh),
-        seconds=np.array([run.seconds for run in fresh], dtype=float),
-        seed=wave.seed,
-        model_hash=model_hash,
-    )
-    if before is None:
-        return new
-    rows = ("theta", "force_n", "wave", "held_out", "ok", "seconds")
-    joined: dict[str, Any] = {
-        name: np.concatenate([getattr(before, name), getattr(new, name)]) for name in rows
-    }
-    joined["messages"] = before.messages + new.messages
-    return Design(
-        space=before.space, edges_s=before.edges_s, seed=before.seed, model_hash=model_hash, **joined
-    )
-
-
-def _write(path: Path, design: Design, waves: list[dict[str, Any]]) -> None:
-    """Replaces the file, in one step, by a file with all rows and the records of the waves."""
-    storage.save(path, design, {"waves": json.dumps(waves)})
-
-
-def _remove_stale(path: Path) -> None:
-    """Removes partial files that a killed process may have left; only the journal's holder may do this."""
-    for stale in path.parent.glob(f".{escape(path.name)}.*.partial"):
-        stale.unlink(missing_ok=True)
-    path.with_name(f".{path.name}.journal.partial").unlink(missing_ok=True)

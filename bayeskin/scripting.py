@@ -20,12 +20,12 @@ import numpy as np
 
 from bayeskin import inference, storage
 from bayeskin.config import FEWEST_CHECKED, config_of, parameter_space, to_toml
+from bayeskin.design_files import load_design
 from bayeskin.errors import InputError
 from bayeskin.finite_element import simulate as run_model
 from bayeskin.inference import LogPosterior, Weighed
 from bayeskin.json_files import plain
 from bayeskin.recordings import idealised_motion, read_recording, segment
-from bayeskin.runner import load_design
 from bayeskin.surrogates import load_surrogate
 from bayeskin.types import BinnedForce, PadMotion, Recording, Simulation
 from bayeskin.workflow import diagnosis

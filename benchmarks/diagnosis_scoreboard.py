@@ -27,7 +27,6 @@ import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import rows
@@ -35,6 +34,7 @@ from scipy.stats import binomtest
 
 from bayeskin.mechanisms import catalogue
 from bayeskin.mismatch import hypotheses
+from bayeskin.mismatch.hypotheses import VerdictSettings
 from bayeskin.proof import score
 from bayeskin.workflow.diagnosis import diagnose
 
@@ -68,15 +68,15 @@ SHARES = {
     "base parameters beside a clear effect in 90 % intervals": ("base_in_interval", "clear"),
     "base parameters where nothing is concealed": ("base_in_interval_nothing",),
 }
-RULES: dict[str, dict[str, float]] = {
-    "rule in use": {"PROBABLE": hypotheses.PROBABLE},
-    "no condition on the explained share": {"MOST_OF_IT": 0.0},
-    "explained share of at least 0.8": {"MOST_OF_IT": 0.8},
-    "explained share of at least 0.95": {"MOST_OF_IT": 0.95},
-    "named from a probability of 0.8": {"PROBABLE": 0.8},
-    "named from a probability of 0.95": {"PROBABLE": 0.95},
-    "prior probability of 0.01": {"ODDS": float(np.log(0.01 / 0.99))},
-    "prior probability of 0.2": {"ODDS": float(np.log(0.2 / 0.8))},
+RULES = {
+    "rule in use": VerdictSettings(),
+    "no condition on the explained share": VerdictSettings(most_of_it=0.0),
+    "explained share of at least 0.8": VerdictSettings(most_of_it=0.8),
+    "explained share of at least 0.95": VerdictSettings(most_of_it=0.95),
+    "named from a probability of 0.8": VerdictSettings(probable=0.8),
+    "named from a probability of 0.95": VerdictSettings(probable=0.95),
+    "prior probability of 0.01": VerdictSettings(prior=0.01),
+    "prior probability of 0.2": VerdictSettings(prior=0.2),
 }  # the priors are those of each mechanism and of the unnamed smooth discrepancy
 WEIGHED = (
     "false alarms", "clear effects named, up to look-alikes", "smaller effects named, up to look-alikes",
@@ -204,9 +204,8 @@ def ablation(said: Mapping[str, Mapping[str, Any]]) -> str:
     keys = {case: key_of(case, known=True) for case in said}
     judged = {case: answer for case, answer in said.items() if "verdict" in answer}
     table = []
-    for label, thresholds in RULES.items():
-        with mock.patch.multiple(hypotheses, **thresholds):
-            board = score(keys, {case: by_present_rule(answer) for case, answer in judged.items()})
+    for label, settings in RULES.items():
+        board = score(keys, {case: by_present_rule(answer, settings) for case, answer in judged.items()})
         table.append([label, *(_share(board, SHARES[name]).split(" (")[0] for name in WEIGHED)])
     return rows.markdown((f"{len(judged)} recordings", *WEIGHED), table)
 
@@ -243,7 +242,9 @@ def share(hits: int, count: int) -> str:
     return f"{hits / count:.2f}, {interval.low:.2f} to {interval.high:.2f}"
 
 
-def by_present_rule(said: Mapping[str, Any]) -> dict[str, Any]:
+def by_present_rule(
+    said: Mapping[str, Any], settings: VerdictSettings = RULES["rule in use"]
+) -> dict[str, Any]:
     """Returns an answer with the verdict that the present rule derives from its log-evidences.
 
     The answer of a failed diagnosis is returned unchanged.
@@ -254,10 +255,12 @@ def by_present_rule(said: Mapping[str, Any]) -> dict[str, Any]:
     family = hypotheses.Family([
         hypothesis for names, evidence in evidences_of.items()
         for hypothesis in hypotheses.hypotheses_of(
-            names, hypotheses.Evidences(evidence["log_evidence_alone"], evidence["log_evidence_with_smooth"])
+            names,
+            hypotheses.Evidences(evidence["log_evidence_alone"], evidence["log_evidence_with_smooth"]),
+            settings,
         )
     ])  # fmt: skip
-    judgement = hypotheses.judge_family(family, catalogue(), said["explained"])
+    judgement = hypotheses.judge_family(family, catalogue(), said["explained"], settings)
     values = said["fit"]["after"]["theta"]
     named = [
         {"name": mechanism.name, "probability": mechanism.probability,

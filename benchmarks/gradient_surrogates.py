@@ -23,7 +23,6 @@ import time
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from unittest import mock
 
 import healthy_skin
 import numpy as np
@@ -36,16 +35,9 @@ from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.report import save_figure
 from bayeskin.report.style import PAGE_IN, new_figure, plain_log, state_finding, styled
-from bayeskin.surrogates import hyperparameters
-from bayeskin.surrogates.chaos import (
-    FOLDS,
-    MOST_TERMS,
-    LatentChaos,
-    _pursue,
-    fit_sparse,
-)
+from bayeskin.surrogates.chaos import ChaosSettings, LatentChaos, _pursue, fit_sparse
 from bayeskin.surrogates.gp import LatentGPs
-from bayeskin.surrogates.hyperparameters import fit_latent
+from bayeskin.surrogates.hyperparameters import HyperparameterSettings, fit_latent
 from bayeskin.surrogates.shapes import ShapeTransform, split
 from bayeskin.surrogates.similarity import Similarity
 from bayeskin.surrogates.train import fit_latents
@@ -58,6 +50,7 @@ SIZES = (24, 48, 96)
 HELD_OUT = 32
 SPEC = ModelSpec(refinement=0)
 EDGES_S = np.arange(9.5, 347.0, 0.5)
+CHAOS = ChaosSettings()
 STEERED = ("E_s", "k_c", "k_s", "p_init")  # the force is differentiated by one parameter for each input
 P_INIT_CHANGE_PA = 100.0
 SLOPE_WEIGHTS = (0.03, 0.1, 0.3)  # weight of a derivative over the box's width, relative to a value
@@ -141,19 +134,19 @@ def _pursued(unit: Array, target: Array, slopes: Array) -> Callable[[Array], Arr
     Cross-validation over folds chooses its terms and the weight of the slopes.
     """
     n, dim = unit.shape
-    fold = np.arange(n) % FOLDS
+    fold = np.arange(n) % CHAOS.folds
     best = (np.inf, 0.0, np.zeros((0, dim), dtype=np.int64), [0])
     for degree in range(1, 13):
         indices = multi_indices(dim, degree)
         if len(indices) > n * (1 + dim):
             break
         basis, slope_basis = legendre_basis(unit, indices), _slope_basis(unit, indices)
-        term_limit = min(n * (1 + dim) // 3, MOST_TERMS, len(indices))
+        term_limit = min(n * (1 + dim) // 3, CHAOS.most_terms, len(indices))
         for weight in SLOPE_WEIGHTS:
             stacked = np.concatenate([basis, *(weight * slope_basis)])
             aims = np.concatenate([target, *(weight * slopes.T)])
             residual = np.empty((n, term_limit))
-            for k in range(FOLDS):
+            for k in range(CHAOS.folds):
                 is_training = np.tile(fold != k, 1 + dim)
                 residual[fold == k] = _pursue(stacked, aims, is_training, term_limit)[1][
                     : int(np.sum(fold == k))
@@ -185,8 +178,8 @@ def _predictions(kind: str, inputs: Array, targets: Array, slopes: Array, at: Ar
         targets = np.concatenate([targets, *(predicted for _, predicted in stepped)])
         ones = np.ones(len(inputs))
     # The fit uses all rows at once, because a subset could separate rows that belong to the same run.
-    with mock.patch.object(hyperparameters, "ROWS_TO_SEARCH", len(inputs)):
-        gps = [fit_latent(inputs, column, ones) for column in targets.T]
+    settings = HyperparameterSettings(first_rows=len(inputs))
+    gps = [fit_latent(inputs, column, ones, settings) for column in targets.T]
     return LatentGPs.assemble(inputs, targets, gps).predict(at)[0]
 
 

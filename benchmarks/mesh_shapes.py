@@ -27,7 +27,7 @@ from bayeskin.design import default_space, sobol_points
 from bayeskin.execution.local import Lost, run_parallel
 from bayeskin.finite_element import simulate
 from bayeskin.finite_element.simulate import ModelSpec
-from bayeskin.inference.model_error import RELAXATION_S, errors, shapes
+from bayeskin.inference.model_error import ErrorSizes, errors, shapes
 from bayeskin.mismatch.stiffness_ratio import STIFFEST_BELOW
 from bayeskin.types import Array
 
@@ -35,7 +35,7 @@ SEED = 21
 BIN_S = 0.5
 DOCS = Path(__file__).parents[1] / "docs"
 NAMES = default_space().names
-ANSWERS = tuple(f"relaxing in {tau:g} s" for tau in RELAXATION_S)
+ANSWERS = tuple(f"relaxing in {tau:g} s" for tau in ErrorSizes().relaxation_s)
 PARTS = ("factor", "bend", *ANSWERS)
 LEFT = ("all", "left by the factor", "left by factor and bend", "left by all shapes")
 ROWS = rows.Rows(
@@ -62,7 +62,7 @@ def refined(theta: dict[str, float]) -> dict[str, float] | str:
             return run.message
     default, finer = (run.bin_means(edges_s) for run in runs)
     peak = float(np.abs(finer).max())
-    columns = errors(default[None], *shapes(motion, edges_s))[0]
+    columns = errors(default[None], *shapes(motion, edges_s, ErrorSizes().relaxation_s))[0]
     remaining_rms = [_rms(finer - default) / peak]
     for count in (1, 2, len(columns)):
         coefficients, *_ = np.linalg.lstsq(columns[:count].T, finer - default, rcond=None)

@@ -27,7 +27,7 @@ import rows
 from bayeskin import inference
 from bayeskin.inference import LogPosterior, SampleSettings
 from bayeskin.inference.convergence import Convergence, assess
-from bayeskin.inference.sample import initial_walkers
+from bayeskin.inference.ensembles import initial_walkers
 from bayeskin.recordings import analyse, bin_recording, read_recording, segment
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_surrogate

@@ -16,10 +16,11 @@ from toys.closed_form_model import toy_simulate
 from toys.design_runs import SHORT, assert_same_rows, run
 from toys.unreliable_models import COARSE_S
 
+from bayeskin.design_files import load_design
 from bayeskin.errors import InputError
 from bayeskin.execution.cluster import on_scheduler, on_slurm
 from bayeskin.execution.local import Lost, local
-from bayeskin.runner import load_design, run_design
+from bayeskin.runner import run_design
 from bayeskin.types import Design
 
 distributed = pytest.importorskip("distributed")

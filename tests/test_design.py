@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from scipy.stats import qmc
 from toys.closed_form_model import SPACE, toy_force
 
-from bayeskin.design import default_space, first_wave, misfit_bounds, next_wave, posterior_wave, sobol_points
+from bayeskin.design import default_space, first_wave, posterior_wave, sobol_points
 from bayeskin.errors import InputError
+from bayeskin.history_matching import misfit_bounds, next_wave
 from bayeskin.types import Array, Parameter, ParameterSpace, Prediction
 
 SQUARE = ParameterSpace((Parameter("a", "m", 0.0, 1.0, "uniform"), Parameter("b", "m", 0.0, 1.0, "uniform")))

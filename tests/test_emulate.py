@@ -14,7 +14,7 @@ from toys.closed_form_reduced import TRUTH, Exact
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.emulate import EmulationSettings, Forces, emulate
 from bayeskin.mismatch.fit import fit_near
-from bayeskin.mismatch.resample import resample
+from bayeskin.mismatch.resample import ResampleSettings, resample
 from bayeskin.mismatch.trust_region import SetFit, fit_set, within
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.surrogates import train
@@ -113,11 +113,11 @@ def test_it_is_the_posterior_by_the_force_itself(fitted: tuple[DiagnosisContext,
     exact = Exact(innermost(about.surrogate).space)
     seen = dataclasses.replace(about.surrogate, inner=exact) if found.fit.names else exact
     whole = dataclasses.replace(about, surrogate=seen)
-    there = fit_near(found.fit.names, whole, emulated.fit.theta, None)
+    there = fit_near(found.fit.names, whole, emulated.fit.theta)
     assert emulated.fit.value == pytest.approx(there.value, abs=1.0)
     # Permeabilities that change places make almost the same force: the toy has another mode far away.
     near = within(whole, whole.vector(there.theta), 0.2)
-    right = resample(dataclasses.replace(there, log_posterior=near), None, 2, (120,))
+    right = resample(dataclasses.replace(there, log_posterior=near), 2, ResampleSettings(legs=(120,)))
     draws = [whole.to_sampling(one.draws) for one in (emulated.draws, right)]
     of_force = slice(0, whole.surrogate.space.dim)
     (mean, sd), (exact_mean, exact_sd) = (

@@ -14,9 +14,10 @@ from toys.spring_case import NOISE_N, SPACE, configured, refused, spring_case
 
 from bayeskin import cli, report, storage
 from bayeskin.design import Wave
+from bayeskin.design_files import load_design
 from bayeskin.execution.local import local
 from bayeskin.external.model import identity, simulate_with
-from bayeskin.runner import load_design, run_design
+from bayeskin.runner import run_design
 from bayeskin.types import PadMotion, Recording
 from bayeskin.workflow import stages
 from bayeskin.workflow.diagnosis import diagnose

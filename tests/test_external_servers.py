@@ -25,13 +25,14 @@ from toys.spring_case import SPACE, configured, refused, spring_case
 
 from bayeskin import report
 from bayeskin.design import Wave
+from bayeskin.design_files import load_design
 from bayeskin.errors import InputError, Unavailable
 from bayeskin.execution.local import local
 from bayeskin.external.model import identity, simulate_own, simulate_server, simulate_with
 from bayeskin.external.umbridge import Client, server
 from bayeskin.finite_element import ModelSpec
 from bayeskin.mechanisms import bin_means, catalogue, observed
-from bayeskin.runner import load_design, run_design
+from bayeskin.runner import run_design
 from bayeskin.types import Parameter
 from bayeskin.workflow import stages
 from bayeskin.workflow.doctor import FULL_MODEL_N, THETA

@@ -25,9 +25,9 @@ from toys.closed_form_model import MOTION
 from toys.external_models import PARAMETERS, SPRING, TRUE, spring
 
 from bayeskin import storage
+from bayeskin.design_files import load_design
 from bayeskin.errors import InputError
 from bayeskin.json_files import read_lines
-from bayeskin.runner import load_design
 from bayeskin.types import Recording
 from bayeskin.workflow.folder import read_record
 

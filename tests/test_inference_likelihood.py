@@ -12,7 +12,7 @@ from scipy import optimize, stats
 from toys.inference_problems import NOISE, TRUTH, empty_recording, toy_problem
 
 from bayeskin.errors import InputError
-from bayeskin.inference.likelihood import FARTHEST, STIFF, log_likelihood
+from bayeskin.inference.likelihood import ERROR_PRIOR, log_likelihood
 from bayeskin.inference.noise_model import (
     NoiseChain,
     bins_in_windows,
@@ -219,15 +219,16 @@ def test_latents_beyond_what_a_surrogate_denies_are_found_as_by_a_general_optimi
     white = innovations(chain, noise[0], prediction.diagonal[0, chain.bins], columns)
 
     def energy(z: Array) -> float:
-        beyond = np.maximum(np.abs(z) - FARTHEST, 0.0)
+        beyond = np.maximum(np.abs(z) - ERROR_PRIOR.farthest, 0.0)
         logs = np.log1p((white[:, 0] - white[:, 1:] @ z) ** 2 / nu)
-        return 0.5 * float(z @ z + STIFF * beyond @ beyond) + 0.5 * (nu + 1.0) * float(logs.sum())
+        return 0.5 * float(z @ z + ERROR_PRIOR.stiff * beyond @ beyond) + 0.5 * (nu + 1.0) * float(logs.sum())
 
     tops = [optimize.minimize(energy, share * latent, tol=1e-10) for share in (0.0, 0.2, 1.0)]
     z = min(tops, key=lambda top: top.fun).x
     square = (white[:, 0] - white[:, 1:] @ z) ** 2
     bend = (nu + 1.0) * (nu - square) / (nu + square) ** 2
-    curvature = (white[:, 1:].T * bend) @ white[:, 1:] + np.diag(1.0 + STIFF * (np.abs(z) > FARTHEST))
+    stiff = ERROR_PRIOR.stiff * (np.abs(z) > ERROR_PRIOR.farthest)
+    curvature = (white[:, 1:].T * bend) @ white[:, 1:] + np.diag(1.0 + stiff)
     scale = np.diag(np.linalg.cholesky(covariance(chain, noise[0], prediction.diagonal[0])))
     density = len(white) * stats.t.logpdf(0.0, nu) - np.log(scale).sum()
     expected = density - energy(z) - 0.5 * np.linalg.slogdet(curvature)[1]

@@ -14,8 +14,10 @@ from toys.inference_problems import NOISE, TRUTH, ToySurrogate, toy_problem
 from bayeskin.finite_element.accuracy import mesh_error
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.forward.posterior import UNKNOWN_MESH, model_error
-from bayeskin.inference.model_error import BEND, CALIBRATION, RELAXATION_S, RELAXING, ModelError, relaxing
+from bayeskin.inference.model_error import ErrorSizes, ModelError, relaxing
 from bayeskin.inference.noise_model import noise_covariance
+
+SIZES = ErrorSizes()
 
 
 def test_the_mesh_s_error_is_a_factor_and_a_bend_of_the_force_and_what_relaxes() -> None:
@@ -31,10 +33,9 @@ def test_the_mesh_s_error_is_a_factor_and_a_bend_of_the_force_and_what_relaxes()
         np.argmax(closed_form_model.MOTION.at(middle)),
         np.argmin(closed_form_model.MOTION.at(middle)),
     )
-    np.testing.assert_allclose(new[[top, bottom], 1], BEND * plain.mean[0, [top, bottom]] * [1, -1])
-    np.testing.assert_allclose(
-        new[:, 2:].T, RELAXING * plain.mean[0].max() * relaxing(closed_form_model.MOTION, middle)
-    )
+    np.testing.assert_allclose(new[[top, bottom], 1], SIZES.bend * plain.mean[0, [top, bottom]] * [1, -1])
+    relaxed = relaxing(closed_form_model.MOTION, middle, SIZES.relaxation_s)
+    np.testing.assert_allclose(new[:, 2:].T, SIZES.relaxing * plain.mean[0].max() * relaxed)
 
 
 def test_what_relaxes_is_the_answer_of_a_spring_and_a_dashpot() -> None:
@@ -42,7 +43,8 @@ def test_what_relaxes_is_the_answer_of_a_spring_and_a_dashpot() -> None:
     step_s = 1e-3
     time_s = np.arange(0.0, closed_form_model.MOTION.time_s[-1], step_s)
     share = closed_form_model.MOTION.at(time_s) / closed_form_model.MOTION.displacement_m.max()
-    for found, tau in zip(relaxing(closed_form_model.MOTION, time_s), RELAXATION_S, strict=True):
+    relaxed = relaxing(closed_form_model.MOTION, time_s, SIZES.relaxation_s)
+    for found, tau in zip(relaxed, SIZES.relaxation_s, strict=True):
         decay, slow = np.exp(-step_s / tau), np.exp(-0.5 * step_s / tau)
         by_steps = lfilter([slow], [1.0, -decay], np.diff(share, prepend=share[0]))
         np.testing.assert_allclose(found, by_steps, atol=2e-4)
@@ -90,9 +92,9 @@ def test_the_mesh_and_the_load_cell_are_allowed_for_where_the_force_is_the_pad_s
     found = model_error(spec, closed_form_model.MOTION, edges_s)
     assert known is not None
     assert found is not None
-    assert found.amplitude == pytest.approx(np.hypot(known.rms, CALIBRATION))
+    assert found.amplitude == pytest.approx(np.hypot(known.rms, SIZES.calibration))
     longer = dataclasses.replace(spec.geometry, gauge_m=0.04)
     other = model_error(ModelSpec(geometry=longer), closed_form_model.MOTION, edges_s)
     assert other is not None
-    assert other.amplitude == pytest.approx(np.hypot(UNKNOWN_MESH, CALIBRATION))
+    assert other.amplitude == pytest.approx(np.hypot(UNKNOWN_MESH, SIZES.calibration))
     assert model_error(ModelSpec("article", "some.msh"), closed_form_model.MOTION, edges_s) is None

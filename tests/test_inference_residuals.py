@@ -9,8 +9,9 @@ from scipy import stats
 from toys.inference_problems import NOISE, TRUTH, ToySurrogate, toy_problem
 
 from bayeskin.inference import LogPosterior, ResidualCheck, check_residuals, find_map
-from bayeskin.inference.gauss_newton import gauss_newton, surrogate_error
+from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.residuals import autocorrelation, normal_scores
+from bayeskin.inference.surrogate_error import surrogate_error
 from bayeskin.types import Array
 
 SEEDS = range(30)

@@ -13,16 +13,18 @@ from toys.inference_problems import NOISE, TRUTH, ToySurrogate, line_problem, to
 
 from bayeskin.inference import LogPosterior, NoisePriors, find_map
 from bayeskin.inference.convergence import Limits
-from bayeskin.inference.gauss_newton import gauss_newton, promise, surrogate_error
+from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.model_error import ModelError
+from bayeskin.inference.score_test import promise
+from bayeskin.inference.surrogate_error import surrogate_error
 from bayeskin.mechanisms import catalogue
 from bayeskin.mismatch.fit import Fit, fit, fit_near, value_for_multiple
 from bayeskin.mismatch.fit_starts import likely, other_skins
 from bayeskin.mismatch.hypotheses import weight
-from bayeskin.mismatch.locate import exceedance_probability, locate, model_error
+from bayeskin.mismatch.locate import LocateSettings, exceedance_probability, locate, model_error
 from bayeskin.mismatch.observed import ObservedSurrogate
 from bayeskin.mismatch.refuted import refuted
-from bayeskin.mismatch.resample import resample
+from bayeskin.mismatch.resample import ResampleSettings, resample
 from bayeskin.mismatch.stiffness_ratio import subcutis_too_stiff
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.types import Jumps, ParameterSpace
@@ -69,18 +71,18 @@ def test_the_chance_of_the_farthest_window_is_uniform_where_nothing_is_missing()
 
 
 @pytest.mark.parametrize("share", [1e-3, 1e-2])
-def test_what_the_model_is_wrong_by_is_no_mismatch(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_model_is_wrong_by_is_no_mismatch(share: float) -> None:
     """In each phase by another amount, of a sd that is allowed for, below the noise's and above."""
-    monkeypatch.setattr("bayeskin.mismatch.locate.MESH_ERROR", share)
-    chances = []
+    settings, chances = LocateSettings(mesh_error=share), []
     for seed in range(30):
         alone = concealing(seed)
         binned = alone.binned
-        error_n = model_error(alone) * np.random.default_rng([seed, 1]).standard_normal(len(binned.phases))
+        normals = np.random.default_rng([seed, 1]).standard_normal(len(binned.phases))
+        error_n = model_error(alone, settings) * normals
         binned = dataclasses.replace(binned, force_n=binned.force_n + error_n[binned.phase])
         off = dataclasses.replace(alone, binned=binned)
         at = Fit((), off, {**TRUTH, **NOISE}, 0.0, 0.0, 1e-6 * np.eye(off.dim), np.zeros(3))
-        chances.append(locate(at, at.theta, seed).chance)
+        chances.append(locate(at, at.theta, seed, settings).chance)
     assert np.sum(np.array(chances) < 0.05) <= 5
 
 
@@ -92,7 +94,7 @@ def test_the_chance_of_a_window_farther_than_all_draws_is_read_from_their_tail(s
         tall = scale * np.abs(np.random.default_rng(seed).standard_normal((1000, 200))).max(axis=1)
         for chance in (0.3, 1e-3, 1e-5):
             height = scale * norm.isf(0.5 * (1.0 - (1.0 - chance) ** (1.0 / 200.0)))
-            found.append(np.log(exceedance_probability(tall, height) / chance))
+            found.append(np.log(exceedance_probability(tall, height, 0.1) / chance))
     by_chance = np.reshape(found, (20, 3))
     assert np.all(np.abs(by_chance.mean(axis=0)) < np.log([1.05, 1.3, 2.0]))
     assert np.all(by_chance.std(axis=0) < np.log([1.1, 1.7, 3.0]))
@@ -239,18 +241,16 @@ def test_a_mesh_that_is_off_by_a_factor_stays_inside_the_intervals() -> None:
         assert (low < truth < high) == inside, (low, truth, high)
 
 
-def test_draws_are_the_same_however_often_it_is_asked_whether_they_do(monkeypatch) -> None:
+def test_draws_are_the_same_however_often_it_is_asked_whether_they_do() -> None:
     alone = concealing(0)
     base = fitted(alone)
 
     def drawn(legs: tuple[int, ...], effective: float) -> np.ndarray:
-        monkeypatch.setattr("bayeskin.mismatch.resample.LEGS", legs)
-        monkeypatch.setattr("bayeskin.mismatch.resample.LIMITS", Limits(effective, 5.0, 1.1))
-        return resample(base, 1).draws
+        return resample(base, 1, ResampleSettings(legs=legs, limits=Limits(effective, 5.0, 1.1))).draws
 
-    whole = drawn((400,), np.inf)
-    np.testing.assert_array_equal(drawn((200, 400), np.inf), whole)
-    assert 0 < len(drawn((200, 400), 50.0)) < len(whole)
+    whole = drawn((600,), np.inf)
+    np.testing.assert_array_equal(drawn((300, 600), np.inf), whole)
+    assert 0 < len(drawn((300, 600), 50.0)) < len(whole)
 
 
 @pytest.mark.parametrize(("of_sd", "there"), [(2.0, False), (30.0, True)])

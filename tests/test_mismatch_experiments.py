@@ -19,7 +19,7 @@ from toys.inference_problems import NOISE, SCALE, TRUTH, ToySurrogate, empty_rec
 
 from bayeskin.config.run_sections import ModelConfig
 from bayeskin.errors import InputError
-from bayeskin.experiments.choice import DRAWS, OPEN, Experiment, compete, noise_of, ranked, search, weigh
+from bayeskin.experiments.choice import ChoiceSettings, Experiment, compete, noise_of, ranked, search, weigh
 from bayeskin.experiments.information import expected_gain
 from bayeskin.experiments.protocols import Limits, changed, own, phases_of, variations
 from bayeskin.forward.reduced import ReducedForward
@@ -54,6 +54,7 @@ KNOWN = {
         ("rub",),
     ),
 }  # fmt: skip
+DRAWS = ChoiceSettings().draws
 
 
 def gaussians(distance: float, draws: int, seed: int) -> tuple[list[np.ndarray], np.ndarray]:
@@ -262,7 +263,7 @@ def test_sets_with_look_alikes_in_the_place_of_the_likeliest_compete() -> None:
     none = dataclasses.replace(alike, names=(), log_evidence=3.0)
     found = [none, alike, both, likely]
     assert [one.names for one in compete(found, ["rub"], KNOWN)] == [("rub",), ("drag",)]
-    ruled_out = dataclasses.replace(alike, log_evidence=9.0 - OPEN - 0.1)
+    ruled_out = dataclasses.replace(alike, log_evidence=9.0 - ChoiceSettings().open - 0.1)
     assert [one.names for one in compete([none, ruled_out, likely], ["rub"], KNOWN)] == [("rub",)]
     impossible = dataclasses.replace(alike, log_evidence=-np.inf)
     assert [one.names for one in compete([none, impossible, likely], ["rub"], KNOWN)] == [("rub",)]

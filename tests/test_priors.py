@@ -12,7 +12,7 @@ from bayeskin.config import load_config, parameter_space, to_toml
 from bayeskin.errors import InputError
 from bayeskin.inference import identifiability
 from bayeskin.inference.gauss_newton import gauss_newton
-from bayeskin.sensitivity.sobol import describe
+from bayeskin.sensitivity.result import describe
 from bayeskin.types import Array, Correlation, Parameter, ParameterSpace
 
 SPACE = ParameterSpace(

@@ -19,7 +19,7 @@ from toys.synthetic_recordings import (
 )
 
 from bayeskin.errors import InputError
-from bayeskin.mismatch.noise_bounds import QUICK_S, without_swings
+from bayeskin.mismatch.noise_bounds import NOISE_BOUNDS, without_swings
 from bayeskin.recordings import (
     NoiseAnalysis,
     analyse,
@@ -255,7 +255,7 @@ def test_a_slow_swing_is_no_quick_noise() -> None:
     for name, force in (("plain", plain), ("swinging", swinging)):
         made = recording(force)
         whole = bin_recording(made, PHASES, EDGES_S)
-        quick = bin_recording(made, PHASES, EDGES_S, analyse(made, PHASES, QUICK_S))
+        quick = bin_recording(made, PHASES, EDGES_S, analyse(made, PHASES, NOISE_BOUNDS.quick_s))
         holds = np.array([PHASES[i].kind == "hold" for i in whole.phase])
         less = without_swings(whole, quick.variance_n2)
         kept = less.variance_n2[~holds] / whole.variance_n2[~holds]

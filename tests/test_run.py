@@ -17,10 +17,10 @@ from toys import stand_in_model
 from toys.closed_form_model import MOTION, SPACE, toy_force
 
 from bayeskin import report, storage
+from bayeskin.design_files import load_design
 from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data
 from bayeskin.number_format import interval
 from bayeskin.report.page.prose import prose
-from bayeskin.runner import load_design
 from bayeskin.types import Design, PadMotion, Recording, Simulation
 from bayeskin.workflow import maximum, model, stages, waves
 from bayeskin.workflow.calibration import refined_posterior

@@ -17,13 +17,14 @@ from toys.closed_form_model import SPACE, toy_bin_means, toy_simulate
 from toys.design_runs import SHORT, assert_same_rows, run
 from toys.unreliable_models import COARSE_S, WAVE
 
-from bayeskin import runner, storage
+from bayeskin import storage
 from bayeskin.design import first_wave
+from bayeskin.design_files import load_design, load_waves
 from bayeskin.errors import InputError
 from bayeskin.execution import local as workers
 from bayeskin.execution.local import local
 from bayeskin.journal import Journal
-from bayeskin.runner import add_points, load_design, load_waves, run_design
+from bayeskin.runner import add_points, run_design
 from bayeskin.types import Design
 
 HERE = Path(__file__).parent
@@ -109,8 +110,8 @@ def test_a_kill_at_each_step_of_the_fold_loses_nothing(
     tmp_path: Path, whole: Design, monkeypatch: pytest.MonkeyPatch, step: str, when: str
 ) -> None:
     owner, name = {
-        "storage.save": (runner.storage, "save"),
-        "os.replace": (runner.storage.os, "replace"),
+        "storage.save": (storage, "save"),
+        "os.replace": (storage.os, "replace"),
         "Journal.forget": (Journal, "forget"),
     }[step]
     original = getattr(owner, name)

@@ -9,7 +9,9 @@ from toys.ishigami import ONE_BIN, box, ishigami, ishigami_indices
 
 from bayeskin.errors import InputError
 from bayeskin.number_format import interval
-from bayeskin.sensitivity.sobol import error_draws, pick_freeze, projection, sentence, sobol, uninformed
+from bayeskin.sensitivity.estimators import pick_freeze, projection
+from bayeskin.sensitivity.result import sentence, uninformed
+from bayeskin.sensitivity.sobol import ErrorDrawSettings, error_draws, sobol
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_surrogate
 from bayeskin.types import ParameterSpace, Prediction
@@ -233,7 +235,8 @@ def test_error_draws_have_the_predicted_spread_and_are_smooth():
     unit[1, 0] += 1e-3
     theta = SPACE.from_unit(unit)
     mean = surrogate.predict(theta).mean
-    draws = np.array([f(theta) for f in error_draws(surrogate, 200, np.random.default_rng(1))])
+    many, rng = ErrorDrawSettings(draws=200), np.random.default_rng(1)
+    draws = np.array([f(theta) for f in error_draws(surrogate, rng, many)])
     spread = (draws[:, :, 12] - mean[:, 12]) / mean[:, 12]
     assert spread[:, 0].std() == pytest.approx(0.1, rel=0.15)
     assert np.abs(spread[:, 1] - spread[:, 0]).max() < 0.01

@@ -11,12 +11,14 @@ from scipy.stats import qmc
 from bayeskin import storage
 from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.shipped import shipped
+from bayeskin.surrogates import subspace
 from bayeskin.surrogates.chaos import LatentChaos, fit_sparse
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.hyperparameters import LatentFit, TrainingData, fit_latent, restricted_likelihood
 from bayeskin.surrogates.kernels import KERNELS, kernel, squared_distances, trend_basis, trend_degree
 from bayeskin.surrogates.shapes import split
 from bayeskin.surrogates.similarity import Similarity
+from bayeskin.surrogates.subspace import SubspaceSettings
 from bayeskin.types import Design
 
 
@@ -96,7 +98,7 @@ def test_a_variance_from_few_directions_is_hardly_larger_and_never_smaller(nugge
     gps = LatentGPs.assemble(unit, targets, fits)
     assert [one.few is None for one in gps.conditioned] == [False, nugget < 1.0, True, False]
     found = gps.predict(points)
-    monkeypatch.setattr("bayeskin.surrogates.gp.WORTH_IT", 1000)
+    monkeypatch.setattr(subspace, "SUBSPACE", SubspaceSettings(least_rows=1000))
     exact = LatentGPs.assemble(unit, targets, fits).predict(points)
     np.testing.assert_allclose(found[0], exact[0], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(gps.predict_mean(points), exact[0], rtol=1e-9, atol=1e-9)

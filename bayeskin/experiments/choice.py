@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayeskin.errors import InputError
-from bayeskin.experiments.information import FEWEST, expected_gain
+from bayeskin.experiments.information import GainSettings, expected_gain
 from bayeskin.experiments.protocols import Limits, Protocol, changed, phases_of
 from bayeskin.inference.noise_model import noise_chain, noise_covariance
 from bayeskin.mechanisms import Mechanism
@@ -23,14 +23,30 @@ from bayeskin.mismatch.hypotheses import weight
 from bayeskin.mismatch.tasks import AnswerTasks, OtherProtocolTask
 from bayeskin.types import Array, BinnedForce, PadMotion
 
-DRAWS = 12  # number of posterior draws of each hypothesis
 BIT = float(np.log(2.0))  # nats
-# In each of `ROUNDS` rounds, the best `PARENTS` protocols give `CHANGES` changed protocols.
-PARENTS, CHANGES, ROUNDS = 2, 4, 3
-ENOUGH = 0.02  # the search stops if a round can add or has added less than this share of the possible gain
-MOST_BINS = 800  # largest number of bins of a protocol; longer protocols have wider bins
-MOST_SETS = 4  # largest number of competing sets
-OPEN = 12.0  # the recording has ruled out a set whose log weight is this many nats below the best set's
+
+
+@dataclass(frozen=True)
+class ChoiceSettings:
+    """Settings of the choice of a further test.
+
+    open, most_sets : the recording has ruled out a set whose log weight is `open` [nats] below the best
+        set's; largest number of competing sets
+    draws : number of posterior draws of each hypothesis
+    most_bins : largest number of bins of a protocol; longer protocols have wider bins
+    rounds, parents, changes : in each of `rounds` rounds, the best `parents` protocols give `changes` changed
+        protocols
+    enough : the search stops if a round can add or has added less than this share of the possible gain
+    """
+
+    open: float = 12.0
+    most_sets: int = 4
+    draws: int = 12
+    most_bins: int = 800
+    rounds: int = 3
+    parents: int = 2
+    changes: int = 4
+    enough: float = 0.02
 
 
 @dataclass(frozen=True)
@@ -55,133 +71,143 @@ class Experiment:
 Judge = Callable[[Protocol], Experiment]
 
 
-def compete(found: Sequence[Fit], names: Sequence[str], known: Mapping[str, Mechanism]) -> list[Fit]:
+def compete(
+    fits: Sequence[Fit], names: Sequence[str], known: Mapping[str, Mechanism],
+    settings: ChoiceSettings = ChoiceSettings(),
+) -> list[Fit]:  # fmt: skip
     """Returns the best fit of the set with these names, followed by the most probable competing sets.
 
     A competing set was tried, has look-alikes in place of some mechanisms of the set, and its log weight is
-    less than `OPEN` below the best fit's. Each competing choice of mechanisms appears once. At most
-    `MOST_SETS` fits are returned.
+    less than `open` below the best fit's. Each competing choice of mechanisms appears once. At most
+    `most_sets` fits are returned.
 
     Raises InputError if no fit has exactly these names.
     """
-    fits_of_set = [fit for fit in found if fit.names == tuple(names)]
+    fits_of_set = [fit for fit in fits if fit.names == tuple(names)]
     if not fits_of_set:
         expected = "the fits that `bayeskin diagnose` stores; remove the run's folder `diagnose` to fit again"
         raise InputError("searches", f"no fit of {', '.join(names) or 'the base model'}", expected)
     best = max(fits_of_set, key=weight)
 
-    def alike(other: Fit) -> bool:
-        removed, added = set(best.names) - set(other.names), set(other.names) - set(best.names)
+    def competes(fit: Fit) -> bool:
+        removed, added = set(best.names) - set(fit.names), set(fit.names) - set(best.names)
         groups = {name for mechanism in removed for name in known[mechanism].group}
-        is_open = weight(other) > weight(best) - OPEN
+        is_open = weight(fit) > weight(best) - settings.open
         return bool(removed) and len(removed) == len(added) and added <= groups and is_open
 
-    by_names = {other.names: other for other in found if alike(other)}
-    return [best, *sorted(by_names.values(), key=weight, reverse=True)[: MOST_SETS - 1]]
+    by_names = {fit.names: fit for fit in fits if competes(fit)}
+    return [best, *sorted(by_names.values(), key=weight, reverse=True)[: settings.most_sets - 1]]
 
 
-def search(judge: Judge, first: Sequence[Protocol], limits: Limits, seed: int) -> list[Experiment]:
+def search(
+    judge: Judge, first: Sequence[Protocol], limits: Limits, seed: int,
+    settings: ChoiceSettings = ChoiceSettings(),
+) -> list[Experiment]:  # fmt: skip
     """Returns the judged protocols, the most informative first.
 
     The search judges the protocols in `first`, then random changes of the most informative ones within the
     limits. It ends if a round brings hardly more information, if the best protocol already gives almost all
-    of it, and after `ROUNDS` rounds at the latest.
+    of it, and after `rounds` rounds at the latest.
     """
-    rng = np.random.default_rng(seed)
+    rng, count = np.random.default_rng(seed), settings.changes
     experiments = ranked([judge(protocol) for protocol in first])
-    for turn in range(ROUNDS):
+    for turn in range(settings.rounds):
         best = experiments[0]
-        if np.isnan(best.gain_bits) or best.gain_bits > (1.0 - ENOUGH) * best.possible_bits:
+        if np.isnan(best.gain_bits) or best.gain_bits > (1.0 - settings.enough) * best.possible_bits:
             break
-        parents = [experiment.protocol for experiment in experiments[:PARENTS]]
+        parents = [experiment.protocol for experiment in experiments[: settings.parents]]
         new = [
-            changed(parents[i % len(parents)], limits, f"proposal {CHANGES * turn + i + 1}", rng)
-            for i in range(CHANGES)
+            changed(parents[i % len(parents)], limits, f"proposal {count * turn + i + 1}", rng)
+            for i in range(count)
         ]
         experiments = ranked([*experiments, *(judge(protocol) for protocol in new)])
-        if experiments[0].gain_bits < best.gain_bits + ENOUGH * best.possible_bits:
+        if experiments[0].gain_bits < best.gain_bits + settings.enough * best.possible_bits:
             break
     return experiments
 
 
 def weigh(
-    protocol: Protocol, fits: Sequence[Fit], known: Mapping[str, Mechanism], ask: AnswerTasks, seed: int
-) -> Experiment:
+    protocol: Protocol, fits: Sequence[Fit], known: Mapping[str, Mechanism], ask: AnswerTasks, seed: int,
+    settings: ChoiceSettings = ChoiceSettings(),
+) -> Experiment:  # fmt: skip
     """Returns the information that a protocol is expected to give about which of the sets is true.
 
     All sets have the same probability before the test.
 
     fits : the fit of each hypothesis, the most probable one first. Its `names` are the mechanisms of `known`
         that are active.
-    ask : answers the tasks; each hypothesis has `DRAWS` tasks that simulate the test
+    ask : answers the tasks; each hypothesis has `draws` tasks that simulate the test
 
     Raises InputError for fewer than two hypotheses.
     """
     if len(fits) < 2:
         raise InputError("hypotheses", f"{len(fits)}", "at least two, each with its fit")
-    motion, edges_s = protocol.motion, _bin_edges(protocol.motion, fits[0])
+    draws, motion = settings.draws, protocol.motion
+    edges_s = _bin_edges(motion, fits[0], settings.most_bins)
     tasks = [
         OtherProtocolTask(
             fit.names, theta, tuple(motion.time_s.tolist()), tuple(motion.displacement_m.tolist()),
             tuple(edges_s.tolist()),
         )
-        for i, fit in enumerate(fits) for theta in _posterior_draws(fit, known, seed + i)
+        for i, fit in enumerate(fits) for theta in _posterior_draws(fit, known, draws, seed + i)
     ]  # fmt: skip
     answers = ask(tasks)
     forces = [
-        np.array([force for force in answers[DRAWS * i : DRAWS * (i + 1)] if not isinstance(force, str)])
+        np.array([force for force in answers[draws * i : draws * (i + 1)] if not isinstance(force, str)])
         for i in range(len(fits))
     ]
     gain = (np.nan, np.nan, np.nan)
-    if min(len(rows) for rows in forces) >= FEWEST:
+    if min(len(rows) for rows in forces) >= GainSettings().fewest:
         expected = expected_gain(forces, noise_of(fits[0], motion, edges_s), np.ones(len(fits)), seed)
         gain = (expected.nats / BIT, expected.standard_error / BIT, expected.named)
-    failed = sum(DRAWS - len(rows) for rows in forces)
+    failed = sum(draws - len(rows) for rows in forces)
     return Experiment(protocol, *gain, float(np.log(len(fits))) / BIT, failed)
 
 
-def ranked(found: Sequence[Experiment]) -> list[Experiment]:
+def ranked(experiments: Sequence[Experiment]) -> list[Experiment]:
     """Returns the experiments in order, the most informative first.
 
     Among experiments with nearly the same information, the shortest test comes first. Experiments without an
     estimate come last.
     """
 
-    def place(one: Experiment) -> tuple[bool, float, float]:
-        share = one.gain_bits / one.possible_bits
-        return bool(np.isnan(share)), -round(share, 2), float(one.protocol.motion.time_s[-1])
+    def place(experiment: Experiment) -> tuple[bool, float, float]:
+        share = experiment.gain_bits / experiment.possible_bits
+        return bool(np.isnan(share)), -round(share, 2), float(experiment.protocol.motion.time_s[-1])
 
-    return sorted(found, key=place)
+    return sorted(experiments, key=place)
 
 
-def _bin_edges(motion: PadMotion, found: Fit) -> Array:
+def _bin_edges(motion: PadMotion, fit: Fit, most_bins: int) -> Array:
     """Returns the edges (m+1,) of equal bins that are as wide as the recording's bins or wider."""
     end_s = float(motion.time_s[-1])
-    width_s = max(float(np.median(np.diff(found.log_posterior.binned.edges_s))), end_s / MOST_BINS)
+    width_s = max(float(np.median(np.diff(fit.log_posterior.binned.edges_s))), end_s / most_bins)
     return np.asarray(width_s * np.arange(int(end_s / width_s + 1e-6) + 1, dtype=float))
 
 
-def _posterior_draws(found: Fit, known: Mapping[str, Mechanism], seed: int) -> list[dict[str, float]]:
+def _posterior_draws(
+    fit: Fit, known: Mapping[str, Mechanism], count: int, seed: int
+) -> list[dict[str, float]]:
     """Returns posterior draws of all parameters that determine the force of a set of mechanisms."""
-    names = found.log_posterior.surrogate.space.names
-    neutral = {name: value for mechanism in found.names for name, value in known[mechanism].neutral.items()}
+    names = fit.log_posterior.surrogate.space.names
+    neutral = {name: value for mechanism in fit.names for name, value in known[mechanism].neutral.items()}
     return [
         neutral | dict(zip(names, draw.tolist(), strict=True))
-        for draw in found.draws(DRAWS, seed)[:, : len(names)]
+        for draw in fit.draws(count, seed)[:, : len(names)]
     ]
 
 
-def noise_of(found: Fit, motion: PadMotion, edges_s: Array) -> Array:
+def noise_of(fit: Fit, motion: PadMotion, edges_s: Array) -> Array:
     """Returns the covariance (m, m) [N^2] of the noise that is expected in another test, from a fit.
 
     The noise has the fitted sds and correlation time. It also has the median measured variance of each kind
     of phase, which is proportional to 1 / width of the bins. A kind of phase that was not recorded has the
     noise of the noisiest kind.
     """
-    log_posterior = found.log_posterior
+    log_posterior = fit.log_posterior
     chain, binned = log_posterior.chain, log_posterior.binned
     wider = float(edges_s[1] - edges_s[0]) / float(np.median(np.diff(binned.edges_s)))
-    sd = {kind: found.theta[f"sd_{kind}"] for kind in chain.kinds}
+    sd = {kind: fit.theta[f"sd_{kind}"] for kind in chain.kinds}
     recorded = np.array([binned.phases[p].kind for p in binned.phase[chain.bins]])
     variance = {
         str(kind): float(np.median(chain.variance_n2[recorded == kind])) / wider
@@ -199,5 +225,5 @@ def noise_of(found: Fit, motion: PadMotion, edges_s: Array) -> Array:
     )  # fmt: skip
     future = noise_chain(planned, by_kind=log_posterior.noise_priors.by_kind)
     sds = [sd.get(kind, max(sd.values())) for kind in future.kinds]
-    noise = np.array([*sds, found.theta["tau_noise"], np.inf])
+    noise = np.array([*sds, fit.theta["tau_noise"], np.inf])
     return noise_covariance(future, noise, np.zeros(len(middle)))

@@ -38,13 +38,24 @@ from scipy.special import logsumexp
 from bayeskin.errors import InputError
 from bayeskin.types import Array
 
-FEWEST = 4  # least number of draws of a hypothesis
-REPLICATES = 64  # number of noise realisations for each draw
-SPREAD = 1  # number of directions of largest spread, in addition to the discriminants
-# Singular values of the whitened draws below this share of the largest are negligible, and gains [nats] below
-# this value too.
-NEGLIGIBLE = 1e-9
-DOUBTS = (1e-4, 0.01, 0.03, 0.1, 0.3, 1.0)  # shares of the prior in q that are tried
+
+@dataclass(frozen=True)
+class GainSettings:
+    """Settings of the estimate of an expected information gain.
+
+    fewest : least number of draws of a hypothesis
+    replicates : number of noise realisations for each draw
+    spread : number of directions of largest spread, in addition to the discriminants
+    negligible : share of the largest singular value of the whitened draws below which others are negligible,
+        and gain [nats] below which there is none
+    doubts : shares of the prior in q that are tried
+    """
+
+    fewest: int = 4
+    replicates: int = 64
+    spread: int = 1
+    negligible: float = 1e-9
+    doubts: tuple[float, ...] = (1e-4, 0.01, 0.03, 0.1, 0.3, 1.0)
 
 
 @dataclass(frozen=True)
@@ -60,8 +71,9 @@ class Gain:
 
 
 def expected_gain(
-    forces_n: Sequence[Array], noise_n2: ArrayLike, probabilities: ArrayLike, seed: int
-) -> Gain:
+    forces_n: Sequence[Array], noise_n2: ArrayLike, probabilities: ArrayLike, seed: int,
+    settings: GainSettings = GainSettings(),
+) -> Gain:  # fmt: skip
     """Returns the expected gain of an experiment about which hypothesis is true.
 
     forces_n : for each hypothesis the force without noise (draws, m) [N] at posterior draws, at least 4 draws
@@ -71,31 +83,31 @@ def expected_gain(
     Raises InputError for too few draws or hypotheses, or for shapes that do not match.
     """
     noise, prior = np.asarray(noise_n2, dtype=float), np.asarray(probabilities, dtype=float)
-    _refuse(forces_n, noise, prior)
+    _refuse(forces_n, noise, prior, settings.fewest)
     log_prior = np.log(prior / prior.sum())
-    white = _whitened_draws(forces_n, np.linalg.cholesky(noise))
-    rng = np.random.default_rng(seed)
-    of_truth = [np.empty((len(draws), REPLICATES)) for draws in white]  # log p(h | y), where h is true
+    white = _whitened_draws(forces_n, np.linalg.cholesky(noise), settings.negligible)
+    rng, replicates = np.random.default_rng(seed), settings.replicates
+    of_truth = [np.empty((len(draws), replicates)) for draws in white]  # log p(h | y), where h is true
     for h, draws in enumerate(white):
         for i, draw in enumerate(draws):
             others = [np.delete(rows, i, axis=0) if g == h else rows for g, rows in enumerate(white)]
-            axes = _projection_axes(others, np.exp(log_prior))
-            seen = (draw + rng.standard_normal((REPLICATES, len(draw)))) @ axes
+            axes = _projection_axes(others, np.exp(log_prior), settings.spread)
+            seen = (draw + rng.standard_normal((replicates, len(draw)))) @ axes
             of_truth[h][i] = _log_posterior(seen, others, axes, log_prior)[h]
     nats, error2, named = 0.0, 0.0, 0.0
     for log_post, start, share in zip(
-        _mixed_with_prior(of_truth, log_prior), log_prior, np.exp(log_prior), strict=True
+        _mixed_with_prior(of_truth, log_prior, settings.doubts), log_prior, np.exp(log_prior), strict=True
     ):
         each = log_post.mean(axis=1) - start
         nats += share * float(each.mean())
         error2 += share**2 * float(each.var(ddof=1)) / len(each)
         named += share * float(np.exp(log_post).mean())
-    if nats <= NEGLIGIBLE:  # the approximation is no better than the prior
+    if nats <= settings.negligible:  # the approximation is no better than the prior
         nats, named = 0.0, float(np.sum(np.exp(2.0 * log_prior)))
     return Gain(nats, float(np.sqrt(error2)), named)
 
 
-def _mixed_with_prior(of_truth: Sequence[Array], log_prior: Array) -> list[Array]:
+def _mixed_with_prior(of_truth: Sequence[Array], log_prior: Array, doubts: Sequence[float]) -> list[Array]:
     """Returns log q(h | y) from log p(h | y), arrays (draws, replicates) for each hypothesis.
 
     Every second draw belongs to the same half. Each half uses the share of the prior that makes the mean of
@@ -113,15 +125,15 @@ def _mixed_with_prior(of_truth: Sequence[Array], log_prior: Array) -> list[Array
                 np.exp(start) * mixed(log_truth[1 - half :: 2], start, doubt).mean()
                 for log_truth, start in zip(of_truth, log_prior, strict=True)
             )
-            for doubt in DOUBTS
+            for doubt in doubts
         ]
-        best = DOUBTS[int(np.argmax(means))]
+        best = doubts[int(np.argmax(means))]
         for log_truth, start, mixture in zip(of_truth, log_prior, log_q, strict=True):
             mixture[half::2] = mixed(log_truth[half::2], start, best)
     return log_q
 
 
-def _whitened_draws(forces_n: Sequence[Array], root: Array) -> list[Array]:
+def _whitened_draws(forces_n: Sequence[Array], root: Array, negligible: float) -> list[Array]:
     """Returns the whitened draws (n, r) of each hypothesis; the covariance of the noise becomes I.
 
     The coordinates belong to an orthonormal basis of the space of all differences between draws.
@@ -129,13 +141,13 @@ def _whitened_draws(forces_n: Sequence[Array], root: Array) -> list[Array]:
     rows = np.concatenate(list(forces_n))
     white = solve_triangular(root, (rows - rows.mean(axis=0)).T, lower=True).T
     left, size, _ = np.linalg.svd(white, full_matrices=False)
-    kept = size > NEGLIGIBLE * max(size[0], 1e-300)
+    kept = size > negligible * max(size[0], 1e-300)
     kept[0] = True
     inside = left[:, kept] * size[kept]
     return np.split(inside, np.cumsum([len(draws) for draws in forces_n])[:-1])
 
 
-def _projection_axes(draws: Sequence[Array], prior: Array) -> Array:
+def _projection_axes(draws: Sequence[Array], prior: Array, spread_count: int) -> Array:
     """Returns the discriminants and the directions of largest spread as orthonormal columns (r, q)."""
     means = np.array([rows.mean(axis=0) for rows in draws])
     within = sum(
@@ -147,7 +159,7 @@ def _projection_axes(draws: Sequence[Array], prior: Array) -> Array:
     left, size, _ = np.linalg.svd(directions, full_matrices=False)
     left = left[:, : len(draws) - 1][:, size[: len(draws) - 1] > 0.0]
     spread = within - left @ (left.T @ within)
-    widest = np.linalg.svd(spread)[0][:, :SPREAD]
+    widest = np.linalg.svd(spread)[0][:, :spread_count]
     return np.asarray(np.linalg.qr(np.concatenate([left, widest], axis=1))[0])
 
 
@@ -168,7 +180,7 @@ def _log_posterior(seen: Array, draws: Sequence[Array], axes: Array, log_prior: 
     return np.asarray(joint - logsumexp(joint, axis=0))
 
 
-def _refuse(forces_n: Sequence[Array], noise: Array, prior: Array) -> None:
+def _refuse(forces_n: Sequence[Array], noise: Array, prior: Array, fewest: int) -> None:
     if len(forces_n) < 2 or prior.shape != (len(forces_n),) or not np.all(prior > 0.0):
         raise InputError(
             "hypotheses",
@@ -176,9 +188,9 @@ def _refuse(forces_n: Sequence[Array], noise: Array, prior: Array) -> None:
             "at least two, each with a probability above 0",
         )
     for h, forces in enumerate(forces_n):
-        if forces.ndim != 2 or len(forces) < FEWEST or forces.shape[1:] != noise.shape[:1]:
+        if forces.ndim != 2 or len(forces) < fewest or forces.shape[1:] != noise.shape[:1]:
             raise InputError(
                 f"hypothesis {h}",
                 f"forces of shape {forces.shape}",
-                f"at least {FEWEST} draws on {len(noise)} bins",
+                f"at least {fewest} draws on {len(noise)} bins",
             )

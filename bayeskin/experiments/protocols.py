@@ -11,16 +11,39 @@ import numpy as np
 from bayeskin.errors import InputError
 from bayeskin.types import Array, PadMotion, Phase, PhaseKind
 
-# Pads are still if they are slower than this share of the largest speed. Still pads are at rest, not held, if
-# they are within this share of the travel from the lowest level.
-MOVING = 0.05
-STILL_S = (10.0, 60.0)  # shortest and longest hold that is taken from the recording
-LONG_S = 600.0
-BEFORE_S = 5.0  # rest at the start
-LEAST_REACH = 0.2  # least displacement of a changed cycle, as a share of the device's largest displacement
-CHANGE = 0.7  # sd of the logarithm of the random factors
-SHORT_S = 5.0  # added to holds and rests before a factor changes them, so that a hold of 0 s can grow
-MOST_CYCLES = 5
+
+@dataclass(frozen=True)
+class ProtocolSettings:
+    """Settings of the tests that are made from a recorded one.
+
+    Reading a motion
+    moving : share of the largest speed below which pads are still; still pads are at rest, not held, if they
+        are within the same share of the travel from the lowest level
+    still_s : shortest and longest hold that is taken from the recording [s]
+
+    Variations
+    long_s : duration of a long hold or rest [s]
+    before_s : rest at the start [s]
+
+    Random changes
+    change : sd of the logarithm of the random factors
+    least_reach : least displacement of a changed cycle, as a share of the device's largest displacement
+    short_s : time [s] that is added to holds and rests before a factor changes them, so that a hold of 0 s
+        can grow
+    most_cycles : largest number of cycles
+    """
+
+    moving: float = 0.05
+    still_s: tuple[float, float] = (10.0, 60.0)
+    long_s: float = 600.0
+    before_s: float = 5.0
+    change: float = 0.7
+    least_reach: float = 0.2
+    short_s: float = 5.0
+    most_cycles: int = 5
+
+
+PROTOCOLS = ProtocolSettings()
 
 
 @dataclass(frozen=True)
@@ -61,7 +84,7 @@ class Protocol:
     @cached_property
     def motion(self) -> PadMotion:
         """Returns the pads' motion, which begins with a short rest."""
-        time_s, displacement_m = [0.0, BEFORE_S], [0.0, 0.0]
+        time_s, displacement_m = [0.0, PROTOCOLS.before_s], [0.0, 0.0]
         for cycle in self.cycles:
             ramp_s = cycle.reach_m / cycle.speed_m_s
             for lasts_s, level_m in ((ramp_s, cycle.reach_m), (cycle.hold_s, cycle.reach_m), (ramp_s, 0.0),
@@ -85,7 +108,8 @@ class Protocol:
         """
         cycles = [cycle.within(limits) for cycle in self.cycles]
         waits_s = sum(cycle.hold_s + cycle.rest_s for cycle in cycles)
-        available_s = max(limits.longest_s - BEFORE_S - sum(cycle.seconds for cycle in cycles) + waits_s, 0.0)
+        total_s = sum(cycle.seconds for cycle in cycles)
+        available_s = max(limits.longest_s - PROTOCOLS.before_s - total_s + waits_s, 0.0)
         share = min(1.0, available_s / waits_s) if waits_s else 1.0
         return Protocol(self.name, tuple(
             replace(cycle, hold_s=share * cycle.hold_s, rest_s=share * cycle.rest_s) for cycle in cycles
@@ -115,11 +139,11 @@ def variations(motion: PadMotion, limits: Limits) -> tuple[Protocol, ...]:
         "same again": [ordinary] * 2,
         "quarter speed": [replace(ordinary, speed_m_s=0.25 * speed_m_s)] * 2,
         "five times faster": [replace(ordinary, speed_m_s=5.0 * speed_m_s)] * 2,
-        "one long hold": [replace(ordinary, hold_s=LONG_S)],
+        "one long hold": [replace(ordinary, hold_s=PROTOCOLS.long_s)],
         "half displacement": [small] * 2,
         "small, then large": [small, small, ordinary, small, ordinary],
-        "long pause": [replace(ordinary, rest_s=LONG_S), ordinary],
-        "rests at zero": [replace(ordinary, hold_s=0.0, rest_s=2.0 * STILL_S[1])] * 3,
+        "long pause": [replace(ordinary, rest_s=PROTOCOLS.long_s), ordinary],
+        "rests at zero": [replace(ordinary, hold_s=0.0, rest_s=2.0 * PROTOCOLS.still_s[1])] * 3,
         "no holds": [replace(ordinary, hold_s=0.0, rest_s=0.0)] * 4,
     }
     return tuple(Protocol(name, tuple(cycles)).within(limits) for name, cycles in listed.items())
@@ -133,21 +157,22 @@ def changed(protocol: Protocol, limits: Limits, name: str, rng: np.random.Genera
     """
     cycles = list(protocol.cycles)
     added = int(rng.integers(-1, 2))
-    if added > 0 and len(cycles) < MOST_CYCLES:
+    if added > 0 and len(cycles) < PROTOCOLS.most_cycles:
         cycles.append(cycles[-1])
     elif added < 0 and len(cycles) > 1:
         cycles.pop()
     which = range(len(cycles)) if rng.random() < 0.5 else [int(rng.integers(len(cycles)))]
-    factors = np.exp(CHANGE * rng.standard_normal(4))
+    factors = np.exp(PROTOCOLS.change * rng.standard_normal(4))
     for i in which:
         cycles[i] = _scaled(cycles[i], factors, limits)
     return Protocol(name, tuple(cycles)).within(limits)
 
 
 def _scaled(cycle: Cycle, factors: Array, limits: Limits) -> Cycle:
-    reach_m = max(cycle.reach_m * factors[0], LEAST_REACH * limits.largest_m)
+    reach_m = max(cycle.reach_m * factors[0], PROTOCOLS.least_reach * limits.largest_m)
+    short_s = PROTOCOLS.short_s
     hold_s, rest_s = (
-        max((wait_s + SHORT_S) * factor - SHORT_S, 0.0)
+        max((wait_s + short_s) * factor - short_s, 0.0)
         for wait_s, factor in zip((cycle.hold_s, cycle.rest_s), factors[2:], strict=True)
     )
     return Cycle(float(reach_m), float(cycle.speed_m_s * factors[1]), float(hold_s), float(rest_s))
@@ -164,13 +189,13 @@ def own(motion: PadMotion) -> tuple[float, float, float]:
     amplitude = float(np.ptp(motion.displacement_m))
     if amplitude <= 0.0:
         raise InputError("motion", "pads that never move", "at least one ramp")
-    moving = speed > MOVING * speed.max()
+    moving = speed > PROTOCOLS.moving * speed.max()
     mean_speed = float(np.abs(travel[moving]).sum() / lasts[moving].sum())
     level = 0.5 * (motion.displacement_m[1:] + motion.displacement_m[:-1]) - motion.displacement_m.min()
-    held = ~moving & (level > MOVING * amplitude)
+    held = ~moving & (level > PROTOCOLS.moving * amplitude)
     runs = np.split(np.arange(len(lasts)), np.flatnonzero(np.diff(held)) + 1)
     holds = [float(lasts[run].sum()) for run in runs if held[run[0]]]
-    return amplitude, mean_speed, float(np.clip(np.median(holds) if holds else 0.0, *STILL_S))
+    return amplitude, mean_speed, float(np.clip(np.median(holds) if holds else 0.0, *PROTOCOLS.still_s))
 
 
 def phases_of(motion: PadMotion) -> tuple[Phase, ...]:
@@ -182,7 +207,7 @@ def phases_of(motion: PadMotion) -> tuple[Phase, ...]:
     for i, step in enumerate(travel):
         kind: PhaseKind = "load" if step > 0.0 else "unload"
         if step == 0.0:
-            kind = "hold" if motion.displacement_m[i] - lowest > MOVING * reach else "rest"
+            kind = "hold" if motion.displacement_m[i] - lowest > PROTOCOLS.moving * reach else "rest"
         if kind == "load" and turned:
             cycle, turned = cycle + 1, False
         turned = turned or kind in ("unload", "rest")

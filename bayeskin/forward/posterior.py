@@ -7,7 +7,7 @@ import numpy as np
 from bayeskin.finite_element.accuracy import mesh_error
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.inference import LogPosterior, NoisePriors
-from bayeskin.inference.model_error import CALIBRATION, ModelError
+from bayeskin.inference.model_error import ErrorSizes, ModelError
 from bayeskin.inference.noise_model import Windows
 from bayeskin.inference.problem import Excludes
 from bayeskin.types import Array, BinnedForce, PadMotion, ParameterSpace, Surrogate
@@ -41,4 +41,4 @@ def model_error(spec: ModelSpec, motion: PadMotion, edges_s: Array) -> ModelErro
         return None
     known = mesh_error(spec.mesh_hash)
     mesh = UNKNOWN_MESH if known is None else known.rms
-    return ModelError(motion, edges_s, float(np.hypot(mesh, CALIBRATION)))
+    return ModelError(motion, edges_s, float(np.hypot(mesh, ErrorSizes().calibration)))

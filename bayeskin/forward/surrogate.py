@@ -10,10 +10,9 @@ import numpy as np
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.forward.interface import ModelRun
 from bayeskin.hashing import sha256_of
+from bayeskin.inference.problem import FORCE_STEP
 from bayeskin.mechanisms import Mechanism
 from bayeskin.types import Array, ParameterSpace, Surrogate
-
-STEP = 1e-4  # of the width of the prior's box; step for finite differences of a surrogate
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ def slopes(surrogate: Surrogate, theta: Array) -> Array:
     """
     box = surrogate.space.box
     unit = box.to_unit(theta)
-    steps = np.diag(np.where(unit > 0.5, -STEP, STEP))
+    steps = np.diag(np.where(unit > 0.5, -FORCE_STEP, FORCE_STEP))
     rows = np.vstack([theta, np.clip(box.from_unit(unit + steps), box.lower, box.upper)])
     mean = surrogate.predict_mean(rows)
     return np.asarray((mean[1:] - mean[0]).T / np.diag(steps))

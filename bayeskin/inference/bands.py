@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayeskin.errors import InputError
-from bayeskin.inference.gauss_newton import drawn_errors
 from bayeskin.inference.noise_model import (
     KINDS,
     NoiseChain,
@@ -21,10 +20,10 @@ from bayeskin.inference.noise_model import (
     noise_chain,
 )
 from bayeskin.inference.problem import LogPosterior
-from bayeskin.types import Array, BinnedForce, Prediction, _FreezesArrays
+from bayeskin.inference.surrogate_error import drawn_errors
+from bayeskin.types import POINTS_AT_ONCE, Array, BinnedForce, Prediction, _FreezesArrays
 
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
-_CHUNK = 256
 
 
 @dataclass(frozen=True)
@@ -94,8 +93,8 @@ def predictive_draws(log_posterior: LogPosterior, theta: ArrayLike, rng: np.rand
     theta = np.atleast_2d(np.asarray(theta, dtype=float))
     fitted = log_posterior.chain
     chain = _whole_chain(log_posterior.binned, log_posterior.noise_priors)
-    parts = [_predictive(log_posterior, fitted, chain, theta[a : a + _CHUNK], rng)
-             for a in range(0, len(theta), _CHUNK)]  # fmt: skip
+    parts = [_predictive(log_posterior, fitted, chain, theta[a : a + POINTS_AT_ONCE], rng)
+             for a in range(0, len(theta), POINTS_AT_ONCE)]  # fmt: skip
     return ForceDraws(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 

@@ -18,10 +18,19 @@ from bayeskin.types import Array, Prediction, Simulation, Surrogate, _FreezesArr
 FullRun = Callable[[Mapping[str, float]], Simulation]
 Retrain = Callable[[Mapping[str, float], Simulation], Surrogate]
 
-# A surrogate with a correct sd and one dominant error mode exceeds this limit at one point in twenty.
-Z_LIMIT = 2.0
-# An error below this share of the noise does not change the posterior, whatever sd the surrogate claims.
-NOISE_SHARE = 0.1
+
+@dataclass(frozen=True)
+class CheckSettings:
+    """Limits of the surrogate's error at the most probable point.
+
+    z : largest RMS of the errors over their claimed sd; a surrogate with a correct sd and one dominant error
+        mode exceeds it at one point in twenty
+    noise_share : share of the noise below which an error does not change the posterior, whatever sd the
+        surrogate claims
+    """
+
+    z: float = 2.0
+    noise_share: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -64,6 +73,7 @@ def check_map(
     theta: Mapping[str, float],
     noise_sd_n: float = 0.0,
     fitted: NDArray[np.int64] | None = None,
+    settings: CheckSettings = CheckSettings(),
 ) -> MapCheck:
     """Runs the full model at `theta` (SI by name) and returns how far the surrogate is from it.
 
@@ -85,7 +95,7 @@ def check_map(
     error = prediction.mean[0] - simulation.bin_means(surrogate.edges_s)
     rms, largest = float(np.sqrt(np.mean(error**2))), float(np.abs(error).max())
     rms_z = _rms_z(error, prediction.sd()[0])
-    as_claimed, negligible = rms_z <= Z_LIMIT, rms <= NOISE_SHARE * noise_sd_n
+    as_claimed, negligible = rms_z <= settings.z, rms <= settings.noise_share * noise_sd_n
     where_fitted_n = float(np.sqrt(np.mean(error[slice(None) if fitted is None else fitted] ** 2)))
     below_noise = noise_sd_n == 0.0 or where_fitted_n <= noise_sd_n
     text = (
@@ -93,16 +103,16 @@ def check_map(
         f"{rms_z:.2f} of its stated sd"
     )
     if as_claimed and below_noise:
-        text += f": below the limit of {Z_LIMIT:g}"
+        text += f": below the limit of {settings.z:g}"
     elif negligible:
-        text += f", but less than {NOISE_SHARE:g} times the noise ({quantity(noise_sd_n, 'N')})"
+        text += f", but less than {settings.noise_share:g} times the noise ({quantity(noise_sd_n, 'N')})"
     elif as_claimed:
         text += (
             f", but {quantity(where_fitted_n, 'N')} RMS in the fitted bins, more than the noise "
             f"({quantity(noise_sd_n, 'N')}); add the point to the design and train again"
         )
     else:
-        text += f": above the limit of {Z_LIMIT:g}; add the point to the design and train again"
+        text += f": above the limit of {settings.z:g}; add the point to the design and train again"
     passes = bool((as_claimed and below_noise) or negligible)
     return MapCheck(
         material, error, rms, largest, rms_z, _mahalanobis(error, prediction), passes, text, simulation

@@ -19,10 +19,21 @@ from scipy.stats import rankdata
 
 from bayeskin.types import Array, _FreezesArrays
 
-_RESOLVED = 2000  # samples of a series from which its autocorrelation time is computed
-_BURN_IN_LENGTHS = 10  # autocorrelation times after which the start is forgotten
-_RARELY = 0.1  # a walker is stuck if it moves less often than this share of its ensemble's median
-_BELOW = 5.0  # a walker is also stuck if its log density is this many robust sd below its ensemble's median
+
+@dataclass(frozen=True)
+class ConvergenceSettings:
+    """Settings with which the convergence of chains is measured.
+
+    resolved : number of samples of a series from which its autocorrelation time is computed
+    burn_in_lengths : number of autocorrelation times after which the start is forgotten
+    rarely : a walker is stuck if it moves less often than this share of its ensemble's median
+    below : a walker is also stuck if its log density is this many robust sd below its ensemble's median
+    """
+
+    resolved: int = 2000
+    burn_in_lengths: int = 10
+    rarely: float = 0.1
+    below: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -71,37 +82,38 @@ class Convergence(_FreezesArrays):
 
 
 def assess(
-    chains: Array, log_prob: Array, names: tuple[str, ...], limits: Limits, settled: int = 0
-) -> Convergence:
+    chains: Array, log_prob: Array, names: tuple[str, ...], limits: Limits, settled: int = 0,
+    settings: ConvergenceSettings = ConvergenceSettings(),
+) -> Convergence:  # fmt: skip
     """Returns the convergence of chains (E, n, W, D) in sampling coordinates with log densities (E, n, W).
 
     The first `settled` steps always count as burn-in. After them nothing interferes with the chains.
     """
     steps = chains.shape[1]
     # Only the second half is used, because a start that is not yet forgotten would lengthen the time.
-    late = _highest(autocorrelation_steps(chains[:, steps // 2 :]))
-    forgotten = math.ceil(_BURN_IN_LENGTHS * late) if np.isfinite(late) else steps
+    late = _highest(autocorrelation_steps(chains[:, steps // 2 :], settings))
+    forgotten = math.ceil(settings.burn_in_lengths * late) if np.isfinite(late) else steps
     burn_in = max(min(forgotten, steps // 2), settled)
     kept = chains[:, burn_in:]
-    tau = autocorrelation_steps(kept)
+    tau = autocorrelation_steps(kept, settings)
     longest = _highest(tau)
     thin = int(min(max(1, math.ceil(longest)), kept.shape[1])) if np.isfinite(longest) else 1
     ess = np.sum(kept.shape[1] * kept.shape[2] / tau, axis=0)
     thinned = kept[:, ::thin]
     rhat = np.array([split_rhat(thinned[..., j].reshape(len(chains), -1)) for j in range(chains.shape[3])])
     moved = np.any(np.diff(kept, axis=1) != 0.0, axis=3).mean(axis=1)
-    stuck = _stuck_walkers(moved, log_prob[:, burn_in:])
+    stuck = _stuck_walkers(moved, log_prob[:, burn_in:], settings)
     verdict = _verdict(kept.shape[1], tau, ess, rhat, stuck, names, limits)
     return Convergence(steps, burn_in, thin, tau, ess, rhat, moved.mean(axis=1), stuck, verdict)
 
 
-def autocorrelation_steps(chains: Array) -> Array:
+def autocorrelation_steps(chains: Array, settings: ConvergenceSettings = ConvergenceSettings()) -> Array:
     """Returns the integrated autocorrelation time (E, D) [steps] of chains (E, n, W, D).
 
     It is NaN where nothing moves. A walker that never moves in a coordinate has no autocorrelation there and
     is left out. `_stuck_walkers` reports the walkers that move in no coordinate.
     """
-    every = max(1, chains.shape[1] // _RESOLVED)
+    every = max(1, chains.shape[1] // settings.resolved)
     times = np.full((len(chains), chains.shape[3]), np.nan)
     for e, chain in enumerate(chains[:, ::every]):
         moving = np.any(chain != chain[0], axis=0)
@@ -136,12 +148,14 @@ def _rhat(draws: Array) -> float:
     return math.sqrt((n - 1) / n + between / within) if within > 0 else math.inf
 
 
-def _stuck_walkers(moved: Array, log_prob: Array) -> tuple[tuple[int, int], ...]:
-    rarely = moved <= _RARELY * np.median(moved, axis=1, keepdims=True)
+def _stuck_walkers(
+    moved: Array, log_prob: Array, settings: ConvergenceSettings
+) -> tuple[tuple[int, int], ...]:
+    rarely = moved <= settings.rarely * np.median(moved, axis=1, keepdims=True)
     level = np.median(log_prob, axis=1)
     centre = np.median(log_prob, axis=(1, 2))[:, None]
     spread = 1.4826 * np.median(np.abs(log_prob - centre[:, None]), axis=(1, 2))[:, None]
-    low = level < centre - _BELOW * np.maximum(spread, 1e-9)
+    low = level < centre - settings.below * np.maximum(spread, 1e-9)
     return tuple((int(e), int(w)) for e, w in np.argwhere(rarely | low))
 
 

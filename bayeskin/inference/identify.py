@@ -12,20 +12,36 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter1d
 from scipy.stats import rankdata
 
+from bayeskin.inference.problem import UNIFORM_PRECISION
 from bayeskin.number_format import interval, number, quantity
 from bayeskin.types import Array, Parameter, ParameterSpace
 
-_NOTHING_NATS, _NOTHING_CONTRACTION = 0.03, 0.1  # below both, the posterior counts as equal to the prior
-_WEAK = 0.5  # contraction below which the data narrow a parameter only a little
-# A posterior leans on a bound where the outermost 2 % of the prior hold three times their prior mass.
-_EDGE, _LEANS = 0.02, 0.06
-_RIDGE = 0.8  # rank correlation above which two parameters form a ridge
-# Two peaks are separate where the density between them falls below this share of the lower peak.
-_VALLEY = 0.4
-_SIDE = 0.05  # smallest share of the draws that counts as a part
-_CELLS = 200
-
 Side = Literal["lower", "upper"]
+
+
+@dataclass(frozen=True)
+class IdentifiabilitySettings:
+    """Thresholds with which a posterior is compared with its prior.
+
+    nothing_nats, nothing_contraction : below both, the posterior counts as equal to the prior
+    weak : contraction below which the data narrow a parameter only a little
+    edge, leans : a posterior leans on a bound where the outermost share `edge` of the prior holds more than
+        the share `leans` of the draws, three times the prior's mass there
+    ridge : rank correlation above which two parameters form a ridge
+    valley : share of the lower of two peaks; they are separate where the density between them falls below it
+    side : smallest share of the draws that counts as a separate range
+    cells : number of cells of the histogram in which separate ranges are looked for
+    """
+
+    nothing_nats: float = 0.03
+    nothing_contraction: float = 0.1
+    weak: float = 0.5
+    edge: float = 0.02
+    leans: float = 0.06
+    ridge: float = 0.8
+    valley: float = 0.4
+    side: float = 0.05
+    cells: int = 200
 
 
 class Informed(StrEnum):
@@ -140,19 +156,23 @@ class Identifiability:
     ridges: tuple[Ridge, ...]
 
 
-def identifiability(space: ParameterSpace, draws: ArrayLike) -> Identifiability:
+def identifiability(
+    space: ParameterSpace, draws: ArrayLike, settings: IdentifiabilitySettings = IdentifiabilitySettings()
+) -> Identifiability:
     """Returns what posterior draws (s, D) in SI say beyond the prior of `space`."""
     unit = space.to_unit(np.asarray(draws, dtype=float))
-    learned = tuple(map(_learn, space.parameters, unit.T))
+    learned = tuple(_learn(p, own, settings) for p, own in zip(space.parameters, unit.T, strict=True))
     with np.errstate(invalid="ignore"):
         correlation: Array = np.nan_to_num(np.atleast_2d(np.corrcoef(rankdata(unit, axis=0), rowvar=False)))
-    pairs = [(i, j) for j in range(space.dim) for i in range(j) if abs(correlation[i, j]) > _RIDGE]
+    pairs = [(i, j) for j in range(space.dim) for i in range(j) if abs(correlation[i, j]) > settings.ridge]
     pairs.sort(key=lambda pair: -abs(correlation[pair]))
     ridges = [Ridge(space.names[i], space.names[j], float(correlation[i, j])) for i, j in pairs]
     return Identifiability(learned, tuple(ridges))
 
 
-def parts(unit: ArrayLike) -> list[tuple[float, float]]:
+def parts(
+    unit: ArrayLike, settings: IdentifiabilitySettings = IdentifiabilitySettings()
+) -> list[tuple[float, float]]:
     """Returns the separate ranges of the prior-uniform coordinate in which draws (s,) lie.
 
     Each range spans the 5 to 95 % quantiles of its draws. There is a single range unless valleys of the
@@ -160,23 +180,24 @@ def parts(unit: ArrayLike) -> list[tuple[float, float]]:
     interval. The width of the kernel follows from the smaller of sd and scaled interquartile range
     (Silverman 1986, eq. 3.31), because two distant peaks would otherwise blur it.
     """
-    unit = np.asarray(unit, dtype=float)
+    unit, cells = np.asarray(unit, dtype=float), settings.cells
     quartiles = np.diff(np.quantile(unit, [0.25, 0.75]))[0] / 1.34
     width = 0.9 * min(unit.std(), quartiles or unit.std()) * len(unit) ** -0.2
-    counts, edges = np.histogram(unit, _CELLS, (0.0, 1.0))
-    density = gaussian_filter1d(counts.astype(float), max(width * _CELLS, 0.5), mode="reflect")
+    counts, edges = np.histogram(unit, cells, (0.0, 1.0))
+    density = gaussian_filter1d(counts.astype(float), max(width * cells, 0.5), mode="reflect")
     cuts, start = [0], 0
     for valley in np.flatnonzero((density[1:-1] <= density[:-2]) & (density[1:-1] < density[2:])) + 1:
         left, right = density[start:valley], density[valley:]
         mass = counts[start:valley].sum(), counts[valley:].sum()
-        if density[valley] < _VALLEY * min(left.max(), right.max()) and min(mass) > _SIDE * len(unit):
+        is_deep = density[valley] < settings.valley * min(left.max(), right.max())
+        if is_deep and min(mass) > settings.side * len(unit):
             cuts.append(int(valley))
             start = int(valley)
-    pieces = [unit[(unit >= edges[a]) & (unit <= edges[b])] for a, b in pairwise([*cuts, _CELLS])]
+    pieces = [unit[(unit >= edges[a]) & (unit <= edges[b])] for a, b in pairwise([*cuts, cells])]
     return [(float(low), float(high)) for low, high in (np.quantile(piece, [0.05, 0.95]) for piece in pieces)]
 
 
-def noise_remarks(found: Identifiability) -> tuple[str, ...]:
+def noise_remarks(learned: Identifiability) -> tuple[str, ...]:
     """Returns a remark where noise parameters lie at their bounds, since this points to a misfit.
 
     The likelihood then takes the misfit for noise. The noise of a load cell is neither correlated over
@@ -188,7 +209,7 @@ def noise_remarks(found: Identifiability) -> tuple[str, ...]:
             ("tau_noise", "upper", "correlated for as long as its prior allows"),
             ("nu_noise", "lower", "with the heaviest tails that its prior allows"),
         )
-        for parameter in found.parameters
+        for parameter in learned.parameters
         if parameter.name == name and side in parameter.leans_on
     ]
     if not leaning:
@@ -220,24 +241,24 @@ def _spacing_entropy(ordered: Array) -> float:
     return float(np.mean(np.log(spacing * n / (high - low))))
 
 
-def _learn(parameter: Parameter, unit: Array) -> Learned:
+def _learn(parameter: Parameter, unit: Array, settings: IdentifiabilitySettings) -> Learned:
     box = ParameterSpace((parameter,))
 
     def in_si(places: ArrayLike) -> list[float]:
         return [float(value) for value in box.from_unit(np.asarray(places)[:, None])[:, 0]]
 
-    contraction = float(1.0 - 12.0 * unit.var())  # a uniform coordinate has variance 1/12
+    contraction = float(1.0 - UNIFORM_PRECISION * unit.var())
     gain_nats = information_gain_nats(unit)
-    informed = Informed.WELL if contraction >= _WEAK else Informed.WEAKLY
-    if gain_nats < _NOTHING_NATS and abs(contraction) < _NOTHING_CONTRACTION:
+    informed = Informed.WELL if contraction >= settings.weak else Informed.WEAKLY
+    if gain_nats < settings.nothing_nats and abs(contraction) < settings.nothing_contraction:
         informed = Informed.NOT
     low, middle, high = in_si(np.quantile(unit, [0.05, 0.5, 0.95]))
     leans_on: list[Side] = []
     ranges: list[list[float]] = []
     if informed is not Informed.NOT and not parameter.peaked:
-        leans_on += ["lower"] if np.mean(unit < _EDGE) > _LEANS else []
-        leans_on += ["upper"] if np.mean(unit > 1.0 - _EDGE) > _LEANS else []
-        ranges = [in_si(ends) for ends in parts(unit)]
+        leans_on += ["lower"] if np.mean(unit < settings.edge) > settings.leans else []
+        leans_on += ["upper"] if np.mean(unit > 1.0 - settings.edge) > settings.leans else []
+        ranges = [in_si(ends) for ends in parts(unit, settings)]
     separate = tuple((first, last) for first, last in ranges) if len(ranges) > 1 else ()
     return Learned(
         parameter, contraction, gain_nats, informed, (low, middle, high), tuple(leans_on), separate

@@ -21,9 +21,19 @@ from bayeskin.inference.problem import LogPosterior
 from bayeskin.number_format import number
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
-SMOOTHED_FROM = 200  # number of draws from which on the weights are smoothed
-KHAT_LIMIT = 0.7
-EFFECTIVE_SHARE = 0.5  # share of effective draws below which the surrogate's posterior counts as different
+
+@dataclass(frozen=True)
+class WeightSettings:
+    """Settings of importance weights and of their verdict.
+
+    smoothed_from : number of draws from which on the weights are smoothed
+    khat : largest k-hat with which sums of the weights are reliable (Vehtari et al. 2024)
+    effective_share : share of effective draws below which the surrogate's posterior counts as different
+    """
+
+    smoothed_from: int = 200
+    khat: float = 0.7
+    effective_share: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -60,7 +70,10 @@ class Corrected:
     sd_ratio: float
 
 
-def weigh(log_posterior: LogPosterior, theta: ArrayLike, force_n: ArrayLike) -> Weighed:
+def weigh(
+    log_posterior: LogPosterior, theta: ArrayLike, force_n: ArrayLike,
+    settings: WeightSettings = WeightSettings(),
+) -> Weighed:  # fmt: skip
     """Returns posterior draws theta (s, D) in SI with weights, from the full model's forces at them.
 
     force_n (s, m) [N] are the bin means of these forces. A row of NaN stands for a run that failed.
@@ -72,9 +85,9 @@ def weigh(log_posterior: LogPosterior, theta: ArrayLike, force_n: ArrayLike) -> 
         exact = log_posterior.of_full_model(force[ok])
         full = log_likelihood(log_posterior.chain, exact, log_posterior.split(theta[ok])[1])
         log_ratio[ok] = full - log_posterior.log_likelihood(theta[ok])
-    weights, khat = _weights(log_ratio)
+    weights, khat = _weights(log_ratio, settings)
     effective = float(1.0 / np.sum(weights**2)) if ok.any() else 0.0
-    verdict = _verdict(weights, effective, khat, int((~ok).sum()))
+    verdict = _verdict(weights, effective, khat, int((~ok).sum()), settings)
     return Weighed(log_posterior.space, theta, log_ratio, weights, effective, khat, verdict)
 
 
@@ -102,12 +115,12 @@ def corrected(weighed: Weighed, draws: ArrayLike) -> tuple[Corrected, ...]:
     )
 
 
-def _weights(log_ratio: Array) -> tuple[Array, float]:
-    """Returns normalised weights (s,), smoothed from 200 draws on, and k-hat."""
+def _weights(log_ratio: Array, settings: WeightSettings) -> tuple[Array, float]:
+    """Returns normalised weights (s,), smoothed where the draws are many, and k-hat."""
     if not np.isfinite(log_ratio).any():
         return np.zeros(len(log_ratio)), float("nan")
     relative, khat = log_ratio - log_ratio.max(), float("nan")
-    if np.isfinite(relative).sum() >= SMOOTHED_FROM:
+    if np.isfinite(relative).sum() >= settings.smoothed_from:
         import arviz as az  # imported here, because the import takes seconds and is rarely needed
 
         smooth, shape = az.psislw(np.maximum(relative, -700.0))
@@ -116,14 +129,15 @@ def _weights(log_ratio: Array) -> tuple[Array, float]:
     return weights / weights.sum(), khat
 
 
-def _verdict(weights: Array, effective: float, khat: float, failed: int) -> Verdict:
+def _verdict(weights: Array, effective: float, khat: float, failed: int, settings: WeightSettings) -> Verdict:
     count = len(weights)
+    fewest = settings.effective_share * count
     text = (
         f"full model at {count} posterior draws: {effective:.1f} effective draws, at least "
-        f"{EFFECTIVE_SHARE * count:g} are needed; the largest weight is {number(weights.max(), 2)}"
+        f"{fewest:g} are needed; the largest weight is {number(weights.max(), 2)}"
     )
-    good = effective >= EFFECTIVE_SHARE * count
+    good = effective >= fewest
     if np.isfinite(khat):
-        text += f"; Pareto k-hat is {khat:.2f}, at most {KHAT_LIMIT:g} is allowed"
-        good = good and khat <= KHAT_LIMIT
+        text += f"; Pareto k-hat is {khat:.2f}, at most {settings.khat:g} is allowed"
+        good = good and khat <= settings.khat
     return Verdict(bool(good), (text + (f"; {failed} runs failed" if failed else ""),))

@@ -19,6 +19,7 @@ call serves any number of points.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -27,15 +28,42 @@ from numpy.typing import NDArray
 from bayeskin.inference.noise_model import NoiseChain, filter_gains
 from bayeskin.types import Array, Prediction
 
-_STEPS = 40  # upper limit on the steps of the mode search; five or six are usual
-FARTHEST, STIFF = 3.0, 100.0  # number of sd within which z is normal, and the added stiffness beyond
-_REWEIGHTED = 2  # steps of reweighted least squares before Newton steps, which need a start near the mode
-_SLOW = 0.1  # share of the previous decrement above which the curvature is computed anew
-# This many first steps may go too far, because such a step often lands on the side of three sd that the next
-# step needs.
-_PATIENT = 8
-_BACK = 0.3  # factor on the distance from the best point, for a later step that goes too far
-_DECREMENT = 1e-8  # decrement of the log density below which the search for the mode ends
+
+class ErrorPrior(NamedTuple):
+    """Prior of the surrogate's error z, in sd of each column of the factor.
+
+    farthest : number of sd within which z is normal
+    stiff : added stiffness beyond, which makes larger errors practically impossible
+    """
+
+    farthest: float = 3.0
+    stiff: float = 100.0
+
+
+class ModeSearch(NamedTuple):
+    """Settings of the search for the mode of z.
+
+    steps : upper limit on the number of steps; five or six are usual
+    reweighted : number of steps of reweighted least squares before Newton steps, which need a start near the
+        mode
+    slow : share of the previous decrement above which the curvature is computed anew
+    patient : number of first steps that may go too far, because such a step often lands on the side of three
+        sd that the next step needs
+    back : factor on the distance from the best point, for a later step that goes too far
+    decrement : decrement of the log density [nats] below which the search ends
+    """
+
+    steps: int = 40
+    reweighted: int = 2
+    slow: float = 0.1
+    patient: int = 8
+    back: float = 0.3
+    decrement: float = 1e-8
+
+
+# Numba compiles both into the kernel as constants, and its cache notices a change of this file only. So this
+# file is not split.
+ERROR_PRIOR, MODE_SEARCH = ErrorPrior(), ModeSearch()
 # Sums may be reordered for SIMD; infinities and NaN keep their meaning.
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 # The helpers are inlined into `_kernel` before it is compiled. As separate functions, their sums would be
@@ -180,30 +208,30 @@ def _marginal(white: Array, design: Array, rank: int, nu: float, work: Array) ->
     gram, curvature = np.empty((len(design), len(design))), np.empty((rank, rank))
     eps, pulled, bend = work[0], work[1], work[2]
     value, lowest, decrement = np.inf, np.inf, np.inf
-    for step in range(_STEPS):
+    for step in range(MODE_SEARCH.steps):
         value = _energy(white, design, rank, z, nu, eps)
-        if step == 1 and gaussian and np.all(np.abs(z) <= FARTHEST):
+        if step == 1 and gaussian and np.all(np.abs(z) <= ERROR_PRIOR.farthest):
             break  # the integrand is a normal density: one step is exact
         before = decrement
         if value <= lowest + 1e-9:
             lowest = value
             best[:] = z[:rank]
-        elif step >= _PATIENT:
-            z[:rank] = best + (0.0 if step == _PATIENT else _BACK) * (z[:rank] - best)
+        elif step >= MODE_SEARCH.patient:
+            z[:rank] = best + (0.0 if step == MODE_SEARCH.patient else MODE_SEARCH.back) * (z[:rank] - best)
             continue
-        _weights(eps, nu, step, step >= _REWEIGHTED, pulled, bend)
+        _weights(eps, nu, step, step >= MODE_SEARCH.reweighted, pulled, bend)
         _slope(design, z, pulled, gradient)
         if step == 0:
             _gram(design, bend, gram)
         sound, decrement = _solved(gram, z, gradient, change, curvature)
-        if step > 0 and not gaussian and (not sound or decrement > _SLOW * before):
+        if step > 0 and not gaussian and (not sound or decrement > MODE_SEARCH.slow * before):
             _gram(design, bend, gram)
             sound, decrement = _solved(gram, z, gradient, change, curvature)
             if not sound:
                 _weights(eps, nu, step, False, pulled, bend)
                 _gram(design, bend, gram)
                 sound, decrement = _solved(gram, z, gradient, change, curvature)
-        if step > 0 and decrement < _DECREMENT:
+        if step > 0 and decrement < MODE_SEARCH.decrement:
             value -= 0.5 * decrement
             break
         z[:rank] += change
@@ -211,10 +239,10 @@ def _marginal(white: Array, design: Array, rank: int, nu: float, work: Array) ->
         z[:rank] = best
         value = _energy(white, design, rank, z, nu, eps)
     if not gaussian:  # Laplace needs the density's own curvature, not that of a bound or of an earlier point
-        _weights(eps, nu, _STEPS, True, pulled, bend)
+        _weights(eps, nu, MODE_SEARCH.steps, True, pulled, bend)
         _gram(design, bend, gram)
         if not _factored(gram, z, curvature):
-            _weights(eps, nu, _STEPS, False, pulled, bend)
+            _weights(eps, nu, MODE_SEARCH.steps, False, pulled, bend)
             _gram(design, bend, gram)
             _factored(gram, z, curvature)
     for a in range(rank):
@@ -245,8 +273,8 @@ def _energy(white: Array, design: Array, rank: int, z: Array, nu: float, eps: Ar
     eps[:] = white
     square = 0.0
     for a in range(rank):
-        beyond = max(abs(z[a]) - FARTHEST, 0.0)
-        square += z[a] * z[a] + STIFF * beyond * beyond
+        beyond = max(abs(z[a]) - ERROR_PRIOR.farthest, 0.0)
+        square += z[a] * z[a] + ERROR_PRIOR.stiff * beyond * beyond
     for a in range(0, len(design) if square > 0.0 else 0, 4):
         one, two, three, four = design[a], design[a + 1], design[a + 2], design[a + 3]
         for j in range(k):
@@ -288,8 +316,8 @@ def _slope(design: Array, z: Array, pulled: Array, gradient: Array) -> None:
         row, total = design[a], 0.0
         for j in range(len(pulled)):
             total += row[j] * pulled[j]
-        beyond = max(abs(z[a]) - FARTHEST, 0.0)
-        gradient[a] = total - z[a] - math.copysign(STIFF * beyond, z[a])
+        beyond = max(abs(z[a]) - ERROR_PRIOR.farthest, 0.0)
+        gradient[a] = total - z[a] - math.copysign(ERROR_PRIOR.stiff * beyond, z[a])
 
 
 @nb.njit(fastmath=_FAST, inline="always")
@@ -327,7 +355,7 @@ def _factored(gram: Array, z: Array, lower: Array) -> bool:
         for b in range(a + 1):
             total = gram[a, b]
             if a == b:
-                total += 1.0 + STIFF if abs(z[a]) > FARTHEST else 1.0
+                total += 1.0 + ERROR_PRIOR.stiff if abs(z[a]) > ERROR_PRIOR.farthest else 1.0
             for c in range(b):
                 total -= lower[a, c] * lower[b, c]
             if a != b:

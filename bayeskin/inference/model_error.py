@@ -15,6 +15,7 @@ skin: the intervals of the moduli become as narrow as the noise alone allows.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,11 +24,22 @@ import numpy as np
 from bayeskin.types import Array, PadMotion, Prediction
 from bayeskin.types.joint import recording_at
 
-CALIBRATION = 0.01  # sd of a factor on the force: the error of a load cell of class 1 (ISO 7500-1:2018)
-BEND = 3e-3  # b, a share of the force
-RELAXING = 1.5e-3  # c, a share of the largest force
-# tau_i. A response can be told from another that is three times slower, but hardly from one twice as slow.
-RELAXATION_S = (3.0, 12.0, 50.0)
+
+@dataclass(frozen=True)
+class ErrorSizes:
+    """Sizes (sd) and times of the errors that are allowed for the full model and the load cell.
+
+    calibration : sd of a factor on the force, the error of a load cell of class 1 (ISO 7500-1:2018)
+    bend : b, as a share of the force (`benchmarks/mesh_shapes.py`)
+    relaxing : c, as a share of the largest force (`benchmarks/mesh_shapes.py`)
+    relaxation_s : tau_i [s]. A response can be told from another that is three times slower, but hardly from
+        one twice as slow.
+    """
+
+    calibration: float = 0.01
+    bend: float = 3e-3
+    relaxing: float = 1.5e-3
+    relaxation_s: tuple[float, ...] = (3.0, 12.0, 50.0)
 
 
 @dataclass(frozen=True)
@@ -41,6 +53,7 @@ class ModelError:
     edges_s: Array
     amplitude: float
     measured_n: Array | None = None
+    sizes: ErrorSizes = ErrorSizes()
 
     def beside(self, prediction: Prediction) -> Prediction:
         """Returns the prediction with these errors as further columns of its factor."""
@@ -55,25 +68,26 @@ class ModelError:
     @property
     def columns(self) -> int:
         """Returns the number of these errors."""
-        return 2 + len(RELAXATION_S) + (0 if self.measured_n is None else len(self.measured_n))
+        return 2 + len(self.sizes.relaxation_s) + (0 if self.measured_n is None else len(self.measured_n))
 
     @cached_property
     def _sd(self) -> Array:
-        return np.array([self.amplitude, BEND, *[RELAXING] * len(RELAXATION_S)])
+        sizes = self.sizes
+        return np.array([self.amplitude, sizes.bend, *[sizes.relaxing] * len(sizes.relaxation_s)])
 
     @cached_property
     def _shapes(self) -> tuple[Array, Array]:
-        return shapes(self.motion, self.edges_s)
+        return shapes(self.motion, self.edges_s, self.sizes.relaxation_s)
 
 
-def shapes(motion: PadMotion, edges_s: Array) -> tuple[Array, Array]:
+def shapes(motion: PadMotion, edges_s: Array, relaxation_s: Sequence[float]) -> tuple[Array, Array]:
     """Returns the factors (2, m) that multiply the force in each bin, and the relaxing responses (k, m)."""
     middle = 0.5 * (edges_s[1:] + edges_s[:-1])
     share = motion.at(middle) / float(np.max(np.abs(motion.displacement_m)))
-    return np.stack([np.ones(len(middle)), 2.0 * share - 1.0]), relaxing(motion, middle)
+    return np.stack([np.ones(len(middle)), 2.0 * share - 1.0]), relaxing(motion, middle, relaxation_s)
 
 
-def relaxing(motion: PadMotion, time_s: Array) -> Array:
+def relaxing(motion: PadMotion, time_s: Array, relaxation_s: Sequence[float]) -> Array:
     """Returns the force (k, m) of springs and dashpots in series at given times, stretched by d / max d.
 
     It is exact, because a protocol is straight between its corners. Each of several recordings starts
@@ -83,15 +97,15 @@ def relaxing(motion: PadMotion, time_s: Array) -> Array:
         recording = recording_at(motion.spans, time_s)
         return np.concatenate(
             [
-                relaxing(part, time_s[recording == number] - span.start_s)
+                relaxing(part, time_s[recording == number] - span.start_s, relaxation_s)
                 for number, (part, span) in enumerate(zip(motion.parts, motion.spans, strict=True))
             ],
             axis=1,
         )
     largest = float(np.max(np.abs(motion.displacement_m)))
     rate = np.diff(motion.displacement_m) / largest / np.diff(motion.time_s)
-    out = np.zeros((len(RELAXATION_S), len(time_s)))
-    for row, tau in zip(out, RELAXATION_S, strict=True):
+    out = np.zeros((len(relaxation_s), len(time_s)))
+    for row, tau in zip(out, relaxation_s, strict=True):
         for start, end, speed in zip(motion.time_s[:-1], motion.time_s[1:], rate, strict=True):
             since = np.maximum(time_s - start, 0.0)
             after = np.maximum(time_s - end, 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import emcee
@@ -12,12 +13,40 @@ from bayeskin.inference.coordinates import MoveCoordinates
 from bayeskin.inference.proposal import Mixture, Product
 from bayeskin.types import Array
 
-_CROSSOVER = (0.15, 0.3, 1.0)  # shares of the coordinates that a step moves
-# Share of steps of full length, which can lead from mode to mode; sd of the noise that lets steps fill space.
-_JUMP, _JITTER = 0.1, 1e-5
-_TRIES = 5  # points from which a walker chooses
-_WALKERS_A_COORDINATE = 3  # walkers for each coordinate below which no tries are made
-_GAMMA = 1.7  # about 2.38 / sqrt(2), which is optimal for the difference of two projected points
+
+@dataclass(frozen=True)
+class MoveSettings:
+    """Settings of the moves of an ensemble.
+
+    Differential evolution
+    crossover : shares of the coordinates that a step moves
+    jump : share of steps of full length, which can lead from mode to mode
+    jitter : sd of the noise that lets steps fill space
+    snooker : factor on the projected difference of two walkers, about 2.38 / sqrt(2), which is optimal
+
+    Tries
+    tries : number of points from which a walker chooses
+    walkers_a_coordinate : number of walkers for each coordinate below which no tries are made
+
+    Shares of the steps
+    known_tries, own_tries : share of tries from a known distribution, and from one fitted to the walkers
+    others : shares of differential evolution, stretch and snooker among the remaining steps. Accepted tries
+        forget the position fastest. Differential evolution makes progress where tries are rejected. Stretch
+        and snooker moves keep it from depending on a single scale.
+    """
+
+    crossover: tuple[float, ...] = (0.15, 0.3, 1.0)
+    jump: float = 0.1
+    jitter: float = 1e-5
+    snooker: float = 1.7
+    tries: int = 5
+    walkers_a_coordinate: int = 3
+    known_tries: float = 0.8
+    own_tries: float = 0.6
+    others: tuple[float, float, float] = (0.8, 0.1, 0.1)
+
+
+MOVES = MoveSettings()
 
 
 class SnookerMove(emcee.moves.red_blue.RedBlueMove):
@@ -43,7 +72,7 @@ class SnookerMove(emcee.moves.red_blue.RedBlueMove):
         apart = length > 0.0
         length = np.where(apart, length, 1.0)
         unit = line / length[:, None]
-        step = _GAMMA * np.einsum("nd,nd->n", unit, first - second)
+        step = MOVES.snooker * np.einsum("nd,nd->n", unit, first - second)
         proposal = walkers + step[:, None] * unit
         with np.errstate(divide="ignore"):
             factor = (walkers.shape[1] - 1) * np.log(np.abs(length + step) / length)
@@ -65,11 +94,12 @@ class SubspaceMove(emcee.moves.red_blue.RedBlueMove):
         count, dim = walkers.shape
         picks = random.random_sample((count, len(others))).argsort(axis=1)[:, :2]
         first, second = others[picks.T]
-        rate = random.choice(_CROSSOVER, size=count)[:, None]
+        rate = random.choice(MOVES.crossover, size=count)[:, None]
         moved = random.random_sample((count, dim)) < rate
         moved[np.arange(count), random.randint(dim, size=count)] = True
-        gamma = np.where(random.random_sample(count) < _JUMP, 1.0, 2.38 / np.sqrt(2.0 * moved.sum(axis=1)))
-        step = gamma[:, None] * (first - second) + _JITTER * random.standard_normal((count, dim))
+        full = random.random_sample(count) < MOVES.jump
+        gamma = np.where(full, 1.0, 2.38 / np.sqrt(2.0 * moved.sum(axis=1)))
+        step = gamma[:, None] * (first - second) + MOVES.jitter * random.standard_normal((count, dim))
         return walkers + moved * step, np.zeros(count)
 
 
@@ -104,20 +134,20 @@ class TriesMove(emcee.moves.Move):
         accepted: NDArray[np.bool_],
     ) -> None:  # fmt: skip
         """Moves the walkers `own` in `state`, and marks in `accepted` which of them have moved."""
-        y = self.coordinates.forward(state.coords[own])
-        tries = proposal.draw(len(own) * _TRIES, model.random)
+        y, count = self.coordinates.forward(state.coords[own]), MOVES.tries
+        tries = proposal.draw(len(own) * count, model.random)
         points = self.coordinates.back(tries)
         log_prob, _ = model.compute_log_prob_fn(points)
         weight = log_prob + self.coordinates.log_volume(tries) - proposal.log_density(tries)
-        weight = weight.reshape(len(own), _TRIES)
+        weight = weight.reshape(len(own), count)
         stay = state.log_prob[own] + self.coordinates.log_volume(y) - proposal.log_density(y)
         top = np.maximum(weight.max(axis=1), stay)
         weight, stay = np.exp(weight - top[:, None]), np.exp(stay - top)
         total = weight.sum(axis=1)
         row, level = np.arange(len(own)), model.random.random_sample(len(own)) * total
-        chosen = np.minimum((np.cumsum(weight, axis=1) < level[:, None]).sum(axis=1), _TRIES - 1)
+        chosen = np.minimum((np.cumsum(weight, axis=1) < level[:, None]).sum(axis=1), count - 1)
         moves = model.random.random_sample(len(own)) * (total - weight[row, chosen] + stay) < total
-        movers, picks = own[moves], (row * _TRIES + chosen)[moves]
+        movers, picks = own[moves], (row * count + chosen)[moves]
         state.coords[movers], state.log_prob[movers], accepted[movers] = points[picks], log_prob[picks], True
 
 
@@ -129,11 +159,9 @@ def mixed_moves(
     Tries come from the distribution `known`. Without a known distribution, tries are made only if the walkers
     are many enough: half of them must define a distribution in so many coordinates. Otherwise the tries miss.
     """
-    # Accepted tries forget the position fastest. Differential evolution makes progress where tries are
-    # rejected. Stretch and snooker moves keep it from depending on a single scale.
-    enough = walkers >= _WALKERS_A_COORDINATE * len(coordinates.low)
-    tries = 0.8 if known is not None else 0.6 if enough else 0.0
-    kinds = ((SubspaceMove, 0.8), (emcee.moves.StretchMove, 0.1), (SnookerMove, 0.1))
+    enough = walkers >= MOVES.walkers_a_coordinate * len(coordinates.low)
+    tries = MOVES.known_tries if known is not None else MOVES.own_tries if enough else 0.0
+    kinds = zip((SubspaceMove, emcee.moves.StretchMove, SnookerMove), MOVES.others, strict=True)
     moves = [(_in_move_coordinates(kind)(coordinates), (1.0 - tries) * share) for kind, share in kinds]
     return [(TriesMove(coordinates, known), tries), *moves] if tries else moves
 

@@ -20,16 +20,9 @@ from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.reparametrisation import Shear, find_shear
 from bayeskin.types import Array
 
-# Starts within this many nats of the best have reached the same maximum, even where it is flat around.
-_AGREE = 0.1
 # NLopt 2.11 has its own base class of errors; earlier versions raise Python's errors.
 _ERRORS = (nlopt.RoundoffLimited, getattr(nlopt, "exception", RuntimeError), RuntimeError, MemoryError)
 _WORST = -1e30  # value of a point without a density, because NLopt needs finite values
-_LEVELS = 3.0  # range of log amplitudes that is searched on either side of the recorded force's
-_STEP = 1e-6  # step of central differences in a unit coordinate
-_STEEP = 1e4  # nats that the density falls per box width outside the prior
-_CLIMBS = 16  # number of Gauss-Newton climbs from the prior that make one start
-_POPULATION = 10  # members of differential evolution for each parameter
 _STATUS = {
     nlopt.SUCCESS: "converged",
     nlopt.STOPVAL_REACHED: "converged",
@@ -38,6 +31,33 @@ _STATUS = {
     nlopt.MAXEVAL_REACHED: "stopped at the evaluation limit",
     nlopt.MAXTIME_REACHED: "stopped at the time limit",
 }
+
+
+@dataclass(frozen=True)
+class OptimiserSettings:
+    """Settings of the search for the most probable point.
+
+    agree : difference in log density [nats] up to which two starts have reached the same maximum, even where
+        it is flat around
+    levels : range of log amplitudes that is searched on either side of the recorded force's
+    step : step of central differences in a unit coordinate
+    steep : nats that the density falls per box width outside the prior
+    climbs : number of Gauss-Newton climbs from the prior that make one start
+    population : number of members of differential evolution for each parameter
+    reached, settled : change in log density [nats] below which a global and a local search of NLopt end
+    """
+
+    agree: float = 0.1
+    levels: float = 3.0
+    step: float = 1e-6
+    steep: float = 1e4
+    climbs: int = 16
+    population: int = 10
+    reached: float = 1e-3
+    settled: float = 1e-6
+
+
+OPTIMISER = OptimiserSettings()
 
 
 @dataclass(frozen=True)
@@ -72,7 +92,7 @@ class MapResult:
     @property
     def message(self) -> str:
         """Returns a sentence that says whether to rely on the maximum, and what to do if not."""
-        reached = [kind for kind, value in self.by_search.items() if value >= self.value - _AGREE]
+        reached = [kind for kind, value in self.by_search.items() if value >= self.value - OPTIMISER.agree]
         summary = f"{round(self.agreement * len(self.starts))} of {len(self.starts)} starts reached it"
         summary += f", by {', '.join(reached)}"
         if len(reached) > 1 or self.agreement >= 0.5:
@@ -109,10 +129,10 @@ def find_map(
         results.append(_one_start(space, list(SEARCHES)[index % len(SEARCHES)], int(state), evaluations))
         if progress:
             progress((index + 1) / starts, f"start {index + 1} of {starts}: {results[-1].value:.2f}")
-        if index + 1 == len(SEARCHES) and np.ptp([r.value for r in results]) <= _AGREE:
+        if index + 1 == len(SEARCHES) and np.ptp([r.value for r in results]) <= OPTIMISER.agree:
             break
     best = max(results, key=lambda r: r.value)
-    agreement = float(np.mean([r.value >= best.value - _AGREE for r in results]))
+    agreement = float(np.mean([r.value >= best.value - OPTIMISER.agree for r in results]))
     return MapResult(best.theta, best.value, tuple(results), agreement)
 
 
@@ -132,7 +152,7 @@ def climb(
     search.best = space.unit(np.clip(log_posterior.vector(start), low, high)[None])[0]
     status = "failed: no point with a density above zero"
     for algorithm in (nlopt.LD_LBFGS, nlopt.LN_SBPLX, nlopt.LD_LBFGS):
-        status = search.run(algorithm, search.best, evaluations // 3, 1e-6)
+        status = search.run(algorithm, search.best, evaluations // 3, OPTIMISER.settled)
     theta = log_posterior.from_sampling(space.points(search.best[None])[0][0])
     return StartResult(log_posterior.named(theta), search.value, status, search.evaluations)
 
@@ -146,7 +166,7 @@ def _one_start(search_space: SearchSpace, kind: str, seed: int, evaluations: int
         reached = search_space.points(search.best[None])[0][0]
         search.offer(gauss_newton(log_posterior, reached, search_space.shear).vector)
         for algorithm in (nlopt.LD_LBFGS, nlopt.LN_SBPLX):
-            status = search.run(algorithm, search.best, evaluations // 4, 1e-6)
+            status = search.run(algorithm, search.best, evaluations // 4, OPTIMISER.settled)
     theta = log_posterior.from_sampling(search_space.points(search.best[None])[0][0])
     return StartResult(log_posterior.named(theta), search.value, status, search.evaluations, kind)
 
@@ -154,23 +174,23 @@ def _one_start(search_space: SearchSpace, kind: str, seed: int, evaluations: int
 def _controlled_random(search: Search, seed: int, evaluations: int) -> None:
     nlopt.srand(seed)
     unit = np.random.default_rng(seed).uniform(size=len(search.best))
-    search.run(nlopt.GN_CRS2_LM, unit, evaluations, 1e-3)
+    search.run(nlopt.GN_CRS2_LM, unit, evaluations, OPTIMISER.reached)
 
 
 def _evolution(search: Search, seed: int, evaluations: int) -> None:
     dim = len(search.best)
-    generations = max(evaluations // (_POPULATION * dim) - 1, 1)
+    generations = max(evaluations // (OPTIMISER.population * dim) - 1, 1)
     differential_evolution(
         lambda columns: -search.offer_unit(columns.T), [(0.0, 1.0)] * dim, maxiter=generations,
-        popsize=_POPULATION, tol=0.0, atol=_AGREE, polish=False, updating="deferred", vectorized=True,
-        seed=np.random.default_rng(seed),
+        popsize=OPTIMISER.population, tol=0.0, atol=OPTIMISER.agree, polish=False, updating="deferred",
+        vectorized=True, seed=np.random.default_rng(seed),
     )  # fmt: skip
 
 
 def _climbs(search: Search, seed: int, evaluations: int) -> None:
     log_posterior, shear = search.space.log_posterior, search.space.shear
     low, high = log_posterior.bounds
-    for start in np.random.default_rng(seed).uniform(low, high, (_CLIMBS, len(low))):
+    for start in np.random.default_rng(seed).uniform(low, high, (OPTIMISER.climbs, len(low))):
         search.offer(gauss_newton(log_posterior, start, shear).vector)
 
 
@@ -185,7 +205,7 @@ class SearchSpace:
             level = (self.low[group].mean(), self.high[group].mean())
             self.low[group], self.high[group] = self.low[group] - level[1], self.high[group] - level[0]
             first = int(np.argmax(group))
-            self.low[first], self.high[first] = -_LEVELS, _LEVELS
+            self.low[first], self.high[first] = -OPTIMISER.levels, OPTIMISER.levels
 
     def points(self, unit: Array) -> tuple[Array, Array]:
         """Returns sampling coordinates (n, D) moved into the prior box, and by how many box widths (n,)."""
@@ -204,7 +224,7 @@ class SearchSpace:
     def values(self, unit: Array) -> Array:
         """Returns log densities (n,), always finite; outside the prior box a steep cone is subtracted."""
         inside, outside = self.points(unit)
-        return np.maximum(self.log_posterior.log_prob(inside) - _STEEP * outside, _WORST)
+        return np.maximum(self.log_posterior.log_prob(inside) - OPTIMISER.steep * outside, _WORST)
 
 
 class Search:
@@ -219,13 +239,13 @@ class Search:
     def __call__(self, unit: Array, gradient: Array) -> float:
         trials = unit[None]
         if gradient.size:
-            step = _STEP * np.eye(len(unit))
+            step = OPTIMISER.step * np.eye(len(unit))
             trials = np.concatenate([trials, unit + step, unit - step])
         values = self.space.values(trials)
         self.evaluations += len(trials)
         if gradient.size:
             up, down = values[1:].reshape(2, -1)
-            gradient[:] = (up - down) / (2 * _STEP)
+            gradient[:] = (up - down) / (2 * OPTIMISER.step)
         if values[0] > max(self.value, _WORST):
             self.best, self.value = np.array(unit), float(values[0])
         return float(values[0])

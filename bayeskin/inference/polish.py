@@ -18,15 +18,27 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayeskin.inference.optimise import climb
-from bayeskin.inference.problem import LogPosterior
+from bayeskin.inference.problem import HELD, LogPosterior
 from bayeskin.types import Array, ParameterSpace, Prediction, Simulation
 
 FullRun = Callable[[Mapping[str, float]], Simulation]
 
-# Half-widths of the trust region, in the logarithm of a parameter (or as a share of its prior's range): the
-# largest, the smallest, and one that holds the parameter at the run.
-TRUST, SMALLEST_TRUST, RUN_ITSELF = 1.0, 0.02, 1e-9
-ENOUGH = 0.05  # nats still to be gained below which the polish ends; far less than distinguishes two points
+
+@dataclass(frozen=True)
+class PolishSettings:
+    """Settings of a polish; half-widths are in the logarithm of a parameter, or a share of its prior's range.
+
+    largest, smallest : half-width of the trust region at the start, which is its largest, and the half-width
+        below which the polish ends
+    shrinks, grows : factors on the half-width after a run that is no better, and after a better one
+    enough : gain [nats] below which the polish ends, because it is far less than distinguishes two points
+    """
+
+    largest: float = 1.0
+    smallest: float = 0.02
+    shrinks: float = 0.25
+    grows: float = 2.0
+    enough: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -85,12 +97,13 @@ def polish_map(
     full_run: FullRun,
     start: Mapping[str, float],
     rounds: int = 6,
+    settings: PolishSettings = PolishSettings(),
 ) -> Polished:
     """Returns the maximum by Gauss-Newton from `start` (all parameters, SI), on full runs with derivatives.
 
     A full run that fails ends the polish with the best point so far, which is `start` for the first run.
     """
-    best, value, trust = dict(start), -np.inf, TRUST
+    best, value, trust = dict(start), -np.inf, settings.largest
     local: LogPosterior | None = None
     trial, first = dict(start), -np.inf
     runs: list[tuple[float, Simulation]] = []
@@ -99,18 +112,18 @@ def polish_map(
         if run.status != "ok":
             return Polished(best, value, value - first, runs, f"a full run failed: {run.message}")
         linearised = _linearised(log_posterior, run)
-        exact = _maximum(linearised, trial, RUN_ITSELF)  # finds the most probable noise for this run
+        exact = _maximum(linearised, trial, HELD)  # finds the most probable noise for this run
         runs.append((exact[1], run))
         if exact[1] > value:
             first = exact[1] if len(runs) == 1 else first
             best, value, local = exact[0], exact[1], linearised
-            trust = trust if len(runs) == 1 else min(2.0 * trust, TRUST)
+            trust = trust if len(runs) == 1 else min(settings.grows * trust, settings.largest)
         else:
-            trust *= 0.25
-        if local is None or trust < SMALLEST_TRUST:
+            trust *= settings.shrinks
+        if local is None or trust < settings.smallest:
             break
         trial, promised = _maximum(local, best, trust)
-        if promised - value < ENOUGH:
+        if promised - value < settings.enough:
             return Polished(best, value, value - first, runs, f"converged after {len(runs)} full runs")
     return Polished(best, value, value - first, runs, f"stopped after {len(runs)} full runs")
 
@@ -137,7 +150,7 @@ def _maximum(
     linear, narrowed = about.surrogate, []
     assert isinstance(linear, LinearForce)
     for p, moves in zip(linear.space.parameters, linear.moves, strict=True):
-        reach = trust if moves else RUN_ITSELF
+        reach = trust if moves else HELD
         middle = float(np.clip(centre[p.name], p.lower, p.upper))
         if p.in_log:
             low, high = middle * np.exp(-reach), middle * np.exp(reach)

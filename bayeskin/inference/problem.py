@@ -21,9 +21,12 @@ from bayeskin.errors import InputError
 from bayeskin.inference.likelihood import log_likelihood
 from bayeskin.inference.model_error import ModelError
 from bayeskin.inference.noise_model import NoiseChain, NoisePriors, noise_chain, noise_space
-from bayeskin.types import Array, BinnedForce, ParameterSpace, Prediction, Surrogate
+from bayeskin.types import POINTS_AT_ONCE, Array, BinnedForce, ParameterSpace, Prediction, Surrogate
 
-_CHUNK = 256  # points that are predicted at once, so that factors of many bins stay small in memory
+# Half-width of the prior of a parameter that is held, in its logarithm or as a share of its prior's range.
+HELD = 1e-9
+FORCE_STEP = 1e-4  # step of one-sided differences of a surrogate's force, as a share of the prior's box
+UNIFORM_PRECISION = 12.0  # inverse variance of a uniform prior over the unit cube
 
 # Returns for parameters (n, d) of a space whether the prior is zero there, (n,).
 Excludes = Callable[[ParameterSpace, Array], NDArray[np.bool_]]
@@ -259,7 +262,7 @@ class LogPosterior:
 
 
 def _chunks(index: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    return [index[a : a + _CHUNK] for a in range(0, len(index), _CHUNK)]
+    return [index[a : a + POINTS_AT_ONCE] for a in range(0, len(index), POINTS_AT_ONCE)]
 
 
 def _check_inside(material: ParameterSpace, box: ParameterSpace) -> None:

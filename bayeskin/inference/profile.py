@@ -15,13 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayeskin.inference.gauss_newton import gauss_newton
-from bayeskin.inference.problem import LogPosterior
+from bayeskin.inference.problem import HELD, LogPosterior
 from bayeskin.inference.reparametrisation import Shear, find_shear
 from bayeskin.types import Array, Parameter, ParameterSpace, _FreezesArrays
 
 DROP = 1.353  # nats below the top: half the 90 % quantile of chi-square with one degree of freedom
-_HELD = 1e-9  # half-width of a held parameter's prior, as a share of its value or of its prior's range
-_ROUNDS = 12
+_ROUNDS = 12  # largest number of rounds of a climb
 
 
 @dataclass(frozen=True)
@@ -125,7 +124,7 @@ def _maximum_with_held(
 
 
 def _narrowed(parameter: Parameter, value: float) -> Parameter:
-    reach = _HELD * (abs(value) if parameter.in_log else parameter.upper - parameter.lower)
+    reach = HELD * (abs(value) if parameter.in_log else parameter.upper - parameter.lower)
     lower = min(max(value - reach, parameter.lower), parameter.upper - 2 * reach)
     return replace(parameter, lower=lower, upper=lower + 2 * reach)
 

@@ -16,10 +16,27 @@ from scipy.special import gammaln, logsumexp
 
 from bayeskin.types import Array, _FreezesArrays
 
-_FREEDOM = 5.0  # degrees of freedom of the t-distributions, whose tails reach where no draw has been yet
-_COMPONENTS, _ROUNDS = 24, 15  # largest number of components; rounds of expectation maximisation
-_PRIOR = 5.0  # weight of the prior on a component's spread, in draws for each coordinate
-_FIRST, _NARROW = 0.1, 0.005  # spread at the start and in the prior, as shares of the covariance of all draws
+
+@dataclass(frozen=True)
+class MixtureSettings:
+    """Settings of a mixture of t-distributions and of its fit to draws.
+
+    freedom : degrees of freedom of the t-distributions, whose tails reach where no draw has been yet
+    components : largest number of components
+    rounds : number of rounds of expectation maximisation
+    prior : weight of the prior on a component's spread, in draws for each coordinate
+    first, narrow : spread at the start and in the prior, as shares of the covariance of all draws
+    """
+
+    freedom: float = 5.0
+    components: int = 24
+    rounds: int = 15
+    prior: float = 5.0
+    first: float = 0.1
+    narrow: float = 0.005
+
+
+MIXTURE = MixtureSettings()
 
 
 @dataclass(frozen=True)
@@ -50,11 +67,11 @@ class Mixture(_FreezesArrays):
         """
         count, dim = points.shape
         spread = np.atleast_2d(np.cov(points.T)) + 1e-9 * np.eye(dim)
-        start = rng.choice(count, min(_COMPONENTS, count // (2 * dim) + 1), replace=False)
-        roots = np.repeat(np.linalg.cholesky(_FIRST * spread)[None], len(start), axis=0)
+        start = rng.choice(count, min(MIXTURE.components, count // (2 * dim) + 1), replace=False)
+        roots = np.repeat(np.linalg.cholesky(MIXTURE.first * spread)[None], len(start), axis=0)
         mixture = cls(np.full(len(start), 1.0 / len(start)), points[start], roots)
-        for _ in range(_ROUNDS):
-            mixture = mixture._maximised(points, _PRIOR * dim, _NARROW * spread)
+        for _ in range(MIXTURE.rounds):
+            mixture = mixture._maximised(points, MIXTURE.prior * dim, MIXTURE.narrow * spread)
         return mixture
 
     def _maximised(self, points: Array, prior: float, narrow: Array) -> Mixture:
@@ -69,7 +86,7 @@ class Mixture(_FreezesArrays):
         size = share.sum(axis=0)
         kept = size >= min(dim, size.max())
         share, size = share[:, kept], size[kept]
-        pull = share * (_FREEDOM + dim) / (_FREEDOM + squared[:, kept])
+        pull = share * (MIXTURE.freedom + dim) / (MIXTURE.freedom + squared[:, kept])
         centres = (pull.T @ points) / pull.sum(axis=0)[:, None]
         differences = [points - centre for centre in centres]
         spreads = np.stack([(away * pull[:, k, None]).T @ away for k, away in enumerate(differences)])
@@ -79,7 +96,7 @@ class Mixture(_FreezesArrays):
     def draw(self, count: int, random: np.random.RandomState) -> Array:
         """Returns points (count, d) drawn from the mixture."""
         component = random.choice(len(self.weights), count, p=self.weights)
-        size = np.sqrt(random.chisquare(_FREEDOM, (count, 1)) / _FREEDOM)
+        size = np.sqrt(random.chisquare(MIXTURE.freedom, (count, 1)) / MIXTURE.freedom)
         normal = random.standard_normal((count, self.centres.shape[1])) / size
         return np.asarray(self.centres[component] + np.einsum("nij,nj->ni", self.roots[component], normal))
 
@@ -95,12 +112,10 @@ class Mixture(_FreezesArrays):
 
     def _log_densities(self, squared: Array) -> Array:
         """Returns the log (n, k) of the components' densities times their weights."""
-        dim = self.centres.shape[1]
+        dim, nu = self.centres.shape[1], MIXTURE.freedom
         sizes = np.log(np.diagonal(self.roots, axis1=1, axis2=2)).sum(axis=1)
-        norm = (
-            gammaln(0.5 * (_FREEDOM + dim)) - gammaln(0.5 * _FREEDOM) - 0.5 * dim * np.log(_FREEDOM * np.pi)
-        )
-        bend = 0.5 * (_FREEDOM + dim) * np.log1p(squared / _FREEDOM)
+        norm = gammaln(0.5 * (nu + dim)) - gammaln(0.5 * nu) - 0.5 * dim * np.log(nu * np.pi)
+        bend = 0.5 * (nu + dim) * np.log1p(squared / nu)
         return np.asarray(np.log(self.weights) - sizes + norm - bend)
 
 

@@ -26,14 +26,25 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from bayeskin.inference.problem import LogPosterior
-from bayeskin.types import Array, _FreezesArrays
+from bayeskin.types import POINTS_AT_ONCE, Array, _FreezesArrays
 
-_POINTS = 2048  # points of the prior from which the amplitude is learnt
-_CHUNK = 256
-_MIN_SHARE = 0.02  # mean share of the amplitude from which on a parameter belongs to the group
-_DEGREE = 5
-_NEWTON = 4  # Newton steps onto the ridge
-_STEP = 1e-4  # step of differences in a logarithm
+
+@dataclass(frozen=True)
+class ShearSettings:
+    """Settings of the fit of a shear.
+
+    points : number of points of the prior from which the amplitude is learnt
+    least_share : mean share of the amplitude from which on a parameter belongs to the group
+    degree : degree of the polynomial
+    newton : number of Newton steps onto the ridge
+    step : step of central differences in a logarithm
+    """
+
+    points: int = 2048
+    least_share: float = 0.02
+    degree: int = 5
+    newton: int = 4
+    step: float = 1e-4
 
 
 @dataclass(frozen=True)
@@ -87,8 +98,8 @@ class Shear(_FreezesArrays):
         """
         column = [own.index(name) if name in own else -1 for name in names]
 
-        def spread(values: NDArray[Any], other: float) -> NDArray[Any]:
-            wide = np.full((*values.shape[:-1], len(names)), other, dtype=values.dtype)
+        def spread(values: NDArray[Any], added: float) -> NDArray[Any]:
+            wide = np.full((*values.shape[:-1], len(names)), added, dtype=values.dtype)
             wide[..., np.array(column) >= 0] = values[..., [c for c in column if c >= 0]]
             return wide
 
@@ -126,7 +137,7 @@ def log_sum(values: Array) -> Array:
     return top + np.log(np.exp(values - top[..., None]).sum(axis=-1))
 
 
-def find_shear(log_posterior: LogPosterior) -> Shear | None:
+def find_shear(log_posterior: LogPosterior, settings: ShearSettings = ShearSettings()) -> Shear | None:
     """Returns the shear that fits the surrogate's amplitude, or None when no two parameters share it.
 
     The amplitude is that of the recorded force y in the predicted force f, <y, f> / <y, y> over the fitted
@@ -135,11 +146,11 @@ def find_shear(log_posterior: LogPosterior) -> Shear | None:
     material = log_posterior.surrogate.space.dim
     low, high = log_posterior.bounds
     rng = np.random.default_rng(0)
-    x = np.tile(0.5 * (low + high), (_POINTS, 1))
-    x[:, :material] = rng.uniform(low[:material], high[:material], (_POINTS, material))
+    x = np.tile(0.5 * (low + high), (settings.points, 1))
+    x[:, :material] = rng.uniform(low[:material], high[:material], (settings.points, material))
     alpha = _amplitude(log_posterior, x)
     is_log = log_posterior.space.is_log & (np.arange(log_posterior.dim) < material)
-    weight = _weights(np.where(is_log, np.exp(np.where(is_log, x, 0.0)), 0.0), alpha)
+    weight = _weights(np.where(is_log, np.exp(np.where(is_log, x, 0.0)), 0.0), alpha, settings.least_share)
     group = weight > 0
     if group.sum() < 2:
         return None
@@ -149,10 +160,12 @@ def find_shear(log_posterior: LogPosterior) -> Shear | None:
         group, log_weight, np.zeros((0, log_posterior.dim), dtype=np.int64), np.zeros(0),
         0.5 * (low + high), 0.5 * (high - low),
     )  # fmt: skip
-    return _with_polynomial(log_posterior, plain, x, material)
+    return _with_polynomial(log_posterior, plain, x, material, settings)
 
 
-def shear_at(log_posterior: LogPosterior, x: Array, power: float) -> Shear | None:
+def shear_at(
+    log_posterior: LogPosterior, x: Array, power: float, settings: ShearSettings = ShearSettings()
+) -> Shear | None:
     """Returns the shear from the amplitude's slopes along each modulus at a point (D,), without a polynomial.
 
     It returns None where fewer than two moduli raise the amplitude.
@@ -161,11 +174,11 @@ def shear_at(log_posterior: LogPosterior, x: Array, power: float) -> Shear | Non
     moduli = log_posterior.surrogate.space.scaled(1)
     if len(moduli) < 2:
         return None
-    step = _STEP * np.eye(len(x))[moduli]
+    step = settings.step * np.eye(len(x))[moduli]
     ahead, back = (_amplitude(log_posterior, x + way * step) for way in (1.0, -1.0))
     share = np.zeros(len(x))
-    share[moduli] = (ahead - back) / (2.0 * _STEP)  # the amplitude at x is about one
-    group = share > _MIN_SHARE
+    share[moduli] = (ahead - back) / (2.0 * settings.step)  # the amplitude at x is about one
+    group = share > settings.least_share
     if group.sum() < 2:
         return None
     with np.errstate(divide="ignore"):
@@ -180,13 +193,13 @@ def _amplitude(log_posterior: LogPosterior, x: Array) -> Array:
     theta = log_posterior.from_sampling(x)
     return np.concatenate(
         [
-            log_posterior.predict_mean(theta[a : a + _CHUNK])[:, chain.bins] @ share
-            for a in range(0, len(theta), _CHUNK)
+            log_posterior.predict_mean(theta[a : a + POINTS_AT_ONCE])[:, chain.bins] @ share
+            for a in range(0, len(theta), POINTS_AT_ONCE)
         ]
     )
 
 
-def _weights(columns: Array, alpha: Array) -> Array:
+def _weights(columns: Array, alpha: Array, least_share: float) -> Array:
     """Returns non-negative a_j (D,) with alpha = sum a_j columns_j, fitted relatively; 0 for small shares."""
     usable = np.isfinite(alpha) & (alpha > 0)
     weight = np.zeros(columns.shape[1])
@@ -201,20 +214,22 @@ def _weights(columns: Array, alpha: Array) -> Array:
         weight[candidate] /= size[candidate]
         # A permeability's column is nearly always tiny, so a fit may give it a weight. Such columns are
         # dropped, and the others are fitted again.
-        small = candidate & ((relative * weight).mean(axis=0) < _MIN_SHARE)
+        small = candidate & ((relative * weight).mean(axis=0) < least_share)
         if not small.any():
             break
         candidate = candidate & ~small
     return weight
 
 
-def _with_polynomial(log_posterior: LogPosterior, plain: Shear, x: Array, material: int) -> Shear:
+def _with_polynomial(
+    log_posterior: LogPosterior, plain: Shear, x: Array, material: int, settings: ShearSettings
+) -> Shear:
     """Returns the shear with a polynomial that brings the points of the ridge to c' = 0."""
     low, high = log_posterior.bounds
     rest = plain.split(x)[1]
     on_ridge = plain.join(-plain.height(rest), rest)
     good = np.ones(len(x), dtype=bool)
-    for _ in range(_NEWTON):  # the amplitude is nearly of degree one in all moduli together
+    for _ in range(settings.newton):  # the amplitude is nearly of degree one in all moduli together
         good &= np.all((on_ridge >= low) & (on_ridge <= high), axis=1)
         alpha = np.full(len(x), np.nan)
         if good.any():
@@ -223,7 +238,7 @@ def _with_polynomial(log_posterior: LogPosterior, plain: Shear, x: Array, materi
         on_ridge[good] = plain.join(-np.log(alpha[good]), on_ridge[good])
     # The sum of P x over the group is zero, so one member of the group is redundant.
     axes = [j for j in range(material) if j != np.argmax(plain.group)]
-    powers = _powers(axes, len(low))
+    powers = _powers(axes, len(low), settings.degree)
     if good.sum() < 5 * len(powers):
         return plain
     level, rest = plain.split(on_ridge[good])
@@ -240,9 +255,9 @@ def _with_polynomial(log_posterior: LogPosterior, plain: Shear, x: Array, materi
     return replace(shear, coefficients=coefficients)
 
 
-def _powers(axes: list[int], dim: int) -> NDArray[np.int64]:
+def _powers(axes: list[int], dim: int, highest: int) -> NDArray[np.int64]:
     rows = [np.zeros(dim, dtype=np.int64)]
-    for degree in range(1, _DEGREE + 1):
+    for degree in range(1, highest + 1):
         for chosen in combinations_with_replacement(axes, degree):
             row = np.zeros(dim, dtype=np.int64)
             np.add.at(row, list(chosen), 1)

@@ -5,7 +5,7 @@ then independent draws from the noise's t-distribution. This distribution transf
 scores (z with Phi(z) = T_nu(eps)), so that the scores are the same for tails of any weight. The scores are
 tested for
 - their distribution: Kolmogorov & Smirnov,
-- their correlation over `LAGS` bins: Ljung & Box (1978), Biometrika 65:297, about the assumed mean of zero,
+- their correlation over ten bins: Ljung & Box (1978), Biometrika 65:297, about the assumed mean of zero,
 - in each kind of phase their sd, which should be 1, and the correlation of neighbours, which should be 0.
 The parameters were fitted to the same bins, which makes the tests lenient, never strict.
 """
@@ -18,16 +18,30 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from bayeskin.inference.gauss_newton import surrogate_error
 from bayeskin.inference.noise_model import innovations
 from bayeskin.inference.problem import LogPosterior
+from bayeskin.inference.surrogate_error import surrogate_error
 from bayeskin.number_format import number
 from bayeskin.types import Array, _FreezesArrays
 
-LAGS = 10
-FAMILY_WISE = 0.01  # probability that noise as assumed fails any of the tests
-_FEWEST = 8  # pairs of neighbouring bins from which on a kind of phase is tested by itself
-_SMALLEST = 1e-300  # smallest tail probability, whose score is still a finite number: 37 sd
+
+@dataclass(frozen=True)
+class ResidualSettings:
+    """Settings of the tests of residuals.
+
+    lags : number of bins over which the correlation is tested
+    family_wise : probability that noise as assumed fails any of the tests
+    fewest : number of pairs of neighbouring bins from which on a kind of phase is tested by itself
+    smallest : smallest tail probability, whose score is still a finite number: 37 sd
+    """
+
+    lags: int = 10
+    family_wise: float = 0.01
+    fewest: int = 8
+    smallest: float = 1e-300
+
+
+RESIDUALS = ResidualSettings()
 
 
 @dataclass(frozen=True)
@@ -61,8 +75,8 @@ class ResidualCheck(_FreezesArrays):
 
     @property
     def limit(self) -> float:
-        """Returns the p-value below which a single test fails, so that all together keep `FAMILY_WISE`."""
-        return FAMILY_WISE / (2 + 2 * len(self.kinds))
+        """Returns the p-value below which a single test fails, so that all together keep `family_wise`."""
+        return RESIDUALS.family_wise / (2 + 2 * len(self.kinds))
 
     @property
     def passes(self) -> bool:
@@ -119,7 +133,7 @@ def check_residuals(log_posterior: LogPosterior, vector: Array) -> ResidualCheck
     for i, kind in enumerate(chain.kinds):
         later = 1 + np.flatnonzero(follows & (chain.kind[1:] == i))
         kinds.append(_check_kind(kind, scores[chain.kind == i], scores[later - 1], scores[later]))
-    correlation = autocorrelation(scores, min(LAGS, len(scores) - 1))
+    correlation = autocorrelation(scores, min(RESIDUALS.lags, len(scores) - 1))
     p_law = float(stats.kstest(scores, "norm").pvalue)
     return ResidualCheck(scores, correlation, p_law, _ljung_box(correlation, len(scores)), tuple(kinds))
 
@@ -129,7 +143,7 @@ def normal_scores(innovation: Array, nu: float) -> Array:
 
     nu may be inf.
     """
-    tail = np.maximum(stats.t.sf(np.abs(innovation), nu), _SMALLEST)
+    tail = np.maximum(stats.t.sf(np.abs(innovation), nu), RESIDUALS.smallest)
     return np.asarray(np.sign(innovation) * stats.norm.isf(tail))
 
 
@@ -149,7 +163,7 @@ def _check_kind(kind: str, scores: Array, before: Array, after: Array) -> KindCh
 
     before, after (p,) : the pairs of neighbours among these scores
     """
-    if len(after) < _FEWEST:
+    if len(after) < RESIDUALS.fewest:
         return KindCheck(kind, len(scores), math.nan, math.nan, math.nan, math.nan)
     square = float(scores @ scores)
     p_sd = 2.0 * min(stats.chi2.cdf(square, len(scores)), stats.chi2.sf(square, len(scores)))

@@ -53,18 +53,18 @@ def answer(context: DiagnosisContext, task: Task) -> dict[str, Any]:
     return _fit_answer(context, task)
 
 
-def read_answer(context: DiagnosisContext, task: Task, said: Mapping[str, Any]) -> object:
+def read_answer(context: DiagnosisContext, task: Task, reply: Mapping[str, Any]) -> object:
     """Returns an answer in the form that a search uses: a fit, gain [nats], force, evidences, or message."""
-    if "message" in said:
-        return said["message"]
+    if "message" in reply:
+        return reply["message"]
     context = _context_of(context, task)
     if isinstance(task, RunTask | FullRunTask | OtherProtocolTask):
-        return np.array(said["force_n"])
+        return np.array(reply["force_n"])
     if isinstance(task, ScoreTestTask):
-        return said["nats"]
+        return reply["nats"]
     if isinstance(task, EvidenceTask):
-        return Evidences(**said)
-    set_fit = _fit_from_json(context, said, task.until_s if isinstance(task, FitTask) else None)
+        return Evidences(**reply)
+    set_fit = _fit_from_json(context, reply, task.until_s if isinstance(task, FitTask) else None)
     contradicted = refuted(set_fit.fit, context.known, context.motion, context.jumps)
     return f"the samples of the recording contradict {', '.join(contradicted)}" if contradicted else set_fit
 
@@ -119,7 +119,7 @@ def _posterior_with_added(context: DiagnosisContext, task: ScoreTestTask) -> tup
     The new mechanisms are the added one and those that it needs.
     """
     new = [name for name in with_one(task.names, task.name, context.known) if name not in task.names]
-    return context.posterior(task.names, [task.run], _as_array(task.correction_n), more=new), new
+    return context.posterior(task.names, [task.run], _as_array(task.correction_n), added=new), new
 
 
 def _fit_from_json(

@@ -12,12 +12,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.stats import qmc
 
-from bayeskin.inference.gauss_newton import promise
+from bayeskin.inference.score_test import promise
 from bayeskin.mechanisms import Mechanism, with_one
 from bayeskin.mechanisms.mechanism import Tissue
+from bayeskin.mismatch.hypotheses import VerdictSettings
 from bayeskin.mismatch.search_context import SearchContext, correction, gained
 from bayeskin.mismatch.search_record import Names
-from bayeskin.mismatch.search_settings import RARITY
 from bayeskin.mismatch.tasks import FitTask, FitWithAddedTask, RunTask, ScoreTestTask, Task
 from bayeskin.mismatch.trust_region import SetFit
 from bayeskin.mismatch.wrapper import innermost
@@ -49,7 +49,7 @@ class Candidates:
         correction_n = correction(current)  # valid for sets with the same mechanisms of the tissue
         promised, starts, finished = self._score_tests(current)
         order = sorted(promised, key=lambda name: -promised[name])
-        least = settings.gain + RARITY
+        least = settings.gain - VerdictSettings().log_odds  # a gain in evidence makes up for the odds
         if context.leaves_more_than_noise(current):
             least = settings.promised
         chosen = [name for name in order if promised[name] > least][: settings.shortlist]

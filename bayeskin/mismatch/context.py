@@ -156,22 +156,22 @@ class DiagnosisContext:
         force = observed(beyond, rows, motion, lambda time_s: np.atleast_2d(run.at(time_s)))
         return bin_means(force, motion, edges_s, beyond)[0]
 
-    def observe(self, names: Sequence[str], more: Sequence[str], runs: Sequence[ModelRun]) -> Surrogate:
+    def observe(self, names: Sequence[str], added: Sequence[str], runs: Sequence[ModelRun]) -> Surrogate:
         """Returns a surrogate of the reported force near runs of a set.
 
-        more : further mechanisms, which act on the force of these runs
+        added : further mechanisms, which act on the force of these runs
         """
         errors_n = self.forward.errors(runs[0].theta)
         tissue = Tangent(self.space(names), self.binned.edges_s, tuple(runs), errors_n)
         beyond = tuple(
-            self.known[name] for name in sorted({*names, *more})
-            if name in more or name not in self.forward.solves
+            self.known[name] for name in sorted({*names, *added})
+            if name in added or name not in self.forward.solves
         )  # fmt: skip
         return ObservedSurrogate(tissue, beyond, self.motion) if beyond else tissue
 
     def posterior(
         self, names: Sequence[str], runs: Sequence[ModelRun], correction_n: Array | None = None,
-        until_s: float | None = None, more: Sequence[str] = (),
+        until_s: float | None = None, added: Sequence[str] = (),
     ) -> LogPosterior:  # fmt: skip
         """Returns the posterior of a set near runs of the set.
 
@@ -179,9 +179,9 @@ class DiagnosisContext:
             varies between points by as much as its own size, so the likelihood allows for an error with this
             sd
         until_s : end of the part of the recording that is fitted [s]; None for the whole recording
-        more : further mechanisms, which act on the force of these runs
+        added : further mechanisms, which act on the force of these runs
         """
-        force = self.observe(names, more, runs)
+        force = self.observe(names, added, runs)
         priors = ParameterSpace(force.space.parameters, self.base.correlations)
         windows = None if until_s is None else ((float(self.binned.edges_s[0]), until_s),)
         posterior = posterior_of(

@@ -34,14 +34,33 @@ from bayeskin.mismatch.unexplained import Memory, Place, Unexplained, unexplaine
 from bayeskin.types import Array, PadMotion
 
 PARTS = ("displacement", "change", "phase", "cycle")
-# Bounds of the size s: the lower one in sd of the noise, the upper one in RMS of the residual.
-SMALLEST, LARGEST = 0.01, 10.0
-# Bounds of the length l: as a share of the displacement's range, and in units of log(1 + t / 1 s).
-OVER_DISPLACEMENT, OVER_TIME = (0.05, 2.0), (0.2, 3.0)
-LENGTHS = (OVER_DISPLACEMENT, OVER_DISPLACEMENT, OVER_TIME, OVER_TIME)
-LITTLE = 0.1  # share of the fitted noise with a memory from which a climb with a discrepancy starts
-STEP = 1e-3  # step for second derivatives, as a share of a hyperparameter's range
-NOTICEABLE = 5.0  # nats that a discrepancy must gain; noise alone gains less in 99 of 100 recordings
+
+
+@dataclass(frozen=True)
+class DiscrepancySettings:
+    """Settings of the Gaussian process of a discrepancy.
+
+    smallest, largest : bounds of the size s, in sd of the noise and in RMS of the residual
+    over_displacement, over_time : bounds of the length l, as a share of the displacement's range, and in
+        units of log(1 + t / 1 s)
+    first_lengths : lengths of the four parts from which a climb starts; their sizes start from half the RMS
+    little : share of the fitted noise with a memory from which a climb with a discrepancy starts
+    step : step for second derivatives, as a share of a hyperparameter's range
+    noticeable : gain [nats] from which a discrepancy is more than noise, which gains less in 99 of 100
+        recordings
+    """
+
+    smallest: float = 0.01
+    largest: float = 10.0
+    over_displacement: tuple[float, float] = (0.05, 2.0)
+    over_time: tuple[float, float] = (0.2, 3.0)
+    first_lengths: tuple[float, float, float, float] = (0.3, 0.3, 0.8, 0.8)
+    little: float = 0.1
+    step: float = 1e-3
+    noticeable: float = 5.0
+
+
+DISCREPANCY = DiscrepancySettings()
 
 
 @dataclass(frozen=True)
@@ -82,12 +101,12 @@ class Discrepancy:
     @property
     def noticeable(self) -> bool:
         """Returns whether the discrepancy is more than noise."""
-        return self.gain_nats > NOTICEABLE
+        return self.gain_nats > DISCREPANCY.noticeable
 
 
-def discrepancy(found: Fit, motion: PadMotion) -> Discrepancy:
+def discrepancy(fit: Fit, motion: PadMotion) -> Discrepancy:
     """Returns the discrepancy at a fit; `motion` is the protocol of the recording."""
-    remainder = unexplained(found, motion)
+    remainder = unexplained(fit, motion)
     squares, masks, bounds = squared_distances(remainder.at), kernel_masks(remainder.at), _bounds(remainder)
     noise_only = _maximise(partial(negative_log_evidence, rest=remainder), _starts(remainder), bounds[:2])
     objective = partial(negative_log_evidence, rest=remainder, squares=squares, masks=masks)
@@ -112,7 +131,8 @@ def discrepancy(found: Fit, motion: PadMotion) -> Discrepancy:
     beyond = remainder.beyond(remainder.residual_n)
     square_by_part = {name: float(part @ part) for name, part in parts.items()}
     total = float(beyond @ beyond) * sum(square_by_part.values())
-    features = describe(remainder, mean, sd) if gain > NOTICEABLE else ("nothing is left beyond the noise",)
+    noticeable = gain > DISCREPANCY.noticeable
+    features = describe(remainder, mean, sd) if noticeable else ("nothing is left beyond the noise",)
     return Discrepancy(
         remainder.bins, mean, sd, parts, beyond, remainder.residual_n - beyond,
         float(np.sqrt(np.mean(mean**2))),
@@ -157,7 +177,9 @@ def _bounds(remainder: Unexplained) -> Array:
     noise_n = float(np.sqrt(np.median(np.diag(remainder.measured_n2))))
     rms_n = max(float(np.sqrt(np.mean(remainder.beyond(remainder.residual_n) ** 2))), noise_n)
     noise_bounds = [remainder.memory.size_within, remainder.memory.time_within]
-    return np.log([*noise_bounds, *[(SMALLEST * noise_n, LARGEST * rms_n)] * 4, *LENGTHS])
+    sizes = (DISCREPANCY.smallest * noise_n, DISCREPANCY.largest * rms_n)
+    lengths = [DISCREPANCY.over_displacement] * 2 + [DISCREPANCY.over_time] * 2
+    return np.log([*noise_bounds, *[sizes] * 4, *lengths])
 
 
 def _starts(remainder: Unexplained, bounds: Array | None = None) -> list[Array]:
@@ -166,11 +188,11 @@ def _starts(remainder: Unexplained, bounds: Array | None = None) -> list[Array]:
     With `bounds`, the points contain the parts of the discrepancy too, and only the small noise is used.
     """
     fitted = np.log([remainder.memory.size, remainder.memory.time_s])
-    noise_starts = [fitted, fitted + np.log([LITTLE, 1.0])]
+    noise_starts = [fitted, fitted + np.log([DISCREPANCY.little, 1.0])]
     if bounds is None:
         return noise_starts
-    rms_n = np.exp(bounds[2, 1]) / LARGEST
-    parts = np.concatenate([np.full(4, np.log(rms_n / 2.0)), np.log([0.3, 0.3, 0.8, 0.8])])
+    rms_n = np.exp(bounds[2, 1]) / DISCREPANCY.largest
+    parts = np.concatenate([np.full(4, np.log(rms_n / 2.0)), np.log(DISCREPANCY.first_lengths)])
     return [np.concatenate([noise, parts]) for noise in noise_starts[1:]]
 
 
@@ -197,7 +219,7 @@ def _maximise(
             for start in starts]  # fmt: skip
     best = min(results, key=lambda result: result.fun)
     logs, width = np.asarray(best.x), bounds[:, 1] - bounds[:, 0]
-    side = np.where(logs + STEP * width < bounds[:, 1], STEP, -STEP)
+    side = DISCREPANCY.step * np.where(logs + DISCREPANCY.step * width < bounds[:, 1], 1.0, -1.0)
     gradient = objective(logs)[1]
     gradients = [objective(logs + change)[1] for change in np.diag(side * width)]
     curvature = np.array(

@@ -24,15 +24,10 @@ import numpy as np
 
 from bayeskin.inference import LogPosterior
 from bayeskin.mismatch.fit import Fit, fit_near
-from bayeskin.mismatch.resample import LEGS, MODES, PosteriorDraws, resample
+from bayeskin.mismatch.resample import PosteriorDraws, ResampleSettings, resample
 from bayeskin.mismatch.trust_region import SetFit, within
 from bayeskin.mismatch.wrapper import Wrapper, innermost
 from bayeskin.types import Array, Design, ParameterSpace, Surrogate
-
-MOST = 1500  # largest number of draws among which the points of a wave are chosen
-# Distance in the unit cube within which errors hardly change, so that an emulator can learn them.
-NEARBY = 0.1
-BEFORE = (60,)  # steps of the ensembles whose draws give the points of a further wave
 
 # Returns the skin's forces (m,) [N] with the set at points (n, d): by the forward model at all points, and by
 # the full model at the given number of first points. A run that failed has its message instead.
@@ -46,23 +41,30 @@ class EmulationSettings:
 
     checks : number of runs of the full model, in addition to the runs at the fits, where the forward model's
         error matters
-    points, more, waves : number of runs of the first wave and of each further wave; largest number of waves
+    points, further_points, waves : number of runs of the first wave and of each further wave; largest number
+        of waves
+    candidates : largest number of draws among which the points of a wave are chosen
+    steps : numbers of steps of the ensembles whose draws give the points of a further wave
     first : the first points are drawn within this distance of a fit's run, on either side, as a share of the
         prior's width
     nearer : factor on this distance for the next points, as long as the emulator is too uncertain everywhere
     sure : largest sd of the emulator, RMS over bins, with which it is used; in units of the noise of a bin
     enough : RMS error of the emulator, as the median over the new runs, with which the emulation ends; in
         units of the noise of a bin
+    nearby : distance in the unit cube within which errors hardly change, so that an emulator can learn them
     """
 
     checks: int = 3
     points: int = 30
-    more: int = 20
+    further_points: int = 20
     waves: int = 8
+    candidates: int = 1500
+    steps: tuple[int, ...] = (60,)
     first: float = 0.5
     nearer: float = 0.5
     sure: float = 2.0
     enough: float = 0.2
+    nearby: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -89,10 +91,13 @@ class _ForwardErrors:
 
     Between the places the error is an average of all errors, each weighted by the inverse square of its
     distance (Shepard 1968, Proc. 23rd ACM Nat. Conf., 517).
+
+    nearby : distance within which errors hardly change
     """
 
     places: Array
     errors_n: Array
+    nearby: float
 
     def with_more(
         self, places: Array, forward: Sequence[Array | str], full: Sequence[Array | str]
@@ -106,12 +111,13 @@ class _ForwardErrors:
         return _ForwardErrors(
             np.concatenate([self.places, [place for place, _ in new]]),
             np.concatenate([self.errors_n, [error for _, error in new]]),
+            self.nearby,
         )
 
     def at(self, unit: Array) -> Array:
         """Returns the interpolated errors (n, m) [N] at points (n, d) of the unit cube."""
         square_distance = np.sum((unit[:, None] - self.places) ** 2, axis=2)
-        weight = 1.0 / (square_distance + NEARBY**2)
+        weight = 1.0 / (square_distance + self.nearby**2)
         return np.asarray((weight / weight.sum(axis=1, keepdims=True)) @ self.errors_n)
 
     def left(self) -> Array:
@@ -119,15 +125,19 @@ class _ForwardErrors:
 
         Each row is an error minus its interpolation from the other errors, divided by the root of k.
         """
-        without = [_ForwardErrors(*(np.delete(errors, i, axis=0) for errors in (self.places, self.errors_n)))
-                  for i in range(len(self.places))]  # fmt: skip
+        without = [
+            replace(
+                self, places=np.delete(self.places, i, axis=0), errors_n=np.delete(self.errors_n, i, axis=0)
+            )
+            for i in range(len(self.places))
+        ]
         predicted = [errors.at(place[None])[0] for errors, place in zip(without, self.places, strict=True)]
         return np.asarray((self.errors_n - predicted) / np.sqrt(len(predicted)))
 
 
 def emulate(
     maxima: Sequence[SetFit], forces: Forces, learn: Learn, noise_n: float, seed: int,
-    settings: EmulationSettings | None = None,
+    settings: EmulationSettings = EmulationSettings(),
 ) -> EmulatedPosterior | str:  # fmt: skip
     """Returns the posterior of a set near its fits; if all runs of the first wave fail, a run's message.
 
@@ -135,21 +145,22 @@ def emulate(
     forces : runs the forward model and the full model; learn : makes an emulator from a design
     noise_n : sd of the noise in a bin's mean [N]
     """
-    settings, rng = settings or EmulationSettings(), np.random.default_rng([seed, 11])
-    first = maxima[0]
+    first, rng = maxima[0], np.random.default_rng([seed, 11])
     posterior, names = first.fit.log_posterior, first.fit.names
     space, error_n = innermost(posterior.surrogate).space, None
-    reach = settings.first
-    draws = _draws_near(maxima, reach, seed)
+    reach, before = settings.first, ResampleSettings(legs=settings.steps, modes=0)
+    draws = _draws_near(maxima, reach, seed, before)
     errors = _ForwardErrors(
         space.box.to_unit([maximum.run.theta for maximum in maxima]),
         np.array([maximum.correction_n for maximum in maxima]),
+        settings.nearby,
     )
     design = _empty_design(space, posterior.surrogate.edges_s)
     emulated: EmulatedPosterior | None = None
     for wave in range(settings.waves):
-        count = settings.more if wave else settings.points
-        points = _spread(space, draws[:, : space.dim], design.theta, count, rng)
+        count = settings.further_points if wave else settings.points
+        rows = rng.choice(len(draws), min(len(draws), settings.candidates), replace=False)
+        points = _spread(space, draws[:, : space.dim][rows], design.theta, count)
         if wave == 0:
             points = np.concatenate([points[: -len(maxima)], [maximum.run.theta for maximum in maxima]])
         answers, full = forces(points, settings.checks if wave == 0 and errors.errors_n.any() else 0)
@@ -171,7 +182,7 @@ def emulate(
         is_sure = bool(np.isfinite(best.value))
         if not is_sure and wave < settings.waves - 1:
             reach *= settings.nearer
-            draws = _draws_near(maxima, reach, seed)
+            draws = _draws_near(maxima, reach, seed, before)
             continue
         if not is_sure:  # after the last wave the emulator is used where it is uncertain too
             local = replace(local, sure_within_n=None)
@@ -179,8 +190,7 @@ def emulate(
         done = is_sure and error_n is not None and error_n <= settings.enough * noise_n
         last = done or wave == settings.waves - 1
         known = [maximum.fit.theta for maximum in maxima]
-        legs, modes = (LEGS, MODES) if last else (BEFORE, 0)
-        drawn = resample(best, seed, legs, modes, known)
+        drawn = resample(best, seed, ResampleSettings() if last else before, known)
         draws, emulated = drawn.draws, EmulatedPosterior(best, drawn, len(design.theta), error_n, done)
         if done:
             break
@@ -188,7 +198,7 @@ def emulate(
     return emulated
 
 
-def _draws_near(maxima: Sequence[SetFit], reach: float, seed: int) -> Array:
+def _draws_near(maxima: Sequence[SetFit], reach: float, seed: int, settings: ResampleSettings) -> Array:
     """Returns draws (n, D) of the posterior near each fit's run.
 
     reach : largest distance from the run on either side, as a share of the prior's width
@@ -198,7 +208,7 @@ def _draws_near(maxima: Sequence[SetFit], reach: float, seed: int) -> Array:
         posterior = fit.fit.log_posterior
         vector = np.clip(posterior.vector(fit.fit.theta), *posterior.bounds)
         limited = replace(fit.fit, log_posterior=within(posterior, vector, reach))
-        return resample(limited, seed, BEFORE, 0).draws
+        return resample(limited, seed, settings).draws
 
     return np.concatenate([near(fit) for fit in maxima])
 
@@ -227,14 +237,11 @@ def _likeliest_run(posterior: LogPosterior, fit: Fit, theta: Array) -> dict[str,
     return posterior.named(rows[int(np.argmax(posterior.log_prob(posterior.to_sampling(rows))))])
 
 
-def _spread(
-    space: ParameterSpace, draws: Array, before: Array, count: int, rng: np.random.Generator
-) -> Array:
-    """Returns `count` of the draws (n, d), each as far as possible from earlier points, in sd of the draws.
+def _spread(space: ParameterSpace, candidates: Array, before: Array, count: int) -> Array:
+    """Returns `count` of candidates (n, d), each as far as possible from earlier points, in sd of candidates.
 
     before : parameters (k, d) of earlier runs
     """
-    candidates = draws[rng.choice(len(draws), min(len(draws), MOST), replace=False)]
     unit = space.box.to_unit(candidates)
     scale = unit.std(axis=0) + 1e-9
     unit = unit / scale

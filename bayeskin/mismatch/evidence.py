@@ -16,16 +16,33 @@ where a bound is near. Evidence and covariance then both shrink by this share.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from bayeskin.inference import LogPosterior
 from bayeskin.inference.gauss_newton import Top
+from bayeskin.inference.problem import UNIFORM_PRECISION
 from bayeskin.types import Array
 
-# Largest distance from a maximum [sd], smallest distance as a share of the prior's width, and the ratio of
-# neighbouring distances.
-FAR, NEAR, NEXT = 5.0, 1e-4, 1.6
-EDGE = 1e-6  # distance from a bound, in the unit cube, below which a coordinate lies on it
+
+@dataclass(frozen=True)
+class EvidenceSettings:
+    """Settings of an evidence.
+
+    far, near : largest distance from the maximum [sd] up to which the density is integrated along a
+        coordinate, and smallest distance, as a share of the prior's width
+    ratio : ratio of neighbouring distances
+    edge : distance from a bound, in the unit cube, below which a coordinate lies on it
+    """
+
+    far: float = 5.0
+    near: float = 1e-4
+    ratio: float = 1.6
+    edge: float = 1e-6
+
+
+EVIDENCE = EvidenceSettings()
 
 
 def evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
@@ -34,10 +51,11 @@ def evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
     Where the density at `top` is zero they are -inf and the prior's covariance.
     """
     if not np.isfinite(top.value):
-        return -np.inf, np.eye(log_posterior.dim) / 12.0
+        return -np.inf, np.eye(log_posterior.dim) / UNIFORM_PRECISION
     low, high = log_posterior.bounds
     unit = (top.vector - low) / (high - low)
-    uphill = np.where(unit < EDGE, -top.gradient, np.where(unit > 1.0 - EDGE, top.gradient, 0.0))
+    edge = EVIDENCE.edge
+    uphill = np.where(unit < edge, -top.gradient, np.where(unit > 1.0 - edge, top.gradient, 0.0))
     held = uphill > 0.0
     free = ~held
     values, vectors = np.linalg.eigh(top.information[np.ix_(free, free)])
@@ -46,7 +64,7 @@ def evidence(log_posterior: LogPosterior, top: Top) -> tuple[float, Array]:
     log_likelihood = top.value + float(np.sum(np.log(high - low)))
     log_evidence = log_likelihood + occam(values) + float(np.sum(np.log(mass)))
     covariance = np.zeros((len(unit), len(unit)))
-    width = np.maximum(np.maximum(values, 0.0) + 2.0 * np.pi, 12.0)
+    width = np.maximum(np.maximum(values, 0.0) + 2.0 * np.pi, UNIFORM_PRECISION)
     covariance[np.ix_(free, free)] = (vectors / width) @ vectors.T
     mean_square = np.trapezoid(density * t**2, t, axis=1) / mass  # mean square distance from the bound
     covariance[held, held] = mean_square
@@ -84,9 +102,9 @@ def _integral_along(log_posterior: LogPosterior, top: Top, unit: Array, i: int) 
     information reaches.
     """
     low, high = log_posterior.bounds
-    far = min(FAR / np.sqrt(max(top.information[i, i], 1.0)), 1.0)
-    near = min(NEAR, far / 100.0)
-    away = np.geomspace(far, near, 1 + round(np.log(far / near) / np.log(NEXT)))
+    far = min(EVIDENCE.far / np.sqrt(max(top.information[i, i], 1.0)), 1.0)
+    near = min(EVIDENCE.near, far / 100.0)
+    away = np.geomspace(far, near, 1 + round(np.log(far / near) / np.log(EVIDENCE.ratio)))
     places = np.unique(np.clip(np.concatenate([unit[i] - away, unit[i : i + 1], unit[i] + away]), 0.0, 1.0))
     points = np.repeat(unit[None], len(places), axis=0)
     points[:, i] = places

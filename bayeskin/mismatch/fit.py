@@ -10,20 +10,40 @@ from typing import Any
 import numpy as np
 
 from bayeskin.inference import LogPosterior
-from bayeskin.inference.gauss_newton import Top, gauss_newton, promise, with_less_noise
+from bayeskin.inference.gauss_newton import Top, gauss_newton
+from bayeskin.inference.score_test import promise, with_less_noise
 from bayeskin.mismatch.evidence import evidence
-from bayeskin.mismatch.fit_starts import likely, other_skins
-from bayeskin.mismatch.wrapper import skins
+from bayeskin.mismatch.fit_starts import starts_elsewhere
 from bayeskin.types import Array
 
-DRAWS = 96  # number of prior draws for each new parameter, among which starting points are chosen
-RANKED = 32  # number of prior draws for each new parameter in score tests, which only rank the mechanisms
-SKIN_STARTS = 4  # number of climbs from the best of other tissues
-STARTS = 2  # number of the most promising draws of a part's parameters from which climbs start
-REDRAWN = 1  # how often the parameters of a part are drawn again, near the best point so far
-# Every climb has the first number of rounds. The FIRST_KEPT best of them then have the second number.
-FIRST_ROUNDS, FIRST_KEPT = (2, 4), 3
-ROUNDS = 25  # largest number of rounds of the climb that is then the best
+SAME_MAXIMUM = 0.1  # largest difference of any parameter at one maximum, as a share of the prior's width
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Settings of a fit of a set of mechanisms.
+
+    draws : number of prior draws for each new parameter, among which starting points are chosen
+    ranked : the same number for score tests, which only rank the mechanisms
+    starts : number of the most promising draws of a part's parameters from which climbs start
+    redrawn : how often the parameters of a part are drawn again, near the best point so far
+    tissues : number of climbs from the best of other tissues
+    first_rounds, first_kept : every climb has the first number of rounds; the `first_kept` best of them then
+        have the second number
+    rounds : largest number of rounds of the climb that is then the best
+    """
+
+    draws: int = 96
+    ranked: int = 32
+    starts: int = 2
+    redrawn: int = 1
+    tissues: int = 4
+    first_rounds: tuple[int, int] = (2, 4)
+    first_kept: int = 3
+    rounds: int = 25
+
+
+FITS = FitSettings()
 
 
 @dataclass(frozen=True)
@@ -77,11 +97,11 @@ class Fit:
         return self.log_posterior.from_sampling(low + unit * (high - low))
 
 
-def stored(found: Fit) -> dict[str, Any]:
+def stored(fitted: Fit) -> dict[str, Any]:
     """Returns a fit without its posterior, in JSON's types."""
-    plain = {"names": list(found.names), "theta": dict(found.theta), "value": found.value}
-    arrays = {"covariance": found.covariance.tolist(), "latent": found.latent.tolist()}
-    return {**plain, "log_evidence": found.log_evidence, **arrays}
+    plain = {"names": list(fitted.names), "theta": dict(fitted.theta), "value": fitted.value}
+    arrays = {"covariance": fitted.covariance.tolist(), "latent": fitted.latent.tolist()}
+    return {**plain, "log_evidence": fitted.log_evidence, **arrays}
 
 
 def restored(plain: Mapping[str, Any], log_posterior: LogPosterior) -> Fit:
@@ -106,7 +126,7 @@ def promised(
     new = np.array([name not in start for name in log_posterior.names])
     for part in parts:
         columns = [log_posterior.names.index(name) for name in part]
-        trials = _drawn(vector, columns, RANKED, low, high, rng)
+        trials = _drawn(vector, columns, FITS.ranked, low, high, rng)
         best = max(best, promise(log_posterior, vector, trials, ~new, 1)[0][1])
     return best
 
@@ -150,7 +170,7 @@ def fit(
 def fit_near(names: Sequence[str], log_posterior: LogPosterior, theta: Mapping[str, float]) -> Fit:
     """Returns the fit that a single climb from a point reaches."""
     low, high = log_posterior.bounds
-    top = gauss_newton(log_posterior, np.clip(log_posterior.vector(theta), low, high), None, ROUNDS)
+    top = gauss_newton(log_posterior, np.clip(log_posterior.vector(theta), low, high), None, FITS.rounds)
     return _fit_at(names, log_posterior, top)
 
 
@@ -168,12 +188,12 @@ def _search_part(
     without = log_posterior.named(log_posterior.from_sampling(vector))
     without |= {name: neutral[name] for name in (*part, *later)}
     neutral_vector = np.clip(log_posterior.vector(without), low, high)
-    trials = _drawn(neutral_vector, columns, DRAWS, low, high, rng)
+    trials = _drawn(neutral_vector, columns, FITS.draws, low, high, rng)
     top = _best_climbs(
         log_posterior,
         [vector, *_promising_starts(log_posterior, neutral_vector, trials, part, later, neutral)],
     )[0]
-    for _ in range(REDRAWN if len(columns) > 1 else 0):
+    for _ in range(FITS.redrawn if len(columns) > 1 else 0):
         near = _redrawn(top.vector, columns, low, high, len(trials), rng)
         trials[:, columns] = near[:, columns]
         starts = _promising_starts(log_posterior, neutral_vector, trials, part, later, neutral)
@@ -199,7 +219,7 @@ def _promising_starts(
     in_part = np.array([name in part for name in names])
     free = ~in_part & np.array([name not in later for name in names])
     starts = []
-    for row, _, multiple, moved in promise(log_posterior, neutral_vector, trials, free, STARTS):
+    for row, _, multiple, moved in promise(log_posterior, neutral_vector, trials, free, FITS.starts):
         for background in (neutral_vector, moved):
             values = log_posterior.named(
                 log_posterior.from_sampling(np.where(in_part, trials[row], background))
@@ -246,9 +266,9 @@ def _best_climbs(log_posterior: LogPosterior, starts: Sequence[Array]) -> list[T
     All climbs have a few rounds; then only the best of them continue.
     """
     tops: list[Top] = []
-    for rounds in FIRST_ROUNDS:
+    for rounds in FITS.first_rounds:
         tops = [gauss_newton(log_posterior, start, None, rounds, quick=True) for start in starts]
-        tops = sorted(tops, key=lambda top: -top.value)[:FIRST_KEPT]
+        tops = sorted(tops, key=lambda top: -top.value)[: FITS.first_kept]
         starts = [top.vector for top in tops]
     return tops
 
@@ -258,23 +278,13 @@ def _best_fit(
 ) -> Fit:  # fmt: skip
     """Returns the best fit of climbs from given points, from other tissues, and from a smaller noise."""
     best = _best_climbs(log_posterior, starts)[0]
-    other_tissues = _other_starts(best.vector, log_posterior, seed, SKIN_STARTS)
+    other_tissues = starts_elsewhere(best.vector, log_posterior, seed, FITS.tissues)
     less_noise = with_less_noise(log_posterior, best.vector)
     best = _best_climbs(log_posterior, [best.vector, less_noise, *other_tissues])[0]
-    return _fit_at(names, log_posterior, gauss_newton(log_posterior, best.vector, None, ROUNDS))
+    return _fit_at(names, log_posterior, gauss_newton(log_posterior, best.vector, None, FITS.rounds))
 
 
 def _fit_at(names: Sequence[str], log_posterior: LogPosterior, top: Top) -> Fit:
     """Returns the fit at the end point of a climb."""
     theta = log_posterior.named(log_posterior.from_sampling(top.vector))
     return Fit(tuple(names), log_posterior, theta, top.value, *evidence(log_posterior, top), top.latent)
-
-
-def _other_starts(vector: Array, log_posterior: LogPosterior, seed: int, count: int) -> list[Array]:
-    """Returns starting points (D,) in other tissues, with and without other values of tissue mechanisms.
-
-    count : number of starting points of each of these two kinds, the most probable ones of `other_skins`
-    """
-    sizes = skins(log_posterior.surrogate)
-    tissues = [other_skins(vector, log_posterior, seed, size) for size in sizes]
-    return [start for trials in tissues for start in likely(log_posterior, trials, count)]

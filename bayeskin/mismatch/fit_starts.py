@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayeskin.inference import LogPosterior
+from bayeskin.mismatch.wrapper import skins
 from bayeskin.types import Array
 
 SKINS = 192  # number of tissues drawn from the prior
@@ -37,3 +38,13 @@ def other_skins(vector: Array, log_posterior: LogPosterior, seed: int, skin: int
     trials = np.tile(np.clip(vector, low, high), (SKINS, 1))
     trials[:, :skin] = np.random.default_rng(seed).uniform(low[:skin], high[:skin], (len(trials), skin))
     return trials
+
+
+def starts_elsewhere(vector: Array, log_posterior: LogPosterior, seed: int, count: int) -> list[Array]:
+    """Returns starting points (D,) in other tissues, with and without other values of tissue mechanisms.
+
+    count : number of starting points of each of these two kinds, the most probable ones of `other_skins`
+    """
+    sizes = skins(log_posterior.surrogate)
+    tissues = [other_skins(vector, log_posterior, seed, size) for size in sizes]
+    return [start for trials in tissues for start in likely(log_posterior, trials, count)]

@@ -7,7 +7,7 @@ term is kept if its gain is
 
     more than the best term of the whole library gains from noise alone in 19 of 20 draws,
     more than the standard error of the gain over phases (a gain in one phase alone is no form), and
-    at least the share `WORTH` of the squared residual.
+    at least the share `worth` of the squared residual.
 
 All terms together are proposed if they predict a third of the squared residual that exceeds the noise. Such a
 form is a proposal that needs a test, not a finding. Suppose that each of nine phases has a smooth error of
@@ -27,22 +27,36 @@ from numpy.typing import NDArray
 
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.terms import Term, library
-from bayeskin.mismatch.unexplained import Unexplained, unexplained
+from bayeskin.mismatch.unexplained import UNEXPLAINED, Unexplained, unexplained
 from bayeskin.number_format import number, unit_text
 from bayeskin.types import Array, PadMotion
 
-MOST = 4  # largest number of terms
-WORTH = 0.05  # smallest gain of a term, as a share of the squared residual
-ENOUGH = 1.0 / 3.0  # smallest gain of all terms, as a share of the squared residual beyond the noise
-LEVEL = 0.05  # probability that the best term of the library gains more than the limit from noise alone
-DRAWS = 400  # number of draws of the noise
-# Added to the diagonal for terms of unit norm. It keeps the equations solvable for two terms that differ only
-# in the phase left out.
-RIDGE = 1e-9
-SEEN = 1e-3  # smallest share of a term's norm that must remain after the parameters' part is removed
-ONE_PHASE = 0.9  # share of a term's square in a single phase above which no other phase can test it
-ALIKE = 0.98  # correlation of two terms above which they cannot be told apart
-NEARLY_BEST = 0.98  # share of the best gain from which a simpler term is preferred
+
+@dataclass(frozen=True)
+class FormSettings:
+    """Settings of the search for a form.
+
+    most : largest number of terms
+    worth : smallest gain of a term, as a share of the squared residual
+    enough : smallest gain of all terms, as a share of the squared residual beyond the noise
+    level : probability that the best term of the library gains more than the limit from noise alone
+    draws : number of draws of the noise
+    ridge : number that is added to the diagonal for terms of unit norm. It keeps the equations solvable for
+        two terms that differ only in the phase left out.
+    one_phase : share of a term's square in a single phase above which no other phase can test it
+    alike : correlation of two terms above which they cannot be told apart
+    nearly_best : share of the best gain from which a simpler term is preferred
+    """
+
+    most: int = 4
+    worth: float = 0.05
+    enough: float = 1.0 / 3.0
+    level: float = 0.05
+    draws: int = 400
+    ridge: float = 1e-9
+    one_phase: float = 0.9
+    alike: float = 0.98
+    nearly_best: float = 0.98
 
 
 @dataclass(frozen=True)
@@ -73,11 +87,6 @@ class Form:
     force_n: Array
     sentence: str
 
-    @property
-    def found(self) -> bool:
-        """Returns whether a form was found."""
-        return bool(self.terms)
-
 
 @dataclass(frozen=True)
 class _Blocks:
@@ -86,19 +95,21 @@ class _Blocks:
     gram : products of terms with each other, (b, p, p); cross : products of terms with the residual, (b, p)
     square : sum of squares of the residual, (b,)
     noise : covariance (p, p) of the products of terms with the noise, over all phases
+    ridge : number that is added to the diagonal of the normal equations
     """
 
     gram: Array
     cross: Array
     square: Array
     noise: Array
+    ridge: float
 
     def left_out(self, chosen: list[int]) -> Array:
         """Returns the squared error (b,) in each phase, with coefficients fitted to the other phases."""
         if not chosen:
             return self.square
         gram, cross = self._among(chosen)
-        value = _coefficients(gram.sum(axis=0) - gram, cross.sum(axis=0) - cross)
+        value = self._solved(gram.sum(axis=0) - gram, cross.sum(axis=0) - cross)
         fitted = np.einsum("bi,bij,bj->b", value, gram, value)
         return np.asarray(self.square - 2.0 * np.einsum("bi,bi->b", value, cross) + fitted)
 
@@ -108,39 +119,38 @@ class _Blocks:
         The standard error is the larger of the one by the noise and the one by the jackknife over phases.
         """
         gram, cross = self._among(chosen)
-        fits = _coefficients(gram.sum(axis=0) - gram, cross.sum(axis=0) - cross)
+        fits = self._solved(gram.sum(axis=0) - gram, cross.sum(axis=0) - cross)
         jackknife = (1.0 - 1.0 / len(gram)) * np.sum((fits - fits.mean(axis=0)) ** 2, axis=0)
-        inverse = np.linalg.inv(gram.sum(axis=0) + RIDGE * np.eye(len(chosen)))
+        inverse = np.linalg.inv(gram.sum(axis=0) + self.ridge * np.eye(len(chosen)))
         noise_variance = np.diag(inverse @ self.noise[np.ix_(chosen, chosen)] @ inverse)
-        return _coefficients(gram.sum(axis=0), cross.sum(axis=0)), np.sqrt(
-            np.maximum(jackknife, noise_variance)
-        )
+        standard_errors = np.sqrt(np.maximum(jackknife, noise_variance))
+        return self._solved(gram.sum(axis=0), cross.sum(axis=0)), standard_errors
 
     def _among(self, chosen: list[int]) -> tuple[Array, Array]:
         """Returns `gram` and `cross` of the chosen terms."""
         return self.gram[:, chosen][:, :, chosen], self.cross[:, chosen]
 
+    def _solved(self, gram: Array, cross: Array) -> Array:
+        """Returns the coefficients (..., p) that solve normal equations (..., p, p) and (..., p)."""
+        stable = gram + self.ridge * np.eye(gram.shape[-1])
+        return np.asarray(np.linalg.solve(stable, cross[..., None])[..., 0])
 
-def _coefficients(gram: Array, cross: Array) -> Array:
-    """Returns the coefficients (..., p) that solve normal equations (..., p, p) and (..., p)."""
-    return np.asarray(np.linalg.solve(gram + RIDGE * np.eye(gram.shape[-1]), cross[..., None])[..., 0])
 
-
-def propose_form(found: Fit, motion: PadMotion, seed: int) -> Form:
+def propose_form(fit: Fit, motion: PadMotion, seed: int, settings: FormSettings = FormSettings()) -> Form:
     """Returns a form for the force that a fit leaves unexplained; `motion` is the recording's protocol."""
-    remainder = unexplained(found, motion)
-    binned = found.log_posterior.binned
+    remainder = unexplained(fit, motion)
+    binned = fit.log_posterior.binned
     terms = library(remainder, binned.edges_s, binned.phases, motion)
-    shapes, terms, norm = _testable_terms(remainder, terms)
+    shapes, terms, norm = _testable_terms(remainder, terms, settings.one_phase)
     target_n = remainder.beyond(remainder.residual_n)
-    blocks = _blocks(shapes, target_n, remainder)
+    blocks = _blocks(shapes, target_n, remainder, settings.ridge)
     chosen = (
-        _chosen(blocks, _gain_from_noise(shapes, remainder, seed))
+        _chosen(blocks, _gain_from_noise(shapes, remainder, seed, settings), settings)
         if len(terms) and len(blocks.square) > 1 else []
     )  # fmt: skip
     total, gain = float(blocks.square.sum()), float((blocks.square - blocks.left_out(chosen)).sum())
     noise_square = float(np.trace(remainder.basis.T @ remainder.noise_n2 @ remainder.basis))
-    if not chosen or gain < ENOUGH * (total - noise_square):
+    if not chosen or gain < settings.enough * (total - noise_square):
         sentence = "No form found: no term of the library predicts the unexplained force in held-out phases."
         return Form((), 0.0, np.zeros(len(target_n)), sentence)
     values, standard_errors = blocks.coefficients(chosen)
@@ -148,7 +158,7 @@ def propose_form(found: Fit, motion: PadMotion, seed: int) -> Form:
     form_terms = tuple(
         FormTerm(
             terms[i].name, float(value / norm[i]), float(sd / norm[i]), terms[i].unit,
-            tuple(terms[j].name for j in np.flatnonzero(np.abs(correlation[i]) > ALIKE) if j != i),
+            tuple(terms[j].name for j in np.flatnonzero(np.abs(correlation[i]) > settings.alike) if j != i),
         )
         for i, value, sd in zip(chosen, values, standard_errors, strict=True)
     )  # fmt: skip
@@ -158,7 +168,9 @@ def propose_form(found: Fit, motion: PadMotion, seed: int) -> Form:
     )
 
 
-def _testable_terms(remainder: Unexplained, terms: list[Term]) -> tuple[Array, list[Term], Array]:
+def _testable_terms(
+    remainder: Unexplained, terms: list[Term], one_phase: float
+) -> tuple[Array, list[Term], Array]:
     """Returns the terms (k, p) without the part that parameters could explain, scaled to unit norm.
 
     Only terms that can be tested are returned. The results are their values, the terms and their norms.
@@ -166,10 +178,10 @@ def _testable_terms(remainder: Unexplained, terms: list[Term]) -> tuple[Array, l
     values = np.stack([term.values for term in terms], axis=1)
     remaining = remainder.beyond(values)
     norm = np.linalg.norm(remaining, axis=0)
-    testable = norm > SEEN * np.maximum(np.linalg.norm(values, axis=0), 1e-300)
+    testable = norm > UNEXPLAINED.seen * np.maximum(np.linalg.norm(values, axis=0), 1e-300)
     remaining = remaining / np.where(testable, norm, 1.0)
     largest_share = np.max([np.sum(remaining[inside] ** 2, axis=0) for inside in _phases(remainder)], axis=0)
-    kept = np.flatnonzero(testable & (largest_share < ONE_PHASE))
+    kept = np.flatnonzero(testable & (largest_share < one_phase))
     return remaining[:, kept], [terms[i] for i in kept], norm[kept]
 
 
@@ -178,7 +190,7 @@ def _phases(remainder: Unexplained) -> list[NDArray[np.bool_]]:
     return [remainder.at.phase == phase for phase in np.unique(remainder.at.phase)]
 
 
-def _blocks(shapes: Array, target: Array, remainder: Unexplained) -> _Blocks:
+def _blocks(shapes: Array, target: Array, remainder: Unexplained, ridge: float) -> _Blocks:
     """Returns the products of terms `shapes` (k, p) and the residual `target` (k,) [N], by phase."""
     phases = _phases(remainder)
     return _Blocks(
@@ -186,38 +198,40 @@ def _blocks(shapes: Array, target: Array, remainder: Unexplained) -> _Blocks:
         np.array([shapes[phase].T @ target[phase] for phase in phases]),
         np.array([target[phase] @ target[phase] for phase in phases]),
         shapes.T @ remainder.noise_n2 @ shapes,
+        ridge,
     )
 
 
-def _gain_from_noise(shapes: Array, remainder: Unexplained, seed: int) -> float:
-    """Returns the gain that the best single term exceeds with probability `LEVEL` where all is noise."""
-    noise_n = np.random.default_rng(seed).standard_normal((remainder.basis.shape[1], DRAWS))
+def _gain_from_noise(shapes: Array, remainder: Unexplained, seed: int, settings: FormSettings) -> float:
+    """Returns the gain that the best single term exceeds with probability `level` where all is noise."""
+    noise_n = np.random.default_rng(seed).standard_normal((remainder.basis.shape[1], settings.draws))
     noise_n = remainder.expand @ noise_n
     phases = _phases(remainder)
     cross = np.array([shapes[phase].T @ noise_n[phase] for phase in phases])  # (b, p, draws)
     square = np.array([np.sum(shapes[phase] ** 2, axis=0) for phase in phases])[:, :, None]
     coefficient = (cross.sum(axis=0) - cross) / (square.sum(axis=0) - square)
     gain = np.sum(2.0 * coefficient * cross - coefficient**2 * square, axis=0)
-    return float(np.quantile(gain.max(axis=0), 1.0 - LEVEL))
+    return float(np.quantile(gain.max(axis=0), 1.0 - settings.level))
 
 
-def _chosen(blocks: _Blocks, noise_gain: float) -> list[int]:
+def _chosen(blocks: _Blocks, noise_gain: float, settings: FormSettings) -> list[int]:
     """Returns the numbers of the terms of the form, in the order in which they are added.
 
     noise_gain : smallest gain of a term, from `_gain_from_noise`
     """
     chosen: list[int] = []
     total = float(blocks.square.sum())
-    while len(chosen) < MOST:
+    while len(chosen) < settings.most:
         before = blocks.left_out(chosen)
         unused = [i for i in range(blocks.cross.shape[1]) if i not in chosen]
         gains = np.array([before - blocks.left_out([*chosen, i]) for i in unused])  # (p, b)
         gain = gains.sum(axis=1)
         standard_error = np.sqrt(gains.shape[1]) * gains.std(axis=1, ddof=1)
-        kept = (gain > noise_gain) & (gain > standard_error) & (gain > WORTH * total)
+        kept = (gain > noise_gain) & (gain > standard_error) & (gain > settings.worth * total)
         if not kept.any():
             break
-        chosen.append(unused[int(np.flatnonzero(kept & (gain >= NEARLY_BEST * gain[kept].max()))[0])])
+        nearly_best = gain >= settings.nearly_best * gain[kept].max()
+        chosen.append(unused[int(np.flatnonzero(kept & nearly_best)[0])])
     return chosen
 
 

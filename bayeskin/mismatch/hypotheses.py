@@ -25,12 +25,28 @@ import numpy as np
 from bayeskin.mechanisms import Mechanism
 from bayeskin.mismatch.fit import Fit
 
-PRIOR = 0.05  # prior probability that a mechanism acts
-ODDS = float(np.log(PRIOR / (1.0 - PRIOR)))
-PROBABLE = 0.9  # probability of a mechanism, or of its look-alikes, from which it is named
-LIKELIER_THAN_NOT = 0.5
-# Share of the squared misfit that named mechanisms must explain where a discrepancy is likelier than not.
-MOST_OF_IT = 0.9
+
+@dataclass(frozen=True)
+class VerdictSettings:
+    """Probabilities of the rule that gives the verdict.
+
+    prior : prior probability that a mechanism acts
+    probable : probability of a mechanism, or of its look-alikes, from which it is named
+    likelier_than_not : probability from which a discrepancy, or that nothing is missing, is likelier than not
+    most_of_it : share of the squared misfit that named mechanisms must explain where a discrepancy is
+        likelier than not
+    `benchmarks/diagnosis_scoreboard.py` shows which verdicts other values would give.
+    """
+
+    prior: float = 0.05
+    probable: float = 0.9
+    likelier_than_not: float = 0.5
+    most_of_it: float = 0.9
+
+    @property
+    def log_odds(self) -> float:
+        """Returns the logarithm of the prior odds that a mechanism acts."""
+        return float(np.log(self.prior / (1.0 - self.prior)))
 
 
 @dataclass(frozen=True)
@@ -78,17 +94,19 @@ class Judgement:
     smooth_probability: float
 
 
-def weight(found: Fit) -> float:
+def weight(fit: Fit, settings: VerdictSettings = VerdictSettings()) -> float:
     """Returns the logarithm of a set's weight: its evidence times the prior odds of its mechanisms."""
-    return found.log_evidence + len(found.names) * ODDS
+    return fit.log_evidence + len(fit.names) * settings.log_odds
 
 
-def hypotheses_of(names: tuple[str, ...], said: Evidences) -> tuple[Hypothesis, Hypothesis]:
+def hypotheses_of(
+    names: tuple[str, ...], evidences: Evidences, settings: VerdictSettings = VerdictSettings()
+) -> tuple[Hypothesis, Hypothesis]:
     """Returns both hypotheses of a set: without and with an unnamed discrepancy."""
-    log_prior = len(names) * ODDS
+    log_prior = len(names) * settings.log_odds
     return (
-        Hypothesis(names, False, said.alone + log_prior),
-        Hypothesis(names, True, said.with_discrepancy + log_prior + ODDS),
+        Hypothesis(names, False, evidences.alone + log_prior),
+        Hypothesis(names, True, evidences.with_discrepancy + log_prior + settings.log_odds),
     )
 
 
@@ -127,7 +145,10 @@ class Family:
         return float(share[np.array(among)].sum() / share.sum())
 
 
-def judge_family(family: Family, known: Mapping[str, Mechanism], explained: float) -> Judgement:
+def judge_family(
+    family: Family, known: Mapping[str, Mechanism], explained: float,
+    settings: VerdictSettings = VerdictSettings(),
+) -> Judgement:  # fmt: skip
     """Returns the verdict with the named mechanisms.
 
     known : all mechanisms by name
@@ -140,12 +161,12 @@ def judge_family(family: Family, known: Mapping[str, Mechanism], explained: floa
         group = [member for member in known[name].group if member in known and member not in already_named]
         together = family.probability(group)
         likeliest = probability >= max(alone[member] for member in group)
-        if probability >= PROBABLE or (likeliest and together >= PROBABLE):
+        if probability >= settings.probable or (likeliest and together >= settings.probable):
             named.append(NamedMechanism(name, probability, known[name].group, together))
-    if family.smooth > LIKELIER_THAN_NOT and explained < MOST_OF_IT:
+    if family.smooth > settings.likelier_than_not and explained < settings.most_of_it:
         named = []
     if named:
         verdict: Literal["nothing-missing", "named", "unknown"] = "named"
     else:
-        verdict = "nothing-missing" if family.nothing > LIKELIER_THAN_NOT else "unknown"
+        verdict = "nothing-missing" if family.nothing > settings.likelier_than_not else "unknown"
     return Judgement(verdict, tuple(named), family.nothing, family.smooth)

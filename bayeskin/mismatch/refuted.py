@@ -13,19 +13,19 @@ from bayeskin.types import Jumps, PadMotion
 from bayeskin.types.joint import Span, values_in
 
 
-def refuted(found: Fit, known: Mapping[str, Mechanism], motion: PadMotion, jumps: Jumps) -> list[str]:
+def refuted(fit: Fit, known: Mapping[str, Mechanism], motion: PadMotion, jumps: Jumps) -> list[str]:
     """Returns the mechanisms of a fit that the recording's samples contradict.
 
     The list is empty if the fit has an amplifier that smooths the force, or a clock that is off.
 
     jumps : the force jumps that the samples allow; only those in the fitted part are used
     """
-    acts = {name: known[name].act for name in found.names}
+    acts = {name: known[name].act for name in fit.names}
     instrument = {name: act for name, act in acts.items() if isinstance(act, Instrument)}
     if any(act.place >= Place.AMPLIFIER for act in instrument.values()):
         return []
-    values = {name: np.array([value]) for name, value in found.theta.items()}
-    log_posterior = found.log_posterior
+    values = {name: np.array([value]) for name, value in fit.theta.items()}
+    log_posterior = fit.log_posterior
     fitted_jumps = jumps.until(log_posterior.binned.edges_s[log_posterior.chain.bins[-1] + 1])
     spans = motion.spans or (Span("", 0.0, float(motion.time_s[-1])),)
     parts = [

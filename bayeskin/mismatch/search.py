@@ -40,7 +40,7 @@ from bayeskin.types import BinnedForce, ParameterSpace
 def search(
     ask: AnswerTasks, binned: BinnedForce, base: ParameterSpace, known: Mapping[str, Mechanism],
     solves: Collection[str], noise: Mapping[str, float], seed: int, tell: Tell,
-    settings: SearchSettings | None = None,
+    settings: SearchSettings = SearchSettings(),
 ) -> SearchResult:  # fmt: skip
     """Returns the fits of all sets that the search has fitted, and the evidences of the likely ones.
 
@@ -49,9 +49,7 @@ def search(
         forward model solves; noise : values of the noise parameters from which fits start
     Raises InputError where the model runs with no tissue of these priors.
     """
-    context = SearchContext(
-        ask, binned, base, known, frozenset(solves), noise, seed, tell, settings or SearchSettings()
-    )
+    context = SearchContext(ask, binned, base, known, frozenset(solves), noise, seed, tell, settings)
     searcher = Searcher(context)
     searcher.fit_base_model()
     searcher.search_sets()

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bayeskin.mismatch.hypotheses import ODDS
-
-RARITY = -ODDS  # gain in log-evidence with which a mechanism is as probable as its absence
+from bayeskin.mismatch.fit import SAME_MAXIMUM
 
 
 @dataclass(frozen=True)
@@ -79,4 +77,4 @@ class SearchSettings:
     ends: tuple[float, float] = (0.1, 0.9)
     ratios: tuple[float, ...] = (0.05, 0.2, 0.6, 1.5)
     maxima: int = 3
-    alike_by: float = 0.1
+    alike_by: float = SAME_MAXIMUM

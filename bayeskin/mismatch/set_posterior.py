@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bayeskin.mismatch.context import DiagnosisContext
-from bayeskin.mismatch.emulate import EmulatedPosterior, Learn, emulate
+from bayeskin.mismatch.emulate import EmulatedPosterior, EmulationSettings, Learn, emulate
 from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.resample import PosteriorDraws, resample
 from bayeskin.mismatch.search_context import noise_of
@@ -17,13 +17,11 @@ from bayeskin.mismatch.tasks import AnswerTasks, FullRunTask, RunTask, Task
 from bayeskin.mismatch.trust_region import SetFit, within
 from bayeskin.types import Array
 
-REACH = 0.5  # distance from a run within which its tangent is sampled, as a share of the prior's width
-
 
 def draws_near_run(fit: Fit, seed: int) -> PosteriorDraws:
-    """Returns draws of the posterior near a fit's run, up to the distance `REACH` from it."""
-    posterior = fit.log_posterior
-    near = within(posterior, np.clip(posterior.vector(fit.theta), *posterior.bounds), REACH)
+    """Returns draws of the posterior near a fit's run, where an emulation has its first points."""
+    posterior, reach = fit.log_posterior, EmulationSettings().first
+    near = within(posterior, np.clip(posterior.vector(fit.theta), *posterior.bounds), reach)
     return resample(replace(fit, log_posterior=near), seed)
 
 

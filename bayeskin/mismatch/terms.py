@@ -14,13 +14,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayeskin.mismatch.unexplained import Place, Unexplained, place
+from bayeskin.mismatch.unexplained import KIND_IN_WORDS, Place, Unexplained, place
 from bayeskin.types import Array, PadMotion, Phase
 from bayeskin.types.joint import recording_at
 
-POINTS = 8  # number of times inside a bin
-TAUS_S = (1.0, 3.0, 10.0, 30.0, 100.0)
-KINDS = {"hold": "in holds", "rest": "at rest", "load": "while loading", "unload": "while unloading"}
+
+@dataclass(frozen=True)
+class LibrarySettings:
+    """Settings of the library of terms.
+
+    points : number of times inside a bin at which a function is evaluated
+    taus_s : times of memories and of exponential relaxations [s], about three to a decade
+    log_taus_s : times of logarithmic relaxations [s]
+    """
+
+    points: int = 8
+    taus_s: tuple[float, ...] = (1.0, 3.0, 10.0, 30.0, 100.0)
+    log_taus_s: tuple[float, ...] = (1.0, 10.0)
 
 
 @dataclass(frozen=True)
@@ -53,22 +63,27 @@ _UNITS = {
 }
 
 
-def library(rest: Unexplained, edges_s: Array, phases: tuple[Phase, ...], motion: PadMotion) -> list[Term]:
+def library(
+    rest: Unexplained, edges_s: Array, phases: tuple[Phase, ...], motion: PadMotion,
+    settings: LibrarySettings = LibrarySettings(),
+) -> list[Term]:  # fmt: skip
     """Returns all terms on the fitted bins of a recording, the simpler ones first."""
     start, end = edges_s[rest.bins], edges_s[rest.bins + 1]
-    share = (np.arange(POINTS) + 0.5) / POINTS
+    share = (np.arange(settings.points) + 0.5) / settings.points
     time_s = start[:, None] + share * (end - start)[:, None]
     starts = np.array([p.start_s for p in phases])
     phase = np.clip(np.searchsorted(starts, time_s, side="right") - 1, 0, len(phases) - 1)
     at = place(time_s, phase, phases, motion)
     return [
         Term(name, *_UNITS[unit], np.broadcast_to(values, time_s.shape).mean(axis=1))
-        for name, unit, values in _functions(at, rest.force_n[:, None], motion)
+        for name, unit, values in _functions(at, rest.force_n[:, None], motion, settings)
     ]
 
 
-def _functions(at: Place, force_n: Array, motion: PadMotion) -> Iterator[tuple[str, str, Array]]:
-    """Yields the name, the unit and the values at times (k, POINTS) of each function."""
+def _functions(
+    at: Place, force_n: Array, motion: PadMotion, settings: LibrarySettings
+) -> Iterator[tuple[str, str, Array]]:
+    """Yields the name, the unit and the values at times (k, points) of each function."""
     u, direction = at.displacement_m, at.direction
     cycles_done = np.maximum(at.cycle - 1.0, 0.0)
     in_first_cycle = (at.cycle <= 1.0).astype(float)
@@ -77,8 +92,8 @@ def _functions(at: Place, force_n: Array, motion: PadMotion) -> Iterator[tuple[s
     yield "displacement", "m", u
     yield "time", "s", at.time_s
     yield "cycles done", "1", cycles_done
-    for kind, words in KINDS.items():
-        yield f"a constant {words}", "1", (at.kind == kind).astype(float)
+    for kind in ("hold", "rest", "load", "unload"):
+        yield f"a constant {KIND_IN_WORDS[kind]}", "1", (at.kind == kind).astype(float)
     yield "speed", "m/s", at.speed_m_s
     yield "the model's force", "N", force_n * np.ones_like(u)
     yield "displacement squared", "m^2", u**2
@@ -91,16 +106,19 @@ def _functions(at: Place, force_n: Array, motion: PadMotion) -> Iterator[tuple[s
     yield "the model's force with the sign of motion", "N", force_n * direction
     yield "the model's force times cycles done", "N", force_n * cycles_done
     yield "the model's force times time", "N s", force_n * at.time_s
-    for tau_s in TAUS_S:
+    for tau_s in settings.taus_s:
         yield f"memory of displacement over {tau_s:g} s", "m", memory(motion, at.time_s, tau_s)
     for kind in ("hold", "rest"):
         inside = (at.kind == kind) & (at.cycle > 0)
-        for tau_s in TAUS_S:
+        for tau_s in settings.taus_s:
+            name = f"1 − exp(−t / {tau_s:g} s) {KIND_IN_WORDS[kind]}"
+            yield name, "1", inside * -np.expm1(-at.since_s / tau_s)
+        for tau_s in settings.log_taus_s:
             yield (
-                f"1 − exp(−t / {tau_s:g} s) {KINDS[kind]}", "1", inside * -np.expm1(-at.since_s / tau_s)
-            )  # fmt: skip
-        for tau_s in (1.0, 10.0):
-            yield f"log(1 + t / {tau_s:g} s) {KINDS[kind]}", "1", inside * np.log1p(at.since_s / tau_s)
+                f"log(1 + t / {tau_s:g} s) {KIND_IN_WORDS[kind]}",
+                "1",
+                inside * np.log1p(at.since_s / tau_s),
+            )
 
 
 def memory(motion: PadMotion, time_s: Array, tau_s: float) -> Array:

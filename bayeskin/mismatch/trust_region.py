@@ -19,8 +19,10 @@ import numpy as np
 
 from bayeskin.forward.interface import ModelRun
 from bayeskin.inference import LogPosterior
-from bayeskin.inference.gauss_newton import Top, gauss_newton, with_less_noise
+from bayeskin.inference.gauss_newton import Top, gauss_newton
+from bayeskin.inference.problem import HELD
 from bayeskin.inference.reparametrisation import Shear, shear_at
+from bayeskin.inference.score_test import with_less_noise
 from bayeskin.mismatch.evidence import evidence
 from bayeskin.mismatch.fit import Fit, stored
 from bayeskin.mismatch.tangent import POWER
@@ -34,8 +36,8 @@ class TrustSettings:
 
     first, largest, smallest : half width of the region at the start, its largest value, and the value below
         which the fit ends; as shares of the prior's width
-    kept, more : shares of the promised gain that a step must reach so that the region does not shrink, and
-        so that it grows
+    kept, expanded : shares of the promised gain that a step must reach so that the region does not shrink,
+        and so that it grows
     shrinks, grows : factors on the half width
     moved : share of its half width from which a parameter has moved far; the region shrinks and grows along
         such parameters
@@ -48,7 +50,7 @@ class TrustSettings:
     largest: float = 0.5
     smallest: float = 0.004
     kept: float = 0.3
-    more: float = 0.8
+    expanded: float = 0.8
     shrinks: float = 0.3
     moved: float = 0.5
     grows: float = 2.0
@@ -79,22 +81,22 @@ class SetFit:
     correction_n: Array
 
 
-def as_json(found: SetFit) -> dict[str, Any]:
+def as_json(set_fit: SetFit) -> dict[str, Any]:
     """Returns a fit in JSON's types."""
-    assert found.run.slopes_n is not None
+    assert set_fit.run.slopes_n is not None
     run = {
-        "theta": found.run.theta.tolist(), "force_n": found.run.force_n.tolist(),
-        "slopes_n": found.run.slopes_n.tolist(),
+        "theta": set_fit.run.theta.tolist(), "force_n": set_fit.run.force_n.tolist(),
+        "slopes_n": set_fit.run.slopes_n.tolist(),
     }  # fmt: skip
     return {
-        "fit": stored(found.fit), "run": run, "runs": found.runs, "settled": found.settled,
-        "off_n": found.correction_n.tolist(),
+        "fit": stored(set_fit.fit), "run": run, "runs": set_fit.runs, "settled": set_fit.settled,
+        "off_n": set_fit.correction_n.tolist(),
     }  # fmt: skip
 
 
 def fit_set(
     names: Sequence[str], start: Mapping[str, float], skin: Skin, local: Local,
-    settings: TrustSettings | None = None, correction_n: Array | None = None,
+    settings: TrustSettings = TrustSettings(), correction_n: Array | None = None,
 ) -> SetFit | str:  # fmt: skip
     """Returns the fit of a set that is reached from `start`; if the first run fails, its message.
 
@@ -102,7 +104,6 @@ def fit_set(
     skin : runs the forward model; local : returns the posterior near runs
     correction_n (m,) : force [N] that is added to each run
     """
-    settings = settings or TrustSettings()
 
     def run_at(theta: Mapping[str, float]) -> ModelRun | str:
         run = skin(names, theta)
@@ -143,7 +144,7 @@ def fit_set(
             run, vector, value = new_run, proposal, new_value
         if gain < settings.kept * promised:
             reach[moved_far if moved_far.any() else solved] *= settings.shrinks
-        elif gain > settings.more * promised:
+        elif gain > settings.expanded * promised:
             reach[moved_far] = np.minimum(settings.grows * reach[moved_far], settings.largest)
     correction_n = np.zeros_like(run.force_n) if correction_n is None else correction_n
     return SetFit(_fit(names, local(names, [run]), vector), run, run_count, settled, correction_n)
@@ -193,7 +194,7 @@ def in_box(about: LogPosterior, vector: Array, reach: Array) -> LogPosterior:
     """
     space, (low, high) = about.surrogate.space, about.bounds
     low, high, centre = low[: space.dim], high[: space.dim], vector[: space.dim]
-    half_width = np.maximum(reach, 1e-9) * (high - low)
+    half_width = np.maximum(reach, HELD) * (high - low)
     lower, upper = (space.from_line(np.clip(centre + sign * half_width, low, high)) for sign in (-1.0, 1.0))
     prior = about.material or space
     narrowed = tuple(

@@ -30,10 +30,28 @@ from bayeskin.mismatch.evidence import held_density
 from bayeskin.mismatch.fit import Fit
 from bayeskin.types import Array, PadMotion, Phase
 
-STEP = 1e-3  # step of central differences, as a share of the prior box in sampling coordinates
-AT_BOUND = 1e-3  # distance from a bound, as a share of the box, below which a parameter is held there
-SMALLEST = 1e-6  # smallest singular value of the derivatives that counts, as a share of the largest one
 DIRECTION = {"rest": 0.0, "load": 1.0, "hold": 0.0, "unload": -1.0}
+KIND_IN_WORDS = {"rest": "at rest", "load": "while loading", "hold": "in holds", "unload": "while unloading"}
+
+
+@dataclass(frozen=True)
+class UnexplainedSettings:
+    """Settings of the split of a residual.
+
+    step : step of central differences, as a share of the prior's box in sampling coordinates
+    at_bound : distance from a bound, as a share of the box, below which a parameter is held there
+    smallest : smallest singular value of the derivatives that counts, as a share of the largest one
+    seen : smallest share of the norm of a force or coordinate that must remain after the parameters' part is
+        removed, so that it can be compared with the residual
+    """
+
+    step: float = 1e-3
+    at_bound: float = 1e-3
+    smallest: float = 1e-6
+    seen: float = 1e-3
+
+
+UNEXPLAINED = UnexplainedSettings()
 
 
 @dataclass(frozen=True)
@@ -177,26 +195,26 @@ class Unexplained:
         return np.asarray(forces_n - self.taken @ (self.taken.T @ forces_n))
 
 
-def unexplained(found: Fit, motion: PadMotion) -> Unexplained:
+def unexplained(fit: Fit, motion: PadMotion) -> Unexplained:
     """Returns the residual at a fit on the fitted bins; `motion` is the protocol of the recording."""
-    log_posterior = found.log_posterior
+    log_posterior = fit.log_posterior
     chain, binned = log_posterior.chain, log_posterior.binned
-    theta = log_posterior.from_sampling(log_posterior.vector(found.theta))[None]
+    theta = log_posterior.from_sampling(log_posterior.vector(fit.theta))[None]
     prediction = log_posterior.predict(theta)
     force = prediction.mean[0, chain.bins]
     noise = log_posterior.split(theta)[1][0]
     measured = np.where(np.arange(len(noise)) < len(noise) - 2, 0.0, noise)
     covariance = noise_covariance(chain, measured, prediction.diagonal[0, chain.bins])
     factor = prediction.factor[0, chain.bins]
-    material = found.unit[: log_posterior.surrogate.space.dim]
-    can_move = (material > AT_BOUND) & (material < 1.0 - AT_BOUND)
-    all_slopes = derivatives(log_posterior, found.unit)[chain.bins]
+    material = fit.unit[: log_posterior.surrogate.space.dim]
+    can_move = (material > UNEXPLAINED.at_bound) & (material < 1.0 - UNEXPLAINED.at_bound)
+    all_slopes = derivatives(log_posterior, fit.unit)[chain.bins]
     slopes, inwards = (
         all_slopes[:, can_move],
         (all_slopes * np.where(material < 0.5, 1.0, -1.0))[:, ~can_move],
     )
     vectors, size, _ = np.linalg.svd(slopes)
-    rank = int(np.sum(size > SMALLEST * size.max(initial=0.0)))
+    rank = int(np.sum(size > UNEXPLAINED.smallest * size.max(initial=0.0)))
     at = place(binned.time_s[chain.bins], binned.phase[chain.bins], binned.phases, motion)
     return Unexplained(
         chain.bins, chain.force_n - force, force, covariance + factor @ factor.T,
@@ -219,11 +237,11 @@ def derivatives(log_posterior: LogPosterior, unit: Array) -> Array:
 
     unit : point (D,) in the unit cube
     """
-    d = log_posterior.surrogate.space.dim
+    d, step = log_posterior.surrogate.space.dim, UNEXPLAINED.step
     low, high = log_posterior.bounds
-    centre = np.clip(unit, STEP, 1.0 - STEP)
+    centre = np.clip(unit, step, 1.0 - step)
     points = np.tile(centre, (2 * d, 1))
-    points[:d, :d] += STEP * np.eye(d)
-    points[d:, :d] -= STEP * np.eye(d)
+    points[:d, :d] += step * np.eye(d)
+    points[d:, :d] -= step * np.eye(d)
     mean = log_posterior.predict_mean(log_posterior.from_sampling(low + points * (high - low)))
-    return np.asarray((mean[:d] - mean[d:]).T / (2 * STEP))
+    return np.asarray((mean[:d] - mean[d:]).T / (2 * step))

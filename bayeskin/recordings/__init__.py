@@ -3,14 +3,8 @@
 from bayeskin.recordings.bins import bin_recording, covered_s, uniform_edges
 from bayeskin.recordings.describe import describe, describe_json
 from bayeskin.recordings.motion import idealised_motion, motion_of, recorded_motion
-from bayeskin.recordings.noise import (
-    NoiseAnalysis,
-    PhaseNoise,
-    analyse,
-    jumps_of,
-    phase_noise,
-    summarise,
-)
+from bayeskin.recordings.noise import PhaseNoise, jumps_of, phase_noise, summarise
+from bayeskin.recordings.noise_analysis import NoiseAnalysis, analyse
 from bayeskin.recordings.read import read_recording
 from bayeskin.recordings.segment import resolution_m, segment
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bayeskin.errors import InputError
 from bayeskin.recordings.correlation import NoiseShape, weighted_covariance
-from bayeskin.recordings.noise import NoiseAnalysis, analyse
+from bayeskin.recordings.noise_analysis import NoiseAnalysis, analyse
 from bayeskin.types import Array, BinnedForce, PadMotion, Phase, Recording
 
 MOST_BINS = 1_000_000

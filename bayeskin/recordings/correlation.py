@@ -23,10 +23,20 @@ from scipy.signal import correlate
 
 from bayeskin.types import Array, frozen_array
 
-_DEGREE = 2
-_GRID = 40  # number of correlation times that are tried
-_LONGEST = 0.4  # longest correlation time that is tried, as a share of the window
-_CHANCE = 9.0  # square of three standard deviations
+
+@dataclass(frozen=True)
+class CorrelationSettings:
+    """Settings of the estimate of a correlation.
+
+    times : number of correlation times that are tried
+    longest : longest correlation time that is tried, as a share of the window
+    chance : a correlated part must lower the misfit by more than this multiple of the variance that white
+        noise gives an estimated correlation, the square of three standard deviations
+    """
+
+    times: int = 40
+    longest: float = 0.4
+    chance: float = 9.0
 
 
 @dataclass(frozen=True)
@@ -47,7 +57,7 @@ WHITE = NoiseShape(1.0, 1.0)
 
 def parabola_basis(size: int) -> Array:
     """Returns orthonormal polynomials up to degree two on `size` samples, (size, 3)."""
-    return np.linalg.qr(np.vander(np.linspace(-1, 1, size), _DEGREE + 1))[0]
+    return np.linalg.qr(np.vander(np.linspace(-1, 1, size), 3))[0]
 
 
 def residual_windows(values: Array, size: int) -> Array:
@@ -88,7 +98,10 @@ def expected_products(correlation: Array, lags: int) -> Array:
     return correlation[:lags] + change / (size - np.arange(lags))
 
 
-def fit_shape(correlogram: Array, samples: int, interval_s: float, size: int) -> NoiseShape:
+def fit_shape(
+    correlogram: Array, samples: int, interval_s: float, size: int,
+    settings: CorrelationSettings = CorrelationSettings(),
+) -> NoiseShape:  # fmt: skip
     """Returns the noise whose expected lagged products are nearest to the measured ones.
 
     correlogram (lags,) contains the mean lagged products divided by the product at lag 0. They come from
@@ -96,10 +109,10 @@ def fit_shape(correlogram: Array, samples: int, interval_s: float, size: int) ->
     misfit by more than chance allows under white noise. The estimated correlations of white noise scatter
     with variance 1 / samples.
     """
-    taus, dictionary = _dictionary(interval_s, size, len(correlogram))
+    taus, dictionary = _dictionary(interval_s, size, len(correlogram), settings)
     white = dictionary[0]
     remainder = correlogram - white * float(white @ correlogram) / float(white @ white)
-    least, best = float(remainder @ remainder) - _CHANCE / samples, WHITE
+    least, best = float(remainder @ remainder) - settings.chance / samples, WHITE
     for tau, slow in zip(taus, dictionary[1:], strict=True):
         amplitude, misfit = nnls(np.column_stack([white, slow]), correlogram)
         if misfit**2 < least:
@@ -108,13 +121,15 @@ def fit_shape(correlogram: Array, samples: int, interval_s: float, size: int) ->
 
 
 @lru_cache(maxsize=8)
-def _dictionary(interval_s: float, size: int, lags: int) -> tuple[Array, Array]:
+def _dictionary(
+    interval_s: float, size: int, lags: int, settings: CorrelationSettings
+) -> tuple[Array, Array]:
     """Returns the correlation times that are tried, (k,), and the expected products (k + 1, lags).
 
     The first row of the products belongs to white noise, the others belong to the correlation times.
     """
     lag_s = interval_s * np.arange(size)
-    taus = np.geomspace(interval_s, _LONGEST * size * interval_s, _GRID)
+    taus = np.geomspace(interval_s, settings.longest * size * interval_s, settings.times)
     correlations = [np.where(lag_s == 0, 1.0, 0.0), *(np.exp(-lag_s / tau) for tau in taus)]
     products = np.array([expected_products(correlation, lags) for correlation in correlations])
     return frozen_array(taus), frozen_array(products)

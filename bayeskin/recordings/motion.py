@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,11 +11,22 @@ from bayeskin.recordings.polyline import simplify
 from bayeskin.recordings.segment import resolution_m
 from bayeskin.types import Array, PadMotion, Phase, Recording
 
-_ROUNDING_S = 0.1  # half width over which a drive rounds a corner; it contains a turning point's extreme
-_CLEAR_S = 0.5  # duration that is ignored at both ends of a still phase when its level is measured
+
+@dataclass(frozen=True)
+class CornerSettings:
+    """Settings of the displacement at corners.
+
+    rounding_s : half width [s] over which a drive rounds a corner; it contains a turning point's extreme
+    clear_s : duration [s] that is ignored at both ends of a still phase when its level is measured
+    """
+
+    rounding_s: float = 0.1
+    clear_s: float = 0.5
 
 
-def corner_heights_m(recording: Recording, phases: Sequence[Phase]) -> Array:
+def corner_heights_m(
+    recording: Recording, phases: Sequence[Phase], settings: CornerSettings = CornerSettings()
+) -> Array:
     """Returns the displacement [m] (len(phases) + 1,) at the corners, as the protocol intended it.
 
     Beside a still phase it is the level of that phase. Between a loading and an unloading it is the extreme
@@ -26,11 +38,11 @@ def corner_heights_m(recording: Recording, phases: Sequence[Phase]) -> Array:
         still = [p for p in phases[max(i - 1, 0) : i + 1] if p.kind in ("rest", "hold")]
         corner_s = phases[i].start_s if i < len(phases) else phases[-1].end_s
         if still:
-            clear = min(_CLEAR_S, 0.2 * (still[0].end_s - still[0].start_s))
+            clear = min(settings.clear_s, 0.2 * (still[0].end_s - still[0].start_s))
             inside = (time_s >= still[0].start_s + clear) & (time_s <= still[0].end_s - clear)
             heights.append(float(np.median(displacement_m[inside])))
             continue
-        near = displacement_m[np.abs(time_s - corner_s) <= _ROUNDING_S]
+        near = displacement_m[np.abs(time_s - corner_s) <= settings.rounding_s]
         if i in (0, len(phases)) or phases[i - 1].kind == phases[i].kind:
             heights.append(float(np.interp(corner_s, time_s, displacement_m)))
         else:

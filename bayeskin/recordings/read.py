@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,16 +19,38 @@ from bayeskin.types import Array, Recording
 _WORKBOOKS = {".xlsx", ".xlsm"}
 _TEXTS = {".csv", ".tsv", ".txt"}
 _STORED = {".h5", ".hdf5"}
-_MIN_SAMPLES = 100
 
-# These are the smallest and the largest plausible duration, travel and peak force of an extensometer test on
-# living skin, in SI. The ranges are wide on purpose. They only choose a unit that a header does not give, and
-# only if exactly one unit fits.
-_PLAUSIBLE = {"time": (5.0, 7200.0), "displacement": (5e-5, 0.1), "force": (0.01, 100.0)}
-_PLAUSIBLE_INTERVAL_S = (1e-6, 0.2)
-# No skin test exceeds these values. Larger values mean that the header does not give the unit of the numbers.
-_LARGEST = {"displacement": (0.1, "m"), "force": (1e3, "N")}
-_SMALLEST_TRAVEL_M = 1e-5
+
+@dataclass(frozen=True)
+class PlausibleTest:
+    """Plausible sizes of an extensometer test on living skin.
+
+    The choice of a unit that a header does not give; the ranges are wide on purpose, and a unit is chosen
+    only if it is the only one that fits
+    duration_s, travel_m, peak_n : smallest and largest duration, travel and peak force
+    interval_s : smallest and largest time between samples
+
+    Refusal of a recording
+    samples, least_travel_m : least number of samples, and least travel
+    largest_m, largest_n : no skin test exceeds these values; larger values mean that the header does not give
+        the unit of the numbers
+    """
+
+    duration_s: tuple[float, float] = (5.0, 7200.0)
+    travel_m: tuple[float, float] = (5e-5, 0.1)
+    peak_n: tuple[float, float] = (0.01, 100.0)
+    interval_s: tuple[float, float] = (1e-6, 0.2)
+    samples: int = 100
+    least_travel_m: float = 1e-5
+    largest_m: float = 0.1
+    largest_n: float = 1e3
+
+    def range_of(self, quantity: str) -> tuple[float, float]:
+        """Returns the smallest and the largest plausible size of a quantity."""
+        return {"time": self.duration_s, "displacement": self.travel_m, "force": self.peak_n}[quantity]
+
+
+PLAUSIBLE = PlausibleTest()
 
 
 def read_recording(path: Path | str, *, sheet: str | None = None) -> Recording:
@@ -126,11 +148,11 @@ def _guess_unit(table: Table, column: Column, raw: Array) -> str:
     """
     quantity = column.quantity
     size = float(np.ptp(raw) if quantity != "force" else np.max(np.abs(raw)))
-    low, high = _PLAUSIBLE[quantity]
+    low, high = PLAUSIBLE.range_of(quantity)
     fitting = [unit for unit, factor in UNITS[quantity].items() if low <= size * factor <= high]
     if quantity == "time":
         interval = float(np.median(np.abs(np.diff(raw)))) if len(raw) > 1 else 0.0
-        shortest, longest = _PLAUSIBLE_INTERVAL_S
+        shortest, longest = PLAUSIBLE.interval_s
         fitting = [u for u in fitting if shortest <= interval * UNITS[quantity][u] <= longest]
     if len(fitting) == 1:
         return fitting[0]
@@ -155,8 +177,8 @@ def _refuse_invalid(where: str, first_row: int, time_s: Array, displacement_m: A
     that changes.
     """
     named = {"time": time_s, "displacement": displacement_m, "force": force_n}
-    if len(time_s) < _MIN_SAMPLES:
-        raise InputError(where, f"{len(time_s)} samples", f"at least {_MIN_SAMPLES}")
+    if len(time_s) < PLAUSIBLE.samples:
+        raise InputError(where, f"{len(time_s)} samples", f"at least {PLAUSIBLE.samples}")
     for name, values in named.items():
         _refuse_infinite(f"{where}, row", first_row, name, values)
     back = np.flatnonzero(np.diff(time_s) <= 0)
@@ -166,7 +188,10 @@ def _refuse_invalid(where: str, first_row: int, time_s: Array, displacement_m: A
         raise InputError(
             f"{where}, row {first_row + back[0] + 1}", problem, "times that increase from row to row"
         )
-    for name, (largest, unit) in _LARGEST.items():
+    for name, largest, unit in (
+        ("displacement", PLAUSIBLE.largest_m, "m"),
+        ("force", PLAUSIBLE.largest_n, "N"),
+    ):
         peak = int(np.argmax(np.abs(named[name])))
         value = abs(named[name][peak])
         if value > largest:
@@ -174,6 +199,6 @@ def _refuse_invalid(where: str, first_row: int, time_s: Array, displacement_m: A
             expected = f"at most {largest:g} {unit} (is the column in {'mm' if unit == 'm' else 'mN'}?)"
             raise InputError(f"{where}, row {first_row + peak}", problem, expected)
     travel = float(np.ptp(displacement_m))
-    if travel < _SMALLEST_TRAVEL_M:
+    if travel < PLAUSIBLE.least_travel_m:
         problem = f"a displacement that changes by {travel:.3g} m in all"
-        raise InputError(where, problem, f"at least {_SMALLEST_TRAVEL_M:g} m (is its unit right?)")
+        raise InputError(where, problem, f"at least {PLAUSIBLE.least_travel_m:g} m (is its unit right?)")

@@ -18,12 +18,30 @@ from bayeskin.errors import InputError
 from bayeskin.recordings.polyline import simplify
 from bayeskin.types import Array, Phase, PhaseKind, Recording
 
-_STILL_SHARE = 0.03  # a piece that moves less than this share of the travel is still (drift, overshoot)
-_REST_SHARE = 0.05  # a still piece closer to the lowest level than this share is a rest, else a hold
-_SHORTEST_STILL_S = 0.2  # a dwell at a turning point that is shorter than this is not a phase
-_SPEED_CHANGE = 1.5  # a ramp whose speed changes by a larger factor has a corner there
-_SHORTEST_RAMP_S = 0.5  # both parts of such a ramp must last at least this long
-_TRIM_S = 0.5  # duration that a line fit ignores at a piece's rounded end, at most a tenth of the piece
+
+@dataclass(frozen=True)
+class SegmentSettings:
+    """Settings of the search for phases. Shares are shares of the whole travel of the displacement.
+
+    tolerance : largest distance of the polyline from the displacement, if the resolution is finer
+    still : a piece that moves less than this share is still (drift, overshoot)
+    rest : a still piece closer to the lowest level than this share is a rest, else a hold
+    shortest_still_s : a dwell at a turning point that is shorter than this [s] is not a phase
+    speed_change : a ramp whose speed changes by a larger factor has a corner there
+    shortest_ramp_s : both parts of such a ramp must last at least this long [s]
+    trim_s : duration [s] that a line fit ignores at a piece's rounded end, at most a tenth of the piece
+    """
+
+    tolerance: float = 0.005
+    still: float = 0.03
+    rest: float = 0.05
+    shortest_still_s: float = 0.2
+    speed_change: float = 1.5
+    shortest_ramp_s: float = 0.5
+    trim_s: float = 0.5
+
+
+SEGMENT = SegmentSettings()
 
 
 @dataclass(frozen=True)
@@ -60,7 +78,7 @@ def segment(recording: Recording) -> tuple[Phase, ...]:
     time_s = recording.time_s
     smooth = median_filter(recording.displacement_m, 5, mode="nearest")
     travel = float(np.ptp(smooth))
-    tolerance = max(0.005 * travel, 4 * resolution_m(recording.displacement_m))
+    tolerance = max(SEGMENT.tolerance * travel, 4 * resolution_m(recording.displacement_m))
     if travel < 5 * tolerance:
         raise InputError(
             recording.name,
@@ -68,9 +86,8 @@ def segment(recording: Recording) -> tuple[Phase, ...]:
             "loading and unloading",
         )
     knots = simplify(time_s, smooth, tolerance, np.empty(0, dtype=np.int64))
-    pieces = _merge(
-        _fragments(time_s, smooth, knots, _STILL_SHARE * travel), time_s, smooth, _STILL_SHARE * travel
-    )
+    still_m = SEGMENT.still * travel
+    pieces = _merge(_fragments(time_s, smooth, knots, still_m), time_s, smooth, still_m)
     if len(pieces) < 2:
         raise InputError(
             recording.name,
@@ -108,7 +125,7 @@ def _merge(fragments: list[_Piece], time_s: Array, smooth: Array, still_m: float
     kept = [
         piece
         for piece in pieces
-        if piece.direction or time_s[piece.stop] - time_s[piece.start] >= _SHORTEST_STILL_S
+        if piece.direction or time_s[piece.stop] - time_s[piece.start] >= SEGMENT.shortest_still_s
     ]
     return _join_equal(kept, time_s, smooth, still_m)
 
@@ -134,9 +151,9 @@ def _are_separate_ramps(a: _Piece, b: _Piece, time_s: Array, smooth: Array, stil
     moved = np.array([abs(smooth[p.stop] - smooth[p.start]) for p in (a, b)])
     lasted = np.array([time_s[p.stop] - time_s[p.start] for p in (a, b)])
     speed = moved / lasted
-    if a.direction == 0 or moved.min() < still_m or lasted.min() < _SHORTEST_RAMP_S:
+    if a.direction == 0 or moved.min() < still_m or lasted.min() < SEGMENT.shortest_ramp_s:
         return False
-    return bool(speed.max() > _SPEED_CHANGE * speed.min())
+    return bool(speed.max() > SEGMENT.speed_change * speed.min())
 
 
 def _fit_line(time_s: Array, smooth: Array, start: int, stop: int) -> tuple[float, float]:
@@ -153,7 +170,7 @@ def _fit_line(time_s: Array, smooth: Array, start: int, stop: int) -> tuple[floa
 def _near_half(time_s: Array, piece: _Piece, at_end: bool) -> tuple[int, int]:
     """Returns the first and last sample of the half of a piece next to a corner, without the rounded end."""
     length = time_s[piece.stop] - time_s[piece.start]
-    trim = min(0.1 * length, _TRIM_S)
+    trim = min(0.1 * length, SEGMENT.trim_s)
     near, far = trim, max(0.5 * length, trim)
     if at_end:
         window = (time_s[piece.stop] - far, time_s[piece.stop] - near)
@@ -175,7 +192,8 @@ def _corner_s(time_s: Array, smooth: Array, before: _Piece, after: _Piece) -> fl
     if slope_a == slope_b:
         return knot_s
     meeting_s = (intercept_b - intercept_a) / (slope_a - slope_b)
-    return float(meeting_s) if abs(meeting_s - knot_s) <= max(reach, _SHORTEST_STILL_S) else knot_s
+    reach = max(reach, SEGMENT.shortest_still_s)
+    return float(meeting_s) if abs(meeting_s - knot_s) <= reach else knot_s
 
 
 def _name_phases(pieces: list[_Piece], edges: list[float], smooth: Array) -> tuple[Phase, ...]:
@@ -186,7 +204,7 @@ def _name_phases(pieces: list[_Piece], edges: list[float], smooth: Array) -> tup
     for i, (piece, level) in enumerate(zip(pieces, levels, strict=True)):
         kind: PhaseKind = "load" if piece.direction > 0 else "unload"
         if piece.direction == 0:
-            kind = "rest" if level < low + _REST_SHARE * travel else "hold"
+            kind = "rest" if level < low + SEGMENT.rest * travel else "hold"
         elif kind == "load" and not (phases and phases[-1].kind in ("hold", "load")):
             cycle += 1
         phases.append(Phase(kind, cycle, edges[i], edges[i + 1]))

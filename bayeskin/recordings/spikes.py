@@ -21,15 +21,31 @@ from scipy.stats import norm
 
 from bayeskin.types import Array, _FreezesArrays
 
-FAMILY_WISE = 0.05  # probability that noise alone shows any spike in a whole recording
-_WINDOW_S = 0.5
-_SCALE_S = 2.5  # the noise changes even within a hold, so its sd is estimated over blocks of this length
-_TAIL_SD = 2.0
-_PASSES = 3  # spikes may be dense, so each pass takes the median of the force without the last pass's spikes
-_FINEST = 1e-4  # least noise sd, as a share of the force's range
-_HUBER = 2.5
+_HUBER = 2.5  # number of sd at which residuals are winsorised
 # This is E min(z^2, k^2) of a standard normal z. Dividing by it makes the winsorised variance consistent.
 _CONSISTENT = 1 - 2 * norm.sf(_HUBER) - 2 * _HUBER * norm.pdf(_HUBER) + 2 * _HUBER**2 * norm.sf(_HUBER)
+
+
+@dataclass(frozen=True)
+class SpikeSettings:
+    """Settings of the search for spikes.
+
+    family_wise : probability that noise alone shows any spike in a whole recording
+    window_s : width of the running median [s]
+    scale_s : length of blocks [s] over which the sd of the noise is estimated, since the noise changes even
+        within a hold
+    tail : neighbouring samples that are this many sd away on the same side belong to the spike too
+    passes : number of passes; spikes may be dense, so each pass takes the median of the force without the
+        last pass's spikes
+    finest : least sd of the noise, as a share of the force's range
+    """
+
+    family_wise: float = 0.05
+    window_s: float = 0.5
+    scale_s: float = 2.5
+    tail: float = 2.0
+    passes: int = 3
+    finest: float = 1e-4
 
 
 @dataclass(frozen=True)
@@ -59,26 +75,29 @@ class Despiked(_FreezesArrays):
         )
 
 
-def despike(time_s: Array, force_n: Array, breaks: Sequence[int]) -> Despiked:
+def despike(
+    time_s: Array, force_n: Array, breaks: Sequence[int], settings: SpikeSettings = SpikeSettings()
+) -> Despiked:
     """Finds spikes in force_n (n,) and removes them.
 
     `breaks` are sample indices, including 0 and n, that the running median must not cross.
     """
     interval_s = float(np.median(np.diff(time_s)))
-    half = max(2, round(0.5 * _WINDOW_S / interval_s))
-    block = max(50, round(_SCALE_S / interval_s))
-    threshold = float(norm.isf(0.5 * FAMILY_WISE / len(force_n)))
-    # Rounding alone gives every force some noise, and no load cell is better than `_FINEST` of its range.
-    least = max(_least_step(force_n) / np.sqrt(12.0), _FINEST * float(np.ptp(force_n)), 1e-12)
+    half = max(2, round(0.5 * settings.window_s / interval_s))
+    block = max(50, round(settings.scale_s / interval_s))
+    threshold = float(norm.isf(0.5 * settings.family_wise / len(force_n)))
+    # Rounding alone gives every force some noise, and no load cell is better than `finest` of its range.
+    finest_n = settings.finest * float(np.ptp(force_n))
+    least = max(_least_step(force_n) / np.sqrt(12.0), finest_n, 1e-12)
     median, sd, spike = np.empty_like(force_n), np.empty_like(force_n), np.zeros(len(force_n), dtype=np.int8)
     for a, b in pairwise(breaks):
         force = force_n[a:b]
-        for _ in range(_PASSES):
+        for _ in range(settings.passes):
             cleaned = np.where(spike[a:b] != 0, median[a:b], force) if spike[a:b].any() else force
             median[a:b] = running_median(cleaned, half)
             residual = force - median[a:b]
             sd[a:b] = _local_sd(residual, spike[a:b] == 0, block, least)
-            spike[a:b] = _excursions(residual / sd[a:b], threshold)
+            spike[a:b] = _excursions(residual / sd[a:b], threshold, settings.tail)
     return Despiked(np.where(spike != 0, median, force_n), median, sd, spike, threshold)
 
 
@@ -128,10 +147,10 @@ def _local_sd(residual: Array, kept: NDArray[np.bool_], block: int, least: float
     return out
 
 
-def _excursions(z: Array, threshold: float) -> NDArray[np.int8]:
+def _excursions(z: Array, threshold: float, tail: float) -> NDArray[np.int8]:
     out = np.zeros(len(z), dtype=np.int8)
     for sign in (-1, 1):
         seeds = sign * z > threshold
         if seeds.any():
-            out[binary_propagation(seeds, mask=sign * z > _TAIL_SD)] = sign
+            out[binary_propagation(seeds, mask=sign * z > tail)] = sign
     return out

@@ -19,15 +19,33 @@ from scipy.stats import norm
 from bayeskin.recordings.correlation import NoiseShape, weighted_covariance
 from bayeskin.types import Array, Jumps
 
-FAMILY_WISE = 0.01  # probability that noise alone shows any step in a whole recording
-_WINDOW_S = 0.5
-_GAP_S = 0.05  # a step of the zero is not infinitely fast
-_MOST = 50  # largest number of steps in one phase
-_FINEST_S = 0.01  # approximate least time between the samples that are used to judge jumps
-_BESIDE_S = 1.0  # time on either side of a moment whose samples are used to judge a jump
-# The samples refute a jump that exceeds the estimated jump both by `_BEYOND` sd and by the factor `_TIMES`.
-_BEYOND = 3.0
-_TIMES = 2.0
+
+@dataclass(frozen=True)
+class StepSettings:
+    """Settings of the search for steps and of the limits of jumps.
+
+    gap_s : time [s] that is left out beside a step or jump, since neither is infinitely fast
+
+    Steps
+    family_wise : probability that noise alone shows any step in a whole recording
+    window_s : time [s] over which the force is averaged on either side of a moment
+    most : largest number of steps in one phase
+
+    Jumps
+    finest_s : approximate least time [s] between the samples that are used
+    beside_s : time [s] on either side of a moment whose samples are used
+    beyond, times : the samples refute a jump that exceeds the estimated jump both by `beyond` sd and by the
+        factor `times`
+    """
+
+    gap_s: float = 0.05
+    family_wise: float = 0.01
+    window_s: float = 0.5
+    most: int = 50
+    finest_s: float = 0.01
+    beside_s: float = 1.0
+    beyond: float = 3.0
+    times: float = 2.0
 
 
 @dataclass(frozen=True)
@@ -39,17 +57,20 @@ class Step:
     significance: float
 
 
-def step_filter(interval_s: float) -> Array:
+def step_filter(interval_s: float, settings: StepSettings = StepSettings()) -> Array:
     """Returns weights (odd size,) that give the size of a step in their middle, and 0 on a straight line."""
-    window = max(3, round(_WINDOW_S / interval_s))
-    gap = max(1, round(_GAP_S / interval_s))
+    window = max(3, round(settings.window_s / interval_s))
+    gap = max(1, round(settings.gap_s / interval_s))
     near = np.full(window, 1.0 / window)
     reach = (window + 2 * gap + 1) / window  # near windows' distance over the distance from near to far
     right = np.concatenate([np.zeros(gap), (1 + 0.5 * reach) * near, -0.5 * reach * near])
     return np.concatenate([-right[::-1], [0.0], right])
 
 
-def find_steps(time_s: Array, force_n: Array, sd_n: float, shape: NoiseShape, tests: int) -> tuple[Step, ...]:
+def find_steps(
+    time_s: Array, force_n: Array, sd_n: float, shape: NoiseShape, tests: int,
+    settings: StepSettings = StepSettings(),
+) -> tuple[Step, ...]:  # fmt: skip
     """Returns the steps in one phase's force without spikes (n,), in time order.
 
     `sd_n` and `shape` describe the noise of an undisturbed phase. `tests` is the number of samples of the
@@ -57,18 +78,18 @@ def find_steps(time_s: Array, force_n: Array, sd_n: float, shape: NoiseShape, te
     ends of the phase.
     """
     interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
-    weights = step_filter(interval_s)
+    weights = step_filter(interval_s, settings)
     half = len(weights) // 2
     if len(force_n) <= 2 * len(weights):
         return ()
     correlation = shape.at(interval_s * np.arange(len(weights)))
     expected = sd_n * float(np.sqrt(weighted_covariance(weights, weights, correlation)))
-    threshold = float(norm.isf(0.5 * FAMILY_WISE / tests))
-    window = max(3, round(_WINDOW_S / interval_s))
+    threshold = float(norm.isf(0.5 * settings.family_wise / tests))
+    window = max(3, round(settings.window_s / interval_s))
     corrected, steps = force_n.copy(), []
     jump = np.convolve(corrected, weights[::-1], mode="valid")
     available = np.ones(len(jump), dtype=bool)
-    for _ in range(_MOST):
+    for _ in range(settings.most):
         peak = int(np.argmax(np.where(available, np.abs(jump), 0.0)))
         first = _first_sample_after_step(corrected, peak + half, window)
         size = float(jump[np.clip(first - half, 0, len(jump) - 1)])
@@ -83,26 +104,28 @@ def find_steps(time_s: Array, force_n: Array, sd_n: float, shape: NoiseShape, te
     return tuple(sorted(steps, key=lambda step: step.time_s))
 
 
-def allowed_jumps(time_s: Array, force_n: Array, sd_n: Array, shape: NoiseShape) -> Jumps:
+def allowed_jumps(
+    time_s: Array, force_n: Array, sd_n: Array, shape: NoiseShape, settings: StepSettings = StepSettings()
+) -> Jumps:
     """Returns the jumps that one phase's force without spikes (n,) allows, with noise of local sd_n (n,).
 
     Generalised least squares fits a parabola plus a jump over one second on either side. The fit leaves a
     gap, because a jump may take some samples. The limits include the jumps estimated up to half a second
     before and after, because the time of a jump is not known more precisely. Near the phase's ends the force
-    itself bends, so no jump is judged there. If the samples are closer than `_FINEST_S`, only some of them
+    itself bends, so no jump is judged there. If the samples are closer than `finest_s`, only some of them
     are used.
     """
     interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
-    every = max(1, int(_FINEST_S / interval_s))
+    every = max(1, int(settings.finest_s / interval_s))
     time_s, force_n, sd_n, interval_s = time_s[::every], force_n[::every], sd_n[::every], every * interval_s
-    half = max(5, round(_BESIDE_S / interval_s))
+    half = max(5, round(settings.beside_s / interval_s))
     lowest, highest = np.full(len(time_s), -np.inf), np.full(len(time_s), np.inf)
     if len(force_n) > 4 * half:
-        gap = max(1, round(_GAP_S / interval_s))
+        gap = max(1, round(settings.gap_s / interval_s))
         weights, share = _jump_filter(half, gap, shape.at(interval_s * np.arange(2 * half)))
         jump = np.convolve(force_n, weights[::-1], mode="valid")  # element i is the jump at sample i + half
-        unit = _BEYOND * share * sd_n[half : len(sd_n) - half + 1]
-        low, high = np.minimum(jump - unit, _TIMES * jump), np.maximum(jump + unit, _TIMES * jump)
+        unit, enlarged = settings.beyond * share * sd_n[half : len(sd_n) - half + 1], settings.times * jump
+        low, high = np.minimum(jump - unit, enlarged), np.maximum(jump + unit, enlarged)
         reach = half // 2
         judged = slice(half + reach, len(time_s) - half - reach + 1)
         lowest[judged] = minimum_filter1d(np.minimum(low, 0.0), 2 * reach + 1)[reach : len(low) - reach]

@@ -21,13 +21,25 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayeskin.polynomials import legendre_basis, multi_indices
+from bayeskin.sensitivity.estimators import REPLICATES
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
-REPLICATES = 200
-HIGHEST_DEGREE = 10
-DRAWS_A_TERM = 5  # least number of draws for each term of a polynomial
-COMPONENTS = 8  # number of principal components of the force that are predicted; the others vary little
-_BLOCKS = 40  # number of blocks of draws that the bootstrap resamples
+
+@dataclass(frozen=True)
+class ShapleySettings:
+    """Settings of Shapley effects.
+
+    highest_degree : highest degree of a polynomial
+    draws_a_term : least number of draws for each term of a polynomial
+    components : number of principal components of the force that are predicted; the others vary little
+    replicates, blocks : number of bootstrap replicates, and of blocks of draws that the bootstrap resamples
+    """
+
+    highest_degree: int = 10
+    draws_a_term: int = 5
+    components: int = 8
+    replicates: int = REPLICATES
+    blocks: int = 40
 
 
 @dataclass(frozen=True)
@@ -54,6 +66,7 @@ def shapley(
     edges_s: ArrayLike,
     rng: np.random.Generator,
     distribution: str,
+    settings: ShapleySettings = ShapleySettings(),
 ) -> ShapleyResult:
     """Returns the Shapley effects of the parameters theta (n, d), in SI, on the force_n (n, m).
 
@@ -64,10 +77,10 @@ def shapley(
     weight = np.diff(np.asarray(edges_s, dtype=float))
     centred = (force - force.mean(axis=0)) * np.sqrt(weight / weight.sum())
     squares = np.einsum("nm,nm->n", centred, centred)
-    explained = _explained_by_set(unit, centred, squares)
-    block = rng.permutation(len(squares)) % min(_BLOCKS, len(squares))
+    explained = _explained_by_set(unit, centred, squares, settings)
+    block = rng.permutation(len(squares)) % min(settings.blocks, len(squares))
     sums = np.stack([np.bincount(block, values) for values in explained.values()])
-    picks = rng.integers(0, sums.shape[1], (REPLICATES, sums.shape[1]))
+    picks = rng.integers(0, sums.shape[1], (settings.replicates, sums.shape[1]))
     resampled = sums[:, picks].sum(axis=2)  # (sets, replicates)
     columns = dict(zip(explained, range(len(explained)), strict=True))
     best = _shares_from_sets(sums.sum(axis=1)[:, None], columns, space.dim)[0]
@@ -75,21 +88,23 @@ def shapley(
     return ShapleyResult(space.names, best, limits, float(squares.mean()), len(squares), distribution)
 
 
-def _explained_by_set(unit: Array, centred: Array, own: Array) -> dict[tuple[int, ...], Array]:
+def _explained_by_set(
+    unit: Array, centred: Array, own: Array, settings: ShapleySettings
+) -> dict[tuple[int, ...], Array]:
     """Returns, for each set of parameters, each draw's part (n,) of the variance that the set explains."""
-    dim = unit.shape[1]
+    dim, kept = unit.shape[1], slice(settings.components)
     left, size, _ = np.linalg.svd(centred, full_matrices=False)
-    components = left[:, :COMPONENTS] * size[:COMPONENTS]
+    components = left[:, kept] * size[kept]
     predicted = np.einsum("nr,nr->n", components, components)
     explained: dict[tuple[int, ...], Array] = {(): np.zeros(len(own))}
     for count in range(1, dim):
         for chosen in combinations(range(dim), count):
-            explained[chosen] = predicted - _squared_errors(unit[:, chosen], components)
+            explained[chosen] = predicted - _squared_errors(unit[:, chosen], components, settings)
     explained[tuple(range(dim))] = own
     return explained
 
 
-def _squared_errors(points: Array, values: Array) -> Array:
+def _squared_errors(points: Array, values: Array, settings: ShapleySettings) -> Array:
     """Returns the squared errors (n,) with which a polynomial in points (n, k) predicts values (n, r).
 
     Each row is predicted by a fit to all other rows. The polynomial has the degree with the smallest sum of
@@ -97,9 +112,9 @@ def _squared_errors(points: Array, values: Array) -> Array:
     """
     scaled = _scaled_principal_axes(points)
     best = np.einsum("nr,nr->n", values, values)
-    for degree in range(1, HIGHEST_DEGREE + 1):
+    for degree in range(1, settings.highest_degree + 1):
         terms = multi_indices(points.shape[1], degree, 1.0)
-        if len(terms) * DRAWS_A_TERM > len(points):
+        if len(terms) * settings.draws_a_term > len(points):
             break
         basis = np.linalg.qr(legendre_basis(scaled, terms))[0]
         residual = values - basis @ (basis.T @ values)

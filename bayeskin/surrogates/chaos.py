@@ -18,10 +18,20 @@ from numpy.typing import NDArray
 from bayeskin.polynomials import Indices, legendre_basis, multi_indices
 from bayeskin.types import Array, _FreezesArrays
 
-HIGHEST_DEGREE = 12
-MOST_CANDIDATES = 500
-MOST_TERMS = 120
-FOLDS = 5
+
+@dataclass(frozen=True)
+class ChaosSettings:
+    """Settings of the choice of terms.
+
+    highest_degree : highest degree of a polynomial
+    most_candidates, most_terms : largest number of polynomials among which terms are chosen, and of terms
+    folds : number of folds of the cross-validation
+    """
+
+    highest_degree: int = 12
+    most_candidates: int = 500
+    most_terms: int = 120
+    folds: int = 5
 
 
 class SparseFit(NamedTuple):
@@ -35,23 +45,25 @@ class SparseFit(NamedTuple):
     error: float
 
 
-def fit_sparse(unit: Array, target: Array, weights: Array) -> SparseFit:
+def fit_sparse(
+    unit: Array, target: Array, weights: Array, settings: ChaosSettings = ChaosSettings()
+) -> SparseFit:
     """Returns the terms for one latent (n,) at unit-cube points (n, d).
 
     The degree grows until two successive degrees bring no improvement. `weights` (n,) are the weights of the
     rows in the error. The regression does not use them.
     """
     n, dim = unit.shape
-    fold = np.arange(n) % FOLDS
-    most = max(min(n // 3, MOST_TERMS), 1)
+    fold = np.arange(n) % settings.folds
+    most = max(min(n // 3, settings.most_terms), 1)
     best, failures = SparseFit(np.zeros((1, dim), dtype=np.int64), np.inf, np.inf), 0
-    for degree in range(1, HIGHEST_DEGREE + 1):
+    for degree in range(1, settings.highest_degree + 1):
         indices = multi_indices(dim, degree)
-        if len(indices) > MOST_CANDIDATES or failures == 2:
+        if len(indices) > settings.most_candidates or failures == 2:
             break
         basis = legendre_basis(unit, indices)
         residual = np.empty((n, min(most, len(indices))))
-        for k in range(FOLDS):
+        for k in range(settings.folds):
             residual[fold == k] = _pursue(basis, target, fold != k, residual.shape[1])[1]
         errors = np.average(residual**2, axis=0, weights=weights)
         step = int(np.argmin(errors))

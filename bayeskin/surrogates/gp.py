@@ -2,11 +2,7 @@
 
 The method is universal kriging: Rasmussen & Williams (2006), ch. 2.7.
 
-A variance requires a product with an (n, n) matrix for each point. If the nugget is not small, the rows of
-the kernel lie almost in a subspace of few directions. Pivoted Cholesky factors give this subspace (Harbrecht,
-Peters & Schneider 2012, Appl. Numer. Math. 62:428), and a product with an (r, n) matrix is then enough. The
-part outside the subspace counts as unexplained. The variance therefore becomes larger, never smaller. At the
-training rows it grows by at most `SPARED` of the nugget.
+A variance requires a product with an (n, n) matrix for each point, or with a smaller one (`subspace`).
 """
 
 from __future__ import annotations
@@ -18,8 +14,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr, solve_triangular
-from scipy.linalg.lapack import dpstrf, dtrtri
+from scipy.linalg.lapack import dtrtri
 
 from bayeskin.surrogates.hyperparameters import SMALLEST_NUGGET, LatentFit
 from bayeskin.surrogates.kernels import (
@@ -29,12 +24,10 @@ from bayeskin.surrogates.kernels import (
     trend_basis,
     trend_degree,
 )
+from bayeskin.surrogates.subspace import few_directions
 from bayeskin.types import Array, _FreezesArrays
 
 CHUNK = 128  # number of points whose kernel rows fit into the cache
-WORTH_IT = 100  # with fewer rows the products cost almost nothing, so no subspace is sought
-SPARED = 0.1  # share of the nugget by which a variance may become larger at a training row
-LEAST_NUGGET = 1e-6  # with a smaller nugget the rows are not near a subspace, or rounding hides it
 
 
 class Conditioned(NamedTuple):
@@ -119,30 +112,6 @@ def _collect(white: Array, linear: Array, trend: Array, mean: Array, variance: A
             variance[j, i] = 1.0 - explained
 
 
-def _few_directions(covariance: Array, nugget: float, whitener: Array) -> Array | None:
-    """Returns a matrix (r, n) that whitens rows of the kernel almost as `whitener` does.
-
-    `covariance` (n, n) is the kernel matrix without its nugget. The result is None for few rows, for a small
-    nugget, and if more directions than half the number of rows are necessary.
-    """
-    n = len(covariance)
-    if n < WORTH_IT or nugget < LEAST_NUGGET:
-        return None
-    explained = np.sum((whitener @ covariance) ** 2, axis=0)
-    for residual in (1.0, 0.3, 0.1, 0.03):
-        factor, pivots, rank, _ = dpstrf(covariance, tol=residual * min(nugget, 0.5), lower=1)
-        if rank > n // 2:
-            return None
-        columns = np.empty((n, rank))
-        columns[pivots - 1] = np.tril(factor)[:, :rank]
-        inside = qr(columns, mode="economic")[0]
-        lower = np.linalg.cholesky(inside.T @ covariance @ inside + nugget * np.eye(rank))
-        few = solve_triangular(lower, inside.T, lower=True)
-        if np.max(explained - np.sum((few @ covariance) ** 2, axis=0)) <= SPARED * nugget:
-            return np.asarray(few)
-    return None
-
-
 def _turned(stack: Array) -> Array:
     return np.ascontiguousarray(stack.transpose(0, 2, 1))
 
@@ -207,7 +176,7 @@ class LatentGPs(_FreezesArrays):
         return Conditioned(
             mapped,
             np.asfortranarray(whitener),
-            _few_directions(covariance, float(self.nuggets[j]), whitener),
+            few_directions(covariance, float(self.nuggets[j]), whitener),
             whitener.T @ rest,
             trend,
             whitener.T @ white_basis,
@@ -228,8 +197,8 @@ class LatentGPs(_FreezesArrays):
             part = slice(start, start + CHUNK)
             basis = trend_basis(unit[part], self.degree)
             for stack in self._stacks:
-                found = stack.predict(unit[part] - 0.5, basis)
-                mean[part, stack.latents], variance[part, stack.latents] = found
+                predicted = stack.predict(unit[part] - 0.5, basis)
+                mean[part, stack.latents], variance[part, stack.latents] = predicted
         return mean, variance
 
     def predict_mean(self, unit: Array) -> Array:
@@ -245,24 +214,24 @@ class LatentGPs(_FreezesArrays):
     @cached_property
     def _stacks(self) -> list[_Stack]:
         alike: dict[tuple[str, bool], list[int]] = {}
-        for j, one in enumerate(self.conditioned):
-            alike.setdefault((self.kernels[j], one.few is None), []).append(j)
+        for j, latent in enumerate(self.conditioned):
+            alike.setdefault((self.kernels[j], latent.few is None), []).append(j)
         return [self._stack(name, np.array(latents)) for (name, _), latents in sorted(alike.items())]
 
     def _stack(self, name: str, latents: NDArray[np.intp]) -> _Stack:
         given = [self.conditioned[j] for j in latents]
-        whiteners = [one.whitener if one.few is None else one.few for one in given]
+        whiteners = [latent.whitener if latent.few is None else latent.few for latent in given]
         half = len(self.inputs) // 2 if given[0].few is None else 0
         longest = max(len(whitener) for whitener in whiteners)
         whiteners = [np.pad(whitener, ((0, longest - len(whitener)), (0, 0))) for whitener in whiteners]
-        mapped = np.stack([one.mapped for one in given])
+        mapped = np.stack([latent.mapped for latent in given])
         square = -0.5 * np.sum(mapped**2, axis=2, keepdims=True)
         linear = [
-            np.vstack([whitener[half:], one.trend_root @ one.trend_weights.T, one.weights])
-            for one, whitener in zip(given, whiteners, strict=True)
+            np.vstack([whitener[half:], latent.trend_root @ latent.trend_weights.T, latent.weights])
+            for latent, whitener in zip(given, whiteners, strict=True)
         ]
-        deviation = np.array([one.deviation for one in given])
-        spread = (self.inflation[latents] * deviation) ** 2 * [one.variance for one in given]
+        deviation = np.array([latent.deviation for latent in given])
+        spread = (self.inflation[latents] * deviation) ** 2 * [latent.variance for latent in given]
         return _Stack(
             name=name,
             latents=latents,
@@ -271,9 +240,9 @@ class LatentGPs(_FreezesArrays):
             inputs=_turned(np.concatenate([mapped, np.ones_like(square), square], axis=2)),
             top=_turned(np.stack([whitener[:half, :half] for whitener in whiteners])),
             bottom=_turned(np.stack(linear)),
-            trend=np.stack([np.column_stack([one.trend_root.T, one.trend]) for one in given]),
+            trend=np.stack([np.column_stack([latent.trend_root.T, latent.trend]) for latent in given]),
             nugget=self.nuggets[latents][:, None],
-            centre=np.array([one.centre for one in given])[:, None],
+            centre=np.array([latent.centre for latent in given])[:, None],
             deviation=deviation[:, None],
             spread=spread[:, None],
         )

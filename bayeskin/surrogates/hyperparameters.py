@@ -10,6 +10,7 @@ Rasmussen & Williams (2006), ch. 2.7 and 5.4.1. Leave-one-out in closed form: Du
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
 
@@ -23,16 +24,52 @@ from bayeskin.surrogates.kernels import KERNELS, kernel, squared_distances, tren
 from bayeskin.types import Array
 
 SMALLEST_NUGGET = 1e-8  # share of the kernel's variance; it keeps the factorisation accurate to 1e-6
-LENGTHS = (0.05, 50.0)  # shortest and longest correlation length, as shares of the box's width
-DIAGONAL_WIDTH, OBLIQUE_WIDTH = 3.0, 0.25  # prior standard deviations of W's entries
-ROWS_TO_SEARCH = 320  # with more rows the search begins on at most this many of them
-ALIGNED_STEPS, OBLIQUE_STEPS, ALL_ROWS_STEPS = 15, 40, 20
-ALL_ROWS_NUGGET = 1e-4  # largest initial nugget for all rows, which can follow what few rows treat as noise
-FEWEST_TO_SEARCH = 3  # least number of rows for each input and the nugget; fewer rows use a single length
-ONE_LENGTH_RATES = (0.3, 1.0, 3.0)  # inverse lengths that are tried, for a box of width 1
-ONE_LENGTH_NUGGETS = np.logspace(-6.0, 0.0, 13)
-FOLDS = 3
-FOLD_WORK = 640  # rows times search steps of a fold; few rows mislead the search more, and cost less
+
+
+@dataclass(frozen=True)
+class HyperparameterSettings:
+    """Settings of the search for hyperparameters.
+
+    Prior
+    lengths : shortest and longest correlation length, as shares of the box's width
+    diagonal_width, oblique_width : prior standard deviations of W's entries
+
+    Search
+    first_rows : with more rows the search begins on at most this many of them
+    first_nugget : nugget at which the search begins
+    aligned_steps, oblique_steps, all_rows_steps : largest number of steps with W diagonal, with W triangular,
+        and on all rows
+    all_rows_nugget : largest initial nugget for all rows, which can follow what few rows treat as noise
+
+    Few rows
+    fewest : least number of rows for each input and the nugget; fewer rows use a single length
+    rates : inverse lengths that are tried then, for a box of width 1
+    log10_nuggets, nuggets : logarithms of the smallest and largest nugget that are tried, and their number
+
+    Cross-validation
+    folds : number of folds
+    fold_work, fold_steps : rows times search steps of a fold, and limits of the number of steps; few rows
+        mislead the search more, and cost less
+    """
+
+    lengths: tuple[float, float] = (0.05, 50.0)
+    diagonal_width: float = 3.0
+    oblique_width: float = 0.25
+    first_rows: int = 320
+    first_nugget: float = 1e-4
+    aligned_steps: int = 15
+    oblique_steps: int = 40
+    all_rows_steps: int = 20
+    all_rows_nugget: float = 1e-4
+    fewest: int = 3
+    rates: tuple[float, ...] = (0.3, 1.0, 3.0)
+    log10_nuggets: tuple[float, float] = (-6.0, 0.0)
+    nuggets: int = 13
+    folds: int = 3
+    fold_work: int = 640
+    fold_steps: tuple[int, int] = (5, 20)
+
+
 NORMAL_90 = 1.6448536269514722  # a standard normal variable lies within +- this value with probability 90 %
 
 
@@ -112,7 +149,12 @@ def restricted_likelihood(name: str, linear_map: Array, nugget: float, data: Tra
 
 
 def _search(
-    name: str, data: TrainingData, free: NDArray[np.bool_], start: tuple[Array, float], iterations: int
+    name: str,
+    data: TrainingData,
+    free: NDArray[np.bool_],
+    start: tuple[Array, float],
+    iterations: int,
+    settings: HyperparameterSettings,
 ) -> tuple[Array, float]:
     """Returns the linear map and the nugget of the most probable hyperparameters.
 
@@ -120,7 +162,7 @@ def _search(
     """
     dim = len(free)
     eye = np.eye(dim, dtype=bool)
-    width = np.where(eye, DIAGONAL_WIDTH, OBLIQUE_WIDTH)[free]
+    width = np.where(eye, settings.diagonal_width, settings.oblique_width)[free]
 
     def objective(x: Array) -> tuple[float, Array]:
         linear_map = np.zeros((dim, dim))
@@ -129,8 +171,9 @@ def _search(
         prior = 0.5 * float(np.sum((x[:-1] / width) ** 2))
         return at.value + prior, np.append(at.by_map[free] + x[:-1] / width**2, at.by_log_nugget)
 
-    lowest = np.where(eye, 1.0 / LENGTHS[1], -1.0 / LENGTHS[0])[free]
-    bounds = [(low, 1.0 / LENGTHS[0]) for low in lowest] + [(np.log(SMALLEST_NUGGET), 0.0)]
+    shortest, longest = settings.lengths
+    lowest = np.where(eye, 1.0 / longest, -1.0 / shortest)[free]
+    bounds = [(low, 1.0 / shortest) for low in lowest] + [(np.log(SMALLEST_NUGGET), 0.0)]
     x = minimize(
         objective,
         np.append(start[0][free], np.log(start[1])),
@@ -144,7 +187,9 @@ def _search(
     return linear_map, float(np.exp(x[-1]))
 
 
-def fit_latent(unit: Array, target: Array, weights: Array) -> LatentFit:
+def fit_latent(
+    unit: Array, target: Array, weights: Array, settings: HyperparameterSettings = HyperparameterSettings()
+) -> LatentFit:
     """Fits one latent (n,) at unit-cube points (n, d) with the kernel of least leave-one-out error.
 
     `weights` (n,) are the weights of the rows in this error. The likelihood does not use them.
@@ -155,34 +200,37 @@ def fit_latent(unit: Array, target: Array, weights: Array) -> LatentFit:
         return LatentFit("gaussian", np.eye(dim), 1.0, 0.0, 1.0)
     basis = trend_basis(unit, trend_degree(len(unit), dim))
     data = TrainingData(unit - 0.5, basis, (target - target.mean()) / deviation)
-    if len(unit) < FEWEST_TO_SEARCH * (dim + 1):
-        return _fit_one_length(data, weights, deviation)
+    if len(unit) < settings.fewest * (dim + 1):
+        return _fit_one_length(data, weights, deviation, settings)
     aligned, oblique = np.eye(dim, dtype=bool), np.tri(dim, dtype=bool)
-    few = data.rows(np.arange(len(unit)) % -(-len(unit) // ROWS_TO_SEARCH) == 0)
+    few = data.rows(np.arange(len(unit)) % -(-len(unit) // settings.first_rows) == 0)
     candidates = []
     for name in KERNELS:
         # The search for the oblique map is not convex, so it starts from the best axis-aligned lengths.
-        optimum = _search(name, few, aligned, (np.eye(dim), 1e-4), ALIGNED_STEPS)
-        optimum = _search(name, few, oblique, optimum, OBLIQUE_STEPS)
+        first = (np.eye(dim), settings.first_nugget)
+        optimum = _search(name, few, aligned, first, settings.aligned_steps, settings)
+        optimum = _search(name, few, oblique, optimum, settings.oblique_steps, settings)
         if len(few.target) < len(unit):
-            optimum = _search(
-                name, data, oblique, (optimum[0], min(optimum[1], ALL_ROWS_NUGGET)), ALL_ROWS_STEPS
-            )
+            restart = (optimum[0], min(optimum[1], settings.all_rows_nugget))
+            optimum = _search(name, data, oblique, restart, settings.all_rows_steps, settings)
         residual = restricted_likelihood(name, *optimum, data).residual
         candidates.append((float(np.average(residual**2, weights=weights)), name, optimum))
     _, name, optimum = min(candidates, key=lambda candidate: candidate[0])
-    best = _cross_validate(name, data, oblique, optimum, weights)
+    best = _cross_validate(name, data, oblique, optimum, weights, settings)
     return best._replace(error=best.error * deviation**2)
 
 
-def _fit_one_length(data: TrainingData, weights: Array, deviation: float) -> LatentFit:
+def _fit_one_length(
+    data: TrainingData, weights: Array, deviation: float, settings: HyperparameterSettings
+) -> LatentFit:
     """Returns a fit for few rows: the most probable length and nugget of a grid.
 
     The length is the same for all inputs, because so few rows cannot distinguish between lengths. A search
     for different lengths would predict far too small errors.
     """
     eye = np.eye(data.inputs.shape[1])
-    choices = product(ONE_LENGTH_RATES, ONE_LENGTH_NUGGETS)
+    nuggets = np.logspace(*settings.log10_nuggets, settings.nuggets)
+    choices = product(settings.rates, nuggets)
     rate, nugget = min(
         choices, key=lambda at: restricted_likelihood("gaussian", at[0] * eye, at[1], data).value
     )
@@ -194,7 +242,12 @@ def _fit_one_length(data: TrainingData, weights: Array, deviation: float) -> Lat
 
 
 def _cross_validate(
-    name: str, data: TrainingData, free: NDArray[np.bool_], at: tuple[Array, float], weights: Array
+    name: str,
+    data: TrainingData,
+    free: NDArray[np.bool_],
+    at: tuple[Array, float],
+    weights: Array,
+    settings: HyperparameterSettings,
 ) -> LatentFit:
     """Returns the fit with its leave-one-out errors.
 
@@ -202,12 +255,13 @@ def _cross_validate(
     the hyperparameters of all rows, the closed form would be too optimistic: for few rows it gives a standard
     deviation that is too small by a factor of up to two to four.
     """
-    fold = np.arange(len(data.target)) % FOLDS
-    steps = min(max(FOLD_WORK // len(fold), 5), 20)
+    fold = np.arange(len(data.target)) % settings.folds
+    fewest, most = settings.fold_steps
+    steps = min(max(settings.fold_work // len(fold), fewest), most)
     residual, ratio = np.empty(len(fold)), np.empty(len(fold))
-    for k in range(FOLDS):
+    for k in range(settings.folds):
         kept = data.rows(fold != k)
-        linear_map, nugget = _search(name, kept, free, at, steps)
+        linear_map, nugget = _search(name, kept, free, at, steps, settings)
         variance = restricted_likelihood(name, linear_map, nugget, kept).variance
         all_rows = restricted_likelihood(name, linear_map, nugget, data)
         held_out = fold == k

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -22,12 +22,26 @@ from bayeskin.types import Array, Design, ParameterSpace
 
 Kind = Literal["gp", "chaos"]
 F = TypeVar("F", LatentFit, SparseFit)
-MOST_COMPONENTS = 12
-# Components are added until the remainder is at most this share of the shape's squared error. The remainder
-# counts as noise of single bins.
-TRUNCATION_SHARE = 0.01
-MARGIN = 0.15  # share of the region's width; rows just outside the region support the surrogate at its faces
-FOLDS = 4
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """Settings of the training of a surrogate.
+
+    most_components : largest number of principal components
+    truncation_share : components are added until the remainder is at most this share of the shape's squared
+        error; the remainder counts as noise of single bins
+    margin : share of the region's width; rows just outside the region support the surrogate at its faces
+    folds : number of folds that choose the kind where no row is held out
+    """
+
+    most_components: int = 12
+    truncation_share: float = 0.01
+    margin: float = 0.15
+    folds: int = 4
+
+
+TRAINING = TrainSettings()
 
 
 def train(
@@ -57,7 +71,7 @@ def train(
         raise InputError("focus", f"shape {focus.shape}", f"{len(design.theta)} finite weights >= 0")
     inputs = Similarity(space).inputs(design.theta)
     active = np.arange(inputs.shape[1]) if active is None else active
-    training = design.training & _near_cube(inputs, MARGIN) & (focus > 0.0)
+    training = design.training & _near_cube(inputs, TRAINING.margin) & (focus > 0.0)
     testing = design.testing & space.contains(design.theta) & (focus > 0.0)
     _refuse_unusable(design, space, training)
     kinds: tuple[Kind, ...] = ("gp", "chaos") if kind == "auto" else (kind,)
@@ -146,8 +160,9 @@ def fit_latents(
     scores = (shapes - full.mean) @ full.components.T
     fits = [fit_one(inputs, amplitude - log_scale, weights)]
     error, remainder = 0.0, float(variances.sum())  # for shapes, whose squares sum to the number of bins
-    for k in range(min(MOST_COMPONENTS, len(inputs) // 3, int(np.sum(variances > 1e-14 * remainder)))):
-        if remainder <= max(TRUNCATION_SHARE * error, 1e-14 * shapes.shape[1]):
+    usable = int(np.sum(variances > 1e-14 * remainder))
+    for k in range(min(TRAINING.most_components, len(inputs) // 3, usable)):
+        if remainder <= max(TRAINING.truncation_share * error, 1e-14 * shapes.shape[1]):
             break
         fit = fit_one(inputs, scores[:, k], weights)
         fits.append(fit)
@@ -183,9 +198,9 @@ def _best_of_folds(
     rows = np.flatnonzero(training & space.contains(design.theta))
     order = np.random.default_rng(seed).permutation(rows)
     errors = dict.fromkeys(kinds, 0.0)
-    for k in range(FOLDS):
+    for k in range(TRAINING.folds):
         fold_rows = np.zeros_like(training)
-        fold_rows[order[k::FOLDS]] = True
+        fold_rows[order[k :: TRAINING.folds]] = True
         for kind in kinds:
             surrogate = _fit(kind, space, design, training & ~fold_rows, focus, {}, active)
             residual = surrogate.predict_mean(design.theta[fold_rows]) - design.force_n[fold_rows]

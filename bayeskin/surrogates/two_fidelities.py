@@ -29,10 +29,18 @@ from bayeskin.surrogates.surrogate import Latents, ShapeSurrogate
 from bayeskin.surrogates.validate import Validation, compare, validate
 from bayeskin.types import Array, Design
 
-FEWEST_MORE = 3  # least number of fine runs beyond the number of inputs
-# The fine shapes' own components are added until the remainder is at most this share of the shapes' squared
-# error.
-LEFT = 1e-4
+
+@dataclass(frozen=True)
+class CorrectionSettings:
+    """Settings of a correction.
+
+    fewest_beyond : least number of fine runs beyond the number of inputs
+    left : the fine shapes' own components are added until the remainder is at most this share of the shapes'
+        squared error
+    """
+
+    fewest_beyond: int = 3
+    left: float = 1e-4
 
 
 @dataclass(frozen=True)
@@ -72,8 +80,9 @@ class CorrectedLatents:
 
 
 def correct(
-    surrogate: ShapeSurrogate, fine: Design, focus: Array | None = None
-) -> tuple[ShapeSurrogate, Validation]:
+    surrogate: ShapeSurrogate, fine: Design, focus: Array | None = None,
+    settings: CorrectionSettings = CorrectionSettings(),
+) -> tuple[ShapeSurrogate, Validation]:  # fmt: skip
     """Returns the surrogate of the fine model, and its validation.
 
     The training rows of `fine` correct the coarse `surrogate`. If `surrogate` already has a correction, the
@@ -88,7 +97,7 @@ def correct(
     inside = surrogate.space.contains(fine.theta)
     training, testing = fine.training & inside, fine.testing & inside
     similarity = surrogate.similarity
-    fewest = len(surrogate.active) + FEWEST_MORE
+    fewest = len(surrogate.active) + settings.fewest_beyond
     if training.sum() < fewest:
         raise InputError("fine design", f"{training.sum()} finished training rows", f"at least {fewest}")
     theta, force_n = fine.theta[training], fine.force_n[training]
@@ -99,7 +108,7 @@ def correct(
     change[:, 0] -= similarity.log_scale(theta)
     fits = [fit_latent(inputs, column, weights) for column in change.T]
     transform, further_fits = _add_components(
-        transform, inputs, force_n, weights, sum(fit.error for fit in fits[1:])
+        transform, inputs, force_n, weights, sum(fit.error for fit in fits[1:]), settings.left
     )
     change = np.concatenate([change, transform.encode(force_n)[:, len(fits) :]], axis=1)
     fits += further_fits
@@ -117,11 +126,11 @@ def correct(
 
 
 def _add_components(
-    transform: ShapeTransform, inputs: Array, force_n: Array, weights: Array, error: float
+    transform: ShapeTransform, inputs: Array, force_n: Array, weights: Array, error: float, left: float
 ) -> tuple[ShapeTransform, list[LatentFit]]:
     """Returns the transform with added components for the remainder of histories (n, m), and their fits.
 
-    Components are added until the remainder is below the share `LEFT` of the squared `error` of the shapes.
+    Components are added until the remainder is below the share `left` of the squared `error` of the shapes.
     The total number of components is at most a third of the rows.
     """
     shapes = split(force_n)[1]
@@ -132,7 +141,7 @@ def _add_components(
     squares, fits = singular**2, []
     most = min(len(inputs) // 3, len(squares)) - len(transform.components)
     for k in range(max(most, 0)):
-        if np.sum(squares[k:]) <= LEFT * error:
+        if np.sum(squares[k:]) <= left * error:
             break
         fits.append(fit_latent(inputs, remainder @ directions[k], weights))
         error += fits[-1].error

@@ -7,10 +7,9 @@ from typing import Literal
 
 import numpy as np
 
+from bayeskin.surrogates.hyperparameters import NORMAL_90
 from bayeskin.surrogates.surrogate import ShapeSurrogate
 from bayeskin.types import Array, Prediction, _FreezesArrays
-
-NORMAL_90 = 1.6448536269514722
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ from bayeskin.types.protocol import PadMotion, Phase, PhaseKind
 from bayeskin.types.provenance import Provenance
 from bayeskin.types.recording import BinnedForce, Jumps, Recording
 from bayeskin.types.simulation import Observation, Simulation
-from bayeskin.types.surrogate import Prediction, Surrogate
+from bayeskin.types.surrogate import POINTS_AT_ONCE, Prediction, Surrogate
 
 __all__ = [
+    "POINTS_AT_ONCE",
     "Array",
     "BinnedForce",
     "Correlation",

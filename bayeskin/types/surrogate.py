@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike
 from bayeskin.types.arrays import Array
 from bayeskin.types.parameters import ParameterSpace
 
+POINTS_AT_ONCE = 256  # number of points of a `Prediction`, whose factor then takes a few tens of MB
+
 
 @dataclass(frozen=True)
 class Prediction:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from bayeskin import report, storage
+from bayeskin.design_files import load_design
 from bayeskin.json_files import write_json
-from bayeskin.runner import load_design
 from bayeskin.surrogates import load_manifest
 from bayeskin.types import BinnedForce, Design, PadMotion
 from bayeskin.workflow.design_runs import failures_of

@@ -19,7 +19,7 @@ from bayeskin.hashing import sha256_of
 from bayeskin.json_files import read_lines
 from bayeskin.mismatch.answers import answer, read_answer
 from bayeskin.mismatch.context import DiagnosisContext
-from bayeskin.mismatch.noise_bounds import QUICK_S, without_swings
+from bayeskin.mismatch.noise_bounds import NOISE_BOUNDS, without_swings
 from bayeskin.mismatch.tasks import AnswerTasks, Task
 from bayeskin.recordings import analyse, bin_recording, jumps_of
 from bayeskin.recordings.join import join_bins, join_jumps
@@ -70,7 +70,8 @@ def calm_bins(folder: Path) -> tuple[BinnedForce, Jumps, PadMotion]:
 
 def _calm(samples: Recording, binned: BinnedForce) -> tuple[BinnedForce, Jumps]:
     """Returns the bins of one recording with variances of quick noise, and the jumps of its samples."""
-    quick = bin_recording(samples, binned.phases, binned.edges_s, analyse(samples, binned.phases, QUICK_S))
+    quick_noise = analyse(samples, binned.phases, NOISE_BOUNDS.quick_s)
+    quick = bin_recording(samples, binned.phases, binned.edges_s, quick_noise)
     return without_swings(binned, quick.variance_n2), jumps_of(samples, binned.phases)
 
 

@@ -14,8 +14,9 @@ import numpy as np
 from bayeskin import inference, report, storage
 from bayeskin.config import parameter_space
 from bayeskin.number_format import quantity
+from bayeskin.sensitivity.result import SobolResult, sentence, uninformed
 from bayeskin.sensitivity.shapley import shapley
-from bayeskin.sensitivity.sobol import SobolResult, sentence, sobol, uninformed
+from bayeskin.sensitivity.sobol import sobol
 from bayeskin.surrogates import correct, load_surrogate, train
 from bayeskin.types import Design, PadMotion, Parameter, ParameterSpace
 from bayeskin.workflow.engine import Run, Stage

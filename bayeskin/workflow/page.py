@@ -11,7 +11,7 @@ import bayeskin
 from bayeskin import storage
 from bayeskin.config import parameter_space
 from bayeskin.report.page import RunFacts, StageFacts, render_page
-from bayeskin.sensitivity.sobol import SobolResult
+from bayeskin.sensitivity.result import SobolResult
 from bayeskin.workflow import experiment
 from bayeskin.workflow.engine import Run, Stage, standing
 from bayeskin.workflow.folder import Record

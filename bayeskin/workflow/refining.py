@@ -9,8 +9,8 @@ import numpy as np
 
 from bayeskin import storage
 from bayeskin.design import Wave
+from bayeskin.design_files import load_design
 from bayeskin.forward.design_model import ForceModel
-from bayeskin.runner import load_design
 from bayeskin.surrogates import load_manifest, load_surrogate, manifest_of, save_surrogate
 from bayeskin.types import Array, BinnedForce, Design, PadMotion, Simulation, Surrogate
 from bayeskin.workflow.design_runs import rows_of, run_wave, runs_file

@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from bayeskin.config import parameter_space
-from bayeskin.design import Wave, fine_wave, first_wave, next_wave, posterior_wave
+from bayeskin.design import Wave, fine_wave, first_wave, posterior_wave
+from bayeskin.design_files import load_design
 from bayeskin.errors import InputError
 from bayeskin.forward.design_model import ForceModel, ReducedOrFull
 from bayeskin.forward.joint import EachRecording
+from bayeskin.history_matching import next_wave
 from bayeskin.inference import LogPosterior, SampleSettings, sample
 from bayeskin.json_files import write_json
-from bayeskin.runner import load_design
 from bayeskin.surrogates import Similarity, train
 from bayeskin.surrogates.focus import focus, noise_floor_n
 from bayeskin.types import Array, BinnedForce, Design, PadMotion, ParameterSpace

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from bayeskin.report.page import RunFacts, StageFacts
 from bayeskin.report.page.figures import FIGURES
 from bayeskin.report.save import figure_bytes
-from bayeskin.sensitivity.sobol import SobolResult
+from bayeskin.sensitivity.result import SobolResult
 
 PARAMETERS = {"E_c": "Young's modulus of the cutis", "p_init": "initial interstitial pressure"}
 HISTORY = {

@@ -19,6 +19,7 @@ from toys.gmsh_file import coarse_tetrahedra, gmsh_text
 from bayeskin import storage
 from bayeskin.config import load_config
 from bayeskin.config.device import load_device
+from bayeskin.design_files import load_waves
 from bayeskin.errors import InputError
 from bayeskin.external.umbridge import Refused, parsed_answer
 from bayeskin.finite_element.gmsh import read_gmsh
@@ -27,7 +28,6 @@ from bayeskin.geometry import Geometry
 from bayeskin.inference import chains, draws_of, load_inference_data, save_inference_data
 from bayeskin.journal import Journal, Run
 from bayeskin.recordings import phase_noise, read_recording, segment
-from bayeskin.runner import load_waves
 from bayeskin.surrogates import load_manifest, manifest_of, save_surrogate, train
 from bayeskin.types import Design, Recording
 from bayeskin.workflow import folder

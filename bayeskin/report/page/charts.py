@@ -15,7 +15,7 @@ from bayeskin.number_format import number
 from bayeskin.report.page.parts import Chart, Key
 from bayeskin.report.page.plot import Phases, Plot, moments
 from bayeskin.report.style import parameter_colors
-from bayeskin.sensitivity.sobol import SobolResult
+from bayeskin.sensitivity.result import SobolResult
 from bayeskin.types import Array
 
 _BANDS = Key("50 and 90 % bands", "band")

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from bayeskin.sensitivity.sobol import SobolResult
+from bayeskin.sensitivity.result import SobolResult
 
 
 @dataclass(frozen=True)
