@@ -25,4 +25,11 @@ def test_the_catalogue_completes_both_of_a_pair() -> None:
     for name, mechanism in KNOWN.items():
         assert set(stated(name)) <= set(mechanism.look_alikes) <= set(KNOWN)
         assert all(name in KNOWN[other].look_alikes for other in mechanism.look_alikes)
-        assert mechanism.group == (name, *mechanism.look_alikes)
+        assert mechanism.group == (name, *mechanism.look_alikes, *mechanism.also_possible)
+
+
+def test_a_mechanism_that_is_also_possible_is_no_look_alike() -> None:
+    for mechanism in KNOWN.values():
+        assert set(mechanism.also_possible) <= set(KNOWN) - set(mechanism.look_alikes)
+    assert "device-friction" in KNOWN["force-offset"].group
+    assert "force-offset" not in KNOWN["device-friction"].group

@@ -39,6 +39,7 @@ MECHANISM = Mechanism(
         f"The load cell is not linear: at 1 N it reads {number(100 * abs(v['cell_bend']), 2)} % too "
         f"{'much' if v['cell_bend'] > 0 else 'little'}, and this percentage grows in proportion to the force."
     ),
-    look_alikes=("fibre-anisotropy", "strain-stiffening"),
+    look_alikes=("fibre-anisotropy",),
+    also_possible=("strain-stiffening",),
     act=Instrument(Place.CELL, observe, adds=False),
 )

@@ -89,6 +89,6 @@ MECHANISM = Mechanism(
         f"The slide has a dry friction of {1e3 * v['Fc']:.0f} mN against the motion, which changes sign over "
         f"a presliding length of {number(1e3 * v['presliding'], 2)} mm and persists during holds."
     ),
-    look_alikes=("force-offset", "plastic-set", "viscous-drag"),
+    look_alikes=("plastic-set", "viscous-drag"),
     act=Instrument(Place.DRIVE, observe),
 )

@@ -21,6 +21,6 @@ MECHANISM = Mechanism(
     statement=lambda v: (
         f"The load cell reads {number(1e3 * v['F0'], sign=True)} mN when the skin exerts no force."
     ),
-    look_alikes=("pre-stretch",),
+    also_possible=("device-friction",),
     act=Instrument(Place.CELL, observe),
 )

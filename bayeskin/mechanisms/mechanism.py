@@ -87,6 +87,8 @@ class Mechanism:
     statement : returns one plain sentence for a report, from the parameters' values
     look_alikes : names of mechanisms that one force channel cannot tell apart from it. One entry of a pair
         states the other; the catalogue completes both
+    also_possible : names of mechanisms that may be the true one where this one is named, although this one is
+        hardly the truth where they are named
     parts : groups of parameters, by name, that act without the others. The first parameter of each part
         switches it on. () means that all parameters form one part
     act : its action, on the force or on the full model
@@ -99,13 +101,14 @@ class Mechanism:
     statement: Callable[[Mapping[str, float]], str]
     act: Instrument | Tissue
     look_alikes: tuple[str, ...] = ()
+    also_possible: tuple[str, ...] = ()
     parts: tuple[tuple[str, ...], ...] = ()
     needs: tuple[str, ...] = ()
 
     @property
     def group(self) -> tuple[str, ...]:
-        """Returns the names of the mechanism and of its look-alikes."""
-        return (self.name, *self.look_alikes)
+        """Returns the name of the mechanism, and of those that may be the true one where it is named."""
+        return (self.name, *self.look_alikes, *self.also_possible)
 
     @property
     def whole_or_parts(self) -> tuple[tuple[str, ...], ...]:

@@ -37,5 +37,6 @@ MECHANISM = Mechanism(
     neutral={"opening": 0.0},
     statement=lambda v: f"The skin was already stretched by {100 * v['opening']:.1f} % when the test began.",
     look_alikes=("strain-stiffening",),
+    also_possible=("force-offset",),
     act=Tissue(bind),
 )
