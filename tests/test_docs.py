@@ -65,7 +65,8 @@ def checked_toml(text: str) -> None:
     """A fragment of a configuration is one, with a recording added; of a package's it is TOML."""
     plain = tomllib.loads(text)
     if "project" not in plain:
-        Config.model_validate_json(json.dumps({"name": "x", "recording": {"file": "x.h5"}, **plain}))
+        recording = {} if "recordings" in plain else {"recording": {"file": "x.h5"}}
+        Config.model_validate_json(json.dumps({"name": "x", **recording, **plain}))
 
 
 def named(page: Path) -> str:

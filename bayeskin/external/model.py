@@ -89,7 +89,8 @@ def simulate_server(url: str, motion: PadMotion, theta: Mapping[str, float]) -> 
     Raises InputError where the server has another number of inputs, and Unavailable where it does not answer.
     """
     started, time_s, client = time.perf_counter(), motion.times(STEP_S), Client(url)
-    config = {"protocol": {k: v.tolist() for k, v in vars(motion).items()}, "times_s": time_s.tolist()}
+    protocol = {"time_s": motion.time_s.tolist(), "displacement_m": motion.displacement_m.tolist()}
+    config = {"protocol": protocol, "times_s": time_s.tolist()}
     try:
         name = client.name()
         sizes = client.sizes(name, "input", config)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,9 +25,10 @@ FEWEST_PER_INPUT = 4  # fewest training runs per input with which a surrogate ca
 
 def runs_file(run: Run, model: ForceModel, motion: PadMotion, edges_s: Array, space: ParameterSpace) -> Path:
     """Returns the path of the file with all runs of one model on one protocol."""
-    identity = sha256_of(
-        [model.hash, vars(motion), edges_s, [vars(p) for p in space.without_texts.parameters]]
-    )
+    protocol: dict[str, Any] = {"time_s": motion.time_s, "displacement_m": motion.displacement_m}
+    if motion.spans:
+        protocol["spans"] = motion.spans
+    identity = sha256_of([model.hash, protocol, edges_s, [vars(p) for p in space.without_texts.parameters]])
     return run.folder / "runs" / f"{identity[:16]}.h5"
 
 
