@@ -9,6 +9,7 @@ from toys.gmsh_file import coarse_tetrahedra, gmsh_text
 from bayeskin.errors import InputError
 from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.finite_element.tissue import TissueLaw
+from bayeskin.forward.reduced import stands_for
 from bayeskin.geometry import Geometry
 from bayeskin.recordings import idealised_motion, recorded_motion, segment
 from bayeskin.types import PadMotion, Recording
@@ -56,6 +57,11 @@ def test_what_a_formulation_does_not_offer_is_refused(spec: ModelSpec) -> None:
     ):
         with pytest.raises(InputError, match=f"{where}: found observation '{spec.observation}'"):
             simulate(spec, MOTION, THETA, **asked)
+
+
+def test_a_reduced_model_replaces_only_the_reaction_on_bricks() -> None:
+    assert stands_for(ModelSpec(refinement=0))
+    assert not any(map(stands_for, (ARTICLE, OWN, ModelSpec(mesh="some.msh"))))
 
 
 def test_samples_drive_the_articles_formulation_and_a_protocol_drives_the_others() -> None:

@@ -26,10 +26,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bayeskin.finite_element.accepted import AcceptedSteps
 from bayeskin.finite_element.article_equations import ArticleModel
 from bayeskin.finite_element.extrapolation import EXTRAPOLATION_POINTS, extrapolate
-from bayeskin.finite_element.formulation import Formulation, Task
-from bayeskin.finite_element.history import History
+from bayeskin.finite_element.formulation import Formulation, RunRequest
 from bayeskin.finite_element.problem import material
 from bayeskin.types import Array, Simulation
 
@@ -47,16 +47,16 @@ class Article(Formulation):
     error_unknown = "the article's force depends on the mesh and does not converge"
     steps = STEP_S
 
-    def run(self, task: Task) -> Simulation:
-        history, problem, motion = History(task), task.problem_at(task.theta), task.motion
-        model = ArticleModel(problem, material(task.theta, problem.mesh.cutis))
+    def run(self, request: RunRequest) -> Simulation:
+        accepted, problem, motion = AcceptedSteps(request), request.problem_at(request.theta), request.motion
+        model = ArticleModel(problem, material(request.theta, problem.mesh.cutis))
         samples_s = np.arange(0.0, motion.time_s[-1] + 1e-9, STEP_S)
 
         def on_step(time_s: float, x: Array, force_n: float) -> None:
-            history.add(time_s, x, force_n, bool(np.abs(motion.time_s - time_s).min() < 1e-6))
+            accepted.add(time_s, x, force_n, bool(np.abs(motion.time_s - time_s).min() < 1e-6))
 
-        message = integrate(model, samples_s, motion.at(samples_s), task.theta["p_init"], on_step)
-        return history.simulation(problem, model.solver, message)
+        message = integrate(model, samples_s, motion.at(samples_s), request.theta["p_init"], on_step)
+        return accepted.simulation(problem, model.solver, message)
 
 
 def integrate(

@@ -17,7 +17,7 @@ OnState = Callable[[float, Array, float], None]  # time_s, x (dofs,), force_n
 
 
 @dataclass(frozen=True)
-class Task:
+class RunRequest:
     """One run that a formulation is asked for.
 
     problem_at : function that returns the problem at parameters
@@ -66,5 +66,5 @@ class Formulation(ABC):
         """Returns the tolerance of the time steps, or their length [s] if it is fixed."""
 
     @abstractmethod
-    def run(self, task: Task) -> Simulation:
+    def run(self, request: RunRequest) -> Simulation:
         """Returns the force history of a run, with status "failed" and a message if it does not finish."""

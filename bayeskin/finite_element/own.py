@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from bayeskin.external.model import STEP_S, simulate_own
-from bayeskin.finite_element.formulation import Formulation, Task
+from bayeskin.finite_element.formulation import Formulation, RunRequest
 from bayeskin.types import Simulation
 
 
@@ -19,5 +19,5 @@ class Own(Formulation):
     error_unknown = "this is a model of your own"
     steps = STEP_S
 
-    def run(self, task: Task) -> Simulation:
-        return simulate_own(self.forward, task.motion, task.theta)
+    def run(self, request: RunRequest) -> Simulation:
+        return simulate_own(self.forward, request.motion, request.theta)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from bayeskin.finite_element.formulation import Formulation, Task
+from bayeskin.finite_element.accepted import AcceptedSteps
+from bayeskin.finite_element.formulation import Formulation, RunRequest
 from bayeskin.finite_element.gradients import ForceGradients
-from bayeskin.finite_element.history import History
 from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.problem import Material, Problem, material
 from bayeskin.finite_element.stages import Step
@@ -29,17 +29,18 @@ class Reaction(Formulation):
     def steps(self) -> float:
         return self.tolerance
 
-    def run(self, task: Task) -> Simulation:
-        history, problem = History(task), task.problem_at(task.theta)
-        return self.run_on(problem, material(task.theta, problem.mesh.cutis), task, history)
+    def run(self, request: RunRequest) -> Simulation:
+        accepted, problem = AcceptedSteps(request), request.problem_at(request.theta)
+        return self.run_on(problem, material(request.theta, problem.mesh.cutis), accepted)
 
-    def run_on(self, problem: Problem, solid: Material, task: Task, history: History) -> Simulation:
-        """Returns a run on a problem, with any constants of its cells."""
-        bound = tuple(bind(task.theta, problem.sites) for bind in task.laws)
-        model = LagrangianModel(problem, solid, task.motion, bound)
+    def run_on(self, problem: Problem, solid: Material, accepted: AcceptedSteps) -> Simulation:
+        """Returns a run on a problem with any constants of its cells; `accepted` is still empty."""
+        request = accepted.request
+        bound = tuple(bind(request.theta, problem.sites) for bind in request.laws)
+        model = LagrangianModel(problem, solid, request.motion, bound)
         slopes = None
-        if task.gradients:
-            slopes = ForceGradients(model, task.theta, task.gradients, task.laws, task.problem_at)
+        if request.gradients:
+            slopes = ForceGradients(model, request.theta, request.gradients, request.laws, request.problem_at)
         at_start: list[float] = []
 
         def on_step(step: Step) -> None:
@@ -50,10 +51,10 @@ class Reaction(Formulation):
                 at_start.append(step.force_n)
                 model.zero_n = at_start[0]
                 force_n = step.force_n - model.zero_n
-                history.add(max(time_s, 0.0), step.state.x, force_n, step.corner, step.error_n)
+                accepted.add(max(time_s, 0.0), step.state.x, force_n, step.corner, step.error_n)
 
         try:
-            message = integrate(model, task.theta["p_init"], self.tolerance, on_step, task.falls_too)
+            message = integrate(model, request.theta["p_init"], self.tolerance, on_step, request.falls_too)
         except FloatingPointError as error:
             message = str(error)
-        return history.simulation(problem, model.solver, message, slopes)
+        return accepted.simulation(problem, model.solver, message, slopes)

@@ -13,10 +13,10 @@ import numpy as np
 
 from bayeskin.errors import InputError
 from bayeskin.external.model import identity
+from bayeskin.finite_element.accepted import AcceptedSteps
 from bayeskin.finite_element.article import Article
-from bayeskin.finite_element.formulation import Formulation, OnState, Task
+from bayeskin.finite_element.formulation import Formulation, OnState, RunRequest
 from bayeskin.finite_element.gmsh import read_gmsh
-from bayeskin.finite_element.history import History
 from bayeskin.finite_element.linear import SOLVER_NAME
 from bayeskin.finite_element.mesh import SkinMesh, brick_mesh
 from bayeskin.finite_element.own import Own
@@ -155,7 +155,7 @@ def simulate(
     if laws and not formulation.takes_laws:
         raise InputError("tissue mechanisms", f"observation {spec.observation!r}", "observation 'reaction'")
     return formulation.run(
-        Task(
+        RunRequest(
             motion, theta, partial(problem_at, spec), spec.hash, on_progress, on_state, gradients, laws,
             falls_too,
         )
@@ -177,8 +177,8 @@ def simulate_on(
     The other arguments and the errors are those of `simulate`. The result's model_hash is that of the mesh.
     """
     _check_parameters(theta, bool(laws))
-    task = Task(motion, theta, lambda _: problem, problem.mesh.hash, laws=laws)
-    return Reaction(tolerance).run_on(problem, solid, task, History(task))
+    request = RunRequest(motion, theta, lambda _: problem, problem.mesh.hash, laws=laws)
+    return Reaction(tolerance).run_on(problem, solid, AcceptedSteps(request))
 
 
 def _check_parameters(theta: Mapping[str, float], more: bool) -> None:

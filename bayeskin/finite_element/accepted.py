@@ -7,18 +7,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayeskin.finite_element.formulation import Task
+from bayeskin.finite_element.formulation import RunRequest
 from bayeskin.finite_element.gradients import ForceGradients
 from bayeskin.finite_element.newton import NewtonSolver
 from bayeskin.finite_element.problem import Problem
 from bayeskin.types import Array, Simulation, frozen_array
 
 
-class History:
+class AcceptedSteps:
     """The accepted steps so far, starting with the state of rest. It reports each step to the callbacks."""
 
-    def __init__(self, task: Task) -> None:
-        self._task, self._started = task, time.perf_counter()
+    def __init__(self, request: RunRequest) -> None:
+        self.request, self._started = request, time.perf_counter()
         self._times_s, self._forces_n, self._errors_n, self._corners = [0.0], [0.0], [0.0], [True]
 
     def add(self, time_s: float, x: Array, force_n: float, corner: bool, error_n: float = 0.0) -> None:
@@ -28,10 +28,10 @@ class History:
             self._forces_n.append(force_n)
             self._corners.append(corner)
             self._errors_n.append(error_n)
-        if self._task.on_state is not None:
-            self._task.on_state(time_s, x, force_n)
-        if self._task.on_progress is not None:
-            self._task.on_progress(time_s / float(self._task.motion.time_s[-1]))
+        if self.request.on_state is not None:
+            self.request.on_state(time_s, x, force_n)
+        if self.request.on_progress is not None:
+            self.request.on_progress(time_s / float(self.request.motion.time_s[-1]))
 
     def simulation(
         self, problem: Problem, solver: NewtonSolver, message: str, slopes: ForceGradients | None = None
@@ -42,7 +42,7 @@ class History:
         """
         seconds = time.perf_counter() - self._started
         solver.release()
-        task, force = self._task, np.array(self._forces_n)
+        request, force = self.request, np.array(self._forces_n)
         stats = {
             "seconds": seconds,
             "steps": float(len(force) - 1),
@@ -54,15 +54,15 @@ class History:
             **({"seconds_of_gradients": slopes.seconds} if slopes else {}),
         }
         return Simulation(
-            theta={name: float(value) for name, value in task.theta.items()},
+            theta={name: float(value) for name, value in request.theta.items()},
             time_s=np.array(self._times_s),
-            displacement_m=task.motion.at(self._times_s),
+            displacement_m=request.motion.at(self._times_s),
             force_n=force,
             corner=frozen_array(self._corners, bool),
             status="failed" if message else "ok",
             message=message,
             stats=stats,
-            model_hash=task.model_hash,
+            model_hash=request.model_hash,
             gradient_names=slopes.names if slopes else (),
             gradient_n=_beyond_start(slopes.force_n[-len(force) :]) if slopes else np.zeros((0, 0)),
         )
