@@ -177,7 +177,7 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
     start = {**bench.noise, **TRUTH}
     aside = off({**TRUTH, "E_s": 1.05 * TRUTH["E_s"]})  # where the fit was checked
     local = functools.partial(bench.posterior, correction_n=aside)
-    found = fit_set((), start, bench.run, local, None, aside)
+    found = fit_set((), start, bench.run, local, correction_n=aside)
     assert isinstance(found, SetFit)
     run = by_the_toy(bench, (), [])
     asked: list[int] = []
