@@ -15,7 +15,7 @@ from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.emulate import EmulationSettings, Forces, emulate
 from bayeskin.mismatch.fit import fit_near
 from bayeskin.mismatch.resample import ResampleSettings, resample
-from bayeskin.mismatch.trust_region import SetFit, TrustSettings, fit_set, within
+from bayeskin.mismatch.trust_region import SetFit, fit_set, within
 from bayeskin.mismatch.wrapper import innermost
 from bayeskin.surrogates import train
 from bayeskin.types import Array, Design, Surrogate
@@ -66,7 +66,7 @@ def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[DiagnosisContext, Set
     assert emulated.settled
     assert emulated.error_n is not None
     assert emulated.error_n < FEW.enough * closed_form_reduced.NOISE_N
-    assert emulated.runs == sum(asked) == FEW.points + FEW.further_points
+    assert emulated.runs == sum(asked) == FEW.points + FEW.more
     assert emulated.fit.value == pytest.approx(found.fit.value, abs=1.0)
     low, high = np.quantile(emulated.draws.draws, [0.01, 0.99], axis=0)
     truth = [{**TRUTH, "F0": -0.03}.get(name, np.nan) for name in emulated.draws.names]
@@ -177,7 +177,7 @@ def test_an_error_that_changes_along_the_posterior_is_part_of_it(
     start = {**bench.noise, **TRUTH}
     aside = off({**TRUTH, "E_s": 1.05 * TRUTH["E_s"]})  # where the fit was checked
     local = functools.partial(bench.posterior, correction_n=aside)
-    found = fit_set((), start, bench.run, local, TrustSettings(), aside)
+    found = fit_set((), start, bench.run, local, correction_n=aside)
     assert isinstance(found, SetFit)
     run = by_the_toy(bench, (), [])
     asked: list[int] = []

@@ -63,7 +63,7 @@ def sample(
     folder: Path | str,
     seed: int,
     start: Mapping[str, float],
-    settings: SampleSettings | None = None,
+    settings: SampleSettings = SampleSettings(),
     progress: Progress | None = None,
     threads: int = 1,
 ) -> Posterior:
@@ -79,7 +79,6 @@ def sample(
     `threads`, over which the ensembles are spread. Raises InputError for fewer than 500 steps, and when the
     files belong to another posterior, seed or number of walkers; these files are not changed.
     """
-    settings = settings or SampleSettings()
     _check_settings(settings, log_posterior.dim)
     files = _files(folder, settings.ensembles)
     identity = {**log_posterior.identity, "seed": str(seed), "walkers": str(settings.walkers)}
