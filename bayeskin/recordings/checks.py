@@ -38,7 +38,7 @@ def refuse_invalid(where: str, first_row: int, time_s: Array, displacement_m: Ar
         if value > largest:
             problem = f"a {name} of {value:.4g} {unit}"
             smaller = "mm" if unit == "m" else "mN"
-            expected = f"at most {largest:g} {unit} (is the column in {smaller}? --unit {name}={smaller})"
+            expected = f"at most {largest:g} {unit} (is the column in {smaller}?)"
             raise InputError(f"{where}, row {first_row + peak}", problem, expected)
     travel = float(np.ptp(displacement_m))
     if travel < _SMALLEST_TRAVEL_M:

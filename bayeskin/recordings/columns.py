@@ -134,17 +134,14 @@ def _listed(heading: Heading) -> str:
 
 def _missing(place: str, quantity: str, heading: Heading, near: Sequence[Column]) -> InputError:
     """Returns the error of a quantity without a column; `near` are columns that name it and do not fit."""
-    units = ", ".join(UNITS[quantity])
     if heading.fault:
-        expected = (
-            "a header, or the columns by their numbers, as --time 1 --displacement 2 --force 3, with --unit"
-        )
+        expected = "a header; or import with --time 1 --displacement 2 --force 3 (the columns) and --unit"
         return InputError(place, heading.fault, expected)
     said = [f"column {c.label}, {c.aside or f'whose unit is {c.unit!r}'}" for c in near]
     found = " and ".join(said) or f"columns {_listed(heading)}"
-    return InputError(
-        place, found, f"a {quantity} column with one of the units {units}, or --{quantity} COLUMN"
-    )
+    units = ", ".join(UNITS[quantity])
+    expected = f"a {quantity} column with one of the units {units}; or import with --{quantity} COLUMN"
+    return InputError(place, found, expected)
 
 
 def _refuse_missing_units(place: str, columns: Candidates, stated: Stated) -> None:
@@ -157,7 +154,7 @@ def _refuse_missing_units(place: str, columns: Candidates, stated: Stated) -> No
     found = f"column{'s' * (len(missing) > 1)} {listed} without a known unit"
     options = " ".join(f"--unit {q}=UNIT" for q in quantities)
     units = "; ".join(f"{q}: {', '.join(UNITS[q])}" for q in quantities)
-    raise InputError(place, found, f"{options} ({units})")
+    raise InputError(place, found, f"a unit; or import with {options} ({units})")
 
 
 def _side_by_side(columns: Candidates) -> list[Candidates] | None:

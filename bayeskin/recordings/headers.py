@@ -6,13 +6,13 @@ import re
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 from bayeskin.recordings.units import QUANTITIES, UNITS, is_unit, plain, unit_of
 from bayeskin.recordings.vocabulary import ASIDE, JAPANESE, SYMBOLS, WORDS
 
 _BRACKETS = re.compile(r"[\[({<]([^\[\](){}<>]*)[\])}>]")
 _COMMENT = re.compile(r"^\s*(?:#+|%+|//+|!+)\s*")  # as numpy and others begin a header
-_ELISION = re.compile(r"\b[dlns]['’´`]", re.IGNORECASE)
 _RULE = re.compile(r"[-=_+|*.\s]*")
 
 
@@ -115,8 +115,7 @@ def _narrow(header: str) -> str:
 
 def _words(header: str) -> list[str]:
     """Returns the words of a header, without units in brackets; "Load1" and "load" are the same word."""
-    text = _ELISION.sub(" ", _narrow(header))
-    text = _BRACKETS.sub(lambda m: " " if is_unit(m[1]) else f" {m[1]} ", text)
+    text = _BRACKETS.sub(lambda m: " " if is_unit(m[1]) else f" {m[1]} ", _narrow(header))
     text = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", text)
     words = re.findall(r"[^\W\d_]+\d*", plain(text))
     return [re.sub(r"\d+$", "", word) if re.match(r"[^\W\d_]{3}", word) else word for word in words]
@@ -125,7 +124,7 @@ def _words(header: str) -> list[str]:
 def _quantities(header: str, words: Sequence[str]) -> set[str]:
     """Returns the quantities that a header names."""
     named = {WORDS[word] for word in words if word in WORDS}
-    named |= {q for q in QUANTITIES if any(word in header for word in JAPANESE[q])}
+    named |= {q for q in QUANTITIES if any(word in _narrow(header) for word in JAPANESE[q])}
     if not named:
         names = [word for word in words if not is_unit(word)] or list(words)
         named = {SYMBOLS[names[0]]} if len(names) == 1 and names[0] in SYMBOLS else set()
@@ -135,5 +134,5 @@ def _quantities(header: str, words: Sequence[str]) -> set[str]:
 def _aside(header: str, words: Sequence[str]) -> str:
     """Returns the reason why a header names no measured value, or ""."""
     listed = [ASIDE[word] for word in words if word in ASIDE]
-    japanese = [reason for word, reason in ASIDE.items() if ord(word[0]) > 0x3000 and word in header]
-    return next(iter([*listed, *japanese]), "")
+    japanese = (reason for word, reason in ASIDE.items() if not word.isascii() and word in _narrow(header))
+    return next(chain(listed, japanese), "")

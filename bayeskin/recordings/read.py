@@ -173,7 +173,7 @@ def _chosen(
         raise longest.error if longest else InputError(path, "no rows of numbers", "a header and numbers")
     if len(fitting) > 1 and sheet != ALL:
         problem = f"the columns in {len(fitting)} of the tables {labels}"
-        raise InputError(path, problem, "the name of one of them, --sheet NAME, or --sheet all")
+        raise InputError(path, problem, "one table; or import with --sheet NAME, or --sheet all")
     readable = []
     for one in fitting:
         if isinstance(one.table, InputError):

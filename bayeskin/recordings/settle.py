@@ -88,7 +88,7 @@ def _chosen(table: Table, raw: Mapping[int, Array], stated: Stated) -> tuple[dic
         apart = [v for v in values[1:] if not _equal(values[0], v)]
         if apart:
             names = " and ".join(c.label for c in moving)
-            expected = f"one {quantity} column; --{quantity} NAME or NUMBER chooses it"
+            expected = f"one {quantity} column; or import with --{quantity} NAME or NUMBER"
             raise InputError(table.place, f"{names}, each a {quantity} column", expected)
         chosen[quantity] = moving[0]
         notes += [f"column {c.label} holds the same as {moving[0].label}" for c in moving[1:]]
@@ -143,7 +143,9 @@ def _zeroed(table: Table, displacement_m: Array, stated: Stated) -> tuple[Array,
     if stated.zero:
         return displacement_m - start_m, start_m, [f"--zero subtracted the first displacement, {start_mm}"]
     if stated.zero is None and abs(start_m) > _AT_ZERO * travel_m:
-        expected = "0 where the skin is at rest; --zero subtracts this first value, --no-zero keeps it"
+        expected = (
+            "0 where the skin is at rest; or import with --zero to subtract it, or --no-zero to keep it"
+        )
         raise InputError(table.place, f"a displacement that starts at {start_mm}", expected)
     if abs(start_m) > _REPORTED * travel_m:
         return displacement_m, 0.0, [f"the displacement starts at {start_mm}, which was kept"]
@@ -174,4 +176,5 @@ def _refuse_negative_pull(
     else:
         found = "a force and a displacement of which one falls while the other rises"
         kept = f"--unit force=+{units['force']} if this is right"
-    raise InputError(table.place, found, f"a pull that counts positive, as with {options}; or {kept}")
+    expected = f"a pull that counts positive; or import with {options} to turn it, or {kept}"
+    raise InputError(table.place, found, expected)

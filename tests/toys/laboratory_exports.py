@@ -56,11 +56,16 @@ def set_by_blanks() -> list[Export]:
         Export(
             "unclear_blanks.txt",
             aligned("Run time Pad displacement Pull force", NUMBERS),
-            refused="above rows of 3 cells; expected a header, or the columns by their numbers",
+            refused="above rows of 3 cells; expected a header; or import with --time 1",
             columns=NUMBERED,
             units=UNITS,
         ),
         Export("savetxt.dat", aligned("# n t_ms disp_um load_mN", counted)),
+        Export(
+            "blank_thousands.txt",
+            aligned("t_s  d_mm  Pull force_mN", cells(T, D, fixed(1e3 * FORCE_N + 1300, 1, thousands=" "))),
+            refused="'t_s  d_mm  Pull force_mN' above rows of 4 cells|between rows of numbers",
+        ),
         Export("row_number.dat", aligned("# t_ms disp_um load_mN", counted)),
     ]
 
@@ -138,6 +143,7 @@ def numbers() -> list[Export]:
         force = fixed(1e3 * FORCE_N, 2, decimal, by)
         return cells(fixed(TIME_S, 2, decimal), fixed(1e3 * PULLED_MM, 0, decimal, by), force)
 
+    commas = cells(*(fixed(v, 3, ",") for v in (TIME_S, 1e3 * PULLED_MM, 1e3 * FORCE_N)))
     whole = [fixed(1e3 * v, 0, "", ".") for v in (TIME_S, PULLED_MM, np.round(FORCE_N, 3))]
     inches = [fixed(TIME_S / 60, 9), fixed(PULLED_MM / 25.4, 9), fixed(FORCE_N / 4.4482216152605, 9)]
     small = [fixed(TIME_S / 3600, 11), fixed(1e-3 * PULLED_MM, 7), fixed(1e6 * FORCE_N, 1)]
@@ -152,6 +158,10 @@ def numbers() -> list[Export]:
         Export("schweiz.csv", text([micro, *thousands("'", ".")], ";")),
         Export(
             "whole.csv", text([["t (ms)", "d (um)", "F (mN)"], *cells(*whole)], ";"), noted="thousands separ"
+        ),
+        Export("three_commas.csv", text([micro, *commas], ";"), noted="a comma is the decimal sign"),
+        Export(
+            "two_signs.csv", text([HEADER, *cells(T, fixed(PULLED_MM, 3, ","), F)], ";"), "one decimal sign"
         ),
         Export("imperial.csv", text([["Time (min)", "Crosshead (in)", "Load (lbf)"], *cells(*inches)], ",")),
         Export("small.csv", text([["Time (h)", "Travel (m)", "Load (uN)"], *cells(*small)], ",")),
@@ -178,7 +188,7 @@ def statements() -> list[Export]:
         Export(
             "absolute.csv",
             text([HEADER, *cells(T, fixed(PULLED_MM + 41.25, 3), F)], ","),
-            refused="starts at 41.25 mm; .*--zero subtracts",
+            refused="starts at 41.25 mm; .*import with --zero",
             zero=True,
             noted="--zero subtracted the first displacement, 41.25 mm",
         ),
@@ -198,7 +208,7 @@ def statements() -> list[Export]:
         Export(
             "minutes.csv",
             text([["Time", *HEADER[1:]], *cells(fixed(TIME_S / 60, 8), D, F)], ","),
-            refused="column 'Time' without a known unit; expected --unit time=UNIT",
+            refused="column 'Time' without a known unit; .*import with --unit time=UNIT",
             units={"time": "min"},
         ),
         Export("percent.csv", text([[*HEADER, "Extension (%)"], *cells(T, D, F, strain)], ",")),
@@ -210,7 +220,7 @@ def statements() -> list[Export]:
         Export(
             "percent_no_unit.csv",
             text([["Time (s)", "Extension", "Load (N)"], *cells(T, strain, F)], ","),
-            refused="'Extension' without a known unit; expected --unit displacement=UNIT",
+            refused="'Extension' without a known unit; .*import with --unit displacement=UNIT",
         ),
     ]
 
