@@ -25,7 +25,7 @@ from bayeskin.errors import InputError
 from bayeskin.finite_element import simulate as run_model
 from bayeskin.inference import LogPosterior, Weighed
 from bayeskin.json_files import plain
-from bayeskin.recordings import idealised_motion, read_recording, segment
+from bayeskin.recordings import Stated, idealised_motion, read_recording, segment, stated_unit
 from bayeskin.surrogates import load_surrogate
 from bayeskin.types import BinnedForce, PadMotion, Recording, Simulation
 from bayeskin.workflow import diagnosis
@@ -42,9 +42,26 @@ if TYPE_CHECKING:
 FILE, CONFIG = "recording.h5", "calibration.toml"
 
 
-def load_recording(path: Path | str, sheet: str | None = None) -> Recording:
-    """Returns a recording (xlsx, csv, tsv, h5) in SI units. Raises InputError for any other file."""
-    return read_recording(path, sheet=sheet)
+def load_recording(
+    path: Path | str,
+    sheet: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    zero: bool | None = None,
+) -> Recording:
+    """Returns a recording in SI units, from any file that ``bayeskin import`` reads (docs/how-to/import.md).
+
+    Parameters
+    ----------
+    sheet : the name of one of several tables
+    columns : the name or number of the column of ``time``, ``displacement`` and ``force``
+    units : the unit of a quantity, such as ``{"force": "gf"}``; a minus, as in ``"-N"``, turns the sign
+    zero : True subtracts the first displacement, False keeps it
+
+    Raises InputError for a file that is no recording, and where the file alone does not decide.
+    """
+    stated_units = {quantity: stated_unit(quantity, unit) for quantity, unit in (units or {}).items()}
+    return read_recording(path, sheet=sheet, stated=Stated(columns or {}, stated_units, zero))
 
 
 def simulate(

@@ -35,7 +35,9 @@ def test_import_writes_the_recording_and_says_what_it_found(
     code, out, err = bayeskin("import", measured, "-o", tmp_path / "r.h5", "--json")
     said = json.loads(out)
     stored = storage.load(tmp_path / "r.h5", Recording)
-    assert (code, err) == (0, "")
+    assert (code, err.splitlines()) == (0, said["notes"])
+    assert said["notes"][1] == "column 'displacement (mm)' read as displacement in mm"
+    assert said["columns"]["displacement"]["factor_to_si"] == 1e-3
     assert said["samples"] == len(stored.time_s) == 1301
     assert [phase["kind"] for phase in said["phases"]][:4] == ["rest", "load", "hold", "unload"]
     assert stored.displacement_m.max() == pytest.approx(9e-3)
@@ -50,9 +52,11 @@ def with_two_forces(path: Path) -> None:
     write_csv(path, "time (s),displacement (mm),force (N),force (N)", ramp, ramp, ramp, 2 * ramp)
 
 
-def one_phase(path: Path) -> None:
-    ramp = np.arange(500) * 0.1
-    write_csv(path, "time (s),displacement (mm),force (N)", ramp, 0.1 * ramp, 0.01 * ramp)
+def still(path: Path) -> None:
+    ramp, noise = np.arange(500) * 0.1, np.random.default_rng(2).normal(size=500)
+    write_csv(
+        path, "time (s),displacement (mm),force (N)", ramp, 0.01 * np.round(noise - noise[0]), 0.01 * ramp
+    )
 
 
 def backwards(path: Path) -> None:
@@ -65,14 +69,19 @@ def backwards(path: Path) -> None:
     [
         (without_force, "force"),
         (with_two_forces, "force"),
-        (one_phase, "one phase only"),
+        (still, "little more than its noise"),
         (backwards, "increase"),
         (lambda path: path.write_text(""), "empty"),
-        (lambda path: path.write_text("time (s),displacement (mm),force (N)\n0,0,abc\n"), "abc"),
+        (
+            lambda path: path.write_text(
+                "time (s),displacement (mm),force (N)\n" + 3 * "0,0,0\n" + "1,0,abc"
+            ),
+            "abc",
+        ),
         (lambda path: None, "no such file"),
         (lambda path: path.mkdir(), "a folder"),
     ],
-    ids=["no force", "two forces", "one phase", "time backwards", "empty", "text", "absent", "a folder"],
+    ids=["no force", "two forces", "still", "time backwards", "empty", "text", "absent", "a folder"],
 )
 def test_an_unsound_recording_is_refused_and_the_earlier_output_kept(
     bayeskin: Command, tmp_path: Path, make: Callable[[Path], object], says: str
@@ -204,7 +213,7 @@ def test_the_exit_code_says_whether_the_answer_can_be_relied_on(
 def test_a_command_that_is_interrupted_says_how_to_go_on(measured: Path, tmp_path: Path, ending: int) -> None:
     code = (
         "import sys, time; from bayeskin import cli; from bayeskin.workflow import importing\n"
-        "def slow(*_): print('at work', flush=True); time.sleep(60)\n"
+        "def slow(*_, **__): print('at work', flush=True); time.sleep(60)\n"
         "importing.import_recording = slow; cli.main(['import', *sys.argv[1:]])"
     )
     command = [sys.executable, "-c", code, str(measured), "-o", str(tmp_path / "r.h5")]

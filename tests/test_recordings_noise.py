@@ -27,6 +27,7 @@ from bayeskin.recordings import (
     covered_s,
     describe,
     describe_json,
+    fitting_width_s,
     jumps_of,
     phase_noise,
     segment,
@@ -316,12 +317,47 @@ def test_a_force_that_never_changes_has_no_noise_to_measure() -> None:
         phase_noise(flat, PHASES)
 
 
-def test_a_recording_too_coarse_to_tell_noise_is_refused() -> None:
+@pytest.mark.parametrize("interval_s", [0.13, 0.2, 0.5, 1.0])
+def test_the_noise_of_few_samples_is_measured(interval_s: float) -> None:
+    time_s = np.arange(0.0, 130.0, interval_s)
+    found = []
+    for seed in range(8):
+        noise_n = 0.002 * np.random.default_rng(seed).standard_normal(len(time_s))
+        made = recording(true_force(time_s) + noise_n, MOTION, time_s)
+        noise = phase_noise(made, segment(made))
+        found.append([p.sd_n for p in noise if p.kind in ("hold", "rest")])
+    assert np.mean(found) == pytest.approx(0.002, rel=0.1)
+
+
+def test_phases_too_short_to_tell_noise_are_refused() -> None:
     time_s = np.arange(0.0, 130.0, 1.0)
     made = recording(true_force(time_s), MOTION, time_s)
     phases = tuple(Phase("hold", 1, a, a + 10.0) for a in np.arange(0.0, 130.0, 10.0))
-    with pytest.raises(InputError, match="to estimate their noise"):
+    with pytest.raises(InputError, match="10 samples in the longest phase; expected at least 15"):
         phase_noise(made, phases)
+
+
+@pytest.mark.parametrize(
+    ("interval_s", "width_s"), [(0.01, 0.5), (0.25, 0.5), (0.26, 1.0), (0.5, 1.0), (1.0, 2.0), (2.0, 5.0)]
+)
+def test_bins_are_wide_enough_for_two_samples(interval_s: float, width_s: float) -> None:
+    time_s = np.arange(0.0, 130.0, interval_s)
+    made = recording(true_force(time_s), MOTION, time_s)
+    assert fitting_width_s(made) == width_s
+    assert np.diff(np.searchsorted(time_s + 1e-9, uniform_edges(float(time_s[-1]), width_s))).min() >= 2
+
+
+def test_the_description_says_what_a_recording_cannot_tell() -> None:
+    time_s = np.arange(0.0, 60.0, 0.5)
+    made = Recording(time_s, 1e-4 * time_s, 4e-3 * time_s + 1e-3 * np.sin(31 * time_s), "pull", "")
+    phases = segment(made)
+    noise = phase_noise(made, phases)
+    said = describe_json(made, phases, noise)["cannot_tell"]
+    assert [sentence.split(",")[0] for sentence in said] == [
+        "There is no hold", "There is no unloading", "Samples are 0.5 s apart. Spikes and steps of the force "
+        "can hardly be told from noise. Bins need a width of 1 s (fit.bin_width_s).",
+    ]  # fmt: skip
+    assert all(sentence in describe(made, phases, noise) for sentence in said)
 
 
 def test_the_description_says_what_was_found() -> None:
@@ -332,6 +368,7 @@ def test_the_description_says_what_was_found() -> None:
     assert text.count("\n   load ") + text.count("\n unload ") == 4
     facts = describe_json(made, PHASES, noise)
     assert json.loads(json.dumps(facts)) == facts
+    assert facts["cannot_tell"] == []
     assert [p["kind"] for p in facts["phases"]] == KINDS
 
 

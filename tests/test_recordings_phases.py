@@ -131,10 +131,29 @@ def test_any_protocol_of_load_hold_unload_rest_is_recovered(
     assert_tiles(phases, time_s)
 
 
-def test_one_phase_only_is_refused() -> None:
-    for displacement in (1e-4 * TIME_S, 1e-5 * np.round(np.random.default_rng(0).normal(size=len(TIME_S)))):
-        with pytest.raises(InputError, match=r"one phase only|little more than its noise"):
-            segment(displaced(displacement))
+def test_a_pull_without_a_hold_is_one_phase() -> None:
+    phases = segment(displaced(quantised(7e-5 * TIME_S, 1e-5)))
+    assert [(p.kind, p.cycle, p.start_s, p.end_s) for p in phases] == [("load", 1, 0.0, TIME_S[-1])]
+
+
+def test_noise_alone_is_refused() -> None:
+    noise = 1e-5 * np.round(np.random.default_rng(0).normal(size=len(TIME_S)))
+    with pytest.raises(InputError, match="little more than its noise"):
+        segment(displaced(noise))
+
+
+@pytest.mark.parametrize("interval_s", [0.2, 0.5, 1.0])
+@pytest.mark.parametrize("step_m", [0.0, 1e-5])
+def test_phases_of_few_samples_are_found(interval_s: float, step_m: float) -> None:
+    time_s = np.arange(0.0, 130.0, interval_s)
+    for motion in (
+        MOTION,
+        PadMotion(np.round(CORNERS_S), MOTION.displacement_m),
+    ):  # corners off and on samples
+        seen = motion.at(time_s)
+        phases = segment(displaced(quantised(seen, step_m) if step_m else seen, time_s))
+        assert [p.kind for p in phases] == KINDS
+        np.testing.assert_allclose(starts(phases), motion.time_s[:-1], atol=0.4 * interval_s)
 
 
 def test_resolution_is_the_least_step_or_the_noise() -> None:
@@ -142,6 +161,9 @@ def test_resolution_is_the_least_step_or_the_noise() -> None:
     assert resolution_m(quantised(u, 1e-5)) == pytest.approx(1e-5, rel=1e-6)
     noisy = u + 2e-5 * np.random.default_rng(1).normal(size=len(u))
     assert resolution_m(noisy) == pytest.approx(2e-5, rel=0.1)
+    seldom = np.repeat([0.0, 1.2e-3, 2.4e-3, 3.6e-3, 4.8e-3, 6e-3], 20)
+    assert resolution_m(seldom) <= 0.05 * 6e-3  # the drive moved so far between samples
+    assert resolution_m(quantised(u, 1e-5) * (1 + 1e-15)) == pytest.approx(1e-5, rel=1e-6)
 
 
 def test_simplify_stays_within_its_tolerance_and_keeps_what_is_fixed() -> None:

@@ -14,7 +14,7 @@ from toys.synthetic_recordings import article_recording
 
 from bayeskin import storage
 from bayeskin.errors import InputError
-from bayeskin.recordings import read_recording, uniform_edges
+from bayeskin.recordings import Stated, read_recording, stated_unit, uniform_edges
 from bayeskin.recordings.headers import parse_header
 from bayeskin.types import Recording
 
@@ -59,7 +59,7 @@ def assert_sound_or_refused_in_one_line(path: Path) -> None:
         refusal = str(error)
     assert "\n" not in refusal
     if recording is not None:
-        assert len(recording.time_s) == len(recording.force_n) == len(recording.displacement_m) >= 100
+        assert len(recording.time_s) == len(recording.force_n) == len(recording.displacement_m) >= 50
         assert np.isfinite([recording.time_s, recording.displacement_m, recording.force_n]).all()
 
 
@@ -94,7 +94,12 @@ def test_text_in_any_usual_dress_gives_the_same_recording(
         ("displacement_m", "displacement", "m"), ("disp (µm)", "displacement", "um"),
         ("LVDT mm", "displacement", "mm"), ("Réaction", "force", ""),
         ("RF (N)", "force", "N"), ("force_n", "force", "N"), ("Effort [mN]", "force", "mN"),
-        ("Displacement rate (mm/s)", "displacement", "mm/s"),
+        ("Displacement rate (mm/s)", "displacement", "mm/s"), ("Temps (mn)", "time", "min"),
+        ("Load / kgf", "force", "kgf"), ("Position (z), mm", "displacement", "mm"), ("Fz, gf", "force", "gf"),
+        ("Load(Linear:Load) (lbf)", "force", "lbf"), ("Displacement (Ch 1) [in]", "displacement", "in"),
+        ("Temps d'essai", "time", ""), ("Standardkraft", "force", ""), ("# time_ms", "time", "ms"),
+        ("変位（ｍｍ）", "displacement", "mm"), ("荷重 [N]", "force", "N"), ("時間 [秒]", "time", "s"),
+        ("Extension (%)", "displacement", "%"), ("AxialForce_uN", "force", "uN"),
     ],
 )  # fmt: skip
 def test_headers_name_quantity_and_unit(header: str, quantity: str, unit: str) -> None:
@@ -103,9 +108,28 @@ def test_headers_name_quantity_and_unit(header: str, quantity: str, unit: str) -
     assert (column.quantity, column.unit) == (quantity, unit)
 
 
-@pytest.mark.parametrize("header", ["Temperature (C)", "pressure", "", "n", "Force per displacement (N/mm)"])
+@pytest.mark.parametrize(
+    "header",
+    ["Temperature (C)", "pressure", "", "n", "Force per displacement (N/mm)", "Température d'ambiance", "d0",
+     "Fmax", "圧力 (kPa)"],
+)  # fmt: skip
 def test_other_headers_name_nothing(header: str) -> None:
     assert parse_header(0, header) is None
+
+
+@pytest.mark.parametrize(
+    ("header", "reason"),
+    [
+        ("Displacement setpoint (mm)", "a set point"), ("Sollweg Traverse (mm)", "a set point"),
+        ("Load step", "a count"), ("荷重設定値 (N)", "a set point"), ("Vitesse course (mm/s)", "a rate"),
+        ("Force min (N)", "an extreme or a limit"), ("Clock time (s)", "a time of day"),
+        ("Time, min", ""), ("Elapsed Time (s)", ""),
+    ],
+)  # fmt: skip
+def test_headers_of_what_was_not_measured_say_so(header: str, reason: str) -> None:
+    column = parse_header(0, header)
+    assert column is not None
+    assert column.aside == reason
 
 
 def test_units_become_si(tmp_path: Path) -> None:
@@ -120,13 +144,15 @@ def test_units_may_stand_in_a_row_of_their_own_below_a_preamble(tmp_path: Path) 
     assert_is_the_test(read_recording(written(tmp_path / "a.csv", rows, ";")))
 
 
-def test_a_unit_left_out_is_taken_where_only_one_fits_and_asked_for_where_not(tmp_path: Path) -> None:
-    recording = read_recording(written(tmp_path / "a.csv", [["time", "disp", "force"], *ROWS]))
+def test_a_unit_left_out_is_asked_for(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.csv", [["time (s)", "disp", "force"], *ROWS])
+    said = r"columns 'disp', 'force' without a known unit; .* --unit displacement=UNIT --unit force=UNIT"
+    with pytest.raises(InputError, match=said):
+        read_recording(path)
+    units = {"displacement": stated_unit("displacement", "mm"), "force": stated_unit("force", "N")}
+    recording = read_recording(path, stated=Stated(units=units))
     assert_is_the_test(recording)
-    assert any("which fits the numbers" in note for note in recording.notes)
-    ambiguous = [[t, u, str(50 * float(f))] for t, u, f in ROWS]  # up to 19: newtons, or millinewtons
-    with pytest.raises(InputError, match=r"'force'.* fit N and mN; expected the unit in the header"):
-        read_recording(written(tmp_path / "b.csv", [["time", "disp", "force"], *ambiguous]))
+    assert "column 'force' read as force in N (stated by --unit)" in recording.notes
 
 
 def test_further_columns_and_rates_are_named_and_ignored(tmp_path: Path) -> None:
@@ -134,7 +160,7 @@ def test_further_columns_and_rates_are_named_and_ignored(tmp_path: Path) -> None
     path = written(tmp_path / "a.csv", [[*HEADER, "Displacement rate (mm/s)", "note"], *rows])
     recording = read_recording(path)
     assert_is_the_test(recording)
-    assert "ignored columns: 'Displacement rate (mm/s)', 'note'" in recording.notes
+    assert "ignored columns: 'Displacement rate (mm/s)' (a rate), 'note'" in recording.notes
 
 
 def test_a_clock_that_starts_late_is_shifted_and_noted(tmp_path: Path) -> None:
@@ -148,7 +174,7 @@ def test_workbooks_are_read_from_the_one_sheet_with_the_columns(tmp_path: Path) 
     path = workbook(tmp_path / "a.xlsx", Notes=[["hello"]], Test=[HEADER, *NUMBERS])
     assert_is_the_test(read_recording(path))
     both = workbook(tmp_path / "b.xlsx", A=[HEADER, *NUMBERS], B=[HEADER, *NUMBERS])
-    with pytest.raises(InputError, match=r"2 of the sheets \['A', 'B'\]"):
+    with pytest.raises(InputError, match=r"2 of the tables \['A', 'B'\]; expected .*--sheet"):
         read_recording(both)
     assert_is_the_test(read_recording(both, sheet="B"))
     with pytest.raises(InputError, match="a sheet 'C'"):
@@ -182,15 +208,18 @@ def spoiled(row: int, column: int, text: str) -> list[list[str]]:
     [
         ([HEADER[:2], *[row[:2] for row in ROWS]], r"row 1: .*expected a force column"),
         (
-            [[*HEADER, "Force (N)"], *[[*row, "0"] for row in ROWS]],
-            r"'RF \(N\)' and 'Force \(N\)', each a force",
+            [[*HEADER, "Force (N)"], *[[*row, row[1]] for row in ROWS]],
+            r"'RF \(N\)' and 'Force \(N\)', each a force column; expected .*--force NAME or NUMBER",
         ),
         (
-            [["Temps (s)", "Displacement (inch)", "RF (N)"], *ROWS],
-            r"'Displacement \(inch\)'; expected .* m, mm, um",
+            [["Temps (s)", "Displacement (px)", "RF (N)"], *ROWS],
+            r"'Displacement \(px\)', whose unit is 'px'; expected .* m, cm, mm, .*--displacement",
         ),
         (spoiled(3, 1, "abc"), r"row 5, column 'Déplacement \(mm\)': found 'abc'; expected a number"),
         (spoiled(3, 1, ""), r"row 5, .*found an empty cell"),
+        (spoiled(3, 0, "10:00:01"), r"row 5, .*found a date or a time of day, '10:00:01'"),
+        (spoiled(3, 1, "1,5"), r"row 5, .*found '1,5'; expected a number with the decimal sign '.'"),
+        (spoiled(3, 1, "1_0"), r"row 5, .*found '1_0'; expected a number"),
         (spoiled(3, 2, "nan"), r"row 5, column 'RF \(N\)': found nan; expected a finite number"),
         (spoiled(3, 2, "-inf"), r"row 5, .*found -inf"),
         (spoiled(9, 0, "0.4"), r"row 11: found time 0.4 s after 0.4 s; expected times that increase"),
@@ -204,13 +233,20 @@ def spoiled(row: int, column: int, text: str) -> list[list[str]]:
             r"found a displacement that changes by .*is its unit right",
         ),
         (spoiled(3, 2, "2000"), r"row 5: found a force of 2000 N; .*is the column in mN\?"),
-        ([HEADER, *ROWS[:60]], r"found 60 samples; expected at least 100"),
-        ([HEADER], r"no row below the header"),
+        ([HEADER, *ROWS[:40]], r"found 40 samples; expected at least 50"),
+        ([HEADER], r"no rows of numbers"),
         ([*[HEADER], *ROWS[:20], ROWS[20][:2], *ROWS[21:]], r"row 22: found 2 cells; expected 3 cells"),
         ([*[HEADER], *ROWS[:20], [*ROWS[20], "7"], *ROWS[21:]], r"row 22: found 4 cells; expected 3 cells"),
         ([*[HEADER], *ROWS[:20], [], *ROWS[21:]], r"row 22: found an empty row before row 23"),
-        (ROWS, r"no header"),
-        ([["some", "text"]], r"no header"),
+        (
+            ROWS,
+            r"no names above rows of 3 cells; .* import with --time 1 --displacement 2",
+        ),
+        ([["some", "text"]], r"no rows of numbers"),
+        (
+            [*[HEADER], *ROWS[:20], ["n/a"] * 3, *ROWS[21:]],
+            r"row 22: found 'n/a n/a n/a' between rows of numbers",
+        ),
     ],
 )
 def test_a_fault_is_named_with_its_place(tmp_path: Path, rows: list[list[str]], said: str) -> None:
@@ -221,18 +257,10 @@ def test_a_fault_is_named_with_its_place(tmp_path: Path, rows: list[list[str]], 
     assert "\n" not in str(caught.value)
 
 
-def test_a_force_against_the_pull_is_remarked(tmp_path: Path) -> None:
-    turned = [[*row[:2], f"{-float(row[2]):g}"] for row in ROWS]
-    remarks = [
-        [note for note in read_recording(written(tmp_path / "a.csv", rows, ";")).notes if "reversed" in note]
-        for rows in ([HEADER, *ROWS], [HEADER, *turned])
-    ]
-    assert [len(found) for found in remarks] == [0, 1]
-
-
-def test_a_sheet_of_a_text_is_refused(tmp_path: Path) -> None:
+def test_a_table_that_is_not_there_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path / "a.csv", [HEADER, *ROWS], ";")
-    with pytest.raises(InputError, match=r"sheet 'Test 3': found the ending '.csv'; expected a workbook"):
+    assert_is_the_test(read_recording(path, sheet="1"))
+    with pytest.raises(InputError, match=r"the tables \['1'\]; expected a sheet 'Test 3'"):
         read_recording(path, sheet="Test 3")
 
 
@@ -240,7 +268,8 @@ def test_a_sheet_of_a_text_is_refused(tmp_path: Path) -> None:
     ("name", "data", "said"),
     [
         ("a.csv", b"", "an empty file"), ("a.csv", b" \n\n", "an empty file"),
-        ("a.csv", b"\x00\x01\x81", "not text"),
+        ("a.csv", b"\x00\x01\x81", "not text"), ("a.csv", b"t,d,f\n1,1\x002,3\n", "NUL within a number"),
+        ("a.txt", b"t_s d_mm f_N T_C\n" + 60 * b"1 2 3 4\n" + b"1 2 4\n", "row 62: found 3 cells"),
         ("a.xlsx", b"PK\x03\x04 no workbook", "an xlsx workbook"), ("a.xlsx", b"", "an xlsx workbook"),
         ("a.h5", b"\x89HDF\r\n\x1a\n", "HDF5"), ("a.pdf", b"%PDF", "ending '.pdf'"),
     ],
@@ -342,7 +371,8 @@ def test_what_is_written_is_what_is_read(
     rows = [[repr(0.1 * i), repr(0.05 * i), repr(f)] for i, f in enumerate(force)]
     if comma and delimiter != ",":
         rows = [[cell.replace(".", ",") for cell in row] for row in rows]
-    recording = read_recording(written(tmp_path / "a.csv", [HEADER, *rows], delimiter))
+    either_sign = Stated(units={"force": stated_unit("force", "+N")})
+    recording = read_recording(written(tmp_path / "a.csv", [HEADER, *rows], delimiter), stated=either_sign)
     assert recording.force_n.tolist() == force
 
 

@@ -39,6 +39,22 @@ def said() -> dict[str, Any]:
     return names
 
 
+def test_a_file_that_does_not_decide_is_read_with_what_a_script_states(tmp_path: Path) -> None:
+    rows = "".join(f"{0.1 * i:.1f};{36 + 0.01 * i:.2f};{0.1 * i:.2f}\n" for i in range(80))
+    (tmp_path / "bare.csv").write_text("clock;place;cell\n" + rows)
+    recording = bk.load_recording(
+        tmp_path / "bare.csv",
+        columns={"time": "clock", "displacement": "place", "force": "3"},
+        units={"time": "s", "displacement": "mm", "force": "gf"},
+        zero=True,
+    )
+    assert recording.displacement_m[-1] == pytest.approx(0.79e-3)
+    assert recording.force_n[-1] == pytest.approx(7.9 * 9.80665e-3)
+    for wrong in ({"columns": {"load": "3"}}, {"units": {"mass": "kg"}}, {"units": {"force": "psi"}}):
+        with pytest.raises(InputError):
+            bk.load_recording(tmp_path / "bare.csv", **wrong)
+
+
 def test_the_first_block_is_a_posterior_in_fifteen_lines() -> None:
     assert len([line for line in BLOCKS[0].splitlines() if line.strip()]) <= 15
 

@@ -10,28 +10,40 @@ import click
 
 from bayeskin.cli.answers import answered
 from bayeskin.cli.options import PATH, device_option
+from bayeskin.cli.terminal import Terminal
 from bayeskin.errors import InputError
 
 
-@click.command("import", short_help="Read a recording (xlsx, csv, tsv, h5), write it as HDF5.")
+@click.command("import", short_help="Read a recording (a table or a workbook), write it as HDF5.")
 @click.argument("file", type=PATH)
 @click.option("-o", "out", required=True, type=PATH, help="HDF5 file to write.")
-@click.option("--sheet", help="Sheet of a workbook, if several sheets have the columns.")
+@click.option("--sheet", metavar="NAME", help="One of several tables, or 'all' for one recording each.")
+@click.option("--time", metavar="COLUMN", help="Name or number of the column of time.")
+@click.option("--displacement", metavar="COLUMN", help="Name or number of the column of displacement.")
+@click.option("--force", metavar="COLUMN", help="Name or number of the column of force.")
+@click.option("--unit", "units", multiple=True, metavar="QUANTITY=UNIT", help="As force=mN; repeatable.")
+@click.option("--zero/--no-zero", default=None, help="Subtract the first displacement, or keep it.")
 @answered
-def import_(file: Path, out: Path, sheet: str | None) -> Mapping[str, Any]:
-    """Read a recording (xlsx, csv, tsv, h5) and write it in SI units as HDF5.
+def import_(**options: Any) -> Mapping[str, Any]:
+    """Read a recording and write it in SI units as HDF5.
 
-    The command finds the columns and their units, and reports how it interpreted them. It also reports the
-    phases, the noise, the spikes and the steps that it detects.
+    FILE is a table (csv, tsv, txt, dat, asc, tra, lvm, npy) or a workbook (xlsx, xls) of any test machine.
+    The command finds the table, its columns and their units, and reports on stderr what it took for what. It
+    also reports the phases, the noise, the spikes and the steps that it detects. If something is not clear,
+    it writes nothing and names the option that decides. A minus before a unit turns the sign, as
+    --unit force=-N where a pull counts negative.
 
     \b
     Example:
       bayeskin import Healthy_skin.xlsx -o runs/healthy-skin.h5
       bayeskin import series.xlsx --sheet "Test 3" -o runs/test-3.h5
+      bayeskin import series.xlsx --sheet all -o runs/series.h5
+      bayeskin import arm.csv --displacement Position --unit force=gf --zero -o runs/arm.h5
     """
     from bayeskin.workflow.importing import import_recording
 
-    return import_recording(file, out, sheet)
+    with Terminal() as terminal:
+        return import_recording(terminal, **options)
 
 
 @click.command(short_help="Write a configuration for a recording of your own.")

@@ -20,9 +20,17 @@ from bayeskin.recordings.noise_analysis import NoiseAnalysis, analyse
 from bayeskin.types import Array, BinnedForce, PadMotion, Phase, Recording
 
 MOST_BINS = 1_000_000
+BIN_WIDTH_S = 0.5
+_WIDER_S = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 
 
-def uniform_edges(recording_or_end_s: Recording | float, width_s: float = 0.5) -> Array:
+def fitting_width_s(recording: Recording) -> float:
+    """Returns the width [s] of bins that suits a recording: 0.5 s, or more where samples are far apart."""
+    least = 2 * _interval_s(recording) * (1 - 1e-6)
+    return next((width for width in (BIN_WIDTH_S, *_WIDER_S) if width >= least), _WIDER_S[-1])
+
+
+def uniform_edges(recording_or_end_s: Recording | float, width_s: float = BIN_WIDTH_S) -> Array:
     """Returns the edges [s] (m+1,) of whole bins of `width_s`, from 0 to the recording's end or a given time.
 
     Raises InputError if there would be `MOST_BINS` bins or more.
@@ -87,9 +95,8 @@ def _refuse_edges(recording: Recording, edges_s: Array) -> None:
     counts = np.diff(np.searchsorted(time_s, edges_s - slack))
     if counts.min() < 2:
         fewest = int(np.argmin(counts))
-        raise InputError(
-            where, f"{counts[fewest]} samples in {edges_s[fewest]:g}-{edges_s[fewest + 1]:g} s", "at least 2"
-        )
+        problem = f"{counts[fewest]} samples in {edges_s[fewest]:g}-{edges_s[fewest + 1]:g} s"
+        raise InputError(where, problem, "at least 2 in a bin, whose width is fit.bin_width_s")
 
 
 def _bin_means(time_s: Array, values: Array, edges_s: Array) -> Array:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayeskin.number_format import number
+from bayeskin.recordings.bins import fitting_width_s
 from bayeskin.recordings.noise import PhaseNoise
 from bayeskin.recordings.segment import resolution_m
 from bayeskin.types import Phase, Recording
@@ -24,13 +25,14 @@ _HEADINGS = (
     "steps",
 )
 _WIDTHS = (7, 5, 9, 9, 16, 10, 9, 6, 5)
+_SLOW_S = 0.25  # sampling interval from which a bin of 0.5 s has fewer than two samples
 
 
 def describe(recording: Recording, phases: Sequence[Phase], noise: Sequence[PhaseNoise]) -> str:
     """Returns the description of a recording as several lines of text.
 
     The lines contain the notes on how the file was read, the ranges of displacement and force, one row for
-    each phase, and every step of the load cell's zero.
+    each phase, every step of the load cell's zero, and what the recording cannot tell.
     """
     facts = describe_json(recording, phases, noise)
     displacement, force = facts["displacement_m"], facts["force_n"]
@@ -50,6 +52,8 @@ def describe(recording: Recording, phases: Sequence[Phase], noise: Sequence[Phas
     for step, phase in steps:
         size, where = f"{1e3 * step['size_n']:+6.1f} mN", f"in the {phase['kind']} of cycle {phase['cycle']}"
         lines.append(f"  {step['time_s']:8.2f} s  {size}  {where}")
+    if facts["cannot_tell"]:
+        lines += ["", "what this recording cannot tell:", *(f"  {said}" for said in facts["cannot_tell"])]
     return "\n".join(lines)
 
 
@@ -76,7 +80,30 @@ def describe_json(
             _phase_facts(recording, phase, phase_noise)
             for phase, phase_noise in zip(phases, noise, strict=True)
         ],
+        "cannot_tell": _cannot_tell(recording, phases),
     }
+
+
+def _cannot_tell(recording: Recording, phases: Sequence[Phase]) -> list[str]:
+    """Returns sentences on what a protocol without some phases, or with few samples, does not determine."""
+    kinds, interval_s = {phase.kind for phase in phases}, float(np.median(np.diff(recording.time_s)))
+    said = []
+    if "hold" not in kinds:
+        said.append(
+            "There is no hold, so the force never relaxes at a constant displacement. The permeabilities and "
+            "mechanisms with a memory can hardly be told from the stiffness."
+        )
+    if "unload" not in kinds:
+        said.append(
+            "There is no unloading, so there is no hysteresis. Friction, damage and plastic set can hardly "
+            "be told from the stiffness."
+        )
+    if interval_s > _SLOW_S:
+        said.append(
+            f"Samples are {number(interval_s, 2)} s apart. Spikes and steps of the force can hardly be told "
+            f"from noise. Bins need a width of {number(fitting_width_s(recording), 2)} s (fit.bin_width_s)."
+        )
+    return said
 
 
 def _phase_facts(recording: Recording, phase: Phase, noise: PhaseNoise) -> dict[str, Any]:

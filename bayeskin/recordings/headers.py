@@ -1,4 +1,4 @@
-"""Recognises the columns of a recording from their headers: time, displacement or force, and the unit."""
+"""Recognises what a header says of a column: time, displacement or force, the unit, or another quantity."""
 
 from __future__ import annotations
 
@@ -6,111 +6,133 @@ import re
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 
-from bayeskin.errors import InputError
+from bayeskin.recordings.units import QUANTITIES, UNITS, is_unit, plain, unit_of
+from bayeskin.recordings.vocabulary import ASIDE, JAPANESE, SYMBOLS, WORDS
 
-QUANTITIES = ("time", "displacement", "force")
-
-# These factors convert to SI. Units are compared in lower case, so MN is read as mN. No skin test reaches a
-# meganewton.
-UNITS: dict[str, dict[str, float]] = {
-    "time": {"s": 1.0, "ms": 1e-3, "min": 60.0},
-    "displacement": {"m": 1.0, "mm": 1e-3, "um": 1e-6},
-    "force": {"N": 1.0, "mN": 1e-3},
-}
-_SPELLINGS = {
-    **{name.lower(): name for table in UNITS.values() for name in table},
-    **dict.fromkeys(("sec", "second", "seconds", "seconde", "secondes"), "s"),
-    **dict.fromkeys(("minute", "minutes"), "min"),
-    **dict.fromkeys(("μm", "micron", "microns", "micrometre", "micrometres"), "um"),
-    **dict.fromkeys(("millimetre", "millimetres", "millimeter", "millimeters"), "mm"),
-    **dict.fromkeys(("newton", "newtons"), "N"),
-}
-_WORDS = {
-    "time": {"t", "time", "temps"},
-    "displacement": {"d", "disp", "displ", "displacement", "depl", "deplacement", "lvdt"}
-    | {"extension", "allongement", "course", "stroke"},
-    "force": {"f", "rf", "force", "effort", "reaction", "load", "charge"},
-}
+_BRACKETS = re.compile(r"[\[({<]([^\[\](){}<>]*)[\])}>]")
+_COMMENT = re.compile(r"^\s*(?:#+|%+|//+|!+)\s*")  # as numpy and others begin a header
+_RULE = re.compile(r"[-=_+|*.\s]*")
 
 
 @dataclass(frozen=True)
 class Column:
-    """A recognised column: its index, quantity and header, and its unit ("" if the header gives none)."""
+    """A recognised column.
+
+    index : its place in the row, from 0
+    quantity : time, displacement or force
+    header : its text in the file
+    unit : the standard name of its unit, an unknown unit as it is written, or "" where none is given
+    aside : the reason why it is no measured value of the quantity ("a set point"), or ""
+    """
 
     index: int
     quantity: str
     header: str
     unit: str
+    aside: str = ""
 
     @property
-    def has_unit_of_its_quantity(self) -> bool:
-        return self.unit == "" or self.unit in UNITS[self.quantity]
+    def has_unit(self) -> bool:
+        """Returns whether the unit is a known unit of the quantity."""
+        return self.unit in UNITS[self.quantity]
+
+    @property
+    def label(self) -> str:
+        """Returns how messages call the column: its header, or its number where it has none."""
+        return repr(self.header) if self.header else str(self.index + 1)
 
 
-def _without_accents(text: str) -> str:
-    """Returns the text in lower case, without accents, and with a single sign for micro."""
-    plain = unicodedata.normalize("NFKD", text)
-    return "".join(c for c in plain if not unicodedata.combining(c)).lower().strip()
+def without_comment(text: str) -> str:
+    """Returns a header without the sign that makes it a comment."""
+    return _COMMENT.sub("", text)
 
 
-def parse_unit(text: str) -> str:
-    """Returns the standard name of a unit ("mm" for "Millimètres"), or the text itself if it is unknown."""
-    return _SPELLINGS.get(_without_accents(text).rstrip("."), text.strip())
+def parse_header(index: int, header: str, unit_below: str = "") -> Column | None:
+    """Returns the column that a header describes, or None if it names none or several of the quantities.
 
-
-def parse_header(index: int, header: str) -> Column | None:
-    """Returns the column that a header describes, or None if the column is not needed.
-
-    The unit stands in brackets, or at the end after an underscore, blank, comma or slash (`time_s`,
-    `Force N`).
+    The unit stands in brackets, after a comma, underscore, slash or blank (`time_s`, `Force N`), or in the
+    row of units, whose cell is `unit_below`.
     """
-    bracketed = re.search(r"[\[({<]([^\])}>]*)[\])}>]", header)
-    name = header if bracketed is None else header[: bracketed.start()] + " " + header[bracketed.end() :]
-    words = [word for word in re.split(r"[^a-zμ]+", _without_accents(name)) if word]
-    unit = parse_unit(bracketed.group(1)) if bracketed else ""
-    if bracketed is None and len(words) > 1 and words[-1] in _SPELLINGS:
-        unit = _SPELLINGS[words.pop()]
-    meant = {q for q in QUANTITIES if _WORDS[q].intersection(words)}
-    return Column(index, meant.pop(), header.strip(), unit) if len(meant) == 1 else None
+    words = _words(header)
+    named = _quantities(header, words)
+    if len(named) != 1:
+        return None
+    quantity = named.pop()
+    unit = unit_in(header, quantity, unit_below)
+    if quantity == "time" and unit == "min":
+        words = [word for word in words if word != "min"]
+    return Column(index, quantity, header.strip(), unit, _aside(header, words))
 
 
-def recognise(headers: Sequence[str]) -> list[Column]:
-    """Returns all columns of a header row that could be time, displacement or force."""
+def unit_in(header: str, quantity: str, unit_below: str = "") -> str:
+    """Returns the unit that a header and the cell below it give to a quantity, or "" if they give none.
+
+    A unit that is not known is returned as it is written. Two different units give both, as "mm, m".
+    """
+    text = _narrow(header)
+    bracketed = [part.strip() for part in _BRACKETS.findall(text)]
+    known = [unit for unit in (unit_of(part, quantity) for part in bracketed) if unit]
+    outside = _BRACKETS.sub(" ", text).strip()
+    last = re.split(r"[\s_,;:/]+", outside)[-1]
+    if not known and unit_of(last, quantity) and last != outside:
+        known = [unit_of(last, quantity) or ""]
+    below = unit_below.strip("[](){}<> ")
+    if below:
+        known.append(unit_of(below, quantity) or below)
+    if not known and "%" in text:
+        return "%"
+    if not known:
+        return bracketed[-1] if bracketed else ""
+    return ", ".join(dict.fromkeys(known))
+
+
+def names_quantities(headers: Sequence[str]) -> int:
+    """Returns how many of the three quantities a row names."""
     columns = (parse_header(index, header) for index, header in enumerate(headers))
-    return [column for column in columns if column is not None]
+    return len({column.quantity for column in columns if column is not None})
 
 
-def is_header(headers: Sequence[str]) -> bool:
-    """Returns whether a row names at least two of the three quantities, which makes it the header."""
-    return len({column.quantity for column in recognise(headers)}) >= 2
+def is_unit_row(cells: Sequence[str]) -> bool:
+    """Returns whether a row such as ``s; mm; N`` or ``(s), (mm), (MPa)`` holds units below their columns."""
+    units = [is_unit(cell.strip("[](){}<> ")) for cell in cells]
+    named = [
+        cell for cell, unit in zip(cells, units, strict=True) if not unit and _quantities(cell, _words(cell))
+    ]
+    return sum(units) >= 2 and not named
 
 
-def choose_columns(where: str, headers: Sequence[str]) -> dict[str, Column]:
-    """Returns the column of each quantity.
+def is_rule(cells: Sequence[str]) -> bool:
+    """Returns whether a row only draws a line, as ``-----``."""
+    return all(_RULE.fullmatch(cell) for cell in cells)
 
-    A column is ignored if its unit does not belong to its quantity ("Displacement rate (mm/s)") and another
-    column of this quantity has a suitable unit or none.
 
-    Raises
-    ------
-    InputError : a quantity has no column, two columns, or a unit that is not known.
-    """
-    columns = recognise(headers)
-    chosen = {}
-    for quantity in QUANTITIES:
-        named = [c for c in columns if c.quantity == quantity]
-        fitting = [c for c in named if c.has_unit_of_its_quantity]
-        accepted = ", ".join(UNITS[quantity])
-        if not named:
-            listed = ", ".join(repr(h.strip()) for h in headers if h.strip()) or "no header"
-            raise InputError(where, listed[:200], f"a {quantity} column with one of the units {accepted}")
-        if not fitting:
-            raise InputError(
-                where, f"column {named[0].header!r}", f"{quantity} with one of the units {accepted}"
-            )
-        if len(fitting) > 1:
-            candidates = " and ".join(repr(c.header) for c in fitting)
-            raise InputError(where, f"{candidates}, each a {quantity} column", f"one {quantity} column")
-        chosen[quantity] = fitting[0]
-    return chosen
+def _narrow(header: str) -> str:
+    """Returns a header without a comment sign, and with ASCII letters and brackets for wide ones."""
+    return unicodedata.normalize("NFKC", without_comment(header))
+
+
+def _words(header: str) -> list[str]:
+    """Returns the words of a header, without units in brackets; "Load1" and "load" are the same word."""
+    text = _BRACKETS.sub(lambda m: " " if is_unit(m[1]) else f" {m[1]} ", _narrow(header))
+    text = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", text)
+    words = re.findall(r"[^\W\d_]+\d*", plain(text))
+    return [re.sub(r"\d+$", "", word) if re.match(r"[^\W\d_]{3}", word) else word for word in words]
+
+
+def _quantities(header: str, words: Sequence[str]) -> set[str]:
+    """Returns the quantities that a header names."""
+    named = {WORDS[word] for word in words if word in WORDS}
+    named |= {q for q in QUANTITIES if any(word in _narrow(header) for word in JAPANESE[q])}
+    if not named:
+        names = [word for word in words if not is_unit(word)] or list(words)
+        named = {SYMBOLS[names[0]]} if len(names) == 1 and names[0] in SYMBOLS else set()
+    return named
+
+
+def _aside(header: str, words: Sequence[str]) -> str:
+    """Returns the reason why a header names no measured value, or ""."""
+    listed = [ASIDE[word] for word in words if word in ASIDE]
+    japanese = (reason for word, reason in ASIDE.items() if not word.isascii() and word in _narrow(header))
+    return next(chain(listed, japanese), "")

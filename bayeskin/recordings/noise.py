@@ -44,8 +44,8 @@ def phase_noise(recording: Recording, phases: Sequence[Phase]) -> tuple[PhaseNoi
 
     Raises
     ------
-    InputError : no phase is long enough (about 30 samples) to distinguish noise from force, the samples are
-        too far apart, or the force never changes.
+    InputError : no phase is long enough (about 30 samples, 15 of a slow recording) to distinguish noise from
+        force, or the force never changes.
     """
     return summarise(analyse(recording, phases), phases)
 

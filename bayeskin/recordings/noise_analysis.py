@@ -30,6 +30,7 @@ class NoiseSettings:
 
     window_s : time [s] over which a parabola describes the force without noise
     least_window : least number of samples in a window
+    least_window_slow : the same for a recording with fewer than `least_window` samples in `window_s`
     longest_share : longest window, as a share of the longest time between breaks
     after_break_s : time [s] that is left out after a corner or step, where the force changes too fast
     lag_s : longest lag [s] at which the correlation is measured
@@ -38,6 +39,7 @@ class NoiseSettings:
 
     window_s: float = 2.5
     least_window: int = 20
+    least_window_slow: int = 10
     longest_share: float = 0.7
     after_break_s: float = 1.0
     lag_s: float = 1.0
@@ -91,11 +93,12 @@ def analyse(recording: Recording, phases: Sequence[Phase], window_s: float = NOI
 
     If the first round finds steps, a second round treats them as breaks of the force.
 
-    window_s : time over which a parabola describes the force without noise, at least 20 samples. With a long
-        window, slow variations of the force count as noise. With a shorter window they do not.
+    window_s : time over which a parabola describes the force without noise, at least 20 samples, or 10 where
+        they are more than an eighth of a second apart. With a long window, slow variations of the force count
+        as noise. With a shorter window they do not.
 
-    Raises InputError for a force that never changes, in which no phase is long enough (about 30 samples) to
-    distinguish noise from force, or whose samples are too far apart.
+    Raises InputError for a force that never changes, or in which no phase is long enough (about 30 samples,
+    15 of a slow recording) to distinguish noise from force.
     """
     if np.ptp(recording.force_n) == 0.0:
         problem = f"{recording.force_n[0]:g} N throughout"
@@ -153,11 +156,8 @@ def _analyse_once(
     breaks = np.unique(np.concatenate([bounds, steps]))
     despiked = despike(time_s, recording.force_n, breaks.tolist())
     longest = int(np.max(np.diff(breaks)))
-    least = NOISE.least_window
+    least = min(NOISE.least_window, max(NOISE.least_window_slow, round(NOISE.window_s / interval_s)))
     size = min(max(round(window_s / interval_s), least), int(NOISE.longest_share * longest))
-    if round(NOISE.window_s / interval_s) < least:
-        expected = f"at most {NOISE.window_s / least:.2g} s, to estimate their noise"
-        raise InputError(recording.name, f"samples {interval_s:.3g} s apart", expected)
     if size < least:
         problem = f"{longest} samples in the longest phase"
         fewest = round(least / NOISE.longest_share) + 1

@@ -1,88 +1,200 @@
-"""Reads recordings from the file formats of laboratories and refuses invalid files in a one-line message."""
+"""Reads recordings from the files of laboratories, and refuses what is not clear in one line."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-
-import numpy as np
 
 from bayeskin import storage
 from bayeskin.errors import InputError
-from bayeskin.number_format import number
 from bayeskin.probe import bytes_of, refuse_damaged, refuse_endless
-from bayeskin.recordings.headers import UNITS, Column
-from bayeskin.recordings.tables import Table, read_text, read_workbook
-from bayeskin.types import Array, Recording
+from bayeskin.recordings.checks import MIN_SAMPLES, refuse_invalid, remarks_on_clock
+from bayeskin.recordings.columns import Stated
+from bayeskin.recordings.headers import Column
+from bayeskin.recordings.settle import settled
+from bayeskin.recordings.tables import Table, Unreadable, tables_of
+from bayeskin.recordings.text import Rows, rows_of_text
+from bayeskin.recordings.workbooks import rows_of_array, sheets_of_xls, sheets_of_xlsx
+from bayeskin.types import Recording
 
-_WORKBOOKS = {".xlsx", ".xlsm"}
-_TEXTS = {".csv", ".tsv", ".txt"}
-_STORED = {".h5", ".hdf5"}
+ALL = "all"  # as the name of a sheet: every table of the file
+_WORKBOOKS = (".xlsx", ".xlsm", ".xls")
+_TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".tra", ".lvm", ".mach-1")
+_STORED = (".h5", ".hdf5")
+_ENDINGS = (*_WORKBOOKS, *_TEXTS, ".npy", *_STORED)
+_EARLY_EXCEL = (b"\x09\x00", b"\x09\x02", b"\x09\x04", b"\x09\x08")  # the first record of a workbook
+_NOTHING_STATED = Stated()
 
 
 @dataclass(frozen=True)
-class PlausibleTest:
-    """Plausible sizes of an extensometer test on living skin.
+class Reading:
+    """A recording with what was taken for what in its file.
 
-    The choice of a unit that a header does not give; the ranges are wide on purpose, and a unit is chosen
-    only if it is the only one that fits
-    duration_s, travel_m, peak_n : smallest and largest duration, travel and peak force
-    interval_s : smallest and largest time between samples
-
-    Refusal of a recording
-    samples, least_travel_m : least number of samples, and least travel
-    largest_m, largest_n : no skin test exceeds these values; larger values mean that the header does not give
-        the unit of the numbers
+    table : the name of the table in its file, "" where the file has only one
+    columns : the column of each quantity; none for a file of bayeskin
+    factors : the factor from the numbers in the file to SI, negative where the sign was turned
+    zero_m : the displacement in the file that became zero
     """
 
-    duration_s: tuple[float, float] = (5.0, 7200.0)
-    travel_m: tuple[float, float] = (5e-5, 0.1)
-    peak_n: tuple[float, float] = (0.01, 100.0)
-    interval_s: tuple[float, float] = (1e-6, 0.2)
-    samples: int = 100
-    least_travel_m: float = 1e-5
-    largest_m: float = 0.1
-    largest_n: float = 1e3
-
-    def range_of(self, quantity: str) -> tuple[float, float]:
-        """Returns the smallest and the largest plausible size of a quantity."""
-        return {"time": self.duration_s, "displacement": self.travel_m, "force": self.peak_n}[quantity]
+    recording: Recording
+    table: str = ""
+    columns: Mapping[str, Column] = field(default_factory=dict)
+    factors: Mapping[str, float] = field(default_factory=dict)
+    zero_m: float = 0.0
 
 
-PLAUSIBLE = PlausibleTest()
+def read_recording(
+    path: Path | str, *, sheet: str | None = None, stated: Stated = _NOTHING_STATED
+) -> Recording:
+    """Reads time, displacement and force from a table, a workbook, or a file of bayeskin.
 
-
-def read_recording(path: Path | str, *, sheet: str | None = None) -> Recording:
-    """Reads time, displacement and force from an xlsx, xlsm, csv, tsv, txt or bayeskin h5 file.
-
-    The headers, in English or French, identify the columns and their units (s, ms, min; m, mm, um; N, mN).
-    `notes` of the result records how each column was interpreted. Values are converted to SI and are
-    otherwise as measured. If time does not start at zero, it is shifted to zero, and a note says so.
+    The headers, in several languages, identify the columns and their units. `notes` of the result records how
+    each column was interpreted. Values are converted to SI and are otherwise as measured. If time does not
+    start at zero, it is shifted to zero, and a note says so.
 
     Parameters
     ----------
-    path : the file
-    sheet : name of the sheet, for a workbook in which several sheets have the columns
+    path : xlsx, xlsm, xls, csv, tsv, txt, dat, asc, tra, lvm, npy, or an h5 file of bayeskin
+    sheet : name of the table, for a file that has several
+    stated : columns, units and zero that the file does not make clear
 
     Raises
     ------
-    InputError : the file cannot be read, or is not a recording of a skin test; the message says where the
-        fault is, what was found and what was expected.
+    InputError : the file cannot be read, is not a recording of a skin test, or can be understood in several
+        ways; the message says where the fault is, what was found and what was expected.
+    """
+    return read_tables(path, sheet=sheet, stated=stated)[0].recording
+
+
+def read_tables(
+    path: Path | str, *, sheet: str | None = None, stated: Stated = _NOTHING_STATED
+) -> tuple[Reading, ...]:
+    """Reads the only table of a file, or the table `sheet`, or with `sheet` "all" every table that it has.
+
+    Tables are the sheets of a workbook, specimens side by side, and tables one below the other. Tables of
+    fewer samples than a recording are left out if the file has others. Raises InputError as `read_recording`.
     """
     path = Path(path)
     refuse_endless(path, "a recording")
-    kind, accepted = path.suffix.lower(), _WORKBOOKS | _TEXTS | _STORED
-    if kind not in accepted:
-        raise InputError(path, f"the ending {kind!r}", f"one of {', '.join(sorted(accepted))}")
-    if sheet is not None and kind not in _WORKBOOKS:
-        raise InputError(f"{path}: sheet {sheet!r}", f"the ending {kind!r}", "a workbook, .xlsx or .xlsm")
+    kind = path.suffix.lower()
+    if kind not in _ENDINGS:
+        raise InputError(path, f"the ending {kind!r}", f"one of {', '.join(_ENDINGS)}")
     if kind in _STORED:
-        return _read_stored(path)
+        if sheet is not None or stated != _NOTHING_STATED:
+            raise InputError(path, "a file of bayeskin, where nothing is to be chosen", "no such option")
+        return (Reading(_read_stored(path)),)
     data = bytes_of(path, "a recording")
-    table = read_workbook(path, data, sheet) if kind in _WORKBOOKS else read_text(path, data)
-    with np.errstate(over="ignore"):  # absurdly large numbers become infinite and are refused then
-        return _to_recording(path.stem, table, hashlib.sha256(data).hexdigest())
+    found, notes = _tables(path, kind, data, sheet, stated)
+    chosen, left_out = _chosen(path, found, sheet)
+    name, sha256 = shown(path.stem), hashlib.sha256(data).hexdigest()
+    readings = []
+    for label, table in chosen:
+        of_several = f" {label}" if sheet == ALL else ""
+        readings.append(_reading(name + of_several, label, table, stated, sha256, (*notes, *left_out)))
+    return tuple(readings)
+
+
+def shown(path: Path | str) -> str:
+    """Returns the name of a file as text; bytes that are not UTF-8 are written as \\xe9."""
+    return os.fsencode(path).decode("utf-8", "backslashreplace")
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A table of a file, or the error of a table that has the columns, and the names that choose it."""
+
+    label: str
+    names: tuple[str, ...]
+    table: Table | Unreadable | InputError
+
+    @property
+    def rows(self) -> int:
+        return MIN_SAMPLES if isinstance(self.table, InputError) else self.table.rows
+
+
+def _sheets(path: Path, kind: str, data: bytes) -> Mapping[str, Rows] | None:
+    """Returns the rows of the sheets of a workbook, or None for a text. The content decides, not the name."""
+    if data.startswith(b"PK\x03\x04") or kind in (".xlsx", ".xlsm"):
+        return sheets_of_xlsx(path, data)
+    if data.startswith(b"\xd0\xcf\x11\xe0") or (kind == ".xls" and data[:2] in _EARLY_EXCEL):
+        return sheets_of_xls(path, data)
+    return None
+
+
+def _tables(
+    path: Path, kind: str, data: bytes, sheet: str | None, stated: Stated
+) -> tuple[list[_Found], tuple[str, ...]]:
+    """Returns the tables of a file in their order, and notes. A sheet of the name `sheet` is read alone."""
+    if kind == ".npy":
+        return _labelled("", tables_of(str(path), rows_of_array(path, data), stated)), ()
+    sheets = _sheets(path, kind, data)
+    if sheets is None:
+        rows, delimiter, notes = rows_of_text(path, data)
+        return _labelled("", tables_of(str(path), rows, stated, delimiter == " ")), notes
+    found = []
+    for name in [sheet] if sheet is not None and sheet in sheets else sheets:
+        try:
+            found += _labelled(name, tables_of(f"{path}: sheet {name!r}", sheets[name], stated))
+        except InputError as error:
+            found.append(_Found(name, (name,), error))
+    return found, ()
+
+
+def _labelled(sheet: str, tables: Sequence[Table | Unreadable]) -> list[_Found]:
+    """Returns the tables of a sheet or text with their names. Short ones count only if there is no other."""
+    long = [table for table in tables if table.rows >= MIN_SAMPLES] or tables
+    titles = [table.title for table in long]
+    found = []
+    for number, table in enumerate(long, start=1):
+        numbered = "" if table.title and titles.count(table.title) == 1 else str(number)
+        own = " ".join(filter(None, (numbered, table.title)))
+        label = sheet if sheet and len(long) == 1 else f"{sheet} {own}".strip()
+        names = (label, sheet, table.title, "" if sheet else str(number))
+        found.append(_Found(label, tuple(filter(None, names)), table))
+    return found
+
+
+def _chosen(
+    path: Path, found: Sequence[_Found], sheet: str | None
+) -> tuple[list[tuple[str, Table]], list[str]]:
+    """Returns the tables to read with their labels, and a note on others. Raises InputError if unclear."""
+    labels = [one.label for one in found]
+    wanted = [one for one in found if sheet in (None, ALL) or sheet in one.names]
+    if not wanted and found:
+        raise InputError(path, f"the tables {labels}", f"a sheet {sheet!r}")
+    long = [one for one in wanted if one.rows >= MIN_SAMPLES] or wanted
+    fitting = [one for one in long if not isinstance(one.table, Unreadable)]
+    if not fitting:
+        unreadable = [one.table for one in long if isinstance(one.table, Unreadable)]
+        longest = max(unreadable, key=lambda table: table.rows, default=None)
+        raise longest.error if longest else InputError(path, "no rows of numbers", "a header and numbers")
+    if len(fitting) > 1 and sheet != ALL:
+        problem = f"the columns in {len(fitting)} of the tables {labels}"
+        raise InputError(path, problem, "one table; or import with --sheet NAME, or --sheet all")
+    readable = []
+    for one in fitting:
+        if isinstance(one.table, InputError):
+            raise one.table
+        if isinstance(one.table, Table):
+            readable.append((one.label, one.table))
+    left_out = [one.label for one in wanted if one not in fitting]
+    return readable, [f"tables left out: {', '.join(map(repr, left_out))}"] if left_out else []
+
+
+def _reading(
+    name: str, label: str, table: Table, stated: Stated, sha256: str, notes: Sequence[str]
+) -> Reading:
+    """Returns the recording of a table, in SI units."""
+    found = settled(table, stated)
+    time_s = found.values["time"]
+    remarks = (*notes, *found.notes, *remarks_on_clock(time_s))
+    recording = Recording(
+        time_s - time_s[0], found.values["displacement"], found.values["force"], name, sha256, remarks
+    )
+    return Reading(recording, label, found.columns, found.factors, found.zero_m)
 
 
 def _read_stored(path: Path) -> Recording:
@@ -94,111 +206,5 @@ def _read_stored(path: Path) -> Recording:
         raise InputError(
             path, "arrays of different shapes or types", "three arrays of numbers with equal lengths"
         )
-    _refuse_invalid(str(path), 0, *arrays)
+    refuse_invalid(str(path), 0, *arrays)
     return recording
-
-
-def _to_recording(name: str, table: Table, sha256: str) -> Recording:
-    notes = list(table.notes)
-    values = {}
-    for quantity, column in table.columns.items():
-        raw = table.values[quantity]
-        _refuse_infinite(f"{table.where}, row", table.first_row, column.header, raw)
-        unit = column.unit or _guess_unit(table, column, raw)
-        values[quantity] = raw * UNITS[quantity][unit]
-        stated = "" if column.unit else ", which fits the numbers (the header gives no unit)"
-        notes.append(f"column {column.header!r} read as {quantity} in {unit}{stated}")
-    used = {column.index for column in table.columns.values()}
-    ignored = [h.strip() for i, h in enumerate(table.headers) if i not in used and h.strip()]
-    if ignored:
-        notes.append("ignored columns: " + ", ".join(map(repr, ignored)))
-    time_s, displacement_m, force_n = values["time"], values["displacement"], values["force"]
-    _refuse_invalid(table.where, table.first_row, time_s, displacement_m, force_n)
-    recording = Recording(time_s, displacement_m, force_n, name, sha256)
-    remarks = (*notes, *_remarks_on_clock(time_s), *_remarks_on_sign(displacement_m, force_n))
-    return replace(recording, time_s=time_s - time_s[0], notes=remarks)
-
-
-def _remarks_on_sign(displacement_m: Array, force_n: Array) -> list[str]:
-    with np.errstate(all="ignore"):  # a force that hardly changes has no correlation
-        correlation = np.corrcoef(displacement_m, force_n)[0, 1]
-    if not correlation < -0.5:
-        return []
-    return ["the force falls where the displacement grows: is the sign of one of them reversed?"]
-
-
-def _remarks_on_clock(time_s: Array) -> list[str]:
-    remarks = []
-    if time_s[0] != 0.0:
-        remarks.append(f"time starts at {number(time_s[0], 6)} s in the file; shifted to 0")
-    intervals = np.diff(time_s)
-    gap, usual = int(np.argmax(intervals)), float(np.median(intervals))
-    if intervals[gap] > 5 * usual:
-        remarks.append(
-            f"a gap of {number(intervals[gap])} s after {time_s[gap]:.3f} s "
-            f"(samples are {number(usual)} s apart)"
-        )
-    return remarks
-
-
-def _guess_unit(table: Table, column: Column, raw: Array) -> str:
-    """Returns the only unit with which the numbers can come from a skin test.
-
-    Raises InputError if no unit or several units fit.
-    """
-    quantity = column.quantity
-    size = float(np.ptp(raw) if quantity != "force" else np.max(np.abs(raw)))
-    low, high = PLAUSIBLE.range_of(quantity)
-    fitting = [unit for unit, factor in UNITS[quantity].items() if low <= size * factor <= high]
-    if quantity == "time":
-        interval = float(np.median(np.abs(np.diff(raw)))) if len(raw) > 1 else 0.0
-        shortest, longest = PLAUSIBLE.interval_s
-        fitting = [u for u in fitting if shortest <= interval * UNITS[quantity][u] <= longest]
-    if len(fitting) == 1:
-        return fitting[0]
-    accepted = ", ".join(UNITS[quantity])
-    problem = f"no unit, and numbers up to {size:g} that fit {' and '.join(fitting) or 'none'}"
-    raise InputError(
-        f"{table.where}, column {column.header!r}", problem, f"the unit in the header ({accepted})"
-    )
-
-
-def _refuse_infinite(where: str, first_row: int, what: str, values: Array) -> None:
-    bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad):
-        place = f"{where} {first_row + bad[0]}, column {what!r}"
-        raise InputError(place, f"{values[bad[0]]}", "a finite number")
-
-
-def _refuse_invalid(where: str, first_row: int, time_s: Array, displacement_m: Array, force_n: Array) -> None:
-    """Raises InputError unless the arrays (n,) can be a skin test.
-
-    The arrays must have enough samples, finite values, increasing times, plausible sizes, and a displacement
-    that changes.
-    """
-    named = {"time": time_s, "displacement": displacement_m, "force": force_n}
-    if len(time_s) < PLAUSIBLE.samples:
-        raise InputError(where, f"{len(time_s)} samples", f"at least {PLAUSIBLE.samples}")
-    for name, values in named.items():
-        _refuse_infinite(f"{where}, row", first_row, name, values)
-    back = np.flatnonzero(np.diff(time_s) <= 0)
-    if len(back):
-        before, after = time_s[back[0]], time_s[back[0] + 1]
-        problem = f"time {after:.6g} s after {before:.6g} s"
-        raise InputError(
-            f"{where}, row {first_row + back[0] + 1}", problem, "times that increase from row to row"
-        )
-    for name, largest, unit in (
-        ("displacement", PLAUSIBLE.largest_m, "m"),
-        ("force", PLAUSIBLE.largest_n, "N"),
-    ):
-        peak = int(np.argmax(np.abs(named[name])))
-        value = abs(named[name][peak])
-        if value > largest:
-            problem = f"a {name} of {value:.4g} {unit}"
-            expected = f"at most {largest:g} {unit} (is the column in {'mm' if unit == 'm' else 'mN'}?)"
-            raise InputError(f"{where}, row {first_row + peak}", problem, expected)
-    travel = float(np.ptp(displacement_m))
-    if travel < PLAUSIBLE.least_travel_m:
-        problem = f"a displacement that changes by {travel:.3g} m in all"
-        raise InputError(where, problem, f"at least {PLAUSIBLE.least_travel_m:g} m (is its unit right?)")

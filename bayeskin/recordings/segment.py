@@ -29,7 +29,10 @@ class SegmentSettings:
     shortest_still_s : a dwell at a turning point that is shorter than this [s] is not a phase
     speed_change : a ramp whose speed changes by a larger factor has a corner there
     shortest_ramp_s : both parts of such a ramp must last at least this long [s]
+    shortest_ramp : and this many sampling intervals, because a corner may lie between two samples
     trim_s : duration [s] that a line fit ignores at a piece's rounded end, at most a tenth of the piece
+    rounding : smaller steps of the displacement are rounding in the computer
+    largest_step : largest step of an LVDT
     """
 
     tolerance: float = 0.005
@@ -38,7 +41,10 @@ class SegmentSettings:
     shortest_still_s: float = 0.2
     speed_change: float = 1.5
     shortest_ramp_s: float = 0.5
+    shortest_ramp: float = 1.5
     trim_s: float = 0.5
+    rounding: float = 1e-9
+    largest_step: float = 0.0125
 
 
 SEGMENT = SegmentSettings()
@@ -54,9 +60,15 @@ class _Piece:
 
 
 def resolution_m(displacement_m: Array) -> float:
-    """Returns the resolution of the displacement [m]: the larger of its smallest step and its noise's sd."""
-    levels = np.unique(displacement_m)
-    step = float(np.min(np.diff(levels))) if len(levels) > 1 else 0.0
+    """Returns the resolution of the displacement [m]: the larger of its smallest step and its noise's sd.
+
+    Steps that rounding in the computer makes do not count. Where samples are far apart, the drive moves by
+    more than the LVDT's step between them, so a step counts as at most 1.25 % of the travel.
+    """
+    travel = float(np.ptp(displacement_m))
+    steps = np.diff(np.unique(displacement_m))
+    steps = steps[steps > SEGMENT.rounding * travel]
+    step = min(float(steps.min(initial=np.inf)), SEGMENT.largest_step * travel)
     second = np.diff(displacement_m, 2)
     limit = max(5 * 1.4826 * float(np.median(np.abs(second))), 2 * step)
     noise = float(np.sqrt(np.mean(second[np.abs(second) <= limit] ** 2) / 6.0))
@@ -73,7 +85,7 @@ def segment(recording: Recording) -> tuple[Phase, ...]:
 
     Raises
     ------
-    InputError : the displacement has a single phase only, or moves little more than its noise.
+    InputError : the displacement neither rises nor falls, or moves little more than its noise.
     """
     time_s = recording.time_s
     smooth = median_filter(recording.displacement_m, 5, mode="nearest")
@@ -88,11 +100,9 @@ def segment(recording: Recording) -> tuple[Phase, ...]:
     knots = simplify(time_s, smooth, tolerance, np.empty(0, dtype=np.int64))
     still_m = SEGMENT.still * travel
     pieces = _merge(_fragments(time_s, smooth, knots, still_m), time_s, smooth, still_m)
-    if len(pieces) < 2:
+    if not any(piece.direction for piece in pieces):
         raise InputError(
-            recording.name,
-            "a displacement with one phase only",
-            "at least two of loading, hold and unloading",
+            recording.name, "a displacement that never rises or falls", "a loading or an unloading"
         )
     corners = [_corner_s(time_s, smooth, a, b) for a, b in pairwise(pieces)]
     edges = [float(time_s[0]), *corners, float(time_s[-1])]
@@ -151,7 +161,9 @@ def _are_separate_ramps(a: _Piece, b: _Piece, time_s: Array, smooth: Array, stil
     moved = np.array([abs(smooth[p.stop] - smooth[p.start]) for p in (a, b)])
     lasted = np.array([time_s[p.stop] - time_s[p.start] for p in (a, b)])
     speed = moved / lasted
-    if a.direction == 0 or moved.min() < still_m or lasted.min() < SEGMENT.shortest_ramp_s:
+    interval_s = float(np.median(np.diff(time_s)))
+    shortest_s = max(SEGMENT.shortest_ramp_s, SEGMENT.shortest_ramp * interval_s)
+    if a.direction == 0 or moved.min() < still_m or lasted.min() < shortest_s:
         return False
     return bool(speed.max() > SEGMENT.speed_change * speed.min())
 

@@ -1,252 +1,277 @@
-"""Converts the rows of text and spreadsheet files to columns of numbers; every error names the row."""
+"""Finds the tables of a sheet or a text: rows of numbers below a heading, one below or beside the other."""
 
 from __future__ import annotations
 
-import csv
-import io
 import re
-import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import chain, islice
-from pathlib import Path
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain, dropwhile, islice, pairwise, takewhile
 from typing import Any
 
-import numpy as np
-
 from bayeskin.errors import InputError
-from bayeskin.recordings.headers import UNITS, Column, choose_columns, is_header, parse_unit
+from bayeskin.recordings.columns import Candidates, Heading, Stated, candidates_of
+from bayeskin.recordings.headers import is_rule, is_unit_row, names_quantities, without_comment
+from bayeskin.recordings.numbers import Numbers, describe_cell, is_number
+from bayeskin.recordings.text import NumberedRow, Rows, header_cells
 from bayeskin.types import Array
 
-_HEADER_WITHIN = 50  # number of rows searched for the header; laboratory exports put a preamble before it
 _CHUNK = 50_000  # number of rows that are in memory as text at a time
-MOST_UNPACKED = 2**30  # bytes of a workbook's parts; a sheet of a million rows with three columns has 10^8
+_ABOVE = 4  # rows above the numbers that may be their heading
+_SECTION = re.compile(r"<(?!END|DATA|INFO|divider|Mach-1 File)([^<>]+)>")  # Mach-1 names its functions so
 Row = Sequence[Any]
-Split = Callable[[Iterable[str]], Iterator[Row]]
+Line = tuple[int, list[str]]  # a row that holds no numbers
 
 
 @dataclass(frozen=True)
 class Table:
-    """The three columns of a file as numbers in the file's own units, with their origin.
+    """The candidate columns of one table, with their numbers in the file's own units.
 
-    `values` maps time, displacement and force to arrays (n,). `first_row` is the row number in the file of
-    the first element of these arrays.
+    where : its file and sheet, for messages
+    title : the text above its heading, or ""
+    candidates : the columns that may hold each quantity
+    numbers : the numbers of each of these columns, by the column's index
+    first_row : the row in the file of the first numbers
+    heading : names and units of all columns
     """
 
-    columns: dict[str, Column]
-    values: dict[str, Array]
-    first_row: int
-    headers: tuple[str, ...]
     where: str
-    notes: tuple[str, ...] = ()
+    title: str
+    candidates: Candidates
+    numbers: dict[int, Numbers]
+    first_row: int
+    heading: Heading
+
+    @property
+    def place(self) -> str:
+        """Returns where its heading stands, for messages."""
+        return f"{self.where}, row {self.heading.row}"
+
+    @property
+    def rows(self) -> int:
+        """Returns the number of rows of numbers."""
+        parts = next(iter(next(iter(self.numbers.values())).read.values()))
+        return sum(map(len, parts))
 
 
-def read_text(path: Path, data: bytes) -> Table:
-    """Returns the columns of a csv, tsv or txt file; detects its delimiter, decimal sign and encoding.
+@dataclass(frozen=True)
+class Unreadable:
+    """Rows of numbers without columns of time, displacement and force, and the error that says so."""
+
+    title: str
+    rows: int
+    error: InputError
+
+
+def tables_of(where: str, rows: Rows, stated: Stated, by_blanks: bool = False) -> list[Table | Unreadable]:
+    """Returns the tables of a sheet or a text, in the order of the file.
+
+    by_blanks : whether blanks separate the columns, so that a row of numbers has to be complete
 
     Raises
     ------
-    InputError : there is no suitable header, a row has too many or too few cells, or a cell is not a number.
+    InputError : a row within a table has a cell that is no number, or too few or too many cells.
     """
-    text, encoding = _decode(path, data)
-    split = _choose_split(path, list(islice(_lines(text), _HEADER_WITHIN)))
-    try:
-        table = _tabulate(str(path), split(_lines(text)))
-    except csv.Error as error:
-        raise InputError(path, f"text that is not a table ({error})", "a table of rows and columns") from None
-    if encoding == "utf-8":
-        return table
-    return replace(table, notes=(f"text read as {encoding}",))
+    found: list[Table | Unreadable] = []
+    rows = partial(_without_dividers, rows)
+    numbered, width = rows(), 0
+    while True:
+        above, section, first = _next_numbers(numbered)
+        if first is None:
+            return found
+        lines = [(n, _names_in(texts, first[1]) if by_blanks else texts) for n, texts in above]
+        if found and isinstance(found[-1], Table):
+            _refuse_interruption(where, lines, first, width)
+        width = len(_texts(first[1]))
+        try:
+            heading = _heading(where, lines, first)
+            groups = candidates_of(where, heading, stated)
+        except InputError as error:
+            count, numbered = _skipped(chain([first], numbered))
+            found.append(Unreadable(section, count, error))
+            continue
+        reader = _Reader(where, heading, by_blanks)
+        if len(groups) == 1:
+            numbers, _, numbered = reader.read(groups[0], chain([first], numbered))
+            found.append(Table(where, section, groups[0], numbers, first[0], heading))
+            continue
+        read = [reader.read(group, _from(rows(), first[0])) for group in groups]
+        last = max(end for _, end, _ in read)
+        for group, title, (numbers, end, _) in zip(groups, _titles(heading, groups), read, strict=True):
+            reader.refuse_numbers_after(numbers, _from(rows(), end), last)
+            found.append(Table(where, title, group, numbers, first[0], heading))
+        numbered = _from(rows(), last)
 
 
-def read_workbook(path: Path, data: bytes, sheet: str | None) -> Table:
-    """Returns the columns of the only sheet of an xlsx file that has them, or those of `sheet`.
-
-    Raises
-    ------
-    InputError : the file cannot be read, no sheet or several sheets have the columns, or a cell is empty or
-        contains text.
-    """
-    import openpyxl
-
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as parts:
-            unpacked = sum(part.file_size for part in parts.infolist())
-        if unpacked > MOST_UNPACKED:
-            raise InputError(path, f"{unpacked:.2g} bytes when unpacked", f"at most {MOST_UNPACKED:.2g}")
-        book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
-        names = list(book.sheetnames)
-        if sheet is not None and sheet not in names:
-            raise InputError(path, f"sheets {names}", f"a sheet {sheet!r}")
-        wanted = [sheet] if sheet is not None else [n for n in names if _sheet_has_header(book[n])]
-        if len(wanted) != 1:
-            problem = f"the columns in {len(wanted)} of the sheets {names}"
-            raise InputError(path, problem, "time, displacement and force in one sheet, or the sheet's name")
-        return _tabulate(f"{path}: sheet {wanted[0]!r}", book[wanted[0]].iter_rows(values_only=True))
-    except InputError:
-        raise
-    except (zipfile.BadZipFile, OSError, EOFError) as error:
-        raise InputError(path, f"a damaged file ({_one_line(error)})", "an xlsx workbook") from None
-    except Exception as error:  # openpyxl passes on any exception of its XML and zip layers
-        problem = f"a workbook that cannot be read ({type(error).__name__}: {_one_line(error)})"
-        raise InputError(path, problem, "an xlsx workbook") from None
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:120]
-
-
-def _sheet_has_header(sheet: Any) -> bool:
-    rows = sheet.iter_rows(values_only=True) if hasattr(sheet, "iter_rows") else ()
-    return any(is_header(_texts(row)) for row in islice(rows, _HEADER_WITHIN))
+def _without_dividers(rows: Rows) -> Iterator[NumberedRow]:
+    """Yields rows without those by which a Mach-1 divides the steps of one function."""
+    return (row for row in rows() if row[1] != ["<divider>"])
 
 
 def _texts(row: Row) -> list[str]:
-    return ["" if cell is None else str(cell) for cell in row]
+    texts = ["" if cell is None else str(cell) for cell in row]
+    while texts and not texts[-1].strip():
+        texts.pop()
+    return texts
 
 
-def _decode(path: Path, data: bytes) -> tuple[str, str]:
-    """Returns the text and its encoding: Unicode, or the encoding of Western European Windows."""
-    if not data.strip():
-        raise InputError(path, "an empty file", "a header row and rows of numbers")
-    utf16 = data[:2] in (b"\xff\xfe", b"\xfe\xff")
-    for encoding in ("utf-16",) if utf16 else ("utf-8-sig", "cp1252"):
+def _names_in(texts: list[str], row: Row) -> list[str]:
+    """Returns the names in a line whose columns are set by blanks, above a row of numbers."""
+    return header_cells(texts[0], len(row)) or texts
+
+
+def _holds_numbers(row: Row) -> bool:
+    return len(list(islice(filter(is_number, row), 2))) == 2
+
+
+def _next_numbers(numbered: Iterator[NumberedRow]) -> tuple[list[Line], str, NumberedRow | None]:
+    """Returns the last rows before the next row of numbers, the section they name, and the row of numbers."""
+    above: deque[Line] = deque(maxlen=_ABOVE)
+    section = ""
+    for number, row in numbered:
+        if _holds_numbers(row):
+            return list(above), section, (number, row)
+        texts = _texts(row)
+        if not is_rule(texts):
+            above.append((number, texts))
+            named = _SECTION.fullmatch(texts[0].strip())
+            section = named[1] if named and len(texts) == 1 else section
+    return list(above), section, None
+
+
+def _refuse_interruption(where: str, above: Sequence[Line], first: NumberedRow, width: int) -> None:
+    """Raises InputError for numbers that continue the table above them after rows without numbers."""
+    if not above:
+        raise InputError(
+            f"{where}, row {first[0] - 1}", f"an empty row before row {first[0]}", "a row of numbers"
+        )
+    if len(_texts(first[1])) == width and not any(names_quantities(texts) >= 2 for _, texts in above):
+        problem = f"{' '.join(above[0][1])[:60]!r} between rows of numbers"
+        raise InputError(f"{where}, row {above[0][0]}", problem, "a row of numbers")
+
+
+def _heading(where: str, above: Sequence[Line], first: NumberedRow) -> Heading:
+    """Returns the names and units that stand right above the first row of numbers."""
+    number, row = first
+    width = len(_texts(row))
+    lines = list(reversed(above))
+    units: tuple[str, ...] = ()
+    if lines and is_unit_row(lines[0][1]):
+        units = tuple(lines.pop(0)[1])
+    named = lines[0] if lines else (number, [])
+    if len(named[1]) > 1 and width == 2 * len(named[1]):
+        problem = f"{len(named[1])} names above rows of {width} cells"
+        raise InputError(
+            f"{where}, row {named[0]}", problem, "a delimiter that is not the decimal sign as well"
+        )
+    if len(named[1]) < width:
+        said = f"{' '.join(named[1])[:80]!r}" if lines else "no names"
+        fault = f"{said} above rows of {width} cells"
+        return Heading(named[0], ("",) * width, _filled(units, width), fault=fault)
+    names = (without_comment(named[1][0]), *named[1][1:])
+    title = lines[1][1] if len(lines) > 1 else []
+    return Heading(named[0], names, _filled(units, len(names)), tuple(title))
+
+
+def _filled(cells: tuple[str, ...], width: int) -> tuple[str, ...]:
+    return (*cells, *("",) * width)[:width]
+
+
+def _titles(heading: Heading, groups: Sequence[Candidates]) -> list[str]:
+    """Returns for each of several tables side by side the only text above its columns, or ""."""
+    starts = [min(column.index for columns in group.values() for column in columns) for group in groups]
+    above = [heading.title[start:end] for start, end in pairwise([*starts, None])]
+    texts = [{cell.strip() for cell in cells if cell.strip()} for cells in above]
+    return [cells.pop() if len(cells) == 1 else "" for cells in texts]
+
+
+def _skipped(numbered: Iterator[NumberedRow]) -> tuple[int, Iterator[NumberedRow]]:
+    """Returns the number of rows of numbers that follow, and the rows after them."""
+    count = 0
+    for number, row in numbered:
+        if not _holds_numbers(row):
+            return count, chain([(number, row)], numbered)
+        count += 1
+    return count, iter(())
+
+
+def _from(rows: Iterator[NumberedRow], number: int) -> Iterator[NumberedRow]:
+    return dropwhile(lambda row: row[0] < number, rows)
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Reads the rows of numbers below one heading; `exact` asks for as many cells as there are names."""
+
+    where: str
+    heading: Heading
+    exact: bool
+
+    def read(
+        self, group: Candidates, numbered: Iterator[NumberedRow]
+    ) -> tuple[dict[int, Numbers], int, Iterator[NumberedRow]]:
+        """Returns the numbers of a table's columns, the row at which the table ends, and the rows from there.
+
+        The table ends where no column has a number. Only one chunk of rows is in memory as text at a time.
+        """
+        needed = {column.index: Numbers() for columns in group.values() for column in columns}
+        last = 0
+        while chunk := list(islice(numbered, _CHUNK)):
+            try:
+                parsed = {i: numbers.parsed([row[i] for _, row in chunk]) for i, numbers in needed.items()}
+                end = len(chunk)
+            except (ValueError, IndexError):
+                end = self._end(needed, chunk)
+                parsed = {i: self._parsed(i, numbers, chunk[:end]) for i, numbers in needed.items()}
+            self._refuse_ragged(chunk[:end])
+            for i, values in parsed.items():
+                needed[i].append(values)
+            if end < len(chunk):
+                return needed, chunk[end][0], chain(chunk[end:], numbered)
+            last = chunk[-1][0]
+        return needed, last + 1, iter(())
+
+    def refuse_numbers_after(self, needed: dict[int, Numbers], rows: Iterator[NumberedRow], end: int) -> None:
+        """Raises InputError if a table has numbers between its own end and row `end`, where all end."""
+        for number, row in takewhile(lambda row: row[0] < end, rows):
+            if any(i < len(row) and is_number(row[i]) for i in needed):
+                raise InputError(
+                    f"{self.where}, row {number}", "numbers below an empty cell", "no gap in a column"
+                )
+
+    def _end(self, needed: dict[int, Numbers], chunk: Sequence[NumberedRow]) -> int:
+        """Returns the index of the row at which the table ends. Raises InputError for an incomplete row."""
+        for k, (number, row) in enumerate(chunk):
+            bad = [i for i in needed if i >= len(row) or not is_number(row[i])]
+            if len(bad) == len(needed):
+                return k
+            if bad and bad[0] >= len(row):
+                raise self._ragged(number, row)
+            if bad:
+                raise InputError(self._place(number, bad[0]), describe_cell(row[bad[0]]), "a number")
+        return len(chunk)
+
+    def _parsed(self, i: int, numbers: Numbers, chunk: Sequence[NumberedRow]) -> dict[str, Array]:
+        """Returns a column of a chunk. Raises InputError for the first cell whose notation differs."""
+        cells = [row[i] for _, row in chunk]
         try:
-            text = data.decode(encoding)
-        except UnicodeDecodeError:
-            continue
-        if "\0" not in text:
-            return text, encoding.removesuffix("-sig")
-    raise InputError(
-        path, "bytes that are not text", "text in UTF-8, UTF-16 with a byte order mark, or Windows-1252"
-    )
+            return numbers.parsed(cells)
+        except ValueError:
+            k, expected = numbers.first_wrong(cells)
+            raise InputError(self._place(chunk[k][0], i), repr(cells[k])[:60], expected) from None
 
+    def _place(self, number: int, i: int) -> str:
+        return f"{self.where}, row {number}, column {self.heading.names[i].strip() or i + 1!r}"
 
-def _lines(text: str) -> Iterator[str]:
-    """Returns an iterator over the lines, because a list of ten million lines would take a gigabyte."""
-    return (match[1] for match in re.finditer(r"([^\r\n]*)(?:\r\n|\r|\n|\Z)", text))
+    def _refuse_ragged(self, chunk: Sequence[NumberedRow]) -> None:
+        width = len(self.heading.names)
+        if {len(row) for _, row in chunk} <= {width}:
+            return
+        for number, row in chunk:
+            if (len(row) < width and self.exact) or len(_texts(row)) > width:
+                raise self._ragged(number, row)
 
-
-def _split_by(delimiter: str) -> Split:
-    return lambda lines: csv.reader(lines, delimiter=delimiter, strict=True)
-
-
-def _split_by_blanks(lines: Iterable[str]) -> Iterator[Row]:
-    """Splits lines into cells at blanks; a unit in brackets belongs to the word before it."""
-    cell = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?|\S")
-    return (cell.findall(line) for line in lines)
-
-
-def _choose_split(path: Path, lines: Sequence[str]) -> Split:
-    """Returns the function that splits lines into cells such that one of the first lines is a header."""
-    for split in (*map(_split_by, ";\t,"), _split_by_blanks):
-        try:
-            if any(is_header(row) for row in split(lines)):
-                return split
-        except csv.Error:
-            continue
-    first = next((line.strip() for line in lines if line.strip()), "")
-    problem = f"no header (the first line is {first[:60]!r})"
-    raise InputError(path, problem, "a header that names a time, a displacement and a force column")
-
-
-def _tabulate(where: str, rows: Iterable[Row]) -> Table:
-    """Returns the table of rows with a header, an optional row of units, and then numbers to the end."""
-    numbered = enumerate(rows, start=1)
-    header_row, headers = next(
-        ((n, _texts(row)) for n, row in islice(numbered, _HEADER_WITHIN) if is_header(_texts(row))), (0, [])
-    )
-    if not header_row:
-        raise InputError(where, "no header", "a header that names a time, a displacement and a force column")
-    columns = choose_columns(f"{where}, row {header_row}", headers)
-    first = next(((n, row) for n, row in numbered if not _blank(row)), None)
-    if first is None:
-        raise InputError(where, "no row below the header", "rows of numbers")
-    units = _unit_row(columns, first[1])
-    if units is not None:
-        columns = units
-        first = next(((n, row) for n, row in numbered if not _blank(row)), first)
-    needed = [columns[quantity].index for quantity in columns]
-    values = _numbers(where, chain([first], numbered), needed, headers)
-    by_quantity = dict(zip(columns, values, strict=True))
-    return Table(columns, by_quantity, first[0], tuple(headers), where)
-
-
-def _blank(row: Row) -> bool:
-    return all(cell is None or (isinstance(cell, str) and not cell.strip()) for cell in row)
-
-
-def _unit_row(columns: dict[str, Column], row: Row) -> dict[str, Column] | None:
-    """Returns the columns with the units from a row such as ``s; mm; N``, or None if it is not such a row."""
-    filled = {}
-    for quantity, column in columns.items():
-        cell = row[column.index] if column.index < len(row) else None
-        unit = parse_unit(cell.strip("[]() ")) if isinstance(cell, str) else ""
-        if unit not in UNITS[quantity]:
-            return None
-        filled[quantity] = replace(column, unit=column.unit or unit)
-    return filled
-
-
-def _numbers(
-    where: str, rows: Iterable[tuple[int, Row]], needed: list[int], headers: list[str]
-) -> list[Array]:
-    """Returns the needed columns as floats; only one chunk of rows is in memory as text at a time."""
-    filled = _until_blank(where, rows)
-    parts = []
-    while chunk := list(islice(filled, _CHUNK)):
-        _refuse_ragged(where, chunk, needed, len(headers))
-        parts.append([_floats(where, chunk, index, headers[index].strip()) for index in needed])
-    return list(np.concatenate(parts, axis=1))
-
-
-def _until_blank(where: str, rows: Iterable[tuple[int, Row]]) -> Iterator[tuple[int, Row]]:
-    """Yields the rows up to the first blank row; only blank rows may follow it."""
-    blank = 0
-    for number, row in rows:
-        if _blank(row):
-            blank = blank or number
-        elif blank:
-            raise InputError(f"{where}, row {blank}", f"an empty row before row {number}", "a row of numbers")
-        else:
-            yield number, row
-
-
-def _refuse_ragged(where: str, chunk: list[tuple[int, Row]], needed: list[int], width: int) -> None:
-    for number, row in chunk:
-        if len(row) != width and (len(row) <= max(needed) or not _blank(row[width:])):
-            raise InputError(
-                f"{where}, row {number}", f"{len(row)} cells", f"{width} cells, as in the header"
-            )
-
-
-def _floats(where: str, chunk: list[tuple[int, Row]], index: int, header: str) -> Array:
-    """Returns one column of a chunk; a comma is the decimal sign unless the column contains points too."""
-    cells = [row[index] for _, row in chunk]
-    signs = {sign for sign in ",." if any(isinstance(c, str) and sign in c for c in cells)}
-    if signs == {","}:
-        cells = [c.replace(",", ".") if isinstance(c, str) else c for c in cells]
-    try:
-        if any(cell is None or isinstance(cell, bool) for cell in cells):
-            raise ValueError
-        return np.array(cells, dtype=float)
-    except (ValueError, TypeError, OverflowError):
-        bad = next(i for i, cell in enumerate(cells) if not _is_number(cell))
-        place = f"{where}, row {chunk[bad][0]}, column {header!r}"
-        raise InputError(place, _describe_cell(chunk[bad][1][index]), "a number") from None
-
-
-def _is_number(cell: Any) -> bool:
-    if cell is None or isinstance(cell, bool):
-        return False
-    try:
-        np.array([cell], dtype=float)
-    except (ValueError, TypeError, OverflowError):
-        return False
-    return True
-
-
-def _describe_cell(cell: Any) -> str:
-    if cell is None or not str(cell).strip():
-        return "an empty cell, or a formula whose value is not stored in the file"
-    return repr(cell)[:60]
+    def _ragged(self, number: int, row: Row) -> InputError:
+        expected = f"{len(self.heading.names)} cells, as in the header"
+        return InputError(f"{self.where}, row {number}", f"{len(row)} cells", expected)

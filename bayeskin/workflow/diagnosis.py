@@ -22,7 +22,7 @@ from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.mismatch.assess import assess
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.explain import explain
-from bayeskin.recordings import read_recording
+from bayeskin.recordings import fitting_width_s, read_recording
 from bayeskin.reduced.region import protocol_outside
 from bayeskin.surrogates import train
 from bayeskin.types import Design, Surrogate
@@ -73,11 +73,11 @@ def opened(sources: Sequence[Path], reporter: Reporter, device: Path | None = No
                 "--device", f"{device} together with a configuration", "its sections [device] and [tissue]"
             )
         return open_run(source, reporter)
-    for file in sources:
-        read_recording(file)
+    width_s = max(fitting_width_s(read_recording(file)) for file in sources)
     stems, folder = "-".join(file.stem for file in sources), source.resolve().parent
     files = [{"file": os.path.relpath(file.resolve(), folder)} for file in sources]
     given: dict[str, Any] = {"recording": files[0]} if len(files) == 1 else {"recordings": files}
+    given["fit"] = {"bin_width_s": width_s}
     if device is not None:
         given |= {key: section.model_dump() for key, section in load_device_file(device)}
     config = config_of({"name": re.sub(r"[^A-Za-z0-9._-]", "-", f"run-{stems}"), **given}, source)

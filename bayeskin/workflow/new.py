@@ -20,12 +20,15 @@ from bayeskin.geometry import Geometry
 from bayeskin.inference import NoisePriors
 from bayeskin.json_files import plain
 from bayeskin.recordings import (
+    BIN_WIDTH_S,
     describe,
     describe_json,
+    fitting_width_s,
     idealised_motion,
     phase_noise,
     read_recording,
     segment,
+    shown,
 )
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.region import protocol_outside
@@ -101,10 +104,15 @@ def new_config(files: Sequence[Path], out: Path | None = None, device: Path | No
         [idealised_motion(*p) for p in both],
     )
     geometry, single = _geometry(stated), len(files) == 1
-    surrogate = shipped_for(motions[0], geometry.geometry) if single and not geometry.sd_m else None
+    width_s = max(map(fitting_width_s, recordings))
+    usual = single and not geometry.sd_m and width_s == BIN_WIDTH_S  # as the shipped surrogates were trained
+    surrogate = shipped_for(motions[0], geometry.geometry) if usual else None
     reduced = None if surrogate else _reduced_for(motions, geometry.geometry, out)
     source, section = _surrogate_source(surrogate, reduced)
     references = [Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix() for file in files]
+    _refuse_names(references)
+    if width_s != BIN_WIDTH_S:
+        section = [*_wide_bins_section(width_s), "", *section]
     text = _configuration(_name(out), references, description, section, surrogate is not None, stated)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open(out, "x", encoding="utf-8") as handle:
@@ -133,6 +141,14 @@ def new_demo(out: Path | None = None) -> dict[str, Any]:
     recording.write_bytes(shipped("data/demo.h5").read_bytes())
     out.write_text(text.replace('"../data/demo.h5"', '"demo-recording.h5"'), encoding="utf-8")
     return plain({"ok": True, "out": out, "text": f"written to {out}\nnext: bayeskin run {out}"})
+
+
+def _refuse_names(references: Sequence[str]) -> None:
+    """Raises InputError for the name of a file that is not UTF-8."""
+    for reference in references:
+        if shown(reference) != reference:
+            expected = "a name in UTF-8: rename it, or write another file by `bayeskin import`"
+            raise InputError(shown(reference), "a name that a configuration cannot contain", expected)
 
 
 def _geometry(stated: DeviceFile | None) -> StatedGeometry:
@@ -194,7 +210,7 @@ def _configuration(
             "# the line of its [section].",
             *(_SHIPPED_KNOWS if ready else ()),
             *([] if stated else _commented_device(config)),
-            *_optional_lines(config),
+            *_optional_lines(config, stated_in=section),
         ],
     ]
     return "\n\n".join("\n".join(part) for part in parts) + "\n"
@@ -218,6 +234,13 @@ def _surrogate_section(file: str) -> list[str]:
         "[surrogate]",
         f"file = {_quoted(file)}",
     ]
+
+
+def _wide_bins_section(width_s: float) -> list[str]:
+    """Returns the section of the fit for a recording whose samples are far apart."""
+    _, _, keys = next(section for section in _SECTIONS if section[0] == "fit")
+    windows = f"# windows_s = {_default_as_toml(None, 'windows_s')}  # {keys['windows_s']}"
+    return ["[fit]", f"bin_width_s = {width_s:g}  # {keys['bin_width_s']}; it needs two samples", windows]
 
 
 def _full_design_section() -> list[str]:
@@ -271,10 +294,12 @@ def _wave_lines(design: DesignConfig) -> list[str]:
     ]
 
 
-def _optional_lines(config: Config) -> list[str]:
-    """Returns commented lines for all that can be set, with the defaults."""
+def _optional_lines(config: Config, stated_in: Sequence[str]) -> list[str]:
+    """Returns commented lines for what can be set and has no section in `stated_in`, with the defaults."""
     lines = []
     for section, subject, keys in _SECTIONS:
+        if f"[{section}]" in stated_in:
+            continue
         defaults = {key: getattr(getattr(config, section), key) for key in keys}
         lines += ["", f"# [{section}]  # {subject}"]
         lines += [

@@ -18,7 +18,7 @@ import atheris
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-with atheris.instrument_imports(include=["bayeskin", "meshio", "openpyxl"]):
+with atheris.instrument_imports(include=["bayeskin", "meshio", "openpyxl", "xlrd"]):
     import bayeskin.scripting
     import bayeskin.workflow.serve  # noqa: F401
 

@@ -15,6 +15,7 @@ import numpy as np
 import openpyxl
 from toys.closed_form_model import EDGES_S, MOTION, SPACE, toy_bin_means, toy_force
 from toys.gmsh_file import coarse_tetrahedra, gmsh_text
+from toys.laboratory_exports import npy, xls
 
 from bayeskin import storage
 from bayeskin.config import load_config
@@ -65,10 +66,14 @@ def as_text(delimiter: str) -> bytes:
     return out.getvalue().encode()
 
 
+def as_rows() -> list[list[object]]:
+    rows = zip(*(column.tolist() for column in a_test()), strict=True)
+    return [["time (s)", "displacement (m)", "force (N)"], *map(list, rows)]
+
+
 def as_workbook() -> bytes:
     book, out = openpyxl.Workbook(), io.BytesIO()
-    book.active.append(["time (s)", "displacement (m)", "force (N)"])
-    for row in zip(*(column.tolist() for column in a_test()), strict=True):
+    for row in as_rows():
         book.active.append(row)
     book.save(out)
     return out.getvalue()
@@ -147,6 +152,12 @@ READERS: dict[str, tuple[Callable[[Path], object], Callable[[Path], bytes], int]
     "a.tsv": (read_and_segment, lambda tmp: as_text("\t"), 1),
     "a.txt": (read_and_segment, lambda tmp: as_text(" "), 1),
     "a.xlsx": (read_and_segment, lambda tmp: as_workbook(), 1),
+    "a.xls": (read_and_segment, lambda tmp: xls({"test": as_rows()}), 1),
+    "a.npy": (
+        read_and_segment,
+        lambda tmp: npy(np.rec.fromarrays(a_test(), names="time_s,disp_m,force_N")),
+        2,
+    ),
     "a.toml": (load_config, lambda tmp: (ROOT / "runs/demo.toml").read_bytes(), 10),
     "device.toml": (load_device, lambda tmp: DEVICE, 10),
     "a.msh": (lambda path: read_gmsh(path, FLAT), lambda tmp: as_mesh(), 4),
