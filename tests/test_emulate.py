@@ -66,7 +66,7 @@ def test_it_ends_as_soon_as_fresh_runs_agree(fitted: tuple[DiagnosisContext, Set
     assert emulated.settled
     assert emulated.error_n is not None
     assert emulated.error_n < FEW.enough * closed_form_reduced.NOISE_N
-    assert emulated.runs == sum(asked) == FEW.points + FEW.more
+    assert emulated.runs == sum(asked) == FEW.points + FEW.further_points
     assert emulated.fit.value == pytest.approx(found.fit.value, abs=1.0)
     low, high = np.quantile(emulated.draws.draws, [0.01, 0.99], axis=0)
     truth = [{**TRUTH, "F0": -0.03}.get(name, np.nan) for name in emulated.draws.names]

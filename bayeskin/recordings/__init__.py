@@ -21,6 +21,7 @@ __all__ = [
     "covered_s",
     "describe",
     "describe_json",
+    "fitting_width_s",
     "idealised_motion",
     "jumps_of",
     "motion_of",
