@@ -57,6 +57,7 @@ def header_cells(line: str, width: int) -> list[str] | None:
     """Returns the `width` names of a header whose columns are set by blanks, or None if they are not clear.
 
     The names are separated by two blanks or more, or each ends with its unit in brackets, or each is a word.
+    Words are not clear where two blanks or more already separate at least three names.
     """
     bracket = r"\s*[\[(][^\[\]()]*[\])]"
     for text in (without_comment(line).strip(), line.strip()) if len(line) < _LONGEST_HEADER else ():
@@ -64,6 +65,8 @@ def header_cells(line: str, width: int) -> list[str] | None:
         bracketed = re.findall(rf"[^\[(]+(?:{bracket})+", text)
         words = re.findall(rf"[^\s\[(]+(?:{bracket})*", text)
         ways = (apart, bracketed) if "".join(bracketed) == text else (apart, words, text.split())
+        if 3 <= len(apart) < width:
+            ways = (bracketed,)
         fitting = {tuple(part.strip() for part in way) for way in ways if len(way) == width}
         if len(fitting) == 1:
             return list(fitting.pop())
