@@ -2,15 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from bayeskin.errors import InputError
+from bayeskin.number_format import number
 from bayeskin.types import Array
 
-MIN_SAMPLES = 50
-# No skin test exceeds these values. Larger values mean that the header does not give the unit of the numbers.
-_LARGEST = {"displacement": (0.1, "m"), "force": (1e3, "N")}
-_SMALLEST_TRAVEL_M = 1e-5
+
+@dataclass(frozen=True)
+class PlausibleTest:
+    """Sizes that a test of skin can have.
+
+    samples, least_travel_m : least number of samples, and least travel
+    largest_m, largest_n : no skin test exceeds these values; larger values mean that the header does not give
+        the unit of the numbers
+    """
+
+    samples: int = 50
+    least_travel_m: float = 1e-5
+    largest_m: float = 0.1
+    largest_n: float = 1e3
+
+
+PLAUSIBLE = PlausibleTest()
 
 
 def refuse_invalid(where: str, first_row: int, time_s: Array, displacement_m: Array, force_n: Array) -> None:
@@ -20,8 +36,8 @@ def refuse_invalid(where: str, first_row: int, time_s: Array, displacement_m: Ar
     that changes.
     """
     named = {"time": time_s, "displacement": displacement_m, "force": force_n}
-    if len(time_s) < MIN_SAMPLES:
-        raise InputError(where, f"{len(time_s)} samples", f"at least {MIN_SAMPLES}")
+    if len(time_s) < PLAUSIBLE.samples:
+        raise InputError(where, f"{len(time_s)} samples", f"at least {PLAUSIBLE.samples}")
     for name, values in named.items():
         refuse_infinite(f"{where}, row", first_row, name, values)
     back = np.flatnonzero(np.diff(time_s) <= 0)
@@ -31,8 +47,10 @@ def refuse_invalid(where: str, first_row: int, time_s: Array, displacement_m: Ar
         raise InputError(
             f"{where}, row {first_row + back[0] + 1}", problem, "times that increase from row to row"
         )
-    for name, values in (("displacement", displacement_m - displacement_m[0]), ("force", force_n)):
-        largest, unit = _LARGEST[name]
+    for name, values, largest, unit in (
+        ("displacement", displacement_m - displacement_m[0], PLAUSIBLE.largest_m, "m"),
+        ("force", force_n, PLAUSIBLE.largest_n, "N"),
+    ):
         peak = int(np.argmax(np.abs(values)))
         value = abs(values[peak])
         if value > largest:
@@ -41,9 +59,9 @@ def refuse_invalid(where: str, first_row: int, time_s: Array, displacement_m: Ar
             expected = f"at most {largest:g} {unit} (is the column in {smaller}?)"
             raise InputError(f"{where}, row {first_row + peak}", problem, expected)
     travel = float(np.ptp(displacement_m))
-    if travel < _SMALLEST_TRAVEL_M:
+    if travel < PLAUSIBLE.least_travel_m:
         problem = f"a displacement that changes by {travel:.3g} m in all"
-        raise InputError(where, problem, f"at least {_SMALLEST_TRAVEL_M:g} m (is its unit right?)")
+        raise InputError(where, problem, f"at least {PLAUSIBLE.least_travel_m:g} m (is its unit right?)")
 
 
 def refuse_infinite(where: str, first_row: int, what: str, values: Array) -> None:
@@ -59,11 +77,12 @@ def remarks_on_clock(time_s: Array) -> list[str]:
     """Returns notes on times (n,) that do not start at zero or leave a gap."""
     remarks = []
     if time_s[0] != 0.0:
-        remarks.append(f"time starts at {time_s[0]:g} s in the file; shifted to 0")
+        remarks.append(f"time starts at {number(time_s[0], 6)} s in the file; shifted to 0")
     intervals = np.diff(time_s)
     gap, usual = int(np.argmax(intervals)), float(np.median(intervals))
     if intervals[gap] > 5 * usual:
         remarks.append(
-            f"a gap of {intervals[gap]:.3g} s after {time_s[gap]:.3f} s (samples are {usual:.3g} s apart)"
+            f"a gap of {number(intervals[gap])} s after {time_s[gap]:.3f} s "
+            f"(samples are {number(usual)} s apart)"
         )
     return remarks

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayeskin.number_format import number
-from bayeskin.recordings.bins import fitting_width_s
+from bayeskin.recordings.bins import BIN_WIDTH_S, fitting_width_s
 from bayeskin.recordings.noise import PhaseNoise
 from bayeskin.recordings.segment import resolution_m
 from bayeskin.types import Phase, Recording
@@ -25,7 +25,6 @@ _HEADINGS = (
     "steps",
 )
 _WIDTHS = (7, 5, 9, 9, 16, 10, 9, 6, 5)
-_SLOW_S = 0.25  # sampling interval from which a bin of 0.5 s has fewer than two samples
 
 
 def describe(recording: Recording, phases: Sequence[Phase], noise: Sequence[PhaseNoise]) -> str:
@@ -98,10 +97,11 @@ def _cannot_tell(recording: Recording, phases: Sequence[Phase]) -> list[str]:
             "There is no unloading, so there is no hysteresis. Friction, damage and plastic set can hardly "
             "be told from the stiffness."
         )
-    if interval_s > _SLOW_S:
+    width_s = fitting_width_s(recording)
+    if width_s > BIN_WIDTH_S:
         said.append(
             f"Samples are {number(interval_s, 2)} s apart. Spikes and steps of the force can hardly be told "
-            f"from noise. Bins need a width of {number(fitting_width_s(recording), 2)} s (fit.bin_width_s)."
+            f"from noise. Bins need a width of {number(width_s, 2)} s (fit.bin_width_s)."
         )
     return said
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from bayeskin import storage
 from bayeskin.errors import InputError
 from bayeskin.probe import bytes_of, refuse_damaged, refuse_endless
-from bayeskin.recordings.checks import MIN_SAMPLES, refuse_invalid, remarks_on_clock
+from bayeskin.recordings.checks import PLAUSIBLE, refuse_invalid, remarks_on_clock
 from bayeskin.recordings.columns import Stated
 from bayeskin.recordings.headers import Column
 from bayeskin.recordings.settle import settled
@@ -112,7 +112,7 @@ class _Found:
 
     @property
     def rows(self) -> int:
-        return MIN_SAMPLES if isinstance(self.table, InputError) else self.table.rows
+        return PLAUSIBLE.samples if isinstance(self.table, InputError) else self.table.rows
 
 
 def _sheets(path: Path, kind: str, data: bytes) -> Mapping[str, Rows] | None:
@@ -145,7 +145,7 @@ def _tables(
 
 def _labelled(sheet: str, tables: Sequence[Table | Unreadable]) -> list[_Found]:
     """Returns the tables of a sheet or text with their names. Short ones count only if there is no other."""
-    long = [table for table in tables if table.rows >= MIN_SAMPLES] or tables
+    long = [table for table in tables if table.rows >= PLAUSIBLE.samples] or tables
     titles = [table.title for table in long]
     found = []
     for number, table in enumerate(long, start=1):
@@ -165,7 +165,7 @@ def _chosen(
     wanted = [one for one in found if sheet in (None, ALL) or sheet in one.names]
     if not wanted and found:
         raise InputError(path, f"the tables {labels}", f"a sheet {sheet!r}")
-    long = [one for one in wanted if one.rows >= MIN_SAMPLES] or wanted
+    long = [one for one in wanted if one.rows >= PLAUSIBLE.samples] or wanted
     fitting = [one for one in long if not isinstance(one.table, Unreadable)]
     if not fitting:
         unreadable = [one.table for one in long if isinstance(one.table, Unreadable)]

@@ -16,10 +16,24 @@ from bayeskin.recordings.tables import Table
 from bayeskin.recordings.units import UNITS
 from bayeskin.types import Array
 
-_SAME = 1e-6  # share of the range by which two columns of one quantity may differ
-_AT_ZERO = 0.05  # a displacement that starts closer to zero than this share of its travel starts at zero
-_REPORTED = 0.005  # and beyond this share it is reported
-_OPPOSED = -0.5  # correlation of force and displacement below which one of them counts the pull as negative
+
+@dataclass(frozen=True)
+class SettleSettings:
+    """Limits beyond which a table is not clear. Shares are shares of a column's range.
+
+    same : share by which two columns of one quantity may differ
+    at_zero : a displacement that starts closer to zero than this share starts at zero
+    reported : and beyond this share it is reported
+    opposed : correlation of force and displacement below which one of them counts the pull as negative
+    """
+
+    same: float = 1e-6
+    at_zero: float = 0.05
+    reported: float = 0.005
+    opposed: float = -0.5
+
+
+SETTLE = SettleSettings()
 
 
 @dataclass(frozen=True)
@@ -97,7 +111,7 @@ def _chosen(table: Table, raw: Mapping[int, Array], stated: Stated) -> tuple[dic
 
 
 def _equal(a: Array, b: Array) -> bool:
-    return bool(np.max(np.abs(a - b)) <= _SAME * np.ptp(a))
+    return bool(np.max(np.abs(a - b)) <= SETTLE.same * np.ptp(a))
 
 
 def _factor(column: Column, stated: Stated) -> float:
@@ -142,12 +156,12 @@ def _zeroed(table: Table, displacement_m: Array, stated: Stated) -> tuple[Array,
     start_mm = f"{1e3 * start_m:.6g} mm"
     if stated.zero:
         return displacement_m - start_m, start_m, [f"--zero subtracted the first displacement, {start_mm}"]
-    if stated.zero is None and abs(start_m) > _AT_ZERO * travel_m:
+    if stated.zero is None and abs(start_m) > SETTLE.at_zero * travel_m:
         expected = (
             "0 where the skin is at rest; or import with --zero to subtract it, or --no-zero to keep it"
         )
         raise InputError(table.place, f"a displacement that starts at {start_mm}", expected)
-    if abs(start_m) > _REPORTED * travel_m:
+    if abs(start_m) > SETTLE.reported * travel_m:
         return displacement_m, 0.0, [f"the displacement starts at {start_mm}, which was kept"]
     return displacement_m, 0.0, []
 
@@ -159,7 +173,7 @@ def _refuse_negative_pull(
     displacement_m, force_n = values["displacement"], values["force"]
     signed = {q for q, unit in stated.units.items() if unit.signed}
     with np.errstate(all="ignore"):  # a force that hardly changes has no correlation
-        opposed = bool(np.corrcoef(displacement_m, force_n)[0, 1] < _OPPOSED)
+        opposed = bool(np.corrcoef(displacement_m, force_n)[0, 1] < SETTLE.opposed)
     lowest_m = float(displacement_m.min())
     closing = -lowest_m > float(displacement_m.max()) and "displacement" not in signed
     if not closing and (not opposed or "force" in signed):

@@ -6,6 +6,7 @@ import csv
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
@@ -13,10 +14,24 @@ from bayeskin.errors import InputError
 from bayeskin.recordings.headers import names_quantities, without_comment
 from bayeskin.recordings.numbers import is_number
 
-HEADER_WITHIN = 1000  # rows in which a table has to begin; a laboratory's preamble stands before it
-_RUN = 3  # consecutive rows of numbers with as many cells make a delimiter credible
-_LONGEST_CELL = 10  # lines of a quoted cell
-_LONGEST_HEADER = 5000  # characters of a header whose columns are set by blanks
+
+@dataclass(frozen=True)
+class TextSettings:
+    """Limits of what is taken for a table.
+
+    header_within : rows in which a table has to begin; a laboratory's preamble stands before it
+    run : consecutive rows of numbers with as many cells that make a delimiter credible
+    lines_of_cell : most lines of a quoted cell
+    longest_header : most characters of a header whose columns are set by blanks
+    """
+
+    header_within: int = 1000
+    run: int = 3
+    lines_of_cell: int = 10
+    longest_header: int = 5000
+
+
+TEXT = TextSettings()
 _DELIMITERS = (";", "\t", ",", "|", " ")
 _BLANKS, _ZEROS = re.compile(r"[ \t]+"), re.compile(r"(?<![\d.,eE+-])[+-]?0\d")
 NumberedRow = tuple[int, Sequence[object]]
@@ -60,7 +75,7 @@ def header_cells(line: str, width: int) -> list[str] | None:
     Words are not clear where two blanks or more already separate at least three names.
     """
     bracket = r"\s*[\[(][^\[\]()]*[\])]"
-    for text in (without_comment(line).strip(), line.strip()) if len(line) < _LONGEST_HEADER else ():
+    for text in (without_comment(line).strip(), line.strip()) if len(line) < TEXT.longest_header else ():
         apart = re.split(r"\s{2,}|\t", text)
         bracketed = re.findall(rf"[^\[(]+(?:{bracket})+", text)
         words = re.findall(rf"[^\s\[(]+(?:{bracket})*", text)
@@ -110,13 +125,13 @@ def _start(text: str, delimiter: str) -> list[list[str]] | None:
     """Returns the rows before the first rows of numbers, or None if the delimiter makes no such rows."""
     before: list[list[str]] = []
     run, width = 0, 0
-    for _, row in islice(_split(_lines(text), delimiter), HEADER_WITHIN):
+    for _, row in islice(_split(_lines(text), delimiter), TEXT.header_within):
         if sum(map(is_number, row)) < 2:
             before.append([str(cell) for cell in row])
             run = 0
             continue
         run, width = (run + 1 if len(row) == width else 1), len(row)
-        if run == _RUN:
+        if run == TEXT.run:
             return before if delimiter != " " else [header_cells(row[0], width) or row for row in before]
     return None
 
@@ -144,7 +159,7 @@ def _split_by(lines: Iterator[str], delimiter: str) -> Iterator[NumberedRow]:
             yield number, line.split(delimiter)
             continue
         whole = [line]
-        while sum(part.count('"') for part in whole) % 2 and len(whole) < _LONGEST_CELL:
+        while sum(part.count('"') for part in whole) % 2 and len(whole) < TEXT.lines_of_cell:
             following = next(numbered, None)
             if following is None:
                 break
