@@ -20,6 +20,7 @@ from bayeskin.types import Array
 _CHUNK = 50_000  # number of rows that are in memory as text at a time
 _ABOVE = 4  # rows above the numbers that may be their heading
 _SECTION = re.compile(r"<(?!END|DATA|INFO|divider|Mach-1 File)([^<>]+)>")  # Mach-1 names its functions so
+_THOUSANDS, _GROUP = re.compile(r"[+-]?[1-9]\d{0,2}"), re.compile(r"\d{3}(?:[.,]\d*)?")
 Row = Sequence[Any]
 Line = tuple[int, list[str]]  # a row that holds no numbers
 
@@ -225,6 +226,7 @@ class _Reader:
                 end = self._end(needed, chunk)
                 parsed = {i: self._parsed(i, numbers, chunk[:end]) for i, numbers in needed.items()}
             self._refuse_ragged(chunk[:end])
+            self._refuse_blank_thousands(needed, chunk[:end])
             for i, values in parsed.items():
                 needed[i].append(values)
             if end < len(chunk):
@@ -271,6 +273,19 @@ class _Reader:
         for number, row in chunk:
             if (len(row) < width and self.exact) or len(_texts(row)) > width:
                 raise self._ragged(number, row)
+
+    def _refuse_blank_thousands(self, needed: dict[int, Numbers], chunk: Sequence[NumberedRow]) -> None:
+        """Raises InputError if blanks set the columns and two of them may be one number, such as 1 234.5."""
+        if not self.exact or not chunk:
+            return
+        for left in sorted({j for i in needed for j in (i - 1, i) if 0 <= j < len(self.heading.names) - 1}):
+            pairs = ((str(row[left]), str(row[left + 1])) for _, row in chunk)
+            if all(_THOUSANDS.fullmatch(a) and _GROUP.fullmatch(b) for a, b in pairs):
+                number, row = chunk[0]
+                found = (
+                    f"'{row[left]} {row[left + 1]}' in columns {left + 1} and {left + 2}, maybe one number"
+                )
+                raise InputError(f"{self.where}, row {number}", found, "another delimiter than blanks")
 
     def _ragged(self, number: int, row: Row) -> InputError:
         expected = f"{len(self.heading.names)} cells, as in the header"

@@ -49,6 +49,7 @@ UNITS = {"time": "s", "displacement": "mm", "force": "N"}
 
 def set_by_blanks() -> list[Export]:
     counted = cells(range(len(T)), fixed(1e3 * TIME_S, 0), fixed(1e3 * PULLED_MM, 1), fixed(1e3 * FORCE_N, 2))
+    preloaded = cells(T, D, fixed(1e3 * FORCE_N + 1300, 1, thousands=" "))
     return [
         Export("blanks.txt", aligned("Run time (s)   Pad displacement (mm)   Pull force (N)", NUMBERS)),
         Export("blanks_unit_row.txt", aligned("Test time   Crosshead   Pull force\nsec   mm   N", NUMBERS)),
@@ -63,8 +64,18 @@ def set_by_blanks() -> list[Export]:
         Export("savetxt.dat", aligned("# n t_ms disp_um load_mN", counted)),
         Export(
             "blank_thousands.txt",
-            aligned("t_s  d_mm  Pull force_mN", cells(T, D, fixed(1e3 * FORCE_N + 1300, 1, thousands=" "))),
-            refused="'t_s  d_mm  Pull force_mN' above rows of 4 cells|between rows of numbers",
+            aligned("t_s  d_mm  Pull force_mN", preloaded),
+            refused="'t_s  d_mm  Pull force_mN' above rows of 4 cells",
+        ),
+        Export(
+            "blank_thousands_one_blank.txt",
+            aligned("t_s d_mm Pull force_mN", preloaded),
+            refused=r"row 2: found '1 3\d\d\.\d' in columns 3 and 4, maybe one number",
+        ),
+        Export(
+            "blank_thousands_zeros.txt",
+            aligned("t_s d_mm Pull force_mN", cells(T, D, fixed(1e3 * FORCE_N + 1005, 1, thousands=" "))),
+            refused=r"' .* 1 0.*' above rows of 4 cells",
         ),
         Export("row_number.dat", aligned("# t_ms disp_um load_mN", counted)),
     ]
