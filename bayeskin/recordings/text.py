@@ -79,9 +79,9 @@ def header_cells(line: str, width: int) -> list[str] | None:
         apart = re.split(r"\s{2,}|\t", text)
         bracketed = re.findall(rf"[^\[(]+(?:{bracket})+", text)
         words = re.findall(rf"[^\s\[(]+(?:{bracket})*", text)
-        ways = (apart, bracketed) if "".join(bracketed) == text else (apart, words, text.split())
-        if 3 <= len(apart) < width:
-            ways = (bracketed,)
+        ways = [apart, bracketed]
+        if "".join(bracketed) != text:
+            ways = [apart] if 3 <= len(apart) < width else [apart, words, text.split()]
         fitting = {tuple(part.strip() for part in way) for way in ways if len(way) == width}
         if len(fitting) == 1:
             return list(fitting.pop())
