@@ -94,7 +94,7 @@ def answered(case: str, folder: Path, workers: int) -> dict[str, Any]:
     if not config.exists():
         shutil.copy(DATA / set_name / "recordings" / f"{number}.h5", folder / f"{name}.h5")
         config.write_text(CONFIG.format(name=name, workers=workers))
-    answer = {"case": case, "commit": commit(), **essential(diagnose(config, rows.Log()))}
+    answer = {"case": case, "commit": commit(), **essential(diagnose([config], rows.Log()))}
     with open(KEPT, "a", encoding="utf-8") as handle:  # two processes may append; each writes whole lines
         handle.write(json.dumps(answer) + "\n")
     return answer

@@ -75,7 +75,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     recording = folder / "healthy-skin.h5"
     if not recording.exists():
-        import_recording(Path(supplement) / "data" / "Healthy_skin.xlsx", recording)
+        import_recording(rows.Log(), Path(supplement) / "data" / "Healthy_skin.xlsx", recording)
     (shipped_run, shipped_draws), (other_run, reduced_draws) = (sampled(folder, name) for name in SOURCES)
     table = []
     for name, fitted in shipped_run.items():

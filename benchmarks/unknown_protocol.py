@@ -129,7 +129,7 @@ def main() -> None:
         theta = make(folder / "staircase.h5", options.seed)
         config = folder / "staircase.toml"
         if not config.exists():
-            new_config(folder / "staircase.h5")
+            new_config([folder / "staircase.h5"])
         table, summary = stage_by_stage(config)
     print(rows.markdown(["stage", "seconds", "CPU seconds"], table))
     print(rows.markdown(["", "true", "5 %", "95 %", "inside"], covered(summary["posterior"], theta)))
