@@ -18,6 +18,7 @@ from bayeskin.design_files import load_design
 from bayeskin.execution.local import local
 from bayeskin.external.model import identity, simulate_with
 from bayeskin.runner import run_design
+from bayeskin.store import Store
 from bayeskin.types import PadMotion, Recording
 from bayeskin.workflow import stages
 from bayeskin.workflow.diagnosis import diagnose
@@ -85,7 +86,8 @@ def test_any_callable_runs_through_the_runner(tmp_path: Path) -> None:
     )
     wave = Wave(SPACE, theta, np.zeros(3, bool), 0, 1)
     run = partial(simulate_with, hooke, MOTION, model_hash="mine")
-    design = run_design(tmp_path / "d.h5", wave, edges_s, run, "mine", local(1))
+    with Store(tmp_path / "a.store", "mine") as store:
+        design = run_design(store, wave, edges_s, run, "mine", local(1))
     middle_s = edges_s[:-1] + 0.5
     assert design.ok.all()
     np.testing.assert_allclose(

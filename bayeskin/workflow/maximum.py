@@ -14,7 +14,6 @@ from bayeskin import inference, report, storage
 from bayeskin.finite_element.gradients import logarithms
 from bayeskin.finite_element.simulate import simulate
 from bayeskin.forward.joint import on_each_recording
-from bayeskin.hashing import sha256_of
 from bayeskin.inference import MapCheck, RefinedMap
 from bayeskin.types import Array, BinnedForce, PadMotion, Simulation
 from bayeskin.workflow.calibration import log_posterior_of, rmse_table
@@ -40,17 +39,17 @@ class _FullModel:
         return self.spec.formulation.differentiable
 
     def __call__(self, theta: Mapping[str, float]) -> Simulation:
-        """Returns the run at parameters theta, from its file where it was made before."""
-        file = self.run.at("map", f"full-run-{sha256_of([self.spec.hash, dict(theta)])[:16]}.h5")
-        if file.is_file():
-            return storage.load(file, Simulation)
-        values = ", ".join(f"{name} = {value:.4g}" for name, value in theta.items())
-        self.run.reporter.log(f"map: full run at {values}")
-        by = logarithms(theta) if self.differentiable else None
-        simulation = on_each_recording(self._simulated, self.motion, theta, by)
-        if simulation.status == "ok":  # the cause of a failed run may be corrected later
-            storage.save(file, simulation)
-        return simulation
+        """Returns the run at parameters theta, from the store where it was made before."""
+        with self.run.store("simulations", [self.spec.hash, vars(self.motion)]) as store:
+            if theta in store:
+                return store.read(theta, Simulation)
+            values = ", ".join(f"{name} = {value:.4g}" for name, value in theta.items())
+            self.run.reporter.log(f"map: full run at {values}")
+            by = logarithms(theta) if self.differentiable else None
+            simulation = on_each_recording(self._simulated, self.motion, theta, by)
+            if simulation.status == "ok":  # the cause of a failed run may be corrected later
+                store.add(theta, simulation)
+            return simulation
 
     def _simulated(
         self, motion: PadMotion, theta: Mapping[str, float], by: Mapping[str, float] | None

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from operator import itemgetter
 from pathlib import Path
@@ -17,6 +17,7 @@ from bayeskin.design import default_space
 from bayeskin.errors import InputError
 from bayeskin.execution.cluster import on_scheduler
 from bayeskin.execution.local import Map, local
+from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.geometry import Geometry
 from bayeskin.json_files import plain
 from bayeskin.mechanisms import catalogue
@@ -28,9 +29,9 @@ from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.region import other_geometry
 from bayeskin.reduced.runs import FullRuns
 from bayeskin.shipped import shipped
+from bayeskin.store import Store
 from bayeskin.types import ParameterSpace
 from bayeskin.workflow.engine import Reporter
-from bayeskin.workflow.folder import locked
 from bayeskin.workflow.output_paths import check_ending
 
 SHIPPED = "surrogates/article-device-reduced.h5"
@@ -48,8 +49,8 @@ def reduce(
     out : HDF5 file to write; by default beside the source, with "-reduced" after its name
     scheduler : address of a Dask scheduler that makes the training runs; without it, this machine makes them
 
-    Training runs are stored in a folder beside `out` until the model is finished, so the same command
-    continues after an interruption. Raises InputError for wrong input, with nothing written. An `out` that is
+    Training runs are stored in a file beside `out` until the model is finished, so the same command continues
+    after an interruption. Raises InputError for wrong input, with nothing written. An `out` that is
     finished stays unchanged.
     """
     geometry = _geometry(source)
@@ -59,23 +60,19 @@ def reduce(
     finished = _finished(path, trained)
     if finished:
         return _answer(path, load_reduced(path), 0.0, "done before, unchanged")
-    folder, started = path.with_name(f"{path.stem}-training"), time.perf_counter()
-    settings = BuildSettings()
-    with locked(folder):
-        if scheduler is None:
-            _build(path, trained, settings, folder, local(WORKERS), reporter)
-        else:
-            with on_scheduler(scheduler) as run_all:
-                _build(path, trained, settings, folder, run_all, reporter)
-    shutil.rmtree(folder)
+    settings, started = BuildSettings(), time.perf_counter()
+    executor = nullcontext(local(WORKERS)) if scheduler is None else on_scheduler(scheduler)
+    with Store(path.with_name(f"{path.stem}-training.store"), "training runs") as store, executor as run_all:
+        _build(path, trained, settings, store, run_all, reporter)
+        store.path.unlink()
     return _answer(path, load_reduced(path), time.perf_counter() - started, "built")
 
 
 def _build(
-    path: Path, trained: Trained, settings: BuildSettings, folder: Path, run_all: Map, reporter: Reporter
+    path: Path, trained: Trained, settings: BuildSettings, store: Store, run_all: Map, reporter: Reporter
 ) -> None:
     """Builds the base model and stores it, so that it can be used meanwhile; then builds the whole model."""
-    full = FullRuns(trained.geometry, REFINEMENT, folder)
+    full = FullRuns(ModelSpec(refinement=REFINEMENT, geometry=trained.geometry), store)
 
     def progress(what: str, share: float) -> None:
         """Reports the progress."""
