@@ -17,7 +17,8 @@ Reasons for this format:
 - Results are read from the file when they are needed, so memory does not grow with the file.
 - Nothing in the file is executed.
 
-One process at a time may open the file. It needs no results of the others: worker processes return theirs.
+Several processes may have the file open and add results at once: each addition locks the file, and first
+reads what the others have added.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ import fcntl
 import json
 import os
 import zlib
-from collections.abc import Mapping
-from io import FileIO
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from io import BufferedReader, FileIO
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -45,32 +47,40 @@ REMEDY = "a store of finished results that this command wrote (without this file
 
 
 class Store:
-    """Finished results in one file; a context manager that locks the file while it is open.
+    """Finished results in one file; a context manager, which several processes may have open at once.
 
     path : the file; it is made with its first result
     computed_from : all that the results of the file have in common, as values that `sha256_of` accepts
+    say : receives a line about results that are damaged, and therefore will be computed again
 
-    Opening it raises InputError when another process has the file open, when the file cannot be written, when
-    it is of another format, and when its results were computed from something else. Such a file is unchanged.
+    Opening it raises InputError when the file cannot be written, when it is of another format, and when its
+    results were computed from something else. Such a file is unchanged.
     """
 
-    def __init__(self, path: Path, computed_from: Any) -> None:
-        self.path = path
+    def __init__(
+        self, path: Path, computed_from: Any, say: Callable[[str], None] = lambda text: None
+    ) -> None:
+        self.path, self._say = path, say
         self._header = b"%s %s\n" % (FORMAT, sha256_of(computed_from).encode())
 
     def __enter__(self) -> Store:
-        self._file = _open_locked(self.path)
+        self._places, self._end = dict[bytes, tuple[int, int]](), 0
+        self._file = _opened(self.path)
         try:
-            self._places = self._read_places()
+            with self._locked():
+                return self
         except BaseException:
             self._file.close()
             raise
-        return self
 
     def __exit__(self, *_: object) -> None:
-        if not os.fstat(self._file.fileno()).st_size:
-            self.path.unlink(missing_ok=True)
-        self._file.close()
+        try:
+            if not self._end:
+                with self._locked():
+                    if not self._end:
+                        self.path.unlink()
+        finally:
+            self._file.close()
 
     def __contains__(self, computed_from: Any) -> bool:
         return sha256_of(computed_from).encode() in self._places
@@ -85,8 +95,9 @@ class Store:
         text = json.dumps(fields, default=_in_json).encode()
         content = b"%s %s" % (address, text)
         line = b"%08x %d %s\n" % (zlib.crc32(content), len(content), content)
-        end = self._append(line)
-        self._places[address] = (end - 1 - len(text), len(text))
+        with self._locked():
+            self._append(line)
+            self._places[address] = (self._end - 1 - len(text), len(text))
 
     def read(self, computed_from: Any, kind: type[T]) -> T:
         """Returns the result that was computed from these values, as a dataclass `kind` or as a dict.
@@ -105,40 +116,70 @@ class Store:
                 raise
             raise InputError(f"{self.path}, byte {start}", f"no {kind.__name__} in a line", REMEDY) from None
 
-    def _append(self, line: bytes) -> int:
-        """Writes a line, completely or not at all, and returns the new length of the file."""
-        before = os.fstat(self._file.fileno()).st_size
-        left = memoryview(line if before else self._header + line)
-        end = before + len(left)
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Keeps other processes out of the file, after reading what they have added since the last time.
+
+        The system removes the lock when a process ends.
+        """
+        while True:
+            _lock(self._file, self.path)
+            if self._end or _is_at(self._file, self.path):
+                break
+            self._file.close()  # another process had no results either, and has removed the file
+            self._file = _opened(self.path)
+        try:
+            self._read_on()
+            yield
+        finally:
+            fcntl.flock(self._file, fcntl.LOCK_UN)
+
+    def _append(self, line: bytes) -> None:
+        """Writes a line, completely or not at all."""
+        text = line if self._end else self._header + line
+        left = memoryview(text)
         try:
             while left:
                 left = left[self._file.write(left) :]
             os.fsync(self._file.fileno())
         except BaseException as error:
-            self._file.truncate(before)
+            self._file.truncate(self._end)
             if isinstance(error, OSError):
                 raise _cannot_write(self.path, error) from None
             raise
-        return end
+        self._end += len(text)
 
-    def _read_places(self) -> dict[bytes, tuple[int, int]]:
-        """Returns start and length of each result's JSON by its address, and cuts off an incomplete end."""
-        places, end = dict[bytes, tuple[int, int]](), len(self._header)
-        with open(self.path, "rb") as lines:
-            first = lines.readline(end)
-            if not self._header.startswith(first):
-                known = first.startswith(FORMAT + b" ")
-                found = "results that were computed from other inputs" if known else "other contents"
-                raise InputError(self.path, found, REMEDY)
+    def _read_on(self) -> None:
+        """Finds the results that follow those found before, and cuts off an incomplete end."""
+        damaged = 0
+        with open(self._file.fileno(), "rb", closefd=False) as lines:
+            lines.seek(self._end)
+            if not self._end:
+                self._end = self._length_of_header(lines)
             for line in lines:
                 if not line.endswith(b"\n"):
                     break
-                end += len(line)
-                if (content := _content_of_whole_line(line[:-1])) is not None:
+                self._end += len(line)
+                if (content := _content_of_whole_line(line[:-1])) is None:
+                    damaged += 1
+                else:
                     address, _, text = content.partition(b" ")
-                    places[address] = (end - 1 - len(text), len(text))
-        self._file.truncate(end if first == self._header else 0)
-        return places
+                    self._places[address] = (self._end - 1 - len(text), len(text))
+        if os.fstat(self._file.fileno()).st_size > self._end:
+            self._file.truncate(self._end)
+            damaged += 1
+        if damaged:
+            what = "a result is" if damaged == 1 else f"{damaged} results are"
+            self._say(f"{self.path}: {what} damaged, and computed again where needed")
+
+    def _length_of_header(self, lines: BufferedReader) -> int:
+        """Returns the length of the first line, and 0 where it is incomplete."""
+        first = lines.readline(len(self._header))
+        if not self._header.startswith(first):
+            known = first.startswith(FORMAT + b" ")
+            found = "results that were computed from other inputs" if known else "other contents"
+            raise InputError(self.path, found, REMEDY)
+        return len(first) if first == self._header else 0
 
 
 def _content_of_whole_line(line: bytes) -> bytes | None:
@@ -170,25 +211,28 @@ def _from_json(plain: Mapping[str, Any]) -> Any:
     return np.frombuffer(base64.b64decode(plain["base64"], validate=True), dtype).reshape(plain["shape"])
 
 
-def _open_locked(path: Path) -> FileIO:
-    """Opens a file for appending under an exclusive lock, which the system releases when the process ends."""
-    while True:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            handle = FileIO(path, "a+")
-        except OSError as error:
-            raise _cannot_write(path, error) from None
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            handle.close()
-            if not isinstance(error, BlockingIOError):
-                raise _cannot_write(path, error) from None
-            raise InputError(path, "a store that another process has open", "one process at a time") from None
-        # Another process may have removed the file after it was opened and before it was locked.
-        if path.exists() and os.path.samestat(os.fstat(handle.fileno()), os.stat(path)):
-            return handle
-        handle.close()
+def _opened(path: Path) -> FileIO:
+    """Opens a file for reading and appending, and makes it and its folder where they do not exist."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return FileIO(path, "a+")
+    except OSError as error:
+        raise _cannot_write(path, error) from None
+
+
+def _lock(file: FileIO, path: Path) -> None:
+    """Waits until no other process has locked the file, and locks it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX)
+    except OSError as error:
+        raise _cannot_write(path, error) from None
+
+
+def _is_at(file: FileIO, path: Path) -> bool:
+    """Returns whether an open file has not been removed from its path."""
+    with suppress(FileNotFoundError):
+        return os.path.samestat(os.fstat(file.fileno()), os.stat(path))
+    return False
 
 
 def _cannot_write(path: Path, error: OSError) -> InputError:

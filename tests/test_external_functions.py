@@ -144,7 +144,7 @@ def test_what_cannot_be_used_is_told_in_one_line(
 ) -> None:
     (case.parent / "broken.py").write_text("def force(:\n")
     assert says in refused(capsys, "design", configured(case, forward, more))
-    assert not list((case.parent / "case").glob("runs/*"))
+    assert not list((case.parent / "case").glob("finished/*"))
 
 
 def test_own_and_full_models_are_not_mixed(case: Path, capsys: pytest.CaptureFixture[str]) -> None:

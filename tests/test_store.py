@@ -12,8 +12,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from toys import worker_functions
 
 from bayeskin.errors import InputError
+from bayeskin.execution.local import run_parallel
 from bayeskin.hashing import sha256_of
 from bayeskin.store import Store
 from bayeskin.types import Array
@@ -50,9 +52,9 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "a.store"
 
 
-def kept(path: Path) -> list[bool]:
+def kept(path: Path, heard: list[str] | None = None) -> list[bool]:
     """Whether the store has the first and the second result, which are unchanged."""
-    with Store(path, SHARED) as store:
+    with Store(path, SHARED, (heard if heard is not None else []).append) as store:
         return [key in store and same(store.read(key, Result), result)
                 for key, result in (({"E_c": 1e5}, FIRST), ([2, "b"], SECOND))]  # fmt: skip
 
@@ -86,7 +88,10 @@ def test_a_store_cut_at_any_byte_keeps_the_whole_lines_and_can_be_continued(path
     header, first, _ = (len(line) for line in text.splitlines(keepends=True))
     for cut in range(len(text)):
         path.write_bytes(text[:cut])
-        assert kept(path) == [cut >= header + first, False]
+        heard: list[str] = []
+        assert kept(path, heard) == [cut >= header + first, False]
+        incomplete = cut not in (0, header, header + first)
+        assert heard == [f"{path}: a result is damaged, and computed again where needed"] * incomplete
         with Store(path, SHARED) as store:
             store.add([2, "b"], SECOND)
         assert kept(path) == [cut >= header + first, True]
@@ -100,8 +105,12 @@ def test_a_flipped_bit_costs_its_result_only(path: Path) -> None:
         if at < header:
             with pytest.raises(InputError, match=r"a\.store: found (results that|other contents)"):
                 kept(path)
-        elif at != header + first - 1:  # without the line's end, both results are gone
-            assert kept(path) == [at >= header + first, at < header + first]
+            continue
+        heard: list[str] = []
+        found = kept(path, heard)
+        assert heard == [f"{path}: a result is damaged, and computed again where needed"]
+        if at != header + first - 1:  # without the line's end, both results are gone
+            assert found == [at >= header + first, at < header + first]
 
 
 def test_results_of_other_inputs_are_refused_and_stay(path: Path) -> None:
@@ -149,10 +158,39 @@ def test_a_line_with_the_right_checksum_that_is_no_result_is_refused(path: Path,
         kept(path)
 
 
-def test_one_process_at_a_time(path: Path) -> None:
-    with Store(path, SHARED), pytest.raises(InputError, match="another process has open"):
-        kept(path)
-    assert kept(path) == [True, True]
+def test_an_addition_finds_what_other_processes_have_added(path: Path) -> None:
+    heard: list[str] = []
+    with Store(path, SHARED) as one, Store(path, SHARED, heard.append) as other:
+        one.add("a", {"force_n": EDGE})
+        with open(path, "ab") as file:
+            file.write(b"what a killed process was writing")
+        other.add("b", {"force_n": EDGE + 1.0})
+        one.add("c", {"force_n": EDGE + 2.0})
+        assert ["a" in other, "c" in other, "b" in one] == [True, False, True]
+        np.testing.assert_array_equal(one.read("b", dict)["force_n"], EDGE + 1.0)
+    assert len(heard) == 1
+    assert kept(path, heard) == [True, True]
+    assert len(heard) == 1
+
+
+def test_a_store_that_another_process_left_without_results_is_made_again(tmp_path: Path) -> None:
+    path = tmp_path / "a.store"
+    with Store(path, SHARED) as one:
+        with Store(path, SHARED):
+            pass
+        assert not path.exists()
+        one.add({"E_c": 1e5}, FIRST)
+    assert kept(path) == [True, False]
+
+
+def test_several_processes_add_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "a.store"
+    numbers = [int(number) for _, number in run_parallel(worker_functions.added, [str(path)] * 3, 3)]
+    with Store(path, "shared") as store:
+        for number in numbers:
+            for n in range(worker_functions.ADDED):
+                np.testing.assert_array_equal(store.read([number, n], dict)["force_n"], np.full(3000, n))
+    assert len(path.read_bytes().splitlines()) == 1 + 3 * worker_functions.ADDED
 
 
 @contextmanager

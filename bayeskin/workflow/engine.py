@@ -61,7 +61,7 @@ class Run:
     def store(self, kind: str, computed_from: Any) -> Store:
         """Returns the store of finished results of a kind that were computed from these values."""
         file = f"{kind}-{sha256_of(computed_from)[:16]}.store"
-        return Store(self.folder / "finished" / file, computed_from)
+        return Store(self.folder / "finished" / file, computed_from, self.reporter.log)
 
     def inputs_sha256(self, stage: str) -> str:
         """Returns the hash of all that a stage depends on, which is recorded when the stage begins."""

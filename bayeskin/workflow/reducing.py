@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -32,6 +33,7 @@ from bayeskin.shipped import shipped
 from bayeskin.store import Store
 from bayeskin.types import ParameterSpace
 from bayeskin.workflow.engine import Reporter
+from bayeskin.workflow.folder import locked
 from bayeskin.workflow.output_paths import check_ending
 
 SHIPPED = "surrogates/article-device-reduced.h5"
@@ -49,8 +51,8 @@ def reduce(
     out : HDF5 file to write; by default beside the source, with "-reduced" after its name
     scheduler : address of a Dask scheduler that makes the training runs; without it, this machine makes them
 
-    Training runs are stored in a file beside `out` until the model is finished, so the same command continues
-    after an interruption. Raises InputError for wrong input, with nothing written. An `out` that is
+    Training runs are stored in a folder beside `out` until the model is finished, so the same command
+    continues after an interruption. Raises InputError for wrong input, with nothing written. An `out` that is
     finished stays unchanged.
     """
     geometry = _geometry(source)
@@ -60,11 +62,12 @@ def reduce(
     finished = _finished(path, trained)
     if finished:
         return _answer(path, load_reduced(path), 0.0, "done before, unchanged")
-    settings, started = BuildSettings(), time.perf_counter()
+    folder, started = path.with_name(f"{path.stem}-training"), time.perf_counter()
     executor = nullcontext(local(WORKERS)) if scheduler is None else on_scheduler(scheduler)
-    with Store(path.with_name(f"{path.stem}-training.store"), "training runs") as store, executor as run_all:
-        _build(path, trained, settings, store, run_all, reporter)
-        store.path.unlink()
+    training_runs = Store(folder / "runs.store", "training runs", reporter.log)
+    with executor as run_all, locked(folder), training_runs as store:
+        _build(path, trained, BuildSettings(), store, run_all, reporter)
+    shutil.rmtree(folder)
     return _answer(path, load_reduced(path), time.perf_counter() - started, "built")
 
 
