@@ -1,9 +1,8 @@
-"""Runs a design through the full model, on this machine or a cluster, into one HDF5 file.
+"""Runs a design through a model, on this machine or a cluster, and keeps the finished runs in a store.
 
-While a wave runs, each finished run goes into a journal beside the file (`bayeskin.journal`). When all runs
-are there, a new file with all rows is written and replaces the old one, and the journal is removed. The file
-is thus complete at every moment, and a process that is killed at any moment loses only the runs in progress.
-The rows have the order of the points, in whatever order the runs finished.
+Each finished run is on disk before the next one is kept (`bayeskin.store`), so a process that is killed at
+any moment loses only the runs in progress. The rows have the order of the points, in whatever order the runs
+finished.
 """
 
 from __future__ import annotations
@@ -12,49 +11,55 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from bayeskin.design import Wave
-from bayeskin.design_files import (
-    check_same,
-    extended,
-    identity_of,
-    load_design,
-    load_waves,
-    remove_stale,
-    rows_ok,
-    save_design,
-)
 from bayeskin.errors import InputError, Unavailable
 from bayeskin.execution.local import Lost, Map, local
-from bayeskin.journal import Journal, Run
+from bayeskin.hashing import sha256_of
+from bayeskin.store import Store
 from bayeskin.types import Array, Design, Simulation
 
 Simulate = Callable[[Mapping[str, float]], Simulation]
 Progress = Callable[[int, int, int], None]
 
 
-class _Outcome(NamedTuple):
-    """The result that a worker sends back; `force_n` is None where the run failed.
+@dataclass(frozen=True)
+class FinishedRun:
+    """The result of one run of a design.
 
+    force_n : the bin means [N] (m,), or NaN where the run failed
+    ok : whether the run succeeded
+    message : why it failed, or a remark
+    seconds : its duration
+    """
+
+    force_n: Array
+    ok: bool
+    message: str
+    seconds: float
+
+
+class _Outcome(NamedTuple):
+    """The result that a worker sends back.
+
+    model_hash : hash of the model that made the run, or an empty text where none was made
     unavailable : `where`, `found` and `expected` of an `Unavailable` error, where something that the run
         needs was not available
     """
 
-    force_n: Array | None
-    message: str
-    seconds: float
+    run: FinishedRun
     model_hash: str
     unavailable: tuple[str, str, str] | None = None
 
 
 def run_design(
-    path: Path | str,
+    store: Store,
     wave: Wave,
     edges_s: ArrayLike,
     simulate: Simulate,
@@ -62,77 +67,54 @@ def run_design(
     run_all: Map | None = None,
     progress: Progress | None = None,
 ) -> Design:
-    """Runs the points of `wave` that are in no file yet, and returns the design with all its waves.
+    """Runs the points of `wave` that are not in the store yet, and returns all of them as a design.
 
-    edges_s : the edges (m+1,) of the bins whose mean force is stored
+    store : an open store, for runs of one motion only
+    edges_s : the edges (m+1,) of the bins whose mean force is kept
     simulate : maps ``{name: value}`` to a Simulation; it must be picklable, and its results carry
         `model_hash`
     run_all : maps a function over the points (`execution.local.local`, by default with two processes, or a
-        cluster); the file is the same for each of them
+        cluster); the design is the same for each of them
     progress : called as progress(done, total, failed) with the counts of this wave's points
 
-    A point is identified by its bytes, so a repeated point is not run again. A run that fails, raises an
-    error, or kills its worker `ATTEMPTS` times becomes a row with ``ok`` False and a message. A call after an
-    interruption of any kind continues the wave. Ctrl-C ends the workers, keeps the finished runs and raises
-    KeyboardInterrupt.
+    A run is found again by its parameters, bins and model, so a repeated point is not run again. A run that
+    fails, raises an error, or kills its worker `ATTEMPTS` times becomes a row with ``ok`` False and a
+    message. A call after an interruption of any kind continues the wave. Ctrl-C ends the workers, keeps the
+    finished runs and raises KeyboardInterrupt.
 
-    Raises InputError, with nothing written, when the file holds another parameter space, model or bins, when
-    a point lies outside the box, when another process runs the same file, or when `simulate` belongs to
-    another model. Raises Unavailable when something that the runs need is not available, such as a server.
-    This says nothing about the points, so none of these runs is stored.
+    Raises InputError when a point lies outside the box, and when `simulate` belongs to another model. Raises
+    Unavailable when something that the runs need is not available, such as a server. This says nothing about
+    the points, so none of these runs is kept.
     """
-    path, edges = Path(path), np.asarray(edges_s, dtype=float)
-    points = _distinct(wave)
-    identity, bins = identity_of(wave.space, edges, model_hash), len(edges) - 1
-    with Journal(path.with_name(f"{path.name}.journal"), identity, bins) as journal:
-        remove_stale(path)
-        before = load_design(path) if path.exists() else None
-        if before is not None:
-            check_same(path, before, wave.space, edges, model_hash)
-        known = rows_ok(before) | {key: run.ok for key, run in journal.runs.items()}
-        todo = [row for key, row in points.items() if key not in known]
-        report = _progress_reporter(progress, len(points), [known[key] for key in points if key in known])
-        report(None)
-        task = partial(_bin_means_of, simulate, wave.space.names, edges)
-        with closing((run_all or local(2))(task, todo)) as results:
-            for index, outcome in results:
-                if todo[index].tobytes() in journal.runs:  # a cluster may have run the point twice
-                    continue
-                run = _as_run(path, todo[index], outcome, bins, model_hash)
-                journal.append(run)
-                report(run)
-        stored = set(rows_ok(before))
-        fresh = [journal.runs[key] for key in points if key not in stored]
-        design = extended(before, wave, edges, model_hash, fresh)
-        if fresh:
-            save_design(path, design, [*(load_waves(path) if before else ()), dict(wave.record)])
-        journal.forget(stored | set(points))
-    return design
+    edges, points = np.asarray(edges_s, dtype=float), _distinct(wave)
+    common = sha256_of([wave.space.names, edges, model_hash])
+    done = {
+        key: store.read([common, point], FinishedRun)
+        for key, point in points.items()
+        if [common, point] in store
+    }
 
+    def report() -> None:
+        """Reports the progress."""
+        if progress is not None:
+            progress(len(done), len(points), sum(not run.ok for run in done.values()))
 
-def add_points(
-    path: Path | str,
-    theta: ArrayLike,
-    simulate: Simulate,
-    reason: str,
-    run_all: Map | None = None,
-    progress: Progress | None = None,
-) -> Design:
-    """Adds training points (n, d) that no rule has drawn, such as a MAP estimate, as the next wave.
-
-    `reason` goes into the wave's record. The call resumes after an interruption as `run_design` does. Raises
-    InputError as `run_design` and `load_design` do.
-    """
-    design = load_design(path)
-    theta = np.atleast_2d(np.asarray(theta, dtype=float))
-    number = int(design.wave.max()) + 1
-    record = {"wave": number, "seed": design.seed, "training": len(theta), "held_out": 0, "rule": reason}
-    wave = Wave(design.space, theta, np.zeros(len(theta), bool), number, design.seed, record)
-    return run_design(path, wave, design.edges_s, simulate, design.model_hash, run_all, progress)
+    report()
+    todo = [point for key, point in points.items() if key not in done]
+    task = partial(_bin_means_of, simulate, wave.space.names, edges)
+    with closing((run_all or local(2))(task, todo)) as outcomes:
+        for index, outcome in outcomes:
+            point = todo[index]
+            if point.tobytes() in done:  # a cluster may have run the point twice
+                continue
+            done[point.tobytes()] = _checked_run(store, outcome, len(edges) - 1, model_hash)
+            store.add([common, point], done[point.tobytes()])
+            report()
+    return _design(wave, edges, model_hash, [done[point.tobytes()] for point in wave.theta])
 
 
 def _bin_means_of(simulate: Simulate, names: tuple[str, ...], edges: Array, theta: Array) -> _Outcome:
-    """Returns the bin means [N] (m,) of one run, or the reason why it has none.
+    """Returns the outcome of one run, with the bin means [N] (m,) or the reason why it has none.
 
     This function runs in a worker. It raises no error.
     """
@@ -149,7 +131,15 @@ def _bin_means_of(simulate: Simulate, names: tuple[str, ...], edges: Array, thet
         unavailable = (error.where, error.found, error.expected)
     except Exception as error:
         message = f"{type(error).__name__}: {error}"
-    return _Outcome(force_n, message, time.perf_counter() - start, model_hash, unavailable)
+    seconds = time.perf_counter() - start
+    if force_n is None:
+        return _Outcome(_failed(len(edges) - 1, message, seconds), model_hash, unavailable)
+    return _Outcome(FinishedRun(force_n, True, message, seconds), model_hash)
+
+
+def _failed(bins: int, message: str, seconds: float) -> FinishedRun:
+    """Returns a run that failed."""
+    return FinishedRun(np.full(bins, np.nan), False, message, seconds)
 
 
 def _checked_means(run: Simulation, edges: Array) -> tuple[Array | None, str]:
@@ -166,36 +156,15 @@ def _checked_means(run: Simulation, edges: Array) -> tuple[Array | None, str]:
     return run.bin_means(edges), run.message
 
 
-def _as_run(path: Path, theta: Array, outcome: _Outcome | Lost, bins: int, model_hash: str) -> Run:
-    """Returns the outcome of a worker as a run. Raises Unavailable, and InputError for another model."""
+def _checked_run(store: Store, outcome: _Outcome | Lost, bins: int, model_hash: str) -> FinishedRun:
+    """Returns the run of a worker's outcome. Raises Unavailable, and InputError for another model."""
     if isinstance(outcome, Lost):
-        return Run(theta, np.full(bins, np.nan), False, outcome.reason, math.nan)
+        return _failed(bins, outcome.reason, math.nan)
     if outcome.unavailable is not None:
         raise Unavailable(*outcome.unavailable)
     if outcome.model_hash not in ("", model_hash):
-        raise InputError(path, f"a run of model {outcome.model_hash}", f"runs of model {model_hash}")
-    ok = outcome.force_n is not None
-    force_n = outcome.force_n if outcome.force_n is not None else np.full(bins, np.nan)
-    return Run(theta, force_n, ok, outcome.message, outcome.seconds)
-
-
-def _progress_reporter(
-    progress: Progress | None, total: int, known: list[bool]
-) -> Callable[[Run | None], None]:
-    """Returns a function that turns finished runs into calls of `progress`.
-
-    `known` says for each earlier run whether it is ok.
-    """
-    states = list(known)
-
-    def report(run: Run | None) -> None:
-        """Counts a finished run (None: no new run) and reports the progress."""
-        if run is not None:
-            states.append(run.ok)
-        if progress is not None:
-            progress(len(states), total, states.count(False))
-
-    return report
+        raise InputError(store.path, f"a run of model {outcome.model_hash}", f"runs of model {model_hash}")
+    return outcome.run
 
 
 def _distinct(wave: Wave) -> dict[bytes, Array]:
@@ -213,3 +182,20 @@ def _distinct(wave: Wave) -> dict[bytes, Array]:
             f"points of a design: row {row}", theta[row].tolist(), "a point inside the prior box"
         )
     return {row.tobytes(): row for row in theta}
+
+
+def _design(wave: Wave, edges: Array, model_hash: str, runs: list[FinishedRun]) -> Design:
+    """Returns the points of a wave with their runs."""
+    return Design(
+        space=wave.space,
+        edges_s=edges,
+        theta=wave.theta,
+        force_n=np.array([run.force_n for run in runs]).reshape(-1, len(edges) - 1),
+        wave=np.full(len(runs), wave.number, dtype=np.int64),
+        held_out=wave.held_out,
+        ok=np.array([run.ok for run in runs], dtype=bool),
+        messages=tuple(run.message for run in runs),
+        seconds=np.array([run.seconds for run in runs], dtype=float),
+        seed=wave.seed,
+        model_hash=model_hash,
+    )

@@ -11,7 +11,6 @@ kills, of finished items that were gone after a kill, and whether the result equ
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shutil
 import signal
@@ -181,31 +180,19 @@ def _kill_after(config: Path, stage: str, seconds: float) -> bool:
 def finished_items(folder: Path) -> dict[str, set[str]]:
     """Returns the names of everything that is finished in a run's folder; these sets may only grow."""
     run = folder / "case"
-    finished: dict[str, set[str]] = {"run": set(), "steps": set(), "fit": set(), "stage": set()}
-    for file in run.glob("runs/*.h5"):
-        with h5py.File(file) as handle:
-            finished["run"] |= {row.tobytes().hex() for row in handle["theta"][()]}
-    for journal in run.glob("runs/*.journal"):
-        finished["run"] |= set(map(_point, journal.read_bytes().split(b"\n"))) - {""}
+    finished: dict[str, set[str]] = {"result": set(), "steps": set(), "stage": set()}
+    for store in run.glob("finished/*.store"):
+        text = store.read_bytes()
+        results = text[: text.rfind(b"\n") + 1].splitlines()[1:]
+        finished["result"] |= {result.split(b" ", 3)[2].decode() for result in results}
     for chain in run.glob("chains/*/*.h5"):
         with h5py.File(chain) as handle:
             finished["steps"] |= {f"{chain.name} {n}" for n in range(int(handle["mcmc"].attrs["iteration"]))}
-    for search in run.glob("searches/*.jsonl"):
-        text = search.read_text()
-        finished["fit"] |= {f"{search.name} {line}" for line in text[: text.rfind("\n") + 1].splitlines()}
     for record in run.glob("*/stage.json"):
         stage_record = read_record(record.parent)
         if stage_record is not None and current_record(record.parent, stage_record.inputs_sha256) is not None:
             finished["stage"].add(record.parent.name)
     return finished
-
-
-def _point(line: bytes) -> str:
-    """Returns the parameter point in a journal's line, or an empty text where the line is cut short."""
-    try:
-        return np.array(json.loads(line.split(b" ", 2)[2])["theta"]).tobytes().hex()
-    except (IndexError, ValueError):
-        return ""
 
 
 def _result(folder: Path, stage: str) -> Any:

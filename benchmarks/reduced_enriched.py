@@ -27,6 +27,7 @@ from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.shipped import shipped
+from bayeskin.store import Store
 from bayeskin.workflow.reducing import SHIPPED
 
 HEADER = (
@@ -47,10 +48,11 @@ def row(model: ReducedModel, number: int, folder: Path) -> list[str]:
     with h5py.File(RESULTS) as handle:
         before = compared(model, motion, skin.theta, skin.mechanisms, handle[f"{number:02d}/article"])
     started = spent_s()
-    result = enrich(
-        model, skin.theta, skin.mechanisms, motion, EnrichmentSettings(), folder / f"{number:02d}", local(2),
-        lambda what, share: None,
-    )  # fmt: skip
+    with Store(folder / f"{number:02d}.store", "full runs near a skin") as store:
+        result = enrich(
+            model, skin.theta, skin.mechanisms, motion, EnrichmentSettings(), store, local(2),
+            lambda what, share: None,
+        )  # fmt: skip
     total_s = spent_s() - started
     mechanisms, costs = [catalogue()[name] for name in skin.mechanisms], []
     for either in (model, result.model):
@@ -76,7 +78,6 @@ def main() -> None:
     options = parser.parse_args()
     model, table = load_reduced(shipped(SHIPPED)), list[list[str]]()
     for number in options.skins:
-        (options.folder / f"{number:02d}").mkdir(parents=True, exist_ok=True)
         table.append(row(model, number, options.folder))
         rows.say(" | ".join(table[-1]))
     print(rows.markdown(HEADER, table))

@@ -24,12 +24,13 @@ from reduced_model import Row, compared, keep_full_run
 
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.geometry import LENGTHS
+from bayeskin.hashing import sha256_of
 from bayeskin.reduced import simulate as reduced_runs
 from bayeskin.reduced.cases import BASE, SETS, THICKNESS_RANGE, Case
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.region import outside
-from bayeskin.reduced.runs import FullRuns
+from bayeskin.reduced.runs import depends_on
 from bayeskin.report.style import INK, PAGE_IN, new_figure, state_finding, styled
 from bayeskin.shipped import shipped
 from bayeskin.types import PadMotion, ParameterSpace
@@ -145,8 +146,7 @@ def figure(rows: Sequence[tuple[Case, Row]]) -> Figure:
 
 def key_of(name: str, case: Case) -> str:
     """Returns the key of a case in the file: its name, and a hash of all that the force depends on."""
-    spec = ModelSpec()
-    return f"{name}-{FullRuns(spec.geometry, spec.refinement, RESULTS.parent).path(case).stem[:12]}"
+    return f"{name}-{sha256_of(depends_on(ModelSpec(), case))[:12]}"
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -35,6 +35,7 @@ from bayeskin.execution import cluster
 from bayeskin.execution.local import Map, local
 from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.runner import run_design
+from bayeskin.store import Store
 
 SEED = 5
 SPEC = ModelSpec()
@@ -64,8 +65,8 @@ def alone(wave: Wave) -> None:
 
 def designed(wave: Wave, run_all: Map) -> None:
     """Makes every run by the runner, into a new file."""
-    with tempfile.TemporaryDirectory() as folder:
-        design = run_design(Path(folder) / "design.h5", wave, EDGES_S, RUN, SPEC.hash, run_all)
+    with tempfile.TemporaryDirectory() as folder, Store(Path(folder) / "runs.store", SPEC.hash) as store:
+        design = run_design(store, wave, EDGES_S, RUN, SPEC.hash, run_all)
     if not design.ok.all():
         raise SystemExit(f"a run failed: {next(text for text in design.messages if text)}")
 

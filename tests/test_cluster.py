@@ -12,15 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from toys import unreliable_models
-from toys.closed_form_model import toy_simulate
 from toys.design_runs import SHORT, assert_same_rows, run
-from toys.unreliable_models import COARSE_S
 
-from bayeskin.design_files import load_design
 from bayeskin.errors import InputError
 from bayeskin.execution.cluster import on_scheduler, on_slurm
-from bayeskin.execution.local import Lost, local
-from bayeskin.runner import run_design
+from bayeskin.execution.local import Lost
 from bayeskin.types import Design
 
 distributed = pytest.importorskip("distributed")
@@ -37,14 +33,14 @@ def cluster():
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory) -> Design:
-    return run(tmp_path_factory.mktemp("here") / "design.h5", SHORT)
+    return run(tmp_path_factory.mktemp("here") / "a.store", SHORT)
 
 
-def test_the_file_is_the_same_whoever_made_the_runs(cluster, tmp_path: Path, expected: Design) -> None:
+def test_the_design_is_the_same_whoever_made_the_runs(cluster, tmp_path: Path, expected: Design) -> None:
     with on_scheduler(cluster.scheduler_address) as over:
-        found = run_design(tmp_path / "design.h5", SHORT, COARSE_S, toy_simulate, "toy", over)
+        found = run(tmp_path / "a.store", SHORT, run_all=over)
     assert_same_rows(found, expected)
-    again = run_design(tmp_path / "design.h5", SHORT, COARSE_S, unreliable_models.failing, "toy", local(1))
+    again = run(tmp_path / "a.store", SHORT, unreliable_models.failing)
     assert_same_rows(again, expected)
 
 
@@ -63,7 +59,7 @@ def test_a_worker_killed_in_mid_run_costs_its_own_point_which_is_run_again(
     thread = threading.Thread(target=kill)
     thread.start()
     with on_scheduler(cluster.scheduler_address) as over:
-        found = run_design(tmp_path / "design.h5", SHORT, COARSE_S, simulate, "toy", over)
+        found = run(tmp_path / "a.store", SHORT, simulate, over)
     thread.join()
     assert killed
     assert_same_rows(found, expected)
@@ -72,7 +68,7 @@ def test_a_worker_killed_in_mid_run_costs_its_own_point_which_is_run_again(
 def test_a_point_that_kills_every_worker_is_a_failed_row(cluster, tmp_path: Path) -> None:
     simulate = partial(unreliable_models.deadly, folder=str(tmp_path), deaths=99)
     with on_scheduler(cluster.scheduler_address) as over:
-        found = run_design(tmp_path / "out" / "design.h5", SHORT, COARSE_S, simulate, "toy", over)
+        found = run(tmp_path / "out" / "a.store", SHORT, simulate, over)
     stiff = SHORT.theta[:, 0] > 3e5
     np.testing.assert_array_equal(found.ok, ~stiff)
     assert all("ended" in found.messages[row] for row in np.flatnonzero(stiff))
@@ -99,9 +95,9 @@ def test_a_run_that_comes_back_twice_is_one_row(tmp_path: Path, expected: Design
             yield index, function(item)
             yield index, function(item)
 
-    found = run_design(tmp_path / "design.h5", SHORT, COARSE_S, toy_simulate, "toy", twice)
+    found = run(tmp_path / "a.store", SHORT, run_all=twice)
     assert_same_rows(found, expected)
-    assert_same_rows(load_design(tmp_path / "design.h5"), expected)
+    assert_same_rows(run(tmp_path / "a.store", SHORT, unreliable_models.failing), expected)
 
 
 def test_an_address_where_nobody_answers_is_told_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -74,11 +74,11 @@ def test_a_solid_that_relaxes_is_named_on_any_protocol_and_a_second_call_makes_n
     written = json.loads((folder / "diagnose" / "diagnosis.json").read_text())
     assert written["verdict"] == "named"
 
-    (answers,) = (folder / "searches").glob("*.jsonl")
+    (answers,) = (folder / "finished").glob("answers-*.store")
     before = answers.read_bytes()
     shutil.rmtree(folder / "diagnose")
     again = diagnose(recording, Silent())
     assert answers.read_bytes() == before
-    assert [answers] == list((folder / "searches").iterdir())
+    assert [answers] == list((folder / "finished").iterdir())
     same = ("verdict", "mechanisms", "sets", "fit", "located", "full_model")
     assert {name: again[name] for name in same} == {name: said[name] for name in same}

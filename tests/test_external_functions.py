@@ -18,6 +18,7 @@ from bayeskin.design_files import load_design
 from bayeskin.execution.local import local
 from bayeskin.external.model import identity, simulate_with
 from bayeskin.runner import run_design
+from bayeskin.store import Store
 from bayeskin.types import PadMotion, Recording
 from bayeskin.workflow import stages
 from bayeskin.workflow.diagnosis import diagnose
@@ -85,7 +86,8 @@ def test_any_callable_runs_through_the_runner(tmp_path: Path) -> None:
     )
     wave = Wave(SPACE, theta, np.zeros(3, bool), 0, 1)
     run = partial(simulate_with, hooke, MOTION, model_hash="mine")
-    design = run_design(tmp_path / "d.h5", wave, edges_s, run, "mine", local(1))
+    with Store(tmp_path / "a.store", "mine") as store:
+        design = run_design(store, wave, edges_s, run, "mine", local(1))
     middle_s = edges_s[:-1] + 0.5
     assert design.ok.all()
     np.testing.assert_allclose(
@@ -142,7 +144,7 @@ def test_what_cannot_be_used_is_told_in_one_line(
 ) -> None:
     (case.parent / "broken.py").write_text("def force(:\n")
     assert says in refused(capsys, "design", configured(case, forward, more))
-    assert not list((case.parent / "case").glob("runs/*"))
+    assert not list((case.parent / "case").glob("finished/*"))
 
 
 def test_own_and_full_models_are_not_mixed(case: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -33,6 +33,7 @@ from bayeskin.external.umbridge import Client, server
 from bayeskin.finite_element import ModelSpec
 from bayeskin.mechanisms import bin_means, catalogue, observed
 from bayeskin.runner import run_design
+from bayeskin.store import Store
 from bayeskin.types import Parameter
 from bayeskin.workflow import stages
 from bayeskin.workflow.doctor import FULL_MODEL_N, THETA
@@ -312,13 +313,17 @@ def test_a_server_that_goes_away_costs_no_finished_run_and_fails_none(tmp_path: 
     theta = SPACE.from_unit(np.random.default_rng(2).uniform(size=(8, 3)))
     wave, edges_s = Wave(SPACE, theta, np.zeros(8, bool), 0, 1), np.arange(0.0, 131.0, 10.0)
     run = partial(simulate_server, url, MOTION)
-    with pytest.raises(Unavailable, match=r"no answer .*; expected a server that speaks UM-Bridge"):
-        run_design(tmp_path / "d.h5", wave, edges_s, run, identity(url), local(1))
-    kept = len((tmp_path / "d.h5.journal").read_bytes().splitlines())
+    with (
+        Store(tmp_path / "a.store", url) as store,
+        pytest.raises(Unavailable, match=r"no answer .*; expected a server that speaks UM-Bridge"),
+    ):
+        run_design(store, wave, edges_s, run, identity(url), local(1))
+    kept = len((tmp_path / "a.store").read_bytes().splitlines()) - 1
     assert 3 <= kept <= 4
     Mortal.left = 1000
     listening = start(port)
-    design = run_design(tmp_path / "d.h5", wave, edges_s, run, identity(url), local(1))
+    with Store(tmp_path / "a.store", url) as store:
+        design = run_design(store, wave, edges_s, run, identity(url), local(1))
     stop()
     assert Mortal.left == 1000 - (8 - kept)
     assert design.ok.all()

@@ -26,8 +26,6 @@ from toys.external_models import PARAMETERS, SPRING, TRUE, spring
 
 from bayeskin import storage
 from bayeskin.design_files import load_design
-from bayeskin.errors import InputError
-from bayeskin.json_files import read_lines
 from bayeskin.types import Recording
 from bayeskin.workflow.folder import read_record
 
@@ -210,17 +208,6 @@ def test_a_record_of_other_contents_is_none(tmp_path: Path, record: str) -> None
     assert read_record(tmp_path) is None
 
 
-def test_a_torn_last_line_is_cut_off_and_another_one_is_told(tmp_path: Path) -> None:
-    file = tmp_path / "made.jsonl"
-    file.write_bytes('{"a": 1}\n{"b": "caf\u00e9'.encode()[:-1])
-    assert read_lines(file) == [{"a": 1}]
-    assert file.read_bytes() == b'{"a": 1}\n'
-    for line in (b"[1]\n", b"{nonsense\n", b"\xff\n"):
-        file.write_bytes(b'{"a": 1}\n' + line)
-        with pytest.raises(InputError, match="line 2: found no JSON object"):
-            read_lines(file)
-
-
 def test_a_second_run_on_a_folder_is_refused_and_the_first_goes_on(case: Path) -> None:
     go = case.parent / "go"
     waiting = f"    while not os.path.exists({str(go)!r}):\n        time.sleep(0.05)\n    pull ="
@@ -326,16 +313,16 @@ def test_one_kill_of_a_design_loses_nothing_and_is_seen_by_the_study(
 ) -> None:
     kills = benchmark("kills")
     process = subprocess.Popen([sys.executable, "-c", MAIN, "design", str(case)], stderr=subprocess.DEVNULL)
-    while len(kills.finished_items(case.parent)["run"]) < 3:
+    while len(kills.finished_items(case.parent)["result"]) < 3:
         assert process.poll() is None
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    had = kills.finished_items(case.parent)["run"]
+    had = kills.finished_items(case.parent)["result"]
     assert bayeskin("design", case)[0] == 0
     now = kills.finished_items(case.parent)
-    assert had <= now["run"]
+    assert had <= now["result"]
     assert now["stage"] == {"recording", "design"}
-    assert len(now["run"]) == 30
+    assert len(now["result"]) == 31
     record = read_record(case.parent / "case/design")
     assert record is not None

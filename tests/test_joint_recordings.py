@@ -5,14 +5,19 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from toys import closed_form_reduced
+from toys import closed_form_reduced, stand_in_model
 from toys.closed_form_reduced import BASE, EDGES_S, MOTION, NO_WORD, NOISE_N, TRUTH, recorded
 
+from bayeskin import storage
+from bayeskin.config import Config
+from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.forward.interface import ModelRun
 from bayeskin.forward.joint import JointForward
 from bayeskin.inference.likelihood import log_likelihood
@@ -25,8 +30,10 @@ from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.tasks import FitTask, Task
 from bayeskin.mismatch.trust_region import SetFit
 from bayeskin.recordings.join import PAUSE_S, join_bins, join_jumps, join_motions, join_samples, spans_of
-from bayeskin.types import BinnedForce, PadMotion, ParameterSpace, Prediction, Recording
+from bayeskin.types import BinnedForce, PadMotion, ParameterSpace, Prediction, Recording, Simulation
 from bayeskin.types.joint import own_name, plain_name, recording_of, values_in
+from bayeskin.workflow import maximum
+from bayeskin.workflow.engine import Run, Silent
 
 SHORT = PadMotion(np.array([0.0, 3.0, 8.0, 30.0]), 1e-3 * np.array([0.0, 0.0, 5.0, 5.0]))
 
@@ -137,6 +144,33 @@ def test_a_joint_run_is_the_run_of_each_recording(monkeypatch: pytest.MonkeyPatc
             np.testing.assert_array_equal(joint, alone.slopes_n[:, column])
         other = own_name("p_init", 1 - number)
         assert not run.slopes_n[bins, names.index(other)].any()
+
+
+def test_the_full_run_of_a_recording_is_kept_before_the_next_one_begins(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    motions, theta = (MOTION, SHORT), {**TRUTH, "p_init@2": -200.0}
+    recordings = [samples(motion, name, 0.1) for motion, name in zip(motions, "AB", strict=True)]
+    joint = join_motions(motions, spans_of(recordings, motions))
+    storage.save(tmp_path / "recording" / "motion.h5", joint)
+    run, made = Run(Config.model_construct(), tmp_path / "a.toml", tmp_path, Silent()), list[PadMotion]()
+
+    def simulated(spec: ModelSpec, motion: PadMotion, *more: Any, **options: Any) -> Simulation:
+        made.append(motion)
+        if len(made) == 2:
+            raise KeyboardInterrupt
+        return stand_in_model.simulate(spec, motion, *more, **options)
+
+    monkeypatch.setattr(maximum, "model_spec", lambda _: ModelSpec())
+    monkeypatch.setattr(maximum, "simulate", simulated)
+    with pytest.raises(KeyboardInterrupt):
+        maximum._FullModel(run)(theta)
+    found = maximum._FullModel(run)(theta)
+    assert [len(motion.time_s) for motion in made] == [len(m.time_s) for m in (MOTION, SHORT, SHORT)]
+    again = maximum._FullModel(run)(theta)
+    assert len(made) == 3
+    for name in ("time_s", "force_n", "gradient_n"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
 
 
 def test_each_recording_has_its_own_instrument_and_both_have_one_skin(

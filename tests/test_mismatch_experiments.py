@@ -306,7 +306,10 @@ def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
     write_record(tmp_path / "x" / "diagnose", record)
     config = SimpleNamespace(model=ModelConfig(), design=SimpleNamespace(coarse=None), seed=0)
     run = SimpleNamespace(
-        config=config, folder=tmp_path / "x", at=lambda *parts: tmp_path.joinpath("x", *parts)
+        config=config,
+        folder=tmp_path / "x",
+        at=lambda *parts: tmp_path.joinpath("x", *parts),
+        store=lambda *_: None,
     )
     trained = SimpleNamespace(protocols=Protocols())
     model: Any = SimpleNamespace(trained=trained)
@@ -315,7 +318,7 @@ def diagnosed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Asked:
     monkeypatch.setattr(experiment, "opened", lambda *_: run)
     monkeypatch.setattr(experiment, "source_of", lambda _: None)
     monkeypatch.setattr(experiment, "context_of", lambda *_: bench)
-    monkeypatch.setattr(experiment, "searches_file", lambda *_: tmp_path / "searches")
+    monkeypatch.setattr(experiment, "depends_on", lambda _: "x")
     monkeypatch.setattr(experiment, "asked", lambda *_: nullcontext(asked))
     monkeypatch.setattr(experiment, "caption", lambda _: "x")
     monkeypatch.setattr(diagnosis, "diagnose", lambda *_: {"best_set": ["rub"]})

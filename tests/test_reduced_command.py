@@ -11,7 +11,12 @@ import pytest
 
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
+from bayeskin.reduced.files import load_reduced
+from bayeskin.reduced.model import ReducedModel
+from bayeskin.reduced.runs import FullRuns
 from bayeskin.shipped import shipped
+from bayeskin.workflow import reducing
+from bayeskin.workflow.engine import Silent
 from bayeskin.workflow.reducing import SHIPPED, default_path, reduced_file
 
 DEVICE = "[device]\ngauge_mm = 30\n"
@@ -116,3 +121,27 @@ def test_a_finished_model_stays_as_it_is(bayeskin, tmp_path) -> None:
     assert code == 2
     assert "another geometry" in error
     assert path.read_bytes() == before
+
+
+def test_an_interrupted_building_goes_on_and_a_second_one_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, model, found = tmp_path / "model.h5", load_reduced(shipped(SHIPPED)), list[bool]()
+
+    def base(trained: object, full: FullRuns, *_: object) -> ReducedModel:
+        found.append("a run" in full.store)
+        if not found[-1]:
+            full.store.add("a run", {"message": ""})
+            with pytest.raises(InputError, match="in use by another bayeskin"):
+                reducing.reduce(None, path, Silent())
+            raise KeyboardInterrupt
+        return model
+
+    monkeypatch.setattr(reducing, "base_model", base)
+    monkeypatch.setattr(reducing, "with_mechanisms", lambda *_: model)
+    with pytest.raises(KeyboardInterrupt):
+        reducing.reduce(None, path, Silent())
+    assert not path.exists()
+    assert reducing.reduce(None, path, Silent())["ok"]
+    assert found == [False, True]
+    assert {file.name for file in tmp_path.iterdir()} == {"model.h5", "model.json"}

@@ -29,9 +29,10 @@ from bayeskin.reduced.equations import ReducedEquations
 from bayeskin.reduced.files import load_reduced, save_reduced
 from bayeskin.reduced.library import Library, Modes
 from bayeskin.reduced.model import ReducedModel
-from bayeskin.reduced.runs import FullRuns
+from bayeskin.reduced.runs import FullRuns, depends_on
 from bayeskin.reduced.sensitivities import ReducedGradients
 from bayeskin.reduced.simulate import simulate_reduced
+from bayeskin.store import Store
 from bayeskin.types import PadMotion, Simulation
 
 THETA = {"E_c": 9e4, "E_s": 2e4, "k_c": 3e-14, "k_s": 4e-13, "p_init": 300.0}
@@ -64,13 +65,13 @@ def rms(found: Simulation, right: Simulation) -> float:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("training")
+def training(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("training") / "runs.store"
 
 
 @pytest.fixture(scope="module")
-def model(folder) -> ReducedModel:
-    return built(folder)
+def model(training) -> ReducedModel:
+    return built(training)
 
 
 @pytest.mark.parametrize("names", [(), ("preconditioning",), NAMES], ids=["base", "one", "two"])
@@ -190,29 +191,34 @@ def test_a_run_that_is_inside_out_between_its_points_has_failed(model, monkeypat
     assert "the mesh is inverted between the cubature points; run the full model" in found.message
 
 
-def test_full_runs_are_made_once(model, folder) -> None:
+def test_full_runs_are_made_once(model, training, tmp_path) -> None:
     def refuse(function, items):
         assert items == []
         yield from ()
 
     cases = [case for kind in (BASE, *NAMES) for case in SETTINGS.cases(model.trained, kind)]
-    runs = FullRuns(Geometry(), 0, folder)
-    runs.make(cases, refuse, unheard)
-    runs.path(cases[3]).unlink()
+    lines = training.read_bytes().splitlines(keepends=True)
+    (tmp_path / "fewer.store").write_bytes(b"".join([*lines[:4], *lines[5:]]))
     made: list[Case] = []
-    runs.make(
-        cases, lambda function, items: (made.append(c) or (n, function(c)) for n, c in enumerate(items)),
-        unheard,
-    )  # fmt: skip
+    with Store(training, "training runs") as store, Store(tmp_path / "fewer.store", "training runs") as fewer:
+        FullRuns(SPEC, store).make(cases, refuse, unheard)
+        FullRuns(SPEC, fewer).make(
+            cases,
+            lambda function, items: (made.append(c) or (n, function(c)) for n, c in enumerate(items)),
+            unheard,
+        )
+        again = FullRuns(SPEC, fewer).read(cases[3])
+        for name, value in vars(FullRuns(SPEC, store).read(cases[3])).items():
+            np.testing.assert_array_equal(getattr(again, name), value)
     assert made == [cases[3]]
-    assert runs.path(cases[3]).is_file()
 
 
-def test_a_full_run_of_another_law_is_not_taken_for_it(model, folder, monkeypatch) -> None:
-    runs, case = FullRuns(Geometry(), 0, folder), SETTINGS.cases(model.trained, NAMES[0])[0]
-    assert runs.path(case).is_file()
-    monkeypatch.setattr("bayeskin.reduced.runs.law_hashes", dict.fromkeys)
-    assert not runs.path(case).is_file()
+def test_a_full_run_of_another_law_is_not_taken_for_it(model, training, monkeypatch) -> None:
+    case = SETTINGS.cases(model.trained, NAMES[0])[0]
+    with Store(training, "training runs") as store:
+        assert depends_on(SPEC, case) in store
+        monkeypatch.setattr("bayeskin.reduced.runs.law_hashes", dict.fromkeys)
+        assert depends_on(SPEC, case) not in store
 
 
 @pytest.fixture(scope="module")
@@ -280,9 +286,10 @@ def test_enrichment_ends_where_the_measured_error_is_small(model, tmp_path) -> N
         yield from one_by_one(function, items)
 
     theta = THETA | STRONG
-    found = enrich(model, theta, NAMES, MOTION, settings, tmp_path, counted, unheard)
+    with Store(tmp_path / "runs.store", "near") as store:
+        found = enrich(model, theta, NAMES, MOTION, settings, store, counted, unheard)
     assert found.error <= settings.wanted
-    assert sum(calls) == found.full_runs == len(list(tmp_path.glob("*.h5")))
+    assert sum(calls) == found.full_runs
     there = simulate_reduced(found.model, MOTION, theta, of(NAMES))
     before = simulate_reduced(model, MOTION, theta, of(NAMES))
     right = full(theta, NAMES)
@@ -290,5 +297,6 @@ def test_enrichment_ends_where_the_measured_error_is_small(model, tmp_path) -> N
     far = simulate_reduced(found.model, MOTION, theta | {"E_c": 1e6}, of(NAMES))
     assert far.stats["inside"] == 0.0
     calls.clear()
-    enrich(model, theta, NAMES, MOTION, settings, tmp_path, counted, unheard)
+    with Store(tmp_path / "runs.store", "near") as store:
+        enrich(model, theta, NAMES, MOTION, settings, store, counted, unheard)
     assert sum(calls) == 0

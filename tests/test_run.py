@@ -222,7 +222,7 @@ def test_draws_join_the_design_where_the_full_model_is_elsewhere(
 ) -> None:
     shutil.copytree(folder, tmp_path / "run")
     run = open_run(tmp_path / "run" / "case.toml", Silent())
-    shutil.rmtree(run.folder / "runs")  # of the model as it was
+    shutil.rmtree(run.folder / "finished")  # of the model as it was
     problem, asked = refined_posterior(run), []
     theta = run.summary("map")["theta"]
     monkeypatch.setattr(model, "FullModel", partial(Steeper, about_pa=theta["E_c"], power=power))

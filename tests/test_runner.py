@@ -1,4 +1,4 @@
-"""A design's file: the same rows whatever the workers, the order, the failures or the kills."""
+"""A design: the same rows whatever the workers, the order, the failures or the kills."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,19 +20,15 @@ from toys.unreliable_models import COARSE_S, WAVE
 
 from bayeskin import storage
 from bayeskin.design import first_wave
-from bayeskin.design_files import load_design, load_waves
+from bayeskin.design_files import load_design
 from bayeskin.errors import InputError
 from bayeskin.execution import local as workers
 from bayeskin.execution.local import local
-from bayeskin.journal import Journal
-from bayeskin.runner import add_points, run_design
-from bayeskin.types import Design
+from bayeskin.runner import run_design
+from bayeskin.store import Store
+from bayeskin.types import Design, Simulation
 
 HERE = Path(__file__).parent
-
-
-def assert_one_file(path: Path) -> None:
-    assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
 @pytest.fixture
@@ -46,15 +43,13 @@ def serial(monkeypatch: pytest.MonkeyPatch) -> None:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Design:
     """The program of unreliable_models, never interrupted, with one worker."""
     path = tmp_path_factory.mktemp("whole") / "design.h5"
-    unreliable_models.main(str(path), workers=1, seconds=0.0)
-    assert_one_file(path)
-    return load_design(path)
+    return unreliable_models.main(str(path), workers=1, seconds=0.0)
 
 
 def test_rows_are_the_points_and_the_models_bin_means(whole: Design) -> None:
-    n = len(WAVE.theta)
-    np.testing.assert_array_equal(whole.theta[:n], WAVE.theta)
-    np.testing.assert_array_equal(whole.held_out[:n], WAVE.held_out)
+    np.testing.assert_array_equal(whole.theta, WAVE.theta)
+    np.testing.assert_array_equal(whole.held_out, WAVE.held_out)
+    assert whole.wave.tolist() == [0] * len(WAVE.theta)
     assert whole.ok.all()
     # The toy is sampled every 0.5 s and interpolated, hence not to the last digit.
     exact = toy_bin_means(whole.theta, COARSE_S)
@@ -67,7 +62,6 @@ def test_order_and_workers_leave_no_trace(tmp_path: Path, whole: Design) -> None
     path = tmp_path / "design.h5"
     unreliable_models.main(str(path), workers=3, seconds=0.02)
     assert_same_rows(load_design(path), whole)
-    assert_one_file(path)
 
 
 def kill_until_done(path: Path, workers: int, kills: int, rng: np.random.Generator) -> None:
@@ -86,7 +80,7 @@ def kill_until_done(path: Path, workers: int, kills: int, rng: np.random.Generat
 def test_a_design_killed_at_random_moments_ends_as_if_it_had_not_been(tmp_path: Path, whole: Design) -> None:
     kill_until_done(tmp_path / "design.h5", workers=2, kills=4, rng=np.random.default_rng(0))
     assert_same_rows(load_design(tmp_path / "design.h5"), whole)
-    assert_one_file(tmp_path / "design.h5")
+    assert {p.name for p in tmp_path.iterdir()} == {"design.h5", "design.store"}
 
 
 @pytest.mark.slow
@@ -96,7 +90,6 @@ def test_fifty_kills_leave_no_trace(tmp_path: Path, whole: Design) -> None:
         path = tmp_path / str(attempt) / "design.h5"
         kill_until_done(path, workers=1 + attempt % 2, kills=10, rng=rng)
         assert_same_rows(load_design(path), whole)
-        assert_one_file(path)
 
 
 class Killed(BaseException):
@@ -104,45 +97,36 @@ class Killed(BaseException):
 
 
 @pytest.mark.usefixtures("serial")
-@pytest.mark.parametrize("when", ["before", "after"])
-@pytest.mark.parametrize("step", ["storage.save", "os.replace", "Journal.forget"])
-def test_a_kill_at_each_step_of_the_fold_loses_nothing(
-    tmp_path: Path, whole: Design, monkeypatch: pytest.MonkeyPatch, step: str, when: str
+@pytest.mark.parametrize(("when", "calls"), [("before", 5), ("after", 4)])
+def test_a_kill_beside_the_write_of_a_run_costs_this_run_at_most(
+    tmp_path: Path, whole: Design, monkeypatch: pytest.MonkeyPatch, when: str, calls: int
 ) -> None:
-    owner, name = {
-        "storage.save": (storage, "save"),
-        "os.replace": (storage.os, "replace"),
-        "Journal.forget": (Journal, "forget"),
-    }[step]
-    original = getattr(owner, name)
+    add = Store.add
 
-    def dies(*args: object, **options: object) -> None:
-        if when == "after":
-            original(*args, **options)
-        raise Killed
+    def dies(store: Store, computed_from: object, result: object) -> None:
+        third = np.array_equal(computed_from[1], SHORT.theta[2])
+        if when == "after" or not third:
+            add(store, computed_from, result)
+        if third:
+            raise Killed
 
-    path, calls = tmp_path / "design.h5", tmp_path / "calls"
-    calls.mkdir()
-    simulate = partial(unreliable_models.counted, folder=str(calls))
-    first = replace(WAVE, theta=WAVE.theta[:3], held_out=WAVE.held_out[:3])
+    path, made = tmp_path / "a.store", tmp_path / "calls"
+    made.mkdir()
+    simulate = partial(unreliable_models.counted, folder=str(made))
     with monkeypatch.context() as patch:
-        patch.setattr(owner, name, dies)
+        patch.setattr(Store, "add", dies)
         with pytest.raises(Killed):
-            run(path, first, simulate)
-    if path.exists():
-        load_design(path)  # whole at every moment
-    design = run(path, first, simulate)
-    assert_same_rows(design, load_design(path))
-    np.testing.assert_array_equal(design.force_n, whole.force_n[:3])
-    assert len(load_waves(path)) == 1
-    assert len(list(calls.iterdir())) == 3, "no point is run twice"
+            run(path, SHORT, simulate)
+    design = run(path, SHORT, simulate)
+    np.testing.assert_array_equal(design.force_n, whole.force_n[: len(SHORT.theta)])
+    assert len(list(made.iterdir())) == calls
 
 
 def test_a_worker_that_dies_loses_only_its_own_point_which_is_run_again(
     tmp_path: Path, whole: Design
 ) -> None:
     simulate = partial(unreliable_models.deadly, folder=str(tmp_path), deaths=2)
-    design = run(tmp_path / "out" / "design.h5", SHORT, simulate, workers=2)
+    design = run(tmp_path / "out" / "a.store", SHORT, simulate, local(2))
     assert len(list(tmp_path.glob("*.*"))) == 2 * np.sum(SHORT.theta[:, 0] > 3e5) > 0, "workers did die"
     np.testing.assert_array_equal(design.force_n, whole.force_n[: len(SHORT.theta)])
     assert design.ok.all()
@@ -150,7 +134,7 @@ def test_a_worker_that_dies_loses_only_its_own_point_which_is_run_again(
 
 def test_a_point_that_kills_three_workers_is_a_failed_row(tmp_path: Path) -> None:
     simulate = partial(unreliable_models.deadly, folder=str(tmp_path), deaths=99)
-    design = run(tmp_path / "out" / "design.h5", SHORT, simulate)
+    design = run(tmp_path / "out" / "a.store", SHORT, simulate)
     stiff = SHORT.theta[:, 0] > 3e5
     assert stiff.any()
     np.testing.assert_array_equal(design.ok, ~stiff)
@@ -161,7 +145,7 @@ def test_a_point_that_kills_three_workers_is_a_failed_row(tmp_path: Path) -> Non
 
 @pytest.mark.usefixtures("serial")
 def test_failed_runs_are_rows_with_their_message(tmp_path: Path) -> None:
-    path = tmp_path / "design.h5"
+    path = tmp_path / "a.store"
     design = run(path, first_wave(SPACE, 24, 0, seed=1), unreliable_models.failing)
     e_c, e_s = design.theta[:, 0], design.theta[:, 1]
     expected = np.where(
@@ -174,7 +158,6 @@ def test_failed_runs_are_rows_with_their_message(tmp_path: Path) -> None:
     assert np.isnan(design.force_n[~design.ok]).all()
     assert np.isfinite(design.force_n[design.ok]).all()
     assert not (design.training & ~design.ok).any()
-    assert_same_rows(load_design(path), design)
     seen = []
     run(
         path,
@@ -187,40 +170,31 @@ def test_failed_runs_are_rows_with_their_message(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("serial")
 def test_a_longer_wave_runs_only_what_is_new(tmp_path: Path, whole: Design) -> None:
-    path, calls = tmp_path / "design.h5", tmp_path / "calls"
+    path, calls = tmp_path / "a.store", tmp_path / "calls"
     calls.mkdir()
     simulate = partial(unreliable_models.counted, folder=str(calls))
     run(path, SHORT, simulate)
-    repeated = replace(WAVE, theta=np.tile(WAVE.theta, (2, 1)), held_out=np.tile(WAVE.held_out, 2))
-    design = run(path, repeated, simulate)
+    again, held_out = np.concatenate([WAVE.theta, WAVE.theta[:3]]), np.arange(len(WAVE.theta) + 3) > 6
+    design = run(path, replace(WAVE, theta=again, held_out=held_out, number=1), simulate)
     assert len(list(calls.iterdir())) == len(WAVE.theta)
-    np.testing.assert_array_equal(design.theta, WAVE.theta)
-    np.testing.assert_array_equal(design.force_n, whole.force_n[: len(WAVE.theta)])
-
-
-@pytest.mark.usefixtures("serial")
-def test_added_points_are_training_points_of_the_next_wave(whole: Design, tmp_path: Path) -> None:
-    assert whole.wave.tolist() == [0] * len(WAVE.theta) + [1]
-    assert not whole.held_out[-1]
-    path = tmp_path / "design.h5"
-    run(path)
-    add_points(path, whole.theta[-1:], toy_simulate, "most probable point", local(1))
-    again = add_points(path, whole.theta[-1:], toy_simulate, "again", local(1))
-    assert_same_rows(again, whole)
-    assert [w["rule"] for w in load_waves(path)] == [WAVE.record["rule"], "most probable point"]
+    np.testing.assert_array_equal(design.theta, again)
+    np.testing.assert_array_equal(design.force_n, np.concatenate([whole.force_n, whole.force_n[:3]]))
+    np.testing.assert_array_equal(design.held_out, held_out)
+    assert design.wave.tolist() == [1] * len(again)
 
 
 @pytest.mark.usefixtures("serial")
 def test_progress_counts(tmp_path: Path) -> None:
     seen = []
-    run(tmp_path / "design.h5", progress=lambda *now: seen.append(now))
+    run(tmp_path / "a.store", progress=lambda *now: seen.append(now))
     n = len(WAVE.theta)
     assert seen == [(i, n, 0) for i in range(n + 1)]
 
 
 @pytest.mark.usefixtures("serial")
-def test_a_damaged_journal_beside_a_design_is_run_again(tmp_path: Path, whole: Design) -> None:
-    path = tmp_path / "design.h5"
+def test_damaged_runs_of_an_interrupted_design_are_run_again(tmp_path: Path, whole: Design) -> None:
+    path, calls = tmp_path / "a.store", tmp_path / "calls"
+    calls.mkdir()
 
     def interrupted(done: int, *_: object) -> None:
         if done == 5:
@@ -228,77 +202,55 @@ def test_a_damaged_journal_beside_a_design_is_run_again(tmp_path: Path, whole: D
 
     with pytest.raises(KeyboardInterrupt):
         run(path, progress=interrupted)
-    journal = tmp_path / "design.h5.journal"
-    lines = journal.read_bytes().splitlines(keepends=True)
-    assert len(lines) == 5
-    journal.write_bytes(lines[0] + b"\0" * 4096 + lines[2][:-300])
-    design = run(path)
-    np.testing.assert_array_equal(design.force_n, whole.force_n[: len(WAVE.theta)])
-    assert_one_file(path)
+    lines = path.read_bytes().splitlines(keepends=True)
+    assert len(lines) == 1 + 5
+    path.write_bytes(b"".join(lines[:2]) + b"\0" * 4096 + b"".join(lines[3:5]) + lines[5][:-30])
+    design = run(path, simulate=partial(unreliable_models.counted, folder=str(calls)))
+    assert_same_rows(design, whole)
+    assert len(list(calls.iterdir())) == len(WAVE.theta) - 2
 
 
 @pytest.mark.usefixtures("serial")
-def test_what_a_killed_process_was_writing_is_cleared_away(tmp_path: Path) -> None:
-    path = tmp_path / "design.h5"
-    for name in (".design.h5.4711.partial", ".design.h5.journal.partial"):
-        (tmp_path / name).write_bytes(b"half a file")
+def test_runs_of_other_models_bins_and_parameters_are_no_runs_of_this_design(tmp_path: Path) -> None:
+    def fails(theta: Mapping[str, float]) -> Simulation:
+        return replace(toy_simulate(theta), status="failed", message="not the same", model_hash="")
+
+    path = tmp_path / "a.store"
     run(path)
-    assert_one_file(path)
+    with Store(path, "toy") as store:
+        assert run_design(store, WAVE, COARSE_S, fails, "toy", local(1)).ok.all()
+        assert not run_design(store, WAVE, COARSE_S, fails, "another", local(1)).ok.any()
+        assert not run_design(store, WAVE, COARSE_S[:-1], fails, "toy", local(1)).ok.any()
+        first = replace(SPACE.parameters[0], name="E")
+        renamed = replace(WAVE, space=replace(SPACE, parameters=(first, *SPACE.parameters[1:])))
+        assert not run_design(store, renamed, COARSE_S, fails, "toy", local(1)).ok.any()
 
 
 @pytest.mark.usefixtures("serial")
-def test_one_process_at_a_time(tmp_path: Path) -> None:
-    path = tmp_path / "design.h5"
-    held = Journal(tmp_path / "design.h5.journal", "a", bins=3)
-    with pytest.raises(InputError, match="another process"):
-        run(path)
-    assert not path.exists()
-    held.__exit__()
-    run(path)
-
-
-@pytest.mark.usefixtures("serial")
-def test_a_file_of_another_design_is_refused_and_left_alone(tmp_path: Path) -> None:
-    path = tmp_path / "design.h5"
-    run(path, first_wave(SPACE, 2, 0, seed=1))
-    before = path.read_bytes()
-    wider = replace(SPACE.parameters[0], upper=3e6)
-    other = first_wave(replace(SPACE, parameters=(wider, *SPACE.parameters[1:])), 2, 0, seed=1)
-    with pytest.raises(InputError, match="parameters"):
-        run(path, other)
-    with pytest.raises(InputError, match="model"):
-        run_design(path, WAVE, COARSE_S, toy_simulate, "another")
-    with pytest.raises(InputError, match="bins"):
-        run_design(path, WAVE, COARSE_S[:-1], toy_simulate, "toy")
-    outside = replace(WAVE, theta=WAVE.theta * np.array([1, 1, 1, 1e6, 1]))
+def test_a_point_outside_the_box_is_refused_before_any_run(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="row 0"):
-        run(path, outside)
-    assert path.read_bytes() == before
-    assert_one_file(path)
-    path.write_bytes(b"not HDF5")
-    with pytest.raises(InputError):
-        run(path)
-    assert path.read_bytes() == b"not HDF5"
+        run(tmp_path / "a.store", replace(WAVE, theta=WAVE.theta * np.array([1, 1, 1, 1e6, 1])))
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.usefixtures("serial")
 def test_a_simulate_of_another_model_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="model toy"):
-        run_design(tmp_path / "design.h5", WAVE, COARSE_S, toy_simulate, "another")
+    with pytest.raises(InputError, match="model toy"), Store(tmp_path / "a.store", "toy") as store:
+        run_design(store, WAVE, COARSE_S, toy_simulate, "another")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.usefixtures("serial")
 def test_bins_beyond_the_run_are_failures_not_extrapolations(tmp_path: Path) -> None:
     wave = first_wave(SPACE, 1, 0, seed=1)
-    design = run_design(tmp_path / "d.h5", wave, np.linspace(0, 200, 5), toy_simulate, "toy")
+    with Store(tmp_path / "a.store", "toy") as store:
+        design = run_design(store, wave, np.linspace(0, 200, 5), toy_simulate, "toy")
     assert "covers 0..130 s" in design.messages[0]
 
 
 def test_a_design_file_is_an_ordinary_file_of_the_project(tmp_path: Path, whole: Design) -> None:
     storage.save(tmp_path / "copy.h5", whole)
     assert_same_rows(load_design(tmp_path / "copy.h5"), whole)
-    assert load_waves(tmp_path / "copy.h5") == ()
     with pytest.raises(InputError, match="no such file"):
         load_design(tmp_path / "absent.h5")
 
@@ -315,7 +267,7 @@ def test_a_design_file_is_an_ordinary_file_of_the_project(tmp_path: Path, whole:
 def test_a_design_whose_arrays_do_not_belong_together_is_refused(
     serial: None, tmp_path: Path, name: str, value: object, says: str
 ) -> None:
-    made = run(tmp_path / "design.h5")
+    made = run(tmp_path / "a.store")
     storage.save(tmp_path / "other.h5", replace(made, **{name: value}))
     with pytest.raises(InputError, match=says):
         load_design(tmp_path / "other.h5")

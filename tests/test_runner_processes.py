@@ -22,7 +22,7 @@ HERE = Path(__file__).parent
 def test_workers_have_one_thread_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
-    design = run(tmp_path / "design.h5", first_wave(SPACE, 1, 0, seed=1), unreliable_models.threads)
+    design = run(tmp_path / "a.store", first_wave(SPACE, 1, 0, seed=1), unreliable_models.threads)
     assert design.messages == ("1,1,1",)
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert "MKL_NUM_THREADS" not in os.environ
@@ -48,10 +48,11 @@ def test_workers_end_with_their_parent(tmp_path: Path, ending: signal.Signals) -
         "from toys import unreliable_models as models\n"
         "if __name__ == '__main__':\n"
         "    simulate = partial(models.stuck, folder=sys.argv[1])\n"
-        "    models.run_design(sys.argv[2], models.WAVE, models.COARSE_S, simulate, 'toy')\n"
+        "    with models.Store(models.Path(sys.argv[2]), 'toy') as store:\n"
+        "        models.run_design(store, models.WAVE, models.COARSE_S, simulate, 'toy')\n"
     )
     (tmp_path / "program.py").write_text(script)
-    command = [sys.executable, str(tmp_path / "program.py"), str(tmp_path), str(tmp_path / "out" / "d.h5")]
+    command = [sys.executable, str(tmp_path / "program.py"), str(tmp_path), str(tmp_path / "out" / "a.store")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent)])}
     program = subprocess.Popen(
         command, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True,
@@ -79,7 +80,8 @@ def test_workers_that_cannot_start_are_the_users_to_mend(tmp_path: Path) -> None
     script = (
         "from toys.unreliable_models import *\n"
         "def homemade(theta): return toy_simulate(theta)\n"
-        f"run_design({str(tmp_path / 'd.h5')!r}, WAVE, COARSE_S, homemade, 'toy')\n"
+        f"with Store(Path({str(tmp_path / 'a.store')!r}), 'toy') as store:\n"
+        "    run_design(store, WAVE, COARSE_S, homemade, 'toy')\n"
     )
     (tmp_path / "unguarded.py").write_text(script)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent)])}

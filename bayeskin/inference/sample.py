@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from bayeskin.errors import InputError
-from bayeskin.inference import chains as store
+from bayeskin.inference import chains as chain_files
 from bayeskin.inference.convergence import Convergence, Limits, assess
 from bayeskin.inference.ensembles import adapt_proposals, advance_all, ensembles
 from bayeskin.inference.problem import LogPosterior
@@ -82,7 +82,7 @@ def sample(
     _check_settings(settings, log_posterior.dim)
     files = _files(folder, settings.ensembles)
     identity = {**log_posterior.identity, "seed": str(seed), "walkers": str(settings.walkers)}
-    backends = [store.load(f, log_posterior.names, identity) if f.exists() else None for f in files]
+    backends = [chain_files.load(f, log_posterior.names, identity) if f.exists() else None for f in files]
     runs = ensembles(log_posterior, log_posterior.vector(start), seed, settings.walkers, backends)
     convergence: Convergence | None = None
     settled = 0
@@ -93,7 +93,7 @@ def sample(
                     text = f"ensemble {e + 1} of {len(runs)}, step {at} of {goal}"
                     _report_progress(progress, convergence, settings, text)
                 elif runs[e].changed:
-                    store.save(files[e], runs[e].backend, log_posterior.names, identity)
+                    chain_files.save(files[e], runs[e].backend, log_posterior.names, identity)
                     runs[e].changed = False
         chains = np.stack([r.backend.chain[:goal] for r in runs])
         log_prob = np.stack([r.backend.log_prob[:goal] for r in runs])
@@ -117,7 +117,7 @@ def load_chains(folder: Path | str, log_posterior: LogPosterior, ensembles: int)
     another posterior.
     """
     files = _files(folder, ensembles)
-    parts = [store.load(f, log_posterior.names, log_posterior.identity).chain for f in files]
+    parts = [chain_files.load(f, log_posterior.names, log_posterior.identity).chain for f in files]
     steps = min(len(p) for p in parts)
     return log_posterior.from_sampling(np.stack([p[:steps] for p in parts]))
 

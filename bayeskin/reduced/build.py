@@ -65,20 +65,19 @@ class BuildSettings:
 def base_model(
     trained: Trained, full: FullRuns, settings: BuildSettings, run_all: Map, progress: Progress
 ) -> ReducedModel:
-    """Returns the reduced model without mechanisms; makes the full runs that are not in the folder yet.
+    """Returns the reduced model without mechanisms; makes the full runs that are not in the store yet.
 
     Raises InputError where no full run finishes, or where a worker is lost.
     """
     cases = settings.cases(trained, BASE)
     full.make(cases, run_all, progress)
-    spec = ModelSpec(refinement=full.refinement, geometry=trained.geometry)
-    inner = inner_of(problem_of("bricks", full.refinement, trained.geometry))
+    inner = inner_of(problem_of("bricks", full.spec.refinement, full.spec.geometry))
     library = Library(modes_of(weighted_modes_of(full, cases, inner), inner, settings.base), {})
-    teacher = Teacher(full, library, settings, "cubature of the base model")
+    teacher = Teacher(full.spec, library, settings, "cubature of the base model")
     shadows = [trained.case(BASE, index, settings.seed + 1) for index in range(settings.base_shadows)]
     rule = teacher.rule(shadows, settings.base_points, run_all, progress)
     region = replace(trained, mechanisms={})
-    return ReducedModel(region, full.refinement, library, Cubatures(rule, rule), spec.hash)
+    return ReducedModel(region, full.spec.refinement, library, Cubatures(rule, rule), full.spec.hash)
 
 
 def with_mechanisms(
@@ -97,7 +96,7 @@ def with_mechanisms(
         for kind, cases_of_kind in cases.items()
     }
     library = Library(modes_of_base, beyond)
-    teacher = Teacher(full, library, settings, "cubature of mechanism sets")
+    teacher = Teacher(full.spec, library, settings, "cubature of mechanism sets")
     shadows = [trained.case(SETS, index, settings.seed + 1) for index in range(settings.set_shadows)]
     rule = teacher.rule(shadows, settings.set_points, run_all, progress)
     return replace(base, trained=trained, library=library, cubatures=Cubatures(base.cubatures.base, rule))
@@ -110,7 +109,7 @@ def weighted_modes_of(full: FullRuns, cases: Sequence[Case], inner: Inner) -> Mo
     """
     finished = [run for run in map(full.read, cases) if not run.message]
     if not finished:
-        raise InputError(f"{full.folder}", "no full run that finished", "at least one")
+        raise InputError(full.store.path, "no full run that finished", "at least one")
 
     def weighted(name: str, product: sp.csr_matrix) -> Array:
         rows = np.concatenate([getattr(run, name) for run in finished]).astype(float)
@@ -124,14 +123,14 @@ def weighted_modes_of(full: FullRuns, cases: Sequence[Case], inner: Inner) -> Mo
 class Teacher:
     """Trains a cubature on reduced runs that are followed on all points of the mesh.
 
-    full : full runs, whose mesh and geometry are used; label : name of this work in the progress report
+    spec : full model, whose mesh and geometry are used; label : name of this work in the progress report
     known : cubature at whose points the reduced runs are solved, or None for all points
 
     A call takes a case and the number of a random stream for the mixtures, and returns the integrands of the
     case's run. Instances can be pickled, so that worker processes can use them.
     """
 
-    full: FullRuns
+    spec: ModelSpec
     library: Library
     settings: BuildSettings
     label: str
@@ -139,7 +138,7 @@ class Teacher:
 
     def __call__(self, item: tuple[Case, int]) -> Taken:
         case, number = item
-        problem = problem_of("bricks", self.full.refinement, self.full.geometry)
+        problem = problem_of("bricks", self.spec.refinement, self.spec.geometry)
         basis = self.library.basis(tissue_of(case.mechanisms), inner_of(problem))
         rng = np.random.default_rng([self.settings.seed, 2, number])
         return shadowed(problem, basis, case, self.known, self.settings.cubature, rng)
@@ -150,7 +149,7 @@ class Teacher:
         The first runs are solved on all points, the later ones on the points of the cubature trained so far.
         Raises InputError where no reduced run is accurate enough to learn from, or where a worker is lost.
         """
-        problem = problem_of("bricks", self.full.refinement, self.full.geometry)
+        problem = problem_of("bricks", self.spec.refinement, self.spec.geometry)
         at = point_fields(problem, self.library.basis((), inner_of(problem)))
         rows, rule, done = list[Array](), None, 0
         ends = [end for end in ROUNDS if end < len(cases)]

@@ -4,20 +4,20 @@ A set of mechanisms needs many modes over the whole prior, but few over the skin
 plausible. Full runs at and near a point, on the recording's protocol, give these modes. Reduced runs near the
 point train the cubature. The model predicts each further full run before that run is added, which measures
 the error. The model is finished when the error is not above the wanted value; otherwise the run is added.
-All full runs are kept in a folder.
+All full runs are kept in a store.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import scipy.sparse as sp
 
 from bayeskin.errors import InputError
 from bayeskin.execution.local import Map
+from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.mechanisms import catalogue
 from bayeskin.reduced.basis import Inner, pod
 from bayeskin.reduced.build import BuildSettings, Teacher
@@ -28,6 +28,7 @@ from bayeskin.reduced.model import Cubatures, ReducedModel, inner_of
 from bayeskin.reduced.runs import FullRuns, Progress, tissue_of
 from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.reduced.training import TrainingRun
+from bayeskin.store import Store
 from bayeskin.types import Array, PadMotion, ParameterSpace
 
 
@@ -74,18 +75,18 @@ class Enriched:
 
 def enrich(
     model: ReducedModel, theta: Mapping[str, float], mechanisms: Sequence[str], motion: PadMotion,
-    settings: EnrichmentSettings, folder: Path, run_all: Map, progress: Progress,
+    settings: EnrichmentSettings, store: Store, run_all: Map, progress: Progress,
 ) -> Enriched:  # fmt: skip
     """Returns the reduced model of a set of mechanisms around a point, on one protocol.
 
-    folder : where full runs are stored, and read again if they exist already
+    store : an open store, which keeps the full runs
     Raises InputError where no full run finishes.
     """
     rng = np.random.default_rng([settings.seed, 7])
     nearby = _NearbyCases(model, mechanisms, motion, settings.width)
     cases = [nearby.case(theta, None), *(nearby.case(theta, rng) for _ in range(settings.most - 1))]
     shadows = [nearby.case(theta, rng) for _ in range(settings.shadows)]
-    full = FullRuns(model.trained.geometry, model.refinement, folder)
+    full = FullRuns(ModelSpec(refinement=model.refinement, geometry=model.trained.geometry), store)
 
     def full_runs_of(wanted: Sequence[Case]) -> list[TrainingRun]:
         full.make(wanted, run_all, progress)
@@ -95,7 +96,7 @@ def enrich(
     errors: list[float] = []
     while True:
         library = _library(nearby, runs, inner_of(model.problem()), settings)
-        teacher = Teacher(full, library, settings.build, "cubature near the point")
+        teacher = Teacher(full.spec, library, settings.build, "cubature near the point")
         rule = teacher.rule(shadows, settings.points, run_all, progress)
         fitted = replace(
             model, trained=nearby.region(model.trained, theta), library=library,

@@ -6,40 +6,35 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bayeskin.design import Wave
 from bayeskin.forward.design_model import ForceModel
-from bayeskin.hashing import sha256_of
 from bayeskin.runner import run_design
+from bayeskin.store import Store
 from bayeskin.surrogates import Similarity
-from bayeskin.types import Array, Design, PadMotion, ParameterSpace
+from bayeskin.types import Array, Design, PadMotion
 from bayeskin.workflow.engine import CannotGoOn, Run
 from bayeskin.workflow.executor import executor
 
 FEWEST_PER_INPUT = 4  # fewest training runs per input with which a surrogate can be trained
 
 
-def runs_file(run: Run, model: ForceModel, motion: PadMotion, edges_s: Array, space: ParameterSpace) -> Path:
-    """Returns the path of the file with all runs of one model on one protocol."""
-    protocol: dict[str, Any] = {"time_s": motion.time_s, "displacement_m": motion.displacement_m}
-    if motion.spans:
-        protocol["spans"] = motion.spans
-    identity = sha256_of([model.hash, protocol, edges_s, [vars(p) for p in space.without_texts.parameters]])
-    return run.folder / "runs" / f"{identity[:16]}.h5"
+def runs_store(run: Run, model: ForceModel, motion: PadMotion) -> Store:
+    """Returns the store of all runs of one model on one protocol."""
+    return run.store("runs", [model.hash, vars(motion)])
 
 
 def run_wave(
-    run: Run, label: str, runs_file: Path, wave: Wave, edges_s: Array, model: ForceModel, motion: PadMotion
-) -> None:
-    """Runs the points of a wave that are not in the file yet, and stores them there."""
+    run: Run, label: str, wave: Wave, edges_s: Array, model: ForceModel, motion: PadMotion
+) -> Design:
+    """Returns the runs of a wave's points; those that are in the store are not made again."""
     run.reporter.log(f"{label}: {len(wave.theta)} runs")
-    with executor(run) as run_all:
-        run_design(
-            runs_file, wave, edges_s, partial(model, motion), model.hash, run_all, partial(_tell, run, label)
+    with executor(run) as run_all, runs_store(run, model, motion) as store:
+        return run_design(
+            store, wave, edges_s, partial(model, motion), model.hash, run_all, partial(_tell, run, label)
         )
 
 
@@ -48,19 +43,14 @@ def _tell(run: Run, label: str, done: int, total: int, failed: int) -> None:
     run.reporter.progress(label, done / max(total, 1), f"{done} of {total} runs, {failed} failed")
 
 
-def rows_of(runs: Design, waves: Sequence[Wave]) -> Design:
-    """Returns the rows of `runs` at the waves' points, in the order of the waves and with their labels."""
-    row_of = {theta.tobytes(): row for row, theta in enumerate(runs.theta)}
-    points = np.concatenate([wave.theta for wave in waves])
-    rows = np.array([row_of[theta.tobytes()] for theta in points])
-    return replace(
-        runs,
-        theta=points,
-        wave=np.concatenate([np.full(len(wave.theta), wave.number) for wave in waves]),
-        held_out=np.concatenate([wave.held_out for wave in waves]),
-        messages=tuple(runs.messages[row] for row in rows),
-        **{name: getattr(runs, name)[rows] for name in ("force_n", "ok", "seconds")},
-    )
+def joined(designs: Sequence[Design]) -> Design:
+    """Returns the rows of several designs, one design after the other."""
+    rows: dict[str, Any] = {
+        name: np.concatenate([getattr(design, name) for design in designs])
+        for name in ("theta", "force_n", "wave", "held_out", "ok", "seconds")
+    }
+    messages = tuple(message for design in designs for message in design.messages)
+    return replace(designs[0], messages=messages, **rows)
 
 
 def enough(design: Design) -> Design:

@@ -29,7 +29,7 @@ from bayeskin.types import Design, Surrogate
 from bayeskin.workflow import design, recording, training
 from bayeskin.workflow.diagnosis_answer import answer_of
 from bayeskin.workflow.diagnosis_figures import draw
-from bayeskin.workflow.diagnosis_tasks import ContextSource, asked, open_context, searches_file
+from bayeskin.workflow.diagnosis_tasks import ContextSource, asked, depends_on, open_context
 from bayeskin.workflow.diagnosis_text import in_words
 from bayeskin.workflow.engine import CannotGoOn, Reporter, Run, Stage, open_run, run_stages
 from bayeskin.workflow.model import model_spec
@@ -139,7 +139,8 @@ def _work(run: Run) -> Mapping[str, Any]:
     started, source = time.monotonic(), source_of(run)
     context = context_of(run, source)
     learn = partial(_trained_emulator, seed=run.config.seed)
-    with asked(source, context, searches_file(run.folder, context), run.config.design.workers) as ask:
+    store = run.store("answers", depends_on(context))
+    with asked(source, context, store, run.config.design.workers) as ask:
         explanation = explain(context, ask, learn, run.reporter.log)
     if explanation is None:
         raise CannotGoOn("no set of mechanisms could be assessed")

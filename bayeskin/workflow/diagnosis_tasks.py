@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -16,13 +15,13 @@ from bayeskin.execution.local import Lost, standing
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.forward.opened import forward_model
 from bayeskin.hashing import sha256_of
-from bayeskin.json_files import read_lines
 from bayeskin.mismatch.answers import answer, read_answer
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.noise_bounds import NOISE_BOUNDS, without_swings
 from bayeskin.mismatch.tasks import AnswerTasks, Task
 from bayeskin.recordings import analyse, bin_recording, jumps_of
 from bayeskin.recordings.join import join_bins, join_jumps
+from bayeskin.store import Store
 from bayeskin.types import BinnedForce, Jumps, PadMotion, ParameterSpace, Recording
 
 
@@ -93,38 +92,32 @@ def _opened_once(source: ContextSource) -> DiagnosisContext:
 
 @contextmanager
 def asked(
-    source: ContextSource, context: DiagnosisContext, file: Path, workers: int
+    source: ContextSource, context: DiagnosisContext, store: Store, workers: int
 ) -> Iterator[AnswerTasks]:
-    """Yields a function that answers tasks in worker processes, and keeps all answers in a file.
+    """Yields a function that answers tasks in worker processes, and keeps all answers in a store.
 
-    A task whose answer is in the file is not run again. Raises InputError for a file with other contents.
+    A task whose answer is in the store is not run again.
     """
-    kept = {row["task"]: row["answer"] for row in read_lines(file)}
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with standing(_Worker(source), workers) as run_all, open(file, "a", encoding="utf-8") as handle:
+    with standing(_Worker(source), workers) as run_all, store:
 
         def ask(tasks: Sequence[Task]) -> list[object]:
             keys = [sha256_of([type(task).__name__, asdict(task)]) for task in tasks]
-            new = [i for i, key in enumerate(keys) if key not in kept]
+            new = [i for i, key in enumerate(keys) if key not in store]
             for i, result in run_all([tasks[i] for i in new]):
-                plain_answer = {"message": result.reason} if isinstance(result, Lost) else result
-                kept[keys[new[i]]] = plain_answer
-                handle.write(json.dumps({"task": keys[new[i]], "answer": plain_answer}) + "\n")
-                handle.flush()
-            return [read_answer(context, task, kept[key]) for task, key in zip(tasks, keys, strict=True)]
+                store.add(keys[new[i]], {"message": result.reason} if isinstance(result, Lost) else result)
+            return [
+                read_answer(context, task, store.read(key, dict))
+                for task, key in zip(tasks, keys, strict=True)
+            ]
 
         yield ask
 
 
-def searches_file(run_folder: Path, context: DiagnosisContext) -> Path:
-    """Returns the file that keeps the answers to a context's tasks.
-
-    Its name is a hash of everything on which the answers depend.
-    """
-    identity = [
+def depends_on(context: DiagnosisContext) -> list[Any]:
+    """Returns everything on which the answers to a context's tasks depend besides the tasks."""
+    return [
         bayeskin.__version__, context.seed, repr(context.base.without_texts),
         sorted(context.stated_noise.items()), sorted(context.shared),
         context.forward.hash, asdict(context.binned), asdict(context.motion),
         [repr(ParameterSpace(m.parameters).without_texts) for m in context.known.values()],
     ]  # fmt: skip
-    return run_folder / "searches" / f"{sha256_of(identity)[:16]}.jsonl"

@@ -14,6 +14,7 @@ from bayeskin.config.device import DeviceConfig, TissueConfig
 from bayeskin.errors import InputError
 from bayeskin.hashing import sha256_of, sha256_of_input
 from bayeskin.json_files import plain
+from bayeskin.store import Store
 from bayeskin.workflow import folder
 from bayeskin.workflow.folder import Record
 
@@ -56,6 +57,16 @@ class Run:
     def at(self, stage: str, file: str) -> Path:
         """Returns the path of an output of a stage."""
         return self.folder / stage / file
+
+    def store(self, kind: str, computed_from: Any) -> Store:
+        """Returns the store of finished results of a kind that were computed from these values."""
+        file = f"{kind}-{sha256_of(computed_from)[:16]}.store"
+        return Store(self.folder / "finished" / file, computed_from, self.reporter.log)
+
+    def inputs_sha256(self, stage: str) -> str:
+        """Returns the hash of all that a stage depends on, which is recorded when the stage begins."""
+        record = folder.read_record(self.folder / stage)
+        return record.inputs_sha256 if record is not None else ""
 
     def beside(self, file: str) -> Path:
         """Returns the path of a file that the configuration names; raises InputError where there is none."""

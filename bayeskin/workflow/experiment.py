@@ -28,7 +28,7 @@ from bayeskin.mismatch.fit import Fit
 from bayeskin.mismatch.tasks import AnswerTasks
 from bayeskin.workflow import diagnosis
 from bayeskin.workflow.diagnosis import context_of, opened, source_of
-from bayeskin.workflow.diagnosis_tasks import asked, searches_file
+from bayeskin.workflow.diagnosis_tasks import asked, depends_on
 from bayeskin.workflow.engine import Reporter, Run
 from bayeskin.workflow.folder import Record, current_record, locked, output_hashes, read_record, write_record
 from bayeskin.workflow.provenance import caption
@@ -63,7 +63,7 @@ def choose(sources: Sequence[Path], reporter: Reporter, device: Path | None = No
         folder.mkdir(parents=True, exist_ok=True)
         context_source = source_of(run)
         context = context_of(run, context_source)
-        with asked(context_source, context, searches_file(run.folder, context), WORKERS) as ask:
+        with asked(context_source, context, run.store("answers", depends_on(context)), WORKERS) as ask:
             all_fits = [set_fit.fit for set_fit in searched(context, ask, reporter.log).fits.values()]
             fits = compete(all_fits, diagnosed["best_set"], context.known)
             experiments = _judged_protocols(fits, context, ask, reporter) if len(fits) > 1 else []

@@ -14,7 +14,6 @@ from bayeskin import inference, report, storage
 from bayeskin.finite_element.gradients import logarithms
 from bayeskin.finite_element.simulate import simulate
 from bayeskin.forward.joint import on_each_recording
-from bayeskin.hashing import sha256_of
 from bayeskin.inference import MapCheck, RefinedMap
 from bayeskin.types import Array, BinnedForce, PadMotion, Simulation
 from bayeskin.workflow.calibration import log_posterior_of, rmse_table
@@ -40,24 +39,29 @@ class _FullModel:
         return self.spec.formulation.differentiable
 
     def __call__(self, theta: Mapping[str, float]) -> Simulation:
-        """Returns the run at parameters theta, from its file where it was made before."""
-        file = self.run.at("map", f"full-run-{sha256_of([self.spec.hash, dict(theta)])[:16]}.h5")
-        if file.is_file():
-            return storage.load(file, Simulation)
-        values = ", ".join(f"{name} = {value:.4g}" for name, value in theta.items())
-        self.run.reporter.log(f"map: full run at {values}")
+        """Returns the run at parameters theta; of several recordings, each is run on its own protocol."""
         by = logarithms(theta) if self.differentiable else None
-        simulation = on_each_recording(self._simulated, self.motion, theta, by)
-        if simulation.status == "ok":  # the cause of a failed run may be corrected later
-            storage.save(file, simulation)
-        return simulation
+        return on_each_recording(self._simulated, self.motion, theta, by)
 
     def _simulated(
         self, motion: PadMotion, theta: Mapping[str, float], by: Mapping[str, float] | None
     ) -> Simulation:
-        """Returns a run on one protocol, with derivatives by the parameters of `by`."""
-        tell = self.run.reporter.progress
-        return simulate(self.spec, motion, theta, lambda share: tell("full run", share), gradients=by)
+        """Returns a run on one protocol, from the store where it was made before.
+
+        by : the parameters to differentiate by, with their changes
+        """
+        with self.run.store("simulations", [self.spec.hash, vars(motion)]) as store:
+            if theta in store:
+                return store.read(theta, Simulation)
+            tell = self.run.reporter
+            values = ", ".join(f"{name} = {value:.4g}" for name, value in theta.items())
+            tell.log(f"map: full run at {values}")
+            simulation = simulate(
+                self.spec, motion, theta, lambda share: tell.progress("full run", share), gradients=by
+            )
+            if simulation.status == "ok":  # the cause of a failed run may be corrected later
+                store.add(theta, simulation)
+            return simulation
 
 
 def _find_maximum(run: Run) -> Mapping[str, Any]:

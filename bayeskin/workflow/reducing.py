@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from operator import itemgetter
 from pathlib import Path
@@ -17,6 +18,7 @@ from bayeskin.design import default_space
 from bayeskin.errors import InputError
 from bayeskin.execution.cluster import on_scheduler
 from bayeskin.execution.local import Map, local
+from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.geometry import Geometry
 from bayeskin.json_files import plain
 from bayeskin.mechanisms import catalogue
@@ -28,6 +30,7 @@ from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.region import other_geometry
 from bayeskin.reduced.runs import FullRuns
 from bayeskin.shipped import shipped
+from bayeskin.store import Store
 from bayeskin.types import ParameterSpace
 from bayeskin.workflow.engine import Reporter
 from bayeskin.workflow.folder import locked
@@ -60,22 +63,19 @@ def reduce(
     if finished:
         return _answer(path, load_reduced(path), 0.0, "done before, unchanged")
     folder, started = path.with_name(f"{path.stem}-training"), time.perf_counter()
-    settings = BuildSettings()
-    with locked(folder):
-        if scheduler is None:
-            _build(path, trained, settings, folder, local(WORKERS), reporter)
-        else:
-            with on_scheduler(scheduler) as run_all:
-                _build(path, trained, settings, folder, run_all, reporter)
+    executor = nullcontext(local(WORKERS)) if scheduler is None else on_scheduler(scheduler)
+    training_runs = Store(folder / "runs.store", "training runs", reporter.log)
+    with executor as run_all, locked(folder), training_runs as store:
+        _build(path, trained, BuildSettings(), store, run_all, reporter)
     shutil.rmtree(folder)
     return _answer(path, load_reduced(path), time.perf_counter() - started, "built")
 
 
 def _build(
-    path: Path, trained: Trained, settings: BuildSettings, folder: Path, run_all: Map, reporter: Reporter
+    path: Path, trained: Trained, settings: BuildSettings, store: Store, run_all: Map, reporter: Reporter
 ) -> None:
     """Builds the base model and stores it, so that it can be used meanwhile; then builds the whole model."""
-    full = FullRuns(trained.geometry, REFINEMENT, folder)
+    full = FullRuns(ModelSpec(refinement=REFINEMENT, geometry=trained.geometry), store)
 
     def progress(what: str, share: float) -> None:
         """Reports the progress."""

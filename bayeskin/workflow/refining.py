@@ -9,11 +9,10 @@ import numpy as np
 
 from bayeskin import storage
 from bayeskin.design import Wave
-from bayeskin.design_files import load_design
 from bayeskin.forward.design_model import ForceModel
 from bayeskin.surrogates import load_manifest, load_surrogate, manifest_of, save_surrogate
 from bayeskin.types import Array, BinnedForce, Design, PadMotion, Simulation, Surrogate
-from bayeskin.workflow.design_runs import rows_of, run_wave, runs_file
+from bayeskin.workflow.design_runs import joined, run_wave
 from bayeskin.workflow.engine import Run
 from bayeskin.workflow.model import full_model, waves_model
 from bayeskin.workflow.training import corrected, fine_design, trained
@@ -44,10 +43,10 @@ class Refining:
         waves = runs
         if self.fine is not None:
             waves = runs_at(self.run, "coarse model", runs, waves_model(self.run))
-        self.design = _joined(self.design, waves)
+        self.design = _extended(self.design, waves)
         self.surrogate, validation = trained(self.run, self.design, self.binned)
         if self.fine is not None:
-            self.fine = _joined(self.fine, runs)
+            self.fine = _extended(self.fine, runs)
             self.surrogate, validation = corrected(self.run, self.surrogate, self.fine, self.binned)
         self.manifest = {**self.manifest, **manifest_of(self.surrogate, validation)}
         return self.surrogate
@@ -70,9 +69,7 @@ def runs_at(run: Run, label: str, points: Design, model: ForceModel) -> Design:
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     training = np.zeros(len(points.theta), bool)
     wave = Wave(points.space, points.theta, training, 0, run.config.seed, {"rule": label})
-    file = runs_file(run, model, motion, points.edges_s, points.space)
-    run_wave(run, label, file, wave, points.edges_s, model, motion)
-    return rows_of(load_design(file), [wave])
+    return run_wave(run, label, wave, points.edges_s, model, motion)
 
 
 def points_like(design: Design, theta: Array) -> Design:
@@ -93,16 +90,7 @@ def _as_design(like: Design, theta: Mapping[str, float], simulation: Simulation)
     )  # fmt: skip
 
 
-def _joined(design: Design, runs: Design) -> Design:
+def _extended(design: Design, runs: Design) -> Design:
     """Returns the design with further training rows, which form a wave of their own."""
     number = np.full(len(runs.theta), design.wave.max() + 1)
-    return dataclasses.replace(
-        design,
-        theta=np.concatenate([design.theta, runs.theta]),
-        force_n=np.concatenate([design.force_n, runs.force_n]),
-        wave=np.concatenate([design.wave, number]),
-        held_out=np.concatenate([design.held_out, runs.held_out]),
-        ok=np.concatenate([design.ok, runs.ok]),
-        messages=(*design.messages, *runs.messages),
-        seconds=np.concatenate([design.seconds, runs.seconds]),
-    )
+    return joined([design, dataclasses.replace(runs, wave=number)])

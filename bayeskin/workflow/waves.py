@@ -5,29 +5,25 @@ With `design.coarse`, the waves run a quicker model, and the model itself then r
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bayeskin.config import parameter_space
 from bayeskin.design import Wave, fine_wave, first_wave, posterior_wave
-from bayeskin.design_files import load_design
 from bayeskin.errors import InputError
 from bayeskin.forward.design_model import ForceModel, ReducedOrFull
 from bayeskin.forward.joint import EachRecording
 from bayeskin.history_matching import next_wave
 from bayeskin.inference import LogPosterior, SampleSettings, sample
-from bayeskin.json_files import write_json
 from bayeskin.surrogates import Similarity, train
 from bayeskin.surrogates.focus import focus, noise_floor_n
 from bayeskin.types import Array, BinnedForce, Design, PadMotion, ParameterSpace
 from bayeskin.workflow.calibration import log_posterior_of
-from bayeskin.workflow.design_runs import enough, rows_of, run_wave, runs_file
+from bayeskin.workflow.design_runs import enough, joined, run_wave, runs_store
 from bayeskin.workflow.engine import Run
 from bayeskin.workflow.model import check_protocol, full_model, waves_model
 from bayeskin.workflow.recording import fitted_bins
@@ -45,19 +41,15 @@ def run_waves(run: Run, binned: BinnedForce, motion: PadMotion) -> tuple[Design,
     check_protocol(run, motion)
     model, config = waves_model(run), run.config.design
     space = parameter_space(run.config, run.config_path).box  # training covers the box evenly
-    file = runs_file(run, model, motion, binned.edges_s, space)
-    waves: list[Wave] = []
-    if run.config.model.forward is not None and not file.is_file():
+    if run.config.model.forward is not None and not runs_store(run, model, motion).path.is_file():
         _try_forward_model(run, model, motion, space)
+    designs, records = list[Design](), list[Mapping[str, Any]]()
     for number, count in enumerate(config.points):
-        drawn = run.at("design", f"wave-{number}.json")
-        if not drawn.is_file():
-            wave = _choose_wave(run, number, count, space, (binned, motion), waves, file)
-            write_json(drawn, {"theta": wave.theta, "held_out": wave.held_out, "record": wave.record})
-        waves.append(_load_wave(drawn, space, number, run.config.seed))
+        wave = _drawn_wave(run, number, count, space, (binned, motion), designs)
         label = f"wave {number + 1} of {len(config.points)}"
-        run_wave(run, label, file, waves[-1], binned.edges_s, _model_of_wave(model, number), motion)
-    return rows_of(load_design(file), waves), [wave.record for wave in waves]
+        designs.append(run_wave(run, label, wave, binned.edges_s, _model_of_wave(model, number), motion))
+        records.append(wave.record)
+    return joined(designs), records
 
 
 def run_fine(run: Run, design: Design, motion: PadMotion) -> Design:
@@ -71,9 +63,7 @@ def run_fine(run: Run, design: Design, motion: PadMotion) -> Design:
         near = design.held_out | (design.wave == design.wave.max())
         candidates = replace(design, ok=design.ok & near)
     wave = fine_wave(candidates, inputs, config.fine_points, config.fine_held_out, run.config.seed)
-    file = runs_file(run, model, motion, design.edges_s, design.space)
-    run_wave(run, "fine model", file, wave, design.edges_s, model, motion)
-    return rows_of(load_design(file), [wave])
+    return run_wave(run, "fine model", wave, design.edges_s, model, motion)
 
 
 def _model_of_wave(model: ForceModel, number: int) -> ForceModel:
@@ -102,15 +92,23 @@ def _try_forward_model(run: Run, model: ForceModel, motion: PadMotion, space: Pa
         raise InputError(forward, simulation.message, f"a force at {middle}")
 
 
+def _drawn_wave(
+    run: Run, number: int, count: int, space: ParameterSpace, recorded: tuple[BinnedForce, PadMotion],
+    before: Sequence[Design],
+) -> Wave:  # fmt: skip
+    """Returns the points of the next wave, from the store where they were drawn before."""
+    with run.store("waves", run.inputs_sha256("design")) as store:
+        if number not in store:
+            wave = _choose_wave(run, number, count, space, recorded, before)
+            store.add(number, {"theta": wave.theta, "held_out": wave.held_out, "record": wave.record})
+        drawn = store.read(number, dict)
+    return Wave(space, drawn["theta"], drawn["held_out"], number, run.config.seed, drawn["record"])
+
+
 def _choose_wave(
-    run: Run,
-    number: int,
-    count: int,
-    space: ParameterSpace,
-    recorded: tuple[BinnedForce, PadMotion],
-    before: Sequence[Wave],
-    runs_file: Path,
-) -> Wave:
+    run: Run, number: int, count: int, space: ParameterSpace, recorded: tuple[BinnedForce, PadMotion],
+    before: Sequence[Design],
+) -> Wave:  # fmt: skip
     """Returns the points of the next wave.
 
     The first wave covers the whole box. A later wave lies in the plausible part that the surrogate of the
@@ -120,7 +118,7 @@ def _choose_wave(
     config, (binned, motion) = run.config, recorded
     if not before:
         return first_wave(space, count, config.design.held_out, config.seed)
-    design, fitted = enough(rows_of(load_design(runs_file), before)), fitted_bins(run, binned)
+    design, fitted = enough(joined(before)), fitted_bins(run, binned)
     weights = focus(design, binned, fitted)
     surrogate, _ = train(design, config.surrogate.kind, config.seed, weights)
     if config.design.coarse == "reduced" and number >= FIRST_OF_POSTERIOR:
@@ -151,10 +149,3 @@ def _posterior_draws(run: Run, log_posterior: LogPosterior, theta: Array) -> Arr
         threads = run.config.design.workers
         posterior = sample(log_posterior, folder, run.config.seed, start, settings, threads=threads)
     return log_posterior.split(posterior.flat)[0]
-
-
-def _load_wave(path: Path, space: ParameterSpace, number: int, seed: int) -> Wave:
-    """Returns a wave from its file."""
-    stored = json.loads(path.read_text())
-    held_out = np.array(stored["held_out"], dtype=bool)
-    return Wave(space, np.array(stored["theta"], dtype=float), held_out, number, seed, stored["record"])

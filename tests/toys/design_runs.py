@@ -4,23 +4,26 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from toys.closed_form_model import toy_simulate
 from toys.unreliable_models import COARSE_S, WAVE
 
 from bayeskin.design import Wave
-from bayeskin.execution.local import local
+from bayeskin.execution.local import Map, local
 from bayeskin.runner import run_design
+from bayeskin.store import Store
 from bayeskin.types import Design
 
 SHORT = replace(WAVE, theta=WAVE.theta[:4], held_out=WAVE.held_out[:4])
 
 
 def run(
-    path: Path, wave: Wave = WAVE, simulate: object = toy_simulate, workers: int = 1, **options: object
+    path: Path, wave: Wave = WAVE, simulate: object = toy_simulate, run_all: Map | None = None, **options: Any
 ) -> Design:
-    return run_design(path, wave, COARSE_S, simulate, "toy", local(workers), **options)
+    with Store(path, "toy") as store:
+        return run_design(store, wave, COARSE_S, simulate, "toy", run_all or local(1), **options)
 
 
 def assert_same_rows(found: Design, expected: Design) -> None:

@@ -20,15 +20,16 @@ from toys.laboratory_exports import npy, xls
 from bayeskin import storage
 from bayeskin.config import load_config
 from bayeskin.config.device import load_device
-from bayeskin.design_files import load_waves
+from bayeskin.design_files import load_design
 from bayeskin.errors import InputError
 from bayeskin.external.umbridge import Refused, parsed_answer
 from bayeskin.finite_element.gmsh import read_gmsh
 from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.geometry import Geometry
 from bayeskin.inference import chains, draws_of, load_inference_data, save_inference_data
-from bayeskin.journal import Journal, Run
 from bayeskin.recordings import phase_noise, read_recording, segment
+from bayeskin.runner import FinishedRun
+from bayeskin.store import Store
 from bayeskin.surrogates import load_manifest, manifest_of, save_surrogate, train
 from bayeskin.types import Design, Recording
 from bayeskin.workflow import folder
@@ -88,12 +89,11 @@ def as_mesh() -> bytes:
     return gmsh_text(coarse_tetrahedra(FLAT)).encode()
 
 
-def as_journal(tmp: Path) -> bytes:
-    with Journal(tmp / "j", "same", 3) as journal:
+def as_store(tmp: Path) -> bytes:
+    with Store(tmp / "a.store", "same") as store:
         for n in range(4):
-            journal.append(Run(np.full(5, float(n)), np.arange(3.0), n != 2, "why", 0.5))
-        found = (tmp / "j").read_bytes()
-    return found
+            store.add(n, FinishedRun(np.arange(3.0), n != 2, "why", 0.5))
+    return (tmp / "a.store").read_bytes()
 
 
 def as_hdf5(tmp: Path) -> bytes:
@@ -106,9 +106,9 @@ def read_and_segment(path: Path) -> object:
     return phase_noise(recording, segment(recording))
 
 
-def read_journal(path: Path) -> object:
-    with Journal(path, "same", 3) as journal:
-        return journal.runs
+def read_store(path: Path) -> object:
+    with Store(path, "same") as store:
+        return [store.read(n, FinishedRun) for n in range(4) if n in store]
 
 
 def read_stage(path: Path) -> object:
@@ -161,7 +161,7 @@ READERS: dict[str, tuple[Callable[[Path], object], Callable[[Path], bytes], int]
     "a.toml": (load_config, lambda tmp: (ROOT / "runs/demo.toml").read_bytes(), 10),
     "device.toml": (load_device, lambda tmp: DEVICE, 10),
     "a.msh": (lambda path: read_gmsh(path, FLAT), lambda tmp: as_mesh(), 4),
-    "a.journal": (read_journal, as_journal, 10),
+    "a.store": (read_store, as_store, 10),
     "stage.json": (read_stage, lambda tmp: json.dumps(STAGE).encode(), 10),
     "answer.json": (read_answer, lambda tmp: b'{"output": [[1.0, 2.0]], "inputSizes": [5]}', 10),
     "request.json": (read_request, lambda tmp: json.dumps(REQUEST).encode(), 10),
@@ -210,7 +210,7 @@ def as_chain(path: Path) -> None:
 # name of the file, how a sound one is made, how it is read, examples a run: of altered contents, of bytes
 HDF5: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], int, int]] = {
     "surrogate.h5": (as_surrogate, load_manifest, 40, 2),
-    "design.h5": (lambda path: storage.save(path, a_design(), {"waves": "[{}]"}), load_waves, 40, 2),
+    "design.h5": (lambda path: storage.save(path, a_design()), load_design, 40, 2),
     "posterior.nc": (as_posterior, lambda path: draws_of(load_inference_data(path)), 10, 2),
     "chain.h5": (as_chain, lambda path: chains.load(path, ("a", "b"), HERE), 40, 0),  # a run's own
 }

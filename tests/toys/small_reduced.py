@@ -20,6 +20,7 @@ from bayeskin.reduced.library import Library, Modes
 from bayeskin.reduced.model import Cubatures, ReducedModel
 from bayeskin.reduced.operators import Rule
 from bayeskin.reduced.runs import FullRuns
+from bayeskin.store import Store
 from bayeskin.types import ParameterSpace
 
 NAMES = ("preconditioning", "solid-viscoelasticity")
@@ -52,11 +53,12 @@ def trained() -> Trained:
     return Trained(Geometry(), ParameterSpace(base), spaces, Protocols(holds_s=(2.0, 60.0)))
 
 
-def built(folder: Path) -> ReducedModel:
-    """The reduced model, from full runs in a folder."""
-    full = FullRuns(Geometry(), 0, folder)
-    base = base_model(trained(), full, SETTINGS, one_by_one, unheard)
-    return with_mechanisms(base, trained(), full, SETTINGS, one_by_one, unheard)
+def built(path: Path) -> ReducedModel:
+    """The reduced model, from full runs that are kept in a store."""
+    with Store(path, "training runs") as store:
+        full = FullRuns(ModelSpec(refinement=0), store)
+        base = base_model(trained(), full, SETTINGS, one_by_one, unheard)
+        return with_mechanisms(base, trained(), full, SETTINGS, one_by_one, unheard)
 
 
 def unheard(what: str, share: float) -> None:

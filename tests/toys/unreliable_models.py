@@ -14,10 +14,12 @@ from pathlib import Path
 import numpy as np
 from toys.closed_form_model import EDGES_S, SPACE, toy_simulate
 
+from bayeskin import storage
 from bayeskin.design import Wave
 from bayeskin.execution.local import local
-from bayeskin.runner import add_points, run_design
-from bayeskin.types import Simulation
+from bayeskin.runner import run_design
+from bayeskin.store import Store
+from bayeskin.types import Design, Simulation
 
 COARSE_S = EDGES_S[::10]
 WAVE = Wave(  # random, not Sobol': each worker imports this file, and SciPy's qmc takes a second
@@ -83,11 +85,12 @@ def threads(theta: Mapping[str, float]) -> Simulation:
     return replace(toy_simulate(theta), status="failed", message=settings)
 
 
-def main(path: str, workers: int, seconds: float) -> None:
-    """Runs a wave and one added point; safe to kill at any moment and to start again."""
-    simulate = partial(slow, seconds=seconds)
-    run_design(path, WAVE, COARSE_S, simulate, "toy", local(workers))
-    add_points(path, SPACE.from_unit(np.full((1, 5), 0.5)), simulate, "most probable point", local(workers))
+def main(path: str, workers: int, seconds: float) -> Design:
+    """Runs a wave in a store beside a file, and saves it there; may be killed and started again."""
+    with Store(Path(path).with_suffix(".store"), "toy") as store:
+        design = run_design(store, WAVE, COARSE_S, partial(slow, seconds=seconds), "toy", local(workers))
+    storage.save(path, design)
+    return design
 
 
 if __name__ == "__main__":

@@ -7,6 +7,12 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
+
+from bayeskin.store import Store
+
+ADDED = 50
+
 
 def met(folder: str) -> int:
     """Returns the process's id when two processes are in the folder."""
@@ -42,3 +48,12 @@ def counted(item: int) -> tuple[int, ...]:
     """All items that this process has had."""
     kept.append(item)
     return tuple(kept)
+
+
+def added(path: str) -> int:
+    """Adds results to a store while another process does the same, and returns this process's id."""
+    with Store(Path(path), "shared") as store:
+        met(str(Path(path).parent))
+        for n in range(ADDED):
+            store.add([os.getpid(), n], {"force_n": np.full(3000, n)})
+    return os.getpid()
