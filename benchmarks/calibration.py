@@ -229,7 +229,7 @@ def _draw_ranks(ax: Axes, ranks: Array) -> None:
     edges = np.linspace(0, DRAWS + 1, 11).round()
     low, high = (binom.ppf(q, len(ranks), 0.1) for q in (0.005, 0.995))
     ax.axhspan(low, high, color=GREY, alpha=0.25, lw=0)
-    ax.hist(ranks, edges - 0.5, color=MODEL)
+    ax.hist(ranks, list(edges - 0.5), color=MODEL)
     ax.set(xlim=(-0.5, DRAWS + 0.5), ylim=(0, 1.15 * max(high, ax.get_ylim()[1])), xlabel="rank")
 
 

@@ -297,11 +297,11 @@ def main() -> None:
     print(block)
     rows.into_docs(args.docs / "discretisation.md", "study", block)
     cells = {r.run.mesh: int(r.row["cells"]) for r in results if r.force}
-    at_c = [r for r in results if r.run.point == "C" and r.force and r.run.protocol != LOADING]
+    at_c = [r for r in results if r.run.point == "C" and r.run.protocol != LOADING]
     figure = figure_discretisation(
         {(cells[m], m, p): e.rms for (m, p), e in space_errors(results).items() if m != SPACE_REFERENCE},
         {name: {key: e.rms for key, e in errors.items()} for name, errors in times.items()},
-        [(r.run.mesh, r.force, r.face_stress) for r in at_c],
+        [(r.run.mesh, r.force, r.face_stress) for r in at_c if r.force and r.face_stress],
         args.time_target,
     )
     save_figure(figure, args.docs / "figures" / "discretisation", "benchmarks/discretisation_study.py")

@@ -92,9 +92,10 @@ class TimedFactorisations:
     """Wraps factorisations so that a clock counts their stages; keeps the last matrix."""
 
     def __init__(self, inner: Factorisations, clock: Clock) -> None:
-        self.inner, self.last = inner, None
-        self.first = clock.timed("analysis", inner.factorise)
-        self.later = clock.timed("factorisation", inner.factorise)
+        self.inner = inner
+        self.next, self.later = (
+            clock.timed(stage, inner.factorise) for stage in ("analysis", "factorisation")
+        )
         self.solve, self.release = clock.timed("solve", inner.solve), inner.release
 
     @property
@@ -102,8 +103,8 @@ class TimedFactorisations:
         return self.inner.room
 
     def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None:
-        (self.later if self.last else self.first)(number, matrix, scale)
-        self.last = matrix, scale
+        self.next(number, matrix, scale)
+        self.next, self.last = self.later, (matrix, scale)
 
 
 @contextmanager

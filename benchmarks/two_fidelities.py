@@ -67,7 +67,7 @@ def sampled(case: str) -> tuple[dict[str, Array], str]:
     path.write_text(CASES[case])
     rows.say(f"{case}:")
     answer = stages.run(path, "sample", Teller())
-    posterior = load_inference_data(FOLDER / case / "sample" / "posterior.nc").posterior
+    posterior = load_inference_data(FOLDER / case / "sample" / "posterior.nc")["posterior"]
     draws = {name: np.ravel(posterior[name].to_numpy()) for name in QUANTITIES[1:]}
     draws["stiffness"] = PEAK_N_PER_PA[0] * draws["E_c"] + PEAK_N_PER_PA[1] * draws["E_s"]
     design = json.loads((FOLDER / case / "design" / "stage.json").read_text())["summary"]
@@ -114,7 +114,8 @@ def figure(draws: dict[str, dict[str, Array]]) -> Figure:
     axes = drawn.subplots(1, 3)
     for ax, name, letter, unit in zip(axes, QUANTITIES, "abc", ("N", "Pa", "Pa"), strict=False):
         everything = np.concatenate([draws[case][name] for case in CASES])
-        edges = np.linspace(*np.quantile(everything, [0.001, 0.999]), 61)
+        low, high = np.quantile(everything, [0.001, 0.999])
+        edges = np.linspace(low, high, 61)
         for case, colour in COLOURS.items():
             density = np.histogram(draws[case][name], edges, density=True)[0]
             ax.stairs(density, edges, color=colour, label=case, lw=1.0)
