@@ -220,7 +220,7 @@ def verdict(
     The tolerance is chosen on the first protocol of `times` and tested on the second.
     """
     sentences = []
-    (chosen_on, chosen_from), (tested_on, tested) = list(times.items()) or [("", {})] * 2
+    (chosen_on, chosen_from), (tested_on, tested) = times.items()
     tolerance = choose(chosen_from, time_target)
     if tolerance is not None:
         worst_rms = max((e.rms for (t, _), e in tested.items() if t == tolerance), default=np.nan)
@@ -239,7 +239,7 @@ def verdict(
             f"{100 * default_rms[1]:.3f} % on these protocols. Looser tolerances take as many steps, because "
             f"no phase has fewer than {STEPS_PER_PHASE}."
         )
-    elif times:
+    else:
         sentences.append(
             f"Tolerance: no tested value has an RMS error below {100 * time_target:g} % of the peak."
         )
