@@ -105,12 +105,13 @@ def cost_of(preset: Preset, time_s: Array, target_n: Array, force_of: Callable[[
 
 def search(cost: Cost, lower: Array, upper: Array, seed: int, evaluations: int = EVALUATIONS) -> Array:
     """Returns the end point (4,) of the article's optimiser in SI units."""
-    best = [np.inf, START]
+    best: tuple[float, Array] = (np.inf, START)
 
     def scaled(x: Array, _: Array) -> float:
+        nonlocal best
         value = cost(x * START)
         if value < best[0]:
-            best[:] = [value, x * START]
+            best = (value, x * START)
         return value
 
     nlopt.srand(seed)
@@ -121,7 +122,7 @@ def search(cost: Cost, lower: Array, upper: Array, seed: int, evaluations: int =
     optimiser.set_maxeval(evaluations)
     optimiser.set_min_objective(scaled)
     optimiser.optimize(np.clip(START, lower, upper) / START)
-    return np.asarray(best[1])
+    return best[1]
 
 
 def least(cost: Cost, lower: Array, upper: Array) -> Array:
@@ -169,15 +170,17 @@ def line(label: str, theta: Array, cost_n: float, spread: str = "") -> list[str]
     return [label, *(f"{value:.3g}" for value in theta), f"{1e3 * cost_n:.2f}", spread]
 
 
-def report(name: str, cost: Cost, lower: Array, upper: Array, searches: int) -> tuple[list[list[str]], Array]:
+def report(
+    name: str, cost: Cost, bounds: tuple[Array, Array], searches: int
+) -> tuple[list[list[str]], Array]:
     """Returns the table's rows of one preset, and the end point (4,) of its best search."""
-    end_points = [search(cost, lower, upper, seed) for seed in range(1, searches + 1)]
+    end_points = [search(cost, *bounds, seed) for seed in range(1, searches + 1)]
     costs = np.array([cost(theta) for theta in end_points])
     best = end_points[int(np.argmin(costs))]
     spread = f"median {1e3 * np.median(costs):.2f}, worst {1e3 * costs.max():.2f} of {searches} seeds"
     lines = [line(f"{name}: best of the article's searches", best, costs.min(), spread)]
     if searches > 1:
-        optimum = least(cost, lower, upper)
+        optimum = least(cost, *bounds)
         lines.append(line(f"{name}: lowest cost in the same bounds", optimum, cost(optimum)))
     return lines, best
 
@@ -212,7 +215,7 @@ def main() -> int:
         cost = cost_of(preset, time_s, target_n, by_model if options.full else by_surrogate)
         table.append(line(f"{name}: the article's point", FOUND, cost(FOUND)))
         bounds = (np.array(preset.lower), np.array(preset.upper)) if options.full else preset.within(box)
-        lines, best = report(name, cost, *bounds, searches=1 if options.full else options.seeds)
+        lines, best = report(name, cost, bounds, searches=1 if options.full else options.seeds)
         table += lines
         if options.check:
             full_cost = cost_of(preset, time_s, target_n, by_model)

@@ -229,7 +229,7 @@ def _draw_ranks(ax: Axes, ranks: Array) -> None:
     edges = np.linspace(0, DRAWS + 1, 11).round()
     low, high = (binom.ppf(q, len(ranks), 0.1) for q in (0.005, 0.995))
     ax.axhspan(low, high, color=GREY, alpha=0.25, lw=0)
-    ax.hist(ranks, edges - 0.5, color=MODEL)
+    ax.hist(ranks, list(edges - 0.5), color=MODEL)
     ax.set(xlim=(-0.5, DRAWS + 0.5), ylim=(0, 1.15 * max(high, ax.get_ylim()[1])), xlabel="rank")
 
 
@@ -241,30 +241,25 @@ def main() -> None:
     parser.add_argument("--data", choices=("surrogate", "full"), default="surrogate")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--results", type=Path, default=rows.RESULTS)
-    parser.add_argument("--figures", type=Path, default=FIGURES)
     options = parser.parse_args()
-    store = replace(ROWS, path=options.results / ROWS.path.name)
     inputs = {"surrogate": surrogate_hash(), "data": options.data, "seed": options.seed}
     items = [{**inputs, "index": index} for index in range(options.n)]
-    stored_rows = {store.key_of(row): row for row in store.read()}
-    todo = [item for item in items if store.key_of(item) not in stored_rows]
+    stored_rows = {ROWS.key_of(row): row for row in ROWS.read()}
+    todo = [item for item in items if ROWS.key_of(item) not in stored_rows]
     rows.say(f"{len(items) - len(todo)} of {len(items)} are finished already")
     for done, (i, result) in enumerate(run_parallel(perform, todo, options.workers), start=1):
         if isinstance(result, Lost | str):
             rows.say(f"{todo[i]['index']} failed: {result.reason if isinstance(result, Lost) else result}")
             continue
-        stored_rows[store.key_of(result)] = store.append(**result)
+        stored_rows[ROWS.key_of(result)] = ROWS.append(**result)
         rows.say(f"{done} of {len(todo)}: {float(result['cpu_s']):.1f} CPU s, {result['steps']} steps")
-    recordings = [stored_rows[store.key_of(item)] for item in items if store.key_of(item) in stored_rows]
+    recordings = [stored_rows[ROWS.key_of(item)] for item in items if ROWS.key_of(item) in stored_rows]
     rows.warn_of_mixed_code(recordings)
     failed = sum(row["trusted"] != "True" for row in recordings)
     print(f"{options.data}, seed {options.seed}: {len(recordings)} recordings, {failed} chains not trusted\n")
     print(table(recordings))
     stem = "calibration" if options.data == "surrogate" else "calibration-full"
-    save_figure(
-        figure_calibration(recordings, options.data), options.figures / stem, "benchmarks/calibration.py"
-    )
+    save_figure(figure_calibration(recordings, options.data), FIGURES / stem, "benchmarks/calibration.py")
 
 
 if __name__ == "__main__":

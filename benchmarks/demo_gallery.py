@@ -36,7 +36,7 @@ def smaller(path: Path, target: Path) -> None:
     with Image.open(path) as image:
         texts = PngInfo()
         for key, text in image.info.items():
-            if isinstance(text, str):
+            if isinstance(key, str) and isinstance(text, str):
                 texts.add_text(key, text)
         colours = image.convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE)
         colours.save(target, optimize=True, pnginfo=texts, dpi=image.info["dpi"])

@@ -5,10 +5,9 @@
 The verdicts stored beside these recordings are by a former version, which learnt the effects of mechanisms
 separately. In the present version the reduced model solves all mechanisms of a set together. Verdict and
 values of each recording are kept in `benchmarks/results/diagnosis_scoreboard.jsonl`, with the commit of the
-sources, so that a second start continues from there. `--part 1/2` takes every second recording, for two
-processes side by side. The verdicts are derived from the stored log-evidences by the present rule. Some
-effects were outside the catalogue when a set was made, and have joined it since. Here they count as
-mechanisms of the catalogue; for the stored verdicts they count as outside.
+sources, so that a second start continues from there. The verdicts are derived from the stored log-evidences
+by the present rule. Some effects were outside the catalogue when a set was made, and have joined it since.
+Here they count as mechanisms of the catalogue; for the stored verdicts they count as outside.
 
 The program prints a row for each recording. It has what is concealed and its size (in noise floors), what is
 named, the probability that nothing is missing, and how many of the skin's and the effect's parameters lie in
@@ -281,13 +280,11 @@ def _share(board: Mapping[str, Any], path: tuple[str, ...]) -> str:
     return f"{share['hits']} of {share['of']} ({share['low']:.2f} to {share['high']:.2f})"
 
 
-def cases_of(sets: list[str], part: str) -> list[str]:
-    """Returns the recordings of some sets; for "k/n" every n-th of them, from the k-th on."""
-    number, count = (int(digits) for digits in part.split("/"))
-    cases = [
+def cases_of(sets: list[str]) -> list[str]:
+    """Returns the recordings of some sets."""
+    return [
         f"{name}/{path.stem}" for name in sets for path in sorted((DATA / name / "recordings").glob("*.h5"))
     ]
-    return cases[number - 1 :: count]
 
 
 def main() -> None:
@@ -299,13 +296,12 @@ def main() -> None:
     parser.add_argument(
         "--sets", nargs="+", default=["development"], help="sets whose recordings are diagnosed"
     )
-    parser.add_argument("--part", default="1/1", help="k/n: every n-th recording, from the k-th on")
     parser.add_argument("--workers", type=int, default=2, help="number of processes of a diagnosis")
     parser.add_argument("--kept", action="store_true", help="use only stored answers, diagnose nothing")
     parser.add_argument("cases", nargs="*", help="recordings such as development/009, instead of whole sets")
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
-    cases = options.cases or cases_of(options.sets, options.part)
+    cases = options.cases or cases_of(options.sets)
     if options.kept:
         stored_answers = kept()
         cases = [case for case in cases if case in stored_answers]

@@ -62,7 +62,8 @@ def _finding(histories: Sequence[tuple[str, Simulation, Simulation]]) -> str:
     if len(histories) < 2:
         return "Error of the discretisation"
     reaction, stress = (
-        [float(h[i].at([PEAK_S])[0]) for h in histories if h[i].time_s[-1] >= PEAK_S] for i in (1, 2)
+        [float(history.at([PEAK_S])[0]) for history in column if history.time_s[-1] >= PEAK_S]
+        for column in ([force for _, force, _ in histories], [stress for _, _, stress in histories])
     )
     return (
         f"At the first peak the reaction varies by {100 * (max(reaction) / min(reaction) - 1):.1f} % over "

@@ -12,7 +12,6 @@ docs/discretisation.md.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import healthy_skin
@@ -29,7 +28,7 @@ REFERENCE = 2
 SKINS = ("A", "C")
 CORNERS_S = (0.0, 9.4, 20.0, 29.4)
 EXTENSION = 9.45e-3 / Geometry().gauge_m  # as a share of the gauge, as in the healthy-skin recording
-DOCS = Path(__file__).parents[1] / "docs"
+PAGE = Path(__file__).parents[1] / "docs" / "discretisation.md"
 GEOMETRIES = {
     "the article's": Geometry(),
     "the article's device, force on pad and guard": Geometry(force_on="pad and guard"),
@@ -77,17 +76,12 @@ def _error_text(found: Error) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder that holds discretisation.md")
-    options = parser.parse_args()
     header = ["device [mm]"]
     for kind in ("default", "coarsest"):
         header += [f"{kind} bricks", *(f"{skin}: RMS error, after best factor [% of peak]" for skin in SKINS)]
     block = rows.markdown(header, [line(*device) for device in GEOMETRIES.items()])
     print(block)
-    rows.into_docs(options.docs / "discretisation.md", "geometries", block)
+    rows.into_docs(PAGE, "geometries", block)
 
 
 if __name__ == "__main__":

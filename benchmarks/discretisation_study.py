@@ -18,16 +18,15 @@ peak of the reference.
 
     OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 python benchmarks/discretisation_study.py
 
-`--first-cycle` takes only the first cycle of every protocol. A study that was stopped continues where it
-ended: finished runs are rows of benchmarks/results/discretisation.csv, and their histories are stored beside
-it. The study writes the tables between the markers of docs/discretisation.md, and draws
-docs/figures/discretisation.{png,svg}. It also writes the meshes' errors into
-bayeskin/finite_element/discretisation.json, from which `bayeskin simulate` reports them.
+A study that was stopped continues where it ended: finished runs are rows of
+benchmarks/results/discretisation.csv, and their histories are stored beside it. The study writes the tables
+between the markers of docs/discretisation.md, and draws docs/figures/discretisation.{png,svg}. It also writes
+the meshes' errors into bayeskin/finite_element/discretisation.json, from which `bayeskin simulate` reports
+them.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from contextlib import ExitStack
@@ -69,6 +68,8 @@ from bayeskin.types import Array, PadMotion, Recording, Simulation
 
 TOLERANCES = (3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5)
 TIME_REFERENCE, TIME_CHECK = 1e-6, 1e-5
+TIME_TARGET, MESH_TARGET = 5e-4, 0.005  # required RMS errors over the peak
+POINTS, CYCLE = list(healthy_skin.POINTS), "healthy, first cycle"
 SETTINGS = {
     "as run": {},
     "reference": {
@@ -106,22 +107,25 @@ def demo_motion() -> PadMotion:
 
 
 def motions() -> dict[str, PadMotion]:
-    """Returns all protocols of the study by their names: whole, first cycle only, and first loading only."""
-    whole = {"healthy": healthy_skin.HEALTHY_SKIN, "demo": demo_motion()}
-    cycles = {f"{name}, first cycle": healthy_skin.first_cycle(motion) for name, motion in whole.items()}
-    loading = PadMotion(np.array([0.0, 9.4]), np.array([0.0, 9.45e-3]))
-    return whole | cycles | {LOADING: loading}
+    """Returns all protocols of the study by their names."""
+    healthy = healthy_skin.HEALTHY_SKIN
+    return {
+        "demo": demo_motion(),
+        "healthy": healthy,
+        CYCLE: healthy_skin.first_cycle(healthy),
+        LOADING: PadMotion(np.array([0.0, 9.4]), np.array([0.0, 9.45e-3])),
+    }
 
 
-def perform(run: Run, table: rows.Rows) -> Result:
+def perform(run: Run) -> Result:
     """Returns the result of a run; simulates the run where the table or its histories lack it."""
     try:
         with healthy_skin.spec_on(run.mesh, run.tolerance) as spec:
             inputs = vars(run) | {"model_hash": spec.hash}
-            stem = table.path.parent / "discretisation" / rows.digest(inputs)
-            row = table.find(**inputs)
+            stem = ROWS.path.with_suffix("") / rows.digest(inputs)
+            row = ROWS.find(**inputs)
             if row is None or (row["status"] == "ok" and not stem.with_suffix(".stress.h5").is_file()):
-                row = _simulate(run, spec, table, stem)
+                row = _simulate(run, spec, stem)
     except InputError as error:  # the mesh does not exist or cannot be read
         return Result(run, {"status": "not run", "message": str(error)})
     if row["status"] != "ok":
@@ -130,7 +134,7 @@ def perform(run: Run, table: rows.Rows) -> Result:
     return Result(run, row, *histories)
 
 
-def _simulate(run: Run, spec: ModelSpec, table: rows.Rows, stem: Path) -> rows.Row:
+def _simulate(run: Run, spec: ModelSpec, stem: Path) -> rows.Row:
     """Simulates a run, saves its histories beside the table, and appends its row."""
     rows.say(f"{run.protocol}, point {run.point}, {run.mesh}, tolerance {run.tolerance:g}, {run.settings}")
     theta, problem = healthy_skin.POINTS[run.point], problem_of(spec.mesh, spec.refinement)
@@ -147,7 +151,7 @@ def _simulate(run: Run, spec: ModelSpec, table: rows.Rows, stem: Path) -> rows.R
         seconds = time.process_time() - started
     storage.save(stem.with_suffix(".force.h5"), simulation)
     storage.save(stem.with_suffix(".stress.h5"), replace(simulation, force_n=np.array(stress)))
-    return table.append(
+    return ROWS.append(
         **vars(run),
         model_hash=spec.hash,
         status=simulation.status,
@@ -191,46 +195,37 @@ class FaceStress:
         return float(np.sum((stress - np.asarray(self._p.interpolate(x[self._n :]))) * self._u.dx))
 
 
-def time_study(
-    asked: argparse.Namespace, table: rows.Rows
-) -> tuple[dict[str, dict[tuple[float, str], Error]], dict[str, dict[str, Error]]]:
+def time_study() -> tuple[dict[str, dict[tuple[float, str], Error]], dict[str, dict[str, Error]]]:
     """Returns the errors by protocol, then by tolerance and point; and the errors of the reference itself.
 
     The latter are by protocol and point. They compare the reference with a run of ten times its tolerance.
     """
-    suffix = ", first cycle" if asked.first_cycle else ""
-    names = ("demo" + suffix, "healthy" + suffix)
+    names = ("demo", "healthy")
     errors: dict[str, dict[tuple[float, str], Error]] = {name: {} for name in names}
     reference_errors: dict[str, dict[str, Error]] = {name: {} for name in names}
-    for name, point in product(names, asked.points):
+    for name, point in product(names, POINTS):
         reference, check = (
-            perform(Run(name, point, tolerance=t, settings="reference"), table)
-            for t in (TIME_REFERENCE, TIME_CHECK)
+            perform(Run(name, point, tolerance=t, settings="reference")) for t in (TIME_REFERENCE, TIME_CHECK)
         )
         if not (reference.force and check.force):
             rows.say(f"no reference: {reference.row['message'] or check.row['message']}")
             continue
         reference_errors[name][point] = error(check.force, reference.force)
-        for tolerance in asked.tolerances:
-            result = perform(Run(name, point, tolerance=tolerance), table)
+        for tolerance in TOLERANCES:
+            result = perform(Run(name, point, tolerance=tolerance))
             if result.force:
                 errors[name][tolerance, point] = error(result.force, reference.force)
     return errors, reference_errors
 
 
-def space_study(asked: argparse.Namespace, table: rows.Rows) -> list[Result]:
+def space_study() -> list[Result]:
     """Returns the results of all runs in space, including those of the reference; cheap runs come first."""
-    cycle = "healthy, first cycle"
-    whole_or_cycle = cycle if asked.first_cycle else "healthy"
-    runs = [Run(whole_or_cycle, point, mesh) for mesh in WHOLE_MESHES for point in asked.points]
-    runs += [Run(cycle, point, mesh) for mesh in (*CYCLE_MESHES, SPACE_REFERENCE) for point in asked.points]
+    runs = [Run("healthy", point, mesh) for mesh in WHOLE_MESHES for point in POINTS]
+    runs += [Run(CYCLE, point, mesh) for mesh in (*CYCLE_MESHES, SPACE_REFERENCE) for point in POINTS]
     loading_meshes = ("bricks-1", "bricks-1-halved", "bricks-2", SPACE_REFERENCE, *LOADING_MESHES)
-    runs += [Run(LOADING, "C", mesh) for mesh in loading_meshes if "C" in asked.points]
+    runs += [Run(LOADING, "C", mesh) for mesh in loading_meshes]
     supplement = healthy_skin.supplement_mesh("") is not None
-    kept = [
-        r for r in runs if r.mesh in asked.meshes and (supplement or r.mesh not in healthy_skin.GMSH_MESHES)
-    ]
-    return [perform(run, table) for run in kept]
+    return [perform(run) for run in runs if supplement or run.mesh not in healthy_skin.GMSH_MESHES]
 
 
 def write_mesh_errors(errors: dict[str, dict[str, float]]) -> None:
@@ -244,67 +239,33 @@ def write_mesh_errors(errors: dict[str, dict[str, float]]) -> None:
     path.write_text(json.dumps(by_hash, indent=2) + "\n")
 
 
-def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    all_meshes = (*WHOLE_MESHES, *CYCLE_MESHES, SPACE_REFERENCE, *LOADING_MESHES)
-    parser.add_argument(
-        "--first-cycle", action="store_true", help="use only the first cycle of every protocol"
-    )
-    parser.add_argument("--points", nargs="+", default=list(healthy_skin.POINTS), choices=healthy_skin.POINTS)
-    parser.add_argument(
-        "--tolerances", nargs="*", type=float, default=TOLERANCES, help="leave empty to skip the time study"
-    )
-    parser.add_argument(
-        "--meshes",
-        nargs="*",
-        default=all_meshes,
-        choices=all_meshes,
-        help="leave empty to skip the space study",
-    )
-    parser.add_argument(
-        "--time-target", type=float, default=5e-4, help="required RMS error over the peak (default 5e-4)"
-    )
-    parser.add_argument(
-        "--mesh-target", type=float, default=0.005, help="required RMS error over the peak (default 0.005)"
-    )
-    parser.add_argument("--results", type=Path, default=rows.RESULTS)
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder that holds discretisation.md")
-    return parser.parse_args()
-
-
 def main() -> None:
-    args = arguments()
-    table = replace(ROWS, path=args.results / ROWS.path.name)
-    times, reference_errors = time_study(args, table) if args.tolerances else ({}, {})
-    results = space_study(args, table) if args.meshes else []
-    rows.warn_of_mixed_code(table.read())
+    (times, reference_errors), results = time_study(), space_study()
+    rows.warn_of_mixed_code(ROWS.read())
     parts = [
-        f"Time, `{name}`:\n\n{time_table(errors, reference_errors[name], args.points)}"
+        f"Time, `{name}`:\n\n{time_table(errors, reference_errors[name], POINTS)}"
         for name, errors in times.items()
     ]
-    if results:
-        parts.append(f"Space, first cycle, against {SPACE_REFERENCE}:\n\n{space_table(results, args.points)}")
-        if not args.first_cycle:
-            parts.append(f"Space, whole protocol, against bricks-2:\n\n{whole_table(results, args.points)}")
-        parts.append(f"Reaction and face stress at point C:\n\n{peak_table(results)}")
-    parts.append(verdict(times, results, args.time_target, args.mesh_target))
-    parts.append("![Errors in space and time, two observations of force by mesh](figures/discretisation.png)")
-    if results and not args.first_cycle:
-        write_mesh_errors(mesh_errors(results))
+    parts += [
+        f"Space, first cycle, against {SPACE_REFERENCE}:\n\n{space_table(results, POINTS)}",
+        f"Space, whole protocol, against bricks-2:\n\n{whole_table(results, POINTS)}",
+        f"Reaction and face stress at point C:\n\n{peak_table(results)}",
+        verdict(times, results, TIME_TARGET, MESH_TARGET),
+        "![Errors in space and time, two observations of force by mesh](figures/discretisation.png)",
+    ]
+    write_mesh_errors(mesh_errors(results))
     block = "\n\n".join(parts)
     print(block)
-    rows.into_docs(args.docs / "discretisation.md", "study", block)
+    rows.into_docs(DOCS / "discretisation.md", "study", block)
     cells = {r.run.mesh: int(r.row["cells"]) for r in results if r.force}
-    at_c = [r for r in results if r.run.point == "C" and r.force and r.run.protocol != LOADING]
+    at_c = [r for r in results if r.run.point == "C" and r.run.protocol != LOADING]
     figure = figure_discretisation(
         {(cells[m], m, p): e.rms for (m, p), e in space_errors(results).items() if m != SPACE_REFERENCE},
         {name: {key: e.rms for key, e in errors.items()} for name, errors in times.items()},
-        [(r.run.mesh, r.force, r.face_stress) for r in at_c],
-        args.time_target,
+        [(r.run.mesh, r.force, r.face_stress) for r in at_c if r.force and r.face_stress],
+        TIME_TARGET,
     )
-    save_figure(figure, args.docs / "figures" / "discretisation", "benchmarks/discretisation_study.py")
+    save_figure(figure, DOCS / "figures" / "discretisation", "benchmarks/discretisation_study.py")
 
 
 if __name__ == "__main__":

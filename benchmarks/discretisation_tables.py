@@ -137,10 +137,12 @@ def mesh_errors(results: Sequence[Result]) -> dict[str, dict[str, float]]:
         for mesh in dict.fromkeys(mesh for mesh, _ in errors if mesh != SPACE_REFERENCE)
         for at_points in [[e for (name, _), e in errors.items() if name == mesh]]
     }
-    loads = {r.run.mesh: r for r in results if r.force and r.run.protocol == LOADING}
+    loads = {
+        r.run.mesh: (int(r.row["cells"]), r.force) for r in results if r.force and r.run.protocol == LOADING
+    }
     if SPACE_REFERENCE in loads:
-        finest = max(loads.values(), key=lambda r: int(r.row["cells"])).force
-        reference_error = error(loads[SPACE_REFERENCE].force, finest)
+        _, finest = max(loads.values(), key=lambda load: load[0])
+        reference_error = error(loads[SPACE_REFERENCE][1], finest)
         by_mesh[SPACE_REFERENCE] = {"rms": reference_error.rms, "largest": reference_error.largest}
     return by_mesh
 
@@ -158,7 +160,9 @@ def whole_table(results: Sequence[Result], points: Sequence[str]) -> str:
 def peak_table(results: Sequence[Result]) -> str:
     """Returns a table of reaction and face stress at the first peak, and their relaxation in the hold."""
     table = []
-    for r in [r for r in results if r.run.point == "C" and r.force and r.face_stress]:
+    for r in [r for r in results if r.run.point == "C"]:
+        if not (r.force and r.face_stress):
+            continue
         forces_n = [np.interp([9.4], h.time_s, h.force_n) for h in (r.force, r.face_stress)]
         cells = [f"{forces_n[0][0]:.4f}", f"{forces_n[1][0]:.4f}", "", ""]
         if r.run.protocol != LOADING:
@@ -216,7 +220,7 @@ def verdict(
     The tolerance is chosen on the first protocol of `times` and tested on the second.
     """
     sentences = []
-    (chosen_on, chosen_from), (tested_on, tested) = list(times.items()) or [("", {})] * 2
+    (chosen_on, chosen_from), (tested_on, tested) = times.items()
     tolerance = choose(chosen_from, time_target)
     if tolerance is not None:
         worst_rms = max((e.rms for (t, _), e in tested.items() if t == tolerance), default=np.nan)
@@ -235,7 +239,7 @@ def verdict(
             f"{100 * default_rms[1]:.3f} % on these protocols. Looser tolerances take as many steps, because "
             f"no phase has fewer than {STEPS_PER_PHASE}."
         )
-    elif times:
+    else:
         sentences.append(
             f"Tolerance: no tested value has an RMS error below {100 * time_target:g} % of the peak."
         )

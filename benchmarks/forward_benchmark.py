@@ -33,7 +33,7 @@ import resource
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -53,7 +53,7 @@ from bayeskin.types import Array, PadMotion
 ARTICLE_CPU_S = 3600.0  # not measured here, for 694 steps; see above
 STAGES = ("evaluation", "law", "residual", "tangent", "analysis", "factorisation", "solve", "rest")
 FACTORISATIONS_ALONE, SOLVES_ALONE = 5, 30
-MESHES = ("bricks-1", "Mesh_SKIN.msh")
+MESHES, PROTOCOL = ("bricks-1", "Mesh_SKIN.msh"), "whole"
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 ROWS = rows.Rows(
     rows.RESULTS / "forward.csv",
@@ -92,9 +92,10 @@ class TimedFactorisations:
     """Wraps factorisations so that a clock counts their stages; keeps the last matrix."""
 
     def __init__(self, inner: Factorisations, clock: Clock) -> None:
-        self.inner, self.last = inner, None
-        self.first = clock.timed("analysis", inner.factorise)
-        self.later = clock.timed("factorisation", inner.factorise)
+        self.inner = inner
+        self.next, self.later = (
+            clock.timed(stage, inner.factorise) for stage in ("analysis", "factorisation")
+        )
         self.solve, self.release = clock.timed("solve", inner.solve), inner.release
 
     @property
@@ -102,8 +103,8 @@ class TimedFactorisations:
         return self.inner.room
 
     def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None:
-        (self.later if self.last else self.first)(number, matrix, scale)
-        self.last = matrix, scale
+        self.next(number, matrix, scale)
+        self.next, self.last = self.later, (matrix, scale)
 
 
 @contextmanager
@@ -127,12 +128,10 @@ def on_the_clock(clock: Clock) -> Iterator[list[TimedFactorisations]]:
         yield timed_factorisations
 
 
-def measure(item: tuple[str, str, int]) -> dict[str, Any]:
-    """Returns one row for (protocol, mesh, repeat); runs in a process of its own."""
-    protocol, mesh, repeat = item
-    motion = healthy_skin.HEALTHY_SKIN
-    motion = healthy_skin.first_cycle(motion) if protocol == "first cycle" else motion
-    theta = healthy_skin.POINTS["C"]
+def measure(item: tuple[str, int]) -> dict[str, Any]:
+    """Returns one row for (mesh, repeat); runs in a process of its own."""
+    mesh, repeat = item
+    motion, theta = healthy_skin.HEALTHY_SKIN, healthy_skin.POINTS["C"]
     with healthy_skin.spec_on(mesh, ModelSpec().tolerance) as spec:
         compiling = PadMotion(np.array([0.0, 1.0]), np.array([0.0, 1e-4]))
         simulate(ModelSpec(tolerance=1.0), compiling, theta, gradients=logarithms(theta))
@@ -150,7 +149,7 @@ def measure(item: tuple[str, str, int]) -> dict[str, Any]:
     factorisation_s, solve_s, factor_bytes = alone(matrix, scale)
     factorisations = clock.counts["factorisation"] + clock.counts["analysis"]
     return {
-        "protocol": protocol, "mesh": mesh, "repeat": repeat, "tolerance": spec.tolerance,
+        "protocol": PROTOCOL, "mesh": mesh, "repeat": repeat, "tolerance": spec.tolerance,
         "model_hash": run.model_hash, "code": rows.CODE, "status": run.status,
         "linear_solver": SOLVER_NAME, "cells": problem.mesh.geometry.nelements, "dofs": problem.space.dofs,
         "steps": int(run.stats["steps"]), "iterations": int(run.stats["iterations"]), "cpu_s": cpu_s,
@@ -179,7 +178,7 @@ def alone(matrix: sp.csr_matrix, scale: Array) -> tuple[float, float, int]:
     factors.factorise(0, matrix, scale)  # not timed, because it also analyses the pattern
     factorisation_s = _median_s(lambda: factors.factorise(0, matrix, scale), FACTORISATIONS_ALONE)
     solve_s = _median_s(lambda: factors.solve(0, right), SOLVES_ALONE)
-    size = _bytes_of(factors)
+    size = factors.bytes_each
     factors.release()
     return factorisation_s, solve_s, size
 
@@ -194,17 +193,6 @@ def _median_s(action: Callable[[], Any], times: int) -> float:
     return float(np.median(seconds))
 
 
-def _bytes_of(factors: Any) -> int:
-    """Returns the size of the factors in bytes.
-
-    PARDISO reports the entries of its factor, which are in single precision. SuperLU's size has values and
-    indices.
-    """
-    if SOLVER_NAME == "SuperLU":
-        return 12 * int(factors._stored[0][0].nnz)
-    return 4 * int(factors._settings[linear._ENTRIES_OF_FACTOR - 1])
-
-
 def medians(found: Sequence[rows.Row]) -> dict[str, dict[str, float]]:
     """Returns the medians over repeats of every number, by mesh."""
     numbers = [name for name in ROWS.values if name not in ("status", "linear_solver")]
@@ -214,12 +202,11 @@ def medians(found: Sequence[rows.Row]) -> dict[str, dict[str, float]]:
     }
 
 
-def table(found: dict[str, dict[str, float]], whole: bool) -> str:
+def table(found: dict[str, dict[str, float]]) -> str:
     """Returns the medians as a table with one column for each mesh."""
     lines = [["CPU s", *(f"{m['cpu_s']:.2f}" for m in found.values())]]
-    if whole:
-        ratios = [f"{ARTICLE_CPU_S / m['cpu_s']:.0f}" for m in found.values()]
-        lines.append([f"ratio of the article's {ARTICLE_CPU_S:.0f} CPU s to these", *ratios])
+    ratios = [f"{ARTICLE_CPU_S / m['cpu_s']:.0f}" for m in found.values()]
+    lines.append([f"ratio of the article's {ARTICLE_CPU_S:.0f} CPU s to these", *ratios])
     lines.append(["cells, unknowns", *(f"{m['cells']:.0f}, {m['dofs']:.0f}" for m in found.values())])
     lines.append(["steps, iterations", *(f"{m['steps']:.0f}, {m['iterations']:.0f}" for m in found.values())])
     for stage in STAGES:
@@ -252,50 +239,34 @@ def table(found: dict[str, dict[str, float]], whole: bool) -> str:
     return rows.markdown(["", *found], lines)
 
 
-def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--meshes", nargs="+", default=MESHES, choices=MESHES)
-    parser.add_argument(
-        "--first-cycle",
-        action="store_true",
-        help="run only the first cycle; leaves out the ratio to the article's time",
-    )
-    parser.add_argument("--results", type=Path, default=rows.RESULTS)
-    parser.add_argument("--figures", type=Path, default=FIGURES)
-    return parser.parse_args()
-
-
 def main() -> None:
     # Not imported above, so that plotting does not count in the memory of the measured processes.
     from forward_figure import figure_forward
 
     from bayeskin.report import save_figure
 
-    options = arguments()
-    results = replace(ROWS, path=options.results / ROWS.path.name)
-    protocol = "first cycle" if options.first_cycle else "whole"
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--repeats", type=int, default=3)
+    options = parser.parse_args()
     supplement = healthy_skin.supplement_mesh("") is not None
     table_rows = []
-    for mesh in [m for m in options.meshes if supplement or m not in healthy_skin.GMSH_MESHES]:
+    for mesh in [m for m in MESHES if supplement or m not in healthy_skin.GMSH_MESHES]:
         with healthy_skin.spec_on(mesh, ModelSpec().tolerance) as spec:
             same = {"tolerance": spec.tolerance, "model_hash": spec.hash, "code": rows.CODE}
         for repeat in range(options.repeats):
-            row = results.find(protocol=protocol, mesh=mesh, repeat=repeat, **same)
+            row = ROWS.find(protocol=PROTOCOL, mesh=mesh, repeat=repeat, **same)
             if row is None:
-                rows.say(f"{mesh}, {protocol}, repeat {repeat}")
-                _, measured = next(run_parallel(measure, [(protocol, mesh, repeat)], 1))
+                rows.say(f"{mesh}, repeat {repeat}")
+                _, measured = next(run_parallel(measure, [(mesh, repeat)], 1))
                 if isinstance(measured, Lost):
                     raise SystemExit(f"{mesh}: {measured.reason}")
-                row = results.append(**measured)
+                row = ROWS.append(**measured)
             table_rows.append(row)
     by_mesh = medians(table_rows)
-    print(table(by_mesh, whole=not options.first_cycle))
-    save_figure(
-        figure_forward(by_mesh, STAGES), options.figures / "forward", "benchmarks/forward_benchmark.py"
-    )
+    print(table(by_mesh))
+    save_figure(figure_forward(by_mesh, STAGES), FIGURES / "forward", "benchmarks/forward_benchmark.py")
 
 
 if __name__ == "__main__":

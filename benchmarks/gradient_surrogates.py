@@ -35,7 +35,7 @@ from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.report import save_figure
 from bayeskin.report.style import PAGE_IN, new_figure, plain_log, state_finding, styled
-from bayeskin.surrogates.chaos import ChaosSettings, LatentChaos, _pursue, fit_sparse
+from bayeskin.surrogates.chaos import ChaosSettings, LatentChaos, fit_sparse, pursue
 from bayeskin.surrogates.gp import LatentGPs
 from bayeskin.surrogates.hyperparameters import HyperparameterSettings, fit_latent
 from bayeskin.surrogates.shapes import ShapeTransform, split
@@ -148,12 +148,12 @@ def _pursued(unit: Array, target: Array, slopes: Array) -> Callable[[Array], Arr
             residual = np.empty((n, term_limit))
             for k in range(CHAOS.folds):
                 is_training = np.tile(fold != k, 1 + dim)
-                residual[fold == k] = _pursue(stacked, aims, is_training, term_limit)[1][
+                residual[fold == k] = pursue(stacked, aims, is_training, term_limit)[1][
                     : int(np.sum(fold == k))
                 ]
             errors = np.mean(residual**2, axis=0)
             if errors.min() < best[0]:
-                chosen = _pursue(stacked, aims, np.ones(len(aims), dtype=bool), int(np.argmin(errors)) + 1)[0]
+                chosen = pursue(stacked, aims, np.ones(len(aims), dtype=bool), int(np.argmin(errors)) + 1)[0]
                 best = (float(errors.min()), weight, indices, chosen)
     _, weight, indices, chosen = best
     terms = indices[chosen]

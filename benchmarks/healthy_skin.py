@@ -18,7 +18,7 @@ import numpy as np
 
 from bayeskin.finite_element import mesh as mesh_module
 from bayeskin.finite_element.bricks import brick_lines
-from bayeskin.finite_element.simulate import ModelSpec, _mesh, problem_of
+from bayeskin.finite_element.simulate import ModelSpec, mesh_of, problem_of
 from bayeskin.geometry import Geometry
 from bayeskin.proof.protocol import MOTION
 from bayeskin.types import Array, PadMotion
@@ -83,5 +83,5 @@ def halved_lines(
 
 def _forget_meshes() -> None:
     """Clears the caches of meshes and problems, which do not know that the lines were replaced."""
-    _mesh.cache_clear()
+    mesh_of.cache_clear()
     problem_of.cache_clear()

@@ -20,6 +20,7 @@ from pathlib import Path
 import healthy_skin
 import numpy as np
 import rows
+from matplotlib.figure import Figure
 
 from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.mechanisms import Mechanism, catalogue, laws, observed, solved
@@ -122,7 +123,7 @@ def run(values: Mapping[str, float], mechanisms: list[Mechanism]) -> tuple[Array
 
 
 @styled
-def figure_mechanisms(found: Mapping[str, Shown]):
+def figure_mechanisms(found: Mapping[str, Shown]) -> Figure:
     """Returns the figure: the force that each mechanism adds, in its own panel, over the force without it."""
     columns = 4
     row_count = -(-(len(found) + 1) // columns)

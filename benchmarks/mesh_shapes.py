@@ -16,7 +16,6 @@ program writes the table between the markers of docs/discretisation.md.
 from __future__ import annotations
 
 import argparse
-from functools import partial
 from pathlib import Path
 
 import healthy_skin
@@ -33,7 +32,7 @@ from bayeskin.types import Array
 
 SEED = 21
 BIN_S = 0.5
-DOCS = Path(__file__).parents[1] / "docs"
+PAGE = Path(__file__).parents[1] / "docs" / "discretisation.md"
 NAMES = default_space().names
 ANSWERS = tuple(f"relaxing in {tau:g} s" for tau in ErrorSizes().relaxation_s)
 PARTS = ("factor", "bend", *ANSWERS)
@@ -91,12 +90,11 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--skins", type=int, default=16)
-    parser.add_argument("--docs", type=Path, default=DOCS, help="folder that holds discretisation.md")
     options = parser.parse_args()
     inputs = [{"seed": SEED, "index": i, "model_hash": ModelSpec().hash} for i in range(options.skins)]
     cases = [dict(zip(NAMES, map(float, theta), strict=True)) for theta in skins(options.skins)]
     missing = [i for i, key in enumerate(inputs) if ROWS.find(**key) is None]
-    for position, outcome in run_parallel(partial(refined), [cases[i] for i in missing], 2):
+    for position, outcome in run_parallel(refined, [cases[i] for i in missing], 2):
         i = missing[position]
         if isinstance(outcome, Lost | str):
             rows.say(f"skin {i}: {outcome if isinstance(outcome, str) else outcome.reason}")
@@ -107,7 +105,7 @@ def main() -> None:
         )
     block = table([row for key in inputs if (row := ROWS.find(**key))])
     print(block)
-    rows.into_docs(options.docs / "discretisation.md", "shapes", block)
+    rows.into_docs(PAGE, "shapes", block)
 
 
 if __name__ == "__main__":

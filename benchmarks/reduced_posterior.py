@@ -17,11 +17,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-import arviz as az
 import numpy as np
 import rows
 
-from bayeskin.config import load_config
+from bayeskin.inference import load_inference_data
 from bayeskin.types import Array
 from bayeskin.workflow.importing import import_recording
 from bayeskin.workflow.stages import run
@@ -59,7 +58,7 @@ def sampled(folder: Path, name: str) -> tuple[dict[str, dict[str, Any]], dict[st
         config.write_text(CONFIG.format(name=name, source=SOURCES[name]))
     summary = run(config, "sample", rows.Log())
     rows.say(f"{name}: {summary['verdict']}: {'; '.join(summary['reasons'])}")
-    posterior = az.from_netcdf(folder / load_config(config).name / "sample" / "posterior.nc")["posterior"]
+    posterior = load_inference_data(Path(summary["folder"]) / "sample" / "posterior.nc")["posterior"]
     return summary["parameters"], {key: np.ravel(posterior[key]) for key in summary["parameters"]}
 
 

@@ -95,13 +95,11 @@ def perform(spec: ModelSpec, item: Item) -> Item:
 
     An exception counts as a failure too, although the model should never raise one.
     """
-    motion = healthy_skin.HEALTHY_SKIN
-    motion = healthy_skin.first_cycle(motion) if item["protocol"] == "first cycle" else motion
     theta = {name: item[name] for name in NAMES}
     _compile(spec)
     started = time.process_time()
     try:
-        simulation = simulate(spec, motion, theta)
+        simulation = simulate(spec, healthy_skin.HEALTHY_SKIN, theta)
     except Exception as error:  # one failing run must not end the count
         return item | _no_run("raised", f"{type(error).__name__}: {error}", time.process_time() - started)
     return item | {
@@ -133,19 +131,19 @@ def _no_run(status: str, message: str, cpu_s: float) -> Item:
     }  # fmt: skip
 
 
-def run_all(spec: ModelSpec, items: Sequence[Item], table: rows.Rows, workers: int) -> list[rows.Row]:
+def run_all(spec: ModelSpec, items: Sequence[Item], workers: int) -> list[rows.Row]:
     """Returns the rows of all items, including those that were finished before."""
-    table_rows = {table.key_of(row): row for row in table.read()}
-    remaining = [item for item in items if table.key_of(item) not in table_rows]
+    table_rows = {ROWS.key_of(row): row for row in ROWS.read()}
+    remaining = [item for item in items if ROWS.key_of(item) not in table_rows]
     rows.say(f"{len(items) - len(remaining)} of {len(items)} runs are finished already")
     for done, (i, result) in enumerate(run_parallel(partial(perform, spec), remaining, workers), start=1):
         row = remaining[i] | _no_run("lost", result.reason, np.nan) if isinstance(result, Lost) else result
-        table_rows[table.key_of(row)] = table.append(**row)
+        table_rows[ROWS.key_of(row)] = ROWS.append(**row)
         if row["status"] != "ok" or done % 20 == 0 or done == len(remaining):
             rows.say(
                 f"{done} of {len(remaining)}: {row['box']} {row['index']} {row['status']} {row['message']}"
             )
-    return [table_rows[table.key_of(item)] for item in items]
+    return [table_rows[ROWS.key_of(item)] for item in items]
 
 
 def summary(found: dict[str, list[rows.Row]]) -> str:
@@ -228,36 +226,27 @@ def arguments() -> argparse.Namespace:
     )
     parser.add_argument("--n", type=int, default=500, help="number of points in each box (default 500)")
     parser.add_argument("--refinement", type=int, choices=(0, 1), default=1, help="refinement of the bricks")
-    parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--first-cycle", action="store_true", help="run only the first cycle of the protocol")
-    parser.add_argument("--results", type=Path, default=rows.RESULTS)
-    parser.add_argument("--figures", type=Path, default=FIGURES)
     return parser.parse_args()
 
 
 def main() -> None:
     args = arguments()
     spec, mesh = ModelSpec(refinement=args.refinement), ("80 bricks", "448 bricks")[args.refinement]
-    table = replace(ROWS, path=args.results / ROWS.path.name)
-    shared = {
-        "protocol": "first cycle" if args.first_cycle else "whole",
-        "seed": args.seed,
-        "model_hash": spec.hash,
-    }
-    points_of = {box: points(space, args.n, args.seed) for box, space in boxes().items()}
+    shared = {"protocol": "whole", "seed": SEED, "model_hash": spec.hash}
+    points_of = {box: points(space, args.n, SEED) for box, space in boxes().items()}
     # The boxes alternate, so that a count that was stopped has points of both.
     items = [
         {**shared, "box": box, "index": index, **theta}
         for index, pair in enumerate(zip(*points_of.values(), strict=True))
         for box, theta in zip(points_of, pair, strict=True)
     ]
-    finished = run_all(spec, items, table, args.workers)
+    finished = run_all(spec, items, args.workers)
     rows.warn_of_mixed_code(finished)
     rows_by_box = {box: [r for r in finished if r["box"] == box] for box in boxes()}
-    print(f"seed {args.seed}\n\n{summary(rows_by_box)}\n\n{failures(rows_by_box)}")
+    print(f"seed {SEED}\n\n{summary(rows_by_box)}\n\n{failures(rows_by_box)}")
     stem = f"robustness-{mesh.replace(' ', '-')}"
-    save_figure(figure_robustness(rows_by_box, mesh), args.figures / stem, "benchmarks/robustness.py")
+    save_figure(figure_robustness(rows_by_box, mesh), FIGURES / stem, "benchmarks/robustness.py")
 
 
 if __name__ == "__main__":

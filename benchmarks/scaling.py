@@ -20,8 +20,8 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -73,9 +73,11 @@ def designed(wave: Wave, run_all: Map) -> None:
 
 def timed(wave: Wave, way: str, workers: int, repeats: int) -> list[float]:
     """Returns the seconds of each repeat; one more repeat before them is not counted."""
-    maps = {"local": lambda: nullcontext(local(workers)), "Dask": lambda: dask(workers)}
+    maps: dict[str, Callable[[], AbstractContextManager[Map | None]]] = {
+        "alone": nullcontext, "local": lambda: nullcontext(local(workers)), "Dask": lambda: dask(workers)
+    }  # fmt: skip
     seconds = []
-    with maps[way]() if way in maps else nullcontext(None) as run_all:
+    with maps[way]() as run_all:
         for repeat in range(repeats + 1):
             started = time.perf_counter()
             alone(wave) if run_all is None else designed(wave, run_all)

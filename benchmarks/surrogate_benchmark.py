@@ -24,6 +24,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +85,7 @@ def design(seed: int, points: int = POINTS, tests: int = TESTS) -> Design:
     )  # fmt: skip
 
 
-def rate(action, points: int) -> float:  # type: ignore[no-untyped-def]
+def rate(action: Callable[[], object], points: int) -> float:
     """Returns points per CPU second, the median of five rounds."""
     action()
     rates = []
@@ -141,7 +142,7 @@ def peer_rows(package: str, python: str) -> list[Row]:
     if subprocess.run([python, "-c", probe], check=False).returncode:
         print(f"{package}: not installed for {python}, skipped")
         return []
-    script, by_method = Path(__file__).with_name("surrogate_peers.py"), {}  # type: ignore[var-annotated]
+    script, by_method = Path(__file__).with_name("surrogate_peers.py"), dict[str, list[Row]]()
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(SEEDS):
             runs, file = design(seed), Path(folder) / f"{seed}.npz"

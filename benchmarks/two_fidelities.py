@@ -16,7 +16,6 @@ benchmarks/results/two_fidelities.
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -50,24 +49,14 @@ PEAK_N_PER_PA = (3.8e-6, 9.9e-6)  # change of the peak force by E_c and by E_s
 QUANTITIES = ("stiffness", "E_c", "E_s", "k_c", "k_s")
 
 
-class Teller:
-    """Prints on stderr how a run proceeds."""
-
-    def log(self, message: str) -> None:
-        rows.say(message)
-
-    def progress(self, label: str, share: float, note: str = "") -> None:
-        print(f"\r  {label}: {100 * share:3.0f} % {note}", end="", file=sys.stderr, flush=True)
-
-
 def sampled(case: str) -> tuple[dict[str, Array], str]:
     """Returns the draws of every quantity, and a sentence on their cost and on whether they are trusted."""
     FOLDER.mkdir(parents=True, exist_ok=True)
     path = FOLDER / f"{case}.toml"
     path.write_text(CASES[case])
     rows.say(f"{case}:")
-    answer = stages.run(path, "sample", Teller())
-    posterior = load_inference_data(FOLDER / case / "sample" / "posterior.nc").posterior
+    answer = stages.run(path, "sample", rows.Log())
+    posterior = load_inference_data(FOLDER / case / "sample" / "posterior.nc")["posterior"]
     draws = {name: np.ravel(posterior[name].to_numpy()) for name in QUANTITIES[1:]}
     draws["stiffness"] = PEAK_N_PER_PA[0] * draws["E_c"] + PEAK_N_PER_PA[1] * draws["E_s"]
     design = json.loads((FOLDER / case / "design" / "stage.json").read_text())["summary"]
@@ -114,7 +103,8 @@ def figure(draws: dict[str, dict[str, Array]]) -> Figure:
     axes = drawn.subplots(1, 3)
     for ax, name, letter, unit in zip(axes, QUANTITIES, "abc", ("N", "Pa", "Pa"), strict=False):
         everything = np.concatenate([draws[case][name] for case in CASES])
-        edges = np.linspace(*np.quantile(everything, [0.001, 0.999]), 61)
+        low, high = np.quantile(everything, [0.001, 0.999])
+        edges = np.linspace(low, high, 61)
         for case, colour in COLOURS.items():
             density = np.histogram(draws[case][name], edges, density=True)[0]
             ax.stairs(density, edges, color=colour, label=case, lw=1.0)

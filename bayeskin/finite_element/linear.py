@@ -47,11 +47,16 @@ MOST, MEMORY_BYTES = 10, 480_000_000  # largest number of kept factorisations, a
 class Factorisations(Protocol):
     """Factorisations of matrices that all share one sparsity pattern. They are numbered from 0.
 
-    room : number of factorisations that fit into the allowed memory, known after the first factorisation
+    bytes_each : size of one factorisation, known after the first one
+    room : number of factorisations that fit into the allowed memory, known after the first one
     """
 
     @property
-    def room(self) -> int: ...
+    def bytes_each(self) -> int: ...
+
+    @property
+    def room(self) -> int:
+        return int(np.clip(MEMORY_BYTES // max(self.bytes_each, 1), 1, MOST))
 
     def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None:
         """Factorises a matrix under a number; scale (n,) is the size of each unknown."""
@@ -69,7 +74,7 @@ class Factorisations(Protocol):
         ...
 
 
-class Pardiso:
+class Pardiso(Factorisations):
     """Factorisations by MKL PARDISO.
 
     The class calls MKL directly, because the methods of pypardiso allow only double precision and only one
@@ -89,9 +94,8 @@ class Pardiso:
         self._entries: dict[int, np.ndarray] = {}  # entries of each matrix, where MKL needs them again
 
     @property
-    def room(self) -> int:
-        bytes_each = 4 * int(self._settings[_ENTRIES_OF_FACTOR - 1])
-        return int(np.clip(MEMORY_BYTES // max(bytes_each, 1), 1, MOST))
+    def bytes_each(self) -> int:
+        return 4 * int(self._settings[_ENTRIES_OF_FACTOR - 1])  # entries in single precision
 
     def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None:
         first = not self._scale
@@ -167,16 +171,15 @@ def _scaled_mean(indptr, indices, own, mirrored, data, scale, out):  # type: ign
             out[k] = 0.5 * (data[own[k]] + data[mirrored[k]]) * scale[row] * scale[indices[k]]
 
 
-class SuperLU:
+class SuperLU(Factorisations):
     """Factorisations by SuperLU, which scipy includes."""
 
     def __init__(self) -> None:
         self._stored: dict[int, tuple[spla.SuperLU, Array]] = {}
 
     @property
-    def room(self) -> int:
-        entries = max((factors.nnz for factors, _ in self._stored.values()), default=1)
-        return int(np.clip(MEMORY_BYTES // (12 * entries), 1, MOST))
+    def bytes_each(self) -> int:
+        return 12 * max((factors.nnz for factors, _ in self._stored.values()), default=0)  # with indices
 
     def factorise(self, number: int, matrix: sp.csr_matrix, scale: Array) -> None:
         diagonal = sp.diags(scale)

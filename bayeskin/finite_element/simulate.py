@@ -80,7 +80,7 @@ class ModelSpec:
     @property
     def mesh_hash(self) -> str:
         """Returns the hash of the mesh, which `accuracy.mesh_error` takes."""
-        return _mesh(self.mesh, self.refinement, self.geometry).hash
+        return mesh_of(self.mesh, self.refinement, self.geometry).hash
 
     @property
     def hash(self) -> str:
@@ -95,7 +95,7 @@ class ModelSpec:
 
 
 @lru_cache(maxsize=2)
-def _mesh(mesh: str, refinement: int, geometry: Geometry) -> SkinMesh:
+def mesh_of(mesh: str, refinement: int, geometry: Geometry) -> SkinMesh:
     """Returns the mesh of a specification."""
     return brick_mesh(refinement, geometry) if mesh == "bricks" else read_gmsh(Path(mesh), geometry)
 
@@ -103,7 +103,7 @@ def _mesh(mesh: str, refinement: int, geometry: Geometry) -> SkinMesh:
 @lru_cache(maxsize=2)
 def problem_of(mesh: str, refinement: int, geometry: Geometry = Geometry()) -> Problem:
     """Returns the boundary-value problem of a mesh, which is built once in each process."""
-    return build_problem(_mesh(mesh, refinement, geometry))
+    return build_problem(mesh_of(mesh, refinement, geometry))
 
 
 def problem_at(spec: ModelSpec, theta: Mapping[str, float]) -> Problem:

@@ -64,11 +64,11 @@ def fit_sparse(
         basis = legendre_basis(unit, indices)
         residual = np.empty((n, min(most, len(indices))))
         for k in range(settings.folds):
-            residual[fold == k] = _pursue(basis, target, fold != k, residual.shape[1])[1]
+            residual[fold == k] = pursue(basis, target, fold != k, residual.shape[1])[1]
         errors = np.average(residual**2, axis=0, weights=weights)
         step = int(np.argmin(errors))
         if errors[step] < best.error:
-            chosen = _pursue(basis, target, np.ones(n, dtype=bool), step + 1)[0]
+            chosen = pursue(basis, target, np.ones(n, dtype=bool), step + 1)[0]
             variance = float(np.mean(residual[:, step] ** 2))
             best, failures = SparseFit(indices[chosen], variance, float(errors[step])), 0
         else:
@@ -76,7 +76,7 @@ def fit_sparse(
     return best
 
 
-def _pursue(basis: Array, target: Array, learn: NDArray[np.bool_], most: int) -> tuple[list[int], Array]:
+def pursue(basis: Array, target: Array, learn: NDArray[np.bool_], most: int) -> tuple[list[int], Array]:
     """Returns the terms in the order in which the pursuit chooses them, and the errors of the other rows.
 
     Orthogonal matching pursuit uses the rows `learn` and begins with the constant. The errors (rows, most)
