@@ -11,6 +11,7 @@ import pytest
 
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
+from bayeskin.reduced.build import BuildSettings
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.runs import FullRuns
@@ -126,11 +127,11 @@ def test_a_finished_model_stays_as_it_is(bayeskin, tmp_path) -> None:
 def test_an_interrupted_building_goes_on_and_a_second_one_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, model, found = tmp_path / "model.h5", load_reduced(shipped(SHIPPED)), list[bool]()
+    path, model, built = tmp_path / "model.h5", load_reduced(shipped(SHIPPED)), list[tuple[int, bool]]()
 
-    def base(trained: object, full: FullRuns, *_: object) -> ReducedModel:
-        found.append("a run" in full.store)
-        if not found[-1]:
+    def base(trained: object, full: FullRuns, settings: BuildSettings, *_: object) -> ReducedModel:
+        built.append((settings.base_runs, "a run" in full.store))
+        if not built[-1][1]:
             full.store.add("a run", {"message": ""})
             with pytest.raises(InputError, match="in use by another bayeskin"):
                 reducing.reduce(None, path, Silent())
@@ -143,5 +144,6 @@ def test_an_interrupted_building_goes_on_and_a_second_one_is_refused(
         reducing.reduce(None, path, Silent())
     assert not path.exists()
     assert reducing.reduce(None, path, Silent())["ok"]
-    assert found == [False, True]
+    few, all_runs = BuildSettings().first_runs, BuildSettings().base_runs
+    assert built == [(few, False), (few, True), (all_runs, True)]
     assert {file.name for file in tmp_path.iterdir()} == {"model.h5", "model.json"}

@@ -74,7 +74,10 @@ def reduce(
 def _build(
     path: Path, trained: Trained, settings: BuildSettings, store: Store, run_all: Map, reporter: Reporter
 ) -> None:
-    """Builds the base model and stores it, so that it can be used meanwhile; then builds the whole model."""
+    """Builds a first base model, then one from more runs, then the whole model.
+
+    Each replaces the one before it in the file, so that it can be used meanwhile.
+    """
     full = FullRuns(ModelSpec(refinement=REFINEMENT, geometry=trained.geometry), store)
 
     def progress(what: str, share: float) -> None:
@@ -82,10 +85,15 @@ def _build(
         reporter.progress(what, share)
 
     if not path.is_file():
-        reporter.log(f"the base model is trained with {settings.base_runs} full runs")
-        save_reduced(path, base_model(trained, full, settings, run_all, progress), _manifest(settings))
-        reporter.log(f"{path}: the base model can be used; {len(trained.mechanisms)} mechanisms follow")
-    complete = with_mechanisms(load_reduced(path), trained, full, settings, run_all, progress)
+        first = settings.first
+        reporter.log(f"a first base model is trained with {first.base_runs} full runs")
+        save_reduced(path, base_model(trained, full, first, run_all, progress), _manifest(first))
+        reporter.log(f"{path}: the first base model can be used")
+    reporter.log(f"the base model is trained with {settings.base_runs} full runs")
+    base = base_model(trained, full, settings, run_all, progress)
+    save_reduced(path, base, _manifest(settings))
+    reporter.log(f"{path}: the base model can be used; {len(trained.mechanisms)} mechanisms follow")
+    complete = with_mechanisms(base, trained, full, settings, run_all, progress)
     save_reduced(path, complete, _manifest(settings))
 
 
