@@ -41,7 +41,7 @@ def recording(tmp_path: Path) -> Path:
 def test_a_solid_that_relaxes_is_named_on_any_protocol_and_a_second_call_makes_nothing_anew(
     recording: Path,
 ) -> None:
-    said = diagnose(recording, Silent())
+    said = diagnose([recording], Silent())
     assert said["ok"]
     assert said["verdict"] == "named"
     (one,) = said["mechanisms"]
@@ -77,7 +77,7 @@ def test_a_solid_that_relaxes_is_named_on_any_protocol_and_a_second_call_makes_n
     (answers,) = (folder / "finished").glob("answers-*.store")
     before = answers.read_bytes()
     shutil.rmtree(folder / "diagnose")
-    again = diagnose(recording, Silent())
+    again = diagnose([recording], Silent())
     assert answers.read_bytes() == before
     assert [answers] == list((folder / "finished").iterdir())
     same = ("verdict", "mechanisms", "sets", "fit", "located", "full_model")
