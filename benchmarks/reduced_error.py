@@ -175,7 +175,10 @@ def ran(model: ReducedModel, cases: Mapping[str, Case]) -> list[tuple[Case, Row]
     rows = []
     with h5py.File(RESULTS) as handle:
         for name, case in cases.items():
-            group = handle[key_of(name, case)]
+            key = key_of(name, case)
+            if key not in handle:
+                raise SystemExit(f"{RESULTS}: no force of {name}; compute it with --full")
+            group = handle[key]
             if not group.attrs["message"]:
                 row = compared(model, case.motion, theta_of(case), case.mechanisms, group, estimate=True)
                 rows.append((case, row))

@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from scipy.stats import binom
@@ -44,6 +45,14 @@ def shown(table: str) -> bool:
     """Returns whether a page of the documentation has the rows of a table."""
     page = (Path(__file__).parents[1] / "docs" / "inference.md").read_text()
     return all(line in page for line in table.splitlines()[2:])
+
+
+def test_the_forces_of_the_fresh_cases_are_stored_for_the_present_laws(benchmark):
+    """The key of a force has the hash of the laws; docs/reduced.md tells what the cases show."""
+    fresh = benchmark("reduced_error")
+    cases = fresh.fresh() | {f"outside-{i}": fresh.beyond(i) for i in range(4 * fresh.EACH)}
+    with h5py.File(fresh.RESULTS) as stored:
+        assert {fresh.key_of(name, case) for name, case in cases.items()} == set(stored)
 
 
 def test_the_page_of_the_recording_says_what_the_diagnosis_says(benchmark):
