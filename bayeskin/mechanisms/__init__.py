@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
 from importlib.metadata import entry_points
 
 from bayeskin.errors import InputError
@@ -33,6 +35,12 @@ def catalogue() -> dict[str, Mechanism]:
     Raises InputError if two mechanisms or two parameters have the same name. It also raises InputError if a
     mechanism needs one that is not in the catalogue, or one that itself needs another.
     """
+    return dict(_catalogue_on(tuple(sys.path)))
+
+
+@cache  # entry points are searched for in every installed package, and models ask at each run
+def _catalogue_on(_: tuple[str, ...]) -> dict[str, Mechanism]:
+    """Returns the catalogue with the packages that are installed on a search path."""
     modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
     found = [module.MECHANISM for module in modules if hasattr(module, "MECHANISM")]
     found += [entry.load() for entry in entry_points(group=ENTRY_POINTS)]
