@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -42,6 +43,7 @@ def exact(values: Mapping[str, float]) -> Array:
 
 
 FEW = SearchSettings(skins=8, others=4, tried=1)
+QUICK = replace(FEW, ends=(), shapes=0)  # further maxima are sought from two starts only
 
 
 class Asked:
@@ -60,7 +62,7 @@ class Asked:
         said = {"message": "the worker ended"} if self.lost(task) else answer(self.bench, task)
         return read_answer(self.bench, task, json.loads(json.dumps(said)))
 
-    def search(self, seed: int = 1, settings: SearchSettings = FEW) -> SearchResult:
+    def search(self, seed: int = 1, settings: SearchSettings = QUICK) -> SearchResult:
         bench, tell = self.bench, self.told.append
         solves = bench.forward.solves
         return search(self, bench.binned, bench.base, KNOWN, solves, bench.noise, seed, tell, settings)
@@ -82,6 +84,27 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Asked]:
 Make = Callable[..., Asked]
 
 
+@pytest.fixture(scope="module")
+def searched() -> Callable[..., tuple[Asked, SearchResult]]:
+    """Searches a recording of the full model with mechanisms of these values; each search is made once."""
+
+    @cache
+    def make(full: Full = exact, seed: int = 0, **values: float) -> tuple[Asked, SearchResult]:
+        with pytest.MonkeyPatch.context() as patch:
+            binned = closed_form_reduced.recorded(seed, **values)
+            left_out_n = full(closed_form_reduced.TRUTH) - exact(closed_form_reduced.TRUTH)
+            binned = replace(binned, force_n=binned.force_n + left_out_n)
+            one = Asked(closed_form_reduced.bench(patch, binned, full=full))
+            return one, one.search()
+
+    return make
+
+
+Searched = Callable[..., tuple[Asked, SearchResult]]
+DRIFT = {"drift": 3e-4}
+BOTH = {"stiffness_rate": 9e-4, "F0": -0.03}
+
+
 def names_of(task: Task) -> tuple[str, ...]:
     """The set that a task is to fit or to run."""
     asked = task.score_test if isinstance(task, FitWithAddedTask) else task
@@ -92,16 +115,16 @@ def names_of(task: Task) -> tuple[str, ...]:
 @pytest.mark.parametrize(
     ("values", "names"),
     [
-        ({"F0": -0.03}, ("force-offset",)),
-        ({"drift": 3e-4}, ("sensor-drift",)),
+        (DRIFT, ("sensor-drift",)),
         ({"stiffness_rate": -9e-4, "stiffness_time": 200.0}, ("stiffness-drift",)),
-        ({"stiffness_rate": 9e-4, "F0": -0.03}, ("force-offset", "stiffness-drift")),
+        (BOTH, ("force-offset", "stiffness-drift")),
     ],
-    ids=["offset", "drift", "tissue", "both"],
+    ids=["drift", "tissue", "both"],
 )
-def test_what_is_concealed_is_found(asked: Make, values: dict[str, float], names: tuple[str, ...]) -> None:
-    one = asked(**values)
-    found = one.search()
+def test_what_is_concealed_is_found(
+    searched: Searched, values: dict[str, float], names: tuple[str, ...]
+) -> None:
+    one, found = searched(**values)
     best = found.best.fit
     assert best.names == names
     assert weight(best) > max(weight(other.fit) for other in found.fits.values() if other.fit is not best)
@@ -116,26 +139,26 @@ def test_what_is_concealed_is_found(asked: Make, values: dict[str, float], names
 
 
 @pytest.mark.parametrize("rate", [-9e-4, 9e-4])
-def test_a_mechanism_of_the_tissue_is_fitted_from_what_its_probes_promise(asked: Make, rate: float) -> None:
-    one = asked(stiffness_rate=rate, stiffness_time=200.0)
-    one.search()
+def test_a_mechanism_of_the_tissue_is_fitted_from_what_its_probes_promise(
+    searched: Searched, rate: float
+) -> None:
+    one, _ = searched(stiffness_rate=rate, stiffness_time=200.0)
     starts = [task.start for task in one.tasks
               if isinstance(task, FitTask) and task.names == ("stiffness-drift",)]  # fmt: skip
     assert 0.5 < starts[0]["stiffness_rate"] / rate < 1.5
 
 
-def test_nothing_is_found_where_nothing_is_concealed(asked: Make) -> None:
+def test_nothing_is_found_where_nothing_is_concealed(searched: Searched) -> None:
     for seed in range(3):
-        found = asked(seed).search()
+        _, found = searched(seed=seed)
         assert found.best.fit.names == ()
         np.testing.assert_allclose(
             found.best.fit.mean_n, closed_form_reduced.means(closed_form_reduced.TRUTH)[0], atol=6e-3
         )
 
 
-def test_no_task_is_asked_twice_and_only_what_is_taken_is_fitted_from_other_skins(asked: Make) -> None:
-    one = asked(stiffness_rate=9e-4, F0=-0.03)
-    found = one.search()
+def test_no_task_is_asked_twice_and_only_what_is_taken_is_fitted_from_other_skins(searched: Searched) -> None:
+    one, found = searched(**BOTH)
     assert set(Counter(key(task) for task in one.tasks).values()) == {1}
     fitted = {names_of(task) for task in one.tasks if isinstance(task, FitTask | FitWithAddedTask)}
     assert fitted == set(found.fits)
@@ -155,17 +178,12 @@ def more(values: Mapping[str, float]) -> Array:
     return exact(values) + SHAPE
 
 
-@pytest.mark.parametrize(
-    "values", [{}, {"F0": -0.03}, {"stiffness_rate": 9e-4, "F0": -0.03}], ids=["nothing", "one", "two"]
-)
+@pytest.mark.parametrize("values", [{}, BOTH], ids=["nothing", "two"])
 def test_sets_are_compared_by_forces_that_runs_of_the_full_model_correct(
-    asked: Make, values: dict[str, float]
+    searched: Searched, values: dict[str, float]
 ) -> None:
     """The recording is the full model's; what the reduced one leaves out of it is no mismatch."""
-    one = asked(full=more, **values)
-    binned = replace(one.bench.binned, force_n=one.bench.binned.force_n + SHAPE)
-    one.bench = replace(one.bench, binned=binned)
-    found = one.search()
+    one, found = searched(more, **values)
     best = found.best
     assert best.fit.names == tuple(sorted({"F0": "force-offset", "stiffness_rate": "stiffness-drift"}[name]
                                           for name in values))  # fmt: skip
@@ -179,29 +197,28 @@ def test_sets_are_compared_by_forces_that_runs_of_the_full_model_correct(
     assert max(full.values()) <= FEW.checks + FEW.maxima  # each further maximum has a run of its own
 
 
-def test_where_the_reduced_model_is_exact_a_check_changes_nothing(asked: Make) -> None:
-    found = asked(F0=-0.03).search()
+def test_where_the_reduced_model_is_exact_a_check_changes_nothing(searched: Searched) -> None:
+    _, found = searched(**DRIFT)
     assert all(not fit.correction_n.any() for fit in found.fits.values())
     for fit in found.fits.values():  # no error is allowed for that was not found
         error = fit.fit.log_posterior.model_error
         assert error is not None
         assert error.measured_n is None
         assert len(fit.fit.latent) == 1 + error.columns
-    assert found.checks[("force-offset",)].off < 1e-9
+    assert found.checks[("sensor-drift",)].off < 1e-9
 
 
 def test_a_check_in_which_the_full_model_fails_is_told(asked: Make) -> None:
-    one = asked(full=lambda values: "the skin folds", F0=-0.03)
+    one = asked(full=lambda values: "the skin folds", **DRIFT)
     found = one.search()
-    assert found.best.fit.names == ("force-offset",)
-    assert found.checks[("force-offset",)].full_n == "the skin folds"
-    assert "force-offset: the full model fails at the fit: the skin folds" in one.told
+    assert found.best.fit.names == ("sensor-drift",)
+    assert found.checks[("sensor-drift",)].full_n == "the skin folds"
+    assert "sensor-drift: the full model fails at the fit: the skin folds" in one.told
 
 
-def test_a_mechanism_that_stood_in_for_others_is_exchanged(asked: Make) -> None:
+def test_a_mechanism_that_stood_in_for_others_is_exchanged(searched: Searched) -> None:
     """Each of a set of two is left out in turn, and the others are tried beside the rest."""
-    one = asked(stiffness_rate=9e-4, F0=-0.03)
-    found = one.search()
+    one, found = searched(**BOTH)
     assert found.best.fit.names == ("force-offset", "stiffness-drift")
     tried = {names_of(task) for task in one.tasks if isinstance(task, ScoreTestTask)}
     assert ("sensor-drift", "stiffness-drift") in tried
@@ -212,11 +229,12 @@ def key(task: Task) -> str:
     return json.dumps([type(task).__name__, asdict(task)], default=np.ndarray.tolist)
 
 
-def test_the_same_seed_gives_the_same_search(asked: Make) -> None:
-    first, second, other = (asked(F0=-0.03) for _ in range(3))
-    assert _as_values(first.search(3)) == _as_values(second.search(3))
+def test_the_same_seed_gives_the_same_search(asked: Make, searched: Searched) -> None:
+    first, found = searched()
+    second, other = asked(), asked()
+    assert _as_values(second.search(1)) == _as_values(found)
     assert len(first.tasks) == len(second.tasks)
-    assert _as_values(other.search(4)) != _as_values(first.search(3))
+    assert _as_values(other.search(4)) != _as_values(found)
 
 
 def _as_values(found: SearchResult) -> dict[tuple[str, ...], tuple[float, dict[str, float]]]:
@@ -239,7 +257,7 @@ def of_the_drift(task: Task) -> bool:
 def test_tasks_that_fail_do_no_more_than_leave_mechanisms_out(
     asked: Make, lost: Callable[[Task], bool], reached: set[str]
 ) -> None:
-    found = asked(stiffness_rate=9e-4, F0=-0.03, lost=lost).search()
+    found = asked(**DRIFT, lost=lost).search()
     assert {name for names in found.fits for name in names} == reached
     assert () in found.fits
 
@@ -298,10 +316,21 @@ def test_priors_without_a_skin_that_can_be_are_refused(monkeypatch: pytest.Monke
         Asked(closed_form_reduced.bench(monkeypatch, closed_form_reduced.recorded(0), base)).search()
 
 
-def test_further_maxima_are_sought_where_the_force_says_little(asked: Make) -> None:
+@pytest.fixture(scope="module")
+def elsewhere() -> tuple[Asked, SearchResult]:
+    """A search for further maxima, where the full model is off by more than noise."""
+    with pytest.MonkeyPatch.context() as patch:
+        recorded = closed_form_reduced.recorded(0, stiffness_rate=9e-4)
+        one = Asked(closed_form_reduced.bench(patch, recorded, full=lambda values: exact(values) + 2e-3))
+        return one, one.search(settings=FEW)
+
+
+def test_further_maxima_are_sought_where_the_force_says_little(
+    elsewhere: tuple[Asked, SearchResult],
+) -> None:
     """Fits set out from layers that drain alike, in exchange, at once or not at all; from other drifts."""
-    one = asked(stiffness_rate=9e-4)
-    best = one.search().best
+    one, found = elsewhere
+    best = found.best
     assert best.fit.names == ("stiffness-drift",)
     climbs = [task for task in one.tasks if isinstance(task, FitTask)]
     (first,) = (i for i, task in enumerate(climbs) if task.start["k_c"] == task.start["k_s"])
@@ -322,8 +351,8 @@ def test_further_maxima_are_sought_where_the_force_says_little(asked: Make) -> N
     assert len(times - {equal["stiffness_time"], exchanged["stiffness_time"]}) == FEW.shapes
 
 
-def test_maxima_are_all_distinct_and_the_likeliest_is_the_fit(asked: Make) -> None:
-    found = asked(full=lambda values: exact(values) + 2e-3, stiffness_rate=9e-4).search()
+def test_maxima_are_all_distinct_and_the_likeliest_is_the_fit(elsewhere: tuple[Asked, SearchResult]) -> None:
+    _, found = elsewhere
     best = found.fits[("stiffness-drift",)]
     space = innermost(best.fit.log_posterior.surrogate).space
     places = [space.to_unit(one.run.theta) for one in (best, *found.others)]
@@ -333,16 +362,16 @@ def test_maxima_are_all_distinct_and_the_likeliest_is_the_fit(asked: Make) -> No
     assert 0 < len(found.others) <= FEW.maxima
 
 
-def test_larger_sets_are_fitted_anew_from_a_new_maximum_of_a_part(asked: Make) -> None:
-    one = asked(stiffness_rate=-9e-4, F0=-0.03)
-    found, bench = one.search(), one.bench
+def test_larger_sets_are_fitted_anew_from_a_new_maximum_of_a_part(asked: Make, searched: Searched) -> None:
+    one, (_, found) = asked(**BOTH), searched(**BOTH)
+    bench = one.bench
     part, both = ("stiffness-drift",), ("force-offset", "stiffness-drift")
     assert {part, both} <= set(found.evidences)
     right = found.fits[both]
     worse = replace(right, fit=replace(right.fit, log_evidence=right.fit.log_evidence - 50.0))
     record = SearchRecord({**found.fits, both: worse}, dict(found.checks), dict(found.evidences))
     context = SearchContext(
-        one, bench.binned, bench.base, KNOWN, bench.forward.solves, bench.noise, 1, one.told.append, FEW,
+        one, bench.binned, bench.base, KNOWN, bench.forward.solves, bench.noise, 1, one.told.append, QUICK,
         record,
     )  # fmt: skip
     fit_larger_sets(context, found.fits[part])
@@ -365,9 +394,8 @@ def test_what_has_no_name_is_not_imitated_by_ever_larger_sets(asked: Make) -> No
     assert any("with an unnamed smooth discrepancy is as likely" in line for line in one.told)
 
 
-def test_the_sets_that_are_compared_are_weighed_at_their_last_fits(asked: Make) -> None:
-    one = asked(full=lambda values: exact(values) + 2e-3, stiffness_rate=9e-4, F0=-0.03)
-    found = one.search()
+def test_the_sets_that_are_compared_are_weighed_at_their_last_fits(searched: Searched) -> None:
+    one, found = searched(more, **BOTH)
     assert found.chosen == ("force-offset", "stiffness-drift")
     weighed = {tuple(task.fit["fit"]["names"]): task.fit["fit"]["value"]
                for task in one.tasks if isinstance(task, EvidenceTask)}  # fmt: skip
