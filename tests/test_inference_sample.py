@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,11 +18,33 @@ from toys import banana
 from toys.inference_problems import NOISE, TRUTH, ToySurrogate, line_problem, toy_problem
 
 from bayeskin.errors import InputError
-from bayeskin.inference import Limits, LogPosterior, SampleSettings, identifiability, load_chains, sample
+from bayeskin.inference import (
+    Limits,
+    LogPosterior,
+    Posterior,
+    SampleSettings,
+    identifiability,
+    load_chains,
+    sample,
+)
 from bayeskin.types import Array
 
 LINE_START = {"a": 0.2, "b": -0.3, "sd_hold": 0.05002, "tau_noise": 0.0010005, "nu_noise": 1.0005e6}
 SHORT = SampleSettings(ensembles=2, walkers=16, max_steps=500)
+LONGER = SampleSettings(2, 16, 750, Limits(effective_samples=1e9))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Posterior]:
+    """Chains on a line that were sampled at one go, with what they gave."""
+    folder = tmp_path_factory.mktemp("whole")
+    return folder, sample(line_problem(), folder, 7, LINE_START, LONGER)
+
+
+@pytest.fixture
+def chains(whole: tuple[Path, Posterior], tmp_path: Path) -> Path:
+    """A copy of the folder with these chains."""
+    return Path(shutil.copytree(whole[0], tmp_path / "chains"))
 
 
 def test_a_thin_curved_ridge_is_sampled_to_its_ends(tmp_path: Path) -> None:
@@ -35,12 +58,11 @@ def test_a_thin_curved_ridge_is_sampled_to_its_ends(tmp_path: Path) -> None:
     assert np.abs((draws.var(axis=0) / banana.VARIANCE - 1.0) / spread).max() < 4.0
 
 
-def test_densities_on_file_are_the_posterior_s_at_every_step(tmp_path: Path) -> None:
+def test_densities_on_file_are_the_posterior_s_at_every_step(chains: Path) -> None:
     """Also at those that are drawn from a power of it."""
     problem = line_problem()
-    sample(problem, tmp_path, 7, LINE_START, SHORT)
-    stored = emcee.backends.HDFBackend(str(tmp_path / "ensemble_0.h5"), read_only=True)
-    expected = problem.log_prob(stored.get_chain().reshape(-1, problem.dim)).reshape(500, 16)
+    stored = emcee.backends.HDFBackend(str(chains / "ensemble_0.h5"), read_only=True)
+    expected = problem.log_prob(stored.get_chain().reshape(-1, problem.dim)).reshape(750, 16)
     assert stored.get_log_prob() == pytest.approx(expected, rel=1e-10)
 
 
@@ -86,33 +108,30 @@ def test_data_of_one_hold_cover_the_truth_and_leave_p_init_alone(tmp_path: Path)
     assert learned.contraction > 0.5
 
 
-def test_a_run_in_two_parts_is_the_run_in_one(tmp_path: Path) -> None:
+def test_a_run_in_two_parts_is_the_run_in_one(whole: tuple[Path, Posterior], tmp_path: Path) -> None:
     problem = line_problem()
-    longer = dataclasses.replace(SHORT, max_steps=600, limits=Limits(effective_samples=1e9))
-    whole = sample(problem, tmp_path / "one", 7, LINE_START, longer)
     sample(problem, tmp_path / "two", 7, LINE_START, SHORT)
-    parts = sample(problem, tmp_path / "two", 7, LINE_START, longer)
-    assert np.array_equal(whole.draws, parts.draws)
-    assert np.array_equal(*(load_chains(tmp_path / part, problem, 2) for part in ("one", "two")))
-    other = sample(problem, tmp_path / "three", 8, LINE_START, longer)
-    assert not np.array_equal(whole.log_prob, other.log_prob)
-    assert not np.array_equal(*load_chains(tmp_path / "one", problem, 2))  # ensembles are independent
+    parts = sample(problem, tmp_path / "two", 7, LINE_START, LONGER)
+    assert np.array_equal(whole[1].draws, parts.draws)
+    found = load_chains(tmp_path / "two", problem, 2)
+    assert np.array_equal(load_chains(whole[0], problem, 2), found)
+    assert not np.array_equal(*found)  # ensembles are independent
+    sample(problem, tmp_path / "three", 8, LINE_START, SHORT)
+    assert not np.array_equal(load_chains(tmp_path / "three", problem, 2), found[:, :500])
 
 
-def test_chains_of_more_ensembles_than_are_asked_for_are_left_alone(tmp_path: Path) -> None:
+def test_chains_of_more_ensembles_than_are_asked_for_are_left_alone(chains: Path) -> None:
     problem = line_problem()
-    sample(problem, tmp_path, 7, LINE_START, dataclasses.replace(SHORT, ensembles=3))
-    further = SampleSettings(2, 16, 520, Limits(effective_samples=1e9))
-    sample(problem, tmp_path, 7, LINE_START, further)
-    assert load_chains(tmp_path, problem, 2).shape[:2] == (2, 520)
+    before = (chains / "ensemble_1.h5").read_bytes()
+    further = dataclasses.replace(LONGER, ensembles=1, max_steps=770)
+    sample(problem, chains, 7, LINE_START, further)
+    assert load_chains(chains, problem, 1).shape[:2] == (1, 770)
+    assert (chains / "ensemble_1.h5").read_bytes() == before
 
 
-def test_threads_change_nothing(tmp_path: Path) -> None:
-    problem = line_problem()
-    settings = SampleSettings(3, 16, 600, Limits(effective_samples=1e9))
-    alone = sample(problem, tmp_path / "one", 7, LINE_START, settings)
-    together = sample(problem, tmp_path / "two", 7, LINE_START, settings, threads=2)
-    assert np.array_equal(alone.draws, together.draws)
+def test_threads_change_nothing(whole: tuple[Path, Posterior], tmp_path: Path) -> None:
+    together = sample(line_problem(), tmp_path, 7, LINE_START, LONGER, threads=2)
+    assert np.array_equal(whole[1].draws, together.draws)
 
 
 def test_an_error_in_a_thread_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,23 +147,21 @@ def test_an_error_in_a_thread_is_not_lost(tmp_path: Path, monkeypatch: pytest.Mo
         sample(line_problem(), tmp_path, 7, LINE_START, SampleSettings(2, 16, 600), threads=2)
 
 
-def test_an_interrupted_run_goes_on_bit_for_bit(tmp_path: Path) -> None:
+def test_an_interrupted_run_goes_on_bit_for_bit(whole: tuple[Path, Posterior], tmp_path: Path) -> None:
     problem = line_problem()
-    settings = SampleSettings(2, 16, 750, Limits(effective_samples=1e9))
-    whole = sample(problem, tmp_path / "one", 7, LINE_START, settings)
 
     def interrupt(_: float, text: str) -> None:
         if "ensemble 2" in text and "step 700" in text:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sample(problem, tmp_path / "two", 7, LINE_START, settings, interrupt)
+        sample(problem, tmp_path, 7, LINE_START, LONGER, interrupt)
     steps = [
-        emcee.backends.HDFBackend(str(tmp_path / "two" / f"ensemble_{e}.h5"), read_only=True).iteration
+        emcee.backends.HDFBackend(str(tmp_path / f"ensemble_{e}.h5"), read_only=True).iteration
         for e in (0, 1)
     ]
     assert steps == [750, 500]
-    assert np.array_equal(whole.draws, sample(problem, tmp_path / "two", 7, LINE_START, settings).draws)
+    assert np.array_equal(whole[1].draws, sample(problem, tmp_path, 7, LINE_START, LONGER).draws)
 
 
 KILLED = """
@@ -157,22 +174,19 @@ sample(line_problem(), sys.argv[1], 7, start, SampleSettings(2, 16, 100000, Limi
 """
 
 
-def test_a_killed_process_leaves_chains_that_go_on(tmp_path: Path) -> None:
+def test_a_killed_process_leaves_chains_that_go_on(whole: tuple[Path, Posterior], tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     code = KILLED.format(start=LINE_START)
-    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "two")], env=environment)
-    last = tmp_path / "two" / "ensemble_1.h5"
+    process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], env=environment)
+    last = tmp_path / "ensemble_1.h5"
     deadline = time.monotonic() + 120
     while not last.exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    problem = line_problem()
-    reached = emcee.backends.HDFBackend(str(last), read_only=True).iteration
-    settings = SampleSettings(2, 16, max(500, reached + 20))
-    settings = dataclasses.replace(settings, limits=Limits(effective_samples=1e9))
-    whole = sample(problem, tmp_path / "one", 7, LINE_START, settings)
-    assert np.array_equal(whole.draws, sample(problem, tmp_path / "two", 7, LINE_START, settings).draws)
+    assert emcee.backends.HDFBackend(str(last), read_only=True).iteration < 750
+    going_on = sample(line_problem(), tmp_path, 7, LINE_START, LONGER)
+    assert np.array_equal(whole[1].draws, going_on.draws)
 
 
 def other_data(problem: LogPosterior) -> LogPosterior:
@@ -198,28 +212,25 @@ def other_surrogate(problem: LogPosterior) -> LogPosterior:
         ),
     ],
 )
-def test_chains_of_another_posterior_are_refused_and_kept(tmp_path: Path, change, complaint) -> None:  # type: ignore[no-untyped-def]
-    problem = line_problem()
-    sample(problem, tmp_path, 7, LINE_START, SHORT)
-    before = (tmp_path / "ensemble_0.h5").read_bytes()
+def test_chains_of_another_posterior_are_refused_and_kept(chains: Path, change, complaint) -> None:  # type: ignore[no-untyped-def]
+    before = (chains / "ensemble_0.h5").read_bytes()
     with pytest.raises(InputError, match=complaint):
-        sample(change(problem), tmp_path, 7, LINE_START, SHORT)
-    assert (tmp_path / "ensemble_0.h5").read_bytes() == before
+        sample(change(line_problem()), chains, 7, LINE_START, SHORT)
+    assert (chains / "ensemble_0.h5").read_bytes() == before
 
 
-def test_another_shape_seed_or_file_is_refused(tmp_path: Path) -> None:
+def test_another_shape_seed_or_file_is_refused(chains: Path, tmp_path: Path) -> None:
     problem = line_problem()
-    sample(problem, tmp_path, 7, LINE_START, SHORT)
     with pytest.raises(InputError, match="a chain of different input: walkers"):
-        sample(problem, tmp_path, 7, LINE_START, dataclasses.replace(SHORT, walkers=18))
+        sample(problem, chains, 7, LINE_START, dataclasses.replace(SHORT, walkers=18))
     with pytest.raises(InputError, match="a chain of different input: seed"):
-        sample(problem, tmp_path, 0, LINE_START, SHORT)
+        sample(problem, chains, 0, LINE_START, SHORT)
     toy = toy_problem(surrogate=ToySurrogate())
     with pytest.raises(InputError, match="a chain of a, b"):
-        sample(toy, tmp_path, 7, {**TRUTH, **NOISE}, dataclasses.replace(SHORT, walkers=24))
-    (tmp_path / "ensemble_0.h5").write_bytes(b"half a file")
+        sample(toy, chains, 7, {**TRUTH, **NOISE}, dataclasses.replace(SHORT, walkers=24))
+    (chains / "ensemble_0.h5").write_bytes(b"half a file")
     with pytest.raises(InputError, match="not readable as HDF5"):
-        sample(problem, tmp_path, 7, LINE_START, SHORT)
+        sample(problem, chains, 7, LINE_START, SHORT)
     with pytest.raises(InputError, match="at least 12"):
         sample(problem, tmp_path / "new", 7, LINE_START, dataclasses.replace(SHORT, walkers=8))
     assert not (tmp_path / "new").exists()
