@@ -13,12 +13,20 @@ import pytest
 from toys.quick_proof import COUNT, SEED, nothing_found
 
 import bayeskin
+from bayeskin import report
 from bayeskin.errors import InputError
 from bayeskin.proof import scoring_history
 from bayeskin.workflow import proof as pipeline
 from bayeskin.workflow.diagnosing_sources import imported
 from bayeskin.workflow.engine import Silent
 from bayeskin.workflow.folder import locked
+
+
+@pytest.fixture(autouse=True)
+def quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draws no scoreboard, and takes the sources' hash as read: both are tested elsewhere."""
+    monkeypatch.setattr(report, "save_figure", lambda figure, stem, stamp: [])
+    monkeypatch.setattr(pipeline, "diagnosing_sources", lambda: "these")
 
 
 def test_a_diagnosis_that_fails_ends_no_set(concealed_set: Path, tmp_path: Path) -> None:
