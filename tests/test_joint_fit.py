@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,11 +34,12 @@ START = {
 PEAKED = dataclasses.replace(BASE.parameters[0], prior="log-normal", centre=150e3, spread=0.5)
 
 
-@pytest.fixture
-def bench(monkeypatch: pytest.MonkeyPatch) -> DiagnosisContext:
-    return closed_form_reduced.bench(
-        monkeypatch, closed_form_reduced.recorded(0, F0=-0.03, stiffness_rate=-8e-4)
-    )
+@pytest.fixture(scope="module")
+def bench() -> Iterator[DiagnosisContext]:
+    with pytest.MonkeyPatch.context() as patch:
+        yield closed_form_reduced.bench(
+            patch, closed_form_reduced.recorded(0, F0=-0.03, stiffness_rate=-8e-4)
+        )
 
 
 def start(bench: DiagnosisContext) -> dict[str, float]:
@@ -115,6 +116,7 @@ def test_several_runs_are_all_met_with_their_slopes(bench: DiagnosisContext) -> 
             np.testing.assert_allclose((ahead - back) / (2.0 * step), run.slopes_n[:, i], rtol=0, atol=2e-5)
 
 
+@pytest.fixture(scope="module")
 def highest(bench: DiagnosisContext) -> tuple[float, dict[str, float]]:
     """Log density and values of the highest top of the set's posterior by the skin itself, of many climbs."""
     about = bench.posterior(SET, [a_run(bench, SET)])
@@ -129,9 +131,11 @@ def highest(bench: DiagnosisContext) -> tuple[float, dict[str, float]]:
     return top.value, whole.named(whole.from_sampling(top.vector))
 
 
-def test_a_fit_reaches_the_maximum_of_the_skin_itself(bench: DiagnosisContext) -> None:
+def test_a_fit_reaches_the_maximum_of_the_skin_itself(
+    bench: DiagnosisContext, highest: tuple[float, dict[str, float]]
+) -> None:
     found = fit_set(SET, start(bench), bench.run, bench.posterior)
-    value, theta = highest(bench)
+    value, theta = highest
     assert isinstance(found, SetFit)
     assert found.settled
     assert found.fit.names == SET
@@ -177,14 +181,14 @@ class Unsteady:
 
 @pytest.mark.parametrize("failing", [(2,), (3,), (2, 4)])
 def test_a_fit_goes_on_where_a_run_in_the_middle_fails(
-    bench: DiagnosisContext, failing: tuple[int, ...]
+    bench: DiagnosisContext, highest: tuple[float, dict[str, float]], failing: tuple[int, ...]
 ) -> None:
     skin = Unsteady(bench, failing)
     found = fit_set(SET, start(bench), skin, bench.posterior, TrustSettings(runs=14))
     assert isinstance(found, SetFit)
     assert found.runs == skin.made > max(failing)
     assert found.settled
-    assert found.fit.value == pytest.approx(highest(bench)[0], abs=2.0 * TrustSettings().enough)
+    assert found.fit.value == pytest.approx(highest[0], abs=2.0 * TrustSettings().enough)
 
 
 def test_a_fit_whose_first_run_fails_is_its_message(bench: DiagnosisContext) -> None:
@@ -200,7 +204,9 @@ def test_a_fit_is_the_first_run_s_where_all_others_fail(bench: DiagnosisContext)
     np.testing.assert_array_equal(found.run.theta[:5], [START[name] for name in BASE.names])
 
 
-def test_a_fit_takes_shorter_steps_where_long_ones_fail(bench: DiagnosisContext) -> None:
+def test_a_fit_takes_shorter_steps_where_long_ones_fail(
+    bench: DiagnosisContext, highest: tuple[float, dict[str, float]]
+) -> None:
     last, failed = np.array([START["E_c"], START["E_s"]]), []
 
     def skin(names: Sequence[str], theta: Mapping[str, float]) -> ModelRun | str:
@@ -217,7 +223,7 @@ def test_a_fit_takes_shorter_steps_where_long_ones_fail(bench: DiagnosisContext)
     assert isinstance(found, SetFit)
     assert failed
     assert found.settled
-    assert found.fit.value == pytest.approx(highest(bench)[0], abs=2.0 * TrustSettings().enough)
+    assert found.fit.value == pytest.approx(highest[0], abs=2.0 * TrustSettings().enough)
 
 
 @pytest.mark.parametrize("power", [1.0, POWER])
