@@ -43,12 +43,11 @@ def test_a_recording_is_made_inferred_and_ranked_in_one_row(benchmark):
     calibration = benchmark("calibration")
     settings = calibration.SampleSettings(2, 24, 500, calibration.Limits())
     item = {"surrogate": calibration.surrogate_hash(), "data": "surrogate", "seed": 1, "index": 3}
-    rows = [calibration.replicate(item, calibration.problem(), settings) for _ in range(2)]
-    assert set(rows[0]) == set(calibration.ROWS.columns)
-    assert {**rows[0], "cpu_s": 0} == {**rows[1], "cpu_s": 0}
-    assert not rows[0]["trusted"]  # 40 steps, and it says so
-    assert "needed" in rows[0]["reason"]
-    assert 0.0 <= rows[0]["band50"] <= rows[0]["band90"] <= 1.0
+    row = calibration.replicate(item, calibration.problem(), settings)
+    assert set(row) == set(calibration.ROWS.columns)
+    assert not row["trusted"]  # 500 steps, and it says so
+    assert "needed" in row["reason"]
+    assert 0.0 <= row["band50"] <= row["band90"] <= 1.0
 
 
 def test_a_recording_of_the_full_model_is_near_the_surrogate_s(benchmark, monkeypatch):
