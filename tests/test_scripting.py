@@ -6,6 +6,8 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +17,12 @@ import numpy as np
 import pytest
 
 import bayeskin as bk
+from bayeskin import scripting
 from bayeskin.config import config_of, load_config, to_toml
 from bayeskin.errors import InputError
+from bayeskin.finite_element import ModelSpec, simulate
 from bayeskin.inference import draws_of
-from bayeskin.types import Recording
+from bayeskin.types import PadMotion, Recording, Simulation
 from bayeskin.workflow import diagnosis
 
 mpl.use("Agg")
@@ -30,10 +34,15 @@ BLOCKS = re.findall(
 
 @pytest.fixture(scope="module")
 def said() -> dict[str, Any]:
-    """The names that the documentation's blocks leave, run from the checkout's root."""
+    """The names that the documentation's blocks leave, run from the checkout's root on a coarse mesh."""
+
+    def coarsely(spec: ModelSpec, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
+        return simulate(replace(spec, refinement=0), motion, theta)
+
     names: dict[str, Any] = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
+        patch.setattr(scripting, "run_model", coarsely)
         for block in BLOCKS:
             exec(compile(block, "docs/scripting.md", "exec"), names)
     return names
@@ -97,10 +106,13 @@ def test_the_full_model_weighs_the_documented_draws(said: dict[str, Any]) -> Non
 
 
 def test_a_folder_keeps_the_chains_and_the_same_call_repeats_the_draws(tmp_path: Path) -> None:
+    """With numbers of NumPy among the settings."""
     recording = bk.load_recording(ROOT / "data" / "demo.h5")
     small = {
-        "sample": {"ensembles": 2, "walkers": 24, "max_steps": 500},
+        "sample": {"ensembles": np.int64(2), "walkers": 24, "max_steps": 500},
         "map": {"starts": 1, "evaluations": 200},
+        "fit": {"windows_s": np.array([[0.0, 75.0]])},
+        "seed": np.int64(3),
     }
     one = bk.calibrate(recording, folder=tmp_path, **small)  # the shipped surrogate that knows the protocol
     files = {f: f.stat().st_mtime_ns for f in tmp_path.rglob("ensemble_*.h5")}
@@ -108,6 +120,8 @@ def test_a_folder_keeps_the_chains_and_the_same_call_repeats_the_draws(tmp_path:
     assert len(files) == 2
     assert files == {f: f.stat().st_mtime_ns for f in tmp_path.rglob("ensemble_*.h5")}
     np.testing.assert_array_equal(draws_of(one)[1], draws_of(again)[1])
+    config = json.loads(one.attrs["provenance"])["config"]
+    assert (config["seed"], config["fit"]["windows_s"]) == (3, [[0.0, 75.0]])
 
 
 def test_a_diagnosis_takes_the_posteriors_settings(
@@ -153,16 +167,6 @@ def test_a_script_that_diagnoses_needs_no_guard(tmp_path: Path) -> None:
         [sys.executable, tmp_path / "unguarded.py"], capture_output=True, text=True, cwd=ROOT
     )
     assert (done.returncode, done.stdout.split()) == (0, ["once", "{0:", "2.0}", "True"]), done.stderr
-
-
-def test_numbers_of_numpy_are_settings_too(tmp_path: Path) -> None:
-    recording = bk.load_recording(ROOT / "data" / "demo.h5")
-    small = {"sample": {"ensembles": np.int64(2), "walkers": 24, "max_steps": 500}, "map": {"starts": 1}}
-    made = bk.calibrate(
-        recording, seed=np.int64(3), fit={"windows_s": np.array([[0.0, 75.0]])}, folder=tmp_path, **small
-    )
-    config = json.loads(made.attrs["provenance"])["config"]
-    assert (config["seed"], config["fit"]["windows_s"]) == (3, [[0.0, 75.0]])
 
 
 def test_wrong_input_is_one_line() -> None:
