@@ -1,5 +1,6 @@
 """Profile likelihoods: a parabola where the force is linear, flat where it does not know a parameter."""
 
+from collections.abc import Mapping
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,12 @@ from toys.inference_problems import NOISE, TRUTH, line_problem, toy_problem
 
 from bayeskin.inference import LogPosterior, find_map, profile, profiles
 from bayeskin.inference.profile import DROP
+
+
+@pytest.fixture(scope="module")
+def best() -> Mapping[str, float]:
+    """The most probable point of the toy's recording."""
+    return find_map(toy_problem(), seed=1, starts=3, evaluations=2000).theta
 
 
 def nothing(problem: LogPosterior) -> np.ndarray:
@@ -21,7 +28,7 @@ def test_a_linear_models_profile_is_a_parabola_of_its_standard_error() -> None:
     x = problem.surrogate.columns
     covariance = (2.5e-3 + 1e-6) * np.eye(40) + 1e-4 * np.outer(x[1], x[1])
     spread = np.linalg.inv(x @ np.linalg.solve(covariance, x.T))
-    for j, found in enumerate(profiles(problem, best, nothing(problem), points=201)):
+    for j, found in enumerate(profiles(problem, best, nothing(problem), points=101)):
         exact = -0.5 * (found.values - best[found.name]) ** 2 / spread[j, j]
         near = exact > -4.0  # further out the surrogate's error leaves its three sd
         assert near.sum() > 4
@@ -33,9 +40,10 @@ def test_a_linear_models_profile_is_a_parabola_of_its_standard_error() -> None:
         assert not found.flat
 
 
-def test_a_parameter_without_effect_has_a_flat_profile_and_one_with_effect_has_not() -> None:
+def test_a_parameter_without_effect_has_a_flat_profile_and_one_with_effect_has_not(
+    best: Mapping[str, float],
+) -> None:
     problem = toy_problem()
-    best = find_map(problem, seed=1, starts=3, evaluations=2000).theta
     found = {one.name: one for one in profiles(problem, best, nothing(problem), points=9)}
     assert found["p_init"].flat
     assert np.ptp(found["p_init"].drop_nats) < 0.1
@@ -46,9 +54,10 @@ def test_a_parameter_without_effect_has_a_flat_profile_and_one_with_effect_has_n
         assert low <= TRUTH[name] <= high, name
 
 
-def test_a_profile_is_nowhere_above_the_maximum_and_tops_what_holds_the_rest() -> None:
+def test_a_profile_is_nowhere_above_the_maximum_and_tops_what_holds_the_rest(
+    best: Mapping[str, float],
+) -> None:
     problem = toy_problem()
-    best = find_map(problem, seed=1, starts=3, evaluations=2000).theta
     top = problem.log_likelihood(np.array([list(best.values())]))[0]
     found = profiles(problem, best, nothing(problem), points=7)[0]
     rows = np.tile([best[name] for name in problem.names], (len(found.values), 1))
@@ -59,10 +68,9 @@ def test_a_profile_is_nowhere_above_the_maximum_and_tops_what_holds_the_rest() -
     assert set(NOISE) <= set(problem.names)
 
 
-def test_a_profile_begins_at_draws_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_profile_begins_at_draws_too(best: Mapping[str, float], monkeypatch: pytest.MonkeyPatch) -> None:
     """Without any climb: as high as the likeliest and the nearest draw about each value, moved onto it."""
     problem = toy_problem()
-    best = find_map(problem, seed=1, starts=3, evaluations=2000).theta
     rng = np.random.default_rng(4)
     about = problem.vector(best) + 0.02 * rng.standard_normal((40, problem.dim))
     low, high = problem.bounds
