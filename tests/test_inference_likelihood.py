@@ -333,6 +333,7 @@ print(hashlib.sha256(values.tobytes()).hexdigest())
 """
 
 
+@pytest.mark.slow  # compiles
 def test_it_is_the_same_to_the_last_bit_whether_just_compiled_or_loaded(tmp_path: Path) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).parent)}
     found = [
