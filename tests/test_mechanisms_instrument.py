@@ -292,8 +292,12 @@ PLUGIN = """
 from bayeskin.mechanisms.mechanism import Instrument, Mechanism, Place, added
 from bayeskin.types import Parameter
 MECHANISM = Mechanism(
-    name="{name}", parameters=(Parameter("{parameter}", "N", 0.0, 1.0, "uniform"),),
-    neutral={{"{parameter}": 0.0}},
+    name="{name}",
+    parameters=(
+        Parameter("{parameter}", "N", 0.0, 1.0, "uniform"),
+        Parameter("rust", "-", {lower}, 1.0, "log-uniform"),
+    ),
+    neutral={{"{neutral}": 0.0}},
     statement=lambda v: "A magnet.",
     act=Instrument(
         Place.CELL,
@@ -308,8 +312,11 @@ MECHANISM = Mechanism(
 def plugin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Installs a package beside bayeskin that brings a mechanism of its own."""
 
-    def install(name: str, parameter: str, more: str = "") -> None:
-        (tmp_path / "magnet.py").write_text(PLUGIN.format(name=name, parameter=parameter, more=more))
+    def install(name: str, parameter: str, more: str = "", neutral: str = "", lower: float = 0.01) -> None:
+        text = PLUGIN.format(
+            name=name, parameter=parameter, more=more, neutral=neutral or parameter, lower=lower
+        )
+        (tmp_path / "magnet.py").write_text(text)
         info = tmp_path / "magnet-1.0.dist-info"
         info.mkdir()
         (info / "METADATA").write_text("Metadata-Version: 2.1\nName: magnet\nVersion: 1.0\n")
@@ -333,8 +340,35 @@ def test_a_need_of_what_there_is_not_is_refused(plugin):
         catalogue()
 
 
-@pytest.mark.parametrize(("name", "parameter"), [("force-offset", "pull"), ("magnet", "F0")])
-def test_two_of_one_name_are_refused(plugin, name, parameter):
+@pytest.mark.parametrize(
+    ("name", "parameter", "message"),
+    [
+        ("force-offset", "pull", "found force-offset twice"),
+        ("magnet", "F0", "found a parameter F0 in force-offset and magnet"),
+    ],
+)
+def test_two_of_one_name_are_refused(plugin, name, parameter, message):
     plugin(name, parameter)
-    with pytest.raises(InputError, match="twice"):
+    with pytest.raises(InputError, match=message):
+        catalogue()
+
+
+def test_a_parameter_without_a_neutral_value_gets_the_median_of_its_prior(plugin):
+    plugin("magnet", "pull")
+    assert catalogue()["magnet"].neutral == {"rust": pytest.approx(0.1), "pull": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        ({"neutral": "pul"}, "magnet: found a neutral value of pul; expected of at least one .* pull, rust"),
+        ({"lower": 0.0}, "magnet: rust: found log-uniform from 0 to 1; expected a lower bound"),
+        ({"lower": 2.0}, "magnet: rust: found log-uniform from 2 to 1; expected a lower bound"),
+        ({"more": "coil=3"}, "entry point magnet = magnet:MECHANISM: found TypeError.*import magnet"),
+        ({"more": "); MECHANISM = dict("}, "magnet:MECHANISM: found an object of the type dict"),
+    ],
+)
+def test_a_mechanism_of_another_package_that_cannot_work_is_refused_in_one_line(plugin, made, message):
+    plugin("magnet", "pull", **made)
+    with pytest.raises(InputError, match=message):
         catalogue()

@@ -118,7 +118,9 @@ class Config(Section):
         coarse = self.design.coarse
         if self.model.forward is not None and (coarse is not None or self.surrogate.file is not None):
             key = "design.coarse" if coarse is not None else "surrogate.file"
-            raise InputError(key, "a value with model.forward", "none, because it concerns the full model")
+            raise InputError(
+                key, "a value with model.forward", "no such line, because it concerns the full model"
+            )
         return self
 
     @property

@@ -15,7 +15,9 @@ deformation (n, 3, 3), pressure (n,), gradient (n, 3) : F, p [Pa] and grad p [Pa
 before, after (n, m) : the law's memory at the start and at the end of the solve; `respond` fills all of
     `after`
 stress (n, 3, 3), content (n,), flux (n, 3) : the response of the base law and of the laws that were evaluated
-    before this one; the kernel changes it in place
+    before this one; the kernel changes it in place. The stress is the first Piola-Kirchhoff stress with the
+    pressure of the fluid, P = P_e - p J F^-T (`bayeskin.mechanisms.elastic` gives P_e). The flux is that over
+    the whole solve
 stress_f (n, 9, 9), stress_p, content_f (n, 9), content_p (n,), flux_f (n, 3, 9), flux_g (n, 3, 3) : the
     derivatives of that response with respect to deformation (as rows of nine), pressure and gradient; the
     kernel changes them in place

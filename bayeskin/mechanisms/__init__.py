@@ -9,10 +9,13 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import sys
-from collections.abc import Mapping
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
+
+import numpy as np
 
 from bayeskin.errors import InputError
 from bayeskin.mechanisms.mechanism import (
@@ -25,6 +28,7 @@ from bayeskin.mechanisms.mechanism import (
     with_one,
     without_one,
 )
+from bayeskin.types import ParameterSpace
 
 ENTRY_POINTS = "bayeskin.mechanisms"
 
@@ -33,7 +37,8 @@ def catalogue() -> dict[str, Mechanism]:
     """Returns all mechanisms by name, in alphabetical order.
 
     Raises InputError if two mechanisms or two parameters have the same name. It also raises InputError if a
-    mechanism needs one that is not in the catalogue, or one that itself needs another.
+    mechanism needs one that is not in the catalogue, or one that itself needs another, and if an entry point
+    provides no mechanism.
     """
     return dict(_catalogue_on(tuple(sys.path)))
 
@@ -43,11 +48,8 @@ def _catalogue_on(_: tuple[str, ...]) -> dict[str, Mechanism]:
     """Returns the catalogue with the packages that are installed on a search path."""
     modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
     found = [module.MECHANISM for module in modules if hasattr(module, "MECHANISM")]
-    found += [entry.load() for entry in entry_points(group=ENTRY_POINTS)]
-    for names in ([m.name for m in found], [p.name for m in found for p in m.parameters]):
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise InputError("mechanisms", f"{twice[0]} twice", "different names")
+    found += [_checked(_loaded(entry)) for entry in entry_points(group=ENTRY_POINTS)]
+    _check_names(found)
     known = {m.name: m for m in sorted(found, key=lambda m: m.name)}
     for mechanism in found:
         for name in mechanism.needs:
@@ -55,6 +57,52 @@ def _catalogue_on(_: tuple[str, ...]) -> dict[str, Mechanism]:
                 expected = "a mechanism of the catalogue that needs none itself"
                 raise InputError(mechanism.name, f"a need of {name}", expected)
     return _with_both_look_alikes(known)
+
+
+def _loaded(entry: EntryPoint) -> Mechanism:
+    """Returns the mechanism of an entry point. Raises InputError if it cannot be imported or is none."""
+    where = f"entry point {entry.name} = {entry.value}"
+    try:
+        mechanism = entry.load()
+    except Exception as error:  # the file of another package can raise any exception
+        whole = f'python -c "import {entry.module}" may show more'
+        expected = f"a mechanism in a file that Python can import; {whole}"
+        raise InputError(where, f"{type(error).__name__}: {error}", expected) from None
+    if not isinstance(mechanism, Mechanism):
+        raise InputError(where, f"an object of the type {type(mechanism).__name__}", "a Mechanism")
+    return mechanism
+
+
+def _checked(mechanism: Mechanism) -> Mechanism:
+    """Returns a mechanism whose `neutral` has all parameters: those that it lacks get their prior's median.
+
+    Raises InputError if `neutral` names another parameter, or none, and if a prior has no such bounds.
+    """
+    where, names = f"mechanism {mechanism.name}", [p.name for p in mechanism.parameters]
+    for p in mechanism.parameters:
+        if not p.lower < p.upper or (p.in_log and not p.lower + p.offset > 0.0):
+            expected = "a lower bound below the upper one; for a logarithmic prior above 0, or with an offset"
+            raise InputError(f"{where}: {p.name}", f"{p.prior} from {p.lower:g} to {p.upper:g}", expected)
+    if not mechanism.neutral or not set(names).issuperset(mechanism.neutral):
+        found = f"a neutral value of {', '.join(mechanism.neutral) or 'no parameter'}"
+        raise InputError(where, found, f"of at least one of its parameters {', '.join(names)}, and no other")
+    medians = ParameterSpace(mechanism.parameters).from_unit(np.full(len(names), 0.5)).tolist()
+    return replace(mechanism, neutral={**dict(zip(names, medians, strict=True)), **mechanism.neutral})
+
+
+def _check_names(found: Sequence[Mechanism]) -> None:
+    """Raises InputError if two mechanisms, or two of their parameters, have the same name."""
+    owners = defaultdict[str, list[str]](list)
+    for mechanism in found:
+        for parameter in mechanism.parameters:
+            owners[parameter.name].append(mechanism.name)
+    for name, count in Counter(m.name for m in found).items():
+        if count > 1:
+            raise InputError("mechanisms", f"{name} twice", "another name for one of them")
+    for name, both in owners.items():
+        if len(both) > 1:
+            at = " and ".join(both)
+            raise InputError("mechanisms", f"a parameter {name} in {at}", "another name in one of them")
 
 
 def _with_both_look_alikes(known: Mapping[str, Mechanism]) -> dict[str, Mechanism]:

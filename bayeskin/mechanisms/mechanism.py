@@ -83,7 +83,8 @@ class Mechanism:
     """One entry of the catalogue.
 
     parameters : its parameters in SI units, with priors
-    neutral : values of these parameters that switch it off
+    neutral : values of these parameters that switch it off. Parameters that it does not name, because their
+        value makes no difference then, get the median of their prior in the catalogue
     statement : returns one plain sentence for a report, from the parameters' values
     look_alikes : names of mechanisms that one force channel cannot tell apart from it. One entry of a pair
         states the other; the catalogue completes both
