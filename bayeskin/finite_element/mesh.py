@@ -23,7 +23,7 @@ TOP_TOLERANCE_M = 1e-6  # points so near to the skin's outer face count as lying
 BOUNDARIES = ("pad", "guard", "symmetry_x", "symmetry_y", "bottom")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SkinMesh:
     """A rolled mesh with the facets of each boundary and the cells of the cutis.
 

@@ -11,11 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import lru_cache
 
 import numpy as np
 import scipy.sparse as sp
 import skfem
 
+from bayeskin.finite_element.mesh import SkinMesh
 from bayeskin.finite_element.problem import Problem, Sites
 from bayeskin.finite_element.space import TaylorHood
 from bayeskin.types import Array, PadMotion
@@ -105,17 +107,22 @@ def surface_mass(
     weight : function of points (3, ...) by which the products are multiplied, 1 if None; the result has its
         unit times m^2
     """
-    mesh = problem.mesh.geometry
-    bricks = isinstance(mesh, skfem.MeshHex)
+    basis = _facet_basis(problem.mesh, facets.astype(np.int64).tobytes(), displacement)
+    form = skfem.BilinearForm(lambda u, v, w: (1.0 if weight is None else weight(w.x)) * u * v)
+    return form.assemble(basis).tocoo()
+
+
+@lru_cache(maxsize=2)  # a term may need several integrals over the same facets
+def _facet_basis(mesh: SkinMesh, facets: bytes, displacement: bool) -> skfem.FacetBasis:
+    """Returns shape functions of displacement or pressure on facets, given as the bytes of an array."""
+    bricks = isinstance(mesh.geometry, skfem.MeshHex)
     quadratic, linear = (
         (skfem.ElementHex2(), skfem.ElementHex1()) if bricks else (skfem.ElementTetP2(), skfem.ElementTetP1())
     )
-    element = quadratic if displacement else linear
-    basis = skfem.FacetBasis(
-        mesh, element, problem.mesh.facet_mapping(), facets=facets, intorder=SURFACE_QUADRATURE_DEGREE
-    )
-    form = skfem.BilinearForm(lambda u, v, w: (1.0 if weight is None else weight(w.x)) * u * v)
-    return form.assemble(basis).tocoo()
+    return skfem.FacetBasis(
+        mesh.geometry, quadratic if displacement else linear, mesh.facet_mapping(),
+        facets=np.frombuffer(facets, dtype=np.int64), intorder=SURFACE_QUADRATURE_DEGREE,
+    )  # fmt: skip
 
 
 def pressure_rows(space: TaylorHood, mass: sp.coo_matrix) -> sp.csr_matrix:
