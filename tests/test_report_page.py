@@ -12,7 +12,7 @@ from toys.html_walk import Walk
 
 from bayeskin.report.page import RunFacts, StageFacts, render_page
 from bayeskin.report.page.answer import answer
-from bayeskin.report.page.figures import FIGURES
+from bayeskin.report.page.figures import FIGURES, pictures
 
 SECTIONS = ["answer", "recording", "fit", "posterior", "sobol", "mismatch", "checks", "provenance"]
 
@@ -214,3 +214,14 @@ def test_a_posterior_that_is_not_trusted_says_so_and_why_at_the_top() -> None:
         sure = answer(dataclasses.replace(run, stages={**run.stages, stage: changed})).sure
         assert (sure.word, sure.tone) == ("not trusted", "doubt")
         assert sure.lines[0] in ("12 lengths of 50", "off by 9 mN")
+
+
+def test_figures_of_further_recordings_follow_that_of_the_first() -> None:
+    run = facts()
+    sample = run.stages["sample"]
+    figures = {**sample.figures, "fit-2": sample.figures["fit"], "fit-10": sample.figures["fit"]}
+    changed = dataclasses.replace(sample, figures=figures)
+    both = dataclasses.replace(run, stages={**run.stages, "sample": changed})
+    fits = pictures(both, "sample", ["fit"])
+    assert [picture.title for picture in fits[1:]] == [f"{fits[0].title}, recording {n}" for n in (2, 10)]
+    assert len(pictures(run, "sample", ["fit"])) == 1

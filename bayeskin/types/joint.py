@@ -36,6 +36,11 @@ def own_name(name: str, recording: int) -> str:
     return name if recording == 0 else f"{name}{_MARK}{recording + 1}"
 
 
+def figure_name(name: str, recording: int) -> str:
+    """Returns the name of a figure of recording number 0, 1, ...; that of the first is the plain one."""
+    return name if recording == 0 else f"{name}-{recording + 1}"
+
+
 def plain_name(name: str) -> str:
     """Returns the name of a value without the number of a recording."""
     return name.partition(_MARK)[0]

@@ -14,6 +14,7 @@ from bayeskin.mismatch.assess import AssessedFit, Diagnosis
 from bayeskin.mismatch.context import DiagnosisContext
 from bayeskin.mismatch.locate import Located
 from bayeskin.types import Array, BinnedForce
+from bayeskin.types.joint import figure_name
 
 
 @dataclass(frozen=True)
@@ -86,8 +87,8 @@ def draw(
         ),
     }
     for number in range(len(binned.parts)):
-        suffix = "" if number == 0 else f"-{number + 1}"
-        figures |= {f"{name}{suffix}": made for name, made in _of_recording(context, diagnosis, number)}
+        of_recording = _of_recording(context, diagnosis, number)
+        figures |= {figure_name(name, number): figure for name, figure in of_recording}
     if diagnosis.remainder is not None:
         figures["discrepancy"] = report.figure_discrepancy(binned, motion, diagnosis.remainder.discrepancy)
     return [

@@ -19,6 +19,7 @@ from bayeskin.sensitivity.shapley import shapley
 from bayeskin.sensitivity.sobol import sobol
 from bayeskin.surrogates import correct, load_surrogate, train
 from bayeskin.types import Design, PadMotion, Parameter, ParameterSpace
+from bayeskin.types.joint import bins_of, edges_of, figure_name
 from bayeskin.workflow.engine import Run, Stage
 from bayeskin.workflow.provenance import caption
 from bayeskin.workflow.training import fine_design
@@ -46,7 +47,9 @@ def _compute_indices(run: Run) -> Mapping[str, Any]:
     motion = storage.load(run.at("recording", "motion.h5"), PadMotion)
     for name, result in results.items():
         storage.save(run.at("sobol", f"{name}.h5"), result)
-        report.save_figure(_indices_figure(result, motion), run.at("sobol", f"sobol_{name}"), caption(run))
+        for number in range(len(motion.parts)):
+            file = run.at("sobol", figure_name(f"sobol_{name}", number))
+            report.save_figure(_indices_figure(result, motion, number), file, caption(run))
     tables = {name: _table(result) for name, result in results.items()}
     return {**tables, "posterior": _over_posterior(run, rng)}
 
@@ -121,18 +124,20 @@ def _table(result: SobolResult) -> dict[str, Any]:
     }
 
 
-def _indices_figure(result: SobolResult, motion: PadMotion) -> Any:
-    """Returns the figure of the indices over time."""
-    time_s = 0.5 * (result.edges_s[1:] + result.edges_s[:-1])
+def _indices_figure(result: SobolResult, motion: PadMotion, number: int) -> Any:
+    """Returns the figure of the indices over time in one of the recordings."""
+    edges_s = edges_of(motion.spans, result.edges_s)[number]
+    bins = bins_of(motion.spans, result.edges_s)[number]
+    time_s = 0.5 * (edges_s[1:] + edges_s[:-1])
 
     def with_limits(interval: Any, estimate: Any) -> Any:
         """Returns lower limit, estimate and upper limit, (3, m, d), or (3, d) for aggregated indices."""
         return np.moveaxis(np.stack([interval[0], estimate, interval[1]]), 1, -1)
 
     return report.figure_sobol(
-        result.names, time_s, motion.at(time_s),
-        with_limits(result.first_interval, result.first),
-        with_limits(result.total_interval, result.total),
+        result.names, time_s, motion.parts[number].at(time_s),
+        with_limits(result.first_interval, result.first)[:, bins],
+        with_limits(result.total_interval, result.total)[:, bins],
         with_limits(result.first_aggregated_interval, result.first_aggregated),
         with_limits(result.total_aggregated_interval, result.total_aggregated),
         result.distribution,

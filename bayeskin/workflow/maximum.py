@@ -16,6 +16,7 @@ from bayeskin.finite_element.simulate import simulate
 from bayeskin.forward.joint import on_each_recording
 from bayeskin.inference import MapCheck, RefinedMap
 from bayeskin.types import Array, BinnedForce, PadMotion, Simulation
+from bayeskin.types.joint import figure_name
 from bayeskin.workflow.calibration import log_posterior_of, rmse_table
 from bayeskin.workflow.engine import Run, Stage
 from bayeskin.workflow.model import model_spec
@@ -135,10 +136,10 @@ def _draw_check(run: Run, binned: BinnedForce, refined: RefinedMap) -> None:
     if check.simulation.status != "ok":
         return
     prediction = surrogate.predict(np.array([list(check.theta.values())]))
-    figure = report.figure_map_check(
-        binned, _full_model_means(check, binned), prediction.mean[0], prediction.sd()[0]
-    )
-    report.save_figure(figure, run.at("map", "map_check"), caption(run))
+    forces = _full_model_means(check, binned), prediction.mean[0], prediction.sd()[0]
+    for number, (bins, part) in enumerate(zip(binned.slices, binned.parts, strict=True)):
+        figure = report.figure_map_check(part, *(force[bins] for force in forces))
+        report.save_figure(figure, run.at("map", figure_name("map_check", number)), caption(run))
 
 
 STAGE = Stage(

@@ -18,6 +18,7 @@ from bayeskin.inference import LogPosterior, Posterior, Verdict
 from bayeskin.json_files import write_json
 from bayeskin.number_format import quantity
 from bayeskin.types import PadMotion, Provenance, Recording
+from bayeskin.types.joint import figure_name
 from bayeskin.workflow.calibration import refined_posterior, rmse_table
 from bayeskin.workflow.checking import (
     Checked,
@@ -264,21 +265,18 @@ def _draw_figures(
     figures = {
         "posterior": report.figure_posterior(posterior.space, posterior.flat, best, material),
         "posterior_noise": report.figure_posterior(posterior.space, posterior.flat, best, noise),
-        "fit": report.figure_fit(
-            binned,
-            motion.at(binned.time_s),
-            fitted,
-            mean_n=drawn.mean_n,
-            surrogate_sd_n=drawn.surrogate_sd_n,
-            noise_sd_n=drawn.noise_sd_n,
-            force_n=drawn.force_n,
-        ),
         "profiles": report.figure_profiles(posterior.space, posterior.flat, profiles),
         "residuals": report.figure_residuals(residuals),
         "traces": report.figure_traces(
             posterior.space, chains, convergence.verdict, settings_of(run.config).limits
         ),
     }
+    for number, (bins, part) in enumerate(zip(binned.slices, binned.parts, strict=True)):
+        figures[figure_name("fit", number)] = report.figure_fit(
+            part, motion.parts[number].at(part.time_s), fitted[bins],
+            mean_n=drawn.mean_n[:, bins], surrogate_sd_n=drawn.surrogate_sd_n[:, bins],
+            noise_sd_n=drawn.noise_sd_n[:, bins], force_n=drawn.force_n[:, bins],
+        )  # fmt: skip
     if checked.rounds and says_something(checked.rounds[-1]):
         weighed = checked.rounds[-1]
         moved = inference.corrected(weighed, posterior.flat)

@@ -31,6 +31,7 @@ from bayeskin.recordings import (
 )
 from bayeskin.recordings.join import join_bins, join_motions, join_samples, spans_of
 from bayeskin.types import BinnedForce, PadMotion, Phase, Recording
+from bayeskin.types.joint import figure_name
 from bayeskin.workflow.engine import Run, Stage
 from bayeskin.workflow.provenance import caption
 
@@ -100,8 +101,7 @@ def _prepare_recordings(run: Run) -> Mapping[str, Any]:
     storage.save(run.at("recording", "binned.h5"), binned)
     for number, (recording, part) in enumerate(zip(recordings, parts, strict=True)):
         figure = report.figure_recording(recording, part.binned)
-        name = "recording" if number == 0 else f"recording-{number + 1}"
-        report.save_figure(figure, run.at("recording", name), caption(run))
+        report.save_figure(figure, run.at("recording", figure_name("recording", number)), caption(run))
     if len(parts) == 1:
         return facts[0]
     total = {key: sum(fact[key] for fact in facts) for key in ("samples", "duration_s")}

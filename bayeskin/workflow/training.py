@@ -23,6 +23,7 @@ from bayeskin.surrogates import (
 )
 from bayeskin.surrogates.focus import focus
 from bayeskin.types import Array, BinnedForce, Design, PadMotion
+from bayeskin.types.joint import figure_name
 from bayeskin.workflow.design_runs import enough
 from bayeskin.workflow.engine import Run, Stage
 from bayeskin.workflow.provenance import caption
@@ -98,8 +99,9 @@ def _draw_figures(
     space = parameter_space(run.config, run.config_path)
     theta = space.draw(np.random.default_rng([run.config.seed, 3]), PRIOR_DRAWS)
     drawn = surrogate.predict_mean(theta)
-    figure = report.figure_prior_predictive(binned, drawn)
-    report.save_figure(figure, run.at("train", "prior_predictive"), caption(run))
+    for number, (bins, part) in enumerate(zip(binned.slices, binned.parts, strict=True)):
+        figure = report.figure_prior_predictive(part, drawn[:, bins])
+        report.save_figure(figure, run.at("train", figure_name("prior_predictive", number)), caption(run))
 
 
 def _earlier_predictions(

@@ -111,13 +111,26 @@ def pictures(facts: RunFacts, stage: str, names: Iterable[str] | None = None) ->
     drawn = facts.stage(stage).figures
     known = [name for owner, name in FIGURES if owner == stage]
     wanted = names if names is not None else [*known, *sorted(set(drawn) - set(known))]
-    return [_picture(stage, name, drawn[name]) for name in wanted if name in drawn]
+    by_name: dict[str, list[str]] = {}
+    for name in sorted(drawn, key=lambda name: (len(name), name)):
+        by_name.setdefault(_of_first(name), []).append(name)
+    each = dict.fromkeys(name for first in wanted for name in by_name.get(_of_first(first), ()))
+    return [_picture(stage, name, drawn[name]) for name in each]
+
+
+def _of_first(name: str) -> str:
+    """Returns the name of a figure of the first recording, for that of any of several recordings."""
+    first, _, number = name.rpartition("-")
+    return first if number.isdigit() else name
 
 
 def _picture(stage: str, name: str, svg: str) -> Picture:
     """Returns a figure with its title and description; a figure whose file is damaged stays empty."""
     plain = name.replace("_", " ")
-    title, alt = FIGURES.get((stage, name), (plain.capitalize(), f"Figure {plain} of the stage {stage}."))
+    unknown = plain.capitalize(), f"Figure {plain} of the stage {stage}."
+    title, alt = FIGURES.get((stage, _of_first(name)), unknown)
+    if name != _of_first(name):
+        title = f"{title}, recording {name.rpartition('-')[2]}"
     key = f"{stage}-{name}".replace("_", "-")
     try:
         return Picture(key, title, alt, inline_svg(svg, key))
