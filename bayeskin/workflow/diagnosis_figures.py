@@ -87,7 +87,7 @@ def draw(
     }
     for number in range(len(binned.parts)):
         suffix = "" if number == 0 else f"-{number + 1}"
-        figures |= {f"{name}{suffix}": made for name, made in _of_recording(context, diagnosis, number)}
+        figures |= {f"{name}{suffix}": figure for name, figure in _of_recording(context, diagnosis, number)}
     if diagnosis.remainder is not None:
         figures["discrepancy"] = report.figure_discrepancy(binned, motion, diagnosis.remainder.discrepancy)
     return [
