@@ -9,7 +9,7 @@ import numpy as np
 import rows
 
 from bayeskin.finite_element import ModelSpec
-from bayeskin.finite_element.stepping import STEPS_PER_PHASE
+from bayeskin.finite_element.stepping import STEPPING
 from bayeskin.types import Simulation
 
 SPACE_TOLERANCE = 3e-4
@@ -56,11 +56,11 @@ class Error:
     rms_scaled: float
 
 
-def error(found: Simulation, reference: Simulation) -> Error:
+def error(simulation: Simulation, reference: Simulation) -> Error:
     """Returns the error of a history against a reference, over the time that both cover."""
-    end = min(found.time_s[-1], reference.time_s[-1])
+    end = min(simulation.time_s[-1], reference.time_s[-1])
     time_s = np.linspace(0.0, end, round(10 * end) + 1)
-    a, b = found.at(time_s), reference.at(time_s)
+    a, b = simulation.at(time_s), reference.at(time_s)
     peak = float(np.abs(b).max())
     scale = float(a @ b / (a @ a))
     rms, rms_scaled = (float(np.sqrt(np.mean(d**2))) / peak for d in (a - b, scale * a - b))
@@ -237,7 +237,7 @@ def verdict(
         sentences.append(
             f"The default is {default:g}. Its RMS error is at most {100 * default_rms[0]:.3f} and "
             f"{100 * default_rms[1]:.3f} % on these protocols. Looser tolerances take as many steps, because "
-            f"no phase has fewer than {STEPS_PER_PHASE}."
+            f"no phase has fewer than {STEPPING.steps_per_phase}."
         )
     else:
         sentences.append(

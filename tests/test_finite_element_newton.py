@@ -14,7 +14,7 @@ from bayeskin.finite_element.mesh import layered_mesh
 from bayeskin.finite_element.newton import Equations, NewtonSolver
 from bayeskin.finite_element.problem import build_problem, material
 from bayeskin.finite_element.relaxation import relax
-from bayeskin.finite_element.stepping import integrate
+from bayeskin.finite_element.stepping import StepSettings, integrate
 from bayeskin.types import PadMotion
 
 
@@ -29,9 +29,9 @@ def test_a_step_that_does_not_contract_is_damped(start: float) -> None:
         scale=np.ones(2),
         place=np.zeros(1),
     )
-    found = NewtonSolver().solve(equations, np.array([start, 0.5 * start]))
-    assert found is not None
-    np.testing.assert_allclose(found, 0.0, atol=1e-7)
+    solution = NewtonSolver().solve(equations, np.array([start, 0.5 * start]))
+    assert solution is not None
+    np.testing.assert_allclose(solution, 0.0, atol=1e-7)
 
 
 def arch(load: float) -> Equations:
@@ -54,9 +54,9 @@ def test_past_a_fold_a_fall_ends_in_the_next_equilibrium(side: float) -> None:
     load, before = side * 0.7, np.full(2, side * -1.05)
     assert NewtonSolver().solve(arch(load), before) is None
     solver = NewtonSolver()
-    found = relax(solver, arch(load), before, np.array([1.0, 0.0]))
-    assert found is not None
-    np.testing.assert_allclose(found, side * max(np.roots([1 / 3, 0, -1, -0.7]).real), atol=1e-7)
+    rest = relax(solver, arch(load), before, np.array([1.0, 0.0]))
+    assert rest is not None
+    np.testing.assert_allclose(rest, side * max(np.roots([1 / 3, 0, -1, -0.7]).real), atol=1e-7)
     assert solver.counts["falls"] == 1
 
 
@@ -86,7 +86,7 @@ def test_a_soft_cutis_on_a_stiff_subcutis_folds_and_the_run_goes_on() -> None:
 
 
 def test_a_run_that_folds_too_often_is_given_up_and_says_where(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stepping, "MOST_CRAWLS", 2)
+    monkeypatch.setattr(stepping, "STEPPING", StepSettings(most_crawls=2))
     model = foldable()
     message = integrate(model, 700.0, 1e-3, lambda step: None)
     assert re.fullmatch(r"step \d+ at t = \S+ s: the skin has folded and snapped 1 times; try .*", message)
