@@ -21,13 +21,13 @@ from bayeskin.inference.noise_model import (
 )
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.surrogate_error import drawn_errors
-from bayeskin.types import POINTS_AT_ONCE, Array, BinnedForce, Prediction, _FreezesArrays
+from bayeskin.types import POINTS_AT_ONCE, Array, BinnedForce, FreezesArrays, Prediction
 
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
 @dataclass(frozen=True)
-class ForceDraws(_FreezesArrays):
+class ForceDraws(FreezesArrays):
     """Posterior predictive draws on all bins; each array is (s, m) [N].
 
     mean_n is the force without noise; it includes the errors of surrogate and model that the recording
@@ -42,7 +42,7 @@ class ForceDraws(_FreezesArrays):
 
 
 @dataclass(frozen=True)
-class Bands(_FreezesArrays):
+class Bands(FreezesArrays):
     """Predictive bands over the bins, (m,) each [N], and the parts of their variance.
 
     `sd_model_n` is the sd of the force without noise over the draws; it contains the uncertainty of the

@@ -13,7 +13,7 @@ from scipy.linalg import cho_factor, cho_solve
 from bayeskin.inference.optimise import MapResult, find_map
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.number_format import quantity
-from bayeskin.types import Array, Prediction, Simulation, Surrogate, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays, Prediction, Simulation, Surrogate
 
 FullRun = Callable[[Mapping[str, float]], Simulation]
 Retrain = Callable[[Mapping[str, float], Simulation], Surrogate]
@@ -34,7 +34,7 @@ class CheckSettings:
 
 
 @dataclass(frozen=True)
-class MapCheck(_FreezesArrays):
+class MapCheck(FreezesArrays):
     """Error of the surrogate at one point: its force minus that of the full model.
 
     error_n (m,) [N] is the error in each bin. rms_n and max_n [N] are its root mean square and its largest

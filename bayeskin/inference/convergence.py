@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import ndtri
 from scipy.stats import rankdata
 
-from bayeskin.types import Array, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Convergence(_FreezesArrays):
+class Convergence(FreezesArrays):
     """Convergence of a run of E ensembles: tau_steps (E, D); ess, rhat (D,); acceptance (E,).
 
     `stuck` lists (ensemble, walker). A parameter that does not move has NaN in tau_steps, ess and rhat.

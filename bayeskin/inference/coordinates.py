@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from bayeskin.inference.reparametrisation import Shear
-from bayeskin.types import Array, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays
 
 _EDGE = 1e-14  # smallest distance from a bound at which a score is taken, as a share of the box
 
 
 @dataclass(frozen=True)
-class MoveCoordinates(_FreezesArrays):
+class MoveCoordinates(FreezesArrays):
     """The map from sampling coordinates x (n, D), inside the box low..high (D,), to y (n, D)."""
 
     shear: Shear | None

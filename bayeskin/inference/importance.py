@@ -19,7 +19,7 @@ from bayeskin.inference.convergence import Verdict
 from bayeskin.inference.likelihood import log_likelihood
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.number_format import number
-from bayeskin.types import Array, ParameterSpace, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays, ParameterSpace
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class WeightSettings:
 
 
 @dataclass(frozen=True)
-class Weighed(_FreezesArrays):
+class Weighed(FreezesArrays):
     """Draws theta (s, D) in SI with normalised weights (s,); a draw whose full run failed has weight zero.
 
     log_ratio (s,) : log-likelihood of the full model less that of the surrogate [nats], -inf for a failed run

@@ -32,10 +32,10 @@ from bayeskin.errors import InputError
 from bayeskin.types import (
     Array,
     BinnedForce,
+    FreezesArrays,
     Parameter,
     ParameterSpace,
     PhaseKind,
-    _FreezesArrays,
 )
 from bayeskin.types.joint import own_name, plain_name, recording_at, recording_of
 
@@ -62,7 +62,7 @@ class NoisePriors:
 
 
 @dataclass(frozen=True)
-class NoiseChain(_FreezesArrays):
+class NoiseChain(FreezesArrays):
     """The bins that enter a likelihood, in time order, with all values that do not depend on a parameter.
 
     All arrays are (k,). `bins` are indices of the recording's bins, and `force_n` are their forces.

@@ -17,14 +17,14 @@ import numpy as np
 from bayeskin.inference.gauss_newton import gauss_newton
 from bayeskin.inference.problem import HELD, LogPosterior
 from bayeskin.inference.reparametrisation import Shear, find_shear
-from bayeskin.types import Array, Parameter, ParameterSpace, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays, Parameter, ParameterSpace
 
 DROP = 1.353  # nats below the top: half the 90 % quantile of chi-square with one degree of freedom
 _ROUNDS = 12  # largest number of rounds of a climb
 
 
 @dataclass(frozen=True)
-class Profile(_FreezesArrays):
+class Profile(FreezesArrays):
     """Profile of one parameter: values (g,) in SI over its prior, and log-likelihoods (g,) less the largest.
 
     interval : 90 % interval by the likelihood ratio, in SI; an end at the prior's bound is open

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaln, logsumexp
 
-from bayeskin.types import Array, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ MIXTURE = MixtureSettings()
 
 
 @dataclass(frozen=True)
-class Mixture(_FreezesArrays):
+class Mixture(FreezesArrays):
     """Mixture of t-distributions: weights (k,), centres (k, d), Cholesky factors (k, d, d) of the spreads."""
 
     weights: Array

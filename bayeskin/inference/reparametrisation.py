@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from bayeskin.inference.problem import LogPosterior
-from bayeskin.types import POINTS_AT_ONCE, Array, _FreezesArrays
+from bayeskin.types import POINTS_AT_ONCE, Array, FreezesArrays
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class ShearSettings:
 
 
 @dataclass(frozen=True)
-class Shear(_FreezesArrays):
+class Shear(FreezesArrays):
     """The map for x (n, D): `group` (D,) bool marks G, and log_weight (D,) is log a_j in G, -inf outside.
 
     The polynomial has exponents `powers` (t, D) and `coefficients` (t,), in (P x - centre) / scale. If

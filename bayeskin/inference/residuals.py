@@ -22,7 +22,7 @@ from bayeskin.inference.noise_model import innovations
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.surrogate_error import surrogate_error
 from bayeskin.number_format import number
-from bayeskin.types import Array, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class KindCheck:
 
 
 @dataclass(frozen=True)
-class ResidualCheck(_FreezesArrays):
+class ResidualCheck(FreezesArrays):
     """Residuals of a fit as scores (k,) of the fitted bins, standard normal if the noise is as assumed.
 
     autocorrelation (l,) is over 1 to l bins. p_law is the p-value of Kolmogorov & Smirnov, and p_correlation

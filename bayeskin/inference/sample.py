@@ -18,7 +18,7 @@ from bayeskin.inference.convergence import Convergence, Limits, assess
 from bayeskin.inference.ensembles import adapt_proposals, advance_all, ensembles
 from bayeskin.inference.problem import LogPosterior
 from bayeskin.inference.schedule import SCHEDULE
-from bayeskin.types import Array, ParameterSpace, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays, ParameterSpace
 
 Progress = Callable[[float, str], None]
 
@@ -39,7 +39,7 @@ class SampleSettings:
 
 
 @dataclass(frozen=True)
-class Posterior(_FreezesArrays):
+class Posterior(FreezesArrays):
     """Draws after burn-in, thinned by the autocorrelation time, so that each is worth about one sample.
 
     draws (E, n, D) are in SI with the columns of `space`. Steps are in order, with an ensemble's walkers side

@@ -22,14 +22,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bayeskin.forward.interface import ModelRun
-from bayeskin.types import Array, ParameterSpace, Prediction, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays, ParameterSpace, Prediction
 
 AT_A_RUN = 1e-12  # added to the square of a distance in the box, so that it is never zero
 POWER = 0.8  # the force is linear in this power of a modulus
 
 
 @dataclass(frozen=True)
-class Tangent(_FreezesArrays):
+class Tangent(FreezesArrays):
     """The force near runs of a forward model; it satisfies `types.Surrogate`.
 
     edges_s (m+1,) : edges of the bins over which the runs' forces are averaged

@@ -10,11 +10,11 @@ import numpy as np
 
 from bayeskin.recordings.noise_analysis import NoiseAnalysis, analyse
 from bayeskin.recordings.steps import allowed_jumps
-from bayeskin.types import Array, Jumps, Phase, PhaseKind, Recording, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays, Jumps, Phase, PhaseKind, Recording
 
 
 @dataclass(frozen=True)
-class PhaseNoise(_FreezesArrays):
+class PhaseNoise(FreezesArrays):
     """Noise of the force in one phase.
 
     `sd_n` is the sd of the noise that is faster than about a second, without spikes. It has a white part,

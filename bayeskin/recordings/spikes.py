@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_propagation, label, median_filter
 from scipy.stats import norm
 
-from bayeskin.types import Array, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays
 
 _HUBER = 2.5  # number of sd at which residuals are winsorised
 # This is E min(z^2, k^2) of a standard normal z. Dividing by it makes the winsorised variance consistent.
@@ -49,7 +49,7 @@ class SpikeSettings:
 
 
 @dataclass(frozen=True)
-class Despiked(_FreezesArrays):
+class Despiked(FreezesArrays):
     """A recording's force without its spikes; all arrays have shape (n,).
 
     force_n : force [N] in which the running median replaces spikes

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from bayeskin.number_format import interval, number, quantity
-from bayeskin.types import Array, Parameter, ParameterSpace, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays, Parameter, ParameterSpace
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class UninformedSettings:
 
 
 @dataclass(frozen=True)
-class SobolResult(_FreezesArrays):
+class SobolResult(FreezesArrays):
     """First-order, total and second-order Sobol' indices, for each bin and for the whole history.
 
     first, total : (d, m) indices, NaN in bins whose force hardly varies

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from bayeskin.polynomials import legendre_basis, multi_indices
 from bayeskin.sensitivity.estimators import REPLICATES
-from bayeskin.types import Array, ParameterSpace, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays, ParameterSpace
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ShapleySettings:
 
 
 @dataclass(frozen=True)
-class ShapleyResult(_FreezesArrays):
+class ShapleyResult(FreezesArrays):
     """Shapley effects: shares (d,) of the variance of the whole force history.
 
     `interval` (2, d) holds the 5 % and 95 % limits. `variance_n2` is the mean of the variance over time.

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayeskin.polynomials import Indices, legendre_basis, multi_indices
-from bayeskin.types import Array, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class _Regression(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LatentChaos(_FreezesArrays):
+class LatentChaos(FreezesArrays):
     """Expansions of q latents; the coefficients are derived from these few arrays, also after loading.
 
     inputs : (n, d) in the unit cube

@@ -25,7 +25,7 @@ from bayeskin.surrogates.kernels import (
     trend_degree,
 )
 from bayeskin.surrogates.subspace import few_directions
-from bayeskin.types import Array, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays
 
 CHUNK = 128  # number of points whose kernel rows fit into the cache
 
@@ -117,7 +117,7 @@ def _turned(stack: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class LatentGPs(_FreezesArrays):
+class LatentGPs(FreezesArrays):
     """Independent Gaussian processes of q latents.
 
     The matrix factors are derived from these few arrays, also after loading.

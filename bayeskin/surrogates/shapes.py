@@ -13,13 +13,13 @@ import numba as nb
 import numpy as np
 
 from bayeskin.errors import InputError
-from bayeskin.types import Array, Prediction, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays, Prediction
 
 SMALLEST_AMPLITUDE = 1e-9  # share of the largest amplitude; a history of zeros has no logarithm
 
 
 @dataclass(frozen=True)
-class ShapeTransform(_FreezesArrays):
+class ShapeTransform(FreezesArrays):
     """The mean (m,) and the components (K, m) of shapes; truncation (m,) is the variance of the remainder."""
 
     mean: Array

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from bayeskin.errors import InputError
 from bayeskin.surrogates.shapes import ShapeTransform
 from bayeskin.surrogates.similarity import Similarity
-from bayeskin.types import Array, ParameterSpace, Prediction, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays, ParameterSpace, Prediction
 
 ROUNDING = 1e-12  # relative tolerance, so that a corner computed as exp(log(corner)) lies in the box
 
@@ -38,7 +38,7 @@ class Latents(Protocol):
 
 
 @dataclass(frozen=True)
-class ShapeSurrogate(_FreezesArrays):
+class ShapeSurrogate(FreezesArrays):
     """Predicts the force as a scale times exp(amplitude) times a shape; implements `types.Surrogate`.
 
     The latents give the amplitude and the shape.

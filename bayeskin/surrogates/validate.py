@@ -9,11 +9,11 @@ import numpy as np
 
 from bayeskin.surrogates.hyperparameters import NORMAL_90
 from bayeskin.surrogates.surrogate import ShapeSurrogate
-from bayeskin.types import Array, Prediction, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays, Prediction
 
 
 @dataclass(frozen=True)
-class Validation(_FreezesArrays):
+class Validation(FreezesArrays):
     """Errors of a surrogate over n rows and m bins.
 
     kind : "gp" or "chaos"

@@ -5,7 +5,7 @@ samples or parameter points, ``d`` parameters, ``m`` time bins, and ``k`` corner
 name each dataclass of this package, so a dataclass keeps its name.
 """
 
-from bayeskin.types.arrays import Array, _FreezesArrays, frozen_array
+from bayeskin.types.arrays import Array, FreezesArrays, frozen_array
 from bayeskin.types.design import Design
 from bayeskin.types.joint import Span
 from bayeskin.types.parameters import Correlation, Parameter, ParameterSpace
@@ -21,6 +21,7 @@ __all__ = [
     "BinnedForce",
     "Correlation",
     "Design",
+    "FreezesArrays",
     "Jumps",
     "Observation",
     "PadMotion",
@@ -34,6 +35,5 @@ __all__ = [
     "Simulation",
     "Span",
     "Surrogate",
-    "_FreezesArrays",
     "frozen_array",
 ]

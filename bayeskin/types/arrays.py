@@ -17,7 +17,7 @@ def frozen_array(values: ArrayLike, dtype: Any = np.float64) -> NDArray[Any]:
     return array
 
 
-class _FreezesArrays:
+class FreezesArrays:
     """Makes every array field of a frozen dataclass read-only."""
 
     def __post_init__(self) -> None:

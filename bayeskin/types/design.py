@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayeskin.types.arrays import Array, _FreezesArrays
+from bayeskin.types.arrays import Array, FreezesArrays
 from bayeskin.types.parameters import ParameterSpace
 
 
 @dataclass(frozen=True)
-class Design(_FreezesArrays):
+class Design(FreezesArrays):
     """Parameter points, and the full model's force at each of them.
 
     theta : the points, (n, d)

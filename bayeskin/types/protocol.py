@@ -8,14 +8,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayeskin.types.arrays import Array, _FreezesArrays
+from bayeskin.types.arrays import Array, FreezesArrays
 from bayeskin.types.joint import Span
 
 PhaseKind = Literal["rest", "load", "hold", "unload"]
 
 
 @dataclass(frozen=True)
-class Phase(_FreezesArrays):
+class Phase(FreezesArrays):
     """A phase of the protocol, in which the pads rest, load, hold or unload."""
 
     kind: PhaseKind
@@ -29,7 +29,7 @@ class Phase(_FreezesArrays):
 
 
 @dataclass(frozen=True)
-class PadMotion(_FreezesArrays):
+class PadMotion(FreezesArrays):
     """The protocol: the LVDT displacement over time, as straight lines between corners.
 
     `displacement_m` is the *full* LVDT reading; each pad of the symmetric model moves by half of it. Both

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bayeskin.types.arrays import Array, _FreezesArrays
+from bayeskin.types.arrays import Array, FreezesArrays
 from bayeskin.types.joint import Span, bins_of
 from bayeskin.types.protocol import Phase
 
 
 @dataclass(frozen=True)
-class Recording(_FreezesArrays):
+class Recording(FreezesArrays):
     """A recording as measured, in SI units, without smoothing and without a zero correction; arrays (n,)."""
 
     time_s: Array
@@ -33,7 +33,7 @@ class Recording(_FreezesArrays):
 
 
 @dataclass(frozen=True)
-class BinnedForce(_FreezesArrays):
+class BinnedForce(FreezesArrays):
     """Robust bin means of a recording's force, with the noise of each mean.
 
     edges_s : the edges of the bins, (m+1,)
@@ -85,7 +85,7 @@ class BinnedForce(_FreezesArrays):
 
 
 @dataclass(frozen=True)
-class Jumps(_FreezesArrays):
+class Jumps(FreezesArrays):
     """The range of force jumps that a recording's samples allow.
 
     lowest_n, highest_n : the smallest and the largest jump at time_s, (n,) each; infinite where the samples

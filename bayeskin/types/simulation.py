@@ -10,13 +10,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bayeskin.types.arrays import Array, _FreezesArrays
+from bayeskin.types.arrays import Array, FreezesArrays
 
 Observation = Literal["reaction", "article", "own"]  # the force that a model reports
 
 
 @dataclass(frozen=True)
-class Simulation(_FreezesArrays):
+class Simulation(FreezesArrays):
     """One run of the full model.
 
     A failed run is a value too: its `status` is not "ok", and its `message` says what to do.
