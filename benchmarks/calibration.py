@@ -187,17 +187,17 @@ def uniformity(ranks: Array) -> float:
     return float(chi2.sf(np.sum((counts - expected) ** 2 / expected), 9))
 
 
-def table(found: Sequence[Mapping[str, str]]) -> str:
+def table(recordings: Sequence[Mapping[str, str]]) -> str:
     """Returns the table: for each parameter the p-value of uniform ranks and the shares inside the intervals.
 
     The last row has the shares of a fresh recording inside the predictive bands.
     """
     table_rows = []
     for name in NAMES:
-        ranks = np.array([int(r[f"rank_{name}"]) for r in found])
-        shares = [np.mean([r[f"in{level}_{name}"] == "True" for r in found]) for level in (50, 90)]
+        ranks = np.array([int(r[f"rank_{name}"]) for r in recordings])
+        shares = [np.mean([r[f"in{level}_{name}"] == "True" for r in recordings]) for level in (50, 90)]
         table_rows.append([name, f"{uniformity(ranks):.3f}", *(f"{100 * share:.1f} %" for share in shares)])
-    bands = [np.mean([float(r[f"band{level}"]) for r in found]) for level in (50, 90)]
+    bands = [np.mean([float(r[f"band{level}"]) for r in recordings]) for level in (50, 90)]
     table_rows.append(["predictive bands, fresh recording", "", *(f"{100 * b:.1f} %" for b in bands)])
     return rows.markdown(
         ["", "p-value of uniform ranks", "inside 50 % interval", "inside 90 % interval"], table_rows
@@ -205,21 +205,21 @@ def table(found: Sequence[Mapping[str, str]]) -> str:
 
 
 @styled
-def figure_calibration(found: Sequence[Mapping[str, str]], data: str) -> Figure:
+def figure_calibration(recordings: Sequence[Mapping[str, str]], data: str) -> Figure:
     """Returns rank histograms of all parameters, with the range that uniform ranks would have."""
     figure = new_figure(PAGE_IN, 3.6)
     axes = figure.subplots(2, 5).ravel()
     for ax, name in zip(axes, NAMES, strict=False):
-        _draw_ranks(ax, np.array([int(r[f"rank_{name}"]) for r in found]))
+        _draw_ranks(ax, np.array([int(r[f"rank_{name}"]) for r in recordings]))
         ax.set_title(symbol(name))
     axes[-1].axis("off")
-    failed = sum(r["trusted"] != "True" for r in found)
-    smallest = min(uniformity(np.array([int(r[f"rank_{n}"]) for r in found])) for n in NAMES)
+    failed = sum(r["trusted"] != "True" for r in recordings)
+    smallest = min(uniformity(np.array([int(r[f"rank_{n}"]) for r in recordings])) for n in NAMES)
     source = "the surrogate with its error" if data == "surrogate" else "the full model"
     state_finding(
         figure, f"Ranks of the true values among posterior draws: least p-value of nine {smallest:.2g}",
-        f"{len(found)} recordings made by {source} at draws of the prior; {failed} of the chains did not "
-        f"reach the limits of trust. Grey: 99 % of uniform ranks' counts. Ten bins of {DRAWS + 1} ranks.",
+        f"{len(recordings)} recordings made by {source} at draws of the prior; {failed} of the chains did "
+        f"not reach the limits of trust. Grey: 99 % of uniform ranks' counts. Ten bins of {DRAWS + 1} ranks.",
     )  # fmt: skip
     return figure
 

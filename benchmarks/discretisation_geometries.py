@@ -70,9 +70,9 @@ def line(name: str, geometry: Geometry) -> list[str]:
     return [name, *cells]
 
 
-def _error_text(found: Error) -> str:
+def _error_text(error: Error) -> str:
     """Returns an error as text: RMS, RMS after the best factor, and that factor."""
-    return f"{100 * found.rms:.2f}, {100 * found.rms_scaled:.2f} (x {found.scale:.4f})"
+    return f"{100 * error.rms:.2f}, {100 * error.rms_scaled:.2f} (x {error.scale:.4f})"
 
 
 def main() -> None:

@@ -56,11 +56,11 @@ class Error:
     rms_scaled: float
 
 
-def error(found: Simulation, reference: Simulation) -> Error:
+def error(simulation: Simulation, reference: Simulation) -> Error:
     """Returns the error of a history against a reference, over the time that both cover."""
-    end = min(found.time_s[-1], reference.time_s[-1])
+    end = min(simulation.time_s[-1], reference.time_s[-1])
     time_s = np.linspace(0.0, end, round(10 * end) + 1)
-    a, b = found.at(time_s), reference.at(time_s)
+    a, b = simulation.at(time_s), reference.at(time_s)
     peak = float(np.abs(b).max())
     scale = float(a @ b / (a @ a))
     rms, rms_scaled = (float(np.sqrt(np.mean(d**2))) / peak for d in (a - b, scale * a - b))

@@ -193,50 +193,52 @@ def _median_s(action: Callable[[], Any], times: int) -> float:
     return float(np.median(seconds))
 
 
-def medians(found: Sequence[rows.Row]) -> dict[str, dict[str, float]]:
+def medians(measured: Sequence[rows.Row]) -> dict[str, dict[str, float]]:
     """Returns the medians over repeats of every number, by mesh."""
     numbers = [name for name in ROWS.values if name not in ("status", "linear_solver")]
     return {
-        mesh: {n: float(np.median([float(r[n]) for r in found if r["mesh"] == mesh])) for n in numbers}
-        for mesh in dict.fromkeys(r["mesh"] for r in found)
+        mesh: {n: float(np.median([float(r[n]) for r in measured if r["mesh"] == mesh])) for n in numbers}
+        for mesh in dict.fromkeys(r["mesh"] for r in measured)
     }
 
 
-def table(found: dict[str, dict[str, float]]) -> str:
+def table(by_mesh: dict[str, dict[str, float]]) -> str:
     """Returns the medians as a table with one column for each mesh."""
-    lines = [["CPU s", *(f"{m['cpu_s']:.2f}" for m in found.values())]]
-    ratios = [f"{ARTICLE_CPU_S / m['cpu_s']:.0f}" for m in found.values()]
+    lines = [["CPU s", *(f"{m['cpu_s']:.2f}" for m in by_mesh.values())]]
+    ratios = [f"{ARTICLE_CPU_S / m['cpu_s']:.0f}" for m in by_mesh.values()]
     lines.append([f"ratio of the article's {ARTICLE_CPU_S:.0f} CPU s to these", *ratios])
-    lines.append(["cells, unknowns", *(f"{m['cells']:.0f}, {m['dofs']:.0f}" for m in found.values())])
-    lines.append(["steps, iterations", *(f"{m['steps']:.0f}, {m['iterations']:.0f}" for m in found.values())])
+    lines.append(["cells, unknowns", *(f"{m['cells']:.0f}, {m['dofs']:.0f}" for m in by_mesh.values())])
+    lines.append(
+        ["steps, iterations", *(f"{m['steps']:.0f}, {m['iterations']:.0f}" for m in by_mesh.values())]
+    )
     for stage in STAGES:
-        calls = [f" ({m[f'{stage}_count']:.0f} calls)" if stage != "rest" else "" for m in found.values()]
+        calls = [f" ({m[f'{stage}_count']:.0f} calls)" if stage != "rest" else "" for m in by_mesh.values()]
         lines.append(
             [
                 f"{stage} [s]",
-                *(f"{m[f'{stage}_s']:.2f}{n}" for m, n in zip(found.values(), calls, strict=True)),
+                *(f"{m[f'{stage}_s']:.2f}{n}" for m, n in zip(by_mesh.values(), calls, strict=True)),
             ]
         )
-    alone_ms = [(1e3 * m["one_factorisation_s"], 1e3 * m["one_solve_s"]) for m in found.values()]
+    alone_ms = [(1e3 * m["one_factorisation_s"], 1e3 * m["one_solve_s"]) for m in by_mesh.values()]
     lines.append(["one factorisation, one solve, alone [ms]", *(f"{a:.0f}, {b:.1f}" for a, b in alone_ms)])
     lines.append(
-        ["floor: these times the number of calls [s]", *(f"{m['floor_s']:.2f}" for m in found.values())]
+        ["floor: these times the number of calls [s]", *(f"{m['floor_s']:.2f}" for m in by_mesh.values())]
     )
     lines.append(
         [
             "ratio of the run's CPU s to the floor",
-            *(f"{m['cpu_s'] / m['floor_s']:.2f}" for m in found.values()),
+            *(f"{m['cpu_s'] / m['floor_s']:.2f}" for m in by_mesh.values()),
         ]
     )
-    lines.append(["derivatives [CPU s]", *(f"{m['gradients_s']:.2f}" for m in found.values())])
-    shares = [f"{m['gradients_s'] / m['cpu_s']:.2f}" for m in found.values()]
+    lines.append(["derivatives [CPU s]", *(f"{m['gradients_s']:.2f}" for m in by_mesh.values())])
+    shares = [f"{m['gradients_s'] / m['cpu_s']:.2f}" for m in by_mesh.values()]
     lines.append(["ratio of derivatives to the run", *shares])
-    lines.append(["factors [MB]", *(f"{m['factor_bytes'] / 1e6:.1f}" for m in found.values())])
-    rate = [2 * m["factor_bytes"] / m["one_solve_s"] / 1e9 for m in found.values()]
+    lines.append(["factors [MB]", *(f"{m['factor_bytes'] / 1e6:.1f}" for m in by_mesh.values())])
+    rate = [2 * m["factor_bytes"] / m["one_solve_s"] / 1e9 for m in by_mesh.values()]
     lines.append(["rate of reading the factors twice per solve [GB/s]", *(f"{r:.1f}" for r in rate)])
-    memory = [m["peak_memory_bytes"] / 2**20 for m in found.values()]
+    memory = [m["peak_memory_bytes"] / 2**20 for m in by_mesh.values()]
     lines.append(["peak memory of the process [MiB]", *(f"{b:.0f}" for b in memory)])
-    return rows.markdown(["", *found], lines)
+    return rows.markdown(["", *by_mesh], lines)
 
 
 def main() -> None:

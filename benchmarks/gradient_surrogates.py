@@ -214,12 +214,12 @@ def _rows(theta: Array) -> list[tuple[str, int, float, float, float]]:
 
 
 @styled
-def _draw(found: Sequence[tuple[str, int, float, float, float]]) -> Figure:
+def _draw(trained: Sequence[tuple[str, int, float, float, float]]) -> Figure:
     """Returns the figure of error against CPU time."""
     figure = new_figure(0.7 * PAGE_IN, 3.4)
     axes = figure.subplots()
     for kind, colour in zip(KINDS, COLOURS, strict=True):
-        of_kind = [row for row in found if row[0] == kind]
+        of_kind = [row for row in trained if row[0] == kind]
         axes.loglog(
             [row[2] / 60 for row in of_kind], [row[3] for row in of_kind], "o-", color=colour, label=kind
         )

@@ -80,9 +80,9 @@ def _mn(some: list[Mapping[str, Any]], what: str) -> list[str]:
     return ["not available" if entry[what] is None else f"{1e3 * entry[what]:.1f} mN" for entry in some]
 
 
-def _by_phase(one: Mapping[str, Any]) -> str:
+def _by_phase(fit: Mapping[str, Any]) -> str:
     """Returns the RMSE of each kind of phase in mN as text."""
-    return " / ".join(f"{1e3 * one['rmse_by_phase'][kind]:.0f}" for kind in KINDS) + " mN"
+    return " / ".join(f"{1e3 * fit['rmse_by_phase'][kind]:.0f}" for kind in KINDS) + " mN"
 
 
 def main() -> None:

@@ -123,13 +123,13 @@ def run(values: Mapping[str, float], mechanisms: list[Mechanism]) -> tuple[Array
 
 
 @styled
-def figure_mechanisms(found: Mapping[str, Shown]) -> Figure:
+def figure_mechanisms(by_mechanism: Mapping[str, Shown]) -> Figure:
     """Returns the figure: the force that each mechanism adds, in its own panel, over the force without it."""
     columns = 4
-    row_count = -(-(len(found) + 1) // columns)
+    row_count = -(-(len(by_mechanism) + 1) // columns)
     figure = new_figure(PAGE_IN, 1.2 * row_count + 0.5)
     axes = figure.subplots(row_count, columns).ravel()
-    for ax, (name, forces) in zip(axes, found.items(), strict=False):
+    for ax, (name, forces) in zip(axes, by_mechanism.items(), strict=False):
         background = ax.twinx()
         background.fill_between(TIMES_S, forces.without, color=FAINT, alpha=0.6)
         background.set_axis_off()
@@ -141,13 +141,13 @@ def figure_mechanisms(found: Mapping[str, Shown]) -> Figure:
         ax.axhline(0.0, color=FAINT, lw=0.6, zorder=0)
         ax.margins(y=0.1)
         ax.set_title(name.replace("-dependent-", "-dependent\n"))
-    for ax in axes[: len(found) : columns]:
+    for ax in axes[: len(by_mechanism) : columns]:
         ax.set_ylabel("added force [mN]")
-    for ax in axes[: len(found)][-columns:]:
+    for ax in axes[: len(by_mechanism)][-columns:]:
         ax.set_xlabel("time [s]")
-    for ax in axes[len(found) :]:
+    for ax in axes[len(by_mechanism) :]:
         ax.set_axis_off()
-    legend_panel = axes[len(found)]
+    legend_panel = axes[len(by_mechanism)]
     legend_panel.plot([], [], color=MODEL, label="what it adds")
     legend_panel.plot([], [], color=ACCENT, ls=(0, (3, 2)), label="by its shortcut on\nthe force alone")
     legend_panel.fill_between([], [], color=FAINT, alpha=0.6, label="the force without,\nto another scale")
@@ -160,13 +160,13 @@ def figure_mechanisms(found: Mapping[str, Shown]) -> Figure:
     return figure
 
 
-def table(found: Mapping[str, Shown], known: Mapping[str, Mechanism]) -> str:
+def table(by_mechanism: Mapping[str, Shown], known: Mapping[str, Mechanism]) -> str:
     """Returns the mechanisms as a Markdown table: effect, error of the shortcut, seconds and description."""
     lines = [
         "| mechanism | effect, RMS [mN] | RMS error of the shortcut [mN] | run [s] | description |",
         "|---|--:|--:|--:|---|",
     ]
-    for name, forces in found.items():
+    for name, forces in by_mechanism.items():
         effect_mn = 1e3 * np.sqrt(np.mean((forces.force - forces.without) ** 2))
         shortcut_error = (
             ""

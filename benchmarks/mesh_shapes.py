@@ -74,15 +74,15 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def table(found: list[rows.Row]) -> str:
+def table(skins: list[rows.Row]) -> str:
     """Returns the RMS, smallest and largest value of each quantity over the skins as a table."""
     lines = []
     for name in (*PARTS, *LEFT):
-        values = 100.0 * np.array([float(row[name]) for row in found])
+        values = 100.0 * np.array([float(row[name]) for row in skins])
         lines.append(
             [name, f"{np.sqrt(np.mean(values**2)):.3f}", f"{values.min():.3f}", f"{values.max():.3f}"]
         )
-    return rows.markdown([f"{len(found)} skins", "RMS [%]", "smallest", "largest"], lines)
+    return rows.markdown([f"{len(skins)} skins", "RMS [%]", "smallest", "largest"], lines)
 
 
 def main() -> None:

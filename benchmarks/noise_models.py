@@ -123,11 +123,11 @@ def with_phase_of(about: LogPosterior, phase: int, force_n: Array) -> LogPosteri
     return replace(about, binned=replace(about.binned, force_n=mixed))
 
 
-def table(found: Mapping[str, Score]) -> str:
+def table(scores: Mapping[str, Score]) -> str:
     """Returns a table of the models, the best first, with their scores relative to the shipped model's."""
-    reference = found[SHIPPED].phases
+    reference = scores[SHIPPED].phases
     lines = []
-    for name, score in sorted(found.items(), key=lambda item: -item[1].phases.sum()):
+    for name, score in sorted(scores.items(), key=lambda item: -item[1].phases.sum()):
         lines.append(
             [
                 name, "" if name == SHIPPED else difference(score.phases, reference),

@@ -115,12 +115,12 @@ def scores(board: Mapping[str, Any], seconds: Mapping[str, float]) -> str:
     return rows.markdown(("", "result", "90 % interval", "aim"), table)
 
 
-def _share_row(what: str, one: Mapping[str, Any], to_reach: str) -> list[str]:
+def _share_row(what: str, share: Mapping[str, Any], to_reach: str) -> list[str]:
     """Returns the table's row of one share with its interval."""
-    if not one["of"]:
+    if not share["of"]:
         return [what, "not tested", "", to_reach]
-    interval = f"{100 * one['low']:.0f} to {100 * one['high']:.0f} %"
-    return [what, f"{one['hits']} of {one['of']}, {100 * one['share']:.0f} %", interval, to_reach]
+    interval = f"{100 * share['low']:.0f} to {100 * share['high']:.0f} %"
+    return [what, f"{share['hits']} of {share['of']}, {100 * share['share']:.0f} %", interval, to_reach]
 
 
 def each(board: Mapping[str, Any]) -> str:
@@ -233,18 +233,18 @@ def sizes(board: Mapping[str, Any]) -> str:
     return rows.markdown(head, table)
 
 
-def _worth(one: Mapping[str, Any]) -> str:
+def _worth(answer: Mapping[str, Any]) -> str:
     """Returns the judgement of one answer in words."""
-    if one["answer"] == "nothing-missing" and one["size"] < 1.0:
+    if answer["answer"] == "nothing-missing" and answer["size"] < 1.0:
         return "below the floor"
-    if one["kind"] == "outside":
-        return "right" if one["answer"] == "unknown" else ("missed" if not one["named"] else "wrong")
-    if one["right"]:
+    if answer["kind"] == "outside":
+        return "right" if answer["answer"] == "unknown" else ("missed" if not answer["named"] else "wrong")
+    if answer["right"]:
         return "right"
-    if not one["named"]:
+    if not answer["named"]:
         return "missed"
-    truth = set(one["label"].split(" + "))
-    return "in part" if set(one["named"]) < truth else "wrong"
+    truth = set(answer["label"].split(" + "))
+    return "in part" if set(answer["named"]) < truth else "wrong"
 
 
 def _at(board: Mapping[str, Any], path: Sequence[str]) -> Mapping[str, Any]:

@@ -146,12 +146,12 @@ def run_all(spec: ModelSpec, items: Sequence[Item], workers: int) -> list[rows.R
     return [table_rows[ROWS.key_of(item)] for item in items]
 
 
-def summary(found: dict[str, list[rows.Row]]) -> str:
+def summary(by_box: dict[str, list[rows.Row]]) -> str:
     """Returns a table of finished and failed runs and of CPU times, by box."""
     header = ["box", "runs", "finished", "failed", "with NaN or infinite force", "finished after folding"]
     header += ["CPU s a run: median", "95 %", "largest"]
     lines = []
-    for box, runs in found.items():
+    for box, runs in by_box.items():
         finished = sum(r["status"] == "ok" for r in runs)
         seconds = np.array([float(r["cpu_s"]) for r in runs])
         spread = [np.nanmedian(seconds), np.nanquantile(seconds, 0.95), np.nanmax(seconds)]
@@ -167,9 +167,9 @@ def summary(found: dict[str, list[rows.Row]]) -> str:
     return rows.markdown(header, lines)
 
 
-def failures(found: dict[str, list[rows.Row]]) -> str:
+def failures(by_box: dict[str, list[rows.Row]]) -> str:
     """Returns a table of the failed runs with their parameters."""
-    failed = [r for runs in found.values() for r in runs if r["status"] != "ok" or r["finite"] != "True"]
+    failed = [r for runs in by_box.values() for r in runs if r["status"] != "ok" or r["finite"] != "True"]
     if not failed:
         return "No run failed."
     cells = [
@@ -180,14 +180,14 @@ def failures(found: dict[str, list[rows.Row]]) -> str:
 
 
 @styled
-def figure_robustness(found: dict[str, list[rows.Row]], mesh: str) -> Figure:
+def figure_robustness(by_box: dict[str, list[rows.Row]], mesh: str) -> Figure:
     """Returns the figure: the failed runs by the two ratios that govern them, and the CPU times."""
     figure = new_figure(PAGE_IN, 2.9)
-    axes = figure.subplots(1, len(found) + 1)
-    for letter, ax, (box, runs) in zip("abc", axes, found.items(), strict=False):
+    axes = figure.subplots(1, len(by_box) + 1)
+    for letter, ax, (box, runs) in zip("abc", axes, by_box.items(), strict=False):
         _draw_box(ax, runs)
         panel_title(ax, letter, f"{box} box, {len(runs)} runs")
-    for (box, runs), colour in zip(found.items(), (INK, "#0072B2"), strict=False):
+    for (box, runs), colour in zip(by_box.items(), (INK, "#0072B2"), strict=False):
         seconds = np.sort([float(r["cpu_s"]) for r in runs])
         axes[-1].step(
             seconds, 100 * np.arange(1, len(runs) + 1) / len(runs), color=colour, where="post", label=box
@@ -198,8 +198,8 @@ def figure_robustness(found: dict[str, list[rows.Row]], mesh: str) -> Figure:
     plain_log(axes[-1].xaxis)
     axes[-1].legend(loc="lower right")
     panel_title(axes[-1], "c", "cost")
-    failed = sum(r["status"] != "ok" for runs in found.values() for r in runs)
-    total = sum(map(len, found.values()))
+    failed = sum(r["status"] != "ok" for runs in by_box.values() for r in runs)
+    total = sum(map(len, by_box.values()))
     state_finding(
         figure, f"{total - failed} of {total} runs at random parameters finish",
         f"Each point is a full run over the healthy-skin protocol on {mesh}; crosses failed. "

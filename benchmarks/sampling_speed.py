@@ -47,17 +47,17 @@ class Timed:
     """Holds the wall time of one way to sample the posterior, and the convergence of its chains."""
 
     seconds: float
-    found: Convergence
+    convergence: Convergence
 
     @property
     def fewest(self) -> float:
         """Returns the effective samples of the parameter that has the fewest; 0 where one does not move."""
-        return float(np.nan_to_num(self.found.ess).min())
+        return float(np.nan_to_num(self.convergence.ess).min())
 
     @property
     def highest(self) -> float:
         """Returns R-hat of the parameter that has the largest."""
-        return float(self.found.rhat.max())
+        return float(self.convergence.rhat.max())
 
 
 def problem(recording: Path, surrogate: Path) -> LogPosterior:
@@ -118,12 +118,13 @@ def main() -> None:
         best = dict(inference.find_map(about, seed).theta)
         fitted = time.perf_counter()
         ours = shipped_sampler(about, best, seed)
-        peer = default_move(about, best, seed, ours.found.steps)
+        peer = default_move(about, best, seed, ours.convergence.steps)
         rows.say(f"seed {seed}: {ours.fewest:.0f} effective samples in {ours.seconds:.0f} s")
         rate = (ours.fewest / ours.seconds) / (peer.fewest / peer.seconds) if peer.fewest else np.inf
         lines.append(
-            [loaded - started, fitted - loaded, ours.seconds, ours.found.steps, ours.fewest, ours.highest,
-             float(ours.found.verdict.trusted), peer.seconds, peer.fewest, peer.highest, rate]
+            [loaded - started, fitted - loaded, ours.seconds, ours.convergence.steps, ours.fewest,
+             ours.highest, float(ours.convergence.verdict.trusted), peer.seconds, peer.fewest, peer.highest,
+             rate]
         )  # fmt: skip
     seed_rows = [[str(seed), *told(line)] for seed, line in enumerate(lines, start=1)]
     print(rows.markdown(HEADER, [*seed_rows, ["median", *told(np.median(lines, axis=0))]]))

@@ -117,10 +117,10 @@ def test_the_default_move_is_judged_on_the_same_density_and_repeats(benchmark):
     speed, problem = benchmark("sampling_speed"), inference_problems.toy_problem()
     start = {**inference_problems.TRUTH, **inference_problems.NOISE}
     timed = [speed.default_move(problem, start, seed, 200) for seed in (1, 1, 2)]
-    assert timed[0].found.steps == 200
+    assert timed[0].convergence.steps == 200
     assert 0.0 < timed[0].fewest == timed[1].fewest != timed[2].fewest
     assert timed[0].highest > 1.01  # 200 steps are too few, and the measure sees it
-    assert not timed[0].found.verdict.trusted
+    assert not timed[0].convergence.verdict.trusted
 
 
 def ramp(until_s=180.0):

@@ -117,7 +117,7 @@ class ArticleModel:
         def residual(x: Array) -> Array | None:
             out = np.zeros(s.dofs)
             for chunk in self._chunks:
-                c, at, response = chunk.cells, chunk.at, chunk.found
+                c, at, response = chunk.cells, chunk.at, chunk.response
                 evaluate(x, chunk)
                 smallest = article_law.respond(
                     at.deformation, at.pressure, at.gradient, m.mu[c], m.lam[c], m.mobility[c], m.storage[c],

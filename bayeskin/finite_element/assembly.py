@@ -79,13 +79,13 @@ class Chunk:
 
     cells : the cells of the group
     points : the quadrature points of these cells, among all points in order of cells
-    at, found, by : storage for the state, the response and its derivatives
+    at, response, by : storage for the state, the response and its derivatives
     """
 
     cells: slice
     points: slice
     at: Points
-    found: Response
+    response: Response
     by: Linearised
 
 

@@ -95,7 +95,7 @@ class Balances:
         elapsed_s = h if elapsed_s is None else elapsed_s
         memory = tuple(np.empty_like(before) for before in old.memory)
         for chunk in self._chunks:
-            c, at, response = chunk.cells, chunk.at, chunk.found
+            c, at, response = chunk.cells, chunk.at, chunk.response
             self._evaluate(x, chunk)
             pressure[c] = at.pressure
             smallest = poroelastic.respond(

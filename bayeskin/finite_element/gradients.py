@@ -219,11 +219,11 @@ class ForceGradients:
         return TangentAction(self._model, stage, self._rates, before.volume, before.pressure)
 
     def _subtract_lost(
-        self, stage: Stage, before: Slopes, x: Array, found: Differentiated, force: Array
+        self, stage: Stage, before: Slopes, x: Array, held: Differentiated, force: Array
     ) -> tuple[Slopes, Array]:
         """Returns all derivatives after the elements in series with the skin have responded to the force.
 
-        x, found, force : the derivatives with the lost displacement held, with the response to the pads'
+        x, held, force : the derivatives with the lost displacement held, with the response to the pads'
             travel as last column
         """
         model, r = self._model, len(self._varied)
@@ -237,8 +237,8 @@ class ForceGradients:
         def less(values: Array) -> Array:
             return np.asarray(values[..., :r] - values[..., r:] / self._reach_m * lost_change)
 
-        memory = tuple(less(slope) for slope in found.memory)
-        slopes = Slopes(stage.state, columns, less(found.volume), less(found.pressure), memory, lost)
+        memory = tuple(less(slope) for slope in held.memory)
+        slopes = Slopes(stage.state, columns, less(held.volume), less(held.pressure), memory, lost)
         return slopes, force[:r] - stiffness * lost_change
 
     def _lost(self, stage: Stage, before: Slopes, force: Array, stiffness: float) -> tuple[Array, Memories]:

@@ -126,8 +126,8 @@ class Pardiso(Factorisations):
         scaled = np.ascontiguousarray(right.T) * scale  # MKL stores one column after the other
         # each column is scaled to size one, so that no number underflows in single precision
         size = np.maximum(np.abs(scaled).max(axis=-1, keepdims=True), np.finfo(float).tiny)
-        found = self._call(number, _SOLVE, (scaled / size).astype(np.float32))
-        return np.asarray((found.astype(float) * (size * scale)).T)
+        solution = self._call(number, _SOLVE, (scaled / size).astype(np.float32))
+        return np.asarray((solution.astype(float) * (size * scale)).T)
 
     def release(self) -> None:
         """Frees the memory of MKL, which Python's garbage collector does not manage."""

@@ -147,25 +147,25 @@ class SeriesSolver:
 
     def _solve_lost(
         self,
-        found: Solved | None,
+        solution: Solved | None,
         lost_m: float,
         follow: Callable[[float], Memories],
         moved: Callable[[Array, float], Solved | None],
     ) -> tuple[Solved, Memories] | None:
         """Iterates until the lost displacement agrees with the force.
 
-        found : solution with the displacement `lost_m` lost, from which the iteration starts
+        solution : solution with the displacement `lost_m` lost, from which the iteration starts
         """
         allowed_m = SERIES_TOLERANCE * self._drive.largest_m
         past: tuple[float, Array, float] | None = None  # lost displacement, unknowns, force
         for _ in range(MOST_TRIALS):
-            if found is None:
+            if solution is None:
                 break
-            x, force_n = found
+            x, force_n = solution
             lost = follow(force_n)
             missing_m = total(lost) - lost_m
             if abs(missing_m) < allowed_m:
-                return found, lost
+                return solution, lost
             if past is not None and abs(lost_m - past[0]) > allowed_m:
                 change_m = lost_m - past[0]
                 self._answer = (force_n - past[2]) / change_m, (x - past[1]) / change_m
@@ -174,7 +174,7 @@ class SeriesSolver:
             softness = yielding(follow, force_n, 1e-3 * abs(force_n) + 1e-9)
             step_m = missing_m / max(1.0 - softness * stiffness, 0.5)
             lost_m += step_m
-            found = moved(x + step_m * ride, lost_m)
+            solution = moved(x + step_m * ride, lost_m)
         return None
 
 

@@ -148,9 +148,9 @@ class Sparsity:
             if not mine.any():
                 continue
             numbered = sp.csr_matrix((np.arange(1, block.nnz + 1), block.indices, block.indptr), block.shape)
-            found = np.asarray(numbered[number[row[mine]], number[column[mine]]]).ravel()
-            assert (found > 0).all()
-            place[mine] = offset + found - 1
+            place_in_block = np.asarray(numbered[number[row[mine]], number[column[mine]]]).ravel()
+            assert (place_in_block > 0).all()
+            place[mine] = offset + place_in_block - 1
         return place, np.asarray(value)
 
 

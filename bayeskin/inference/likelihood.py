@@ -152,11 +152,23 @@ def _whiten(
         keep[j] = 0.0 if fresh else keep[j] * sd[j] / sd[j - 1]
         keep_quick[j] = 0.0 if fresh or own[j - 1] == 0.0 else correlation[j] * own[j] / own[j - 1]
     keep[0] = keep_quick[0] = 0.0
-    one, two, three, four = work[4], work[5], work[6], work[7]
+    column1, column2, column3, column4 = work[4], work[5], work[6], work[7]
     for j in range(k):
-        one[j] = force[j] - mean[bins[j]]
+        column1[j] = force[j] - mean[bins[j]]
     _innovations(
-        one, one, one, one, keep, keep_quick, of_memory, of_quick, inverse, white, white, white, white
+        column1,
+        column1,
+        column1,
+        column1,
+        keep,
+        keep_quick,
+        of_memory,
+        of_quick,
+        inverse,
+        white,
+        white,
+        white,
+        white,
     )
     rank, last = len(factor), len(design)
     whole = bins[k - 1] - bins[0] == k - 1  # without a gap the bins are one slice, which is faster to copy
@@ -171,7 +183,7 @@ def _whiten(
             if a + b >= rank:
                 target[:] = 0.0
         _innovations(
-            one, two, three, four, keep, keep_quick, of_memory, of_quick, inverse,
+            column1, column2, column3, column4, keep, keep_quick, of_memory, of_quick, inverse,
             design[a], design[a + 1], design[a + 2], design[a + 3],
         )  # fmt: skip
     return log_scale
@@ -179,19 +191,24 @@ def _whiten(
 
 @nb.njit(fastmath=_FAST, inline="always")
 def _innovations(
-    one: Array, two: Array, three: Array, four: Array,
+    column1: Array, column2: Array, column3: Array, column4: Array,
     keep: Array, keep_quick: Array, of_memory: Array, of_quick: Array, inverse: Array,
-    first: Array, second: Array, third: Array, fourth: Array,
+    out1: Array, out2: Array, out3: Array, out4: Array,
 ) -> None:  # fmt: skip
     """Computes the innovations of four columns (k,) at once, so that the processor need not wait for each."""
     m1, m2, m3, m4 = 0.0, 0.0, 0.0, 0.0
     q1, q2, q3, q4 = 0.0, 0.0, 0.0, 0.0
-    for j in range(len(one)):
+    for j in range(len(column1)):
         a, b, g, h, s = keep[j], keep_quick[j], of_memory[j], of_quick[j], inverse[j]
         m1, m2, m3, m4 = a * m1, a * m2, a * m3, a * m4
         q1, q2, q3, q4 = b * q1, b * q2, b * q3, b * q4
-        e1, e2, e3, e4 = one[j] - m1 - q1, two[j] - m2 - q2, three[j] - m3 - q3, four[j] - m4 - q4
-        first[j], second[j], third[j], fourth[j] = e1 * s, e2 * s, e3 * s, e4 * s
+        e1, e2, e3, e4 = (
+            column1[j] - m1 - q1,
+            column2[j] - m2 - q2,
+            column3[j] - m3 - q3,
+            column4[j] - m4 - q4,
+        )
+        out1[j], out2[j], out3[j], out4[j] = e1 * s, e2 * s, e3 * s, e4 * s
         m1, m2, m3, m4 = m1 + g * e1, m2 + g * e2, m3 + g * e3, m4 + g * e4
         q1, q2, q3, q4 = q1 + h * e1, q2 + h * e2, q3 + h * e3, q4 + h * e4
 
@@ -276,9 +293,9 @@ def _energy(white: Array, design: Array, rank: int, z: Array, nu: float, eps: Ar
         beyond = max(abs(z[a]) - ERROR_PRIOR.farthest, 0.0)
         square += z[a] * z[a] + ERROR_PRIOR.stiff * beyond * beyond
     for a in range(0, len(design) if square > 0.0 else 0, 4):
-        one, two, three, four = design[a], design[a + 1], design[a + 2], design[a + 3]
+        g1, g2, g3, g4 = design[a], design[a + 1], design[a + 2], design[a + 3]
         for j in range(k):
-            eps[j] -= one[j] * z[a] + two[j] * z[a + 1] + three[j] * z[a + 2] + four[j] * z[a + 3]
+            eps[j] -= g1[j] * z[a] + g2[j] * z[a + 1] + g3[j] * z[a + 2] + g4[j] * z[a + 3]
     if math.isinf(nu):
         for j in range(k):
             square += eps[j] * eps[j]
@@ -327,19 +344,19 @@ def _gram(design: Array, bend: Array, gram: Array) -> None:
     for a in range(0, len(gram), 2):
         upper, under = design[a], design[a + 1]
         for b in range(0, a + 2, 4):
-            one, two, three, four = design[b], design[b + 1], design[b + 2], design[b + 3]
+            g1, g2, g3, g4 = design[b], design[b + 1], design[b + 2], design[b + 3]
             first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
             fifth, sixth, seventh, eighth = 0.0, 0.0, 0.0, 0.0
             for j in range(k):
                 left, right = upper[j] * bend[j], under[j] * bend[j]
-                first += left * one[j]
-                second += left * two[j]
-                third += left * three[j]
-                fourth += left * four[j]
-                fifth += right * one[j]
-                sixth += right * two[j]
-                seventh += right * three[j]
-                eighth += right * four[j]
+                first += left * g1[j]
+                second += left * g2[j]
+                third += left * g3[j]
+                fourth += left * g4[j]
+                fifth += right * g1[j]
+                sixth += right * g2[j]
+                seventh += right * g3[j]
+                eighth += right * g4[j]
             gram[a, b], gram[a, b + 1], gram[a, b + 2], gram[a, b + 3] = first, second, third, fourth
             gram[a + 1, b], gram[a + 1, b + 1] = fifth, sixth
             gram[a + 1, b + 2], gram[a + 1, b + 3] = seventh, eighth

@@ -176,21 +176,21 @@ def filter_gains(
     """
     k = len(sd)
     of_memory, of_quick, scale = np.empty(k), np.empty(k), np.empty(k)
-    one, both, two = 1.0, 0.0, 1.0  # variance of x, covariance, variance of w
+    var_x, cov, var_w = 1.0, 0.0, 1.0  # variances and covariance of x and w
     for j in range(k):
         a, c = decay[j], correlation[j]
         if starts[j]:
-            one, both, two = 1.0, 0.0, 1.0
+            var_x, cov, var_w = 1.0, 0.0, 1.0
         else:
-            one, both, two = 1.0 - a * a * (1.0 - one), a * c * both, 1.0 - c * c * (1.0 - two)
+            var_x, cov, var_w = 1.0 - a * a * (1.0 - var_x), a * c * cov, 1.0 - c * c * (1.0 - var_w)
         quick = math.sqrt(variance[j])
-        first, second = sd[j] * one + quick * both, sd[j] * both + quick * two
+        first, second = sd[j] * var_x + quick * cov, sd[j] * cov + quick * var_w
         square = sd[j] * first + quick * second + diagonal[j]
         inverse = 1.0 / square
         of_memory[j], of_quick[j], scale[j] = first * inverse, second * inverse, math.sqrt(square)
-        one -= first * of_memory[j]
-        both -= first * of_quick[j]
-        two -= second * of_quick[j]
+        var_x -= first * of_memory[j]
+        cov -= first * of_quick[j]
+        var_w -= second * of_quick[j]
     return of_memory, of_quick, scale
 
 

@@ -135,7 +135,7 @@ def observed(
     They act in the order of their places, then of their names, in whatever order they are given.
     """
     acts = [(m.act.place, m.name, m.act) for m in mechanisms if isinstance(m.act, Instrument)]
-    for _, _, act in sorted(acts, key=lambda one: one[:2]):
+    for _, _, act in sorted(acts, key=lambda placed: placed[:2]):
         force = act.observe(values, motion, force)
     return force
 
@@ -177,9 +177,9 @@ class Bins:
 
     def means(self, force: ForceOfTime) -> Array:
         """Returns the means of a force over the bins, (n, m)."""
-        found = np.ascontiguousarray(force(self._time_s)).reshape(-1, len(self._width), GAUSS_POINTS)
-        integral = np.empty((len(found), len(self._lasts_s)))
-        bin_integrals(found, self._weight, self._width, self._first, integral)
+        at_gauss = np.ascontiguousarray(force(self._time_s)).reshape(-1, len(self._width), GAUSS_POINTS)
+        integral = np.empty((len(at_gauss), len(self._lasts_s)))
+        bin_integrals(at_gauss, self._weight, self._width, self._first, integral)
         integral /= self._lasts_s
         return integral
 

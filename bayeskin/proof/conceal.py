@@ -115,7 +115,7 @@ def conceal(
     _start_or_check(folder, seed, count, only)
     numbers = [f"{place + 1:03d}" for place in range(count)]
     missing = [place for place, number in enumerate(numbers) if not _finished(folder, number)]
-    made = 0
+    written = 0
     with closing(run_all(make, [wanted[place] for place in missing])) as results:
         for index, result in results:
             if isinstance(result, Lost):
@@ -123,10 +123,10 @@ def conceal(
             if not isinstance(result, Concealed):
                 raise InputError(*result)
             _write(folder, numbers[missing[index]], result)
-            made += 1
-            done = count - len(missing) + made
+            written += 1
+            done = count - len(missing) + written
             tell(done / count, f"{done} of {count}")
-    return made
+    return written
 
 
 def concealed(plan: Plan, screen: Screen, run: Run = full_run) -> Concealed:
@@ -269,8 +269,8 @@ def _hashes(folder: Path, number: str) -> dict[str, str]:
     }
 
 
-def _write(folder: Path, number: str, one: Concealed) -> None:
-    storage.save(seals.recording_path(folder, number), one.recording)
-    seals.write_json(folder / seals.SEALS / f"{number}.json", dict(one.key))
+def _write(folder: Path, number: str, result: Concealed) -> None:
+    storage.save(seals.recording_path(folder, number), result.recording)
+    seals.write_json(folder / seals.SEALS / f"{number}.json", dict(result.key))
     index = {**seals.read_index(folder), number: _hashes(folder, number)}
     seals.write_json(folder / seals.INDEX, {"recordings": dict(sorted(index.items()))})

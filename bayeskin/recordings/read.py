@@ -87,8 +87,8 @@ def read_tables(
             raise InputError(path, "a file of bayeskin, where nothing is to be chosen", "no such option")
         return (Reading(_read_stored(path)),)
     data = bytes_of(path, "a recording")
-    found, notes = _tables(path, kind, data, sheet, stated)
-    chosen, left_out = _chosen(path, found, sheet)
+    tables, notes = _tables(path, kind, data, sheet, stated)
+    chosen, left_out = _chosen(path, tables, sheet)
     name, sha256 = shown(path.stem), hashlib.sha256(data).hexdigest()
     readings = []
     for label, table in chosen:
@@ -103,7 +103,7 @@ def shown(path: Path | str) -> str:
 
 
 @dataclass(frozen=True)
-class _Found:
+class _Labelled:
     """A table of a file, or the error of a table that has the columns, and the names that choose it."""
 
     label: str
@@ -126,7 +126,7 @@ def _sheets(path: Path, kind: str, data: bytes) -> Mapping[str, Rows] | None:
 
 def _tables(
     path: Path, kind: str, data: bytes, sheet: str | None, stated: Stated
-) -> tuple[list[_Found], tuple[str, ...]]:
+) -> tuple[list[_Labelled], tuple[str, ...]]:
     """Returns the tables of a file in their order, and notes. A sheet of the name `sheet` is read alone."""
     if kind == ".npy":
         return _labelled("", tables_of(str(path), rows_of_array(path, data), stated)), ()
@@ -134,53 +134,53 @@ def _tables(
     if sheets is None:
         rows, delimiter, notes = rows_of_text(path, data)
         return _labelled("", tables_of(str(path), rows, stated, delimiter == " ")), notes
-    found = []
+    tables = []
     for name in [sheet] if sheet is not None and sheet in sheets else sheets:
         try:
-            found += _labelled(name, tables_of(f"{path}: sheet {name!r}", sheets[name], stated))
+            tables += _labelled(name, tables_of(f"{path}: sheet {name!r}", sheets[name], stated))
         except InputError as error:
-            found.append(_Found(name, (name,), error))
-    return found, ()
+            tables.append(_Labelled(name, (name,), error))
+    return tables, ()
 
 
-def _labelled(sheet: str, tables: Sequence[Table | Unreadable]) -> list[_Found]:
+def _labelled(sheet: str, tables: Sequence[Table | Unreadable]) -> list[_Labelled]:
     """Returns the tables of a sheet or text with their names. Short ones count only if there is no other."""
     long = [table for table in tables if table.rows >= PLAUSIBLE.samples] or tables
     titles = [table.title for table in long]
-    found = []
+    labelled = []
     for number, table in enumerate(long, start=1):
         numbered = "" if table.title and titles.count(table.title) == 1 else str(number)
         own = " ".join(filter(None, (numbered, table.title)))
         label = sheet if sheet and len(long) == 1 else f"{sheet} {own}".strip()
         names = (label, sheet, table.title, "" if sheet else str(number))
-        found.append(_Found(label, tuple(filter(None, names)), table))
-    return found
+        labelled.append(_Labelled(label, tuple(filter(None, names)), table))
+    return labelled
 
 
 def _chosen(
-    path: Path, found: Sequence[_Found], sheet: str | None
+    path: Path, tables: Sequence[_Labelled], sheet: str | None
 ) -> tuple[list[tuple[str, Table]], list[str]]:
     """Returns the tables to read with their labels, and a note on others. Raises InputError if unclear."""
-    labels = [one.label for one in found]
-    wanted = [one for one in found if sheet in (None, ALL) or sheet in one.names]
-    if not wanted and found:
+    labels = [entry.label for entry in tables]
+    wanted = [entry for entry in tables if sheet in (None, ALL) or sheet in entry.names]
+    if not wanted and tables:
         raise InputError(path, f"the tables {labels}", f"a sheet {sheet!r}")
-    long = [one for one in wanted if one.rows >= PLAUSIBLE.samples] or wanted
-    fitting = [one for one in long if not isinstance(one.table, Unreadable)]
+    long = [entry for entry in wanted if entry.rows >= PLAUSIBLE.samples] or wanted
+    fitting = [entry for entry in long if not isinstance(entry.table, Unreadable)]
     if not fitting:
-        unreadable = [one.table for one in long if isinstance(one.table, Unreadable)]
+        unreadable = [entry.table for entry in long if isinstance(entry.table, Unreadable)]
         longest = max(unreadable, key=lambda table: table.rows, default=None)
         raise longest.error if longest else InputError(path, "no rows of numbers", "a header and numbers")
     if len(fitting) > 1 and sheet != ALL:
         problem = f"the columns in {len(fitting)} of the tables {labels}"
         raise InputError(path, problem, "one table; or import with --sheet NAME, or --sheet all")
     readable = []
-    for one in fitting:
-        if isinstance(one.table, InputError):
-            raise one.table
-        if isinstance(one.table, Table):
-            readable.append((one.label, one.table))
-    left_out = [one.label for one in wanted if one not in fitting]
+    for entry in fitting:
+        if isinstance(entry.table, InputError):
+            raise entry.table
+        if isinstance(entry.table, Table):
+            readable.append((entry.label, entry.table))
+    left_out = [entry.label for entry in wanted if entry not in fitting]
     return readable, [f"tables left out: {', '.join(map(repr, left_out))}"] if left_out else []
 
 
@@ -188,13 +188,18 @@ def _reading(
     name: str, label: str, table: Table, stated: Stated, sha256: str, notes: Sequence[str]
 ) -> Reading:
     """Returns the recording of a table, in SI units."""
-    found = settled(table, stated)
-    time_s = found.values["time"]
-    remarks = (*notes, *found.notes, *remarks_on_clock(time_s))
+    quantities = settled(table, stated)
+    time_s = quantities.values["time"]
+    remarks = (*notes, *quantities.notes, *remarks_on_clock(time_s))
     recording = Recording(
-        time_s - time_s[0], found.values["displacement"], found.values["force"], name, sha256, remarks
+        time_s - time_s[0],
+        quantities.values["displacement"],
+        quantities.values["force"],
+        name,
+        sha256,
+        remarks,
     )
-    return Reading(recording, label, found.columns, found.factors, found.zero_m)
+    return Reading(recording, label, quantities.columns, quantities.factors, quantities.zero_m)
 
 
 def _read_stored(path: Path) -> Recording:

@@ -74,15 +74,15 @@ def tables_of(where: str, rows: Rows, stated: Stated, by_blanks: bool = False) -
     ------
     InputError : a row within a table has a cell that is no number, or too few or too many cells.
     """
-    found: list[Table | Unreadable] = []
+    tables: list[Table | Unreadable] = []
     rows = partial(_without_dividers, rows)
     numbered, width = rows(), 0
     while True:
         above, section, first = _next_numbers(numbered)
         if first is None:
-            return found
+            return tables
         lines = [(n, _names_in(texts, first[1]) if by_blanks else texts) for n, texts in above]
-        if found and isinstance(found[-1], Table):
+        if tables and isinstance(tables[-1], Table):
             _refuse_interruption(where, lines, first, width)
         width = len(_texts(first[1]))
         try:
@@ -90,18 +90,18 @@ def tables_of(where: str, rows: Rows, stated: Stated, by_blanks: bool = False) -
             groups = candidates_of(where, heading, stated)
         except InputError as error:
             count, numbered = _skipped(chain([first], numbered))
-            found.append(Unreadable(section, count, error))
+            tables.append(Unreadable(section, count, error))
             continue
         reader = _Reader(where, heading, by_blanks)
         if len(groups) == 1:
             numbers, _, numbered = reader.read(groups[0], chain([first], numbered))
-            found.append(Table(where, section, groups[0], numbers, first[0], heading))
+            tables.append(Table(where, section, groups[0], numbers, first[0], heading))
             continue
         read = [reader.read(group, _from(rows(), first[0])) for group in groups]
         last = max(end for _, end, _ in read)
         for group, title, (numbers, end, _) in zip(groups, _titles(heading, groups), read, strict=True):
             reader.refuse_numbers_after(numbers, _from(rows(), end), last)
-            found.append(Table(where, title, group, numbers, first[0], heading))
+            tables.append(Table(where, title, group, numbers, first[0], heading))
         numbered = _from(rows(), last)
 
 

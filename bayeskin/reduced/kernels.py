@@ -79,10 +79,10 @@ def _kinematics(system, x, start, end, room):
 
 
 @compiled
-def _product(one, other):
+def _product(left, right):
     total = 0.0
-    for c in range(len(one)):
-        total += one[c] * other[c]
+    for c in range(len(left)):
+        total += left[c] * right[c]
     return total
 
 
@@ -92,11 +92,11 @@ def answer(system, laws, past, start, end, room):
     smallest = _base(system, past, start, end, room)
     if not smallest > 0.0:
         return smallest
-    for one in range(len(laws.respond)):
-        if laws.respond[one] != 0:
-            before, after, data, par = _of_law(laws, one, start, end, past.memory, room.memory)
+    for law in range(len(laws.respond)):
+        if laws.respond[law] != 0:
+            before, after, data, par = _of_law(laws, law, start, end, past.memory, room.memory)
             call_respond(
-                laws.respond[one], past.time_s, past.elapsed_s, par, data,
+                laws.respond[law], past.time_s, past.elapsed_s, par, data,
                 room.deformation[start:end], room.at_pressure[start:end], room.at_slope[start:end],
                 before, after, room.stress[start:end], room.content[start:end], room.flux[start:end],
             )  # fmt: skip
@@ -118,14 +118,14 @@ def _base(system, past, start, end, room):
 
 
 @compiled
-def _of_law(laws, one, start, end, old, new):
+def _of_law(laws, law, start, end, old, new):
     """Returns a law's memory before and after, its constants at some points, and its constants of the run."""
-    width, at = laws.memory_width[one], laws.memory_at[one]
+    width, at = laws.memory_width[law], laws.memory_at[law]
     before = old[at + start * width : at + end * width].reshape(end - start, width)
     after = new[at + start * width : at + end * width].reshape(end - start, width)
-    wide, place = laws.data_width[one], laws.data_at[one]
+    wide, place = laws.data_width[law], laws.data_at[law]
     data = laws.data[place + start * wide : place + end * wide].reshape(end - start, wide)
-    return before, after, data, laws.par[laws.par_at[one] : laws.par_at[one + 1]]
+    return before, after, data, laws.par[laws.par_at[law] : laws.par_at[law + 1]]
 
 
 @compiled
@@ -165,11 +165,11 @@ def tangent(system, laws, past, room):
         stress_f.reshape(n, 1, 9, 9), stress_p.reshape(n, 1, 9), content_f.reshape(n, 1, 9),
         content_p.reshape(n, 1), flux_f.reshape(n, 1, 3, 9), flux_g.reshape(n, 1, 3, 3),
     )  # fmt: skip
-    for one in range(len(laws.linearise)):
-        if laws.linearise[one] != 0:
-            before, _, data, par = _of_law(laws, one, 0, n, past.memory, room.memory)
+    for law in range(len(laws.linearise)):
+        if laws.linearise[law] != 0:
+            before, _, data, par = _of_law(laws, law, 0, n, past.memory, room.memory)
             call_linearise(
-                laws.linearise[one], past.time_s, past.elapsed_s, par, data, room.deformation,
+                laws.linearise[law], past.time_s, past.elapsed_s, par, data, room.deformation,
                 room.at_pressure, room.at_slope, before, stress_f, stress_p, content_f, content_p, flux_f,
                 flux_g,
             )  # fmt: skip
@@ -186,13 +186,13 @@ def _assembled(system, past, stress_f, stress_p, content_f, content_p, flux_f, f
     for q in range(n):
         w = system.weight[q]
         for j in range(9):
-            one = system.gradient[q, j]
+            gradient_row = system.gradient[q, j]
             for i in range(9):
-                _add_multiple(solid[9 * q + i], w * stress_f[q, i, j], one)
+                _add_multiple(solid[9 * q + i], w * stress_f[q, i, j], gradient_row)
             for i in range(3):
-                _add_multiple(turned[3 * q + i], w * flux_f[q, i, j], one)
-            _add_multiple(column[q], w * stress_p[q, j], one)
-            _add_multiple(row[q], w * content_f[q, j], one)
+                _add_multiple(turned[3 * q + i], w * flux_f[q, i, j], gradient_row)
+            _add_multiple(column[q], w * stress_p[q, j], gradient_row)
+            _add_multiple(row[q], w * content_f[q, j], gradient_row)
         for j in range(3):
             for i in range(3):
                 _add_multiple(flow[3 * q + i], w * flux_g[q, i, j], system.slope[q, j])
@@ -210,9 +210,9 @@ def _assembled(system, past, stress_f, stress_p, content_f, content_p, flux_f, f
 
 @compiled
 def _add_multiple(to, factor, values):
-    one = np.float32(factor)
+    single = np.float32(factor)
     for c in range(len(values)):
-        to[c] += one * values[c]
+        to[c] += single * values[c]
 
 
 @compiled

@@ -115,24 +115,24 @@ def _left(system, laws, past, room, varied, before, exact, rows, out):
     )  # fmt: skip
     stress = np.empty((r, 9 * n), np.float32)
     content, flux = np.empty((r, n), np.float32), np.empty((r, 3 * n), np.float32)
-    for one in range(r):
-        i = rows[one]
+    for parameter in range(r):
+        i = rows[parameter]
         for q in range(n):
-            other.at_pressure[q] = room.at_pressure[q] + step * pressed[one, q]
+            other.at_pressure[q] = room.at_pressure[q] + step * pressed[parameter, q]
             for a in range(3):
-                other.at_slope[q, a] = room.at_slope[q, a] + step * sloped[one, 3 * q + a]
+                other.at_slope[q, a] = room.at_slope[q, a] + step * sloped[parameter, 3 * q + a]
                 for b in range(3):
-                    moved = step * deformed[one, 9 * q + 3 * a + b]
+                    moved = step * deformed[parameter, 9 * q + 3 * a + b]
                     other.deformation[q, a, b] = room.deformation[q, a, b] + moved
         _answer_varied(system, laws, past, varied, before, i, other)
         for q in range(n):
             w = system.weight[q] / step
-            content[one, q] = w * (other.content[q] - room.content[q])
+            content[parameter, q] = w * (other.content[q] - room.content[q])
             for a in range(3):
-                flux[one, 3 * q + a] = w * (other.flux[q, a] - room.flux[q, a])
+                flux[parameter, 3 * q + a] = w * (other.flux[q, a] - room.flux[q, a])
                 for b in range(3):
-                    stress[one, 9 * q + 3 * a + b] = w * (other.stress[q, a, b] - room.stress[q, a, b])
-            out.pressure[i, q] = pressed[one, q]
+                    stress[parameter, 9 * q + 3 * a + b] = w * (other.stress[q, a, b] - room.stress[q, a, b])
+            out.pressure[i, q] = pressed[parameter, q]
         out.volume[i] = (other.volume - room.volume) / step
         out.memory[i] = (other.memory - room.memory) / step
     left = exact[rows]

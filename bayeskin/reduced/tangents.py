@@ -57,5 +57,5 @@ class Tangents:
         self._kept.append((place, copy))
 
 
-def _apart(one: tuple[float, float], other: tuple[float, float]) -> float:
-    return abs(one[0] - other[0]) + abs(one[1] - other[1])
+def _apart(place: tuple[float, float], other: tuple[float, float]) -> float:
+    return abs(place[0] - other[0]) + abs(place[1] - other[1])

@@ -174,9 +174,9 @@ def figure_base_parameters(parameters: Sequence[Parameter], before: Summaries, a
     return figure
 
 
-def _overlap(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+def _overlap(parameter: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Returns whether the 90 % intervals of two parameter summaries overlap."""
-    (low, high), (other_low, other_high) = one["interval90"], other["interval90"]
+    (low, high), (other_low, other_high) = parameter["interval90"], other["interval90"]
     return bool(low <= other_high and other_low <= high)
 
 

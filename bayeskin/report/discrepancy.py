@@ -77,7 +77,7 @@ class _Experiment(Protocol):
 
 
 @styled
-def figure_discrepancy(binned: BinnedForce, motion: PadMotion, found: _Discrepancy) -> Figure:
+def figure_discrepancy(binned: BinnedForce, motion: PadMotion, discrepancy: _Discrepancy) -> Figure:
     """Returns a figure of the discrepancy over time, over displacement by direction, and after a corner.
 
     motion : motion of the pads in the recording
@@ -87,9 +87,9 @@ def figure_discrepancy(binned: BinnedForce, motion: PadMotion, found: _Discrepan
     grid = figure.add_gridspec(2, 2, height_ratios=(1.15, 1))
     over_time = figure.add_subplot(grid[0, :])
     over_displacement, over_memory = (figure.add_subplot(grid[1, i]) for i in (0, 1))
-    _draw_over_time(over_time, binned, found)
-    _draw_phases(over_displacement, binned, motion, found, ("load", "unload"))
-    _draw_phases(over_memory, binned, motion, found, ("hold", "rest"))
+    _draw_over_time(over_time, binned, discrepancy)
+    _draw_phases(over_displacement, binned, motion, discrepancy, ("load", "unload"))
+    _draw_phases(over_memory, binned, motion, discrepancy, ("hold", "rest"))
     for ax in (over_displacement, over_memory):
         ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
         ax.set_ylabel("unexplained [mN]")
@@ -100,11 +100,11 @@ def figure_discrepancy(binned: BinnedForce, motion: PadMotion, found: _Discrepan
     panel_title(over_displacement, "b", "while the pads move")
     panel_title(over_memory, "c", "while the pads are still")
     finding = (
-        f"The model leaves {1e3 * found.size_n:.1f} mN RMS unexplained"
-        if found.noticeable
+        f"The model leaves {1e3 * discrepancy.size_n:.1f} mN RMS unexplained"
+        if discrepancy.noticeable
         else "The model leaves nothing but noise unexplained"
     )
-    features = "; ".join(found.features)
+    features = "; ".join(discrepancy.features)
     state_finding(
         figure, finding,
         "Dots: the part of the residual that no change of the parameters can explain. Lines and bands: the "
@@ -114,36 +114,38 @@ def figure_discrepancy(binned: BinnedForce, motion: PadMotion, found: _Discrepan
     return figure
 
 
-def _draw_over_time(ax: Axes, binned: BinnedForce, found: _Discrepancy) -> None:
-    time_s = binned.time_s[found.bins]
+def _draw_over_time(ax: Axes, binned: BinnedForce, discrepancy: _Discrepancy) -> None:
+    time_s = binned.time_s[discrepancy.bins]
     shade_phases(ax, binned.phases, cycles=True)
     phase_legend(ax, binned.phases)
-    ax.plot(time_s, 1e3 * found.beyond_n, ".", ms=1.8, color=RECORDED, alpha=0.5, lw=0, label="residual")
-    low, high = (1e3 * (found.mean_n + sign * Z90 * found.sd_n) for sign in (-1, 1))
-    for part in _unbroken(found.bins):
+    ax.plot(
+        time_s, 1e3 * discrepancy.beyond_n, ".", ms=1.8, color=RECORDED, alpha=0.5, lw=0, label="residual"
+    )
+    low, high = (1e3 * (discrepancy.mean_n + sign * Z90 * discrepancy.sd_n) for sign in (-1, 1))
+    for part in _unbroken(discrepancy.bins):
         ax.fill_between(time_s[part], low[part], high[part], color=MODEL, alpha=0.3, lw=0)
-        ax.plot(time_s[part], 1e3 * found.mean_n[part], color=MODEL, lw=0.9)
+        ax.plot(time_s[part], 1e3 * discrepancy.mean_n[part], color=MODEL, lw=0.9)
     ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
     ax.margins(y=0.12)
     ax.set(xlabel="time [s]", ylabel="unexplained force [mN]")
 
 
 def _draw_phases(
-    ax: Axes, binned: BinnedForce, motion: PadMotion, found: _Discrepancy, kinds: Sequence[PhaseKind]
+    ax: Axes, binned: BinnedForce, motion: PadMotion, discrepancy: _Discrepancy, kinds: Sequence[PhaseKind]
 ) -> None:
     """Draws a line with its band for each phase of `kinds`. Later cycles are fainter."""
     last = max((phase.cycle for phase in binned.phases), default=1)
     drawn_kinds = set()
     for index, phase in enumerate(binned.phases):
-        part = np.flatnonzero(binned.phase[found.bins] == index)
+        part = np.flatnonzero(binned.phase[discrepancy.bins] == index)
         if phase.kind not in kinds or not len(part) or (phase.kind == "rest" and phase.cycle == 0):
             continue
-        time_s = binned.time_s[found.bins[part]]
+        time_s = binned.time_s[discrepancy.bins[part]]
         still = phase.kind in ("hold", "rest")
         x = np.maximum(time_s - phase.start_s, 0.1) if still else 1e3 * motion.at(time_s)
-        mean, half = 1e3 * found.mean_n[part], 1e3 * Z90 * found.sd_n[part]
+        mean, half = 1e3 * discrepancy.mean_n[part], 1e3 * Z90 * discrepancy.sd_n[part]
         color, strength = COLORS[phase.kind], 1.0 - 0.6 * max(phase.cycle - 1, 0) / max(last - 1, 1)
-        ax.plot(x, 1e3 * found.beyond_n[part], ".", ms=1.5, color=color, alpha=0.35 * strength)
+        ax.plot(x, 1e3 * discrepancy.beyond_n[part], ".", ms=1.5, color=color, alpha=0.35 * strength)
         ax.fill_between(x, mean - half, mean + half, color=color, alpha=0.18 * strength, lw=0)
         ax.plot(x, mean, color=color, alpha=strength, lw=1.1)
         drawn_kinds.add(phase.kind)

@@ -86,15 +86,15 @@ def figure_detectability(mechanisms: Mapping[str, Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def _draw_curve(ax: Axes, one: Mapping[str, Any]) -> None:
+def _draw_curve(ax: Axes, answers: Mapping[str, Any]) -> None:
     """Draws all answers about one mechanism by size, and the curve of the share that is named."""
-    at, curve = np.array(one["curve"]["at"]), one["curve"]
+    at, curve = np.array(answers["curve"]["at"]), answers["curve"]
     ax.fill_between(at, curve["low"], curve["high"], color=MODEL, alpha=0.18)
-    sizes, right = np.array(one["sizes"]), np.array(one["right"], bool)
+    sizes, right = np.array(answers["sizes"]), np.array(answers["right"], bool)
     tested = (at >= sizes.min()) & (at <= sizes.max())
     ax.plot(at, curve["mean"], color=MODEL, lw=0.7, ls="--")
     ax.plot(at[tested], np.array(curve["mean"])[tested], color=MODEL)
-    look_alike = np.array(one["up_to"], bool) & ~right
+    look_alike = np.array(answers["up_to"], bool) & ~right
     for chosen, height, marker, color in (
         (right, 1.0, "o", INK),
         (look_alike, 0.0, "s", GREY),
@@ -107,12 +107,12 @@ def _draw_curve(ax: Axes, one: Mapping[str, Any]) -> None:
     plain_log(ax.xaxis)
 
 
-def half_in_words(one: Mapping[str, Any]) -> str:
+def half_in_words(answers: Mapping[str, Any]) -> str:
     """Returns, as text, the size at which half of the recordings are named, with its 90 % interval.
 
     Where a value lies outside the sizes of the recordings, the text states a bound instead.
     """
-    half, least, largest = one["curve"]["half"], min(one["sizes"]), max(one["sizes"])
+    half, least, largest = answers["curve"]["half"], min(answers["sizes"]), max(answers["sizes"])
     if half["median"] > largest:
         return f"above {min(max(half['low'], least), largest):.1f}"
     if half["median"] < least:

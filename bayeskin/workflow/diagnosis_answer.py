@@ -34,7 +34,7 @@ def answer_of(diagnosis: Diagnosis, known: Mapping[str, Mechanism]) -> dict[str,
         "located": [_window_entry(window, after.binned.spans) for window in before.located.windows],
         "remaining": [_window_entry(window, after.binned.spans) for window in after.located.windows],
         "recordings": [
-            {**asdict(one), "contradicts": one.contradicts} for one in explanation.agreement
+            {**asdict(recording), "contradicts": recording.contradicts} for recording in explanation.agreement
         ],
         "mechanisms": _mechanism_entries(diagnosis, known),
         "unexplained": None if diagnosis.remainder is None else remainder_entry(diagnosis.remainder),

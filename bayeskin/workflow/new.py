@@ -100,7 +100,7 @@ def new_config(files: Sequence[Path], out: Path | None = None, device: Path | No
     both = list(zip(recordings, phases, strict=True))
     described = [(*pair, phase_noise(*pair)) for pair in both]
     description, motions = (
-        "\n\n".join(describe(*one) for one in described),
+        "\n\n".join(describe(*parts) for parts in described),
         [idealised_motion(*p) for p in both],
     )
     geometry, single = _geometry(stated), len(files) == 1
@@ -117,7 +117,7 @@ def new_config(files: Sequence[Path], out: Path | None = None, device: Path | No
     out.parent.mkdir(parents=True, exist_ok=True)
     with open(out, "x", encoding="utf-8") as handle:
         handle.write(text)
-    facts = [describe_json(*one) for one in described]
+    facts = [describe_json(*parts) for parts in described]
     contents = facts[0] if single else {"recordings": facts}
     answer = {"ok": True, "out": out, "surrogate": surrogate.name if surrogate else None, **contents}
     return plain(
@@ -184,7 +184,7 @@ def _name(out: Path) -> str:
 
 
 def _configuration(
-    name: str, references: Sequence[str], found: str, section: list[str], ready: bool,
+    name: str, references: Sequence[str], description: str, section: list[str], ready: bool,
     stated: DeviceFile | None,
 ) -> str:  # fmt: skip
     """Returns the text of the configuration. Raises InputError for two recordings of one name."""
@@ -194,7 +194,7 @@ def _configuration(
     table = "[recording]" if len(given) == 1 else "[[recordings]]"
     parts = [
         [f"name = {_quoted(name)}", f"seed = {config.seed}"],
-        _description_lines(found),
+        _description_lines(description),
         *(
             [
                 table,

@@ -126,10 +126,10 @@ def _at_draws(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:
     return [*blocks, *pictures(facts, "sample", ["model_check"])]
 
 
-def _median(one: Mapping[str, Any], unit: str) -> tuple[Cell, Cell]:
+def _median(parameter: Mapping[str, Any], unit: str) -> tuple[Cell, Cell]:
     """Returns the cells of a parameter's median and 90 % interval."""
-    low, high = one["low_90"], one["high_90"]
-    return cell(one["median"], unit), Cell(interval(low, high, unit), low)
+    low, high = parameter["low_90"], parameter["high_90"]
+    return cell(parameter["median"], unit), Cell(interval(low, high, unit), low)
 
 
 def _held_out(facts: RunFacts, said: Mapping[str, Any]) -> list[Block]:

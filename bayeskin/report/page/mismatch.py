@@ -43,7 +43,7 @@ def mismatch(facts: RunFacts) -> Section:
     return Section("mismatch", "Mismatch", blocks)
 
 
-def _mechanisms(found: Sequence[Mapping[str, Any]]) -> Table:
+def _mechanisms(named: Sequence[Mapping[str, Any]]) -> Table:
     rows = [
         row(
             (
@@ -54,16 +54,16 @@ def _mechanisms(found: Sequence[Mapping[str, Any]]) -> Table:
                 ", ".join(name for name in mechanism["group"] if name != mechanism["name"]) or "none",
             )
         )
-        for mechanism in found
+        for mechanism in named
     ]
     head = ("mechanism", "effect in this recording", "probability", "changes the force by", "look-alikes")
     return Table("Mechanisms that were named", head, rows)
 
 
-def _parameters(found: Sequence[Mapping[str, Any]]) -> Table:
+def _parameters(named: Sequence[Mapping[str, Any]]) -> Table:
     rows = [
         row((mechanism["name"], name, cell(p["mean"], p["unit"]), cell(p["sd"], p["unit"])))
-        for mechanism in found
+        for mechanism in named
         for name, p in mechanism["parameters"].items()
     ]
     return Table("Parameters of the mechanisms", ("mechanism", "parameter", "mean", "sd"), rows)

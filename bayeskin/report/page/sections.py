@@ -253,17 +253,17 @@ def sobol(facts: RunFacts) -> Section:
     return Section("sobol", "Sobol' indices", blocks)
 
 
-def _indices(one: Mapping[str, Any], title: str) -> list[Block]:
+def _indices(summary: Mapping[str, Any], title: str) -> list[Block]:
     """Returns a table of first-order and total indices for parameters, and of second-order ones for pairs."""
     pairs = [
         row((pair, Cell(_share(index["second"]), index["second"]), _between(index["second_90"])))
-        for pair, index in one["pairs"].items()
+        for pair, index in summary["pairs"].items()
     ]
     return [
         Table(
             f"Sobol' indices aggregated over time, {title}",
             ("parameter", "first order", "90 % interval", "total", "90 % interval"),
-            [_index(parameter, index) for parameter, index in one["aggregated"].items()],
+            [_index(parameter, index) for parameter, index in summary["aggregated"].items()],
             symbols=True,
         ),
         Folded(
@@ -273,10 +273,10 @@ def _indices(one: Mapping[str, Any], title: str) -> list[Block]:
     ]
 
 
-def _shares(one: Mapping[str, Any]) -> Table:
+def _shares(summary: Mapping[str, Any]) -> Table:
     rows = [
         row((name, Cell(percent(share["share"]), share["share"]), _between(share["share_90"])))
-        for name, share in one["shares"].items()
+        for name, share in summary["shares"].items()
     ]
     return Table(
         "Shapley effects aggregated over time, over the posterior",
