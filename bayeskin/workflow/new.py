@@ -1,23 +1,16 @@
-"""Writes a configuration for a recording of the user's own.
-
-Its comments describe the recording and all that can be set.
-"""
+"""Writes a configuration for a recording of the user's own, and chooses the surrogate that it uses."""
 
 from __future__ import annotations
 
-import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bayeskin.config import Config, DesignConfig, config_of
-from bayeskin.config.device import DeviceFile, StatedGeometry, device_lines, load_device_file, stated_geometry
-from bayeskin.design import default_space
+from bayeskin.config.device import DeviceFile, StatedGeometry, load_device_file, stated_geometry
 from bayeskin.errors import InputError
 from bayeskin.geometry import Geometry
-from bayeskin.inference import NoisePriors
 from bayeskin.json_files import plain
 from bayeskin.recordings import (
     BIN_WIDTH_S,
@@ -33,52 +26,17 @@ from bayeskin.recordings import (
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.region import protocol_outside
 from bayeskin.shipped import shipped
-from bayeskin.types import PadMotion, Parameter
+from bayeskin.types import PadMotion
+from bayeskin.workflow.configuration_text import (
+    configuration_text,
+    full_design_section,
+    reduced_design_section,
+    surrogate_section,
+    wide_bins_section,
+)
 from bayeskin.workflow.output_paths import check_ending
 from bayeskin.workflow.reducing import find_reduced
 from bayeskin.workflow.shipping import shipped_for
-
-_SECONDS_A_RUN = (4, 15)  # of one full run on one core, on the default mesh
-_REDUCED_SECONDS_A_RUN = (0.1, 0.4)
-_SHIPPED_KNOWS = (
-    "# The shipped surrogate was trained for this model, this bin width and these bounds. For another model",
-    "# or bin width, or for wider bounds, remove [surrogate] above. The run then trains its own surrogate.",
-)
-
-_NOISE = NoisePriors()
-_EXAMPLES = {"windows_s": [[0.0, 60.0]], "sd_n": _NOISE.sd_n, "tau_s": _NOISE.tau_s, "nu": _NOISE.nu}
-# Each entry has the name of a section, its subject, and its keys with their meaning.
-_SECTIONS: Sequence[tuple[str, str, Mapping[str, str]]] = (
-    ("model", "the force that the model reports, and the mesh", {
-        "observation": '"reaction": force on the pad; "article": force as the article\'s code computes it',
-        "mesh": '"bricks" or the name of a gmsh file',
-        "refinement": "refinement of the bricks: 0 is coarse and fast, 2 is fine and slow",
-    }),
-    ("fit", "the part of the recording that is fitted", {
-        "windows_s": "an example, in s; without this key, the whole recording is fitted",
-        "bin_width_s": "width of the bins, in s; the mean force of each bin is fitted",
-    }),
-    ("noise", "bounds of the log-uniform priors of the noise", {
-        "sd_n": "standard deviation, in N, of each kind of phase",
-        "tau_s": "correlation time, in s",
-        "nu": "degrees of freedom of the Student-t noise; small values mean heavy tails",
-    }),
-    ("map", "the search for the most probable point", {
-        "starts": "number of starting points; three kinds of search take turns",
-        "evaluations": "largest number of evaluations for each start",
-    }),
-    ("sample", "the sampler of the posterior, and when it stops", {
-        "ensembles": "number of independent ensembles of walkers",
-        "walkers": "number of walkers in each ensemble",
-        "effective_samples": "sampling stops when every parameter has so many effective samples",
-        "max_steps": "sampling stops after so many steps, even if the result is not trusted",
-    }),
-    ("check", "the check of the posterior with the full model", {
-        "draws": "number of posterior draws at which the full model runs; 0 for no check",
-        "rounds": "how often these runs may be added to the design, if the surrogate is not accurate",
-    }),
-    ("sobol", "Sobol' indices over the prior", {"samples": "more samples give narrower intervals"}),
-)  # fmt: skip
 
 
 def new_config(files: Sequence[Path], out: Path | None = None, device: Path | None = None) -> dict[str, Any]:
@@ -112,8 +70,8 @@ def new_config(files: Sequence[Path], out: Path | None = None, device: Path | No
     references = [Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix() for file in files]
     _refuse_names(references)
     if width_s != BIN_WIDTH_S:
-        section = [*_wide_bins_section(width_s), "", *section]
-    text = _configuration(_name(out), references, description, section, surrogate is not None, stated)
+        section = [*wide_bins_section(width_s), "", *section]
+    text = configuration_text(_name(out), references, description, section, surrogate is not None, stated)
     out.parent.mkdir(parents=True, exist_ok=True)
     with open(out, "x", encoding="utf-8") as handle:
         handle.write(text)
@@ -172,159 +130,12 @@ def _reduced_for(motions: Sequence[PadMotion], geometry: Geometry, out: Path) ->
 def _surrogate_source(surrogate: Path | None, reduced: Path | None) -> tuple[str, list[str]]:
     """Returns how a run gets its surrogate, in words and as lines of the configuration."""
     if surrogate is not None:
-        return f"the shipped surrogate {surrogate.name}", _surrogate_section(surrogate.name)
+        return f"the shipped surrogate {surrogate.name}", surrogate_section(surrogate.name)
     if reduced is not None:
-        return f"a design of the reduced model {reduced.name}", _reduced_design_section(reduced.name)
-    return "a design of full runs", _full_design_section()
+        return f"a design of the reduced model {reduced.name}", reduced_design_section(reduced.name)
+    return "a design of full runs", full_design_section()
 
 
 def _name(out: Path) -> str:
     """Returns a run's name from a file's name; characters that are not allowed become hyphens."""
     return re.sub(r"^[^A-Za-z0-9]+", "", re.sub(r"[^A-Za-z0-9._-]", "-", out.stem)) or "run"
-
-
-def _configuration(
-    name: str, references: Sequence[str], description: str, section: list[str], ready: bool,
-    stated: DeviceFile | None,
-) -> str:  # fmt: skip
-    """Returns the text of the configuration. Raises InputError for two recordings of one name."""
-    given = [{"file": reference} for reference in references]
-    sections: dict[str, Any] = {"recording": given[0]} if len(given) == 1 else {"recordings": given}
-    config = config_of({"name": name, **sections}, "recordings")
-    table = "[recording]" if len(given) == 1 else "[[recordings]]"
-    parts = [
-        [f"name = {_quoted(name)}", f"seed = {config.seed}"],
-        _description_lines(description),
-        *(
-            [
-                table,
-                f"file = {_quoted(recording.file)}  # path relative to this file",
-                f'# protocol = {_quoted(recording.protocol)}  # or "recorded": as measured, but slower',
-            ]
-            for recording in config.each_recording
-        ),
-        *([device_lines(stated.device, stated.tissue)] if stated else []),
-        section,
-        [
-            "# All other settings, with their defaults. To change one, remove the # from its line and from",
-            "# the line of its [section].",
-            *(_SHIPPED_KNOWS if ready else ()),
-            *([] if stated else _commented_device(config)),
-            *_optional_lines(config, stated_in=section),
-        ],
-    ]
-    return "\n\n".join("\n".join(part) for part in parts) + "\n"
-
-
-def _quoted(text: str) -> str:
-    """Returns a text as a TOML string."""
-    return json.dumps(text, ensure_ascii=False)
-
-
-def _description_lines(text: str) -> list[str]:
-    """Returns the description of the recording as TOML comments; unprintable characters become blanks."""
-    clean = ("".join(c if c.isprintable() else " " for c in line) for line in text.splitlines())
-    return ["# Contents of the recording:", *(f"#   {line}".rstrip() for line in clean)]
-
-
-def _surrogate_section(file: str) -> list[str]:
-    """Returns the section of a shipped surrogate."""
-    return [
-        "# A shipped surrogate was trained for this protocol, so no full runs are needed before sampling.",
-        "[surrogate]",
-        f"file = {_quoted(file)}",
-    ]
-
-
-def _wide_bins_section(width_s: float) -> list[str]:
-    """Returns the section of the fit for a recording whose samples are far apart."""
-    _, _, keys = next(section for section in _SECTIONS if section[0] == "fit")
-    windows = f"# windows_s = {_default_as_toml(None, 'windows_s')}  # {keys['windows_s']}"
-    return ["[fit]", f"bin_width_s = {width_s:g}  # {keys['bin_width_s']}; it needs two samples", windows]
-
-
-def _full_design_section() -> list[str]:
-    """Returns the section of a design by the full model, with its expected duration."""
-    design = DesignConfig()
-    runs, (quick, slow) = _runs(design), _SECONDS_A_RUN
-    low, high = (seconds * runs / (60 * design.workers) for seconds in _SECONDS_A_RUN)
-    return [
-        "# No shipped surrogate was trained for this protocol and this device, so the full model runs first:",
-        f"# {runs} runs of about {quick} to {slow} s each, {low:.0f} to {high:.0f} minutes with "
-        f"{design.workers} workers.",
-        "# `bayeskin reduce` with this file builds a reduced model of the device from hundreds of full runs.",
-        '# A design with coarse = "reduced" then takes minutes if the pads open no further than in training.',
-        "[design]",
-        *_wave_lines(design),
-    ]
-
-
-def _reduced_design_section(file: str) -> list[str]:
-    """Returns the section of a design by the reduced model, with its expected duration."""
-    design = DesignConfig.model_validate({"coarse": "reduced"})
-    full = design.fine_points + design.fine_held_out
-    low, high = (
-        (seconds * full + quick * _runs(design)) / (60 * design.workers)
-        for seconds, quick in zip(_SECONDS_A_RUN, _REDUCED_SECONDS_A_RUN, strict=True)
-    )
-    return [
-        "# No shipped surrogate was trained for this protocol and this device, so these runs come first:",
-        f"# {_runs(design)} runs of the reduced model {file}, except where the skin folds,",
-        f"# and {full} runs of the full model, which correct them: {low:.0f} to {high:.0f} minutes with "
-        f"{design.workers} workers.",
-        "[design]",
-        'coarse = "reduced"  # the model that runs the points of the waves',
-        f"fine_points = {design.fine_points}  # full runs that correct the reduced model",
-        f"fine_held_out = {design.fine_held_out}  # further full runs, which measure the surrogate's error",
-        *_wave_lines(design),
-    ]
-
-
-def _runs(design: DesignConfig) -> int:
-    """Returns the number of runs of a design's waves."""
-    return sum(design.points) + len(design.points) * design.held_out
-
-
-def _wave_lines(design: DesignConfig) -> list[str]:
-    """Returns the lines of a design's waves and workers."""
-    return [
-        f"points = {list(design.points)}  # number of training runs in each wave",
-        f"held_out = {design.held_out}  # further runs in each wave, which measure the surrogate's error",
-        f"workers = {design.workers}  # number of worker processes",
-    ]
-
-
-def _optional_lines(config: Config, stated_in: Sequence[str]) -> list[str]:
-    """Returns commented lines for what can be set and has no section in `stated_in`, with the defaults."""
-    lines = []
-    for section, subject, keys in _SECTIONS:
-        if f"[{section}]" in stated_in:
-            continue
-        defaults = {key: getattr(getattr(config, section), key) for key in keys}
-        lines += ["", f"# [{section}]  # {subject}"]
-        lines += [
-            f"# {key} = {_default_as_toml(value, key)}  # {keys[key]}" for key, value in defaults.items()
-        ]
-    for parameter in default_space().parameters:
-        lines += ["", *_prior_lines(parameter)]
-    return lines
-
-
-def _commented_device(config: Config) -> list[str]:
-    """Returns the sections of the device and the tissue as comments."""
-    return ["", *(f"# {line}" if line else "" for line in device_lines(config.device, config.tissue))]
-
-
-def _default_as_toml(value: object, key: str) -> str:
-    """Returns a default as TOML; where a key has no default, an example or the value that is used."""
-    return json.dumps(_EXAMPLES[key] if value is None else value)
-
-
-def _prior_lines(parameter: Parameter) -> list[str]:
-    """Returns commented lines for the prior of a parameter."""
-    return [
-        f"# [parameters.{parameter.name}]  # {parameter.description}, {parameter.unit}",
-        f"# lower = {parameter.lower!r}",
-        f"# upper = {parameter.upper!r}",
-        f"# prior = {_quoted(parameter.prior)}",
-    ]

@@ -9,7 +9,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from bayeskin.report.page import checks, mismatch, sections
+from bayeskin.report.page import checks, indices, mismatch, sections
 from bayeskin.report.page.answer import answer
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.parts import Block, Section
@@ -41,7 +41,7 @@ def render_page(facts: RunFacts) -> str:
 
 
 def _sections(facts: RunFacts) -> list[Section]:
-    upper = (sections.recording, sections.fit, sections.posterior, sections.sobol)
+    upper = (sections.recording, sections.fit, sections.posterior, indices.sobol)
     lower = (mismatch.mismatch, checks.checks, checks.provenance)
     return [make(facts) for make in (*upper, *lower)]
 

@@ -1,4 +1,4 @@
-"""Makes the sections of a page below its answer: recording, fit, posterior and Sobol' indices."""
+"""Makes the sections of a page below its answer: recording, fit and posterior."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayeskin.number_format import interval, number, percent, quantity, scale
-from bayeskin.report.page.charts import history_chart, indices_chart, residual_chart
+from bayeskin.report.page.charts import history_chart, residual_chart
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.figures import pictures
 from bayeskin.report.page.parts import Block, Cell, Facts, Folded, Missing, Section, Table, Text, row
@@ -17,12 +17,6 @@ _WHY = {
     "not finished": "was begun and is not finished",
     "failed": "failed",
     "out of date": "is out of date: configuration, inputs or version have changed since",
-}
-_INDICES = {
-    "prior_gp": "over the prior, Gaussian process",
-    "prior_chaos": "over the prior, polynomial chaos",
-    "near_map": "near the most probable point",
-    "posterior": "over the posterior",
 }
 
 
@@ -103,14 +97,15 @@ def fit(facts: RunFacts) -> Section:
     blocks: list[Block] = list(absent(facts, "sample"))
     if summary:
         if facts.history is not None:
-            blocks += [chart(facts.history, _phases_of(facts)) for chart in (history_chart, residual_chart)]
+            blocks += [chart(facts.history, phases_of(facts)) for chart in (history_chart, residual_chart)]
         tables = {"posterior mean": summary["rmse"], "full model, most probable point": None}
         tables["full model, most probable point"] = facts.said("map").get("rmse_of_full_model")
         blocks += [_rmse(tables), _bands(summary), *pictures(facts, "sample", ["fit"])]
     return Section("fit", "Fit", blocks)
 
 
-def _phases_of(facts: RunFacts) -> Sequence[Mapping[str, Any]]:
+def phases_of(facts: RunFacts) -> Sequence[Mapping[str, Any]]:
+    """Returns the phases of the recording, or nothing where it was not read."""
     phases: Sequence[Mapping[str, Any]] = facts.said("recording").get("phases", ())
     return phases
 
@@ -223,81 +218,3 @@ def _parameters(facts: RunFacts, table: Mapping[str, Mapping[str, Any]]) -> Tabl
         prior, outcome = prior_in_words(summary["prior"], summary["unit"]), known[name]["outcome"]
         rows.append(row((name, meaning, prior, *cells[:3], unit, cells[3], outcome)))
     return Table("Parameters: prior, posterior, and what the data says about each", head, rows, symbols=True)
-
-
-def sobol(facts: RunFacts) -> Section:
-    """Returns the section on Sobol' indices."""
-    summaries = facts.said("sobol")
-    blocks: list[Block] = list(absent(facts, "sobol"))
-    for name, summary in summaries.items():
-        title = _INDICES.get(name, name)
-        tables = [_shares(summary)] if "shares" in summary else _indices(summary, title)
-        key, indices = f"indices-{name}".replace("_", "-"), facts.indices.get(name)
-        blocks += [
-            *tables,
-            Text([summary["sentence"]]),
-            *([indices_chart(key, title, indices, _phases_of(facts))] if indices is not None else []),
-            *pictures(facts, "sobol", [f"sobol_{name}"]),
-            Folded(
-                f"Method: {title}",
-                [
-                    Text(
-                        [
-                            f"{summary['method']}, {summary['samples']} samples",
-                            f"inputs: {summary['distribution']}",
-                        ]
-                    )
-                ],
-            ),
-        ]
-    return Section("sobol", "Sobol' indices", blocks)
-
-
-def _indices(summary: Mapping[str, Any], title: str) -> list[Block]:
-    """Returns a table of first-order and total indices for parameters, and of second-order ones for pairs."""
-    pairs = [
-        row((pair, Cell(_share(index["second"]), index["second"]), _between(index["second_90"])))
-        for pair, index in summary["pairs"].items()
-    ]
-    return [
-        Table(
-            f"Sobol' indices aggregated over time, {title}",
-            ("parameter", "first order", "90 % interval", "total", "90 % interval"),
-            [_index(parameter, index) for parameter, index in summary["aggregated"].items()],
-            symbols=True,
-        ),
-        Folded(
-            f"Pairs: {title}",
-            [Table(f"Second order, {title}", ("pair", "second order", "90 % interval"), pairs, symbols=True)],
-        ),
-    ]
-
-
-def _shares(summary: Mapping[str, Any]) -> Table:
-    rows = [
-        row((name, Cell(percent(share["share"]), share["share"]), _between(share["share_90"])))
-        for name, share in summary["shares"].items()
-    ]
-    return Table(
-        "Shapley effects aggregated over time, over the posterior",
-        ("parameter", "share of the variance", "90 % interval"),
-        rows,
-        symbols=True,
-    )
-
-
-def _index(name: str, index: Mapping[str, Any]) -> tuple[Cell, ...]:
-    cells: list[str | Cell] = [name]
-    for kind in ("first", "total"):
-        cells += [Cell(_share(index[kind]), index[kind]), _between(index[f"{kind}_90"])]
-    return row(cells)
-
-
-def _between(limits: Sequence[float | None]) -> Cell:
-    low, high = limits
-    return Cell(f"{_share(low)} to {_share(high)}", low)
-
-
-def _share(value: float | None) -> str:
-    """Returns an index with three decimals, because further decimals would only be noise of the estimate."""
-    return "–" if value is None else f"{round(value, 3) + 0.0:.3f}".replace("-", "−")
