@@ -74,8 +74,7 @@ SETTINGS = {
     "as run": {},
     "reference": {
         (lagrangian, "SOLVER_TOLERANCE"): 1e-7,
-        (stepping, "SHORTEST_STEP"): 1e-6,
-        (stepping, "STEPS_PER_PHASE"): 40,
+        (stepping, "STEPPING"): stepping.StepSettings(shortest=1e-6, steps_per_phase=40),
     },
 }
 WHOLE_MESHES = ("bricks-1", "bricks-2", "Mesh_SKIN.msh")

@@ -9,7 +9,7 @@ import numpy as np
 import rows
 
 from bayeskin.finite_element import ModelSpec
-from bayeskin.finite_element.stepping import STEPS_PER_PHASE
+from bayeskin.finite_element.stepping import STEPPING
 from bayeskin.types import Simulation
 
 SPACE_TOLERANCE = 3e-4
@@ -237,7 +237,7 @@ def verdict(
         sentences.append(
             f"The default is {default:g}. Its RMS error is at most {100 * default_rms[0]:.3f} and "
             f"{100 * default_rms[1]:.3f} % on these protocols. Looser tolerances take as many steps, because "
-            f"no phase has fewer than {STEPS_PER_PHASE}."
+            f"no phase has fewer than {STEPPING.steps_per_phase}."
         )
     else:
         sentences.append(

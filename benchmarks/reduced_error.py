@@ -27,7 +27,7 @@ from bayeskin.finite_element.simulate import ModelSpec
 from bayeskin.geometry import LENGTHS
 from bayeskin.hashing import sha256_of
 from bayeskin.reduced import simulate as reduced_runs
-from bayeskin.reduced.cases import BASE, SETS, THICKNESS_RANGE, Case
+from bayeskin.reduced.cases import BASE, CASES, SETS, Case
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.region import outside
@@ -73,7 +73,7 @@ def beyond(index: int) -> Case:
         return replace(
             case, motion=PadMotion(time_s * fastest / (FASTER * trained.protocols.speeds_m_s[1]), height_m)
         )
-    thick = 1.0 + THICKER * THICKNESS_RANGE
+    thick = 1.0 + THICKER * CASES.thickness_range
     layers = {name: thick * getattr(trained.geometry, name) for name in ("cutis_m", "subcutis_m")}
     return replace(case, geometry=replace(trained.geometry, **layers))
 

@@ -14,7 +14,7 @@ from bayeskin.finite_element.mesh import layered_mesh
 from bayeskin.finite_element.newton import Equations, NewtonSolver
 from bayeskin.finite_element.problem import build_problem, material
 from bayeskin.finite_element.relaxation import relax
-from bayeskin.finite_element.stepping import integrate
+from bayeskin.finite_element.stepping import StepSettings, integrate
 from bayeskin.types import PadMotion
 
 
@@ -86,7 +86,7 @@ def test_a_soft_cutis_on_a_stiff_subcutis_folds_and_the_run_goes_on() -> None:
 
 
 def test_a_run_that_folds_too_often_is_given_up_and_says_where(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stepping, "MOST_CRAWLS", 2)
+    monkeypatch.setattr(stepping, "STEPPING", StepSettings(most_crawls=2))
     model = foldable()
     message = integrate(model, 700.0, 1e-3, lambda step: None)
     assert re.fullmatch(r"step \d+ at t = \S+ s: the skin has folded and snapped 1 times; try .*", message)

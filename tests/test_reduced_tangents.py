@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayeskin.reduced.tangents import FAR, ROOM, SAME_PLACE, Tangent, Tangents
+from bayeskin.reduced.tangents import KEEPING, Tangent, Tangents
 
 
 def tangent(value: float) -> Tangent:
@@ -28,17 +28,17 @@ def test_the_nearest_serves_as_a_copy() -> None:
 def test_one_of_a_far_longer_stage_does_not_serve() -> None:
     kept, taken = Tangents(), Tangent(2)
     kept.keep((0.0, 0.0), tangent(1.0))
-    assert kept.take((0.0, 0.99 * FAR), taken)
-    assert not kept.take((0.0, 1.01 * FAR), taken)
+    assert kept.take((0.0, 0.99 * KEEPING.far), taken)
+    assert not kept.take((0.0, 1.01 * KEEPING.far), taken)
 
 
 def test_one_at_the_same_place_is_replaced_and_the_oldest_goes_where_there_is_no_room() -> None:
     kept, taken = Tangents(), Tangent(2)
     kept.keep((0.0, 0.0), tangent(1.0))
-    kept.keep((0.5 * SAME_PLACE, 0.0), tangent(2.0))
+    kept.keep((0.5 * KEEPING.same_place, 0.0), tangent(2.0))
     assert kept.take((0.0, 0.0), taken)
     assert np.all(taken.inverse == 2.0)
-    for number in range(ROOM):
+    for number in range(KEEPING.most):
         kept.keep((1.0 + 0.1 * number, 0.0), tangent(3.0 + number))
     assert kept.take((0.0, 0.0), taken)
     assert np.all(taken.inverse == 3.0)

@@ -12,11 +12,10 @@ import scipy.sparse as sp
 import skfem
 
 from bayeskin.finite_element import article_law, assembly
-from bayeskin.finite_element.newton import Equations, NewtonSolver
+from bayeskin.finite_element.newton import SOLVER_TOLERANCE, Equations, NewtonSolver
 from bayeskin.finite_element.problem import Material, Problem
 from bayeskin.types import Array
 
-SOLVER_TOLERANCE = 1e-4  # relative to the largest displacement and pressure, before the last correction
 FACE_QUADRATURE_DEGREE = 6
 
 

@@ -10,6 +10,7 @@ Anderson's method (SIAM J. Numer. Anal. 49, 2011, 1715).
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -20,13 +21,28 @@ from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.newton import Equations
 from bayeskin.types import Array
 
-TOLERANCE = 1e-4  # largest force that a correction may still add, relative to the nominal force
-UNCORRECTED = 0.05  # factor on TOLERANCE for an uncorrected guess, whose error adds up from stage to stage
-MOST_CORRECTIONS = 12
-ANDERSON_DEPTH = 4
-DUALS = 10  # largest number of kept dual solutions
-
 Differentiated = Evaluated | ResidualDifferences
+
+
+@dataclass(frozen=True)
+class CorrectionSettings:
+    """Settings of the correction of derivatives.
+
+    tolerance : largest force that a correction may still add, relative to the nominal force
+    uncorrected : factor on the tolerance for an uncorrected guess, whose error adds up from stage to stage
+    most_corrections : largest number of corrections
+    anderson_depth : number of corrections that are combined in a step
+    duals : largest number of kept dual solutions
+    """
+
+    tolerance: float = 1e-4
+    uncorrected: float = 0.05
+    most_corrections: int = 12
+    anderson_depth: int = 4
+    duals: int = 10
+
+
+CORRECTION = CorrectionSettings()
 
 
 class Corrector:
@@ -46,15 +62,15 @@ class Corrector:
         """
         model, solver, free = self._model, self._model.solver, self._model.problem.pattern.free
         dual = self._dual(solver.toward(equations.place))
-        weight, allowed_n = equations.weight[:, None], TOLERANCE * model.nominal_force()
+        weight, allowed_n = equations.weight[:, None], CORRECTION.tolerance * model.nominal_force()
         tried: list[tuple[Array, Array]] = []  # unknowns, and the correction computed at each
-        for _ in range(MOST_CORRECTIONS):
+        for _ in range(CORRECTION.most_corrections):
             evaluated = action(x)
             missing_n = -dual @ evaluated.residual[free]
-            if np.abs(missing_n).max() <= (allowed_n if tried else UNCORRECTED * allowed_n):
+            if np.abs(missing_n).max() <= (allowed_n if tried else CORRECTION.uncorrected * allowed_n):
                 break
             correction = -solver.back_substitute(evaluated.residual[free])
-            tried = [*tried, (x[free] * weight, correction * weight)][-ANDERSON_DEPTH:]
+            tried = [*tried, (x[free] * weight, correction * weight)][-CORRECTION.anderson_depth :]
             x[free] += _anderson_step(tried) / weight
         return x, evaluated, 2.0 * evaluated.residual[model.problem.measured_x].sum(axis=0) + missing_n
 
@@ -63,7 +79,7 @@ class Corrector:
         known = self._duals.get(id(place))
         if known is None:
             known = place, self._model.solver.back_substitute(self._model.pad_gradient)
-            self._duals = dict([*self._duals.items(), (id(place), known)][-DUALS:])
+            self._duals = dict([*self._duals.items(), (id(place), known)][-CORRECTION.duals :])
         return known[1]
 
 

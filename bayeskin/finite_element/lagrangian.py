@@ -12,14 +12,12 @@ from functools import cached_property
 import numpy as np
 
 from bayeskin.finite_element.balances import Balances
-from bayeskin.finite_element.newton import Equations, NewtonSolver
+from bayeskin.finite_element.newton import SOLVER_TOLERANCE, Equations, NewtonSolver
 from bayeskin.finite_element.problem import nominal_force
 from bayeskin.finite_element.relaxation import relax
 from bayeskin.finite_element.series import SeriesSolver, Solved
 from bayeskin.finite_element.stages import Stage, State, Step
 from bayeskin.types import Array
-
-SOLVER_TOLERANCE = 1e-4  # relative to the largest displacement and pressure, before the last correction
 
 
 @dataclass

@@ -20,14 +20,30 @@ import scipy.sparse as sp
 from bayeskin.finite_element.linear import Factorisations, factorisations
 from bayeskin.types import Array
 
-MAX_RENEWALS = 8
-MAX_BROYDEN = 25
-# The solver makes a new factorisation if more than so many iterations are left. A factorisation costs about
-# as much as twenty-five iterations, but later solves use it again.
-DEAR = 8.0
-SMALLEST_DAMPING = 1 / 64
-SAME_PLACE = 0.2  # a new factorisation replaces an old one that is nearer than this
+SOLVER_TOLERANCE = 1e-4  # relative to the largest displacement and pressure, before the last correction
 COUNTED = ("iterations", "residuals", "factorisations", "solves", "falls", "crawls")
+
+
+@dataclass(frozen=True)
+class NewtonSettings:
+    """Settings of a solve.
+
+    most_renewals : largest number of new factorisations in a solve
+    most_iterations : largest number of iterations with one factorisation
+    dear : a new factorisation is made if more than so many iterations are left. It costs about as much as
+        twenty-five iterations, but later solves use it again
+    smallest_damping : smallest share of a step that is tried
+    same_place : a new factorisation replaces an old one that is nearer than this
+    """
+
+    most_renewals: int = 8
+    most_iterations: int = 25
+    dear: float = 8.0
+    smallest_damping: float = 1 / 64
+    same_place: float = 0.2
+
+
+NEWTON = NewtonSettings()
 
 
 @dataclass(frozen=True)
@@ -91,7 +107,7 @@ class NewtonSolver:
         of the least recently used factorisation.
         """
         nearest = self._nearest(place)
-        if nearest is not None and np.abs(self._places[nearest] - place).sum() < SAME_PLACE:
+        if nearest is not None and np.abs(self._places[nearest] - place).sum() < NEWTON.same_place:
             return nearest
         if len(self._places) < self._factors.room:
             return len(self._places)
@@ -151,7 +167,7 @@ class NewtonSolver:
             self.renew(equations, x)
         else:
             self._current = nearest
-        for _ in range(MAX_RENEWALS):
+        for _ in range(NEWTON.most_renewals):
             x_new, converged = self._broyden(equations, x, fresh)
             if converged:
                 return x_new
@@ -179,7 +195,7 @@ class NewtonSolver:
         steps = [self._newton_step(equations, right)]
         sizes: list[float] = []
         free = equations.free
-        for iteration in range(MAX_BROYDEN):
+        for iteration in range(NEWTON.most_iterations):
             self.counts["iterations"] += 1
             size = float(np.abs(steps[-1]).max())
             if not np.isfinite(size) or (iteration > 1 and size > 2.0 * sizes[-1]):
@@ -195,7 +211,7 @@ class NewtonSolver:
             if size < 1.0:
                 self.last_residual = float(np.abs(right).max())
                 return x, True
-            if iteration > 1 and _iterations_left(size, sizes) > DEAR:
+            if iteration > 1 and _iterations_left(size, sizes) > NEWTON.dear:
                 return x, False
             sizes.append(size)
             steps.append(
@@ -216,7 +232,7 @@ class NewtonSolver:
         step : (free,) in units of the tolerance
         """
         damping = 0.5
-        while damping >= SMALLEST_DAMPING:
+        while damping >= NEWTON.smallest_damping:
             trial = x.copy()
             trial[equations.free] += damping * step / equations.weight
             right = self.residual(equations, trial)

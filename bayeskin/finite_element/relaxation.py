@@ -7,14 +7,33 @@ viscous medium by pseudo-transient continuation (Kelley & Keyes, SIAM J. Numer. 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from bayeskin.finite_element.newton import Equations, NewtonSolver
 from bayeskin.types import Array
 
-MOST_STEPS = 400
-NEGLIGIBLE_DRAG = 1e5  # length of a step in which the drag has become negligible
-ALLOWED_CONTRACTION, WANTED_CONTRACTION, MOST_GROWTH = 0.8, 0.25, 10.0
+
+@dataclass(frozen=True)
+class RelaxationSettings:
+    """Settings of the steps by which a body comes to rest.
+
+    most_steps : largest number of steps
+    negligible_drag : length of a step in which the drag has become negligible
+    allowed_contraction : a step in which the iteration contracts less than this is halved
+    wanted_contraction : contraction toward which the length of the steps is controlled
+    most_growth : largest ratio of a step to the step before
+    """
+
+    most_steps: int = 400
+    negligible_drag: float = 1e5
+    allowed_contraction: float = 0.8
+    wanted_contraction: float = 0.25
+    most_growth: float = 10.0
+
+
+RELAXATION = RelaxationSettings()
 
 
 def relax(solver: NewtonSolver, equations: Equations, x: Array, drag: Array) -> Array | None:
@@ -32,17 +51,17 @@ def relax(solver: NewtonSolver, equations: Equations, x: Array, drag: Array) -> 
     if right is None:
         return None
     solver.counts["falls"] += 1
-    length, growth = 1.0, MOST_GROWTH
-    for _ in range(MOST_STEPS):
+    length, growth = 1.0, RELAXATION.most_growth
+    for _ in range(RELAXATION.most_steps):
         trial, after, moved, contraction = _step(solver, equations, x, right, drag / length)
-        if after is None or not contraction < ALLOWED_CONTRACTION:
+        if after is None or not contraction < RELAXATION.allowed_contraction:
             length, growth = 0.5 * length, 1.0
             continue
         x, right = trial, after
-        if length > NEGLIGIBLE_DRAG and moved < 1.0:
+        if length > RELAXATION.negligible_drag and moved < 1.0:
             return solver.solve(equations, x)
-        change = np.sqrt(WANTED_CONTRACTION / contraction) if contraction > 0.0 else growth
-        length, growth = length * float(np.clip(change, 0.5, growth)), MOST_GROWTH
+        change = np.sqrt(RELAXATION.wanted_contraction / contraction) if contraction > 0.0 else growth
+        length, growth = length * float(np.clip(change, 0.5, growth)), RELAXATION.most_growth
     return None
 
 

@@ -18,7 +18,7 @@ stopped.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -28,12 +28,30 @@ from bayeskin.finite_element.stages import Stage, State, Step
 from bayeskin.types import Array, PadMotion
 
 GAMMA = 1.0 - np.sqrt(0.5)
-FIRST_STEP_S = 1.0
-SHORTEST_STEP = 1e-3  # relative to the phase; a step that would have to be shorter is a fall, or fails
-GROWTH, SHRINK = 2.0, 0.25  # the method is zero-stable while steps grow less than 2.41-fold
-MOST_CRAWLS = 3000  # largest number of relaxation steps in a run; a fall takes about 150
-# Fewer and longer steps would cost as much, because their guesses are worse and their tangents differ more.
-STEPS_PER_PHASE = 5
+
+
+@dataclass(frozen=True)
+class StepSettings:
+    """Settings of the control of time steps.
+
+    first_s : length of the first step of a phase [s]; in a phase shorter than twice this, half the phase
+    shortest : relative to the phase; a step that would have to be shorter is a fall, or fails
+    growth, shrink : largest and smallest ratio of a step to the step before; the method is zero-stable while
+        steps grow less than 2.41-fold
+    steps_per_phase : smallest number of steps in a phase. Fewer and longer steps would cost as much, because
+        their guesses are worse and their tangents differ more
+    most_crawls : largest number of relaxation steps in a run; a fall takes about 150
+    """
+
+    first_s: float = 1.0
+    shortest: float = 1e-3
+    growth: float = 2.0
+    shrink: float = 0.25
+    steps_per_phase: int = 5
+    most_crawls: int = 3000
+
+
+STEPPING = StepSettings()
 
 
 class Solver(Protocol):
@@ -158,11 +176,11 @@ def integrate(
     on_step(Step(state, 0.0, 0.0, corner=True))
     allowed_n, count = tolerance * model.nominal_force(), 0
     for start, end in zip(model.motion.time_s[:-1], model.motion.time_s[1:], strict=True):
-        past, h = [state], min(FIRST_STEP_S, 0.5 * (end - start))
-        longest, shortest = (end - start) / STEPS_PER_PHASE, SHORTEST_STEP * (end - start)
+        past, h = [state], min(STEPPING.first_s, 0.5 * (end - start))
+        longest, shortest = (end - start) / STEPPING.steps_per_phase, STEPPING.shortest * (end - start)
         while state.time_s < end - 1e-9:
             spent, at_s = model.solver.counts, state.time_s - model.starts_s
-            if spent["crawls"] > MOST_CRAWLS:
+            if spent["crawls"] > STEPPING.most_crawls:
                 return (
                     f"step {count + 1} at t = {at_s:.3f} s: the skin has folded and snapped "
                     f"{spent['falls']} times; try layers of more similar stiffness, or a coarser mesh"
@@ -184,13 +202,13 @@ def integrate(
                     )
             excess = step.error_n / allowed_n if step else np.inf
             if step is None or (excess > 1.0 and h > shortest):
-                h *= 0.5 if step is None else max(SHRINK, 0.9 / np.sqrt(excess))
+                h *= 0.5 if step is None else max(STEPPING.shrink, 0.9 / np.sqrt(excess))
                 past = past if step else [state]
                 continue
             state, count = step.state, count + 1
             past = [state] if falls else [*past, state][-EXTRAPOLATION_POINTS:]
             on_step(replace(step, corner=abs(state.time_s - end) < 1e-9))
-            h *= min(GROWTH, 0.9 / np.sqrt(max(excess, 1e-6)))
+            h *= min(STEPPING.growth, 0.9 / np.sqrt(max(excess, 1e-6)))
         model.remember_travel(past)
     return ""
 

@@ -13,12 +13,9 @@ from bayeskin.forward.observed import beside_neutral
 from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import Instrument
 from bayeskin.reduced.model import ReducedModel
+from bayeskin.reduced.region import REGION
 from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.types import Array, PadMotion, ParameterSpace, Simulation
-
-# Smallest stiffness of the skin, relative to rest. Nearer to folding the reduced model is of no use. Runs of
-# the full model check the results.
-FOLDING = 0.15
 
 
 @dataclass(frozen=True)
@@ -73,7 +70,9 @@ class ReducedForward:
         by: Mapping[str, float] | None = None,
     ) -> Simulation:  # fmt: skip
         """Returns a simulation on any protocol; by : changes of parameters to differentiate by."""
-        return simulate_reduced(self.model, motion, values, mechanisms, by, least_stiffness=FOLDING)
+        return simulate_reduced(
+            self.model, motion, values, mechanisms, by, least_stiffness=REGION.least_stiffness_if_checked
+        )
 
     def errors(self, at: Array) -> Array:
         """Returns no errors (0, m), since the reduced model states none. Runs of the full model show them."""

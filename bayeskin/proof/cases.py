@@ -25,11 +25,28 @@ from bayeskin.proof.refit_residual import ALONE, rms
 from bayeskin.proof.screen import Screen
 from bayeskin.types import Array, ParameterSpace
 
-PEAK_N = (0.1, 2.0)
 STIFFEST_BELOW = 2.0  # upper bound of E_s / E_c
-NEAR = 0.2  # difference in logarithm from its target at which a size is near enough
-LEAST_SHARE = 0.25  # share of the size of several mechanisms that each of them should have
-BATCH, BATCHES, FITTED = 16, 16, 3  # draws in a batch, batches, draws of a batch that are fitted
+
+
+@dataclass(frozen=True)
+class CaseSearchSettings:
+    """Settings of the search for a case.
+
+    peak_n : bounds of the peak force [N]
+    near : difference in logarithm from its target at which a size is near enough
+    least_share : share of the size of several mechanisms that each of them should have
+    batch, batches, fitted : draws in a batch, largest number of batches, draws of a batch that are fitted
+    """
+
+    peak_n: tuple[float, float] = (0.1, 2.0)
+    near: float = 0.2
+    least_share: float = 0.25
+    batch: int = 16
+    batches: int = 16
+    fitted: int = 3
+
+
+CASES = CaseSearchSettings()
 
 
 @dataclass(frozen=True)
@@ -74,31 +91,32 @@ def _nearest_draw(
 
     Of several mechanisms, each should contribute its share of the size. A fit that is linear about theta
     chooses a few draws of each batch, for which the base model is then fitted in full.
-    Raises InputError if no draw has a peak in `PEAK_N`.
+    Raises InputError if no draw has a peak in `CASES.peak_n`.
     """
     parameters = ParameterSpace(tuple(p for n in plan.mechanisms for p in screen.known[n].parameters))
     best, nearest = np.inf, None
-    for _ in range(BATCHES):
-        theta, base_n = _base_draws(rng, screen, BATCH)
-        drawn = parameters.from_unit(rng.random((BATCH, parameters.dim)))
+    for _ in range(CASES.batches):
+        theta, base_n = _base_draws(rng, screen, CASES.batch)
+        drawn = parameters.from_unit(rng.random((CASES.batch, parameters.dim)))
         drawn = np.clip(drawn, parameters.lower, parameters.upper)
         values = dict(zip(parameters.names, drawn.T, strict=True))
         all_n = screen.force(plan.mechanisms, theta, values)
         size = rms(screen.refit.linear(all_n - base_n, theta)) / floor_n
         short = _shortfall(plan, screen, theta, values, all_n, size * floor_n)
         # Both comparisons are False for a failed run, whose force is NaN.
-        usable = (np.abs(all_n).max(axis=1) < PEAK_N[1]) & (all_n.max(axis=1) > PEAK_N[0])
+        usable = (np.abs(all_n).max(axis=1) < CASES.peak_n[1]) & (all_n.max(axis=1) > CASES.peak_n[0])
         short[~usable] = np.inf
-        for row in np.argsort(_distance(size, target) + short)[: min(FITTED, usable.sum())]:
+        for row in np.argsort(_distance(size, target) + short)[: min(CASES.fitted, usable.sum())]:
             fitted = rms(screen.refit.residual(all_n[row], theta[row], ALONE)) / floor_n
             distance = _distance(fitted, target) + short[row]
             if distance < best:
                 best, nearest = distance, (theta[row], {name: float(v[row]) for name, v in values.items()})
-        if best < NEAR:
+        if best < CASES.near:
             break
     if nearest is None:
-        found_n = f"no draw of {', '.join(plan.mechanisms)} with a peak of {PEAK_N[0]:g} to {PEAK_N[1]:g} N"
-        raise InputError("proof", found_n, f"at least one such draw among {BATCHES * BATCH}")
+        low_n, high_n = CASES.peak_n
+        found_n = f"no draw of {', '.join(plan.mechanisms)} with a peak of {low_n:g} to {high_n:g} N"
+        raise InputError("proof", found_n, f"at least one such draw among {CASES.batches * CASES.batch}")
     return Case(plan, screen.by_name(nearest[0]), nearest[1], 0.0, floor_n, target)
 
 
@@ -115,7 +133,7 @@ def _shortfall(
     for name in plan.mechanisms if len(plan.mechanisms) > 1 else ():
         without_n = screen.force([n for n in plan.mechanisms if n != name], theta, values)
         part_n = rms(screen.refit.linear(all_n - without_n, theta))
-        short += np.maximum(np.log(LEAST_SHARE * size_n / np.maximum(part_n, 1e-12)), 0.0)
+        short += np.maximum(np.log(CASES.least_share * size_n / np.maximum(part_n, 1e-12)), 0.0)
     return short
 
 
@@ -130,6 +148,7 @@ def _base_draws(rng: np.random.Generator, screen: Screen, count: int) -> tuple[A
         trial = np.clip(space.from_unit(rng.random((4 * count, space.dim))), space.lower, space.upper)
         trial_n = screen.refit.force(trial)
         peak = trial_n.max(axis=1)
-        kept = (peak > PEAK_N[0]) & (peak < PEAK_N[1]) & (trial[:, 1] < STIFFEST_BELOW * trial[:, 0])
+        usable = (peak > CASES.peak_n[0]) & (peak < CASES.peak_n[1])
+        kept = usable & (trial[:, 1] < STIFFEST_BELOW * trial[:, 0])
         theta, force = np.concatenate([theta, trial[kept]]), np.concatenate([force, trial_n[kept]])
     return theta[:count], force[:count]

@@ -13,13 +13,13 @@ from bayeskin.proof.protocol import EDGES_S, MOTION, SURROGATE
 from bayeskin.proof.refit_residual import Refit
 from bayeskin.reduced.files import load_reduced
 from bayeskin.reduced.model import ReducedModel
+from bayeskin.reduced.region import REGION
 from bayeskin.reduced.simulate import simulate_reduced
 from bayeskin.shipped import shipped
 from bayeskin.surrogates import load_surrogate
 from bayeskin.types import Array
 
 REDUCED = "surrogates/article-device-reduced.h5"
-FOLDING = 0.15  # share of the stiffness at rest; runs that fall below it are too near folding to be used
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,8 @@ class Screen:
         """Returns the change (m,) of the bin means that mechanisms make at theta (5,)."""
         mechanisms = [self.known[name] for name in names]
         theta_named, within_model = self.by_name(theta), solved(mechanisms)
-        runs = [simulate_reduced(self.model, MOTION, {**theta_named, **values}, used, least_stiffness=FOLDING)
+        least = REGION.least_stiffness_if_checked
+        runs = [simulate_reduced(self.model, MOTION, {**theta_named, **values}, used, least_stiffness=least)
                 for used in (within_model, [])]  # fmt: skip
         if any(run.status != "ok" for run in runs):
             return np.full(len(EDGES_S) - 1, np.nan)

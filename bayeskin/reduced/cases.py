@@ -16,10 +16,26 @@ from bayeskin.types import PadMotion, ParameterSpace
 
 BASE = "base"  # the kind of runs without a mechanism
 SETS = "sets"  # the kind of runs with one to four mechanisms
-ACCOMPANIED = 0.5  # fraction of a mechanism's runs in which one or two other mechanisms act as well
-MOVED = {BASE: 0.5}  # fraction of the runs with other thicknesses of the layers and another radius of the arm
-MOVED_OTHERWISE = 0.25
-THICKNESS_RANGE, RADIUS_RANGE = 0.4, 0.3  # largest relative changes of layers and arm
+
+
+@dataclass(frozen=True)
+class CaseSettings:
+    """Settings of the drawing of training cases.
+
+    accompanied : fraction of a mechanism's runs in which one or two other mechanisms act as well
+    moved_base, moved : fraction of the base model's runs, and of the other runs, in which the layers have
+        other thicknesses and the arm has another radius
+    thickness_range, radius_range : largest relative changes of the layers and of the arm
+    """
+
+    accompanied: float = 0.5
+    moved_base: float = 0.5
+    moved: float = 0.25
+    thickness_range: float = 0.4
+    radius_range: float = 0.3
+
+
+CASES = CaseSettings()
 
 
 @dataclass(frozen=True)
@@ -63,10 +79,10 @@ class Trained:
         """Returns case `index` of a kind: "base", "sets", or the name of a mechanism that acts in it."""
         rng = np.random.default_rng([seed, index, *kind.encode()])
         names = self._names(kind, rng)
+        moved = CASES.moved_base if kind == BASE else CASES.moved
         return Case(
-            self._theta(names, rng), names, self._moved(MOVED.get(kind, MOVED_OTHERWISE), rng),
-            random_motion(rng, self.protocols),
-        )  # fmt: skip
+            self._theta(names, rng), names, self._moved(moved, rng), random_motion(rng, self.protocols)
+        )
 
     def _names(self, kind: str, rng: np.random.Generator) -> tuple[str, ...]:
         if kind == BASE:
@@ -75,7 +91,7 @@ class Trained:
         if kind == SETS:
             count = int(rng.integers(1, 5))
         else:
-            count = int(rng.integers(1, 3)) if rng.uniform() < ACCOMPANIED else 0
+            count = int(rng.integers(1, 3)) if rng.uniform() < CASES.accompanied else 0
         others = sorted(set(self.mechanisms) - set(chosen))
         return tuple(sorted([*chosen, *rng.choice(others, min(count, len(others)), replace=False).tolist()]))
 
@@ -91,9 +107,11 @@ class Trained:
             return g
         return replace(
             g,
-            cutis_m=g.cutis_m * (1.0 + THICKNESS_RANGE * cutis),
-            subcutis_m=g.subcutis_m * (1.0 + THICKNESS_RANGE * subcutis),
-            arm_radius_m=None if g.arm_radius_m is None else g.arm_radius_m * (1.0 + RADIUS_RANGE * radius),
+            cutis_m=g.cutis_m * (1.0 + CASES.thickness_range * cutis),
+            subcutis_m=g.subcutis_m * (1.0 + CASES.thickness_range * subcutis),
+            arm_radius_m=None
+            if g.arm_radius_m is None
+            else g.arm_radius_m * (1.0 + CASES.radius_range * radius),
         )
 
 

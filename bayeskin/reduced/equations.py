@@ -21,6 +21,7 @@ from bayeskin.reduced.tangents import Tangent, Tangents
 from bayeskin.types import Array, PadMotion
 
 SOLVER_TOLERANCE = 1e-5  # relative to the amplitude of displacements and to the nominal force
+REMEMBERED_STATES = 8  # number of states for which further results are kept; a step needs at most three
 
 
 class ReducedEquations:

@@ -18,10 +18,10 @@ import numpy as np
 
 from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.stages import Stage, State
+from bayeskin.reduced.equations import REMEMBERED_STATES
 from bayeskin.reduced.operators import Basis
 from bayeskin.types import Array
 
-REMEMBERED = 8  # number of states that are kept on the nodes; a step needs at most three
 SAME_PLACE = 0.6  # of the largest displacement; an adjoint is used again for states whose pads are this near
 
 
@@ -57,7 +57,7 @@ class DualWeightedResidual:
             return np.inf
         end = State(stage.state.time_s, x, values.volume, values.pressure, values.memory)
         self._known[id(stage.state)] = stage.state, end
-        for key in list(self._known)[:-REMEMBERED]:
+        for key in list(self._known)[:-REMEMBERED_STATES]:
             del self._known[key]
         if force_n is None:
             return None

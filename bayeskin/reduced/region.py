@@ -7,19 +7,35 @@ folding a small error of the modes is a large error of the force.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
 
 from bayeskin.finite_element.stages import Step
 from bayeskin.geometry import Geometry
-from bayeskin.reduced.cases import RADIUS_RANGE, THICKNESS_RANGE, Protocols, Trained
+from bayeskin.reduced.cases import CASES, Protocols, Trained
 from bayeskin.types import Array, PadMotion, ParameterSpace
 
-LEAST_STIFFNESS = 0.4  # smallest eigenvalue of the stiffness, relative to rest (docs/reduced.md)
-LOW = 0.3  # of the largest displacement; the stiffness is checked at corners below it
-FASTER = 2.0  # largest allowed speed over the fastest in training; the skin is undrained at both
+
+@dataclass(frozen=True)
+class RegionSettings:
+    """Settings of the region in which a reduced model is trusted.
+
+    least_stiffness : smallest eigenvalue of the stiffness, relative to rest (docs/reduced.md)
+    least_stiffness_if_checked : the same where runs of the full model check the results; nearer to folding
+        the reduced model is of no use
+    low : of the largest displacement; the stiffness is checked at corners below it
+    faster : largest allowed speed over the fastest in training; the skin is undrained at both
+    """
+
+    least_stiffness: float = 0.4
+    least_stiffness_if_checked: float = 0.15
+    low: float = 0.3
+    faster: float = 2.0
+
+
+REGION = RegionSettings()
 
 
 def outside(
@@ -51,7 +67,7 @@ def protocol_outside(trained: Protocols, motion: PadMotion) -> list[str]:
     if lowest_m < -1e-6:
         lines.append(f"the pads are pushed together by {-1e3 * lowest_m:.2f} mm")
     fastest = float(np.abs(np.diff(motion.displacement_m) / np.diff(motion.time_s)).max(initial=0.0))
-    if fastest > FASTER * trained.speeds_m_s[1]:
+    if fastest > REGION.faster * trained.speeds_m_s[1]:
         lines.append(f"the pads move at {1e3 * fastest:.3g} mm/s, faster than in the training")
     return lines
 
@@ -80,9 +96,8 @@ def other_geometry(trained: Geometry, geometry: Geometry) -> list[str]:
     )
     if same_tissue != trained:
         lines.append("the pads, the guard or the load cell differ")
-    for name, share in (
-        ("cutis_m", THICKNESS_RANGE), ("subcutis_m", THICKNESS_RANGE), ("arm_radius_m", RADIUS_RANGE)
-    ):  # fmt: skip
+    thickness, radius = CASES.thickness_range, CASES.radius_range
+    for name, share in (("cutis_m", thickness), ("subcutis_m", thickness), ("arm_radius_m", radius)):
         ref_m, given_m = getattr(trained, name), getattr(geometry, name)
         if (ref_m is None) != (given_m is None):
             lines.append("the arm is flat" if given_m is None else "the arm is round")
@@ -100,7 +115,7 @@ class Stability:
     """
 
     def __init__(self, largest_m: float, least: float) -> None:
-        self._low_m, self._least = LOW * largest_m, least
+        self._low_m, self._least = REGION.low * largest_m, least
         self._rest: Array | None = None
         self.left = 1.0
 

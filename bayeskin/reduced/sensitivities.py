@@ -26,19 +26,32 @@ from bayeskin.geometry import LENGTHS
 from bayeskin.reduced import kernels, slopes
 from bayeskin.reduced.arrays import History
 from bayeskin.reduced.binding import Bound, bound
-from bayeskin.reduced.equations import ReducedEquations
+from bayeskin.reduced.equations import REMEMBERED_STATES, ReducedEquations
 from bayeskin.reduced.operators import ReducedSpace
 from bayeskin.types import Array, PadMotion
 
-STEP = 1e-6  # of a parameter's change; truncation error 1e-6, rounding error 1e-10
-# A length changes by this step in both directions. The moved fields are in single precision, so the
-# truncation error is 1e-4 and the rounding error 1e-4 to 1e-3.
-LENGTH_STEP = 1e-2
-PASSES_BY_LENGTH = 5
-# Derivatives smaller than these are solved only as accurately as the stage itself. The first is a derivative
-# of the modes' coefficients, which are of order one; the second is relative to the scale of the force.
-LEAST_DISPLACEMENT, LEAST_FORCE = 0.01, 0.001
-REMEMBERED = 8  # number of states whose derivatives are kept; a step needs at most three
+
+@dataclass(frozen=True)
+class SensitivitySettings:
+    """Settings of the differences and of the solves.
+
+    step : of a parameter's change; truncation error 1e-6, rounding error 1e-10
+    length_step : of a length's change, in both directions. The moved fields are in single precision, so the
+        truncation error is 1e-4 and the rounding error 1e-4 to 1e-3
+    passes_by_length : largest number of passes of a solve for a length
+    least_displacement, least_force : derivatives smaller than these are solved only as accurately as the
+        stage itself. The first is a derivative of the modes' coefficients, which are of order one; the second
+        is relative to the scale of the force
+    """
+
+    step: float = 1e-6
+    length_step: float = 1e-2
+    passes_by_length: int = 5
+    least_displacement: float = 0.01
+    least_force: float = 0.001
+
+
+SENSITIVITY = SensitivitySettings()
 
 
 @dataclass(frozen=True)
@@ -72,11 +85,16 @@ class ReducedGradients:
         runs = []
         for i, (name, change) in enumerate(changes.items()):
             if name in LENGTHS:
-                ends = [{**theta, name: theta[name] + way * LENGTH_STEP * change} for way in (1.0, -1.0)]
+                ends = [
+                    {**theta, name: theta[name] + way * SENSITIVITY.length_step * change}
+                    for way in (1.0, -1.0)
+                ]
                 self._moved[i] = [ReducedEquations(space_at(end), end, binds, protocol) for end in ends]
                 runs.append(equations.run)  # in the unmoved space a length changes only the history
             else:
-                runs.append(bound(equations.space, {**theta, name: theta[name] + STEP * change}, binds))
+                runs.append(
+                    bound(equations.space, {**theta, name: theta[name] + SENSITIVITY.step * change}, binds)
+                )
         self._drives = [on_the_way(protocol, run.laws) for run in runs]
         self._in_series = bool(equations.drive.elements)
         self._varied = _varied(equations, [*runs, *([equations.run] if self._in_series else [])])
@@ -84,7 +102,9 @@ class ReducedGradients:
         self._start = self._at_rest(changes.get("p_init", 0.0))
         self._known: dict[int, _Derivatives] = {}
         self._zero_n = np.zeros(len(changes))
-        least = np.array([LEAST_DISPLACEMENT, LEAST_FORCE * equations.nominal_force()])
+        least = np.array(
+            [SENSITIVITY.least_displacement, SENSITIVITY.least_force * equations.nominal_force()]
+        )
         self._scale = np.repeat(least[:, None], len(self._varied.mu), axis=1)
         self.force_n: list[Array] = [np.zeros(len(changes))]
 
@@ -108,7 +128,7 @@ class ReducedGradients:
         if abs(step.state.time_s - self._equations.starts_s) < 1e-6:
             self._zero_n = force
         self.force_n.append(force)
-        self._known = dict(list(self._known.items())[-REMEMBERED:])
+        self._known = dict(list(self._known.items())[-REMEMBERED_STATES:])
 
     def _derivatives_of(self, state: State) -> _Derivatives:
         return self._known.get(id(state), self._start)
@@ -151,7 +171,7 @@ class ReducedGradients:
 
         Row i of ``out.x`` is a guess at the start.
         """
-        t, ways = self._equations.tangent, (LENGTH_STEP, -LENGTH_STEP)
+        t, ways = self._equations.tangent, (SENSITIVITY.length_step, -SENSITIVITY.length_step)
         rooms = [equations.make_room() for equations in self._moved[i]]
         residuals = np.empty((2, len(x)))
         pasts = [
@@ -162,17 +182,17 @@ class ReducedGradients:
             )
             for way in ways
         ]  # fmt: skip
-        for _ in range(PASSES_BY_LENGTH):
+        for _ in range(SENSITIVITY.passes_by_length):
             for n, moved in enumerate(self._moved[i]):
                 moved_x = x + ways[n] * out.x[i]
                 kernels.residual(moved.system, moved.packed, pasts[n], moved_x, rooms[n], residuals[n])
-            derivative = (residuals[0] - residuals[1]) / (2.0 * LENGTH_STEP)
+            derivative = (residuals[0] - residuals[1]) / (2.0 * SENSITIVITY.length_step)
             step = -t.inverse @ derivative[2:]
             out.x[i, 2:] += step
         up, down = rooms
-        out.volume[i] = (up.volume - down.volume) / (2.0 * LENGTH_STEP)
-        out.pressure[i] = (up.at_pressure - down.at_pressure) / (2.0 * LENGTH_STEP)
-        out.memory[i] = (up.memory - down.memory) / (2.0 * LENGTH_STEP)
+        out.volume[i] = (up.volume - down.volume) / (2.0 * SENSITIVITY.length_step)
+        out.pressure[i] = (up.at_pressure - down.at_pressure) / (2.0 * SENSITIVITY.length_step)
+        out.memory[i] = (up.memory - down.memory) / (2.0 * SENSITIVITY.length_step)
         return float(2.0 * derivative[1] + t.force_row @ step)
 
     def _pads_by(self, time_s: float, lost: Memories) -> Array:
@@ -181,7 +201,9 @@ class ReducedGradients:
         With elements in series a last entry follows: the derivative by the pads' travel itself.
         """
         nominal_m = self._equations.drive.motion.at(time_s)
-        moved = np.array([(float(drive.motion.at(time_s)) - nominal_m) / STEP for drive in self._drives])
+        moved = np.array(
+            [(float(drive.motion.at(time_s)) - nominal_m) / SENSITIVITY.step for drive in self._drives]
+        )
         moved = moved - sum(memory[0] for memory in lost)
         return 0.5 * np.append(moved, [2.0 * self._reach_m] * self._in_series)
 
@@ -201,7 +223,14 @@ class ReducedGradients:
 
             def memories(slopes_n: Array) -> Memories:
                 return memory_slopes(
-                    self._drives, STEP, force_n, slopes_n, stage.elapsed_s, before, held, stage.state.lost
+                    self._drives,
+                    SENSITIVITY.step,
+                    force_n,
+                    slopes_n,
+                    stage.elapsed_s,
+                    before,
+                    held,
+                    stage.state.lost,
                 )
 
             softness = yielding(
@@ -224,6 +253,6 @@ def _varied(equations: ReducedEquations, runs: Sequence[Bound]) -> slopes.Varied
         np.array([run.solid.mu for run in runs]), np.array([run.solid.lam for run in runs]),
         np.array([run.solid.mobility for run in runs]),
         np.array([run.par for run in runs]), np.array([run.data for run in runs]), solid_units, flow_units,
-        np.array([(run.solid_by - unchanged.solid_by) / STEP for run in runs]),
-        np.array([(run.flow_by - unchanged.flow_by) / STEP for run in runs]), STEP,
+        np.array([(run.solid_by - unchanged.solid_by) / SENSITIVITY.step for run in runs]),
+        np.array([(run.flow_by - unchanged.flow_by) / SENSITIVITY.step for run in runs]), SENSITIVITY.step,
     )  # fmt: skip

@@ -14,11 +14,9 @@ from bayeskin.finite_element.stages import Stage, State
 from bayeskin.finite_element.tissue import Bind
 from bayeskin.reduced import kernels
 from bayeskin.reduced.arrays import History, Room
-from bayeskin.reduced.equations import ReducedEquations
+from bayeskin.reduced.equations import REMEMBERED_STATES, ReducedEquations
 from bayeskin.reduced.operators import ReducedSpace
 from bayeskin.types import Array, PadMotion
-
-REMEMBERED = 8  # number of states that are kept at all points; a step needs at most three
 
 
 @dataclass(frozen=True)
@@ -57,7 +55,7 @@ class Shadow:
             return None
         end = State(stage.state.time_s, stage.state.x, room.volume, room.at_pressure, (room.memory,))
         self._known[id(stage.state)] = stage.state, end
-        for old in list(self._known)[:-REMEMBERED]:
+        for old in list(self._known)[:-REMEMBERED_STATES]:
             del self._known[old]
         return Followed(room, past, out)
 

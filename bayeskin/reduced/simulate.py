@@ -10,7 +10,7 @@ import numpy as np
 
 from bayeskin.finite_element.lagrangian import LagrangianModel
 from bayeskin.finite_element.problem import material
-from bayeskin.finite_element.simulate import OnState
+from bayeskin.finite_element.simulate import ModelSpec, OnState
 from bayeskin.finite_element.stages import Step
 from bayeskin.finite_element.stepping import integrate
 from bayeskin.geometry import Geometry, moved
@@ -20,11 +20,11 @@ from bayeskin.reduced.equations import ReducedEquations
 from bayeskin.reduced.error import DualWeightedResidual
 from bayeskin.reduced.model import ReducedModel
 from bayeskin.reduced.operators import ReducedSpace
-from bayeskin.reduced.region import LEAST_STIFFNESS, Stability, outside
+from bayeskin.reduced.region import REGION, Stability, outside
 from bayeskin.reduced.sensitivities import ReducedGradients
 from bayeskin.types import PadMotion, Simulation, frozen_array
 
-TOLERANCE = 1e-3  # allowed error of a time step, relative to the nominal force; the default of the full model
+TOLERANCE = ModelSpec.tolerance  # the full model's default
 ESTIMATES = 12  # approximate number of states, besides the corners, at which the error is estimated
 INSIDE_OUT = "the mesh is inverted between the cubature points; run the full model"
 SAFETY = 3.0  # factor on the error that the residual gives; chosen on the skins of docs/reduced.md
@@ -39,7 +39,7 @@ def simulate_reduced(
     geometry: Geometry | None = None,
     estimate: bool = False,
     on_state: OnState | None = None,
-    least_stiffness: float = LEAST_STIFFNESS,
+    least_stiffness: float = REGION.least_stiffness,
 ) -> Simulation:
     """Runs a reduced model over the whole motion and returns the simulation.
 

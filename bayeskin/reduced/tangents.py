@@ -7,11 +7,26 @@ the place of the stage. A new stage takes the inverse of the nearest place.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-ROOM = 32  # largest number of tangents that are kept
-SAME_PLACE = 0.02  # a kept tangent this near to a new one is replaced by it
-FAR = np.log(4.0)  # a tangent farther away is not used; a long stage drains more than a short one
+
+@dataclass(frozen=True)
+class TangentSettings:
+    """Settings of the keeping of tangents.
+
+    most : largest number of tangents that are kept
+    same_place : a kept tangent this near to a new one is replaced by it
+    far : a tangent farther away is not used; a long stage drains more than a short one
+    """
+
+    most: int = 32
+    same_place: float = 0.02
+    far: float = float(np.log(4.0))
+
+
+KEEPING = TangentSettings()
 
 
 class Tangent:
@@ -35,7 +50,7 @@ class Tangents:
     def take(self, place: tuple[float, float], into: Tangent) -> bool:
         """Copies the tangent of the nearest place to `into`; returns False where none is near enough."""
         nearest = min(self._kept, key=lambda kept: _apart(kept[0], place), default=None)
-        if nearest is None or _apart(nearest[0], place) > FAR:
+        if nearest is None or _apart(nearest[0], place) > KEEPING.far:
             return False
         into.set_to(nearest[1])
         return True
@@ -49,8 +64,8 @@ class Tangents:
 
         It replaces the tangent at the same place, or the oldest one where the storage is full.
         """
-        same = [i for i, kept in enumerate(self._kept) if _apart(kept[0], place) < SAME_PLACE]
-        full = [0] if len(self._kept) == ROOM else []
+        same = [i for i, kept in enumerate(self._kept) if _apart(kept[0], place) < KEEPING.same_place]
+        full = [0] if len(self._kept) == KEEPING.most else []
         number = next(iter([*same, *full]), None)
         copy = Tangent(len(tangent.force_row)) if number is None else self._kept.pop(number)[1]
         copy.set_to(tangent)

@@ -16,10 +16,24 @@ from bayeskin.reduced.basis import Inner, weighted_modes
 from bayeskin.reduced.cases import Case
 from bayeskin.types import Array
 
-DUAL_EVERY = 8  # number of steps from one stored adjoint solution to the next
-DUAL_SCALE_M = 5e-3  # weight of adjoint solutions relative to states, as a displacement
-KEPT = 1e-5  # modes of a run with singular values below this fraction of the largest are left out
-MOST_MODES = 24  # largest number of modes of each kind from a run
+
+@dataclass(frozen=True)
+class CompressionSettings:
+    """Settings of the compression of a run.
+
+    dual_every : number of steps from one stored adjoint solution to the next
+    dual_scale_m : weight of adjoint solutions relative to states, as a displacement
+    kept : modes with singular values below this fraction of the largest are left out
+    most_modes : largest number of modes of each kind
+    """
+
+    dual_every: int = 8
+    dual_scale_m: float = 5e-3
+    kept: float = 1e-5
+    most_modes: int = 24
+
+
+COMPRESSION = CompressionSettings()
 
 
 @dataclass(frozen=True)
@@ -61,7 +75,7 @@ class _States:
             self.time_s.append(time_s)
             self.force_n.append(step.force_n - model.zero_n)
         self.unknowns.append(step.state.x)
-        if step.corner or len(self.unknowns) % DUAL_EVERY == 1:
+        if step.corner or len(self.unknowns) % COMPRESSION.dual_every == 1:
             self.duals.append(self._dual(step))
 
     def _dual(self, step: Step) -> Array:
@@ -98,7 +112,7 @@ def training_run(
     force_n = np.array(states.force_n)
     peak_n = max(float(np.abs(force_n).max()), 1e-9)
     states_u, states_p = _weighted(states.unknowns, inner.moving, inner, peak_n, 1.0)
-    duals_u, duals_p = _weighted(states.duals, inner.dual, inner, peak_n, DUAL_SCALE_M)
+    duals_u, duals_p = _weighted(states.duals, inner.dual, inner, peak_n, COMPRESSION.dual_scale_m)
     return TrainingRun(
         np.concatenate([states_u, duals_u]).astype(np.float32),
         np.concatenate([states_p, duals_p]).astype(np.float32),
@@ -119,6 +133,6 @@ def _weighted(
     p = inner.without_mean(states[:, n:] / peak_n)
     factor = scale / np.sqrt(max(len(states), 1))
     return (
-        weighted_modes(factor * u, inner.displacement, KEPT, MOST_MODES),
-        weighted_modes(factor * p, inner.pressure, KEPT, MOST_MODES),
+        weighted_modes(factor * u, inner.displacement, COMPRESSION.kept, COMPRESSION.most_modes),
+        weighted_modes(factor * p, inner.pressure, COMPRESSION.kept, COMPRESSION.most_modes),
     )

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
+from bayeskin.report.mismatch import Z90
 from bayeskin.report.style import (
     ACCENT,
     FAINT,
@@ -29,7 +30,6 @@ from bayeskin.report.style import (
 from bayeskin.report.timeline import phase_legend, shade_phases
 from bayeskin.types import Array, BinnedForce, PadMotion, PhaseKind
 
-Z90 = 1.645
 COLORS = {"load": ACCENT, "unload": MODEL, "hold": "#009E73", "rest": GREY}
 
 

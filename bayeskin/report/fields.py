@@ -23,11 +23,27 @@ _SEQUENTIAL = LinearSegmentedColormap.from_list("grey-blue", ["#E6E6E6", "#86B8D
 _DIVERGING = LinearSegmentedColormap.from_list(
     "blue-grey-red", ["#08284F", "#0072B2", "#86B8D9", "#E6E6E6", "#EDA377", "#D55E00", "#5C2000"]
 )
-# From this direction the top and both planes of symmetry are visible.
-_ELEVATION, _AZIMUTH = np.radians(38.0), np.radians(-112.0)
-_DECADES = 2.0  # decades of a vector's colour scale; smaller vectors have its lowest colour and no arrow
-_LABEL_IN = 0.95
-_ARROW_MM, _SPACING_MM = 4.5, 5.5
+
+
+@dataclass(frozen=True)
+class _DrawingSettings:
+    """Settings of the drawing.
+
+    elevation, azimuth : direction of view [rad], in which the top and both planes of symmetry are visible
+    decades : decades of a vector's colour scale; smaller vectors have its lowest colour and no arrow
+    label_in : width of the labels of the rows [inches]
+    arrow_mm, spacing_mm : length of an arrow, and smallest distance of two arrows [mm of the skin]
+    """
+
+    elevation: float = float(np.radians(38.0))
+    azimuth: float = float(np.radians(-112.0))
+    decades: float = 2.0
+    label_in: float = 0.95
+    arrow_mm: float = 4.5
+    spacing_mm: float = 5.5
+
+
+_DRAWING = _DrawingSettings()
 
 
 @dataclass(frozen=True)
@@ -74,10 +90,10 @@ def figure_fields(
     flat = 1e3 * points @ _view()  # (t, v, 3): right, up, toward the viewer
     visible = flat[:, np.unique(nodes)]
     low, high = visible.min(axis=(0, 1)), visible.max(axis=(0, 1))
-    panel_in = (PAGE_IN - _LABEL_IN) / max(len(columns), 3)
+    panel_in = (PAGE_IN - _DRAWING.label_in) / max(len(columns), 3)
     height_in = len(row_labels) * (panel_in * (high - low)[1] / (high - low)[0] + 0.06)
-    figure = new_figure(_LABEL_IN + panel_in * len(columns), height_in + 1.15)
-    widths = [_LABEL_IN, *[panel_in] * len(columns)]
+    figure = new_figure(_DRAWING.label_in + panel_in * len(columns), height_in + 1.15)
+    widths = [_DRAWING.label_in, *[panel_in] * len(columns)]
     axes = figure.subplots(len(row_labels), 1 + len(columns), squeeze=False, width_ratios=widths)
     for j, field in enumerate(columns, start=1):
         scale = _scale(field)
@@ -127,7 +143,7 @@ def _view() -> Array:
 
     Its columns are the directions to the right of the page, up the page, and toward the viewer.
     """
-    e, a = _ELEVATION, _AZIMUTH
+    e, a = _DRAWING.elevation, _DRAWING.azimuth
     right = (-np.sin(a), np.cos(a), 0.0)
     up = (-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e))
     toward = (np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e))
@@ -141,7 +157,7 @@ def _scale(field: SurfaceField) -> ScalarMappable:
     if field.signed:
         return ScalarMappable(Normalize(-reach, reach), _DIVERGING)
     if field.directions is not None:
-        return ScalarMappable(LogNorm(reach / 10**_DECADES, reach, clip=True), _SEQUENTIAL)
+        return ScalarMappable(LogNorm(reach / 10**_DRAWING.decades, reach, clip=True), _SEQUENTIAL)
     return ScalarMappable(Normalize(min(0.0, float(np.min(values, initial=0.0))), reach), _SEQUENTIAL)
 
 
@@ -183,13 +199,14 @@ def _arrows(ax: Axes, centres_mm: Array, field: SurfaceField, row: int, scale: S
     chosen: list[int] = []
     for k in np.flatnonzero(field.values[row] > (scale.norm.vmin or 0.0)):
         gaps = np.linalg.norm(centres_mm[chosen, :2] - centres_mm[k, :2], axis=1)
-        if np.all(gaps > _SPACING_MM):
+        if np.all(gaps > _DRAWING.spacing_mm):
             chosen.append(int(k))
     if not chosen:
         return
     vectors = field.directions[row, chosen]
-    along = _ARROW_MM * (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)) @ _view()[:, :2]
-    seen = np.linalg.norm(along, axis=1) > 0.3 * _ARROW_MM  # an arrow toward the viewer shows no direction
+    along = _DRAWING.arrow_mm * (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)) @ _view()[:, :2]
+    # An arrow toward the viewer shows no direction.
+    seen = np.linalg.norm(along, axis=1) > 0.3 * _DRAWING.arrow_mm
     ax.quiver(
         *centres_mm[chosen, :2][seen].T, *along[seen].T, angles="xy", scale_units="xy", scale=1.0,
         pivot="mid", units="xy", width=0.5, headwidth=4.0, headlength=4.5, headaxislength=4.0,

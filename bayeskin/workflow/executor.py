@@ -10,6 +10,8 @@ from bayeskin.execution.cluster import on_scheduler, on_slurm
 from bayeskin.execution.local import Map, local
 from bayeskin.workflow.engine import Run
 
+WORKERS = 2  # worker processes of a command that has no such setting
+
 
 def with_scheduler(run: Run, scheduler: str) -> Run:
     """Returns the same run, except that a Dask scheduler at the given address makes the full runs."""

@@ -30,12 +30,12 @@ from bayeskin.workflow import diagnosis
 from bayeskin.workflow.diagnosis import context_of, opened, source_of
 from bayeskin.workflow.diagnosis_tasks import asked, depends_on
 from bayeskin.workflow.engine import Reporter, Run
+from bayeskin.workflow.executor import WORKERS
 from bayeskin.workflow.folder import Record, current_record, locked, output_hashes, read_record, write_record
 from bayeskin.workflow.provenance import caption
 
 FOLDER = "experiment"
 LONGEST_S = 1800.0  # longest test: a person can hardly keep an arm still for longer
-WORKERS = 2
 
 
 def choose(sources: Sequence[Path], reporter: Reporter, device: Path | None = None) -> dict[str, Any]:

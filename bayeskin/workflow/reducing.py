@@ -33,12 +33,12 @@ from bayeskin.shipped import shipped
 from bayeskin.store import Store
 from bayeskin.types import ParameterSpace
 from bayeskin.workflow.engine import Reporter
+from bayeskin.workflow.executor import WORKERS
 from bayeskin.workflow.folder import locked
 from bayeskin.workflow.output_paths import check_ending
 
 SHIPPED = "surrogates/article-device-reduced.h5"
 REFINEMENT = 1  # of the bricks of the full model that reduced models replace
-WORKERS = 2
 EXPECTED = "a configuration, or a file with [device] and [tissue]"
 
 

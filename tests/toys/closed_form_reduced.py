@@ -22,7 +22,7 @@ from bayeskin.mechanisms import Mechanism, catalogue
 from bayeskin.mechanisms.mechanism import observed
 from bayeskin.mismatch import context
 from bayeskin.mismatch.context import DiagnosisContext
-from bayeskin.reduced.region import LEAST_STIFFNESS
+from bayeskin.reduced.region import REGION
 from bayeskin.types import (
     Array,
     BinnedForce,
@@ -84,7 +84,7 @@ def simulate(
     gradients: Mapping[str, float] | None = None, *, least_stiffness: float,
 ) -> Simulation:  # fmt: skip
     """Has the signature of `simulate_reduced`."""
-    assert least_stiffness < LEAST_STIFFNESS
+    assert least_stiffness < REGION.least_stiffness
     slopes = []
     for name, by in (gradients or {}).items():
         ends = {**theta, name: theta[name] + 1e-5 * by * np.array([-1.0, 1.0])}
