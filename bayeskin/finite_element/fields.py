@@ -127,8 +127,8 @@ class FieldWriter:
     To use it, pass its method `on_state` to `simulate`, and call `write` when the run has ended.
     """
 
-    def __init__(self, directory: Path | str, problem: Problem, theta: Mapping[str, float]) -> None:
-        self.path = Path(directory) / "fields.xdmf"
+    def __init__(self, folder: Path | str, problem: Problem, theta: Mapping[str, float]) -> None:
+        self.path = Path(folder) / "fields.xdmf"
         self._problem, self._theta = problem, dict(theta)
         self._states: list[tuple[float, Array]] = []
 

@@ -108,8 +108,9 @@ def discrepancy(fit: Fit, motion: PadMotion) -> Discrepancy:
     """Returns the discrepancy at a fit; `motion` is the protocol of the recording."""
     remainder = unexplained(fit, motion)
     squares, masks, bounds = squared_distances(remainder.at), kernel_masks(remainder.at), _bounds(remainder)
-    noise_only = _maximise(partial(negative_log_evidence, rest=remainder), _starts(remainder), bounds[:2])
-    objective = partial(negative_log_evidence, rest=remainder, squares=squares, masks=masks)
+    of_noise = partial(negative_log_evidence, remainder=remainder)
+    noise_only = _maximise(of_noise, _starts(remainder), bounds[:2])
+    objective = partial(negative_log_evidence, remainder=remainder, squares=squares, masks=masks)
     best = _maximise(objective, _starts(remainder, bounds), bounds)
     without, remainder = remainder.with_memory(noise_only.line), remainder.with_memory(best.line[:2])
     logs = best.line[2:]
@@ -229,28 +230,31 @@ def _maximise(
 
 
 def negative_log_evidence(
-    logs: Array, rest: Unexplained, squares: Array | None = None, masks: Array | None = None
+    logs: Array, remainder: Unexplained, squares: Array | None = None, masks: Array | None = None
 ) -> tuple[float, Array]:
     """Returns minus the log-evidence, up to a constant, and its derivatives by the logarithms.
 
     logs : logarithms of the noise's size and time (2,); with `squares` and `masks` they are followed
         by those of the parts' sizes and lengths (10,)
     """
-    rest = rest.with_memory(logs[:2])
-    memory_n2 = rest.memory.covariance_n2
-    covariance, kernels = rest.noise_n2 + rest.open_n2, None
+    remainder = remainder.with_memory(logs[:2])
+    memory_n2 = remainder.memory.covariance_n2
+    covariance, kernels = remainder.noise_n2 + remainder.open_n2, None
     if squares is not None and masks is not None:
         kernels = _kernels(logs[2:], squares, masks)
-        covariance = covariance + rest.beyond(rest.beyond(kernels.sum(axis=0)).T)
+        covariance = covariance + remainder.beyond(remainder.beyond(kernels.sum(axis=0)).T)
     lower, inverse = _inverted(covariance)
-    weight = inverse @ rest.residual_n
-    value = 0.5 * float(rest.residual_n @ weight) + float(np.sum(np.log(np.diag(lower))))
+    weight = inverse @ remainder.residual_n
+    value = 0.5 * float(remainder.residual_n @ weight) + float(np.sum(np.log(np.diag(lower))))
     by_covariance = inverse - np.outer(weight, weight)
-    relative_age = np.where(np.isfinite(rest.memory.apart_s), rest.memory.apart_s, 0.0) / rest.memory.time_s
+    relative_age = (
+        np.where(np.isfinite(remainder.memory.apart_s), remainder.memory.apart_s, 0.0)
+        / remainder.memory.time_s
+    )
     gradient = [np.sum(by_covariance * memory_n2), 0.5 * np.sum(by_covariance * memory_n2 * relative_age)]
     if kernels is None or squares is None:
         return value, np.array(gradient)
-    by_covariance = rest.beyond(rest.beyond(by_covariance).T)
+    by_covariance = remainder.beyond(remainder.beyond(by_covariance).T)
     by_size = np.einsum("ij,pij->p", by_covariance, kernels)
     by_length = np.einsum("ij,pij,pij->p", by_covariance, kernels, squares) * 0.5 * np.exp(-2.0 * logs[6:])
     return value, np.concatenate([gradient, by_size, by_length])

@@ -30,16 +30,16 @@ class FeatureSettings:
 
 
 def describe(
-    rest: Unexplained, mean_n: Array, sd_n: Array, settings: FeatureSettings = FeatureSettings()
+    remainder: Unexplained, mean_n: Array, sd_n: Array, settings: FeatureSettings = FeatureSettings()
 ) -> tuple[str, ...]:
     """Returns sentences that describe a discrepancy of given mean and sd, (k,) each [N].
 
     They say in which phases it is certain, its sign, its trend over the cycles, and the coordinates that it
     correlates with.
     """
-    at, certain = rest.at, np.abs(mean_n) > settings.certain * sd_n
+    at, certain = remainder.at, np.abs(mean_n) > settings.certain * sd_n
     sentences = [_in_phases(kind, at, mean_n, certain, settings) for kind in KIND_IN_WORDS]
-    sentences += [_over_cycles(at, mean_n, certain, settings), *_correlations(rest, mean_n, settings)]
+    sentences += [_over_cycles(at, mean_n, certain, settings), *_correlations(remainder, mean_n, settings)]
     return tuple(sentence for sentence in sentences if sentence)
 
 

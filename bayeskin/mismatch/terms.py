@@ -64,11 +64,11 @@ _UNITS = {
 
 
 def library(
-    rest: Unexplained, edges_s: Array, phases: tuple[Phase, ...], motion: PadMotion,
+    remainder: Unexplained, edges_s: Array, phases: tuple[Phase, ...], motion: PadMotion,
     settings: LibrarySettings = LibrarySettings(),
 ) -> list[Term]:  # fmt: skip
     """Returns all terms on the fitted bins of a recording, the simpler ones first."""
-    start, end = edges_s[rest.bins], edges_s[rest.bins + 1]
+    start, end = edges_s[remainder.bins], edges_s[remainder.bins + 1]
     share = (np.arange(settings.points) + 0.5) / settings.points
     time_s = start[:, None] + share * (end - start)[:, None]
     starts = np.array([p.start_s for p in phases])
@@ -76,7 +76,7 @@ def library(
     at = place(time_s, phase, phases, motion)
     return [
         Term(name, *_UNITS[unit], np.broadcast_to(values, time_s.shape).mean(axis=1))
-        for name, unit, values in _functions(at, rest.force_n[:, None], motion, settings)
+        for name, unit, values in _functions(at, remainder.force_n[:, None], motion, settings)
     ]
 
 
