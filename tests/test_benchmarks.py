@@ -67,11 +67,11 @@ def test_error_of_a_scaled_history_is_gone_after_one_factor(benchmark):
     def history(force_n):
         return Simulation({}, time_s, time_s, force_n, np.zeros(51, bool), "ok", "", {}, "")
 
-    found = study.error(history(1.02 * time_s), history(time_s))
-    assert found.largest == pytest.approx(0.02)
-    assert found.rms == pytest.approx(0.02 * np.sqrt(1 / 3), rel=1e-2)
-    assert found.scale == pytest.approx(1 / 1.02)
-    assert found.rms_scaled < 1e-12
+    error = study.error(history(1.02 * time_s), history(time_s))
+    assert error.largest == pytest.approx(0.02)
+    assert error.rms == pytest.approx(0.02 * np.sqrt(1 / 3), rel=1e-2)
+    assert error.scale == pytest.approx(1 / 1.02)
+    assert error.rms_scaled < 1e-12
 
 
 def test_the_tolerance_chosen_is_the_loosest_below_which_all_are_good(benchmark):
@@ -85,11 +85,11 @@ def test_the_tolerance_chosen_is_the_loosest_below_which_all_are_good(benchmark)
 def test_the_peers_likelihood_is_the_normal_with_their_covariance(benchmark):
     peers, rng = benchmark("surrogate_peers"), np.random.default_rng(1)
     residual, factor = 0.02 * rng.normal(size=(3, 8)), 0.02 * rng.normal(size=(3, 2, 8))
-    found = peers.log_likelihood(residual, factor)
+    computed = peers.log_likelihood(residual, factor)
     for i in range(3):
         covariance = factor[i].T @ factor[i] + peers.NOISE_N**2 * np.eye(8)
         exact = multivariate_normal(np.zeros(8), covariance).logpdf(residual[i])
-        assert found[i] == pytest.approx(exact, rel=1e-10)
+        assert computed[i] == pytest.approx(exact, rel=1e-10)
     plain = multivariate_normal(np.zeros(8), peers.NOISE_N**2 * np.eye(8)).logpdf(residual)
     np.testing.assert_allclose(peers.log_likelihood(residual, None), plain, rtol=1e-10)
 

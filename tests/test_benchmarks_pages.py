@@ -27,16 +27,16 @@ def test_stored_ranks_are_uniform_and_stand_in_the_documentation(benchmark, data
     stored = [row for row in calibration.ROWS.read() if (row["data"], row["seed"]) == (data, "1")]
     on_page = []
     for surrogate in sorted({row["surrogate"] for row in stored}):
-        found = sorted((r for r in stored if r["surrogate"] == surrogate), key=lambda r: int(r["index"]))
-        on_page += [found[:n] for n in range(len(found), 49, -1) if shown(calibration.table(found[:n]))]
+        chosen = sorted((r for r in stored if r["surrogate"] == surrogate), key=lambda r: int(r["index"]))
+        on_page += [chosen[:n] for n in range(len(chosen), 49, -1) if shown(calibration.table(chosen[:n]))]
     assert len(on_page) == 1  # the page has the table of so many
-    (found,) = on_page
-    n = len(found)
+    (chosen,) = on_page
+    n = len(chosen)
     for name in calibration.NAMES:
-        ranks = np.array([int(row[f"rank_{name}"]) for row in found])
+        ranks = np.array([int(row[f"rank_{name}"]) for row in chosen])
         assert calibration.uniformity(ranks) > 0.01 / len(calibration.NAMES), name
         for level in (50, 90):
-            held = sum(row[f"in{level}_{name}"] == "True" for row in found)
+            held = sum(row[f"in{level}_{name}"] == "True" for row in chosen)
             low, high = binom.ppf([0.0005, 0.9995], n, level / 100)
             assert low <= held <= high, (name, level)
 
@@ -127,7 +127,7 @@ def test_the_skins_parameters_are_counted_by_what_was_concealed(benchmark):
 
 def test_the_table_of_sizes_tells_clear_effects_from_smaller_ones(benchmark):
     sizes, right = [1.0, 2.0, 4.0, 8.0], [False, True, True, True]
-    one = {"sizes": sizes, "right": right, "up_to": [True] * 4, "curve": curve(sizes, right)}
-    line = benchmark("proof_page").sizes({"by_mechanism": {"pad-slip": one}}).splitlines()[-1]
+    answers = {"sizes": sizes, "right": right, "up_to": [True] * 4, "curve": curve(sizes, right)}
+    line = benchmark("proof_page").sizes({"by_mechanism": {"pad-slip": answers}}).splitlines()[-1]
     cells = [cell.strip() for cell in line.strip("|").split("|")]
     assert cells[:5] == ["pad-slip", "1.0 to 8.0", "2 of 2", "1 of 2", "1"]

@@ -55,10 +55,12 @@ def test_simulate_takes_a_device_and_the_means_of_an_uncertain_tissue(
     out = tmp_path / "force.h5"
     given = ("--recording", short, "--device", tmp_path / "device.toml", "-o", out)
     assert bayeskin("simulate", tmp_path / "case.toml", *given)[0] == 0
-    found, recording = storage.load(out, Simulation), read_recording(short)
+    simulation, recording = storage.load(out, Simulation), read_recording(short)
     motion: PadMotion = idealised_motion(recording, segment(recording))
     spec = ModelSpec(refinement=0, geometry=Geometry(gauge_m=24e-3, guard=None, cutis_m=1.5e-3))
-    np.testing.assert_allclose(found.force_n, simulate(spec, motion, found.theta).force_n, rtol=1e-9)
+    np.testing.assert_allclose(
+        simulation.force_n, simulate(spec, motion, simulation.theta).force_n, rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize(

@@ -99,8 +99,8 @@ def test_every_table_becomes_a_recording(bayeskin: Command, tmp_path: Path) -> N
     said = json.loads(out)
     files = [tmp_path / "s-left-arm.h5", tmp_path / "s-right-arm.h5"]
     assert (code, said["ok"]) == (0, True)
-    assert [Path(one["out"]) for one in said["recordings"]] == files
-    assert [one["table"] for one in said["recordings"]] == ["left arm", "right arm"]
+    assert [Path(table["out"]) for table in said["recordings"]] == files
+    assert [table["table"] for table in said["recordings"]] == ["left arm", "right arm"]
     assert [storage.load(file, Recording).name for file in files] == ["series left arm", "series right arm"]
     assert err.count("s-left-arm.h5: column 'Force (N)' read as force in N") == 1
     assert not (tmp_path / "s.h5").exists()

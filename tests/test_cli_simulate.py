@@ -94,7 +94,7 @@ def test_with_mechanisms_no_two_times_are_the_same(
 @pytest.fixture
 def runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """A stand-in for the full model that stretches all uniformly; lists the names of the runs it made."""
-    made: list[str] = []
+    drawn: list[str] = []
 
     def stretch(
         spec: ModelSpec,
@@ -104,7 +104,7 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         on_state: OnState | None,
         laws: object,
     ) -> Simulation:
-        made.append(spec.mesh)
+        drawn.append(spec.mesh)
         space = problem_of(spec.mesh, spec.refinement).space
         for time_s in motion.time_s if on_state else ():
             x = np.zeros(space.dofs)
@@ -114,7 +114,7 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return stand_in_model.simulate(spec, motion, theta)
 
     monkeypatch.setattr(simulating, "simulate", stretch)
-    return made
+    return drawn
 
 
 def test_force_fields_and_figure_come_of_one_run(

@@ -38,8 +38,8 @@ def expected(tmp_path_factory) -> Design:
 
 def test_the_design_is_the_same_whoever_made_the_runs(cluster, tmp_path: Path, expected: Design) -> None:
     with on_scheduler(cluster.scheduler_address) as over:
-        found = run(tmp_path / "a.store", SHORT, run_all=over)
-    assert_same_rows(found, expected)
+        design = run(tmp_path / "a.store", SHORT, run_all=over)
+    assert_same_rows(design, expected)
     again = run(tmp_path / "a.store", SHORT, unreliable_models.failing)
     assert_same_rows(again, expected)
 
@@ -59,19 +59,19 @@ def test_a_worker_killed_in_mid_run_costs_its_own_point_which_is_run_again(
     thread = threading.Thread(target=kill)
     thread.start()
     with on_scheduler(cluster.scheduler_address) as over:
-        found = run(tmp_path / "a.store", SHORT, simulate, over)
+        design = run(tmp_path / "a.store", SHORT, simulate, over)
     thread.join()
     assert killed
-    assert_same_rows(found, expected)
+    assert_same_rows(design, expected)
 
 
 def test_a_point_that_kills_every_worker_is_a_failed_row(cluster, tmp_path: Path) -> None:
     simulate = partial(unreliable_models.deadly, folder=str(tmp_path), deaths=99)
     with on_scheduler(cluster.scheduler_address) as over:
-        found = run(tmp_path / "out" / "a.store", SHORT, simulate, over)
+        design = run(tmp_path / "out" / "a.store", SHORT, simulate, over)
     stiff = SHORT.theta[:, 0] > 3e5
-    np.testing.assert_array_equal(found.ok, ~stiff)
-    assert all("ended" in found.messages[row] for row in np.flatnonzero(stiff))
+    np.testing.assert_array_equal(design.ok, ~stiff)
+    assert all("ended" in design.messages[row] for row in np.flatnonzero(stiff))
 
 
 def test_what_stands_in_the_queue_of_a_worker_that_dies_is_not_lost_with_it() -> None:
@@ -84,9 +84,9 @@ def test_what_stands_in_the_queue_of_a_worker_that_dies_is_not_lost_with_it() ->
         ) as cluster,
         on_scheduler(cluster.scheduler_address) as over,
     ):
-        found = dict(over(unreliable_models.deadly_first, range(3)))
-    assert isinstance(found[0], Lost)
-    assert (found[1], found[2]) == (1, 2)
+        results = dict(over(unreliable_models.deadly_first, range(3)))
+    assert isinstance(results[0], Lost)
+    assert (results[1], results[2]) == (1, 2)
 
 
 def test_a_run_that_comes_back_twice_is_one_row(tmp_path: Path, expected: Design) -> None:
@@ -95,8 +95,8 @@ def test_a_run_that_comes_back_twice_is_one_row(tmp_path: Path, expected: Design
             yield index, function(item)
             yield index, function(item)
 
-    found = run(tmp_path / "a.store", SHORT, run_all=twice)
-    assert_same_rows(found, expected)
+    design = run(tmp_path / "a.store", SHORT, run_all=twice)
+    assert_same_rows(design, expected)
     assert_same_rows(run(tmp_path / "a.store", SHORT, unreliable_models.failing), expected)
 
 
@@ -113,17 +113,17 @@ def test_an_address_where_nobody_answers_is_told_in_a_line(monkeypatch: pytest.M
 def test_slurm_is_asked_for_single_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """The job script that would be submitted; there is no SLURM here to run it."""
     queue = pytest.importorskip("dask_jobqueue")
-    scripts, made = [], []
+    scripts, submitted = [], []
 
     class Recorded(queue.SLURMCluster):
         def scale(self, jobs):
             scripts.append(self.job_script())
-            made.append(jobs)
+            submitted.append(jobs)
 
     monkeypatch.setattr(queue, "SLURMCluster", Recorded)
     with on_slurm(3, {"queue": "long", "memory": "2GB", "walltime": "01:00:00"}):
         pass
-    assert made[0] == 3
+    assert submitted[0] == 3
     assert "#SBATCH -p long" in scripts[0]
     assert "--nthreads 1" in scripts[0]
     with pytest.raises(InputError, match="slurm"), on_slurm(1, {"memory": "2GB", "colour": "blue"}):

@@ -162,12 +162,12 @@ def test_a_recording_is_told_from_a_configuration(tmp_path: Path) -> None:
 
 def test_what_is_no_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
-    for path, found in (
+    for path, message in (
         (tmp_path, "a folder"),
         (tmp_path / "pipe.toml", "a pipe or a device instead of a file"),
         (Path(os.devnull), "a pipe or a device instead of a file"),
     ):
-        with pytest.raises(InputError, match=f": found {found}; expected a TOML"):
+        with pytest.raises(InputError, match=f": found {message}; expected a TOML"):
             load_config(path)
 
 

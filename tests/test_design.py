@@ -74,8 +74,8 @@ def test_points_fill_the_prior_better_than_chance() -> None:
 
 
 def test_seeds_differ_and_seed_zero_is_one_of_them() -> None:
-    zero, one = sobol_points(SPACE, 8, 0), sobol_points(SPACE, 8, 1)
-    assert not np.any(zero == one)
+    zero, first = sobol_points(SPACE, 8, 0), sobol_points(SPACE, 8, 1)
+    assert not np.any(zero == first)
     np.testing.assert_array_equal(sobol_points(SPACE, 8, 0), zero)
     with pytest.raises(InputError):
         sobol_points(SPACE, -1, 0)

@@ -32,8 +32,8 @@ def recording(tmp_path: Path) -> Path:
     assert run.status == "ok", run.message
     time_s = np.arange(0.0, 60.0, 0.05)
     noise_n = NOISE_N * np.random.default_rng(4).standard_normal(len(time_s))
-    made = Recording(time_s, MOTION.at(time_s), run.at(time_s) + noise_n, "relaxing", "0" * 64)
-    storage.save(tmp_path / "relaxing.h5", made)
+    recorded = Recording(time_s, MOTION.at(time_s), run.at(time_s) + noise_n, "relaxing", "0" * 64)
+    storage.save(tmp_path / "relaxing.h5", recorded)
     return tmp_path / "relaxing.h5"
 
 
@@ -44,11 +44,11 @@ def test_a_solid_that_relaxes_is_named_on_any_protocol_and_a_second_call_makes_n
     said = diagnose([recording], Silent())
     assert said["ok"]
     assert said["verdict"] == "named"
-    (one,) = said["mechanisms"]
-    assert one["name"] == "solid-viscoelasticity"
-    assert one["probability"] > 0.9
+    (mechanism,) = said["mechanisms"]
+    assert mechanism["name"] == "solid-viscoelasticity"
+    assert mechanism["probability"] > 0.9
     assert said["best_set"] == ["solid-viscoelasticity"]
-    for name, parameter in one["parameters"].items():
+    for name, parameter in mechanism["parameters"].items():
         low, high = parameter["interval90"]
         assert low < high
         if name in ("g_1", "tau_1"):

@@ -85,7 +85,7 @@ def two(path: Path) -> tuple[Path, Path]:
 def test_several_recordings_have_their_own_initial_pressures(tmp_path: Path) -> None:
     run = opened(two(tmp_path), Silent())
     assert run.folder == tmp_path / "a test-second-diagnosis"
-    assert [one.file for one in run.config.each_recording] == ["a test.h5", "second.h5"]
+    assert [recording.file for recording in run.config.each_recording] == ["a test.h5", "second.h5"]
     assert parameter_space(run.config).names[-2:] == ("p_init", "p_init@2")
     case = tmp_path / "case.toml"
     case.write_text(

@@ -109,7 +109,7 @@ def test_a_mechanism_s_part_is_what_it_adds_at_its_own_values() -> None:
 
 
 def test_friction_takes_its_creep_along() -> None:
-    parts = {one.name: one for one in parts_of("device-friction", "friction-creep")}
+    parts = {part.name: part for part in parts_of("device-friction", "friction-creep")}
     friction, creep = parts["device-friction"], parts["friction-creep"]
     assert friction.along == ("friction-creep",)
     assert creep.along == ()

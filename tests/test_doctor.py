@@ -27,7 +27,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def broken(said: dict[str, Any]) -> dict[str, str]:
-    return {one["name"]: one["found"] for one in said["findings"] if not one["ok"]}
+    return {finding["name"]: finding["found"] for finding in said["findings"] if not finding["ok"]}
 
 
 def test_the_models_give_the_stored_numbers_here(
@@ -40,7 +40,7 @@ def test_the_models_give_the_stored_numbers_here(
     said = json.loads(capsys.readouterr().out)
     assert broken(said) == {}
     assert (said["ok"], end.value.code) == (True, 0)
-    names = [one["name"] for one in said["findings"]]
+    names = [finding["name"] for finding in said["findings"]]
     expected = ["numpy", "linear solver", "threads", "disk space", "write access", "full model", "surrogate"]
     assert [name for name in names if name in expected] == expected
     assert list(tmp_path.iterdir()) == []

@@ -119,8 +119,8 @@ def test_ours_answers_the_client_of_the_package_umbridge(served: str) -> None:
     assert model.get_input_sizes() == [3]
     assert model.get_output_sizes() == [130]
     direct = simulate_with(spring(), MOTION, TRUE)
-    (found,) = model([list(TRUE.values())])
-    np.testing.assert_allclose(found, direct.bin_means(np.arange(131.0)), rtol=1e-6, atol=1e-9)
+    (output,) = model([list(TRUE.values())])
+    np.testing.assert_allclose(output, direct.bin_means(np.arange(131.0)), rtol=1e-6, atol=1e-9)
     at = {"times_s": [10.0, 20.5]}
     assert model.get_output_sizes(at) == [2]
     np.testing.assert_allclose(model([list(TRUE.values())], at)[0], direct.at([10.0, 20.5]), rtol=1e-5)
@@ -160,8 +160,8 @@ def test_instrument_mechanisms_bring_their_parameters(served: str) -> None:
     direct = simulate_with(spring(), MOTION, TRUE)
     columns = {name: np.array([value]) for name, value in zip([*TRUE, *names], values.values(), strict=True)}
     force = observed([known[n] for n in config["mechanisms"]], columns, MOTION, lambda t: direct.at(t)[None])
-    (found,) = model([list(values.values())], config)
-    np.testing.assert_allclose(found, bin_means(force, MOTION, np.arange(131.0))[0], rtol=1e-5)
+    (output,) = model([list(values.values())], config)
+    np.testing.assert_allclose(output, bin_means(force, MOTION, np.arange(131.0))[0], rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -303,9 +303,9 @@ def test_a_server_that_goes_away_costs_no_finished_run_and_fails_none(tmp_path: 
         listening.server_close()
 
     def start(port: int):
-        found = server(Mortal(), "127.0.0.1", port)
-        threading.Thread(target=found.serve_forever, daemon=True).start()
-        return found
+        served = server(Mortal(), "127.0.0.1", port)
+        threading.Thread(target=served.serve_forever, daemon=True).start()
+        return served
 
     listening = start(0)
     port = listening.server_address[1]

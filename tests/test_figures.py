@@ -43,8 +43,8 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path, kind: str) -> None:
         field = report.SurfaceField("u", "mm", points[:1, quads[:, 0], 0])
         return report.figure_fields(["5 s"], points[:1], quads, 0 * quads[:, 0], [], [field], "")
 
-    one = figure()
-    written = [report.save_figure(f, tmp_path / str(i), "x") for i, f in enumerate((one, figure(), one))]
+    drawn = figure()
+    written = [report.save_figure(f, tmp_path / str(i), "x") for i, f in enumerate((drawn, figure(), drawn))]
     assert len({tuple(path.read_bytes() for path in paths) for paths in written}) == 1
 
 

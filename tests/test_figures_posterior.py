@@ -130,10 +130,10 @@ def test_profiles_of_many_parameters_take_several_rows() -> None:
 
 def test_the_model_check_says_what_moves_most() -> None:
     weights = np.array([0.4, 0.3, 0.2, 0.1])
-    found = Weighed(SPACE, DRAWS[:4], np.log(weights), weights, 10 / 3, float("nan"), Verdict(True, ("",)))
+    weighed = Weighed(SPACE, DRAWS[:4], np.log(weights), weights, 10 / 3, float("nan"), Verdict(True, ("",)))
     quantiles = (0.5, 1.0, 2.0)
     moved = [Corrected(n, quantiles, -0.8 if n == "k_s" else 0.1, 0.05, 1.0) for n in SPACE.names]
-    figure = drawn(report.figure_model_check(found, moved))
+    figure = drawn(report.figure_model_check(weighed, moved))
     assert "Of 4 draws with full runs, 3 are effective" in headline(figure)
     assert "k_" in headline(figure)
     assert "0.80 of its sd" in headline(figure)
@@ -141,8 +141,8 @@ def test_the_model_check_says_what_moves_most() -> None:
 
 def test_names_along_a_large_triangle_do_not_run_into_each_other() -> None:
     names = ("sd_rest", "sd_load", "sd_hold", "sd_unload", *(f"E_{letter}" for letter in "abdefgh"))
-    one = dataclasses.replace(SPACE.parameters[0], unit="N", prior="log-uniform", lower=1e-4, upper=0.3)
-    space = ParameterSpace(tuple(dataclasses.replace(one, name=name) for name in names))
+    parameter = dataclasses.replace(SPACE.parameters[0], unit="N", prior="log-uniform", lower=1e-4, upper=0.3)
+    space = ParameterSpace(tuple(dataclasses.replace(parameter, name=name) for name in names))
     draws = 10.0 ** np.random.default_rng(1).uniform(-3.5, -1.0, (400, len(names)))
     figure = drawn(report.figure_posterior(space, draws, {}))
     boxes = [ax.yaxis.label.get_window_extent() for ax in figure.axes if ax.get_ylabel()]

@@ -114,10 +114,10 @@ def test_the_pressure_at_the_centre_of_cryers_sphere_rises_before_it_falls(cells
     seconds = EDGE_M**2 / (layer.mobility * (layer.lam + 2 * layer.mu))
     taus = np.concatenate([np.geomspace(1e-4, 0.01, 8), np.geomspace(0.01, 0.4, 30)[1:]])
     centre = int(np.argmin(np.linalg.norm(corners, axis=0)))
-    found = [s.state.x[3 * n + centre] / pressure for s in march(model, model.state_at(x), seconds * taus)]
+    computed = [s.state.x[3 * n + centre] / pressure for s in march(model, model.state_at(x), seconds * taus)]
     expected = [cryer_centre(0.2, tau) for tau in taus]
-    assert max(found) == pytest.approx(1.364, abs=bound)
-    np.testing.assert_allclose(found, expected, atol=bound)
+    assert max(computed) == pytest.approx(1.364, abs=bound)
+    np.testing.assert_allclose(computed, expected, atol=bound)
 
 
 @pytest.mark.parametrize("kind", ["bricks", "tetrahedra"])
@@ -156,9 +156,9 @@ def test_a_confined_column_compressed_by_a_quarter_follows_the_one_dimensional_e
             [early, np.arange(11, 101) / 10, ramp + early, np.arange(111, 181) / 10, np.arange(19, 41), times]
         )
     )
-    found = {}
+    computed = {}
     for step in march(model, model.initial_state(0.0), fine, corner_s=ramp):
-        found[round(step.state.time_s, 6)] = model.full_residual[3 * top + 2].sum() / 1e-6
-    stress = np.array([found[round(t, 6)] for t in times])
+        computed[round(step.state.time_s, 6)] = model.full_residual[3 * top + 2].sum() / 1e-6
+    stress = np.array([computed[round(t, 6)] for t in times])
     assert reference.min() < 1.2 * reference[-1] < 0  # the fluid carries a good part of the peak
     np.testing.assert_allclose(stress, reference, rtol=2e-3)

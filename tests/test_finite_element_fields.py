@@ -83,13 +83,13 @@ def test_the_solid_s_velocity_is_its_mean_over_a_cell(tetrahedra):
     x, rate = np.zeros(space.dofs), np.zeros(space.dofs)
     rate[2 : 3 * space.n_nodes : 3] = z**2
     corners = z[space.nodes_u[:, : 4 if tetrahedra else 8]]
-    found = fields_of(problem, THETA, x, rate).fluid_velocity[:, 2]
+    computed = fields_of(problem, THETA, x, rate).fluid_velocity[:, 2]
     if tetrahedra:  # the mean of a product of linear functions over a simplex
         expected = (corners.sum(axis=1) ** 2 + (corners**2).sum(axis=1)) / 20
     else:
         low, high = corners.min(axis=1), corners.max(axis=1)
         expected = (low**2 + low * high + high**2) / 3
-    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    np.testing.assert_allclose(computed, expected, rtol=1e-6)
 
 
 def corners_of(problem):

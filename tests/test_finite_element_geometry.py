@@ -44,8 +44,8 @@ HASHES = {
 
 @pytest.mark.parametrize("refinement", [0, 1])
 def test_the_article_s_device_has_the_forces_that_it_had(refinement):
-    found = simulate(ModelSpec(refinement=refinement), SHORT, THETA)
-    np.testing.assert_allclose(found.at([0.0, 1.0, 4.0, 10.0]), BEFORE[refinement], rtol=1e-9)
+    simulation = simulate(ModelSpec(refinement=refinement), SHORT, THETA)
+    np.testing.assert_allclose(simulation.at([0.0, 1.0, 4.0, 10.0]), BEFORE[refinement], rtol=1e-9)
 
 
 def test_hashes_of_the_article_s_device_are_those_of_stored_designs():
@@ -86,8 +86,8 @@ def area(mesh, facets):
 
 def test_lines_grow_with_the_device():
     twice = Geometry(72e-3, 16e-3, 16e-3, Guard(2e-3, 16e-3), "pad", 4e-3, 16e-3, 96e-3)
-    for one, other in zip(brick_lines(2), brick_lines(2, twice), strict=True):
-        np.testing.assert_allclose(other, 2 * one)
+    for line, other in zip(brick_lines(2), brick_lines(2, twice), strict=True):
+        np.testing.assert_allclose(other, 2 * line)
 
 
 def test_a_mesh_like_another_has_its_cells_with_nodes_moved_by_layer():
@@ -152,11 +152,13 @@ def test_that_is_the_integral_of_the_stress_over_the_plane(pulled):
 
 def test_derivatives_are_those_of_the_force_on_pad_and_guard():
     spec = ModelSpec(refinement=0, geometry=Geometry(force_on="pad and guard"), tolerance=1e-2)
-    found = simulate(spec, SHORT, THETA, gradients=logarithms(THETA))
-    assert found.force_n[-1] > 1.5 * simulate(ModelSpec(refinement=0), SHORT, THETA).force_n[-1]
+    simulation = simulate(spec, SHORT, THETA, gradients=logarithms(THETA))
+    assert simulation.force_n[-1] > 1.5 * simulate(ModelSpec(refinement=0), SHORT, THETA).force_n[-1]
     ends = [simulate(spec, SHORT, THETA | {"E_s": THETA["E_s"] * (1 + h)}) for h in (1e-3, -1e-3)]
     difference = (ends[0].force_n[-1] - ends[1].force_n[-1]) / 2e-3
-    assert found.gradient_n[-1, found.gradient_names.index("E_s")] == pytest.approx(difference, rel=1e-3)
+    assert simulation.gradient_n[-1, simulation.gradient_names.index("E_s")] == pytest.approx(
+        difference, rel=1e-3
+    )
 
 
 def test_pre_stretch_opens_the_pads_by_a_share_of_this_gauge():

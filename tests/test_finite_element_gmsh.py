@@ -28,18 +28,18 @@ def written(folder: Path, geometry: Geometry = FLAT, **wrong: object) -> Path:
 @pytest.mark.parametrize("first", [None, "everything"])
 def test_a_file_gives_the_mesh_that_it_was_written_from(geometry, first, tmp_path):
     """Also where each surface carries another name before its own."""
-    mesh, found = coarse_tetrahedra(geometry), read_gmsh(written(tmp_path, geometry, first=first), geometry)
-    assert found.lengths == geometry
+    mesh, read = coarse_tetrahedra(geometry), read_gmsh(written(tmp_path, geometry, first=first), geometry)
+    assert read.lengths == geometry
 
-    def middles(one, cells):
+    def middles(either, cells):
         return {
-            tuple(np.round(1e9 * middle).astype(int)) for middle in one.geometry.p[:, cells].mean(axis=1).T
+            tuple(np.round(1e9 * middle).astype(int)) for middle in either.geometry.p[:, cells].mean(axis=1).T
         }
 
     for name in BOUNDARIES:
-        sides = [one.geometry.facets[:, one.facets[name]] for one in (mesh, found)]
-        assert middles(mesh, sides[0]) == middles(found, sides[1]), name
-    assert middles(mesh, mesh.geometry.t[:, mesh.cutis]) == middles(found, found.geometry.t[:, found.cutis])
+        sides = [either.geometry.facets[:, either.facets[name]] for either in (mesh, read)]
+        assert middles(mesh, sides[0]) == middles(read, sides[1]), name
+    assert middles(mesh, mesh.geometry.t[:, mesh.cutis]) == middles(read, read.geometry.t[:, read.cutis])
 
 
 @pytest.mark.parametrize(

@@ -90,8 +90,8 @@ def test_derivatives_are_central_differences(monkeypatch, case):
         start_at_zero(skin, step)
 
     assert integrate(skin, theta["p_init"], 1e-2, on_step) == ""
-    found = np.array(slopes.force_n)
-    largest = np.abs(found).max()
+    computed = np.array(slopes.force_n)
+    largest = np.abs(computed).max()
     for column, (name, value) in enumerate(theta.items()):
         h = 2e-6 if name == "yield_stretch" else 1e-3  # over which few points begin to yield
         up, down = (
@@ -100,9 +100,9 @@ def test_derivatives_are_central_differences(monkeypatch, case):
         )
         difference = (up - down) / (2 * h)
         smooth = np.array([name != "gap" or not step.corner for step in steps])  # a gap moves the corners
-        assert np.abs(found[:, column] - difference)[smooth].max() < 1e-4 * largest
+        assert np.abs(computed[:, column] - difference)[smooth].max() < 1e-4 * largest
     column = list(theta).index("k_s")
-    assert np.abs(found[:, column]).max() > 1e-3 * largest  # so that it says something
+    assert np.abs(computed[:, column]).max() > 1e-3 * largest  # so that it says something
 
 
 @pytest.mark.parametrize("h", [0.02, 20.0])
@@ -125,7 +125,7 @@ def test_the_exact_tangent_is_the_difference_of_residuals(h):
     j_old, p_old = 1e-2 * rng.normal(size=(*shape, r)), 50.0 * rng.normal(size=(*shape, r))
     rates = tuple(a[:, None] * rng.normal(size=r) for a in (skin.material.mu, skin.material.lam))
     rates = (*rates, skin.material.mobility[:, None] * rng.normal(size=r))
-    found = TangentAction(skin, stage, rates, j_old, p_old)(along)
+    computed = TangentAction(skin, stage, rates, j_old, p_old)(along)
     for k in range(r):
 
         def at(by: float, k: int = k) -> Evaluated:
@@ -136,10 +136,10 @@ def test_the_exact_tangent_is_the_difference_of_residuals(h):
 
         up, down = at(1e-5), at(-1e-5)
         for mine, high, low in (
-            (found.residual[:n, k], up.residual[:n], down.residual[:n]),
-            (found.residual[n:, k], up.residual[n:], down.residual[n:]),
-            (found.volume[..., k], up.volume, down.volume),
-            (found.pressure[..., k], up.pressure, down.pressure),
+            (computed.residual[:n, k], up.residual[:n], down.residual[:n]),
+            (computed.residual[n:, k], up.residual[n:], down.residual[n:]),
+            (computed.volume[..., k], up.volume, down.volume),
+            (computed.pressure[..., k], up.pressure, down.pressure),
         ):
             expected = (high - low) / 2e-5
             np.testing.assert_allclose(mine, expected, atol=1e-6 * np.abs(expected).max())

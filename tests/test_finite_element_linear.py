@@ -32,14 +32,14 @@ def matrices() -> list[sp.csr_matrix]:
     pattern = ((pattern + pattern.T) != 0).astype(float)
     size = np.where(np.arange(n) < 45, 1.0, 1e-5)
     sign = np.where(np.arange(n) < 45, 1.0, -1.0)
-    made = []
+    factorised = []
     for _ in range(3):
         matrix = pattern.multiply(0.3 * rng.standard_normal((n, n)))
         matrix = 0.5 * (matrix + matrix.T) + sp.diags(8.0 * sign)
         matrix = (sp.diags(size) @ matrix @ sp.diags(size)).tocsr()
         matrix.sort_indices()
-        made.append(matrix)
-    return made
+        factorised.append(matrix)
+    return factorised
 
 
 @pytest.mark.parametrize(("solver", "accuracy"), SOLVERS)
@@ -52,11 +52,11 @@ def test_each_factorisation_solves_with_its_own_matrix(solver, accuracy):
     rng = np.random.default_rng(1)
     for number in (2, 0, 1, 0):
         exact = rng.standard_normal((60, 4)) * scale[:, None] * [1.0, 1e-30, 1e20, 0.0]
-        found = kept.solve(number, given[number] @ exact)
+        computed = kept.solve(number, given[number] @ exact)
         largest = np.abs(exact / scale[:, None]).max(axis=0)
-        assert np.all(np.abs((found - exact) / scale[:, None]).max(axis=0) <= accuracy * largest)
-        one = kept.solve(number, given[number] @ exact[:, 0])
-        np.testing.assert_allclose(one / scale, exact[:, 0] / scale, atol=accuracy * largest[0])
+        assert np.all(np.abs((computed - exact) / scale[:, None]).max(axis=0) <= accuracy * largest)
+        column = kept.solve(number, given[number] @ exact[:, 0])
+        np.testing.assert_allclose(column / scale, exact[:, 0] / scale, atol=accuracy * largest[0])
     kept.factorise(0, given[2], scale)  # replaced
     exact = rng.standard_normal(60) * scale
     np.testing.assert_allclose(kept.solve(0, given[2] @ exact) / scale, exact / scale, atol=4 * accuracy)

@@ -109,18 +109,18 @@ def test_parameters_that_cannot_be_are_named(change, named):
 
 
 def test_at_rest_the_initial_pressure_is_gone_and_no_force_appears():
-    found = simulate(ModelSpec(), STILL, THETA)
-    assert found.status == "ok"
-    assert np.abs(found.force_n).max() < 1e-6
+    simulation = simulate(ModelSpec(), STILL, THETA)
+    assert simulation.status == "ok"
+    assert np.abs(simulation.force_n).max() < 1e-6
 
 
 def test_an_impossible_stretch_is_a_failed_run_with_a_remedy():
     torn = PadMotion(np.array([0.0, 1.0]), np.array([0.0, -200.0]))
-    found = simulate(ModelSpec(), torn, THETA)
-    assert found.status == "failed"
-    assert "t = " in found.message
-    assert "try" in found.message
-    assert np.isfinite(found.force_n).all()
+    simulation = simulate(ModelSpec(), torn, THETA)
+    assert simulation.status == "failed"
+    assert "t = " in simulation.message
+    assert "try" in simulation.message
+    assert np.isfinite(simulation.force_n).all()
 
 
 def test_hash_depends_on_what_the_force_depends_on():

@@ -29,9 +29,9 @@ def test_a_step_that_does_not_contract_is_damped(start: float) -> None:
         scale=np.ones(2),
         place=np.zeros(1),
     )
-    found = NewtonSolver().solve(equations, np.array([start, 0.5 * start]))
-    assert found is not None
-    np.testing.assert_allclose(found, 0.0, atol=1e-7)
+    solution = NewtonSolver().solve(equations, np.array([start, 0.5 * start]))
+    assert solution is not None
+    np.testing.assert_allclose(solution, 0.0, atol=1e-7)
 
 
 def arch(load: float) -> Equations:
@@ -54,9 +54,9 @@ def test_past_a_fold_a_fall_ends_in_the_next_equilibrium(side: float) -> None:
     load, before = side * 0.7, np.full(2, side * -1.05)
     assert NewtonSolver().solve(arch(load), before) is None
     solver = NewtonSolver()
-    found = relax(solver, arch(load), before, np.array([1.0, 0.0]))
-    assert found is not None
-    np.testing.assert_allclose(found, side * max(np.roots([1 / 3, 0, -1, -0.7]).real), atol=1e-7)
+    rest = relax(solver, arch(load), before, np.array([1.0, 0.0]))
+    assert rest is not None
+    np.testing.assert_allclose(rest, side * max(np.roots([1 / 3, 0, -1, -0.7]).real), atol=1e-7)
     assert solver.counts["falls"] == 1
 
 

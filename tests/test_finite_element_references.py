@@ -47,9 +47,9 @@ def reaction_difference(case: str, until_s: float) -> float:
     kept = time_s <= until_s
     time_s, pad_m, force_n = time_s[kept], pad_m[kept], force_n[kept]
     spec = ModelSpec(mesh=str(supplement("data/Mesh_SKIN.msh")))
-    found = simulate(spec, corners_of(time_s, pad_m), POINTS[case])
-    assert found.status == "ok", found.message
-    return float(np.sqrt(np.mean((found.at(time_s) - force_n) ** 2)) / force_n.max())
+    simulation = simulate(spec, corners_of(time_s, pad_m), POINTS[case])
+    assert simulation.status == "ok", simulation.message
+    return float(np.sqrt(np.mean((simulation.at(time_s) - force_n) ** 2)) / force_n.max())
 
 
 def test_reaction_of_the_first_ramp_is_the_independent_solvers():
@@ -73,22 +73,24 @@ def article_run(until_s: float, theta: dict[str, float] = CALIBRATED):
     kept = time_s <= until_s
     motion = PadMotion(time_s[kept], 2 * pad_m[kept])
     spec = ModelSpec("article", str(supplement("data/Mesh_SKIN.msh")))
-    found = simulate(spec, motion, theta)
-    assert found.status == "ok", found.message
-    return found, time_s[kept], force_n[kept]
+    simulation = simulate(spec, motion, theta)
+    assert simulation.status == "ok", simulation.message
+    return simulation, time_s[kept], force_n[kept]
 
 
 def test_articles_force_on_the_first_ramp_is_its_scripts():
-    found, time_s, force_n = article_run(until_s=17.0)
-    np.testing.assert_allclose(found.time_s, time_s)
+    simulation, time_s, force_n = article_run(until_s=17.0)
+    np.testing.assert_allclose(simulation.time_s, time_s)
     # the difference grows along the ramp, to 4e-5 N in 215 s; 1e-3 N is what is asked for
-    np.testing.assert_allclose(found.force_n, force_n, rtol=0, atol=5e-5)
+    np.testing.assert_allclose(simulation.force_n, force_n, rtol=0, atol=5e-5)
 
 
 @pytest.mark.slow
 def test_articles_force_over_the_whole_recording_is_its_scripts():
-    found, _, force_n = article_run(until_s=1e9)
-    assert np.sqrt(np.mean((found.force_n - force_n) ** 2)) < 1e-4  # 2.7e-5 N; 1e-3 N is what is asked for
+    simulation, _, force_n = article_run(until_s=1e9)
+    assert (
+        np.sqrt(np.mean((simulation.force_n - force_n) ** 2)) < 1e-4
+    )  # 2.7e-5 N; 1e-3 N is what is asked for
 
 
 @pytest.mark.slow
@@ -102,9 +104,9 @@ def test_articles_force_is_its_sensitivity_studys_in_the_hold():
     rows = np.array(
         [row[:2] for row in book["reference"].iter_rows(min_row=2, values_only=True)], dtype=float
     )
-    found, *_ = article_run(until_s=79.5)
+    simulation, *_ = article_run(until_s=79.5)
     held = (rows[:, 0] > 20.9) & (rows[:, 0] < 75.1)
-    there = np.interp(rows[held, 0], found.time_s, found.force_n)
+    there = np.interp(rows[held, 0], simulation.time_s, simulation.force_n)
     assert np.sqrt(np.mean((there - rows[held, 1]) ** 2)) < 1e-3
 
 

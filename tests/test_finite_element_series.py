@@ -108,7 +108,7 @@ def test_derivatives_of_a_memory_go_with_those_before():
     element, step = KelvinVoigt(COMPLIANCE, 8.0), 1e-6
     drive, before = driven(element), (np.array([1e-3, 0.2]),)
     after = drive.follow(0.3, 4.0, before)
-    found = memory_slopes(
+    slopes = memory_slopes(
         [drive], step, 0.3, np.zeros(1), 4.0, before, (np.array([[2.0], [0.0]]),), after
     )  # fmt: skip
-    assert found[0][0, 0] == pytest.approx(2.0 * np.exp(-0.5), rel=1e-6)
+    assert slopes[0][0, 0] == pytest.approx(2.0 * np.exp(-0.5), rel=1e-6)

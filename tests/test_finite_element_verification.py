@@ -140,14 +140,14 @@ def test_time_integration_of_large_strain_is_of_second_order_in_both_fields():
         weak_load(exact, space, *layers),
         space=space,
     )
-    found = []
+    computed = []
     for steps in (16, 32, 64):
         *_, last = march(model, exact_state(exact, space, 0.0), np.linspace(0, 1, steps + 1)[1:])
-        found.append(errors(exact, space, last.state.x, 1.0))
+        computed.append(errors(exact, space, last.state.x, 1.0))
     for name in ("u", "p"):
-        rates = np.log2([a[name] / b[name] for a, b in pairwise(found)])
-        assert np.all((rates > 1.9) & (rates < 2.25)), (name, rates, found)
-    assert found[-1]["u"] < 1e-4
+        rates = np.log2([a[name] / b[name] for a, b in pairwise(computed)])
+        assert np.all((rates > 1.9) & (rates < 2.25)), (name, rates, computed)
+    assert computed[-1]["u"] < 1e-4
 
 
 def prescribed_block(kind: str, turn) -> tuple[DrivenModel, dict[str, np.ndarray]]:
@@ -268,7 +268,7 @@ def test_the_drained_limit_agrees_with_felupe():
 
     model = driven(space.mesh, by_layer(space.mesh.cutis, UPPER, LOWER), fixed, values, space=space)
     *_, last = march(model, model.initial_state(0.0), np.array([0.5, 1.0]))
-    found = last.state.x[: 3 * n].reshape(-1, 3)
+    computed = last.state.x[: 3 * n].reshape(-1, 3)
 
     ours = 1 - 2 * skfem.ElementHex2().doflocs  # inverted: scikit-fem's bricks are left-handed
     theirs = felupe.element.TriQuadraticHexahedron().points
@@ -292,5 +292,5 @@ def test_the_drained_limit_agrees_with_felupe():
     reference = field[0].values
     force = body.assemble.vector(field).toarray().reshape(-1, 3)[end].sum(axis=0)
     reaction = model.full_residual[: 3 * n].reshape(-1, 3)[end].sum(axis=0)
-    assert np.abs(found - reference).max() < 1e-7 * np.abs(reference).max()
+    assert np.abs(computed - reference).max() < 1e-7 * np.abs(reference).max()
     np.testing.assert_allclose(reaction, force, atol=1e-7 * np.abs(force).max())

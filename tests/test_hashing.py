@@ -70,7 +70,7 @@ def sources() -> st.SearchStrategy[str]:
 
 
 def tokens(source: str, kind: int) -> list[tokenize.TokenInfo]:
-    return [one for one in tokenize.generate_tokens(io.StringIO(source).readline) if one.type == kind]
+    return [token for token in tokenize.generate_tokens(io.StringIO(source).readline) if token.type == kind]
 
 
 def replaced(source: str, old: tokenize.TokenInfo, text: str) -> str:
@@ -99,8 +99,8 @@ def test_comments_and_blank_lines_do_not_count(
 def test_a_docstring_does_not_count(source: str, words: str, data: st.DataObject) -> None:
     tree = ast.parse(source)
     kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    found = [node for node in ast.walk(tree) if isinstance(node, kinds)]
-    node = data.draw(st.sampled_from(found))
+    nodes = [node for node in ast.walk(tree) if isinstance(node, kinds)]
+    node = data.draw(st.sampled_from(nodes))
     if ast.get_docstring(node) is not None:
         del node.body[0]
     assume(not node.body or ast.get_docstring(node) is None)
@@ -122,7 +122,7 @@ def test_every_number_counts(source: str, number: str, data: st.DataObject) -> N
 @given(sources(), st.data())
 def test_every_name_counts(source: str, data: st.DataObject) -> None:
     reserved = {*keyword.kwlist, *keyword.softkwlist}
-    names = [one for one in tokens(source, tokenize.NAME) if one.string not in reserved]
+    names = [token for token in tokens(source, tokenize.NAME) if token.string not in reserved]
     assume(names)
     name = data.draw(st.sampled_from(names))
     changed = replaced(source, name, f"{name.string}_other")

@@ -23,9 +23,9 @@ VALUES = {"F0": -0.03}
 
 
 def fitted(bench: DiagnosisContext, names: Sequence[str]) -> SetFit:
-    found = fit_set(names, {**bench.noise, **TRUTH, **VALUES}, bench.run, bench.posterior)
-    assert isinstance(found, SetFit)
-    return found
+    fitted = fit_set(names, {**bench.noise, **TRUTH, **VALUES}, bench.run, bench.posterior)
+    assert isinstance(fitted, SetFit)
+    return fitted
 
 
 def begun(
@@ -42,19 +42,21 @@ def test_what_follows_does_not_count_and_is_predicted(monkeypatch: pytest.Monkey
     later = recorded.time_s > SPLIT_S
     bench = closed_form_reduced.bench(monkeypatch, recorded)
     sets = [fitted(bench, names) for names in ((), OFFSET)]
-    found = begun(bench, sets)
-    assert found is not None
-    assert found.best.names == OFFSET
-    left_n = [(recorded.force_n - one.force_n)[later] for one in (found.base, found.best)]
-    before, after = (np.sqrt(np.mean(np.square(one))) for one in left_n)
+    beginnings = begun(bench, sets)
+    assert beginnings is not None
+    assert beginnings.best.names == OFFSET
+    left_n = [
+        (recorded.force_n - prediction.force_n)[later] for prediction in (beginnings.base, beginnings.best)
+    ]
+    before, after = (np.sqrt(np.mean(np.square(prediction))) for prediction in left_n)
     assert after < 3.0 * closed_form_reduced.NOISE_N
     assert after < 0.5 * before
     force_n = np.where(later, recorded.force_n + 0.1, recorded.force_n)
     other = closed_form_reduced.bench(monkeypatch, dataclasses.replace(recorded, force_n=force_n))
     same = begun(other, sets)
     assert same is not None
-    assert same.best.theta == pytest.approx(found.best.theta)
-    assert same.best.log_evidence == pytest.approx(found.best.log_evidence)
+    assert same.best.theta == pytest.approx(beginnings.best.theta)
+    assert same.best.log_evidence == pytest.approx(beginnings.best.log_evidence)
 
 
 def test_nothing_is_held_out_of_a_test_without_a_third_hold(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,11 +27,11 @@ CHANCES = st.floats(0.0) | st.floats(0.0, 1e-6)
 @st.composite
 def families(draw: st.DrawFn) -> Family:
     """Draws evidences, near each other or far apart, of a few sets and the set without mechanisms."""
-    names = {tuple(sorted(one)) for one in draw(SETS)} | {()}
+    names = {tuple(sorted(chosen)) for chosen in draw(SETS)} | {()}
     near = st.floats(-4.0, 4.0)
     evidence = draw(st.sampled_from([EVIDENCES, near]))
     said = [(own, Evidences(draw(evidence), draw(evidence))) for own in sorted(names)]
-    return Family([one for own, its in said for one in hypotheses_of(own, its)])
+    return Family([chosen for own, its in said for chosen in hypotheses_of(own, its)])
 
 
 def judged(family: Family) -> Judgement:
@@ -40,7 +40,7 @@ def judged(family: Family) -> Judgement:
 
 @given(families())
 def test_probabilities_of_sets_add_up_to_one(family: Family) -> None:
-    sets = {one.names for one in family.hypotheses}
+    sets = {hypothesis.names for hypothesis in family.hypotheses}
     assert sum(family.probability_of_set(names) for names in sets) == pytest.approx(1.0)
     assert family.nothing + family.smooth + family.probability(NAMES) >= 1.0 - 1e-9
     assert family.probability_of_set(()) + family.probability(NAMES) == pytest.approx(1.0)
@@ -51,21 +51,21 @@ def test_probabilities_of_sets_add_up_to_one(family: Family) -> None:
 def test_a_mechanism_is_no_likelier_than_its_look_alikes_together(family: Family) -> None:
     for name, mechanism in KNOWN.items():
         assert family.probability([name]) <= family.probability(mechanism.group) + 1e-12
-    for one in judged(family).named:
-        assert one.probability == family.probability([one.name])
-        assert one.probability <= one.group_probability + 1e-12
-        assert one.group_probability >= 0.9
-        assert one.name in one.group
+    for member in judged(family).named:
+        assert member.probability == family.probability([member.name])
+        assert member.probability <= member.group_probability + 1e-12
+        assert member.group_probability >= 0.9
+        assert member.name in member.group
 
 
 @given(families())
 def test_a_verdict_is_one_of_three_that_exclude_each_other(family: Family) -> None:
-    found = judged(family)
-    assert (found.verdict == "named") == bool(found.named)
-    assert (found.verdict == "unknown") == (not found.named and family.nothing <= 0.5)
-    assert found.smooth_probability == family.smooth
-    assert found.nothing_probability == family.nothing
-    names = [one.name for one in found.named]
+    verdict = judged(family)
+    assert (verdict.verdict == "named") == bool(verdict.named)
+    assert (verdict.verdict == "unknown") == (not verdict.named and family.nothing <= 0.5)
+    assert verdict.smooth_probability == family.smooth
+    assert verdict.nothing_probability == family.nothing
+    names = [mechanism.name for mechanism in verdict.named]
     assert len(set(names)) == len(names)
     certain = {name for name in NAMES if family.probability([name]) >= 0.9}
     assert certain <= set(names)
@@ -73,8 +73,10 @@ def test_a_verdict_is_one_of_three_that_exclude_each_other(family: Family) -> No
 
 @given(families(), st.floats(-1e4, 1e4))
 def test_a_constant_more_in_all_evidences_changes_nothing(family: Family, constant: float) -> None:
-    moved = Family([replace(one, log_weight=one.log_weight + constant) for one in family.hypotheses])
-    for names in {one.names for one in family.hypotheses}:
+    moved = Family(
+        [replace(hypothesis, log_weight=hypothesis.log_weight + constant) for hypothesis in family.hypotheses]
+    )
+    for names in {hypothesis.names for hypothesis in family.hypotheses}:
         assert moved.probability_of_set(names) == pytest.approx(family.probability_of_set(names), abs=1e-9)
     assert moved.smooth == pytest.approx(family.smooth, abs=1e-9)
     assert moved.nothing == pytest.approx(family.nothing, abs=1e-9)
@@ -87,11 +89,11 @@ def test_each_mechanism_and_what_has_no_name_cost_the_same_prior(
     said = Evidences(alone, smooth)
     fewer = hypotheses_of(tuple(sorted(names)), said)
     more = hypotheses_of((*sorted(names), "stiffness-drift"), said)
-    for less, one in zip(fewer, more, strict=True):
-        assert one.log_weight - less.log_weight == pytest.approx(ODDS, abs=1e-9)
+    for less, mechanism in zip(fewer, more, strict=True):
+        assert mechanism.log_weight - less.log_weight == pytest.approx(ODDS, abs=1e-9)
     assert fewer[0].log_weight == pytest.approx(alone + len(names) * ODDS)
     assert fewer[1].log_weight - fewer[0].log_weight == pytest.approx(smooth - alone + ODDS, abs=1e-9)
-    assert [one.smooth for one in fewer] == [False, True]
+    assert [mechanism.smooth for mechanism in fewer] == [False, True]
 
 
 def of(**nats: float) -> Family:
@@ -100,15 +102,15 @@ def of(**nats: float) -> Family:
     rows += [
         hypotheses_of((name.replace("_", "-"),), Evidences(value, -50.0)) for name, value in nats.items()
     ]
-    return Family([one for row in rows for one in row])
+    return Family([hypothesis for row in rows for hypothesis in row])
 
 
 def test_the_verdicts_by_hand() -> None:
     assert judged(of()).verdict == "nothing-missing"
     # 19 to 1 against, e^6 for: 403 / (403 + 19)
-    found = judged(of(sensor_drift=6.0))
-    assert found.verdict == "named"
-    assert found.named[0].probability == pytest.approx(np.exp(6.0) / (np.exp(6.0) + 19.0))
+    verdict = judged(of(sensor_drift=6.0))
+    assert verdict.verdict == "named"
+    assert verdict.named[0].probability == pytest.approx(np.exp(6.0) / (np.exp(6.0) + 19.0))
     assert judged(of(sensor_drift=5.0)).verdict == "unknown"  # 148 / 167, below nine in ten
     assert judged(of(sensor_drift=2.5)).verdict == "nothing-missing"  # 12 / 31
     smooth = Family([*hypotheses_of((), Evidences(0.0, 3.5))])  # e^3.5 is 33, to 19
@@ -117,10 +119,10 @@ def test_the_verdicts_by_hand() -> None:
 
 
 def test_of_look_alikes_that_share_the_chances_the_likeliest_is_named() -> None:
-    (one,) = judged(of(device_friction=20.0, force_offset=20.5)).named
-    assert one.name == "force-offset"
-    assert one.probability < 0.9
-    assert one.group_probability == pytest.approx(1.0, abs=1e-6)
+    (mechanism,) = judged(of(device_friction=20.0, force_offset=20.5)).named
+    assert mechanism.name == "force-offset"
+    assert mechanism.probability < 0.9
+    assert mechanism.group_probability == pytest.approx(1.0, abs=1e-6)
     assert judged(of(sensor_drift=20.0, stiffness_drift=20.5)).verdict == "unknown"  # not alike
 
 
@@ -129,8 +131,8 @@ def test_a_mechanism_is_not_named_for_a_likelier_look_alike() -> None:
     pair = ("sensor-drift", "stiffness-drift")
     known = {**KNOWN, "sensor-drift": replace(KNOWN["sensor-drift"], look_alikes=pair[1:])}
     assert judge_family(of(sensor_drift=20.0, stiffness_drift=20.5), known, 1.0).named == ()
-    (one,) = judge_family(of(sensor_drift=20.5, stiffness_drift=20.0), known, 1.0).named
-    assert (one.name, one.group) == ("sensor-drift", pair)
+    (mechanism,) = judge_family(of(sensor_drift=20.5, stiffness_drift=20.0), known, 1.0).named
+    assert (mechanism.name, mechanism.group) == ("sensor-drift", pair)
 
 
 def test_a_device_whose_model_knows_few_mechanisms_has_a_verdict() -> None:

@@ -26,17 +26,17 @@ def test_the_parts_of_the_bands_are_what_they_are_called(sd_n: float) -> None:
     problem = toy_problem(surrogate=ToySurrogate(sd_n=sd_n))
     draws = around_truth(600, 0.01)
     draws[:, -1] = 100.0
-    found = bands(problem, draws, np.random.default_rng(0))
+    predicted = bands(problem, draws, np.random.default_rng(0))
     drawn = predictive_draws(problem, draws, np.random.default_rng(0))
-    assert found.sd_model_n == pytest.approx(drawn.mean_n.std(axis=0))
-    assert found.sd_surrogate_n == pytest.approx(problem.predict(draws).sd()[0])
+    assert predicted.sd_model_n == pytest.approx(drawn.mean_n.std(axis=0))
+    assert predicted.sd_surrogate_n == pytest.approx(problem.predict(draws).sd()[0])
     kinds = np.array([p.kind for p in problem.binned.phases])[problem.binned.phase]
-    hold = found.sd_noise_n[kinds == "hold"]
+    hold = predicted.sd_noise_n[kinds == "hold"]
     assert hold == pytest.approx(np.sqrt(NOISE["sd_hold"] ** 2 + 1e-6), rel=0.01)
-    whole = np.diff(found.interval(0.9), axis=0)[0] / (2 * 1.645)
-    assert whole.mean() == pytest.approx(found.sd_total_n.mean(), rel=0.05)
+    whole = np.diff(predicted.interval(0.9), axis=0)[0] / (2 * 1.645)
+    assert whole.mean() == pytest.approx(predicted.sd_total_n.mean(), rel=0.05)
     with pytest.raises(InputError, match=r"0\.5 or 0\.9"):
-        found.interval(0.8)
+        predicted.interval(0.8)
 
 
 def test_bands_cover_further_recordings_of_the_same_skin_as_often_as_they_say() -> None:
@@ -66,10 +66,10 @@ def test_an_error_of_the_model_is_in_the_bands_as_the_recording_shows_it() -> No
     binned = dataclasses.replace(problem.binned, force_n=1.02 * mean)
     problem = dataclasses.replace(problem, binned=binned, model_error=error)
     theta = np.tile([*TRUTH.values(), *NOISE.values()], (200, 1))
-    found = bands(problem, theta, np.random.default_rng(1))
-    np.testing.assert_allclose(found.mean_n, 1.02 * mean, atol=2e-3)
-    assert found.sd_model_n.max() < 0.2 * 0.02 * mean.max()
-    assert found.sd_surrogate_n.max() < 1e-6
+    predicted = bands(problem, theta, np.random.default_rng(1))
+    np.testing.assert_allclose(predicted.mean_n, 1.02 * mean, atol=2e-3)
+    assert predicted.sd_model_n.max() < 0.2 * 0.02 * mean.max()
+    assert predicted.sd_surrogate_n.max() < 1e-6
 
 
 def test_kinds_that_were_not_fitted_take_the_largest_noise() -> None:
@@ -82,8 +82,8 @@ def test_kinds_that_were_not_fitted_take_the_largest_noise() -> None:
 def test_rmse_is_told_by_window_and_kind() -> None:
     problem = toy_problem()
     residual = np.where(problem.binned.phase == 2, 3.0, 1.0)
-    found = rmse(problem.binned, problem.binned.force_n - residual, [(15.0, 45.0), (45.0, 55.0), (0.2, 0.4)])
-    assert found.by_window_n[:2] == (3.0, 1.0)
-    assert np.isnan(found.by_window_n[2])
-    assert found.by_kind_n["hold"] == pytest.approx(np.sqrt(5.0))
-    assert found.whole_n == pytest.approx(np.sqrt((30 * 9 + 100) / 130))
+    errors = rmse(problem.binned, problem.binned.force_n - residual, [(15.0, 45.0), (45.0, 55.0), (0.2, 0.4)])
+    assert errors.by_window_n[:2] == (3.0, 1.0)
+    assert np.isnan(errors.by_window_n[2])
+    assert errors.by_kind_n["hold"] == pytest.approx(np.sqrt(5.0))
+    assert errors.whole_n == pytest.approx(np.sqrt((30 * 9 + 100) / 130))

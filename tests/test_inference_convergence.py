@@ -72,14 +72,14 @@ def test_stuck_walkers_are_named() -> None:
     chains[1, :, 4] = chains[1, 0, 4]
     low = -0.5 * (chains**2).sum(axis=3)
     low[0, :, 7] -= 40.0
-    found = assess(chains, low, ("a", "b"), Limits())
-    assert found.stuck == ((0, 7), (1, 4))
-    assert "2 stuck walkers, ensemble 0 walker 7" in found.verdict.reasons[0]
+    convergence = assess(chains, low, ("a", "b"), Limits())
+    assert convergence.stuck == ((0, 7), (1, 4))
+    assert "2 stuck walkers, ensemble 0 walker 7" in convergence.verdict.reasons[0]
 
 
 def test_burn_in_leaves_the_start_behind() -> None:
     chains = autoregressive((2, 3000, 20, 1), 0.9, np.random.default_rng(4))
     chains += 30 * np.exp(-np.arange(3000) / 20.0)[:, None, None]
-    found = assess(chains, -0.5 * (chains**2).sum(axis=3), ("a",), Limits())
-    assert 100 < found.burn_in < 600
-    assert found.rhat[0] < 1.01
+    convergence = assess(chains, -0.5 * (chains**2).sum(axis=3), ("a",), Limits())
+    assert 100 < convergence.burn_in < 600
+    assert convergence.rhat[0] < 1.01

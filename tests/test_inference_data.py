@@ -41,11 +41,11 @@ def some_posterior(n: int = 120) -> Posterior:
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> tuple[Posterior, az.InferenceData]:
     problem, posterior = toy_problem(), some_posterior()
-    made = to_inference_data(
+    idata = to_inference_data(
         problem, posterior, Provenance("1.2", recording_sha256="abc"), np.random.default_rng(0), 100
     )
     path = tmp_path_factory.mktemp("nc") / "posterior.nc"
-    save_inference_data(path, made)
+    save_inference_data(path, idata)
     assert [p.name for p in path.parent.iterdir()] == ["posterior.nc"]
     return posterior, load_inference_data(path)
 

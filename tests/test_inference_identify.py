@@ -27,18 +27,24 @@ def ridge_draws(n: int = 4000) -> Array:
 
 
 def test_a_parameter_with_its_prior_back_is_said_to_be_uninformed() -> None:
-    found = identifiability(SPACE, ridge_draws())
-    assert found.parameters[2].statement == "p_init: the data does not inform it (posterior = prior)"
-    assert [one.informed for one in found.parameters] == [Informed.WELL, Informed.WELL, Informed.NOT]
-    assert found.parameters[2].contraction == pytest.approx(0.0, abs=0.05)
-    e = found.parameters[0]
+    identified = identifiability(SPACE, ridge_draws())
+    assert identified.parameters[2].statement == "p_init: the data does not inform it (posterior = prior)"
+    assert [parameter.informed for parameter in identified.parameters] == [
+        Informed.WELL,
+        Informed.WELL,
+        Informed.NOT,
+    ]
+    assert identified.parameters[2].contraction == pytest.approx(0.0, abs=0.05)
+    e = identified.parameters[0]
     assert e.contraction == pytest.approx(1 - 12 * 1.01 / 100, abs=0.02)
     assert e.quantiles == pytest.approx(np.exp(5 + np.array([-1.645, 0, 1.645])), rel=0.1)
     assert e.statement.startswith("E: the data informs it: median")
 
 
 def test_a_sentence_without_statistics_says_what_the_test_taught() -> None:
-    sentences = {one.name: one.sentence for one in identifiability(SPACE, ridge_draws()).parameters}
+    sentences = {
+        parameter.name: parameter.sentence for parameter in identifiability(SPACE, ridge_draws()).parameters
+    }
     assert sentences["p_init"].startswith("This test says nothing about the")
     assert "only known to lie in the assumed range" in sentences["p_init"]
     assert "times narrower than assumed" in sentences["E"]
@@ -47,18 +53,18 @@ def test_a_sentence_without_statistics_says_what_the_test_taught() -> None:
 def test_two_separate_ranges_are_said_and_one_of_any_shape_is_not() -> None:
     rng = np.random.default_rng(3)
     two = np.concatenate([0.2 + 0.03 * rng.standard_normal(1500), 0.7 + 0.05 * rng.standard_normal(500)])
-    found = parts(two)
-    assert len(found) == 2
-    np.testing.assert_allclose(found, [(0.15, 0.25), (0.62, 0.78)], atol=0.02)
-    one = (rng.uniform(size=3000), rng.beta(2, 9, 3000), np.full(50, 0.3), 1 - rng.exponential(0.02, 3000))
-    assert [len(parts(draws)) for draws in one] == [1, 1, 1, 1]
+    computed = parts(two)
+    assert len(computed) == 2
+    np.testing.assert_allclose(computed, [(0.15, 0.25), (0.62, 0.78)], atol=0.02)
+    shapes = (rng.uniform(size=3000), rng.beta(2, 9, 3000), np.full(50, 0.3), 1 - rng.exponential(0.02, 3000))
+    assert [len(parts(draws)) for draws in shapes] == [1, 1, 1, 1]
     few = np.concatenate([0.2 + 0.03 * rng.standard_normal(1970), 0.7 + 0.03 * rng.standard_normal(30)])
     assert len(parts(few)) == 1
     space = ParameterSpace((Parameter("E", "Pa", 1.0, np.exp(10.0), "log-uniform"),))
     (learned,) = identifiability(space, space.from_unit(two[:, None])).parameters
-    np.testing.assert_allclose(np.log(learned.ranges) / 10.0, found, atol=1e-6)
+    np.testing.assert_allclose(np.log(learned.ranges) / 10.0, computed, atol=1e-6)
     assert "2 separate ranges fit: " in learned.statement
-    assert identifiability(space, space.from_unit(one[1][:, None])).parameters[0].ranges == ()
+    assert identifiability(space, space.from_unit(shapes[1][:, None])).parameters[0].ranges == ()
 
 
 def test_noise_parameters_at_their_bounds_are_remarked_on() -> None:
@@ -79,10 +85,10 @@ def test_noise_parameters_at_their_bounds_are_remarked_on() -> None:
 
 
 def test_a_ridge_is_named() -> None:
-    found = identifiability(SPACE, ridge_draws()).ridges
-    assert [(r.first, r.second) for r in found] == [("E", "F")]
-    assert found[0].correlation == pytest.approx(-0.99, abs=0.01)
-    assert "E and F form a ridge" in found[0].statement
+    identified = identifiability(SPACE, ridge_draws()).ridges
+    assert [(r.first, r.second) for r in identified] == [("E", "F")]
+    assert identified[0].correlation == pytest.approx(-0.99, abs=0.01)
+    assert "E and F form a ridge" in identified[0].statement
 
 
 def test_a_curved_ridge_is_named() -> None:

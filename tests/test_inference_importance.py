@@ -40,15 +40,15 @@ def full_force(theta: Array, slope: float = 0.0) -> Array:
 def test_weighed_draws_give_the_full_models_posterior() -> None:
     problem = line_problem()
     theta, slope = draws(problem, 4000), 0.02
-    found = weigh(problem, theta, full_force(theta, slope))
+    weighed = weigh(problem, theta, full_force(theta, slope))
     mean, covariance = gaussian(problem, np.zeros((40, 40)))
     exact = mean - [0.0, slope]  # b takes the slope away
-    for j, one in enumerate(corrected(found, theta)[:2]):
+    for j, moments in enumerate(corrected(weighed, theta)[:2]):
         sd = np.sqrt(covariance[j, j])
         expected = exact[j] + sd * ndtri([0.05, 0.5, 0.95])
-        np.testing.assert_allclose(one.quantiles, expected, atol=0.12 * sd)
-        assert one.sd_ratio * theta[:, j].std() == pytest.approx(sd, rel=0.06)
-    b = corrected(found, theta)[1]
+        np.testing.assert_allclose(moments.quantiles, expected, atol=0.12 * sd)
+        assert moments.sd_ratio * theta[:, j].std() == pytest.approx(sd, rel=0.06)
+    b = corrected(weighed, theta)[1]
     raw = theta[:, 1]
     assert b.shift_sd == pytest.approx((exact[1] - raw.mean()) / raw.std(), abs=4 * b.shift_error_sd)
     assert abs(b.shift_sd) > 5 * b.shift_error_sd
@@ -74,32 +74,32 @@ def test_a_permeability_stays_one_when_the_weights_move_it_far() -> None:
     many = 1e-13 * np.exp(1.5 * rng.standard_normal((4000, 1)))
     weights = np.where(np.arange(24) < 4, 0.24, 0.002)
     few = np.sort(many[:24], axis=0)
-    found = Weighed(space, few, np.log(weights), weights, 4.0, float("nan"), Verdict(False, ("",)))
-    (one,) = corrected(found, many)
-    assert 1e-16 <= one.quantiles[0] < one.quantiles[1] < min(one.quantiles[2], np.median(many))
+    weighed = Weighed(space, few, np.log(weights), weights, 4.0, float("nan"), Verdict(False, ("",)))
+    (summary,) = corrected(weighed, many)
+    assert 1e-16 <= summary.quantiles[0] < summary.quantiles[1] < min(summary.quantiles[2], np.median(many))
     expected = np.median(np.log(many)) + weights @ np.log(few[:, 0]) - np.log(few[:, 0]).mean()
-    assert np.log(one.quantiles[1]) == pytest.approx(expected, abs=0.05)
+    assert np.log(summary.quantiles[1]) == pytest.approx(expected, abs=0.05)
 
 
 def test_few_draws_are_judged_by_their_effective_number() -> None:
     problem = line_problem()
     theta = draws(problem, 24)
-    found = weigh(problem, theta, full_force(theta))
-    assert found.verdict.trusted
-    assert np.isnan(found.khat)
-    assert found.effective == pytest.approx(1 / np.sum(found.weights**2))
-    assert f"{found.effective:.1f} effective" in found.verdict.reasons[0]
-    assert "k-hat" not in found.verdict.reasons[0]
+    weighed = weigh(problem, theta, full_force(theta))
+    assert weighed.verdict.trusted
+    assert np.isnan(weighed.khat)
+    assert weighed.effective == pytest.approx(1 / np.sum(weighed.weights**2))
+    assert f"{weighed.effective:.1f} effective" in weighed.verdict.reasons[0]
+    assert "k-hat" not in weighed.verdict.reasons[0]
 
 
 def test_from_200_draws_on_weights_are_pareto_smoothed() -> None:
     problem = line_problem()
     theta = draws(problem, 300)
-    found = weigh(problem, theta, full_force(theta, 0.05))
-    smooth, khat = az.psislw(found.log_ratio)
-    np.testing.assert_allclose(found.weights, np.exp(smooth) / np.exp(smooth).sum(), rtol=1e-8)
-    assert found.khat == pytest.approx(float(khat))
-    assert "k-hat" in found.verdict.reasons[0]
+    weighed = weigh(problem, theta, full_force(theta, 0.05))
+    smooth, khat = az.psislw(weighed.log_ratio)
+    np.testing.assert_allclose(weighed.weights, np.exp(smooth) / np.exp(smooth).sum(), rtol=1e-8)
+    assert weighed.khat == pytest.approx(float(khat))
+    assert "k-hat" in weighed.verdict.reasons[0]
 
 
 def test_a_surrogate_that_is_elsewhere_is_not_trusted() -> None:
@@ -117,10 +117,10 @@ def test_a_failed_run_weighs_nothing_and_none_at_all_is_no_error() -> None:
     theta = draws(problem, 12)
     force = full_force(theta)
     force[3] = np.nan
-    found = weigh(problem, theta, force)
-    assert found.weights[3] == 0.0
-    assert found.weights.sum() == pytest.approx(1.0)
-    assert "1 runs failed" in found.verdict.reasons[0]
+    weighed = weigh(problem, theta, force)
+    assert weighed.weights[3] == 0.0
+    assert weighed.weights.sum() == pytest.approx(1.0)
+    assert "1 runs failed" in weighed.verdict.reasons[0]
     none = weigh(problem, theta, np.full_like(force, np.nan))
     assert (none.effective, none.verdict.trusted) == (0.0, False)
 

@@ -33,25 +33,25 @@ def test_the_toy_surrogate_is_the_toy() -> None:
 
 def test_the_maximum_of_a_line_is_its_least_squares() -> None:
     problem = line_problem()
-    found = find_map(problem, seed=0, starts=2, evaluations=4000)
+    maximum = find_map(problem, seed=0, starts=2, evaluations=4000)
     x = problem.surrogate.columns
     covariance = 2.5e-3 * np.eye(40) + 1e-6 * np.eye(40) + 1e-4 * np.outer(x[1], x[1])
     information = x @ np.linalg.solve(covariance, x.T)
     exact = np.linalg.solve(information, x @ np.linalg.solve(covariance, problem.binned.force_n))
-    assert [found.theta["a"], found.theta["b"]] == pytest.approx(exact, abs=1e-3)
-    assert found.agreement == 1.0
-    assert found == find_map(problem, seed=0, starts=2, evaluations=4000)
+    assert [maximum.theta["a"], maximum.theta["b"]] == pytest.approx(exact, abs=1e-3)
+    assert maximum.agreement == 1.0
+    assert maximum == find_map(problem, seed=0, starts=2, evaluations=4000)
 
 
 def test_starts_on_the_ridge_agree_on_its_height() -> None:
     problem = toy_problem(windows=HOLDS)
-    found = find_map(problem, seed=1, starts=2, evaluations=4000)
+    maximum = find_map(problem, seed=1, starts=2, evaluations=4000)
     truth = problem.vector({k: v for k, v in {**TRUTH, **NOISE}.items() if k in problem.names})
-    assert found.value > problem.log_prob(truth)[0]
-    assert found.value == max(s.value for s in found.starts)
-    assert all(s.value > found.value - 2.0 for s in found.starts)
-    assert problem.log_prob(problem.vector(found.theta))[0] == pytest.approx(found.value, abs=1e-6)
-    assert "of 2 starts" in found.message
+    assert maximum.value > problem.log_prob(truth)[0]
+    assert maximum.value == max(s.value for s in maximum.starts)
+    assert all(s.value > maximum.value - 2.0 for s in maximum.starts)
+    assert problem.log_prob(problem.vector(maximum.theta))[0] == pytest.approx(maximum.value, abs=1e-6)
+    assert "of 2 starts" in maximum.message
 
 
 class Folded(LineSurrogate):
@@ -68,17 +68,17 @@ class Folded(LineSurrogate):
 
 def test_three_kinds_of_search_end_at_one_maximum() -> None:
     problem = dataclasses.replace(line_problem(1), surrogate=Folded())
-    found = find_map(problem, seed=1, starts=6, evaluations=4000)
-    assert min(start.value for start in found.starts) < found.value - 0.3  # there is a lower one besides
-    assert list(found.by_search) == list(optimise.SEARCHES)
-    assert all(found.value - value < 0.1 for value in found.by_search.values())
-    assert "by controlled random search, differential evolution, Gauss-Newton" in found.message
+    maximum = find_map(problem, seed=1, starts=6, evaluations=4000)
+    assert min(start.value for start in maximum.starts) < maximum.value - 0.3  # there is a lower one besides
+    assert list(maximum.by_search) == list(optimise.SEARCHES)
+    assert all(maximum.value - value < 0.1 for value in maximum.by_search.values())
+    assert "by controlled random search, differential evolution, Gauss-Newton" in maximum.message
 
 
 def test_no_more_starts_are_made_where_every_kind_of_search_agrees() -> None:
-    found = find_map(line_problem(), seed=0, starts=8, evaluations=4000)
-    assert [start.search for start in found.starts] == list(optimise.SEARCHES)
-    assert found.agreement == 1.0
+    maximum = find_map(line_problem(), seed=0, starts=8, evaluations=4000)
+    assert [start.search for start in maximum.starts] == list(optimise.SEARCHES)
+    assert maximum.agreement == 1.0
     folded = dataclasses.replace(line_problem(1), surrogate=Folded())
     assert len(find_map(folded, seed=1, starts=5, evaluations=4000).starts) == 5
 
@@ -99,8 +99,8 @@ def test_a_failing_optimiser_is_a_status(monkeypatch: pytest.MonkeyPatch) -> Non
             raise nlopt.RoundoffLimited("roundoff")
 
     monkeypatch.setattr(optimise.nlopt, "opt", Failing)
-    found = find_map(line_problem(), seed=0, starts=2, evaluations=100)
-    assert all(s.status.startswith("failed") for s in found.starts)
+    maximum = find_map(line_problem(), seed=0, starts=2, evaluations=100)
+    assert all(s.status.startswith("failed") for s in maximum.starts)
     with pytest.raises(InputError, match="at least 1 start"):
         find_map(line_problem(), seed=0, starts=0)
 

@@ -44,10 +44,10 @@ def test_what_relaxes_is_the_answer_of_a_spring_and_a_dashpot() -> None:
     time_s = np.arange(0.0, closed_form_model.MOTION.time_s[-1], step_s)
     share = closed_form_model.MOTION.at(time_s) / closed_form_model.MOTION.displacement_m.max()
     relaxed = relaxing(closed_form_model.MOTION, time_s, SIZES.relaxation_s)
-    for found, tau in zip(relaxed, SIZES.relaxation_s, strict=True):
+    for computed, tau in zip(relaxed, SIZES.relaxation_s, strict=True):
         decay, slow = np.exp(-step_s / tau), np.exp(-0.5 * step_s / tau)
         by_steps = lfilter([slow], [1.0, -decay], np.diff(share, prepend=share[0]))
-        np.testing.assert_allclose(found, by_steps, atol=2e-4)
+        np.testing.assert_allclose(computed, by_steps, atol=2e-4)
 
 
 def test_it_is_a_normal_error_of_the_force_in_the_likelihood() -> None:
@@ -70,8 +70,8 @@ def test_it_is_a_normal_error_of_the_force_in_the_likelihood() -> None:
 def test_chains_of_a_posterior_without_it_are_those_of_another() -> None:
     problem = toy_problem()
     errors = [ModelError(closed_form_model.MOTION, problem.binned.edges_s, sd) for sd in (0.01, 0.02)]
-    made = [problem, *(dataclasses.replace(problem, model_error=one) for one in errors)]
-    assert len({one.identity["model error"] for one in made}) == 3
+    problems = [problem, *(dataclasses.replace(problem, model_error=one) for one in errors)]
+    assert len({one.identity["model error"] for one in problems}) == 3
 
 
 def test_a_model_s_error_is_no_doubt_about_its_surrogate() -> None:
@@ -89,10 +89,10 @@ def test_the_mesh_and_the_load_cell_are_allowed_for_where_the_force_is_the_pad_s
     edges_s = np.linspace(0.0, 10.0, 21)
     spec = ModelSpec()
     known = mesh_error(spec.mesh_hash)
-    found = model_error(spec, closed_form_model.MOTION, edges_s)
+    error = model_error(spec, closed_form_model.MOTION, edges_s)
     assert known is not None
-    assert found is not None
-    assert found.amplitude == pytest.approx(np.hypot(known.rms, SIZES.calibration))
+    assert error is not None
+    assert error.amplitude == pytest.approx(np.hypot(known.rms, SIZES.calibration))
     longer = dataclasses.replace(spec.geometry, gauge_m=0.04)
     other = model_error(ModelSpec(geometry=longer), closed_form_model.MOTION, edges_s)
     assert other is not None

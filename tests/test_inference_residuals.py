@@ -39,17 +39,17 @@ def correlated(rng: np.random.Generator, time_s: Array, sd: Array) -> Array:
 
 
 def test_noise_as_assumed_gives_uniform_p_values_and_passes() -> None:
-    found = [at_truth(toy_problem(seed)) for seed in SEEDS]
-    assert sum(not one.passes for one in found) <= 1
+    checks = [at_truth(toy_problem(seed)) for seed in SEEDS]
+    assert sum(not check.passes for check in checks) <= 1
     for p in (
-        [one.p_law for one in found],
-        [one.p_correlation for one in found],
-        [kind.p_sd for one in found for kind in one.kinds],
-        [kind.p_correlation for one in found for kind in one.kinds],
+        [check.p_law for check in checks],
+        [check.p_correlation for check in checks],
+        [kind.p_sd for check in checks for kind in check.kinds],
+        [kind.p_correlation for check in checks for kind in check.kinds],
     ):
         assert stats.kstest(p, "uniform").pvalue > 1e-3
-    assert found[0].sentence.startswith("The residual looks like the assumed noise: in its distribution")
-    assert [(kind.kind, kind.bins) for kind in found[0].kinds] == [
+    assert checks[0].sentence.startswith("The residual looks like the assumed noise: in its distribution")
+    assert [(kind.kind, kind.bins) for kind in checks[0].kinds] == [
         ("rest", 30), ("load", 20), ("hold", 60), ("unload", 20)
     ]  # fmt: skip
 
@@ -74,18 +74,18 @@ def test_noise_as_assumed_passes_at_the_fit_too() -> None:
 def test_other_noise_fails_and_is_named(
     draw: Callable[[np.random.Generator, Array, Array], Array], word: str
 ) -> None:
-    found = [at_truth(with_noise(draw, seed)) for seed in range(10)]
-    assert sum(not one.passes for one in found) >= 8
-    named = [one.sentence for one in found if not one.passes]
+    checks = [at_truth(with_noise(draw, seed)) for seed in range(10)]
+    assert sum(not one.passes for one in checks) >= 8
+    named = [one.sentence for one in checks if not one.passes]
     assert all(one.startswith("The residual is not the assumed noise: ") for one in named)
     assert sum(word in one for one in named) >= 6
 
 
 def test_a_sine_fails_even_where_the_noise_is_fitted_to_it() -> None:
     """The sampled correlation time takes in what it can of a slow oscillation, and not all."""
-    made = with_noise(lambda rng, t, sd: correlated(rng, t, sd) + 0.02 * np.sin(t / 2.0), 1)
-    best = find_map(made, seed=1, starts=2, evaluations=3000)
-    assert not check_residuals(made, made.vector(best.theta)).passes
+    problem = with_noise(lambda rng, t, sd: correlated(rng, t, sd) + 0.02 * np.sin(t / 2.0), 1)
+    best = find_map(problem, seed=1, starts=2, evaluations=3000)
+    assert not check_residuals(problem, problem.vector(best.theta)).passes
 
 
 @pytest.mark.parametrize("nu", [2.0, 6.0, 1e6, np.inf])
@@ -120,8 +120,8 @@ def test_what_the_surrogate_s_error_explains_is_not_left() -> None:
 
 
 def test_few_bins_are_not_tested_by_kind() -> None:
-    found = at_truth(toy_problem(windows=((0.0, 4.0), (15.0, 45.0))))
-    assert [kind.bins for kind in found.kinds] == [4, 30]
-    assert np.isnan(found.kinds[0].p_sd)
-    assert np.isfinite(found.kinds[1].p_sd)
+    check = at_truth(toy_problem(windows=((0.0, 4.0), (15.0, 45.0))))
+    assert [kind.bins for kind in check.kinds] == [4, 30]
+    assert np.isnan(check.kinds[0].p_sd)
+    assert np.isfinite(check.kinds[1].p_sd)
     assert np.isnan(at_truth(toy_problem(windows=((0.0, 1.0),))).p_correlation)

@@ -153,11 +153,11 @@ def test_the_full_run_of_a_recording_is_kept_before_the_next_one_begins(
     recordings = [samples(motion, name, 0.1) for motion, name in zip(motions, "AB", strict=True)]
     joint = join_motions(motions, spans_of(recordings, motions))
     storage.save(tmp_path / "recording" / "motion.h5", joint)
-    run, made = Run(Config.model_construct(), tmp_path / "a.toml", tmp_path, Silent()), list[PadMotion]()
+    run, received = Run(Config.model_construct(), tmp_path / "a.toml", tmp_path, Silent()), list[PadMotion]()
 
     def simulated(spec: ModelSpec, motion: PadMotion, *more: Any, **options: Any) -> Simulation:
-        made.append(motion)
-        if len(made) == 2:
+        received.append(motion)
+        if len(received) == 2:
             raise KeyboardInterrupt
         return stand_in_model.simulate(spec, motion, *more, **options)
 
@@ -165,12 +165,12 @@ def test_the_full_run_of_a_recording_is_kept_before_the_next_one_begins(
     monkeypatch.setattr(maximum, "simulate", simulated)
     with pytest.raises(KeyboardInterrupt):
         maximum._FullModel(run)(theta)
-    found = maximum._FullModel(run)(theta)
-    assert [len(motion.time_s) for motion in made] == [len(m.time_s) for m in (MOTION, SHORT, SHORT)]
+    simulation = maximum._FullModel(run)(theta)
+    assert [len(motion.time_s) for motion in received] == [len(m.time_s) for m in (MOTION, SHORT, SHORT)]
     again = maximum._FullModel(run)(theta)
-    assert len(made) == 3
+    assert len(received) == 3
     for name in ("time_s", "force_n", "gradient_n"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
+        np.testing.assert_array_equal(getattr(again, name), getattr(simulation, name))
 
 
 def test_each_recording_has_its_own_instrument_and_both_have_one_skin(

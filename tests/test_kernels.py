@@ -111,13 +111,13 @@ def test_compiled_code_calls_the_kernels_of_any_laws_by_their_address():
     before, after = (
         List([state(law)[part][place] for law in LAWS.values()]) for part, place in ((0, 3), (1, 0))
     )
-    found, expected = (state(LAWS["strain-stiffening"])[1][1:] for _ in range(2))
+    computed, expected = (state(LAWS["strain-stiffening"])[1][1:] for _ in range(2))
     par, data = (List([getattr(law, name) for law in LAWS.values()]) for name in ("par", "data"))
-    one_after_the_other(kernels, par, data, *given, before, after, *found)
+    one_after_the_other(kernels, par, data, *given, before, after, *computed)
     for law in LAWS.values():
         own, room, _ = state(law)
         law.respond(7.0, 0.5, law.par, law.data, *given, own[3], room[0], *expected)
-    for mine, theirs in zip(found, expected, strict=True):
+    for mine, theirs in zip(computed, expected, strict=True):
         np.testing.assert_array_equal(mine, theirs)
 
 
@@ -135,5 +135,5 @@ def test_forces_are_what_they_were(name):
     theta = THETA | (STRONG if mechanisms else {})
     run = simulate(ModelSpec(refinement=0), MOTION, theta, laws=laws(mechanisms))
     assert run.status == "ok"
-    found = run.at(MOTION.time_s[1:])
-    np.testing.assert_allclose(found, FORCES_N[name], rtol=0, atol=1e-7 * max(FORCES_N[name]))
+    computed = run.at(MOTION.time_s[1:])
+    np.testing.assert_allclose(computed, FORCES_N[name], rtol=0, atol=1e-7 * max(FORCES_N[name]))

@@ -138,12 +138,12 @@ def test_permeability_follows_the_volume_in_a_confined_column():
     model = driven(space.mesh, by_layer(space.mesh.cutis, layer, layer), fixed, values, space=space)
     model.laws = (SOLVED["strain-dependent-permeability"].act.bind({"M_k": exponent}, model.problem.sites),)
     grid = np.union1d(np.concatenate([np.linspace(0.1, 10, 40), 10 + np.geomspace(0.02, 20, 40)]), times)
-    found = {}
+    computed = {}
     for t, step in zip(grid, march(model, model.initial_state(0.0), grid, corner_s=ramp), strict=True):
         if np.isclose(times, t).any():
-            found[float(t)] = step.stages[-1].residual[3 * top + 2].sum() / 1e-6
+            computed[float(t)] = step.stages[-1].residual[3 * top + 2].sum() / 1e-6
     np.testing.assert_allclose(
-        list(found.values()), reference, rtol=4e-3, atol=4e-3 * np.abs(reference).max()
+        list(computed.values()), reference, rtol=4e-3, atol=4e-3 * np.abs(reference).max()
     )
 
 
@@ -165,7 +165,7 @@ def solved_series(rate, motion, compliance=0.0):
         )
 
     corners = motion.time_s
-    times, found, now = [], [], 0.0
+    times, computed, now = [], [], 0.0
     for start, end in pairwise(corners):
         t = np.linspace(start, end, 41)
         run = solve_ivp(
@@ -178,9 +178,9 @@ def solved_series(rate, motion, compliance=0.0):
             max_step=0.05,
         )
         times.extend(t)
-        found.extend(force_of(a, b) for a, b in zip(t, run.y[0], strict=True))
+        computed.extend(force_of(a, b) for a, b in zip(t, run.y[0], strict=True))
         now = run.y[0, -1]
-    return np.array(times), np.array(found)
+    return np.array(times), np.array(computed)
 
 
 BAR_MOTION = PadMotion(
@@ -225,11 +225,11 @@ def test_a_gap_and_a_compliant_frame_delay_each_reversal():
 def test_what_trails_a_gap_is_the_play_operator(heights, gap):
     motion = PadMotion(np.arange(len(heights) + 1.0), np.array([0.0, *heights]))
     fine = np.linspace(0.0, len(heights), 200 * len(heights) + 1)
-    u, p, found = motion.at(fine), 0.0, []
+    u, p, computed = motion.at(fine), 0.0, []
     for value in u:
         p = max(value - gap, min(value, p))
-        found.append(p)
-    np.testing.assert_allclose(trailing(motion, gap).at(fine), found, atol=6e-3)
+        computed.append(p)
+    np.testing.assert_allclose(trailing(motion, gap).at(fine), computed, atol=6e-3)
 
 
 @settings(max_examples=60, deadline=None)
@@ -250,19 +250,19 @@ def test_the_element_under_a_constant_force_creeps_by_its_exponential():
 
 @pytest.mark.parametrize("name", sorted(SOLVED))
 def test_a_neutral_mechanism_gives_the_base_models_run(base, name):
-    found = simulate(ModelSpec(), SHORT, THETA | SOLVED[name].neutral, laws=laws([SOLVED[name]]))
-    assert found.status == "ok"
-    np.testing.assert_allclose(found.at(base.time_s), base.force_n, atol=1e-4 * base.force_n.max())
+    simulation = simulate(ModelSpec(), SHORT, THETA | SOLVED[name].neutral, laws=laws([SOLVED[name]]))
+    assert simulation.status == "ok"
+    np.testing.assert_allclose(simulation.at(base.time_s), base.force_n, atol=1e-4 * base.force_n.max())
 
 
 @pytest.mark.parametrize("name", sorted(IN_SERIES & set(SOLVED)))
 def test_a_shortcut_is_near_the_full_model(base, name):
     """RMS within a tenth of the effect."""
     mechanism = SOLVED[name]
-    found = simulate(ModelSpec(), SHORT, strong(mechanism.name), laws=laws([mechanism]))
+    simulation = simulate(ModelSpec(), SHORT, strong(mechanism.name), laws=laws([mechanism]))
     columns = {key: np.array([value]) for key, value in STRONG.items()}
     times = np.arange(0.0, 18.0, 0.2)
     quick = observed([mechanism], columns, SHORT, lambda t: np.atleast_2d(base.at(t)))(times)[0]
-    effect = np.sqrt(np.mean((found.at(times) - base.at(times)) ** 2))
+    effect = np.sqrt(np.mean((simulation.at(times) - base.at(times)) ** 2))
     assert effect > 1e-3
-    assert np.sqrt(np.mean((quick - found.at(times)) ** 2)) < 0.1 * effect
+    assert np.sqrt(np.mean((quick - simulation.at(times)) ** 2)) < 0.1 * effect

@@ -77,17 +77,17 @@ def test_a_drained_bar_pulls_with_the_factor_times_the_force_without(rate, time_
     along = fibres(BAR.problem.sites, np.array([1.0, 0.0, 0.0]), 0.5 * MU, 1.2)
     law = bound("stiffness-drift", stiffness_rate=rate, stiffness_time=time_s)
     t, without = pulled(motion, along)
-    _, found = pulled(motion, law, along)
+    _, computed = pulled(motion, law, along)
     factor = 1 + rate * time_s * (1 - np.exp(-t / time_s))
-    np.testing.assert_allclose(found, factor * without, atol=3e-4 * without.max())
+    np.testing.assert_allclose(computed, factor * without, atol=3e-4 * without.max())
 
 
 def test_a_drift_without_end_is_straight_and_pieces_follow_each_other():
     law = drifting(BAR.problem.sites, [(0.0, 1.0, 2e-3, np.inf), (20.0, 1.04, -1e-3, np.inf)])
-    t, found = pulled(HELD, law)
+    t, computed = pulled(HELD, law)
     factor = 1 + np.where(t < 20.0, 2e-3 * t, 0.04 - 1e-3 * (t - 20.0))
     held = t >= 1e-6
-    np.testing.assert_allclose(found[held], factor[held] * elastic_force(1 + STRETCH_M)[0], rtol=2e-5)
+    np.testing.assert_allclose(computed[held], factor[held] * elastic_force(1 + STRETCH_M)[0], rtol=2e-5)
 
 
 def test_branches_relax_the_stress_that_has_drifted():
@@ -95,12 +95,12 @@ def test_branches_relax_the_stress_that_has_drifted():
     rate, end_s, g, tau = 4e-3, 50.0, 0.8, 5.0
     viscous = bound("solid-viscoelasticity", g_1=g, tau_1=tau, g_2=0.0, tau_2=1.0)
     drift = bound("stiffness-drift", stiffness_rate=rate, stiffness_time=end_s)
-    t, found = pulled(HELD, viscous, drift, steps=200)
+    t, computed = pulled(HELD, viscous, drift, steps=200)
     grown = rate * (np.exp(-t / end_s) - np.exp(-t / tau)) / (1 / tau - 1 / end_s)
     factor = 1 + rate * end_s * (1 - np.exp(-t / end_s)) + g * (np.exp(-t / tau) + grown)
     held = t >= 1e-6
     expected = factor * elastic_force(1 + STRETCH_M)[0]
-    np.testing.assert_allclose(found[held], expected[held], rtol=5e-5)
+    np.testing.assert_allclose(computed[held], expected[held], rtol=5e-5)
 
 
 def test_a_factor_is_on_the_solids_own_stress_and_not_on_the_pressure():
@@ -142,9 +142,9 @@ def test_moduli_that_would_vanish_are_refused_and_those_that_nearly_do_stay_abov
         bound("stiffness-drift", stiffness_rate=-0.011, stiffness_time=100.0)
     law = bound("stiffness-drift", stiffness_rate=-0.01, stiffness_time=100.0)
     motion = PadMotion(np.array([0.0, 1e-6, 1000.0]), 2 * STRETCH_M * np.array([0.0, 1.0, 1.0]))
-    t, found = pulled(motion, law)
+    t, computed = pulled(motion, law)
     held, rest = t >= 1e-6, elastic_force(1 + STRETCH_M)[0]
-    np.testing.assert_allclose(found[held], rest * np.maximum(np.exp(-t[held] / 100.0), LEAST), rtol=2e-4)
+    np.testing.assert_allclose(computed[held], rest * np.maximum(np.exp(-t[held] / 100.0), LEAST), rtol=2e-4)
 
 
 # A set that stays

@@ -55,18 +55,18 @@ def test_a_neutral_mechanism_leaves_the_residual_as_it_is(problem, name):
     x = unknowns(problem, 1)
     base, off = (skin(problem), skin(problem, name, **SOLVED[name].neutral))
     assert off.laws[0].opening_m == 0.0
-    expected, found = (m.residual(x, 0.7, m.initial_state(300.0))[0] for m in (base, off))
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
+    expected, computed = (m.residual(x, 0.7, m.initial_state(300.0))[0] for m in (base, off))
+    np.testing.assert_allclose(computed, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("name", AT_POINTS)
 def test_a_mechanism_off_its_neutral_value_changes_the_residual(problem, name):
     x = unknowns(problem, 1)
     base, on = skin(problem), skin(problem, name)
-    expected, found = (m.residual(x, 0.7, m.initial_state(300.0))[0] for m in (base, on))
+    expected, computed = (m.residual(x, 0.7, m.initial_state(300.0))[0] for m in (base, on))
     n = 3 * problem.space.n_nodes
     changed = [
-        np.abs(found - expected)[rows].max() / np.abs(expected)[rows].max()
+        np.abs(computed - expected)[rows].max() / np.abs(expected)[rows].max()
         for rows in (slice(n), slice(n, None))
     ]
     assert max(changed) > 1e-4
@@ -174,11 +174,11 @@ def test_permeability_follows_the_volume(problem):
 def test_springs_below_answer_a_shift_along_the_arm_by_their_stiffness(problem):
     x = np.zeros(problem.space.dofs)
     x[0 : 3 * problem.space.n_nodes : 3] = 1e-4
-    found = [
+    computed = [
         m.residual(x, 1.0, m.initial_state(0.0))[0]
         for m in (skin(problem), skin(problem, "bottom-adherence"))
     ]
-    force = (found[1] - found[0])[: 3 * problem.space.n_nodes].reshape(-1, 3)
+    force = (computed[1] - computed[0])[: 3 * problem.space.n_nodes].reshape(-1, 3)
     assert force[:, 0].sum() == pytest.approx(STRONG["adherence"] * 1e-4 * 0.105 * 0.084, rel=1e-3)
     np.testing.assert_allclose(force[:, 1:], 0.0, atol=1e-12)
 
@@ -196,11 +196,13 @@ def test_leakage_of_a_uniform_pressure_is_conductance_times_the_open_area(proble
     x = np.zeros(problem.space.dofs)
     n = 3 * problem.space.n_nodes
     x[n:] = 2e3
-    found = [
+    computed = [
         m.residual(x, 5.0, m.initial_state(2e3))[0] for m in (skin(problem), skin(problem, "fluid-leakage"))
     ]
     area = 1e-6 * (105 * 84 - 8 * 4 - (17 * 7 + 8 * 5))
-    assert -(found[1] - found[0])[n:].sum() == pytest.approx(STRONG["leakage"] * 5.0 * 2e3 * area, rel=1e-3)
+    assert -(computed[1] - computed[0])[n:].sum() == pytest.approx(
+        STRONG["leakage"] * 5.0 * 2e3 * area, rel=1e-3
+    )
     assert not set(open_surface(problem)) & set(problem.mesh.facets["pad"])
 
 
@@ -211,14 +213,14 @@ def test_pre_stretched_skin_pulls_as_skin_that_was_pulled_slowly_before():
     motion = PadMotion(np.array([0.0, 10.0]), np.array([0.0, 4e-3]))
     whole = PadMotion(np.array([0.0, 10.0, 20.0]), np.array([0.0, opening_m, opening_m + 4e-3]))
     spec = ModelSpec()
-    found = simulate(spec, motion, strong("pre-stretch") | theta, laws=laws([TISSUE["pre-stretch"]]))
+    simulation = simulate(spec, motion, strong("pre-stretch") | theta, laws=laws([TISSUE["pre-stretch"]]))
     slow = simulate(spec, whole, theta)
     times = np.linspace(0.0, 10.0, 6)
-    assert found.status == "ok"
-    assert found.time_s[0] == 0.0
-    assert found.force_n[0] == 0.0
+    assert simulation.status == "ok"
+    assert simulation.time_s[0] == 0.0
+    assert simulation.force_n[0] == 0.0
     expected = slow.at(10.0 + times) - slow.at(np.array([10.0]))
-    np.testing.assert_allclose(found.at(times), expected, atol=0.01 * expected.max())
+    np.testing.assert_allclose(simulation.at(times), expected, atol=0.01 * expected.max())
 
 
 def test_tissue_mechanisms_need_the_reaction(tmp_path):

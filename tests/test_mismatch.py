@@ -40,7 +40,7 @@ def concealing(seed: int, names: Sequence[str] = (), **values: float) -> LogPost
     """The toy's recording with mechanisms at work, and the posterior that knows of none."""
     plain = toy_problem(seed)
     mechanisms = tuple(KNOWN[name] for name in names)
-    theta = [*TRUTH.values(), *(values[p.name] for one in mechanisms for p in one.parameters)]
+    theta = [*TRUTH.values(), *(values[p.name] for mechanism in mechanisms for p in mechanism.parameters)]
     seen = ObservedSurrogate(ToySurrogate(), mechanisms, closed_form_model.MOTION).predict([theta]).mean[0]
     alone = ToySurrogate().predict([list(TRUTH.values())]).mean[0]
     binned = dataclasses.replace(plain.binned, force_n=plain.binned.force_n + seen - alone)
@@ -64,7 +64,7 @@ def building(alone: LogPosterior, names: Sequence[str]) -> LogPosterior:
 
 def test_the_chance_of_the_farthest_window_is_uniform_where_nothing_is_missing() -> None:
     fits = [fitted(alone) for alone in map(concealing, range(12))]
-    chances = [locate(one, one.theta, 1).chance for one in fits]
+    chances = [locate(each_fit, each_fit.theta, 1).chance for each_fit in fits]
     assert kstest(chances, "uniform").pvalue > 0.01
     off = concealing(0, ("viscous-drag",), drag=30.0)
     assert locate(fitted(off), fits[0].theta, 1).chance < 1e-6
@@ -89,13 +89,13 @@ def test_what_the_model_is_wrong_by_is_no_mismatch(share: float) -> None:
 @pytest.mark.parametrize("scale", [1.0, 0.7])
 def test_the_chance_of_a_window_farther_than_all_draws_is_read_from_their_tail(scale: float) -> None:
     """The largest of 200 Gaussians has a known exceedance probability, whatever their sd."""
-    found = []
+    computed = []
     for seed in range(20):
         tall = scale * np.abs(np.random.default_rng(seed).standard_normal((1000, 200))).max(axis=1)
         for chance in (0.3, 1e-3, 1e-5):
             height = scale * norm.isf(0.5 * (1.0 - (1.0 - chance) ** (1.0 / 200.0)))
-            found.append(np.log(exceedance_probability(tall, height, 0.1) / chance))
-    by_chance = np.reshape(found, (20, 3))
+            computed.append(np.log(exceedance_probability(tall, height, 0.1) / chance))
+    by_chance = np.reshape(computed, (20, 3))
     assert np.all(np.abs(by_chance.mean(axis=0)) < np.log([1.05, 1.3, 2.0]))
     assert np.all(by_chance.std(axis=0) < np.log([1.1, 1.7, 3.0]))
 
@@ -103,15 +103,15 @@ def test_the_chance_of_a_window_farther_than_all_draws_is_read_from_their_tail(s
 def test_a_fit_where_nothing_is_possible_has_no_weight() -> None:
     alone = dataclasses.replace(concealing(0), excludes=lambda space, theta: np.ones(len(theta), bool))
     middle = alone.named(alone.from_sampling(np.mean(alone.bounds, axis=0)))
-    found = fit_near((), alone, middle)
-    assert weight(found) == found.value == -np.inf
-    assert np.all(np.isfinite(found.covariance))
+    near_fit = fit_near((), alone, middle)
+    assert weight(near_fit) == near_fit.value == -np.inf
+    assert np.all(np.isfinite(near_fit.covariance))
 
 
 def test_what_is_off_at_infinity_is_climbed_to_from_there() -> None:
     """Creep of friction has an infinite time constant where there is none."""
     both = tuple(catalogue()[name] for name in ("device-friction", "friction-creep"))
-    names = tuple(one.name for one in both)
+    names = tuple(mechanism.name for mechanism in both)
     truth = {"Fc": 0.08, "presliding": 5e-5, "friction_start": 0.0, "friction_tau": 15.0}
     seen = ObservedSurrogate(ToySurrogate(), both, closed_form_model.MOTION)
     plain = concealing(0)
@@ -122,12 +122,12 @@ def test_what_is_off_at_infinity_is_climbed_to_from_there() -> None:
     binned = dataclasses.replace(plain.binned, force_n=plain.binned.force_n + gap[0])
     wide = dataclasses.replace(plain, binned=binned, surrogate=seen)
     base = fitted(dataclasses.replace(plain, binned=binned))
-    neutral = {name: value for one in both for name, value in one.neutral.items()}
-    parts = [part for one in both for part in one.whole_or_parts]
-    found = fit(names, wide, base.theta, neutral, 1, parts)
+    neutral = {name: value for mechanism in both for name, value in mechanism.neutral.items()}
+    parts = [part for mechanism in both for part in mechanism.whole_or_parts]
+    joint = fit(names, wide, base.theta, neutral, 1, parts)
     best = fit_near(names, wide, {**base.theta, **TRUTH, **truth})
-    assert found.value > best.value - 0.5
-    assert found.theta["friction_tau"] == pytest.approx(15.0, rel=0.3)
+    assert joint.value > best.value - 0.5
+    assert joint.theta["friction_tau"] == pytest.approx(15.0, rel=0.3)
     assert value_for_multiple(2.0, 30.0, np.inf) == 15.0
     assert value_for_multiple(-1.0, 30.0, np.inf) == np.inf
     assert value_for_multiple(2.0, 0.3, 0.1) == pytest.approx(0.5)
@@ -153,7 +153,7 @@ def test_evidence_is_that_of_a_line_in_closed_form() -> None:
     problem = line_problem()
     priors = dataclasses.replace(problem.noise_priors, nu=(1e4, 1.001e4))  # at 1e6 lgamma rounds
     problem = dataclasses.replace(problem, noise_priors=priors)
-    found = fitted(problem)
+    top = fitted(problem)
     columns, sd = problem.surrogate.columns, 0.05  # type: ignore[attr-defined]
     noise = (sd**2 + 1e-6) * np.eye(columns.shape[1]) + 1e-4 * np.outer(columns[1], columns[1])
     force = problem.chain.force_n
@@ -162,7 +162,7 @@ def test_evidence_is_that_of_a_line_in_closed_form() -> None:
     left = force - best @ columns
     peak = -0.5 * (left @ np.linalg.solve(noise, left) + np.linalg.slogdet(2.0 * np.pi * noise)[1])
     exact = peak + np.log(2.0 * np.pi) - 0.5 * np.linalg.slogdet(precision)[1] - np.log(4.0)
-    assert found.log_evidence == pytest.approx(exact, abs=0.05)
+    assert top.log_evidence == pytest.approx(exact, abs=0.05)
 
 
 def test_climbs_reach_at_least_what_the_global_search_finds() -> None:
@@ -235,8 +235,8 @@ def test_a_mesh_that_is_off_by_a_factor_stays_inside_the_intervals() -> None:
         skin = ToySurrogate(sd_n=1e-9)
         error = allowing(0.004 if allows else 0.0)
         alone = dataclasses.replace(right, binned=off, surrogate=skin, model_error=error)
-        found = resample(fitted(alone), 1)
-        force = skin.predict(found.draws[:, : len(TRUTH)]).mean.max(axis=1)
+        resampled = resample(fitted(alone), 1)
+        force = skin.predict(resampled.draws[:, : len(TRUTH)]).mean.max(axis=1)
         low, high = np.quantile(force, [0.05, 0.95])
         assert (low < truth < high) == inside, (low, truth, high)
 
@@ -287,15 +287,15 @@ def test_an_error_that_the_surrogate_denies_is_held_by_its_spring() -> None:
     binned = dataclasses.replace(problem.binned, force_n=40.0 * slope)
     near = tuple(dataclasses.replace(p, lower=-1e-4, upper=1e-4) for p in problem.surrogate.space.parameters)
     held = dataclasses.replace(problem, binned=binned, material=ParameterSpace(near))
-    found = gauss_newton(held, np.mean(held.bounds, axis=0), None)
+    top = gauss_newton(held, np.mean(held.bounds, axis=0), None)
     information = np.sum(slope**2) / (0.05**2 + 1e-6)
     expected = (40.0 * information + 300.0) / (information + 101.0)
-    np.testing.assert_allclose(found.latent, [expected], rtol=1e-3)
+    np.testing.assert_allclose(top.latent, [expected], rtol=1e-3)
     # what is known of the line is what the density's curvature says, by differences along each parameter
     low, high = held.bounds
     step = np.diag(0.1 * (high - low))[:2]
     middle = np.mean(held.bounds, axis=0)
-    middle[2:] = found.vector[2:]
+    middle[2:] = top.vector[2:]
     up, here, down = (held.log_prob(middle + sign * step) for sign in (1, 0, -1))
     at = gauss_newton(held, middle, None, 0)
     np.testing.assert_allclose(np.diag(at.information)[:2], (2 * here - up - down) / 0.01, rtol=0.02)
@@ -308,8 +308,8 @@ def test_starts_are_among_those_that_can_be() -> None:
     ratio = problem.from_sampling(trials)[:, 1] / problem.from_sampling(trials)[:, 0]
     assert (ratio > 2.0).sum() > 50
     possible = trials[ratio <= 2.0]
-    for one, other in zip(likely(problem, trials, 6), likely(problem, possible, 6), strict=True):
-        np.testing.assert_array_equal(one, other)
+    for start, other in zip(likely(problem, trials, 6), likely(problem, possible, 6), strict=True):
+        np.testing.assert_array_equal(start, other)
 
 
 def test_what_a_posterior_rules_out_is_part_of_what_it_is() -> None:
@@ -318,7 +318,7 @@ def test_what_a_posterior_rules_out_is_part_of_what_it_is() -> None:
         dataclasses.replace(plain, excludes=subcutis_too_stiff),
         dataclasses.replace(plain, sure_within_n=1.0),
     ]
-    assert len({one.identity["parameters"] for one in (plain, *others)}) == 3
+    assert len({posterior.identity["parameters"] for posterior in (plain, *others)}) == 3
 
 
 def test_the_most_probable_error_of_a_surrogate_that_knows_nothing_is_found() -> None:
@@ -337,7 +337,9 @@ def test_samples_refute_no_step_beside_what_smooths_or_shifts_it(smoother: str |
     alone = concealing(0)
     edges_s = alone.binned.edges_s
     none = Jumps(edges_s, *np.zeros((2, len(edges_s))))
-    theta = {name: value for one in known.values() for name, value in one.neutral.items()}
+    theta = {name: value for mechanism in known.values() for name, value in mechanism.neutral.items()}
     theta |= {"event_1_step": 0.03}
-    found = Fit(names, alone, theta, 0.0, 0.0, np.eye(1), np.zeros(1))
-    assert refuted(found, known, closed_form_model.MOTION, none) == ([] if smoother else ["sensor-events"])
+    neutral_fit = Fit(names, alone, theta, 0.0, 0.0, np.eye(1), np.zeros(1))
+    assert refuted(neutral_fit, known, closed_form_model.MOTION, none) == (
+        [] if smoother else ["sensor-events"]
+    )

@@ -103,23 +103,23 @@ def test_draws_that_spread_in_as_many_directions_as_there_are_draws_do_not_hide_
         rng = np.random.default_rng(seed)
         first, second = (rng.standard_normal((DRAWS, 10)) @ spread.T for _ in range(2))
         gains.append(expected_gain([first, apart + second], np.eye(60), [1.0, 1.0], seed))
-    assert min(one.nats for one in gains) > 0.25
-    assert max(one.nats for one in gains) < exact(4.0)
-    assert max(one.standard_error for one in gains) < 0.3
+    assert min(estimate.nats for estimate in gains) > 0.25
+    assert max(estimate.nats for estimate in gains) < exact(4.0)
+    assert max(estimate.standard_error for estimate in gains) < 0.3
 
 
 def test_nothing_is_learnt_about_hypotheses_that_are_the_same() -> None:
     forces, noise = gaussians(0.0, 20, 0)
-    found = expected_gain([forces[0], forces[0].copy()], noise, [1.0, 3.0], 0)
-    assert found.nats == 0.0
-    assert found.named == pytest.approx(0.25**2 + 0.75**2)
+    gain = expected_gain([forces[0], forces[0].copy()], noise, [1.0, 3.0], 0)
+    assert gain.nats == 0.0
+    assert gain.named == pytest.approx(0.25**2 + 0.75**2)
 
 
 def test_a_gain_is_at_most_the_entropy_of_the_hypotheses_and_repeats() -> None:
     forces, noise = gaussians(12.0, 12, 0)
-    found = expected_gain(forces, noise, [1.0, 3.0], 5)
-    assert found.nats == pytest.approx(-0.25 * np.log(0.25) - 0.75 * np.log(0.75), abs=1e-3)
-    assert found == expected_gain(forces, noise, [1.0, 3.0], 5)
+    gain = expected_gain(forces, noise, [1.0, 3.0], 5)
+    assert gain.nats == pytest.approx(-0.25 * np.log(0.25) - 0.75 * np.log(0.75), abs=1e-3)
+    assert gain == expected_gain(forces, noise, [1.0, 3.0], 5)
 
 
 def test_too_few_draws_are_refused() -> None:
@@ -133,12 +133,12 @@ def test_too_few_draws_are_refused() -> None:
 def test_protocols_vary_the_recordings_own_motion() -> None:
     amplitude, speed, hold = own(closed_form_model.MOTION)
     assert (amplitude, speed, hold) == pytest.approx((9e-3, OWN_SPEED, 30.0))
-    listed = {one.name: one for one in variations(closed_form_model.MOTION, LIMITS)}
+    listed = {variation.name: variation for variation in variations(closed_form_model.MOTION, LIMITS)}
     assert len(listed) == 9
-    for one in listed.values():
-        assert np.all(np.diff(one.motion.time_s) > 0.0)
-        assert one.motion.displacement_m[0] == one.motion.displacement_m.min() == 0.0
-        assert one.sentence.endswith(".")
+    for variation in listed.values():
+        assert np.all(np.diff(variation.motion.time_s) > 0.0)
+        assert variation.motion.displacement_m[0] == variation.motion.displacement_m.min() == 0.0
+        assert variation.sentence.endswith(".")
     slow = listed["quarter speed"].motion
     assert np.diff(slow.displacement_m)[1] / np.diff(slow.time_s)[1] == pytest.approx(OWN_SPEED / 4)
     kinds = [p.kind for p in phases_of(listed["same again"].motion)]
@@ -187,20 +187,24 @@ def fitted(name: str, **values: float) -> Fit:
 
 
 def judged(fits: Sequence[Fit], ask: AnswerTasks = asked) -> list[Experiment]:
-    return ranked([weigh(one, fits, KNOWN, ask, 0) for one in variations(closed_form_model.MOTION, LIMITS)])
+    return ranked(
+        [weigh(variation, fits, KNOWN, ask, 0) for variation in variations(closed_form_model.MOTION, LIMITS)]
+    )
 
 
 def test_friction_is_told_from_drag_by_another_speed_and_not_by_a_repeat() -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
     table = judged(fits)
-    by_name = {one.protocol.name: one for one in table}
+    by_name = {experiment.protocol.name: experiment for experiment in table}
     assert table[0].protocol.name in ("quarter speed", "five times faster")
     assert by_name["five times faster"].gain_bits > 0.5
     assert by_name["quarter speed"].gain_bits > 0.3
     assert by_name["same again"].gain_bits < 0.05
     assert by_name["half displacement"].gain_bits < 0.05
-    assert all(one.possible_bits == pytest.approx(1.0) for one in table)
-    assert [one.gain_bits for one in table] == sorted((one.gain_bits for one in table), reverse=True)
+    assert all(experiment.possible_bits == pytest.approx(1.0) for experiment in table)
+    assert [experiment.gain_bits for experiment in table] == sorted(
+        (experiment.gain_bits for experiment in table), reverse=True
+    )
 
 
 def test_the_figure_shows_every_protocol_that_could_be_judged() -> None:
@@ -220,7 +224,9 @@ def test_failed_runs_are_counted_and_leave_a_row() -> None:
 
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
     table = judged(fits, failing)
-    assert all(np.isnan(one.gain_bits) and one.failed == 2 * (DRAWS - 3) for one in table)
+    assert all(
+        np.isnan(experiment.gain_bits) and experiment.failed == 2 * (DRAWS - 3) for experiment in table
+    )
     with pytest.raises(InputError, match="at least two"):
         judged(fits[:1])
 
@@ -230,12 +236,12 @@ def test_changes_of_the_most_telling_tests_are_judged_and_tell_more() -> None:
     fits = [fitted("rub", rubbing=4e-3), fitted("drag", dragging=DRAG)]
     others = ("quarter speed", "five times faster")
     first = [one for one in variations(closed_form_model.MOTION, LIMITS) if one.name not in others]
-    found = search(lambda one: weigh(one, fits, KNOWN, asked, 0), first, LIMITS, 1)
-    listed = [one for one in found if one.protocol in first]
-    assert found[0].protocol not in first
-    assert found[0].gain_bits > listed[0].gain_bits + 0.1
+    experiments = search(lambda one: weigh(one, fits, KNOWN, asked, 0), first, LIMITS, 1)
+    listed = [one for one in experiments if one.protocol in first]
+    assert experiments[0].protocol not in first
+    assert experiments[0].gain_bits > listed[0].gain_bits + 0.1
     again = search(lambda one: weigh(one, fits, KNOWN, asked, 0), first, LIMITS, 1)
-    assert [one.protocol for one in again] == [one.protocol for one in found]
+    assert [one.protocol for one in again] == [one.protocol for one in experiments]
     sure = search(lambda one: Experiment(one, 1.0, 0.0, 1.0, 1.0, 0), first, LIMITS, 1)
     assert len(sure) == len(first)
 
@@ -244,16 +250,16 @@ def test_changes_of_the_most_telling_tests_are_judged_and_tell_more() -> None:
 @given(st.integers(0, 10**6), st.floats(60.0, 3000.0))
 def test_changed_tests_stay_within_the_limits_of_the_device(seed: int, longest_s: float) -> None:
     rng, limits = np.random.default_rng(seed), Limits(8e-3, (2e-4, 2e-3), longest_s)
-    one = variations(closed_form_model.MOTION, limits)[seed % 9]
+    protocol = variations(closed_form_model.MOTION, limits)[seed % 9]
     for _ in range(4):
-        one = changed(one, limits, "changed", rng)
-        speed = np.abs(np.diff(one.motion.displacement_m) / np.diff(one.motion.time_s))
-        assert one.motion.displacement_m.max() <= limits.largest_m * (1.0 + 1e-9)
+        protocol = changed(protocol, limits, "changed", rng)
+        speed = np.abs(np.diff(protocol.motion.displacement_m) / np.diff(protocol.motion.time_s))
+        assert protocol.motion.displacement_m.max() <= limits.largest_m * (1.0 + 1e-9)
         assert np.all(speed[speed > 0.0] <= 2e-3 * (1.0 + 1e-6))
         assert np.all(speed[speed > 0.0] >= 2e-4 * (1.0 - 1e-6))
-        ramps_s = sum(2.0 * cycle.reach_m / cycle.speed_m_s for cycle in one.cycles)
-        assert one.motion.time_s[-1] <= max(longest_s, 5.0 + ramps_s) * (1.0 + 1e-9)
-        assert one.sentence.endswith(".")
+        ramps_s = sum(2.0 * cycle.reach_m / cycle.speed_m_s for cycle in protocol.cycles)
+        assert protocol.motion.time_s[-1] <= max(longest_s, 5.0 + ramps_s) * (1.0 + 1e-9)
+        assert protocol.sentence.endswith(".")
 
 
 def test_sets_with_look_alikes_in_the_place_of_the_likeliest_compete() -> None:
@@ -261,20 +267,20 @@ def test_sets_with_look_alikes_in_the_place_of_the_likeliest_compete() -> None:
     alike = fitted("drag", dragging=DRAG)
     both = dataclasses.replace(alike, names=("drag", "rub"), log_evidence=1.0)
     none = dataclasses.replace(alike, names=(), log_evidence=3.0)
-    found = [none, alike, both, likely]
-    assert [one.names for one in compete(found, ["rub"], KNOWN)] == [("rub",), ("drag",)]
+    fits = [none, alike, both, likely]
+    assert [fit.names for fit in compete(fits, ["rub"], KNOWN)] == [("rub",), ("drag",)]
     ruled_out = dataclasses.replace(alike, log_evidence=9.0 - ChoiceSettings().open - 0.1)
-    assert [one.names for one in compete([none, ruled_out, likely], ["rub"], KNOWN)] == [("rub",)]
+    assert [fit.names for fit in compete([none, ruled_out, likely], ["rub"], KNOWN)] == [("rub",)]
     impossible = dataclasses.replace(alike, log_evidence=-np.inf)
-    assert [one.names for one in compete([none, impossible, likely], ["rub"], KNOWN)] == [("rub",)]
+    assert [fit.names for fit in compete([none, impossible, likely], ["rub"], KNOWN)] == [("rub",)]
 
 
 def test_noise_of_a_test_to_come_is_that_of_the_fit() -> None:
-    found = fitted("rub", rubbing=4e-3)
-    covariance = noise_of(found, closed_form_model.MOTION, found.log_posterior.binned.edges_s)
+    fit = fitted("rub", rubbing=4e-3)
+    covariance = noise_of(fit, closed_form_model.MOTION, fit.log_posterior.binned.edges_s)
     kinds = [p.kind for p in phases_of(closed_form_model.MOTION)]
     phase = np.searchsorted(
-        [p.end_s for p in phases_of(closed_form_model.MOTION)], found.log_posterior.binned.time_s
+        [p.end_s for p in phases_of(closed_form_model.MOTION)], fit.log_posterior.binned.time_s
     )
     expected = [NOISE[f"sd_{kinds[i]}"] ** 2 + 1e-6 for i in phase]
     np.testing.assert_allclose(np.diag(covariance), expected, rtol=1e-12)
@@ -286,7 +292,7 @@ def test_noise_of_a_test_to_come_is_that_of_the_fit() -> None:
 
 def made(fits: Sequence[Fit]) -> Any:
     """A search that has made these fits."""
-    return SimpleNamespace(fits={one.names: SimpleNamespace(fit=one) for one in fits})
+    return SimpleNamespace(fits={fit.names: SimpleNamespace(fit=fit) for fit in fits})
 
 
 @dataclasses.dataclass(frozen=True)

@@ -73,16 +73,16 @@ def in_second_cycle(at: Place) -> np.ndarray:
 
 
 def test_noise_is_no_discrepancy() -> None:
-    found = [discrepancy(known_fit(seed), closed_form_model.MOTION) for seed in range(8)]
-    assert sum(one.noticeable for one in found) == 0
-    assert all(np.all(np.abs(one.mean_n) <= 3.0 * one.sd_n + 1e-5) for one in found)
-    assert all(one.size_n < 5e-4 for one in found)
-    assert found[0].features == ("nothing is left beyond the noise",)
+    remainders = [discrepancy(known_fit(seed), closed_form_model.MOTION) for seed in range(8)]
+    assert sum(remainder.noticeable for remainder in remainders) == 0
+    assert all(np.all(np.abs(remainder.mean_n) <= 3.0 * remainder.sd_n + 1e-5) for remainder in remainders)
+    assert all(remainder.size_n < 5e-4 for remainder in remainders)
+    assert remainders[0].features == ("nothing is left beyond the noise",)
 
 
-def gained(found: Discrepancy) -> float:
+def gained(remainder: Discrepancy) -> float:
     """Nats by which a discrepancy is likelier than none."""
-    return found.log_evidence - found.without_log_evidence
+    return remainder.log_evidence - remainder.without_log_evidence
 
 
 @pytest.mark.parametrize("memory_s", [0.1, 0.5, 2.0, 5.0, 8.0])
@@ -99,10 +99,10 @@ def test_noise_with_a_memory_is_no_discrepancy(memory_s: float) -> None:
 @pytest.mark.parametrize("memory_s", [0.5, 2.0, 5.0])
 @pytest.mark.parametrize("extra", [rubbing, creeping])
 def test_a_discrepancy_is_found_in_noise_with_a_memory(extra: Extra, memory_s: float) -> None:
-    found = [
+    remainders = [
         discrepancy(known_fit(seed, extra, 1.5e-3, memory_s), closed_form_model.MOTION) for seed in range(4)
     ]
-    assert min(map(gained, found)) > 4.0
+    assert min(map(gained, remainders)) > 4.0
 
 
 @pytest.mark.slow
@@ -119,29 +119,32 @@ def test_a_discrepancy_is_found_and_its_band_holds_it(extra: Extra) -> None:
     covered = []
     for seed in range(6):
         fit = known_fit(seed, extra)
-        found, rest = discrepancy(fit, closed_form_model.MOTION), unexplained(fit, closed_form_model.MOTION)
+        estimate, rest = (
+            discrepancy(fit, closed_form_model.MOTION),
+            unexplained(fit, closed_form_model.MOTION),
+        )
         truth = rest.beyond(extra(rest.at))
-        covered.append(np.mean(np.abs(found.mean_n - truth) < 1.645 * found.sd_n))
-        assert found.noticeable
-        assert np.sqrt(np.mean((found.mean_n - truth) ** 2)) < 0.4 * np.sqrt(np.mean(truth**2))
+        covered.append(np.mean(np.abs(estimate.mean_n - truth) < 1.645 * estimate.sd_n))
+        assert estimate.noticeable
+        assert np.sqrt(np.mean((estimate.mean_n - truth) ** 2)) < 0.4 * np.sqrt(np.mean(truth**2))
     assert 0.75 < np.mean(covered) <= 1.0
 
 
 def test_parts_shares_and_residual_add_up() -> None:
-    found = discrepancy(known_fit(1, creeping), closed_form_model.MOTION)
-    np.testing.assert_allclose(np.sum(list(found.parts_n.values()), axis=0), found.mean_n, atol=1e-15)
-    assert 0.5 < sum(found.share.values()) < 1.0
-    assert found.share["phase"] == max(found.share.values())
+    estimate = discrepancy(known_fit(1, creeping), closed_form_model.MOTION)
+    np.testing.assert_allclose(np.sum(list(estimate.parts_n.values()), axis=0), estimate.mean_n, atol=1e-15)
+    assert 0.5 < sum(estimate.share.values()) < 1.0
+    assert estimate.share["phase"] == max(estimate.share.values())
     changed = discrepancy(known_fit(1, less_displaced), closed_form_model.MOTION)
     assert changed.share["change"] == max(changed.share.values())
     rest = unexplained(known_fit(1, creeping), closed_form_model.MOTION)
-    np.testing.assert_allclose(found.beyond_n + found.taken_n, rest.residual_n, atol=1e-15)
+    np.testing.assert_allclose(estimate.beyond_n + estimate.taken_n, rest.residual_n, atol=1e-15)
 
 
 def test_mean_and_sd_are_those_of_a_dense_gaussian_process_with_a_flat_prior_of_parameters() -> None:
     fit = known_fit(1, creeping)
-    found = discrepancy(fit, closed_form_model.MOTION)
-    rest = dataclasses.replace(unexplained(fit, closed_form_model.MOTION), memory=found.memory)
+    estimate = discrepancy(fit, closed_form_model.MOTION)
+    rest = dataclasses.replace(unexplained(fit, closed_form_model.MOTION), memory=estimate.memory)
     at, memory_s = rest.at, np.log1p(rest.at.since_s)
     displacement = at.displacement_m / 9e-3
     axes = {"displacement": displacement, "change": displacement, "phase": memory_s, "cycle": memory_s}
@@ -154,16 +157,16 @@ def test_mean_and_sd_are_those_of_a_dense_gaussian_process_with_a_flat_prior_of_
     }
     kernel = np.zeros((130, 130))
     for name, x in axes.items():
-        far = ((x[:, None] - x) / found.length_by_part[name]) ** 2
-        kernel += found.size_by_part[name] ** 2 * same[name] * np.exp(-0.5 * far)
+        far = ((x[:, None] - x) / estimate.length_by_part[name]) ** 2
+        kernel += estimate.size_by_part[name] ** 2 * same[name] * np.exp(-0.5 * far)
     free = rest.basis @ rest.basis.T
     kernel = free @ kernel @ free
     whole = kernel + rest.noise_n2 + 10.0 * (np.eye(130) - free)
-    np.testing.assert_allclose(found.mean_n, kernel @ np.linalg.solve(whole, rest.residual_n), atol=1e-8)
+    np.testing.assert_allclose(estimate.mean_n, kernel @ np.linalg.solve(whole, rest.residual_n), atol=1e-8)
     variance = np.diag(kernel - kernel @ np.linalg.solve(whole, kernel))
-    np.testing.assert_allclose(found.sd_n, np.sqrt(variance), rtol=1e-3, atol=1e-8)
+    np.testing.assert_allclose(estimate.sd_n, np.sqrt(variance), rtol=1e-3, atol=1e-8)
     covariance = free @ rest.noise_n2 @ free
-    assert np.all(found.sd_n < np.sqrt(np.diag(covariance)))
+    assert np.all(estimate.sd_n < np.sqrt(np.diag(covariance)))
 
 
 def test_the_evidence_without_a_discrepancy_is_the_integral_over_the_parameters() -> None:
@@ -202,8 +205,8 @@ def test_a_discrepancy_pays_for_its_sizes_and_lengths() -> None:
     without, with_it = (
         discrepancy(known_fit(1, extra), closed_form_model.MOTION) for extra in (None, creeping)
     )
-    for found in (without, with_it):
-        cost = found.log_evidence - found.without_log_evidence - found.gain_nats
+    for estimate in (without, with_it):
+        cost = estimate.log_evidence - estimate.without_log_evidence - estimate.gain_nats
         assert -30.0 < cost < 0.1
     assert without.log_evidence < without.without_log_evidence + 1.0  # nothing there
     assert with_it.log_evidence > with_it.without_log_evidence + 20.0
@@ -223,10 +226,10 @@ def test_slopes_of_the_likelihood_are_its_differences() -> None:
 
 def test_the_discrepancy_is_orthogonal_to_what_parameters_do() -> None:
     fit = known_fit(2, rubbing)
-    found = discrepancy(fit, closed_form_model.MOTION)
+    estimate = discrepancy(fit, closed_form_model.MOTION)
     slopes = derivatives(fit.log_posterior, fit.unit)
     moving = slopes[:, np.linalg.norm(slopes, axis=0) > 1e-6]
-    cosine = moving.T @ found.mean_n / np.linalg.norm(moving, axis=0) / np.linalg.norm(found.mean_n)
+    cosine = moving.T @ estimate.mean_n / np.linalg.norm(moving, axis=0) / np.linalg.norm(estimate.mean_n)
     np.testing.assert_allclose(cosine, 0.0, atol=1e-10)
 
 
@@ -257,7 +260,7 @@ def test_a_parameter_at_its_bound_takes_up_nothing() -> None:
     at_bound = dataclasses.replace(
         fit, log_posterior=dataclasses.replace(fit.log_posterior, material=material)
     )
-    width = [unexplained(one, closed_form_model.MOTION).basis.shape[1] for one in (fit, at_bound)]
+    width = [unexplained(near, closed_form_model.MOTION).basis.shape[1] for near in (fit, at_bound)]
     assert width == [127, 128]
 
 
@@ -319,7 +322,7 @@ def test_the_share_left_out_is_that_of_fits_without_each_phase() -> None:
         fit.log_posterior.binned,
     )
     terms = {t.name: t.values for t in library(rest, binned.edges_s, binned.phases, closed_form_model.MOTION)}
-    shapes = rest.beyond(np.stack([terms[one.name] for one in form.terms], axis=1))
+    shapes = rest.beyond(np.stack([terms[term.name] for term in form.terms], axis=1))
     target, errors = rest.beyond(rest.residual_n), []
     for phase in range(len(binned.phases)):
         inside = binned.phase == phase
@@ -328,7 +331,7 @@ def test_the_share_left_out_is_that_of_fits_without_each_phase() -> None:
     assert len(form.terms) >= 2
     assert form.r2_left_out == pytest.approx(1.0 - np.sum(errors) / np.sum(target**2), rel=1e-6)
     whole = np.linalg.lstsq(shapes, target, rcond=None)[0]
-    np.testing.assert_allclose([one.coefficient for one in form.terms], whole, rtol=1e-6)
+    np.testing.assert_allclose([term.coefficient for term in form.terms], whole, rtol=1e-6)
     np.testing.assert_allclose(form.force_n, shapes @ whole, atol=1e-9)
 
 
@@ -377,6 +380,6 @@ def test_windows_that_were_fitted_are_all_that_is_described() -> None:
     fit = known_fit(0, drifting)
     half = dataclasses.replace(fit.log_posterior, fit_windows=((0.0, 45.0), (65.0, 105.0)))
     part = dataclasses.replace(fit, log_posterior=half)
-    found = discrepancy(part, closed_form_model.MOTION)
-    assert len(found.mean_n) == len(found.bins) == 85
-    assert len(figure_discrepancy(half.binned, closed_form_model.MOTION, found).axes) == 3
+    estimate = discrepancy(part, closed_form_model.MOTION)
+    assert len(estimate.mean_n) == len(estimate.bins) == 85
+    assert len(figure_discrepancy(half.binned, closed_form_model.MOTION, estimate).axes) == 3

@@ -31,8 +31,8 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     program = found()
     if program is None:
         pytest.skip(f"no browser: none of {', '.join(NAMES)} is on the PATH")
-    with Browser(program, tmp_path_factory.mktemp("profile")) as one:
-        yield one
+    with Browser(program, tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "light"), (1280, "dark")])

@@ -51,10 +51,10 @@ def test_a_normal_prior_far_from_its_centre_keeps_its_law(side: float):
     low, high = sorted((12.0 * side, 12.5 * side))
     space = ParameterSpace((Parameter("x", "1", low, high, "normal", centre=0.0, spread=1.0),))
     unit = np.array([[0.1], [0.5], [0.9]])
-    found, law = space.from_unit(unit), stats.truncnorm(low, high)
-    np.testing.assert_allclose(found[:, 0], law.ppf(unit[:, 0]), rtol=1e-9)
-    np.testing.assert_allclose(space.to_unit(found), unit, rtol=1e-9)
-    np.testing.assert_allclose(space.log_density(found), law.logpdf(found[:, 0]), rtol=1e-9)
+    computed, law = space.from_unit(unit), stats.truncnorm(low, high)
+    np.testing.assert_allclose(computed[:, 0], law.ppf(unit[:, 0]), rtol=1e-9)
+    np.testing.assert_allclose(space.to_unit(computed), unit, rtol=1e-9)
+    np.testing.assert_allclose(space.log_density(computed), law.logpdf(computed[:, 0]), rtol=1e-9)
 
 
 def test_the_box_of_a_normal_prior_is_flat_and_a_flat_one_is_its_own():
@@ -77,9 +77,9 @@ def assert_conjugate(parameters: tuple[Parameter, ...], precision: Array, *corre
     mean = np.linalg.solve(information, x @ np.linalg.solve(covariance, problem.binned.force_n))
     offsets = 0.01 * np.random.default_rng(1).standard_normal((50, 2))
     rest = np.tile(informed.bounds[0][2:], (50, 1))
-    found = informed.log_prob(np.column_stack([mean + offsets, rest]))
+    computed = informed.log_prob(np.column_stack([mean + offsets, rest]))
     exact = -0.5 * np.einsum("ni,ij,nj->n", offsets, information, offsets)
-    np.testing.assert_allclose(found - found[0], exact - exact[0], atol=0.02)
+    np.testing.assert_allclose(computed - computed[0], exact - exact[0], atol=0.02)
 
 
 def test_a_normal_prior_gives_the_conjugate_posterior_of_a_line():
@@ -118,9 +118,9 @@ def test_a_climb_sees_a_normal_prior():
 
 def test_draws_of_a_normal_prior_taught_nothing():
     draws = SPACE.from_unit(np.random.default_rng(2).uniform(size=(4000, 3)))
-    for one in identifiability(SPACE, draws).parameters:
-        assert "does not inform" in one.statement
-        assert one.contraction == pytest.approx(0.0, abs=0.05)
+    for parameter in identifiability(SPACE, draws).parameters:
+        assert "does not inform" in parameter.statement
+        assert parameter.contraction == pytest.approx(0.0, abs=0.05)
 
 
 JOINT = dataclasses.replace(SPACE, correlations=(Correlation("E", "p", -0.7),))

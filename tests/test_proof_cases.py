@@ -42,8 +42,8 @@ def test_the_seed_of_a_committed_set_draws_what_it_conceals(name: str) -> None:
 
 
 def test_a_set_of_64_has_every_mechanism_alone_and_at_least_15_effects_outside() -> None:
-    found = plans(3, 64)
-    of = {kind: [p for p in found if p.kind == kind] for kind in ("nothing", "alone", "pair", "outside")}
+    drawn = plans(3, 64)
+    of = {kind: [p for p in drawn if p.kind == kind] for kind in ("nothing", "alone", "pair", "outside")}
     assert {kind: len(some) for kind, some in of.items()} == {
         "nothing": 20,
         "alone": 22,
@@ -55,12 +55,12 @@ def test_a_set_of_64_has_every_mechanism_alone_and_at_least_15_effects_outside()
     assert len({p.outside for p in of["outside"]}) == 15
     assert len(OUTSIDE) >= 15
     assert not set(OUTSIDE) & set(CONCEALED)
-    assert sum(p.tetrahedra for p in found) >= 64 / 3
+    assert sum(p.tetrahedra for p in drawn) >= 64 / 3
 
 
 def test_a_set_of_what_was_asked_for_has_each_as_often_with_sizes_even_in_logarithm() -> None:
-    found = plans(3, 18, ["nothing", "friction-creep", "breathing"])
-    of = {name: [p for p in found if p.label == name] for name in ("nothing", "friction-creep", "breathing")}
+    drawn = plans(3, 18, ["nothing", "friction-creep", "breathing"])
+    of = {name: [p for p in drawn if p.label == name] for name in ("nothing", "friction-creep", "breathing")}
     assert [len(some) for some in of.values()] == [6, 6, 6]
     assert {p.kind for p in of["nothing"]} == {"nothing"}
     assert {p.mechanisms for p in of["friction-creep"]} == {("device-friction", "friction-creep")}
@@ -68,8 +68,8 @@ def test_a_set_of_what_was_asked_for_has_each_as_often_with_sizes_even_in_logari
     targets = sorted(p.target for p in of["friction-creep"])
     np.testing.assert_allclose(np.diff(np.log(targets)), np.log(30.0) / 6)
     assert (targets[0] * targets[-1]) == pytest.approx(30.0)
-    assert len({p.numbers for p in found}) == 18
-    assert sum(p.tetrahedra for p in found) == 7
+    assert len({p.numbers for p in drawn}) == 18
+    assert sum(p.tetrahedra for p in drawn) == 7
     assert draw(of["friction-creep"][0], 0, SKIN).target == of["friction-creep"][0].target
     with pytest.raises(InputError, match=r"--only: found pad-slop; expected nothing, or one of backlash"):
         plans(3, 18, ["pad-slop"])

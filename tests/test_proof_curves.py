@@ -26,11 +26,11 @@ def test_nine_of_ten_curves_have_the_half_that_their_answers_were_drawn_with() -
 def test_a_curve_of_many_answers_is_the_share_that_they_were_drawn_with() -> None:
     rng = np.random.default_rng(5)
     sizes = np.exp(rng.uniform(np.log(0.5), np.log(30.0), 1000))
-    found = curve(sizes.tolist(), (rng.random(1000) < 1.0 / (1.0 + (3.0 / sizes) ** 2.5)).tolist())
-    at, mean = np.array(found["at"]), np.array(found["mean"])
+    fitted = curve(sizes.tolist(), (rng.random(1000) < 1.0 / (1.0 + (3.0 / sizes) ** 2.5)).tolist())
+    at, mean = np.array(fitted["at"]), np.array(fitted["mean"])
     np.testing.assert_allclose(mean, 1.0 / (1.0 + (3.0 / at) ** 2.5), atol=0.1)
-    assert np.all(np.array(found["low"]) <= mean)
-    assert np.all(mean <= np.array(found["high"]))
+    assert np.all(np.array(fitted["low"]) <= mean)
+    assert np.all(mean <= np.array(fitted["high"]))
 
 
 def test_a_curve_of_few_answers_is_wide_and_those_alike_say_one_side_only() -> None:
@@ -45,12 +45,12 @@ def test_only_mechanisms_with_several_recordings_have_a_curve() -> None:
     keys = {f"{i:03d}": key("device-friction", size=float(i)) for i in (1, 2, 4, 8)}
     keys["009"] = key("pad-slip")
     answers = {number: said("device-friction" if number > "002" else "viscous-drag") for number in keys}
-    found = score(keys, answers)["by_mechanism"]
-    assert list(found) == ["device-friction"]
-    one = found["device-friction"]
-    assert (one["sizes"], one["right"]) == ([1.0, 2.0, 4.0, 8.0], [False, False, True, True])
-    assert one["up_to"] == [True] * 4
-    assert half_in_words(one).endswith(")")
+    by_name = score(keys, answers)["by_mechanism"]
+    assert list(by_name) == ["device-friction"]
+    friction = by_name["device-friction"]
+    assert (friction["sizes"], friction["right"]) == ([1.0, 2.0, 4.0, 8.0], [False, False, True, True])
+    assert friction["up_to"] == [True] * 4
+    assert half_in_words(friction).endswith(")")
 
 
 def test_no_half_is_told_beyond_the_sizes_that_there_were() -> None:
@@ -63,8 +63,13 @@ def test_no_half_is_told_beyond_the_sizes_that_there_were() -> None:
 
 def test_the_figure_of_sizes_is_drawn(tmp_path: Path) -> None:
     sizes, right = [1.0, 2.0, 4.0, 8.0], [False, False, True, True]
-    one = {"sizes": sizes, "right": right, "up_to": [True, False, True, True], "curve": curve(sizes, right)}
-    figure = report.figure_detectability({name: one for name in ("pad-slip", "pre-stretch", "a", "b")})
+    answers = {
+        "sizes": sizes,
+        "right": right,
+        "up_to": [True, False, True, True],
+        "curve": curve(sizes, right),
+    }
+    figure = report.figure_detectability({name: answers for name in ("pad-slip", "pre-stretch", "a", "b")})
     png, _ = report.save_figure(figure, tmp_path / "sizes", "test")
     assert png.stat().st_size > 10_000
 

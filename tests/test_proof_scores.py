@@ -38,19 +38,19 @@ from bayeskin.proof.scoring.shares import share, share_of_parts
 )
 def test_a_name_is_right_alone_or_as_a_look_alike(truth, names, right, group) -> None:
     kind = "pair" if "+" in truth else "alone"
-    found = judge("001", key(truth, kind), said(*names))
-    assert (found.right, found.right_group) == (right, group)
+    judgement = judge("001", key(truth, kind), said(*names))
+    assert (judgement.right, judgement.right_group) == (right, group)
 
 
 def test_a_group_larger_than_what_is_known_to_look_alike_is_wrong() -> None:
     answer = said("pad-slip")
     answer["mechanisms"][0]["group"] = ["pad-slip", "slow-recovery", "backlash"]
-    found = judge("001", key("pad-slip"), answer)
-    assert (found.right, found.right_group) == (False, False)
+    judgement = judge("001", key("pad-slip"), answer)
+    assert (judgement.right, judgement.right_group) == (False, False)
     answer = said("device-friction")
     answer["mechanisms"][0]["group"] = ["viscous-drag", "force-offset"]  # each in one of its groups
-    found = judge("001", key("device-friction"), answer)
-    assert (found.right, found.right_group) == (False, False)
+    judgement = judge("001", key("device-friction"), answer)
+    assert (judgement.right, judgement.right_group) == (False, False)
 
 
 def test_the_probability_of_a_pair_is_that_of_its_less_probable_part() -> None:
@@ -61,22 +61,25 @@ def test_the_probability_of_a_pair_is_that_of_its_less_probable_part() -> None:
 
 def test_of_a_pair_each_mechanism_that_adds_enough_counts_and_each_name() -> None:
     both = key("pad-slip + sensor-drift", "pair", sizes={"pad-slip": 8e-3, "sensor-drift": 5e-3})
-    found = judge("001", both, said("pad-slip", "backlash"))
-    assert found.clear_parts_named == {"pad-slip": True}  # of the other 2.5 floors remain
-    assert found.names_concealed == {"pad-slip": True, "backlash": False}
+    judgement = judge("001", both, said("pad-slip", "backlash"))
+    assert judgement.clear_parts_named == {"pad-slip": True}  # of the other 2.5 floors remain
+    assert judgement.names_concealed == {"pad-slip": True, "backlash": False}
     other = judge("002", key("nothing", "nothing", 0.0), said("backlash"))
     assert (other.clear_parts_named, other.names_concealed) == ({}, {"backlash": False})
     keys = {"001": both, "002": key("nothing", "nothing", 0.0), "003": key("sensor-drift")}
     answers = {"001": said("pad-slip", "backlash"), "002": said("backlash"), "003": said()}
     board = score(keys, answers)
     counts = [board[name] for name in ("clear_mechanisms_named", "named_mechanisms_there")]
-    assert [(one["hits"], one["of"]) for one in counts] == [(1, 2), (1, 3)]
+    assert [(count["hits"], count["of"]) for count in counts] == [(1, 2), (1, 3)]
 
 
 def test_an_interval_of_parameters_counts_recordings() -> None:
-    one, many = share([True, False]), share_of_parts([{"a": True, "b": True}, {"a": False, "b": False}, {}])
+    single, many = (
+        share([True, False]),
+        share_of_parts([{"a": True, "b": True}, {"a": False, "b": False}, {}]),
+    )
     assert (many["hits"], many["of"]) == (2, 4)
-    assert (many["share"], many["low"], many["high"]) == (one["share"], one["low"], one["high"])
+    assert (many["share"], many["low"], many["high"]) == (single["share"], single["low"], single["high"])
 
 
 def test_what_is_held_out_has_a_floor_of_its_own() -> None:
@@ -114,10 +117,10 @@ def test_overlap_is_intersection_over_union_of_bins() -> None:
 
 
 def test_wilson_s_interval_is_that_of_the_books() -> None:
-    found = share([True] * 9 + [False])
-    assert (found["hits"], found["of"], found["share"]) == (9, 10, 0.9)
-    assert found["low"] == pytest.approx(0.6526, abs=2e-3)
-    assert found["high"] == pytest.approx(0.9774, abs=2e-3)
+    right_share = share([True] * 9 + [False])
+    assert (right_share["hits"], right_share["of"], right_share["share"]) == (9, 10, 0.9)
+    assert right_share["low"] == pytest.approx(0.6526, abs=2e-3)
+    assert right_share["high"] == pytest.approx(0.9774, abs=2e-3)
     assert share([])["share"] is None
 
 
@@ -155,13 +158,13 @@ def test_a_scoreboard_of_made_up_verdicts_counts_as_it_should() -> None:
 )
 def test_held_out_is_the_full_model_s_where_it_has_a_fit(full: dict | None, rmse_n: float) -> None:
     answer = said("force-offset", fit={"after": {"rmse_held_out": 3e-3, "full_model": full}})
-    found = judge("001", key("force-offset"), answer)
-    assert found.held_out == pytest.approx(rmse_n / floor_after(2e-3, HELD_OUT_FROM_S))
+    judgement = judge("001", key("force-offset"), answer)
+    assert judgement.held_out == pytest.approx(rmse_n / floor_after(2e-3, HELD_OUT_FROM_S))
 
 
 def test_a_group_larger_than_one_listed_is_no_answer_of_the_confusion_matrix() -> None:
     answer = said("device-friction")
     assert judge("001", key("device-friction"), answer).answer == "device-friction"
     answer["mechanisms"][0]["group"] = ["device-friction", "pad-slip", "backlash"]
-    found = judge("001", key("device-friction"), answer)
-    assert (found.right, found.answer) == (False, "group too large")
+    judgement = judge("001", key("device-friction"), answer)
+    assert (judgement.right, judgement.answer) == (False, "group too large")

@@ -113,8 +113,8 @@ def written(style: Style) -> bytes:
     columns = [columns[which] for which in style.order]
     for place, name in enumerate(style.extra):
         values = [EXTRA[name](i) for i in range(len(TIME_S))]
-        made = [name, "", *(v if isinstance(v, str) else number(float(v), style) for v in values)]
-        columns.insert(2 * place, made)
+        cells = [name, "", *(v if isinstance(v, str) else number(float(v), style) for v in values)]
+        columns.insert(2 * place, cells)
     rows = [list(row) for row in zip(*columns, strict=True)]
     if style.unit_place != "row":
         del rows[1]

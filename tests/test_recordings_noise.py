@@ -58,8 +58,8 @@ SEEDS = range(8)
 def noisy(white_mn: float, slow_mn: float, time_s: float, seed: int) -> tuple[Recording, NoiseAnalysis]:
     rng = np.random.default_rng([seed, 77])
     noise = coloured(rng, len(TIME_S), 1e-3 * white_mn, 1e-3 * slow_mn, time_s)
-    made = recording(FORCE_N + noise)
-    return made, analyse(made, PHASES)
+    recorded = recording(FORCE_N + noise)
+    return recorded, analyse(recorded, PHASES)
 
 
 def true_bin_means() -> np.ndarray:
@@ -87,9 +87,9 @@ def test_parabolas_leave_no_residual() -> None:
 def test_a_shape_is_recovered_from_its_own_expected_products(shape: NoiseShape) -> None:
     size, lags = 250, 101
     products = expected_products(shape.at(INTERVAL_S * np.arange(size)), lags)
-    found = fit_shape(products / products[0], 10_000, INTERVAL_S, size)
-    assert found.white_share == pytest.approx(shape.white_share, abs=0.03)
-    assert found.time_s == pytest.approx(shape.time_s, rel=0.1)
+    fitted = fit_shape(products / products[0], 10_000, INTERVAL_S, size)
+    assert fitted.white_share == pytest.approx(shape.white_share, abs=0.03)
+    assert fitted.time_s == pytest.approx(shape.time_s, rel=0.1)
 
 
 def test_the_variance_of_a_mean_of_ar1_noise_is_the_textbooks() -> None:
@@ -134,34 +134,34 @@ def test_bin_means_know_their_variance_and_their_neighbours(noise: tuple[float, 
     truth = true_bin_means()
     z, stated = [], []
     for seed in SEEDS:
-        made, analysis = noisy(*noise, seed)
-        binned = bin_recording(made, PHASES, EDGES_S, analysis)
+        recorded, analysis = noisy(*noise, seed)
+        binned = bin_recording(recorded, PHASES, EDGES_S, analysis)
         z.append((binned.force_n - truth) / np.sqrt(binned.variance_n2))
         stated.append(binned.correlation)
     assert np.mean(np.square(z)) == pytest.approx(1.0, abs=0.13)
-    found = np.mean([np.mean(row[1:] * row[:-1]) / np.mean(row**2) for row in z])
-    assert found == pytest.approx(np.mean(stated), abs=0.06)
+    neighbours = np.mean([np.mean(row[1:] * row[:-1]) / np.mean(row**2) for row in z])
+    assert neighbours == pytest.approx(np.mean(stated), abs=0.06)
 
 
 def test_bin_means_of_gaussian_noise_are_as_good_as_plain_means() -> None:
     truth, robust, plain = true_bin_means(), [], []
     for seed in SEEDS:
-        made, analysis = noisy(*NOISES[0], seed)
-        robust.append(bin_recording(made, PHASES, EDGES_S, analysis).force_n - truth)
+        recorded, analysis = noisy(*NOISES[0], seed)
+        robust.append(bin_recording(recorded, PHASES, EDGES_S, analysis).force_n - truth)
         plain.append(
-            made.force_n[:-1].reshape(-1, 50).mean(axis=1) + 0.5 * np.diff(FORCE_N[::50]) / 50 - truth
+            recorded.force_n[:-1].reshape(-1, 50).mean(axis=1) + 0.5 * np.diff(FORCE_N[::50]) / 50 - truth
         )
     assert np.var(plain) / np.var(robust) > 0.95
 
 
 def test_bin_means_of_straight_forces_are_exact_over_corners_and_between_samples() -> None:
-    made = Recording(TIME_S, MOTION.at(TIME_S), 40.0 * MOTION.at(TIME_S), "made", "")
+    recorded = Recording(TIME_S, MOTION.at(TIME_S), 40.0 * MOTION.at(TIME_S), "made", "")
     edges = np.arange(0.0037, 129.0, 0.5)
     fine = np.unique(np.concatenate([edges, MOTION.time_s]))
     f = 40.0 * MOTION.at(fine)
     sums = np.concatenate([[0.0], np.cumsum(0.5 * (f[1:] + f[:-1]) * np.diff(fine))])
     exact = np.diff(np.interp(edges, fine, sums)) / 0.5
-    np.testing.assert_allclose(bin_recording(made, PHASES, edges).force_n, exact, atol=1e-12)
+    np.testing.assert_allclose(bin_recording(recorded, PHASES, edges).force_n, exact, atol=1e-12)
 
 
 def test_spikes_are_counted_and_leave_the_means_alone() -> None:
@@ -169,11 +169,11 @@ def test_spikes_are_counted_and_leave_the_means_alone() -> None:
     starts = np.sort(rng.choice(np.arange(100, 12900, 20), 150, replace=False))
     noise = coloured(rng, len(TIME_S), 1e-3, 1e-3, 0.1)
     clean, spiked = recording(FORCE_N + noise), recording(with_spikes(rng, FORCE_N + noise, starts, 0.02))
-    found = phase_noise(spiked, PHASES)
-    assert sum(p.spikes for p in found) == pytest.approx(150, abs=6)
-    assert sum(p.spikes_above for p in found) >= sum(p.spikes for p in found) - 2
-    assert [p.spike_threshold_n for p in found] == pytest.approx([4.6 * 1.3e-3] * 9, rel=0.3)
-    assert np.mean([p.sd_n for p in found]) == pytest.approx(np.sqrt(2.08e-6), rel=0.12)
+    measured = phase_noise(spiked, PHASES)
+    assert sum(p.spikes for p in measured) == pytest.approx(150, abs=6)
+    assert sum(p.spikes_above for p in measured) >= sum(p.spikes for p in measured) - 2
+    assert [p.spike_threshold_n for p in measured] == pytest.approx([4.6 * 1.3e-3] * 9, rel=0.3)
+    assert np.mean([p.sd_n for p in measured]) == pytest.approx(np.sqrt(2.08e-6), rel=0.12)
     means = [bin_recording(r, PHASES, EDGES_S).force_n for r in (clean, spiked)]
     raw_bias = np.mean(spiked.force_n - clean.force_n)
     assert raw_bias > 5e-4
@@ -182,9 +182,9 @@ def test_spikes_are_counted_and_leave_the_means_alone() -> None:
 
 
 def test_noise_alone_shows_next_to_no_spikes_and_no_steps() -> None:
-    found = [summarise(noisy(*noise, seed)[1], PHASES) for noise in NOISES for seed in SEEDS]
-    assert sum(p.spikes for phases in found for p in phases) <= 8
-    assert sum(len(p.step_times_s) for phases in found for p in phases) == 0
+    summaries = [summarise(noisy(*noise, seed)[1], PHASES) for noise in NOISES for seed in SEEDS]
+    assert sum(p.spikes for phases in summaries for p in phases) <= 8
+    assert sum(len(p.step_times_s) for phases in summaries for p in phases) == 0
 
 
 def test_the_step_filter_reads_a_step_and_is_blind_to_lines() -> None:
@@ -202,15 +202,15 @@ def test_steps_are_found_with_their_times_and_sizes() -> None:
         times = np.array([2.6, 25.0, 35.0, 85.0, 122.0]) + rng.uniform(-0.4, 0.4, 5)
         sizes = 0.015 * np.array([1, -1, 1.5, 1, -2])
         force = FORCE_N + coloured(rng, len(TIME_S), 1e-3, 1e-3, 0.1)
-        made = recording(
+        recorded = recording(
             force + sum(b * np.clip((TIME_S - a) / 0.03, 0, 1) for a, b in zip(times, sizes, strict=True))
         )
-        found = phase_noise(made, PHASES)
-        np.testing.assert_allclose(np.mean([p.sd_n for p in found]), np.sqrt(2.08e-6), rtol=0.1)
-        at = np.concatenate([p.step_times_s for p in found])
+        noise = phase_noise(recorded, PHASES)
+        np.testing.assert_allclose(np.mean([p.sd_n for p in noise]), np.sqrt(2.08e-6), rtol=0.1)
+        at = np.concatenate([p.step_times_s for p in noise])
         assert len(at) == 5
         errors.append(at - times - 0.015)
-        ratios.append(np.concatenate([p.step_sizes_n for p in found]) / sizes)
+        ratios.append(np.concatenate([p.step_sizes_n for p in noise]) / sizes)
     assert np.max(np.abs(errors)) < 0.03
     np.testing.assert_allclose(ratios, 1.0, atol=0.3)
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.06)
@@ -254,14 +254,14 @@ def test_a_slow_swing_is_no_quick_noise() -> None:
     swinging = plain + np.where(kinds == "hold", 0.1 * FORCE_N * np.sin(2.0 * np.pi * TIME_S / 4.1), 0.0)
     of = {}
     for name, force in (("plain", plain), ("swinging", swinging)):
-        made = recording(force)
-        whole = bin_recording(made, PHASES, EDGES_S)
-        quick = bin_recording(made, PHASES, EDGES_S, analyse(made, PHASES, NOISE_BOUNDS.quick_s))
+        recorded = recording(force)
+        whole = bin_recording(recorded, PHASES, EDGES_S)
+        quick = bin_recording(recorded, PHASES, EDGES_S, analyse(recorded, PHASES, NOISE_BOUNDS.quick_s))
         holds = np.array([PHASES[i].kind == "hold" for i in whole.phase])
         less = without_swings(whole, quick.variance_n2)
         kept = less.variance_n2[~holds] / whole.variance_n2[~holds]
         assert kept.min() > (0.99 if name == "plain" else 0.25)
-        of[name] = [np.median(one.variance_n2[holds]) for one in (whole, less)]
+        of[name] = [np.median(noise.variance_n2[holds]) for noise in (whole, less)]
     assert of["plain"][0] == of["plain"][1]
     assert of["swinging"][0] > 16.0 * of["plain"][0]
     assert of["swinging"][1] < min(15.0 * of["plain"][0], 0.5 * of["swinging"][0])
@@ -280,10 +280,10 @@ def test_a_recording_of_any_sampling_is_analysed() -> None:
     for interval_s in (0.002, 0.05):
         time_s = interval_s * np.arange(int(130 / interval_s) + 1)
         noise = 2e-3 * np.random.default_rng(8).normal(size=len(time_s))
-        made = recording(true_force(time_s) + noise, MOTION, time_s)
-        phases = segment(made)
+        recorded = recording(true_force(time_s) + noise, MOTION, time_s)
+        phases = segment(recorded)
         assert [p.kind for p in phases] == KINDS
-        sds = [p.sd_n for p in phase_noise(made, phases)]
+        sds = [p.sd_n for p in phase_noise(recorded, phases)]
         assert np.median(sds) == pytest.approx(2e-3, rel=0.1)
 
 
@@ -320,21 +320,21 @@ def test_a_force_that_never_changes_has_no_noise_to_measure() -> None:
 @pytest.mark.parametrize("interval_s", [0.13, 0.2, 0.5, 1.0])
 def test_the_noise_of_few_samples_is_measured(interval_s: float) -> None:
     time_s = np.arange(0.0, 130.0, interval_s)
-    found = []
+    estimates = []
     for seed in range(8):
         noise_n = 0.002 * np.random.default_rng(seed).standard_normal(len(time_s))
-        made = recording(true_force(time_s) + noise_n, MOTION, time_s)
-        noise = phase_noise(made, segment(made))
-        found.append([p.sd_n for p in noise if p.kind in ("hold", "rest")])
-    assert np.mean(found) == pytest.approx(0.002, rel=0.1)
+        recorded = recording(true_force(time_s) + noise_n, MOTION, time_s)
+        noise = phase_noise(recorded, segment(recorded))
+        estimates.append([p.sd_n for p in noise if p.kind in ("hold", "rest")])
+    assert np.mean(estimates) == pytest.approx(0.002, rel=0.1)
 
 
 def test_phases_too_short_to_tell_noise_are_refused() -> None:
     time_s = np.arange(0.0, 130.0, 1.0)
-    made = recording(true_force(time_s), MOTION, time_s)
+    recorded = recording(true_force(time_s), MOTION, time_s)
     phases = tuple(Phase("hold", 1, a, a + 10.0) for a in np.arange(0.0, 130.0, 10.0))
     with pytest.raises(InputError, match="10 samples in the longest phase; expected at least 15"):
-        phase_noise(made, phases)
+        phase_noise(recorded, phases)
 
 
 @pytest.mark.parametrize(
@@ -342,31 +342,31 @@ def test_phases_too_short_to_tell_noise_are_refused() -> None:
 )
 def test_bins_are_wide_enough_for_two_samples(interval_s: float, width_s: float) -> None:
     time_s = np.arange(0.0, 130.0, interval_s)
-    made = recording(true_force(time_s), MOTION, time_s)
-    assert fitting_width_s(made) == width_s
+    recorded = recording(true_force(time_s), MOTION, time_s)
+    assert fitting_width_s(recorded) == width_s
     assert np.diff(np.searchsorted(time_s + 1e-9, uniform_edges(float(time_s[-1]), width_s))).min() >= 2
 
 
 def test_the_description_says_what_a_recording_cannot_tell() -> None:
     time_s = np.arange(0.0, 60.0, 0.5)
-    made = Recording(time_s, 1e-4 * time_s, 4e-3 * time_s + 1e-3 * np.sin(31 * time_s), "pull", "")
-    phases = segment(made)
-    noise = phase_noise(made, phases)
-    said = describe_json(made, phases, noise)["cannot_tell"]
+    recorded = Recording(time_s, 1e-4 * time_s, 4e-3 * time_s + 1e-3 * np.sin(31 * time_s), "pull", "")
+    phases = segment(recorded)
+    noise = phase_noise(recorded, phases)
+    said = describe_json(recorded, phases, noise)["cannot_tell"]
     assert [sentence.split(",")[0] for sentence in said] == [
         "There is no hold", "There is no unloading", "Samples are 0.5 s apart. Spikes and steps of the force "
         "can hardly be told from noise. Bins need a width of 1 s (fit.bin_width_s).",
     ]  # fmt: skip
-    assert all(sentence in describe(made, phases, noise) for sentence in said)
+    assert all(sentence in describe(recorded, phases, noise) for sentence in said)
 
 
 def test_the_description_says_what_was_found() -> None:
-    made, analysis = noisy(*NOISES[1], 0)
+    recorded, analysis = noisy(*NOISES[1], 0)
     noise = summarise(analysis, PHASES)
-    text = describe(made, PHASES, noise)
+    text = describe(recorded, PHASES, noise)
     assert "13001 samples at 100 Hz" in text
     assert text.count("\n   load ") + text.count("\n unload ") == 4
-    facts = describe_json(made, PHASES, noise)
+    facts = describe_json(recorded, PHASES, noise)
     assert json.loads(json.dumps(facts)) == facts
     assert facts["cannot_tell"] == []
     assert [p["kind"] for p in facts["phases"]] == KINDS
@@ -397,10 +397,10 @@ def test_the_articles_recording_has_one_sided_spikes_and_steps_of_its_zero() -> 
 def test_the_last_sample_stands_for_an_interval() -> None:
     """A recording at 20 Hz up to 129.95 s has as many bins as one to 130 s."""
     time_s = 0.05 * np.arange(2600)
-    made = recording(true_force(time_s), MOTION, time_s)
-    assert uniform_edges(covered_s(made, MOTION))[-1] == EDGES_S[-1] == 130.0
-    means = bin_recording(made, segment(made), EDGES_S).force_n
+    recorded = recording(true_force(time_s), MOTION, time_s)
+    assert uniform_edges(covered_s(recorded, MOTION))[-1] == EDGES_S[-1] == 130.0
+    means = bin_recording(recorded, segment(recorded), EDGES_S).force_n
     np.testing.assert_allclose(means[-1], true_bin_means()[-1], atol=5e-4)
     assert covered_s(recording(FORCE_N), MOTION) == 130.0
     with pytest.raises(InputError, match=r"within 0 to 130 s"):
-        bin_recording(made, segment(made), np.append(EDGES_S, 130.5))
+        bin_recording(recorded, segment(recorded), np.append(EDGES_S, 130.5))

@@ -195,10 +195,10 @@ def test_the_recorded_protocol_follows_every_sample_and_has_the_corners() -> Non
 
 
 def test_the_sampled_protocol_is_every_fiftieth_sample() -> None:
-    made = recording(true_force())
-    motion = motion_of(made)
-    np.testing.assert_array_equal(motion.time_s, made.time_s[::50])
-    np.testing.assert_array_equal(motion.displacement_m, made.displacement_m[::50])
+    recorded = recording(true_force())
+    motion = motion_of(recorded)
+    np.testing.assert_array_equal(motion.time_s, recorded.time_s[::50])
+    np.testing.assert_array_equal(motion.displacement_m, recorded.displacement_m[::50])
 
 
 def test_the_articles_recording_has_four_cycles_the_third_of_which_is_cut_short() -> None:

@@ -281,8 +281,8 @@ def test_files_that_are_nothing_are_refused(tmp_path: Path, name: str, data: byt
 
 
 def test_a_file_that_is_absent_or_a_folder_is_refused(tmp_path: Path) -> None:
-    for path, found in ((tmp_path / "absent.csv", "no such file"), (tmp_path, "a folder")):
-        with pytest.raises(InputError, match=f": found {found}; expected a recording"):
+    for path, message in ((tmp_path / "absent.csv", "no such file"), (tmp_path, "a folder")):
+        with pytest.raises(InputError, match=f": found {message}; expected a recording"):
             read_recording(path)
 
 

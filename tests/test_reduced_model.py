@@ -52,15 +52,15 @@ def of(names: Sequence[str]) -> list[Mechanism]:
 
 
 def full(theta, names=(), spec=SPEC) -> Simulation:
-    found = simulate(spec, MOTION, theta, laws=laws(of(names)))
-    assert found.status == "ok"
-    return found
+    simulation = simulate(spec, MOTION, theta, laws=laws(of(names)))
+    assert simulation.status == "ok"
+    return simulation
 
 
-def rms(found: Simulation, right: Simulation) -> float:
+def rms(simulation: Simulation, right: Simulation) -> float:
     """RMS over the peak."""
     time_s = np.arange(0.0, MOTION.time_s[-1], 0.5)
-    wrong = found.at(time_s) - right.at(time_s)
+    wrong = simulation.at(time_s) - right.at(time_s)
     return float(np.sqrt(np.mean(wrong**2)) / np.abs(right.force_n).max())
 
 
@@ -77,13 +77,13 @@ def model(training) -> ReducedModel:
 @pytest.mark.parametrize("names", [(), ("preconditioning",), NAMES], ids=["base", "one", "two"])
 def test_the_force_is_near_the_full_models_on_a_protocol_never_seen(model, names) -> None:
     theta = THETA | (STRONG if names else {})
-    found = simulate_reduced(model, MOTION, theta, of(names), estimate=True)
+    reduced = simulate_reduced(model, MOTION, theta, of(names), estimate=True)
     right = full(theta, names)
-    assert found.status == "ok"
-    assert found.stats["inside"] == 1.0
-    assert rms(found, right) < 6e-3
-    estimate = found.stats["error_estimate_n"] / found.stats["peak_force_n"]
-    assert rms(found, right) / 2.0 < estimate < 5e-2
+    assert reduced.status == "ok"
+    assert reduced.stats["inside"] == 1.0
+    assert rms(reduced, right) < 6e-3
+    estimate = reduced.stats["error_estimate_n"] / reduced.stats["peak_force_n"]
+    assert rms(reduced, right) / 2.0 < estimate < 5e-2
 
 
 def test_the_estimate_sees_modes_that_are_missing(model) -> None:
@@ -92,7 +92,7 @@ def test_the_estimate_sees_modes_that_are_missing(model) -> None:
         model, library=Library(Modes(base.displacement[:8], base.pressure[:8]), model.library.beyond)
     )
     errors = [simulate_reduced(m, MOTION, THETA, estimate=True) for m in (model, poor)]
-    whole, few = (found.stats["error_estimate_n"] for found in errors)
+    whole, few = (run.stats["error_estimate_n"] for run in errors)
     missed = rms(errors[1], full(THETA)) * errors[1].stats["peak_force_n"]
     assert few > 3.0 * whole
     assert few > missed / 2.0
@@ -139,28 +139,28 @@ def test_derivatives_are_those_of_two_runs(model, names, changes, monkeypatch) -
 
 
 def test_a_run_gives_its_derivatives_beyond_the_start(model) -> None:
-    found = simulate_reduced(model, MOTION, THETA, gradients={"E_s": 2e4, "k_s": 4e-13})
-    assert found.gradient_names == ("E_s", "k_s")
-    assert found.gradient_n.shape == (len(found.time_s), 2)
-    np.testing.assert_array_equal(found.gradient_n[0], 0.0)
+    reduced = simulate_reduced(model, MOTION, THETA, gradients={"E_s": 2e4, "k_s": 4e-13})
+    assert reduced.gradient_names == ("E_s", "k_s")
+    assert reduced.gradient_n.shape == (len(reduced.time_s), 2)
+    np.testing.assert_array_equal(reduced.gradient_n[0], 0.0)
     with pytest.raises(InputError, match="viscosity"):
         simulate_reduced(model, MOTION, THETA, gradients={"viscosity": 1.0})
 
 
 def test_other_layers_move_the_nodes(model) -> None:
     geometry = replace(Geometry(), cutis_m=2.4e-3, subcutis_m=6.5e-3, arm_radius_m=42e-3)
-    found = simulate_reduced(model, MOTION, THETA, geometry=geometry)
+    reduced = simulate_reduced(model, MOTION, THETA, geometry=geometry)
     moved = full(THETA, spec=ModelSpec(refinement=0, geometry=geometry))
-    assert found.status == "ok"
-    assert rms(found, moved) < 1.2e-2
-    assert rms(found, full(THETA)) > 3.0 * rms(found, moved)
+    assert reduced.status == "ok"
+    assert rms(reduced, moved) < 1.2e-2
+    assert rms(reduced, full(THETA)) > 3.0 * rms(reduced, moved)
 
 
 def test_outside_of_the_trained_region_nothing_runs(model) -> None:
-    found = simulate_reduced(model, MOTION, THETA | {"E_c": 5e6})
-    assert found.status == "failed"
-    assert found.stats["inside"] == 0.0
-    assert "E_c is 5e+06" in found.message
+    reduced = simulate_reduced(model, MOTION, THETA | {"E_c": 5e6})
+    assert reduced.status == "failed"
+    assert reduced.stats["inside"] == 0.0
+    assert "E_c is 5e+06" in reduced.message
     unknown = simulate_reduced(model, MOTION, THETA | {"leakage": 1e-9}, of(["fluid-leakage"]))
     assert "fluid-leakage was not trained" in unknown.message
 
@@ -170,25 +170,25 @@ def test_relaxed_skin_that_is_pushed_together_is_near_folding(model) -> None:
     theta = {"E_c": 344e3, "E_s": 1.1e3, "k_c": 4.6e-15, "k_s": 9.3e-16, "p_init": 500.0}
     theta |= {"g_1": 0.8, "tau_1": 0.87, "g_2": 1.4, "tau_2": 43.0}
     back = PadMotion(np.array([0.0, 9.0, 120.0, 126.0]), 1e-3 * np.array([0.0, 9.5, 9.5, 0.0]))
-    found = simulate_reduced(model, back, theta, of(["solid-viscoelasticity"]))
-    assert found.status == "failed"
-    assert "near folding" in found.message
-    assert found.stats["inside"] == 0.0
+    reduced = simulate_reduced(model, back, theta, of(["solid-viscoelasticity"]))
+    assert reduced.status == "failed"
+    assert "near folding" in reduced.message
+    assert reduced.stats["inside"] == 0.0
     soft = simulate_reduced(model, back, THETA | {"g_1": 0.1, "tau_1": 2.0, "g_2": 0.0, "tau_2": 60.0},
                             of(["solid-viscoelasticity"]))  # fmt: skip
     assert soft.status == "ok"
-    assert found.stats["stiffness_left"] < 0.4 < soft.stats["stiffness_left"]
+    assert reduced.stats["stiffness_left"] < 0.4 < soft.stats["stiffness_left"]
     nearer = simulate_reduced(model, back, theta, of(["solid-viscoelasticity"]), least_stiffness=0.0)
     assert nearer.status == "ok", nearer.message
-    assert nearer.stats["stiffness_left"] == found.stats["stiffness_left"]
+    assert nearer.stats["stiffness_left"] == reduced.stats["stiffness_left"]
 
 
 def test_a_run_that_is_inside_out_between_its_points_has_failed(model, monkeypatch) -> None:
     monkeypatch.setattr(simulate_module.DualWeightedResidual, "follow", lambda *_: np.inf)
-    found = simulate_reduced(model, MOTION, THETA, (), estimate=True)
-    assert found.status == "failed"
-    assert found.stats["inside"] == 0.0
-    assert "the mesh is inverted between the cubature points; run the full model" in found.message
+    reduced = simulate_reduced(model, MOTION, THETA, (), estimate=True)
+    assert reduced.status == "failed"
+    assert reduced.stats["inside"] == 0.0
+    assert "the mesh is inverted between the cubature points; run the full model" in reduced.message
 
 
 def test_full_runs_are_made_once(model, training, tmp_path) -> None:
@@ -199,18 +199,18 @@ def test_full_runs_are_made_once(model, training, tmp_path) -> None:
     cases = [case for kind in (BASE, *NAMES) for case in SETTINGS.cases(model.trained, kind)]
     lines = training.read_bytes().splitlines(keepends=True)
     (tmp_path / "fewer.store").write_bytes(b"".join([*lines[:4], *lines[5:]]))
-    made: list[Case] = []
+    requested: list[Case] = []
     with Store(training, "training runs") as store, Store(tmp_path / "fewer.store", "training runs") as fewer:
         FullRuns(SPEC, store).make(cases, refuse, unheard)
         FullRuns(SPEC, fewer).make(
             cases,
-            lambda function, items: (made.append(c) or (n, function(c)) for n, c in enumerate(items)),
+            lambda function, items: (requested.append(c) or (n, function(c)) for n, c in enumerate(items)),
             unheard,
         )
         again = FullRuns(SPEC, fewer).read(cases[3])
         for name, value in vars(FullRuns(SPEC, store).read(cases[3])).items():
             np.testing.assert_array_equal(getattr(again, name), value)
-    assert made == [cases[3]]
+    assert requested == [cases[3]]
 
 
 def test_a_full_run_of_another_law_is_not_taken_for_it(model, training, monkeypatch) -> None:
@@ -287,14 +287,14 @@ def test_enrichment_ends_where_the_measured_error_is_small(model, tmp_path) -> N
 
     theta = THETA | STRONG
     with Store(tmp_path / "runs.store", "near") as store:
-        found = enrich(model, theta, NAMES, MOTION, settings, store, counted, unheard)
-    assert found.error <= settings.wanted
-    assert sum(calls) == found.full_runs
-    there = simulate_reduced(found.model, MOTION, theta, of(NAMES))
+        enriched = enrich(model, theta, NAMES, MOTION, settings, store, counted, unheard)
+    assert enriched.error <= settings.wanted
+    assert sum(calls) == enriched.full_runs
+    there = simulate_reduced(enriched.model, MOTION, theta, of(NAMES))
     before = simulate_reduced(model, MOTION, theta, of(NAMES))
     right = full(theta, NAMES)
     assert rms(there, right) < min(2e-3, rms(before, right))
-    far = simulate_reduced(found.model, MOTION, theta | {"E_c": 1e6}, of(NAMES))
+    far = simulate_reduced(enriched.model, MOTION, theta | {"E_c": 1e6}, of(NAMES))
     assert far.stats["inside"] == 0.0
     calls.clear()
     with Store(tmp_path / "runs.store", "near") as store:

@@ -200,8 +200,10 @@ def test_the_linear_parts_are_the_full_models_matrix(problem, inner) -> None:
             )
         matrix[np.ix_(dofs, dofs)] += block
     expected = basis.fields @ (matrix.tocsr() @ basis.fields.T)
-    found = np.einsum("l,lij->ij", [2.0, 3.0], parts.shear) + np.einsum("l,lij->ij", [5.0, 7.0], parts.bulk)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    computed = np.einsum("l,lij->ij", [2.0, 3.0], parts.shear) + np.einsum(
+        "l,lij->ij", [5.0, 7.0], parts.bulk
+    )
+    np.testing.assert_allclose(computed, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
 
 
 def test_a_set_has_the_modes_of_its_members_beside_the_base_models(problem, inner) -> None:

@@ -8,9 +8,9 @@ from bayeskin.reduced.tangents import KEEPING, Tangent, Tangents
 
 
 def tangent(value: float) -> Tangent:
-    made = Tangent(2)
-    made.inverse[:], made.force_row[:], made.by_pads[:] = value, value, value
-    return made
+    tangent = Tangent(2)
+    tangent.inverse[:], tangent.force_row[:], tangent.by_pads[:] = value, value, value
+    return tangent
 
 
 def test_the_nearest_serves_as_a_copy() -> None:

@@ -43,7 +43,7 @@ def loads(walk: Walk) -> list[str]:
     styles = [value for _, name, value in walk.attributes if name in ("style", "fill", "clip-path")]
     styles += [data for tag, data in walk.texts if tag == "style"]
     fetched += [url for style in styles for url in re.findall(r"url\(([^)]*)\)|@import", style)]
-    return [one for one in fetched if not one.startswith(("#", "data:"))]
+    return [address for address in fetched if not address.startswith(("#", "data:"))]
 
 
 def test_a_page_loads_nothing(whole: str) -> None:
@@ -58,7 +58,7 @@ def test_a_page_loads_nothing(whole: str) -> None:
 def test_every_section_figure_and_table_is_there(whole: str) -> None:
     walk = Walk(whole)
     ids = walk.values("id")
-    assert [one for one in ids if one in SECTIONS] == SECTIONS
+    assert [anchor for anchor in ids if anchor in SECTIONS] == SECTIONS
     assert {f"{stage}-{name}".replace("_", "-") for stage, name in FIGURES} <= set(ids)
     assert walk.tags.count("table") >= 12
     assert walk.tags.count("caption") == walk.tags.count("table")
@@ -156,7 +156,7 @@ def test_what_is_left_and_which_test_would_tell_stand_in_the_mismatch(whole: str
     )
     nothing = diagnosed_as({"unexplained": None})
     assert "that the parameters cannot explain; it varies" not in nothing
-    stages = {name: one for name, one in facts().stages.items() if name != "experiment"}
+    stages = {name: stage for name, stage in facts().stages.items() if name != "experiment"}
     unasked = Walk(render_page(dataclasses.replace(facts(), stages=stages))).text()
     assert "Which further test" not in unasked
 
@@ -184,7 +184,9 @@ def test_what_comes_from_a_recording_or_a_configuration_is_escaped() -> None:
 
 def only(run: RunFacts, **standing: str) -> RunFacts:
     stages = {name: StageFacts(name, standing.get(name, "not run")) for name in run.stages}
-    done = {name: one for name, one in run.stages.items() if name in standing and standing[name] == "done"}
+    done = {
+        name: stage for name, stage in run.stages.items() if name in standing and standing[name] == "done"
+    }
     return dataclasses.replace(run, stages={**stages, **done}, history=None)
 
 

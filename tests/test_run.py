@@ -108,7 +108,7 @@ def test_the_summary_answers_what_a_reader_asks(folder: Path) -> None:
     assert [line.split(":")[0] for line in summary["identifiability"]][:5] == list(SPACE.names)
     assert set(summary["seconds"]) == {stage.name for stage in stages.BEFORE_REPORT}
     shares = summary["sobol"].pop("posterior")["shares"]
-    assert sum(one["share"] for one in shares.values()) == pytest.approx(1.0)
+    assert sum(part["share"] for part in shares.values()) == pytest.approx(1.0)
     for table in summary["sobol"].values():
         assert "uniform" in table["distribution"]
         stiff = [table["aggregated"][name]["total"] for name in ("E_c", "E_s")]
@@ -130,12 +130,12 @@ def test_priors_with_their_sources_and_what_the_data_says_are_printed(folder: Pa
 
 def test_what_the_fit_leaves_is_tested_and_said(folder: Path) -> None:
     said = json.loads((folder / "case" / "sample" / "stage.json").read_text())["summary"]
-    found = said["residuals"]
-    assert sum(one["bins"] for one in found["by_kind"].values()) == 75  # those fitted
-    assert found["passes"] == (found["sentence"] not in said["remarks"])
+    residuals = said["residuals"]
+    assert sum(one["bins"] for one in residuals["by_kind"].values()) == 75  # those fitted
+    assert residuals["passes"] == (residuals["sentence"] not in said["remarks"])
     shown = (folder / "case" / "report.html").read_text()
-    assert str(prose(found["sentence"])) in shown
-    assert len(found["autocorrelation"]) == 10
+    assert str(prose(residuals["sentence"])) in shown
+    assert len(residuals["autocorrelation"]) == 10
 
 
 def test_the_design_holds_each_wave_with_its_labels(folder: Path) -> None:
@@ -184,7 +184,7 @@ def test_the_page_shows_the_whole_run(folder: Path) -> None:
     said = charts[0]["says"]
     assert len(charts) == 5  # force, residual, Sobol' indices
     assert len(said) == 130
-    assert sum("not fitted" not in one for one in said) == 75
+    assert sum("not fitted" not in line for line in said) == 75
 
 
 def test_the_posterior_is_an_inference_data_with_its_origin(folder: Path) -> None:
@@ -197,10 +197,10 @@ def test_the_posterior_is_an_inference_data_with_its_origin(folder: Path) -> Non
 def test_the_full_model_weighs_draws_of_the_posterior(folder: Path) -> None:
     said = json.loads((folder / "case" / "sample" / "stage.json").read_text())["summary"]
     assert len(said["full_model"]) == 1  # chains that have not converged add nothing to the design
-    found = said["full_model"][0]
-    assert (found["draws"], found["failed"]) == (8, 0)
-    assert found["message"] in said["reasons"]
-    assert found["effective"] >= 1.0
+    point = said["full_model"][0]
+    assert (point["draws"], point["failed"]) == (8, 0)
+    assert point["message"] in said["reasons"]
+    assert point["effective"] >= 1.0
     assert said["corrected"] is None or set(said["corrected"]) == set(said["parameters"])
 
 
@@ -239,15 +239,15 @@ def test_draws_join_the_design_where_the_full_model_is_elsewhere(
         asked.append(log_posterior.surrogate)
         return Posterior(problem.space, near.reshape(2, 200, -1), np.zeros((2, 200)), trusted, 1)
 
-    found = checked_posterior(run, problem, draws_of)
+    checked = checked_posterior(run, problem, draws_of)
     before = storage.load(run.at("map", "design.h5"), Design)
-    assert len(found.rounds) == len(asked) == rounds
-    assert found.log_posterior.surrogate is asked[-1]
+    assert len(checked.rounds) == len(asked) == rounds
+    assert checked.log_posterior.surrogate is asked[-1]
     assert run.at("sample", "surrogate.h5").is_file() == (rounds > 1)
     if rounds > 1:
         after = storage.load(run.at("sample", "design.h5"), Design)
         assert len(after.theta) == len(before.theta) + 8 * (rounds - 1)
-        assert not with_full_model(Verdict(True, ()), found).trusted
+        assert not with_full_model(Verdict(True, ()), checked).trusted
 
 
 def settled(dim: int) -> Convergence:

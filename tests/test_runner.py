@@ -110,16 +110,16 @@ def test_a_kill_beside_the_write_of_a_run_costs_this_run_at_most(
         if third:
             raise Killed
 
-    path, made = tmp_path / "a.store", tmp_path / "calls"
-    made.mkdir()
-    simulate = partial(unreliable_models.counted, folder=str(made))
+    path, log = tmp_path / "a.store", tmp_path / "calls"
+    log.mkdir()
+    simulate = partial(unreliable_models.counted, folder=str(log))
     with monkeypatch.context() as patch:
         patch.setattr(Store, "add", dies)
         with pytest.raises(Killed):
             run(path, SHORT, simulate)
     design = run(path, SHORT, simulate)
     np.testing.assert_array_equal(design.force_n, whole.force_n[: len(SHORT.theta)])
-    assert len(list(made.iterdir())) == calls
+    assert len(list(log.iterdir())) == calls
 
 
 def test_a_worker_that_dies_loses_only_its_own_point_which_is_run_again(
@@ -153,7 +153,7 @@ def test_failed_runs_are_rows_with_their_message(tmp_path: Path) -> None:
         np.where(e_c > 7e5, "ZeroDivisionError: singular tangent", np.where(e_s < 5e3, "not finite", "")),
     )  # fmt: skip
     assert set(expected) == {"Newton stalled", "ZeroDivisionError: singular tangent", "not finite", ""}
-    assert all(want in found for want, found in zip(expected, design.messages, strict=True))
+    assert all(want in message for want, message in zip(expected, design.messages, strict=True))
     np.testing.assert_array_equal(design.ok, expected == "")
     assert np.isnan(design.force_n[~design.ok]).all()
     assert np.isfinite(design.force_n[design.ok]).all()
@@ -267,7 +267,7 @@ def test_a_design_file_is_an_ordinary_file_of_the_project(tmp_path: Path, whole:
 def test_a_design_whose_arrays_do_not_belong_together_is_refused(
     serial: None, tmp_path: Path, name: str, value: object, says: str
 ) -> None:
-    made = run(tmp_path / "a.store")
-    storage.save(tmp_path / "other.h5", replace(made, **{name: value}))
+    design = run(tmp_path / "a.store")
+    storage.save(tmp_path / "other.h5", replace(design, **{name: value}))
     with pytest.raises(InputError, match=says):
         load_design(tmp_path / "other.h5")

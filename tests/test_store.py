@@ -37,10 +37,10 @@ SECOND = Result(np.zeros((0, 3)), (), False, float("nan"))
 SHARED = {"model": "toy", "edges_s": np.arange(3.0)}
 
 
-def same(found: Result, expected: Result) -> bool:
+def same(result: Result, expected: Result) -> bool:
     """Equal bit by bit."""
-    np.testing.assert_array_equal(found.force_n.view(np.int64), expected.force_n.view(np.int64))
-    return repr(found) == repr(expected)
+    np.testing.assert_array_equal(result.force_n.view(np.int64), expected.force_n.view(np.int64))
+    return repr(result) == repr(expected)
 
 
 @pytest.fixture
@@ -69,12 +69,12 @@ def test_a_store_gives_back_to_the_last_bit_what_it_was_given(path: Path) -> Non
             store.read("absent", dict)
         store.add("arrays", arrays | plain | {"number": np.float32(0.5), "flag": np.True_})
     with Store(path, SHARED) as store:
-        found = store.read("arrays", dict)
+        read = store.read("arrays", dict)
     for kind, array in arrays.items():
-        np.testing.assert_array_equal(found[kind], array)
-        assert found[kind].dtype == np.dtype(kind)
-    assert {name: found[name] for name in plain} == plain
-    assert (found["number"], found["flag"]) == (0.5, True)
+        np.testing.assert_array_equal(read[kind], array)
+        assert read[kind].dtype == np.dtype(kind)
+    assert {name: read[name] for name in plain} == plain
+    assert (read["number"], read["flag"]) == (0.5, True)
 
 
 def test_a_store_without_results_leaves_no_file(tmp_path: Path) -> None:
@@ -107,10 +107,10 @@ def test_a_flipped_bit_costs_its_result_only(path: Path) -> None:
                 kept(path)
             continue
         heard: list[str] = []
-        found = kept(path, heard)
+        results = kept(path, heard)
         assert heard == [f"{path}: a result is damaged, and computed again where needed"]
         if at != header + first - 1:  # without the line's end, both results are gone
-            assert found == [at >= header + first, at < header + first]
+            assert results == [at >= header + first, at < header + first]
 
 
 def test_results_of_other_inputs_are_refused_and_stay(path: Path) -> None:
@@ -160,14 +160,14 @@ def test_a_line_with_the_right_checksum_that_is_no_result_is_refused(path: Path,
 
 def test_an_addition_finds_what_other_processes_have_added(path: Path) -> None:
     heard: list[str] = []
-    with Store(path, SHARED) as one, Store(path, SHARED, heard.append) as other:
-        one.add("a", {"force_n": EDGE})
+    with Store(path, SHARED) as first, Store(path, SHARED, heard.append) as other:
+        first.add("a", {"force_n": EDGE})
         with open(path, "ab") as file:
             file.write(b"what a killed process was writing")
         other.add("b", {"force_n": EDGE + 1.0})
-        one.add("c", {"force_n": EDGE + 2.0})
-        assert ["a" in other, "c" in other, "b" in one] == [True, False, True]
-        np.testing.assert_array_equal(one.read("b", dict)["force_n"], EDGE + 1.0)
+        first.add("c", {"force_n": EDGE + 2.0})
+        assert ["a" in other, "c" in other, "b" in first] == [True, False, True]
+        np.testing.assert_array_equal(first.read("b", dict)["force_n"], EDGE + 1.0)
     assert len(heard) == 1
     assert kept(path, heard) == [True, True]
     assert len(heard) == 1
@@ -175,11 +175,11 @@ def test_an_addition_finds_what_other_processes_have_added(path: Path) -> None:
 
 def test_a_store_that_another_process_left_without_results_is_made_again(tmp_path: Path) -> None:
     path = tmp_path / "a.store"
-    with Store(path, SHARED) as one:
+    with Store(path, SHARED) as store:
         with Store(path, SHARED):
             pass
         assert not path.exists()
-        one.add({"E_c": 1e5}, FIRST)
+        store.add({"E_c": 1e5}, FIRST)
     assert kept(path) == [True, False]
 
 

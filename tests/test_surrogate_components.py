@@ -38,11 +38,11 @@ def test_a_shape_that_nothing_predicts_is_an_error_of_all_bins_together():
     rms = np.sqrt(np.mean(DESIGN.force_n**2, axis=1))
     moved = DESIGN.force_n + 0.03 * (rms * rng.standard_normal(len(rms)))[:, None] * shape
     design = replace(DESIGN, force_n=moved)
-    found = train(design, "gp")[0].predict(design.theta[design.held_out])
-    assert np.mean(found.diagonal) < 0.05 * np.mean(found.sd() ** 2)
+    prediction = train(design, "gp")[0].predict(design.theta[design.held_out])
+    assert np.mean(prediction.diagonal) < 0.05 * np.mean(prediction.sd() ** 2)
 
 
 def test_what_is_left_to_the_noise_of_single_bins_is_next_to_nothing_of_the_error():
     design = storage.load(shipped("surrogates/demo-design.h5"), Design)
-    found = train(design, "gp")[0].predict(design.theta[design.testing])
-    assert np.mean(found.diagonal) < 0.01 * np.mean(found.sd() ** 2)
+    prediction = train(design, "gp")[0].predict(design.theta[design.testing])
+    assert np.mean(prediction.diagonal) < 0.01 * np.mean(prediction.sd() ** 2)

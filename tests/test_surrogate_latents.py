@@ -79,9 +79,9 @@ def test_gp_predicts_as_the_textbook_formulas(name):
     mean = both @ bordered[:, :24] @ scaled
     process = scaled @ bordered[:24, :24] @ scaled / (24 - p)
     variance = process * (1 + 1e-4 - np.einsum("ij,jk,ik->i", both, bordered, both))
-    found = gp.predict(points)
-    np.testing.assert_allclose(found[0][:, 0], target.mean() + target.std() * mean, rtol=1e-7)
-    np.testing.assert_allclose(found[1][:, 0], target.var() * variance, rtol=1e-4)
+    prediction = gp.predict(points)
+    np.testing.assert_allclose(prediction[0][:, 0], target.mean() + target.std() * mean, rtol=1e-7)
+    np.testing.assert_allclose(prediction[1][:, 0], target.var() * variance, rtol=1e-4)
 
 
 @pytest.mark.parametrize("nugget", [1e-2, 1.0])
@@ -96,13 +96,13 @@ def test_a_variance_from_few_directions_is_hardly_larger_and_never_smaller(nugge
         for name, map_, own in zip(names, maps, (nugget, nugget, 1e-9, 10 * nugget), strict=True)
     ]
     gps = LatentGPs.assemble(unit, targets, fits)
-    assert [one.few is None for one in gps.conditioned] == [False, nugget < 1.0, True, False]
-    found = gps.predict(points)
+    assert [conditioned.few is None for conditioned in gps.conditioned] == [False, nugget < 1.0, True, False]
+    prediction = gps.predict(points)
     monkeypatch.setattr(subspace, "SUBSPACE", SubspaceSettings(least_rows=1000))
     exact = LatentGPs.assemble(unit, targets, fits).predict(points)
-    np.testing.assert_allclose(found[0], exact[0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(prediction[0], exact[0], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(gps.predict_mean(points), exact[0], rtol=1e-9, atol=1e-9)
-    ratio = found[1] / exact[1]
+    ratio = prediction[1] / exact[1]
     assert ratio.min() > 1.0 - 1e-9
     assert ratio.max() < 1.3
     assert ratio.mean() < 1.03
@@ -118,8 +118,8 @@ def test_latents_of_two_kernels_are_predicted_together_as_each_by_itself():
     together = LatentGPs.assemble(unit, targets, fits).predict(points)
     for j, fit in enumerate(fits):
         alone = LatentGPs.assemble(unit, targets[:, j : j + 1], [fit]).predict(points)
-        for found, expected in zip(together, alone, strict=True):
-            np.testing.assert_allclose(found[:, j], expected[:, 0], rtol=1e-9)
+        for joint, expected in zip(together, alone, strict=True):
+            np.testing.assert_allclose(joint[:, j], expected[:, 0], rtol=1e-9)
 
 
 def test_gp_leave_one_out_is_the_gp_without_the_row():
@@ -210,9 +210,9 @@ def test_cross_validated_error_of_a_latent_is_that_of_fresh_points(kind):
     target = function(unit)
     if kind == "gp":
         fit = fit_latent(unit, target, np.ones(len(unit)))
-        found = LatentGPs.assemble(unit, target[:, None], [fit]).predict(fresh)[0][:, 0]
+        prediction = LatentGPs.assemble(unit, target[:, None], [fit]).predict(fresh)[0][:, 0]
     else:
         fit = fit_sparse(unit, target, np.ones(len(unit)))
-        found = LatentChaos.assemble(unit, target[:, None], [fit]).predict(fresh)[0][:, 0]
-    ratio = np.sqrt(np.mean((found - function(fresh)) ** 2) / fit.error)
+        prediction = LatentChaos.assemble(unit, target[:, None], [fit]).predict(fresh)[0][:, 0]
+    ratio = np.sqrt(np.mean((prediction - function(fresh)) ** 2) / fit.error)
     assert 1 / 2.5 < ratio < 2.5

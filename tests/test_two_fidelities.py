@@ -23,7 +23,9 @@ from bayeskin.workflow.engine import Silent
 def designed(refinement: int, theta: np.ndarray, held_out: np.ndarray) -> Design:
     n = len(theta)
     named = [dict(zip(SPACE.names, row, strict=True)) for row in theta]
-    force_n = toy_bin_means(theta) * np.array([[stand_in_model.finer(refinement, one)] for one in named])
+    force_n = toy_bin_means(theta) * np.array(
+        [[stand_in_model.finer(refinement, values)] for values in named]
+    )
     return Design(
         SPACE, EDGES_S, theta, force_n, np.zeros(n, dtype=np.int64), held_out,
         np.ones(n, dtype=bool), ("",) * n, np.zeros(n), 1, f"refinement {refinement}",
@@ -47,8 +49,8 @@ def test_the_correction_removes_the_coarse_models_bias_on_runs_held_out_of_both(
     corrected, validation = correct(surrogate, fine)
     theta, truth = fine.theta[fine.testing], fine.force_n[fine.testing]
 
-    def bias(found):
-        return np.mean(np.log(found.predict(theta).mean[:, 30:60] / truth[:, 30:60]))
+    def bias(prediction):
+        return np.mean(np.log(prediction.predict(theta).mean[:, 30:60] / truth[:, 30:60]))
 
     assert bias(surrogate) == pytest.approx(0.03, abs=0.008)  # what the fine mesh changes
     assert abs(bias(corrected)) < 0.002
@@ -68,8 +70,8 @@ def test_a_shape_that_the_coarse_model_does_not_know_is_no_noise_of_single_bins(
     share = 0.05 * np.exp(-np.sum(SPACE.to_unit(fine.theta), axis=1))[:, None]
     size = np.sqrt(np.mean(fine.force_n**2, axis=1))[:, None]
     more = dataclasses.replace(fine, force_n=fine.force_n + share * size * bent)
-    found = correct(train(coarse, "gp")[0], more)[0].predict(fine.theta[fine.testing])
-    told = np.sqrt(found.diagonal.mean(axis=1) / np.mean(found.mean**2, axis=1))
+    prediction = correct(train(coarse, "gp")[0], more)[0].predict(fine.theta[fine.testing])
+    told = np.sqrt(prediction.diagonal.mean(axis=1) / np.mean(prediction.mean**2, axis=1))
     added = np.sqrt(np.mean(share**2) * np.mean(bent**2))
     assert np.all(told < 0.1 * added)
 
@@ -97,9 +99,9 @@ def test_a_corrected_surrogate_is_read_back_as_it_was(tmp_path, coarse, fine, ki
     corrected = correct(train(coarse, kind)[0], fine)[0]
     save_surrogate(tmp_path / "s.h5", corrected, {})
     theta = fine.theta[:3]
-    stored, found = (s.predict(theta) for s in (load_surrogate(tmp_path / "s.h5"), corrected))
-    np.testing.assert_array_equal(stored.mean, found.mean)
-    np.testing.assert_array_equal(stored.sd(), found.sd())
+    stored, loaded = (s.predict(theta) for s in (load_surrogate(tmp_path / "s.h5"), corrected))
+    np.testing.assert_array_equal(stored.mean, loaded.mean)
+    np.testing.assert_array_equal(stored.sd(), loaded.sd())
 
 
 def test_fine_points_are_the_coarse_designs_own_and_keep_their_labels(coarse):
@@ -169,9 +171,9 @@ def test_a_run_with_a_coarse_design_is_checked_against_the_fine_model(folder: Pa
     manifest = json.loads((folder / "train" / "surrogate.json").read_text())
     assert manifest["model_hash"] == fine.model_hash
     assert manifest["fine_rows"] == 12
-    found = json.loads((folder / "map" / "stage.json").read_text())["summary"]
-    assert found["ok"]
-    check = found["checks"][-1]
+    summary = json.loads((folder / "map" / "stage.json").read_text())["summary"]
+    assert summary["ok"]
+    check = summary["checks"][-1]
     assert check["rms_n"] < 0.005 * stand_in_model.SCALE * 2000  # the coarse model is off by 3 %
     assert storage.load(folder / "map" / "fine.h5", Design).model_hash == fine.model_hash
 

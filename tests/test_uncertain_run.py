@@ -113,14 +113,14 @@ def test_the_share_of_a_variance_is_that_of_the_regression() -> None:
     z = rng.standard_normal((4, 200_000))
     draws = np.exp([11.0 - 0.3 * z[0] + 0.4 * z[1], 10.0 + 0.1 * z[2], -30.0 + 0.1 * z[3], 0.0 * z[0]]).T
     draws[:, 3] = 2e-3 + 2e-4 * z[0]
-    found = due_to_lengths(space, draws)
-    assert [one.name for one in found] == ["E_c", "E_s"]  # of k_c nothing notable
-    assert found[0].share == pytest.approx(0.36, abs=0.01)
-    assert found[1].share == pytest.approx(0.0, abs=1e-3)
-    assert found[0].sentence == (
+    shares = due_to_lengths(space, draws)
+    assert [parameter.name for parameter in shares] == ["E_c", "E_s"]  # of k_c nothing notable
+    assert shares[0].share == pytest.approx(0.36, abs=0.01)
+    assert shares[1].share == pytest.approx(0.0, abs=1e-3)
+    assert shares[0].sentence == (
         "The uncertain thickness of the cutis explains 36 % of the posterior variance of log E_c."
     )
-    assert "less than 1 %" in found[1].sentence
+    assert "less than 1 %" in shares[1].sentence
     assert due_to_lengths(ParameterSpace(moduli), draws[:, :3]) == ()
 
 

@@ -73,12 +73,12 @@ def test_a_worker_that_is_killed_between_two_calls_is_replaced() -> None:
 def test_an_item_that_kills_a_worker_is_run_again_by_another(tmp_path: Path) -> None:
     with standing(dead_once, 1) as run_all:
         ((_, first),) = run_all([""])
-        found = dict(run_all([str(tmp_path / "died"), ""]))
+        results = dict(run_all([str(tmp_path / "died"), ""]))
         assert (tmp_path / "died").exists()
-        assert set(found) == {0, 1}
-        assert found[0] == found[1] != first
-        assert not any(isinstance(one, Lost) for one in found.values())
-        assert dict(run_all([""])) == {0: found[0]}
+        assert set(results) == {0, 1}
+        assert results[0] == results[1] != first
+        assert not any(isinstance(result, Lost) for result in results.values())
+        assert dict(run_all([""])) == {0: results[0]}
 
 
 def test_a_call_that_is_not_finished_leaves_no_worker_busy(tmp_path: Path) -> None:
@@ -94,8 +94,8 @@ def test_a_call_that_is_not_finished_leaves_no_worker_busy(tmp_path: Path) -> No
         results.close()
         assert not alive(busy)
         files = [str(tmp_path / f"{i}") for i in range(4)]
-        found = dict(run_all([(file, 0.0) for file in files]))
-        assert [found[i][0] for i in range(4)] == files
-        pids = {pid for _, pid in found.values()}
+        finished = dict(run_all([(file, 0.0) for file in files]))
+        assert [finished[i][0] for i in range(4)] == files
+        pids = {pid for _, pid in finished.values()}
         assert busy not in pids
     assert not any(alive(pid) for pid in pids)

@@ -45,7 +45,7 @@ def stages() -> dict[str, Stage]:
     def source(run: Run) -> Path:
         return run.beside("input.txt")
 
-    made = [
+    stages = [
         Stage(
             "read",
             "reads",
@@ -58,7 +58,7 @@ def stages() -> dict[str, Stage]:
         Stage("seeded", "draws", ("read",), ("seed",), writes("seeded", lambda run: str(run.config.seed))),
         Stage("end", "ends", ("twice",), (), writes("end", text("twice"))),
     ]
-    return {stage.name: stage for stage in made}
+    return {stage.name: stage for stage in stages}
 
 
 def ran(run: Run, last: str | None = None, of: dict[str, Stage] | None = None) -> list[str]:

@@ -136,7 +136,7 @@ def recorded(seed: int, friction_n: float = 0.0, **values: float) -> BinnedForce
     rng, count = np.random.default_rng(seed), len(middle)
     moves = np.sign(MOTION.at(EDGES_S[1:]) - MOTION.at(EDGES_S[:-1]))
     force_n = skin[0] + more[0] + friction_n * moves + NOISE_N * rng.standard_normal(count)
-    phase = np.searchsorted([one.end_s for one in PHASES], middle)
+    phase = np.searchsorted([part.end_s for part in PHASES], middle)
     return BinnedForce(EDGES_S, force_n, np.full(count, NOISE_N**2), np.zeros(count - 1), phase, PHASES)
 
 
@@ -167,7 +167,7 @@ def bench(
 
 def a_run(bench: DiagnosisContext, names: Sequence[str] = (), **values: float) -> ModelRun:
     """With derivatives, at the truth but for these values."""
-    neutral = {name: value for one in names for name, value in KNOWN[one].neutral.items()}
+    neutral = {name: value for mechanism in names for name, value in KNOWN[mechanism].neutral.items()}
     run = bench.run(names, {**neutral, **TRUTH, **values})
     assert isinstance(run, ModelRun)
     return run

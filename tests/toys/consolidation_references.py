@@ -117,10 +117,10 @@ def compression_stress(
         return np.diff(flux) / widths
 
     pattern = diags([np.ones(cells)] * 3, [-1, 0, 1], shape=(cells, cells))
-    found, start, now = [], 0.0, np.ones(cells)
+    computed, start, now = [], 0.0, np.ones(cells)
     for end in times:  # each on its own, so that corners of the motion may be among them
         later = solve_ivp(velocity, (start, end), now, "BDF", rtol=1e-8, atol=1e-10, jac_sparsity=pattern)
         start, now = end, later.y[:, -1]
         assert abs((now - 1) @ widths - displacement(end)) < 1e-6 * length
-        found.append(stress(now)[-1] + rate(end) * resistance(now)[-1])
-    return np.array(found)
+        computed.append(stress(now)[-1] + rate(end) * resistance(now)[-1])
+    return np.array(computed)

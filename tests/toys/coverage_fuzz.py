@@ -31,8 +31,8 @@ def main() -> None:
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as folder:
         corpus, path = Path(folder) / "corpus", Path(folder) / "in" / name
-        for made in (corpus, path.parent):
-            made.mkdir()
+        for needed in (corpus, path.parent):
+            needed.mkdir()
         (corpus / "sound").write_bytes(make(Path(folder)))
 
         def one(data: bytes) -> None:

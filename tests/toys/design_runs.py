@@ -26,11 +26,11 @@ def run(
         return run_design(store, wave, COARSE_S, simulate, "toy", run_all or local(1), **options)
 
 
-def assert_same_rows(found: Design, expected: Design) -> None:
+def assert_same_rows(design: Design, expected: Design) -> None:
     """Equal bit by bit, durations excepted."""
     for name in ("edges_s", "theta", "force_n", "wave", "held_out", "ok"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
-    assert found.space == expected.space
-    assert (found.messages, found.seed, found.model_hash) == (
+        np.testing.assert_array_equal(getattr(design, name), getattr(expected, name), err_msg=name)
+    assert design.space == expected.space
+    assert (design.messages, design.seed, design.model_hash) == (
         expected.messages, expected.seed, expected.model_hash,
     )  # fmt: skip

@@ -67,15 +67,15 @@ class DrivenModel(TightModel):
         return super().solve_stage(time_s, h, old, guess, jump)
 
     def residual(self, x, h, old, elapsed_s=None, changed=None):
-        found = super().residual(x, h, old, elapsed_s, changed)
-        if found is None or self.load is None:
-            return found
-        return found._replace(residual=found.residual - self.load(self.time_s, h))
+        residual = super().residual(x, h, old, elapsed_s, changed)
+        if residual is None or self.load is None:
+            return residual
+        return residual._replace(residual=residual.residual - self.load(self.time_s, h))
 
     def state_at(self, x: Array) -> State:
         """The state at x (dofs,) with a history that is x itself."""
-        found = super().residual(x, 1.0, self.initial_state(0.0))
-        return State(0.0, x, found.volume, found.pressure)
+        residual = super().residual(x, 1.0, self.initial_state(0.0))
+        return State(0.0, x, residual.volume, residual.pressure)
 
 
 def driven(

@@ -51,9 +51,9 @@ unit = "s"
 
 def spring() -> object:
     """The function of `SPRING`."""
-    found: dict[str, object] = {}
-    exec(SPRING, found)
-    return found["force"]
+    namespace: dict[str, object] = {}
+    exec(SPRING, namespace)
+    return namespace["force"]
 
 
 class Served(umbridge.Model):

@@ -168,14 +168,14 @@ def errors(exact: Manufactured, space: TaylorHood, x: Array, t: float) -> dict[s
     u = exact.displacement(points, t).reshape(3, *shape)
     du = exact.gradient(points, t).reshape(*shape, 3, 3)
     p = exact.pressure(points, t).reshape(shape)
-    found = [basis.interpolate(np.ascontiguousarray(x[i:n:3])) for i in range(3)]
+    components = [basis.interpolate(np.ascontiguousarray(x[i:n:3])) for i in range(3)]
     found_p = np.asarray(basis_p.interpolate(np.ascontiguousarray(x[n:])))
 
     def norm(field: Array) -> float:
         return float(np.sqrt((field**2 * basis.dx).sum()))
 
-    values = np.stack([np.asarray(part) for part in found])
-    gradients = np.stack([part.grad for part in found])  # (i, j, e, q)
+    values = np.stack([np.asarray(part) for part in components])
+    gradients = np.stack([part.grad for part in components])  # (i, j, e, q)
     return {
         "u": norm(values - u) / norm(u),
         "grad u": norm(gradients - du.transpose(2, 3, 0, 1)) / norm(du.transpose(2, 3, 0, 1)),

@@ -13,8 +13,8 @@ def constraints(pyproject: Path) -> list[str]:
         *project["dependencies"],
         *(line for name in extras if name != "benchmark" for line in extras[name]),
     ]
-    found = [re.match(r"([A-Za-z0-9_.-]+)>=([0-9.]+)", line) for line in asked]
-    return [f"{match[1]}=={match[2]}" for match in found if match]
+    matches = [re.match(r"([A-Za-z0-9_.-]+)>=([0-9.]+)", line) for line in asked]
+    return [f"{match[1]}=={match[2]}" for match in matches if match]
 
 
 if __name__ == "__main__":

@@ -33,11 +33,11 @@ def pulled(motion, *laws, steps=24):
     """Times and forces a unit area of a drained bar with laws, in equal steps of each phase."""
     held = LagrangianModel(BAR.problem, BAR.material, motion, laws)
     past = [held.initial_state(0.0)]
-    found = [(0.0, 0.0)]
+    points = [(0.0, 0.0)]
     for start, end in pairwise(held.motion.time_s):
         past = past[-1:]
         for _ in range(steps):
             step = advance(held, past[-3:], (end - start) / steps)
             past.append(step.state)
-            found.append((step.state.time_s, step.force_n / 2.0))
-    return np.array(found).T
+            points.append((step.state.time_s, step.force_n / 2.0))
+    return np.array(points).T

@@ -39,11 +39,11 @@ def on_steps_of(model: Model, p_init: float, steps: Sequence[Step]) -> Array:
     past, forces = [model.initial_state(p_init)], [0.0]
     start_at_zero(model, steps[0])
     for step in steps[1:]:
-        made = advance(model, past, step.state.time_s - past[-1].time_s)
-        assert made is not None
-        forces.append(made.force_n)
-        start_at_zero(model, made)
-        past = [*past, made.state][-EXTRAPOLATION_POINTS:]
+        stepped = advance(model, past, step.state.time_s - past[-1].time_s)
+        assert stepped is not None
+        forces.append(stepped.force_n)
+        start_at_zero(model, stepped)
+        past = [*past, stepped.state][-EXTRAPOLATION_POINTS:]
         if step.corner:
             model.remember_travel(past)
             past = past[-1:]
