@@ -35,6 +35,10 @@ class Prediction:
         """Returns the standard deviation of each bin, (n, m) [N]."""
         return np.sqrt(np.einsum("nmr,nmr->nm", self.factor, self.factor) + self.diagonal)
 
+    def of_bins(self, bins: slice) -> Prediction:
+        """Returns the force in some of the bins."""
+        return Prediction(self.mean[:, bins], self.factor[:, bins], self.diagonal[:, bins])
+
 
 @runtime_checkable
 class Surrogate(Protocol):

@@ -88,20 +88,20 @@ def _draw_figures(
     held_out = design if fine is None else fine
     testing = held_out.testing
     truth, prediction = held_out.force_n[testing], surrogate.predict(held_out.theta[testing])
-    noise_sd_n = np.sqrt(binned.variance_n2)
     scale = np.sqrt(np.mean(truth**2, axis=1))
     means = [*_earlier_predictions(run, design, binned, held_out, uncorrected), prediction.mean]
     errors = np.array([np.sqrt(np.mean((mean - truth) ** 2, axis=1)) / scale for mean in means])
-    figure = report.figure_validation(
-        design.edges_s, truth, prediction, noise_sd_n, errors, corrected=fine is not None
-    )
-    report.save_figure(figure, run.at("train", "validation"), caption(run))
     space = parameter_space(run.config, run.config_path)
     theta = space.draw(np.random.default_rng([run.config.seed, 3]), PRIOR_DRAWS)
     drawn = surrogate.predict_mean(theta)
     for number, (bins, part) in enumerate(zip(binned.slices, binned.parts, strict=True)):
         figure = report.figure_prior_predictive(part, drawn[:, bins])
         report.save_figure(figure, run.at("train", figure_name("prior_predictive", number)), caption(run))
+        figure = report.figure_validation(
+            part.edges_s, truth[:, bins], prediction.of_bins(bins), np.sqrt(part.variance_n2), errors,
+            corrected=fine is not None,
+        )  # fmt: skip
+        report.save_figure(figure, run.at("train", figure_name("validation", number)), caption(run))
 
 
 def _earlier_predictions(
