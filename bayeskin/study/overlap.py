@@ -1,0 +1,36 @@
+"""Compares shrunk estimates with those of weighted draws, which need no fitted likelihood.
+
+Given the parameters of the population, draws of a recording's own posterior become draws of its shrunk
+posterior by the weights (density in the population) / (density of the prior). Averaged over the draws of the
+population's parameters, normalised weights give the shrunk posterior exactly, if enough draws have a weight.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayeskin.inference.importance import smoothed_weights
+from bayeskin.study.individual import Individual, log_prior
+from bayeskin.study.model import Model, State, log_normal
+from bayeskin.study.result import Overlap
+
+_DRAWS, _SETS = 2000, 100  # largest numbers of draws of a recording, and of the population's parameters
+
+
+def overlap(number: int, individual: Individual, model: Model, draws: State) -> Overlap:
+    """Returns how well the draws of a recording overlap with its shrunk estimate and agree with it."""
+    chosen = np.linspace(0, len(draws.x) - 1, min(_SETS, len(draws.x))).astype(int)
+    some = draws.taken(chosen)
+    rows = np.linspace(0, len(individual.draws) - 1, min(_DRAWS, len(individual.draws))).astype(int)
+    x = np.log(individual.draws[rows])
+    away = x - model.parents(some)[-1][:, number, None]
+    log_weights = log_normal(away, some.covariances[-1]) - log_prior(individual.space, x)
+    weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
+    weights /= weights.sum(axis=1, keepdims=True)
+    effective = float(np.median(1.0 / np.sum(weights**2, axis=1)))
+    pooled = weights.mean(axis=0)
+    with np.errstate(divide="ignore"):
+        khat = smoothed_weights(np.log(pooled))[1]
+    shrunk = draws.x[:, number]
+    shift = np.abs(pooled @ x - shrunk.mean(axis=0)) / shrunk.std(axis=0)
+    return Overlap(individual.recording, effective, khat, float(shift.max()))
