@@ -15,8 +15,10 @@ from toys import normal_hierarchy as normal
 from bayeskin.study import Individual, Population, Priors, SamplerSettings, infer_population
 from bayeskin.study.exact_draws import draw_coefficients, draw_covariances, draw_values
 from bayeskin.study.individual import Likelihoods, NormalMixture
-from bayeskin.study.model import State
+from bayeskin.study.layout import Layout
+from bayeskin.study.model import Model, State
 from bayeskin.study.moves import Ensembles
+from bayeskin.study.overlap import overlap
 from bayeskin.study.sampler import draw_population
 from bayeskin.types import Array, Parameter, ParameterSpace
 
@@ -230,3 +232,21 @@ def test_draws_that_contradict_the_fitted_likelihood_are_noticed(monkeypatch: py
     monkeypatch.setattr(NormalMixture, "of", classmethod(shifted))
     wrong = infer_population(table, individuals, rng, settings=QUICK).overlaps
     assert [n for n, one in enumerate(wrong) if one.contradicts] == [3]
+
+
+def test_weighted_draws_of_a_recording_that_says_nothing_are_those_of_the_population() -> None:
+    """Its prior is uniform, so the weights have to turn a uniform density into a log-normal one."""
+    rng = np.random.default_rng(12)
+    space = ParameterSpace((Parameter("E_c", "Pa", 1e4, 2e6, "uniform"),))
+    silent = Individual("silent", space, space.draw(rng, 2000))
+    model = Model.of(Layout.of(made_up.table(1, 1, ())), tuple(np.log([[1e4], [2e6]])), Priors())
+    x = np.log(2e5) + 0.5 * rng.standard_normal((4000, 1, 1))
+    draws = State(x, 0.0 * x[..., 0], np.full((4000, 1, 1), np.log(2e5)), (), (np.full((4000, 1, 1), 0.25),))
+    found = overlap(0, silent, model, draws)
+    assert found.shift_sd < 0.1
+    assert 100 < found.effective < 2000
+    assert not found.poor
+    narrow = replace(
+        draws, x=np.log(2e5) + 0.002 * (x - np.log(2e5)), covariances=(1e-6 * draws.covariances[0],)
+    )
+    assert overlap(0, silent, model, narrow).poor

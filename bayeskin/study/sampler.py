@@ -22,7 +22,7 @@ Progress = Callable[[float, str], None]
 
 @dataclass(frozen=True)
 class SamplerSettings:
-    """Number of independent ensembles, number of walkers in each, and when to stop.
+    """Number of independent ensembles, even number of walkers in each, and when to stop.
 
     `limits` are those of `bayeskin.inference.Limits`. A sweep moves all parameters of a walker once.
     """
