@@ -19,14 +19,29 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from bayeskin.errors import InputError
+from bayeskin.inference.sample import evenly
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
 FEWEST_DRAWS = 100
-_MOST_DRAWS = 2000  # draws that the mixture is fitted to
-_COMPONENTS, _ROUNDS = (2, 3, 4, 6, 8, 12, 16, 24), 200  # numbers tried; rounds of expectation maximisation
-_PATIENCE = 2  # numbers of components that may be worse in succession before the search ends
-_NARROWEST = 1e-6  # smallest variance of a component, as a share of the variance of all draws
 _UNIT_EDGE = 1e-12  # distance from a bound, in prior probability, below which points count as at the bound
+
+
+@dataclass(frozen=True)
+class MixtureSettings:
+    """Settings of the mixture that is fitted to the draws of a recording's posterior.
+
+    most_draws : largest number of draws that it is fitted to
+    components : numbers of components that are tried after one, in this order
+    patience : how many of these numbers may be worse in succession before the search ends
+    rounds : largest number of rounds of expectation maximisation
+    narrowest : smallest variance of a component, as a share of the variance of all draws
+    """
+
+    most_draws: int = 2000
+    components: tuple[int, ...] = (2, 3, 4, 6, 8, 12, 16, 24)
+    patience: int = 2
+    rounds: int = 200
+    narrowest: float = 1e-6
 
 
 @dataclass(frozen=True)
@@ -72,29 +87,37 @@ class NormalMixture(_FreezesArrays):
     whiten: Array
 
     @classmethod
-    def of(cls, points: Array, rng: np.random.Generator) -> NormalMixture:
+    def of(
+        cls, points: Array, rng: np.random.Generator, settings: MixtureSettings = MixtureSettings()
+    ) -> NormalMixture:
         """Returns the mixture fitted to points (n, d), with as many components as the criterion favours."""
         centre, spread = points.mean(axis=0), np.atleast_2d(np.cov(points.T))
-        root = np.linalg.cholesky(spread + _NARROWEST * np.diag(spread.diagonal()))
+        root = np.linalg.cholesky(spread + settings.narrowest * np.diag(spread.diagonal()))
         white = np.linalg.solve(root, (points - centre).T).T
-        best, lowest = cls._fitted(white, 1, rng)
+        best, lowest = cls._fitted(white, 1, rng, settings)
         worse = 0
-        for count in _COMPONENTS:
-            mixture, criterion = cls._fitted(white, count, rng)
+        for count in settings.components:
+            mixture, criterion = cls._fitted(white, count, rng, settings)
             worse = 0 if criterion < lowest else worse + 1
             if not worse:
                 best, lowest = mixture, criterion
-            elif worse == _PATIENCE:
+            elif worse == settings.patience:
                 break
         return cls(best.log_weights, centre + best.centres @ root.T, best.whiten @ np.linalg.inv(root))
 
     @classmethod
-    def _fitted(cls, points: Array, count: int, rng: np.random.Generator) -> tuple[NormalMixture, float]:
+    def _fitted(
+        cls, points: Array, count: int, rng: np.random.Generator, settings: MixtureSettings
+    ) -> tuple[NormalMixture, float]:
         """Returns a mixture of `count` components, fitted by expectation maximisation, and its criterion."""
         from sklearn.mixture import GaussianMixture  # imported here, because the import takes seconds
 
-        seed = int(rng.integers(2**31))
-        fit = GaussianMixture(count, reg_covar=_NARROWEST, max_iter=_ROUNDS, random_state=seed)
+        fit = GaussianMixture(
+            count,
+            reg_covar=settings.narrowest,
+            max_iter=settings.rounds,
+            random_state=int(rng.integers(2**31)),
+        )
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a fit that has not converged is judged by its criterion
             fit.fit(points)
@@ -122,7 +145,10 @@ class Likelihoods(_FreezesArrays):
     _offsets: Array
 
     @classmethod
-    def of(cls, individuals: Sequence[Individual], rng: np.random.Generator) -> Likelihoods:
+    def of(
+        cls, individuals: Sequence[Individual], rng: np.random.Generator,
+        settings: MixtureSettings = MixtureSettings(),
+    ) -> Likelihoods:  # fmt: skip
         """Returns the likelihoods of recordings. Raises InputError where their parameters differ."""
         first = individuals[0]
         for individual in individuals:
@@ -135,9 +161,8 @@ class Likelihoods(_FreezesArrays):
         which = np.array([spaces.index(individual.space.without_texts) for individual in individuals])
         mixtures = []
         for individual, space in zip(individuals, which, strict=True):
-            chosen = np.linspace(0, len(individual.draws) - 1, min(_MOST_DRAWS, len(individual.draws)))
-            points = _to_normal(spaces[space], np.log(individual.draws[chosen.astype(int)]))
-            mixtures.append(NormalMixture.of(points, rng))
+            draws = evenly(individual.draws, settings.most_draws)
+            mixtures.append(NormalMixture.of(_to_normal(spaces[space], np.log(draws)), rng, settings))
         return cls(first.space.names, spaces, which, tuple(mixtures), *_stacked(mixtures))
 
     @property

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayeskin.inference.importance import smoothed_weights
+from bayeskin.inference.importance import WeightSettings, smoothed_weights
+from bayeskin.inference.sample import evenly
 from bayeskin.study.individual import Individual, log_prior
 from bayeskin.study.model import Model, State, log_normal
 from bayeskin.study.result import Overlap
@@ -19,10 +20,8 @@ _DRAWS, _SETS = 2000, 100  # largest numbers of draws of a recording, and of the
 
 def overlap(number: int, individual: Individual, model: Model, draws: State) -> Overlap:
     """Returns how well the draws of a recording overlap with its shrunk estimate and agree with it."""
-    chosen = np.linspace(0, len(draws.x) - 1, min(_SETS, len(draws.x))).astype(int)
-    some = draws.taken(chosen)
-    rows = np.linspace(0, len(individual.draws) - 1, min(_DRAWS, len(individual.draws))).astype(int)
-    x = np.log(individual.draws[rows])
+    some = draws.taken(np.arange(0, len(draws.x), -(-len(draws.x) // _SETS)))
+    x = np.log(evenly(individual.draws, _DRAWS))
     away = x - model.parents(some)[-1][:, number, None]
     log_weights = log_normal(away, some.covariances[-1]) - log_prior(individual.space, x)
     weights = np.exp(log_weights - log_weights.max(axis=1, keepdims=True))
@@ -30,7 +29,7 @@ def overlap(number: int, individual: Individual, model: Model, draws: State) -> 
     effective = float(np.median(1.0 / np.sum(weights**2, axis=1)))
     pooled = weights.mean(axis=0)
     with np.errstate(divide="ignore"):
-        khat = smoothed_weights(np.log(pooled))[1]
+        khat = smoothed_weights(np.log(pooled), WeightSettings())[1]
     shrunk = draws.x[:, number]
     shift = np.abs(pooled @ x - shrunk.mean(axis=0)) / shrunk.std(axis=0)
     return Overlap(individual.recording, effective, khat, float(shift.max()))

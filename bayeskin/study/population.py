@@ -11,6 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
+from bayeskin.inference.identify import Informed, Learned, identifiability
 from bayeskin.study.individual import Individual, Likelihoods
 from bayeskin.study.layout import Category, Layout
 from bayeskin.study.model import Model, Priors, State
@@ -20,18 +21,13 @@ from bayeskin.study.sampler import Progress, SamplerSettings, draw_population
 from bayeskin.study.table import Entry
 from bayeskin.types import Array
 
-# A recording informs a parameter if its posterior variance is this much smaller than that of the prior, in
-# the coordinate in which the prior is uniform. Its posterior leans on a bound where the outermost 2 % of the
-# prior hold three times their prior mass.
-_CONTRACTION, _EDGE, _LEANS = 0.1, 0.02, 0.06
-
 
 def infer_population(
     entries: Sequence[Entry],
     individuals: Sequence[Individual],
     rng: np.random.Generator,
-    priors: Priors | None = None,
-    settings: SamplerSettings | None = None,
+    priors: Priors = Priors(),
+    settings: SamplerSettings = SamplerSettings(),
     progress: Progress | None = None,
 ) -> Population:
     """Returns what the recordings of a study say about the population of their subjects.
@@ -45,35 +41,34 @@ def infer_population(
     ------
     InputError : the parameters of the posteriors differ.
     """
-    priors, settings = priors or Priors(), settings or SamplerSettings()
     layout, likelihoods = Layout.of(entries), Likelihoods.of(individuals, rng)
     model = Model.of(layout, likelihoods.bounds, priors)
     draws, convergence = draw_population(model, likelihoods, rng, settings, progress)
+    learned = [identifiability(one.space, one.draws) for one in individuals]
     return Population(
         layout, priors,
-        tuple(_parameter(column, model, draws, individuals) for column in range(len(likelihoods.names))),
+        tuple(
+            _parameter(column, model, draws, [one.parameters[column] for one in learned])
+            for column in range(len(likelihoods.names))
+        ),
         _recordings(layout, draws, individuals), _subjects(model, draws),
         tuple(overlap(n, one, model, draws) for n, one in enumerate(individuals)), convergence,
     )  # fmt: skip
 
 
-def _parameter(
-    column: int, model: Model, draws: State, individuals: Sequence[Individual]
-) -> ParameterOfPopulation:
-    """Returns the summary of one parameter."""
+def _parameter(column: int, model: Model, draws: State, learned: Sequence[Learned]) -> ParameterOfPopulation:
+    """Returns the summary of one parameter; `learned` is what each recording alone says about it."""
     layout, coefficients = model.layout, draws.coefficients[:, :, column]
     groups = layout.group.values if layout.group else ("",)
     between, *within = [covariance[:, column, column] for covariance in draws.covariances]
-    unit = [one.space.to_unit(one.draws)[:, column] for one in individuals]
     return ParameterOfPopulation(
-        individuals[0].space.parameters[column],
+        learned[0].parameter,
         {group: _estimate(np.exp(coefficients @ layout.row(group))) for group in groups},
         _spread(between), _spread(np.sum(within, axis=0)) if within else None,
         _spread(within[1]) if len(within) > 1 else None,
         tuple(contrast for one in layout.categories for contrast in _contrasts(one, coefficients)),
-        sum(bool(1.0 - 12.0 * u.var() >= _CONTRACTION) for u in unit),
-        sum(bool(np.mean(u < _EDGE) > _LEANS) for u in unit),
-        sum(bool(np.mean(u > 1.0 - _EDGE) > _LEANS) for u in unit),
+        sum(one.informed is not Informed.NOT for one in learned),
+        sum("lower" in one.leans_on for one in learned), sum("upper" in one.leans_on for one in learned),
     )  # fmt: skip
 
 

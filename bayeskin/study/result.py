@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayeskin.inference.convergence import Convergence
-from bayeskin.inference.importance import KHAT_LIMIT
+from bayeskin.inference.importance import WeightSettings
 from bayeskin.study.layout import Layout
 from bayeskin.study.model import Priors
 from bayeskin.types import Parameter
@@ -120,7 +120,7 @@ class Overlap:
     @property
     def poor(self) -> bool:
         """Returns whether so few draws lie there that the estimate relies on the fitted likelihood."""
-        return self.effective < FEWEST_EFFECTIVE or self.khat > KHAT_LIMIT
+        return self.effective < FEWEST_EFFECTIVE or self.khat > WeightSettings().khat
 
     @property
     def contradicts(self) -> bool:

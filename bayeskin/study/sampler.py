@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,23 +14,29 @@ from bayeskin.study.model import Model, State
 from bayeskin.study.moves import Ensembles
 from bayeskin.types import Array
 
-_FIRST_CHECK, _GROWTH = 500, 1.5  # sweeps until the first check, and their growth until the next
-_EVERY, _MOST = 5, 200  # every fifth sweep is kept; at most so many make the result
-_START_SDS = (0.1, 1.0)  # range of the spreads at the start
 Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)
 class SamplerSettings:
-    """Number of independent ensembles, even number of walkers in each, and when to stop.
+    """Settings of the sampler. A sweep moves all parameters of a walker once.
 
-    `limits` are those of `bayeskin.inference.Limits`. A sweep moves all parameters of a walker once.
+    ensembles, walkers : number of independent ensembles, and even number of walkers in each
+    limits, max_sweeps : the ensembles end when the limits are met, or after so many sweeps
+    first_check, growth : sweeps until the limits are first checked, and factor of the sweeps until the next
+    every, most : every so many sweeps are kept, and at most so many of those make the result
+    start_sds : range of the sds of all levels at the start
     """
 
     ensembles: int = 4
     walkers: int = 16
+    limits: Limits = Limits(effective_samples=1000.0, lengths=10.0)
     max_sweeps: int = 12000
-    limits: Limits = field(default_factory=lambda: Limits(effective_samples=1000.0, lengths=10.0))
+    first_check: int = 500
+    growth: float = 1.5
+    every: int = 5
+    most: int = 200
+    start_sds: tuple[float, float] = (0.1, 1.0)
 
 
 def draw_population(
@@ -46,26 +52,25 @@ def draw_population(
     check with the share of the way that is done and the first reason of the verdict.
     """
     moves = Ensembles(model, likelihoods, settings.ensembles, settings.walkers)
-    state = _start(model, likelihoods, settings.ensembles * settings.walkers, rng)
+    state = _start(model, likelihoods, settings, rng)
     names = _names(model, likelihoods.names)
     chain, densities, kept = list[Array](), list[Array](), list[State]()
-    goal = min(_FIRST_CHECK, settings.max_sweeps)
+    goal = min(settings.first_check, settings.max_sweeps)
     while True:
         while len(chain) < goal:
             state = _sweep(moves, state, rng)
             chain.append(_coordinates(state))
             densities.append(model.log_density(state))
-            if len(chain) % _EVERY == 0:
+            if len(chain) % settings.every == 0:
                 kept.append(state)
         steps, log_density = (_by_ensemble(rows, settings) for rows in (chain, densities))
         convergence = assess(steps, log_density, names, settings.limits)
         if progress is not None:
             progress(convergence.progress(settings.limits), convergence.verdict.reasons[0])
         if convergence.verdict.trusted or goal == settings.max_sweeps:
-            settled = kept[convergence.burn_in // _EVERY :]
-            chosen = np.linspace(0, len(settled) - 1, min(_MOST, len(settled))).astype(int)
-            return State.joined([settled[at] for at in chosen]), convergence
-        goal = min(int(_GROWTH * goal), settings.max_sweeps)
+            settled = kept[convergence.burn_in // settings.every :]
+            return State.joined(settled[:: -(-len(settled) // settings.most)]), convergence
+        goal = min(int(settings.growth * goal), settings.max_sweeps)
 
 
 def _sweep(moves: Ensembles, state: State, rng: np.random.Generator) -> State:
@@ -73,23 +78,22 @@ def _sweep(moves: Ensembles, state: State, rng: np.random.Generator) -> State:
     model = moves.model
     for draw in (draw_coefficients, draw_values, draw_covariances):
         state = draw(model, state, rng)
-    for move in (
-        moves.from_population,
-        moves.from_posteriors,
-        moves.move_recordings,
-        moves.move_coefficients,
-    ):
-        state = move(state, rng)
+    state = moves.from_population(state, rng)
+    state = moves.from_posteriors(state, rng)
+    state = moves.move_recordings(state, rng)
+    state = moves.move_coefficients(state, rng)
     for level in range(len(model.layout.levels) + 1):
         state = moves.move_spread(state, level, rng)
     return state
 
 
-def _start(model: Model, likelihoods: Likelihoods, count: int, rng: np.random.Generator) -> State:
-    """Returns a state of `count` walkers, in which each recording has a draw of its own posterior."""
+def _start(
+    model: Model, likelihoods: Likelihoods, settings: SamplerSettings, rng: np.random.Generator
+) -> State:
+    """Returns a state of all walkers, in which each recording has a draw of its own posterior."""
+    count, levels = settings.ensembles * settings.walkers, model.layout.levels
     x = likelihoods.draw(count, rng)
-    dim, levels = x.shape[2], model.layout.levels
-    low, high = _START_SDS
+    dim, (low, high) = x.shape[2], settings.start_sds
     sds = low * (high / low) ** rng.random((len(levels) + 1, count, 1, dim))
     state = State(
         x, likelihoods.log_likelihood(x), np.tile(model.centre, (count, 1, 1)),

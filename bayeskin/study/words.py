@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bayeskin.number_format import at_edge, number
+from bayeskin.number_format import number, scale
 from bayeskin.study.result import Contrast, Estimate, ParameterOfPopulation, Population, Spread
 from bayeskin.types import Parameter
 
@@ -140,9 +140,9 @@ def _bracketed(estimate: Estimate) -> str:
 
 
 def _quantity(estimate: Estimate, unit: str) -> str:
-    factor, name = at_edge(unit)
+    factor, name = scale([estimate.median, estimate.low, estimate.high], unit)
     scaled = Estimate(factor * estimate.median, factor * estimate.low, factor * estimate.high)
-    return f"{_bracketed(scaled)} {name}".removesuffix(" 1")
+    return f"{_bracketed(scaled)} {name}".rstrip()
 
 
 def _percent(value: float) -> str:
