@@ -59,6 +59,7 @@ FLOOR, UNSEEN = 5e-15, 0.4  # added to permeabilities [m^2]; share of recordings
 QUANTITIES = ("median control", "median keloid", "ratio", "between", "within")
 ENDS = ("true", "low", "middle", "high")
 SHRINKAGE = ("alone", "shrunk", "error alone", "error shrunk")
+SETTINGS = SamplerSettings()
 NUMERICAL = ("individual", "layout", "model", "exact_draws", "moves", "sampler", "population")
 ROWS = rows.Rows(
     rows.RESULTS / "study_coverage.csv",
@@ -156,7 +157,7 @@ def _permeability(
     return cells + width * rng.uniform(-0.5, 0.5, DRAWS)
 
 
-def infer(inputs: Mapping[str, Any], settings: SamplerSettings | None = None) -> dict[str, Any]:
+def infer(inputs: Mapping[str, Any], settings: SamplerSettings = SETTINGS) -> dict[str, Any]:
     """Simulates one study, infers its population, and returns a row."""
     started = time.process_time()
     rng = np.random.default_rng([inputs["seed"], inputs["index"]])

@@ -9,6 +9,8 @@ import numpy as np
 from bayeskin.study.model import Model, State, sums
 from bayeskin.types import Array
 
+_FREEDOM = 2.0  # degrees of freedom of the prior under which covariances are proposed
+
 
 def draw_coefficients(model: Model, state: State, rng: np.random.Generator) -> State:
     """Returns the state with new coefficients.
@@ -54,17 +56,38 @@ def draw_values(model: Model, state: State, rng: np.random.Generator) -> State:
 
 
 def draw_covariances(model: Model, state: State, rng: np.random.Generator) -> State:
-    """Returns the state with new covariances of all levels, drawn by way of their auxiliary scales."""
-    freedom, dim = model.priors.freedom, state.x.shape[2]
+    """Returns the state after a proposal of new covariances for each level.
+
+    The proposal is exact under the prior of Huang & Wand (2013, Bayesian Analysis 8:439), which is inverse
+    Wishart given auxiliary scales. The ratio of the model's prior to that prior accepts or rejects it.
+    """
+    dim = state.x.shape[2]
     covariances = []
-    for effects, covariance in zip(model.effects(state), state.covariances, strict=True):
-        precision = np.diagonal(np.linalg.inv(covariance), axis1=1, axis2=2)
-        rate = freedom * precision + model.priors.spread_scale**-2
+    for effects, old in zip(model.effects(state), state.covariances, strict=True):
         squares = np.swapaxes(effects, 1, 2) @ effects
-        inverse_scales = rng.gamma(0.5 * (freedom + dim), size=rate.shape) / rate
-        squares[:, range(dim), range(dim)] += 2.0 * freedom * inverse_scales
-        covariances.append(_inverse_wishart(freedom + dim - 1 + effects.shape[1], squares, rng))
+        rate = _huang_wand_rates(old, model.priors.spread_scale)
+        inverse_scales = rng.gamma(0.5 * (_FREEDOM + dim), size=rate.shape) / rate
+        squares[:, range(dim), range(dim)] += 2.0 * _FREEDOM * inverse_scales
+        new = _inverse_wishart(_FREEDOM + dim - 1 + effects.shape[1], squares, rng)
+        gain = _log_prior_ratio(model, new) - _log_prior_ratio(model, old)
+        accepted = np.log(rng.random(len(gain))) < gain
+        covariances.append(np.where(accepted[:, None, None], new, old))
     return replace(state, covariances=tuple(covariances))
+
+
+def _huang_wand_rates(covariance: Array, scale: float) -> Array:
+    """Returns the rates (m, d) of the inverse gamma distributions of the auxiliary scales."""
+    precision = np.diagonal(np.linalg.inv(covariance), axis1=1, axis2=2)
+    return np.asarray(_FREEDOM * precision + scale**-2)
+
+
+def _log_prior_ratio(model: Model, covariance: Array) -> Array:
+    """Returns the log (m,) of the model's prior density over that of Huang & Wand, up to a constant."""
+    dim = covariance.shape[1]
+    rates = _huang_wand_rates(covariance, model.priors.spread_scale)
+    size = np.linalg.slogdet(covariance)[1]
+    other = -0.5 * (_FREEDOM + 2 * dim) * size - 0.5 * (_FREEDOM + dim) * np.log(rates).sum(axis=1)
+    return model.log_prior_of_covariance(covariance) - other
 
 
 def _regression(

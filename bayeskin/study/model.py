@@ -8,9 +8,9 @@ where the effects of each level are normal with mean zero and a covariance of th
 of the layout, and the recordings are the last level. The value of a unit is its effect and the effects of the
 units to which it belongs, so that members scatter around the value of their unit.
 
-Each covariance has the prior of Huang & Wand (2013, Bayesian Analysis 8:439). Its standard deviations are
-half-t, and with two degrees of freedom all correlations between -1 and 1 are equally likely. It is inverse
-Wishart, given auxiliary scales that are inverse gamma. All functions serve m walkers at once.
+The sds of each level are independent of each other and of their correlations. The correlations have the prior
+of Lewandowski, Kurowicka & Joe (2009, Journal of Multivariate Analysis 100:1989), in which the determinant of
+their matrix enters to a power. All functions serve m walkers at once.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ class Priors:
     """The weakly informative priors of a population, on natural logarithms.
 
     ratio_sd : sd of the logarithm of the ratio of two groups' or sites' medians, which is normal around 0
-    spread_scale, freedom : scale and degrees of freedom of the half-t prior of each level's sd
+    spread_scale, freedom : scale and degrees of freedom of the half-t prior of each level's sds
+    correlation_shape : power of the determinant of the correlations, less one; with 1 all matrices of
+        correlations are equally likely, and with more small correlations are likelier
 
     The median of the reference group is normal around the middle of the bounds of the recordings' priors (on
     logarithms), with half the distance of the bounds as sd.
@@ -40,7 +42,8 @@ class Priors:
 
     ratio_sd: float = 2.0
     spread_scale: float = 0.5
-    freedom: float = 2.0
+    freedom: float = 3.0
+    correlation_shape: float = 2.0
 
 
 @dataclass(frozen=True)
@@ -155,12 +158,20 @@ class Model:
         return -0.5 * np.sum(((coefficients - self.centre) / self.sd) ** 2, axis=(1, 2))
 
     def log_prior_of_covariance(self, covariance: Array) -> Array:
-        """Returns the log density (m,), up to a constant, of the covariances (m, d, d) of a level."""
-        dim, freedom = covariance.shape[1], self.priors.freedom
-        precision = np.diagonal(np.linalg.inv(covariance), axis1=1, axis2=2)
-        weight = np.log(freedom * precision + self.priors.spread_scale**-2).sum(axis=1)
-        size = np.linalg.slogdet(covariance)[1]
-        return -0.5 * (freedom + 2 * dim) * size - 0.5 * (freedom + dim) * weight
+        """Returns the log density (m,), up to a constant, of the covariances (m, d, d) of a level.
+
+        In the volume of covariances, the sds and correlations take the d-th power of the product of the sds.
+        """
+        freedom, dim = self.priors.freedom, covariance.shape[1]
+        variances = np.diagonal(covariance, axis1=1, axis2=2)
+        log_sds = 0.5 * np.log(variances).sum(axis=1)
+        half_t = np.log1p(variances / (freedom * self.priors.spread_scale**2)).sum(axis=1)
+        correlations = np.linalg.slogdet(covariance)[1] - 2.0 * log_sds
+        return (
+            -0.5 * (freedom + 1.0) * half_t
+            + (self.priors.correlation_shape - 1.0) * correlations
+            - dim * log_sds
+        )
 
     def log_density(self, state: State) -> Array:
         """Returns the log density (m,) of the states, up to a constant."""

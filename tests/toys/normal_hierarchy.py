@@ -165,16 +165,14 @@ def grid(levels: int, count: int) -> tuple[Array, Array]:
     return np.exp(2.0 * points)[:, :, None, None], log_prior
 
 
-def prior_draws(dim: int, levels: int, count: int, rng: np.random.Generator) -> Array:
-    """Covariances (count, levels, dim, dim) from the prior of Huang & Wand, by its definition.
+def prior_draws(levels: int, count: int, rng: np.random.Generator) -> Array:
+    """Covariances (count, levels, 2, 2) of two parameters from their prior, by its definition.
 
-    A Wishart matrix is the sum of squares of normal vectors, and its inverse is inverse Wishart.
+    The correlation of two parameters has a beta distribution, stretched to the range from -1 to 1.
     """
-    nu, scale = Priors().freedom, Priors().spread_scale
-    inverse_scales = rng.gamma(
-        0.5, scale**2, (count, levels, dim, 1)
-    )  # 1 / a, which has the rate 1 / scale^2
-    vectors = rng.standard_normal((count, levels, dim, int(nu) + dim - 1)) / np.sqrt(
-        2.0 * nu * inverse_scales
-    )
-    return np.linalg.inv(vectors @ np.swapaxes(vectors, 2, 3))
+    priors = Priors()
+    sds = priors.spread_scale * np.abs(rng.standard_t(priors.freedom, (count, levels, 2)))
+    tie = np.ones((count, levels, 2, 2))
+    shape = priors.correlation_shape
+    tie[..., 0, 1] = tie[..., 1, 0] = 2.0 * rng.beta(shape, shape, (count, levels)) - 1.0
+    return sds[..., None] * tie * sds[..., None, :]
