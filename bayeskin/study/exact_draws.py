@@ -1,4 +1,8 @@
-"""Draws the parts of a population that have a closed form, given all others: B, values and covariances."""
+"""Draws the parts of a population whose density, given all others, has a closed form or nearly so.
+
+B and the values of the units are normal. Covariances would be inverse Wishart under a prior that is close to
+the model's.
+"""
 
 from __future__ import annotations
 
