@@ -37,6 +37,7 @@ from bayeskin.study import (
     Population,
     Shrunk,
     Spread,
+    clearest_contrast,
     contrast_sentence,
     percentage,
 )
@@ -216,11 +217,10 @@ def _finding(population: Population) -> str:
     """Returns the clearest difference of two groups or sites, or the widest spread, as a sentence."""
     if not population.trusted:
         return "These results are not to be trusted: the sampler has not converged, or draws contradict them"
+    if (clearest := clearest_contrast(population)) is not None:
+        parameter, contrast = clearest
+        return contrast_sentence(parameter, contrast, symbol(parameter.name)).rstrip(".")
     known = [one for one in population.parameters if one.informative]
-    pairs = [(one, contrast) for one in known for contrast in one.contrasts]
-    if pairs:
-        one, contrast = max(pairs, key=lambda pair: abs(pair[1].probability - 0.5))
-        return contrast_sentence(one.parameter, contrast, symbol(one.parameter.name)).rstrip(".")
     if not known:
         return "No recording of the study informs any of these parameters"
     widest = max(known, key=lambda one: one.between.sd.median)

@@ -13,8 +13,15 @@ from bayeskin.study.result import (
     Spread,
 )
 from bayeskin.study.sampler import SamplerSettings
-from bayeskin.study.table import Entry, read_table
-from bayeskin.study.words import contrast_sentence, percentage, sentences
+from bayeskin.study.table import Entry, read_table, refuse_few_subjects
+from bayeskin.study.words import (
+    clearest_contrast,
+    contrast_sentence,
+    doubts,
+    headline,
+    percentage,
+    sentences,
+)
 
 __all__ = [
     "Contrast",
@@ -28,9 +35,13 @@ __all__ = [
     "SamplerSettings",
     "Shrunk",
     "Spread",
+    "clearest_contrast",
     "contrast_sentence",
+    "doubts",
+    "headline",
     "infer_population",
     "percentage",
     "read_table",
+    "refuse_few_subjects",
     "sentences",
 ]

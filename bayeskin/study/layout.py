@@ -92,7 +92,7 @@ class Layout(_FreezesArrays):
             site, matrix = None, _matrix(len(entries), group)
         levels = _levels(subject, session)
         return cls(
-            tuple(entry.recording.name for entry in entries), subjects, subject, group, site, confounded,
+            tuple(entry.name for entry in entries), subjects, subject, group, site, confounded,
             matrix, levels, _repetition(subject, session, entries[0].session is not None),
         )  # fmt: skip
 

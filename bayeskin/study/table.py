@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from bayeskin.errors import InputError
@@ -25,6 +26,7 @@ class Entry:
 
     where : file and row, for messages
     recording, device : paths, relative ones beside the table
+    name : of the recording in results and folders; by default that of its file
     """
 
     where: str
@@ -34,19 +36,24 @@ class Entry:
     group: str | None = None
     session: str | None = None
     device: Path | None = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            object.__setattr__(self, "name", _as_name(self.recording.stem))
 
 
 def read_table(path: Path | str) -> tuple[Entry, ...]:
     """Returns the rows of a CSV file with the columns `COLUMNS`, separated by commas, semicolons or tabs.
 
     The order of the columns is free, and those of `OPTIONAL` may be absent. Relative paths start beside the
-    table.
+    table. Where two files have one name, the names of the recordings begin with their subjects.
 
     Raises
     ------
     InputError : the table cannot be read; a column is unknown, missing or there twice; a row has too few or
-        too many cells; a cell is empty; a file does not exist; a recording is in two rows; the table or a
-        group has one subject only; or a subject is in two groups at one site.
+        too many cells; a cell is empty; a file does not exist; a recording is in two rows, or has the
+        name of another; the table or a group has one subject only; or a subject is in two groups at one site.
     """
     path = Path(path)
     try:
@@ -60,7 +67,8 @@ def read_table(path: Path | str) -> tuple[Entry, ...]:
     names = _names(f"{path}, row {header[0]}", header[1])
     entries = tuple(_entry(path, number, names, cells) for number, cells in rows)
     _refuse_recordings_twice(entries)
-    _refuse_few_subjects(path, entries)
+    entries = _of_different_names(entries)
+    refuse_few_subjects(path, entries)
     _refuse_groups_within_a_subject(entries)
     return entries
 
@@ -129,11 +137,35 @@ def _refuse_recordings_twice(entries: Sequence[Entry]) -> None:
         seen[file] = entry.where
 
 
-def _refuse_few_subjects(path: Path, entries: Sequence[Entry]) -> None:
+def _of_different_names(entries: tuple[Entry, ...]) -> tuple[Entry, ...]:
+    """Returns the rows with a name of its own for each recording."""
+    if len({entry.name for entry in entries}) == len(entries):
+        return entries
+    named = tuple(
+        replace(entry, name=_as_name(f"{entry.subject}-{entry.recording.stem}")) for entry in entries
+    )
+    seen: dict[str, str] = {}
+    for entry in named:
+        if entry.name in seen:
+            raise InputError(
+                _at(entry.where, "recording"), f"{entry.recording.name}, named {entry.name} as in "
+                f"{seen[entry.name]}", "files of different names for each subject",
+            )  # fmt: skip
+        seen[entry.name] = entry.where
+    return named
+
+
+def _as_name(text: str) -> str:
+    """Returns a text as the name of a run: characters that are not allowed become hyphens."""
+    return re.sub(r"^[^A-Za-z0-9]+", "", re.sub(r"[^A-Za-z0-9._-]", "-", text)) or "recording"
+
+
+def refuse_few_subjects(where: object, entries: Sequence[Entry]) -> None:
+    """Raises InputError for fewer than two subjects, in all or in a group."""
     count = len({entry.subject for entry in entries})
     if count < _FEWEST_SUBJECTS:
         raise InputError(
-            f"{path}, column 'subject'", f"{count} subjects", f"at least {_FEWEST_SUBJECTS} subjects"
+            f"{where}, column 'subject'", f"{count} subjects", f"at least {_FEWEST_SUBJECTS} subjects"
         )
     members: dict[str | None, set[str]] = {}
     for entry in entries:

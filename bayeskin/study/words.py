@@ -23,6 +23,33 @@ def sentences(population: Population) -> tuple[str, ...]:
     return (*by_parameter, *_of_table(population), *_of_checks(population))
 
 
+def headline(population: Population) -> tuple[str, ...]:
+    """Returns the result in two sentences at most: the clearest difference, and the widest variation."""
+    known = [one for one in population.parameters if one.informative]
+    if not known:
+        return ("No recording of the study informs any of these parameters.",)
+    said = [] if (clearest := clearest_contrast(population)) is None else [contrast_sentence(*clearest)]
+    varying = [one for one in known if not one.between.only_upper_bound]
+    if not varying:
+        return (*said, "The variation between subjects cannot be told from zero in any parameter.")
+    widest = max(varying, key=lambda one: one.between.sd.median)
+    variation = f"{widest.parameter.name} varies most: {_spread('between subjects', widest.between)}"
+    if widest.within is not None:
+        variation += f", and {_spread('within a subject', widest.within)}"
+    return (*said, f"{variation}.")
+
+
+def clearest_contrast(population: Population) -> tuple[Parameter, Contrast] | None:
+    """Returns the difference of two groups or sites that is least likely to be none, with its parameter."""
+    pairs = [
+        (one.parameter, contrast)
+        for one in population.parameters
+        for contrast in one.contrasts
+        if one.informative
+    ]
+    return max(pairs, key=lambda pair: abs(pair[1].probability - 0.5)) if pairs else None
+
+
 def contrast_sentence(parameter: Parameter, contrast: Contrast, name: str = "") -> str:
     """Returns which of two groups or sites has the larger parameter, and by which factor.
 
@@ -112,14 +139,19 @@ def _of_checks(population: Population) -> Iterator[str]:
             f"The draws of {poor} of {len(population.overlaps)} recordings hardly overlap with their shrunk "
             "estimates. These estimates rely on the densities that were fitted to the draws."
         )
-    for one in population.overlaps:
-        if one.contradicts:
-            yield (
-                f"Not trusted: the weighted draws of {one.recording} differ from its shrunk estimate by "
-                f"{number(one.shift_sd, 2)} of its sd."
-            )
-    if not population.convergence.verdict.trusted:
-        yield f"Not trusted: {population.convergence.verdict.reasons[0]}."
+    yield from (f"Not trusted: {doubt}." for doubt in doubts(population))
+
+
+def doubts(population: Population) -> tuple[str, ...]:
+    """Returns the reasons why the result is not to be trusted; there are none where it is trusted."""
+    verdict = population.convergence.verdict
+    contradicted = (
+        f"the weighted draws of {one.recording} differ from its shrunk estimate by "
+        f"{number(one.shift_sd, 2)} of its sd"
+        for one in population.overlaps
+        if one.contradicts
+    )
+    return (*contradicted, *(() if verdict.trusted else verdict.reasons[:1]))
 
 
 def _upward(contrast: Contrast) -> tuple[str, str, Estimate, float]:
