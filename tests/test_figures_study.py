@@ -34,9 +34,15 @@ def test_every_subject_has_a_label_and_every_group_a_name() -> None:
 
 def test_the_headline_is_the_clearest_difference() -> None:
     vague = Contrast("group", "control", "keloid", about(1.1), 0.6)
-    figure = drawn(report.figure_recordings(population(table(), K_S | {"contrasts": (vague,)}, {})))
+    figure = drawn(report.figure_population(population(table(), K_S | {"contrasts": (vague,)}, {})))
     assert "stiffer" in headline(figure)
     assert "0.97" in headline(figure)
+
+
+def test_the_headline_of_the_recordings_is_how_much_the_study_narrows_them() -> None:
+    """Made-up intervals are a factor of 2 about the median alone, and of 1.3 given the study."""
+    figure = drawn(report.figure_recordings(population(table(), {}, K_S)))
+    assert headline(figure).endswith(": $E_{c}$ 2.6, $k_{s}$ 2.6")  # log(2) / log(1.3)
 
 
 def test_without_groups_the_widest_spread_is_the_headline() -> None:

@@ -111,7 +111,7 @@ def test_a_study_without_a_population_says_why() -> None:
         "recordings": one.answer["recordings"], "left_out": one.answer["left_out"],
     }  # fmt: skip
     said = words(render_study(StudyFacts("k.toml", "", "t.csv", "", answer, {})))
-    assert "no population one subject is left." in said
+    assert "no population No population: one subject is left." in said
     assert "broken: no such file" in said
     assert "Variation" not in said
 

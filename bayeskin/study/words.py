@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from bayeskin.number_format import number, scale
+from bayeskin.number_format import number, with_interval
 from bayeskin.study.result import Contrast, Estimate, ParameterOfPopulation, Population, Spread
 from bayeskin.types import Parameter
 
@@ -96,7 +96,7 @@ def _of_parameter(population: Population, one: ParameterOfPopulation) -> Iterato
 
 def _medians(one: ParameterOfPopulation) -> str:
     parts = [
-        f"{_quantity(estimate, one.parameter.unit)}{f' in group {group}' if group else ''}"
+        f"{_bracketed(estimate, one.parameter.unit)}{f' in group {group}' if group else ''}"
         for group, estimate in one.medians.items()
     ]
     return f"the median of the population is {' and '.join(parts)}"
@@ -167,14 +167,8 @@ def _probability(value: float) -> str:
     return "above 0.999" if value > 0.999 else number(np.round(value, 3 if value > 0.99 else 2), 3)
 
 
-def _bracketed(estimate: Estimate) -> str:
-    return f"{number(estimate.median, 2)} [{number(estimate.low, 2)}, {number(estimate.high, 2)}]"
-
-
-def _quantity(estimate: Estimate, unit: str) -> str:
-    factor, name = scale([estimate.median, estimate.low, estimate.high], unit)
-    scaled = Estimate(factor * estimate.median, factor * estimate.low, factor * estimate.high)
-    return f"{_bracketed(scaled)} {name}".rstrip()
+def _bracketed(estimate: Estimate, unit: str = "") -> str:
+    return with_interval(estimate.median, estimate.low, estimate.high, unit)
 
 
 def _percent(value: float) -> str:

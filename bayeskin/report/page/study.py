@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bayeskin.number_format import number, percent, scale, with_unit
+from bayeskin.number_format import number, percent, with_interval
 from bayeskin.report.page.parts import (
     Block,
     Cell,
@@ -78,7 +78,7 @@ def study_verdict(facts: StudyFacts) -> Verdict:
     answer = facts.answer
     lines = [*answer.get("headline", ()), _entering(answer)]
     if not answer["ok"]:
-        lines = [*(f"{reason}." for reason in answer["because"]), *lines]
+        lines = [*(f"{answer['verdict'].capitalize()}: {reason}." for reason in answer["because"]), *lines]
     return Verdict(answer["verdict"], "good" if answer["ok"] else "doubt", lines)
 
 
@@ -208,9 +208,7 @@ def _values(one: Mapping[str, Any], parameters: Mapping[str, Any]) -> Sequence[C
 
 def _estimate(one: Mapping[str, float], unit: str) -> Cell:
     """Returns a median with its 90 % interval."""
-    factor, name = scale([one["median"], one["low_90"], one["high_90"]], unit)
-    low, high = (number(factor * one[key], 2) for key in ("low_90", "high_90"))
-    return Cell(f"{with_unit(one['median'], factor, '', 2)} [{low}, {high}] {name}".rstrip(), one["median"])
+    return Cell(with_interval(one["median"], one["low_90"], one["high_90"], unit), one["median"])
 
 
 def _probability(value: float) -> str:
