@@ -60,7 +60,7 @@ QUANTITIES = ("median control", "median keloid", "ratio", "between", "within")
 ENDS = ("true", "low", "middle", "high")
 SHRINKAGE = ("alone", "shrunk", "error alone", "error shrunk")
 SETTINGS = SamplerSettings()
-NUMERICAL = ("individual", "layout", "model", "exact_draws", "moves", "sampler", "population")
+NUMERICAL = ("individual", "mixture", "layout", "model", "exact_draws", "moves", "sampler", "population")
 ROWS = rows.Rows(
     rows.RESULTS / "study_coverage.csv",
     ("sources", "seed", "index"),

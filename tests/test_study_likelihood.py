@@ -11,6 +11,7 @@ from toys import normal_hierarchy as normal
 from bayeskin.errors import InputError
 from bayeskin.study import Individual
 from bayeskin.study.individual import Likelihoods, log_prior
+from bayeskin.study.mixture import NormalMixture
 from bayeskin.types import Array, Correlation, Parameter, ParameterSpace
 
 LOG_UNIFORM = ParameterSpace(
@@ -155,3 +156,20 @@ def test_recordings_with_other_parameters_are_refused() -> None:
                   (("arm-1", LOG_UNIFORM), ("arm-2", fewer))]  # fmt: skip
     with pytest.raises(InputError, match=r"arm-2: found parameters E_c; expected E_c, k_s, as in arm-1"):
         Likelihoods.of(recordings, rng)
+
+
+def test_a_mixture_of_two_normals_is_found_again() -> None:
+    rng = np.random.default_rng(11)
+    narrow, wide = np.array([[0.3, 0.0], [0.2, 0.1]]), np.array([[1.0, 0.0], [-0.8, 0.5]])
+    points = np.concatenate([
+        np.array([2.0, 0.0]) + rng.standard_normal((1500, 2)) @ narrow.T,
+        np.array([-1.0, 1.0]) + rng.standard_normal((500, 2)) @ wide.T,
+    ])  # fmt: skip
+    mixture = NormalMixture.of(points, rng)
+    assert np.sort(np.exp(mixture.log_weights)) == pytest.approx([0.25, 0.75], abs=0.03)
+    first = int(np.argmax(mixture.log_weights))
+    assert mixture.centres[first] == pytest.approx([2.0, 0.0], abs=0.05)
+    root = np.linalg.inv(mixture.whiten[first])
+    assert root @ root.T == pytest.approx(narrow @ narrow.T, abs=0.01)
+    sums = np.exp(mixture.log_parts(np.stack(np.meshgrid(*[np.linspace(-6, 6, 241)] * 2), -1).reshape(-1, 2)))
+    assert sums.sum() * 0.05**2 == pytest.approx(1.0, abs=1e-3)

@@ -13,8 +13,9 @@ from toys import normal_hierarchy as normal
 
 from bayeskin.study import Individual, Population, Priors, SamplerSettings, infer_population
 from bayeskin.study.exact_draws import draw_coefficients, draw_covariances, draw_values
-from bayeskin.study.individual import Likelihoods, NormalMixture
+from bayeskin.study.individual import Likelihoods
 from bayeskin.study.layout import Layout
+from bayeskin.study.mixture import NormalMixture
 from bayeskin.study.model import Model, State
 from bayeskin.study.moves import Ensembles
 from bayeskin.study.overlap import overlap

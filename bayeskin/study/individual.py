@@ -10,7 +10,6 @@ minimises the Bayesian information criterion, so that a curved ridge gets many a
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -20,28 +19,11 @@ from scipy.special import ndtr, ndtri
 
 from bayeskin.errors import InputError
 from bayeskin.inference.sample import evenly
+from bayeskin.study.mixture import MixtureSettings, NormalMixture
 from bayeskin.types import Array, ParameterSpace, _FreezesArrays
 
 FEWEST_DRAWS = 100
 _UNIT_EDGE = 1e-12  # distance from a bound, in prior probability, below which points count as at the bound
-
-
-@dataclass(frozen=True)
-class MixtureSettings:
-    """Settings of the mixture that is fitted to the draws of a recording's posterior.
-
-    most_draws : largest number of draws that it is fitted to
-    components : numbers of components that are tried after one, in this order
-    patience : how many of these numbers may be worse in succession before the search ends
-    rounds : largest number of rounds of expectation maximisation
-    narrowest : smallest variance of a component, as a share of the variance of all draws
-    """
-
-    most_draws: int = 2000
-    components: tuple[int, ...] = (2, 3, 4, 6, 8, 12, 16, 24)
-    patience: int = 2
-    rounds: int = 200
-    narrowest: float = 1e-6
 
 
 @dataclass(frozen=True)
@@ -73,56 +55,6 @@ class Individual(_FreezesArrays):
                 raise InputError(
                     at, "draws that are mostly repeated", "thinned draws, of which few are alike"
                 )
-
-
-@dataclass(frozen=True)
-class NormalMixture(_FreezesArrays):
-    """A mixture of k normal distributions: log_weights (k,), centres (k, d), and whiten (k, d, d).
-
-    `whiten` turns differences from a component's centre into independent unit normals.
-    """
-
-    log_weights: Array
-    centres: Array
-    whiten: Array
-
-    @classmethod
-    def of(
-        cls, points: Array, rng: np.random.Generator, settings: MixtureSettings = MixtureSettings()
-    ) -> NormalMixture:
-        """Returns the mixture fitted to points (n, d), with as many components as the criterion favours."""
-        centre, spread = points.mean(axis=0), np.atleast_2d(np.cov(points.T))
-        root = np.linalg.cholesky(spread + settings.narrowest * np.diag(spread.diagonal()))
-        white = np.linalg.solve(root, (points - centre).T).T
-        best, lowest = cls._fitted(white, 1, rng, settings)
-        worse = 0
-        for count in settings.components:
-            mixture, criterion = cls._fitted(white, count, rng, settings)
-            worse = 0 if criterion < lowest else worse + 1
-            if not worse:
-                best, lowest = mixture, criterion
-            elif worse == settings.patience:
-                break
-        return cls(best.log_weights, centre + best.centres @ root.T, best.whiten @ np.linalg.inv(root))
-
-    @classmethod
-    def _fitted(
-        cls, points: Array, count: int, rng: np.random.Generator, settings: MixtureSettings
-    ) -> tuple[NormalMixture, float]:
-        """Returns a mixture of `count` components, fitted by expectation maximisation, and its criterion."""
-        from sklearn.mixture import GaussianMixture  # imported here, because the import takes seconds
-
-        fit = GaussianMixture(
-            count,
-            reg_covar=settings.narrowest,
-            max_iter=settings.rounds,
-            random_state=int(rng.integers(2**31)),
-        )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a fit that has not converged is judged by its criterion
-            fit.fit(points)
-        whiten = np.swapaxes(fit.precisions_cholesky_, 1, 2)
-        return cls(np.log(fit.weights_), fit.means_, whiten), float(fit.bic(points))
 
 
 @dataclass(frozen=True)
