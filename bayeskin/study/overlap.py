@@ -15,6 +15,7 @@ from bayeskin.study.individual import Individual, log_prior
 from bayeskin.study.model import Model, State, log_normal
 from bayeskin.study.result import Overlap
 
+_EVEN = 0.5  # share of effective draws from which on weights count as nearly even
 _DRAWS, _SETS = 2000, 100  # largest numbers of draws of a recording, and of the population's parameters
 
 
@@ -28,8 +29,10 @@ def overlap(number: int, individual: Individual, model: Model, draws: State) -> 
     weights /= weights.sum(axis=1, keepdims=True)
     effective = float(np.median(1.0 / np.sum(weights**2, axis=1)))
     pooled = weights.mean(axis=0)
-    with np.errstate(divide="ignore"):
-        khat = smoothed_weights(np.log(pooled), WeightSettings())[1]
+    khat = float("nan")
+    if effective < _EVEN * len(x):  # nearly even weights have no tail, and the fit of one is erratic
+        with np.errstate(divide="ignore"):
+            khat = smoothed_weights(np.log(pooled), WeightSettings())[1]
     shrunk = draws.x[:, number]
     shift = np.abs(pooled @ x - shrunk.mean(axis=0)) / shrunk.std(axis=0)
     return Overlap(individual.recording, effective, khat, float(shift.max()))

@@ -108,7 +108,7 @@ class Overlap:
     likelihood.
 
     effective : number of effective draws at one set of parameters of the population (median over the sets)
-    khat : shape of the Pareto tail of the weights, NaN below 200 draws
+    khat : shape of the Pareto tail of the weights, NaN below 200 draws and where the weights are nearly even
     shift_sd : largest difference of the two means over the parameters, in sd of the shrunk estimate
     """
 
