@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 import rows
+from numpy.typing import NDArray
 
 import bayeskin.study
 from bayeskin.study import Entry, Individual, Population, Priors, SamplerSettings, infer_population
@@ -201,7 +202,7 @@ def _contains(estimate: Estimate, value: float) -> bool:
     return bool(estimate.low <= value <= estimate.high)
 
 
-def inside(found: Sequence[Mapping[str, str]], name: str, quantity: str) -> Array:
+def inside(found: Sequence[Mapping[str, str]], name: str, quantity: str) -> NDArray[np.bool_]:
     """Returns for each study whether the 90 % interval contains the true value, (n,)."""
     true, low, _, high = (np.array([float(row[f"{name} {quantity} {end}"]) for row in found]) for end in ENDS)
     return (low <= true) & (true <= high)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -61,12 +60,13 @@ def make(folder: Path, subject: int) -> tuple[str, str, dict[str, float]]:
     return file.stem, group, theta
 
 
-def seconds_by_stage(folder: Path) -> Counter[str]:
+def seconds_by_stage(folder: Path) -> dict[str, float]:
     """Returns the seconds of each stage, summed over the runs in a folder."""
-    seconds = Counter[str]()
+    seconds = dict[str, float]()
     for file in folder.glob("*/*/stage.json"):
         record = read_record(file.parent)
-        seconds[file.parent.name] += record.seconds if record else 0.0
+        name = file.parent.name
+        seconds[name] = seconds.get(name, 0.0) + (record.seconds if record else 0.0)
     return seconds
 
 
@@ -75,7 +75,7 @@ def report(answer: Mapping[str, Any], folder: Path, skins: Mapping[str, Mapping[
     shared, own = (seconds_by_stage(folder / "study" / part) for part in ("protocols", "recordings"))
     table = [["the protocol", stage, f"{s:.0f}"] for stage, s in shared.items()]
     table += [["all recordings", stage, f"{s:.0f}"] for stage, s in own.items()]
-    table.append(["one recording", "all", f"{own.total() / len(skins):.0f}"])
+    table.append(["one recording", "all", f"{sum(own.values()) / len(skins):.0f}"])
     print(rows.markdown(["of", "stage", "process seconds"], table))
     for one in answer["recordings"]:
         if "alone" in one:
