@@ -20,14 +20,14 @@ from scipy.special import ndtr, ndtri
 from bayeskin.errors import InputError
 from bayeskin.inference.sample import evenly
 from bayeskin.study.mixture import MixtureSettings, NormalMixture
-from bayeskin.types import Array, ParameterSpace, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays, ParameterSpace
 
 FEWEST_DRAWS = 100
 _UNIT_EDGE = 1e-12  # distance from a bound, in prior probability, below which points count as at the bound
 
 
 @dataclass(frozen=True)
-class Individual(_FreezesArrays):
+class Individual(FreezesArrays):
     """The posterior of one recording: draws (n, d) in SI, in the columns of `space`, which was their prior.
 
     Raises InputError for draws that are too few, mostly repeated, or outside the bounds, and for a parameter
@@ -58,7 +58,7 @@ class Individual(_FreezesArrays):
 
 
 @dataclass(frozen=True)
-class Likelihoods(_FreezesArrays):
+class Likelihoods(FreezesArrays):
     """The likelihoods of N recordings as functions of x, the natural logarithms of d parameters in SI.
 
     spaces : the different priors of the recordings; which (N,) : the prior of each recording

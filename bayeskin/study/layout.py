@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayeskin.study.table import Entry
-from bayeskin.types import Array, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays
 
 Units = NDArray[np.int64]
 Repetition = Literal["none", "recordings", "recordings of a session", "sessions", "sessions and recordings"]
 
 
 @dataclass(frozen=True)
-class Level(_FreezesArrays):
+class Level(FreezesArrays):
     """Units that have several members, such as subjects with several recordings.
 
     unit (N,) : unit of each recording
@@ -35,7 +35,7 @@ class Level(_FreezesArrays):
 
 
 @dataclass(frozen=True)
-class Category(_FreezesArrays):
+class Category(FreezesArrays):
     """A property whose values have different medians.
 
     value (N,) : number of each recording's value
@@ -58,7 +58,7 @@ class Category(_FreezesArrays):
 
 
 @dataclass(frozen=True)
-class Layout(_FreezesArrays):
+class Layout(FreezesArrays):
     """The layout of a study of N recordings.
 
     subjects, subject (N,) : names of the subjects, and the subject of each recording

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from bayeskin.types import Array, _FreezesArrays
+from bayeskin.types import Array, FreezesArrays
 
 _NO_SHARE = 1e-14  # added to the shares of a component, so that an empty one has a centre
 _ROUNDS_OF_MEANS = 10
@@ -34,7 +34,7 @@ class MixtureSettings:
 
 
 @dataclass(frozen=True)
-class NormalMixture(_FreezesArrays):
+class NormalMixture(FreezesArrays):
     """A mixture of k normal distributions: log_weights (k,), centres (k, d), and whiten (k, d, d).
 
     `whiten` turns differences from a component's centre into independent unit normals.
