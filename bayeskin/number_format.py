@@ -78,6 +78,16 @@ def interval(low: float, high: float, unit: str, beside: float | None = None) ->
     return f"{number(factor * low)} to {with_unit(high, factor, name)}"
 
 
+def with_interval(value: float, low: float, high: float, unit: str = "", digits: int = 2) -> str:
+    """Returns a number, given in the SI `unit`, with an interval, such as "2 [0.9, 4.1] × 10⁻¹⁴ m²"."""
+    factor, name = scale([value, low, high], unit)
+    power = math.floor(math.log10(abs(factor * value))) if value else 0
+    power = 0 if _SMALLEST <= power < _LONGEST else power
+    middle, *ends = (number(factor * one / 10.0**power, digits) for one in (value, low, high))
+    times = f"× 10{str(power).translate(_RAISED)}" if power else ""
+    return " ".join(part for part in (f"{middle} [{ends[0]}, {ends[1]}]", times, name) if part)
+
+
 def percent(share: float | None, digits: int = 3) -> str:
     """Returns a share as a percentage, or a dash for None."""
     return "–" if share is None else f"{number(100 * share, digits)} %"

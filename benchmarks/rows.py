@@ -10,7 +10,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,16 +94,15 @@ def digest(inputs: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _code_digest() -> str:
-    """Returns a hash of how the sources of bayeskin/finite_element behave."""
-    folder = Path(bayeskin.finite_element.__file__).parent
-    hashes = "".join(sha256_of_behaviour(path.read_bytes()) for path in sorted(folder.glob("*.py")))
+def code_digest(sources: Iterable[Path]) -> str:
+    """Returns a hash of how Python sources behave."""
+    hashes = "".join(sha256_of_behaviour(path.read_bytes()) for path in sorted(sources))
     return hashlib.sha256(hashes.encode()).hexdigest()[:12]
 
 
 # This is a hash of the model's source when it was loaded. Times and small errors depend on more than the
 # model hash covers.
-CODE = _code_digest()
+CODE = code_digest(Path(bayeskin.finite_element.__file__).parent.glob("*.py"))
 
 
 def warn_of_mixed_code(rows: Sequence[Row]) -> None:

@@ -62,8 +62,12 @@ def run_page(page: Path, folder: Path, slow: bool, monkeypatch: pytest.MonkeyPat
 
 
 def checked_toml(text: str) -> None:
-    """A fragment of a configuration is one, with a recording added; of a package's it is TOML."""
+    """A fragment of a configuration is one, with a recording added; of a package's it is TOML.
+
+    The file of a study has a table in place of the recording.
+    """
     plain = tomllib.loads(text)
+    plain.pop("table", None)
     if "project" not in plain:
         recording = {} if "recordings" in plain else {"recording": {"file": "x.h5"}}
         Config.model_validate_json(json.dumps({"name": "x", **recording, **plain}))

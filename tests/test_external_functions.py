@@ -133,7 +133,7 @@ def test_a_function_is_asked_for_no_time_twice() -> None:
         ("spring.py:endless", PARAMETERS, "not finite"),
         ("spring.py:force", "", "KeyError: 'stiffness'"),
         ("spring.py:force", "[parameters.stiffness]\nlower = 1.0\n", "stiffness.upper: found nothing"),
-        ("spring.py:force", PARAMETERS + '[surrogate]\nfile = "demo.h5"\n', "surrogate.file: found a value"),
+        ("spring.py:force", PARAMETERS + '[surrogate]\nfile = "demo.h5"\n', "a surrogate of another model"),
         ("ftp://here", PARAMETERS, "expected http://HOST:PORT"),
         ("http://here:port", PARAMETERS, "expected http://HOST:PORT"),
         ("http://127.0.0.1:9", PARAMETERS, "no answer"),

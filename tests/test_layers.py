@@ -54,7 +54,8 @@ BELOW = {
     "mismatch": BASE | {"finite_element", "mechanisms", "inference", "forward"},
     "experiments": BASE | {"mechanisms", "inference", "mismatch"},
     "proof": BASE | SIBLINGS | {"mechanisms", "reduced", "runner"},  # and nothing that diagnoses imports it
-    "report": BASE | {"recordings", "inference", "sensitivity"},
+    "study": BASE | {"inference"},
+    "report": BASE | {"recordings", "inference", "sensitivity", "study"},
     "workflow": BASE
     | SIBLINGS
     | {
@@ -70,6 +71,7 @@ BELOW = {
         "forward",
         "inference",
         "sensitivity",
+        "study",
         "report",
     },
 }

@@ -1,4 +1,4 @@
-"""The commands that run the stages of a configuration: `run`, `report` and the single stages."""
+"""The commands that run stages: `run`, `report`, the single stages, and `study` for many recordings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from bayeskin.cli.answers import answered
-from bayeskin.cli.options import config_argument, scheduler_option
+from bayeskin.cli.options import PATH, config_argument, scheduler_option
 from bayeskin.cli.terminal import Terminal
 
 
@@ -49,6 +49,33 @@ def report(config: Path) -> Mapping[str, Any]:
 
     with Terminal() as terminal:
         return stages.report(config, terminal)
+
+
+@click.command(short_help="Infer all recordings of a study, and what they say about the population.")
+@click.argument("file", type=PATH)
+@scheduler_option
+@answered
+def study(file: Path, scheduler: str | None) -> Mapping[str, Any]:
+    """Infer all recordings of a study, and compare groups of skins.
+
+    FILE states a table with one row for each recording, and settings that all recordings share. Each
+    recording is inferred as by `bayeskin run`. A hierarchical model then gives the medians of the groups,
+    their ratios, the variation between and within subjects, and what the whole study says about each
+    recording. A recording that fails is left out, and the answer says so.
+
+    Outputs are written to a folder beside FILE that has the study's name. Read report.html in this folder
+    for the result. If the command is interrupted, the same command continues the study. With --scheduler,
+    recordings are inferred on a Dask cluster, whose workers need access to the files under the same paths.
+
+    \b
+    Example:
+      bayeskin study runs/keloid.toml
+      bayeskin study runs/keloid.toml --scheduler tcp://10.0.0.5:8786
+    """
+    from bayeskin.workflow import study
+
+    with Terminal() as terminal:
+        return study.study(file, terminal, scheduler)
 
 
 def _stage_command(name: str, text: str) -> click.Command:

@@ -113,14 +113,11 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
-    def _forward_model_has_no_keys_of_the_full_model(self) -> Config:
-        """Refuses keys that concern the full model where a forward model of the user's own replaces it."""
-        coarse = self.design.coarse
-        if self.model.forward is not None and (coarse is not None or self.surrogate.file is not None):
-            key = "design.coarse" if coarse is not None else "surrogate.file"
-            raise InputError(
-                key, "a value with model.forward", "no such line, because it concerns the full model"
-            )
+    def _forward_model_has_no_coarse_model(self) -> Config:
+        """Refuses a coarse model where a forward model of the user's own replaces the full model."""
+        if self.model.forward is not None and self.design.coarse is not None:
+            expected = "no such line, because it concerns the full model"
+            raise InputError("design.coarse", "a value with model.forward", expected)
         return self
 
     @property

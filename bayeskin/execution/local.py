@@ -39,6 +39,12 @@ def local(workers: int) -> Map:
     return lambda function, items: run_parallel(function, items, workers)
 
 
+def here(function: Callable[[Any], Any], items: Sequence[Any]) -> Results:
+    """Yields the same as `run_parallel`, from this process itself; a worker process may start no others."""
+    for index, item in enumerate(items):
+        yield index, function(item)
+
+
 @dataclass(frozen=True)
 class Lost:
     """Takes the place of the result of an item whose worker process died `ATTEMPTS` times."""

@@ -85,7 +85,7 @@ def weigh(
         exact = log_posterior.of_full_model(force[ok])
         full = log_likelihood(log_posterior.chain, exact, log_posterior.split(theta[ok])[1])
         log_ratio[ok] = full - log_posterior.log_likelihood(theta[ok])
-    weights, khat = _weights(log_ratio, settings)
+    weights, khat = smoothed_weights(log_ratio, settings)
     effective = float(1.0 / np.sum(weights**2)) if ok.any() else 0.0
     verdict = _verdict(weights, effective, khat, int((~ok).sum()), settings)
     return Weighed(log_posterior.space, theta, log_ratio, weights, effective, khat, verdict)
@@ -115,8 +115,8 @@ def corrected(weighed: Weighed, draws: ArrayLike) -> tuple[Corrected, ...]:
     )
 
 
-def _weights(log_ratio: Array, settings: WeightSettings) -> tuple[Array, float]:
-    """Returns normalised weights (s,), smoothed where the draws are many, and k-hat."""
+def smoothed_weights(log_ratio: Array, settings: WeightSettings) -> tuple[Array, float]:
+    """Returns normalised weights (s,), smoothed where the draws are many, and k-hat (NaN where not)."""
     if not np.isfinite(log_ratio).any():
         return np.zeros(len(log_ratio)), float("nan")
     relative, khat = log_ratio - log_ratio.max(), float("nan")

@@ -21,6 +21,7 @@ from bayeskin.report.recording import figure_recording
 from bayeskin.report.residuals import figure_residuals
 from bayeskin.report.save import save_figure
 from bayeskin.report.sobol import figure_sobol
+from bayeskin.report.study import figure_population, figure_recordings
 from bayeskin.report.traces import figure_traces
 from bayeskin.report.validation import figure_map_check, figure_validation
 from bayeskin.report.waves import figure_waves
@@ -39,11 +40,13 @@ __all__ = [
     "figure_located",
     "figure_map_check",
     "figure_model_check",
+    "figure_population",
     "figure_posterior",
     "figure_prior_predictive",
     "figure_profiles",
     "figure_proof",
     "figure_recording",
+    "figure_recordings",
     "figure_residual_by_phase",
     "figure_residuals",
     "figure_sobol",

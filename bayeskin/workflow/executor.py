@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 
 from bayeskin.execution.cluster import on_scheduler, on_slurm
-from bayeskin.execution.local import Map, local
+from bayeskin.execution.local import Map, here, local
 from bayeskin.workflow.engine import Run
 
 WORKERS = 2  # worker processes of a command that has no such setting
@@ -23,10 +24,13 @@ def with_scheduler(run: Run, scheduler: str) -> Run:
 def executor(run: Run) -> Iterator[Map]:
     """Yields the executor that the configuration asks for: a function that applies a function to many items.
 
-    Raises InputError where a cluster is not available.
+    In a worker process of another executor, which may start no processes, it is this process itself. Raises
+    InputError where a cluster is not available.
     """
     design, slurm = run.config.design, run.config.slurm
-    if design.scheduler is not None:
+    if multiprocessing.current_process().daemon:
+        yield here
+    elif design.scheduler is not None:
         with on_scheduler(design.scheduler) as run_all:
             yield run_all
     elif slurm is not None:

@@ -27,13 +27,18 @@ def _mesh_or_forward(run: Run) -> dict[str, str]:
     return {"mesh": run.config.model.mesh} if forward is None else {"forward": forward}
 
 
+def doubts_of(run: Run) -> list[str]:
+    """Returns the reasons why a run's posterior is not to be trusted; there are none where it is trusted."""
+    best, sampled = run.summary("map"), run.summary("sample")
+    doubts = [] if best["ok"] else [best["checks"][-1]["message"]]
+    return doubts + ([] if sampled["ok"] else [sampled["reasons"][0]])
+
+
 def _write_summary(run: Run) -> Mapping[str, Any]:
     """Writes and returns the result of a run, for people and programs, from the summaries of its stages."""
     summaries = {stage.name: run.summary(stage.name) for stage in BEFORE_REPORT}
     sampled, map_summary = summaries["sample"], summaries["map"]
-    checked = map_summary["checks"][-1]
-    doubts = [] if map_summary["ok"] else [checked["message"]]
-    doubts += [] if sampled["ok"] else [sampled["reasons"][0]]
+    checked, doubts = map_summary["checks"][-1], doubts_of(run)
     records = {stage.name: read_record(run.folder / stage.name) for stage in BEFORE_REPORT}
     summary = {
         "ok": not doubts,

@@ -30,6 +30,7 @@ from bayeskin.inference import chains, draws_of, load_inference_data, save_infer
 from bayeskin.recordings import phase_noise, read_recording, segment
 from bayeskin.runner import FinishedRun
 from bayeskin.store import Store
+from bayeskin.study import read_table
 from bayeskin.surrogates import load_manifest, manifest_of, save_surrogate, train
 from bayeskin.types import Design, Recording
 from bayeskin.workflow import folder
@@ -87,6 +88,13 @@ DEVICE = b"[device]\nguard_mm = { gap = 1, width = 8 }\n[tissue]\ncutis_mm = { m
 def as_mesh() -> bytes:
     """Flat skin as gmsh writes it."""
     return gmsh_text(coarse_tetrahedra(FLAT)).encode()
+
+
+def as_study(tmp: Path) -> bytes:
+    """A table, in a folder beside the recordings that it names."""
+    for name in ("a.h5", "b.h5", "c.h5"):
+        (tmp / name).touch()
+    return b"recording,subject,site\n../a.h5,anna,arm\n../b.h5,bela,arm\n../c.h5,bela,leg\n"
 
 
 def as_store(tmp: Path) -> bytes:
@@ -160,6 +168,7 @@ READERS: dict[str, tuple[Callable[[Path], object], Callable[[Path], bytes], int]
     ),
     "a.toml": (load_config, lambda tmp: (ROOT / "runs/demo.toml").read_bytes(), 10),
     "device.toml": (load_device, lambda tmp: DEVICE, 10),
+    "study.csv": (read_table, as_study, 10),
     "a.msh": (lambda path: read_gmsh(path, FLAT), lambda tmp: as_mesh(), 4),
     "a.store": (read_store, as_store, 10),
     "stage.json": (read_stage, lambda tmp: json.dumps(STAGE).encode(), 10),

@@ -1,6 +1,7 @@
-"""Builds the report of a run: one HTML file that needs no other file."""
+"""Builds the report of a run or a study: one HTML file that needs no other file."""
 
 from bayeskin.report.page.facts import RunFacts, StageFacts
-from bayeskin.report.page.render import render_page
+from bayeskin.report.page.render import render_page, render_study
+from bayeskin.report.page.study import StudyFacts
 
-__all__ = ["RunFacts", "StageFacts", "render_page"]
+__all__ = ["RunFacts", "StageFacts", "StudyFacts", "render_page", "render_study"]

@@ -9,10 +9,14 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Cell:
-    """Holds the text of a table cell and the number by which it is sorted; with None, its text is sorted."""
+    """Holds the text of a table cell and the number by which it is sorted; with None, its text is sorted.
+
+    href : the page that the text opens
+    """
 
     text: str
     order: float | None = None
+    href: str = ""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,11 @@
-"""Renders the facts of a run as HTML: it fills the template with the sections, the style and the script."""
+"""Renders the facts of a run or a study as HTML: it fills a template with sections, style and script."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
@@ -14,6 +15,7 @@ from bayeskin.report.page.answer import answer
 from bayeskin.report.page.facts import RunFacts
 from bayeskin.report.page.parts import Block, Section
 from bayeskin.report.page.prose import prose
+from bayeskin.report.page.study import StudyFacts, study_picture, study_sections, study_verdict
 
 _HERE = Path(__file__).parent
 
@@ -24,16 +26,30 @@ def render_page(facts: RunFacts) -> str:
     All text from a configuration or a recording is escaped. The page allows its own script only, which it
     identifies by a hash. The same facts give the same bytes.
     """
+    question = "What is this skin made of?"
+    return _rendered(
+        "page.html", facts=facts, question=question, answer=answer(facts), sections=_sections(facts)
+    )
+
+
+def render_study(facts: StudyFacts) -> str:
+    """Returns the HTML document of a study, as `render_page`; it links to the reports of the recordings."""
+    return _rendered(
+        "study.html", facts=facts, question="What does this study show?", answer=study_verdict(facts),
+        pictures=study_picture(facts, "population"), sections=study_sections(facts),
+    )  # fmt: skip
+
+
+def _rendered(template: str, **parts: Any) -> str:
+    """Returns a template filled with parts of a page."""
     environment = Environment(
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.filters |= {"kind": _kind, "prose": prose}
     script = (_HERE / "page.js").read_text(encoding="utf-8")
-    return environment.get_template("page.html").render(
-        facts=facts,
-        answer=answer(facts),
-        sections=_sections(facts),
+    return environment.get_template(template).render(
+        **parts,
         style=Markup((_HERE / "page.css").read_text(encoding="utf-8")),
         script=Markup(script),
         script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
