@@ -83,11 +83,11 @@ def _given(state: Array) -> tuple[Array, Array, Array]:
 
 def _response(law: TissueLaw, solid: Material, state: Array, before: Array) -> tuple[Array, Array]:
     """Returns the response (n, 13) of the base law as the law changes it, and the law's memory."""
-    given, one, past = _given(state), (POINTS, 1), (np.ones((POINTS, 1)), np.zeros((POINTS, 1)))
-    stress, content, flux = np.empty((*one, 3, 3)), np.empty(one), np.empty((*one, 3))
+    given, shape, past = _given(state), (POINTS, 1), (np.ones((POINTS, 1)), np.zeros((POINTS, 1)))
+    stress, content, flux = np.empty((*shape, 3, 3)), np.empty(shape), np.empty((*shape, 3))
     poroelastic.respond(
         *(g[:, None] for g in given), solid.mu, solid.lam, solid.mobility, solid.storage, ELAPSED_S, *past,
-        stress, content, flux, np.empty(one),
+        stress, content, flux, np.empty(shape),
     )  # fmt: skip
     stress, content, flux, after = stress[:, 0], content[:, 0], flux[:, 0], np.full_like(before, np.nan)
     if law.respond is not None:

@@ -90,13 +90,13 @@ def _checked(mechanism: Mechanism) -> Mechanism:
     return replace(mechanism, neutral={**dict(zip(names, medians, strict=True)), **mechanism.neutral})
 
 
-def _check_names(found: Sequence[Mechanism]) -> None:
+def _check_names(mechanisms: Sequence[Mechanism]) -> None:
     """Raises InputError if two mechanisms, or two of their parameters, have the same name."""
     owners = defaultdict[str, list[str]](list)
-    for mechanism in found:
+    for mechanism in mechanisms:
         for parameter in mechanism.parameters:
             owners[parameter.name].append(mechanism.name)
-    for name, count in Counter(m.name for m in found).items():
+    for name, count in Counter(m.name for m in mechanisms).items():
         if count > 1:
             raise InputError("mechanisms", f"{name} twice", "another name for one of them")
     for name, both in owners.items():
@@ -110,7 +110,7 @@ def _with_both_look_alikes(known: Mapping[str, Mechanism]) -> dict[str, Mechanis
     pairs = {(m.name, other) for m in known.values() for other in m.look_alikes}
     pairs |= {(other, name) for name, other in pairs}
     return {
-        name: replace(m, look_alikes=tuple(sorted(other for one, other in pairs if one == name)))
+        name: replace(m, look_alikes=tuple(sorted(other for first, other in pairs if first == name)))
         for name, m in known.items()
     }
 
