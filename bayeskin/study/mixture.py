@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from bayeskin.types import Array, FreezesArrays
 
 _NO_SHARE = 1e-14  # added to the shares of a component, so that an empty one has a centre
-_ROUNDS_OF_MEANS = 10
+_ROUNDS_OF_MEANS = 30
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class MixtureSettings:
     components: tuple[int, ...] = (2, 3, 4, 6, 8, 12, 16, 24)
     patience: int = 2
     rounds: int = 200
-    gain: float = 1e-3
+    gain: float = 1e-4
     narrowest: float = 1e-6
 
 
