@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import arviz as az
@@ -11,7 +12,7 @@ from scipy.integrate import cumulative_trapezoid
 from toys import inference_problems
 
 from bayeskin.finite_element import ModelSpec
-from bayeskin.inference import NoisePriors
+from bayeskin.inference import NoisePriors, proposal
 from bayeskin.recordings import read_recording
 from bayeskin.shipped import shipped
 from bayeskin.types import Recording
@@ -39,7 +40,8 @@ def test_ranks_and_intervals_are_those_of_the_draws(benchmark):
     assert row["rank_E_s"] == pytest.approx(90, abs=10)
 
 
-def test_a_recording_is_made_inferred_and_ranked_in_one_row(benchmark):
+def test_a_recording_is_made_inferred_and_ranked_in_one_row(benchmark, monkeypatch):
+    monkeypatch.setattr(proposal, "MIXTURE", replace(proposal.MIXTURE, components=4, rounds=2))
     calibration = benchmark("calibration")
     settings = calibration.SampleSettings(2, 24, 500, calibration.Limits())
     item = {"surrogate": calibration.surrogate_hash(), "data": "surrogate", "seed": 1, "index": 3}

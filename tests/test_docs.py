@@ -105,6 +105,7 @@ def test_every_command_that_the_pages_name_exists() -> None:
     assert set(cli.commands) <= set(re.findall(r"`bayeskin ([a-z]+)", (ROOT / "README.md").read_text()))
 
 
+@pytest.mark.slow
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("sphinx")
     command = [

@@ -93,6 +93,8 @@ def test_derivatives_are_central_differences(monkeypatch, case):
     computed = np.array(slopes.force_n)
     largest = np.abs(computed).max()
     for column, (name, value) in enumerate(theta.items()):
+        if WITH[case] and name in ("E_s", "k_c", "p_init"):
+            continue  # "base" checks these
         h = 2e-6 if name == "yield_stretch" else 1e-3  # over which few points begin to yield
         up, down = (
             forces_on_the_same_steps(model(varied, binds, refinement), varied["p_init"], steps)
@@ -146,13 +148,13 @@ def test_the_exact_tangent_is_the_difference_of_residuals(h):
 
 
 def test_a_run_carries_its_derivatives():
-    run = simulate(ModelSpec(), MOTION, THETA, gradients=logarithms(THETA))
+    run = simulate(ModelSpec(refinement=0), MOTION, THETA, gradients=logarithms(THETA))
     assert run.gradient_names == ("E_c", "E_s", "k_c", "k_s")
     assert run.gradient_n.shape == (len(run.time_s), 4)
     means = run.gradient_bin_means(np.linspace(0, 23, 24))
     assert means.shape == (23, 4)
     assert not simulate(
-        ModelSpec(), PadMotion(MOTION.time_s[:2], MOTION.displacement_m[:2]), THETA
+        ModelSpec(refinement=0), PadMotion(MOTION.time_s[:2], MOTION.displacement_m[:2]), THETA
     ).gradient_names
 
 

@@ -16,9 +16,9 @@ import pytest
 from toys import stand_in_model
 from toys.closed_form_model import MOTION, SPACE, toy_force
 
-from bayeskin import report, storage
+from bayeskin import inference, report, storage
 from bayeskin.design_files import load_design
-from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data
+from bayeskin.inference import Convergence, LogPosterior, Posterior, Verdict, load_inference_data, proposal
 from bayeskin.number_format import interval
 from bayeskin.report.page.prose import prose
 from bayeskin.types import Design, PadMotion, Recording, Simulation
@@ -74,6 +74,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "save_figure", drawn)  # rendering is most of a small run's time
+        patch.setattr(proposal, "MIXTURE", dataclasses.replace(proposal.MIXTURE, components=4, rounds=2))
+        patch.setattr(inference, "profiles", partial(inference.profiles, points=3))
         patch.setattr(model, "FullModel", stand_in_model.ToyModel)
         patch.setattr(maximum, "simulate", interrupted)
         with pytest.raises(KeyboardInterrupt):
@@ -260,6 +262,8 @@ def test_longer_sampling_repeats_no_stage_before_it_and_keeps_the_chains(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(report, "save_figure", lambda *arguments: None)
+    monkeypatch.setattr(proposal, "MIXTURE", dataclasses.replace(proposal.MIXTURE, components=4, rounds=2))
+    monkeypatch.setattr(inference, "profiles", partial(inference.profiles, points=3))
     monkeypatch.setattr(model, "FullModel", stand_in_model.ToyModel)
     chains = list((folder / "case" / "chains").iterdir())
     (folder / "case.toml").write_text(CONFIG.format(steps=600))

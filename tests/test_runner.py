@@ -77,6 +77,7 @@ def kill_until_done(path: Path, workers: int, kills: int, rng: np.random.Generat
     subprocess.run(command, env=environment, check=True)
 
 
+@pytest.mark.slow
 def test_a_design_killed_at_random_moments_ends_as_if_it_had_not_been(tmp_path: Path, whole: Design) -> None:
     kill_until_done(tmp_path / "design.h5", workers=2, kills=4, rng=np.random.default_rng(0))
     assert_same_rows(load_design(tmp_path / "design.h5"), whole)

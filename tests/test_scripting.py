@@ -21,7 +21,7 @@ from bayeskin import scripting
 from bayeskin.config import config_of, load_config, to_toml
 from bayeskin.errors import InputError
 from bayeskin.finite_element import ModelSpec, simulate
-from bayeskin.inference import draws_of
+from bayeskin.inference import draws_of, proposal
 from bayeskin.types import PadMotion, Recording, Simulation
 from bayeskin.workflow import diagnosis
 
@@ -34,7 +34,7 @@ BLOCKS = re.findall(
 
 @pytest.fixture(scope="module")
 def said() -> dict[str, Any]:
-    """The names that the documentation's blocks leave, run from the checkout's root on a coarse mesh."""
+    """The names that the documentation's blocks leave, run on a coarse mesh and with coarse proposals."""
 
     def coarsely(spec: ModelSpec, motion: PadMotion, theta: Mapping[str, float]) -> Simulation:
         return simulate(replace(spec, refinement=0), motion, theta)
@@ -43,6 +43,7 @@ def said() -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(ROOT)
         patch.setattr(scripting, "run_model", coarsely)
+        patch.setattr(proposal, "MIXTURE", replace(proposal.MIXTURE, components=4, rounds=2))
         for block in BLOCKS:
             exec(compile(block, "docs/scripting.md", "exec"), names)
     return names
@@ -105,8 +106,11 @@ def test_the_full_model_weighs_the_documented_draws(said: dict[str, Any]) -> Non
     assert np.isfinite(weighed.log_ratio).all()
 
 
-def test_a_folder_keeps_the_chains_and_the_same_call_repeats_the_draws(tmp_path: Path) -> None:
+def test_a_folder_keeps_the_chains_and_the_same_call_repeats_the_draws(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With numbers of NumPy among the settings."""
+    monkeypatch.setattr(proposal, "MIXTURE", replace(proposal.MIXTURE, components=4, rounds=2))
     recording = bk.load_recording(ROOT / "data" / "demo.h5")
     small = {
         "sample": {"ensembles": np.int64(2), "walkers": 24, "max_steps": 500},
