@@ -93,6 +93,13 @@ def percent(share: float | None, digits: int = 3) -> str:
     return "–" if share is None else f"{number(100 * share, digits)} %"
 
 
+def probability(value: float) -> str:
+    """Returns a probability with three decimals at most; next to 0 and 1 it states a limit."""
+    if value < 0.001:
+        return "< 0.001"
+    return "> 0.999" if value > 0.999 else number(round(value, 3), 3)
+
+
 def _short(text: str) -> str:
     """Returns a decimal number without trailing zeros."""
     return text.rstrip("0").rstrip(".") if "." in text else text

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayeskin.mechanisms import catalogue
-from bayeskin.number_format import number
+from bayeskin.number_format import number, probability
 from bayeskin.types import ParameterSpace
 
 
@@ -40,3 +40,11 @@ def test_no_statement_of_a_mechanism_has_a_power_of_ten(at):
         said = mechanism.statement({**values, "E_c": 6e4, "E_s": 2e4})
         small = [v for v in values.values() if 0 < abs(v) < 1e-9]  # a leakage near zero may have one
         assert small or not re.search(r"\de[+-]?\d|× 10", said), said
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "< 0.001"), (0.001, "0.001"), (0.18, "0.18"), (0.9876, "0.988"), (1.0, "> 0.999")],
+)
+def test_a_probability_is_never_rounded_to_certainty(value: float, text: str) -> None:
+    assert probability(value) == text

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from bayeskin.number_format import number
+from bayeskin.number_format import number, probability
 from bayeskin.report.style import (
     ACCENT,
     FAINT,
@@ -160,7 +160,7 @@ def _draw_ratios(ax: Axes, pairs: Sequence[tuple[ParameterOfPopulation, Contrast
         ax.plot([ratio.low, ratio.high], [row, row], color=color, lw=1.4)
         ax.plot(ratio.median, row, "o", ms=4, color=color)
         ax.annotate(
-            number(round(contrast.probability, 3), 3), (1.0, row), xycoords=("axes fraction", "data"),
+            probability(contrast.probability), (1.0, row), xycoords=("axes fraction", "data"),
             xytext=(4, 0), textcoords="offset points", va="center", fontsize=7,
         )  # fmt: skip
     ax.annotate(

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from bayeskin.number_format import number, percent, with_interval
+from bayeskin.number_format import number, percent, probability, with_interval
 from bayeskin.report.page.parts import (
     Block,
     Cell,
@@ -119,7 +119,7 @@ def _groups(facts: StudyFacts) -> Section:
     ratios = [
         row((
             name, f"{ratio['numerator']} / {ratio['denominator']}", _estimate(ratio, ""),
-            Cell(_probability(ratio["probability_above_1"]), ratio["probability_above_1"]),
+            Cell(probability(ratio["probability_above_1"]), ratio["probability_above_1"]),
         ))
         for name, one in facts.parameters.items()
         for ratio in one["ratios"]
@@ -209,12 +209,6 @@ def _values(one: Mapping[str, Any], parameters: Mapping[str, Any]) -> Sequence[C
 def _estimate(one: Mapping[str, float], unit: str) -> Cell:
     """Returns a median with its 90 % interval."""
     return Cell(with_interval(one["median"], one["low_90"], one["high_90"], unit), one["median"])
-
-
-def _probability(value: float) -> str:
-    return (
-        number(round(value, 3), 3) if 0.001 <= value <= 0.999 else ("> 0.999" if value > 0.5 else "< 0.001")
-    )
 
 
 def _provenance(facts: StudyFacts) -> Section:
