@@ -51,7 +51,7 @@ def report(config: Path) -> Mapping[str, Any]:
         return stages.report(config, terminal)
 
 
-@click.command(short_help="Infer all recordings of a study, and what they say about the population.")
+@click.command(short_help="Infer all recordings of a study, and their population.")
 @click.argument("file", type=PATH)
 @scheduler_option
 @answered
