@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -15,7 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ import pytest
 from toys import fuzzed_files
 from toys.closed_form_model import MOTION
 from toys.external_models import PARAMETERS, SPRING, TRUE, spring
+from toys.full_disk import files_at_most
 
 from bayeskin import storage
 from bayeskin.design_files import load_design
@@ -71,17 +71,6 @@ def refused(answer: tuple[int, str, str], says: str) -> None:
     assert "Traceback" not in err
     assert [line for line in err.splitlines() if line.startswith("bayeskin: ")] == [err.splitlines()[-1]]
     assert says in err.splitlines()[-1]
-
-
-@contextmanager
-def files_at_most(size: int) -> Iterator[None]:
-    """Limits the size of files, so that writes fail as on a full disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.parametrize("size", [0, 1000, 10_000])

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import resource
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from toys import worker_functions
+from toys.full_disk import files_at_most
 
 from bayeskin.errors import InputError
 from bayeskin.execution.local import run_parallel
@@ -191,17 +189,6 @@ def test_several_processes_add_at_once(tmp_path: Path) -> None:
             for n in range(worker_functions.ADDED):
                 np.testing.assert_array_equal(store.read([number, n], dict)["force_n"], np.full(3000, n))
     assert len(path.read_bytes().splitlines()) == 1 + 3 * worker_functions.ADDED
-
-
-@contextmanager
-def files_at_most(size: int) -> Iterator[None]:
-    """Writes fail as on a full disk beyond a file's size."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.parametrize("room", [0, 10, 200])
