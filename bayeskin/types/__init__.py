@@ -8,7 +8,7 @@ name each dataclass of this package, so a dataclass keeps its name.
 from bayeskin.types.arrays import Array, FreezesArrays, frozen_array
 from bayeskin.types.design import Design
 from bayeskin.types.joint import Span
-from bayeskin.types.parameters import Correlation, Parameter, ParameterSpace
+from bayeskin.types.parameters import STIFFEST_BELOW, Correlation, Parameter, ParameterSpace
 from bayeskin.types.protocol import PadMotion, Phase, PhaseKind
 from bayeskin.types.provenance import Provenance
 from bayeskin.types.recording import BinnedForce, Jumps, Recording
@@ -17,6 +17,7 @@ from bayeskin.types.surrogate import POINTS_AT_ONCE, Prediction, Surrogate
 
 __all__ = [
     "POINTS_AT_ONCE",
+    "STIFFEST_BELOW",
     "Array",
     "BinnedForce",
     "Correlation",
