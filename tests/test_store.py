@@ -51,7 +51,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def kept(path: Path, heard: list[str] | None = None) -> list[bool]:
-    """Whether the store has the first and the second result, which are unchanged."""
+    """Returns whether the store has the first and the second result unchanged."""
     with Store(path, SHARED, (heard if heard is not None else []).append) as store:
         return [key in store and same(store.read(key, Result), result)
                 for key, result in (({"E_c": 1e5}, FIRST), ([2, "b"], SECOND))]  # fmt: skip
